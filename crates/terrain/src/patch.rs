@@ -1,0 +1,312 @@
+//! Vehicle-aligned patches: what the encoders see.
+
+use crate::geometry::Pose2;
+use crate::world_map::WorldMap;
+
+/// Pixels along each side of a patch (paper §III-A: 128 x 128).
+pub const PATCH_PX: usize = 128;
+
+/// Distance between neighbouring pixels of a patch, m (chosen: 12.8 m of ground at the resolution of the maps).
+pub const PATCH_RESOLUTION_M: f64 = 0.1;
+
+const PIXELS: usize = PATCH_PX * PATCH_PX;
+
+/// One observation of the terrain around the vehicle, normalised to [-1, 1].
+///
+/// Row 0 is furthest ahead, column 0 furthest left; the vehicle stands in the centre, between pixels 63 and 64.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Patch {
+    /// Elevation relative to the ground under the centre, (row, column), normalised.
+    pub elevation: Vec<f32>,
+    /// Colours, (channel = 3, row, column), normalised; all zero on a map without semantics.
+    pub semantic: Vec<f32>,
+    /// Share of the pixels that lie on the map and next to no hole, 0..=1.
+    pub known_share: f32,
+}
+
+impl Patch {
+    /// An empty patch, to be reused between calls of [`sample_patch`].
+    pub fn new() -> Self {
+        Self {
+            elevation: vec![0.0; PIXELS],
+            semantic: vec![0.0; 3 * PIXELS],
+            known_share: 0.0,
+        }
+    }
+}
+
+impl Default for Patch {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Global normalisation of patches to [-1, 1] (paper §IV-A).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct PatchScale {
+    /// Relative elevation that becomes 1, m.
+    pub elevation_half_range_m: f32,
+    /// Colour that becomes 0, per channel, on the scale 0..=255 of the image.
+    pub semantic_mean: [f32; 3],
+    /// Colour difference that becomes 1, per channel, on the same scale.
+    pub semantic_half_range: [f32; 3],
+}
+
+impl Default for PatchScale {
+    /// 3 m of relief (18 degrees over the 9 m to a corner of the patch), and the whole colour range.
+    fn default() -> Self {
+        Self {
+            elevation_half_range_m: 3.0,
+            semantic_mean: [127.5; 3],
+            semantic_half_range: [127.5; 3],
+        }
+    }
+}
+
+/// The patch as an affine walk over the grid: cell coordinates of pixel (0, 0), and what one column and one row add.
+///
+/// Coordinates count from `base`, a cell near the patch, so that f32 resolves 1e-5 of a cell wherever the map lies.
+struct Walk {
+    base: [i64; 2],
+    start: [f32; 2],
+    per_column: [f32; 2],
+    per_row: [f32; 2],
+}
+
+impl Walk {
+    fn new(map: &WorldMap, pose: Pose2) -> Self {
+        let step = PATCH_RESOLUTION_M / map.geometry().resolution_m;
+        let (sin, cos) = pose.yaw_rad.sin_cos();
+        let centre = map.geometry().to_grid(pose.x_m, pose.y_m);
+        // One row down is one step back, one column right is one step to the right.
+        let per_row = [-step * cos, -step * sin];
+        let per_column = [step * sin, -step * cos];
+        let half = (PATCH_PX as f64 - 1.0) / 2.0;
+        let first = [0, 1].map(|k| centre[k] - half * (per_row[k] + per_column[k]));
+        // The walk spans less than `reach` cells on either side of the centre: every local coordinate is positive.
+        let reach = (PATCH_PX as f64 * step).ceil() + 1.0;
+        let base = [0, 1].map(|k| (centre[k] - reach).floor() as i64);
+        let start = [0, 1].map(|k| (first[k] - base[k] as f64) as f32);
+        Self {
+            base,
+            start,
+            per_column: per_column.map(|v| v as f32),
+            per_row: per_row.map(|v| v as f32),
+        }
+    }
+
+    fn row_start(&self, row: usize) -> [f32; 2] {
+        [0, 1].map(|k| self.start[k] + row as f32 * self.per_row[k])
+    }
+
+    /// Whether every pixel, and its upper neighbours, lie on a grid of this size.
+    fn is_inside(&self, width: usize, height: usize) -> bool {
+        let last = (PATCH_PX - 1) as f32;
+        [width, height].iter().enumerate().all(|(k, side)| {
+            let (a, b) = (self.start[k], self.start[k] + last * self.per_row[k]);
+            let across = last * self.per_column[k];
+            let low = a.min(b).min(a + across).min(b + across);
+            let high = a.max(b).max(a + across).max(b + across);
+            // One cell of margin covers f32 rounding and the upper neighbour.
+            self.base[k] as f64 + f64::from(low) >= 1.0
+                && self.base[k] as f64 + f64::from(high) <= *side as f64 - 3.0
+        })
+    }
+}
+
+/// Cells and fractions of one row of a patch.
+struct RowCells {
+    index: [u32; PATCH_PX],
+    east: [f32; PATCH_PX],
+    north: [f32; PATCH_PX],
+}
+
+/// Four corner values (south-west, south-east, north-west, north-east) of one row of a patch.
+struct Corners<T> {
+    sw: [T; PATCH_PX],
+    se: [T; PATCH_PX],
+    nw: [T; PATCH_PX],
+    ne: [T; PATCH_PX],
+}
+
+impl<T: Copy> Corners<T> {
+    fn new(zero: T) -> Self {
+        Self {
+            sw: [zero; PATCH_PX],
+            se: [zero; PATCH_PX],
+            nw: [zero; PATCH_PX],
+            ne: [zero; PATCH_PX],
+        }
+    }
+
+    /// Gathers the corners of a row from a layer of the given width.
+    #[inline(always)]
+    fn gather(&mut self, layer: &[T], width: usize, cells: &RowCells) {
+        for column in 0..PATCH_PX {
+            let at = cells.index[column] as usize;
+            let south = &layer[at..at + 2];
+            let north = &layer[at + width..at + width + 2];
+            self.sw[column] = south[0];
+            self.se[column] = south[1];
+            self.nw[column] = north[0];
+            self.ne[column] = north[1];
+        }
+    }
+}
+
+/// Samples the patch around a pose (paper §III-A: the observation m_k at the predicted pose).
+///
+/// Bilinear. Elevation is relative to the ground under the centre, divided by the half range and clamped to [-1, 1]; colours are
+/// shifted, scaled and clamped per channel. Pixels off the map take the nearest border value and pixels at holes the nearest known
+/// height; both count out of `known_share`. A pose that is not finite gives a patch at the origin of the map with `known_share` 0.
+/// Nothing is allocated when the patch is reused.
+pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut Patch) {
+    patch.elevation.resize(PIXELS, 0.0);
+    patch.semantic.resize(3 * PIXELS, 0.0);
+    let finite = pose.x_m.is_finite() && pose.y_m.is_finite() && pose.yaw_rad.is_finite();
+    let [x_m, y_m] = map.geometry().to_world(0, 0);
+    let pose = if finite {
+        pose
+    } else {
+        Pose2 {
+            x_m,
+            y_m,
+            yaw_rad: 0.0,
+        }
+    };
+
+    let (width, height) = (map.geometry().width, map.geometry().height);
+    let walk = Walk::new(map, pose);
+    let inside = walk.is_inside(width, height);
+    let centre_m = map.nearest_height_m(pose.x_m, pose.y_m) as f32;
+    let per_elevation = 1.0 / scale.elevation_half_range_m;
+    let per_colour = scale.semantic_half_range.map(|half| 1.0 / half);
+
+    let mut cells = RowCells {
+        index: [0; PATCH_PX],
+        east: [0.0; PATCH_PX],
+        north: [0.0; PATCH_PX],
+    };
+    let mut heights = Corners::new(0.0f32);
+    let mut colours = Corners::new(0u32);
+    let mut unknown = 0;
+    for row in 0..PATCH_PX {
+        if inside {
+            cells_inside(&walk, row, width, &mut cells);
+        } else {
+            unknown += cells_clamped(&walk, row, [width, height], map, &mut cells);
+        }
+        if inside && let Some(known) = &map.surface.known {
+            unknown += cells
+                .index
+                .iter()
+                .filter(|i| !is_known(known, **i as usize, width))
+                .count();
+        }
+        heights.gather(&map.surface.height_m, width, &cells);
+        let out = &mut patch.elevation[row * PATCH_PX..(row + 1) * PATCH_PX];
+        mix_heights(&heights, &cells, centre_m, per_elevation, out);
+        let Some(colour) = &map.colour else { continue };
+        colours.gather(colour, width, &cells);
+        for channel in 0..3 {
+            let at = channel * PIXELS + row * PATCH_PX;
+            let out = &mut patch.semantic[at..at + PATCH_PX];
+            let (mean, per_unit) = (scale.semantic_mean[channel], per_colour[channel]);
+            mix_colours(&colours, &cells, 8 * channel as u32, mean, per_unit, out);
+        }
+    }
+    if map.colour.is_none() {
+        patch.semantic.fill(0.0);
+    }
+    patch.known_share = if finite {
+        1.0 - unknown as f32 / PIXELS as f32
+    } else {
+        0.0
+    };
+}
+
+fn is_known(known: &[bool], index: usize, width: usize) -> bool {
+    known[index] && known[index + 1] && known[index + width] && known[index + width + 1]
+}
+
+/// Cells of a row that lies wholly on the map: no clamping.
+#[inline(always)]
+fn cells_inside(walk: &Walk, row: usize, width: usize, cells: &mut RowCells) {
+    let [u0, v0] = walk.row_start(row);
+    let [du, dv] = walk.per_column;
+    let base = walk.base[1] * width as i64 + walk.base[0];
+    // The sum is a valid index although its parts may be negative: wrapping 32-bit arithmetic keeps the loop in lanes.
+    let base = base as i32;
+    for column in 0..PATCH_PX {
+        let u = u0 + column as f32 * du;
+        let v = v0 + column as f32 * dv;
+        let (i, j) = (u as i32, v as i32);
+        cells.index[column] = base.wrapping_add(j * width as i32 + i) as u32;
+        cells.east[column] = u - i as f32;
+        cells.north[column] = v - j as f32;
+    }
+}
+
+/// Cells of a row with clamping to the border; returns how many pixels are off the map or next to a hole.
+fn cells_clamped(
+    walk: &Walk,
+    row: usize,
+    size: [usize; 2],
+    map: &WorldMap,
+    cells: &mut RowCells,
+) -> usize {
+    let start = walk.row_start(row);
+    let mut unknown = 0;
+    for column in 0..PATCH_PX {
+        let mut off_map = false;
+        let mut cell = [0usize; 2];
+        let mut fraction = [0.0f32; 2];
+        for k in 0..2 {
+            let local = f64::from(start[k] + column as f32 * walk.per_column[k]);
+            let at = walk.base[k] as f64 + local;
+            let last = (size[k] - 1) as f64;
+            // 1e-4 of a cell forgives f32 rounding at the outermost points.
+            off_map |= !(-1e-4..=last + 1e-4).contains(&at);
+            // `max` before `min`: a NaN becomes 0.
+            let clamped = at.max(0.0).min(last);
+            cell[k] = (clamped as usize).min(size[k] - 2);
+            fraction[k] = (clamped - cell[k] as f64) as f32;
+        }
+        let index = cell[1] * size[0] + cell[0];
+        cells.index[column] = index as u32;
+        cells.east[column] = fraction[0];
+        cells.north[column] = fraction[1];
+        unknown += usize::from(off_map || !map.surface.is_known(index, size[0]));
+    }
+    unknown
+}
+
+#[inline(always)]
+fn mix_heights(z: &Corners<f32>, cells: &RowCells, centre_m: f32, per_unit: f32, out: &mut [f32]) {
+    for column in 0..PATCH_PX {
+        let south = z.sw[column] + cells.east[column] * (z.se[column] - z.sw[column]);
+        let north = z.nw[column] + cells.east[column] * (z.ne[column] - z.nw[column]);
+        let height = south + cells.north[column] * (north - south);
+        out[column] = ((height - centre_m) * per_unit).clamp(-1.0, 1.0);
+    }
+}
+
+#[inline(always)]
+fn mix_colours(
+    c: &Corners<u32>,
+    cells: &RowCells,
+    shift: u32,
+    mean: f32,
+    per_unit: f32,
+    out: &mut [f32],
+) {
+    let channel = |packed: u32| ((packed >> shift) & 255) as i32 as f32;
+    for column in 0..PATCH_PX {
+        let (sw, se) = (channel(c.sw[column]), channel(c.se[column]));
+        let (nw, ne) = (channel(c.nw[column]), channel(c.ne[column]));
+        let south = sw + cells.east[column] * (se - sw);
+        let north = nw + cells.east[column] * (ne - nw);
+        let value = south + cells.north[column] * (north - south);
+        out[column] = ((value - mean) * per_unit).clamp(-1.0, 1.0);
+    }
+}

@@ -1,0 +1,334 @@
+//! The immutable, versioned map of a world.
+
+use nesam_physics::SOIL_DIM;
+use sha2::{Digest, Sha256};
+
+use crate::error::TerrainError;
+use crate::geometry::{Bilinear, GridGeometry};
+use crate::surface::{Surface, fill_holes, footprint_slopes};
+
+/// Prior knowledge about one semantic class: its colour and the range of each soil parameter.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SoilClassRange {
+    /// Class name, e.g. `dry_sand`.
+    pub name: String,
+    /// Palette colour in the semantic image, where the world states one.
+    pub colour: Option<[u8; 3]>,
+    /// Lower bounds, SI and rad, in the order k_phi, k_c, n, c, phi, k_shear.
+    pub low: [f64; SOIL_DIM],
+    /// Upper bounds, same order.
+    pub high: [f64; SOIL_DIM],
+}
+
+/// Ground under a point.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Ground {
+    /// Height of the undeformed surface, World z, m.
+    pub height_m: f64,
+    /// dz/dx along World x, smoothed over about a wheel footprint, -.
+    pub slope_x: f64,
+    /// dz/dy along World y, -.
+    pub slope_y: f64,
+}
+
+/// Elevation and semantics of a world on one regular grid, row 0 in the south.
+///
+/// A map never changes: [`WorldMap::with_tile`] gives a new map with the next version, so a prediction can name the version it used
+/// and share the map without a lock. Holes are kept apart from heights: patches see them filled with the nearest known height,
+/// while [`WorldMap::height_m`] and [`WorldMap::ground`] answer `None` next to them.
+#[derive(Debug)]
+pub struct WorldMap {
+    id: String,
+    version: u64,
+    hash: String,
+    geometry: GridGeometry,
+    pub(crate) surface: Surface,
+    /// Colours packed as r | g << 8 | b << 16.
+    pub(crate) colour: Option<Vec<u32>>,
+    soil_classes: Vec<SoilClassRange>,
+}
+
+impl WorldMap {
+    /// Builds a map from layers in memory, both row-major with row 0 in the south; a NaN elevation is a hole.
+    ///
+    /// # Errors
+    /// `TerrainError::Layers` naming the field (and row and column) when the geometry is not usable, a layer has another number of
+    /// cells than the geometry, an elevation is infinite or beyond 10 km, or no elevation is known at all.
+    pub fn from_layers(
+        id: &str,
+        version: u64,
+        geometry: GridGeometry,
+        elevation_m: Vec<f32>,
+        semantic_rgb: Option<Vec<[u8; 3]>>,
+    ) -> Result<Self, TerrainError> {
+        let wrong = |field, reason| TerrainError::Layers {
+            id: id.to_string(),
+            field,
+            reason,
+        };
+        geometry
+            .check()
+            .map_err(|(field, reason)| wrong(field, reason))?;
+        if elevation_m.len() != geometry.cells() {
+            let reason = format!(
+                "{} cells, the geometry asks for {}",
+                elevation_m.len(),
+                geometry.cells()
+            );
+            return Err(wrong("elevation_m", reason));
+        }
+        if let Some(rgb) = &semantic_rgb
+            && rgb.len() != geometry.cells()
+        {
+            let reason = format!(
+                "{} cells, the geometry asks for {}",
+                rgb.len(),
+                geometry.cells()
+            );
+            return Err(wrong("semantic_rgb", reason));
+        }
+        if let Some(at) = elevation_m
+            .iter()
+            .position(|z| z.is_infinite() || z.abs() > 1e4)
+        {
+            let (row, column) = (at / geometry.width, at % geometry.width);
+            let reason = format!(
+                "{} m at row {row}, column {column} is beyond 10 km",
+                elevation_m[at]
+            );
+            return Err(wrong("elevation_m", reason));
+        }
+        let colour = semantic_rgb.map(|rgb| rgb.into_iter().map(pack).collect::<Vec<u32>>());
+        let hash = hash_layers(&geometry, &elevation_m, colour.as_deref());
+        let (height_m, known) = fill_holes(&geometry, elevation_m)
+            .ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
+        let slope = footprint_slopes(&geometry, &height_m);
+        let surface = Surface {
+            height_m,
+            slope,
+            known,
+        };
+        Ok(Self {
+            id: id.into(),
+            version,
+            hash,
+            geometry,
+            surface,
+            colour,
+            soil_classes: Vec::new(),
+        })
+    }
+
+    /// The same map with the prior soil ranges of its semantic classes.
+    pub fn with_soil_classes(mut self, soil_classes: Vec<SoilClassRange>) -> Self {
+        self.soil_classes = soil_classes;
+        self
+    }
+
+    /// A copy in which one rectangle is replaced, with the next version; `self` stays as it is.
+    ///
+    /// `column0`, `row0` are the south-west cell of the tile; layers are row-major, row 0 in the south; a NaN elevation makes a hole.
+    /// Without semantics in the tile the old colours stay.
+    ///
+    /// # Errors
+    /// `TerrainError::Layers` naming the field when the tile is empty or leaves the map, a layer has the wrong number of cells,
+    /// the tile has semantics but the map has none, or the patched map is not valid.
+    pub fn with_tile(
+        &self,
+        column0: usize,
+        row0: usize,
+        width: usize,
+        height: usize,
+        elevation_m: &[f32],
+        semantic_rgb: Option<&[[u8; 3]]>,
+    ) -> Result<Self, TerrainError> {
+        let wrong = |field, reason| TerrainError::Layers {
+            id: self.id.clone(),
+            field,
+            reason,
+        };
+        let GridGeometry {
+            width: map_width,
+            height: map_height,
+            ..
+        } = self.geometry;
+        for (field, start, side, limit) in [
+            ("tile width", column0, width, map_width),
+            ("tile height", row0, height, map_height),
+        ] {
+            if side == 0 || start.checked_add(side).is_none_or(|end| end > limit) {
+                return Err(wrong(
+                    field,
+                    format!("{side} cells from cell {start} do not fit in {limit} cells"),
+                ));
+            }
+        }
+        if elevation_m.len() != width * height {
+            let reason = format!(
+                "{} cells, the tile has {width} x {height}",
+                elevation_m.len()
+            );
+            return Err(wrong("tile elevation_m", reason));
+        }
+        if let Some(rgb) = semantic_rgb {
+            if self.colour.is_none() {
+                return Err(wrong(
+                    "tile semantic_rgb",
+                    "the map has no semantic layer to patch".into(),
+                ));
+            }
+            if rgb.len() != width * height {
+                let reason = format!("{} cells, the tile has {width} x {height}", rgb.len());
+                return Err(wrong("tile semantic_rgb", reason));
+            }
+        }
+        let mut elevation = self.elevation_m();
+        let mut semantic = self.semantic_rgb();
+        for row in 0..height {
+            let to = (row0 + row) * map_width + column0;
+            let from = row * width..(row + 1) * width;
+            elevation[to..to + width].copy_from_slice(&elevation_m[from.clone()]);
+            if let (Some(map), Some(tile)) = (semantic.as_mut(), semantic_rgb) {
+                map[to..to + width].copy_from_slice(&tile[from]);
+            }
+        }
+        let patched = Self::from_layers(
+            &self.id,
+            self.version + 1,
+            self.geometry,
+            elevation,
+            semantic,
+        )?;
+        Ok(patched.with_soil_classes(self.soil_classes.clone()))
+    }
+
+    /// World id.
+    pub fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// Version; grows by one with each patched tile.
+    pub fn version(&self) -> u64 {
+        self.version
+    }
+
+    /// SHA-256 (hex) over geometry and layers: equal content has an equal hash, whatever id and version.
+    pub fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    /// The grid.
+    pub fn geometry(&self) -> &GridGeometry {
+        &self.geometry
+    }
+
+    /// Whether there is a semantic layer.
+    pub fn has_semantics(&self) -> bool {
+        self.colour.is_some()
+    }
+
+    /// Prior soil ranges of the semantic classes; empty where the world states none.
+    pub fn soil_classes(&self) -> &[SoilClassRange] {
+        &self.soil_classes
+    }
+
+    /// Elevation layer as given, row-major, row 0 in the south, NaN = hole, m.
+    pub fn elevation_m(&self) -> Vec<f32> {
+        let known = |i: usize| self.surface.known.as_ref().is_none_or(|k| k[i]);
+        self.surface
+            .height_m
+            .iter()
+            .enumerate()
+            .map(|(i, z)| if known(i) { *z } else { f32::NAN })
+            .collect()
+    }
+
+    /// Semantic layer as given, row-major, row 0 in the south.
+    pub fn semantic_rgb(&self) -> Option<Vec<[u8; 3]>> {
+        self.colour.as_ref().map(|c| {
+            c.iter()
+                .map(|p| [*p as u8, (p >> 8) as u8, (p >> 16) as u8])
+                .collect()
+        })
+    }
+
+    /// Whether the point lies on the map (holes included).
+    pub fn contains(&self, x_m: f64, y_m: f64) -> bool {
+        self.geometry.contains(x_m, y_m)
+    }
+
+    /// Bilinear height, m; `None` off the map or where one of the four cells around is a hole.
+    #[inline]
+    pub fn height_m(&self, x_m: f64, y_m: f64) -> Option<f64> {
+        self.lookup(x_m, y_m)
+            .map(|at| self.surface.height(at, self.geometry.width))
+    }
+
+    /// Bilinear height and the slope smoothed over about a wheel footprint (0.3 m); `None` as for [`WorldMap::height_m`].
+    #[inline]
+    pub fn ground(&self, x_m: f64, y_m: f64) -> Option<Ground> {
+        let at = self.lookup(x_m, y_m)?;
+        let [slope_x, slope_y] = self.surface.slope(at, self.geometry.width);
+        Some(Ground {
+            height_m: self.surface.height(at, self.geometry.width),
+            slope_x,
+            slope_y,
+        })
+    }
+
+    /// Height with holes filled and points off the map clamped to the border, m; a fallback where any height beats none.
+    pub fn nearest_height_m(&self, x_m: f64, y_m: f64) -> f64 {
+        self.surface
+            .height(self.geometry.bilinear(x_m, y_m), self.geometry.width)
+    }
+
+    #[inline]
+    fn lookup(&self, x_m: f64, y_m: f64) -> Option<Bilinear> {
+        if !self.geometry.contains(x_m, y_m) {
+            return None;
+        }
+        let at = self.geometry.bilinear(x_m, y_m);
+        self.surface
+            .is_known(at.index, self.geometry.width)
+            .then_some(at)
+    }
+}
+
+/// Packs a colour as r | g << 8 | b << 16.
+fn pack([r, g, b]: [u8; 3]) -> u32 {
+    u32::from(r) | u32::from(g) << 8 | u32::from(b) << 16
+}
+
+/// SHA-256 over geometry, elevation (every NaN as one bit pattern) and colours.
+fn hash_layers(geometry: &GridGeometry, elevation_m: &[f32], colour: Option<&[u32]>) -> String {
+    let mut hash = Sha256::new();
+    hash.update(b"nesam.world/1");
+    for value in [
+        geometry.origin_m[0],
+        geometry.origin_m[1],
+        geometry.resolution_m,
+    ] {
+        hash.update(value.to_le_bytes());
+    }
+    hash.update((geometry.width as u64).to_le_bytes());
+    hash.update((geometry.height as u64).to_le_bytes());
+    let mut row = Vec::with_capacity(geometry.width * 4);
+    for cells in elevation_m.chunks(geometry.width) {
+        row.clear();
+        for z in cells {
+            let canonical = if z.is_nan() { f32::NAN } else { *z };
+            row.extend_from_slice(&canonical.to_le_bytes());
+        }
+        hash.update(&row);
+    }
+    hash.update([u8::from(colour.is_some())]);
+    for cells in colour.unwrap_or_default().chunks(geometry.width) {
+        row.clear();
+        row.extend(cells.iter().flat_map(|c| c.to_le_bytes()));
+        hash.update(&row);
+    }
+    hash.finalize()
+        .iter()
+        .map(|byte| format!("{byte:02x}"))
+        .collect()
+}
