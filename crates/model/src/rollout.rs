@@ -1,0 +1,101 @@
+//! The K-step rollout: queries, results and validity flags.
+
+use std::sync::Arc;
+
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, WHEELS};
+use nesam_terrain::WorldMap;
+
+/// One step of the recent past: the measured state and the command applied from it (one token of the paper, §III-B).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct HistoryStep {
+    /// Measured state x_j.
+    pub state: VehicleState<f64>,
+    /// Command u_j, valid over [t_j, t_j + dt).
+    pub control: Control<f64>,
+}
+
+/// Ablation switches at inference.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Variant {
+    /// The whole model.
+    #[default]
+    Full,
+    /// The learned state residual is switched off (paper: "NeSAM w/o SR").
+    NoResidual,
+    /// The wheel sinkage is suppressed (paper: "NeSAM, Sinkage = 0").
+    ZeroSinkage,
+}
+
+/// A batch of candidate command sequences from one start state.
+#[derive(Clone, Debug)]
+pub struct RolloutQuery<'a> {
+    /// Past steps, oldest first, without the start itself; only the last `HISTORY - 1` are used. May be empty.
+    pub history: &'a [HistoryStep],
+    /// State to start from.
+    pub start: VehicleState<f64>,
+    /// Commands, row-major (samples, horizon, 2): speed in m/s, second in the unit of the card.
+    pub controls: &'a [f32],
+    /// Number of candidate sequences N.
+    pub samples: usize,
+    /// Steps K, 1 ..= `MAX_HORIZON`.
+    pub horizon: usize,
+    /// Ground; `None` = unknown map: flat ground through the wheels and the default soil prior, flagged.
+    pub map: Option<&'a Arc<WorldMap>>,
+    /// Correction Δθ of the soil prior in physical units (paper Alg. 1), zero before any update.
+    pub soil_correction: [f64; SOIL_DIM],
+    /// Ablation.
+    pub variant: Variant,
+}
+
+/// Bits of [`Rollout::flags`], one word per sample.
+pub mod flag {
+    /// A state of this sample is not finite; the other samples are unaffected.
+    pub const NOT_FINITE: u32 = 1;
+    /// The rollout left the known map.
+    pub const OFF_MAP: u32 = 2;
+    /// No map was given.
+    pub const NO_MAP: u32 = 4;
+    /// Speed command outside the trained range.
+    pub const SPEED_UNTRAINED: u32 = 8;
+    /// Second command outside the trained range.
+    pub const STEERING_UNTRAINED: u32 = 16;
+    /// Slope (roll or pitch) outside the trained range.
+    pub const SLOPE_UNTRAINED: u32 = 32;
+    /// The vehicle lies on its side or roof (|roll| or |pitch| over 60 degrees).
+    pub const OVERTURNED: u32 = 64;
+}
+
+/// Predicted states.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Rollout {
+    /// Row-major (samples, horizon, state = 12), order of `VehicleState::to_array`; yaw is wrapped into (-pi, pi].
+    pub states: Vec<f32>,
+    /// Row-major (samples, horizon, 4): wheel sinkages, m.
+    pub sinkage_m: Vec<f32>,
+    /// Validity flags per sample, see [`flag`].
+    pub flags: Vec<u32>,
+    /// Soil used under the start pose (prior + correction, clipped), order of `SOIL_NAMES`.
+    pub soil: [f64; SOIL_DIM],
+    /// N.
+    pub samples: usize,
+    /// K.
+    pub horizon: usize,
+}
+
+impl Rollout {
+    /// State of sample `n` after step `k` (0-based: `k = 0` is one step after the start).
+    pub fn state(&self, n: usize, k: usize) -> VehicleState<f32> {
+        let at = (n * self.horizon + k) * STATE_DIM;
+        let mut x = [0.0; STATE_DIM];
+        x.copy_from_slice(&self.states[at..at + STATE_DIM]);
+        VehicleState::from_array(x)
+    }
+
+    /// Sinkage of sample `n` during step `k`, m.
+    pub fn sinkage(&self, n: usize, k: usize) -> [f32; WHEELS] {
+        let at = (n * self.horizon + k) * WHEELS;
+        let mut s = [0.0; WHEELS];
+        s.copy_from_slice(&self.sinkage_m[at..at + WHEELS]);
+        s
+    }
+}

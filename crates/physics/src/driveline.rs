@@ -1,0 +1,137 @@
+//! The drive line: from commands to rim speeds and road-wheel angles (ADR: how Ω follows from the command).
+//!
+//! A car-like vehicle tracks the commanded speed of its reference point: its drive line holds every rim a little faster or slower than the
+//! ground under it, in proportion to the speed error and to its integral, within a limit. A skid-steer vehicle servoes the rims themselves. The steering
+//! actuator lags the command and is limited in rate. The actuator state depends on commands and measured speed only, so a server
+//! rebuilds it from the history of a session.
+
+use crate::scalar::Real;
+use crate::state::Control;
+use crate::vehicle::{SecondCommand, Vehicle, WHEELS};
+
+/// State of the actuators between steps.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct DrivelineState {
+    /// Position of the steering actuator, in the unit of the second command.
+    pub steering: f64,
+    /// Leaky integral of the speed error, m.
+    pub speed_error_integral_m: f64,
+}
+
+impl DrivelineState {
+    /// Actuators that have settled on a command.
+    pub fn settled(control: &Control<f64>) -> Self {
+        Self { steering: control.second, speed_error_integral_m: 0.0 }
+    }
+
+    /// Advances the actuators by `dt_s` under a command, given the measured or predicted forward speed.
+    ///
+    /// Exact first-order lag for a held command, limited in rate; the integral of the speed error leaks with the card's time constant.
+    pub fn advance(&self, vehicle: &Vehicle, control: &Control<f64>, forward_m_s: f64, dt_s: f64) -> Self {
+        let line = &vehicle.driveline;
+        let travel = line.steering_rate_limit_per_s * dt_s;
+        let target = control.second - self.steering;
+        let lagged = if line.steering_lag_s > 0.0 { target * (1.0 - (-dt_s / line.steering_lag_s).exp()) } else { target };
+        let leak = (-dt_s / line.speed_integral_leak_s).exp();
+        let limit = line.speed_integral_limit_m;
+        let integral = self.speed_error_integral_m * leak + (control.speed_m_s - forward_m_s) * dt_s;
+        Self { steering: self.steering + lagged.clamp(-travel, travel), speed_error_integral_m: integral.clamp(-limit, limit) }
+    }
+}
+
+/// What the wheels are told during one step; constants of the step (no derivative flows through the actuators).
+#[derive(Clone, Copy, Debug)]
+pub struct WheelCommand<T> {
+    /// Road-wheel angle, rad, positive left.
+    pub angle_rad: [T; WHEELS],
+    /// Rim speed = `rim_base` + `rim_follow` · (wheel's own forward speed) + `rim_gain` · (speed command - forward speed of the vehicle).
+    pub rim_base_m_s: [T; WHEELS],
+    /// 1 when the rim follows the ground under it (speed-controlled vehicle), 0 when it is servoed or measured.
+    pub rim_follow: T,
+    /// Over-speed per speed error, -.
+    pub rim_gain: T,
+    /// Over-speed limit, m/s.
+    pub overspeed_limit_m_s: T,
+    /// Speed command, m/s.
+    pub speed_m_s: T,
+}
+
+/// Linear interpolation in an ascending table, held at its ends.
+fn interpolate(x: f64, grid: &[f64], values: &[f64]) -> f64 {
+    let last = grid.len() - 1;
+    if x <= grid[0] {
+        return values[0];
+    }
+    if x >= grid[last] {
+        return values[last];
+    }
+    let i = grid.partition_point(|&g| g <= x) - 1;
+    let share = (x - grid[i]) / (grid[i + 1] - grid[i]);
+    values[i] + share * (values[i + 1] - values[i])
+}
+
+/// Road-wheel angles FL, FR, RL, RR of an actuator position, rad.
+pub fn road_wheel_angles(vehicle: &Vehicle, steering: f64) -> [f64; WHEELS] {
+    match (&vehicle.steering, vehicle.second) {
+        (Some(table), SecondCommand::SteeringNormalised) => [
+            interpolate(steering, &table.command, &table.front_left_rad),
+            interpolate(steering, &table.command, &table.front_right_rad),
+            0.0,
+            0.0,
+        ],
+        (_, SecondCommand::RoadWheelAngleRad) => [steering, steering, 0.0, 0.0],
+        _ => [0.0; WHEELS],
+    }
+}
+
+/// What the command makes of the wheels over one step, from the mean actuator position of the step.
+pub fn command_wheels<T: Real>(vehicle: &Vehicle, before: &DrivelineState, after: &DrivelineState, control: &Control<f64>) -> WheelCommand<T> {
+    let line = &vehicle.driveline;
+    let steering = 0.5 * (before.steering + after.steering);
+    let skid = vehicle.second == SecondCommand::YawRateRadS;
+    let mut base = [line.speed_integral_gain_per_s * before.speed_error_integral_m; WHEELS];
+    if skid {
+        let half = 0.5 * vehicle.track_m * steering;
+        let (left, right) = (control.speed_m_s - half, control.speed_m_s + half);
+        base = [left, right, left, right];
+    }
+    WheelCommand {
+        angle_rad: road_wheel_angles(vehicle, steering).map(T::lit),
+        rim_base_m_s: base.map(T::lit),
+        rim_follow: T::lit(if skid { 0.0 } else { 1.0 }),
+        rim_gain: T::lit(if skid { 0.0 } else { line.speed_gain }),
+        overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s),
+        speed_m_s: T::lit(control.speed_m_s),
+    }
+}
+
+/// Wheels driven by measured rim speeds and road-wheel angles (`--inputs wheels`).
+pub fn measured_wheels<T: Real>(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHEELS], angle_rad: &[f64; WHEELS]) -> WheelCommand<T> {
+    WheelCommand {
+        angle_rad: angle_rad.map(T::lit),
+        rim_base_m_s: wheel_speed_rad_s.map(|w| T::lit(w * vehicle.wheel_radius_m)),
+        rim_follow: T::lit(0.0),
+        rim_gain: T::lit(0.0),
+        overspeed_limit_m_s: T::lit(1.0),
+        speed_m_s: T::lit(0.0),
+    }
+}
+
+impl<T: Real> WheelCommand<T> {
+    /// Rim speed of wheel `i`, m/s, given its own and the vehicle's forward speed.
+    #[inline(always)]
+    pub fn rim_speed_m_s(&self, i: usize, wheel_forward_m_s: T, vehicle_forward_m_s: T) -> T {
+        let demand = self.rim_base_m_s[i] * self.rim_follow + self.rim_gain * (self.speed_m_s - vehicle_forward_m_s);
+        // Smooth saturation d / sqrt(1 + (d / limit)²): slope one at zero, the limit far out.
+        let share = demand / self.overspeed_limit_m_s;
+        let overspeed = demand / (T::lit(1.0) + share * share).sqrt();
+        let servo = self.rim_base_m_s[i] * (T::lit(1.0) - self.rim_follow);
+        servo + self.rim_follow * wheel_forward_m_s + overspeed
+    }
+
+    /// -∂(rim speed - wheel's forward speed)/∂(forward speed): how strongly a gain in speed eats the over-speed.
+    #[inline(always)]
+    pub fn slip_feedback(&self) -> T {
+        self.rim_follow * self.rim_gain + (T::lit(1.0) - self.rim_follow)
+    }
+}

@@ -1,0 +1,17 @@
+//! Bekker-Wong terramechanics and Newton-Euler, once, generic over the scalar.
+#![forbid(unsafe_code)]
+
+pub mod driveline;
+pub mod linear;
+pub mod scalar;
+mod soil;
+mod state;
+pub mod step;
+pub mod terramechanics;
+pub mod vec3;
+mod vehicle;
+
+pub use scalar::Real;
+pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
+pub use state::{Control, DT_S, STATE_DIM, VehicleState, wrap_angle};
+pub use vehicle::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};

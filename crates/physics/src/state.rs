@@ -1,0 +1,73 @@
+//! The state of the vehicle, its command and the increment of one step.
+
+use crate::scalar::Real;
+
+/// Dimension of the state vector of the paper (§III-A): position, attitude, linear and angular velocity.
+pub const STATE_DIM: usize = 12;
+
+/// Sampling interval of the paper, s.
+pub const DT_S: f64 = 0.1;
+
+/// State x of the vehicle (paper §III-A), R^12.
+///
+/// `position_m` is that of the reference point of the vehicle card in World (x east, y north, z up); `attitude_rad` is roll, pitch,
+/// yaw of R_WB = Rz(yaw) Ry(pitch) Rx(roll) with Body FLU (x forward, y left, z up), so pitch > 0 is nose down; both velocities
+/// are expressed in Body (REP-103/105: twist in the child frame).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VehicleState<T> {
+    /// x, y, z in World, m.
+    pub position_m: [T; 3],
+    /// Roll, pitch, yaw, rad.
+    pub attitude_rad: [T; 3],
+    /// Linear velocity of the reference point in Body, m/s.
+    pub velocity_m_s: [T; 3],
+    /// Angular velocity in Body, rad/s.
+    pub angular_velocity_rad_s: [T; 3],
+}
+
+impl<T: Copy> VehicleState<T> {
+    /// The state as the twelve numbers of the paper's order: position, attitude, velocity, angular velocity.
+    pub fn to_array(&self) -> [T; STATE_DIM] {
+        let (p, a, v, w) = (self.position_m, self.attitude_rad, self.velocity_m_s, self.angular_velocity_rad_s);
+        [p[0], p[1], p[2], a[0], a[1], a[2], v[0], v[1], v[2], w[0], w[1], w[2]]
+    }
+
+    /// Inverse of [`VehicleState::to_array`].
+    pub fn from_array(x: [T; STATE_DIM]) -> Self {
+        Self {
+            position_m: [x[0], x[1], x[2]],
+            attitude_rad: [x[3], x[4], x[5]],
+            velocity_m_s: [x[6], x[7], x[8]],
+            angular_velocity_rad_s: [x[9], x[10], x[11]],
+        }
+    }
+
+    /// The same state in another scalar.
+    pub fn map<U: Copy>(&self, f: impl FnMut(T) -> U) -> VehicleState<U> {
+        VehicleState::from_array(self.to_array().map(f))
+    }
+}
+
+impl<T: Real> VehicleState<T> {
+    /// At rest at the origin.
+    pub fn zero() -> Self {
+        Self::from_array([T::lit(0.0); STATE_DIM])
+    }
+}
+
+/// Command u of one interval: forward speed and steering.
+///
+/// `second` is what the vehicle card says: normalised steering in [-1, 1], road-wheel angle (rad) or yaw rate (rad/s); positive = left.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Control<T> {
+    /// Commanded forward speed, m/s.
+    pub speed_m_s: T,
+    /// Second command, in the unit of the vehicle card.
+    pub second: T,
+}
+
+/// Wraps an angle into (-pi, pi].
+pub fn wrap_angle(angle_rad: f64) -> f64 {
+    let wrapped = angle_rad.rem_euclid(core::f64::consts::TAU);
+    if wrapped > core::f64::consts::PI { wrapped - core::f64::consts::TAU } else { wrapped }
+}

@@ -1,0 +1,122 @@
+//! Stress integration under a rigid wheel (Wong & Reece 1967), the Bekker-Wong operator B of the paper (§III-B).
+
+use crate::scalar::Real;
+use crate::soil::Soil;
+use crate::terramechanics::gauss::GaussRule;
+use crate::terramechanics::pressure_sinkage::normal_stress;
+use crate::terramechanics::shear::{mohr_coulomb, shear_fraction};
+use crate::terramechanics::slip::ContactMotion;
+
+/// Shear displacement below which its direction is smoothed, m.
+const SHEAR_FLOOR_M: f64 = 1e-6;
+/// Largest sinkage as a share of the radius at which the contact geometry is evaluated.
+const SINKAGE_SHARE_MAX: f64 = 0.9;
+/// Smallest sinkage, m: a wheel off the ground carries no load, but its contact stays differentiable.
+const SINKAGE_FLOOR_M: f64 = 1e-5;
+
+/// Geometry and contact coefficients of a wheel.
+#[derive(Clone, Debug, PartialEq)]
+pub struct WheelGeometry {
+    /// Radius r, m.
+    pub radius_m: f64,
+    /// Width b, m.
+    pub width_m: f64,
+    /// c_1 of the angle of maximum stress θ_m = (c_1 + c_2 |s|) θ_1 (Wong & Reece 1967; 0.4 after Ishigami 2007).
+    pub c1: f64,
+    /// c_2 of the same (0.15).
+    pub c2: f64,
+    /// Recovery λ of the exit angle θ_2 = -acos(1 - λ z / r); 0 = the soil does not spring back.
+    pub recovery: f64,
+    /// Quadrature.
+    pub rule: GaussRule,
+}
+
+impl WheelGeometry {
+    /// Wheel with the coefficients of Ishigami (2007) and five quadrature nodes.
+    pub fn new(radius_m: f64, width_m: f64) -> Self {
+        Self { radius_m, width_m, c1: 0.4, c2: 0.15, recovery: 0.0, rule: GaussRule::new(5) }
+    }
+}
+
+/// Resultant of the contact stresses, in the wheel's contact frame (x = rolling direction, y = left, z = away from the ground).
+#[derive(Clone, Copy, Debug)]
+pub struct WheelWrench<T> {
+    /// Thrust H = r b ∫ τ_x cos θ dθ, N.
+    pub thrust_n: T,
+    /// Compaction resistance R = r b ∫ σ sin θ dθ, N.
+    pub resistance_n: T,
+    /// Side force of the soil on the wheel, -r b ∫ τ_y dθ, N.
+    pub side_n: T,
+    /// Normal force W = r b ∫ (σ cos θ + τ_x sin θ) dθ, N.
+    pub normal_n: T,
+    /// Driving torque T = r² b ∫ τ_x dθ, N m.
+    pub torque_n_m: T,
+}
+
+impl<T: Real> WheelWrench<T> {
+    /// Drawbar pull DP = H - R, N.
+    #[inline(always)]
+    pub fn drawbar_n(&self) -> T {
+        self.thrust_n - self.resistance_n
+    }
+}
+
+/// Angle whose cosine is 1 - depth / r, with its sine; exact and smooth for 0 < depth < 2 r.
+#[inline(always)]
+fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
+    let cos = T::lit(1.0) - depth_share;
+    let sin = (depth_share * (T::lit(2.0) - depth_share)).sqrt();
+    // tan(θ/2) = sin / (1 + cos): no branch at θ = π/2.
+    ((sin / (T::lit(1.0) + cos)).atan() * T::lit(2.0), sin, cos)
+}
+
+/// Integrates normal and shear stress over the contact arc at a given sinkage (m).
+///
+/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - λz/r); maximum stress at θ_m = (c_1 + c_2 |s|) θ_1. Shear displacement
+/// j_x = r [(θ_1 - θ) - (v_x / rΩ)(sin θ_1 - sin θ)], j_y = r (v_y / rΩ)(θ_1 - θ), combined isotropically (Jia 2011). Neglects
+/// bulldozing at the side wall and the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
+#[inline(always)]
+pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &ContactMotion<T>, soil: &Soil<T>) -> WheelWrench<T> {
+    let radius = wheel.radius_m;
+    let z = sinkage_m.max(T::lit(SINKAGE_FLOOR_M)).min(T::lit(SINKAGE_SHARE_MAX * radius));
+    let share = z * T::lit(1.0 / radius);
+    let (entry, sin_entry, cos_entry) = angle_of_depth(share);
+    let exit = -angle_of_depth(share * T::lit(wheel.recovery) + T::lit(1e-24)).0;
+    let slip_size = motion.slip.abs_smooth(1e-9);
+    let peak = entry * (T::lit(wheel.c1) + T::lit(wheel.c2) * slip_size).min(T::lit(0.999));
+    let (front, rear) = (entry - peak, peak - exit);
+    let tan_phi = soil.phi.tan();
+
+    let zero = T::lit(0.0);
+    let mut sum = WheelWrench { thrust_n: zero, resistance_n: zero, side_n: zero, normal_n: zero, torque_n_m: zero };
+    for &(t2, weight) in wheel.rule.nodes() {
+        let theta_front = entry - front * T::lit(t2);
+        let front_trig = theta_front.sin_cos();
+        // The rear branch mirrors the front stress (Wong & Reece 1967): one evaluation of depth^n serves both.
+        let sigma = normal_stress((front_trig.1 - cos_entry) * T::lit(radius), wheel.width_m, soil);
+        let strength = mohr_coulomb(sigma, tan_phi, soil);
+        let theta_rear = exit + rear * T::lit(t2);
+        for (theta, (sin, cos), arc) in [(theta_front, front_trig, front), (theta_rear, theta_rear.sin_cos(), rear)] {
+            let swept = entry - theta;
+            let j_x = (motion.rim_ratio * swept - motion.travel_ratio * (sin_entry - sin)) * T::lit(radius);
+            let j_y = motion.lateral_ratio * swept * T::lit(radius);
+            let j = (j_x * j_x + j_y * j_y + T::lit(SHEAR_FLOOR_M * SHEAR_FLOOR_M)).sqrt();
+            let mobilised = strength * shear_fraction(j, soil);
+            let (tau_x, tau_y) = (mobilised * j_x, mobilised * j_y);
+            let w = arc * T::lit(weight);
+            sum.thrust_n = sum.thrust_n + tau_x * cos * w;
+            sum.resistance_n = sum.resistance_n + sigma * sin * w;
+            sum.side_n = sum.side_n - tau_y * w;
+            sum.normal_n = sum.normal_n + (sigma * cos + tau_x * sin) * w;
+            sum.torque_n_m = sum.torque_n_m + tau_x * w;
+        }
+    }
+    let area = T::lit(radius * wheel.width_m);
+    WheelWrench {
+        thrust_n: sum.thrust_n * area,
+        resistance_n: sum.resistance_n * area,
+        side_n: sum.side_n * area,
+        normal_n: sum.normal_n * area,
+        torque_n_m: sum.torque_n_m * area * T::lit(radius),
+    }
+}

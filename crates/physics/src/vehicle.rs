@@ -1,0 +1,100 @@
+//! What the physics must know of a vehicle.
+
+use crate::state::Control;
+
+/// Number of wheels of the platforms served.
+pub const WHEELS: usize = 4;
+
+/// Meaning of the second command.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SecondCommand {
+    /// Normalised steering in [-1, 1], mapped to road-wheel angles by the card's table.
+    SteeringNormalised,
+    /// Road-wheel angle, rad.
+    RoadWheelAngleRad,
+    /// Yaw rate of a skid-steer vehicle, rad/s.
+    YawRateRadS,
+}
+
+/// Steering: command -> road-wheel angles of the two front wheels (left, right).
+#[derive(Clone, Debug, PartialEq)]
+pub struct SteeringTable {
+    /// Ascending commands.
+    pub command: Vec<f64>,
+    /// Front-left angle at each command, rad, positive left.
+    pub front_left_rad: Vec<f64>,
+    /// Front-right angle at each command, rad.
+    pub front_right_rad: Vec<f64>,
+}
+
+/// Drive line and actuators: how commands become wheel speeds and road-wheel angles.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Driveline {
+    /// Time constant of the steering actuator's first-order lag, s.
+    pub steering_lag_s: f64,
+    /// Rate limit of the steering command, 1/s (or rad/s for angles).
+    pub steering_rate_limit_per_s: f64,
+    /// Share of the speed error that the drive line turns into rim over-speed, -.
+    pub speed_gain: f64,
+    /// Rim over-speed per integrated speed error, 1/s.
+    pub speed_integral_gain_per_s: f64,
+    /// Time constant with which the integral forgets, s.
+    pub speed_integral_leak_s: f64,
+    /// Bound of the integral, m.
+    pub speed_integral_limit_m: f64,
+    /// Largest rim over-speed the drive line can hold, m/s.
+    pub overspeed_limit_m_s: f64,
+}
+
+/// A vehicle as the physics sees it. SI; Body FLU with origin at the reference point (the static centre of mass).
+#[derive(Clone, Debug, PartialEq)]
+pub struct Vehicle {
+    /// Name from the card.
+    pub name: String,
+    /// Total mass, kg.
+    pub mass_kg: f64,
+    /// Inertia tensor about the centre of mass, Body axes, kg m².
+    pub inertia_kg_m2: [[f64; 3]; 3],
+    /// True when the inertia is a box estimate because the card gives none.
+    pub inertia_estimated: bool,
+    /// Wheel centres FL, FR, RL, RR relative to the reference point, Body, at static ride height, m.
+    pub wheel_centre_m: [[f64; 3]; WHEELS],
+    /// Wheel radius, m.
+    pub wheel_radius_m: f64,
+    /// Wheel width, m.
+    pub wheel_width_m: f64,
+    /// Vertical rate of the suspension at each wheel, N/m.
+    pub suspension_n_m: [f64; WHEELS],
+    /// Vertical damping at each wheel, N s/m.
+    pub suspension_n_s_m: [f64; WHEELS],
+    /// Meaning of the second command.
+    pub second: SecondCommand,
+    /// Range of (speed m/s, second) the card admits: `[[min, max]; 2]`.
+    pub command_range: [[f64; 2]; 2],
+    /// Steering table; `None` for a skid-steer vehicle.
+    pub steering: Option<SteeringTable>,
+    /// Effective track of the differential drive, m (skid-steer: nominal base; else geometric track).
+    pub track_m: f64,
+    /// Wheelbase, m.
+    pub wheelbase_m: f64,
+    /// Drive line.
+    pub driveline: Driveline,
+    /// Gravity, m/s².
+    pub gravity_m_s2: f64,
+}
+
+impl Vehicle {
+    /// Static load of each wheel on flat ground, N: the share of the weight that balances the moments of the axles, half to each side.
+    pub fn static_load_n(&self) -> [f64; WHEELS] {
+        let [front, rear] = [0, 2].map(|i| self.wheel_centre_m[i][0]);
+        let weight = self.mass_kg * self.gravity_m_s2;
+        let on_front = weight * -rear / (front - rear);
+        [0.5 * on_front, 0.5 * on_front, 0.5 * (weight - on_front), 0.5 * (weight - on_front)]
+    }
+
+    /// Whether the command lies in the range of the card (both ends included).
+    pub fn admits(&self, control: &Control<f64>) -> bool {
+        let inside = |v: f64, r: [f64; 2]| v >= r[0] && v <= r[1];
+        inside(control.speed_m_s, self.command_range[0]) && inside(control.second, self.command_range[1])
+    }
+}

@@ -1,0 +1,126 @@
+//! Vehicles and soils shared by the tests of this crate; figures from the given vehicle cards.
+#![allow(dead_code)]
+
+use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::step::{Ground, StepInput, StepModel, StepOutput};
+use nesam_physics::{Control, DT_S, Driveline, Real, SecondCommand, Soil, SteeringTable, Vehicle, VehicleState};
+
+/// The 2.5-tonne car of the Chrono drives.
+pub fn truck() -> Vehicle {
+    Vehicle {
+        name: "truck".into(),
+        mass_kg: 2493.56,
+        inertia_kg_m2: [[1445.1, 0.0, -23.6], [0.0, 4121.7, 0.0], [-23.6, 0.0, 5026.4]],
+        inertia_estimated: false,
+        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1155], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
+        wheel_radius_m: 0.467,
+        wheel_width_m: 0.254,
+        suspension_n_m: [107e3, 107e3, 236e3, 236e3],
+        suspension_n_s_m: [14.4e3, 14.4e3, 22.4e3, 22.4e3],
+        second: SecondCommand::SteeringNormalised,
+        command_range: [[-2.0, 12.0], [-1.0, 1.0]],
+        steering: Some(SteeringTable { command: vec![-1.0, 1.0], front_left_rad: vec![-0.37, 0.37], front_right_rad: vec![-0.37, 0.37] }),
+        track_m: 1.83,
+        wheelbase_m: 3.2977,
+        driveline: Driveline {
+            steering_lag_s: 0.08,
+            steering_rate_limit_per_s: 3.0,
+            speed_gain: 0.15,
+            speed_integral_gain_per_s: 0.0,
+            speed_integral_leak_s: 2.0,
+            speed_integral_limit_m: 2.0,
+            overspeed_limit_m_s: 0.8,
+        },
+        gravity_m_s2: 9.81,
+    }
+}
+
+/// A 50-kg skid-steer robot.
+pub fn robot() -> Vehicle {
+    let (x, y) = (0.256, 0.2775);
+    Vehicle {
+        name: "robot".into(),
+        mass_kg: 50.0,
+        inertia_kg_m2: [[1.9, 0.0, 0.0], [0.0, 2.5, 0.0], [0.0, 0.0, 3.6]],
+        wheel_centre_m: [[x, y, -0.05], [x, -y, -0.05], [-x, y, -0.05], [-x, -y, -0.05]],
+        wheel_radius_m: 0.165,
+        wheel_width_m: 0.125,
+        suspension_n_m: [12e3; 4],
+        suspension_n_s_m: [550.0; 4],
+        second: SecondCommand::YawRateRadS,
+        command_range: [[-2.0, 2.0], [-4.0, 4.0]],
+        steering: None,
+        track_m: 0.55,
+        wheelbase_m: 0.512,
+        driveline: Driveline { steering_lag_s: 0.0, steering_rate_limit_per_s: 1e3, speed_gain: 1.0, ..truck().driveline },
+        ..truck()
+    }
+}
+
+/// Sandy loam, 15 % moisture (Wong's table).
+pub fn loam() -> Soil<f64> {
+    Soil { k_phi: 1515.04e3, k_c: 5.27e3, n: 0.7, c: 1.72e3, phi: 29f64.to_radians(), k_shear: 0.025 }
+}
+
+/// Ground that is a plane of the given slopes in World, seen from a pose with its reference point at (x, y).
+pub fn plane(model: &StepModel, state: &VehicleState<f64>, slope_x: f64, slope_y: f64) -> [Ground<f64>; 4] {
+    let [roll, pitch, yaw] = state.attitude_rad;
+    let (sin, cos) = yaw.sin_cos();
+    model.wheel_offsets_heading(roll, pitch).map(|offset| {
+        let x = state.position_m[0] + cos * offset[0] - sin * offset[1];
+        let y = state.position_m[1] + sin * offset[0] + cos * offset[1];
+        Ground { height_m: slope_x * x + slope_y * y, slope_ahead: cos * slope_x + sin * slope_y, slope_left: -sin * slope_x + cos * slope_y }
+    })
+}
+
+/// A drive on a plane: the loop that a rollout is, without the network.
+pub struct Drive {
+    pub model: StepModel,
+    pub state: VehicleState<f64>,
+    pub actuators: DrivelineState,
+    pub soil: Soil<f64>,
+    pub slope: [f64; 2],
+}
+
+impl Drive {
+    /// A vehicle set down on flat ground at a speed.
+    pub fn new(vehicle: Vehicle, speed_m_s: f64) -> Self {
+        let mut state = VehicleState::zero();
+        state.position_m[2] = vehicle.wheel_radius_m - vehicle.wheel_centre_m[0][2];
+        state.velocity_m_s[0] = speed_m_s;
+        let actuators = DrivelineState { steering: 0.0, speed_error_integral_m: 0.0 };
+        Self { model: StepModel::new(&vehicle, DT_S, 2), state, actuators, soil: loam(), slope: [0.0; 2] }
+    }
+
+    /// Input of the next step under a command, and the actuators after it.
+    pub fn input(&self, control: &Control<f64>) -> (StepInput<f64>, DrivelineState) {
+        let after = self.actuators.advance(self.model.vehicle(), control, self.state.velocity_m_s[0], DT_S);
+        let input = StepInput {
+            state: self.state,
+            wheels: command_wheels(self.model.vehicle(), &self.actuators, &after, control),
+            sinkage_log_ratio: [0.0; 4],
+            soil: self.soil,
+            ground: plane(&self.model, &self.state, self.slope[0], self.slope[1]),
+        };
+        (input, after)
+    }
+
+    /// One step.
+    pub fn step(&mut self, speed_m_s: f64, second: f64) -> StepOutput<f64> {
+        let (input, after) = self.input(&Control { speed_m_s, second });
+        let output = self.model.step(&input);
+        self.state = advance(&self.state, &output.increment);
+        self.actuators = after;
+        output
+    }
+}
+
+/// x + Δx: the displacement is in the heading frame.
+pub fn advance<T: Real>(state: &VehicleState<T>, increment: &VehicleState<T>) -> VehicleState<T> {
+    let (sin, cos) = state.attitude_rad[2].sin_cos();
+    let [dx, dy, dz] = increment.position_m;
+    let (x, i) = (state.to_array(), increment.to_array());
+    let mut next = VehicleState::from_array(core::array::from_fn(|k| x[k] + i[k]));
+    next.position_m = [state.position_m[0] + cos * dx - sin * dy, state.position_m[1] + sin * dx + cos * dy, state.position_m[2] + dz];
+    next
+}
