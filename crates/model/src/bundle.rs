@@ -1,32 +1,184 @@
-//! The versioned model bundle on disk.
+//! The versioned model bundle on disk: a folder whose manifest holds the hash of every file.
 
-use std::path::Path;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 
 use nesam_physics::{SOIL_DIM, Vehicle};
+use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 use crate::ModelError;
+use crate::normalization::Normalization;
+use crate::weights::Weights;
+
+/// Version of the layout; another version is refused.
+pub const FORMAT: &str = "nesam.bundle/1";
+const MANIFEST: &str = "manifest.toml";
+const WEIGHTS: &str = "weights.safetensors";
+const VEHICLE: &str = "vehicle.json";
+const NORMALIZATION: &str = "normalization.toml";
+const EFFECTS: &str = "effects.toml";
+const BASELINES: &str = "baselines.json";
+const REQUIRED: [&str; 4] = [WEIGHTS, VEHICLE, NORMALIZATION, EFFECTS];
+
+/// Where a bundle comes from; shown by `inspect`, copied into every report.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct Provenance {
+    /// Command that made the bundle.
+    pub command: String,
+    /// Seed.
+    pub seed: u64,
+    /// SHA-256 of the training data.
+    pub data_hash: String,
+    /// Optimiser steps.
+    pub steps: u64,
+    /// Wall time of training, s.
+    pub training_s: f64,
+    /// Version of the program.
+    pub program: String,
+    /// Hash of the bundle this one was derived from.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub parent: Option<String>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Manifest {
+    format: String,
+    name: String,
+    provenance: Provenance,
+    /// SHA-256 of each file.
+    files: BTreeMap<String, String>,
+}
 
 /// A loaded, verified bundle.
 #[derive(Clone, Debug)]
 pub struct ModelBundle {
     /// Bundle name and version from the manifest.
     pub name: String,
-    /// SHA-256 (hex) over the manifest, which itself holds the hash of every file.
+    /// SHA-256 (hex) of the manifest, which holds the hash of every file.
     pub hash: String,
     /// The vehicle the bundle was trained for.
     pub vehicle: Vehicle,
-    /// Soil used where there is no map or no semantics.
+    /// Soil used where there is no map or no semantics, order of `SOIL_NAMES`.
     pub default_soil: [f64; SOIL_DIM],
     /// Trainable parameters of the kinodynamic model (without the frozen encoders).
     pub parameters: usize,
+    /// Scales and trained ranges.
+    pub normalization: Normalization,
+    /// All arrays.
+    pub weights: Weights,
+    /// Fitted baselines as JSON, if the bundle carries them.
+    pub baselines_json: Option<String>,
+    /// Where the bundle comes from.
+    pub provenance: Provenance,
+}
+
+/// Lower-case hex SHA-256.
+pub fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+struct Folder<'a>(&'a Path);
+
+impl Folder<'_> {
+    fn fail(&self, file: &str, reason: impl Into<String>) -> ModelError {
+        ModelError::Bundle { path: self.0.join(file), reason: reason.into() }
+    }
+
+    fn read(&self, file: &str) -> Result<Vec<u8>, ModelError> {
+        std::fs::read(self.0.join(file)).map_err(|e| self.fail(file, format!("cannot be read: {e}")))
+    }
+
+    fn text(&self, file: &str, bytes: Vec<u8>) -> Result<String, ModelError> {
+        String::from_utf8(bytes).map_err(|_| self.fail(file, "is not UTF-8 text"))
+    }
+
+    fn write(&self, file: &str, bytes: &[u8]) -> Result<(), ModelError> {
+        std::fs::write(self.0.join(file), bytes).map_err(|e| self.fail(file, format!("cannot be written: {e}")))
+    }
 }
 
 impl ModelBundle {
-    /// Loads and verifies a bundle directory.
+    /// Loads and verifies a bundle folder.
     ///
     /// # Errors
-    /// `ModelError::Bundle` naming the file and what was wrong (missing, wrong hash, wrong shape, unknown version).
+    /// `ModelError::Bundle` or `ModelError::Weights` naming the file or array and what was wrong (missing, wrong hash, wrong shape, unknown format).
     pub fn load(dir: &Path) -> Result<Self, ModelError> {
-        Err(ModelError::Bundle { path: dir.to_path_buf(), reason: "not wired yet".into() })
+        let folder = Folder(dir);
+        let manifest_bytes = folder.read(MANIFEST)?;
+        let hash = sha256_hex(&manifest_bytes);
+        let text = folder.text(MANIFEST, manifest_bytes)?;
+        let manifest: Manifest = toml::from_str(&text).map_err(|e| folder.fail(MANIFEST, format!("is not a manifest: {e}")))?;
+        if manifest.format != FORMAT {
+            return Err(folder.fail(MANIFEST, format!("has format `{}`, this program reads `{FORMAT}`", manifest.format)));
+        }
+        let mut files = BTreeMap::new();
+        for (name, expected) in &manifest.files {
+            if name.contains(['/', '\\']) || name.starts_with('.') {
+                return Err(folder.fail(MANIFEST, format!("lists `{name}`, which is not a plain file name")));
+            }
+            let bytes = folder.read(name)?;
+            let found = sha256_hex(&bytes);
+            if found != *expected {
+                return Err(folder.fail(name, format!("has SHA-256 {found}, the manifest says {expected}: the file was changed or damaged")));
+            }
+            files.insert(name.as_str(), bytes);
+        }
+        for name in REQUIRED {
+            if !files.contains_key(name) {
+                return Err(folder.fail(name, "is not listed in the manifest"));
+            }
+        }
+        let take = |name: &str| files.get(name).cloned();
+        let text_of = |name: &str| folder.text(name, take(name).unwrap_or_default());
+        let weights = Weights::from_bytes(&take(WEIGHTS).unwrap_or_default(), &dir.join(WEIGHTS))?;
+        let normalization: Normalization =
+            toml::from_str(&text_of(NORMALIZATION)?).map_err(|e| folder.fail(NORMALIZATION, format!("is not readable: {e}")))?;
+        let vehicle = nesam_vehicle_card::from_json(&text_of(VEHICLE)?).map_err(|e| folder.fail(VEHICLE, e.to_string()))?;
+        let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;
+        Ok(Self {
+            name: manifest.name,
+            hash,
+            vehicle,
+            default_soil: normalization.default_soil(),
+            parameters: weights.parameters("") - weights.parameters("encoder."),
+            normalization,
+            weights,
+            baselines_json,
+            provenance: manifest.provenance,
+        })
+    }
+
+    /// Writes the bundle into a folder (created if absent; files of an older bundle there are replaced) and sets [`ModelBundle::hash`].
+    ///
+    /// # Errors
+    /// `ModelError::Bundle` naming the file that could not be written.
+    pub fn save(&mut self, dir: &Path) -> Result<PathBuf, ModelError> {
+        let folder = Folder(dir);
+        std::fs::create_dir_all(dir).map_err(|e| folder.fail("", format!("cannot be created: {e}")))?;
+        let normalization = toml::to_string(&self.normalization).expect("plain numbers serialise; this is a bug");
+        let mut files: Vec<(&str, Vec<u8>)> = vec![
+            (WEIGHTS, self.weights.to_bytes()),
+            (VEHICLE, nesam_vehicle_card::to_json(&self.vehicle).into_bytes()),
+            (NORMALIZATION, normalization.into_bytes()),
+            (EFFECTS, b"# Effects found by `nesam diagnose`; none yet.\neffects = []\n".to_vec()),
+        ];
+        if let Some(json) = &self.baselines_json {
+            files.push((BASELINES, json.clone().into_bytes()));
+        }
+        for (name, bytes) in &files {
+            folder.write(name, bytes)?;
+        }
+        let manifest = Manifest {
+            format: FORMAT.into(),
+            name: self.name.clone(),
+            provenance: self.provenance.clone(),
+            files: files.iter().map(|(name, bytes)| ((*name).to_string(), sha256_hex(bytes))).collect(),
+        };
+        let text = toml::to_string(&manifest).expect("a manifest serialises; this is a bug");
+        folder.write(MANIFEST, text.as_bytes())?;
+        self.hash = sha256_hex(text.as_bytes());
+        Ok(dir.to_path_buf())
     }
 }

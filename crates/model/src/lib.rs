@@ -1,26 +1,51 @@
 //! The neural half: encoders, soil prior, Transformer, rollout, bundle.
+//!
+//! A [`ModelBundle`] is loaded from disk and becomes a [`Predictor`], which answers [`RolloutQuery`]s: from one start state, N candidate
+//! command sequences over K steps. At every step each sample looks up its terrain token at the predicted pose, the Transformer turns the token
+//! into wheel sinkages and a state residual, and `nesam_physics` moves the vehicle (paper Eq. 2). [`reference`] holds the same network as
+//! candle tensors: it trains, and the tests hold the fast path against it.
 
-mod bundle;
+pub mod bundle;
+pub mod dims;
+pub mod encoder;
+mod fused;
+mod ground;
+pub mod normalization;
 mod predictor;
+pub mod reference;
 mod rollout;
+pub mod soil_coordinates;
+mod soil_prior;
+pub mod step_row;
+mod terrain_tokens;
+pub mod token;
+pub mod weights;
 
-pub use bundle::ModelBundle;
-pub use predictor::Predictor;
+pub use bundle::{ModelBundle, Provenance};
+pub use dims::{HISTORY, MAX_HORIZON};
+pub use ground::{GroundSource, history_actuators};
+pub use normalization::Normalization;
+pub use predictor::{Predictor, TerrainMode};
 pub use rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
-
-/// Tokens of measured history the Transformer sees, the current one included (paper §IV-C).
-pub const HISTORY: usize = 32;
-/// Longest horizon: the positions left after the history (paper §IV-C: 64 positions).
-pub const MAX_HORIZON: usize = 32;
+pub use terrain_tokens::TerrainToken;
+pub use weights::Weights;
 
 /// What can go wrong with a bundle or a query.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
     /// A bundle cannot be used.
-    #[error("bundle {}: {reason}", path.display())]
+    #[error("bundle file {}: {reason}", path.display())]
     Bundle {
         /// File or folder at fault.
         path: std::path::PathBuf,
+        /// What was wrong and what was expected.
+        reason: String,
+    },
+    /// An array of the weights cannot be used.
+    #[error("weights array `{name}` {reason}")]
+    Weights {
+        /// Array at fault.
+        name: String,
         /// What was wrong and what was expected.
         reason: String,
     },

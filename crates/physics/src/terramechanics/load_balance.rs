@@ -1,6 +1,6 @@
 //! Sinkage at which the soil carries what the suspension presses into it.
 
-use crate::scalar::Real;
+use crate::scalar::{Dual, Real};
 use crate::soil::Soil;
 use crate::terramechanics::pressure_sinkage::bekker_sinkage;
 use crate::terramechanics::slip::ContactMotion;
@@ -42,15 +42,44 @@ pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, mot
     for _ in 0..ITERATIONS {
         z = newton_step(wheel, z, &support_value, &motion_value, &soil_value);
     }
-    newton_step(wheel, T::from_value(z), support, motion, soil)
+    // Last step on `T`: the exact slope of the residual makes z - f / f' carry the derivatives of the implicit function.
+    let slope = residual_slope(wheel, z, &support_value, &motion_value, &soil_value);
+    let z = T::from_value(z);
+    bounded(z, z - residual(wheel, z, support, motion, soil).0 / T::from_value(slope), wheel)
 }
 
+/// f(z) = W(z) - pressed(z), N, and the force carried W(z).
 #[inline(always)]
-fn newton_step<T: Real>(wheel: &WheelGeometry, z: T, support: &Support<T>, motion: &ContactMotion<T>, soil: &Soil<T>) -> T {
+fn residual<T: Real>(wheel: &WheelGeometry, z: T, support: &Support<T>, motion: &ContactMotion<T>, soil: &Soil<T>) -> (T, T) {
     let carried = wheel_wrench(wheel, z, motion, soil).normal_n;
-    let pressed = (support.preload_n - support.rate_n_m * z).relu_smooth(1.0);
-    let slope = (soil.n + T::lit(0.5)) * carried / z + support.rate_n_m;
-    // Derivatives flow through the residual only; the slope is a constant of the step.
-    let next = z - (carried - pressed) / T::from_value(slope.value());
+    (carried - (support.preload_n - support.rate_n_m * z).relu_smooth(1.0), carried)
+}
+
+/// f'(z), N/m, by a dual number in z.
+#[inline(always)]
+fn residual_slope<V: Real>(wheel: &WheelGeometry, z: V, support: &Support<V>, motion: &ContactMotion<V>, soil: &Soil<V>) -> V {
+    let c = Dual::<V, 1>::constant;
+    let motion = ContactMotion {
+        travel_ratio: c(motion.travel_ratio),
+        rim_ratio: c(motion.rim_ratio),
+        lateral_ratio: c(motion.lateral_ratio),
+        slip: c(motion.slip),
+    };
+    let soil = Soil::from_array(soil.to_array().map(c));
+    let support = Support { preload_n: c(support.preload_n), rate_n_m: c(support.rate_n_m) };
+    residual(wheel, Dual::variable(z, 0), &support, &motion, &soil).0.eps[0]
+}
+
+/// A Newton step that takes W for a power law of exponent n + 1/2.
+#[inline(always)]
+fn newton_step<V: Real>(wheel: &WheelGeometry, z: V, support: &Support<V>, motion: &ContactMotion<V>, soil: &Soil<V>) -> V {
+    let (f, carried) = residual(wheel, z, support, motion, soil);
+    let slope = (soil.n + V::lit(0.5)) * carried / z + support.rate_n_m;
+    bounded(z, z - f / slope, wheel)
+}
+
+/// Keeps a step within a decade and the wheel.
+#[inline(always)]
+fn bounded<T: Real>(z: T, next: T, wheel: &WheelGeometry) -> T {
     next.max(z * T::lit(0.1)).min(z * T::lit(4.0)).min(T::lit(0.85 * wheel.radius_m)).max(T::lit(1e-5))
 }

@@ -1,0 +1,77 @@
+//! Adam (Kingma & Ba 2015) with moments that can be saved, and a bound on the norm of the gradient.
+
+use std::collections::HashMap;
+
+use candle_core::{Result, Tensor, Var};
+use nesam_model::Weights;
+
+const BETA1: f32 = 0.9;
+const BETA2: f32 = 0.999;
+const EPS: f32 = 1e-8;
+
+/// Optimiser state.
+#[derive(Clone, Debug, Default)]
+pub struct Adam {
+    first: HashMap<String, Vec<f32>>,
+    second: HashMap<String, Vec<f32>>,
+    steps: i32,
+}
+
+impl Adam {
+    /// Updates taken.
+    pub fn steps(&self) -> i32 {
+        self.steps
+    }
+
+    /// One update with learning rate `rate`; gradients are scaled so that their joint norm is at most `norm_max`. Returns the norm before scaling.
+    ///
+    /// # Errors
+    /// A candle error when a variable cannot be read or set.
+    pub fn update(&mut self, variables: &[(String, Var)], gradients: &HashMap<String, Vec<f32>>, rate: f64, norm_max: f32) -> Result<f32> {
+        self.steps += 1;
+        let norm = gradients.values().flatten().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt() as f32;
+        if !norm.is_finite() {
+            return Ok(norm); // a bad batch must not destroy the weights; the caller reports it
+        }
+        let shrink = if norm > norm_max { norm_max / norm } else { 1.0 };
+        let (correct1, correct2) = (1.0 - BETA1.powi(self.steps), 1.0 - BETA2.powi(self.steps));
+        for (name, var) in variables {
+            let Some(gradient) = gradients.get(name) else { continue };
+            let m = self.first.entry(name.clone()).or_insert_with(|| vec![0.0; gradient.len()]);
+            let v = self.second.entry(name.clone()).or_insert_with(|| vec![0.0; gradient.len()]);
+            let mut values: Vec<f32> = var.flatten_all()?.to_vec1()?;
+            for i in 0..values.len() {
+                let g = gradient[i] * shrink;
+                m[i] = BETA1 * m[i] + (1.0 - BETA1) * g;
+                v[i] = BETA2 * v[i] + (1.0 - BETA2) * g * g;
+                values[i] -= rate as f32 * (m[i] / correct1) / ((v[i] / correct2).sqrt() + EPS);
+            }
+            var.set(&Tensor::from_vec(values, var.dims(), var.device())?)?;
+        }
+        Ok(norm)
+    }
+
+    /// Adds the moments to a set of arrays, for a checkpoint.
+    pub fn save(&self, weights: &mut Weights) {
+        for (name, m) in &self.first {
+            weights.insert(format!("adam.first.{name}"), &[m.len()], m.clone());
+            weights.insert(format!("adam.second.{name}"), &[m.len()], self.second[name].clone());
+        }
+        weights.insert("adam.steps", &[1], vec![self.steps as f32]);
+    }
+
+    /// Takes the moments back out of a checkpoint.
+    pub fn load(weights: &Weights) -> Self {
+        let mut adam = Self::default();
+        for (name, array) in weights.iter() {
+            if let Some(name) = name.strip_prefix("adam.first.") {
+                adam.first.insert(name.into(), array.values.clone());
+            } else if let Some(name) = name.strip_prefix("adam.second.") {
+                adam.second.insert(name.into(), array.values.clone());
+            } else if name == "adam.steps" {
+                adam.steps = array.values[0] as i32;
+            }
+        }
+        adam
+    }
+}

@@ -1,0 +1,186 @@
+//! A batch of training windows: rows for the reference rollout, targets, and terrain tokens along the driven paths.
+
+use candle_core::{Device, Result, Tensor};
+use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, HIDDEN};
+use nesam_model::reference::{Network, Row, TerrainProvider};
+use nesam_model::{GroundSource, Normalization, history_actuators};
+use nesam_physics::step::StepModel;
+use nesam_physics::{SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
+
+use crate::drives::{Drive, Place};
+
+/// Samples past the window in which a fast prediction may find its place.
+const AHEAD: usize = 8;
+
+/// A window: drive, start sample, horizon and history.
+#[derive(Clone, Copy, Debug)]
+pub struct Window<'a> {
+    /// Drive.
+    pub drive: &'a Drive,
+    /// Start sample i; prediction starts from its measured state.
+    pub start: usize,
+}
+
+impl Window<'_> {
+    /// Last sample whose context the window may use.
+    fn last(&self, horizon: usize) -> usize {
+        (self.start + horizon + AHEAD).min(self.drive.states.len() - 1)
+    }
+}
+
+/// Rows of the rollout.
+pub fn rows<'a>(windows: &[Window<'a>], history: usize, horizon: usize, model: &StepModel, dt_s: f64) -> Vec<Row<'a>> {
+    windows
+        .iter()
+        .map(|w| {
+            let (drive, i) = (w.drive, w.start);
+            let steps = drive.history(i - history, i);
+            let start = drive.states[i];
+            // Actuators remember longer than the tokens: use all the commands there are, up to the model's full history.
+            let actuator_steps = drive.history(i.saturating_sub(nesam_model::HISTORY - 1), i);
+            Row {
+                actuators: history_actuators(model, &actuator_steps, &drive.controls[i], dt_s),
+                history: steps,
+                start,
+                controls: drive.controls[i..i + horizon].to_vec(),
+                ground: GroundSource::new(drive.map.as_deref(), model, &start),
+            }
+        })
+        .collect()
+}
+
+/// Measured states after step `k` (0-based) relative to the start, scaled as the predictions are: (batch, 12), yaw unwrapped towards the start.
+pub fn targets(windows: &[Window<'_>], k: usize) -> Result<Tensor> {
+    let mut values = Vec::with_capacity(windows.len() * STATE_DIM);
+    for w in windows {
+        let start = w.drive.states[w.start].to_array();
+        let mut x = w.drive.states[w.start + k + 1].to_array();
+        for i in 0..3 {
+            x[i] -= start[i];
+        }
+        values.extend(x.map(|v| v as f32));
+    }
+    Tensor::from_vec(values, (windows.len(), STATE_DIM), &Device::Cpu)
+}
+
+/// Mean over rows of Σ_i (√(1 + e_i²) - 1) with e the scaled error: squared near zero, absolute far out (mean absolute error is what is reported).
+pub fn state_loss(predicted: &Tensor, target: &Tensor, scales: &Normalization) -> Result<Tensor> {
+    let scale = Tensor::from_slice(&scales.loss_scale, (1, STATE_DIM), &Device::Cpu)?;
+    let error = (predicted - target)?;
+    // The yaw of a prediction is not wrapped, the measured one is: compare modulo a turn.
+    let turns = error.narrow(1, 5, 1)?.detach().affine(1.0 / core::f64::consts::TAU, 0.0)?.round()?;
+    let yaw = (error.narrow(1, 5, 1)? - turns.affine(core::f64::consts::TAU, 0.0)?)?;
+    let error = Tensor::cat(&[error.narrow(1, 0, 5)?, yaw, error.narrow(1, 6, 6)?], 1)?.broadcast_div(&scale)?;
+    ((error.sqr()? + 1.0)?.sqrt()? - 1.0)?.sum(1)?.mean_all()
+}
+
+/// Terrain tokens of a batch, computed once for all samples that its rollouts can reach.
+pub struct PathTerrain<'a, 'w> {
+    windows: &'w [Window<'a>],
+    horizon: usize,
+    history_tokens: Option<Tensor>,
+    tokens: Tensor,
+    soils: Tensor,
+    /// First row of each window in `tokens` and `soils`.
+    first_row: Vec<u32>,
+    has_map: bool,
+    default_soil: [f32; SOIL_DIM],
+}
+
+impl<'a, 'w> PathTerrain<'a, 'w> {
+    /// Projects and reads the soil of every reachable sample: one large matrix product instead of one per step.
+    ///
+    /// # Errors
+    /// A candle error.
+    pub fn new(network: &Network, windows: &'w [Window<'a>], history: usize, horizon: usize, scales: &Normalization) -> Result<Self> {
+        let has_map = windows.iter().all(|w| w.drive.has_features());
+        let rows: usize = windows.iter().map(|w| w.last(horizon) - w.start + 1).sum();
+        let (mut context, mut past, mut semantic) = (Vec::new(), Vec::new(), Vec::new());
+        let mut first_row = Vec::with_capacity(windows.len());
+        if has_map {
+            context.reserve(rows * CONTEXT);
+            for w in windows {
+                first_row.push((context.len() / CONTEXT) as u32);
+                for i in w.start..=w.last(horizon) {
+                    w.drive.push_context(i, &mut context);
+                    w.drive.push_semantic(i, &mut semantic);
+                }
+                for i in w.start - history..w.start {
+                    w.drive.push_context(i, &mut past);
+                }
+            }
+        }
+        let device = &Device::Cpu;
+        let project = |values: Vec<f32>| {
+            let n = values.len() / CONTEXT;
+            network.context_token(&Tensor::from_vec(values, (n, CONTEXT), device)?)
+        };
+        let zeros = |n: usize| Tensor::zeros((n, HIDDEN), candle_core::DType::F32, device);
+        let past_rows = windows.len() * history;
+        Ok(Self {
+            windows,
+            horizon,
+            history_tokens: match (has_map, past_rows) {
+                (_, 0) => None,
+                (true, _) => Some(project(past)?),
+                (false, n) => Some(zeros(n)?),
+            },
+            tokens: if has_map { project(context)? } else { zeros(1)? },
+            soils: if has_map {
+                network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?
+            } else {
+                Tensor::zeros((1, SOIL_DIM), candle_core::DType::F32, device)?
+            },
+            first_row,
+            has_map,
+            default_soil: scales.default_soil_raw,
+        })
+    }
+
+    /// (1 - share) · row(at) + share · row(at + 1) of each place.
+    fn interpolate(&self, table: &Tensor, places: &[Place]) -> Result<Tensor> {
+        let device = &Device::Cpu;
+        let n = places.len();
+        let row = |b: usize, extra: usize| self.first_row[b] + (places[b].at + extra - self.windows[b].start) as u32;
+        let pick = |extra: usize| {
+            let last = |b: usize| self.windows[b].last(self.horizon) - self.windows[b].start;
+            let rows: Vec<u32> = (0..n).map(|b| row(b, extra).min(self.first_row[b] + last(b) as u32)).collect();
+            table.index_select(&Tensor::from_vec(rows, n, device)?, 0)
+        };
+        let share = Tensor::from_vec(places.iter().map(|p| p.share).collect::<Vec<f32>>(), (n, 1), device)?;
+        let rest = share.affine(-1.0, 1.0)?;
+        pick(0)?.broadcast_mul(&rest)? + pick(1)?.broadcast_mul(&share)?
+    }
+}
+
+impl TerrainProvider for PathTerrain<'_, '_> {
+    fn history(&mut self) -> Result<Tensor> {
+        self.history_tokens.clone().ok_or_else(|| candle_core::Error::Msg("a batch without history has no history tokens".into()))
+    }
+
+    fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
+        if !self.has_map {
+            let n = states.len();
+            let soil = Tensor::from_slice(&self.default_soil, (1, SOIL_DIM), &Device::Cpu)?.broadcast_as((n, SOIL_DIM))?.contiguous()?;
+            return Ok((Tensor::zeros((n, HIDDEN), candle_core::DType::F32, &Device::Cpu)?, soil));
+        }
+        let places: Vec<Place> =
+            self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();
+        Ok((self.interpolate(&self.tokens, &places)?, self.interpolate(&self.soils, &places)?))
+    }
+}
+
+/// Mean absolute errors of predictions over a batch: horizontal position (m), z (m), roll, pitch, yaw (rad).
+pub fn absolute_errors(predicted: &Tensor, target: &Tensor) -> Result<[f64; 5]> {
+    let (p, t): (Vec<Vec<f32>>, Vec<Vec<f32>>) = (predicted.to_vec2()?, target.to_vec2()?);
+    let mut sums = [0.0; 5];
+    for (p, t) in p.iter().zip(&t) {
+        let e = |i: usize| f64::from(p[i] - t[i]);
+        sums[0] += e(0).hypot(e(1));
+        sums[1] += e(2).abs();
+        sums[2] += e(3).abs();
+        sums[3] += e(4).abs();
+        sums[4] += wrap_angle(e(5)).abs();
+    }
+    Ok(sums.map(|s| s / p.len() as f64))
+}

@@ -1,0 +1,123 @@
+//! Training drives with their terrain features.
+//!
+//! The encoders are frozen, so the context c of every measured pose is computed once. A predicted pose near the driven path takes the
+//! context interpolated between the two measured poses it lies between: it is looked up by place, not by time, so the future of the
+//! drive does not leak into the prediction.
+
+use std::sync::Arc;
+
+use half::f16;
+use half::slice::HalfFloatSliceExt;
+use nesam_model::dims::{CONTEXT, FEATURES};
+use nesam_model::encoder::{EncoderScratch, TerrainEncoders};
+use nesam_model::HistoryStep;
+use nesam_physics::{Control, VehicleState, wrap_angle};
+use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
+use rayon::prelude::*;
+
+/// Metres that one radian of heading counts when places are compared.
+const METRES_PER_RADIAN: f64 = 2.0;
+
+/// One recorded drive: measured channels only.
+#[derive(Clone, Debug)]
+pub struct Drive {
+    /// Trajectory id.
+    pub id: String,
+    /// Ground; `None` without a map.
+    pub map: Option<Arc<WorldMap>>,
+    /// Measured states at the step of the model.
+    pub states: Vec<VehicleState<f64>>,
+    /// Commands, valid from each sample to the next.
+    pub controls: Vec<Control<f64>>,
+    /// Contexts (samples, 9216), empty until encoded.
+    features: Vec<f16>,
+}
+
+/// A place on the driven path: share `1 - share` of sample `at`, `share` of the next one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Place {
+    /// Sample.
+    pub at: usize,
+    /// Share of the next sample, 0..=1.
+    pub share: f32,
+}
+
+impl Drive {
+    /// A drive without features yet.
+    pub fn new(id: String, map: Option<Arc<WorldMap>>, states: Vec<VehicleState<f64>>, controls: Vec<Control<f64>>) -> Self {
+        Self { id, map, states, controls, features: Vec::new() }
+    }
+
+    /// Pose of sample `i`.
+    pub fn pose(&self, i: usize) -> Pose2 {
+        let s = &self.states[i];
+        Pose2 { x_m: s.position_m[0], y_m: s.position_m[1], yaw_rad: s.attitude_rad[2] }
+    }
+
+    /// Steps `from .. to` as history.
+    pub fn history(&self, from: usize, to: usize) -> Vec<HistoryStep> {
+        (from..to).map(|j| HistoryStep { state: self.states[j], control: self.controls[j] }).collect()
+    }
+
+    /// Whether contexts exist (a map, and `encode` was called).
+    pub fn has_features(&self) -> bool {
+        !self.features.is_empty()
+    }
+
+    /// Appends the context of sample `i`, (9216), to `out`.
+    pub fn push_context(&self, i: usize, out: &mut Vec<f32>) {
+        self.push(&self.features[i * CONTEXT..(i + 1) * CONTEXT], out);
+    }
+
+    /// Appends the semantic features of sample `i`, (16, 16, 18), to `out`.
+    pub fn push_semantic(&self, i: usize, out: &mut Vec<f32>) {
+        self.push(&self.features[i * CONTEXT + FEATURES..(i + 1) * CONTEXT], out);
+    }
+
+    fn push(&self, features: &[f16], out: &mut Vec<f32>) {
+        let at = out.len();
+        out.resize(at + features.len(), 0.0);
+        features.convert_to_f32_slice(&mut out[at..]);
+    }
+
+    /// Where on the path, among samples `first ..= last`, a predicted state is nearest.
+    pub fn nearest_place(&self, state: &VehicleState<f64>, first: usize, last: usize) -> Place {
+        let offset = |i: usize| {
+            let s = &self.states[i];
+            let turn = METRES_PER_RADIAN * wrap_angle(state.attitude_rad[2] - s.attitude_rad[2]);
+            [state.position_m[0] - s.position_m[0], state.position_m[1] - s.position_m[1], turn]
+        };
+        let dot = |a: [f64; 3], b: [f64; 3]| a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+        let distance = |i: usize| dot(offset(i), offset(i));
+        let nearest = (first..=last).min_by(|&a, &b| distance(a).total_cmp(&distance(b))).unwrap_or(first);
+        // Project onto the two segments that meet at the nearest sample and keep the better one.
+        let project = |from: usize| {
+            let (a, b) = (offset(from), offset(from + 1));
+            let segment: [f64; 3] = core::array::from_fn(|i| a[i] - b[i]);
+            let share = (dot(a, segment) / dot(segment, segment).max(1e-9)).clamp(0.0, 1.0);
+            let rest: [f64; 3] = core::array::from_fn(|i| a[i] - share * segment[i]);
+            (dot(rest, rest), Place { at: from, share: share as f32 })
+        };
+        let candidates = [nearest.checked_sub(1).filter(|&p| p >= first), Some(nearest).filter(|&n| n < last)];
+        let best = candidates.into_iter().flatten().map(project).min_by(|a, b| a.0.total_cmp(&b.0));
+        best.map_or(Place { at: first, share: 0.0 }, |(_, place)| place)
+    }
+}
+
+/// Computes the contexts of all drives with a map, in parallel; `progress(done)` counts samples.
+pub fn encode_drives(drives: &mut [Drive], encoders: &TerrainEncoders, scale: &PatchScale, progress: impl Fn(usize) + Sync) {
+    drives.par_iter_mut().for_each_init(
+        || (Patch::new(), EncoderScratch::default(), vec![0f32; CONTEXT]),
+        |(patch, scratch, context), drive| {
+            let Some(map) = drive.map.clone() else { return };
+            let mut features = vec![f16::ZERO; drive.states.len() * CONTEXT];
+            for (i, slot) in features.chunks_exact_mut(CONTEXT).enumerate() {
+                sample_patch(&map, drive.pose(i), scale, patch);
+                encoders.encode(patch, scratch, context);
+                slot.convert_from_f32_slice(context);
+            }
+            drive.features = features;
+            progress(drive.states.len());
+        },
+    );
+}

@@ -1,0 +1,20 @@
+//! Offline training: encoder pre-training and autoregressive rollouts (paper §III-D, §IV).
+//!
+//! A run has four stages: the encoders are pre-trained as autoencoders on patches around the driven places ([`autoencoder`]); the drive line
+//! of the vehicle card is calibrated with the symbolic model alone ([`calibrate`]); the contexts of all measured poses are computed once
+//! ([`drives`]); and the network is trained through K-step rollouts ([`trainer`]).
+#![forbid(unsafe_code)]
+
+pub mod adam;
+pub mod autoencoder;
+pub mod batch;
+pub mod calibrate;
+pub mod drives;
+pub mod initial;
+pub mod recipe;
+pub mod scales;
+pub mod schedule;
+pub mod trainer;
+
+pub use drives::{Drive, encode_drives};
+pub use trainer::{EpochReport, Trained, TrainingError, TrainingPlan, TrainingSet, train};

@@ -1,0 +1,251 @@
+//! From a data root to a bundle: the stages of a training run in their order, each resumable.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Instant;
+
+use nesam_model::bundle::sha256_hex;
+use nesam_model::encoder::{ENCODERS, TerrainEncoders};
+use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
+use nesam_physics::Vehicle;
+use nesam_physics::step::StepModel;
+use nesam_trajectories::{DataRoot, Trajectory};
+
+use crate::autoencoder::{Places, PretrainPlan, pretrain};
+use crate::calibrate::calibrate_driveline;
+use crate::drives::{Drive, encode_drives};
+use crate::initial::initial_weights;
+use crate::scales::measure;
+use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
+
+/// What a run is told; the defaults of the command line are in `nesam train --help`.
+#[derive(Clone, Debug)]
+pub struct Recipe {
+    /// Name of the bundle.
+    pub name: String,
+    /// Step of the model, s.
+    pub dt_s: f64,
+    /// Steps of encoder pre-training.
+    pub encoder_steps: usize,
+    /// Patches per step of encoder pre-training.
+    pub encoder_batch: usize,
+    /// Learning rate of encoder pre-training.
+    pub encoder_rate: f64,
+    /// Training plan; its folder is `out/checkpoint`.
+    pub plan: TrainingPlan,
+    /// Output folder.
+    pub out: PathBuf,
+    /// Goes on where an interrupted run of the same command stopped.
+    pub resume: bool,
+    /// The command line, for the bundle.
+    pub command: String,
+}
+
+/// Told how a run goes.
+pub trait Reporter: Sync {
+    /// A stage begins that counts to `total`.
+    fn stage(&self, name: &str, total: usize);
+    /// Progress within the stage, with a short remark.
+    fn progress(&self, done: usize, remark: &str);
+    /// A line worth keeping.
+    fn line(&self, text: &str);
+}
+
+/// Every tenth drive of a sorted list validates; the rest trains.
+fn is_validation(index: usize) -> bool {
+    index % 10 == 7
+}
+
+/// Trains a bundle on the drives of the train split and writes it to `out/bundle`.
+///
+/// # Errors
+/// `TrainingError`; an interruption keeps what is needed to resume.
+pub fn run(
+    root: &DataRoot,
+    trajectories: &[Trajectory],
+    data_hash: &str,
+    recipe: &Recipe,
+    baselines_json: Option<String>,
+    reporter: &dyn Reporter,
+    interrupted: &dyn Fn() -> bool,
+) -> Result<ModelBundle, TrainingError> {
+    let began = Instant::now();
+    let mut drives = load_drives(root, trajectories)?;
+    let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
+        (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
+    };
+    let (train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
+    let mut vehicle = root.vehicle().clone();
+    let scales = calibrated(&mut vehicle, &drives, &train_at, recipe.dt_s, reporter);
+
+    let mut weights = initial_weights(recipe.plan.seed, &scales);
+    if drives.iter().any(|d| d.map.is_some()) {
+        for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
+            weights.insert(name, &array.shape, array.values.clone());
+        }
+        let samples = drives.iter().map(|d| d.states.len()).sum();
+        reporter.stage("terrain contexts", samples);
+        let done = AtomicUsize::new(0);
+        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), |n| {
+            reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
+        });
+    }
+
+    let set = TrainingSet {
+        train: train_at.iter().map(|&i| &drives[i]).collect(),
+        validation: if validation_at.is_empty() { &train_at } else { &validation_at }.iter().map(|&i| &drives[i]).collect(),
+        scales: &scales,
+        model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
+    };
+    reporter.line(&format!("{} drives train, {} validate, {} parameters", set.train.len(), validation_at.len(), weights.parameters("") - weights.parameters("encoder.")));
+    reporter.stage("training", recipe.plan.steps);
+    let plan = TrainingPlan { folder: recipe.out.join("checkpoint"), ..recipe.plan.clone() };
+    let trained = train(
+        &set,
+        &weights,
+        &plan,
+        recipe.resume,
+        interrupted,
+        |step, loss, norm| reporter.progress(step, &format!("loss {loss:.3}, gradient {norm:.2}")),
+        |line| reporter.line(&describe(line)),
+    )?;
+    let curve = serde_json::to_string_pretty(&trained.curve).expect("numbers serialise; this is a bug");
+    write(&recipe.out.join("loss_curve.json"), curve.as_bytes())?;
+    let mut bundle = ModelBundle {
+        name: recipe.name.clone(),
+        hash: String::new(),
+        default_soil: scales.default_soil(),
+        parameters: trained.weights.parameters("") - trained.weights.parameters("encoder."),
+        vehicle,
+        normalization: scales,
+        weights: trained.weights,
+        baselines_json,
+        provenance: Provenance {
+            command: recipe.command.clone(),
+            seed: plan.seed,
+            data_hash: data_hash.into(),
+            steps: trained.steps as u64,
+            training_s: began.elapsed().as_secs_f64(),
+            program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
+            parent: None,
+        },
+    };
+    bundle.save(&recipe.out.join("bundle"))?;
+    Ok(bundle)
+}
+
+/// One line of the loss curve for people.
+fn describe(line: &EpochReport) -> String {
+    let [position, z, roll, pitch, yaw] = line.validation;
+    format!(
+        "step {}: loss {:.3}; validation, mean over the horizon: position {position:.3} m, z {z:.3} m, roll {:.2}°, pitch {:.2}°, yaw {:.2}°; {:.2} s per step",
+        line.step,
+        line.loss,
+        roll.to_degrees(),
+        pitch.to_degrees(),
+        yaw.to_degrees(),
+        line.step_s
+    )
+}
+
+/// Measured channels of the trajectories with their maps, in the order of their ids.
+fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<Drive>, TrainingError> {
+    let mut sorted: Vec<&Trajectory> = trajectories.iter().collect();
+    sorted.sort_by(|a, b| a.id.cmp(&b.id));
+    sorted
+        .into_iter()
+        .map(|t| {
+            let map = t.world.as_ref().map(|id| root.world(id)).transpose().map_err(|e| TrainingError::Drives(e.to_string()))?;
+            Ok(Drive::new(t.id.clone(), map, t.states.clone(), t.controls.clone()))
+        })
+        .collect()
+}
+
+/// Scales, and the drive line of the vehicle fitted on the training drives.
+fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64, reporter: &dyn Reporter) -> Normalization {
+    let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
+    let scales = measure(&training, vehicle, dt_s);
+    reporter.stage("drive line", 12);
+    let mut done = 0;
+    let few: Vec<&Drive> = training.iter().copied().step_by((training.len() / 60).max(1)).collect();
+    let [before, after] = calibrate_driveline(vehicle, &few, &scales, |name, value, error| {
+        done += 1;
+        reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
+    });
+    reporter.line(&format!("drive line calibrated: symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", vehicle.driveline));
+    scales
+}
+
+/// Pre-trained encoders, from the output folder if this run was made before.
+fn encoders(
+    drives: &[Drive],
+    train_at: &[usize],
+    scales: &Normalization,
+    recipe: &Recipe,
+    reporter: &dyn Reporter,
+    interrupted: &dyn Fn() -> bool,
+) -> Result<Weights, TrainingError> {
+    let plan = PretrainPlan { steps: recipe.encoder_steps, batch: recipe.encoder_batch, rate: recipe.encoder_rate, seed: recipe.plan.seed };
+    let key = sha256_hex(format!("{plan:?} {:?}", train_at.iter().map(|&i| &drives[i].id).collect::<Vec<_>>()).as_bytes());
+    let path = recipe.out.join(format!("encoders-{}.safetensors", &key[..12]));
+    if let Ok(bytes) = std::fs::read(&path) {
+        reporter.line(&format!("encoders taken from {}", path.display()));
+        return Ok(Weights::from_bytes(&bytes, &path)?);
+    }
+    let places: Places = train_at
+        .iter()
+        .filter_map(|&i| drives[i].map.as_ref().map(|map| (map, &drives[i])))
+        .flat_map(|(map, drive)| drive.states.iter().step_by(3).map(move |s| (map.clone(), s.position_m[0], s.position_m[1])))
+        .collect();
+    reporter.stage("encoders", 2 * plan.steps);
+    let done = AtomicUsize::new(0);
+    let results: Vec<_> = std::thread::scope(|scope| {
+        let (places, plan, done) = (&places, &plan, &done);
+        let running: Vec<_> = ENCODERS
+            .iter()
+            .map(|(name, _)| {
+                scope.spawn(move || {
+                    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread can be started; this is a bug");
+                    pool.install(|| {
+                        pretrain(name, places, &scales.patch_scale(), plan, |_, loss| {
+                            reporter.progress(done.fetch_add(1, Ordering::Relaxed) + 1, &format!("{name} loss {loss:.5}"));
+                        })
+                    })
+                })
+            })
+            .collect();
+        running.into_iter().map(|r| r.join().expect("pre-training does not panic; this is a bug")).collect()
+    });
+    if interrupted() {
+        return Err(TrainingError::Interrupted(0));
+    }
+    let mut weights = Weights::default();
+    for ((name, _), result) in ENCODERS.iter().zip(results) {
+        let pretrained = result?;
+        reporter.line(&format!("{name} encoder: {:.1} % of the variance is lost in the features", 100.0 * pretrained.unexplained));
+        for (array_name, array) in pretrained.weights.iter() {
+            weights.insert(array_name, &array.shape, array.values.clone());
+        }
+    }
+    write(&path, &weights.to_bytes())?;
+    Ok(weights)
+}
+
+fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {
+    let fail = |reason: String| TrainingError::Model(ModelError::Bundle { path: path.to_path_buf(), reason });
+    if let Some(parent) = path.parent() {
+        std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
+    }
+    std::fs::write(path, bytes).map_err(|e| fail(e.to_string()))
+}
+
+/// The variant a name stands for: `nesam`, `nesam_no_residual`, `nesam_zero_sinkage`.
+pub fn variant_of(name: &str) -> Option<Variant> {
+    match name {
+        "nesam" => Some(Variant::Full),
+        "nesam_no_residual" => Some(Variant::NoResidual),
+        "nesam_zero_sinkage" => Some(Variant::ZeroSinkage),
+        _ => None,
+    }
+}

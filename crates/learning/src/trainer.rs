@@ -1,0 +1,350 @@
+//! The training loop: fully autoregressive rollouts, two shards of a batch side by side, checkpoints, validation.
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Instant;
+
+use candle_core::{DType, Device, Result, Tensor};
+use nesam_model::reference::{Network, ReferenceRollout};
+use nesam_model::{HISTORY, ModelError, Normalization, Variant, Weights};
+use nesam_physics::step::StepModel;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use crate::adam::Adam;
+use crate::batch::{PathTerrain, Window, absolute_errors, rows, state_loss, targets};
+use crate::drives::Drive;
+use crate::schedule::{cosine, curriculum};
+
+/// What a training run was told.
+#[derive(Clone, Debug)]
+pub struct TrainingPlan {
+    /// Optimiser steps in all (paper: 40 × 250).
+    pub steps: usize,
+    /// Windows per step (paper: 32).
+    pub batch: usize,
+    /// Peak learning rate.
+    pub rate: f64,
+    /// Longest horizon K.
+    pub horizon: usize,
+    /// Seed of the batches.
+    pub seed: u64,
+    /// Steps between validations and checkpoints.
+    pub epoch: usize,
+    /// Threads that each take a share of the batch.
+    pub shards: usize,
+    /// Ablation trained.
+    pub variant: Variant,
+    /// Where checkpoints go.
+    pub folder: PathBuf,
+}
+
+/// One line of the loss curve.
+#[derive(Clone, Copy, Debug, serde::Serialize, serde::Deserialize)]
+pub struct EpochReport {
+    /// Optimiser steps taken.
+    pub step: usize,
+    /// Mean training loss since the last report.
+    pub loss: f32,
+    /// Mean absolute errors on validation drives, mean over the horizon: position (m), z (m), roll, pitch, yaw (rad).
+    pub validation: [f64; 5],
+    /// Seconds per step since the last report.
+    pub step_s: f64,
+}
+
+/// Result of a run.
+pub struct Trained {
+    /// Weights with the lowest validation error.
+    pub weights: Weights,
+    /// Loss curve.
+    pub curve: Vec<EpochReport>,
+    /// Steps of this run and of those it resumed.
+    pub steps: usize,
+}
+
+/// A run that stopped.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainingError {
+    /// candle or the bundle.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// A checkpoint.
+    #[error("checkpoint {}: {reason}", path.display())]
+    Checkpoint {
+        /// File.
+        path: PathBuf,
+        /// What was wrong.
+        reason: String,
+    },
+    /// The data cannot be trained on.
+    #[error("training data: {0}")]
+    Drives(String),
+    /// Stopped on request; the last checkpoint resumes the run.
+    #[error("training was interrupted after step {0}; the same command with --resume goes on")]
+    Interrupted(usize),
+}
+
+impl From<candle_core::Error> for TrainingError {
+    fn from(error: candle_core::Error) -> Self {
+        Self::Model(ModelError::Tensor(error))
+    }
+}
+
+/// Everything a run reads.
+pub struct TrainingSet<'a> {
+    /// Drives to learn from.
+    pub train: Vec<&'a Drive>,
+    /// Drives to choose the checkpoint on; never the test split.
+    pub validation: Vec<&'a Drive>,
+    /// Scales.
+    pub scales: &'a Normalization,
+    /// Physics.
+    pub model: Arc<StepModel>,
+}
+
+impl TrainingSet<'_> {
+    /// Loss and gradients of one shard.
+    fn shard(&self, network: &Network, windows: &[Window<'_>], history: usize, horizon: usize, variant: Variant) -> Result<(f32, HashMap<String, Vec<f32>>)> {
+        let loss = self.loss(network, windows, history, horizon, variant)?;
+        let store = loss.backward()?;
+        let mut gradients = HashMap::new();
+        for (name, var) in &network.variables {
+            if let Some(gradient) = store.get(var) {
+                gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
+            }
+        }
+        Ok((loss.to_scalar::<f32>()?, gradients))
+    }
+
+    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1).
+    ///
+    /// # Errors
+    /// A candle error.
+    pub fn loss(&self, network: &Network, windows: &[Window<'_>], history: usize, horizon: usize, variant: Variant) -> Result<Tensor> {
+        let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
+        let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
+        let mut terrain = PathTerrain::new(network, windows, history, horizon, self.scales)?;
+        let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;
+        for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
+            total = (total + state_loss(&step.state, &targets(windows, k)?, self.scales)?)?;
+        }
+        total / horizon as f64
+    }
+
+    /// Mean absolute errors over fixed windows of the validation drives.
+    fn validate(&self, network: &Network, horizon: usize, variant: Variant) -> Result<[f64; 5]> {
+        let windows: Vec<Window<'_>> = self
+            .validation
+            .iter()
+            .flat_map(|drive| {
+                let first = (HISTORY - 1).min(drive.states.len().saturating_sub(horizon + 1));
+                (first..drive.states.len().saturating_sub(horizon)).step_by(40).map(move |start| Window { drive, start })
+            })
+            .collect();
+        let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
+        let mut sums = [0.0; 5];
+        let mut count = 0.0;
+        for windows in windows.chunks(64) {
+            let history = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
+            let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
+            let mut terrain = PathTerrain::new(network, windows, history, horizon, self.scales)?;
+            for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
+                let errors = absolute_errors(&step.state, &targets(windows, k)?)?;
+                for (sum, e) in sums.iter_mut().zip(errors) {
+                    *sum += e * windows.len() as f64;
+                }
+                count += windows.len() as f64;
+            }
+        }
+        Ok(sums.map(|s| s / count))
+    }
+}
+
+/// Errors weighted as the targets of the evaluation weigh them: one number to choose a checkpoint by.
+fn score(errors: &[f64; 5]) -> f64 {
+    errors[0] / 0.20 + errors[1] / 0.045 + (errors[2] / 0.8 + errors[3] / 0.7 + errors[4] / 1.7).to_degrees()
+}
+
+/// Steps of history for a training step: all of it mostly, less one time in six, so that a fresh session predicts well too.
+fn draw_history(rng: &mut ChaCha8Rng, available: usize) -> usize {
+    if rng.random_range(0..6) > 0 { available } else { rng.random_range(0..=available) }
+}
+
+/// Trains from `weights`; resumes from the folder's checkpoint if asked. `progress(step, loss, norm)` after each step, `report` after each epoch.
+///
+/// # Errors
+/// `TrainingError`; an interruption leaves a checkpoint.
+pub fn train(
+    set: &TrainingSet<'_>,
+    weights: &Weights,
+    plan: &TrainingPlan,
+    resume: bool,
+    interrupted: &dyn Fn() -> bool,
+    mut progress: impl FnMut(usize, f32, f32),
+    mut report: impl FnMut(&EpochReport),
+) -> std::result::Result<Trained, TrainingError> {
+    let starts = window_starts(set, plan)?;
+    let mut checkpoint = if resume { Checkpoint::load(&plan.folder)? } else { None }
+        .unwrap_or_else(|| Checkpoint { step: 0, best_score: f64::INFINITY, best: weights.clone(), latest: weights.clone(), adam: Adam::default(), curve: Vec::new() });
+    let network = Network::from_weights(&checkpoint.latest)?;
+    let pools: Vec<rayon::ThreadPool> = (0..plan.shards)
+        .map(|_| rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread can be started; this is a bug"))
+        .collect();
+    let (mut loss_sum, mut loss_count, mut since) = (0.0, 0, Instant::now());
+    while checkpoint.step < plan.steps {
+        let step = checkpoint.step;
+        // Each step has its own random stream, so a resumed run draws the batches that an uninterrupted one would have drawn.
+        let mut rng = ChaCha8Rng::seed_from_u64(plan.seed ^ (step as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15));
+        let horizon = curriculum(plan.horizon, step, plan.steps);
+        let mut windows: Vec<Window<'_>> = Vec::with_capacity(plan.batch);
+        for _ in 0..plan.batch {
+            let (drive, start) = starts[rng.random_range(0..starts.len())];
+            windows.push(Window { drive, start });
+        }
+        let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
+        let history = draw_history(&mut rng, available);
+        let (loss, gradients) = parallel_gradients(set, &network, &windows, history, horizon, plan, &pools)?;
+        let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0)?;
+        checkpoint.step += 1;
+        loss_sum += loss;
+        loss_count += 1;
+        progress(checkpoint.step, loss, norm);
+        let stop = interrupted();
+        if checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps || stop {
+            let step_s = since.elapsed().as_secs_f64() / loss_count as f64;
+            let validation = set.validate(&network, plan.horizon, plan.variant)?;
+            let line = EpochReport { step: checkpoint.step, loss: loss_sum / loss_count as f32, validation, step_s };
+            checkpoint.latest = merged(weights, &network.to_weights()?);
+            if score(&validation) < checkpoint.best_score {
+                checkpoint.best_score = score(&validation);
+                checkpoint.best = checkpoint.latest.clone();
+            }
+            checkpoint.curve.push(line);
+            checkpoint.save(&plan.folder)?;
+            report(&line);
+            (loss_sum, loss_count, since) = (0.0, 0, Instant::now());
+        }
+        if stop {
+            return Err(TrainingError::Interrupted(checkpoint.step));
+        }
+    }
+    Ok(Trained { weights: checkpoint.best, curve: checkpoint.curve, steps: checkpoint.step })
+}
+
+/// Every (drive, start) whose rollout fits.
+fn window_starts<'a>(set: &TrainingSet<'a>, plan: &TrainingPlan) -> std::result::Result<Vec<(&'a Drive, usize)>, TrainingError> {
+    let mut starts = Vec::new();
+    for drive in &set.train {
+        let n = drive.states.len();
+        let first = if n > HISTORY + plan.horizon { HISTORY - 1 } else { 0 };
+        starts.extend((first..n.saturating_sub(plan.horizon)).map(|start| (*drive, start)));
+    }
+    if starts.is_empty() {
+        return Err(TrainingError::Drives(format!("no drive is longer than the horizon of {} steps", plan.horizon)));
+    }
+    Ok(starts)
+}
+
+fn parallel_gradients(
+    set: &TrainingSet<'_>,
+    network: &Network,
+    windows: &[Window<'_>],
+    history: usize,
+    horizon: usize,
+    plan: &TrainingPlan,
+    pools: &[rayon::ThreadPool],
+) -> Result<(f32, HashMap<String, Vec<f32>>)> {
+    let size = windows.len().div_ceil(pools.len());
+    let parts: Vec<Result<(f32, HashMap<String, Vec<f32>>)>> = std::thread::scope(|scope| {
+        let running: Vec<_> = windows
+            .chunks(size)
+            .zip(pools)
+            .map(|(windows, pool)| scope.spawn(move || pool.install(|| set.shard(network, windows, history, horizon, plan.variant))))
+            .collect();
+        running.into_iter().map(|thread| thread.join().expect("a shard does not panic; this is a bug")).collect()
+    });
+    // Summed in the order of the shards: the same batch gives the same bytes.
+    let mut total: HashMap<String, Vec<f32>> = HashMap::new();
+    let mut loss = 0.0;
+    for (part, windows_of_part) in parts.into_iter().zip(windows.chunks(size)) {
+        let weight = windows_of_part.len() as f32 / windows.len() as f32;
+        let (part_loss, gradients) = part?;
+        loss += weight * part_loss;
+        for (name, gradient) in gradients {
+            let sum = total.entry(name).or_insert_with(|| vec![0.0; gradient.len()]);
+            for (s, g) in sum.iter_mut().zip(gradient) {
+                *s += weight * g;
+            }
+        }
+    }
+    Ok((loss, total))
+}
+
+/// `base` with the arrays of `trained` in place of its own.
+fn merged(base: &Weights, trained: &Weights) -> Weights {
+    let mut weights = base.clone();
+    for (name, array) in trained.iter() {
+        weights.insert(name, &array.shape, array.values.clone());
+    }
+    weights
+}
+
+/// What an interrupted run needs.
+struct Checkpoint {
+    step: usize,
+    best_score: f64,
+    best: Weights,
+    latest: Weights,
+    adam: Adam,
+    curve: Vec<EpochReport>,
+}
+
+impl Checkpoint {
+    fn save(&self, folder: &Path) -> std::result::Result<(), TrainingError> {
+        let fail = |path: &Path, e: std::io::Error| TrainingError::Checkpoint { path: path.to_path_buf(), reason: e.to_string() };
+        std::fs::create_dir_all(folder).map_err(|e| fail(folder, e))?;
+        let mut moments = Weights::default();
+        self.adam.save(&mut moments);
+        let state = serde_json::json!({ "step": self.step, "best_score": self.best_score, "curve": self.curve });
+        let files = [
+            ("best.safetensors", self.best.to_bytes()),
+            ("latest.safetensors", self.latest.to_bytes()),
+            ("adam.safetensors", moments.to_bytes()),
+            // Written last: a run killed in between resumes from files that agree.
+            ("state.json", state.to_string().into_bytes()),
+        ];
+        for (name, bytes) in &files {
+            let path = folder.join(format!("{name}.new"));
+            std::fs::write(&path, bytes).map_err(|e| fail(&path, e))?;
+        }
+        for (name, _) in &files {
+            let path = folder.join(name);
+            std::fs::rename(folder.join(format!("{name}.new")), &path).map_err(|e| fail(&path, e))?;
+        }
+        Ok(())
+    }
+
+    fn load(folder: &Path) -> std::result::Result<Option<Self>, TrainingError> {
+        let state_path = folder.join("state.json");
+        if !state_path.exists() {
+            return Ok(None);
+        }
+        let fail = |path: &Path, reason: String| TrainingError::Checkpoint { path: path.to_path_buf(), reason };
+        let read = |name: &str| {
+            let path = folder.join(name);
+            std::fs::read(&path).map_err(|e| fail(&path, e.to_string()))
+        };
+        let arrays = |name: &str| -> std::result::Result<Weights, TrainingError> { Ok(Weights::from_bytes(&read(name)?, &folder.join(name))?) };
+        let state: serde_json::Value = serde_json::from_slice(&read("state.json")?).map_err(|e| fail(&state_path, e.to_string()))?;
+        let missing = |key: &str| fail(&state_path, format!("`{key}` is missing"));
+        Ok(Some(Self {
+            step: state["step"].as_u64().ok_or_else(|| missing("step"))? as usize,
+            best_score: state["best_score"].as_f64().unwrap_or(f64::INFINITY),
+            curve: serde_json::from_value(state["curve"].clone()).map_err(|e| fail(&state_path, e.to_string()))?,
+            best: arrays("best.safetensors")?,
+            latest: arrays("latest.safetensors")?,
+            adam: Adam::load(&arrays("adam.safetensors")?),
+        }))
+    }
+}

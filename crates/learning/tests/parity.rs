@@ -1,0 +1,153 @@
+//! Goal: the fast path and the candle reference are one model; a row of a batch is the row alone; the cache changes nothing.
+//! Method: the same weights, drive and terrain tokens through both; exact comparison where bits must agree.
+
+mod common;
+
+use std::sync::Arc;
+
+use candle_core::{Device, Result, Tensor};
+use common::{drive, hills, lively_weights, measured_scales, predictor, truck};
+use nesam_model::dims::HIDDEN;
+use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
+use nesam_model::{GroundSource, Predictor, RolloutQuery, Variant, history_actuators};
+use nesam_physics::step::StepModel;
+use nesam_physics::{SOIL_DIM, VehicleState};
+use nesam_terrain::{Pose2, WorldMap};
+
+/// Terrain tokens as the predictor sees them.
+struct FromPredictor<'a> {
+    predictor: &'a Predictor,
+    map: Option<&'a Arc<WorldMap>>,
+    history: Vec<Pose2>,
+}
+
+fn pose(s: &VehicleState<f64>) -> Pose2 {
+    Pose2 { x_m: s.position_m[0], y_m: s.position_m[1], yaw_rad: s.attitude_rad[2] }
+}
+
+impl FromPredictor<'_> {
+    fn tensors(&self, poses: &[Pose2]) -> Result<(Tensor, Tensor)> {
+        let tokens = self.predictor.terrain_tokens(self.map, poses);
+        let context: Vec<f32> = tokens.iter().flat_map(|t| t[..HIDDEN].to_vec()).collect();
+        let soil: Vec<f32> = tokens.iter().flat_map(|t| t[HIDDEN..].to_vec()).collect();
+        Ok((Tensor::from_vec(context, (poses.len(), HIDDEN), &Device::Cpu)?, Tensor::from_vec(soil, (poses.len(), SOIL_DIM), &Device::Cpu)?))
+    }
+}
+
+impl TerrainProvider for FromPredictor<'_> {
+    fn history(&mut self) -> Result<Tensor> {
+        Ok(self.tensors(&self.history)?.0)
+    }
+    fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
+        self.tensors(&states.iter().map(pose).collect::<Vec<_>>())
+    }
+}
+
+fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
+    let drive = drive(map, 80);
+    let scales = measured_scales(&drive);
+    let weights = lively_weights(&scales);
+    let predictor = predictor(&scales, weights.clone());
+    let start = 33;
+    let past = drive.history(start - history, start);
+    let controls: Vec<f32> = drive.controls[start..start + 32].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let query = RolloutQuery {
+        history: &past,
+        start: drive.states[start],
+        controls: &controls,
+        samples: 1,
+        horizon: 32,
+        map,
+        soil_correction: [0.0; SOIL_DIM],
+        variant,
+    };
+    let fast = predictor.rollout(&query).expect("a valid query");
+
+    let network = Network::from_weights(&weights).expect("all arrays are there");
+    let model = Arc::new(StepModel::new(&truck(), scales.dt_s, scales.substeps));
+    let row = Row {
+        actuators: history_actuators(&model, &past, &drive.controls[start], 0.1),
+        history: past.clone(),
+        start: drive.states[start],
+        controls: drive.controls[start..start + 32].to_vec(),
+        ground: GroundSource::new(map.map(Arc::as_ref), &model, &drive.states[start]),
+    };
+    let mut provider = FromPredictor { predictor: &predictor, map, history: past.iter().map(|s| pose(&s.state)).collect() };
+    let rollout = ReferenceRollout { network: &network, model: &model, scales: &scales, variant };
+    let steps = rollout.run(&[row], 32, &mut provider).expect("the reference runs");
+    for (k, step) in steps.iter().enumerate() {
+        let mut slow = step.state.to_vec2::<f32>().expect("readable")[0].clone();
+        for i in 0..3 {
+            slow[i] += drive.states[start].position_m[i] as f32;
+        }
+        for (i, (a, b)) in fast.state(0, k).to_array().iter().zip(&slow).enumerate() {
+            // 32 steps of f32 with two orders of summation: a millimetre, a tenth of a milliradian.
+            assert!((a - b).abs() < 1.5e-3, "step {k}, entry {i}: fast {a}, reference {b} ({variant:?}, history {history})");
+        }
+    }
+}
+
+#[test]
+fn property_fast_path_equals_the_reference() {
+    let map = hills();
+    for variant in [Variant::Full, Variant::NoResidual, Variant::ZeroSinkage] {
+        compare(Some(&map), 31, variant);
+    }
+    compare(Some(&map), 5, Variant::Full);
+    compare(Some(&map), 0, Variant::Full);
+    compare(None, 31, Variant::Full);
+}
+
+#[test]
+fn property_row_of_a_batch_equals_the_row_alone() {
+    let map = hills();
+    let drive = drive(Some(&map), 80);
+    let scales = measured_scales(&drive);
+    let predictor = predictor(&scales, lively_weights(&scales));
+    let past = drive.history(2, 33);
+    let (samples, horizon) = (37, 16);
+    let controls: Vec<f32> = (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect();
+    let query = RolloutQuery {
+        history: &past,
+        start: drive.states[33],
+        controls: &controls,
+        samples,
+        horizon,
+        map: Some(&map),
+        soil_correction: [0.0; SOIL_DIM],
+        variant: Variant::Full,
+    };
+    let batch = predictor.rollout(&query).expect("a valid query");
+    for n in [0, 7, 16, 36] {
+        let own = &controls[n * horizon * 2..(n + 1) * horizon * 2];
+        let alone = predictor.rollout(&RolloutQuery { controls: own, samples: 1, ..query.clone() }).expect("a valid query");
+        for k in 0..horizon {
+            assert_eq!(batch.state(n, k), alone.state(0, k), "row {n}, step {k}");
+            assert_eq!(batch.sinkage(n, k), alone.sinkage(0, k));
+        }
+    }
+}
+
+#[test]
+fn analytic_cached_attention_equals_attention_over_everything() {
+    let drive = drive(None, 40);
+    let scales = measured_scales(&drive);
+    let network = Network::from_weights(&lively_weights(&scales)).expect("all arrays are there");
+    let x = Tensor::randn(0f32, 1f32, (3, 20, HIDDEN), &Device::Cpu).expect("a tensor");
+    let whole = network.transformer(&x, &mut KvCache::new(), Some(&causal_mask(20).expect("a mask"))).expect("runs");
+    let mut cache = KvCache::new();
+    let first = x.narrow(1, 0, 12).and_then(|t| t.contiguous()).expect("a slice");
+    network.transformer(&first, &mut cache, Some(&causal_mask(12).expect("a mask"))).expect("runs");
+    for t in 12..20 {
+        let token = x.narrow(1, t, 1).and_then(|t| t.contiguous()).expect("a slice");
+        let step = network.transformer(&token, &mut cache, None).expect("runs");
+        let error = (step - whole.narrow(1, t, 1).expect("a slice")).and_then(|d| d.abs()?.max_all()?.to_scalar::<f32>()).expect("a number");
+        assert!(error < 1e-4, "token {t}: {error}");
+    }
+}
+
+#[test]
+fn published_soil_prior_has_the_papers_parameters() {
+    let drive = drive(None, 40);
+    assert_eq!(lively_weights(&measured_scales(&drive)).parameters("soil."), 28_262);
+}

@@ -1,0 +1,64 @@
+//! What rollout and training share outside the network: the ground under the wheels and the actuators after the history.
+
+use nesam_physics::driveline::DrivelineState;
+use nesam_physics::step::{Ground, StepModel};
+use nesam_physics::{Control, VehicleState, WHEELS};
+use nesam_terrain::WorldMap;
+
+use crate::rollout::HistoryStep;
+
+/// Where the ground is.
+#[derive(Clone, Copy, Debug)]
+pub enum GroundSource<'a> {
+    /// A map.
+    Map(&'a WorldMap),
+    /// Level ground at this height, m (no map: through the wheels of the start state).
+    Level(f64),
+}
+
+impl<'a> GroundSource<'a> {
+    /// The map, or level ground on which the start state would stand at static ride height.
+    pub fn new(map: Option<&'a WorldMap>, model: &StepModel, start: &VehicleState<f64>) -> Self {
+        match map {
+            Some(map) => Self::Map(map),
+            None => {
+                let [roll, pitch, _] = start.attitude_rad;
+                let offsets = model.wheel_offsets_heading(roll, pitch);
+                let mean = offsets.iter().map(|o| o[2]).sum::<f64>() / WHEELS as f64;
+                Self::Level(start.position_m[2] + mean - model.vehicle().wheel_radius_m)
+            }
+        }
+    }
+
+    /// Ground at a point: height (m), slope along x and y of World, and whether the point is known.
+    pub fn at(&self, x_m: f64, y_m: f64) -> (f64, [f64; 2], bool) {
+        match self {
+            Self::Level(height) => (*height, [0.0; 2], true),
+            Self::Map(map) => match map.ground(x_m, y_m) {
+                Some(ground) => (ground.height_m, [ground.slope_x, ground.slope_y], true),
+                None => (map.nearest_height_m(x_m, y_m), [0.0; 2], false),
+            },
+        }
+    }
+
+    /// Ground under each wheel in the heading frame, heights relative to `datum_m`; false when a wheel is off the map.
+    pub fn under_wheels(&self, model: &StepModel, state: &VehicleState<f64>, datum_m: f64) -> ([Ground<f64>; WHEELS], bool) {
+        let [roll, pitch, yaw] = state.attitude_rad;
+        let (sin, cos) = yaw.sin_cos();
+        let mut known = true;
+        let ground = model.wheel_offsets_heading(roll, pitch).map(|offset| {
+            let x = state.position_m[0] + cos * offset[0] - sin * offset[1];
+            let y = state.position_m[1] + sin * offset[0] + cos * offset[1];
+            let (height, [slope_x, slope_y], inside) = self.at(x, y);
+            known &= inside;
+            Ground { height_m: height - datum_m, slope_ahead: cos * slope_x + sin * slope_y, slope_left: cos * slope_y - sin * slope_x }
+        });
+        (ground, known)
+    }
+}
+
+/// Actuators at the start of a rollout, rebuilt from the commands and measured speeds of the history.
+pub fn history_actuators(model: &StepModel, history: &[HistoryStep], first: &Control<f64>, dt_s: f64) -> DrivelineState {
+    let initial = DrivelineState::settled(history.first().map_or(first, |step| &step.control));
+    history.iter().fold(initial, |actuators, step| actuators.advance(model.vehicle(), &step.control, step.state.velocity_m_s[0], dt_s))
+}

@@ -1,0 +1,266 @@
+//! Token projection, causal Transformer, heads and soil prior as candle tensors.
+
+use candle_core::{D, DType, Device, Result, Tensor, Var};
+
+use super::image::{Conv, conv2d};
+use crate::dims::*;
+use crate::soil_coordinates::{LOGARITHMIC, span};
+use crate::weights::Weights;
+use nesam_physics::{SOIL_DIM, STATE_DIM, WHEELS};
+
+/// x Wᵀ + b over the last dimension: (rows, in) -> (rows, out), weight (out, in).
+///
+/// # Errors
+/// A candle error when shapes disagree.
+pub fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    x.matmul(&weight.t()?)?.broadcast_add(bias)
+}
+
+/// Layer normalisation over the last dimension, same shape.
+///
+/// # Errors
+/// A candle error when shapes disagree.
+pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+    let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
+    let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
+    let normal = centred.broadcast_div(&(variance + f64::from(NORM_EPS))?.sqrt()?)?;
+    normal.broadcast_mul(weight)?.broadcast_add(bias)
+}
+
+/// θ (rows, 6) of raw coordinates (rows, 6): see `soil_coordinates`.
+///
+/// # Errors
+/// A candle error when the last dimension is not six.
+pub fn soil_from_raw(raw: &Tensor) -> Result<Tensor> {
+    let share = ((raw.neg()?.exp()? + 1.0)?).recip()?;
+    let columns: Vec<Tensor> = (0..SOIL_DIM)
+        .map(|i| {
+            let (low, high) = span(i);
+            let value = share.narrow(1, i, 1)?.affine(high - low, low)?;
+            if LOGARITHMIC[i] { value.exp() } else { Ok(value) }
+        })
+        .collect::<Result<_>>()?;
+    Tensor::cat(&columns, 1)
+}
+
+/// Keys and values of one block: each (batch, heads, positions, head width).
+pub type KvCache = Vec<Option<(Tensor, Tensor)>>;
+
+struct Block {
+    norm1: [Tensor; 2],
+    qkv: [Tensor; 2],
+    out: [Tensor; 2],
+    norm2: [Tensor; 2],
+    up: [Tensor; 2],
+    down: [Tensor; 2],
+}
+
+/// The soil prior h_θ (paper §IV-B): two convolutions of stride 2 (the paper does not state the stride), mean, two-layer perceptron.
+pub struct SoilPriorHead {
+    conv1: [Tensor; 2],
+    conv2: [Tensor; 2],
+    hidden: [Tensor; 2],
+    out: [Tensor; 2],
+}
+
+/// All trainable tensors of the kinodynamic model.
+pub struct Network {
+    /// Trainable variables by name, in the order of the names.
+    pub variables: Vec<(String, Var)>,
+    token_state: Tensor,
+    token_context: Tensor,
+    token_bias: Tensor,
+    position: Tensor,
+    blocks: Vec<Block>,
+    norm: [Tensor; 2],
+    sinkage: [Tensor; 2],
+    residual: [Tensor; 2],
+    /// Soil prior.
+    pub soil: SoilPriorHead,
+}
+
+/// Names and shapes of every trainable array of the kinodynamic model.
+pub fn trainable_shapes() -> Vec<(String, Vec<usize>)> {
+    let mut shapes: Vec<(String, Vec<usize>)> = vec![
+        ("token.state.weight".into(), vec![HIDDEN, STATE_CONTROL]),
+        ("token.context.weight".into(), vec![HIDDEN, CONTEXT]),
+        ("token.bias".into(), vec![HIDDEN]),
+        ("position".into(), vec![POSITIONS, HIDDEN]),
+    ];
+    let mut layer = |name: String, out: usize, input: usize| {
+        shapes.push((format!("{name}.weight"), vec![out, input]));
+        shapes.push((format!("{name}.bias"), vec![out]));
+    };
+    for b in 0..BLOCKS {
+        layer(format!("block{b}.qkv"), 3 * HIDDEN, HIDDEN);
+        layer(format!("block{b}.out"), HIDDEN, HIDDEN);
+        layer(format!("block{b}.up"), FEED_FORWARD, HIDDEN);
+        layer(format!("block{b}.down"), HIDDEN, FEED_FORWARD);
+    }
+    layer("sinkage".into(), WHEELS, HIDDEN);
+    layer("residual".into(), STATE_DIM, HIDDEN);
+    layer("soil.conv1".into(), 32, 9 * FEATURE_CHANNELS);
+    layer("soil.conv2".into(), 64, 9 * 32);
+    layer("soil.hidden".into(), 64, 64);
+    layer("soil.out".into(), SOIL_DIM, 64);
+    for name in ["block0.norm1", "block0.norm2", "block1.norm1", "block1.norm2", "norm"] {
+        shapes.push((format!("{name}.weight"), vec![HIDDEN]));
+        shapes.push((format!("{name}.bias"), vec![HIDDEN]));
+    }
+    shapes
+}
+
+impl Network {
+    /// Trainable variables from weights.
+    ///
+    /// # Errors
+    /// `ModelError::Weights` when an array is absent or has another shape.
+    pub fn from_weights(weights: &Weights) -> std::result::Result<Self, crate::ModelError> {
+        let mut variables = Vec::new();
+        for (name, shape) in trainable_shapes() {
+            let values = weights.get(&name, &shape)?;
+            variables.push((name, Var::from_tensor(&Tensor::from_slice(values, shape, &Device::Cpu)?)?));
+        }
+        let find = |name: &str| {
+            let (_, var) = variables.iter().find(|(n, _)| n == name).expect("every name is listed; this is a bug");
+            var.as_tensor().clone()
+        };
+        let pair = |name: &str| [find(&format!("{name}.weight")), find(&format!("{name}.bias"))];
+        let blocks = (0..BLOCKS)
+            .map(|b| Block {
+                norm1: pair(&format!("block{b}.norm1")),
+                qkv: pair(&format!("block{b}.qkv")),
+                out: pair(&format!("block{b}.out")),
+                norm2: pair(&format!("block{b}.norm2")),
+                up: pair(&format!("block{b}.up")),
+                down: pair(&format!("block{b}.down")),
+            })
+            .collect();
+        Ok(Self {
+            token_state: find("token.state.weight"),
+            token_context: find("token.context.weight"),
+            token_bias: find("token.bias"),
+            position: find("position"),
+            blocks,
+            norm: pair("norm"),
+            sinkage: pair("sinkage"),
+            residual: pair("residual"),
+            soil: SoilPriorHead {
+                conv1: pair("soil.conv1"),
+                conv2: pair("soil.conv2"),
+                hidden: pair("soil.hidden"),
+                out: pair("soil.out"),
+            },
+            variables,
+        })
+    }
+
+    /// The current values of the variables.
+    ///
+    /// # Errors
+    /// A candle error when a tensor cannot be read.
+    pub fn to_weights(&self) -> Result<Weights> {
+        let mut weights = Weights::default();
+        for (name, var) in &self.variables {
+            weights.insert(name.clone(), var.dims(), var.flatten_all()?.to_vec1()?);
+        }
+        Ok(weights)
+    }
+
+    /// W_c c: (rows, context = 9216) -> (rows, 128).
+    ///
+    /// # Errors
+    /// A candle error when shapes disagree.
+    pub fn context_token(&self, context: &Tensor) -> Result<Tensor> {
+        context.matmul(&self.token_context.t()?)
+    }
+
+    /// Embedding of tokens: scaled state and control entries (rows, 14) and W_c c (rows, 128) -> (rows, 128), without position.
+    ///
+    /// # Errors
+    /// A candle error when shapes disagree.
+    pub fn embed(&self, entries: &Tensor, context_token: &Tensor) -> Result<Tensor> {
+        linear(entries, &self.token_state, &self.token_bias)? + context_token
+    }
+
+    /// Rows `from .. from + n` of the positional embedding, (n, 128).
+    ///
+    /// # Errors
+    /// A candle error past position 64.
+    pub fn positions(&self, from: usize, n: usize) -> Result<Tensor> {
+        self.position.narrow(0, from, n)
+    }
+
+    /// Runs `x` (batch, new, 128), already with positions, through the causal Transformer, extending the cache.
+    ///
+    /// `mask` (batch or 1, 1, new, cached + new) is added to the scores; `None` lets every new token see everything.
+    ///
+    /// # Errors
+    /// A candle error when shapes disagree.
+    pub fn transformer(&self, x: &Tensor, cache: &mut KvCache, mask: Option<&Tensor>) -> Result<Tensor> {
+        let (batch, new, _) = x.dims3()?;
+        let mut x = x.reshape((batch * new, HIDDEN))?;
+        cache.resize(BLOCKS, None);
+        for (block, slot) in self.blocks.iter().zip(cache.iter_mut()) {
+            let normal = layer_norm(&x, &block.norm1[0], &block.norm1[1])?;
+            let qkv = linear(&normal, &block.qkv[0], &block.qkv[1])?.reshape((batch, new, 3, HEADS, HEAD_DIM))?;
+            let part = |i: usize| qkv.narrow(2, i, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous();
+            let (q, mut k, mut v) = (part(0)?, part(1)?, part(2)?);
+            if let Some((old_k, old_v)) = slot.as_ref() {
+                k = Tensor::cat(&[old_k, &k], 2)?.contiguous()?;
+                v = Tensor::cat(&[old_v, &v], 2)?.contiguous()?;
+            }
+            let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (HEAD_DIM as f64).sqrt()))?;
+            if let Some(mask) = mask {
+                scores = scores.broadcast_add(mask)?;
+            }
+            let attended = softmax(&scores)?.matmul(&v)?.transpose(1, 2)?.reshape((batch * new, HIDDEN))?;
+            *slot = Some((k, v));
+            x = (x + linear(&attended, &block.out[0], &block.out[1])?)?;
+            let normal = layer_norm(&x, &block.norm2[0], &block.norm2[1])?;
+            let hidden = linear(&normal, &block.up[0], &block.up[1])?.gelu()?;
+            x = (x + linear(&hidden, &block.down[0], &block.down[1])?)?;
+        }
+        layer_norm(&x, &self.norm[0], &self.norm[1])?.reshape((batch, new, HIDDEN))
+    }
+
+    /// Heads: hidden (rows, 128) -> raw sinkage (rows, 4) and raw residual (rows, 12).
+    ///
+    /// # Errors
+    /// A candle error when shapes disagree.
+    pub fn heads(&self, hidden: &Tensor) -> Result<(Tensor, Tensor)> {
+        Ok((linear(hidden, &self.sinkage[0], &self.sinkage[1])?, linear(hidden, &self.residual[0], &self.residual[1])?))
+    }
+}
+
+impl SoilPriorHead {
+    /// Raw soil coordinates (rows, 6) of semantic features (rows, 16, 16, 18).
+    ///
+    /// # Errors
+    /// A candle error when shapes disagree.
+    pub fn raw(&self, features: &Tensor) -> Result<Tensor> {
+        let conv = |px, channels| Conv { px, channels, stride: 2 };
+        let h = conv2d(features, conv(FEATURE_PX, FEATURE_CHANNELS), &self.conv1[0], &self.conv1[1])?.silu()?;
+        let h = conv2d(&h, conv(FEATURE_PX / 2, 32), &self.conv2[0], &self.conv2[1])?.silu()?;
+        let rows = h.dim(0)?;
+        let pooled = h.reshape((rows, 16, 64))?.mean(1)?;
+        linear(&linear(&pooled, &self.hidden[0], &self.hidden[1])?.silu()?, &self.out[0], &self.out[1])
+    }
+}
+
+/// Softmax over the last dimension.
+fn softmax(x: &Tensor) -> Result<Tensor> {
+    let shifted = x.broadcast_sub(&x.max_keepdim(D::Minus1)?.detach())?.exp()?;
+    shifted.broadcast_div(&shifted.sum_keepdim(D::Minus1)?)
+}
+
+/// Additive causal mask (1, 1, n, n): 0 where a token may look, -1e9 ahead of it.
+pub fn causal_mask(n: usize) -> Result<Tensor> {
+    let values: Vec<f32> = (0..n * n).map(|i| if i % n > i / n { -1e9 } else { 0.0 }).collect();
+    Tensor::from_vec(values, (1, 1, n, n), &Device::Cpu)
+}
+
+/// Zeros (rows, columns).
+pub fn zeros(rows: usize, columns: usize) -> Result<Tensor> {
+    Tensor::zeros((rows, columns), DType::F32, &Device::Cpu)
+}

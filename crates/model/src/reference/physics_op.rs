@@ -1,0 +1,87 @@
+//! The bridge from candle to the physics: one fused op for the whole step, forward in lanes, backward by duals over lanes.
+
+use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use nesam_physics::scalar::{Dual, f32x8};
+use nesam_physics::step::StepModel;
+use std::sync::Arc;
+
+use super::image::values;
+use crate::step_row::{COLUMNS, CONSTANT, DIFFERENTIABLE, OUTPUTS, step_input};
+
+const LANES: usize = 8;
+
+struct Step(Arc<StepModel>);
+struct StepGradient(Arc<StepModel>);
+
+/// Columns `from..from + N` of eight rows as lanes; rows past the end repeat the last one.
+fn lanes<const N: usize>(packed: &[f32], base: usize, from: usize) -> [f32x8; N] {
+    let last = packed.len() / COLUMNS - 1;
+    core::array::from_fn(|k| f32x8::from(core::array::from_fn::<f32, LANES, _>(|l| packed[(base + l).min(last) * COLUMNS + from + k])))
+}
+
+impl CustomOp1 for Step {
+    fn name(&self) -> &'static str {
+        "physics-step"
+    }
+
+    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let packed = values(storage, layout)?;
+        let rows = packed.len() / COLUMNS;
+        let mut out = vec![0f32; rows * OUTPUTS];
+        for base in (0..rows).step_by(LANES) {
+            let input = step_input::<f32x8>(lanes(packed, base, 0), lanes::<CONSTANT>(packed, base, DIFFERENTIABLE));
+            let increment = self.0.step(&input).increment.to_array().map(f32x8::to_array);
+            for lane in 0..LANES.min(rows - base) {
+                for (column, value) in increment.iter().enumerate() {
+                    out[(base + lane) * OUTPUTS + column] = value[lane];
+                }
+            }
+        }
+        Ok((CpuStorage::F32(out), Shape::from((rows, OUTPUTS))))
+    }
+
+    fn bwd(&self, arg: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
+        let gradient = StepGradient(self.0.clone());
+        Ok(Some(arg.contiguous()?.apply_op2_no_bwd(&grad.contiguous()?, &gradient)?))
+    }
+}
+
+impl CustomOp2 for StepGradient {
+    fn name(&self) -> &'static str {
+        "physics-step-gradient"
+    }
+
+    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout, grad: &CpuStorage, grad_layout: &Layout) -> Result<(CpuStorage, Shape)> {
+        let (packed, upstream) = (values(storage, layout)?, values(grad, grad_layout)?);
+        let rows = packed.len() / COLUMNS;
+        let mut out = vec![0f32; packed.len()];
+        for base in (0..rows).step_by(LANES) {
+            let varying = lanes::<DIFFERENTIABLE>(packed, base, 0);
+            let varying: [Dual<f32x8, DIFFERENTIABLE>; DIFFERENTIABLE] = core::array::from_fn(|k| Dual::variable(varying[k], k));
+            let constant = lanes::<CONSTANT>(packed, base, DIFFERENTIABLE).map(Dual::constant);
+            let increment = self.0.step(&step_input(varying, constant)).increment.to_array();
+            let weight: [f32x8; OUTPUTS] = core::array::from_fn(|o| {
+                f32x8::from(core::array::from_fn::<f32, LANES, _>(|l| upstream[(base + l).min(rows - 1) * OUTPUTS + o]))
+            });
+            for column in 0..DIFFERENTIABLE {
+                let sum = (0..OUTPUTS).fold(f32x8::ZERO, |sum, o| sum + increment[o].eps[column] * weight[o]).to_array();
+                for lane in 0..LANES.min(rows - base) {
+                    out[(base + lane) * COLUMNS + column] = sum[lane];
+                }
+            }
+        }
+        Ok((CpuStorage::F32(out), Shape::from((rows, COLUMNS))))
+    }
+}
+
+/// Increment Δx_NE (rows, 12) of packed step inputs (rows, `COLUMNS`), differentiable in the first `DIFFERENTIABLE` columns.
+///
+/// # Errors
+/// A candle error when the tensor is not (rows, `COLUMNS`) of f32 on the CPU.
+pub fn physics_increment(packed: &Tensor, model: &Arc<StepModel>) -> Result<Tensor> {
+    let (_, columns) = packed.dims2()?;
+    if columns != COLUMNS {
+        bail!("physics step: {columns} columns, expected {COLUMNS}");
+    }
+    packed.contiguous()?.apply_op1(Step(model.clone()))
+}

@@ -1,0 +1,249 @@
+//! The K-step rollout as candle tensors, differentiable end to end (paper Eq. 1-3).
+//!
+//! Terrain tokens come from a provider, because training looks them up among precomputed poses and inference on a pose grid. Poses are
+//! detached there: no gradient flows through the choice of the patch, nor through the height of the ground under a wheel.
+
+use std::sync::Arc;
+
+use candle_core::{Device, Result, Tensor};
+use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::step::StepModel;
+use nesam_physics::{Control, STATE_DIM, VehicleState, wrap_angle};
+
+use super::network::{KvCache, Network, causal_mask, soil_from_raw};
+use super::physics_op::physics_increment;
+use crate::dims::*;
+use crate::ground::GroundSource;
+use crate::rollout::{HistoryStep, Variant};
+use crate::step_row::{CONSTANT, pack_constants};
+use crate::token::token_entries;
+use crate::Normalization;
+
+/// One row of a batch.
+#[derive(Clone, Debug)]
+pub struct Row<'a> {
+    /// Past steps, oldest first; all rows of a batch have the same number.
+    pub history: Vec<HistoryStep>,
+    /// Start state.
+    pub start: VehicleState<f64>,
+    /// Commands of the K steps.
+    pub controls: Vec<Control<f64>>,
+    /// Actuators at the start.
+    pub actuators: DrivelineState,
+    /// Ground.
+    pub ground: GroundSource<'a>,
+}
+
+/// Where terrain tokens come from.
+pub trait TerrainProvider {
+    /// W_c c of the history tokens, (batch · tokens, 128), row by row, oldest first.
+    ///
+    /// # Errors
+    /// A candle error.
+    fn history(&mut self) -> Result<Tensor>;
+    /// W_c c (batch, 128) and raw soil (batch, 6) at the poses (x, y in World m, yaw rad) of the rows before step `k`.
+    ///
+    /// # Errors
+    /// A candle error.
+    fn at(&mut self, k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)>;
+}
+
+/// Predicted state of every row after one step, relative to its start: x and y from the start position, z from the start height.
+#[derive(Clone, Debug)]
+pub struct PredictedStep {
+    /// (batch, 12): x, y relative (m), z relative (m), roll, pitch, yaw (absolute, not wrapped), velocities in Body.
+    pub state: Tensor,
+}
+
+/// A rollout in progress.
+pub struct ReferenceRollout<'a> {
+    /// Network.
+    pub network: &'a Network,
+    /// Physics.
+    pub model: &'a Arc<StepModel>,
+    /// Scales.
+    pub scales: &'a Normalization,
+    /// Ablation.
+    pub variant: Variant,
+}
+
+/// Columns `from .. from + n`.
+fn columns(x: &Tensor, from: usize, n: usize) -> Result<Tensor> {
+    x.narrow(1, from, n)
+}
+
+fn rows_tensor<const N: usize>(rows: &[[f32; N]]) -> Result<Tensor> {
+    Tensor::from_slice(rows.as_flattened(), (rows.len(), N), &Device::Cpu)
+}
+
+impl ReferenceRollout<'_> {
+    /// Predicts `horizon` steps of every row.
+    ///
+    /// # Errors
+    /// A candle error, also of the provider.
+    pub fn run(&self, rows: &[Row<'_>], horizon: usize, provider: &mut dyn TerrainProvider) -> Result<Vec<PredictedStep>> {
+        let batch = rows.len();
+        let mut cache = self.prefill(rows, provider)?;
+        let mut states: Vec<VehicleState<f64>> = rows.iter().map(|r| r.start).collect();
+        let mut previous: Vec<Option<VehicleState<f64>>> = rows.iter().map(|r| r.history.last().map(|h| h.state)).collect();
+        let mut actuators: Vec<DrivelineState> = rows.iter().map(|r| r.actuators).collect();
+        let start: Vec<[f32; STATE_DIM]> = rows
+            .iter()
+            .map(|r| {
+                let mut x = r.start.to_array();
+                x[..3].fill(0.0);
+                x.map(|v| v as f32)
+            })
+            .collect();
+        let mut state = rows_tensor(&start)?;
+        let mut last_increment: Option<Tensor> = None;
+        let first_position = HISTORY - 1;
+        let mut steps = Vec::with_capacity(horizon);
+        for k in 0..horizon {
+            let controls: Vec<Control<f64>> = rows.iter().map(|r| r.controls[k]).collect();
+            let entries = self.entries(rows, &states, &previous, &controls, &state, last_increment.as_ref())?;
+            let (context, raw_soil) = provider.at(k, &states)?;
+            let token = self.network.embed(&entries, &context)?.broadcast_add(&self.network.positions(first_position + k, 1)?)?;
+            let hidden = self.network.transformer(&token.unsqueeze(1)?, &mut cache, None)?.squeeze(1)?;
+            let (raw_sinkage, raw_residual) = self.network.heads(&hidden)?;
+
+            let mut constants = Vec::with_capacity(batch);
+            for (b, row) in rows.iter().enumerate() {
+                let after = actuators[b].advance(self.model.vehicle(), &controls[b], states[b].velocity_m_s[0], self.scales.dt_s);
+                let wheels = command_wheels(self.model.vehicle(), &actuators[b], &after, &controls[b]);
+                let (ground, _) = row.ground.under_wheels(self.model, &states[b], row.start.position_m[2]);
+                constants.push(pack_constants(&wheels, &ground));
+                actuators[b] = after;
+            }
+            let increment = self.increment(&state, &raw_sinkage, &raw_residual, &raw_soil, &constants)?;
+            state = advance(&state, &increment)?;
+            previous = states.iter().copied().map(Some).collect();
+            states = self.to_states(rows, &state)?;
+            last_increment = Some(increment);
+            steps.push(PredictedStep { state: state.clone() });
+        }
+        Ok(steps)
+    }
+
+    /// Encodes the history of every row.
+    fn prefill(&self, rows: &[Row<'_>], provider: &mut dyn TerrainProvider) -> Result<KvCache> {
+        let mut cache = KvCache::new();
+        let tokens = rows[0].history.len();
+        if tokens == 0 {
+            return Ok(cache);
+        }
+        let mut entries = Vec::with_capacity(rows.len() * tokens);
+        for row in rows {
+            for (j, step) in row.history.iter().enumerate() {
+                let previous = j.checked_sub(1).map(|j| &row.history[j].state);
+                entries.push(self.scaled_entries(row, &step.state, previous, &step.control));
+            }
+        }
+        let x = self.network.embed(&rows_tensor(&entries)?, &provider.history()?)?.reshape((rows.len(), tokens, HIDDEN))?;
+        let x = x.broadcast_add(&self.network.positions(HISTORY - 1 - tokens, tokens)?.unsqueeze(0)?)?;
+        self.network.transformer(&x, &mut cache, Some(&causal_mask(tokens)?))?;
+        Ok(cache)
+    }
+
+    fn scaled_entries(
+        &self,
+        row: &Row<'_>,
+        state: &VehicleState<f64>,
+        previous: Option<&VehicleState<f64>>,
+        control: &Control<f64>,
+    ) -> [f32; STATE_CONTROL] {
+        let (height, _, _) = row.ground.at(state.position_m[0], state.position_m[1]);
+        let entries = token_entries(state, previous, [control.speed_m_s, control.second], height, self.scales.dt_s);
+        self.scales.token_scale().apply(entries)
+    }
+
+    /// Token entries (batch, 14) of the current states; differentiable in the predicted state.
+    fn entries(
+        &self,
+        rows: &[Row<'_>],
+        states: &[VehicleState<f64>],
+        previous: &[Option<VehicleState<f64>>],
+        controls: &[Control<f64>],
+        state: &Tensor,
+        increment: Option<&Tensor>,
+    ) -> Result<Tensor> {
+        let measured: Vec<[f32; STATE_CONTROL]> = (0..rows.len())
+            .map(|b| self.scaled_entries(&rows[b], &states[b], previous[b].as_ref(), &controls[b]))
+            .collect();
+        let measured = rows_tensor(&measured)?;
+        let Some(increment) = increment else { return Ok(measured) };
+        // Same numbers as `measured`, but as functions of the prediction; only z enters relative to the ground.
+        let height: Vec<f32> = (0..rows.len())
+            .map(|b| {
+                let (ground, _, _) = rows[b].ground.at(states[b].position_m[0], states[b].position_m[1]);
+                (ground - rows[b].start.position_m[2]) as f32
+            })
+            .collect();
+        let height = Tensor::from_vec(height, (rows.len(), 1), &Device::Cpu)?;
+        let parts = [
+            (columns(state, 2, 1)? - height)?,
+            columns(state, 3, 2)?,
+            columns(increment, 5, 1)?,
+            columns(state, 6, 6)?,
+            columns(increment, 0, 2)?,
+        ];
+        let raw = Tensor::cat(&parts, 1)?;
+        let mean = Tensor::from_slice(&self.scales.token_mean[..STATE_DIM], (1, STATE_DIM), &Device::Cpu)?;
+        let scale = Tensor::from_slice(&self.scales.token_scale[..STATE_DIM], (1, STATE_DIM), &Device::Cpu)?;
+        let scaled = raw.broadcast_sub(&mean)?.broadcast_div(&scale)?;
+        Tensor::cat(&[scaled, columns(&measured, STATE_DIM, CONTROL_DIM)?], 1)
+    }
+
+    /// Δx_NE + Δx_res (batch, 12).
+    fn increment(
+        &self,
+        state: &Tensor,
+        raw_sinkage: &Tensor,
+        raw_residual: &Tensor,
+        raw_soil: &Tensor,
+        constants: &[[f32; CONSTANT]],
+    ) -> Result<Tensor> {
+        let ratio = match self.variant {
+            Variant::ZeroSinkage => (raw_sinkage.zeros_like()? - 12.0)?,
+            _ => (raw_sinkage.tanh()? * f64::from(self.scales.sinkage_log_ratio_max))?,
+        };
+        let packed = Tensor::cat(
+            &[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, rows_tensor(constants)?],
+            1,
+        )?;
+        // z, roll, pitch are columns 2..5; yaw (5) does not enter the step.
+        let symbolic = physics_increment(&packed, self.model)?;
+        if self.variant == Variant::NoResidual {
+            return Ok(symbolic);
+        }
+        let scale = Tensor::from_slice(&self.scales.residual_scale, (1, STATE_DIM), &Device::Cpu)?;
+        symbolic + raw_residual.broadcast_mul(&scale)?
+    }
+
+    /// Predicted tensors as states in World, for the look-ups on the host.
+    fn to_states(&self, rows: &[Row<'_>], state: &Tensor) -> Result<Vec<VehicleState<f64>>> {
+        let values: Vec<Vec<f32>> = state.to_vec2()?;
+        Ok(values
+            .iter()
+            .zip(rows)
+            .map(|(x, row)| {
+                let mut next: [f64; STATE_DIM] = core::array::from_fn(|i| f64::from(x[i]));
+                for i in 0..3 {
+                    next[i] += row.start.position_m[i];
+                }
+                next[5] = wrap_angle(next[5]);
+                VehicleState::from_array(next)
+            })
+            .collect())
+    }
+}
+
+/// x' = x + Δx with the displacement turned from the heading frame into World.
+fn advance(state: &Tensor, increment: &Tensor) -> Result<Tensor> {
+    let yaw = columns(state, 5, 1)?;
+    let (sin, cos) = (yaw.sin()?, yaw.cos()?);
+    let (ahead, left) = (columns(increment, 0, 1)?, columns(increment, 1, 1)?);
+    let moved = Tensor::cat(&[((&cos * &ahead)? - (&sin * &left)?)?, ((&sin * &ahead)? + (&cos * &left)?)?], 1)?;
+    let change = Tensor::cat(&[moved, columns(increment, 2, STATE_DIM - 2)?], 1)?;
+    state + change
+}

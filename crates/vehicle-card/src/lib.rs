@@ -1,0 +1,168 @@
+//! The one schema of vehicle cards, as bundles carry it.
+//!
+//! Data sheets come in several dialects, which `nesam-trajectories` reads; all become a [`Vehicle`], and this crate writes and reads that
+//! vehicle as JSON with units in the names.
+#![forbid(unsafe_code)]
+
+use nesam_physics::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};
+use serde::{Deserialize, Serialize};
+
+/// Format tag of the card.
+pub const FORMAT: &str = "nesam.vehicle/1";
+
+/// A card that cannot be used.
+#[derive(Debug, thiserror::Error)]
+#[error("vehicle card: {0}")]
+pub struct CardError(String);
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Card {
+    format: String,
+    name: String,
+    mass_kg: f64,
+    inertia_kg_m2: [[f64; 3]; 3],
+    inertia_estimated: bool,
+    wheel_centre_m: [[f64; 3]; WHEELS],
+    wheel_radius_m: f64,
+    wheel_width_m: f64,
+    suspension_n_m: [f64; WHEELS],
+    suspension_n_s_m: [f64; WHEELS],
+    second: Second,
+    speed_range_m_s: [f64; 2],
+    second_range: [f64; 2],
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    steering: Option<Table>,
+    track_m: f64,
+    wheelbase_m: f64,
+    driveline: Line,
+    gravity_m_s2: f64,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Second {
+    SteeringNormalised,
+    RoadWheelAngleRad,
+    YawRateRadS,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Table {
+    command: Vec<f64>,
+    front_left_rad: Vec<f64>,
+    front_right_rad: Vec<f64>,
+}
+
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Line {
+    steering_lag_s: f64,
+    steering_rate_limit_per_s: f64,
+    speed_gain: f64,
+    speed_integral_gain_per_s: f64,
+    speed_integral_leak_s: f64,
+    speed_integral_limit_m: f64,
+    overspeed_limit_m_s: f64,
+}
+
+/// The vehicle as a card.
+pub fn to_json(vehicle: &Vehicle) -> String {
+    let v = vehicle.clone();
+    let card = Card {
+        format: FORMAT.into(),
+        name: v.name,
+        mass_kg: v.mass_kg,
+        inertia_kg_m2: v.inertia_kg_m2,
+        inertia_estimated: v.inertia_estimated,
+        wheel_centre_m: v.wheel_centre_m,
+        wheel_radius_m: v.wheel_radius_m,
+        wheel_width_m: v.wheel_width_m,
+        suspension_n_m: v.suspension_n_m,
+        suspension_n_s_m: v.suspension_n_s_m,
+        second: match v.second {
+            SecondCommand::SteeringNormalised => Second::SteeringNormalised,
+            SecondCommand::RoadWheelAngleRad => Second::RoadWheelAngleRad,
+            SecondCommand::YawRateRadS => Second::YawRateRadS,
+        },
+        speed_range_m_s: v.command_range[0],
+        second_range: v.command_range[1],
+        steering: v.steering.map(|t| Table { command: t.command, front_left_rad: t.front_left_rad, front_right_rad: t.front_right_rad }),
+        track_m: v.track_m,
+        wheelbase_m: v.wheelbase_m,
+        driveline: Line {
+            steering_lag_s: v.driveline.steering_lag_s,
+            steering_rate_limit_per_s: v.driveline.steering_rate_limit_per_s,
+            speed_gain: v.driveline.speed_gain,
+            speed_integral_gain_per_s: v.driveline.speed_integral_gain_per_s,
+            speed_integral_leak_s: v.driveline.speed_integral_leak_s,
+            speed_integral_limit_m: v.driveline.speed_integral_limit_m,
+            overspeed_limit_m_s: v.driveline.overspeed_limit_m_s,
+        },
+        gravity_m_s2: v.gravity_m_s2,
+    };
+    serde_json::to_string_pretty(&card).expect("plain numbers serialise; this is a bug")
+}
+
+/// The vehicle of a card.
+///
+/// # Errors
+/// `CardError` naming the key at fault: unknown or missing keys, another format, numbers that are not positive where they must be.
+pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
+    let c: Card = serde_json::from_str(text).map_err(|e| CardError(e.to_string()))?;
+    if c.format != FORMAT {
+        return Err(CardError(format!("format is `{}`, expected `{FORMAT}`", c.format)));
+    }
+    let positive = [
+        ("mass_kg", c.mass_kg),
+        ("wheel_radius_m", c.wheel_radius_m),
+        ("wheel_width_m", c.wheel_width_m),
+        ("track_m", c.track_m),
+        ("wheelbase_m", c.wheelbase_m),
+        ("gravity_m_s2", c.gravity_m_s2),
+        ("driveline.speed_integral_leak_s", c.driveline.speed_integral_leak_s),
+        ("driveline.overspeed_limit_m_s", c.driveline.overspeed_limit_m_s),
+        ("wheel_centre_m: distance between the axles", c.wheel_centre_m[0][0] - c.wheel_centre_m[2][0]),
+    ];
+    if let Some((key, value)) = positive.iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
+        return Err(CardError(format!("`{key}` is {value}, must be positive")));
+    }
+    if let Some(t) = &c.steering {
+        let ascending = t.command.windows(2).all(|w| w[0] < w[1]);
+        let same = t.command.len() == t.front_left_rad.len() && t.command.len() == t.front_right_rad.len();
+        if t.command.len() < 2 || !ascending || !same {
+            return Err(CardError("`steering` needs at least two ascending commands with one angle each".into()));
+        }
+    }
+    Ok(Vehicle {
+        name: c.name,
+        mass_kg: c.mass_kg,
+        inertia_kg_m2: c.inertia_kg_m2,
+        inertia_estimated: c.inertia_estimated,
+        wheel_centre_m: c.wheel_centre_m,
+        wheel_radius_m: c.wheel_radius_m,
+        wheel_width_m: c.wheel_width_m,
+        suspension_n_m: c.suspension_n_m,
+        suspension_n_s_m: c.suspension_n_s_m,
+        second: match c.second {
+            Second::SteeringNormalised => SecondCommand::SteeringNormalised,
+            Second::RoadWheelAngleRad => SecondCommand::RoadWheelAngleRad,
+            Second::YawRateRadS => SecondCommand::YawRateRadS,
+        },
+        command_range: [c.speed_range_m_s, c.second_range],
+        steering: c.steering.map(|t| SteeringTable { command: t.command, front_left_rad: t.front_left_rad, front_right_rad: t.front_right_rad }),
+        track_m: c.track_m,
+        wheelbase_m: c.wheelbase_m,
+        driveline: Driveline {
+            steering_lag_s: c.driveline.steering_lag_s,
+            steering_rate_limit_per_s: c.driveline.steering_rate_limit_per_s,
+            speed_gain: c.driveline.speed_gain,
+            speed_integral_gain_per_s: c.driveline.speed_integral_gain_per_s,
+            speed_integral_leak_s: c.driveline.speed_integral_leak_s,
+            speed_integral_limit_m: c.driveline.speed_integral_limit_m,
+            overspeed_limit_m_s: c.driveline.overspeed_limit_m_s,
+        },
+        gravity_m_s2: c.gravity_m_s2,
+    })
+}

@@ -1,0 +1,28 @@
+//! What the cross-crate tests share: where the repository and its committed sample of recorded drives lie.
+
+use std::path::PathBuf;
+
+/// Root of the repository.
+pub fn repository() -> PathBuf {
+    let tests = PathBuf::from(env!("CARGO_MANIFEST_DIR"));
+    tests.parent().map(PathBuf::from).unwrap_or(tests)
+}
+
+/// The committed sample of Chrono drives, a data root.
+pub fn sample_root() -> PathBuf {
+    repository().join("tests/data/chrono_sample")
+}
+
+/// The full data beside the repository, if it is there.
+pub fn full_data() -> Option<PathBuf> {
+    Some(repository().join("../shared/data")).filter(|path| path.join("chrono").is_dir())
+}
+
+/// The newest shipped bundle.
+pub fn shipped_bundle() -> PathBuf {
+    let mut bundles: Vec<PathBuf> = std::fs::read_dir(repository().join("deploy/bundles"))
+        .map(|entries| entries.filter_map(Result::ok).map(|e| e.path()).filter(|p| p.join("manifest.toml").is_file()).collect())
+        .unwrap_or_default();
+    bundles.sort();
+    bundles.pop().unwrap_or_default()
+}
