@@ -37,18 +37,12 @@ impl GridGeometry {
 
     /// Grid coordinates (column, row) of a World point, in cells; may lie outside the grid.
     pub fn to_grid(&self, x_m: f64, y_m: f64) -> [f64; 2] {
-        [
-            (x_m - self.origin_m[0]) / self.resolution_m,
-            (y_m - self.origin_m[1]) / self.resolution_m,
-        ]
+        [(x_m - self.origin_m[0]) / self.resolution_m, (y_m - self.origin_m[1]) / self.resolution_m]
     }
 
     /// World position of a cell, m.
     pub fn to_world(&self, column: usize, row: usize) -> [f64; 2] {
-        [
-            self.origin_m[0] + self.resolution_m * column as f64,
-            self.origin_m[1] + self.resolution_m * row as f64,
-        ]
+        [self.origin_m[0] + self.resolution_m * column as f64, self.origin_m[1] + self.resolution_m * row as f64]
     }
 
     /// Whether a World point lies in the closed rectangle spanned by the cell points.
@@ -58,48 +52,24 @@ impl GridGeometry {
         const SLACK: f64 = 1e-9;
         let [u, v] = self.to_grid(x_m, y_m);
         // A NaN compares false and so is outside.
-        u >= -SLACK
-            && v >= -SLACK
-            && u <= (self.width - 1) as f64 + SLACK
-            && v <= (self.height - 1) as f64 + SLACK
+        u >= -SLACK && v >= -SLACK && u <= (self.width - 1) as f64 + SLACK && v <= (self.height - 1) as f64 + SLACK
     }
 
     /// Checks the geometry; the first wrong field and the reason otherwise.
     pub(crate) fn check(&self) -> Result<(), (&'static str, String)> {
-        if !self
-            .origin_m
-            .iter()
-            .all(|o| o.is_finite() && o.abs() <= 1e7)
-        {
-            return Err((
-                "origin_m",
-                format!("{:?} is not finite or beyond 1e7 m", self.origin_m),
-            ));
+        if !self.origin_m.iter().all(|o| o.is_finite() && o.abs() <= 1e7) {
+            return Err(("origin_m", format!("{:?} is not finite or beyond 1e7 m", self.origin_m)));
         }
-        if !(self.resolution_m.is_finite() && self.resolution_m >= 1e-3 && self.resolution_m <= 1e3)
-        {
-            return Err((
-                "resolution_m",
-                format!("{} is outside 0.001..=1000 m", self.resolution_m),
-            ));
+        if !(self.resolution_m.is_finite() && self.resolution_m >= 1e-3 && self.resolution_m <= 1e3) {
+            return Err(("resolution_m", format!("{} is outside 0.001..=1000 m", self.resolution_m)));
         }
         for (field, side) in [("width", self.width), ("height", self.height)] {
             if side < 2 || side > MAX_CELLS {
                 return Err((field, format!("{side} cells, at least 2 are needed")));
             }
         }
-        if self
-            .width
-            .checked_mul(self.height)
-            .is_none_or(|n| n > MAX_CELLS)
-        {
-            return Err((
-                "width",
-                format!(
-                    "{} x {} cells exceed the limit of {MAX_CELLS}",
-                    self.width, self.height
-                ),
-            ));
+        if self.width.checked_mul(self.height).is_none_or(|n| n > MAX_CELLS) {
+            return Err(("width", format!("{} x {} cells exceed the limit of {MAX_CELLS}", self.width, self.height)));
         }
         Ok(())
     }
@@ -122,11 +92,7 @@ impl GridGeometry {
         let [u, v] = self.to_grid(x_m, y_m);
         let (column, east) = split(u, self.width);
         let (row, north) = split(v, self.height);
-        Bilinear {
-            index: row * self.width + column,
-            east,
-            north,
-        }
+        Bilinear { index: row * self.width + column, east, north }
     }
 }
 
@@ -144,12 +110,7 @@ mod tests {
 
     #[test]
     fn analytic_grid_and_world_are_inverse() {
-        let grid = GridGeometry {
-            origin_m: [-40.0, -40.0],
-            resolution_m: 0.1,
-            width: 801,
-            height: 801,
-        };
+        let grid = GridGeometry { origin_m: [-40.0, -40.0], resolution_m: 0.1, width: 801, height: 801 };
         let [x, y] = grid.to_world(17, 700);
         let [u, v] = grid.to_grid(x, y);
         assert!((u - 17.0).abs() < 1e-9 && (v - 700.0).abs() < 1e-9);
@@ -159,68 +120,13 @@ mod tests {
 
     #[test]
     fn analytic_bad_geometry_is_refused() {
-        let good = GridGeometry {
-            origin_m: [0.0, 0.0],
-            resolution_m: 0.1,
-            width: 10,
-            height: 10,
-        };
+        let good = GridGeometry { origin_m: [0.0, 0.0], resolution_m: 0.1, width: 10, height: 10 };
         assert!(good.check().is_ok());
-        assert_eq!(
-            GridGeometry {
-                origin_m: [f64::NAN, 0.0],
-                ..good
-            }
-            .check()
-            .unwrap_err()
-            .0,
-            "origin_m"
-        );
-        assert_eq!(
-            GridGeometry {
-                resolution_m: 0.0,
-                ..good
-            }
-            .check()
-            .unwrap_err()
-            .0,
-            "resolution_m"
-        );
-        assert_eq!(
-            GridGeometry {
-                resolution_m: f64::INFINITY,
-                ..good
-            }
-            .check()
-            .unwrap_err()
-            .0,
-            "resolution_m"
-        );
-        assert_eq!(
-            GridGeometry { width: 1, ..good }.check().unwrap_err().0,
-            "width"
-        );
-        assert_eq!(
-            GridGeometry {
-                width: 1 << 40,
-                height: 1 << 40,
-                ..good
-            }
-            .check()
-            .unwrap_err()
-            .0,
-            "width"
-        );
-        assert_eq!(
-            GridGeometry {
-                width: 8192,
-                height: 8192,
-                ..good
-            }
-            .check()
-            .unwrap_err()
-            .0,
-            "width"
-        );
+        assert_eq!(GridGeometry { origin_m: [f64::NAN, 0.0], ..good }.check().unwrap_err().0, "origin_m");
+        assert_eq!(GridGeometry { resolution_m: 0.0, ..good }.check().unwrap_err().0, "resolution_m");
+        assert_eq!(GridGeometry { resolution_m: f64::INFINITY, ..good }.check().unwrap_err().0, "resolution_m");
+        assert_eq!(GridGeometry { width: 1, ..good }.check().unwrap_err().0, "width");
+        assert_eq!(GridGeometry { width: 1 << 40, height: 1 << 40, ..good }.check().unwrap_err().0, "width");
+        assert_eq!(GridGeometry { width: 8192, height: 8192, ..good }.check().unwrap_err().0, "width");
     }
 }

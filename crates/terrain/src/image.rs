@@ -16,63 +16,26 @@ pub(crate) struct ImageKind {
     pub(crate) name: &'static str,
 }
 
-pub(crate) const GRAY_16: ImageKind = ImageKind {
-    colour: ColorType::Grayscale,
-    depth: BitDepth::Sixteen,
-    name: "16-bit gray",
-};
-pub(crate) const RGB_8: ImageKind = ImageKind {
-    colour: ColorType::Rgb,
-    depth: BitDepth::Eight,
-    name: "8-bit rgb",
-};
-pub(crate) const GRAY_8: ImageKind = ImageKind {
-    colour: ColorType::Grayscale,
-    depth: BitDepth::Eight,
-    name: "8-bit gray",
-};
+pub(crate) const GRAY_16: ImageKind = ImageKind { colour: ColorType::Grayscale, depth: BitDepth::Sixteen, name: "16-bit gray" };
+pub(crate) const RGB_8: ImageKind = ImageKind { colour: ColorType::Rgb, depth: BitDepth::Eight, name: "8-bit rgb" };
+pub(crate) const GRAY_8: ImageKind = ImageKind { colour: ColorType::Grayscale, depth: BitDepth::Eight, name: "8-bit gray" };
 
 /// Reads an image of the given kind and size; bytes row-major with the LAST image row (south) first.
-pub(crate) fn read_image(
-    path: &Path,
-    kind: ImageKind,
-    width: usize,
-    height: usize,
-) -> Result<Vec<u8>, TerrainError> {
-    let wrong = |reason: String| TerrainError::Image {
-        path: path.to_path_buf(),
-        reason,
-    };
-    let file = File::open(path).map_err(|source| TerrainError::Read {
-        path: path.to_path_buf(),
-        source,
-    })?;
-    let mut reader = png::Decoder::new(BufReader::new(file))
-        .read_info()
-        .map_err(|error| wrong(format!("not a readable png: {error}")))?;
+pub(crate) fn read_image(path: &Path, kind: ImageKind, width: usize, height: usize) -> Result<Vec<u8>, TerrainError> {
+    let wrong = |reason: String| TerrainError::Image { path: path.to_path_buf(), reason };
+    let file = File::open(path).map_err(|source| TerrainError::Read { path: path.to_path_buf(), source })?;
+    let mut reader = png::Decoder::new(BufReader::new(file)).read_info().map_err(|error| wrong(format!("not a readable png: {error}")))?;
     let header = reader.info();
     if (header.width as usize, header.height as usize) != (width, height) {
-        return Err(wrong(format!(
-            "{} x {} pixels, world.json says {width} x {height}",
-            header.width, header.height
-        )));
+        return Err(wrong(format!("{} x {} pixels, world.json says {width} x {height}", header.width, header.height)));
     }
     if header.color_type != kind.colour || header.bit_depth != kind.depth {
-        return Err(wrong(format!(
-            "{:?} with {:?} bits per sample, expected {}",
-            header.color_type, header.bit_depth, kind.name
-        )));
+        return Err(wrong(format!("{:?} with {:?} bits per sample, expected {}", header.color_type, header.bit_depth, kind.name)));
     }
     if header.interlaced {
         return Err(wrong("interlaced; save it without interlacing".into()));
     }
-    let line = width
-        * kind.colour.samples()
-        * if kind.depth == BitDepth::Sixteen {
-            2
-        } else {
-            1
-        };
+    let line = width * kind.colour.samples() * if kind.depth == BitDepth::Sixteen { 2 } else { 1 };
     let mut bytes = vec![0; line * height];
     for row in 0..height {
         match reader.next_row() {
@@ -84,9 +47,7 @@ pub(crate) fn read_image(
             Err(error) => return Err(wrong(format!("damaged at row {row} of {height}: {error}"))),
         }
     }
-    reader
-        .finish()
-        .map_err(|error| wrong(format!("damaged after the last row: {error}")))?;
+    reader.finish().map_err(|error| wrong(format!("damaged after the last row: {error}")))?;
     Ok(bytes)
 }
 

@@ -27,11 +27,7 @@ pub struct Patch {
 impl Patch {
     /// An empty patch, to be reused between calls of [`sample_patch`].
     pub fn new() -> Self {
-        Self {
-            elevation: vec![0.0; PIXELS],
-            semantic: vec![0.0; 3 * PIXELS],
-            known_share: 0.0,
-        }
+        Self { elevation: vec![0.0; PIXELS], semantic: vec![0.0; 3 * PIXELS], known_share: 0.0 }
     }
 }
 
@@ -55,11 +51,7 @@ pub struct PatchScale {
 impl Default for PatchScale {
     /// 3 m of relief (18 degrees over the 9 m to a corner of the patch), and the whole colour range.
     fn default() -> Self {
-        Self {
-            elevation_half_range_m: 3.0,
-            semantic_mean: [127.5; 3],
-            semantic_half_range: [127.5; 3],
-        }
+        Self { elevation_half_range_m: 3.0, semantic_mean: [127.5; 3], semantic_half_range: [127.5; 3] }
     }
 }
 
@@ -87,12 +79,7 @@ impl Walk {
         let reach = (PATCH_PX as f64 * step).ceil() + 1.0;
         let base = [0, 1].map(|k| (centre[k] - reach).floor() as i64);
         let start = [0, 1].map(|k| (first[k] - base[k] as f64) as f32);
-        Self {
-            base,
-            start,
-            per_column: per_column.map(|v| v as f32),
-            per_row: per_row.map(|v| v as f32),
-        }
+        Self { base, start, per_column: per_column.map(|v| v as f32), per_row: per_row.map(|v| v as f32) }
     }
 
     fn row_start(&self, row: usize) -> [f32; 2] {
@@ -108,8 +95,7 @@ impl Walk {
             let low = a.min(b).min(a + across).min(b + across);
             let high = a.max(b).max(a + across).max(b + across);
             // One cell of margin covers f32 rounding and the upper neighbour.
-            self.base[k] as f64 + f64::from(low) >= 1.0
-                && self.base[k] as f64 + f64::from(high) <= *side as f64 - 3.0
+            self.base[k] as f64 + f64::from(low) >= 1.0 && self.base[k] as f64 + f64::from(high) <= *side as f64 - 3.0
         })
     }
 }
@@ -131,12 +117,7 @@ struct Corners<T> {
 
 impl<T: Copy> Corners<T> {
     fn new(zero: T) -> Self {
-        Self {
-            sw: [zero; PATCH_PX],
-            se: [zero; PATCH_PX],
-            nw: [zero; PATCH_PX],
-            ne: [zero; PATCH_PX],
-        }
+        Self { sw: [zero; PATCH_PX], se: [zero; PATCH_PX], nw: [zero; PATCH_PX], ne: [zero; PATCH_PX] }
     }
 
     /// Gathers the corners of a row from a layer of the given width.
@@ -165,15 +146,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
     patch.semantic.resize(3 * PIXELS, 0.0);
     let finite = pose.x_m.is_finite() && pose.y_m.is_finite() && pose.yaw_rad.is_finite();
     let [x_m, y_m] = map.geometry().to_world(0, 0);
-    let pose = if finite {
-        pose
-    } else {
-        Pose2 {
-            x_m,
-            y_m,
-            yaw_rad: 0.0,
-        }
-    };
+    let pose = if finite { pose } else { Pose2 { x_m, y_m, yaw_rad: 0.0 } };
 
     let (width, height) = (map.geometry().width, map.geometry().height);
     let walk = Walk::new(map, pose);
@@ -182,11 +155,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
     let per_elevation = 1.0 / scale.elevation_half_range_m;
     let per_colour = scale.semantic_half_range.map(|half| 1.0 / half);
 
-    let mut cells = RowCells {
-        index: [0; PATCH_PX],
-        east: [0.0; PATCH_PX],
-        north: [0.0; PATCH_PX],
-    };
+    let mut cells = RowCells { index: [0; PATCH_PX], east: [0.0; PATCH_PX], north: [0.0; PATCH_PX] };
     let mut heights = Corners::new(0.0f32);
     let mut colours = Corners::new(0u32);
     let mut unknown = 0;
@@ -197,11 +166,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
             unknown += cells_clamped(&walk, row, [width, height], map, &mut cells);
         }
         if inside && let Some(known) = &map.surface.known {
-            unknown += cells
-                .index
-                .iter()
-                .filter(|i| !is_known(known, **i as usize, width))
-                .count();
+            unknown += cells.index.iter().filter(|i| !is_known(known, **i as usize, width)).count();
         }
         heights.gather(&map.surface.height_m, width, &cells);
         let out = &mut patch.elevation[row * PATCH_PX..(row + 1) * PATCH_PX];
@@ -218,11 +183,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
     if map.colour.is_none() {
         patch.semantic.fill(0.0);
     }
-    patch.known_share = if finite {
-        1.0 - unknown as f32 / PIXELS as f32
-    } else {
-        0.0
-    };
+    patch.known_share = if finite { 1.0 - unknown as f32 / PIXELS as f32 } else { 0.0 };
 }
 
 fn is_known(known: &[bool], index: usize, width: usize) -> bool {
@@ -248,13 +209,7 @@ fn cells_inside(walk: &Walk, row: usize, width: usize, cells: &mut RowCells) {
 }
 
 /// Cells of a row with clamping to the border; returns how many pixels are off the map or next to a hole.
-fn cells_clamped(
-    walk: &Walk,
-    row: usize,
-    size: [usize; 2],
-    map: &WorldMap,
-    cells: &mut RowCells,
-) -> usize {
+fn cells_clamped(walk: &Walk, row: usize, size: [usize; 2], map: &WorldMap, cells: &mut RowCells) -> usize {
     let start = walk.row_start(row);
     let mut unknown = 0;
     for column in 0..PATCH_PX {
@@ -292,14 +247,7 @@ fn mix_heights(z: &Corners<f32>, cells: &RowCells, centre_m: f32, per_unit: f32,
 }
 
 #[inline(always)]
-fn mix_colours(
-    c: &Corners<u32>,
-    cells: &RowCells,
-    shift: u32,
-    mean: f32,
-    per_unit: f32,
-    out: &mut [f32],
-) {
+fn mix_colours(c: &Corners<u32>, cells: &RowCells, shift: u32, mean: f32, per_unit: f32, out: &mut [f32]) {
     let channel = |packed: u32| ((packed >> shift) & 255) as i32 as f32;
     for column in 0..PATCH_PX {
         let (sw, se) = (channel(c.sw[column]), channel(c.se[column]));

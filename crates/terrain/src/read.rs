@@ -32,15 +32,12 @@ impl WorldMap {
         let scale_m = json.number("elevation.scale_m")?;
         let offset_m = json.number("elevation.offset_m")?;
         if scale_m == 0.0 || scale_m.abs() > 1.0 || offset_m.abs() > 1e4 {
-            let reason = format!(
-                "scale {scale_m} m and offset {offset_m} m do not give heights within 10 km"
-            );
+            let reason = format!("scale {scale_m} m and offset {offset_m} m do not give heights within 10 km");
             return Err(json.wrong("elevation.scale_m", reason));
         }
         let elevation_png = world_dir.join(json.file("elevation.file", "elevation.png")?);
         let gray = read_image(&elevation_png, GRAY_16, width, height)?;
-        let to_height =
-            |b: &[u8]| (offset_m + scale_m * f64::from(u16::from_be_bytes([b[0], b[1]]))) as f32;
+        let to_height = |b: &[u8]| (offset_m + scale_m * f64::from(u16::from_be_bytes([b[0], b[1]]))) as f32;
         let elevation_m: Vec<f32> = gray.chunks_exact(2).map(to_height).collect();
 
         // A world without semantics is valid: either key or image may be missing.
@@ -51,10 +48,7 @@ impl WorldMap {
         } else {
             None
         };
-        let id = world_dir
-            .file_name()
-            .map(|n| n.to_string_lossy().into_owned())
-            .unwrap_or_default();
+        let id = world_dir.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let map = Self::from_layers(&id, 1, geometry, elevation_m, semantic_rgb)?;
         Ok(map.with_soil_classes(json.soil_classes()?))
     }
@@ -68,33 +62,17 @@ struct WorldJson {
 
 impl WorldJson {
     fn read(path: &Path) -> Result<Self, TerrainError> {
-        let text = std::fs::read(path).map_err(|source| TerrainError::Read {
-            path: path.to_path_buf(),
-            source,
-        })?;
-        let root = serde_json::from_slice(&text).map_err(|source| TerrainError::Json {
-            path: path.to_path_buf(),
-            source,
-        })?;
-        Ok(Self {
-            path: path.to_path_buf(),
-            root,
-        })
+        let text = std::fs::read(path).map_err(|source| TerrainError::Read { path: path.to_path_buf(), source })?;
+        let root = serde_json::from_slice(&text).map_err(|source| TerrainError::Json { path: path.to_path_buf(), source })?;
+        Ok(Self { path: path.to_path_buf(), root })
     }
 
     fn wrong(&self, key: &str, reason: impl Into<String>) -> TerrainError {
-        TerrainError::Key {
-            path: self.path.clone(),
-            key: key.into(),
-            reason: reason.into(),
-        }
+        TerrainError::Key { path: self.path.clone(), key: key.into(), reason: reason.into() }
     }
 
     fn get(&self, dotted: &str) -> Option<&Value> {
-        dotted
-            .split('.')
-            .try_fold(&self.root, |value, key| value.get(key))
-            .filter(|v| !v.is_null())
+        dotted.split('.').try_fold(&self.root, |value, key| value.get(key)).filter(|v| !v.is_null())
     }
 
     fn required(&self, key: &str) -> Result<&Value, TerrainError> {
@@ -123,8 +101,7 @@ impl WorldJson {
         };
         let plain = |s: &&str| !s.is_empty() && !s.contains(['/', '\\']) && !s.starts_with("..");
         let name = value.as_str().filter(plain);
-        name.map(String::from)
-            .ok_or_else(|| self.wrong(key, format!("expected a plain file name, found {value}")))
+        name.map(String::from).ok_or_else(|| self.wrong(key, format!("expected a plain file name, found {value}")))
     }
 
     fn geometry(&self) -> Result<GridGeometry, TerrainError> {
@@ -159,21 +136,12 @@ impl WorldJson {
         let Some(ranges) = self.get("soil_prior_ranges") else {
             return Ok(Vec::new());
         };
-        let ranges = ranges
-            .as_object()
-            .ok_or_else(|| self.wrong("soil_prior_ranges", "expected an object of classes"))?;
+        let ranges = ranges.as_object().ok_or_else(|| self.wrong("soil_prior_ranges", "expected an object of classes"))?;
         let listed: Vec<String> = match self.get("classes").and_then(Value::as_array) {
-            Some(names) => names
-                .iter()
-                .filter_map(|n| n.as_str().map(String::from))
-                .collect(),
+            Some(names) => names.iter().filter_map(|n| n.as_str().map(String::from)).collect(),
             None => ranges.keys().cloned().collect(),
         };
-        listed
-            .into_iter()
-            .filter(|name| ranges.contains_key(name))
-            .map(|name| self.soil_class(name))
-            .collect()
+        listed.into_iter().filter(|name| ranges.contains_key(name)).map(|name| self.soil_class(name)).collect()
     }
 
     fn soil_class(&self, name: String) -> Result<SoilClassRange, TerrainError> {
@@ -182,45 +150,20 @@ impl WorldJson {
             let key = format!("soil_prior_ranges.{name}.{parameter}");
             let [a, b] = self.pair(&key, self.required(&key)?)?;
             if !(a > 0.0 && a <= b) {
-                return Err(self.wrong(
-                    &key,
-                    format!("[{a}, {b}] is not a positive ascending range"),
-                ));
+                return Err(self.wrong(&key, format!("[{a}, {b}] is not a positive ascending range")));
             }
-            let unit = if i == PHI {
-                std::f64::consts::PI / 180.0
-            } else {
-                1.0
-            };
+            let unit = if i == PHI { std::f64::consts::PI / 180.0 } else { 1.0 };
             (low[i], high[i]) = (a * unit, b * unit);
         }
         let key = format!("semantic.palette.{name}");
-        let colour = self
-            .get(&key)
-            .map(|value| self.colour(&key, value))
-            .transpose()?;
-        Ok(SoilClassRange {
-            name,
-            colour,
-            low,
-            high,
-        })
+        let colour = self.get(&key).map(|value| self.colour(&key, value)).transpose()?;
+        Ok(SoilClassRange { name, colour, low, high })
     }
 
     fn colour(&self, key: &str, value: &Value) -> Result<[u8; 3], TerrainError> {
-        let wrong = || {
-            self.wrong(
-                key,
-                format!("expected three integers 0..=255, found {value}"),
-            )
-        };
+        let wrong = || self.wrong(key, format!("expected three integers 0..=255, found {value}"));
         let parts = value.as_array().ok_or_else(wrong)?;
-        let bytes: Option<Vec<u8>> = parts
-            .iter()
-            .map(|p| p.as_u64().and_then(|n| u8::try_from(n).ok()))
-            .collect();
-        bytes
-            .and_then(|b| <[u8; 3]>::try_from(b).ok())
-            .ok_or_else(wrong)
+        let bytes: Option<Vec<u8>> = parts.iter().map(|p| p.as_u64().and_then(|n| u8::try_from(n).ok())).collect();
+        bytes.and_then(|b| <[u8; 3]>::try_from(b).ok()).ok_or_else(wrong)
     }
 }

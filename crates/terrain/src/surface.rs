@@ -22,41 +22,22 @@ impl Surface {
     /// Whether the four cells around a lookup are known.
     #[inline]
     pub(crate) fn is_known(&self, index: usize, width: usize) -> bool {
-        self.known
-            .as_ref()
-            .is_none_or(|k| k[index] && k[index + 1] && k[index + width] && k[index + width + 1])
+        self.known.as_ref().is_none_or(|k| k[index] && k[index + 1] && k[index + width] && k[index + width + 1])
     }
 
     /// Bilinear height, m.
     #[inline]
     pub(crate) fn height(&self, at: Bilinear, width: usize) -> f64 {
         let z = |i: usize| f64::from(self.height_m[i]);
-        mix(
-            at,
-            z(at.index),
-            z(at.index + 1),
-            z(at.index + width),
-            z(at.index + width + 1),
-        )
+        mix(at, z(at.index), z(at.index + 1), z(at.index + width), z(at.index + width + 1))
     }
 
     /// Bilinear slope.
     #[inline]
     pub(crate) fn slope(&self, at: Bilinear, width: usize) -> [f64; 2] {
         let [sw, se] = [self.slope[at.index], self.slope[at.index + 1]];
-        let [nw, ne] = [
-            self.slope[at.index + width],
-            self.slope[at.index + width + 1],
-        ];
-        [0, 1].map(|k| {
-            mix(
-                at,
-                f64::from(sw[k]),
-                f64::from(se[k]),
-                f64::from(nw[k]),
-                f64::from(ne[k]),
-            )
-        })
+        let [nw, ne] = [self.slope[at.index + width], self.slope[at.index + width + 1]];
+        [0, 1].map(|k| mix(at, f64::from(sw[k]), f64::from(se[k]), f64::from(nw[k]), f64::from(ne[k])))
     }
 }
 
@@ -69,10 +50,7 @@ fn mix(at: Bilinear, sw: f64, se: f64, nw: f64, ne: f64) -> f64 {
 }
 
 /// Fills holes with the nearest known height (in city-block distance) and returns the mask; `None` when nothing is known.
-pub(crate) fn fill_holes(
-    geometry: &GridGeometry,
-    mut height_m: Vec<f32>,
-) -> Option<(Vec<f32>, Option<Vec<bool>>)> {
+pub(crate) fn fill_holes(geometry: &GridGeometry, mut height_m: Vec<f32>) -> Option<(Vec<f32>, Option<Vec<bool>>)> {
     if !height_m.iter().any(|z| z.is_nan()) {
         return Some((height_m, None));
     }
@@ -112,20 +90,11 @@ pub(crate) fn footprint_slopes(geometry: &GridGeometry, height_m: &[f32]) -> Vec
         let (south, north) = (row.saturating_sub(reach), (row + reach).min(height - 1));
         let rise_y = geometry.resolution_m as f32 * (north - south) as f32 * 3.0;
         for column in 0..width {
-            let (west, east) = (
-                column.saturating_sub(reach),
-                (column + reach).min(width - 1),
-            );
+            let (west, east) = (column.saturating_sub(reach), (column + reach).min(width - 1));
             let rise_x = geometry.resolution_m as f32 * (east - west) as f32 * 3.0;
             let z = |r: usize, c: usize| height_m[r * width + c];
-            let x: f32 = [south, row, north]
-                .iter()
-                .map(|r| z(*r, east) - z(*r, west))
-                .sum();
-            let y: f32 = [west, column, east]
-                .iter()
-                .map(|c| z(north, *c) - z(south, *c))
-                .sum();
+            let x: f32 = [south, row, north].iter().map(|r| z(*r, east) - z(*r, west)).sum();
+            let y: f32 = [west, column, east].iter().map(|c| z(north, *c) - z(south, *c)).sum();
             slopes.push([x / rise_x, y / rise_y]);
         }
     }

@@ -61,62 +61,30 @@ impl WorldMap {
         elevation_m: Vec<f32>,
         semantic_rgb: Option<Vec<[u8; 3]>>,
     ) -> Result<Self, TerrainError> {
-        let wrong = |field, reason| TerrainError::Layers {
-            id: id.to_string(),
-            field,
-            reason,
-        };
-        geometry
-            .check()
-            .map_err(|(field, reason)| wrong(field, reason))?;
+        let wrong = |field, reason| TerrainError::Layers { id: id.to_string(), field, reason };
+        geometry.check().map_err(|(field, reason)| wrong(field, reason))?;
         if elevation_m.len() != geometry.cells() {
-            let reason = format!(
-                "{} cells, the geometry asks for {}",
-                elevation_m.len(),
-                geometry.cells()
-            );
+            let reason = format!("{} cells, the geometry asks for {}", elevation_m.len(), geometry.cells());
             return Err(wrong("elevation_m", reason));
         }
         if let Some(rgb) = &semantic_rgb
             && rgb.len() != geometry.cells()
         {
-            let reason = format!(
-                "{} cells, the geometry asks for {}",
-                rgb.len(),
-                geometry.cells()
-            );
+            let reason = format!("{} cells, the geometry asks for {}", rgb.len(), geometry.cells());
             return Err(wrong("semantic_rgb", reason));
         }
-        if let Some(at) = elevation_m
-            .iter()
-            .position(|z| z.is_infinite() || z.abs() > 1e4)
-        {
+        if let Some(at) = elevation_m.iter().position(|z| z.is_infinite() || z.abs() > 1e4) {
             let (row, column) = (at / geometry.width, at % geometry.width);
-            let reason = format!(
-                "{} m at row {row}, column {column} is beyond 10 km",
-                elevation_m[at]
-            );
+            let reason = format!("{} m at row {row}, column {column} is beyond 10 km", elevation_m[at]);
             return Err(wrong("elevation_m", reason));
         }
         let colour = semantic_rgb.map(|rgb| rgb.into_iter().map(pack).collect::<Vec<u32>>());
         let hash = hash_layers(&geometry, &elevation_m, colour.as_deref());
-        let (height_m, known) = fill_holes(&geometry, elevation_m)
-            .ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
+        let (height_m, known) =
+            fill_holes(&geometry, elevation_m).ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
         let slope = footprint_slopes(&geometry, &height_m);
-        let surface = Surface {
-            height_m,
-            slope,
-            known,
-        };
-        Ok(Self {
-            id: id.into(),
-            version,
-            hash,
-            geometry,
-            surface,
-            colour,
-            soil_classes: Vec::new(),
-        })
+        let surface = Surface { height_m, slope, known };
+        Ok(Self { id: id.into(), version, hash, geometry, surface, colour, soil_classes: Vec::new() })
     }
 
     /// The same map with the prior soil ranges of its semantic classes.
@@ -142,40 +110,20 @@ impl WorldMap {
         elevation_m: &[f32],
         semantic_rgb: Option<&[[u8; 3]]>,
     ) -> Result<Self, TerrainError> {
-        let wrong = |field, reason| TerrainError::Layers {
-            id: self.id.clone(),
-            field,
-            reason,
-        };
-        let GridGeometry {
-            width: map_width,
-            height: map_height,
-            ..
-        } = self.geometry;
-        for (field, start, side, limit) in [
-            ("tile width", column0, width, map_width),
-            ("tile height", row0, height, map_height),
-        ] {
+        let wrong = |field, reason| TerrainError::Layers { id: self.id.clone(), field, reason };
+        let GridGeometry { width: map_width, height: map_height, .. } = self.geometry;
+        for (field, start, side, limit) in [("tile width", column0, width, map_width), ("tile height", row0, height, map_height)] {
             if side == 0 || start.checked_add(side).is_none_or(|end| end > limit) {
-                return Err(wrong(
-                    field,
-                    format!("{side} cells from cell {start} do not fit in {limit} cells"),
-                ));
+                return Err(wrong(field, format!("{side} cells from cell {start} do not fit in {limit} cells")));
             }
         }
         if elevation_m.len() != width * height {
-            let reason = format!(
-                "{} cells, the tile has {width} x {height}",
-                elevation_m.len()
-            );
+            let reason = format!("{} cells, the tile has {width} x {height}", elevation_m.len());
             return Err(wrong("tile elevation_m", reason));
         }
         if let Some(rgb) = semantic_rgb {
             if self.colour.is_none() {
-                return Err(wrong(
-                    "tile semantic_rgb",
-                    "the map has no semantic layer to patch".into(),
-                ));
+                return Err(wrong("tile semantic_rgb", "the map has no semantic layer to patch".into()));
             }
             if rgb.len() != width * height {
                 let reason = format!("{} cells, the tile has {width} x {height}", rgb.len());
@@ -192,13 +140,7 @@ impl WorldMap {
                 map[to..to + width].copy_from_slice(&tile[from]);
             }
         }
-        let patched = Self::from_layers(
-            &self.id,
-            self.version + 1,
-            self.geometry,
-            elevation,
-            semantic,
-        )?;
+        let patched = Self::from_layers(&self.id, self.version + 1, self.geometry, elevation, semantic)?;
         Ok(patched.with_soil_classes(self.soil_classes.clone()))
     }
 
@@ -235,21 +177,12 @@ impl WorldMap {
     /// Elevation layer as given, row-major, row 0 in the south, NaN = hole, m.
     pub fn elevation_m(&self) -> Vec<f32> {
         let known = |i: usize| self.surface.known.as_ref().is_none_or(|k| k[i]);
-        self.surface
-            .height_m
-            .iter()
-            .enumerate()
-            .map(|(i, z)| if known(i) { *z } else { f32::NAN })
-            .collect()
+        self.surface.height_m.iter().enumerate().map(|(i, z)| if known(i) { *z } else { f32::NAN }).collect()
     }
 
     /// Semantic layer as given, row-major, row 0 in the south.
     pub fn semantic_rgb(&self) -> Option<Vec<[u8; 3]>> {
-        self.colour.as_ref().map(|c| {
-            c.iter()
-                .map(|p| [*p as u8, (p >> 8) as u8, (p >> 16) as u8])
-                .collect()
-        })
+        self.colour.as_ref().map(|c| c.iter().map(|p| [*p as u8, (p >> 8) as u8, (p >> 16) as u8]).collect())
     }
 
     /// Whether the point lies on the map (holes included).
@@ -260,8 +193,7 @@ impl WorldMap {
     /// Bilinear height, m; `None` off the map or where one of the four cells around is a hole.
     #[inline]
     pub fn height_m(&self, x_m: f64, y_m: f64) -> Option<f64> {
-        self.lookup(x_m, y_m)
-            .map(|at| self.surface.height(at, self.geometry.width))
+        self.lookup(x_m, y_m).map(|at| self.surface.height(at, self.geometry.width))
     }
 
     /// Bilinear height and the slope smoothed over about a wheel footprint (0.3 m); `None` as for [`WorldMap::height_m`].
@@ -269,17 +201,12 @@ impl WorldMap {
     pub fn ground(&self, x_m: f64, y_m: f64) -> Option<Ground> {
         let at = self.lookup(x_m, y_m)?;
         let [slope_x, slope_y] = self.surface.slope(at, self.geometry.width);
-        Some(Ground {
-            height_m: self.surface.height(at, self.geometry.width),
-            slope_x,
-            slope_y,
-        })
+        Some(Ground { height_m: self.surface.height(at, self.geometry.width), slope_x, slope_y })
     }
 
     /// Height with holes filled and points off the map clamped to the border, m; a fallback where any height beats none.
     pub fn nearest_height_m(&self, x_m: f64, y_m: f64) -> f64 {
-        self.surface
-            .height(self.geometry.bilinear(x_m, y_m), self.geometry.width)
+        self.surface.height(self.geometry.bilinear(x_m, y_m), self.geometry.width)
     }
 
     #[inline]
@@ -288,9 +215,7 @@ impl WorldMap {
             return None;
         }
         let at = self.geometry.bilinear(x_m, y_m);
-        self.surface
-            .is_known(at.index, self.geometry.width)
-            .then_some(at)
+        self.surface.is_known(at.index, self.geometry.width).then_some(at)
     }
 }
 
@@ -303,11 +228,7 @@ fn pack([r, g, b]: [u8; 3]) -> u32 {
 fn hash_layers(geometry: &GridGeometry, elevation_m: &[f32], colour: Option<&[u32]>) -> String {
     let mut hash = Sha256::new();
     hash.update(b"nesam.world/1");
-    for value in [
-        geometry.origin_m[0],
-        geometry.origin_m[1],
-        geometry.resolution_m,
-    ] {
+    for value in [geometry.origin_m[0], geometry.origin_m[1], geometry.resolution_m] {
         hash.update(value.to_le_bytes());
     }
     hash.update((geometry.width as u64).to_le_bytes());
@@ -327,8 +248,5 @@ fn hash_layers(geometry: &GridGeometry, elevation_m: &[f32], colour: Option<&[u3
         row.extend(cells.iter().flat_map(|c| c.to_le_bytes()));
         hash.update(&row);
     }
-    hash.finalize()
-        .iter()
-        .map(|byte| format!("{byte:02x}"))
-        .collect()
+    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
 }

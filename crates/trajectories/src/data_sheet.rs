@@ -1,0 +1,272 @@
+//! Vehicle cards as data roots give them: data sheets in several dialects, read into one [`Vehicle`].
+//!
+//! Names are harmonised here: each quantity is read under every name that a known card uses for it. A card in the schema of bundles
+//! (`"format": "nesam.vehicle/1"`) is accepted too. What a sheet leaves out is estimated by the rules below, all of them chosen:
+//!
+//! * Inertia: that of a solid box of wheelbase + 2 r by track + wheel width by 2.4 r, flagged in `inertia_estimated`.
+//! * Height of the reference point over the ground: 1.25 r (a low robot carries its battery between the axles).
+//! * Wheel centres: half wheelbase ahead and behind, half track to the sides.
+//! * Suspension: none means stiff, a static deflection of 10 mm and a damping ratio of 0.7. A sheet's spring and damper act at the
+//!   shock; with a motion ratio of about 0.8 the wheel sees 0.6 of the rate and 0.64 of the damping.
+//! * Drive line: a car-like vehicle holds 0.15 of its speed error as rim over-speed, at most 0.8 m/s; a skid-steer vehicle servoes its
+//!   rims (gain 1) with an actuator lag of 0.1 s, up to 3 m/s of rim speed. [`Vehicle`] parameters that matter can be calibrated later.
+
+use std::path::Path;
+
+use nesam_physics::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};
+use serde_json::Value;
+
+use crate::error::TrajectoryError;
+use crate::json::JsonFile;
+
+/// Share of the spring rate at the shock that the wheel sees (the given card: motion ratio about 0.8, roughly 0.6).
+const WHEEL_RATE_SHARE: f64 = 0.6;
+/// Share of the damping at the shock that the wheel sees: motion ratio 0.8 squared.
+const WHEEL_DAMPING_SHARE: f64 = 0.64;
+/// Static deflection of a vehicle without suspension, m.
+const STIFF_DEFLECTION_M: f64 = 0.01;
+/// Damping ratio of a vehicle without suspension.
+const STIFF_DAMPING_RATIO: f64 = 0.7;
+/// Speed range of a car-like card that gives none, m/s.
+const CAR_SPEED_RANGE_M_S: [f64; 2] = [-2.0, 12.0];
+/// Largest rim speed of a skid-steer card that gives none, m/s.
+const SKID_RIM_LIMIT_M_S: f64 = 3.0;
+/// Rate limit where a card gives none: none in practice, 1/s.
+const UNLIMITED_RATE_PER_S: f64 = 1e3;
+
+/// Reads a vehicle card.
+///
+/// # Errors
+/// `TrajectoryError` naming the file and the key that is missing, of the wrong type or out of range.
+pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
+    let sheet = JsonFile::read(path)?;
+    if sheet.get("format").is_some() {
+        return card_from_json(&sheet.root().to_string())
+            .map_err(|error| TrajectoryError::Card { path: path.into(), reason: error.to_string() });
+    }
+    let wheels = Wheels::read(&sheet)?;
+    let second = second_command(&sheet)?;
+    let mass_kg = sheet.required(&["mass_total", "mass_kg", "mass"])?;
+    let gravity_m_s2 = sheet.positive(&["gravity", "gravity_m_s2"])?.unwrap_or(9.81);
+    let (inertia_kg_m2, inertia_estimated) = inertia(&sheet, mass_kg, &wheels)?;
+    let (suspension_n_m, suspension_n_s_m) = suspension(&sheet, mass_kg, gravity_m_s2)?;
+    let steering = (second == SecondCommand::SteeringNormalised).then(|| steering_table(&sheet)).transpose()?;
+    let track_m = sheet.positive(&["nominal_diff_drive_base_m"])?.filter(|_| second == SecondCommand::YawRateRadS);
+    let track_m = track_m.unwrap_or(wheels.track_m);
+    Ok(Vehicle {
+        name: sheet.text("vehicle")?.or(sheet.text("name")?).ok_or_else(|| sheet.missing(&["vehicle", "name"]))?.into(),
+        mass_kg,
+        inertia_kg_m2,
+        inertia_estimated,
+        wheel_centre_m: wheels.centre_m,
+        wheel_radius_m: wheels.radius_m,
+        wheel_width_m: wheels.width_m,
+        suspension_n_m,
+        suspension_n_s_m,
+        second,
+        command_range: command_range(&sheet, second, wheels.radius_m, track_m, steering.as_ref())?,
+        steering,
+        track_m,
+        wheelbase_m: wheels.wheelbase_m,
+        driveline: driveline(&sheet, second)?,
+        gravity_m_s2,
+    })
+}
+
+/// The vehicle as a card in the schema of bundles.
+pub fn card_to_json(vehicle: &Vehicle) -> String {
+    nesam_vehicle_card::to_json(vehicle)
+}
+
+/// The vehicle of a card in the schema of bundles.
+///
+/// # Errors
+/// `CardError` naming the key at fault.
+pub fn card_from_json(text: &str) -> Result<Vehicle, nesam_vehicle_card::CardError> {
+    nesam_vehicle_card::from_json(text)
+}
+
+/// Rounds a derived number to 12 digits, which JSON carries without loss: a card read, bundled and read again stays the same.
+fn round(x: f64) -> f64 {
+    format!("{x:.11e}").parse().unwrap_or(x)
+}
+
+/// Placement and size of the wheels.
+struct Wheels {
+    centre_m: [[f64; 3]; WHEELS],
+    radius_m: f64,
+    width_m: f64,
+    track_m: f64,
+    wheelbase_m: f64,
+}
+
+impl Wheels {
+    fn read(sheet: &JsonFile) -> Result<Self, TrajectoryError> {
+        let radius_m = sheet.required(&["tyre.radius", "wheel_radius_m", "wheel.radius"])?;
+        let width_m = sheet.required(&["tyre.width", "wheel_width_m", "wheel.width"])?;
+        let centres = &["wheel_centres_rel_P_static", "wheel_centre_m"];
+        if let Some((key, value)) = sheet.first(centres) {
+            let centre_m: [[f64; 3]; WHEELS] = sheet.matrix(key, value)?;
+            let apart = |a: usize, b: usize, axis: usize| centre_m[a][axis] - centre_m[b][axis];
+            if !(apart(0, 2, 0) > 0.0 && apart(1, 3, 0) > 0.0 && apart(0, 1, 1) > 0.0 && apart(2, 3, 1) > 0.0) {
+                return Err(sheet.wrong(key, "expected the order FL, FR, RL, RR with x forward and y left"));
+            }
+            let track_m = round((apart(0, 1, 1) + apart(2, 3, 1)) / 2.0);
+            let wheelbase_m = round((apart(0, 2, 0) + apart(1, 3, 0)) / 2.0);
+            return Ok(Self { centre_m, radius_m, width_m, track_m, wheelbase_m });
+        }
+        let front = sheet.required(&["track_m", "track_front", "track_front_m"])?;
+        let rear = sheet.positive(&["track_rear", "track_rear_m"])?.unwrap_or(front);
+        let wheelbase_m = sheet.required(&["wheelbase_m", "wheelbase"])?;
+        let height = &["cg_height_above_rigid_flat_ground_static_m", "cg_height_m"];
+        let z = round(radius_m - sheet.positive(height)?.unwrap_or(1.25 * radius_m));
+        let x = wheelbase_m / 2.0;
+        let centre_m = [[x, front / 2.0, z], [x, -front / 2.0, z], [-x, rear / 2.0, z], [-x, -rear / 2.0, z]];
+        Ok(Self { centre_m, radius_m, width_m, track_m: round((front + rear) / 2.0), wheelbase_m })
+    }
+}
+
+/// What the second command means: stated, or implied by the kind of drive.
+fn second_command(sheet: &JsonFile) -> Result<SecondCommand, TrajectoryError> {
+    if let Some(stated) = sheet.text("second")? {
+        return match stated {
+            "steering_normalised" => Ok(SecondCommand::SteeringNormalised),
+            "road_wheel_angle_rad" => Ok(SecondCommand::RoadWheelAngleRad),
+            "yaw_rate_rad_s" => Ok(SecondCommand::YawRateRadS),
+            other => {
+                let reason = format!("`{other}`, expected steering_normalised, road_wheel_angle_rad or yaw_rate_rad_s");
+                Err(sheet.wrong("second", reason))
+            }
+        };
+    }
+    match sheet.text("drive")? {
+        Some("skid_steer" | "differential") => Ok(SecondCommand::YawRateRadS),
+        Some(other) if sheet.get("steering").is_none() => {
+            Err(sheet.wrong("drive", format!("`{other}`, expected skid_steer, or state `second` or `steering`")))
+        }
+        _ if sheet.get("steering.command_to_road_wheel_table").is_some() => Ok(SecondCommand::SteeringNormalised),
+        _ => Err(sheet.wrong("second", "missing, and neither `drive` nor a steering table implies it")),
+    }
+}
+
+/// The inertia matrix of the card, else that of a box.
+fn inertia(sheet: &JsonFile, mass_kg: f64, wheels: &Wheels) -> Result<([[f64; 3]; 3], bool), TrajectoryError> {
+    if let Some((key, value)) = sheet.first(&["inertia_about_cg.matrix", "inertia_kg_m2"]) {
+        let matrix: [[f64; 3]; 3] = sheet.matrix(key, value)?;
+        let symmetric = (0..3).all(|i| (0..3).all(|j| (matrix[i][j] - matrix[j][i]).abs() <= 1e-6 * matrix[i][i].abs()));
+        if !(symmetric && is_positive_definite(&matrix)) {
+            return Err(sheet.wrong(key, "expected a symmetric positive definite matrix"));
+        }
+        return Ok((matrix, false));
+    }
+    let length = wheels.wheelbase_m + 2.0 * wheels.radius_m;
+    let width = wheels.track_m + wheels.width_m;
+    let height = 2.4 * wheels.radius_m;
+    let about = |a: f64, b: f64| round(mass_kg * (a * a + b * b) / 12.0);
+    let (xx, yy, zz) = (about(width, height), about(length, height), about(length, width));
+    Ok(([[xx, 0.0, 0.0], [0.0, yy, 0.0], [0.0, 0.0, zz]], true))
+}
+
+/// Sylvester's criterion.
+fn is_positive_definite(m: &[[f64; 3]; 3]) -> bool {
+    let minor = m[0][0] * m[1][1] - m[0][1] * m[1][0];
+    let determinant = m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
+    m[0][0] > 0.0 && minor > 0.0 && determinant > 0.0
+}
+
+/// Rate and damping at each wheel.
+fn suspension(sheet: &JsonFile, mass_kg: f64, gravity: f64) -> Result<([f64; WHEELS], [f64; WHEELS]), TrajectoryError> {
+    if sheet.get("suspension").is_none() {
+        let load_kg = mass_kg / WHEELS as f64;
+        let rate = round(load_kg * gravity / STIFF_DEFLECTION_M);
+        let damping = round(2.0 * STIFF_DAMPING_RATIO * (rate * load_kg).sqrt());
+        return Ok(([rate; WHEELS], [damping; WHEELS]));
+    }
+    let axle = |name: &str| -> Result<(f64, f64), TrajectoryError> {
+        let spring = sheet.required(&[&format!("suspension.{name}.spring_N_per_m"), &format!("suspension.{name}.spring_n_m")])?;
+        let damper = sheet.required(&[&format!("suspension.{name}.damper_Ns_per_m"), &format!("suspension.{name}.damper_n_s_m")])?;
+        Ok((round(spring * WHEEL_RATE_SHARE), round(damper * WHEEL_DAMPING_SHARE)))
+    };
+    let (front, rear) = (axle("front")?, axle("rear")?);
+    Ok(([front.0, front.0, rear.0, rear.0], [front.1, front.1, rear.1, rear.1]))
+}
+
+/// The table from normalised steering to road-wheel angles.
+fn steering_table(sheet: &JsonFile) -> Result<SteeringTable, TrajectoryError> {
+    const KEY: &str = "steering.command_to_road_wheel_table";
+    let rows = sheet.get(KEY).and_then(Value::as_array).ok_or_else(|| sheet.missing(&[KEY]))?;
+    let mut table = SteeringTable { command: Vec::new(), front_left_rad: Vec::new(), front_right_rad: Vec::new() };
+    for (i, row) in rows.iter().enumerate() {
+        let number = |name: &str| {
+            let key = format!("{KEY}[{i}].{name}");
+            row.get(name).ok_or_else(|| sheet.wrong(&key, "missing")).and_then(|value| sheet.finite(&key, value))
+        };
+        table.command.push(number("cmd")?);
+        table.front_left_rad.push(number("fl_rad")?);
+        table.front_right_rad.push(number("fr_rad")?);
+    }
+    if table.command.len() < 2 || !table.command.windows(2).all(|w| w[0] < w[1]) {
+        return Err(sheet.wrong(KEY, "expected at least two rows with ascending cmd"));
+    }
+    Ok(table)
+}
+
+/// Admissible commands: stated, else what the kind of drive implies.
+fn command_range(
+    sheet: &JsonFile,
+    second: SecondCommand,
+    radius_m: f64,
+    track_m: f64,
+    steering: Option<&SteeringTable>,
+) -> Result<[[f64; 2]; 2], TrajectoryError> {
+    let rim_rad_s = sheet.positive(&["max_wheel_speed_rad_s"])?;
+    let rim_m_s = rim_rad_s.map_or(SKID_RIM_LIMIT_M_S, |omega| round(omega * radius_m));
+    let implied = match second {
+        SecondCommand::YawRateRadS => {
+            let turn = round(2.0 * rim_m_s / track_m);
+            [[-rim_m_s, rim_m_s], [-turn, turn]]
+        }
+        SecondCommand::SteeringNormalised => {
+            let ends = steering.map(|t| [t.command[0], t.command[t.command.len() - 1]]);
+            [CAR_SPEED_RANGE_M_S, ends.unwrap_or([-1.0, 1.0])]
+        }
+        SecondCommand::RoadWheelAngleRad => {
+            let stated = sheet.get("steering.max_road_wheel_angle_rad");
+            let largest = match stated {
+                Some(Value::Array(angles)) => angles.iter().filter_map(Value::as_f64).fold(0.0, f64::max),
+                Some(value) => sheet.finite("steering.max_road_wheel_angle_rad", value)?,
+                None => 0.7,
+            };
+            [CAR_SPEED_RANGE_M_S, [-largest, largest]]
+        }
+    };
+    let stated = |key: &str, otherwise: [f64; 2]| {
+        let Some(value) = sheet.get(key) else { return Ok(otherwise) };
+        let range: [f64; 2] = sheet.array(key, value)?;
+        if range[0] < range[1] { Ok(range) } else { Err(sheet.wrong(key, "expected [min, max] with min < max")) }
+    };
+    Ok([stated("command_range.speed_m_s", implied[0])?, stated("command_range.second", implied[1])?])
+}
+
+/// Actuators and drive line: stated values, else the defaults of the kind of drive.
+fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, TrajectoryError> {
+    let skid = second == SecondCommand::YawRateRadS;
+    let or = |keys: &[&str], default: f64| -> Result<f64, TrajectoryError> {
+        let value = sheet.number(keys)?.unwrap_or(default);
+        if value >= 0.0 { Ok(value) } else { Err(sheet.wrong(keys[0], format!("{value} is negative"))) }
+    };
+    let lag = if skid { 0.1 } else { 0.0 };
+    Ok(Driveline {
+        steering_lag_s: or(&["steering.actuator.time_constant_s", "driveline.steering_lag_s"], lag)?,
+        steering_rate_limit_per_s: or(
+            &["steering.actuator.rate_limit_per_s", "driveline.steering_rate_limit_per_s"],
+            UNLIMITED_RATE_PER_S,
+        )?,
+        speed_gain: or(&["driveline.speed_gain"], if skid { 1.0 } else { 0.15 })?,
+        speed_integral_gain_per_s: or(&["driveline.speed_integral_gain_per_s"], 0.0)?,
+        speed_integral_leak_s: sheet.positive(&["driveline.speed_integral_leak_s"])?.unwrap_or(2.0),
+        speed_integral_limit_m: or(&["driveline.speed_integral_limit_m"], 2.0)?,
+        overspeed_limit_m_s: sheet.positive(&["driveline.overspeed_limit_m_s"])?.unwrap_or(if skid { SKID_RIM_LIMIT_M_S } else { 0.8 }),
+    })
+}

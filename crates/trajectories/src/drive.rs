@@ -1,0 +1,143 @@
+//! One drive from its rows of the samples file.
+
+use nesam_physics::{Control, SecondCommand, Vehicle, VehicleState, WHEELS};
+
+use crate::channels::Channels;
+use crate::error::TrajectoryError;
+use crate::ground_truth::together;
+use crate::resample::Grid;
+use crate::table::Numbers;
+use crate::trajectory::{MeasuredChannels, Trajectory, VelocitySource};
+use crate::velocity::{from_attitudes, from_positions, to_body};
+
+/// A drive at the clock of the log.
+struct Log {
+    time_s: Vec<f64>,
+    position: Vec<[f64; 3]>,
+    attitude: Vec<[f64; 3]>,
+    command: Vec<[f64; 2]>,
+    wheel_speed: Option<Vec<[f64; WHEELS]>>,
+    road_wheel_angle: Option<Vec<[f64; 2]>>,
+}
+
+/// Builds the drive in the given rows: checks every value that is used, completes the velocities, resamples.
+pub(crate) fn build(
+    channels: &Channels,
+    rows: &[usize],
+    vehicle: &Vehicle,
+    path: &std::path::Path,
+    dt_s: f64,
+) -> Result<Trajectory, TrajectoryError> {
+    let log = Log {
+        time_s: times(channels, rows, path)?,
+        position: together(&channels.position, rows)?,
+        attitude: together(&channels.attitude, rows)?,
+        command: together(&channels.command, rows)?,
+        wheel_speed: wheel_speeds(channels, rows)?,
+        road_wheel_angle: optional(&channels.road_wheel_angle, rows)?,
+    };
+    let (velocity, source) = velocity(channels, rows, vehicle, &log)?;
+    let (angular, angular_measured) = angular_velocity(channels, rows, vehicle, &log)?;
+    let grid = Grid::new(&log.time_s, dt_s).map_err(|(at, reason)| TrajectoryError::cell(path, "t", rows[at], reason))?;
+    let (position, attitude) = (grid.linear(&log.position), grid.angles(&log.attitude));
+    let (velocity, angular) = (grid.linear(&velocity), grid.linear(&angular));
+    let states = (0..position.len()).map(|k| VehicleState {
+        position_m: position[k],
+        attitude_rad: attitude[k],
+        velocity_m_s: velocity[k],
+        angular_velocity_rad_s: angular[k],
+    });
+    let controls = grid.held(&log.command).into_iter().map(|[speed_m_s, second]| Control { speed_m_s, second });
+    let measured = MeasuredChannels {
+        position: true,
+        height: true,
+        attitude: true,
+        linear_velocity: source != VelocitySource::Positions,
+        velocity_source: source,
+        angular_velocity: angular_measured,
+        wheel_speed: log.wheel_speed.is_some(),
+        road_wheel_angle: log.road_wheel_angle.is_some(),
+    };
+    Ok(Trajectory {
+        id: String::new(),
+        set: String::new(),
+        world: None,
+        split: None,
+        dt_s,
+        states: states.collect(),
+        controls: controls.collect(),
+        wheel_speed_rad_s: log.wheel_speed.as_deref().map(|w| grid.linear(w)),
+        road_wheel_angle_rad: log.road_wheel_angle.as_deref().map(|a| grid.angles(a)),
+        measured,
+        truth: channels.truth.as_ref().map(|truth| truth.of(rows, &grid)).transpose()?,
+        time_s: grid.time_s,
+    })
+}
+
+/// Time stamps; they must ascend.
+fn times(channels: &Channels, rows: &[usize], path: &std::path::Path) -> Result<Vec<f64>, TrajectoryError> {
+    let time_s = channels.time.finite(rows)?;
+    for (k, pair) in time_s.windows(2).enumerate() {
+        if pair[1] <= pair[0] {
+            let what = if pair[1] == pair[0] { "time stamp is repeated" } else { "time goes backwards" };
+            let reason = format!("{what}: {} s after {} s in row {}", pair[1], pair[0], rows[k]);
+            return Err(TrajectoryError::cell(path, "t", rows[k + 1], reason));
+        }
+    }
+    Ok(time_s)
+}
+
+/// Channels that may be missing: no columns, or columns that are null all along the drive.
+fn optional<const N: usize>(columns: &Option<[Numbers; N]>, rows: &[usize]) -> Result<Option<Vec<[f64; N]>>, TrajectoryError> {
+    match columns {
+        Some(columns) if !columns.iter().any(|c| c.is_absent(rows)) => together(columns, rows).map(Some),
+        _ => Ok(None),
+    }
+}
+
+/// Four wheel speeds; a vehicle whose sides are coupled has one per side.
+fn wheel_speeds(channels: &Channels, rows: &[usize]) -> Result<Option<Vec<[f64; WHEELS]>>, TrajectoryError> {
+    if let Some(wheels) = optional(&channels.wheel_speed, rows)? {
+        return Ok(Some(wheels));
+    }
+    let sides = optional(&channels.side_speed, rows)?;
+    Ok(sides.map(|sides| sides.into_iter().map(|[left, right]| [left, right, left, right]).collect()))
+}
+
+/// Body velocity: measured in Body, else measured in World, else estimated from positions.
+///
+/// The estimate begins with what is known at the first sample: the mean rim speed where wheel speeds are measured, else the commanded
+/// speed.
+fn velocity(channels: &Channels, rows: &[usize], vehicle: &Vehicle, log: &Log) -> Result<(Vec<[f64; 3]>, VelocitySource), TrajectoryError> {
+    if let Some(body) = optional(&channels.body_velocity, rows)? {
+        return Ok((body, VelocitySource::Body));
+    }
+    if let Some(world) = optional(&channels.world_velocity, rows)? {
+        let body = world.into_iter().zip(&log.attitude).map(|(v, attitude)| to_body(*attitude, v)).collect();
+        return Ok((body, VelocitySource::World));
+    }
+    let rim = log.wheel_speed.as_ref().map(|w| w[0].iter().sum::<f64>() / WHEELS as f64 * vehicle.wheel_radius_m);
+    let forward = rim.unwrap_or(log.command[0][0]);
+    let estimate = from_positions(&log.time_s, &log.position, &log.attitude, [forward, 0.0, 0.0]);
+    Ok((estimate, VelocitySource::Positions))
+}
+
+/// Body angular velocity, axis by axis: measured, else estimated from attitudes.
+fn angular_velocity(
+    channels: &Channels,
+    rows: &[usize],
+    vehicle: &Vehicle,
+    log: &Log,
+) -> Result<(Vec<[f64; 3]>, [bool; 3]), TrajectoryError> {
+    let yaw_rate = if vehicle.second == SecondCommand::YawRateRadS { log.command[0][1] } else { 0.0 };
+    let mut rates = from_attitudes(&log.time_s, &log.attitude, [0.0, 0.0, yaw_rate]);
+    let mut measured = [false; 3];
+    for (axis, column) in channels.angular_velocity.iter().enumerate() {
+        let Some(column) = column.as_ref().filter(|c| !c.is_absent(rows)) else { continue };
+        measured[axis] = true;
+        for (rate, value) in rates.iter_mut().zip(column.finite(rows)?) {
+            rate[axis] = value;
+        }
+    }
+    Ok((rates, measured))
+}

@@ -1,0 +1,154 @@
+//! From the clock of the log to the step of the model.
+
+use nesam_physics::wrap_angle;
+
+/// Longest gap between samples that is bridged, s, unless five source steps are longer (chosen: beyond it the motion is unknown).
+const GAP_LIMIT_S: f64 = 0.5;
+
+/// Where each sample of the model lies among the samples of the log: share `1 - share` of `at`, `share` of the next one.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Place {
+    pub(crate) at: usize,
+    pub(crate) share: f64,
+}
+
+/// The resampling of one drive.
+#[derive(Clone, Debug, PartialEq)]
+pub(crate) struct Grid {
+    pub(crate) time_s: Vec<f64>,
+    places: Vec<Place>,
+}
+
+impl Grid {
+    /// Plans the resampling of ascending time stamps to a step; a gap that is too long gives its index and an explanation.
+    ///
+    /// Where the source step divides the step (20 Hz to 10 Hz) samples are picked and nothing is interpolated.
+    pub(crate) fn new(time_s: &[f64], dt_s: f64) -> Result<Self, (usize, String)> {
+        let Some((&first, &last)) = time_s.first().zip(time_s.last()) else {
+            return Ok(Self { time_s: Vec::new(), places: Vec::new() });
+        };
+        let steps: Vec<f64> = time_s.windows(2).map(|w| w[1] - w[0]).collect();
+        let mut sorted = steps.clone();
+        sorted.sort_by(f64::total_cmp);
+        let median_s = sorted.get(sorted.len() / 2).copied().unwrap_or(dt_s);
+        if let Some(picked) = pick(time_s, dt_s, median_s) {
+            return Ok(picked);
+        }
+        let limit_s = GAP_LIMIT_S.max(5.0 * median_s);
+        if let Some(gap) = steps.iter().position(|step| *step > limit_s) {
+            let reason = format!("a gap of {:.3} s follows, at most {limit_s:.3} s are bridged; split the drive there", steps[gap]);
+            return Err((gap, reason));
+        }
+        let count = ((last - first) / dt_s + 1e-6).floor() as usize + 1;
+        let grid: Vec<f64> = (0..count).map(|k| first + k as f64 * dt_s).collect();
+        let mut at = 0;
+        let places = grid
+            .iter()
+            .map(|t| {
+                while at + 2 < time_s.len() && time_s[at + 1] <= *t {
+                    at += 1;
+                }
+                if at + 1 >= time_s.len() {
+                    return Place { at, share: 0.0 };
+                }
+                Place { at, share: ((t - time_s[at]) / (time_s[at + 1] - time_s[at])).clamp(0.0, 1.0) }
+            })
+            .collect();
+        Ok(Self { time_s: grid, places })
+    }
+
+    /// Linear interpolation of N channels.
+    pub(crate) fn linear<const N: usize>(&self, values: &[[f64; N]]) -> Vec<[f64; N]> {
+        self.blend(values, |a, b, share| a + share * (b - a))
+    }
+
+    /// Interpolation of angles along the shorter way; results are wrapped into (-pi, pi].
+    pub(crate) fn angles<const N: usize>(&self, values: &[[f64; N]]) -> Vec<[f64; N]> {
+        self.blend(values, |a, b, share| wrap_angle(a + share * wrap_angle(b - a)))
+    }
+
+    /// The value of the last sample at or before each time (zero-order hold).
+    pub(crate) fn held<T: Copy>(&self, values: &[T]) -> Vec<T> {
+        // A share of 1 is the sample after: time stamps and grid meet there.
+        self.places.iter().map(|p| values[p.at + usize::from(p.share > 1.0 - 1e-6)]).collect()
+    }
+
+    fn blend<const N: usize>(&self, values: &[[f64; N]], f: impl Fn(f64, f64, f64) -> f64) -> Vec<[f64; N]> {
+        let at = |p: &Place| {
+            if p.share == 0.0 {
+                return values[p.at];
+            }
+            let (a, b) = (values[p.at], values[p.at + 1]);
+            core::array::from_fn(|i| f(a[i], b[i], p.share))
+        };
+        self.places.iter().map(at).collect()
+    }
+}
+
+/// Every r-th sample, when the log is uniform and its step divides `dt_s`.
+fn pick(time_s: &[f64], dt_s: f64, median_s: f64) -> Option<Grid> {
+    let ratio = (dt_s / median_s).round();
+    if ratio < 1.0 {
+        return None;
+    }
+    let step = dt_s / ratio;
+    // A tenth of a step forgives time stamps in single precision and small jitter.
+    let uniform = time_s.iter().enumerate().all(|(k, t)| (t - time_s[0] - k as f64 * step).abs() <= 0.1 * step);
+    if !uniform {
+        return None;
+    }
+    let places: Vec<Place> = (0..time_s.len()).step_by(ratio as usize).map(|at| Place { at, share: 0.0 }).collect();
+    let time_s = (0..places.len()).map(|k| time_s[0] + k as f64 * dt_s).collect();
+    Some(Grid { time_s, places })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn clock(n: usize, step: f64) -> Vec<f64> {
+        (0..n).map(|k| k as f64 * step).collect()
+    }
+
+    #[test]
+    fn analytic_dividing_step_picks_samples() {
+        let grid = Grid::new(&clock(40, 0.05), 0.1).unwrap();
+        assert_eq!(grid.time_s.len(), 20);
+        assert!((grid.time_s[19] - 1.9).abs() < 1e-12);
+        let values: Vec<[f64; 1]> = (0..40).map(|k| [f64::from(k)]).collect();
+        assert_eq!(grid.linear(&values)[19], [38.0]);
+        assert_eq!(grid.held(&values)[3], [6.0]);
+        let single = Grid::new(&clock(251, 0.1).iter().map(|t| f64::from(*t as f32)).collect::<Vec<_>>(), 0.1).unwrap();
+        assert_eq!(single.time_s.len(), 251, "time stamps in single precision are no jitter");
+    }
+
+    #[test]
+    fn analytic_lines_and_angles_survive_interpolation() {
+        // 15 Hz to 10 Hz: a line stays a line, a turn through pi does not jump, commands are held.
+        let time = clock(31, 1.0 / 15.0);
+        let grid = Grid::new(&time, 0.1).unwrap();
+        assert_eq!(grid.time_s.len(), 21);
+        let line: Vec<[f64; 1]> = time.iter().map(|t| [3.0 * t - 1.0]).collect();
+        for (t, v) in grid.time_s.iter().zip(grid.linear(&line)) {
+            assert!((v[0] - (3.0 * t - 1.0)).abs() < 1e-12);
+        }
+        let turn: Vec<[f64; 1]> = time.iter().map(|t| [wrap_angle(3.0 + t)]).collect();
+        for (t, v) in grid.time_s.iter().zip(grid.angles(&turn)) {
+            assert!(wrap_angle(v[0] - 3.0 - t).abs() < 1e-12 && v[0].abs() <= std::f64::consts::PI);
+        }
+        let held = grid.held(&time);
+        for (t, h) in grid.time_s.iter().zip(held) {
+            assert!(h <= t + 1e-9 && t - h < 1.0 / 15.0 + 1e-9, "{h} held at {t}");
+        }
+    }
+
+    #[test]
+    fn analytic_gaps_are_refused_and_short_logs_work() {
+        let mut time = clock(20, 0.1);
+        time.extend((0..20).map(|k| 4.0 + 0.1 * f64::from(k)));
+        assert_eq!(Grid::new(&time, 0.1).unwrap_err().0, 19);
+        assert_eq!(Grid::new(&[], 0.1).unwrap().time_s.len(), 0);
+        assert_eq!(Grid::new(&[7.0], 0.1).unwrap().time_s, [7.0]);
+        assert_eq!(Grid::new(&[0.0, 0.5], 0.1).unwrap().time_s.len(), 6);
+    }
+}

@@ -1,0 +1,230 @@
+//! A Parquet file as named columns of numbers and texts.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use bytes::Bytes;
+use parquet::basic::LogicalType;
+use parquet::column::reader::{ColumnReader, ColumnReaderImpl};
+use parquet::data_type::DataType;
+use parquet::file::reader::{FileReader, SerializedFileReader};
+use sha2::{Digest, Sha256};
+
+use crate::error::TrajectoryError;
+
+/// An opened Parquet file.
+pub(crate) struct Table {
+    path: PathBuf,
+    reader: SerializedFileReader<Bytes>,
+    rows: usize,
+    hash: String,
+}
+
+/// A numeric column over all row groups; `None` = null.
+pub(crate) struct Numbers {
+    path: PathBuf,
+    name: String,
+    values: Vec<f64>,
+    /// True where null; empty when nothing is.
+    null: Vec<bool>,
+}
+
+/// A text column; `None` = null. Equal neighbours share one allocation.
+pub(crate) type Texts = Vec<Option<Arc<str>>>;
+
+impl Table {
+    /// Reads the file whole (it is also hashed) and parses its footer.
+    pub(crate) fn open(path: &Path) -> Result<Self, TrajectoryError> {
+        let content = std::fs::read(path).map_err(|source| TrajectoryError::Read { path: path.into(), source })?;
+        let hash = Sha256::digest(&content).iter().map(|byte| format!("{byte:02x}")).collect();
+        let bad = |reason| TrajectoryError::Parquet { path: path.into(), reason };
+        let reader = guarded(|| SerializedFileReader::new(Bytes::from(content))).map_err(bad)?;
+        let rows = reader.metadata().row_groups().iter().map(|g| g.num_rows()).sum::<i64>();
+        let stated = reader.metadata().file_metadata().num_rows();
+        // More rows than bytes can only come from a damaged footer (the columns here do not compress that far).
+        let rows = usize::try_from(rows).ok().filter(|_| rows == stated && rows < i64::from(u32::MAX));
+        let rows = rows.ok_or_else(|| bad(format!("the footer gives inconsistent row counts ({stated})")))?;
+        Ok(Self { path: path.into(), reader, rows, hash })
+    }
+
+    pub(crate) fn path(&self) -> &Path {
+        &self.path
+    }
+
+    pub(crate) fn rows(&self) -> usize {
+        self.rows
+    }
+
+    /// SHA-256 of the file, hex.
+    pub(crate) fn hash(&self) -> &str {
+        &self.hash
+    }
+
+    pub(crate) fn has(&self, name: &str) -> bool {
+        self.position(name).is_some()
+    }
+
+    fn position(&self, name: &str) -> Option<usize> {
+        let schema = self.reader.metadata().file_metadata().schema_descr();
+        (0..schema.num_columns()).find(|i| schema.column(*i).path().string() == name)
+    }
+
+    fn required(&self, name: &str) -> Result<usize, TrajectoryError> {
+        self.position(name).ok_or_else(|| TrajectoryError::column(&self.path, name, "missing"))
+    }
+
+    /// A column of floats or integers, as f64.
+    pub(crate) fn numbers(&self, name: &str) -> Result<Numbers, TrajectoryError> {
+        let column = self.required(name)?;
+        let descriptor = self.reader.metadata().file_metadata().schema_descr().column(column);
+        let scaled = descriptor.logical_type_ref().is_some_and(|logical| {
+            matches!(logical, LogicalType::Decimal { .. } | LogicalType::Timestamp { .. } | LogicalType::Time { .. })
+        });
+        if scaled {
+            return Err(TrajectoryError::column(&self.path, name, "expected plain numbers, found decimal or time stamps"));
+        }
+        let (mut values, mut null) = (Vec::with_capacity(self.rows), Vec::new());
+        self.each_group(column, name, |reader, max_level, rows| {
+            let before = values.len();
+            let levels = match reader {
+                ColumnReader::FloatColumnReader(r) => append(r, max_level, rows, &mut values, |v| f64::from(*v), f64::NAN),
+                ColumnReader::DoubleColumnReader(r) => append(r, max_level, rows, &mut values, |v| *v, f64::NAN),
+                ColumnReader::Int32ColumnReader(r) => append(r, max_level, rows, &mut values, |v| f64::from(*v), f64::NAN),
+                ColumnReader::Int64ColumnReader(r) => append(r, max_level, rows, &mut values, |v| *v as f64, f64::NAN),
+                _ => Err("expected numbers, found another type".into()),
+            }?;
+            if let Some(levels) = levels {
+                null.resize(before, false);
+                null.extend(levels);
+            }
+            Ok(())
+        })?;
+        Ok(Numbers { path: self.path.clone(), name: name.into(), values, null })
+    }
+
+    /// A column of texts (plain or dictionary); a column of only nulls may have any type.
+    pub(crate) fn texts(&self, name: &str) -> Result<Texts, TrajectoryError> {
+        let column = self.required(name)?;
+        let mut texts: Texts = Vec::with_capacity(self.rows);
+        self.each_group(column, name, |reader, max_level, rows| {
+            let ColumnReader::ByteArrayColumnReader(reader) = reader else {
+                let group_is_null = self.is_all_null(column);
+                texts.resize(texts.len() + rows, None);
+                return if group_is_null { Ok(()) } else { Err("expected text, found another type".into()) };
+            };
+            let mut raw = Vec::with_capacity(rows);
+            append(reader, max_level, rows, &mut raw, |v| Some(v.clone()), None)?;
+            for value in raw {
+                let Some(value) = value else {
+                    texts.push(None);
+                    continue;
+                };
+                let text = std::str::from_utf8(value.data()).map_err(|_| format!("row {}: not utf-8", texts.len()))?;
+                match texts.last() {
+                    Some(Some(last)) if **last == *text => texts.push(Some(Arc::clone(last))),
+                    _ => texts.push(Some(text.into())),
+                }
+            }
+            Ok(())
+        })?;
+        Ok(texts)
+    }
+
+    /// Whether the statistics of every row group say that the column holds nothing but nulls.
+    fn is_all_null(&self, column: usize) -> bool {
+        self.reader.metadata().row_groups().iter().all(|group| {
+            let nulls = group.column(column).statistics().and_then(|s| s.null_count_opt());
+            nulls == u64::try_from(group.num_rows()).ok()
+        })
+    }
+
+    /// Calls `read` with the column reader of each row group; failures name the column and the rows of the group.
+    fn each_group(
+        &self,
+        column: usize,
+        name: &str,
+        mut read: impl FnMut(ColumnReader, i16, usize) -> Result<(), String>,
+    ) -> Result<(), TrajectoryError> {
+        let descriptor = self.reader.metadata().file_metadata().schema_descr().column(column);
+        if descriptor.max_rep_level() > 0 {
+            return Err(TrajectoryError::column(&self.path, name, "lists are not supported"));
+        }
+        let mut first = 0;
+        for group in 0..self.reader.num_row_groups() {
+            let rows = self.reader.metadata().row_group(group).num_rows() as usize;
+            let outcome = guarded(|| {
+                let reader = self.reader.get_row_group(group).and_then(|g| g.get_column_reader(column));
+                read(reader.map_err(|error| error.to_string())?, descriptor.max_def_level(), rows)
+            });
+            outcome.map_err(|reason| {
+                let reason = format!("{reason} (rows {first}..{})", first + rows);
+                TrajectoryError::column(&self.path, name, reason)
+            })?;
+            first += rows;
+        }
+        Ok(())
+    }
+}
+
+impl Numbers {
+    /// The values of some rows; a null, NaN or infinity is an error that names its row.
+    pub(crate) fn finite(&self, rows: &[usize]) -> Result<Vec<f64>, TrajectoryError> {
+        rows.iter().map(|row| self.finite_at(*row)).collect()
+    }
+
+    fn finite_at(&self, row: usize) -> Result<f64, TrajectoryError> {
+        let wrong = |reason: String| Err(TrajectoryError::cell(&self.path, &self.name, row, reason));
+        if self.null.get(row) == Some(&true) {
+            return wrong("null, expected a number".into());
+        }
+        let value = self.values[row];
+        if value.is_finite() { Ok(value) } else { wrong(format!("{value}, expected a finite number")) }
+    }
+
+    /// Whether all of some rows are null: the channel was not recorded there.
+    pub(crate) fn is_absent(&self, rows: &[usize]) -> bool {
+        rows.iter().all(|row| self.null.get(*row) == Some(&true))
+    }
+}
+
+/// Appends one row group, nulls as `missing`; gives the null mask where there is a null.
+fn append<T: DataType, V: Clone>(
+    mut reader: ColumnReaderImpl<T>,
+    max_level: i16,
+    rows: usize,
+    out: &mut Vec<V>,
+    convert: impl Fn(&T::T) -> V,
+    missing: V,
+) -> Result<Option<Vec<bool>>, String> {
+    let (mut values, mut levels) = (Vec::new(), Vec::new());
+    let mut done = 0;
+    while done < rows {
+        let (records, _, _) = reader
+            .read_records(rows - done, (max_level > 0).then_some(&mut levels), None, &mut values)
+            .map_err(|error| error.to_string())?;
+        if records == 0 {
+            return Err(format!("ends after {done} of {rows} rows"));
+        }
+        done += records;
+    }
+    if max_level == 0 || values.len() == rows {
+        out.extend(values.iter().map(convert));
+        return if values.len() == rows { Ok(None) } else { Err(format!("{} values for {rows} rows", values.len())) };
+    }
+    let null: Vec<bool> = levels.iter().map(|level| *level < max_level).collect();
+    if null.len() != rows || null.iter().filter(|n| !**n).count() != values.len() {
+        return Err("levels and values disagree".into());
+    }
+    let mut present = values.iter().map(convert);
+    out.extend(null.iter().map(|n| if *n { missing.clone() } else { present.next().unwrap_or(missing.clone()) }));
+    Ok(Some(null))
+}
+
+/// Runs a step of the Parquet decoder. The decoder can panic on damaged bytes; that is turned into the error that it is.
+fn guarded<R, E: ToString>(step: impl FnOnce() -> Result<R, E>) -> Result<R, String> {
+    match catch_unwind(AssertUnwindSafe(step)) {
+        Ok(outcome) => outcome.map_err(|error| error.to_string()),
+        Err(_) => Err("damaged (the decoder gave up)".into()),
+    }
+}

@@ -1,0 +1,85 @@
+//! One recorded drive at the step of the model.
+
+use nesam_physics::{Control, VehicleState, WHEELS};
+
+use crate::ground_truth::GroundTruth;
+
+/// Part of a set that a drive belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Split {
+    /// For training (and validation cut from it).
+    Train,
+    /// For scoring only.
+    Test,
+}
+
+impl Split {
+    /// `train` or `test`.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Test => "test",
+        }
+    }
+}
+
+/// Where the linear velocity comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum VelocitySource {
+    /// Measured in Body (`vbx`, `vby`, `vbz`).
+    Body,
+    /// Measured in World (`vx`, `vy`, `vz`), rotated with the measured attitude.
+    World,
+    /// Not measured: smoothed backward differences of the measured position, which use the past only.
+    Positions,
+}
+
+/// Which channels of the states are measurements; the others are causal estimates.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MeasuredChannels {
+    /// Horizontal position.
+    pub position: bool,
+    /// Height.
+    pub height: bool,
+    /// Roll, pitch and yaw.
+    pub attitude: bool,
+    /// Linear velocity; false = estimated from positions.
+    pub linear_velocity: bool,
+    /// Where the linear velocity comes from.
+    pub velocity_source: VelocitySource,
+    /// Angular velocity about Body x, y, z; false = estimated from attitudes.
+    pub angular_velocity: [bool; 3],
+    /// Wheel speeds.
+    pub wheel_speed: bool,
+    /// Road-wheel angles.
+    pub road_wheel_angle: bool,
+}
+
+/// A recorded drive, resampled to a fixed step; all vectors have one entry per sample.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Trajectory {
+    /// Trajectory id.
+    pub id: String,
+    /// Set, as it was asked for.
+    pub set: String,
+    /// World of the drive; `None` where the index names none or the root has no maps.
+    pub world: Option<String>,
+    /// Split; `None` where there is no index.
+    pub split: Option<Split>,
+    /// Step between samples, s.
+    pub dt_s: f64,
+    /// Time of each sample, s.
+    pub time_s: Vec<f64>,
+    /// Measured states, noise included; see `measured` for what is estimated.
+    pub states: Vec<VehicleState<f64>>,
+    /// Commands, each valid from its sample to the next.
+    pub controls: Vec<Control<f64>>,
+    /// Measured wheel speeds FL, FR, RL, RR, rad/s; a skid-steer vehicle repeats left and right.
+    pub wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,
+    /// Measured road-wheel angles of the front wheels (left, right), rad.
+    pub road_wheel_angle_rad: Option<Vec<[f64; 2]>>,
+    /// What is measured.
+    pub measured: MeasuredChannels,
+    /// Ground truth, only where it was asked for.
+    pub truth: Option<GroundTruth>,
+}
