@@ -1,0 +1,110 @@
+//! Runs the models over the windows and turns the errors into scores.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use nesam_terrain::WorldMap;
+use rayon::prelude::*;
+
+use crate::bootstrap::{Resamples, median};
+use crate::dimension::POSE_DIM;
+use crate::error::EvaluationError;
+use crate::errors::{PosePath, WindowErrors, path_length_m};
+use crate::models::ModelName;
+use crate::predictors::WindowPredictor;
+use crate::score::{ErrorSummary, summarise};
+use crate::windows::{Truth, Window};
+
+/// What one model predicted for every window, in window order.
+#[derive(Clone, Debug)]
+pub struct ModelPaths {
+    /// The model.
+    pub name: ModelName,
+    /// Learned or fitted parameters.
+    pub parameters: usize,
+    /// One path per window.
+    pub paths: Vec<PosePath>,
+}
+
+/// Mean error after each step with its interval: the curve over the horizon.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct HorizonCurve {
+    /// Mean over windows at steps 1…K.
+    pub mean: Vec<f64>,
+    /// 95 % interval at each step; empty where there is none.
+    pub ci95: Vec<[f64; 2]>,
+}
+
+/// Score of one model.
+#[derive(Clone, Debug)]
+pub struct ModelScore {
+    /// The model.
+    pub name: ModelName,
+    /// Learned or fitted parameters.
+    pub parameters: usize,
+    /// `ERR` of the contract.
+    pub summary: ErrorSummary,
+    /// Errors behind it.
+    pub errors: WindowErrors,
+    /// x, y, z, roll, pitch, yaw, then horizontal position, over the horizon; `None` where not scored.
+    pub curves: [Option<HorizonCurve>; POSE_DIM + 1],
+}
+
+/// Map of each drive, in the order of the drives; `None` where the drive has no world.
+pub type DriveMaps = [Option<Arc<WorldMap>>];
+
+/// Runs `predictor` over every window on all cores. `progress` is called with the number of finished windows.
+///
+/// # Errors
+/// The first error of the predictor, naming drive and window.
+pub fn predict_all(
+    name: ModelName,
+    predictor: &WindowPredictor,
+    windows: &[Window<'_>],
+    maps: &DriveMaps,
+    progress: &(dyn Fn(usize) + Sync),
+) -> Result<ModelPaths, EvaluationError> {
+    let done = AtomicUsize::new(0);
+    let paths = windows
+        .par_iter()
+        .map(|window| {
+            let path = predictor.predict(window, maps[window.drive].as_ref())?;
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+            Ok(path)
+        })
+        .collect::<Result<Vec<_>, EvaluationError>>()?;
+    Ok(ModelPaths { name, parameters: predictor.parameters(), paths })
+}
+
+/// Scores predictions against the truth, all models with the same bootstrap draws.
+pub fn score(model: &ModelPaths, windows: &[Window<'_>], truth: Truth, resamples: &Resamples) -> ModelScore {
+    let horizon = windows.first().map_or(0, |w| w.horizon);
+    let mut errors = WindowErrors::empty(horizon);
+    for (window, path) in windows.iter().zip(&model.paths) {
+        errors.push(window.drive, &window.start_pose(), path, &window.truth(truth), measured_dimensions(window));
+    }
+    let curves = std::array::from_fn(|d| {
+        let scored = if d < POSE_DIM { errors.scored[d] } else { errors.scored[0] && errors.scored[1] };
+        scored.then(|| curve(&errors, d, resamples))
+    });
+    ModelScore { name: model.name, parameters: model.parameters, summary: summarise(&errors, resamples), errors, curves }
+}
+
+fn curve(errors: &WindowErrors, dimension: usize, resamples: &Resamples) -> HorizonCurve {
+    let columns: Vec<Vec<f64>> = (0..errors.horizon).map(|k| errors.column(k, dimension)).collect();
+    let mean = columns.iter().map(|c| c.iter().sum::<f64>() / c.len() as f64).collect();
+    let ci95 = columns.par_iter().filter_map(|c| resamples.mean_interval(c, &errors.trajectory)).collect();
+    HorizonCurve { mean, ci95 }
+}
+
+/// Dimensions that the drive of a window measures.
+fn measured_dimensions(window: &Window<'_>) -> [bool; POSE_DIM] {
+    let m = &window.trajectory.measured;
+    [m.position, m.position, m.height, m.attitude, m.attitude, m.attitude]
+}
+
+/// Median over windows of the true path length, m.
+pub fn path_median_m(windows: &[Window<'_>], truth: Truth) -> f64 {
+    let lengths: Vec<f64> = windows.iter().map(|w| path_length_m(&w.start_pose(), &w.truth(truth))).collect();
+    median(&lengths)
+}

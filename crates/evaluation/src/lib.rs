@@ -1,0 +1,50 @@
+//! Prediction error against measured drives: windows, baselines, intervals, reports.
+//!
+//! An evaluation asks one question: how far from the measured motion is a model after 1…K steps, when it knows only what a vehicle
+//! knew at the start of the window and the commands that follow? The steps are
+//!
+//! 1. [`all_windows`] cuts the drives into windows by the rule of the contract;
+//! 2. [`WindowPredictor`] is one of the models ([`ModelName`]): the bundle's, its ablations, or a baseline ([`Kinematic`], fitted on
+//!    training drives by [`Baselines::fit`], and [`constant_velocity`]);
+//! 3. [`predict_all`] runs a model over all windows, [`score`] compares with the [`Truth`] and gives an [`ErrorSummary`] with
+//!    intervals from a bootstrap over whole drives ([`Resamples`]);
+//! 4. [`Evaluation`] writes the JSON, [`report`] the HTML, [`write_predictions`] every predicted pose.
+//!
+//! Distances are in metres and angles in radians inside; scores of angles are in degrees, as their keys say.
+#![forbid(unsafe_code)]
+
+mod baselines;
+mod bootstrap;
+mod constant_velocity;
+mod dimension;
+mod error;
+mod errors;
+mod evaluate;
+mod kinematic;
+mod kinematic_fit;
+mod models;
+mod output;
+mod predictions;
+mod predictors;
+pub mod report;
+mod score;
+mod slices;
+#[cfg(test)]
+mod test_vehicle;
+mod windows;
+
+pub use baselines::Baselines;
+pub use bootstrap::{DEFAULT_RESAMPLES, Resamples, median, quantile_sorted};
+pub use constant_velocity::constant_velocity;
+pub use dimension::{DIMENSION_KEYS, POSE_DIM, Pose, absolute_error, horizontal_distance, pose_of};
+pub use error::EvaluationError;
+pub use errors::{PosePath, StepError, WindowErrors, path_length_m};
+pub use evaluate::{DriveMaps, HorizonCurve, ModelPaths, ModelScore, path_median_m, predict_all, score};
+pub use kinematic::{KINEMATIC_PARAMETERS, Kinematic};
+pub use models::ModelName;
+pub use output::{Evaluation, Provenance};
+pub use predictions::write_predictions;
+pub use predictors::WindowPredictor;
+pub use score::{ErrorSummary, ErrorTree, PATH_FLOOR_M, PerDimension, PositionError, paired_difference, summarise, values};
+pub use slices::{Slice, slices};
+pub use windows::{Truth, Window, all_windows};

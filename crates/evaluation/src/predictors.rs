@@ -1,0 +1,132 @@
+//! One closed set of predictors behind one call.
+
+use std::sync::Arc;
+
+use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
+use nesam_physics::{Control, SOIL_DIM, Vehicle};
+use nesam_terrain::WorldMap;
+
+use crate::constant_velocity::constant_velocity;
+use crate::dimension::{POSE_DIM, pose_of};
+use crate::error::EvaluationError;
+use crate::errors::PosePath;
+use crate::kinematic::{KINEMATIC_PARAMETERS, Kinematic};
+use crate::models::ModelName;
+use crate::windows::Window;
+
+/// A model that is ready to predict windows.
+#[derive(Clone, Debug)]
+pub enum WindowPredictor {
+    /// The bundle's model or one of its ablations.
+    Nesam {
+        /// Loaded bundle.
+        predictor: Arc<Predictor>,
+        /// Ablation.
+        variant: Variant,
+    },
+    /// The kinematic baseline with its fit.
+    Kinematic {
+        /// Fitted parameters.
+        model: Kinematic,
+        /// Geometry.
+        vehicle: Arc<Vehicle>,
+    },
+    /// The measured twist goes on.
+    ConstantVelocity,
+}
+
+impl WindowPredictor {
+    /// The predictor behind a name.
+    ///
+    /// # Errors
+    /// `EvaluationError::KinematicNotFitted` when the kinematic baseline is asked for without a fit; `NoBundle` when
+    /// the model needs a bundle and none was given.
+    pub fn new(
+        name: ModelName,
+        predictor: Option<&Arc<Predictor>>,
+        vehicle: &Arc<Vehicle>,
+        kinematic: Option<Kinematic>,
+    ) -> Result<Self, EvaluationError> {
+        let nesam = |variant| match predictor {
+            Some(predictor) => Ok(Self::Nesam { predictor: Arc::clone(predictor), variant }),
+            None => Err(EvaluationError::NoBundle { name: name.as_str() }),
+        };
+        Ok(match name {
+            ModelName::Nesam => nesam(Variant::Full)?,
+            ModelName::NesamNoResidual => nesam(Variant::NoResidual)?,
+            ModelName::NesamZeroSinkage => nesam(Variant::ZeroSinkage)?,
+            ModelName::ConstantVelocity => Self::ConstantVelocity,
+            ModelName::Kinematic => {
+                let model = kinematic.ok_or_else(|| EvaluationError::KinematicNotFitted {
+                    reason: "the bundle carries no fit for this vehicle and no set of the data root has a train split; leave it out with --models".into(),
+                })?;
+                Self::Kinematic { model, vehicle: Arc::clone(vehicle) }
+            }
+        })
+    }
+
+    /// Number of fitted or learned parameters.
+    pub fn parameters(&self) -> usize {
+        match self {
+            Self::Nesam { predictor, .. } => predictor.bundle().parameters,
+            Self::Kinematic { .. } => KINEMATIC_PARAMETERS,
+            Self::ConstantVelocity => 0,
+        }
+    }
+
+    /// Predicts the poses after steps 1…K of a window from what is known at its start: measured history, map and future commands.
+    ///
+    /// # Errors
+    /// `EvaluationError::Model` naming drive and window when the model refuses the query.
+    pub fn predict(&self, window: &Window<'_>, map: Option<&Arc<WorldMap>>) -> Result<PosePath, EvaluationError> {
+        let drive = window.trajectory;
+        let start = &drive.states[window.start];
+        let future = &drive.controls[window.start..window.start + window.horizon];
+        let poses = match self {
+            Self::Nesam { predictor, variant } => {
+                return nesam(predictor, *variant, window, future, map);
+            }
+            Self::Kinematic { model, vehicle } => {
+                let past = &drive.controls[window.first_history..window.start];
+                model.predict(vehicle, start, past, future, drive.dt_s, map.map(Arc::as_ref))
+            }
+            Self::ConstantVelocity => constant_velocity(start, window.horizon, drive.dt_s),
+        };
+        Ok(PosePath { poses, predicts: [true; POSE_DIM] })
+    }
+}
+
+fn nesam(
+    predictor: &Predictor,
+    variant: Variant,
+    window: &Window<'_>,
+    future: &[Control<f64>],
+    map: Option<&Arc<WorldMap>>,
+) -> Result<PosePath, EvaluationError> {
+    let drive = window.trajectory;
+    let history = window.history();
+    let controls: Vec<f32> = future.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let query = RolloutQuery {
+        history: &history,
+        start: drive.states[window.start],
+        controls: &controls,
+        samples: 1,
+        horizon: window.horizon,
+        map,
+        soil_correction: [0.0; SOIL_DIM],
+        variant,
+    };
+    let rollout =
+        predictor.rollout(&query).map_err(|source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source })?;
+    let poses = (0..window.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
+    Ok(PosePath { poses, predicts: [true; POSE_DIM] })
+}
+
+impl Window<'_> {
+    /// Measured states and commands before the start, oldest first.
+    pub fn history(&self) -> Vec<HistoryStep> {
+        (self.first_history..self.start)
+            .map(|j| HistoryStep { state: self.trajectory.states[j], control: self.trajectory.controls[j] })
+            .collect()
+    }
+}

@@ -1,0 +1,146 @@
+//! The page: title, sections, footer, style.
+
+use std::fmt::Write;
+
+use super::line_plot::LinePlot;
+use super::table::Table;
+
+/// Replaces the characters that HTML gives a meaning to.
+pub fn escape(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
+}
+
+/// A report under construction.
+#[derive(Clone, Debug)]
+pub struct Page {
+    title: String,
+    body: String,
+    footer: Vec<(String, String)>,
+}
+
+impl Page {
+    /// A page with a title and one paragraph that says what was done and what came out.
+    pub fn new(title: &str, lead: &str) -> Self {
+        let body = format!("<p class=\"lead\">{}</p>\n", escape(lead));
+        Self { title: title.into(), body, footer: Vec::new() }
+    }
+
+    /// Starts a section.
+    pub fn section(&mut self, heading: &str) -> &mut Self {
+        let _ = writeln!(self.body, "<h2>{}</h2>", escape(heading));
+        self
+    }
+
+    /// Adds a paragraph of plain text.
+    pub fn text(&mut self, text: &str) -> &mut Self {
+        let _ = writeln!(self.body, "<p>{}</p>", escape(text));
+        self
+    }
+
+    /// Adds a table with a button that copies it as tab-separated text.
+    pub fn table(&mut self, table: &Table) -> &mut Self {
+        self.body.push_str(&table.to_html());
+        self
+    }
+
+    /// Adds plots side by side, as many per row as fit, under one legend and one caption.
+    pub fn plots(&mut self, plots: &[LinePlot], caption: &str) -> &mut Self {
+        self.body.push_str("<figure>\n");
+        if let Some(first) = plots.iter().max_by_key(|p| p.series.len()) {
+            self.body.push_str(&first.legend_html());
+        }
+        self.body.push_str("<div class=\"plots\">\n");
+        for plot in plots {
+            self.body.push_str(&plot.to_svg());
+        }
+        let _ = writeln!(self.body, "</div>\n<figcaption>{}</figcaption>\n</figure>", escape(caption));
+        self
+    }
+
+    /// Adds a line to the footer: what the page was made from.
+    pub fn footer(&mut self, name: &str, value: &str) -> &mut Self {
+        self.footer.push((name.into(), value.into()));
+        self
+    }
+
+    /// The finished HTML document.
+    pub fn render(&self) -> String {
+        let title = escape(&self.title);
+        let mut footer = String::new();
+        for (name, value) in &self.footer {
+            let _ = writeln!(footer, "<dt>{}</dt><dd><code>{}</code></dd>", escape(name), escape(value));
+        }
+        format!(
+            "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
+             <meta name=\"viewport\" content=\"width=device-width, initial-scale=1\">\n<title>{title}</title>\n\
+             <style>{STYLE}</style>\n</head>\n<body>\n<main>\n<h1>{title}</h1>\n{}\n<footer><dl>\n{footer}</dl></footer>\n\
+             </main>\n<script>{SCRIPT}</script>\n</body>\n</html>\n",
+            self.body
+        )
+    }
+}
+
+const STYLE: &str = r#"
+:root { color-scheme: light dark; --ink: #1b1f24; --paper: #ffffff; --soft: #5b6570; --line: #d8dde3; --row: #f5f7f9;
+  --c0: #1b1f24; --c1: #0072b2; --c2: #d55e00; --c3: #009e73; --c4: #cc79a7; --c5: #b07c00; --c6: #3a9bd0; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e6e9ec; --paper: #14171a; --soft: #9aa4ae; --line: #343b43; --row: #1c2126;
+  --c0: #e6e9ec; --c1: #56a8e0; --c2: #f08a3c; --c3: #2fc79a; --c4: #e3a0c8; --c5: #f0c040; --c6: #8ad0f5; } }
+* { box-sizing: border-box; }
+body { margin: 0; background: var(--paper); color: var(--ink); font: 15px/1.55 system-ui, sans-serif; }
+main { max-width: 1180px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
+h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .6rem; }
+h2 { font-size: 1.2rem; margin: 2.4rem 0 .6rem; }
+p { max-width: 75ch; } .lead { font-size: 1.08rem; color: var(--soft); }
+.scroll { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
+caption { text-align: left; color: var(--soft); padding: .3rem 0; }
+th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; }
+tbody tr:nth-child(odd) { background: var(--row); } td.best { font-weight: 700; } td small { color: var(--soft); }
+button { font: inherit; font-size: .8rem; color: var(--soft); background: none; border: 1px solid var(--line);
+  border-radius: 4px; padding: .1rem .5rem; cursor: pointer; margin: .4rem 0; }
+button:hover { color: var(--ink); }
+figure { margin: 1rem 0; } figcaption { color: var(--soft); font-size: .88rem; max-width: 95ch; }
+.plots { display: grid; grid-template-columns: repeat(auto-fill, minmax(330px, 1fr)); gap: .8rem; }
+.legend { display: flex; flex-wrap: wrap; gap: .2rem 1.2rem; font-size: .88rem; margin: .3rem 0; }
+.legend svg { width: 34px; height: 10px; vertical-align: middle; margin-right: .35rem; }
+svg.plot { width: 100%; height: auto; display: block; }
+svg.plot text { fill: var(--soft); font: 11px system-ui, sans-serif; } svg.plot text.title { fill: var(--ink); font-weight: 600; }
+svg .grid { stroke: var(--line); stroke-width: 1; } svg .frame { stroke: var(--soft); fill: none; }
+svg .hit { fill: transparent; stroke: none; } svg .hit:hover { fill: var(--ink); fill-opacity: .35; }
+.s0 { stroke: var(--c0); fill: var(--c0); } .s1 { stroke: var(--c1); fill: var(--c1); } .s2 { stroke: var(--c2); fill: var(--c2); }
+.s3 { stroke: var(--c3); fill: var(--c3); } .s4 { stroke: var(--c4); fill: var(--c4); } .s5 { stroke: var(--c5); fill: var(--c5); }
+.s6 { stroke: var(--c6); fill: var(--c6); }
+path.line { fill: none; stroke-width: 2; stroke-linejoin: round; } path.band { stroke: none; fill-opacity: .16; }
+footer { margin-top: 3rem; border-top: 1px solid var(--line); color: var(--soft); font-size: .85rem; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; } dd { margin: 0; overflow-wrap: anywhere; }
+@media print { button { display: none; } }
+"#;
+
+const SCRIPT: &str = r#"
+document.querySelectorAll('button[data-copy]').forEach(b => b.addEventListener('click', () => {
+  const rows = [...b.nextElementSibling.querySelectorAll('tr')];
+  const text = rows.map(r => [...r.cells].map(c => c.innerText.trim()).join('\t')).join('\n');
+  navigator.clipboard.writeText(text).then(() => { b.textContent = 'copied'; setTimeout(() => b.textContent = 'copy table', 1500); });
+}));
+"#;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::report::Series;
+
+    #[test]
+    fn property_page_is_self_contained_and_escapes_text() {
+        let mut page = Page::new("a < b", "lead & more");
+        let mut plot = LinePlot::new("error", "t [s]", "m");
+        plot.series.push(Series::line("<model>", 1, vec![(0.0, 0.0), (1.0, 2.0)]));
+        page.section("one").plots(&[plot], "caption").footer("command", "nesam evaluate --set \"x\"");
+        let html = page.render();
+        assert!(html.contains("a &lt; b") && html.contains("&lt;model&gt;") && html.contains("--set &quot;x&quot;"));
+        for outside in ["http://", "https://", "src=", "@import", "url("] {
+            assert!(!html.contains(outside), "the page must not load `{outside}`");
+        }
+        assert_eq!(html.matches("<svg").count(), html.matches("</svg>").count());
+    }
+}

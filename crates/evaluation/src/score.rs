@@ -1,0 +1,219 @@
+//! The `ERR` block of the JSON contract: mean absolute errors with intervals.
+
+use serde::{Deserialize, Serialize};
+
+use crate::bootstrap::{Resamples, median};
+use crate::dimension::POSE_DIM;
+use crate::errors::WindowErrors;
+
+/// One value per scored dimension; `None` (JSON `null`) where the model predicts none or the set measures none.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct PerDimension<T> {
+    /// x, m.
+    pub x_m: Option<T>,
+    /// y, m.
+    pub y_m: Option<T>,
+    /// z, m.
+    pub z_m: Option<T>,
+    /// Roll, degrees.
+    pub roll_deg: Option<T>,
+    /// Pitch, degrees.
+    pub pitch_deg: Option<T>,
+    /// Yaw, degrees.
+    pub yaw_deg: Option<T>,
+}
+
+impl<T: Copy> PerDimension<T> {
+    /// From an array in the order of `DIMENSION_KEYS`.
+    pub fn from_array(v: [Option<T>; POSE_DIM]) -> Self {
+        Self { x_m: v[0], y_m: v[1], z_m: v[2], roll_deg: v[3], pitch_deg: v[4], yaw_deg: v[5] }
+    }
+
+    /// As an array in the order of `DIMENSION_KEYS`.
+    pub fn to_array(&self) -> [Option<T>; POSE_DIM] {
+        [self.x_m, self.y_m, self.z_m, self.roll_deg, self.pitch_deg, self.yaw_deg]
+    }
+}
+
+/// Horizontal position error.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct PositionError<T> {
+    /// Mean over steps 1…K, m.
+    pub mean: Option<T>,
+    /// At step K, m.
+    #[serde(rename = "final")]
+    pub final_: Option<T>,
+    /// Median over windows of (error at step K) / (path driven in the window), -. Windows shorter than [`PATH_FLOOR_M`] are left out.
+    pub final_over_path_median: Option<T>,
+}
+
+/// Path below which the relative error of a window says nothing, m (chosen: several times the position noise).
+pub const PATH_FLOOR_M: f64 = 0.2;
+
+/// The tree of numbers that `ERR` carries once as values and once as intervals.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ErrorTree<T> {
+    /// Mean absolute error over windows and steps 1…K.
+    pub mae_mean: PerDimension<T>,
+    /// Mean absolute error over windows at step K.
+    pub mae_final: PerDimension<T>,
+    /// Horizontal position.
+    pub position_m: PositionError<T>,
+}
+
+/// `ERR` of the JSON contract.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+pub struct ErrorSummary {
+    /// Values.
+    #[serde(flatten)]
+    pub tree: ErrorTree<f64>,
+    /// 95 % intervals of the values by bootstrap over drives; `null` with fewer than two drives.
+    pub ci95: ErrorTree<[f64; 2]>,
+    /// Number of windows behind the values.
+    pub windows: usize,
+}
+
+const STATISTICS: usize = 2 * POSE_DIM + 3;
+const RATIO: usize = STATISTICS - 1;
+
+/// One row per statistic, one column per window.
+struct Columns {
+    values: Vec<Vec<f64>>,
+    present: [bool; STATISTICS],
+}
+
+fn columns(errors: &WindowErrors) -> Columns {
+    let k = errors.horizon as f64;
+    let mut values = vec![Vec::with_capacity(errors.windows()); STATISTICS];
+    for w in 0..errors.windows() {
+        let steps = errors.window(w);
+        for d in 0..POSE_DIM {
+            values[d].push(steps.iter().map(|s| s.absolute[d]).sum::<f64>() / k);
+            values[POSE_DIM + d].push(steps[steps.len() - 1].absolute[d]);
+        }
+        let last = steps[steps.len() - 1].position_m;
+        values[2 * POSE_DIM].push(steps.iter().map(|s| s.position_m).sum::<f64>() / k);
+        values[2 * POSE_DIM + 1].push(last);
+        let path = errors.path_m[w];
+        values[RATIO].push(if path > PATH_FLOOR_M { last / path } else { f64::NAN });
+    }
+    let d = errors.scored;
+    let horizontal = d[0] && d[1];
+    let present = std::array::from_fn(|s| if s < 2 * POSE_DIM { d[s % POSE_DIM] } else { horizontal });
+    Columns { values, present }
+}
+
+fn tree<T: Copy>(v: [Option<T>; STATISTICS]) -> ErrorTree<T> {
+    let six = |from: usize| PerDimension::from_array(std::array::from_fn(|d| v[from + d]));
+    ErrorTree {
+        mae_mean: six(0),
+        mae_final: six(POSE_DIM),
+        position_m: PositionError { mean: v[2 * POSE_DIM], final_: v[2 * POSE_DIM + 1], final_over_path_median: v[RATIO] },
+    }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len() as f64
+}
+
+fn finite(v: f64) -> Option<f64> {
+    v.is_finite().then_some(v)
+}
+
+/// The values of the tree over all windows, without intervals.
+pub fn values(errors: &WindowErrors) -> ErrorTree<f64> {
+    let c = columns(errors);
+    tree(std::array::from_fn(|s| {
+        let value = if s == RATIO { median(&c.values[s]) } else { mean(&c.values[s]) };
+        if c.present[s] { finite(value) } else { None }
+    }))
+}
+
+/// The values with their intervals. `cluster` of `errors` must index the drives of `resamples`.
+pub fn summarise(errors: &WindowErrors, resamples: &Resamples) -> ErrorSummary {
+    let c = columns(errors);
+    let ci95 = tree(std::array::from_fn(|s| {
+        let rows = &c.values[s];
+        let interval = |r: &[f64]| {
+            if s == RATIO { resamples.median_interval(r, &errors.trajectory) } else { resamples.mean_interval(r, &errors.trajectory) }
+        };
+        if c.present[s] { interval(rows) } else { None }
+    }));
+    ErrorSummary { tree: values(errors), ci95, windows: errors.windows() }
+}
+
+/// Paired difference `a - b` of the mean statistics with 95 % intervals: negative = `a` is better. The ratio is left out (`null`).
+pub fn paired_difference(a: &WindowErrors, b: &WindowErrors, resamples: &Resamples) -> (ErrorTree<f64>, ErrorTree<[f64; 2]>) {
+    let (ca, cb) = (columns(a), columns(b));
+    let rows: Vec<Vec<f64>> = (0..STATISTICS).map(|s| ca.values[s].iter().zip(&cb.values[s]).map(|(x, y)| x - y).collect()).collect();
+    let present = |s: usize| s != RATIO && ca.present[s] && cb.present[s];
+    let difference = tree(std::array::from_fn(|s| if present(s) { finite(mean(&rows[s])) } else { None }));
+    let interval = tree(std::array::from_fn(|s| if present(s) { resamples.mean_interval(&rows[s], &a.trajectory) } else { None }));
+    (difference, interval)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::errors::StepError;
+
+    fn two_windows() -> WindowErrors {
+        let step = |x: f64, yaw: f64| StepError { absolute: [x, 0.0, 1.0, 0.0, 0.0, yaw], position_m: x };
+        WindowErrors {
+            horizon: 2,
+            scored: [true, true, false, true, true, true],
+            trajectory: vec![0, 1],
+            path_m: vec![4.0, 10.0],
+            steps: vec![step(1.0, 2.0), step(3.0, 4.0), step(0.0, 0.0), step(1.0, 6.0)],
+            not_finite: 0,
+        }
+    }
+
+    #[test]
+    fn analytic_values_by_hand() {
+        let t = values(&two_windows());
+        assert_eq!(t.mae_mean.x_m, Some(1.25));
+        assert_eq!(t.mae_final.x_m, Some(2.0));
+        assert_eq!(t.mae_mean.yaw_deg, Some(3.0));
+        assert_eq!(t.mae_final.yaw_deg, Some(5.0));
+        assert_eq!(t.mae_mean.z_m, None, "a dimension that is not scored is null");
+        assert_eq!(t.position_m.mean, Some(1.25));
+        assert_eq!(t.position_m.final_, Some(2.0));
+        let ratio = t.position_m.final_over_path_median.unwrap();
+        assert!((ratio - 0.5 * (0.75 + 0.1)).abs() < 1e-12, "{ratio}");
+    }
+
+    #[test]
+    fn analytic_schema_has_exactly_the_keys_of_the_contract() {
+        let summary = summarise(&two_windows(), &Resamples::draw(2, 1000, 1));
+        let json = serde_json::to_value(&summary).unwrap();
+        let keys = |v: &serde_json::Value| v.as_object().unwrap().keys().cloned().collect::<Vec<_>>();
+        let mut top = keys(&json);
+        top.sort();
+        assert_eq!(top, ["ci95", "mae_final", "mae_mean", "position_m", "windows"]);
+        for tree in [&json, &json["ci95"]] {
+            for mae in ["mae_mean", "mae_final"] {
+                let mut found = keys(&tree[mae]);
+                found.sort();
+                let mut wanted = crate::DIMENSION_KEYS.map(String::from).to_vec();
+                wanted.sort();
+                assert_eq!(found, wanted);
+            }
+            let mut found = keys(&tree["position_m"]);
+            found.sort();
+            assert_eq!(found, ["final", "final_over_path_median", "mean"]);
+        }
+        assert!(json["mae_mean"]["z_m"].is_null() && json["ci95"]["mae_mean"]["z_m"].is_null());
+        assert_eq!(json["ci95"]["mae_mean"]["x_m"].as_array().unwrap().len(), 2);
+        assert_eq!(serde_json::from_value::<ErrorSummary>(json).unwrap(), summary);
+    }
+
+    #[test]
+    fn analytic_a_model_against_itself_differs_by_zero() {
+        let e = two_windows();
+        let (difference, interval) = paired_difference(&e, &e, &Resamples::draw(2, 1000, 1));
+        assert_eq!(difference.mae_mean.x_m, Some(0.0));
+        assert_eq!(interval.position_m.final_, Some([0.0, 0.0]));
+        assert_eq!(difference.mae_mean.z_m, None);
+    }
+}

@@ -1,0 +1,162 @@
+//! Goal: the errors in the JSON are those that anybody computes from the predictions file. Method: a synthetic drive on a circle with a
+//! slow change of speed, predicted by constant velocity; the Parquet file is read back with another reader and the mean errors are
+//! recomputed from it and from the drive alone.
+
+use std::fs::File;
+use std::sync::Arc;
+
+use nesam_evaluation::{
+    Evaluation, ModelName, Provenance, Resamples, Truth, WindowPredictor, all_windows, path_median_m, predict_all, report, score, slices,
+    write_predictions,
+};
+use nesam_physics::{Control, VehicleState};
+use nesam_trajectories::{MeasuredChannels, Trajectory, VelocitySource};
+use parquet::file::reader::{FileReader, SerializedFileReader};
+use parquet::record::RowAccessor;
+
+fn drive(id: &str, samples: usize, radius_m: f64) -> Trajectory {
+    let mut yaw = 3.0_f64;
+    let (mut x, mut y) = (1.0, -2.0);
+    let states = (0..samples)
+        .map(|i| {
+            let speed = 2.0 + (0.05 * i as f64).sin();
+            let mut s = VehicleState::zero();
+            s.position_m = [x, y, 0.01 * i as f64];
+            s.attitude_rad[2] = nesam_physics::wrap_angle(yaw);
+            s.velocity_m_s[0] = speed;
+            s.angular_velocity_rad_s[2] = speed / radius_m;
+            x += 0.1 * speed * yaw.cos();
+            y += 0.1 * speed * yaw.sin();
+            yaw += 0.1 * speed / radius_m;
+            s
+        })
+        .collect();
+    Trajectory {
+        id: id.into(),
+        set: "synthetic".into(),
+        world: None,
+        split: None,
+        dt_s: 0.1,
+        time_s: (0..samples).map(|i| 0.1 * i as f64).collect(),
+        states,
+        controls: vec![Control { speed_m_s: 2.0, second: 0.0 }; samples],
+        wheel_speed_rad_s: None,
+        road_wheel_angle_rad: None,
+        measured: MeasuredChannels {
+            position: true,
+            height: true,
+            attitude: true,
+            linear_velocity: true,
+            velocity_source: VelocitySource::Body,
+            angular_velocity: [true; 3],
+            wheel_speed: false,
+            road_wheel_angle: false,
+        },
+        truth: None,
+    }
+}
+
+#[test]
+fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() {
+    let drives = [drive("a", 120, 9.0), drive("b", 90, -15.0), drive("c", 100, 30.0)];
+    let windows = all_windows(&drives, 32, 32, Truth::Measured).unwrap();
+    assert_eq!(windows.len(), 7 + 4 + 5);
+    let paths =
+        vec![predict_all(ModelName::ConstantVelocity, &WindowPredictor::ConstantVelocity, &windows, &[None, None, None], &|_| {}).unwrap()];
+    let resamples = Resamples::draw(3, 1000, 5);
+    let scores = vec![score(&paths[0], &windows, Truth::Measured, &resamples)];
+    let evaluation = Evaluation {
+        set: "synthetic",
+        split: "all",
+        horizon_steps: 32,
+        history_steps: 32,
+        dt_s: 0.1,
+        windows: windows.len(),
+        trajectories: drives.len(),
+        path_m_median: path_median_m(&windows, Truth::Measured),
+        truth: Truth::Measured,
+        inputs: "commands",
+        seed: 5,
+        resamples: &resamples,
+        models: &scores,
+        slices: &slices(&windows, &Default::default()),
+        provenance: &Provenance::default(),
+    };
+    let json: serde_json::Value = serde_json::from_str(&evaluation.to_json()).unwrap();
+    assert_eq!(json["schema"], "nesam.evaluate/1");
+    for key in ["set", "split", "horizon_steps", "dt_s", "windows", "path_m_median", "models"] {
+        assert!(!json[key].is_null(), "key `{key}` of the contract");
+    }
+    let model = &json["models"]["constant_velocity"];
+    assert_eq!(model["parameters"], 0);
+    assert_eq!(model["windows"], 16);
+
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("p.parquet");
+    write_predictions(&file, &paths, &windows).unwrap();
+    let reader = SerializedFileReader::new(File::open(&file).unwrap()).unwrap();
+    let (mut x_sum, mut yaw_final, mut rows) = (0.0, 0.0, 0usize);
+    for row in reader.get_row_iter(None).unwrap() {
+        let row = row.unwrap();
+        assert_eq!(row.get_string(0).unwrap(), "constant_velocity");
+        let truth = drives.iter().find(|d| d.id == *row.get_string(1).unwrap()).unwrap();
+        let k = usize::try_from(row.get_int(3).unwrap()).unwrap();
+        let at = (row.get_double(2).unwrap() / 0.1).round() as usize + k;
+        x_sum += (row.get_double(4).unwrap() - truth.states[at].position_m[0]).abs();
+        if k == 32 {
+            let difference = row.get_double(9).unwrap() - truth.states[at].attitude_rad[2];
+            yaw_final += difference.sin().atan2(difference.cos()).to_degrees().abs();
+        }
+        rows += 1;
+    }
+    assert_eq!(rows, 16 * 32);
+    let close = |found: f64, key: &serde_json::Value| (found - key.as_f64().unwrap()).abs() < 1e-9;
+    assert!(close(x_sum / 512.0, &model["mae_mean"]["x_m"]), "{model}");
+    assert!(close(yaw_final / 16.0, &model["mae_final"]["yaw_deg"]), "{model}");
+
+    let html = report::evaluation_page(&evaluation, &paths, &windows);
+    assert!(html.contains("constant_velocity") && html.matches("<svg class=\"plot\"").count() >= 8);
+}
+
+#[test]
+fn property_refusals_name_what_was_wrong() {
+    let drives = [drive("short", 20, 9.0)];
+    let none = all_windows(&drives, 32, 32, Truth::Measured).unwrap_err().to_string();
+    assert!(none.contains("32 steps") && none.contains("20 samples"), "{none}");
+    let gt = all_windows(&drives, 5, 1, Truth::Gt).unwrap_err().to_string();
+    assert!(gt.contains("`short`") && gt.contains("ground-truth"), "{gt}");
+    let vehicle = Arc::new(nesam_vehicle());
+    let kinematic = WindowPredictor::new(ModelName::Kinematic, None, &vehicle, None).unwrap_err().to_string();
+    assert!(kinematic.contains("never fitted"), "{kinematic}");
+    assert!("tal_sem".parse::<ModelName>().unwrap_err().to_string().contains("not part of this version"));
+    assert!("nesma".parse::<ModelName>().unwrap_err().to_string().contains("choose from nesam"));
+}
+
+fn nesam_vehicle() -> nesam_physics::Vehicle {
+    nesam_physics::Vehicle {
+        name: "any".into(),
+        mass_kg: 1.0,
+        inertia_kg_m2: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        inertia_estimated: true,
+        wheel_centre_m: [[0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, 0.5, 0.0], [-0.5, -0.5, 0.0]],
+        wheel_radius_m: 0.2,
+        wheel_width_m: 0.1,
+        suspension_n_m: [1.0; 4],
+        suspension_n_s_m: [1.0; 4],
+        second: nesam_physics::SecondCommand::YawRateRadS,
+        command_range: [[-1.0, 1.0], [-1.0, 1.0]],
+        steering: None,
+        track_m: 1.0,
+        wheelbase_m: 1.0,
+        driveline: nesam_physics::Driveline {
+            steering_lag_s: 0.0,
+            steering_rate_limit_per_s: 1.0,
+            speed_gain: 0.0,
+            speed_integral_gain_per_s: 0.0,
+            speed_integral_leak_s: 1.0,
+            speed_integral_limit_m: 1.0,
+            overspeed_limit_m_s: 1.0,
+        },
+        gravity_m_s2: 9.81,
+    }
+}
