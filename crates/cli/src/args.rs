@@ -1,0 +1,77 @@
+//! Options that several commands share.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+/// Which drives to read.
+#[derive(Args, Clone, Debug)]
+pub struct DataArgs {
+    /// Data root: a vehicle card, `worlds/` and one folder per set [default: the sample shipped with the repository]
+    #[arg(long, value_name = "ROOT")]
+    pub data: Option<PathBuf>,
+    /// Set to read, a folder of the data root; may contain slashes [default: `nominal` if there is one, else the only set]
+    #[arg(long, value_name = "NAME")]
+    pub set: Option<String>,
+    /// Rows of the set's index to use
+    #[arg(long, value_enum, default_value_t = SplitArg::All)]
+    pub split: SplitArg,
+    /// Only these drives
+    #[arg(long, value_name = "ID,…", value_delimiter = ',')]
+    pub trajectories: Option<Vec<String>>,
+    /// Vehicle card, when the data root has none of its own
+    #[arg(long, value_name = "FILE")]
+    pub vehicle: Option<PathBuf>,
+    /// Step to which drives are resampled, s
+    #[arg(long, value_name = "SECONDS", default_value_t = 0.1)]
+    pub dt: f64,
+}
+
+/// Split of a set.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum SplitArg {
+    /// Drives that training may see.
+    Train,
+    /// Drives held back from training.
+    Test,
+    /// Both.
+    All,
+}
+
+impl SplitArg {
+    /// As in JSON.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Train => "train",
+            Self::Test => "test",
+            Self::All => "all",
+        }
+    }
+}
+
+/// Which model to use.
+#[derive(Args, Clone, Debug)]
+pub struct BundleArgs {
+    /// Model bundle [default: the newest in deploy/bundles, found from the executable]
+    #[arg(long, value_name = "DIR")]
+    pub bundle: Option<PathBuf>,
+}
+
+/// Length of a window.
+#[derive(Args, Clone, Copy, Debug)]
+pub struct WindowArgs {
+    /// Steps to predict
+    #[arg(long, value_name = "STEPS", default_value_t = 32, value_parser = positive)]
+    pub horizon: usize,
+    /// Steps of measured history that the model may see, the start included
+    #[arg(long, value_name = "STEPS", default_value_t = 32, value_parser = positive)]
+    pub history: usize,
+}
+
+fn positive(text: &str) -> Result<usize, String> {
+    match text.parse::<usize>() {
+        Ok(0) => Err("must be at least 1".into()),
+        Ok(n) => Ok(n),
+        Err(_) => Err("not a whole number".into()),
+    }
+}

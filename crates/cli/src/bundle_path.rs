@@ -1,0 +1,62 @@
+//! Where the shipped bundle and the shipped sample of drives are.
+
+use std::path::{Path, PathBuf};
+
+use crate::failure::Failure;
+
+/// File that makes a folder a bundle.
+pub const MANIFEST: &str = "manifest.toml";
+
+/// Finds the bundle to use: `--bundle`, else the newest by name in `deploy/bundles`, searched upward from the executable and then from the
+/// current folder.
+pub fn bundle_dir(given: Option<&Path>) -> Result<PathBuf, Failure> {
+    match given {
+        Some(dir) if dir.join(MANIFEST).is_file() => Ok(dir.to_path_buf()),
+        Some(dir) if dir.exists() => Err(Failure::input(format!(
+            "{} is not a bundle: it has no {MANIFEST}; give a folder such as deploy/bundles/<name>",
+            dir.display()
+        ))),
+        Some(dir) => Err(Failure::input(format!("bundle {} does not exist", dir.display()))),
+        None => default_bundle().ok_or_else(|| {
+            Failure::input("no bundle in deploy/bundles above the executable or the current folder; give one with --bundle DIR")
+        }),
+    }
+}
+
+/// The shipped bundle, if there is one.
+pub fn default_bundle() -> Option<PathBuf> {
+    upward("deploy/bundles").into_iter().find_map(|folder| newest(&folder))
+}
+
+/// The shipped sample of drives, if there is one.
+pub fn sample_root() -> Option<PathBuf> {
+    upward("tests/data/chrono_sample").into_iter().next()
+}
+
+/// Whether `dir` lies in a bundle (or is one), where no command may write.
+pub fn inside_bundle(dir: &Path) -> bool {
+    let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_path_buf());
+    absolute.ancestors().any(|a| a.join(MANIFEST).is_file())
+}
+
+/// Existing folders `relative` in the ancestors of the executable, then of the current folder.
+fn upward(relative: &str) -> Vec<PathBuf> {
+    let starts = [std::env::current_exe().ok(), std::env::current_dir().ok()];
+    let mut found: Vec<PathBuf> = Vec::new();
+    for start in starts.iter().flatten() {
+        for ancestor in start.ancestors() {
+            let candidate = ancestor.join(relative);
+            if candidate.is_dir() && !found.contains(&candidate) {
+                found.push(candidate);
+            }
+        }
+    }
+    found
+}
+
+fn newest(folder: &Path) -> Option<PathBuf> {
+    let mut bundles: Vec<PathBuf> =
+        std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| p.join(MANIFEST).is_file()).collect();
+    bundles.sort();
+    bundles.pop()
+}

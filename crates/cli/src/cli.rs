@@ -1,0 +1,81 @@
+//! The command line: names, one-line purposes, examples.
+
+use clap::{CommandFactory, Parser, Subcommand};
+
+use crate::bundle_path::{MANIFEST, default_bundle};
+use crate::commands;
+use crate::failure::Failure;
+
+/// Predicts how an off-road vehicle will move over deformable ground, as a service for planners.
+///
+/// The model joins Bekker-Wong terramechanics with a Transformer; it is shipped as a bundle. Commands read drives from a data root
+/// (without --data: the sample in the repository) and write JSON and HTML where you say.
+#[derive(Parser, Debug)]
+#[command(name = "nesam", disable_version_flag = true, after_help = EXAMPLES, max_term_width = 110)]
+struct Cli {
+    /// Print the version and the hash of the shipped bundle
+    #[arg(short = 'V', long)]
+    version: bool,
+    #[command(subcommand)]
+    command: Option<Command>,
+}
+
+const EXAMPLES: &str = "Examples:
+  nesam demo                                  the whole loop: server, drive, planner, live table
+  nesam evaluate --set nominal --split test   score the shipped model against measured drives
+  nesam evaluate --data ROOT --set NAME --html report.html
+  nesam predict --trajectory n0005 --at 6.2   one rollout as JSON
+  nesam serve                                 answer planners and vehicles until interrupted
+  nesam inspect deploy/bundles/NAME           what a bundle holds and where it comes from
+  nesam check ROOT                            what is wrong with a data root, bundle or configuration
+
+Exit codes: 0 done, 1 failed, 2 wrong usage or input. `nesam COMMAND --help` explains one command.";
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Show the whole loop: real server, recorded drive, planner, live table
+    Demo(commands::demo::DemoArgs),
+    /// Answer planners over gRPC and vehicles over gRPC and Zenoh until interrupted
+    Serve(commands::serve::ServeArgs),
+    /// Score models against measured drives, with intervals and plots
+    Evaluate(commands::evaluate::EvaluateArgs),
+    /// Predict once from an instant of a recorded drive: JSON, CSV or plots
+    Predict(commands::predict::PredictArgs),
+    /// Train a bundle on the train split of a set
+    Train(commands::train::TrainArgs),
+    /// Say what a bundle or a data root holds
+    Inspect(commands::inspect::InspectArgs),
+    /// Say what is wrong with a data root, a bundle or a configuration
+    Check(commands::check::CheckArgs),
+}
+
+/// Parses the arguments and runs the command.
+pub fn run() -> Result<(), Failure> {
+    let cli = Cli::parse();
+    if cli.version {
+        println!("{}", version());
+        return Ok(());
+    }
+    match cli.command {
+        None => {
+            eprintln!("{}", Cli::command().render_help());
+            Err(Failure::input("no command given"))
+        }
+        Some(Command::Demo(args)) => commands::demo::run(&args),
+        Some(Command::Serve(args)) => commands::serve::run(&args),
+        Some(Command::Evaluate(args)) => commands::evaluate::run(&args),
+        Some(Command::Predict(args)) => commands::predict::run(&args),
+        Some(Command::Train(args)) => commands::train::run(&args),
+        Some(Command::Inspect(args)) => commands::inspect::run(&args),
+        Some(Command::Check(args)) => commands::check::run(&args),
+    }
+}
+
+fn version() -> String {
+    let bundle = default_bundle().and_then(|dir| {
+        let manifest = std::fs::read(dir.join(MANIFEST)).ok()?;
+        let name = dir.file_name()?.to_string_lossy().into_owned();
+        Some(format!("bundle {name} {}", nesam_model::bundle::sha256_hex(&manifest)))
+    });
+    format!("nesam {}\n{}", env!("CARGO_PKG_VERSION"), bundle.unwrap_or_else(|| "no bundle found".into()))
+}

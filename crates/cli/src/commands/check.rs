@@ -1,0 +1,149 @@
+//! `nesam check`: reads everything and says what is wrong.
+
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use nesam_evaluation::Baselines;
+use nesam_model::{ModelBundle, Predictor};
+use nesam_trajectories::{DataRoot, Trajectory};
+
+use crate::args::{DataArgs, SplitArg};
+use crate::bundle_path::MANIFEST;
+use crate::failure::{Failure, chain};
+use crate::sources::query;
+
+/// Options of `nesam check`.
+#[derive(Args, Debug)]
+pub struct CheckArgs {
+    /// Data roots, bundles or configuration files
+    #[arg(value_name = "PATH", required = true)]
+    paths: Vec<PathBuf>,
+    /// Vehicle card, when a data root has none of its own
+    #[arg(long, value_name = "FILE")]
+    vehicle: Option<PathBuf>,
+}
+
+/// What was found, worst first when printed.
+#[derive(Default)]
+struct Findings {
+    errors: Vec<String>,
+    notes: Vec<String>,
+}
+
+impl Findings {
+    fn error(&mut self, text: impl Into<String>) {
+        self.errors.push(text.into());
+    }
+
+    fn note(&mut self, text: impl Into<String>) {
+        self.notes.push(text.into());
+    }
+}
+
+/// Runs the command: exit code 2 when anything is wrong.
+pub fn run(args: &CheckArgs) -> Result<(), Failure> {
+    let mut wrong = 0;
+    for path in &args.paths {
+        let mut findings = Findings::default();
+        let kind = check(path, args.vehicle.as_deref(), &mut findings);
+        println!("{} ({kind})", path.display());
+        for note in &findings.notes {
+            println!("  note: {note}");
+        }
+        for error in &findings.errors {
+            println!("  error: {error}");
+        }
+        println!("  {}", if findings.errors.is_empty() { "sound".to_string() } else { format!("errors: {}", findings.errors.len()) });
+        wrong += findings.errors.len();
+    }
+    if wrong > 0 {
+        return Err(Failure::input(format!("the check found errors: {wrong}")));
+    }
+    Ok(())
+}
+
+fn check(path: &Path, card: Option<&Path>, findings: &mut Findings) -> &'static str {
+    if path.is_file() {
+        configuration(path, findings);
+        "configuration"
+    } else if path.join(MANIFEST).is_file() {
+        bundle(path, findings);
+        "bundle"
+    } else if path.is_dir() {
+        data_root(path, card, findings);
+        "data root"
+    } else {
+        findings.error("does not exist");
+        "nothing"
+    }
+}
+
+fn bundle(path: &Path, findings: &mut Findings) {
+    let bundle = match ModelBundle::load(path) {
+        Ok(bundle) => bundle,
+        Err(e) => return findings.error(chain(&e)),
+    };
+    findings.note(format!("{} {}, vehicle `{}`", bundle.name, bundle.hash, bundle.vehicle.name));
+    match bundle.baselines_json.as_deref().map(Baselines::from_json) {
+        None => findings.note("carries no fitted baselines; `evaluate` fits them where a set has a train split"),
+        Some(Err(e)) => findings.error(chain(&e)),
+        Some(Ok(_)) => {}
+    }
+    if let Err(e) = Predictor::new(std::sync::Arc::new(bundle)) {
+        findings.error(chain(&e));
+    }
+}
+
+fn configuration(path: &Path, findings: &mut Findings) {
+    if let Err(text) = super::serve::check_configuration(path) {
+        findings.error(text);
+    }
+}
+
+fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
+    let root = match DataRoot::open(path, card) {
+        Ok(root) => root,
+        Err(e) => return findings.error(chain(&e)),
+    };
+    if root.vehicle().inertia_estimated {
+        findings.note(format!("card of `{}` gives no inertia: a box estimate is used", root.vehicle().name));
+    }
+    if root.sets().is_empty() {
+        findings.error("no set: no folder with index.parquet or index.json and samples.parquet");
+    }
+    for set in root.sets() {
+        check_set(&root, &set, findings);
+    }
+}
+
+fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
+    let args = DataArgs { data: None, set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
+    let drives = match root.load_set(&query(&args, set, SplitArg::All, false)) {
+        Ok(drives) => drives,
+        Err(e) => return findings.error(format!("set {set}: {}", chain(&e))),
+    };
+    let samples: usize = drives.iter().map(|d| d.states.len()).sum();
+    findings.note(format!("set {set}: {} drives, {samples} samples at {} s", drives.len(), args.dt));
+    let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();
+    worlds.sort_unstable();
+    worlds.dedup();
+    for world in &worlds {
+        if let Err(e) = root.world(world) {
+            findings.error(format!("set {set}: world {world}: {}", chain(&e)));
+        }
+    }
+    let without = drives.iter().filter(|d| d.world.is_none()).count();
+    if without > 0 {
+        findings.note(format!("set {set}: {without} drives have no map: flat ground and the default soil will be used"));
+    }
+    let refused: Vec<String> = drives.iter().filter_map(|d| out_of_range(root, d)).collect();
+    if let Some(first) = refused.first() {
+        findings.note(format!("set {set}: {} drives command beyond the card's range, first {first}", refused.len()));
+    }
+}
+
+/// Where a drive's commands leave the range of the card.
+fn out_of_range(root: &DataRoot, drive: &Trajectory) -> Option<String> {
+    let at = drive.controls.iter().position(|c| !root.vehicle().admits(c))?;
+    Some(format!("{} at {:.1} s", drive.id, drive.time_s[at]))
+}

@@ -1,0 +1,253 @@
+//! `nesam evaluate`: errors of the models on recorded drives.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clap::{Args, ValueEnum};
+use nesam_evaluation::{
+    Baselines, DEFAULT_RESAMPLES, Evaluation, Kinematic, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window, WindowPredictor,
+    all_windows, path_median_m, predict_all, report, score, slices, write_predictions,
+};
+use nesam_model::{MAX_HORIZON, Predictor};
+use nesam_trajectories::Trajectory;
+
+use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::failure::{Failure, OrFail};
+use crate::progress::Progress;
+use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives, training_drives, worlds_of};
+use crate::{interrupt, output};
+
+/// Options of `nesam evaluate`.
+#[derive(Args, Debug)]
+pub struct EvaluateArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    #[command(flatten)]
+    window: WindowArgs,
+    /// What drives the prediction over the horizon
+    #[arg(long, value_enum, default_value_t = Inputs::Commands)]
+    inputs: Inputs,
+    /// What errors are measured against
+    #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
+    truth: TruthArg,
+    /// Models to compare [default: all that bundle and data allow]
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    models: Option<Vec<String>>,
+    /// Seed of the bootstrap
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Bootstrap draws
+    #[arg(long, default_value_t = DEFAULT_RESAMPLES, value_parser = at_least_1000)]
+    resamples: usize,
+    /// Folder for evaluate.json and evaluate.html [default: nesam-out/evaluate-<set>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Write the JSON here instead
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write the HTML report here instead
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+    /// Also write every predicted pose: model, trajectory, t0, k, x, y, z, roll, pitch, yaw
+    #[arg(long, value_name = "FILE.parquet")]
+    predictions: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Inputs {
+    /// The recorded commands: what a planner knows.
+    Commands,
+    /// The measured wheel speeds and steering angles of the future: for studying the model, not for planning.
+    Wheels,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum TruthArg {
+    /// The measured channels.
+    Measured,
+    /// The noise-free channels, where a set has them.
+    Gt,
+}
+
+fn at_least_1000(text: &str) -> Result<usize, String> {
+    match text.parse::<usize>() {
+        Ok(n) if (1000..=1_000_000).contains(&n) => Ok(n),
+        _ => Err("must be a whole number from 1000 to 1000000".into()),
+    }
+}
+
+/// Runs the command.
+pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
+    if args.inputs == Inputs::Wheels {
+        return Err(Failure::input("--inputs wheels is not supported by this version; use --inputs commands"));
+    }
+    let names = model_names(args)?;
+    interrupt::exit_on_ctrl_c("nothing was written");
+    let truth = if args.truth == TruthArg::Gt { Truth::Gt } else { Truth::Measured };
+    let drives = read_drives(&args.data, truth == Truth::Gt)?;
+    let out = output::out_dir(args.out.as_deref(), "evaluate", &drives.set)?;
+    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
+    warn_about_training_drives(args, &drives);
+
+    let training = training_drives(&drives, &args.data);
+    let models = Models::prepare(args, &names, &drives, training.as_deref())?;
+    let mut paths = Vec::new();
+    for (name, predictor) in &models.ready {
+        let progress = Progress::start(name.as_str(), windows.len());
+        paths.push(predict_all(*name, predictor, &windows, &drives.maps, &|done| progress.set(done)).or_failed()?);
+        progress.finish();
+    }
+    let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
+    let scores: Vec<ModelScore> = paths.iter().map(|p| score(p, &windows, truth, &resamples)).collect();
+    let worlds = training.as_deref().map(worlds_of).unwrap_or_default();
+    let slices = slices(&windows, &worlds);
+    let provenance = output::provenance(models.predictor.as_ref().map(|p| p.bundle()), &drives);
+    let evaluation = Evaluation {
+        set: &drives.set,
+        split: args.data.split.as_str(),
+        horizon_steps: args.window.horizon,
+        history_steps: args.window.history,
+        dt_s: args.data.dt,
+        windows: windows.len(),
+        trajectories: drives.drives.len(),
+        path_m_median: path_median_m(&windows, truth),
+        truth,
+        inputs: "commands",
+        seed: args.seed,
+        resamples: &resamples,
+        models: &scores,
+        slices: &slices,
+        provenance: &provenance,
+    };
+    print_table(&evaluation);
+    write_results(args, &out, &evaluation, &paths, &windows)
+}
+
+fn write_results(
+    args: &EvaluateArgs,
+    out: &Path,
+    evaluation: &Evaluation<'_>,
+    paths: &[ModelPaths],
+    windows: &[Window<'_>],
+) -> Result<(), Failure> {
+    let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
+    let (json, html) = (at(&args.json, "evaluate.json"), at(&args.html, "evaluate.html"));
+    output::write_file(&json, evaluation.to_json().as_bytes())?;
+    output::write_file(&html, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
+    println!("\nwrote {} and {}", json.display(), html.display());
+    if let Some(file) = &args.predictions {
+        write_predictions(file, paths, windows).or_failed()?;
+        println!("wrote {}", file.display());
+    }
+    Ok(())
+}
+
+fn model_names(args: &EvaluateArgs) -> Result<Vec<ModelName>, Failure> {
+    let Some(given) = &args.models else { return Ok(ModelName::ALL.to_vec()) };
+    let mut names: Vec<ModelName> = Vec::new();
+    for text in given {
+        let name = text.parse().or_input()?;
+        if !names.contains(&name) {
+            names.push(name);
+        }
+    }
+    Ok(names)
+}
+
+fn warn_about_training_drives(args: &EvaluateArgs, drives: &Drives) {
+    let trained_on = drives.drives.iter().filter(|d| d.split == Some(nesam_trajectories::Split::Train)).count();
+    if trained_on > 0 && args.data.split == SplitArg::All {
+        eprintln!("note: {trained_on} of {} drives belong to the train split; --split test scores unseen drives only", drives.drives.len());
+    }
+}
+
+/// The models, ready to run.
+struct Models {
+    predictor: Option<Arc<Predictor>>,
+    ready: Vec<(ModelName, WindowPredictor)>,
+}
+
+impl Models {
+    fn prepare(args: &EvaluateArgs, names: &[ModelName], drives: &Drives, training: Option<&[Trajectory]>) -> Result<Self, Failure> {
+        let predictor = if names.iter().any(|n| n.is_nesam()) {
+            check_model_step(args.data.dt)?;
+            if args.window.horizon > MAX_HORIZON {
+                return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
+            }
+            Some(predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?)
+        } else {
+            None
+        };
+        let kinematic = if names.contains(&ModelName::Kinematic) { kinematic(args, predictor.as_deref(), drives, training)? } else { None };
+        let vehicle = Arc::new(drives.root.vehicle().clone());
+        let mut ready = Vec::new();
+        for &name in names {
+            if name == ModelName::Kinematic && kinematic.is_none() && args.models.is_none() {
+                eprintln!(
+                    "note: kinematic is left out: the bundle carries no fit for this vehicle and no set of the data root has a train split"
+                );
+                continue;
+            }
+            ready.push((name, WindowPredictor::new(name, predictor.as_ref(), &vehicle, kinematic).or_input()?));
+        }
+        Ok(Self { predictor, ready })
+    }
+}
+
+/// The kinematic fit: the bundle's where it is for this vehicle, else a new one on the train split.
+fn kinematic(
+    args: &EvaluateArgs,
+    predictor: Option<&Predictor>,
+    drives: &Drives,
+    training: Option<&[Trajectory]>,
+) -> Result<Option<Kinematic>, Failure> {
+    let bundled = match predictor {
+        Some(p) => p.bundle().baselines_json.clone(),
+        None => load_bundle(args.bundle.bundle.as_deref())
+            .ok()
+            .filter(|b| b.vehicle.name == drives.root.vehicle().name)
+            .and_then(|b| b.baselines_json),
+    };
+    if let Some(json) = bundled {
+        let baselines = Baselines::from_json(&json).or_input()?;
+        if baselines.vehicle == drives.root.vehicle().name {
+            return Ok(Some(baselines.kinematic));
+        }
+    }
+    let Some(training) = training else { return Ok(None) };
+    eprintln!("fitting the kinematic baseline on {} training drives", training.len());
+    Ok(Some(Baselines::fit(drives.root.vehicle(), training, args.window.horizon).or_failed()?.kinematic))
+}
+
+fn print_table(e: &Evaluation<'_>) {
+    println!(
+        "{} ({}): {} windows of {} steps from {} drives, median path {:.2} m; mean absolute errors against {} channels",
+        e.set,
+        e.split,
+        e.windows,
+        e.horizon_steps,
+        e.trajectories,
+        e.path_m_median,
+        e.truth.as_str()
+    );
+    for (title, last) in [("mean over the horizon", false), ("at the last step", true)] {
+        println!(
+            "\n{title:<22}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}  95 % interval",
+            "x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"
+        );
+        for model in e.models {
+            let (t, c) = (&model.summary.tree, &model.summary.ci95);
+            let six = if last { t.mae_final } else { t.mae_mean }.to_array();
+            let (position, interval) =
+                if last { (t.position_m.final_, c.position_m.final_) } else { (t.position_m.mean, c.position_m.mean) };
+            let cells: String = six.iter().chain([&position]).map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}"))).collect();
+            let interval = interval.map_or(String::new(), |[lo, hi]| format!("  [{lo:.3}, {hi:.3}]"));
+            println!("{:<22}{cells}{interval}", model.name.as_str());
+        }
+    }
+    for model in e.models.iter().filter(|m| m.errors.not_finite > 0) {
+        println!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite);
+    }
+}

@@ -1,0 +1,9 @@
+//! One module per command: its options and `run`.
+
+pub mod check;
+pub mod demo;
+pub mod evaluate;
+pub mod inspect;
+pub mod predict;
+pub mod serve;
+pub mod train;

@@ -1,0 +1,294 @@
+//! `nesam predict`: one offline rollout from one instant of a recorded drive.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use clap::{Args, ValueEnum};
+use nesam_evaluation::report::{LinePlot, Page, Series};
+use nesam_evaluation::{Truth, Window, horizontal_distance, pose_of};
+use nesam_model::{MAX_HORIZON, Predictor, Rollout, RolloutQuery, Variant, flag};
+use nesam_physics::{Control, SOIL_DIM, SOIL_NAMES};
+use nesam_terrain::WorldMap;
+use serde_json::{Map, Value, json};
+
+use crate::args::{BundleArgs, DataArgs, WindowArgs};
+use crate::failure::{Failure, OrFail};
+use crate::output;
+use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+
+/// Options of `nesam predict`.
+#[derive(Args, Debug)]
+pub struct PredictArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    #[command(flatten)]
+    window: WindowArgs,
+    /// Drive to start from [default: the first of the set]
+    #[arg(long, value_name = "ID")]
+    trajectory: Option<String>,
+    /// Instant of the drive at which the prediction starts, s [default: as soon as the history is full]
+    #[arg(long, value_name = "SECONDS")]
+    at: Option<f64>,
+    /// Commands to predict under, CSV with the header speed_m_s,second [default: the recorded ones]
+    #[arg(long, value_name = "FILE.csv")]
+    controls: Option<PathBuf>,
+    /// Which form of the model
+    #[arg(long, value_enum, default_value_t = ModelArg::Nesam)]
+    model: ModelArg,
+    /// Form of the answer
+    #[arg(long, value_enum, default_value_t = Format::Json)]
+    format: Format,
+    /// Write here instead of to standard output
+    #[arg(long, value_name = "FILE")]
+    out: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+#[value(rename_all = "snake_case")]
+enum ModelArg {
+    Nesam,
+    NesamNoResidual,
+    NesamZeroSinkage,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum Format {
+    /// Everything, with provenance.
+    Json,
+    /// One row per step.
+    Csv,
+    /// A page with plots of predicted against measured motion.
+    Html,
+}
+
+/// Runs the command.
+pub fn run(args: &PredictArgs) -> Result<(), Failure> {
+    check_model_step(args.data.dt)?;
+    let mut data = args.data.clone();
+    if let Some(id) = &args.trajectory {
+        data.trajectories = Some(vec![id.clone()]);
+    }
+    let drives = read_drives(&data, false)?;
+    let window = window(args, &drives)?;
+    let controls = match &args.controls {
+        Some(file) => read_controls(file, args.window.horizon)?,
+        None => recorded(&window)?,
+    };
+    if controls.len() > MAX_HORIZON {
+        return Err(Failure::input(format!("{} steps exceed the model's {MAX_HORIZON}; use a shorter --horizon", controls.len())));
+    }
+    if let Some(bad) = controls.iter().position(|c| !drives.root.vehicle().admits(c)) {
+        let [speed, second] = drives.root.vehicle().command_range;
+        return Err(Failure::input(format!(
+            "command {bad} (speed {} m/s, second {}) is outside the card's range: speed {speed:?} m/s, second {second:?}",
+            controls[bad].speed_m_s, controls[bad].second
+        )));
+    }
+    let window = Window { horizon: controls.len(), ..window };
+    let predictor = predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?;
+    let map = drives.maps[0].as_ref();
+    let rollout = rollout(args, &predictor, &window, &controls, map)?;
+    let text = match args.format {
+        Format::Json => as_json(&drives, &predictor, &window, &controls, &rollout),
+        Format::Csv => as_csv(&window, &controls, &rollout),
+        Format::Html => as_html(&drives, &predictor, &window, &rollout),
+    };
+    match &args.out {
+        Some(file) => output::write_file(file, text.as_bytes()).inspect(|()| eprintln!("wrote {}", file.display())),
+        None => {
+            print!("{text}");
+            Ok(())
+        }
+    }
+}
+
+/// The window that the options name. Without `--controls` it must lie in the drive whole.
+fn window<'a>(args: &PredictArgs, drives: &'a Drives) -> Result<Window<'a>, Failure> {
+    let drive = &drives.drives[0];
+    let last = drive.states.len() - 1;
+    let start = match args.at {
+        None => (args.window.history.max(1) - 1).min(last),
+        Some(at) => {
+            let end = drive.time_s[last];
+            if !at.is_finite() || at < drive.time_s[0] || at > end {
+                return Err(Failure::input(format!("--at {at} lies outside drive `{}`, {}…{end} s", drive.id, drive.time_s[0])));
+            }
+            drive.time_s.iter().rposition(|t| *t <= at + 1e-6).unwrap_or(0)
+        }
+    };
+    let first_history = (start + 1).saturating_sub(args.window.history);
+    Ok(Window { trajectory: drive, drive: 0, start, first_history, horizon: args.window.horizon })
+}
+
+fn recorded(window: &Window<'_>) -> Result<Vec<Control<f64>>, Failure> {
+    let drive = window.trajectory;
+    drive.controls.get(window.start..window.start + window.horizon).map(<[_]>::to_vec).ok_or_else(|| {
+        Failure::input(format!(
+            "drive `{}` ends {} steps after {:.1} s, --horizon asks for {}; start earlier, predict fewer steps or give --controls",
+            drive.id,
+            drive.states.len() - 1 - window.start,
+            window.start_time_s(),
+            window.horizon
+        ))
+    })
+}
+
+/// Reads commands; errors name file, line and what was expected.
+fn read_controls(file: &std::path::Path, horizon: usize) -> Result<Vec<Control<f64>>, Failure> {
+    let text = std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?;
+    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
+    let header = lines.next().map_or("", |(_, l)| l.trim());
+    if header.replace(' ', "") != "speed_m_s,second" {
+        return Err(Failure::input(format!("{}: line 1 is `{header}`, expected `speed_m_s,second`", file.display())));
+    }
+    let mut controls = Vec::new();
+    for (i, line) in lines.take(horizon) {
+        let cells: Vec<Option<f64>> = line.split(',').map(|c| c.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect();
+        let [Some(speed_m_s), Some(second)] = cells[..] else {
+            return Err(Failure::input(format!("{}: line {}: `{line}` is not two finite numbers", file.display(), i + 1)));
+        };
+        controls.push(Control { speed_m_s, second });
+    }
+    if controls.is_empty() {
+        return Err(Failure::input(format!("{}: no commands below the header", file.display())));
+    }
+    Ok(controls)
+}
+
+fn rollout(
+    args: &PredictArgs,
+    predictor: &Predictor,
+    window: &Window<'_>,
+    controls: &[Control<f64>],
+    map: Option<&Arc<WorldMap>>,
+) -> Result<Rollout, Failure> {
+    let packed: Vec<f32> = controls.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let variant = match args.model {
+        ModelArg::Nesam => Variant::Full,
+        ModelArg::NesamNoResidual => Variant::NoResidual,
+        ModelArg::NesamZeroSinkage => Variant::ZeroSinkage,
+    };
+    let query = RolloutQuery {
+        history: &window.history(),
+        start: window.trajectory.states[window.start],
+        controls: &packed,
+        samples: 1,
+        horizon: controls.len(),
+        map,
+        soil_correction: [0.0; SOIL_DIM],
+        variant,
+    };
+    predictor.rollout(&query).or_failed()
+}
+
+const STATE_KEYS: [&str; 12] =
+    ["x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "vx_m_s", "vy_m_s", "vz_m_s", "wx_rad_s", "wy_rad_s", "wz_rad_s"];
+
+fn named(values: impl IntoIterator<Item = f64>) -> Value {
+    Value::Object(STATE_KEYS.iter().zip(values).map(|(k, v)| ((*k).to_string(), json!(v))).collect::<Map<_, _>>())
+}
+
+/// Names of the validity bits that are set.
+fn flag_names(word: u32) -> Vec<&'static str> {
+    let names = [
+        (flag::NOT_FINITE, "not_finite"),
+        (flag::OFF_MAP, "off_map"),
+        (flag::NO_MAP, "no_map"),
+        (flag::SPEED_UNTRAINED, "speed_untrained"),
+        (flag::STEERING_UNTRAINED, "steering_untrained"),
+        (flag::SLOPE_UNTRAINED, "slope_untrained"),
+        (flag::OVERTURNED, "overturned"),
+    ];
+    names.into_iter().filter(|(bit, _)| word & bit != 0).map(|(_, name)| name).collect()
+}
+
+fn as_json(drives: &Drives, predictor: &Predictor, window: &Window<'_>, controls: &[Control<f64>], rollout: &Rollout) -> String {
+    let drive = window.trajectory;
+    let steps: Vec<Value> = (0..rollout.horizon)
+        .map(|k| {
+            let measured = drive.states.get(window.start + k + 1).map(|s| named(s.to_array()));
+            json!({
+                "k": k + 1,
+                "t_s": window.start_time_s() + (k + 1) as f64 * drive.dt_s,
+                "command": {"speed_m_s": controls[k].speed_m_s, "second": controls[k].second},
+                "state": named(rollout.state(0, k).to_array().map(f64::from)),
+                "sinkage_m": rollout.sinkage(0, k),
+                "measured": measured,
+            })
+        })
+        .collect();
+    let soil: Map<String, Value> = SOIL_NAMES.iter().zip(rollout.soil).map(|(k, v)| ((*k).to_string(), json!(v))).collect();
+    let document = json!({
+        "schema": "nesam.predict/1",
+        "set": drives.set,
+        "trajectory": drive.id,
+        "t0_s": window.start_time_s(),
+        "dt_s": drive.dt_s,
+        "history_steps": window.start - window.first_history + 1,
+        "start": named(drive.states[window.start].to_array()),
+        "soil": soil,
+        "flags": flag_names(rollout.flags[0]),
+        "steps": steps,
+        "provenance": output::provenance(Some(predictor.bundle()), drives),
+    });
+    serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+}
+
+fn as_csv(window: &Window<'_>, controls: &[Control<f64>], rollout: &Rollout) -> String {
+    let sinkage = ["sinkage_fl_m", "sinkage_fr_m", "sinkage_rl_m", "sinkage_rr_m"];
+    let mut text = format!("k,t_s,cmd_speed_m_s,cmd_second,{},{}\n", STATE_KEYS.join(","), sinkage.join(","));
+    for (k, command) in controls.iter().enumerate() {
+        let t = window.start_time_s() + (k + 1) as f64 * window.trajectory.dt_s;
+        let numbers = rollout.state(0, k).to_array().into_iter().chain(rollout.sinkage(0, k)).map(|v| v.to_string());
+        let numbers: Vec<String> = numbers.collect();
+        text += &format!("{},{t},{},{},{}\n", k + 1, command.speed_m_s, command.second, numbers.join(","));
+    }
+    text
+}
+
+fn as_html(drives: &Drives, predictor: &Predictor, window: &Window<'_>, rollout: &Rollout) -> String {
+    let drive = window.trajectory;
+    let start = window.start_pose();
+    let predicted: Vec<_> = (0..rollout.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
+    let covered = window.horizon.min(drive.states.len() - 1 - window.start);
+    let measured = Window { horizon: covered, ..*window }.truth(Truth::Measured);
+    let last_error = covered.checked_sub(1).map_or(f64::NAN, |k| horizontal_distance(&predicted[k], &measured[k]));
+    let lead = format!(
+        "One rollout of {} steps from {:.1} s of drive {}: horizontal error against the measured motion {last_error:.3} m at the last measured step.",
+        rollout.horizon,
+        window.start_time_s(),
+        drive.id
+    );
+    let mut page = Page::new(&format!("nesam predict: {}", drive.id), &lead);
+    let path = |poses: &[nesam_evaluation::Pose]| std::iter::once((start[0], start[1])).chain(poses.iter().map(|p| (p[0], p[1]))).collect();
+    let mut plan = LinePlot::new("path", "x [m]", "y [m]");
+    plan.equal_aspect = true;
+    plan.series = vec![Series::line("measured", 0, path(&measured)), Series::line("predicted", 1, path(&predicted))];
+    plan.series[0].mark_start = true;
+    let mut plots = vec![plan];
+    for (d, (name, unit)) in [("z", "m"), ("roll", "deg"), ("pitch", "deg"), ("yaw", "deg")].into_iter().enumerate() {
+        let of = |poses: &[nesam_evaluation::Pose]| -> Vec<(f64, f64)> {
+            let value = |p: &nesam_evaluation::Pose| if d == 0 { p[2] } else { p[d + 2].to_degrees() };
+            let from_start = std::iter::once((0.0, value(&start)));
+            from_start.chain(poses.iter().enumerate().map(|(k, p)| ((k + 1) as f64 * drive.dt_s, value(p)))).collect()
+        };
+        let mut plot = LinePlot::new(name, "time ahead [s]", &format!("{name} [{unit}]"));
+        plot.series = vec![Series::line("measured", 0, of(&measured)), Series::line("predicted", 1, of(&predicted))];
+        plots.push(plot);
+    }
+    page.section("Motion").plots(&plots, "Measured and predicted motion from the same start; hover for values.");
+    let soil = SOIL_NAMES.iter().zip(rollout.soil).map(|(n, v)| format!("{n} {v:.4}")).collect::<Vec<_>>().join(", ");
+    page.section("Soil and validity").text(&format!("Soil used under the start (SI, rad): {soil}.")).text(&format!(
+        "Validity: {}.",
+        if rollout.flags[0] == 0 { "nothing to say against this prediction".into() } else { flag_names(rollout.flags[0]).join(", ") }
+    ));
+    let p = output::provenance(Some(predictor.bundle()), drives);
+    page.footer("command", &p.command)
+        .footer("version", &format!("nesam {}", p.version))
+        .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
+        .footer("data", &p.data_hash)
+        .footer("maps", &p.maps_hash);
+    page.render()
+}

@@ -1,0 +1,163 @@
+//! `nesam train`: trains a bundle on the train split of a set.
+
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use clap::Args;
+use nesam_evaluation::Baselines;
+use nesam_learning::recipe::{Recipe, Reporter, run as train, variant_of};
+use nesam_learning::{TrainingError, TrainingPlan};
+
+use crate::args::{DataArgs, SplitArg};
+use crate::failure::{Failure, OrFail};
+use crate::progress::Progress;
+use crate::sources::read_drives;
+
+/// Options of `nesam train`.
+#[derive(Args, Debug)]
+pub struct TrainArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    /// Folder of the new bundle and its checkpoints [default: nesam-out/train-<set>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Name of the new bundle [default: <vehicle's first word>-<set>]
+    #[arg(long, value_name = "NAME")]
+    name: Option<String>,
+    /// What to train: nesam, or an ablation with the full budget: nesam_no_residual, nesam_zero_sinkage
+    #[arg(long, value_name = "MODEL", default_value = "nesam")]
+    model: String,
+    /// Optimiser steps of the encoders' pre-training
+    #[arg(long, value_name = "STEPS", default_value_t = 600)]
+    encoder_steps: usize,
+    /// Peak learning rate of the encoders' pre-training
+    #[arg(long, value_name = "RATE", default_value_t = 2e-3)]
+    encoder_lr: f64,
+    /// Epochs: after each, the model is validated and a checkpoint written
+    #[arg(long, default_value_t = 40)]
+    epochs: usize,
+    /// Batches per epoch
+    #[arg(long, default_value_t = 250)]
+    batches: usize,
+    /// Windows per batch
+    #[arg(long, default_value_t = 32)]
+    batch_size: usize,
+    /// Steps of each training rollout
+    #[arg(long, value_name = "STEPS", default_value_t = 32)]
+    horizon: usize,
+    /// Peak learning rate
+    #[arg(long, default_value_t = 5e-4)]
+    lr: f64,
+    /// Seed of weights and batches
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Threads that share each batch; the sum runs in a fixed order, so a number of threads has its own bytes
+    #[arg(long, default_value_t = 2)]
+    threads: usize,
+    /// Go on where an interrupted run of the same command stopped
+    #[arg(long)]
+    resume: bool,
+}
+
+/// Shows the stages of a run as progress bars or lines.
+#[derive(Default)]
+struct Console {
+    stage: Mutex<Option<Progress>>,
+}
+
+impl Reporter for Console {
+    fn stage(&self, name: &str, total: usize) {
+        if let Ok(mut stage) = self.stage.lock() {
+            if let Some(done) = stage.replace(Progress::start(name, total)) {
+                done.finish();
+            }
+        }
+    }
+
+    fn progress(&self, done: usize, remark: &str) {
+        if let Ok(stage) = self.stage.lock() {
+            if let Some(progress) = stage.as_ref() {
+                progress.set_with(done, remark);
+            }
+        }
+    }
+
+    fn line(&self, text: &str) {
+        eprintln!("{text}");
+    }
+}
+
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// The first Ctrl-C asks for a checkpoint after the step in work; the second ends the program at once.
+fn stop_on_ctrl_c() {
+    std::thread::spawn(|| {
+        let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
+        runtime.block_on(async {
+            while tokio::signal::ctrl_c().await.is_ok() {
+                if INTERRUPTED.swap(true, Ordering::SeqCst) {
+                    std::process::exit(1);
+                }
+                eprintln!("\nstopping after this step; Ctrl-C again to stop at once");
+            }
+        });
+    });
+}
+
+/// Runs the command.
+pub fn run(args: &TrainArgs) -> Result<(), Failure> {
+    let variant = variant_of(&args.model)
+        .ok_or_else(|| Failure::input(format!("no model `{}`; one of nesam, nesam_no_residual, nesam_zero_sinkage", args.model)))?;
+    if args.epochs * args.batches * args.batch_size * args.threads == 0 {
+        return Err(Failure::input("--epochs, --batches, --batch-size and --threads must be at least 1"));
+    }
+    let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
+    let hash = drives.root.hash();
+    let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, args.horizon).or_input()?;
+    let name = args.name.clone().unwrap_or_else(|| {
+        let vehicle = drives.root.vehicle().name.split_whitespace().next().unwrap_or("vehicle").to_lowercase();
+        format!("{vehicle}-{}", drives.set.replace('/', "-"))
+    });
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("nesam-out/train-{}", drives.set.replace('/', "-"))));
+    let recipe = Recipe {
+        name,
+        dt_s: args.data.dt,
+        encoder_steps: args.encoder_steps,
+        encoder_batch: 64,
+        encoder_rate: args.encoder_lr,
+        plan: TrainingPlan {
+            steps: args.epochs * args.batches,
+            batch: args.batch_size,
+            rate: args.lr,
+            horizon: args.horizon,
+            seed: args.seed,
+            epoch: args.batches,
+            shards: args.threads,
+            variant,
+            folder: out.join("checkpoint"),
+        },
+        out: out.clone(),
+        resume: args.resume,
+        command: command_line(),
+    };
+    stop_on_ctrl_c();
+    let console = Console::default();
+    let bundle =
+        train(&drives.root, &drives.drives, &hash, &recipe, Some(baselines.to_json()), &console, &|| INTERRUPTED.load(Ordering::SeqCst));
+    let bundle = match bundle {
+        Err(error @ TrainingError::Drives(_)) => return Err(Failure::input(error.to_string())),
+        other => other.or_failed()?,
+    };
+    eprintln!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
+    Ok(())
+}
+
+/// The command as typed, without the folders of this machine.
+fn command_line() -> String {
+    let words = std::env::args().skip(1).map(|word| match word.rsplit_once('/') {
+        Some((_, last)) if word.starts_with('/') => format!("…/{last}"),
+        _ => word,
+    });
+    std::iter::once("nesam".to_string()).chain(words).collect::<Vec<_>>().join(" ")
+}

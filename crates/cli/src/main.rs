@@ -1,0 +1,23 @@
+//! The `nesam` binary: one command line for prediction, evaluation and service. See `nesam --help`.
+
+mod args;
+mod bundle_path;
+mod cli;
+mod commands;
+mod failure;
+mod interrupt;
+mod output;
+mod progress;
+mod sources;
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    match cli::run() {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("error: {failure}");
+            failure.exit_code()
+        }
+    }
+}

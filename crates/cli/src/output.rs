@@ -1,0 +1,53 @@
+//! Where results go.
+
+use std::path::{Path, PathBuf};
+
+use nesam_evaluation::Provenance;
+use nesam_model::ModelBundle;
+
+use crate::bundle_path::inside_bundle;
+use crate::failure::Failure;
+use crate::sources::{Drives, maps_hash};
+
+/// The folder for a command's results, made if needed: `--out`, else `nesam-out/<command>-<set>`. Never inside a bundle.
+pub fn out_dir(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
+    let dir = given.map_or_else(|| Path::new("nesam-out").join(format!("{command}-{}", set.replace('/', "-"))), Path::to_path_buf);
+    if inside_bundle(&dir) {
+        return Err(Failure::input(format!("--out {} lies in a bundle, which no command may change", dir.display())));
+    }
+    std::fs::create_dir_all(&dir).map_err(|e| Failure::input(format!("cannot make the folder {}: {e}", dir.display())))?;
+    Ok(dir)
+}
+
+/// Writes a whole file or none: a neighbour first, then a rename. Folders above it are made.
+pub fn write_file(path: &Path, text: &[u8]) -> Result<(), Failure> {
+    let fail = |e: std::io::Error| Failure::Failed(format!("cannot write {}: {e}", path.display()));
+    if inside_bundle(path.parent().unwrap_or(Path::new("."))) {
+        return Err(Failure::input(format!("{} lies in a bundle, which no command may change", path.display())));
+    }
+    if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
+        std::fs::create_dir_all(folder).map_err(fail)?;
+    }
+    let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
+    let draft = path.with_file_name(format!(".{name}.part"));
+    std::fs::write(&draft, text).and_then(|()| std::fs::rename(&draft, path)).map_err(fail)
+}
+
+/// The command line as it was typed, fit to be pasted into a shell.
+pub fn command_line() -> String {
+    let plain = |a: &str| !a.is_empty() && a.chars().all(|c| c.is_ascii_alphanumeric() || "-_./,=:+@%".contains(c));
+    let words = std::env::args().skip(1).map(|a| if plain(&a) { a } else { format!("'{}'", a.replace('\'', r"'\''")) });
+    std::iter::once("nesam".to_string()).chain(words).collect::<Vec<_>>().join(" ")
+}
+
+/// What a result is made from.
+pub fn provenance(bundle: Option<&ModelBundle>, drives: &Drives) -> Provenance {
+    Provenance {
+        version: env!("CARGO_PKG_VERSION").into(),
+        command: command_line(),
+        bundle: bundle.map_or_else(String::new, |b| b.name.clone()),
+        bundle_hash: bundle.map_or_else(String::new, |b| b.hash.clone()),
+        data_hash: drives.root.hash(),
+        maps_hash: maps_hash(&drives.maps),
+    }
+}

@@ -1,0 +1,140 @@
+//! Opens what the shared options name: data roots, drives with their maps, bundles.
+
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use nesam_model::{ModelBundle, Predictor};
+use nesam_physics::DT_S;
+use nesam_terrain::WorldMap;
+use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, Trajectory};
+
+use crate::args::{DataArgs, SplitArg};
+use crate::bundle_path::{bundle_dir, sample_root};
+use crate::failure::{Failure, OrFail};
+
+/// The drives of one set, with the map of each.
+pub struct Drives {
+    /// The root they come from.
+    pub root: DataRoot,
+    /// Name of the set.
+    pub set: String,
+    /// Drives in the order of the index.
+    pub drives: Vec<Trajectory>,
+    /// Map of each drive; `None` where it has none.
+    pub maps: Vec<Option<Arc<WorldMap>>>,
+}
+
+/// Opens the data root: `--data`, else the shipped sample.
+pub fn open_root(args: &DataArgs) -> Result<(DataRoot, PathBuf), Failure> {
+    let path = match &args.data {
+        Some(path) => path.clone(),
+        None => {
+            let sample = sample_root()
+                .ok_or_else(|| Failure::input("no --data given and no shipped sample found; give a data root with --data ROOT"))?;
+            eprintln!("no --data given: reading the shipped sample {}", sample.display());
+            sample
+        }
+    };
+    if !path.is_dir() {
+        return Err(Failure::input(format!("data root {} is not a folder", path.display())));
+    }
+    Ok((DataRoot::open(&path, args.vehicle.as_deref()).or_input()?, path))
+}
+
+/// The set that the options name, or the one that is meant when they name none.
+pub fn chosen_set(root: &DataRoot, args: &DataArgs) -> Result<String, Failure> {
+    let sets = root.sets();
+    let listed = || if sets.is_empty() { "none".into() } else { sets.join(", ") };
+    match &args.set {
+        Some(set) if sets.contains(set) => Ok(set.clone()),
+        Some(set) => Err(Failure::input(format!("no set `{set}` in the data root; its sets: {}", listed()))),
+        None if sets.iter().any(|s| s == "nominal") => Ok("nominal".into()),
+        None if sets.len() == 1 => Ok(sets[0].clone()),
+        None => Err(Failure::input(format!("which set? give --set; the data root has: {}", listed()))),
+    }
+}
+
+/// Reads the drives that the options name, and their maps.
+pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failure> {
+    check_step(args.dt)?;
+    let (root, _) = open_root(args)?;
+    let set = chosen_set(&root, args)?;
+    let drives = root.load_set(&query(args, &set, args.split, ground_truth)).or_input()?;
+    if drives.is_empty() {
+        return Err(Failure::input(format!("set `{set}` has no drive in split `{}`", args.split.as_str())));
+    }
+    let maps = maps_of(&root, &drives)?;
+    Ok(Drives { root, set, drives, maps })
+}
+
+/// Training drives to fit baselines on: of the same set, else of the first set of the root that has a train split; `None` when none has.
+pub fn training_drives(drives: &Drives, args: &DataArgs) -> Option<Vec<Trajectory>> {
+    let all = DataArgs { trajectories: None, ..args.clone() };
+    let train = |set: &str| drives.root.load_set(&query(&all, set, SplitArg::Train, false)).ok().filter(|d| !d.is_empty());
+    train(&drives.set).or_else(|| drives.root.sets().iter().filter(|s| **s != drives.set).find_map(|s| train(s)))
+}
+
+/// One hash over the maps under the drives; empty without maps.
+pub fn maps_hash(maps: &[Option<Arc<WorldMap>>]) -> String {
+    let mut hashes: Vec<&str> = maps.iter().flatten().map(|m| m.hash()).collect();
+    hashes.sort_unstable();
+    hashes.dedup();
+    if hashes.is_empty() { String::new() } else { nesam_model::bundle::sha256_hex(hashes.concat().as_bytes()) }
+}
+
+/// Worlds of the train split, as far as the root knows them.
+pub fn worlds_of(drives: &[Trajectory]) -> BTreeSet<String> {
+    drives.iter().filter_map(|d| d.world.clone()).collect()
+}
+
+/// The query behind the options.
+pub fn query(args: &DataArgs, set: &str, split: SplitArg, ground_truth: bool) -> SetQuery {
+    let split = match split {
+        SplitArg::Train => SplitFilter::Train,
+        SplitArg::Test => SplitFilter::Test,
+        SplitArg::All => SplitFilter::All,
+    };
+    SetQuery { set: set.into(), split, trajectories: args.trajectories.clone(), dt_s: args.dt, ground_truth }
+}
+
+/// The map of each drive. A drive without a world has none; a world that cannot be read is an error.
+pub fn maps_of(root: &DataRoot, drives: &[Trajectory]) -> Result<Vec<Option<Arc<WorldMap>>>, Failure> {
+    drives.iter().map(|d| d.world.as_deref().map(|world| root.world(world).or_input()).transpose()).collect()
+}
+
+/// Loads and verifies a bundle.
+pub fn load_bundle(given: Option<&Path>) -> Result<ModelBundle, Failure> {
+    ModelBundle::load(&bundle_dir(given)?).or_input()
+}
+
+/// A bundle as a predictor of the vehicle of a data root. The bundle's own card is the calibrated one; only where the data root is of
+/// another vehicle does the physics take the new card, while the learned parts stay. This is said on stderr.
+pub fn predictor_for(mut bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Predictor>, Failure> {
+    let (own, given) = (&bundle.vehicle, root.vehicle());
+    if own.second != given.second || own.name != given.name {
+        eprintln!(
+            "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained",
+            bundle.name, own.name, given.name
+        );
+        bundle.vehicle = given.clone();
+    }
+    Ok(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?))
+}
+
+fn check_step(dt_s: f64) -> Result<(), Failure> {
+    if dt_s.is_finite() && (0.01..=1.0).contains(&dt_s) {
+        return Ok(());
+    }
+    Err(Failure::input(format!("--dt {dt_s} is outside 0.01…1 s")))
+}
+
+/// Refuses a step that the learned model does not know.
+pub fn check_model_step(dt_s: f64) -> Result<(), Failure> {
+    if (dt_s - DT_S).abs() < 1e-9 {
+        return Ok(());
+    }
+    Err(Failure::input(format!(
+        "the model predicts in steps of {DT_S} s; --dt {dt_s} works with --models kinematic,constant_velocity only"
+    )))
+}

@@ -1,0 +1,197 @@
+//! Goal: what a person meets at the command line. Method: the real binary on the committed sample, or on a copy of it that is damaged on
+//! purpose; exit codes and the words of the messages are the contract.
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn sample() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample")
+}
+
+fn nesam(args: &[&str], folder: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn stdout(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+/// Runs and checks exit code 2 and that stderr has every one of `words`.
+fn refused(args: &[&str], folder: &Path, words: &[&str]) {
+    let output = nesam(args, folder);
+    let text = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {text}");
+    for word in words {
+        assert!(text.contains(word), "{args:?} should say `{word}`: {text}");
+    }
+    assert!(!text.contains("panicked"), "{text}");
+}
+
+fn copy_folder(from: &Path, to: &Path) {
+    std::fs::create_dir_all(to).unwrap();
+    for entry in std::fs::read_dir(from).unwrap().flatten() {
+        let target = to.join(entry.file_name());
+        if entry.path().is_dir() {
+            copy_folder(&entry.path(), &target);
+        } else {
+            std::fs::copy(entry.path(), target).unwrap();
+        }
+    }
+}
+
+/// A set of the sample with index rows, and its first drive.
+fn some_set() -> (String, Vec<Value>) {
+    for set in ["nominal", "ood_soil", "effect_open/payload"] {
+        if let Ok(text) = std::fs::read_to_string(sample().join(set).join("index.json")) {
+            return (set.into(), serde_json::from_str(&text).unwrap());
+        }
+    }
+    panic!("the committed sample has no set with an index.json");
+}
+
+/// A copy of the sample with the index of `set` rewritten by `edit`.
+fn edited_root(set: &str, edit: impl Fn(&mut Vec<Value>)) -> tempfile::TempDir {
+    let dir = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), dir.path());
+    let folder = dir.path().join(set);
+    let _ = std::fs::remove_file(folder.join("index.parquet"));
+    let mut rows: Vec<Value> = serde_json::from_str(&std::fs::read_to_string(folder.join("index.json")).unwrap()).unwrap();
+    edit(&mut rows);
+    std::fs::write(folder.join("index.json"), serde_json::to_string(&rows).unwrap()).unwrap();
+    dir
+}
+
+#[test]
+fn service_help_teaches_every_command_and_version_is_printed() {
+    let here = tempfile::tempdir().unwrap();
+    let help = nesam(&["--help"], here.path());
+    assert_eq!(help.status.code(), Some(0));
+    for word in ["serve", "demo", "train", "evaluate", "predict", "inspect", "check", "Examples:", "Exit codes"] {
+        assert!(stdout(&help).contains(word), "help should show `{word}`");
+    }
+    let version = nesam(&["--version"], here.path());
+    assert_eq!(version.status.code(), Some(0));
+    assert!(stdout(&version).starts_with(&format!("nesam {}", env!("CARGO_PKG_VERSION"))));
+    refused(&[], here.path(), &["no command", "Usage"]);
+    refused(&["evaluat"], here.path(), &["unrecognized"]);
+}
+
+#[test]
+fn chrono_constant_velocity_is_scored_and_written() {
+    let here = tempfile::tempdir().unwrap();
+    let (set, _) = some_set();
+    let root = sample().display().to_string();
+    let args = [
+        "evaluate",
+        "--data",
+        &root,
+        "--set",
+        &set,
+        "--models",
+        "constant_velocity",
+        "--json",
+        "e.json",
+        "--html",
+        "e.html",
+        "--predictions",
+        "p.parquet",
+        "--seed",
+        "3",
+    ];
+    let output = nesam(&args, here.path());
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert!(stdout(&output).contains("constant_velocity"));
+    let first = std::fs::read(here.path().join("e.json")).unwrap();
+    let json: Value = serde_json::from_slice(&first).unwrap();
+    assert_eq!(json["schema"], "nesam.evaluate/1");
+    assert_eq!(json["set"].as_str(), Some(set.as_str()));
+    let error = json["models"]["constant_velocity"]["position_m"]["final"].as_f64().unwrap();
+    assert!(error > 0.05 && error < 10.0, "3.2 s of constant velocity: {error} m");
+    assert!(json["provenance"]["command"].as_str().unwrap().starts_with("nesam evaluate"));
+    assert!(!json["provenance"]["data_hash"].as_str().unwrap().is_empty());
+    assert!(std::fs::read_to_string(here.path().join("e.html")).unwrap().contains("<svg"));
+    assert!(std::fs::metadata(here.path().join("p.parquet")).unwrap().len() > 1000);
+
+    nesam(&args, here.path());
+    assert_eq!(first, std::fs::read(here.path().join("e.json")).unwrap(), "the same command gives the same bytes");
+}
+
+#[test]
+fn chrono_wrong_input_is_refused_with_exit_code_2() {
+    let here = tempfile::tempdir().unwrap();
+    let (set, rows) = some_set();
+    let root = sample().display().to_string();
+    let base = ["evaluate", "--data", &root, "--models", "constant_velocity"];
+    let with = |more: &[&str], words: &[&str]| refused(&[&base[..], more].concat(), here.path(), words);
+    with(&["--set", "no_such_set"], &["no_such_set", &set]);
+    with(&["--set", &set, "--trajectories", "x9999"], &["x9999"]);
+    with(&["--set", &set, "--inputs", "wheels"], &["wheels", "not supported"]);
+    with(&["--set", &set, "--horizon", "0"], &["--horizon", "at least 1"]);
+    with(&["--set", &set, "--horizon", "5000"], &["5000 steps", "longest drive"]);
+    with(&["--set", &set, "--dt", "0"], &["--dt"]);
+    with(&["--set", &set, "--models", "tal_elev"], &["tal_elev", "not part of this version"]);
+    with(&["--set", &set, "--resamples", "10"], &["--resamples", "1000"]);
+    refused(&["evaluate", "--data", "no/such/root"], here.path(), &["no/such/root", "not a folder"]);
+    let id = rows[0]["trajectory"].as_str().unwrap();
+    let outside = ["predict", "--data", &root, "--set", &set, "--trajectory", id, "--at", "1e6"];
+    refused(&outside, here.path(), &["--at", id]);
+}
+
+#[test]
+fn chrono_a_missing_split_names_the_splits_that_are_there() {
+    let (set, _) = some_set();
+    let root = edited_root(&set, |rows| rows.iter_mut().for_each(|r| r["split"] = Value::String("test".into())));
+    let data = root.path().display().to_string();
+    let args = ["evaluate", "--data", &data, "--set", &set, "--split", "train", "--models", "constant_velocity"];
+    refused(&args, root.path(), &["train", "test"]);
+}
+
+#[test]
+fn chrono_a_damaged_file_is_named() {
+    let (set, _) = some_set();
+    let dir = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), dir.path());
+    let file = dir.path().join(&set).join("samples.parquet");
+    let bytes = std::fs::read(&file).unwrap();
+    std::fs::write(&file, &bytes[..bytes.len() / 2]).unwrap();
+    let data = dir.path().display().to_string();
+    refused(&["evaluate", "--data", &data, "--set", &set, "--models", "constant_velocity"], dir.path(), &["samples.parquet"]);
+    let check = nesam(&["check", &data], dir.path());
+    assert_eq!(check.status.code(), Some(2));
+    assert!(stdout(&check).contains("samples.parquet"), "{}", stdout(&check));
+}
+
+#[test]
+fn chrono_the_sample_is_sound() {
+    let data = sample().display().to_string();
+    let check = nesam(&["check", &data], Path::new("."));
+    assert_eq!(check.status.code(), Some(0), "{}", stdout(&check));
+    let inspect = nesam(&["inspect", &data], Path::new("."));
+    assert_eq!(inspect.status.code(), Some(0), "{}", stderr(&inspect));
+    assert!(stdout(&inspect).contains("mass_kg"));
+}
+
+#[test]
+fn service_a_missing_or_foreign_bundle_is_refused() {
+    let here = tempfile::tempdir().unwrap();
+    let (set, _) = some_set();
+    let root = sample().display().to_string();
+    let folder = here.path().display().to_string();
+    refused(
+        &["evaluate", "--data", &root, "--set", &set, "--bundle", "no/such/bundle"],
+        here.path(),
+        &["no/such/bundle", "does not exist"],
+    );
+    refused(&["evaluate", "--data", &root, "--set", &set, "--bundle", &folder], here.path(), &["not a bundle", "manifest.toml"]);
+    std::fs::write(here.path().join("manifest.toml"), "format = \"something else\"\n").unwrap();
+    refused(&["inspect", &folder], here.path(), &["manifest.toml"]);
+    let out = format!("{folder}/results");
+    let inside = ["evaluate", "--data", &root, "--set", &set, "--models", "constant_velocity", "--out", &out];
+    refused(&inside, here.path(), &["lies in a bundle"]);
+}
