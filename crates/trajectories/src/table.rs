@@ -133,6 +133,11 @@ impl Table {
 
     /// Whether the statistics of every row group say that the column holds nothing but nulls.
     fn is_all_null(&self, column: usize) -> bool {
+        // Arrow writes a column without values as the logical type "null", and then no statistics.
+        let schema = self.reader.metadata().file_metadata().schema_descr();
+        if matches!(schema.column(column).logical_type_ref(), Some(parquet::basic::LogicalType::Unknown)) {
+            return true;
+        }
         self.reader.metadata().row_groups().iter().all(|group| {
             let nulls = group.column(column).statistics().and_then(|s| s.null_count_opt());
             nulls == u64::try_from(group.num_rows()).ok()
