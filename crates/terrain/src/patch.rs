@@ -9,6 +9,9 @@ pub const PATCH_PX: usize = 128;
 /// Distance between neighbouring pixels of a patch, m (chosen: 12.8 m of ground at the resolution of the maps).
 pub const PATCH_RESOLUTION_M: f64 = 0.1;
 
+/// Part of a cell that forgives f32 rounding at the outermost points.
+const SLACK: f32 = 1e-3;
+
 const PIXELS: usize = PATCH_PX * PATCH_PX;
 
 /// One observation of the terrain around the vehicle, normalised to [-1, 1].
@@ -57,47 +60,86 @@ impl Default for PatchScale {
 
 /// The patch as an affine walk over the grid: cell coordinates of pixel (0, 0), and what one column and one row add.
 ///
-/// Coordinates count from `base`, a cell near the patch, so that f32 resolves 1e-5 of a cell wherever the map lies.
+/// Coordinates count from `base`, a cell near the patch, and are positive, so that f32 resolves a thousandth of a cell wherever the map lies.
 struct Walk {
     base: [i64; 2],
     start: [f32; 2],
     per_column: [f32; 2],
     per_row: [f32; 2],
+    /// First and last cell of the map, along x and y.
+    low: [f32; 2],
+    high: [f32; 2],
 }
 
 impl Walk {
     fn new(map: &WorldMap, pose: Pose2) -> Self {
         let step = PATCH_RESOLUTION_M / map.geometry().resolution_m;
+        let size = [map.geometry().width, map.geometry().height];
         let (sin, cos) = pose.yaw_rad.sin_cos();
+        // The walk spans less than `reach` cells on either side of the centre.
+        let reach = (PATCH_PX as f64 * step).ceil() + 1.0;
+        // Further than that beyond a border every pixel is off the map whatever the distance, and takes the same border value.
         let centre = map.geometry().to_grid(pose.x_m, pose.y_m);
+        let centre = [0, 1].map(|k| centre[k].clamp(-2.0 * reach, size[k] as f64 + 2.0 * reach));
         // One row down is one step back, one column right is one step to the right.
         let per_row = [-step * cos, -step * sin];
         let per_column = [step * sin, -step * cos];
         let half = (PATCH_PX as f64 - 1.0) / 2.0;
         let first = [0, 1].map(|k| centre[k] - half * (per_row[k] + per_column[k]));
-        // The walk spans less than `reach` cells on either side of the centre: every local coordinate is positive.
-        let reach = (PATCH_PX as f64 * step).ceil() + 1.0;
-        let base = [0, 1].map(|k| (centre[k] - reach).floor() as i64);
-        let start = [0, 1].map(|k| (first[k] - base[k] as f64) as f32);
-        Self { base, start, per_column: per_column.map(|v| v as f32), per_row: per_row.map(|v| v as f32) }
+        let base = [0, 1].map(|k| ((centre[k] - reach).floor() as i64).min(size[k] as i64 - 2));
+        Self {
+            base,
+            start: [0, 1].map(|k| (first[k] - base[k] as f64) as f32),
+            per_column: per_column.map(|v| v as f32),
+            per_row: per_row.map(|v| v as f32),
+            low: [0, 1].map(|k| -base[k] as f32),
+            high: [0, 1].map(|k| (size[k] as i64 - 1 - base[k]) as f32),
+        }
     }
 
-    fn row_start(&self, row: usize) -> [f32; 2] {
-        [0, 1].map(|k| self.start[k] + row as f32 * self.per_row[k])
+    /// Cells of one row of the patch, clamped to the border; returns how many pixels are off the map.
+    #[inline(always)]
+    fn row(&self, row: usize, width: usize, cells: &mut RowCells) -> u32 {
+        let [u0, v0] = [0, 1].map(|k| self.start[k] + row as f32 * self.per_row[k]);
+        let [du, dv] = self.per_column;
+        let ([u_low, v_low], [u_high, v_high]) = (self.low, self.high);
+        // The sum is a valid index although `base` may be negative: wrapping 32-bit arithmetic keeps the loop in lanes.
+        let base = (self.base[1] * width as i64 + self.base[0]) as u32;
+        let mut off_map = 0;
+        for column in 0..PATCH_PX {
+            let u = u0 + column as f32 * du;
+            let v = v0 + column as f32 * dv;
+            let off = (u < u_low - SLACK) | (u > u_high + SLACK) | (v < v_low - SLACK) | (v > v_high + SLACK);
+            off_map += u32::from(off);
+            let (u, v) = (u.max(u_low).min(u_high), v.max(v_low).min(v_high));
+            let (west, south) = (u.floor().min(u_high - 1.0), v.floor().min(v_high - 1.0));
+            cells.index[column] = base.wrapping_add(whole(south).wrapping_mul(width as u32)).wrapping_add(whole(west));
+            cells.east[column] = u - west;
+            cells.north[column] = v - south;
+        }
+        off_map
     }
 
-    /// Whether every pixel, and its upper neighbours, lie on a grid of this size.
-    fn is_inside(&self, width: usize, height: usize) -> bool {
-        let last = (PATCH_PX - 1) as f32;
-        [width, height].iter().enumerate().all(|(k, side)| {
-            let (a, b) = (self.start[k], self.start[k] + last * self.per_row[k]);
-            let across = last * self.per_column[k];
-            let low = a.min(b).min(a + across).min(b + across);
-            let high = a.max(b).max(a + across).max(b + across);
-            // One cell of margin covers f32 rounding and the upper neighbour.
-            self.base[k] as f64 + f64::from(low) >= 1.0 && self.base[k] as f64 + f64::from(high) <= *side as f64 - 3.0
-        })
+    /// As [`Walk::row`] on a map with holes; pixels next to a hole count too, once.
+    fn row_with_holes(&self, row: usize, map: &WorldMap, cells: &mut RowCells) -> usize {
+        let width = map.geometry().width;
+        self.row(row, width, cells);
+        let start = [0, 1].map(|k| self.start[k] + row as f32 * self.per_row[k]);
+        let off_map = |column: usize| {
+            (0..2).any(|k| {
+                let at = start[k] + column as f32 * self.per_column[k];
+                at < self.low[k] - SLACK || at > self.high[k] + SLACK
+            })
+        };
+        let unknown = |column: &usize| off_map(*column) || !map.surface.is_known(cells.index[*column] as usize, width);
+        (0..PATCH_PX).filter(unknown).count()
     }
+}
+
+/// The integer in a float that holds one, 0 <= x < 2^22: the low bits of x + 2^23. Unlike `as`, it stays in lanes.
+#[inline(always)]
+fn whole(x: f32) -> u32 {
+    (x + 8_388_608.0).to_bits() & 0x007f_ffff
 }
 
 /// Cells and fractions of one row of a patch.
@@ -148,9 +190,8 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
     let [x_m, y_m] = map.geometry().to_world(0, 0);
     let pose = if finite { pose } else { Pose2 { x_m, y_m, yaw_rad: 0.0 } };
 
-    let (width, height) = (map.geometry().width, map.geometry().height);
+    let width = map.geometry().width;
     let walk = Walk::new(map, pose);
-    let inside = walk.is_inside(width, height);
     let centre_m = map.nearest_height_m(pose.x_m, pose.y_m) as f32;
     let per_elevation = 1.0 / scale.elevation_half_range_m;
     let per_colour = scale.semantic_half_range.map(|half| 1.0 / half);
@@ -160,14 +201,10 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
     let mut colours = Corners::new(0u32);
     let mut unknown = 0;
     for row in 0..PATCH_PX {
-        if inside {
-            cells_inside(&walk, row, width, &mut cells);
-        } else {
-            unknown += cells_clamped(&walk, row, [width, height], map, &mut cells);
-        }
-        if inside && let Some(known) = &map.surface.known {
-            unknown += cells.index.iter().filter(|i| !is_known(known, **i as usize, width)).count();
-        }
+        unknown += match &map.surface.known {
+            None => walk.row(row, width, &mut cells) as usize,
+            Some(_) => walk.row_with_holes(row, map, &mut cells),
+        };
         heights.gather(&map.surface.height_m, width, &cells);
         let out = &mut patch.elevation[row * PATCH_PX..(row + 1) * PATCH_PX];
         mix_heights(&heights, &cells, centre_m, per_elevation, out);
@@ -184,56 +221,6 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
         patch.semantic.fill(0.0);
     }
     patch.known_share = if finite { 1.0 - unknown as f32 / PIXELS as f32 } else { 0.0 };
-}
-
-fn is_known(known: &[bool], index: usize, width: usize) -> bool {
-    known[index] && known[index + 1] && known[index + width] && known[index + width + 1]
-}
-
-/// Cells of a row that lies wholly on the map: no clamping.
-#[inline(always)]
-fn cells_inside(walk: &Walk, row: usize, width: usize, cells: &mut RowCells) {
-    let [u0, v0] = walk.row_start(row);
-    let [du, dv] = walk.per_column;
-    let base = walk.base[1] * width as i64 + walk.base[0];
-    // The sum is a valid index although its parts may be negative: wrapping 32-bit arithmetic keeps the loop in lanes.
-    let base = base as i32;
-    for column in 0..PATCH_PX {
-        let u = u0 + column as f32 * du;
-        let v = v0 + column as f32 * dv;
-        let (i, j) = (u as i32, v as i32);
-        cells.index[column] = base.wrapping_add(j * width as i32 + i) as u32;
-        cells.east[column] = u - i as f32;
-        cells.north[column] = v - j as f32;
-    }
-}
-
-/// Cells of a row with clamping to the border; returns how many pixels are off the map or next to a hole.
-fn cells_clamped(walk: &Walk, row: usize, size: [usize; 2], map: &WorldMap, cells: &mut RowCells) -> usize {
-    let start = walk.row_start(row);
-    let mut unknown = 0;
-    for column in 0..PATCH_PX {
-        let mut off_map = false;
-        let mut cell = [0usize; 2];
-        let mut fraction = [0.0f32; 2];
-        for k in 0..2 {
-            let local = f64::from(start[k] + column as f32 * walk.per_column[k]);
-            let at = walk.base[k] as f64 + local;
-            let last = (size[k] - 1) as f64;
-            // 1e-4 of a cell forgives f32 rounding at the outermost points.
-            off_map |= !(-1e-4..=last + 1e-4).contains(&at);
-            // `max` before `min`: a NaN becomes 0.
-            let clamped = at.max(0.0).min(last);
-            cell[k] = (clamped as usize).min(size[k] - 2);
-            fraction[k] = (clamped - cell[k] as f64) as f32;
-        }
-        let index = cell[1] * size[0] + cell[0];
-        cells.index[column] = index as u32;
-        cells.east[column] = fraction[0];
-        cells.north[column] = fraction[1];
-        unknown += usize::from(off_map || !map.surface.is_known(index, size[0]));
-    }
-    unknown
 }
 
 #[inline(always)]
