@@ -5,6 +5,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 use crate::bundle_path::{MANIFEST, default_bundle};
 use crate::commands;
 use crate::failure::Failure;
+use crate::output::say;
 
 /// Predicts how an off-road vehicle will move over deformable ground, as a service for planners.
 ///
@@ -53,7 +54,7 @@ enum Command {
 pub fn run() -> Result<(), Failure> {
     let cli = Cli::parse();
     if cli.version {
-        println!("{}", version());
+        say!("{}", version());
         return Ok(());
     }
     match cli.command {

@@ -9,6 +9,18 @@ use crate::bundle_path::inside_bundle;
 use crate::failure::Failure;
 use crate::sources::{Drives, maps_hash};
 
+/// Prints a line of results. A reader that closes the pipe early (`| head`) ends nothing: the files are still written.
+pub fn print_line(line: &str) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stdout(), "{line}");
+}
+
+/// `println!` for results, see [`print_line`].
+macro_rules! say {
+    ($($text:tt)*) => { crate::output::print_line(&format!($($text)*)) };
+}
+pub(crate) use say;
+
 /// The folder for a command's results, made if needed: `--out`, else `nesam-out/<command>-<set>`. Never inside a bundle.
 pub fn out_dir(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
     let dir = given.map_or_else(|| Path::new("nesam-out").join(format!("{command}-{}", set.replace('/', "-"))), Path::to_path_buf);

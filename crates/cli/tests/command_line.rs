@@ -195,3 +195,46 @@ fn service_a_missing_or_foreign_bundle_is_refused() {
     let inside = ["evaluate", "--data", &root, "--set", &set, "--models", "constant_velocity", "--out", &out];
     refused(&inside, here.path(), &["lies in a bundle"]);
 }
+
+/// Goal: train → inspect → predict → evaluate hold together, and a damaged bundle is refused by name. Method: a bundle of two training
+/// steps (its errors mean nothing), then one flipped byte.
+#[test]
+fn chrono_a_bundle_made_in_seconds_predicts_and_a_damaged_one_is_refused() {
+    let here = tempfile::tempdir().unwrap();
+    let root = sample().display().to_string();
+    let tiny = ["--epochs", "1", "--batches", "2", "--encoder-steps", "3", "--batch-size", "4", "--out", "made"];
+    let trained = nesam(&[&["train", "--data", &root, "--set", "nominal"], &tiny[..]].concat(), here.path());
+    assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
+    let bundle = "made/bundle";
+    assert_eq!(nesam(&["check", bundle], here.path()).status.code(), Some(0));
+
+    let start = ["--data", &root, "--set", "nominal", "--bundle", bundle];
+    let predicted = nesam(&[&["predict"], &start[..], &["--horizon", "5", "--out", "p.json"]].concat(), here.path());
+    assert_eq!(predicted.status.code(), Some(0), "{}", stderr(&predicted));
+    let json: Value = serde_json::from_slice(&std::fs::read(here.path().join("p.json")).unwrap()).unwrap();
+    assert_eq!(json["steps"].as_array().unwrap().len(), 5);
+    assert_eq!(json["provenance"]["bundle_hash"].as_str().unwrap().len(), 64);
+    let id = json["trajectory"].as_str().unwrap();
+    let scored = nesam(&[&["evaluate"], &start[..], &["--trajectories", id, "--json", "e.json"]].concat(), here.path());
+    assert_eq!(scored.status.code(), Some(0), "{}", stderr(&scored));
+    let json: Value = serde_json::from_slice(&std::fs::read(here.path().join("e.json")).unwrap()).unwrap();
+    for name in ["nesam", "nesam_no_residual", "nesam_zero_sinkage", "kinematic", "constant_velocity"] {
+        assert!(json["models"][name]["mae_mean"]["z_m"].is_number(), "{name}");
+        assert!(json["models"][name]["ci95"]["mae_mean"]["z_m"].is_null(), "one drive has no interval");
+    }
+
+    refused(&[&["predict"], &start[..], &["--horizon", "33"]].concat(), here.path(), &["33", "32"]);
+    refused(&[&["evaluate"], &start[..], &["--horizon", "33"]].concat(), here.path(), &["33", "32"]);
+    refused(&[&["evaluate"], &start[..], &["--dt", "0.05"]].concat(), here.path(), &["--dt 0.05"]);
+    std::fs::write(here.path().join("c.csv"), "speed_m_s,second\n2,0.1\n2,NaN\n").unwrap();
+    refused(&[&["predict"], &start[..], &["--controls", "c.csv"]].concat(), here.path(), &["c.csv", "line 3"]);
+
+    let weights = here.path().join(bundle).join("weights.safetensors");
+    let mut bytes = std::fs::read(&weights).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 1;
+    std::fs::write(&weights, bytes).unwrap();
+    refused(&[&["predict"], &start[..]].concat(), here.path(), &["weights.safetensors", "SHA-256"]);
+    let check = nesam(&["check", bundle], here.path());
+    assert!(check.status.code() == Some(2) && stdout(&check).contains("weights.safetensors"), "{}", stdout(&check));
+}

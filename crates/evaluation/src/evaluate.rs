@@ -53,27 +53,42 @@ pub struct ModelScore {
 /// Map of each drive, in the order of the drives; `None` where the drive has no world.
 pub type DriveMaps = [Option<Arc<WorldMap>>];
 
-/// Runs `predictor` over every window on all cores. `progress` is called with the number of finished windows.
+/// Runs every model over every window on all cores. `progress` is called with the number of finished windows.
+///
+/// Windows are taken world by world and all models of a window together, because a predictor keeps terrain features of a few maps only.
+/// The result does not depend on that order.
 ///
 /// # Errors
-/// The first error of the predictor, naming drive and window.
+/// The first error of a predictor, naming drive and window.
 pub fn predict_all(
-    name: ModelName,
-    predictor: &WindowPredictor,
+    models: &[(ModelName, WindowPredictor)],
     windows: &[Window<'_>],
     maps: &DriveMaps,
     progress: &(dyn Fn(usize) + Sync),
-) -> Result<ModelPaths, EvaluationError> {
+) -> Result<Vec<ModelPaths>, EvaluationError> {
+    let mut order: Vec<usize> = (0..windows.len()).collect();
+    order.sort_by_key(|&w| maps[windows[w].drive].as_ref().map(|m| m.hash()));
     let done = AtomicUsize::new(0);
-    let paths = windows
+    let mut predicted = order
         .par_iter()
-        .map(|window| {
-            let path = predictor.predict(window, maps[window.drive].as_ref())?;
+        .map(|&w| {
+            let map = maps[windows[w].drive].as_ref();
+            let paths = models.iter().map(|(_, m)| m.predict(&windows[w], map)).collect::<Result<Vec<_>, _>>()?;
             progress(done.fetch_add(1, Ordering::Relaxed) + 1);
-            Ok(path)
+            Ok((w, paths))
         })
         .collect::<Result<Vec<_>, EvaluationError>>()?;
-    Ok(ModelPaths { name, parameters: predictor.parameters(), paths })
+    predicted.sort_by_key(|(w, _)| *w);
+    let mut out: Vec<ModelPaths> = models
+        .iter()
+        .map(|(name, model)| ModelPaths { name: *name, parameters: model.parameters(), paths: Vec::with_capacity(windows.len()) })
+        .collect();
+    for (_, paths) in predicted {
+        for (model, path) in out.iter_mut().zip(paths) {
+            model.paths.push(path);
+        }
+    }
+    Ok(out)
 }
 
 /// Scores predictions against the truth, all models with the same bootstrap draws.

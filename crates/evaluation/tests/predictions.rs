@@ -61,8 +61,8 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
     let drives = [drive("a", 120, 9.0), drive("b", 90, -15.0), drive("c", 100, 30.0)];
     let windows = all_windows(&drives, 32, 32, Truth::Measured).unwrap();
     assert_eq!(windows.len(), 7 + 4 + 5);
-    let paths =
-        vec![predict_all(ModelName::ConstantVelocity, &WindowPredictor::ConstantVelocity, &windows, &[None, None, None], &|_| {}).unwrap()];
+    let models = [(ModelName::ConstantVelocity, WindowPredictor::ConstantVelocity)];
+    let paths = predict_all(&models, &windows, &[None, None, None], &|_| {}).unwrap();
     let resamples = Resamples::draw(3, 1000, 5);
     let scores = vec![score(&paths[0], &windows, Truth::Measured, &resamples)];
     let evaluation = Evaluation {

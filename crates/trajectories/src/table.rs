@@ -135,7 +135,7 @@ impl Table {
     fn is_all_null(&self, column: usize) -> bool {
         // Arrow writes a column without values as the logical type "null", and then no statistics.
         let schema = self.reader.metadata().file_metadata().schema_descr();
-        if matches!(schema.column(column).logical_type_ref(), Some(parquet::basic::LogicalType::Unknown)) {
+        if matches!(schema.column(column).logical_type_ref(), Some(LogicalType::Unknown)) {
             return true;
         }
         self.reader.metadata().row_groups().iter().all(|group| {

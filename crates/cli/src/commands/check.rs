@@ -10,6 +10,7 @@ use nesam_trajectories::{DataRoot, Trajectory};
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
+use crate::output::say;
 use crate::sources::query;
 
 /// Options of `nesam check`.
@@ -46,14 +47,14 @@ pub fn run(args: &CheckArgs) -> Result<(), Failure> {
     for path in &args.paths {
         let mut findings = Findings::default();
         let kind = check(path, args.vehicle.as_deref(), &mut findings);
-        println!("{} ({kind})", path.display());
+        say!("{} ({kind})", path.display());
         for note in &findings.notes {
-            println!("  note: {note}");
+            say!("  note: {note}");
         }
         for error in &findings.errors {
-            println!("  error: {error}");
+            say!("  error: {error}");
         }
-        println!("  {}", if findings.errors.is_empty() { "sound".to_string() } else { format!("errors: {}", findings.errors.len()) });
+        say!("  {}", if findings.errors.is_empty() { "sound".to_string() } else { format!("errors: {}", findings.errors.len()) });
         wrong += findings.errors.len();
     }
     if wrong > 0 {

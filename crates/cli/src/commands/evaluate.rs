@@ -13,6 +13,7 @@ use nesam_trajectories::Trajectory;
 
 use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
 use crate::failure::{Failure, OrFail};
+use crate::output::say;
 use crate::progress::Progress;
 use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives, training_drives, worlds_of};
 use crate::{interrupt, output};
@@ -93,12 +94,9 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
 
     let training = training_drives(&drives, &args.data);
     let models = Models::prepare(args, &names, &drives, training.as_deref())?;
-    let mut paths = Vec::new();
-    for (name, predictor) in &models.ready {
-        let progress = Progress::start(name.as_str(), windows.len());
-        paths.push(predict_all(*name, predictor, &windows, &drives.maps, &|done| progress.set(done)).or_failed()?);
-        progress.finish();
-    }
+    let progress = Progress::start("windows predicted", windows.len());
+    let paths = predict_all(&models.ready, &windows, &drives.maps, &|done| progress.set(done)).or_failed()?;
+    progress.finish();
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
     let scores: Vec<ModelScore> = paths.iter().map(|p| score(p, &windows, truth, &resamples)).collect();
     let worlds = training.as_deref().map(worlds_of).unwrap_or_default();
@@ -136,10 +134,10 @@ fn write_results(
     let (json, html) = (at(&args.json, "evaluate.json"), at(&args.html, "evaluate.html"));
     output::write_file(&json, evaluation.to_json().as_bytes())?;
     output::write_file(&html, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
-    println!("\nwrote {} and {}", json.display(), html.display());
+    say!("\nwrote {} and {}", json.display(), html.display());
     if let Some(file) = &args.predictions {
         write_predictions(file, paths, windows).or_failed()?;
-        println!("wrote {}", file.display());
+        say!("wrote {}", file.display());
     }
     Ok(())
 }
@@ -222,7 +220,7 @@ fn kinematic(
 }
 
 fn print_table(e: &Evaluation<'_>) {
-    println!(
+    say!(
         "{} ({}): {} windows of {} steps from {} drives, median path {:.2} m; mean absolute errors against {} channels",
         e.set,
         e.split,
@@ -233,9 +231,15 @@ fn print_table(e: &Evaluation<'_>) {
         e.truth.as_str()
     );
     for (title, last) in [("mean over the horizon", false), ("at the last step", true)] {
-        println!(
+        say!(
             "\n{title:<22}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}  95 % interval",
-            "x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"
+            "x m",
+            "y m",
+            "z m",
+            "roll °",
+            "pitch °",
+            "yaw °",
+            "pos. m"
         );
         for model in e.models {
             let (t, c) = (&model.summary.tree, &model.summary.ci95);
@@ -244,10 +248,10 @@ fn print_table(e: &Evaluation<'_>) {
                 if last { (t.position_m.final_, c.position_m.final_) } else { (t.position_m.mean, c.position_m.mean) };
             let cells: String = six.iter().chain([&position]).map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}"))).collect();
             let interval = interval.map_or(String::new(), |[lo, hi]| format!("  [{lo:.3}, {hi:.3}]"));
-            println!("{:<22}{cells}{interval}", model.name.as_str());
+            say!("{:<22}{cells}{interval}", model.name.as_str());
         }
     }
     for model in e.models.iter().filter(|m| m.errors.not_finite > 0) {
-        println!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite);
+        say!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite);
     }
 }

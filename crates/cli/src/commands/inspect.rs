@@ -11,6 +11,7 @@ use serde_json::{Map, Value, json};
 use crate::bundle_path::{MANIFEST, bundle_dir};
 use crate::failure::{Failure, OrFail};
 use crate::output;
+use crate::output::say;
 
 /// Options of `nesam inspect`.
 #[derive(Args, Debug)]
@@ -116,20 +117,20 @@ fn print_tree(value: &Value, depth: usize) {
             for (name, field) in fields.iter().filter(|(name, _)| *name != "schema") {
                 match field {
                     Value::Object(_) => {
-                        println!("{indent}{name}:");
+                        say!("{indent}{name}:");
                         print_tree(field, depth + 1);
                     }
                     Value::Array(items) if items.iter().any(Value::is_object) => {
-                        println!("{indent}{name}:");
+                        say!("{indent}{name}:");
                         for item in items {
                             print_row(item, depth + 1);
                         }
                     }
-                    other => println!("{indent}{name}: {}", plain(other)),
+                    other => say!("{indent}{name}: {}", plain(other)),
                 }
             }
         }
-        other => println!("{indent}{}", plain(other)),
+        other => say!("{indent}{}", plain(other)),
     }
 }
 
@@ -139,7 +140,7 @@ fn print_row(value: &Value, depth: usize) {
     // The row's own name comes first; the rest keeps the order of the object.
     let rest = fields.iter().filter(|(name, _)| *name != "set");
     let cells: Vec<String> = fields.get("set").map(plain).into_iter().chain(rest.map(|(name, v)| format!("{name} {}", plain(v)))).collect();
-    println!("{}{}", "  ".repeat(depth), cells.join(" · "));
+    say!("{}{}", "  ".repeat(depth), cells.join(" · "));
 }
 
 fn plain(value: &Value) -> String {

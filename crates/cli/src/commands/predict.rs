@@ -14,6 +14,7 @@ use serde_json::{Map, Value, json};
 use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output;
+use crate::output::say;
 use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
 
 /// Options of `nesam predict`.
@@ -98,7 +99,7 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
     match &args.out {
         Some(file) => output::write_file(file, text.as_bytes()).inspect(|()| eprintln!("wrote {}", file.display())),
         None => {
-            print!("{text}");
+            say!("{}", text.trim_end());
             Ok(())
         }
     }
