@@ -1,0 +1,162 @@
+//! Everything that can be asked of the engine.
+
+use std::sync::Arc;
+
+use nesam_model::HistoryStep;
+use nesam_terrain::WorldMap;
+
+use crate::measurement::{Measurement, Outcome};
+use crate::query::{PredictQuery, Prediction, Provenance};
+use crate::session::SoilState;
+
+/// A command. The list is closed: what is not here cannot happen to a session.
+#[derive(Clone, Debug)]
+pub enum Command {
+    /// Opens a session. Answer: `Reply::Session`.
+    Open(OpenSession),
+    /// Reads a session. Answer: `Reply::Session`.
+    Get {
+        /// Name of the session.
+        session: String,
+    },
+    /// Lists the sessions by name. Answer: `Reply::Sessions`.
+    List,
+    /// Closes a session. Answer: `Reply::Done`.
+    Close {
+        /// Name of the session.
+        session: String,
+    },
+    /// Feeds a session. Answer: `Reply::Measured`.
+    Measure {
+        /// Name of the session.
+        session: String,
+        /// Vehicle that the measurement claims to come from, where the transport tells; the session must belong to it.
+        vehicle: Option<String>,
+        /// The measurement.
+        measurement: Measurement,
+    },
+    /// Rolls candidates out. Answer: `Reply::Predicted`.
+    Predict(PredictQuery),
+    /// Takes a new map or a new version. Answer: `Reply::Map`.
+    PutMap {
+        /// The map.
+        map: Arc<WorldMap>,
+        /// Version that a patched map was made from.
+        base: Option<u64>,
+    },
+    /// Reads a map. Answer: `Reply::Map`.
+    GetMap {
+        /// Id of the map.
+        map: String,
+    },
+    /// Lists the maps by id. Answer: `Reply::Maps`.
+    ListMaps,
+    /// Forgets a map that no session uses. Answer: `Reply::Done`.
+    DeleteMap {
+        /// Id of the map.
+        map: String,
+    },
+}
+
+impl Command {
+    /// Name for metrics and logs.
+    pub fn label(&self) -> &'static str {
+        match self {
+            Self::Open(_) => "open",
+            Self::Get { .. } => "get",
+            Self::List => "list",
+            Self::Close { .. } => "close",
+            Self::Measure { .. } => "measure",
+            Self::Predict(_) => "predict",
+            Self::PutMap { .. } => "put_map",
+            Self::GetMap { .. } => "get_map",
+            Self::ListMaps => "list_maps",
+            Self::DeleteMap { .. } => "delete_map",
+        }
+    }
+}
+
+/// A session to open.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct OpenSession {
+    /// Name of the session; empty = the vehicle's.
+    pub session: String,
+    /// Vehicle.
+    pub vehicle: String,
+    /// Name of the vehicle card that the client expects; empty = the bundle's.
+    pub vehicle_card: String,
+    /// Map; empty = none.
+    pub map: String,
+    /// First measurement.
+    pub initial: Option<Measurement>,
+}
+
+/// The answer to a command that was not refused.
+#[derive(Clone, Debug)]
+pub enum Reply {
+    /// A session.
+    Session(Box<SessionView>),
+    /// Sessions.
+    Sessions(Vec<SessionView>),
+    /// What became of a measurement.
+    Measured(MeasureAnswer),
+    /// A prediction.
+    Predicted(Box<Prediction>),
+    /// A map.
+    Map(Arc<WorldMap>),
+    /// Maps.
+    Maps(Vec<Arc<WorldMap>>),
+    /// Done, and nothing to tell.
+    Done,
+}
+
+/// What became of a measurement, and where the session stands now.
+#[derive(Clone, Debug, PartialEq)]
+pub struct MeasureAnswer {
+    /// What became of it.
+    pub outcome: Outcome,
+    /// Steps in the history.
+    pub history_steps: usize,
+    /// Changes of the history since the session was opened.
+    pub history_epoch: u64,
+    /// Updates of the soil correction.
+    pub soil_epoch: u64,
+}
+
+/// A session as the outside sees it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SessionView {
+    /// Name of the session.
+    pub session: String,
+    /// Vehicle.
+    pub vehicle: String,
+    /// What a prediction made now would be computed from.
+    pub provenance: Provenance,
+    /// Steps in the history.
+    pub history_steps: usize,
+    /// Newest step of the history.
+    pub newest: Option<HistoryStep>,
+    /// Stamp of the newest accepted measurement, ns of the vehicle's clock.
+    pub last_stamp_ns: Option<i64>,
+    /// Highest accepted sequence number.
+    pub last_sequence: Option<u64>,
+    /// What was learned of the soil.
+    pub soil: SoilState,
+}
+
+/// What watchers of the engine hear.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Event {
+    /// The soil estimate of a session changed.
+    SoilChanged {
+        /// Name of the session.
+        session: String,
+        /// The new estimate.
+        soil: SoilState,
+    },
+    /// A session was closed.
+    SessionClosed {
+        /// Name of the session.
+        session: String,
+    },
+}

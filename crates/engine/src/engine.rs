@@ -1,0 +1,243 @@
+//! The engine: all sessions and maps, one command at a time.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
+
+use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
+use crate::error::EngineError;
+use crate::limits::{Limits, check_name};
+use crate::maps::MapRegistry;
+use crate::measurement::Measurement;
+use crate::query::{PredictQuery, Prediction, Provenance};
+use crate::session::{Rules, Session};
+
+/// Hears what happens in the engine; called on the engine's thread, so it must not wait.
+pub type EventSink = Box<dyn FnMut(Event) + Send>;
+
+/// A recorded command and the instant at which it was executed, ns of the engine's clock.
+pub type Logged = (u64, Command);
+
+/// All state of the service.
+pub struct Engine {
+    predictor: Arc<Predictor>,
+    limits: Limits,
+    step_ns: i64,
+    sessions: BTreeMap<String, Session>,
+    maps: MapRegistry,
+    events: Option<EventSink>,
+    log: Option<Vec<Logged>>,
+}
+
+impl core::fmt::Debug for Engine {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Engine").field("sessions", &self.sessions).field("maps", &self.maps).finish_non_exhaustive()
+    }
+}
+
+impl Engine {
+    /// An engine without sessions.
+    pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Self {
+        let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
+        Self { predictor, limits, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None }
+    }
+
+    /// Tells a sink what happens from now on.
+    pub fn with_events(mut self, sink: EventSink) -> Self {
+        self.events = Some(sink);
+        self
+    }
+
+    /// Keeps every command from now on, for a replay.
+    pub fn start_recording(&mut self) {
+        self.log = Some(Vec::new());
+    }
+
+    /// The recorded commands.
+    pub fn take_recording(&mut self) -> Vec<Logged> {
+        self.log.take().unwrap_or_default()
+    }
+
+    /// Limits in force.
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
+    /// Answers one command at one instant of the engine's clock. A refused command changes nothing; a prediction never changes anything.
+    ///
+    /// # Errors
+    /// Any [`EngineError`] that names why the command was refused.
+    pub fn execute(&mut self, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
+        if let Some(log) = &mut self.log {
+            log.push((now_ns, command.clone()));
+        }
+        match command {
+            Command::Open(open) => self.open(now_ns, open),
+            Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
+            Command::List => Ok(Reply::Sessions(self.sessions.values().map(|s| self.view(s)).collect())),
+            Command::Close { session } => self.close(session),
+            Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
+            Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Box::new(p))),
+            Command::PutMap { map, base } => {
+                self.maps.put(map.clone(), *base, &self.limits)?;
+                Ok(Reply::Map(map.clone()))
+            }
+            Command::GetMap { map } => self.maps.get(map).cloned().map(Reply::Map),
+            Command::ListMaps => Ok(Reply::Maps(self.maps.all())),
+            Command::DeleteMap { map } => self.delete_map(map),
+        }
+    }
+
+    fn session(&self, id: &str) -> Result<&Session, EngineError> {
+        self.sessions.get(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })
+    }
+
+    fn open(&mut self, now_ns: u64, open: &OpenSession) -> Result<Reply, EngineError> {
+        check_name("vehicle_id", &open.vehicle)?;
+        let id = if open.session.is_empty() { &open.vehicle } else { &open.session };
+        check_name("session_id", id)?;
+        let card = &self.predictor.bundle().vehicle;
+        if !open.vehicle_card.is_empty() && open.vehicle_card != card.name {
+            let reason = format!("is `{}`, the bundle was trained for `{}`", open.vehicle_card, card.name);
+            return Err(EngineError::invalid("vehicle_card", reason));
+        }
+        let map = (!open.map.is_empty()).then_some(open.map.as_str());
+        if let Some(map) = map {
+            self.maps.get(map)?;
+        }
+        if self.sessions.contains_key(id) {
+            return Err(EngineError::SessionExists { session: id.clone() });
+        }
+        if self.sessions.len() >= self.limits.sessions_max {
+            let reason = format!("{} sessions are open, the limit; close one", self.sessions.len());
+            return Err(EngineError::Exhausted { field: "session_id".into(), reason });
+        }
+        let mut session = Session::new(id, &open.vehicle, map);
+        if let Some(initial) = &open.initial {
+            let rules = Rules { step_ns: self.step_ns, vehicle: card, limits: &self.limits };
+            let outcome = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
+            if let crate::Outcome::NotFinite { field } = outcome {
+                return Err(EngineError::invalid(format!("initial.{field}"), "is not finite"));
+            }
+        }
+        let view = self.view(&session);
+        self.sessions.insert(id.clone(), session);
+        Ok(Reply::Session(Box::new(view)))
+    }
+
+    fn close(&mut self, id: &str) -> Result<Reply, EngineError> {
+        self.session(id)?;
+        self.sessions.remove(id);
+        self.emit(Event::SessionClosed { session: id.into() });
+        Ok(Reply::Done)
+    }
+
+    fn measure(&mut self, now_ns: u64, id: &str, vehicle: Option<&str>, measurement: &Measurement) -> Result<Reply, EngineError> {
+        let session = self.sessions.get_mut(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })?;
+        if let Some(vehicle) = vehicle
+            && vehicle != session.vehicle()
+        {
+            let reason = format!("session `{id}` belongs to vehicle `{}`, the measurement comes from `{vehicle}`", session.vehicle());
+            return Err(EngineError::invalid("session_id", reason));
+        }
+        let soil_epoch = session.soil().epoch;
+        let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
+        let outcome = session.observe(measurement, now_ns, rules)?;
+        let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
+        if soil.epoch != soil_epoch {
+            self.emit(Event::SoilChanged { session: id.into(), soil });
+        }
+        Ok(Reply::Measured(MeasureAnswer { outcome, history_steps, history_epoch, soil_epoch: soil.epoch }))
+    }
+
+    fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
+        let session = self.session(&query.session)?;
+        query.check(&self.limits, &self.predictor.bundle().vehicle)?;
+        let map = session.map().map(|id| self.maps.get(id)).transpose()?;
+        let start = match (query.start, session.newest()) {
+            (Some(start), _) => start,
+            (None, Some(newest)) => newest.state,
+            (None, None) => {
+                let reason = "is absent and the session has no measurement yet; give one or send measurements first";
+                return Err(EngineError::NotReady { field: "start".into(), reason: reason.into() });
+            }
+        };
+        if let Some(map) = map
+            && !map.contains(start.position_m[0], start.position_m[1])
+        {
+            let [x, y, _] = start.position_m;
+            let reason = format!("({x:.2}, {y:.2}) m lies outside map `{}`", map.id());
+            return Err(match query.start {
+                Some(_) => EngineError::invalid("start.position_m", reason),
+                None => EngineError::NotReady { field: "session_id".into(), reason: format!("the measured position {reason}") },
+            });
+        }
+        let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
+        let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
+        let rollout = self.predictor.rollout(&RolloutQuery {
+            history: &history,
+            start,
+            controls: &query.controls,
+            samples: query.samples,
+            horizon: query.horizon,
+            map,
+            soil_correction: session.soil().correction,
+            variant: Variant::Full,
+        })?;
+        Ok(Prediction {
+            rollout,
+            start,
+            history_steps: history.len(),
+            soil_variance: session.soil().variance,
+            measurement_age_s: session.age_s(now_ns),
+            provenance: self.provenance(session),
+        })
+    }
+
+    fn delete_map(&mut self, id: &str) -> Result<Reply, EngineError> {
+        if let Some(user) = self.sessions.values().find(|s| s.map() == Some(id)) {
+            return Err(EngineError::MapInUse { map: id.into(), session: user.id().into() });
+        }
+        self.maps.delete(id).map(|()| Reply::Done)
+    }
+
+    fn provenance(&self, session: &Session) -> Provenance {
+        let map = session.map().and_then(|id| self.maps.get(id).ok());
+        let bundle = self.predictor.bundle();
+        Provenance {
+            history_epoch: session.history_epoch(),
+            soil_epoch: session.soil().epoch,
+            map: map.map(|m| (m.id().to_string(), m.version(), m.hash().to_string())),
+            bundle_name: bundle.name.clone(),
+            bundle_hash: bundle.hash.clone(),
+        }
+    }
+
+    fn view(&self, session: &Session) -> SessionView {
+        SessionView {
+            session: session.id().into(),
+            vehicle: session.vehicle().into(),
+            provenance: self.provenance(session),
+            history_steps: session.history().len(),
+            newest: session.newest().copied(),
+            last_stamp_ns: session.last_stamp_ns(),
+            last_sequence: session.last_sequence(),
+            soil: *session.soil(),
+        }
+    }
+
+    fn emit(&mut self, event: Event) {
+        if let Some(sink) = &mut self.events {
+            sink(event);
+        }
+    }
+}
+
+/// Puts the field of an error below a parent field.
+fn below(parent: &str, error: EngineError) -> EngineError {
+    match error {
+        EngineError::Invalid { field, reason } => EngineError::Invalid { field: format!("{parent}.{field}"), reason },
+        other => other,
+    }
+}

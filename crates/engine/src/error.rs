@@ -1,0 +1,126 @@
+//! What can go wrong with a command.
+
+use nesam_model::ModelError;
+
+/// Why a command was refused. No refused command changes anything.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum EngineError {
+    /// No session of this name is open.
+    #[error("session `{session}` is not open; open it first")]
+    UnknownSession {
+        /// Name asked for.
+        session: String,
+    },
+    /// A session of this name is open already.
+    #[error("session `{session}` is open already; close it first or choose another session id")]
+    SessionExists {
+        /// Name asked for.
+        session: String,
+    },
+    /// No map of this name was uploaded.
+    #[error("map `{map}` is not known; upload it first")]
+    UnknownMap {
+        /// Name asked for.
+        map: String,
+    },
+    /// The map is there in this or a newer version.
+    #[error("map `{map}` is held in version {held}; upload a higher version")]
+    MapExists {
+        /// Map.
+        map: String,
+        /// Version held.
+        held: u64,
+    },
+    /// A tile was made for a version that is not the newest any more.
+    #[error("map `{map}` is at version {held}, the tile was made for version {base}; read it again")]
+    MapChanged {
+        /// Map.
+        map: String,
+        /// Version held.
+        held: u64,
+        /// Version that the tile was made for.
+        base: u64,
+    },
+    /// A session drives on the map.
+    #[error("map `{map}` is used by session `{session}`; close it first")]
+    MapInUse {
+        /// Map.
+        map: String,
+        /// One of the sessions.
+        session: String,
+    },
+    /// A value is not acceptable.
+    #[error("`{field}`: {reason}")]
+    Invalid {
+        /// Path of the field at fault.
+        field: String,
+        /// What was wrong and what is allowed.
+        reason: String,
+    },
+    /// The session cannot answer yet.
+    #[error("`{field}`: {reason}")]
+    NotReady {
+        /// What is missing.
+        field: String,
+        /// Why, and what to do.
+        reason: String,
+    },
+    /// A limit on what the service holds is reached.
+    #[error("`{field}`: {reason}")]
+    Exhausted {
+        /// Limit that is reached.
+        field: String,
+        /// How much is held and what to do.
+        reason: String,
+    },
+    /// Too many commands wait.
+    #[error("overloaded: {waiting} {kind} wait, the limit; ask again later or ask for less")]
+    Overloaded {
+        /// What waits: predictions or commands.
+        kind: &'static str,
+        /// How many.
+        waiting: usize,
+    },
+    /// The deadline passed before the computation began.
+    #[error("the deadline passed before the prediction was started; ask for fewer samples or allow more time")]
+    Expired,
+    /// The asker has gone.
+    #[error("the asker did not wait for the prediction")]
+    Abandoned,
+    /// The engine is shutting down.
+    #[error("the service is shutting down")]
+    Stopped,
+    /// A bug of the service; the command was dropped.
+    #[error("internal error: {reason}; this is a bug")]
+    Internal {
+        /// What is known about it.
+        reason: String,
+    },
+}
+
+impl EngineError {
+    /// A value that is not acceptable.
+    pub fn invalid(field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self::Invalid { field: field.into(), reason: reason.into() }
+    }
+
+    /// Path of the field at fault; empty when none is.
+    pub fn field(&self) -> &str {
+        match self {
+            Self::Invalid { field, .. } | Self::NotReady { field, .. } | Self::Exhausted { field, .. } => field,
+            Self::UnknownSession { .. } | Self::SessionExists { .. } => "session_id",
+            Self::UnknownMap { .. } | Self::MapExists { .. } | Self::MapInUse { .. } => "map_id",
+            Self::MapChanged { .. } => "base_version",
+            Self::Overloaded { .. } | Self::Expired | Self::Abandoned | Self::Stopped | Self::Internal { .. } => "",
+        }
+    }
+}
+
+impl From<ModelError> for EngineError {
+    fn from(error: ModelError) -> Self {
+        match error {
+            ModelError::Query { field, reason } => Self::Invalid { field: field.into(), reason },
+            other => Self::Internal { reason: other.to_string() },
+        }
+    }
+}

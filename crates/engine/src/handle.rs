@@ -1,0 +1,161 @@
+//! The engine behind a thread.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
+
+use crate::clock::Clock;
+use crate::command::{Command, Reply};
+use crate::engine::Engine;
+use crate::error::EngineError;
+use crate::limits::Limits;
+use crate::queue::{Queue, Turn};
+
+/// A command on its way to the engine.
+pub struct Submission {
+    /// What is asked.
+    pub command: Command,
+    /// Instant of the engine's clock after which a prediction need not be started any more, ns.
+    pub deadline_ns: Option<u64>,
+    /// Raised when nobody waits for the answer any more; a prediction is then skipped.
+    pub abandoned: Option<Arc<AtomicBool>>,
+    /// Called once with the answer, on the engine's thread or on the submitter's; it must not wait.
+    pub reply: Box<dyn FnOnce(Answer) + Send>,
+    submitted_ns: u64,
+}
+
+impl core::fmt::Debug for Submission {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("Submission").field("command", &self.command.label()).field("deadline_ns", &self.deadline_ns).finish_non_exhaustive()
+    }
+}
+
+impl Submission {
+    /// A command without a deadline.
+    pub fn new(command: Command, reply: impl FnOnce(Answer) + Send + 'static) -> Self {
+        Self { command, deadline_ns: None, abandoned: None, reply: Box::new(reply), submitted_ns: 0 }
+    }
+
+    fn refuse(self, error: EngineError) {
+        (self.reply)(Answer { result: Err(error), queued_ns: 0, busy_ns: 0 });
+    }
+}
+
+/// The answer to a submission.
+#[derive(Debug)]
+pub struct Answer {
+    /// Reply or refusal.
+    pub result: Result<Reply, EngineError>,
+    /// Time in the queue, ns.
+    pub queued_ns: u64,
+    /// Time in the engine, ns.
+    pub busy_ns: u64,
+}
+
+/// The way to an engine that runs on a thread of its own. Clones share the engine.
+#[derive(Clone)]
+pub struct EngineHandle {
+    queue: Arc<Queue>,
+    clock: Arc<dyn Clock>,
+    limits: Arc<Limits>,
+    thread: Arc<Mutex<Option<JoinHandle<Engine>>>>,
+}
+
+impl core::fmt::Debug for EngineHandle {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("EngineHandle").field("queue", &self.queue).finish_non_exhaustive()
+    }
+}
+
+impl EngineHandle {
+    /// Starts the thread.
+    ///
+    /// # Panics
+    /// When the system refuses to start a thread.
+    pub fn spawn(engine: Engine, clock: Arc<dyn Clock>) -> Self {
+        let queue = Arc::new(Queue::default());
+        let limits = Arc::new(engine.limits().clone());
+        let thread = std::thread::Builder::new()
+            .name("nesam-engine".into())
+            .spawn({
+                let (queue, clock) = (queue.clone(), clock.clone());
+                move || run(engine, &queue, clock.as_ref())
+            })
+            .expect("the system starts a thread");
+        Self { queue, clock, limits, thread: Arc::new(Mutex::new(Some(thread))) }
+    }
+
+    /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once.
+    pub fn submit(&self, mut submission: Submission) {
+        submission.submitted_ns = self.clock.now_ns();
+        if let Err((error, submission)) = self.queue.push(submission, &self.limits) {
+            submission.refuse(error);
+        }
+    }
+
+    /// The same, waiting for the answer on this thread.
+    ///
+    /// # Errors
+    /// Any [`EngineError`].
+    pub fn call(&self, command: Command) -> Result<Reply, EngineError> {
+        let (sender, receiver) = std::sync::mpsc::channel();
+        self.submit(Submission::new(command, move |answer| {
+            let _ = sender.send(answer.result);
+        }));
+        receiver.recv().unwrap_or(Err(EngineError::Stopped))
+    }
+
+    /// Limits in force.
+    pub fn limits(&self) -> &Limits {
+        &self.limits
+    }
+
+    /// The engine's clock.
+    pub fn now_ns(&self) -> u64 {
+        self.clock.now_ns()
+    }
+
+    /// Waiting commands and waiting predictions.
+    pub fn waiting(&self) -> (usize, usize) {
+        self.queue.waiting()
+    }
+
+    /// Stops the engine: waiting commands are executed, waiting predictions are refused, later submissions too. Gives the engine back to the first
+    /// caller, `None` to the others and after a crash of the thread.
+    pub fn stop(&self) -> Option<Engine> {
+        for submission in self.queue.stop() {
+            submission.refuse(EngineError::Stopped);
+        }
+        let thread = self.thread.lock().ok()?.take()?;
+        thread.join().ok()
+    }
+}
+
+/// The thread's loop.
+fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock) -> Engine {
+    loop {
+        match queue.next() {
+            Turn::Commands(commands) => commands.into_iter().for_each(|submission| answer(&mut engine, submission, clock)),
+            Turn::Prediction(submission) => answer(&mut engine, submission, clock),
+            Turn::End => return engine,
+        }
+    }
+}
+
+/// Executes one submission. A panic inside is a bug of ours; it costs that command, not the service.
+fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock) {
+    let Submission { command, deadline_ns, abandoned, reply, submitted_ns } = submission;
+    let now_ns = clock.now_ns();
+    let is_prediction = matches!(command, Command::Predict(_));
+    let result = if is_prediction && abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
+        Err(EngineError::Abandoned)
+    } else if is_prediction && deadline_ns.is_some_and(|deadline| now_ns > deadline) {
+        Err(EngineError::Expired)
+    } else {
+        catch_unwind(AssertUnwindSafe(|| engine.execute(now_ns, &command)))
+            .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
+    };
+    let busy_ns = clock.now_ns().saturating_sub(now_ns);
+    reply(Answer { result, queued_ns: now_ns.saturating_sub(submitted_ns), busy_ns });
+}

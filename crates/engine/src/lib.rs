@@ -1,0 +1,41 @@
+//! Sessions, measurements and predictions behind one thread.
+//!
+//! The service keeps a [`Session`] for each vehicle: the last measured steps, the map it drives on, the correction of its soil. Everything that
+//! reads or changes a session is a [`Command`]; [`Engine::execute`] answers one command at one instant and does nothing else: no network, no
+//! thread, no clock. The same commands at the same instants give the same answers, so a run can be recorded ([`Engine::start_recording`]) and
+//! replayed bit for bit.
+//!
+//! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own. Measurements overtake predictions there: a planner that
+//! asks for much never delays what a vehicle reports by more than the prediction that is being computed. A full queue is an
+//! [`EngineError::Overloaded`], never a wait and never a panic; a prediction whose asker has gone or whose deadline has passed is skipped.
+//!
+//! ```text
+//! server ── Command ──► EngineHandle ──► queue ──► Engine::execute ──► Session, Predictor
+//!        ◄── Answer (callback) ◄──────────────────────┘
+//! ```
+#![forbid(unsafe_code)]
+
+mod clock;
+mod command;
+mod engine;
+mod error;
+mod grid;
+mod handle;
+mod limits;
+mod maps;
+mod measurement;
+mod query;
+mod queue;
+mod session;
+
+pub use clock::{Clock, ManualClock};
+pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
+pub use engine::{Engine, EventSink, Logged};
+pub use error::EngineError;
+pub use grid::StepGrid;
+pub use handle::{Answer, EngineHandle, Submission};
+pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
+pub use maps::MapRegistry;
+pub use measurement::{Measurement, Outcome, WheelMeasurement};
+pub use query::{PredictQuery, Prediction, Provenance};
+pub use session::{Session, SoilState};

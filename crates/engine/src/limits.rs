@@ -1,0 +1,169 @@
+//! Limits of everything, and the checks that need nothing else.
+
+use nesam_model::MAX_HORIZON;
+use nesam_physics::{Control, STATE_DIM, Vehicle, VehicleState};
+
+use crate::error::EngineError;
+
+/// Longest name of a session, a vehicle or a map, bytes.
+pub const NAME_LENGTH_MAX: usize = 64;
+
+/// Names of the entries of a state, as paths below the state.
+const STATE_FIELDS: [&str; STATE_DIM] = [
+    "position_m.x",
+    "position_m.y",
+    "position_m.z",
+    "attitude_rad.x",
+    "attitude_rad.y",
+    "attitude_rad.z",
+    "velocity_m_s.x",
+    "velocity_m_s.y",
+    "velocity_m_s.z",
+    "angular_velocity_rad_s.x",
+    "angular_velocity_rad_s.y",
+    "angular_velocity_rad_s.z",
+];
+
+/// What the engine accepts and holds at most.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Limits {
+    /// Open sessions.
+    pub sessions_max: usize,
+    /// Candidate sequences N of one prediction.
+    pub samples_max: usize,
+    /// Steps K of one prediction; never above the positions of the model.
+    pub horizon_max: usize,
+    /// Product N K of one prediction, the budget of one turn of the engine.
+    pub sample_steps_max: usize,
+    /// Uploaded maps.
+    pub maps_max: usize,
+    /// Cells of one map.
+    pub map_cells_max: usize,
+    /// Cells of all maps together.
+    pub map_cells_total_max: usize,
+    /// Predictions that wait.
+    pub waiting_predictions_max: usize,
+    /// Other commands that wait.
+    pub waiting_commands_max: usize,
+    /// |position| along each axis, m.
+    pub position_max_m: f64,
+    /// |velocity| along each axis, m/s.
+    pub speed_max_m_s: f64,
+    /// |angular velocity| about each axis, rad/s.
+    pub angular_speed_max_rad_s: f64,
+    /// Longest pause between two measurements of one session, s. A stamp further ahead is taken for a broken clock.
+    pub pause_max_s: f64,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Self {
+            sessions_max: 1024,
+            samples_max: 4096,
+            horizon_max: MAX_HORIZON,
+            sample_steps_max: 65_536,
+            maps_max: 64,
+            map_cells_max: nesam_terrain::MAX_CELLS,
+            map_cells_total_max: 4 * nesam_terrain::MAX_CELLS,
+            waiting_predictions_max: 64,
+            waiting_commands_max: 4096,
+            position_max_m: 1e6,
+            speed_max_m_s: 100.0,
+            angular_speed_max_rad_s: 50.0,
+            pause_max_s: 86_400.0,
+        }
+    }
+}
+
+impl Limits {
+    /// Checks N, K and N K.
+    ///
+    /// # Errors
+    /// `EngineError::Invalid` naming `samples` or `horizon` and the limit.
+    pub fn check_shape(&self, samples: usize, horizon: usize) -> Result<(), EngineError> {
+        let horizon_max = self.horizon_max.min(MAX_HORIZON);
+        for (field, value, limit) in [("samples", samples, self.samples_max), ("horizon", horizon, horizon_max)] {
+            if value == 0 || value > limit {
+                return Err(EngineError::invalid(field, format!("is {value}, allowed are 1 to {limit}")));
+            }
+        }
+        if samples * horizon > self.sample_steps_max {
+            let reason = format!("samples x horizon = {samples} x {horizon} is above the limit of {}", self.sample_steps_max);
+            return Err(EngineError::invalid("samples", reason));
+        }
+        Ok(())
+    }
+
+    /// Checks the plausibility of a finite state.
+    ///
+    /// # Errors
+    /// `EngineError::Invalid` naming the entry below `path` and its limit.
+    pub fn check_state(&self, path: &str, state: &VehicleState<f64>) -> Result<(), EngineError> {
+        let angle = core::f64::consts::PI + 1e-6;
+        for (i, value) in state.to_array().into_iter().enumerate() {
+            let limit = match i {
+                0..3 => self.position_max_m,
+                3 | 4 => angle,
+                5 => 1e4, // yaw may be unwrapped
+                6..9 => self.speed_max_m_s,
+                _ => self.angular_speed_max_rad_s,
+            };
+            if !value.is_finite() || value.abs() > limit {
+                let reason = format!("is {value}, allowed is a finite number of magnitude up to {limit}");
+                return Err(EngineError::invalid(format!("{path}.{}", STATE_FIELDS[i]), reason));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Path of the first entry below the state that is NaN or infinite.
+pub(crate) fn not_finite(state: &VehicleState<f64>) -> Option<&'static str> {
+    state.to_array().iter().position(|v| !v.is_finite()).map(|i| STATE_FIELDS[i])
+}
+
+/// The entry of a command outside the card's range, with the reason. Compared in f32, so that the ends of the range are admitted in both precisions.
+pub(crate) fn outside_card(vehicle: &Vehicle, control: &Control<f64>) -> Option<(&'static str, String)> {
+    let entries = [("speed_m_s", control.speed_m_s, vehicle.command_range[0]), ("second", control.second, vehicle.command_range[1])];
+    entries.into_iter().find_map(|(name, value, [low, high])| {
+        let inside = value as f32 >= low as f32 && value as f32 <= high as f32;
+        (!inside).then(|| (name, format!("is {value}, the card of {} admits {low} to {high}", vehicle.name)))
+    })
+}
+
+/// Checks the name of a session, a vehicle or a map: 1 to 64 of `A-Z a-z 0-9 _ . -`, so that it can be part of a key or a path.
+///
+/// # Errors
+/// `EngineError::Invalid` naming `field`.
+pub fn check_name(field: &str, name: &str) -> Result<(), EngineError> {
+    let allowed = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
+    if name.is_empty() || name.len() > NAME_LENGTH_MAX || !name.chars().all(allowed) {
+        let reason = format!("must be 1 to {NAME_LENGTH_MAX} of A-Z a-z 0-9 _ . - and is {} bytes long", name.len());
+        return Err(EngineError::invalid(field, reason));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_shape_limits_hold_at_the_edge() {
+        let limits = Limits::default();
+        assert!(limits.check_shape(1, 1).is_ok() && limits.check_shape(4096, 16).is_ok() && limits.check_shape(2048, 32).is_ok());
+        for (samples, horizon, field) in
+            [(0, 1, "samples"), (4097, 1, "samples"), (1, 0, "horizon"), (1, 33, "horizon"), (2049, 32, "samples")]
+        {
+            assert_eq!(limits.check_shape(samples, horizon).unwrap_err().field(), field, "{samples} x {horizon}");
+        }
+    }
+
+    #[test]
+    fn analytic_names_can_be_part_of_a_key() {
+        assert!(check_name("a", "truck_1.x-y").is_ok() && check_name("a", &"x".repeat(64)).is_ok());
+        for name in ["", "a/b", "a b", "*", "é", &"x".repeat(65)] {
+            assert!(check_name("a", name).is_err(), "{name}");
+        }
+    }
+}

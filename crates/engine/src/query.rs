@@ -1,0 +1,82 @@
+//! Predictions: what is asked and what is answered.
+
+use nesam_model::Rollout;
+use nesam_physics::{Control, SOIL_DIM, Vehicle, VehicleState};
+
+use crate::error::EngineError;
+use crate::limits::{Limits, outside_card};
+
+/// A batch of candidate command sequences from one session.
+#[derive(Clone, Debug, PartialEq)]
+pub struct PredictQuery {
+    /// Session to read.
+    pub session: String,
+    /// State to start from; `None` = the newest measured step.
+    pub start: Option<VehicleState<f64>>,
+    /// Whether the measured history precedes the start. A given start then replaces the state of the newest step.
+    pub use_history: bool,
+    /// N.
+    pub samples: usize,
+    /// K.
+    pub horizon: usize,
+    /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the card.
+    pub controls: Vec<f32>,
+}
+
+/// What a prediction was computed from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Provenance {
+    /// Changes of the history since the session was opened.
+    pub history_epoch: u64,
+    /// Updates of the soil correction.
+    pub soil_epoch: u64,
+    /// Map, its version and its hash.
+    pub map: Option<(String, u64, String)>,
+    /// Name of the bundle.
+    pub bundle_name: String,
+    /// Hash of the bundle.
+    pub bundle_hash: String,
+}
+
+/// An answered prediction.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Prediction {
+    /// Predicted states, sinkages, flags and the soil under the start.
+    pub rollout: Rollout,
+    /// State that the rollout started from.
+    pub start: VehicleState<f64>,
+    /// Measured steps before the start.
+    pub history_steps: usize,
+    /// Variance of the soil correction; `None` while no filter runs.
+    pub soil_variance: Option<[f64; SOIL_DIM]>,
+    /// Time since the newest measured step arrived, s.
+    pub measurement_age_s: Option<f64>,
+    /// What it was computed from.
+    pub provenance: Provenance,
+}
+
+impl PredictQuery {
+    /// Checks what needs no session: shape, finite numbers, range of the card, plausible start.
+    ///
+    /// # Errors
+    /// `EngineError::Invalid` naming the field and the limit.
+    pub fn check(&self, limits: &Limits, vehicle: &Vehicle) -> Result<(), EngineError> {
+        limits.check_shape(self.samples, self.horizon)?;
+        let expected = self.samples * self.horizon * 2;
+        if self.controls.len() != expected {
+            let reason = format!("has {} numbers, samples x horizon x 2 = {expected} are needed", self.controls.len());
+            return Err(EngineError::invalid("controls", reason));
+        }
+        for (at, pair) in self.controls.chunks_exact(2).enumerate() {
+            let place = || format!("controls[{}, {}]", at / self.horizon, at % self.horizon);
+            let control = Control { speed_m_s: f64::from(pair[0]), second: f64::from(pair[1]) };
+            if !pair.iter().all(|v| v.is_finite()) {
+                return Err(EngineError::invalid(place(), "holds a number that is not finite"));
+            }
+            if let Some((entry, reason)) = outside_card(vehicle, &control) {
+                return Err(EngineError::invalid(format!("{}.{entry}", place()), reason));
+            }
+        }
+        self.start.as_ref().map_or(Ok(()), |start| limits.check_state("start", start))
+    }
+}
