@@ -1,4 +1,5 @@
 //! World folders: the committed Chrono sample, and folders damaged in every way that a reader meets.
+#![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
 

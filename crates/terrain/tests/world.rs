@@ -1,4 +1,5 @@
 //! Heights, slopes, tiles and patches of maps whose answers are known in closed form.
+#![allow(clippy::unwrap_used)]
 
 use nesam_terrain::{GridGeometry, PATCH_PX, PATCH_RESOLUTION_M, Patch, PatchScale, Pose2, TerrainError, WorldMap, sample_patch};
 

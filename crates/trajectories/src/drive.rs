@@ -118,7 +118,8 @@ fn velocity(channels: &Channels, rows: &[usize], vehicle: &Vehicle, log: &Log) -
     }
     let rim = log.wheel_speed.as_ref().map(|w| w[0].iter().sum::<f64>() / WHEELS as f64 * vehicle.wheel_radius_m);
     let forward = rim.unwrap_or(log.command[0][0]);
-    let estimate = from_positions(&log.time_s, &log.position, &log.attitude, [forward, 0.0, 0.0]);
+    let largest_m_s = vehicle.command_range[0].iter().fold(0.0, |a: f64, b| a.max(b.abs()));
+    let estimate = from_positions(&log.time_s, &log.position, &log.attitude, [forward, 0.0, 0.0], largest_m_s);
     Ok((estimate, VelocitySource::Positions))
 }
 

@@ -8,10 +8,14 @@ use bytes::Bytes;
 use parquet::basic::LogicalType;
 use parquet::column::reader::{ColumnReader, ColumnReaderImpl};
 use parquet::data_type::DataType;
+use parquet::file::metadata::{ColumnChunkMetaData, ParquetMetaData};
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use sha2::{Digest, Sha256};
 
 use crate::error::TrajectoryError;
+
+/// Most rows for which memory is set aside before they are seen, so that a damaged footer cannot ask for all of it.
+const RESERVED: usize = 1 << 18;
 
 /// An opened Parquet file.
 pub(crate) struct Table {
@@ -38,13 +42,16 @@ impl Table {
     pub(crate) fn open(path: &Path) -> Result<Self, TrajectoryError> {
         let content = std::fs::read(path).map_err(|source| TrajectoryError::Read { path: path.into(), source })?;
         let hash = Sha256::digest(&content).iter().map(|byte| format!("{byte:02x}")).collect();
+        let length = content.len();
         let bad = |reason| TrajectoryError::Parquet { path: path.into(), reason };
         let reader = guarded(|| SerializedFileReader::new(Bytes::from(content))).map_err(bad)?;
         let rows = reader.metadata().row_groups().iter().map(|g| g.num_rows()).sum::<i64>();
         let stated = reader.metadata().file_metadata().num_rows();
-        // More rows than bytes can only come from a damaged footer (the columns here do not compress that far).
         let rows = usize::try_from(rows).ok().filter(|_| rows == stated && rows < i64::from(u32::MAX));
         let rows = rows.ok_or_else(|| bad(format!("the footer gives inconsistent row counts ({stated})")))?;
+        if let Some(column) = column_outside(reader.metadata(), length) {
+            return Err(bad(format!("the footer places column `{column}` outside the file")));
+        }
         Ok(Self { path: path.into(), reader, rows, hash })
     }
 
@@ -84,7 +91,7 @@ impl Table {
         if scaled {
             return Err(TrajectoryError::column(&self.path, name, "expected plain numbers, found decimal or time stamps"));
         }
-        let (mut values, mut null) = (Vec::with_capacity(self.rows), Vec::new());
+        let (mut values, mut null) = (Vec::with_capacity(self.rows.min(RESERVED)), Vec::new());
         self.each_group(column, name, |reader, max_level, rows| {
             let before = values.len();
             let levels = match reader {
@@ -106,14 +113,14 @@ impl Table {
     /// A column of texts (plain or dictionary); a column of only nulls may have any type.
     pub(crate) fn texts(&self, name: &str) -> Result<Texts, TrajectoryError> {
         let column = self.required(name)?;
-        let mut texts: Texts = Vec::with_capacity(self.rows);
+        let mut texts: Texts = Vec::with_capacity(self.rows.min(RESERVED));
         self.each_group(column, name, |reader, max_level, rows| {
             let ColumnReader::ByteArrayColumnReader(reader) = reader else {
                 let group_is_null = self.is_all_null(column);
                 texts.resize(texts.len() + rows, None);
                 return if group_is_null { Ok(()) } else { Err("expected text, found another type".into()) };
             };
-            let mut raw = Vec::with_capacity(rows);
+            let mut raw = Vec::with_capacity(rows.min(RESERVED));
             append(reader, max_level, rows, &mut raw, |v| Some(v.clone()), None)?;
             for value in raw {
                 let Some(value) = value else {
@@ -206,7 +213,7 @@ fn append<T: DataType, V: Clone>(
     let mut done = 0;
     while done < rows {
         let (records, _, _) = reader
-            .read_records(rows - done, (max_level > 0).then_some(&mut levels), None, &mut values)
+            .read_records((rows - done).min(RESERVED), (max_level > 0).then_some(&mut levels), None, &mut values)
             .map_err(|error| error.to_string())?;
         if records == 0 {
             return Err(format!("ends after {done} of {rows} rows"));
@@ -224,6 +231,17 @@ fn append<T: DataType, V: Clone>(
     let mut present = values.iter().map(convert);
     out.extend(null.iter().map(|n| if *n { missing.clone() } else { present.next().unwrap_or(missing.clone()) }));
     Ok(Some(null))
+}
+
+/// The first column chunk that the footer places outside a file of this length.
+fn column_outside(metadata: &ParquetMetaData, length: usize) -> Option<String> {
+    let chunks = metadata.row_groups().iter().flat_map(|group| group.columns());
+    let outside = |chunk: &&ColumnChunkMetaData| {
+        let start = chunk.dictionary_page_offset().unwrap_or(chunk.data_page_offset());
+        let end = start.checked_add(chunk.compressed_size());
+        start < 0 || chunk.compressed_size() < 0 || end.is_none_or(|end| end > length as i64)
+    };
+    chunks.into_iter().find(outside).map(|chunk| chunk.column_path().string())
 }
 
 /// Runs a step of the Parquet decoder. The decoder can panic on damaged bytes; that is turned into the error that it is.

@@ -1,7 +1,14 @@
 //! Velocities that were not measured, estimated from the past alone.
 
-/// Time constant of the smoothing, s (chosen: light, so that the lag stays below the step of the model plus half a source step).
-const SMOOTHING_S: f64 = 0.15;
+/// Time constant of the smoothing, s.
+///
+/// Chosen on the training windows of a skid-steer robot whose lidar poses repeat for one or two samples and jump by centimetres: against
+/// central differences over 0.8 s the error is least (0.17 m/s forward) between 0.25 and 0.4 s; the shorter one lags less.
+const SMOOTHING_S: f64 = 0.25;
+
+/// A position that moves faster than this many times the largest speed of the vehicle has jumped, and is not a motion. Two, because a
+/// pose that was repeated once moves twice as far in the next step.
+const JUMP_FACTOR: f64 = 2.0;
 
 /// R_WB^T v: a World vector in Body, for R_WB = Rz(yaw) Ry(pitch) Rx(roll).
 pub(crate) fn to_body([roll, pitch, yaw]: [f64; 3], v: [f64; 3]) -> [f64; 3] {
@@ -15,8 +22,8 @@ pub(crate) fn to_body([roll, pitch, yaw]: [f64; 3], v: [f64; 3]) -> [f64; 3] {
 
 /// Backward differences of a channel, smoothed; sample 0 is `first`, since nothing is known of the past there.
 ///
-/// `difference(k)` is the rate between samples k - 1 and k. The estimate at k uses samples up to k only.
-fn smoothed(time_s: &[f64], first: [f64; 3], difference: impl Fn(usize) -> [f64; 3]) -> Vec<[f64; 3]> {
+/// `difference(k)` is the rate between samples k - 1 and k; a rate above `limit` is left out. The estimate at k uses samples up to k only.
+fn smoothed(time_s: &[f64], first: [f64; 3], limit: f64, difference: impl Fn(usize) -> [f64; 3]) -> Vec<[f64; 3]> {
     let mut estimate = first;
     let mut all = Vec::with_capacity(time_s.len());
     for k in 0..time_s.len() {
@@ -24,8 +31,10 @@ fn smoothed(time_s: &[f64], first: [f64; 3], difference: impl Fn(usize) -> [f64;
             let step = time_s[k] - time_s[k - 1];
             let weight = step / (SMOOTHING_S + step);
             let rate = difference(k);
-            for i in 0..3 {
-                estimate[i] += weight * (rate[i] - estimate[i]);
+            if rate.iter().map(|r| r * r).sum::<f64>().sqrt() <= limit {
+                for i in 0..3 {
+                    estimate[i] += weight * (rate[i] - estimate[i]);
+                }
             }
         }
         all.push(estimate);
@@ -33,9 +42,15 @@ fn smoothed(time_s: &[f64], first: [f64; 3], difference: impl Fn(usize) -> [f64;
     all
 }
 
-/// Body velocity from positions and attitudes, m/s.
-pub(crate) fn from_positions(time_s: &[f64], position_m: &[[f64; 3]], attitude_rad: &[[f64; 3]], first_m_s: [f64; 3]) -> Vec<[f64; 3]> {
-    smoothed(time_s, first_m_s, |k| {
+/// Body velocity from positions and attitudes, m/s; `largest_m_s` is the largest speed of the vehicle.
+pub(crate) fn from_positions(
+    time_s: &[f64],
+    position_m: &[[f64; 3]],
+    attitude_rad: &[[f64; 3]],
+    first_m_s: [f64; 3],
+    largest_m_s: f64,
+) -> Vec<[f64; 3]> {
+    smoothed(time_s, first_m_s, JUMP_FACTOR * largest_m_s, |k| {
         let step = time_s[k] - time_s[k - 1];
         let rate = core::array::from_fn(|i| (position_m[k][i] - position_m[k - 1][i]) / step);
         to_body(attitude_rad[k], rate)
@@ -44,7 +59,7 @@ pub(crate) fn from_positions(time_s: &[f64], position_m: &[[f64; 3]], attitude_r
 
 /// Body angular velocity from attitudes, rad/s: w = [r' - y' sin p, p' cos r + y' cos p sin r, -p' sin r + y' cos p cos r].
 pub(crate) fn from_attitudes(time_s: &[f64], attitude_rad: &[[f64; 3]], first_rad_s: [f64; 3]) -> Vec<[f64; 3]> {
-    smoothed(time_s, first_rad_s, |k| {
+    smoothed(time_s, first_rad_s, f64::INFINITY, |k| {
         let step = time_s[k] - time_s[k - 1];
         let turn = |i: usize| nesam_physics::wrap_angle(attitude_rad[k][i] - attitude_rad[k - 1][i]) / step;
         let (roll_rate, pitch_rate, yaw_rate) = (turn(0), turn(1), turn(2));
@@ -59,18 +74,18 @@ mod tests {
 
     #[test]
     fn analytic_steady_circle_is_recovered() {
-        // Goal: a body on a circle (1.5 m/s, 0.4 rad/s) is seen as forward speed and yaw rate. After 2 s (13 time constants) only the
-        // chord error remains: half a step of heading, 0.01 rad at 20 Hz.
+        // Goal: a body on a circle (1.5 m/s, 0.4 rad/s) is seen as forward speed and yaw rate. After 3 s (12 time constants, 2e-5
+        // of the start) only the chord error remains: half a step of heading, 0.01 rad at 20 Hz.
         let time: Vec<f64> = (0..60).map(|k| 0.05 * f64::from(k)).collect();
         let (speed, rate) = (1.5, 0.4);
         let yaw = |t: f64| nesam_physics::wrap_angle(2.9 + rate * t);
         let position: Vec<[f64; 3]> =
             time.iter().map(|t| [speed / rate * (2.9 + rate * t).sin(), -speed / rate * (2.9 + rate * t).cos(), 0.3]).collect();
         let attitude: Vec<[f64; 3]> = time.iter().map(|t| [0.0, 0.0, yaw(*t)]).collect();
-        let v = from_positions(&time, &position, &attitude, [0.0; 3])[59];
+        let v = from_positions(&time, &position, &attitude, [0.0; 3], 3.0)[59];
         assert!((v[0] - speed).abs() < 2e-3 && v[1].abs() < 0.02 && v[2].abs() < 1e-9, "{v:?}");
         let w = from_attitudes(&time, &attitude, [0.0; 3])[59];
-        assert!((w[2] - rate).abs() < 1e-6 && w[0].abs() < 1e-9, "{w:?}");
+        assert!((w[2] - rate).abs() < 1e-4 && w[0].abs() < 1e-9, "{w:?}");
     }
 
     #[test]
@@ -78,9 +93,18 @@ mod tests {
         let time: Vec<f64> = (0..20).map(|k| 0.05 * f64::from(k)).collect();
         let position: Vec<[f64; 3]> = time.iter().map(|t| [t * t, (3.0 * t).sin(), 0.1 * t]).collect();
         let attitude: Vec<[f64; 3]> = time.iter().map(|t| [0.1 * t, -0.05 * t, t.sin()]).collect();
-        let whole = from_positions(&time, &position, &attitude, [0.2, 0.0, 0.0]);
-        let part = from_positions(&time[..8], &position[..8], &attitude[..8], [0.2, 0.0, 0.0]);
+        let whole = from_positions(&time, &position, &attitude, [0.2, 0.0, 0.0], 5.0);
+        let part = from_positions(&time[..8], &position[..8], &attitude[..8], [0.2, 0.0, 0.0], 5.0);
         assert_eq!(&whole[..8], &part[..]);
+    }
+
+    #[test]
+    fn analytic_jumps_are_left_out() {
+        // A robot of at most 1 m/s stands still while its pose jumps by 1 m and back: nothing has moved.
+        let time: Vec<f64> = (0..20).map(|k| 0.05 * f64::from(k)).collect();
+        let position: Vec<[f64; 3]> = (0..20).map(|k| [if k == 9 { 1.0 } else { 0.0 }, 0.0, 0.0]).collect();
+        let still = from_positions(&time, &position, &[[0.0; 3]; 20], [0.0; 3], 1.0);
+        assert!(still.iter().all(|v| *v == [0.0; 3]));
     }
 
     #[test]

@@ -1,0 +1,133 @@
+//! Vehicle cards: the given ones, and what is refused.
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+use std::path::Path;
+
+use common::{SKID_CARD, sample_root, shared};
+use nesam_physics::{Control, SecondCommand, Vehicle};
+use nesam_trajectories::{TrajectoryError, card_from_json, card_to_json, read_vehicle_card};
+use serde_json::{Value, json};
+
+fn read(card: &str) -> Result<Vehicle, TrajectoryError> {
+    let dir = tempfile::TempDir::new().unwrap();
+    let path = dir.path().join("vehicle_test.json");
+    std::fs::write(&path, card).unwrap();
+    read_vehicle_card(&path)
+}
+
+fn hmmwv_path() -> std::path::PathBuf {
+    sample_root().join("vehicle_hmmwv.json")
+}
+
+fn hmmwv_json() -> Value {
+    serde_json::from_str(&std::fs::read_to_string(hmmwv_path()).unwrap()).unwrap()
+}
+
+#[test]
+fn published_hmmwv_card() {
+    let v = read_vehicle_card(&hmmwv_path()).unwrap();
+    assert_eq!((v.mass_kg, v.wheel_radius_m, v.wheel_width_m, v.gravity_m_s2), (2493.56, 0.467, 0.254, 9.81));
+    assert_eq!(v.inertia_kg_m2[0], [1445.1, 0.0, -23.6]);
+    assert!(!v.inertia_estimated);
+    assert_eq!(v.wheel_centre_m[2], [-1.7028, 0.91, -0.1818]);
+    assert_eq!(v.second, SecondCommand::SteeringNormalised);
+    assert_eq!(v.command_range, [[-2.0, 12.0], [-1.0, 1.0]]);
+    assert!(v.admits(&Control { speed_m_s: 3.0, second: 1.0 }) && !v.admits(&Control { speed_m_s: 3.0, second: 1.1 }));
+    let table = v.steering.as_ref().unwrap();
+    assert_eq!((table.command.len(), table.front_left_rad[8], table.front_right_rad[0]), (9, 0.3636, -0.3637));
+    // The card: the wheel rate is roughly 0.6 of the spring rate at the shock; motion ratio 0.8 squared for the damper.
+    assert!((v.suspension_n_m[0] - 0.6 * 167071.0).abs() < 1e-6 && (v.suspension_n_s_m[3] - 0.64 * 35025.0).abs() < 1e-6);
+    assert_eq!((v.driveline.steering_lag_s, v.driveline.steering_rate_limit_per_s), (0.08, 3.0));
+    assert!((v.wheelbase_m - 3.2977).abs() < 1e-9 && (v.track_m - 1.8276).abs() < 1e-9);
+    assert_eq!(card_from_json(&card_to_json(&v)).unwrap(), v, "bundling keeps every bit");
+}
+
+#[test]
+fn published_husky_card() {
+    let Some(path) = shared("real/husky/vehicle_husky.json") else { return };
+    let v = read_vehicle_card(&path).unwrap();
+    assert_eq!((v.mass_kg, v.wheel_radius_m, v.track_m, v.wheelbase_m), (50.0, 0.165, 0.55, 0.512));
+    assert_eq!(v.second, SecondCommand::YawRateRadS);
+    assert!(v.inertia_estimated && v.steering.is_none());
+    assert_eq!(v.wheel_centre_m[1][1], -0.555 / 2.0);
+    assert_eq!(card_from_json(&card_to_json(&v)).unwrap(), v, "bundling keeps every bit");
+}
+
+#[test]
+fn analytic_estimates_of_a_bare_card() {
+    let v = read(SKID_CARD).unwrap();
+    // A box of 0.82 x 0.6 x 0.384 m and 40 kg.
+    let box_zz = 40.0 * (0.82f64.powi(2) + 0.6f64.powi(2)) / 12.0;
+    assert!(v.inertia_estimated && (v.inertia_kg_m2[2][2] - box_zz).abs() < 1e-9, "{:?}", v.inertia_kg_m2);
+    // Stiff: the weight sinks the body by 10 mm, damping ratio 0.7.
+    assert!((v.suspension_n_m.iter().sum::<f64>() * 0.01 - 40.0 * 9.81).abs() < 1e-6);
+    let ratio = v.suspension_n_s_m[0] / (2.0 * (v.suspension_n_m[0] * 10.0).sqrt());
+    assert!((ratio - 0.7).abs() < 1e-9);
+    assert_eq!(v.wheel_centre_m[3], [-0.25, -0.25, -0.04]);
+    assert_eq!((v.driveline.speed_gain, v.track_m), (1.0, 0.55));
+    assert_eq!(v.command_range[0], [-3.0, 3.0]);
+    let limited = read(&SKID_CARD.replace("\"max_wheel_speed_rad_s\": null", "\"max_wheel_speed_rad_s\": 10")).unwrap();
+    assert_eq!(limited.command_range[0], [-1.6, 1.6]);
+    assert_eq!(card_from_json(&card_to_json(&v)).unwrap(), v);
+    assert_eq!(read(&card_to_json(&v)).unwrap(), v, "a card in the schema of bundles is accepted");
+}
+
+#[test]
+fn regress_missing_and_bad_keys_are_named() {
+    for (pointer, key) in [
+        ("/mass_total", "`mass_total`"),
+        ("/vehicle", "`vehicle`"),
+        ("/tyre/radius", "`tyre.radius`"),
+        ("/tyre/width", "`tyre.width`"),
+        ("/suspension/rear/spring_N_per_m", "`suspension.rear.spring_N_per_m`"),
+        ("/steering/command_to_road_wheel_table", "`second`"),
+    ] {
+        let mut card = hmmwv_json();
+        let (parent, name) = pointer.rsplit_once('/').unwrap();
+        card.pointer_mut(parent).unwrap().as_object_mut().unwrap().remove(name);
+        let error = read(&card.to_string()).unwrap_err().to_string();
+        assert!(error.contains("vehicle_test.json") && error.contains(key), "{pointer}: {error}");
+    }
+    for (pointer, value, key) in [
+        ("/mass_total", json!(-1), "`mass_total`"),
+        ("/mass_total", json!("heavy"), "`mass_total`"),
+        ("/inertia_about_cg/matrix", json!([[1, 0, 0], [0, 1, 0]]), "`inertia_about_cg.matrix`"),
+        ("/inertia_about_cg/matrix", json!([[1, 0, 0], [0, -1, 0], [0, 0, 1]]), "`inertia_about_cg.matrix`"),
+        ("/inertia_about_cg/matrix", json!([[1, 5, 0], [0, 1, 0], [0, 0, 1]]), "`inertia_about_cg.matrix`"),
+        ("/wheel_centres_rel_P_static/0/0", json!(-3.0), "`wheel_centres_rel_P_static`"),
+        ("/wheel_centres_rel_P_static/0", json!([1, 2]), "`wheel_centres_rel_P_static`"),
+        ("/steering/command_to_road_wheel_table/3/cmd", json!(-2.0), "`steering.command_to_road_wheel_table`"),
+        ("/steering/command_to_road_wheel_table/3/fl_rad", json!(null), "`steering.command_to_road_wheel_table[3].fl_rad`"),
+        ("/steering/actuator/time_constant_s", json!(-0.1), "`steering.actuator.time_constant_s`"),
+        ("/gravity", json!(0), "`gravity`"),
+        ("/second", json!("curvature"), "`second`"),
+    ] {
+        let mut card = hmmwv_json();
+        match card.pointer_mut(pointer) {
+            Some(place) => *place = value,
+            None => card[pointer.trim_start_matches('/')] = value,
+        }
+        let error = read(&card.to_string()).unwrap_err().to_string();
+        assert!(error.contains(key), "{pointer}: {error}");
+    }
+    let error = read(&SKID_CARD.replace("skid_steer", "hover")).unwrap_err().to_string();
+    assert!(error.contains("`drive`") && error.contains("hover"), "{error}");
+    assert!(read("{\"vehicle\": ").unwrap_err().to_string().contains("not valid json"));
+    assert!(read("[]").is_err() && read("").is_err());
+    assert!(matches!(read_vehicle_card(Path::new("no/such/card.json")), Err(TrajectoryError::Read { .. })));
+    let bundled = card_to_json(&read(SKID_CARD).unwrap()).replace("\"mass_kg\"", "\"mass\"");
+    assert!(matches!(read(&bundled), Err(TrajectoryError::Card { .. })));
+}
+
+#[test]
+fn analytic_stated_ranges_win() {
+    let mut card = hmmwv_json();
+    card["command_range"] = json!({"speed_m_s": [-1.0, 5.0], "second": [-0.9, 0.9]});
+    card["driveline"]["speed_gain"] = json!(0.3);
+    let v = read(&card.to_string()).unwrap();
+    assert_eq!((v.command_range, v.driveline.speed_gain), ([[-1.0, 5.0], [-0.9, 0.9]], 0.3));
+    card["command_range"]["second"] = json!([0.9, -0.9]);
+    assert!(read(&card.to_string()).unwrap_err().to_string().contains("`command_range.second`"));
+}

@@ -1,0 +1,261 @@
+//! Roots that are damaged, incomplete or unusual: what must load loads, everything else is an error that says where.
+#![allow(clippy::unwrap_used)]
+
+mod common;
+
+use common::{Column, Columns, circle_columns, column, root_of, set, without, write_index, write_parquet};
+use nesam_trajectories::{DataRoot, SetQuery, Split, SplitFilter, Trajectory, TrajectoryError, VelocitySource};
+use parquet::basic::Compression;
+use tempfile::TempDir;
+
+fn load(root: &TempDir) -> Result<Vec<Trajectory>, TrajectoryError> {
+    DataRoot::open(root.path(), None)?.load_set(&SetQuery::all("drive"))
+}
+
+fn refusal(columns: &Columns) -> String {
+    load(&root_of(columns)).unwrap_err().to_string()
+}
+
+fn two_drives() -> Columns {
+    circle_columns(&["a", "b"], 40)
+}
+
+#[test]
+fn analytic_circle_without_index_worlds_and_velocity() {
+    let drives = load(&root_of(&two_drives())).unwrap();
+    assert_eq!(drives.iter().map(|t| t.id.as_str()).collect::<Vec<_>>(), ["a", "b"]);
+    let t = &drives[1];
+    assert_eq!((t.split, t.world.as_deref(), t.set.as_str(), t.states.len()), (None, None, "drive", 20));
+    assert_eq!(t.measured.velocity_source, VelocitySource::Positions);
+    // The first sample knows the encoders only; the others follow the circle: 1 m/s ahead.
+    assert!((t.states[0].velocity_m_s[0] - 1.0).abs() < 1e-9);
+    assert!(t.states.iter().all(|s| (s.velocity_m_s[0] - 1.0).abs() < 1e-3 && s.velocity_m_s[1].abs() < 0.01));
+    assert!(t.states.iter().all(|s| s.angular_velocity_rad_s == [0.0, 0.0, 0.3]));
+    // Commands are held: sample k of 10 Hz takes the command of row 2 k.
+    assert!(t.controls.iter().enumerate().all(|(k, u)| (u.speed_m_s - 1.0 - 0.001 * k as f64).abs() < 1e-12));
+    assert_eq!(t.wheel_speed_rad_s.as_ref().unwrap()[3][0], t.wheel_speed_rad_s.as_ref().unwrap()[3][2]);
+    // Without encoders the first sample takes the commanded speed.
+    let blind = without(&without(&two_drives(), "om_l"), "om_r");
+    let t = &load(&root_of(&blind)).unwrap()[0];
+    assert_eq!((t.states[0].velocity_m_s[0], t.wheel_speed_rad_s.is_none()), (1.0, true));
+}
+
+#[test]
+fn property_later_rows_do_not_change_earlier_samples() {
+    let whole = load(&root_of(&circle_columns(&["a"], 40))).unwrap();
+    let part = load(&root_of(&circle_columns(&["a"], 21))).unwrap();
+    assert_eq!(part[0].states, whole[0].states[..11]);
+    assert_eq!(part[0].controls, whole[0].controls[..11]);
+}
+
+#[test]
+fn property_row_groups_codecs_and_number_types_do_not_matter() {
+    let reference = load(&root_of(&two_drives())).unwrap();
+    for (group, codec) in [(7, Compression::SNAPPY), (40, Compression::ZSTD(Default::default())), (1, Compression::UNCOMPRESSED)] {
+        let root = root_of(&two_drives());
+        write_parquet(&root.path().join("drive/samples.parquet"), &two_drives(), group, codec);
+        assert_eq!(load(&root).unwrap(), reference, "groups of {group}");
+    }
+    let mut mixed = two_drives();
+    *column(&mut mixed, "roll") = Column::Int(vec![0; 80]);
+    *column(&mut mixed, "pitch") = Column::Float(vec![0.0; 80]);
+    assert_eq!(load(&root_of(&mixed)).unwrap(), reference);
+}
+
+#[test]
+fn regress_missing_columns_are_named() {
+    for name in ["trajectory", "t", "x", "y", "z", "roll", "pitch", "yaw", "cmd_speed", "cmd_yaw_rate"] {
+        let error = refusal(&without(&two_drives(), name));
+        assert!(error.contains("samples.parquet") && error.contains(&format!("column `{name}`: missing")), "{error}");
+    }
+}
+
+#[test]
+fn regress_bad_values_name_column_and_row() {
+    for (name, value, says) in [
+        ("x", Some(f64::NAN), "NaN"),
+        ("yaw", Some(f64::INFINITY), "inf"),
+        ("pitch", None, "null"),
+        ("cmd_speed", Some(f64::NAN), "NaN"),
+        ("om_l", None, "null"),
+        ("wz", Some(f64::NEG_INFINITY), "-inf"),
+        ("t", Some(f64::NAN), "NaN"),
+    ] {
+        let mut columns = two_drives();
+        set(&mut columns, name, 57, value);
+        let error = refusal(&columns);
+        assert!(error.contains(&format!("column `{name}`, row 57")) && error.contains(says), "{error}");
+        // The other drive is not affected, and neither is its reading.
+        let root = root_of(&columns);
+        let only_a = SetQuery { trajectories: Some(vec!["a".into()]), ..SetQuery::all("drive") };
+        assert_eq!(DataRoot::open(root.path(), None).unwrap().load_set(&only_a).unwrap().len(), 1);
+    }
+    let mut columns = two_drives();
+    *column(&mut columns, "z") = Column::Text(vec![Some("high".into()); 80]);
+    let error = refusal(&columns);
+    assert!(error.contains("column `z`") && error.contains("expected numbers"), "{error}");
+    let mut columns = two_drives();
+    *column(&mut columns, "trajectory") = Column::Int(vec![1; 80]);
+    assert!(refusal(&columns).contains("column `trajectory`: expected text"));
+    let mut columns = two_drives();
+    if let Column::Text(ids) = column(&mut columns, "trajectory") {
+        ids[12] = None;
+    }
+    assert!(refusal(&columns).contains("column `trajectory`, row 12: null"));
+}
+
+#[test]
+fn regress_time_must_ascend() {
+    let mut repeated = two_drives();
+    set(&mut repeated, "t", 45, Some(0.2));
+    assert!(refusal(&repeated).contains("column `t`, row 45: time stamp is repeated"));
+    let mut back = two_drives();
+    set(&mut back, "t", 45, Some(0.1));
+    assert!(refusal(&back).contains("row 45: time goes backwards"));
+    let mut gap = two_drives();
+    (60..80).for_each(|row| set(&mut gap, "t", row, Some(3.0 + 0.05 * row as f64)));
+    let error = refusal(&gap);
+    assert!(error.contains("column `t`, row 59") && error.contains("gap"), "{error}");
+}
+
+#[test]
+fn property_channels_that_were_not_recorded_may_be_null() {
+    let mut columns = two_drives();
+    (40..80).for_each(|row| set(&mut columns, "om_l", row, None));
+    let drives = load(&root_of(&columns)).unwrap();
+    assert!(drives[0].measured.wheel_speed && !drives[1].measured.wheel_speed);
+}
+
+#[test]
+fn analytic_world_velocity_is_turned_into_body() {
+    let mut columns = two_drives();
+    let rotated = |f: fn(f64) -> f64| Column::Double((0..80).map(|k| Some(f(0.3 * 0.05 * f64::from(k % 40)))).collect());
+    columns.push(("vx".into(), rotated(|yaw| 2.0 * yaw.cos())));
+    columns.push(("vy".into(), rotated(|yaw| 2.0 * yaw.sin())));
+    columns.push(("vz".into(), rotated(|_| 0.5)));
+    let t = &load(&root_of(&columns)).unwrap()[0];
+    assert_eq!(t.measured.velocity_source, VelocitySource::World);
+    for s in &t.states {
+        let [x, y, z] = s.velocity_m_s;
+        assert!((x - 2.0).abs() < 1e-9 && y.abs() < 1e-9 && (z - 0.5).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn regress_every_truncation_and_flipped_byte_is_survived() {
+    // Goal: no damage of the file stops the program. Every length, and every byte changed in two ways; the file is small on purpose.
+    let root = root_of(&circle_columns(&["a"], 8));
+    let path = root.path().join("drive/samples.parquet");
+    let whole = std::fs::read(&path).unwrap();
+    let opened = DataRoot::open(root.path(), None).unwrap();
+    for keep in 0..whole.len() {
+        std::fs::write(&path, &whole[..keep]).unwrap();
+        let error = opened.load_set(&SetQuery::all("drive")).unwrap_err().to_string();
+        assert!(error.contains("samples.parquet"), "cut at {keep}: {error}");
+    }
+    let mut refused = 0;
+    for at in 0..whole.len() {
+        for mask in [0x01, 0xff] {
+            let mut bytes = whole.clone();
+            bytes[at] ^= mask;
+            std::fs::write(&path, &bytes).unwrap();
+            // A flipped bit in a value is another value: only the absence of a crash is asserted here.
+            refused += usize::from(opened.load_set(&SetQuery::all("drive")).is_err());
+        }
+    }
+    println!("{refused} of {} single-byte damages were refused", 2 * whole.len());
+    assert!(refused > 0);
+}
+
+#[test]
+fn analytic_index_gives_split_and_world_from_parquet_or_json() {
+    let root = root_of(&two_drives());
+    let index = root.path().join("drive/index.parquet");
+    write_index(&index, &[("b", None, Some("test")), ("a", Some("w1"), Some("train"))]);
+    let drives = load(&root).unwrap();
+    assert_eq!((drives[0].split, drives[1].split), (Some(Split::Train), Some(Split::Test)));
+    assert_eq!(drives[0].world, None, "a root without worlds has no maps");
+    std::fs::remove_file(&index).unwrap();
+    let json = r#"[{"trajectory":"a","world":"w1","split":"train"},{"trajectory":"b","split":null,"world":null}]"#;
+    std::fs::write(root.path().join("drive/index.json"), json).unwrap();
+    let drives = load(&root).unwrap();
+    assert_eq!((drives[0].split, drives[1].split), (Some(Split::Train), None));
+    for (json, says) in [
+        ("{}", "expected an array"),
+        ("[{\"world\":\"w1\"}]", "row 0: null"),
+        ("[{\"trajectory\":7}]", "[0].trajectory"),
+        ("[{\"trajectory\":\"a\"", "not valid json"),
+        ("[{\"trajectory\":\"a\",\"split\":\"val\"}]", "column `split`, row 0"),
+        ("[{\"trajectory\":\"a\"},{\"trajectory\":\"a\"}]", "row 1: `a` appears a second time"),
+    ] {
+        std::fs::write(root.path().join("drive/index.json"), json).unwrap();
+        let error = load(&root).unwrap_err().to_string();
+        assert!(error.contains("index.json") && error.contains(says), "{json}: {error}");
+    }
+}
+
+#[test]
+fn regress_index_and_samples_must_agree() {
+    let root = root_of(&two_drives());
+    let index = root.path().join("drive/index.parquet");
+    write_index(&index, &[("a", None, Some("test")), ("ghost", None, Some("test"))]);
+    let error = load(&root).unwrap_err().to_string();
+    assert!(error.contains("index.parquet") && error.contains("row 1: `ghost` has no samples"), "{error}");
+    let opened = DataRoot::open(root.path(), None).unwrap();
+    let only_a = SetQuery { trajectories: Some(vec!["a".into()]), ..SetQuery::all("drive") };
+    assert_eq!(opened.load_set(&only_a).unwrap().len(), 1, "other drives may be gone when they are not asked for");
+
+    std::fs::create_dir_all(root.path().join("worlds/w1")).unwrap();
+    write_index(&index, &[("a", Some("w1"), Some("test")), ("b", Some("w9"), Some("test"))]);
+    let error = load(&root).unwrap_err().to_string();
+    assert!(error.contains("column `world`, row 1") && error.contains("w9") && error.contains("present: w1"), "{error}");
+    let whole = std::fs::read(&index).unwrap();
+    std::fs::write(&index, &whole[..whole.len() / 2]).unwrap();
+    assert!(load(&root).unwrap_err().to_string().contains("index.parquet"));
+}
+
+#[test]
+fn regress_queries_that_match_nothing_say_what_is_there() {
+    let root = root_of(&two_drives());
+    write_index(&root.path().join("drive/index.parquet"), &[("a", None, Some("test")), ("b", None, Some("test"))]);
+    let opened = DataRoot::open(root.path(), None).unwrap();
+    let refusal = |query: &SetQuery| opened.load_set(query).unwrap_err().to_string();
+    let all = SetQuery::all("drive");
+    let train = SetQuery { split: SplitFilter::Train, ..all.clone() };
+    assert!(refusal(&train).contains("splits present: test"), "{}", refusal(&train));
+    let unknown = SetQuery { trajectories: Some(vec!["c".into()]), ..all.clone() };
+    assert!(refusal(&unknown).contains("no trajectory `c`; present: a, b"));
+    let wrong_split = SetQuery { trajectories: Some(vec!["a".into()]), ..train };
+    assert!(refusal(&wrong_split).contains("trajectory `a` is in test"));
+    for set in ["nowhere", "../drive", "", "/etc", "drive/../drive", "worlds"] {
+        let error = refusal(&SetQuery { set: set.into(), ..all.clone() });
+        assert!(error.contains("present: drive"), "{set}: {error}");
+    }
+    for dt_s in [0.0, -0.1, f64::NAN, f64::INFINITY] {
+        assert!(refusal(&SetQuery { dt_s, ..all.clone() }).contains("step"));
+    }
+    assert!(refusal(&SetQuery { ground_truth: true, ..all }).contains("column `gt_"));
+    assert!(opened.world("w1").unwrap_err().to_string().contains("no world `w1`; present: none"));
+    assert!(opened.world("../drive").is_err());
+
+    std::fs::remove_file(root.path().join("drive/index.parquet")).unwrap();
+    let no_index = SetQuery { split: SplitFilter::Test, ..SetQuery::all("drive") };
+    assert!(refusal(&no_index).contains("has no index"));
+}
+
+#[test]
+fn regress_a_root_needs_exactly_one_card() {
+    let root = root_of(&two_drives());
+    let card = root.path().join("vehicle_test.json");
+    std::fs::copy(&card, root.path().join("vehicle_other.json")).unwrap();
+    let error = DataRoot::open(root.path(), None).unwrap_err().to_string();
+    assert!(error.contains("vehicle_other.json, vehicle_test.json") && error.contains("--vehicle"), "{error}");
+    assert!(DataRoot::open(root.path(), Some(&card)).is_ok());
+    std::fs::remove_file(&card).unwrap();
+    std::fs::remove_file(root.path().join("vehicle_other.json")).unwrap();
+    assert!(DataRoot::open(root.path(), None).unwrap_err().to_string().contains("--vehicle"));
+    assert!(DataRoot::open(&root.path().join("nowhere"), None).is_err());
+    let empty = circle_columns(&[], 0);
+    let root = root_of(&empty);
+    assert!(load(&root).unwrap_err().to_string().contains("no rows"));
+}
