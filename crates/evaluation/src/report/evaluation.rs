@@ -5,7 +5,7 @@ use crate::evaluate::{ModelPaths, ModelScore};
 use crate::output::Evaluation;
 use crate::report::table::Cell;
 use crate::report::{LinePlot, Page, Series, Table};
-use crate::score::{ErrorTree, values};
+use crate::score::{ErrorTree, paired_difference, values};
 use crate::windows::Window;
 
 const NAMES: [&str; POSE_DIM + 1] = ["x", "y", "z", "roll", "pitch", "yaw", "horizontal position"];
@@ -28,6 +28,9 @@ pub fn evaluation_page(evaluation: &Evaluation<'_>, paths: &[ModelPaths], window
     page.section("Mean absolute error over the horizon").table(&mae_table(evaluation, "steps 1…K", |t| t.mae_mean.to_array()));
     page.section("Mean absolute error at the last step").table(&mae_table(evaluation, "step K", |t| t.mae_final.to_array()));
     page.section("Horizontal position").table(&position_table(evaluation));
+    if evaluation.models.len() > 1 {
+        page.section("Paired differences").table(&difference_table(evaluation));
+    }
     page.section("Error over the horizon")
         .plots(&horizon_plots(evaluation), "Mean absolute error after each step; bands are 95 % intervals.");
     page.section("Predicted and measured paths").plots(
@@ -76,6 +79,23 @@ fn mae_table(e: &Evaluation<'_>, which: &str, pick: fn(&ErrorTree<f64>) -> [Opti
             cell(value[d], interval[d], best)
         }));
         row.push(model.parameters.to_string().into());
+        table.row(row);
+    }
+    table
+}
+
+/// First model minus each other one on the same windows.
+fn difference_table(e: &Evaluation<'_>) -> Table {
+    let first = &e.models[0];
+    let caption = format!("{} minus another model, same windows, steps 1…K; negative = {} is closer to the truth", first.name, first.name);
+    let head: Vec<&str> = std::iter::once("against").chain(DIMENSION_KEYS).chain(["position_m"]).collect();
+    let mut table = Table::new(&caption, &head);
+    for other in &e.models[1..] {
+        let (difference, interval) = paired_difference(&first.errors, &other.errors, e.resamples);
+        let values = difference.mae_mean.to_array().into_iter().chain([difference.position_m.mean]);
+        let intervals = interval.mae_mean.to_array().into_iter().chain([interval.position_m.mean]);
+        let mut row = vec![Cell::from(other.name.as_str())];
+        row.extend(values.zip(intervals).map(|(v, i)| cell(v, i, None)));
         table.row(row);
     }
     table
