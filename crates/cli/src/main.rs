@@ -12,6 +12,10 @@ mod sources;
 
 use std::process::ExitCode;
 
+/// Training and rollouts allocate many short-lived buffers; this allocator keeps their pages.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 fn main() -> ExitCode {
     match cli::run() {
         Ok(()) => ExitCode::SUCCESS,

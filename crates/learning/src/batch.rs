@@ -1,6 +1,9 @@
 //! A batch of training windows: rows for the reference rollout, targets, and terrain tokens along the driven paths.
 
-use candle_core::{Device, Result, Tensor};
+use std::collections::HashMap;
+
+use candle_core::backprop::GradStore;
+use candle_core::{DType, Device, Result, Tensor, Var};
 use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, HIDDEN};
 use nesam_model::reference::{Network, Row, TerrainProvider};
 use nesam_model::{GroundSource, Normalization, history_actuators};
@@ -74,14 +77,23 @@ pub fn state_loss(predicted: &Tensor, target: &Tensor, scales: &Normalization) -
     ((error.sqr()? + 1.0)?.sqrt()? - 1.0)?.sum(1)?.mean_all()
 }
 
+/// Contexts and their projection, cut from the graph: the rollout reads the leaf, and the gradient of W_c is one product at the end.
+struct Projected {
+    context: Tensor,
+    tokens: Var,
+}
+
 /// Terrain tokens of a batch, computed once for all samples that its rollouts can reach.
 pub struct PathTerrain<'a, 'w> {
     windows: &'w [Window<'a>],
     horizon: usize,
-    history_tokens: Option<Tensor>,
-    tokens: Tensor,
-    soils: Tensor,
-    /// First row of each window in `tokens` and `soils`.
+    /// Contexts and their tokens of the history, and of the samples ahead: (rows, 9216) and (rows, 128).
+    past: Option<Projected>,
+    ahead: Projected,
+    /// Raw soil with its graph, and the leaf that the rollout reads.
+    soil_graph: Tensor,
+    soils: Var,
+    /// First row of each window in the table ahead.
     first_row: Vec<u32>,
     has_map: bool,
     default_soil: [f32; SOIL_DIM],
@@ -111,30 +123,64 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             }
         }
         let device = &Device::Cpu;
-        let project = |values: Vec<f32>| {
-            let n = values.len() / CONTEXT;
-            network.context_token(&Tensor::from_vec(values, (n, CONTEXT), device)?)
+        let project = |values: Vec<f32>, rows: usize| -> Result<Projected> {
+            if !has_map {
+                let tokens = Var::zeros((rows, HIDDEN), DType::F32, device)?;
+                return Ok(Projected { context: Tensor::zeros((rows, 1), DType::F32, device)?, tokens });
+            }
+            let context = Tensor::from_vec(values, (rows, CONTEXT), device)?;
+            let tokens = Var::from_tensor(&network.context_token(&context)?.detach())?;
+            Ok(Projected { context, tokens })
         };
-        let zeros = |n: usize| Tensor::zeros((n, HIDDEN), candle_core::DType::F32, device);
         let past_rows = windows.len() * history;
+        let soil_graph = if has_map {
+            network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?
+        } else {
+            Tensor::zeros((1, SOIL_DIM), DType::F32, device)?
+        };
         Ok(Self {
             windows,
             horizon,
-            history_tokens: match (has_map, past_rows) {
-                (_, 0) => None,
-                (true, _) => Some(project(past)?),
-                (false, n) => Some(zeros(n)?),
-            },
-            tokens: if has_map { project(context)? } else { zeros(1)? },
-            soils: if has_map {
-                network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?
-            } else {
-                Tensor::zeros((1, SOIL_DIM), candle_core::DType::F32, device)?
-            },
+            past: if past_rows > 0 { Some(project(past, past_rows)?) } else { None },
+            ahead: project(context, if has_map { rows } else { 1 })?,
+            soils: Var::from_tensor(&soil_graph.detach())?,
+            soil_graph,
             first_row,
             has_map,
             default_soil: scales.default_soil_raw,
         })
+    }
+
+    /// Completes the gradients of a loss for what lies before the leaves: W_c and the soil prior.
+    ///
+    /// # Errors
+    /// A candle error.
+    pub fn add_gradients(&self, network: &Network, store: &GradStore, gradients: &mut HashMap<String, Vec<f32>>) -> Result<()> {
+        if !self.has_map {
+            return Ok(());
+        }
+        let mut projection: Option<Tensor> = None;
+        for part in self.past.iter().chain(core::iter::once(&self.ahead)) {
+            if let Some(upstream) = store.get(&part.tokens) {
+                let own = upstream.t()?.matmul(&part.context)?;
+                projection = Some(match projection {
+                    Some(sum) => (sum + own)?,
+                    None => own,
+                });
+            }
+        }
+        if let Some(projection) = projection {
+            gradients.insert("token.context.weight".into(), projection.flatten_all()?.to_vec1()?);
+        }
+        if let Some(upstream) = store.get(&self.soils) {
+            let pulled = (&self.soil_graph * upstream.detach())?.sum_all()?.backward()?;
+            for (name, var) in network.variables.iter().filter(|(name, _)| name.starts_with("soil.")) {
+                if let Some(gradient) = pulled.get(var) {
+                    gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
+                }
+            }
+        }
+        Ok(())
     }
 
     /// (1 - share) · row(at) + share · row(at + 1) of each place.
@@ -155,18 +201,18 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
 
 impl TerrainProvider for PathTerrain<'_, '_> {
     fn history(&mut self) -> Result<Tensor> {
-        self.history_tokens.clone().ok_or_else(|| candle_core::Error::Msg("a batch without history has no history tokens".into()))
+        self.past.as_ref().map(|past| past.tokens.as_tensor().clone()).ok_or_else(|| candle_core::Error::Msg("a batch without history has no history tokens".into()))
     }
 
     fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
         if !self.has_map {
             let n = states.len();
             let soil = Tensor::from_slice(&self.default_soil, (1, SOIL_DIM), &Device::Cpu)?.broadcast_as((n, SOIL_DIM))?.contiguous()?;
-            return Ok((Tensor::zeros((n, HIDDEN), candle_core::DType::F32, &Device::Cpu)?, soil));
+            return Ok((Tensor::zeros((n, HIDDEN), DType::F32, &Device::Cpu)?, soil));
         }
         let places: Vec<Place> =
             self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();
-        Ok((self.interpolate(&self.tokens, &places)?, self.interpolate(&self.soils, &places)?))
+        Ok((self.interpolate(&self.ahead.tokens, &places)?, self.interpolate(&self.soils, &places)?))
     }
 }
 

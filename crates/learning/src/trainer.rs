@@ -104,24 +104,18 @@ pub struct TrainingSet<'a> {
 }
 
 impl TrainingSet<'_> {
-    /// Loss and gradients of one shard.
-    fn shard(&self, network: &Network, windows: &[Window<'_>], history: usize, horizon: usize, variant: Variant) -> Result<(f32, HashMap<String, Vec<f32>>)> {
-        let loss = self.loss(network, windows, history, horizon, variant)?;
-        let store = loss.backward()?;
-        let mut gradients = HashMap::new();
-        for (name, var) in &network.variables {
-            if let Some(gradient) = store.get(var) {
-                gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
-            }
-        }
-        Ok((loss.to_scalar::<f32>()?, gradients))
-    }
-
-    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1).
+    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1) and its gradient in every trainable array.
     ///
     /// # Errors
     /// A candle error.
-    pub fn loss(&self, network: &Network, windows: &[Window<'_>], history: usize, horizon: usize, variant: Variant) -> Result<Tensor> {
+    pub fn gradients(
+        &self,
+        network: &Network,
+        windows: &[Window<'_>],
+        history: usize,
+        horizon: usize,
+        variant: Variant,
+    ) -> Result<(f32, HashMap<String, Vec<f32>>)> {
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
         let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
         let mut terrain = PathTerrain::new(network, windows, history, horizon, self.scales)?;
@@ -129,7 +123,16 @@ impl TrainingSet<'_> {
         for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
             total = (total + state_loss(&step.state, &targets(windows, k)?, self.scales)?)?;
         }
-        total / horizon as f64
+        let loss = (total / horizon as f64)?;
+        let store = loss.backward()?;
+        let mut gradients = HashMap::new();
+        for (name, var) in &network.variables {
+            if let Some(gradient) = store.get(var) {
+                gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
+            }
+        }
+        terrain.add_gradients(network, &store, &mut gradients)?;
+        Ok((loss.to_scalar::<f32>()?, gradients))
     }
 
     /// Mean absolute errors over fixed windows of the validation drives.
@@ -260,7 +263,7 @@ fn parallel_gradients(
         let running: Vec<_> = windows
             .chunks(size)
             .zip(pools)
-            .map(|(windows, pool)| scope.spawn(move || pool.install(|| set.shard(network, windows, history, horizon, plan.variant))))
+            .map(|(windows, pool)| scope.spawn(move || pool.install(|| set.gradients(network, windows, history, horizon, plan.variant))))
             .collect();
         running.into_iter().map(|thread| thread.join().expect("a shard does not panic; this is a bug")).collect()
     });
