@@ -29,6 +29,7 @@ pub(crate) fn bicycle() -> Vehicle {
             overspeed_limit_m_s: 2.0,
         },
         gravity_m_s2: 9.81,
+        effects: Default::default(),
     }
 }
 

@@ -158,5 +158,6 @@ fn nesam_vehicle() -> nesam_physics::Vehicle {
             overspeed_limit_m_s: 1.0,
         },
         gravity_m_s2: 9.81,
+        effects: Default::default(),
     }
 }

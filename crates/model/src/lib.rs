@@ -25,7 +25,7 @@ pub use bundle::{ModelBundle, Provenance};
 pub use dims::{HISTORY, MAX_HORIZON};
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
-pub use predictor::{Predictor, TerrainMode};
+pub use predictor::{Predictor, TerrainMode, Transition};
 pub use rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
 pub use terrain_tokens::TerrainToken;
 pub use weights::Weights;

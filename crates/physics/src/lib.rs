@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 pub mod driveline;
+pub mod effects;
 pub mod linear;
 pub mod scalar;
 mod soil;

@@ -69,8 +69,36 @@ pub struct StepModel {
     vehicle: Vehicle,
     wheel: WheelGeometry,
     static_load_n: [f64; WHEELS],
+    body: RigidBody,
     substeps: usize,
     dt_s: f64,
+}
+
+/// Speed around which the friction of a dragging wheel changes its sign, m/s (chosen).
+const DRAG_SPEED_M_S: f64 = 0.07;
+
+/// Mass, inertia about the reference point, and centre of mass, effects included.
+#[derive(Clone, Debug)]
+struct RigidBody {
+    mass_kg: f64,
+    inertia_kg_m2: [[f64; 3]; 3],
+    centre_m: [f64; 3],
+    /// M [c]×, the lower left block of the spatial inertia.
+    coupling_kg_m: [[f64; 3]; 3],
+}
+
+impl RigidBody {
+    fn new(vehicle: &Vehicle) -> Self {
+        let (m, r) = (vehicle.effects.added_mass_kg, vehicle.effects.added_at_m);
+        let mass_kg = vehicle.mass_kg + m;
+        let square = dot(r, r);
+        let inertia_kg_m2 = core::array::from_fn(|i| {
+            core::array::from_fn(|j| vehicle.inertia_kg_m2[i][j] + m * (if i == j { square } else { 0.0 } - r[i] * r[j]))
+        });
+        let centre_m = scale(r, m / mass_kg);
+        let [x, y, z] = scale(centre_m, mass_kg);
+        Self { mass_kg, inertia_kg_m2, centre_m, coupling_kg_m: [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]] }
+    }
 }
 
 /// Contact of one wheel as the assembly needs it: axes, lever arm, forces and their rates.
@@ -89,6 +117,7 @@ impl StepModel {
         Self {
             wheel: WheelGeometry::new(vehicle.wheel_radius_m, vehicle.wheel_width_m),
             static_load_n: vehicle.static_load_n(),
+            body: RigidBody::new(vehicle),
             vehicle: vehicle.clone(),
             substeps,
             dt_s,
@@ -129,14 +158,17 @@ impl StepModel {
     fn substep<T: Real>(&self, state: &mut VehicleState<T>, input: &StepInput<T>, h: T) -> [WheelContact<T>; WHEELS] {
         let tilt = Tilt::new(state.attitude_rad[0], state.attitude_rad[1]);
         let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
-        let mass = T::lit(self.vehicle.mass_kg);
-        let inertia = self.vehicle.inertia_kg_m2;
+        let mass = T::lit(self.body.mass_kg);
+        let inertia = self.body.inertia_kg_m2;
         let inertia_w: Vec3<T> = core::array::from_fn(|r| dot(inertia[r].map(T::lit), w));
         let gravity = tilt.to_body([T::lit(0.0), T::lit(0.0), T::lit(-self.vehicle.gravity_m_s2)]);
 
-        // Newton-Euler in Body: M (v̇ + ω × v) = F + M g, I ω̇ + ω × I ω = τ.
-        let force = add(scale(gravity, mass), scale(cross(w, v), -mass));
-        let torque = scale(cross(w, inertia_w), T::lit(-1.0));
+        // Newton-Euler about the reference point, centre of mass at c: M (v̇ + ω × v + ω̇ × c + ω × (ω × c)) = F + M g,
+        // I ω̇ + ω × I ω + M c × (v̇ + ω × v) = τ + c × M g. Without effects c = 0 and these are the paper's equations.
+        let c = self.body.centre_m.map(T::lit);
+        let carried = add(gravity, scale(cross(w, v), T::lit(-1.0)));
+        let force = scale(add(carried, scale(cross(w, cross(w, c)), T::lit(-1.0))), mass);
+        let torque = add(scale(cross(w, inertia_w), T::lit(-1.0)), scale(cross(c, carried), mass));
         let mut rhs = [force[0], force[1], force[2], torque[0], torque[1], torque[2]];
         let zero = T::lit(0.0);
         let mut lhs = [[zero; 6]; 6];
@@ -144,6 +176,7 @@ impl StepModel {
             lhs[r][r] = mass;
             for c in 0..3 {
                 lhs[r + 3][c + 3] = T::lit(inertia[r][c]);
+                lhs[r + 3][c] = T::lit(self.body.coupling_kg_m[r][c]);
             }
         }
 
@@ -204,7 +237,7 @@ impl StepModel {
         let share = load / wrench.normal_n.relu_smooth(1.0);
         let soil_rate = (input.soil.n + T::lit(0.5)) * load / balanced;
         let in_series = soil_rate / (soil_rate + rate);
-        let (drag, contact) = self.traction(&wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
+        let (drag, contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
         Contribution {
             axes: [forward, left, normal],
             lever: add(centre, scale(normal, -distance)),
@@ -220,6 +253,7 @@ impl StepModel {
     #[allow(clippy::too_many_arguments)]
     fn traction<T: Real>(
         &self,
+        wheel: usize,
         wrench: &WheelWrench<T>,
         share: T,
         load: T,
@@ -229,14 +263,17 @@ impl StepModel {
         sinkage_m: T,
         slip: T,
     ) -> ([T; 2], WheelContact<T>) {
-        let forward_n = wrench.drawbar_n() * share * direction;
+        let drag_n = T::lit(self.vehicle.effects.wheel_drag_n_m[wheel] / self.wheel.radius_m);
+        let opposing = wheel_motion.forward_m_s / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
+        let forward_n = wrench.drawbar_n() * share * direction - drag_n * opposing;
         let left_n = wrench.side_n * share;
         // Secant slopes bound the tangents of the concave shear law, so the implicit step never under-damps.
         let floor = 0.02;
         let over = (wheel_motion.rim_speed_m_s - wheel_motion.forward_m_s).abs_smooth(floor);
         let thrust = (wrench.thrust_n * share).abs_smooth(1.0);
         let side = left_n.abs_smooth(1.0) / wheel_motion.left_m_s.abs_smooth(floor);
-        let drag = [thrust / over * input.wheels.slip_feedback(), side];
+        let friction = drag_n / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
+        let drag = [thrust / over * input.wheels.slip_feedback() + friction.max(T::lit(0.0)), side];
         (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip })
     }
 }

@@ -1,5 +1,6 @@
 //! What the physics must know of a vehicle.
 
+use crate::effects::EffectTerms;
 use crate::state::Control;
 
 /// Number of wheels of the platforms served.
@@ -81,6 +82,8 @@ pub struct Vehicle {
     pub driveline: Driveline,
     /// Gravity, m/s².
     pub gravity_m_s2: f64,
+    /// What effects add; all zero for a vehicle as its card says.
+    pub effects: EffectTerms,
 }
 
 impl Vehicle {

@@ -164,5 +164,6 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             overspeed_limit_m_s: c.driveline.overspeed_limit_m_s,
         },
         gravity_m_s2: c.gravity_m_s2,
+        effects: Default::default(),
     })
 }

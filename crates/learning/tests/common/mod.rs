@@ -38,6 +38,7 @@ pub fn truck() -> Vehicle {
             overspeed_limit_m_s: 0.8,
         },
         gravity_m_s2: 9.81,
+        effects: Default::default(),
     }
 }
 

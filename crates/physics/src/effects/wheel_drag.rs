@@ -1,0 +1,28 @@
+//! Friction at one wheel: a dragging brake, a bad bearing.
+
+use super::{EffectTerms, Parameter};
+use crate::vehicle::WHEELS;
+
+/// Wheel drag (catalogue no. 10): F_i = −(τ / r) tanh(v_i / 0.07 m/s) along the wheel's heading, at the contact.
+///
+/// The rims of a speed-controlled vehicle follow the ground here, so the friction torque appears as the force it takes away from the tread.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct WheelDrag {
+    /// Wheel: 0 = front left, 1 = front right, 2 = rear left, 3 = rear right.
+    pub wheel: usize,
+    /// Friction torque, N m.
+    pub torque_n_m: f64,
+}
+
+impl WheelDrag {
+    pub(super) fn parameters(&self) -> Vec<Parameter> {
+        vec![
+            Parameter { name: "wheel", unit: "index", value: self.wheel as f64, range: [-0.5, WHEELS as f64 - 0.5] },
+            Parameter { name: "torque_nm", unit: "N m", value: self.torque_n_m, range: [-200.0, 4000.0] },
+        ]
+    }
+
+    pub(super) fn add_to(&self, terms: &mut EffectTerms) {
+        terms.wheel_drag_n_m[self.wheel.min(WHEELS - 1)] += self.torque_n_m;
+    }
+}
