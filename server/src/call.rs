@@ -1,0 +1,175 @@
+//! The asynchronous way into the engine.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::task::{Context, Poll};
+use std::time::Duration;
+
+use nesam_engine::{
+    Answer, Command, EngineError, EngineHandle, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply, SessionView, Submission,
+};
+use nesam_terrain::WorldMap;
+use tokio::sync::oneshot;
+
+use crate::telemetry::Metrics;
+
+/// Awaits the engine; one for all handlers, clones share it.
+#[derive(Clone, Debug)]
+pub struct EngineClient {
+    handle: EngineHandle,
+    metrics: Arc<Metrics>,
+}
+
+/// How long a prediction waited and computed.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Timing {
+    /// In the queue, s.
+    pub queue_s: f64,
+    /// In the engine, s.
+    pub compute_s: f64,
+}
+
+/// An answer that is on its way. Dropping it tells the engine that nobody waits any more.
+#[derive(Debug)]
+pub struct Pending {
+    answer: oneshot::Receiver<Answer>,
+    abandoned: Arc<AtomicBool>,
+}
+
+impl Future for Pending {
+    type Output = Answer;
+
+    fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Answer> {
+        let stopped = |_| Answer { result: Err(EngineError::Stopped), queued_ns: 0, busy_ns: 0 };
+        Pin::new(&mut self.answer).poll(context).map(|answer| answer.unwrap_or_else(stopped))
+    }
+}
+
+impl Drop for Pending {
+    fn drop(&mut self) {
+        self.abandoned.store(true, Ordering::Relaxed);
+    }
+}
+
+impl EngineClient {
+    /// A client of an engine.
+    pub fn new(handle: EngineHandle, metrics: Arc<Metrics>) -> Self {
+        Self { handle, metrics }
+    }
+
+    /// The engine's handle.
+    pub fn handle(&self) -> &EngineHandle {
+        &self.handle
+    }
+
+    /// Counters of the server.
+    pub fn metrics(&self) -> &Arc<Metrics> {
+        &self.metrics
+    }
+
+    /// Puts a command in the queue now; commands submitted by one task are executed in that order.
+    pub fn submit(&self, command: Command, budget: Duration) -> Pending {
+        let (sender, answer) = oneshot::channel();
+        let abandoned = Arc::new(AtomicBool::new(false));
+        let label = command.label();
+        let metrics = self.metrics.clone();
+        let mut submission = Submission::new(command, move |answer: Answer| {
+            metrics.engine_answer(label, &answer);
+            let _ = sender.send(answer);
+        });
+        submission.abandoned = Some(abandoned.clone());
+        submission.deadline_ns = Some(self.handle.now_ns().saturating_add(u64::try_from(budget.as_nanos()).unwrap_or(u64::MAX)));
+        self.handle.submit(submission);
+        Pending { answer, abandoned }
+    }
+
+    /// Submits and awaits, at most as long as `budget`.
+    async fn call(&self, command: Command, budget: Duration) -> Result<(Reply, Timing), EngineError> {
+        let answer = tokio::time::timeout(budget, self.submit(command, budget)).await.map_err(|_| EngineError::Expired)?;
+        let timing = Timing { queue_s: answer.queued_ns as f64 * 1e-9, compute_s: answer.busy_ns as f64 * 1e-9 };
+        answer.result.map(|reply| (reply, timing))
+    }
+
+    /// Opens a session.
+    ///
+    /// # Errors
+    /// Any `EngineError`, as all functions below.
+    pub async fn open(&self, open: OpenSession, budget: Duration) -> Result<SessionView, EngineError> {
+        match self.call(Command::Open(open), budget).await?.0 {
+            Reply::Session(view) => Ok(*view),
+            _ => Err(mismatch("open")),
+        }
+    }
+
+    /// Reads a session.
+    pub async fn get(&self, session: &str, budget: Duration) -> Result<SessionView, EngineError> {
+        match self.call(Command::Get { session: session.into() }, budget).await?.0 {
+            Reply::Session(view) => Ok(*view),
+            _ => Err(mismatch("get")),
+        }
+    }
+
+    /// Lists the sessions.
+    pub async fn list(&self, budget: Duration) -> Result<Vec<SessionView>, EngineError> {
+        match self.call(Command::List, budget).await?.0 {
+            Reply::Sessions(views) => Ok(views),
+            _ => Err(mismatch("list")),
+        }
+    }
+
+    /// Closes a session.
+    pub async fn close(&self, session: &str, budget: Duration) -> Result<(), EngineError> {
+        self.call(Command::Close { session: session.into() }, budget).await.map(|_| ())
+    }
+
+    /// Predicts.
+    pub async fn predict(&self, query: PredictQuery, budget: Duration) -> Result<(Prediction, Timing), EngineError> {
+        match self.call(Command::Predict(query), budget).await? {
+            (Reply::Predicted(prediction), timing) => Ok((*prediction, timing)),
+            _ => Err(mismatch("predict")),
+        }
+    }
+
+    /// Takes a map.
+    pub async fn put_map(&self, map: Arc<WorldMap>, base: Option<u64>, budget: Duration) -> Result<Arc<WorldMap>, EngineError> {
+        match self.call(Command::PutMap { map, base }, budget).await?.0 {
+            Reply::Map(map) => Ok(map),
+            _ => Err(mismatch("put_map")),
+        }
+    }
+
+    /// Reads a map.
+    pub async fn get_map(&self, map: &str, budget: Duration) -> Result<Arc<WorldMap>, EngineError> {
+        match self.call(Command::GetMap { map: map.into() }, budget).await?.0 {
+            Reply::Map(map) => Ok(map),
+            _ => Err(mismatch("get_map")),
+        }
+    }
+
+    /// Lists the maps.
+    pub async fn list_maps(&self, budget: Duration) -> Result<Vec<Arc<WorldMap>>, EngineError> {
+        match self.call(Command::ListMaps, budget).await?.0 {
+            Reply::Maps(maps) => Ok(maps),
+            _ => Err(mismatch("list_maps")),
+        }
+    }
+
+    /// Forgets a map.
+    pub async fn delete_map(&self, map: &str, budget: Duration) -> Result<(), EngineError> {
+        self.call(Command::DeleteMap { map: map.into() }, budget).await.map(|_| ())
+    }
+}
+
+/// The outcome of a measurement in an engine answer.
+pub fn measured(answer: Answer) -> Result<MeasureAnswer, EngineError> {
+    match answer.result? {
+        Reply::Measured(answer) => Ok(answer),
+        _ => Err(mismatch("measure")),
+    }
+}
+
+fn mismatch(command: &str) -> EngineError {
+    EngineError::Internal { reason: format!("command `{command}` was answered with another reply") }
+}

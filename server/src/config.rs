@@ -1,0 +1,306 @@
+//! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
+
+use std::net::{Ipv4Addr, SocketAddr};
+use std::path::Path;
+
+use figment::Figment;
+use figment::providers::{Format, Serialized, Toml};
+use nesam_engine::{Limits, check_name};
+use serde::{Deserialize, Serialize};
+
+use crate::error::ServerError;
+
+/// Everything that can be configured. Unknown keys are refused.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Config {
+    /// gRPC.
+    pub grpc: GrpcConfig,
+    /// Metrics and status page.
+    pub http: HttpConfig,
+    /// Zenoh.
+    pub zenoh: ZenohConfig,
+    /// What is accepted and held at most.
+    pub limits: LimitsConfig,
+}
+
+/// gRPC.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct GrpcConfig {
+    /// Address to listen on; port 0 takes a free one. Beyond loopback anybody who reaches the port can feed sessions.
+    pub listen: SocketAddr,
+    /// Longest wait of a unary request that brings no deadline of its own, s.
+    pub deadline_s: f64,
+    /// Longest duration of a map upload, s.
+    pub upload_deadline_s: f64,
+    /// Simultaneous map uploads; each holds a whole map in memory.
+    pub uploads_max: usize,
+    /// Largest message with map tiles, bytes.
+    pub tile_bytes_max: usize,
+    /// Simultaneous requests of one connection; more wait.
+    pub streams_per_connection_max: u32,
+    /// Measurements of one stream that may wait for their answers; then the stream is read no further.
+    pub measurements_in_flight_max: usize,
+    /// Interval of keep-alive pings, s; a peer that has gone is noticed after about twice this.
+    pub keepalive_s: f64,
+    /// Longest wait for running requests at shutdown, s.
+    pub drain_s: f64,
+}
+
+/// Metrics and status page.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct HttpConfig {
+    /// Whether to serve HTTP at all.
+    pub enabled: bool,
+    /// Address to listen on; port 0 takes a free one.
+    pub listen: SocketAddr,
+}
+
+/// Role in a Zenoh network.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ZenohMode {
+    /// Listens and connects.
+    Peer,
+    /// Connects to a router; the server does not start without one.
+    Client,
+    /// Routes for others too.
+    Router,
+}
+
+/// Zenoh.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct ZenohConfig {
+    /// Whether to take part in a Zenoh network.
+    pub enabled: bool,
+    /// Role.
+    pub mode: ZenohMode,
+    /// Endpoints to listen on, e.g. `tcp/0.0.0.0:7447`.
+    pub listen: Vec<String>,
+    /// Endpoints to connect to, e.g. `tcp/router:7447`; a peer keeps trying.
+    pub connect: Vec<String>,
+    /// Fleet in the keys `nesam/v1/<fleet>/<vehicle>/...`.
+    pub fleet: String,
+}
+
+/// What is accepted and held at most; see `nesam_engine::Limits`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct LimitsConfig {
+    /// Open sessions.
+    pub sessions_max: usize,
+    /// Candidate sequences of one prediction.
+    pub samples_max: usize,
+    /// Steps of one prediction, at most 32.
+    pub horizon_max: usize,
+    /// Samples times steps of one prediction.
+    pub sample_steps_max: usize,
+    /// Uploaded maps.
+    pub maps_max: usize,
+    /// Cells of one map.
+    pub map_cells_max: usize,
+    /// Cells of all maps together.
+    pub map_cells_total_max: usize,
+    /// Predictions that wait.
+    pub waiting_predictions_max: usize,
+    /// Other commands that wait.
+    pub waiting_commands_max: usize,
+    /// |position| along each axis, m.
+    pub position_max_m: f64,
+    /// |velocity| along each axis, m/s.
+    pub speed_max_m_s: f64,
+    /// |angular velocity| about each axis, rad/s.
+    pub angular_speed_max_rad_s: f64,
+    /// Longest pause between two measurements of one session, s.
+    pub pause_max_s: f64,
+}
+
+impl Default for GrpcConfig {
+    fn default() -> Self {
+        Self {
+            listen: loopback(50051),
+            deadline_s: 10.0,
+            upload_deadline_s: 120.0,
+            uploads_max: 2,
+            tile_bytes_max: 4 << 20,
+            streams_per_connection_max: 256,
+            measurements_in_flight_max: 256,
+            keepalive_s: 20.0,
+            drain_s: 5.0,
+        }
+    }
+}
+
+impl Default for HttpConfig {
+    fn default() -> Self {
+        Self { enabled: true, listen: loopback(50080) }
+    }
+}
+
+impl Default for ZenohConfig {
+    fn default() -> Self {
+        Self {
+            enabled: true,
+            mode: ZenohMode::Peer,
+            listen: vec!["tcp/127.0.0.1:7447".into()],
+            connect: Vec::new(),
+            fleet: "default".into(),
+        }
+    }
+}
+
+impl Default for LimitsConfig {
+    fn default() -> Self {
+        let l = Limits::default();
+        Self {
+            sessions_max: l.sessions_max,
+            samples_max: l.samples_max,
+            horizon_max: l.horizon_max,
+            sample_steps_max: l.sample_steps_max,
+            maps_max: l.maps_max,
+            map_cells_max: l.map_cells_max,
+            map_cells_total_max: l.map_cells_total_max,
+            waiting_predictions_max: l.waiting_predictions_max,
+            waiting_commands_max: l.waiting_commands_max,
+            position_max_m: l.position_max_m,
+            speed_max_m_s: l.speed_max_m_s,
+            angular_speed_max_rad_s: l.angular_speed_max_rad_s,
+            pause_max_s: l.pause_max_s,
+        }
+    }
+}
+
+impl From<&LimitsConfig> for Limits {
+    fn from(c: &LimitsConfig) -> Self {
+        Self {
+            sessions_max: c.sessions_max,
+            samples_max: c.samples_max,
+            horizon_max: c.horizon_max,
+            sample_steps_max: c.sample_steps_max,
+            maps_max: c.maps_max,
+            map_cells_max: c.map_cells_max,
+            map_cells_total_max: c.map_cells_total_max,
+            waiting_predictions_max: c.waiting_predictions_max,
+            waiting_commands_max: c.waiting_commands_max,
+            position_max_m: c.position_max_m,
+            speed_max_m_s: c.speed_max_m_s,
+            angular_speed_max_rad_s: c.angular_speed_max_rad_s,
+            pause_max_s: c.pause_max_s,
+        }
+    }
+}
+
+fn loopback(port: u16) -> SocketAddr {
+    (Ipv4Addr::LOCALHOST, port).into()
+}
+
+impl Config {
+    /// The defaults, overridden by a TOML file.
+    ///
+    /// # Errors
+    /// `ServerError::Config` when the file cannot be read, is not TOML, or has an unknown or mistyped key; `ServerError::Value` as [`Config::check`].
+    pub fn load(path: &Path) -> Result<Self, ServerError> {
+        let config: Self = Figment::from(Serialized::defaults(Self::default()))
+            .merge(Toml::file_exact(path))
+            .extract()
+            .map_err(|error| ServerError::Config { path: path.into(), reason: error.to_string() })?;
+        config.check()?;
+        Ok(config)
+    }
+
+    /// A configuration for tests and the demo: loopback, free ports, no Zenoh.
+    pub fn ephemeral() -> Self {
+        let mut config = Self::default();
+        config.grpc.listen = loopback(0);
+        config.http.listen = loopback(0);
+        config.zenoh.enabled = false;
+        config
+    }
+
+    /// Checks what the types do not.
+    ///
+    /// # Errors
+    /// `ServerError::Value` naming the key.
+    pub fn check(&self) -> Result<(), ServerError> {
+        let seconds = [
+            ("grpc.deadline_s", self.grpc.deadline_s),
+            ("grpc.upload_deadline_s", self.grpc.upload_deadline_s),
+            ("grpc.keepalive_s", self.grpc.keepalive_s),
+            ("grpc.drain_s", self.grpc.drain_s),
+            ("limits.pause_max_s", self.limits.pause_max_s),
+        ];
+        for (key, value) in seconds {
+            if !(value > 0.0 && value <= 1e6) {
+                return Err(ServerError::Value { key, reason: format!("is {value}, allowed is above 0 and up to 1e6 s") });
+            }
+        }
+        let counts = [
+            ("grpc.uploads_max", self.grpc.uploads_max),
+            ("grpc.tile_bytes_max", self.grpc.tile_bytes_max),
+            ("grpc.measurements_in_flight_max", self.grpc.measurements_in_flight_max),
+            ("grpc.streams_per_connection_max", self.grpc.streams_per_connection_max as usize),
+            ("limits.sessions_max", self.limits.sessions_max),
+            ("limits.samples_max", self.limits.samples_max),
+            ("limits.horizon_max", self.limits.horizon_max),
+            ("limits.sample_steps_max", self.limits.sample_steps_max),
+            ("limits.waiting_predictions_max", self.limits.waiting_predictions_max),
+            ("limits.waiting_commands_max", self.limits.waiting_commands_max),
+        ];
+        for (key, value) in counts {
+            if value == 0 {
+                return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
+            }
+        }
+        check_name("zenoh.fleet", &self.zenoh.fleet).map_err(|error| ServerError::Value { key: "zenoh.fleet", reason: error.to_string() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn repository() -> std::path::PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().into()
+    }
+
+    #[test]
+    fn regress_default_file_says_the_defaults() {
+        let path = repository().join("deploy/config/default.toml");
+        assert_eq!(Config::load(&path).unwrap(), Config::default());
+        // Every key stands in the file, so that it documents all of them.
+        let text = std::fs::read_to_string(&path).unwrap();
+        let from_file: figment::value::Dict = Figment::from(Toml::string(&text)).extract().unwrap();
+        let from_code: figment::value::Dict = Figment::from(Serialized::defaults(Config::default())).extract().unwrap();
+        for (section, values) in &from_code {
+            let file = from_file.get(section).and_then(|v| v.as_dict()).unwrap();
+            for key in values.as_dict().unwrap().keys() {
+                assert!(file.contains_key(key), "{section}.{key} is not in default.toml");
+            }
+        }
+    }
+
+    #[test]
+    fn regress_wrong_files_are_refused_with_the_key() {
+        let dir = std::env::temp_dir().join(format!("nesam-config-{}", std::process::id()));
+        std::fs::create_dir_all(&dir).unwrap();
+        for (text, part) in [
+            ("[grpc]\nlisten = 3\n", "listen"),
+            ("[grpc]\nport = 3\n", "port"),
+            ("[limits]\nsessions_max = 0\n", "limits.sessions_max"),
+            ("[zenoh]\nfleet = \"a/b\"\n", "zenoh.fleet"),
+            ("[zenoh]\nmode = \"king\"\n", "king"),
+            ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),
+            ("not toml", "default.toml"),
+        ] {
+            let path = dir.join("default.toml");
+            std::fs::write(&path, text).unwrap();
+            let message = Config::load(&path).unwrap_err().to_string();
+            assert!(message.contains(part), "{text:?}: {message}");
+        }
+        assert!(Config::load(&dir.join("absent.toml")).unwrap_err().to_string().contains("absent.toml"));
+        std::fs::remove_dir_all(&dir).unwrap();
+    }
+}

@@ -1,0 +1,15 @@
+//! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
+
+mod measurement;
+mod prediction;
+mod session;
+mod state;
+mod status;
+mod terrain;
+
+pub use measurement::{measurement, measurement_answer};
+pub use prediction::{OutputSelection, predict_error, predict_query, predict_reply};
+pub use session::{open_session, provenance, session_view, soil_estimate, soil_vector};
+pub use state::{control, control_message, decode_f32, encode_f32, vehicle_state, vehicle_state_message};
+pub use status::{FIELD_METADATA, code, to_status};
+pub use terrain::{MapBuilder, description, patched};

@@ -1,0 +1,139 @@
+//! Predictions.
+
+use nesam_engine::{EngineError, Limits, PredictQuery, Prediction};
+use nesam_physics::{STATE_DIM, WHEELS};
+use nesam_proto::v1 as pb;
+
+use super::{code, decode_f32, encode_f32, provenance, soil_vector, vehicle_state, vehicle_state_message};
+use crate::call::Timing;
+
+/// What the reply carries.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OutputSelection {
+    /// Bit i = channel i.
+    pub channels: u32,
+    /// Every which step.
+    pub stride: usize,
+    /// Whether to send the sinkage.
+    pub wheel_sinkage: bool,
+}
+
+const ALL_CHANNELS: u32 = (1 << STATE_DIM) - 1;
+
+/// A query and what its reply shall carry. Shape and lengths are checked before anything is copied.
+///
+/// # Errors
+/// `Invalid` naming the field and the limit.
+pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(PredictQuery, OutputSelection), EngineError> {
+    let (samples, horizon) = (message.samples as usize, message.horizon as usize);
+    limits.check_shape(samples, horizon)?;
+    let controls = decode_f32("controls", &message.controls, samples * horizon * 2)?;
+    let start = message.start.as_ref().map(|state| vehicle_state("start", state)).transpose()?;
+    let use_history = match pb::HistoryUse::try_from(message.history_use) {
+        Ok(pb::HistoryUse::Unspecified | pb::HistoryUse::Measured) => true,
+        Ok(pb::HistoryUse::None) => false,
+        Err(_) => {
+            let reason = format!("is {}, allowed are 0, 1 (measured) and 2 (none)", message.history_use);
+            return Err(EngineError::invalid("history_use", reason));
+        }
+    };
+    let output = output_selection(&message.output.unwrap_or_default(), horizon)?;
+    Ok((PredictQuery { session: message.session_id.clone(), start, use_history, samples, horizon, controls }, output))
+}
+
+fn output_selection(message: &pb::OutputSelection, horizon: usize) -> Result<OutputSelection, EngineError> {
+    let channels = if message.channels == 0 { ALL_CHANNELS } else { message.channels };
+    if channels & !ALL_CHANNELS != 0 {
+        let reason = format!("is {channels:#x}, only the lowest {STATE_DIM} bits name a channel");
+        return Err(EngineError::invalid("output.channels", reason));
+    }
+    let stride = message.stride.max(1) as usize;
+    if stride > horizon {
+        return Err(EngineError::invalid("output.stride", format!("is {stride}, allowed are 0 to horizon = {horizon}")));
+    }
+    Ok(OutputSelection { channels, stride, wheel_sinkage: message.wheel_sinkage })
+}
+
+impl OutputSelection {
+    /// Steps returned of a horizon.
+    fn steps(&self, horizon: usize) -> usize {
+        horizon / self.stride
+    }
+
+    /// Picks every stride-th step and the given columns of rows of `width` numbers.
+    fn pick(&self, values: &[f32], horizon: usize, width: usize, columns: &[usize]) -> Vec<f32> {
+        let mut picked = Vec::with_capacity(values.len() / width / self.stride * columns.len());
+        for sample in values.chunks_exact(horizon * width) {
+            for step in sample.chunks_exact(width).skip(self.stride - 1).step_by(self.stride) {
+                picked.extend(columns.iter().map(|c| step[*c]));
+            }
+        }
+        picked
+    }
+
+    fn states(&self, prediction: &Prediction) -> bytes::Bytes {
+        let rollout = &prediction.rollout;
+        if self.channels == ALL_CHANNELS && self.stride == 1 {
+            return encode_f32(&rollout.states);
+        }
+        let columns: Vec<usize> = (0..STATE_DIM).filter(|c| self.channels >> c & 1 == 1).collect();
+        encode_f32(&self.pick(&rollout.states, rollout.horizon, STATE_DIM, &columns))
+    }
+
+    fn sinkage(&self, prediction: &Prediction) -> bytes::Bytes {
+        if !self.wheel_sinkage {
+            return bytes::Bytes::new();
+        }
+        let columns: [usize; WHEELS] = core::array::from_fn(|i| i);
+        encode_f32(&self.pick(&prediction.rollout.sinkage_m, prediction.rollout.horizon, WHEELS, &columns))
+    }
+}
+
+/// The reply to a query.
+pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection, timing: Timing) -> pb::PredictReply {
+    pb::PredictReply {
+        tag,
+        samples: prediction.rollout.samples as u32,
+        steps: output.steps(prediction.rollout.horizon) as u32,
+        channels: output.channels,
+        states: output.states(prediction),
+        sinkage_m: output.sinkage(prediction),
+        validity: prediction.rollout.flags.clone(),
+        start: Some(vehicle_state_message(&prediction.start)),
+        history_steps: prediction.history_steps as u32,
+        soil: Some(soil_vector(&prediction.rollout.soil)),
+        soil_variance: prediction.soil_variance.as_ref().map(soil_vector),
+        measurement_age_s: prediction.measurement_age_s,
+        provenance: Some(provenance(&prediction.provenance)),
+        queue_s: timing.queue_s,
+        compute_s: timing.compute_s,
+    }
+}
+
+/// A refusal inside a stream or a Zenoh reply.
+pub fn predict_error(tag: u64, error: &EngineError) -> pb::PredictError {
+    pb::PredictError { tag, code: code(error).into(), field: error.field().into(), message: error.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_selection_picks_channels_and_steps() {
+        let output = output_selection(&pb::OutputSelection { channels: 0b10_0000_0001, stride: 2, wheel_sinkage: false }, 5).unwrap();
+        let (samples, horizon) = (2, 5);
+        let values: Vec<f32> = (0..samples * horizon * STATE_DIM).map(|v| v as f32).collect();
+        let picked = output.pick(&values, horizon, STATE_DIM, &[0, 9]);
+        // Steps 2 and 4 (rows 1 and 3) of both samples.
+        assert_eq!(picked, [12.0, 21.0, 36.0, 45.0, 72.0, 81.0, 96.0, 105.0]);
+        assert_eq!(output.steps(horizon), 2);
+    }
+
+    #[test]
+    fn analytic_packed_f32_round_trip() {
+        let values = [0.0, -1.5, f32::MAX, f32::MIN_POSITIVE];
+        assert_eq!(decode_f32("x", &encode_f32(&values), 4).unwrap(), values);
+        assert_eq!(decode_f32("x", &[0; 15], 4).unwrap_err().field(), "x");
+    }
+}

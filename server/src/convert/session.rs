@@ -1,0 +1,101 @@
+//! Sessions, provenance and soil.
+
+use nesam_engine::EngineError;
+use nesam_engine::{OpenSession, Provenance, SessionView, SoilState};
+use nesam_physics::{SOIL_DIM, SecondCommand, Vehicle};
+use nesam_proto::v1 as pb;
+
+use super::{control_message, measurement, vehicle_state_message};
+
+/// A session to open.
+///
+/// # Errors
+/// `Invalid` naming the field of the initial measurement at fault.
+pub fn open_session(message: &pb::OpenSessionRequest) -> Result<OpenSession, EngineError> {
+    let below = |error| match error {
+        EngineError::Invalid { field, reason } => EngineError::Invalid { field: format!("initial.{field}"), reason },
+        other => other,
+    };
+    Ok(OpenSession {
+        session: message.session_id.clone(),
+        vehicle: message.vehicle_id.clone(),
+        vehicle_card: message.vehicle_card.clone(),
+        map: message.map_id.clone(),
+        initial: message.initial.as_ref().map(measurement).transpose().map_err(below)?,
+    })
+}
+
+/// A session as message.
+pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
+    pb::Session {
+        session_id: view.session.clone(),
+        vehicle_id: view.vehicle.clone(),
+        provenance: Some(provenance(&view.provenance)),
+        vehicle: Some(vehicle_card(vehicle)),
+        history_steps: view.history_steps as u32,
+        last_stamp_ns: view.last_stamp_ns,
+        last_sequence: view.last_sequence,
+        state: view.newest.as_ref().map(|step| vehicle_state_message(&step.state)),
+        command: view.newest.as_ref().map(|step| control_message(&step.control)),
+        soil_correction: Some(soil_vector(&view.soil.correction)),
+        soil_variance: view.soil.variance.as_ref().map(soil_vector),
+    }
+}
+
+fn vehicle_card(vehicle: &Vehicle) -> pb::VehicleCard {
+    let second = match vehicle.second {
+        SecondCommand::SteeringNormalised => pb::SecondCommand::SteeringNormalised,
+        SecondCommand::RoadWheelAngleRad => pb::SecondCommand::RoadWheelAngleRad,
+        SecondCommand::YawRateRadS => pb::SecondCommand::YawRateRadS,
+    };
+    let [[speed_min_m_s, speed_max_m_s], [second_min, second_max]] = vehicle.command_range;
+    let road_wheel_angle_max_rad = match (&vehicle.steering, vehicle.second) {
+        (Some(table), _) => {
+            let last = |angles: &[f64]| angles.last().copied().unwrap_or(0.0);
+            0.5 * (last(&table.front_left_rad) + last(&table.front_right_rad))
+        }
+        (None, SecondCommand::RoadWheelAngleRad) => second_max,
+        (None, _) => 0.0,
+    };
+    pb::VehicleCard {
+        name: vehicle.name.clone(),
+        second: second.into(),
+        speed_min_m_s,
+        speed_max_m_s,
+        second_min,
+        second_max,
+        wheelbase_m: vehicle.wheelbase_m,
+        road_wheel_angle_max_rad,
+    }
+}
+
+/// Provenance as message.
+pub fn provenance(provenance: &Provenance) -> pb::Provenance {
+    let (map_id, map_version, map_hash) = provenance.map.clone().unwrap_or_default();
+    pb::Provenance {
+        history_epoch: provenance.history_epoch,
+        soil_epoch: provenance.soil_epoch,
+        map_id,
+        map_version,
+        map_hash,
+        bundle_name: provenance.bundle_name.clone(),
+        bundle_hash: provenance.bundle_hash.clone(),
+    }
+}
+
+/// Six soil numbers as message.
+pub fn soil_vector(values: &[f64; SOIL_DIM]) -> pb::SoilVector {
+    let [k_phi, k_c, n, c_pa, phi_rad, k_shear_m] = *values;
+    pb::SoilVector { k_phi, k_c, n, c_pa, phi_rad, k_shear_m }
+}
+
+/// A soil estimate as message.
+pub fn soil_estimate(session: &str, soil: &SoilState) -> pb::SoilEstimate {
+    pb::SoilEstimate {
+        session_id: session.into(),
+        soil_epoch: soil.epoch,
+        stamp_ns: soil.stamp_ns,
+        correction: Some(soil_vector(&soil.correction)),
+        variance: soil.variance.as_ref().map(soil_vector),
+    }
+}

@@ -1,0 +1,44 @@
+//! Why a server does not start.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+/// Failure of reading the configuration or of starting.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// A configuration file cannot be used.
+    #[error("configuration {}: {reason}", path.display())]
+    Config {
+        /// File at fault.
+        path: PathBuf,
+        /// Key and reason.
+        reason: String,
+    },
+    /// A configured value makes no sense.
+    #[error("configuration key `{key}`: {reason}")]
+    Value {
+        /// Dotted key.
+        key: &'static str,
+        /// What was wrong and what is allowed.
+        reason: String,
+    },
+    /// An address cannot be listened on.
+    #[error("cannot listen on {address} (`{key}`): {source}; choose another address or stop the program that uses it")]
+    Listen {
+        /// Address asked for.
+        address: SocketAddr,
+        /// Configuration key.
+        key: &'static str,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Zenoh does not start.
+    #[error("zenoh does not start: {reason}; check `zenoh.listen` and `zenoh.connect`, or set `zenoh.enabled = false`")]
+    Zenoh {
+        /// What Zenoh said.
+        reason: String,
+    },
+    /// Zenoh needs more than the runtime offers.
+    #[error("zenoh needs a multi-thread tokio runtime; start the server in one or set `zenoh.enabled = false`")]
+    Runtime,
+}

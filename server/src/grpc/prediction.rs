@@ -1,0 +1,76 @@
+//! nesam.v1.Prediction.
+
+use std::time::Duration;
+
+use nesam_engine::EngineError;
+use nesam_proto::v1 as pb;
+use tokio_stream::StreamExt as _;
+use tonic::{Request, Response, Status, Streaming};
+
+use super::{Edge, ReplyStream, stopped};
+use crate::convert::{predict_error, predict_query, predict_reply, to_status};
+use crate::telemetry::Transport;
+
+/// Answers planners.
+pub struct Service(pub Edge);
+
+/// One request, the same for the unary method, the stream and Zenoh.
+pub(crate) async fn predict(edge: &Edge, request: &pb::PredictRequest, budget: Duration) -> Result<pb::PredictReply, EngineError> {
+    let (query, output) = predict_query(request, edge.engine.handle().limits())?;
+    let (prediction, timing) = edge.engine.predict(query, budget).await?;
+    tracing::debug!(
+        session = request.session_id,
+        samples = request.samples,
+        horizon = request.horizon,
+        compute_s = timing.compute_s,
+        "predicted"
+    );
+    Ok(predict_reply(request.tag, &prediction, output, timing))
+}
+
+#[tonic::async_trait]
+impl pb::prediction_server::Prediction for Service {
+    async fn predict(&self, request: Request<pb::PredictRequest>) -> Result<Response<pb::PredictReply>, Status> {
+        self.0.engine.metrics().request(Transport::Grpc, "predict");
+        let budget = self.0.budget(&request);
+        predict(&self.0, request.get_ref(), budget).await.map(Response::new).map_err(to_status)
+    }
+
+    type PredictStreamStream = ReplyStream<pb::PredictStreamReply>;
+
+    async fn predict_stream(&self, request: Request<Streaming<pb::PredictRequest>>) -> Result<Response<Self::PredictStreamStream>, Status> {
+        let edge = self.0.clone();
+        let mut inbound = request.into_inner();
+        let (sender, receiver) = tokio::sync::mpsc::channel(1);
+        tokio::spawn(async move {
+            let stop = stopped(edge.stopping.clone());
+            tokio::pin!(stop);
+            loop {
+                let item = tokio::select! {
+                    item = inbound.next() => item,
+                    () = &mut stop => Some(Err(Status::unavailable(EngineError::Stopped.to_string()))),
+                    () = sender.closed() => None,
+                };
+                let reply = match item {
+                    Some(Ok(request)) => Ok(answer(&edge, &request).await),
+                    Some(Err(status)) => Err(status),
+                    None => return,
+                };
+                let last = reply.is_err();
+                if sender.send(reply).await.is_err() || last {
+                    return;
+                }
+            }
+        });
+        Ok(Response::new(Box::pin(tokio_stream::wrappers::ReceiverStream::new(receiver))))
+    }
+}
+
+async fn answer(edge: &Edge, request: &pb::PredictRequest) -> pb::PredictStreamReply {
+    edge.engine.metrics().request(Transport::Grpc, "predict_stream");
+    let outcome = match predict(edge, request, edge.stream_budget()).await {
+        Ok(reply) => pb::predict_stream_reply::Outcome::Reply(reply),
+        Err(error) => pb::predict_stream_reply::Outcome::Error(predict_error(request.tag, &error)),
+    };
+    pb::PredictStreamReply { outcome: Some(outcome) }
+}

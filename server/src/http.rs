@@ -1,0 +1,79 @@
+//! HTTP: `/metrics` for Prometheus, `/status` as JSON, `/health` for load balancers, and the pages of `web`.
+
+use std::time::Duration;
+
+use axum::extract::State;
+use axum::http::StatusCode;
+use axum::response::{IntoResponse as _, Response};
+use axum::routing::get;
+use axum::{Json, Router};
+use serde_json::json;
+
+use crate::clock::MonotonicClock;
+use crate::grpc::Edge;
+
+/// What the HTTP side reads.
+#[derive(Clone)]
+pub(crate) struct HttpState {
+    pub edge: Edge,
+    pub clock: MonotonicClock,
+}
+
+const STATUS_DEADLINE: Duration = Duration::from_secs(5);
+
+/// The router.
+pub(crate) fn router(state: HttpState) -> Router {
+    Router::new()
+        .route("/metrics", get(metrics))
+        .route("/status", get(status))
+        .route("/health", get(health))
+        .merge(crate::web::routes())
+        .with_state(state)
+}
+
+async fn metrics(State(state): State<HttpState>) -> Response {
+    let (commands, predictions) = state.edge.engine.handle().waiting();
+    let mut text = state.edge.engine.metrics().render(commands, predictions);
+    text += &format!(
+        "# HELP nesam_uptime_seconds Time since the start.\n# TYPE nesam_uptime_seconds gauge\nnesam_uptime_seconds {}\n",
+        state.clock.elapsed().as_secs_f64()
+    );
+    ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
+}
+
+async fn health(State(state): State<HttpState>) -> StatusCode {
+    if *state.edge.stopping.borrow() { StatusCode::SERVICE_UNAVAILABLE } else { StatusCode::OK }
+}
+
+async fn status(State(state): State<HttpState>) -> Response {
+    let sessions = match state.edge.engine.list(STATUS_DEADLINE).await {
+        Ok(sessions) => sessions,
+        Err(error) => return (StatusCode::SERVICE_UNAVAILABLE, error.to_string()).into_response(),
+    };
+    let bundle = state.edge.predictor.bundle();
+    let (commands, predictions) = state.edge.engine.handle().waiting();
+    let sessions: Vec<_> = sessions
+        .iter()
+        .map(|s| {
+            json!({
+                "session": s.session,
+                "vehicle": s.vehicle,
+                "map": s.provenance.map.as_ref().map(|(id, version, _)| json!({"id": id, "version": version})),
+                "history_steps": s.history_steps,
+                "history_epoch": s.provenance.history_epoch,
+                "soil_epoch": s.provenance.soil_epoch,
+                "position_m": s.newest.as_ref().map(|n| n.state.position_m),
+            })
+        })
+        .collect();
+    let body = json!({
+        "schema": "nesam.status/1",
+        "version": env!("CARGO_PKG_VERSION"),
+        "uptime_s": state.clock.elapsed().as_secs_f64(),
+        "bundle": {"name": bundle.name, "hash": bundle.hash, "vehicle": bundle.vehicle.name},
+        "waiting": {"commands": commands, "predictions": predictions},
+        "predictions": state.edge.engine.metrics().predictions(),
+        "sessions": sessions,
+    });
+    Json(body).into_response()
+}

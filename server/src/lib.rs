@@ -1,0 +1,24 @@
+//! The edge of the service: gRPC, Zenoh and HTTP around the engine.
+//!
+//! [`serve`] starts everything that a [`Config`] asks for and gives a [`RunningServer`]; the command line and the tests use the same function.
+//! A request takes one way whatever brought it: `convert` turns the message into a domain value or names the field at fault, [`call::EngineClient`]
+//! puts it into the engine's queue and awaits the answer, `convert` turns that into a message. Handlers do nothing else.
+#![forbid(unsafe_code)]
+
+pub mod call;
+mod clock;
+mod config;
+pub mod convert;
+mod error;
+mod grpc;
+mod http;
+mod serve;
+mod telemetry;
+mod web;
+mod zenoh;
+
+pub use clock::MonotonicClock;
+pub use config::{Config, GrpcConfig, HttpConfig, LimitsConfig, ZenohConfig, ZenohMode};
+pub use error::ServerError;
+pub use serve::{RunningServer, serve, termination};
+pub use telemetry::Metrics;

@@ -1,0 +1,215 @@
+//! Starting and stopping everything together.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::time::Duration;
+
+use nesam_engine::{Engine, EngineHandle, Event, Limits};
+use nesam_model::Predictor;
+use nesam_proto::v1 as pb;
+use tokio::net::TcpListener;
+use tokio::sync::{Semaphore, broadcast, watch};
+use tokio::task::JoinHandle;
+use tonic::transport::server::TcpIncoming;
+use tonic_health::ServingStatus;
+use tonic_health::server::HealthReporter;
+
+use crate::call::EngineClient;
+use crate::clock::MonotonicClock;
+use crate::config::{Config, GrpcConfig};
+use crate::error::ServerError;
+use crate::grpc::{self, Edge, stopped};
+use crate::http::{self, HttpState};
+use crate::telemetry::Metrics;
+use crate::zenoh::Bus;
+
+/// Events that a slow watcher may lag behind before it has to read anew.
+const EVENTS_KEPT: usize = 1024;
+
+/// Names under which health is reported; the empty one stands for the whole server.
+const HEALTH_NAMES: [&str; 6] =
+    ["", "nesam.v1.Sessions", "nesam.v1.Prediction", "nesam.v1.Measurements", "nesam.v1.Terrain", "nesam.v1.Soil"];
+
+/// A server that listens. Dropping it leaves its tasks running; end it with [`RunningServer::shutdown`].
+pub struct RunningServer {
+    /// Address of gRPC, with the port that was taken.
+    pub grpc_addr: SocketAddr,
+    /// Address of HTTP, if it is enabled.
+    pub http_addr: Option<SocketAddr>,
+    handle: EngineHandle,
+    metrics: Arc<Metrics>,
+    health: HealthReporter,
+    stop: watch::Sender<bool>,
+    grpc: JoinHandle<()>,
+    http: Option<JoinHandle<()>>,
+    bus: Option<Bus>,
+    drain: Duration,
+}
+
+impl core::fmt::Debug for RunningServer {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("RunningServer").field("grpc_addr", &self.grpc_addr).field("http_addr", &self.http_addr).finish_non_exhaustive()
+    }
+}
+
+/// Starts the engine, gRPC, HTTP and Zenoh. Returns when all of them listen.
+///
+/// # Errors
+/// `ServerError` naming the address or the configuration key at fault; nothing keeps running then.
+pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningServer, ServerError> {
+    config.check()?;
+    // Everything that can fail for want of an address comes before the first thread.
+    let grpc_listener = listen(config.grpc.listen, "grpc.listen").await?;
+    let http_listener = match config.http.enabled {
+        true => Some(listen(config.http.listen, "http.listen").await?),
+        false => None,
+    };
+    let grpc_addr = local(&grpc_listener, config.grpc.listen);
+    let http_addr = http_listener.as_ref().map(|listener| local(listener, config.http.listen));
+
+    let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
+    let sink = events.clone();
+    let engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).with_events(Box::new(move |event| {
+        let _ = sink.send(event);
+    }));
+    let clock = MonotonicClock::default();
+    let handle = EngineHandle::spawn(engine, Arc::new(clock));
+    let metrics = Arc::new(Metrics::default());
+    let (stop, stopping) = watch::channel(false);
+    let drain = Duration::from_secs_f64(config.grpc.drain_s);
+    let edge = Edge {
+        engine: EngineClient::new(handle.clone(), metrics.clone()),
+        predictor,
+        uploads: Arc::new(Semaphore::new(config.grpc.uploads_max)),
+        config: Arc::new(config.grpc),
+        events,
+        stopping: stopping.clone(),
+    };
+    let bus = match config.zenoh.enabled {
+        true => match Bus::start(&config.zenoh, &edge).await {
+            Ok(bus) => Some(bus),
+            Err(error) => {
+                handle.stop();
+                return Err(error);
+            }
+        },
+        false => None,
+    };
+    let http = http_listener.map(|listener| {
+        let router = http::router(HttpState { edge: edge.clone(), clock });
+        let stopping = stopping.clone();
+        tokio::spawn(async move {
+            if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
+                tracing::error!(%error, "http ended");
+            }
+        })
+    });
+    let health = HealthReporter::new();
+    report(&health, ServingStatus::Serving).await;
+    let grpc = spawn_grpc(grpc_listener, &edge, &health, stopping);
+    tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), "serving");
+    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, drain })
+}
+
+async fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, ServerError> {
+    TcpListener::bind(address).await.map_err(|source| ServerError::Listen { address, key, source })
+}
+
+fn local(listener: &TcpListener, asked: SocketAddr) -> SocketAddr {
+    listener.local_addr().unwrap_or(asked)
+}
+
+async fn report(health: &HealthReporter, status: ServingStatus) {
+    for name in HEALTH_NAMES {
+        health.set_service_status(name, status).await;
+    }
+}
+
+/// Connection settings of gRPC.
+fn builder(config: &GrpcConfig) -> tonic::transport::Server {
+    let keepalive = Duration::from_secs_f64(config.keepalive_s);
+    tonic::transport::Server::builder()
+        .max_concurrent_streams(config.streams_per_connection_max)
+        .initial_stream_window_size(4 << 20)
+        .initial_connection_window_size(8 << 20)
+        .http2_keepalive_interval(Some(keepalive))
+        .http2_keepalive_timeout(Some(keepalive))
+        .http2_max_pending_accept_reset_streams(Some(64))
+}
+
+fn spawn_grpc(listener: TcpListener, edge: &Edge, health: &HealthReporter, stopping: watch::Receiver<bool>) -> JoinHandle<()> {
+    let health =
+        tonic_health::pb::health_server::HealthServer::new(tonic_health::server::HealthService::from_health_reporter(health.clone()));
+    let reflection = tonic_reflection::server::Builder::configure()
+        .register_encoded_file_descriptor_set(pb::FILE_DESCRIPTOR_SET)
+        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+        .build_v1()
+        .expect("the committed descriptor set decodes; this is a bug");
+    let routes = grpc::routes(edge).add_service(health).add_service(reflection);
+    let router = builder(&edge.config).add_routes(routes);
+    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    tokio::spawn(async move {
+        if let Err(error) = router.serve_with_incoming_shutdown(incoming, stopped(stopping)).await {
+            tracing::error!(%error, "grpc ended");
+        }
+    })
+}
+
+impl RunningServer {
+    /// The engine's handle, for a demo or test in the same program.
+    pub fn engine(&self) -> &EngineHandle {
+        &self.handle
+    }
+
+    /// Counters of the server.
+    pub fn metrics(&self) -> &Metrics {
+        &self.metrics
+    }
+
+    /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements.
+    pub async fn shutdown(mut self) {
+        report(&self.health, ServingStatus::NotServing).await;
+        if let Some(bus) = self.bus.take() {
+            bus.stop().await;
+        }
+        let _ = self.stop.send(true);
+        for mut task in [Some(self.grpc), self.http.take()].into_iter().flatten() {
+            if tokio::time::timeout(self.drain, &mut task).await.is_err() {
+                tracing::warn!("requests still ran after the drain time and were cut off");
+                task.abort();
+            }
+        }
+        let handle = self.handle;
+        let _ = tokio::task::spawn_blocking(move || handle.stop()).await;
+        tracing::info!("stopped");
+    }
+
+    /// Serves until `signal` resolves, then shuts down.
+    pub async fn run_until(self, signal: impl Future<Output = ()>) {
+        signal.await;
+        tracing::info!("stopping");
+        self.shutdown().await;
+    }
+}
+
+/// Resolves on ctrl-c or SIGTERM.
+pub async fn termination() {
+    let interrupt = async {
+        if tokio::signal::ctrl_c().await.is_err() {
+            std::future::pending::<()>().await;
+        }
+    };
+    #[cfg(unix)]
+    let terminate = async {
+        match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
+            Ok(mut signal) => signal.recv().await,
+            Err(_) => std::future::pending().await,
+        }
+    };
+    #[cfg(not(unix))]
+    let terminate = std::future::pending::<Option<()>>();
+    tokio::select! {
+        () = interrupt => {}
+        _ = terminate => {}
+    }
+}

@@ -1,0 +1,144 @@
+//! All counters of one server.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::sync::Mutex;
+
+use nesam_engine::{Answer, EngineError, Reply};
+
+use super::histogram::Histogram;
+
+/// What brought a measurement or a request.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Transport {
+    /// gRPC.
+    Grpc,
+    /// Zenoh.
+    Zenoh,
+}
+
+impl Transport {
+    /// Value of the `transport` label.
+    pub fn label(self) -> &'static str {
+        match self {
+            Self::Grpc => "grpc",
+            Self::Zenoh => "zenoh",
+        }
+    }
+}
+
+/// A counter for each pair of label values.
+type Pairs = Mutex<BTreeMap<(&'static str, &'static str), u64>>;
+
+/// Counters and histograms of one server.
+#[derive(Debug, Default)]
+pub struct Metrics {
+    commands: Pairs,
+    measurements: Pairs,
+    requests: Pairs,
+    queue: Histogram,
+    prediction: Histogram,
+}
+
+fn count(pairs: &Pairs, key: (&'static str, &'static str)) {
+    if let Ok(mut pairs) = pairs.lock() {
+        *pairs.entry(key).or_default() += 1;
+    }
+}
+
+/// Name of a refusal as a label.
+fn refusal(error: &EngineError) -> &'static str {
+    match error {
+        EngineError::UnknownSession { .. } | EngineError::UnknownMap { .. } => "not_found",
+        EngineError::SessionExists { .. } | EngineError::MapExists { .. } => "already_exists",
+        EngineError::MapChanged { .. } => "aborted",
+        EngineError::MapInUse { .. } | EngineError::NotReady { .. } => "failed_precondition",
+        EngineError::Invalid { .. } => "invalid_argument",
+        EngineError::Exhausted { .. } => "exhausted",
+        EngineError::Overloaded { .. } => "overloaded",
+        EngineError::Expired => "deadline_exceeded",
+        EngineError::Abandoned => "abandoned",
+        EngineError::Stopped => "stopped",
+        EngineError::Internal { .. } => "internal",
+    }
+}
+
+impl Metrics {
+    /// Counts the answer to a command and, for a prediction, how long it waited and computed.
+    pub fn engine_answer(&self, command: &'static str, answer: &Answer) {
+        count(&self.commands, (command, answer.result.as_ref().map_or_else(refusal, |_| "ok")));
+        if let Ok(Reply::Predicted(_)) = answer.result {
+            self.queue.record_ns(answer.queued_ns);
+            self.prediction.record_ns(answer.busy_ns);
+        }
+    }
+
+    /// Counts what became of a measurement.
+    pub fn measurement(&self, transport: Transport, outcome: &'static str) {
+        count(&self.measurements, (transport.label(), outcome));
+    }
+
+    /// Counts a request that came over a transport.
+    pub fn request(&self, transport: Transport, method: &'static str) {
+        count(&self.requests, (transport.label(), method));
+    }
+
+    /// Number of predictions answered.
+    pub fn predictions(&self) -> u64 {
+        self.prediction.count()
+    }
+
+    /// Everything in Prometheus' text format.
+    pub fn render(&self, waiting_commands: usize, waiting_predictions: usize) -> String {
+        let mut out = String::new();
+        let tables = [
+            ("nesam_requests_total", "Requests by transport and method.", ["transport", "method"], &self.requests),
+            ("nesam_commands_total", "Engine commands by kind and result.", ["command", "result"], &self.commands),
+            ("nesam_measurements_total", "Measurements by transport and outcome.", ["transport", "outcome"], &self.measurements),
+        ];
+        for (name, help, [first, second], pairs) in tables {
+            let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} counter");
+            let Ok(pairs) = pairs.lock() else { continue };
+            for ((a, b), value) in pairs.iter() {
+                let _ = writeln!(out, "{name}{{{first}=\"{a}\",{second}=\"{b}\"}} {value}");
+            }
+        }
+        self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
+        self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
+        for (lane, value) in [("commands", waiting_commands), ("predictions", waiting_predictions)] {
+            let _ = writeln!(
+                out,
+                "# HELP nesam_waiting_{lane} {lane} in the queue now.\n# TYPE nesam_waiting_{lane} gauge\nnesam_waiting_{lane} {value}"
+            );
+        }
+        out
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_rendered_counts_are_what_was_counted() {
+        let metrics = Metrics::default();
+        for queued_ns in [0, 2_000_000, 9_000_000_000] {
+            let result = Ok(Reply::Done);
+            metrics.engine_answer("close", &Answer { result, queued_ns, busy_ns: 0 });
+            metrics.queue.record_ns(queued_ns);
+        }
+        metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
+        metrics.measurement(Transport::Zenoh, "applied");
+        let text = metrics.render(3, 4);
+        for line in [
+            "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
+            "nesam_commands_total{command=\"predict\",result=\"deadline_exceeded\"} 1",
+            "nesam_measurements_total{transport=\"zenoh\",outcome=\"applied\"} 1",
+            "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
+            "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
+            "nesam_waiting_predictions 4",
+        ] {
+            assert!(text.lines().any(|l| l == line), "{line} is not in\n{text}");
+        }
+    }
+}

@@ -1,0 +1,6 @@
+//! What the server counts.
+
+mod histogram;
+mod metrics;
+
+pub use metrics::{Metrics, Transport};

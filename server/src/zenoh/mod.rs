@@ -1,0 +1,88 @@
+//! The Zenoh side: the same messages, the same conversions, the same engine.
+
+mod keys;
+mod measurements;
+mod predict;
+
+use nesam_engine::EngineError;
+use tokio::sync::mpsc;
+
+use crate::config::{ZenohConfig, ZenohMode};
+use crate::error::ServerError;
+use crate::grpc::Edge;
+
+/// Largest payload of a measurement, bytes.
+const MEASUREMENT_BYTES_MAX: usize = 64 << 10;
+/// Answers that may wait to be published; more are dropped, as the vehicle resends what it got no answer to.
+const ANSWERS_WAITING_MAX: usize = 4096;
+
+/// A running Zenoh side.
+pub(crate) struct Bus {
+    session: ::zenoh::Session,
+    publisher: tokio::task::JoinHandle<()>,
+}
+
+/// A message to publish: key and payload.
+type Outgoing = (String, Vec<u8>);
+
+impl Bus {
+    /// Joins the network and declares subscriber, publisher and queryable.
+    pub async fn start(config: &ZenohConfig, edge: &Edge) -> Result<Self, ServerError> {
+        if tokio::runtime::Handle::current().runtime_flavor() == tokio::runtime::RuntimeFlavor::CurrentThread {
+            return Err(ServerError::Runtime);
+        }
+        let failed = |error: ::zenoh::Error| ServerError::Zenoh { reason: error.to_string() };
+        let session = ::zenoh::open(zenoh_config(config).map_err(failed)?).await.map_err(failed)?;
+        let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
+        measurements::declare(&session, &config.fleet, edge.engine.clone(), sender).await.map_err(failed)?;
+        predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
+        let publisher = tokio::spawn(publish(session.clone(), receiver));
+        tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
+        Ok(Self { session, publisher })
+    }
+
+    /// Leaves the network.
+    pub async fn stop(self) {
+        if let Err(error) = self.session.close().await {
+            tracing::warn!(%error, "zenoh did not close cleanly");
+        }
+        self.publisher.abort();
+    }
+}
+
+fn zenoh_config(config: &ZenohConfig) -> Result<::zenoh::Config, ::zenoh::Error> {
+    let mode = match config.mode {
+        ZenohMode::Peer => "peer",
+        ZenohMode::Client => "client",
+        ZenohMode::Router => "router",
+    };
+    let mut zenoh = ::zenoh::Config::default();
+    let list = |endpoints: &[String]| serde_json::Value::from(endpoints.to_vec()).to_string();
+    zenoh.insert_json5("mode", &format!("{mode:?}"))?;
+    zenoh.insert_json5("scouting/multicast/enabled", "false")?;
+    zenoh.insert_json5("listen/endpoints", &list(&config.listen))?;
+    zenoh.insert_json5("connect/endpoints", &list(&config.connect))?;
+    Ok(zenoh)
+}
+
+/// Publishes what the others hand over, so that no callback of Zenoh or of the engine waits for the network.
+async fn publish(session: ::zenoh::Session, mut outgoing: mpsc::Receiver<Outgoing>) {
+    while let Some((key, payload)) = outgoing.recv().await {
+        if let Err(error) = session.put(key.as_str(), payload).await {
+            tracing::warn!(%error, key, "not published");
+        }
+    }
+}
+
+/// A message of `kind` from a payload of limited size.
+fn decode<M: prost::Message + Default>(kind: &str, payload: &[u8], limit: usize) -> Result<M, EngineError> {
+    if payload.len() > limit {
+        return Err(EngineError::invalid("", format!("a payload of {} bytes is above the limit of {limit}", payload.len())));
+    }
+    M::decode(payload).map_err(|error| EngineError::invalid("", format!("the payload is no {kind}: {error}")))
+}
+
+/// The bytes of a message.
+fn encode(message: &impl prost::Message) -> Vec<u8> {
+    message.encode_to_vec()
+}

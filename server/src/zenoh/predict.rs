@@ -1,0 +1,42 @@
+//! Predictions over Zenoh: a queryable on `.../predict`.
+
+use nesam_proto::v1 as pb;
+
+use super::{decode, encode, keys};
+use crate::convert::predict_error;
+use crate::grpc::Edge;
+use crate::grpc::predict as answer;
+use crate::telemetry::Transport;
+
+/// Answers `PredictRequest` payloads with `PredictReply` payloads, or with `PredictError` as an error reply.
+pub async fn declare(session: &::zenoh::Session, fleet: &str, edge: Edge) -> Result<(), ::zenoh::Error> {
+    let runtime = tokio::runtime::Handle::current();
+    let queryable = session.declare_queryable(keys::all_vehicles(fleet, "predict")).callback(move |query| {
+        edge.engine.metrics().request(Transport::Zenoh, "predict");
+        runtime.spawn(reply(edge.clone(), query));
+    });
+    queryable.background().await
+}
+
+async fn reply(edge: Edge, query: ::zenoh::query::Query) {
+    let key = query.key_expr().clone();
+    let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
+    let limits = edge.engine.handle().limits();
+    let decoded = decode::<pb::PredictRequest>("nesam.v1.PredictRequest", &payload, 8 * limits.sample_steps_max + (64 << 10));
+    let result = match decoded {
+        Ok(mut request) => {
+            if request.session_id.is_empty() {
+                request.session_id = keys::vehicle(key.as_str()).into();
+            }
+            answer(&edge, &request, edge.stream_budget()).await.map_err(|error| (request.tag, error))
+        }
+        Err(error) => Err((0, error)),
+    };
+    let sent = match result {
+        Ok(prediction) => query.reply(key, encode(&prediction)).await,
+        Err((tag, error)) => query.reply_err(encode(&predict_error(tag, &error))).await,
+    };
+    if let Err(error) = sent {
+        tracing::warn!(%error, "prediction not delivered");
+    }
+}
