@@ -1,0 +1,162 @@
+//! The gRPC client.
+
+use nesam_proto::v1;
+use tokio_stream::wrappers::ReceiverStream;
+use tonic::transport::{Channel, Endpoint};
+
+use crate::error::ClientError;
+use crate::map::MapLayers;
+use crate::measure::{MeasurementStream, WAITING_MAX};
+use crate::prediction::{Candidates, Prediction};
+
+/// Largest reply accepted, bytes: 64 for each of 131 072 sample-steps, and some room.
+const REPLY_BYTES_MAX: usize = 16 << 20;
+
+/// A connection to a service. Cheap to clone; clones share the connection.
+#[derive(Clone, Debug)]
+pub struct Client {
+    channel: Channel,
+}
+
+impl Client {
+    /// Connects, e.g. to `http://127.0.0.1:50051`.
+    ///
+    /// # Errors
+    /// `ClientError::Connect` when the address is wrong or nobody answers there.
+    pub async fn connect(address: &str) -> Result<Self, ClientError> {
+        let failed = |source| ClientError::Connect { address: address.into(), source };
+        let endpoint = Endpoint::from_shared(address.to_string()).map_err(failed)?;
+        let endpoint = endpoint.tcp_nodelay(true).initial_stream_window_size(4 << 20).initial_connection_window_size(8 << 20);
+        Ok(Self { channel: endpoint.connect().await.map_err(failed)? })
+    }
+
+    /// The connection, for generated clients of the same server (health, reflection).
+    pub fn channel(&self) -> Channel {
+        self.channel.clone()
+    }
+
+    fn sessions(&self) -> v1::sessions_client::SessionsClient<Channel> {
+        v1::sessions_client::SessionsClient::new(self.channel.clone())
+    }
+
+    fn terrain(&self) -> v1::terrain_client::TerrainClient<Channel> {
+        v1::terrain_client::TerrainClient::new(self.channel.clone())
+    }
+
+    fn prediction(&self) -> v1::prediction_client::PredictionClient<Channel> {
+        v1::prediction_client::PredictionClient::new(self.channel.clone()).max_decoding_message_size(REPLY_BYTES_MAX)
+    }
+
+    /// Opens a session.
+    ///
+    /// # Errors
+    /// `ClientError::Refused` with the service's reason, as all methods below.
+    pub async fn open_session(&mut self, request: v1::OpenSessionRequest) -> Result<v1::Session, ClientError> {
+        Ok(self.sessions().open(request).await?.into_inner())
+    }
+
+    /// Reads a session.
+    pub async fn session(&mut self, session: &str) -> Result<v1::Session, ClientError> {
+        Ok(self.sessions().get(v1::GetSessionRequest { session_id: session.into() }).await?.into_inner())
+    }
+
+    /// Lists the open sessions.
+    pub async fn list_sessions(&mut self) -> Result<Vec<v1::Session>, ClientError> {
+        Ok(self.sessions().list(v1::ListSessionsRequest {}).await?.into_inner().sessions)
+    }
+
+    /// Closes a session.
+    pub async fn close_session(&mut self, session: &str) -> Result<(), ClientError> {
+        self.sessions().close(v1::CloseSessionRequest { session_id: session.into() }).await?;
+        Ok(())
+    }
+
+    /// Uploads a map in tiles.
+    pub async fn upload_map(&mut self, map: &MapLayers) -> Result<v1::MapDescription, ClientError> {
+        self.upload_messages(map.messages()).await
+    }
+
+    /// Uploads a map from ready messages.
+    pub async fn upload_messages(&mut self, messages: Vec<v1::UploadMapRequest>) -> Result<v1::MapDescription, ClientError> {
+        Ok(self.terrain().upload_map(tokio_stream::iter(messages)).await?.into_inner())
+    }
+
+    /// Replaces a rectangle of a map.
+    pub async fn patch_tile(&mut self, request: v1::PatchTileRequest) -> Result<v1::MapDescription, ClientError> {
+        Ok(self.terrain().patch_tile(request).await?.into_inner())
+    }
+
+    /// Describes a map.
+    pub async fn map(&mut self, map: &str) -> Result<v1::MapDescription, ClientError> {
+        Ok(self.terrain().get(v1::GetMapRequest { map_id: map.into() }).await?.into_inner())
+    }
+
+    /// Lists the maps.
+    pub async fn list_maps(&mut self) -> Result<Vec<v1::MapDescription>, ClientError> {
+        Ok(self.terrain().list(v1::ListMapsRequest {}).await?.into_inner().maps)
+    }
+
+    /// Forgets a map.
+    pub async fn delete_map(&mut self, map: &str) -> Result<(), ClientError> {
+        self.terrain().delete(v1::DeleteMapRequest { map_id: map.into() }).await?;
+        Ok(())
+    }
+
+    /// Opens a stream of measurements.
+    pub async fn measure(&mut self) -> Result<MeasurementStream, ClientError> {
+        let (sender, receiver) = tokio::sync::mpsc::channel(WAITING_MAX);
+        let mut client = v1::measurements_client::MeasurementsClient::new(self.channel.clone());
+        let answers = client.stream(ReceiverStream::new(receiver)).await?.into_inner();
+        Ok(MeasurementStream { sender, answers })
+    }
+
+    /// Sends measurements and collects their answers.
+    pub async fn feed(&mut self, measurements: Vec<v1::Measurement>) -> Result<Vec<v1::MeasurementAnswer>, ClientError> {
+        let mut client = v1::measurements_client::MeasurementsClient::new(self.channel.clone());
+        let mut inbound = client.stream(tokio_stream::iter(measurements)).await?.into_inner();
+        let mut answers = Vec::new();
+        while let Some(answer) = inbound.message().await? {
+            answers.push(answer);
+        }
+        Ok(answers)
+    }
+
+    /// Rolls candidates out.
+    pub async fn predict(&mut self, candidates: Candidates) -> Result<Prediction, ClientError> {
+        self.predict_within(candidates, None).await
+    }
+
+    /// Rolls candidates out within a deadline.
+    pub async fn predict_within(
+        &mut self,
+        candidates: Candidates,
+        deadline: Option<std::time::Duration>,
+    ) -> Result<Prediction, ClientError> {
+        let mut request = tonic::Request::new(candidates.to_message());
+        if let Some(deadline) = deadline {
+            request.set_timeout(deadline);
+        }
+        Prediction::from_message(&self.prediction().predict(request).await?.into_inner())
+    }
+
+    /// Rolls a ready message out; the reply is not unpacked.
+    pub async fn predict_message(&mut self, request: v1::PredictRequest) -> Result<v1::PredictReply, ClientError> {
+        Ok(self.prediction().predict(request).await?.into_inner())
+    }
+
+    /// Sends requests over one stream and collects the replies, which may be errors one by one.
+    pub async fn predict_stream(&mut self, requests: Vec<v1::PredictRequest>) -> Result<Vec<v1::PredictStreamReply>, ClientError> {
+        let mut inbound = self.prediction().predict_stream(tokio_stream::iter(requests)).await?.into_inner();
+        let mut replies = Vec::new();
+        while let Some(reply) = inbound.message().await? {
+            replies.push(reply);
+        }
+        Ok(replies)
+    }
+
+    /// Watches the soil estimate of a session.
+    pub async fn watch_soil(&mut self, session: &str) -> Result<tonic::Streaming<v1::SoilEstimate>, ClientError> {
+        let mut client = v1::soil_client::SoilClient::new(self.channel.clone());
+        Ok(client.watch(v1::WatchSoilRequest { session_id: session.into() }).await?.into_inner())
+    }
+}

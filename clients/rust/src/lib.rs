@@ -1,0 +1,37 @@
+//! Typed client of the nesam service.
+//!
+//! [`Client`] speaks gRPC: it opens sessions, uploads maps, streams measurements and asks for predictions. [`zenoh_vehicle::ZenohVehicle`] is the
+//! vehicle's side over Zenoh. Arrays are plain `Vec<f32>` in row-major order with the shape in the documentation; everything small is the message of
+//! `nesam.v1` itself, re-exported as [`v1`]. Units and frames are those of the protocol: SI, radians, World ENU, Body FLU.
+//!
+//! ```no_run
+//! # async fn example() -> Result<(), nesam_client::ClientError> {
+//! use nesam_client::{Candidates, Client, measurement, v1};
+//!
+//! let mut client = Client::connect("http://127.0.0.1:50051").await?;
+//! client.open_session(v1::OpenSessionRequest { vehicle_id: "truck-1".into(), ..Default::default() }).await?;
+//! let state = [0.0; 12]; // x y z roll pitch yaw vx vy vz wx wy wz
+//! client.feed(vec![measurement("truck-1", 0, state, [1.0, 0.0])]).await?;
+//! let controls = vec![1.0, 0.1, 1.0, 0.1]; // (samples = 1, horizon = 2, 2)
+//! let prediction = client.predict(Candidates::new("truck-1", 1, 2, controls)).await?;
+//! println!("after 0.2 s: {:?}", prediction.state(0, 1));
+//! # Ok(())
+//! # }
+//! ```
+#![forbid(unsafe_code)]
+
+mod client;
+mod error;
+mod map;
+mod measure;
+mod message;
+mod prediction;
+pub mod zenoh_vehicle;
+
+pub use client::Client;
+pub use error::ClientError;
+pub use map::MapLayers;
+pub use measure::MeasurementStream;
+pub use message::{measurement, outcome_label, state_array, state_message};
+pub use nesam_proto::v1;
+pub use prediction::{Candidates, Prediction};

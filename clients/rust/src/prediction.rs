@@ -1,0 +1,130 @@
+//! Candidates and predictions.
+
+use nesam_proto::v1;
+
+use crate::error::ClientError;
+use crate::message::{pack, state_array, state_message, unpack};
+
+/// Candidate command sequences to roll out.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Candidates {
+    /// Session.
+    pub session: String,
+    /// State to start from (x y z roll pitch yaw vx vy vz wx wy wz); `None` = the newest measured one.
+    pub start: Option<[f64; 12]>,
+    /// Whether the measured history precedes the start.
+    pub use_history: bool,
+    /// N.
+    pub samples: usize,
+    /// K.
+    pub horizon: usize,
+    /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card.
+    pub controls: Vec<f32>,
+    /// What to return.
+    pub output: v1::OutputSelection,
+    /// Copied to the prediction.
+    pub tag: u64,
+}
+
+impl Candidates {
+    /// Candidates from the newest measured state, everything returned.
+    pub fn new(session: &str, samples: usize, horizon: usize, controls: Vec<f32>) -> Self {
+        let output = v1::OutputSelection { channels: 0, stride: 0, wheel_sinkage: true };
+        Self { session: session.into(), start: None, use_history: true, samples, horizon, controls, output, tag: 0 }
+    }
+
+    /// The same as message.
+    pub fn to_message(&self) -> v1::PredictRequest {
+        let history_use = if self.use_history { v1::HistoryUse::Measured } else { v1::HistoryUse::None };
+        v1::PredictRequest {
+            session_id: self.session.clone(),
+            start: self.start.map(state_message),
+            history_use: history_use.into(),
+            samples: u32::try_from(self.samples).unwrap_or(u32::MAX),
+            horizon: u32::try_from(self.horizon).unwrap_or(u32::MAX),
+            controls: pack(&self.controls),
+            output: Some(self.output),
+            tag: self.tag,
+        }
+    }
+}
+
+/// Predicted trajectories.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Prediction {
+    /// Copied from the candidates.
+    pub tag: u64,
+    /// N.
+    pub samples: usize,
+    /// Steps returned.
+    pub steps: usize,
+    /// Indices of the channels returned, in the order x y z roll pitch yaw vx vy vz wx wy wz.
+    pub channels: Vec<usize>,
+    /// Row-major (samples, steps, channels): m, rad, m/s, rad/s.
+    pub states: Vec<f32>,
+    /// Row-major (samples, steps, 4): wheel sinkage, m; empty unless asked for.
+    pub sinkage_m: Vec<f32>,
+    /// For each sample the sum of its `v1::Validity` bits; 0 = nothing to say against it.
+    pub validity: Vec<u32>,
+    /// State that the rollout started from.
+    pub start: [f64; 12],
+    /// Measured steps before the start.
+    pub history_steps: usize,
+    /// Soil used under the start, order k_phi, k_c, n, c, phi, k_shear.
+    pub soil: [f64; 6],
+    /// Variance of the soil correction; `None` while no filter runs.
+    pub soil_variance: Option<[f64; 6]>,
+    /// Time since the newest measurement arrived, s.
+    pub measurement_age_s: Option<f64>,
+    /// What the prediction was computed from.
+    pub provenance: v1::Provenance,
+    /// Time in the service's queue, s.
+    pub queue_s: f64,
+    /// Time of the computation, s.
+    pub compute_s: f64,
+}
+
+fn soil_array(soil: &v1::SoilVector) -> [f64; 6] {
+    [soil.k_phi, soil.k_c, soil.n, soil.c_pa, soil.phi_rad, soil.k_shear_m]
+}
+
+impl Prediction {
+    /// Unpacks a reply.
+    ///
+    /// # Errors
+    /// `ClientError::Protocol` when a part is missing or a length does not fit.
+    pub fn from_message(reply: &v1::PredictReply) -> Result<Self, ClientError> {
+        let channels: Vec<usize> = (0..12).filter(|i| reply.channels >> i & 1 == 1).collect();
+        let (samples, steps) = (reply.samples as usize, reply.steps as usize);
+        let sinkage = if reply.sinkage_m.is_empty() { 0 } else { samples * steps * 4 };
+        let missing = |part: &str| ClientError::protocol(format!("`{part}` is missing"));
+        Ok(Self {
+            tag: reply.tag,
+            samples,
+            steps,
+            states: unpack("states", &reply.states, samples * steps * channels.len())?,
+            sinkage_m: unpack("sinkage_m", &reply.sinkage_m, sinkage)?,
+            channels,
+            validity: reply.validity.clone(),
+            start: reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?,
+            history_steps: reply.history_steps as usize,
+            soil: reply.soil.as_ref().map(soil_array).ok_or_else(|| missing("soil"))?,
+            soil_variance: reply.soil_variance.as_ref().map(soil_array),
+            measurement_age_s: reply.measurement_age_s,
+            provenance: reply.provenance.clone().ok_or_else(|| missing("provenance"))?,
+            queue_s: reply.queue_s,
+            compute_s: reply.compute_s,
+        })
+    }
+
+    /// Returned channels of sample `n` at returned step `k` (0-based).
+    ///
+    /// # Panics
+    /// When `n` or `k` is out of range.
+    pub fn state(&self, n: usize, k: usize) -> &[f32] {
+        assert!(n < self.samples && k < self.steps, "sample {n}, step {k} of {} x {}", self.samples, self.steps);
+        let width = self.channels.len();
+        let at = (n * self.steps + k) * width;
+        &self.states[at..at + width]
+    }
+}

@@ -1,0 +1,116 @@
+//! The vehicle's side over Zenoh: publishes measurements, hears their answers, may ask for predictions.
+
+use std::time::Duration;
+
+use nesam_proto::v1;
+use prost::Message as _;
+use zenoh::handlers::FifoChannelHandler;
+use zenoh::pubsub::Subscriber;
+use zenoh::qos::CongestionControl;
+use zenoh::sample::Sample;
+
+use crate::error::ClientError;
+use crate::prediction::{Candidates, Prediction};
+
+/// A vehicle in a Zenoh network. Needs a multi-thread tokio runtime.
+#[derive(Debug)]
+pub struct ZenohVehicle {
+    session: zenoh::Session,
+    measurement_key: String,
+    predict_key: String,
+    answers: Subscriber<FifoChannelHandler<Sample>>,
+}
+
+fn failed(error: impl core::fmt::Display) -> ClientError {
+    ClientError::Zenoh { reason: error.to_string() }
+}
+
+impl ZenohVehicle {
+    /// Joins the network as a client of the router or server at `endpoint`, e.g. `tcp/127.0.0.1:7447`. Nothing is searched for by multicast.
+    ///
+    /// # Errors
+    /// `ClientError::Zenoh` when nobody answers there.
+    pub async fn connect(endpoint: &str, fleet: &str, vehicle: &str) -> Result<Self, ClientError> {
+        let mut config = zenoh::Config::default();
+        config.insert_json5("mode", "\"client\"").map_err(failed)?;
+        config.insert_json5("scouting/multicast/enabled", "false").map_err(failed)?;
+        config.insert_json5("connect/endpoints", &format!("[{endpoint:?}]")).map_err(failed)?;
+        let session = zenoh::open(config).await.map_err(failed)?;
+        let key = |topic: &str| format!("nesam/v1/{fleet}/{vehicle}/{topic}");
+        let answers = session.declare_subscriber(key("status")).await.map_err(failed)?;
+        Ok(Self { session, measurement_key: key("measurement"), predict_key: key("predict"), answers })
+    }
+
+    /// Publishes a measurement; waits while the network is congested rather than losing it.
+    ///
+    /// # Errors
+    /// `ClientError::Zenoh` when the session is closed.
+    pub async fn publish(&self, measurement: &v1::Measurement) -> Result<(), ClientError> {
+        self.publish_bytes(measurement.encode_to_vec()).await
+    }
+
+    /// Publishes a ready payload on the measurement key.
+    ///
+    /// # Errors
+    /// As [`ZenohVehicle::publish`].
+    pub async fn publish_bytes(&self, payload: Vec<u8>) -> Result<(), ClientError> {
+        let put = self.session.put(self.measurement_key.as_str(), payload).congestion_control(CongestionControl::Block);
+        put.await.map_err(failed)
+    }
+
+    /// The next answer to a measurement of this vehicle; `None` after `timeout`.
+    ///
+    /// # Errors
+    /// `ClientError::Protocol` when the payload is no answer.
+    pub async fn answer(&self, timeout: Duration) -> Result<Option<v1::MeasurementAnswer>, ClientError> {
+        let Ok(sample) = tokio::time::timeout(timeout, self.answers.recv_async()).await else { return Ok(None) };
+        let payload = sample.map_err(failed)?.payload().to_bytes().into_owned();
+        let answer = v1::MeasurementAnswer::decode(payload.as_slice());
+        answer.map(Some).map_err(|error| ClientError::protocol(error.to_string()))
+    }
+
+    /// Waits until somebody listens to the measurements of this vehicle.
+    ///
+    /// # Errors
+    /// `ClientError::Zenoh` when nobody does within `timeout`.
+    pub async fn wait_for_service(&self, timeout: Duration) -> Result<(), ClientError> {
+        let publisher = self.session.declare_publisher(self.measurement_key.clone()).await.map_err(failed)?;
+        let deadline = tokio::time::Instant::now() + timeout;
+        while !publisher.matching_status().await.map_err(failed)?.matching() {
+            if tokio::time::Instant::now() > deadline {
+                return Err(failed(format!("nobody listens to {}", self.measurement_key)));
+            }
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+        Ok(())
+    }
+
+    /// Asks the service for a prediction over Zenoh.
+    ///
+    /// # Errors
+    /// `ClientError::Refused` with the service's reason, `ClientError::Zenoh` when nobody answers.
+    pub async fn predict(&self, candidates: &Candidates) -> Result<Prediction, ClientError> {
+        let payload = candidates.to_message().encode_to_vec();
+        let replies = self.session.get(self.predict_key.as_str()).payload(payload).await.map_err(failed)?;
+        let reply = replies.recv_async().await.map_err(|_| failed("nobody answers predictions"))?;
+        match reply.result() {
+            Ok(sample) => {
+                let reply = v1::PredictReply::decode(sample.payload().to_bytes().as_ref());
+                Prediction::from_message(&reply.map_err(|error| ClientError::protocol(error.to_string()))?)
+            }
+            Err(error) => {
+                let error = v1::PredictError::decode(error.payload().to_bytes().as_ref());
+                let v1::PredictError { code, field, message, .. } = error.map_err(|error| ClientError::protocol(error.to_string()))?;
+                Err(ClientError::Refused { code: code.into(), field, message })
+            }
+        }
+    }
+
+    /// Leaves the network.
+    ///
+    /// # Errors
+    /// `ClientError::Zenoh`.
+    pub async fn close(self) -> Result<(), ClientError> {
+        self.session.close().await.map_err(failed)
+    }
+}
