@@ -1,8 +1,10 @@
 //! Goal: what a person meets at the command line. Method: the real binary on the committed sample, or on a copy of it that is damaged on
 //! purpose; exit codes and the words of the messages are the contract.
 
+use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::sync::OnceLock;
 
 use serde_json::Value;
 
@@ -196,16 +198,29 @@ fn service_a_missing_or_foreign_bundle_is_refused() {
     refused(&inside, here.path(), &["lies in a bundle"]);
 }
 
+/// A bundle of two training steps: its errors mean nothing, everything else is real.
+fn tiny_bundle() -> &'static Path {
+    static BUNDLE: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
+    let (_, bundle) = BUNDLE.get_or_init(|| {
+        let dir = tempfile::tempdir().unwrap();
+        let root = sample().display().to_string();
+        let tiny = ["--epochs", "1", "--batches", "2", "--encoder-steps", "3", "--batch-size", "4", "--out", "made"];
+        let trained = nesam(&[&["train", "--data", &root, "--set", "nominal"], &tiny[..]].concat(), dir.path());
+        assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
+        let bundle = dir.path().join("made/bundle");
+        (dir, bundle)
+    });
+    bundle
+}
+
 /// Goal: train → inspect → predict → evaluate hold together, and a damaged bundle is refused by name. Method: a bundle of two training
 /// steps (its errors mean nothing), then one flipped byte.
 #[test]
 fn chrono_a_bundle_made_in_seconds_predicts_and_a_damaged_one_is_refused() {
     let here = tempfile::tempdir().unwrap();
     let root = sample().display().to_string();
-    let tiny = ["--epochs", "1", "--batches", "2", "--encoder-steps", "3", "--batch-size", "4", "--out", "made"];
-    let trained = nesam(&[&["train", "--data", &root, "--set", "nominal"], &tiny[..]].concat(), here.path());
-    assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
-    let bundle = "made/bundle";
+    copy_folder(tiny_bundle(), &here.path().join("bundle"));
+    let bundle = "bundle";
     assert_eq!(nesam(&["check", bundle], here.path()).status.code(), Some(0));
 
     let start = ["--data", &root, "--set", "nominal", "--bundle", bundle];
@@ -237,4 +252,67 @@ fn chrono_a_bundle_made_in_seconds_predicts_and_a_damaged_one_is_refused() {
     refused(&[&["predict"], &start[..]].concat(), here.path(), &["weights.safetensors", "SHA-256"]);
     let check = nesam(&["check", bundle], here.path());
     assert!(check.status.code() == Some(2) && stdout(&check).contains("weights.safetensors"), "{}", stdout(&check));
+}
+
+#[test]
+fn service_serve_says_where_it_listens_and_stops_on_a_signal() {
+    let here = tempfile::tempdir().unwrap();
+    let bundle = tiny_bundle().display().to_string();
+    for signal in ["-INT", "-TERM"] {
+        let free = ["--grpc", "127.0.0.1:0", "--http", "127.0.0.1:0", "--no-zenoh"];
+        let mut server = Command::new(env!("CARGO_BIN_EXE_nesam"))
+            .args(["serve", "--bundle", &bundle])
+            .args(free)
+            .current_dir(here.path())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        let mut lines = BufReader::new(server.stdout.take().unwrap()).lines().map(Result::unwrap);
+        let told: Vec<String> = lines.by_ref().take_while(|l| !l.starts_with("ready")).collect();
+        let grpc = told.iter().find_map(|l| l.strip_prefix("grpc")).expect("the address of grpc");
+        std::net::TcpStream::connect(grpc.trim()).expect("somebody listens there");
+        let http = told.iter().find_map(|l| l.strip_prefix("http")).expect("the address of http");
+        assert!(http.contains("http://127.0.0.1:"), "{http}");
+        let pid = server.id().to_string();
+        assert!(Command::new("kill").args([signal, &pid]).status().unwrap().success());
+        assert_eq!(server.wait().unwrap().code(), Some(0), "{signal}");
+        assert_eq!(lines.last().as_deref(), Some("stopped"));
+    }
+}
+
+#[test]
+fn service_serve_refuses_a_bad_configuration_and_a_taken_port() {
+    let here = tempfile::tempdir().unwrap();
+    let bundle = tiny_bundle().display().to_string();
+    std::fs::write(here.path().join("c.toml"), "[grpc]\nport = 3\n").unwrap();
+    refused(&["serve", "--bundle", &bundle, "--config", "c.toml"], here.path(), &["c.toml", "port"]);
+    refused(&["serve", "--bundle", &bundle, "--config", "none.toml"], here.path(), &["none.toml"]);
+    refused(&["check", "c.toml"], here.path(), &["errors"]);
+    refused(&["serve", "--bundle", &bundle, "--fleet", "a/b"], here.path(), &["zenoh.fleet"]);
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = taken.local_addr().unwrap().to_string();
+    refused(&["serve", "--bundle", &bundle, "--grpc", &address, "--no-http", "--no-zenoh"], here.path(), &["grpc.listen", &address]);
+}
+
+/// Goal: the demo closes the loop over real sockets. Method: five seconds without pauses; every measurement has to be applied, and predictions
+/// have to have been compared. How good they are is not asked of an untrained bundle.
+#[test]
+fn service_demo_plays_a_drive_and_compares_predictions() {
+    let here = tempfile::tempdir().unwrap();
+    let bundle = tiny_bundle().display().to_string();
+    let root = sample().display().to_string();
+    let args = ["demo", "--data", &root, "--bundle", &bundle, "--fast", "--seconds", "5", "--json", "d.json"];
+    let output = nesam(&args, here.path());
+    assert_eq!(output.status.code(), Some(0), "{}{}", stdout(&output), stderr(&output));
+    let json: Value = serde_json::from_slice(&std::fs::read(here.path().join("d.json")).unwrap()).unwrap();
+    assert_eq!(json["measurements"]["APPLIED"], 51);
+    let compared = json["position_error"][1]["predictions"].as_u64().unwrap();
+    assert!(compared >= 4, "{json}");
+    assert!(json["latency_p50_s"].as_f64().unwrap() > 0.0);
+    for line in ["map ", "vehicle ", "planner ", "position error at 3.2 s"] {
+        assert!(stdout(&output).contains(line), "{}", stdout(&output));
+    }
+    refused(&["demo", "--data", &root, "--bundle", &bundle, "--seconds", "2"], here.path(), &["more than 3.2 s"]);
+    refused(&["demo", "--data", &root, "--bundle", &bundle, "--rate", "0"], here.path(), &["--rate", "0.1 to 10"]);
 }

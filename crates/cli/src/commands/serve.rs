@@ -1,30 +1,126 @@
 //! `nesam serve`: the service until interrupted.
 
+use std::io::IsTerminal;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use clap::Args;
+use nesam_model::{ModelBundle, Predictor};
+use nesam_server::{Config, RunningServer, ZenohConfig, serve, termination};
+use tracing_subscriber::EnvFilter;
 
 use crate::args::BundleArgs;
-use crate::failure::Failure;
+use crate::failure::{Failure, OrFail};
+use crate::output::say;
+use crate::sources::load_bundle;
 
-/// Options of `nesam serve`.
+/// Options of `nesam serve`. They override the configuration file, which overrides the defaults.
 #[derive(Args, Debug)]
 pub struct ServeArgs {
     #[command(flatten)]
     bundle: BundleArgs,
-    /// Configuration file (TOML)
-    #[arg(long, value_name = "FILE")]
+    /// Configuration file; deploy/config/default.toml documents every key
+    #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
+    /// Address of gRPC; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    grpc: Option<SocketAddr>,
+    /// Address of metrics and status pages; port 0 takes a free one
+    #[arg(long, value_name = "ADDRESS:PORT", conflicts_with = "no_http")]
+    http: Option<SocketAddr>,
+    /// Serve no metrics and status pages
+    #[arg(long)]
+    no_http: bool,
+    /// Zenoh endpoints to listen on, for instance tcp/0.0.0.0:7447
+    #[arg(long, value_name = "ENDPOINT,…", value_delimiter = ',', conflicts_with = "no_zenoh")]
+    zenoh_listen: Option<Vec<String>>,
+    /// Zenoh endpoints to connect to, for instance tcp/router:7447
+    #[arg(long, value_name = "ENDPOINT,…", value_delimiter = ',', conflicts_with = "no_zenoh")]
+    zenoh_connect: Option<Vec<String>>,
+    /// Take no part in a Zenoh network
+    #[arg(long)]
+    no_zenoh: bool,
+    /// Fleet in the Zenoh keys nesam/v1/<fleet>/<vehicle>/...
+    #[arg(long, value_name = "NAME")]
+    fleet: Option<String>,
 }
 
 /// Runs the command.
 pub fn run(args: &ServeArgs) -> Result<(), Failure> {
-    let _ = args;
-    Err(Failure::Failed("the server is not wired yet".into()))
+    let config = configuration(args)?;
+    log_to_stderr("info");
+    let bundle = load_bundle(args.bundle.bundle.as_deref())?;
+    let zenoh = config.zenoh.clone();
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
+    runtime.block_on(async {
+        // The signals are caught before the addresses are printed, so that whoever waits for them can stop the server at once.
+        let signal = tokio::spawn(termination());
+        let (server, bundle) = start(config, bundle).await?;
+        announce(&server, &bundle, &zenoh);
+        server
+            .run_until(async {
+                let _ = signal.await;
+            })
+            .await;
+        say!("stopped");
+        Ok(())
+    })
+}
+
+/// Starts a server on a bundle.
+pub async fn start(config: Config, bundle: ModelBundle) -> Result<(RunningServer, Arc<ModelBundle>), Failure> {
+    let bundle = Arc::new(bundle);
+    let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?);
+    // A port that is taken or a value out of range is for the caller to change.
+    Ok((serve(config, predictor).await.or_input()?, bundle))
+}
+
+fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
+    let mut config = match &args.config {
+        Some(file) => Config::load(file).or_input()?,
+        None => Config::default(),
+    };
+    config.grpc.listen = args.grpc.unwrap_or(config.grpc.listen);
+    config.http.listen = args.http.unwrap_or(config.http.listen);
+    config.http.enabled &= !args.no_http;
+    config.zenoh.enabled &= !args.no_zenoh;
+    for (given, kept) in [(&args.zenoh_listen, &mut config.zenoh.listen), (&args.zenoh_connect, &mut config.zenoh.connect)] {
+        if let Some(endpoints) = given {
+            kept.clone_from(endpoints);
+        }
+    }
+    if let Some(fleet) = &args.fleet {
+        config.zenoh.fleet.clone_from(fleet);
+    }
+    config.check().or_input()?;
+    Ok(config)
+}
+
+/// Says on standard output where the service listens; scripts read these lines.
+fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
+    say!("nesam {} with bundle {} {}", env!("CARGO_PKG_VERSION"), bundle.name, bundle.hash);
+    say!("grpc  {}", server.grpc_addr);
+    if let Some(http) = server.http_addr {
+        say!("http  http://{http}/");
+    }
+    if zenoh.enabled {
+        say!("zenoh {} keys nesam/v1/{}/<vehicle>/...", [&zenoh.listen[..], &zenoh.connect[..]].concat().join(","), zenoh.fleet);
+    }
+    say!("ready; ctrl-c stops");
+}
+
+/// Structured logs on standard error; `RUST_LOG` changes what is shown.
+pub fn log_to_stderr(default: &str) {
+    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format!("{default},zenoh=warn")));
+    let _ = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(std::io::stderr)
+        .with_ansi(std::io::stderr().is_terminal())
+        .try_init();
 }
 
 /// Reads a configuration file and says what is wrong with it.
 pub fn check_configuration(path: &Path) -> Result<(), String> {
-    let _ = path;
-    Err("configurations are not wired yet".into())
+    Config::load(path).map(|_| ()).map_err(|e| crate::failure::chain(&e))
 }

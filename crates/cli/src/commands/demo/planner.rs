@@ -11,7 +11,7 @@ pub const HORIZON: usize = 32;
 /// Correlation of the noise between steps.
 const NOISE_CORRELATION: f64 = 0.8;
 /// Standard deviation of the noise as a share of the command range (speed, second).
-const NOISE_SHARE: [f64; 2] = [0.06, 0.2];
+const NOISE_SHARE: [f64; 2] = [0.03, 0.08];
 /// Cost spread at which a candidate loses e-fold weight, relative to the spread of the costs.
 const TEMPERATURE: f64 = 0.15;
 /// Cost of one radian squared of roll or pitch against one metre squared off the path.
