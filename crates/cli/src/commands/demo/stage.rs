@@ -1,5 +1,6 @@
 //! Sets the stage: server, map, session, vehicle, planner and live table, and takes it down again.
 
+use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -7,7 +8,7 @@ use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{Candidates, Client, MapLayers, Prediction, v1};
 use nesam_model::ModelBundle;
 use nesam_physics::Control;
-use nesam_server::{Config, termination};
+use nesam_server::{Config, RunningServer, termination};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use tokio::sync::watch;
@@ -57,16 +58,8 @@ impl Stage {
     pub async fn play(self, bundle: ModelBundle) -> Result<Summary, Failure> {
         let interrupted = tokio::spawn(termination());
         let endpoint = format!("tcp/127.0.0.1:{}", free_port()?);
-        let mut config = Config::ephemeral();
-        config.zenoh.enabled = true;
-        config.zenoh.listen = vec![endpoint.clone()];
-        config.zenoh.fleet = NAME.into();
         let vehicle_card = bundle.vehicle.clone();
-        let (server, bundle) = serve::start(config, bundle).await?;
-        say!("server    grpc {}, zenoh {endpoint}, bundle {} {}", server.grpc_addr, bundle.name, &bundle.hash[..12]);
-        if let Some(http) = server.http_addr {
-            say!("          status http://{http}/status, metrics http://{http}/metrics");
-        }
+        let server = raise(bundle, &endpoint).await?;
         let mut client = Client::connect(&format!("http://{}", server.grpc_addr)).await.or_failed()?;
         self.prepare(&mut client).await?;
         let vehicle = ZenohVehicle::connect(&endpoint, NAME, NAME).await.or_failed()?;
@@ -107,18 +100,22 @@ impl Stage {
         let _ = vehicle.close().await;
         server.shutdown().await;
         let shared = shared.lock().map_err(|_| Failure::Failed("the planner ended early".into()))?;
+        Ok(self.summary(&shared, now, begin.elapsed().as_secs_f64(), played))
+    }
+
+    fn summary(&self, shared: &Shared, now: usize, wall_s: f64, outcomes: BTreeMap<&'static str, usize>) -> Summary {
         let queries = shared.ledger.queries();
-        Ok(Summary {
+        Summary {
             drive: self.drive.id.clone(),
             played_s: now as f64 * self.drive.dt_s,
-            wall_s: begin.elapsed().as_secs_f64(),
+            wall_s,
             scores: shared.ledger.scores(now),
             latency_s: shared.ledger.latency_quantiles_s(&[0.5, 0.9, 0.99]),
             queries,
             candidates: queries * CANDIDATES,
             plan_cost: shared.cost_sum / queries.max(1) as f64,
-            outcomes: played,
-        })
+            outcomes,
+        }
     }
 
     fn pace(&self) -> String {
@@ -185,6 +182,20 @@ impl Stage {
             Ok(())
         }
     }
+}
+
+/// Starts the server on loopback, with Zenoh at `endpoint`, and says where it is.
+async fn raise(bundle: ModelBundle, endpoint: &str) -> Result<RunningServer, Failure> {
+    let mut config = Config::ephemeral();
+    config.zenoh.enabled = true;
+    config.zenoh.listen = vec![endpoint.into()];
+    config.zenoh.fleet = NAME.into();
+    let (server, bundle) = serve::start(config, bundle).await?;
+    say!("server    grpc {}, zenoh {endpoint}, bundle {} {}", server.grpc_addr, bundle.name, &bundle.hash[..12]);
+    if let Some(http) = server.http_addr {
+        say!("          status http://{http}/status, metrics http://{http}/metrics");
+    }
+    Ok(server)
 }
 
 async fn live_table(drive: Arc<Trajectory>, applied: watch::Receiver<Option<usize>>, shared: Arc<Mutex<Shared>>) {
