@@ -72,7 +72,7 @@ pub struct Prediction {
     pub history_steps: usize,
     /// Soil used under the start, order k_phi, k_c, n, c, phi, k_shear.
     pub soil: [f64; 6],
-    /// Variance of the soil correction; `None` while no filter runs.
+    /// Variance of that soil; `None` while no filter runs.
     pub soil_variance: Option<[f64; 6]>,
     /// Time since the newest measurement arrived, s.
     pub measurement_age_s: Option<f64>,

@@ -186,10 +186,10 @@ impl Engine {
             variant: Variant::Full,
         })?;
         Ok(Prediction {
+            soil_variance: session.soil().variance_at(&rollout.soil),
             rollout,
             start,
             history_steps: history.len(),
-            soil_variance: session.soil().variance,
             measurement_age_s: session.age_s(now_ns),
             provenance: self.provenance(session),
         })

@@ -47,7 +47,7 @@ pub struct Prediction {
     pub start: VehicleState<f64>,
     /// Measured steps before the start.
     pub history_steps: usize,
-    /// Variance of the soil correction; `None` while no filter runs.
+    /// Variance of the soil under the start in physical units squared; `None` while no filter runs.
     pub soil_variance: Option<[f64; SOIL_DIM]>,
     /// Time since the newest measured step arrived, s.
     pub measurement_age_s: Option<f64>,

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use nesam_model::{HISTORY, HistoryStep};
-use nesam_physics::{SOIL_DIM, Vehicle};
+use nesam_physics::{SOIL_DIM, SoilCorrection, Vehicle};
 
 use crate::error::EngineError;
 use crate::grid::{Place, StepGrid};
@@ -20,10 +20,20 @@ pub struct SoilState {
     pub epoch: u64,
     /// Stamp of the last measurement that went in, ns of the vehicle's clock.
     pub stamp_ns: Option<i64>,
-    /// Correction Δθ of the soil prior in physical units, zero before any update.
-    pub correction: [f64; SOIL_DIM],
-    /// Variance of the correction; `None` while no filter runs.
+    /// Correction Δθ of the soil prior, zero before any update.
+    pub correction: SoilCorrection,
+    /// Variance of the correction in its coordinates; `None` while no filter runs.
     pub variance: Option<[f64; SOIL_DIM]>,
+    /// Whether the drive has told something of each parameter.
+    pub learned: [bool; SOIL_DIM],
+}
+
+impl SoilState {
+    /// Variance of a corrected soil in physical units squared, to first order.
+    pub fn variance_at(&self, soil: &[f64; SOIL_DIM]) -> Option<[f64; SOIL_DIM]> {
+        let slope = self.correction.coordinates.slope(soil);
+        self.variance.map(|variance| core::array::from_fn(|i| slope[i] * slope[i] * variance[i]))
+    }
 }
 
 /// A session: identity, recent measured motion, soil.

@@ -57,6 +57,21 @@ pub struct SoilVector {
     #[prost(double, tag = "6")]
     pub k_shear_m: f64,
 }
+/// Correction of the soil prior, the same wherever the vehicle goes.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SoilCorrection {
+    #[prost(enumeration = "SoilCoordinates", tag = "1")]
+    pub coordinates: i32,
+    /// In these coordinates; zero before any update.
+    #[prost(message, optional, tag = "2")]
+    pub delta: ::core::option::Option<SoilVector>,
+    /// Diagonal of the covariance of `delta`, in these coordinates; absent while no filter runs.
+    #[prost(message, optional, tag = "3")]
+    pub variance: ::core::option::Option<SoilVector>,
+    /// Whether the drive has told something of each parameter, in the order of SoilVector; a parameter that is not learned has no number to show.
+    #[prost(bool, repeated, tag = "4")]
+    pub learned: ::prost::alloc::vec::Vec<bool>,
+}
 /// What a reply was computed from. A planner may refuse a reply whose provenance it does not accept.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Provenance {
@@ -114,6 +129,38 @@ impl SecondCommand {
             "SECOND_COMMAND_STEERING_NORMALISED" => Some(Self::SteeringNormalised),
             "SECOND_COMMAND_ROAD_WHEEL_ANGLE_RAD" => Some(Self::RoadWheelAngleRad),
             "SECOND_COMMAND_YAW_RATE_RAD_S" => Some(Self::YawRateRadS),
+            _ => None,
+        }
+    }
+}
+/// Coordinates in which a correction is added to the soil prior.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum SoilCoordinates {
+    Unspecified = 0,
+    /// Differences in the units of SoilVector.
+    Physical = 1,
+    /// Natural logarithm of the factor for k_phi, k_c, c and k_shear; differences for n and phi.
+    Logarithmic = 2,
+}
+impl SoilCoordinates {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "SOIL_COORDINATES_UNSPECIFIED",
+            Self::Physical => "SOIL_COORDINATES_PHYSICAL",
+            Self::Logarithmic => "SOIL_COORDINATES_LOGARITHMIC",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "SOIL_COORDINATES_UNSPECIFIED" => Some(Self::Unspecified),
+            "SOIL_COORDINATES_PHYSICAL" => Some(Self::Physical),
+            "SOIL_COORDINATES_LOGARITHMIC" => Some(Self::Logarithmic),
             _ => None,
         }
     }
@@ -620,7 +667,7 @@ pub struct PredictReply {
     /// Soil used under the start: prior plus correction, clipped to the admissible range.
     #[prost(message, optional, tag = "10")]
     pub soil: ::core::option::Option<SoilVector>,
-    /// Variance of the soil correction (diagonal of its covariance); absent while no filter runs.
+    /// Variance of that soil, units of SoilVector squared, to first order (diagonal of the covariance); absent while no filter runs.
     #[prost(message, optional, tag = "11")]
     pub soil_variance: ::core::option::Option<SoilVector>,
     /// Time between the arrival of the newest measurement of the session and the start of this computation, s; absent before the first.
@@ -1195,12 +1242,9 @@ pub struct Session {
     pub state: ::core::option::Option<VehicleState>,
     #[prost(message, optional, tag = "9")]
     pub command: ::core::option::Option<Control>,
-    /// Correction added to the soil prior, in the units of SoilVector; zero before any update.
+    /// What was learned of the soil.
     #[prost(message, optional, tag = "10")]
-    pub soil_correction: ::core::option::Option<SoilVector>,
-    /// Variance of the correction (diagonal of its covariance); absent while no filter runs.
-    #[prost(message, optional, tag = "11")]
-    pub soil_variance: ::core::option::Option<SoilVector>,
+    pub soil_correction: ::core::option::Option<SoilCorrection>,
 }
 /// The part of the vehicle card that a client needs to form valid commands.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1749,12 +1793,8 @@ pub struct SoilEstimate {
     /// Stamp of the last measurement that went into the estimate, ns of the vehicle's clock; absent before the first update.
     #[prost(int64, optional, tag = "3")]
     pub stamp_ns: ::core::option::Option<i64>,
-    /// Correction added to the soil prior; zero before any update.
     #[prost(message, optional, tag = "4")]
-    pub correction: ::core::option::Option<SoilVector>,
-    /// Variance of the correction (diagonal of its covariance); absent while no filter runs.
-    #[prost(message, optional, tag = "5")]
-    pub variance: ::core::option::Option<SoilVector>,
+    pub correction: ::core::option::Option<SoilCorrection>,
 }
 /// Generated client implementations.
 pub mod soil_client {

@@ -2,7 +2,7 @@
 
 use nesam_engine::EngineError;
 use nesam_engine::{OpenSession, Provenance, SessionView, SoilState};
-use nesam_physics::{SOIL_DIM, SecondCommand, Vehicle};
+use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
 use super::{control_message, measurement, vehicle_state_message};
@@ -37,8 +37,7 @@ pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
         last_sequence: view.last_sequence,
         state: view.newest.as_ref().map(|step| vehicle_state_message(&step.state)),
         command: view.newest.as_ref().map(|step| control_message(&step.control)),
-        soil_correction: Some(soil_vector(&view.soil.correction)),
-        soil_variance: view.soil.variance.as_ref().map(soil_vector),
+        soil_correction: Some(soil_correction(&view.soil)),
     }
 }
 
@@ -89,13 +88,25 @@ pub fn soil_vector(values: &[f64; SOIL_DIM]) -> pb::SoilVector {
     pb::SoilVector { k_phi, k_c, n, c_pa, phi_rad, k_shear_m }
 }
 
+fn soil_correction(soil: &SoilState) -> pb::SoilCorrection {
+    let coordinates = match soil.correction.coordinates {
+        SoilCoordinates::Physical => pb::SoilCoordinates::Physical,
+        SoilCoordinates::Logarithmic => pb::SoilCoordinates::Logarithmic,
+    };
+    pb::SoilCorrection {
+        coordinates: coordinates.into(),
+        delta: Some(soil_vector(&soil.correction.delta)),
+        variance: soil.variance.as_ref().map(soil_vector),
+        learned: soil.learned.to_vec(),
+    }
+}
+
 /// A soil estimate as message.
 pub fn soil_estimate(session: &str, soil: &SoilState) -> pb::SoilEstimate {
     pb::SoilEstimate {
         session_id: session.into(),
         soil_epoch: soil.epoch,
         stamp_ns: soil.stamp_ns,
-        correction: Some(soil_vector(&soil.correction)),
-        variance: soil.variance.as_ref().map(soil_vector),
+        correction: Some(soil_correction(soil)),
     }
 }

@@ -1,0 +1,78 @@
+"""A small sampling planner (MPPI) on top of the service: drives to a goal on a hilly map.
+
+The plant is the service's own prediction of the first step, so that the example needs nothing but a running server:
+
+    nesam serve &
+    python clients/examples/planner.py 127.0.0.1:50051
+"""
+
+import sys
+
+import numpy as np
+
+import nesam
+
+SAMPLES, HORIZON, DT_S = 256, 24, 0.1
+GOAL = np.array([8.0, 5.0])
+TEMPERATURE = 0.5
+
+
+def hilly_map() -> nesam.WorldMap:
+    """40 x 40 m of gentle hills."""
+    y, x = np.mgrid[0:161, 0:161] * 0.25
+    elevation = 0.3 * np.sin(x / 5) * np.cos(y / 6)
+    rgb = np.full((161, 161, 3), (110, 150, 70), dtype=np.uint8)
+    return nesam.WorldMap("planner-hills", elevation.astype(np.float32), 0.25, origin_m=(-20.0, -20.0), semantic_rgb=rgb)
+
+
+def costs(prediction: nesam.Prediction) -> np.ndarray:
+    """(samples,): distance to the goal over the horizon, tilt, and a fine for what the service warns of."""
+    states = prediction.states
+    distance = np.hypot(states[..., 0] - GOAL[0], states[..., 1] - GOAL[1])
+    tilt = np.abs(states[..., 3]) + np.abs(states[..., 4])
+    bad = prediction.validity & (nesam.Validity.NOT_FINITE | nesam.Validity.OFF_MAP | nesam.Validity.OVERTURNED) != 0
+    return distance.mean(axis=1) + 2.0 * distance.min(axis=1) + tilt.mean(axis=1) + 1e3 * bad
+
+
+def main(address: str) -> int:
+    """Plans until the goal is reached; returns the exit code."""
+    random = np.random.default_rng(1)
+    with nesam.Client(address, timeout_s=60.0) as client:
+        world = hilly_map()
+        if world.map_id not in [m.map_id for m in client.maps()]:
+            client.upload_map(world)
+        session = client.open_session("planner-example", map_id=world.map_id)
+        card = session.vehicle
+        fallback = nesam.KinematicFallback(card)
+        low = np.array([0.5, card.second_range[0]], dtype=np.float32)
+        high = np.array([min(3.0, card.speed_range_m_s[1]), card.second_range[1]], dtype=np.float32)
+        nominal = np.tile(np.float32([1.5, 0.0]), (HORIZON, 1))
+        state = np.zeros(12)
+        state[0:3], state[6] = (-6.0, -4.0, 0.6), 1.5
+        reached = False
+        with client.measurement_stream() as vehicle:
+            for step in range(150):
+                vehicle.send(nesam.Measurement(session.session_id, int(step * DT_S * 1e9), state, nominal[0].astype(float)))
+                noise = random.normal(0.0, (0.4, 0.35), (SAMPLES, HORIZON, 2)).astype(np.float32)
+                controls = np.clip(nominal + noise, low, high)
+                controls[0] = nominal
+                prediction = client.predict(session.session_id, controls, fallback=fallback)
+                cost = costs(prediction)
+                weights = np.exp(-(cost - cost.min()) / TEMPERATURE)
+                nominal = np.clip(np.einsum("n,nkc->kc", weights / weights.sum(), controls), low, high).astype(np.float32)
+                plant = client.predict(session.session_id, nominal[None, :1])
+                state = plant.states[0, 0].astype(float)
+                remaining = float(np.hypot(*(state[:2] - GOAL)))
+                if step % 10 == 0:
+                    print(f"t {step * DT_S:4.1f} s  at ({state[0]:6.2f}, {state[1]:6.2f}) m  goal {remaining:5.2f} m  {prediction.computed_by}")
+                nominal = np.vstack([nominal[1:], nominal[-1:]])
+                if remaining < 1.0:
+                    reached = True
+                    break
+        client.close_session(session.session_id)
+    print("goal reached" if reached else "goal not reached")
+    return 0 if reached else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:50051"))

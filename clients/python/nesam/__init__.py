@@ -1,0 +1,43 @@
+"""Client of the nesam kinodynamics prediction service.
+
+`Client` opens sessions, uploads maps, sends measurements and asks for predictions; arrays are numpy arrays. Units are SI and radians, World is ENU
+(z up), Body is x forward, y left, z up. A state is the twelve numbers x y z roll pitch yaw vx vy vz wx wy wz, both velocities in Body.
+"""
+
+from ._client import CHANNELS, Client, MeasurementStream
+from ._errors import (
+    AlreadyExists,
+    DeadlineExceeded,
+    FailedPrecondition,
+    InvalidArgument,
+    NesamError,
+    NotFound,
+    Overloaded,
+    Unavailable,
+)
+from ._fallback import KinematicFallback
+from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Validity, VehicleCard, WorldMap
+
+__all__ = [
+    "CHANNELS",
+    "AlreadyExists",
+    "Answer",
+    "Client",
+    "DeadlineExceeded",
+    "FailedPrecondition",
+    "InvalidArgument",
+    "KinematicFallback",
+    "MapDescription",
+    "Measurement",
+    "MeasurementStream",
+    "NesamError",
+    "NotFound",
+    "Overloaded",
+    "Prediction",
+    "Provenance",
+    "Session",
+    "Unavailable",
+    "Validity",
+    "VehicleCard",
+    "WorldMap",
+]

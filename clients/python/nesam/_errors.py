@@ -1,0 +1,62 @@
+"""Errors: one class for each kind of refusal."""
+
+import grpc
+
+
+class NesamError(Exception):
+    """A call failed. `code` is the gRPC code, `field` the path of the field at fault ("" when none is), `message` what was wrong."""
+
+    def __init__(self, code: grpc.StatusCode, field: str, message: str):
+        super().__init__(f"{code.name}: {message}")
+        self.code = code
+        self.field = field
+        self.message = message
+
+
+class InvalidArgument(NesamError):
+    """A value is not acceptable; `field` says which."""
+
+
+class NotFound(NesamError):
+    """The session or map is not known."""
+
+
+class AlreadyExists(NesamError):
+    """The session or map is there already."""
+
+
+class FailedPrecondition(NesamError):
+    """The session cannot answer yet, for example because it has no measurement."""
+
+
+class Overloaded(NesamError):
+    """Too many requests wait, or a limit on sessions or maps is reached; ask again later."""
+
+
+class DeadlineExceeded(NesamError):
+    """No answer came in time."""
+
+
+class Unavailable(NesamError):
+    """The service cannot be reached or is shutting down."""
+
+
+_CLASSES = {
+    grpc.StatusCode.INVALID_ARGUMENT: InvalidArgument,
+    grpc.StatusCode.OUT_OF_RANGE: InvalidArgument,
+    grpc.StatusCode.NOT_FOUND: NotFound,
+    grpc.StatusCode.ALREADY_EXISTS: AlreadyExists,
+    grpc.StatusCode.FAILED_PRECONDITION: FailedPrecondition,
+    grpc.StatusCode.RESOURCE_EXHAUSTED: Overloaded,
+    grpc.StatusCode.DEADLINE_EXCEEDED: DeadlineExceeded,
+    grpc.StatusCode.UNAVAILABLE: Unavailable,
+}
+
+
+def from_rpc(error: grpc.RpcError) -> NesamError:
+    """The error class for a failed call."""
+    code = error.code()
+    metadata = dict(error.trailing_metadata() or ())
+    field = metadata.get("nesam-field", "")
+    field = field.decode() if isinstance(field, bytes) else field
+    return _CLASSES.get(code, NesamError)(code, field, error.details() or "")

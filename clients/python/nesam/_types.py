@@ -1,0 +1,194 @@
+"""What goes in and what comes out."""
+
+import enum
+from dataclasses import dataclass
+from typing import Optional, Sequence, Tuple
+
+import numpy as np
+
+from .v1 import types_pb2
+
+
+class Validity(enum.IntFlag):
+    """What there is to say against a predicted sample; 0 = nothing."""
+
+    NOT_FINITE = 1
+    OFF_MAP = 2
+    NO_MAP = 4
+    SPEED_UNTRAINED = 8
+    STEERING_UNTRAINED = 16
+    SLOPE_UNTRAINED = 32
+    OVERTURNED = 64
+
+
+@dataclass(frozen=True)
+class VehicleCard:
+    """The part of the vehicle card that a client needs. `second_kind` is steering_normalised, road_wheel_angle_rad or yaw_rate_rad_s."""
+
+    name: str
+    second_kind: str
+    speed_range_m_s: Tuple[float, float]
+    second_range: Tuple[float, float]
+    wheelbase_m: float
+    road_wheel_angle_max_rad: float
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What a reply was computed from."""
+
+    history_epoch: int
+    soil_epoch: int
+    map_id: str
+    map_version: int
+    map_hash: str
+    bundle_name: str
+    bundle_hash: str
+
+
+@dataclass(frozen=True)
+class Session:
+    """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement."""
+
+    session_id: str
+    vehicle_id: str
+    vehicle: VehicleCard
+    provenance: Provenance
+    history_steps: int
+    last_stamp_ns: Optional[int]
+    last_sequence: Optional[int]
+    state: Optional[np.ndarray]
+    command: Optional[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What a vehicle measures at one instant.
+
+    state: (12,), pose in World, twist in Body. command: (speed m/s, second in the unit of the vehicle card), applied from this instant on.
+    stamp_ns: the vehicle's clock. sequence: 0 = not numbered. wheel_speed_rad_s: (4,) FL FR RL RR; road_wheel_angle_rad: (2,) left, right.
+    """
+
+    session_id: str
+    stamp_ns: int
+    state: Sequence[float]
+    command: Sequence[float]
+    sequence: int = 0
+    wheel_speed_rad_s: Optional[Sequence[float]] = None
+    road_wheel_angle_rad: Optional[Sequence[float]] = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The service's answer to one measurement.
+
+    outcome: APPLIED, BUFFERED, DUPLICATE, TOO_OLD, NOT_FINITE, GATED, GAP or REJECTED. Only APPLIED, BUFFERED, GATED and GAP changed the session.
+    field and message say what was wrong with a NOT_FINITE or REJECTED one.
+    """
+
+    outcome: str
+    session_id: str
+    stamp_ns: int
+    sequence: int
+    history_epoch: int
+    soil_epoch: int
+    field: str = ""
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class WorldMap:
+    """A map to upload; row 0 is the southernmost.
+
+    elevation_m: (height, width) float32, NaN = hole. semantic_rgb: (height, width, 3) uint8 or None. origin_m: World position of cell (0, 0).
+    """
+
+    map_id: str
+    elevation_m: np.ndarray
+    resolution_m: float
+    origin_m: Tuple[float, float] = (0.0, 0.0)
+    semantic_rgb: Optional[np.ndarray] = None
+    version: int = 1
+
+
+@dataclass(frozen=True)
+class MapDescription:
+    """A map on the service, without its layers."""
+
+    map_id: str
+    version: int
+    hash: str
+    origin_m: Tuple[float, float]
+    resolution_m: float
+    width: int
+    height: int
+    semantic: bool
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted trajectories.
+
+    states: (samples, steps, channels) float32. channels: names of the channels. steps_s: (steps,) time of each returned step after the start, s.
+    sinkage_m: (samples, steps, 4) float32 or None. validity: (samples,) uint32 of `Validity` bits. start: (12,).
+    soil: (6,) k_phi k_c n c phi k_shear under the start; soil_variance: (6,) or None while no filter runs.
+    computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance and
+    sinkage_m are None, validity is 0 and `fallback_reason` is the service's error.
+    """
+
+    states: np.ndarray
+    channels: Tuple[str, ...]
+    steps_s: np.ndarray
+    validity: np.ndarray
+    start: np.ndarray
+    sinkage_m: Optional[np.ndarray]
+    history_steps: int
+    soil: Optional[np.ndarray]
+    soil_variance: Optional[np.ndarray]
+    measurement_age_s: Optional[float]
+    provenance: Optional[Provenance]
+    queue_s: float
+    compute_s: float
+    computed_by: str = "service"
+    fallback_reason: Optional[Exception] = None
+
+
+def array(values: Sequence[float], shape: Tuple[int, ...], name: str) -> np.ndarray:
+    """`values` as float64 of the given shape; ValueError naming it otherwise."""
+    result = np.asarray(values, dtype=np.float64)
+    if result.shape != shape:
+        raise ValueError(f"{name} has shape {result.shape}, expected {shape}")
+    return result
+
+
+def state_message(state: Sequence[float], name: str = "state") -> types_pb2.VehicleState:
+    """A state message from (12,)."""
+    x = array(state, (12,), name)
+    parts = [types_pb2.Vector3(x=x[i], y=x[i + 1], z=x[i + 2]) for i in (0, 3, 6, 9)]
+    return types_pb2.VehicleState(
+        position_m=parts[0], attitude_rad=parts[1], velocity_m_s=parts[2], angular_velocity_rad_s=parts[3]
+    )
+
+
+def state_array(message: types_pb2.VehicleState) -> np.ndarray:
+    """(12,) from a state message."""
+    parts = (message.position_m, message.attitude_rad, message.velocity_m_s, message.angular_velocity_rad_s)
+    return np.array([value for part in parts for value in (part.x, part.y, part.z)])
+
+
+def soil_array(message: types_pb2.SoilVector) -> np.ndarray:
+    """(6,) from a soil message."""
+    return np.array([message.k_phi, message.k_c, message.n, message.c_pa, message.phi_rad, message.k_shear_m])
+
+
+def provenance(message: types_pb2.Provenance) -> Provenance:
+    """Provenance from its message."""
+    return Provenance(
+        history_epoch=message.history_epoch,
+        soil_epoch=message.soil_epoch,
+        map_id=message.map_id,
+        map_version=message.map_version,
+        map_hash=message.map_hash,
+        bundle_name=message.bundle_name,
+        bundle_hash=message.bundle_hash,
+    )

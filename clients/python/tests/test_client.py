@@ -1,0 +1,185 @@
+"""Goal: what the service says reaches numpy unchanged, and what it refuses becomes a typed error. Method: a real server."""
+
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nesam
+from conftest import straight
+
+
+def fan(samples, horizon, speed=2.0):
+    """Controls (samples, horizon, 2): the same speed, steering from right to left."""
+    controls = np.empty((samples, horizon, 2), dtype=np.float32)
+    controls[..., 0] = speed
+    controls[..., 1] = np.linspace(-0.5, 0.5, samples)[:, None]
+    return controls
+
+
+def test_service_prediction_shapes_and_provenance(driven):
+    prediction = driven.predict("truck", fan(5, 32), wheel_sinkage=True)
+    assert prediction.states.shape == (5, 32, 12) and prediction.states.dtype == np.float32
+    assert prediction.sinkage_m.shape == (5, 32, 4)
+    assert prediction.validity.shape == (5,) and prediction.soil.shape == (6,)
+    assert np.isfinite(prediction.states).all()
+    assert prediction.history_steps == 31 and prediction.computed_by == "service"
+    assert prediction.provenance.history_epoch == 40 and prediction.provenance.map_id == "hills"
+    assert len(prediction.provenance.bundle_hash) == 64
+    assert prediction.start[0] == pytest.approx(-2.2) and 0 <= prediction.measurement_age_s < 60
+    np.testing.assert_allclose(prediction.steps_s[[0, -1]], [0.1, 3.2])
+
+
+def test_service_prediction_is_repeatable_and_rows_are_independent(driven):
+    batch = driven.predict("truck", fan(17, 10)).states
+    assert (driven.predict("truck", fan(17, 10)).states == batch).all()
+    for n in (0, 8, 16):
+        assert (driven.predict("truck", fan(17, 10)[n : n + 1]).states[0] == batch[n]).all()
+
+
+def test_service_selection_returns_the_slice(driven):
+    whole = driven.predict("truck", fan(3, 9))
+    part = driven.predict("truck", fan(3, 9), channels=("yaw", "x"), stride=4)
+    assert part.channels == ("x", "yaw") and part.states.shape == (3, 2, 2)
+    assert (part.states == whole.states[:, [3, 7]][:, :, [0, 5]]).all()
+    np.testing.assert_allclose(part.steps_s, [0.4, 0.8])
+
+
+def test_service_measurement_answers_are_typed(driven):
+    with driven.measurement_stream() as stream:
+        again = list(straight("truck", 42))
+        assert stream.send(again[39]).outcome == "DUPLICATE"
+        assert stream.send(again[40]).outcome == "APPLIED"
+        late = nesam.Measurement("truck", 150_000_000, again[0].state, (1.0, 0.0))
+        assert stream.send(late).outcome == "TOO_OLD"
+        bad = np.zeros(12)
+        bad[7] = np.nan
+        answer = stream.send(nesam.Measurement("truck", 41 * 100_000_000, bad, (1.0, 0.0)))
+        assert (answer.outcome, answer.field) == ("NOT_FINITE", "state.velocity_m_s.y")
+        answer = stream.send(nesam.Measurement("nobody", 0, np.zeros(12), (1.0, 0.0)))
+        assert (answer.outcome, answer.field) == ("REJECTED", "session_id") and "nobody" in answer.message
+        wheels = nesam.Measurement("truck", 41 * 100_000_000, again[41].state, (2.0, 0.0), 42, [4.0] * 4, [0.0] * 2)
+        assert stream.send(wheels).outcome == "APPLIED"
+        assert stream.send(nesam.Measurement("truck", 99 * 100_000_000, again[41].state, (2.0, 0.0))).outcome == "GAP"
+    session = driven.session("truck")
+    assert (session.history_steps, session.last_sequence, session.last_stamp_ns) == (1, 42, 99 * 100_000_000)
+
+
+@pytest.mark.parametrize(
+    "change, error, field",
+    [
+        ({"session_id": "nobody"}, nesam.NotFound, "session_id"),
+        ({"controls": fan(2, 33)}, nesam.InvalidArgument, "horizon"),
+        ({"controls": fan(4097, 1)}, nesam.InvalidArgument, "samples"),
+        ({"controls": fan(0, 3)}, nesam.InvalidArgument, "samples"),
+        ({"controls": fan(2, 3) * np.float32(np.nan)}, nesam.InvalidArgument, "controls[0, 0]"),
+        ({"controls": fan(2, 3, speed=500.0)}, nesam.InvalidArgument, "controls[0, 0].speed_m_s"),
+        ({"start": np.full(12, np.inf)}, nesam.InvalidArgument, "start.position_m.x"),
+        ({"start": [500.0] + [0.0] * 11}, nesam.InvalidArgument, "start.position_m"),
+        ({"stride": 4}, nesam.InvalidArgument, "output.stride"),
+    ],
+)
+def test_service_refusals_name_the_field(driven, change, error, field):
+    before = driven.session("truck")
+    with pytest.raises(error) as caught:
+        driven.predict(**{"session_id": "truck", "controls": fan(2, 3), **change})
+    assert caught.value.field == field and len(caught.value.message) > 10
+    after = driven.session("truck")
+    assert after.provenance == before.provenance and (after.state == before.state).all()
+
+
+def test_wrong_shapes_are_refused_before_anything_is_sent(driven):
+    for controls in (np.zeros((3, 2)), np.zeros((2, 3, 3))):
+        with pytest.raises(ValueError, match="samples, horizon, 2"):
+            driven.predict("truck", controls)
+    with pytest.raises(ValueError, match="start"):
+        driven.predict("truck", fan(1, 1), start=np.zeros(6))
+    with pytest.raises(ValueError, match="channels"):
+        driven.predict("truck", fan(1, 1), channels=("speed",))
+    with pytest.raises(ValueError, match="semantic_rgb"):
+        driven.upload_map(nesam.WorldMap("m", np.zeros((4, 4)), 0.5, semantic_rgb=np.zeros((4, 3, 3))))
+
+
+def test_service_sessions_and_maps(client, hills):
+    description = client.upload_map(hills)
+    assert (description.width, description.height, description.version, description.semantic) == (161, 121, 1, True)
+    with pytest.raises(nesam.AlreadyExists):
+        client.upload_map(hills)
+    session = client.open_session("truck", session_id="s", map_id="hills")
+    assert session.state is None and session.last_stamp_ns is None and session.history_steps == 0
+    assert session.vehicle.speed_range_m_s[1] > 0 and session.vehicle.wheelbase_m > 0
+    with pytest.raises(nesam.FailedPrecondition) as caught:
+        client.predict("s", fan(1, 1))
+    assert caught.value.field == "start"
+    with pytest.raises(nesam.FailedPrecondition):
+        client.delete_map("hills")
+    patched = client.patch_tile("hills", 1, 10, 20, np.full((5, 6), 0.1))
+    assert patched.version == 2 and patched.hash != description.hash
+    with pytest.raises(nesam.NesamError, match="ABORTED"):
+        client.patch_tile("hills", 1, 10, 20, np.full((5, 6), 0.1))
+    assert [m.map_id for m in client.maps()] == ["hills"] and client.map("hills") == patched
+    client.close_session("s")
+    with pytest.raises(nesam.NotFound):
+        client.session("s")
+
+
+def test_service_fallback_is_declared(driven):
+    fallback = nesam.KinematicFallback(driven.session("truck").vehicle)
+    with pytest.raises(nesam.DeadlineExceeded):
+        driven.predict("truck", fan(2000, 32), timeout_s=0.004)
+    late = driven.predict("truck", fan(2000, 32), timeout_s=0.004, fallback=fallback, channels=("x", "y"), stride=8)
+    assert late.computed_by == "kinematic_fallback" and isinstance(late.fallback_reason, nesam.DeadlineExceeded)
+    assert late.states.shape == (2000, 4, 2) and late.soil is None and late.provenance is None
+    np.testing.assert_allclose(late.start, driven.session("truck").state)
+    # In time, the service answers although a fallback is there.
+    assert driven.predict("truck", fan(2, 2), fallback=fallback).computed_by == "service"
+    # A wrong question is not answered by the fallback.
+    with pytest.raises(nesam.InvalidArgument):
+        driven.predict("truck", fan(2, 33), fallback=fallback)
+
+
+def test_service_away_is_unavailable_or_fallback():
+    card = nesam.VehicleCard("cart", "yaw_rate_rad_s", (-1.0, 3.0), (-1.0, 1.0), 1.0, 0.0)
+    with nesam.Client("127.0.0.1:1", timeout_s=0.5) as away:
+        with pytest.raises((nesam.Unavailable, nesam.DeadlineExceeded)):
+            away.sessions()
+        start = np.zeros(12)
+        prediction = away.predict("s", fan(3, 5), start=start, fallback=nesam.KinematicFallback(card))
+        assert prediction.computed_by == "kinematic_fallback"
+
+
+def test_analytic_fallback_drives_arcs():
+    card = nesam.VehicleCard("cart", "road_wheel_angle_rad", (-5.0, 5.0), (-0.5, 0.5), 2.5, 0.5)
+    start = np.zeros(12)
+    start[5] = np.pi / 2
+    controls = np.zeros((2, 32, 2), dtype=np.float32)
+    controls[:, :, 0] = 2.0
+    controls[1, :, 1] = 0.3
+    states = nesam.KinematicFallback(card).rollout(start, controls)
+    np.testing.assert_allclose(states[0, :, 1], 0.2 * np.arange(1, 33), rtol=1e-6)
+    # A left arc of radius wheelbase / tan(angle) around a centre to the left.
+    radius = 2.5 / np.tan(np.float32(0.3))
+    distance = np.hypot(states[1, :, 0] + radius, states[1, :, 1])
+    np.testing.assert_allclose(distance, radius, rtol=1e-5)
+    assert (np.abs(states[..., 5]) <= np.pi + 1e-6).all() and states[1, -1, 11] == pytest.approx(2.0 / radius)
+
+
+def test_service_threads_share_a_client(driven):
+    expected = driven.predict("truck", fan(4, 8)).states
+    seen = []
+    threads = [threading.Thread(target=lambda: seen.append(driven.predict("truck", fan(4, 8)).states)) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(seen) == 6 and all((states == expected).all() for states in seen)
+
+
+def test_service_example_planner_reaches_its_goal(server_address):
+    script = Path(__file__).resolve().parents[2] / "examples" / "planner.py"
+    done = subprocess.run([sys.executable, str(script), server_address], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "goal reached" in done.stdout

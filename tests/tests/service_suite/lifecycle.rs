@@ -1,0 +1,123 @@
+//! Goal: what operators rely on: health, reflection, metrics, status, clean shutdown, clear refusal to start.
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use nesam_client::{Client, v1};
+use nesam_server::{Config, serve};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tokio_stream::StreamExt as _;
+use tonic_health::pb::health_check_response::ServingStatus;
+use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
+use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
+use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
+use tonic_reflection::pb::v1::{ServerReflectionRequest, server_reflection_client::ServerReflectionClient};
+
+use crate::stage::*;
+
+async fn http_get(address: SocketAddr, path: &str) -> (u16, String) {
+    let mut socket = tokio::net::TcpStream::connect(address).await.unwrap();
+    socket.write_all(format!("GET {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n").as_bytes()).await.unwrap();
+    let mut text = String::new();
+    socket.read_to_string(&mut text).await.unwrap();
+    let code = text.split(' ').nth(1).unwrap().parse().unwrap();
+    (code, text.split_once("\r\n\r\n").unwrap().1.to_string())
+}
+
+async fn health(client: &Client, service: &str) -> ServingStatus {
+    let request = HealthCheckRequest { service: service.into() };
+    HealthClient::new(client.channel()).check(request).await.unwrap().into_inner().status()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_health_reflection_metrics_and_status() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    for name in ["", "nesam.v1.Prediction", "nesam.v1.Measurements"] {
+        assert_eq!(health(&client, name).await, ServingStatus::Serving, "{name}");
+    }
+    let list = ServerReflectionRequest { host: String::new(), message_request: Some(MessageRequest::ListServices(String::new())) };
+    let mut replies =
+        ServerReflectionClient::new(client.channel()).server_reflection_info(tokio_stream::once(list)).await.unwrap().into_inner();
+    let Some(MessageResponse::ListServicesResponse(list)) = replies.next().await.unwrap().unwrap().message_response else {
+        panic!("no list of services")
+    };
+    for name in ["Sessions", "Prediction", "Measurements", "Terrain", "Soil"] {
+        assert!(list.service.iter().any(|s| s.name == format!("nesam.v1.{name}")), "{name}");
+    }
+
+    open(&mut client, "s", "").await;
+    client.feed(samples("s", &recorded.drive, 9)).await.unwrap();
+    client.predict(candidates("s", &recorded.drive, 9, 2, 2)).await.unwrap();
+    let _ = client.session("unknown").await;
+    let http = server.http_addr.unwrap();
+    let (code, metrics) = http_get(http, "/metrics").await;
+    assert_eq!(code, 200);
+    for line in [
+        "nesam_measurements_total{transport=\"grpc\",outcome=\"applied\"} 10",
+        "nesam_commands_total{command=\"predict\",result=\"ok\"} 1",
+        "nesam_commands_total{command=\"get\",result=\"not_found\"} 1",
+        "nesam_prediction_compute_seconds_count 1",
+        "nesam_waiting_predictions 0",
+    ] {
+        assert!(metrics.lines().any(|l| l == line), "{line} is not in\n{metrics}");
+    }
+    let (code, status) = http_get(http, "/status").await;
+    let status: serde_json::Value = serde_json::from_str(&status).unwrap();
+    assert_eq!((code, status["schema"].as_str()), (200, Some("nesam.status/1")));
+    assert_eq!(status["sessions"][0]["history_steps"], 10);
+    assert_eq!(status["bundle"]["hash"].as_str(), Some(predictor().bundle().hash.as_str()));
+    assert_eq!(http_get(http, "/health").await.0, 200);
+    assert_eq!(http_get(http, "/nothing").await.0, 404);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_shutdown_ends_streams_and_frees_the_ports() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    let (grpc, http) = (server.grpc_addr, server.http_addr.unwrap());
+    open(&mut client, "s", "").await;
+    let mut stream = client.measure().await.unwrap();
+    stream.exchange(sample("s", &recorded.drive, 0)).await.unwrap();
+    let mut watch = client.watch_soil("s").await.unwrap();
+    let first = watch.message().await.unwrap().unwrap();
+    assert_eq!((first.soil_epoch, first.correction.unwrap().delta), (0, Some(v1::SoilVector::default())));
+    let started = Instant::now();
+    server.shutdown().await;
+    assert!(started.elapsed() < Duration::from_secs(4), "shutdown took {:?}", started.elapsed());
+    assert_eq!(stream.answer().await.unwrap_err().code(), Some(tonic::Code::Unavailable));
+    assert_eq!(watch.message().await.unwrap_err().code(), tonic::Code::Unavailable);
+    // Both ports can be taken again at once.
+    let mut config = Config::ephemeral();
+    (config.grpc.listen, config.http.listen) = (grpc, http);
+    serve(config, predictor()).await.unwrap().shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_closing_a_session_ends_its_soil_watch() {
+    let (server, mut client) = start().await;
+    open(&mut client, "s", "").await;
+    let mut watch = client.watch_soil("s").await.unwrap();
+    watch.message().await.unwrap().unwrap();
+    client.close_session("s").await.unwrap();
+    assert!(watch.message().await.unwrap().is_none());
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_taken_port_is_a_clear_error() {
+    let (server, _client) = start().await;
+    for (key, grpc, http) in [("grpc.listen", server.grpc_addr, None), ("http.listen", "127.0.0.1:0".parse().unwrap(), server.http_addr)] {
+        let mut config = Config::ephemeral();
+        config.grpc.listen = grpc;
+        config.http.listen = http.unwrap_or(config.http.listen);
+        let message = serve(config, predictor()).await.unwrap_err().to_string();
+        assert!(message.contains(key) && message.contains("127.0.0.1"), "{message}");
+    }
+    let mut config = Config::ephemeral();
+    (config.zenoh.enabled, config.zenoh.listen) = (true, vec!["nonsense".into()]);
+    let message = serve(config, predictor()).await.unwrap_err().to_string();
+    assert!(message.contains("zenoh.listen"), "{message}");
+    server.shutdown().await;
+}

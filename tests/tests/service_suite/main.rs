@@ -1,0 +1,11 @@
+//! The service over real sockets: a server on loopback, the Rust client, a recorded drive, the shipped bundle.
+#![allow(clippy::unwrap_used)]
+
+mod bad_input;
+mod lifecycle;
+mod measurements;
+mod overload;
+mod predictions;
+mod replay;
+mod stage;
+mod zenoh_network;

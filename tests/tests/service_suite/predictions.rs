@@ -1,0 +1,123 @@
+//! Goal: a prediction through the service is the offline rollout, whatever else happens around it.
+
+use nesam_client::v1;
+
+use crate::stage::*;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_prediction_equals_offline_rollout_bit_for_bit() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    let description = client.upload_map(&layers(&recorded.world)).await.unwrap();
+    assert_eq!(description.hash, recorded.world.hash(), "the uploaded map has the layers of the file");
+    open(&mut client, "s", recorded.world.id()).await;
+    for (i, history_steps) in [(10, 10), (40, 31), (101, 31)] {
+        let fed = client.feed(samples("s", &recorded.drive, i)).await.unwrap();
+        assert_eq!(fed.len(), i + 1);
+        let candidates = candidates("s", &recorded.drive, i, 5, 32);
+        let prediction = client.predict(candidates.clone()).await.unwrap();
+        assert_same(&prediction, &offline(&recorded, i, &candidates, history_steps));
+        assert!(prediction.states.iter().all(|v| v.is_finite()));
+        assert_eq!(prediction.history_steps, history_steps);
+        assert_eq!(prediction.start, recorded.drive.states[i].to_array());
+        assert!(prediction.measurement_age_s.is_some_and(|age| (0.0..60.0).contains(&age)));
+        let provenance = &prediction.provenance;
+        assert_eq!((provenance.history_epoch, provenance.soil_epoch, provenance.map_version), (i as u64 + 1, 0, 1));
+        assert_eq!((provenance.map_hash.as_str(), &provenance.bundle_hash), (recorded.world.hash(), &predictor().bundle().hash));
+    }
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_batch_row_equals_row_alone() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "s", recorded.world.id()).await;
+    client.feed(samples("s", &recorded.drive, 60)).await.unwrap();
+    let batch = candidates("s", &recorded.drive, 60, 19, 8);
+    let together = client.predict(batch.clone()).await.unwrap();
+    for n in [0, 7, 15, 16, 18] {
+        let mut alone = batch.clone();
+        alone.samples = 1;
+        alone.controls = batch.controls[n * 16..(n + 1) * 16].to_vec();
+        let alone = client.predict(alone).await.unwrap();
+        assert!(bits(&alone.states) == bits(&together.states[n * 96..(n + 1) * 96]), "row {n}");
+        assert_eq!(alone.validity[0], together.validity[n]);
+    }
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_given_start_history_use_and_selection() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "s", recorded.world.id()).await;
+    let i = 50;
+    let mut query = candidates("s", &recorded.drive, i, 3, 9);
+    // No measurement yet: a start must be given.
+    assert_refused("no start", client.predict(query.clone()).await, tonic::Code::FailedPrecondition, "start");
+    query.start = Some(recorded.drive.states[i].to_array());
+    let alone = client.predict(query.clone()).await.unwrap();
+    assert_same(&alone, &offline(&recorded, i, &query, 0));
+    assert_eq!(alone.measurement_age_s, None);
+
+    client.feed(samples("s", &recorded.drive, i)).await.unwrap();
+    let before = client.session("s").await.unwrap();
+    let full = client.predict(query.clone()).await.unwrap();
+    assert_same(&full, &offline(&recorded, i, &query, 31));
+    query.use_history = false;
+    assert_same(&client.predict(query.clone()).await.unwrap(), &offline(&recorded, i, &query, 0));
+
+    query.use_history = true;
+    query.output = v1::OutputSelection { channels: 0b10_0011, stride: 4, wheel_sinkage: false };
+    let part = client.predict(query).await.unwrap();
+    assert_eq!((part.steps, part.channels.as_slice(), part.sinkage_m.len()), (2, &[0, 1, 5][..], 0));
+    for n in 0..3 {
+        for (step, k) in [(0, 3), (1, 7)] {
+            let whole = full.state(n, k);
+            assert_eq!(part.state(n, step), [whole[0], whole[1], whole[5]]);
+        }
+    }
+    assert_eq!(client.session("s").await.unwrap(), before, "a prediction changes nothing");
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_stream_of_requests_equals_single_requests_and_survives_bad_ones() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "s", recorded.world.id()).await;
+    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let good = |tag| v1::PredictRequest { tag, ..candidates("s", &recorded.drive, 40, 2, 4).to_message() };
+    let requests =
+        vec![good(1), v1::PredictRequest { horizon: 33, ..good(2) }, v1::PredictRequest { session_id: "x".into(), ..good(3) }, good(4)];
+    let single = client.predict_message(good(9)).await.unwrap();
+    let replies = client.predict_stream(requests).await.unwrap();
+    let mut seen = Vec::new();
+    for reply in replies {
+        match reply.outcome.unwrap() {
+            v1::predict_stream_reply::Outcome::Reply(reply) => {
+                assert_eq!((&reply.states, &reply.validity), (&single.states, &single.validity));
+                seen.push((reply.tag, 0, String::new()));
+            }
+            v1::predict_stream_reply::Outcome::Error(error) => seen.push((error.tag, error.code, error.field)),
+        }
+    }
+    assert_eq!(seen, [(1, 0, String::new()), (2, 3, "horizon".into()), (3, 5, "session_id".into()), (4, 0, String::new())]);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_without_a_map_says_so() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    open(&mut client, "s", "").await;
+    client.feed(samples("s", &recorded.drive, 20)).await.unwrap();
+    let prediction = client.predict(candidates("s", &recorded.drive, 20, 2, 5)).await.unwrap();
+    assert!(prediction.validity.iter().all(|v| v & v1::Validity::NoMap as u32 != 0));
+    assert_eq!(prediction.provenance.map_id, "");
+    server.shutdown().await;
+}

@@ -1,0 +1,177 @@
+//! What every test needs: a predictor, a recorded drive, a running server, a client.
+
+use std::sync::{Arc, OnceLock};
+
+use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
+use nesam_learning::{Drive, initial::initial_weights, scales};
+use nesam_model::{HistoryStep, ModelBundle, Predictor, Provenance, Rollout, RolloutQuery, Variant};
+use nesam_physics::SoilCorrection;
+use nesam_server::{Config, RunningServer, serve};
+use nesam_terrain::WorldMap;
+use nesam_tests::{sample_root, shipped_bundle};
+use nesam_trajectories::{DataRoot, SetQuery, Trajectory};
+
+/// Step of the model, ns.
+pub const STEP_NS: i64 = 100_000_000;
+/// Test drive of the committed sample.
+pub const DRIVE: &str = "n0005";
+
+/// A drive with the world it was driven in.
+pub struct Recorded {
+    pub drive: Trajectory,
+    pub world: Arc<WorldMap>,
+}
+
+/// The recorded test drive.
+pub fn recorded() -> Recorded {
+    let root = DataRoot::open(&sample_root(), None).unwrap();
+    let query = SetQuery { trajectories: Some(vec![DRIVE.into()]), ..SetQuery::all("nominal") };
+    let drive = root.load_set(&query).unwrap().remove(0);
+    let world = root.world(drive.world.as_ref().unwrap()).unwrap();
+    Recorded { drive, world }
+}
+
+/// The shipped bundle; untrained weights where none is shipped yet, as no test here depends on how good the model is.
+fn bundle() -> Arc<ModelBundle> {
+    static BUNDLE: OnceLock<Arc<ModelBundle>> = OnceLock::new();
+    BUNDLE
+        .get_or_init(|| {
+            let dir = shipped_bundle();
+            if dir.join("manifest.toml").is_file() {
+                return Arc::new(ModelBundle::load(&dir).unwrap());
+            }
+            eprintln!("no bundle is shipped; the service is tested with untrained weights");
+            let Recorded { drive, world } = recorded();
+            let vehicle = DataRoot::open(&sample_root(), None).unwrap().vehicle().clone();
+            let drive = Drive::new(drive.id, Some(world), drive.states, drive.controls);
+            let normalization = scales::measure(&[&drive], &vehicle, 0.1);
+            Arc::new(ModelBundle {
+                name: "untrained".into(),
+                hash: "0".repeat(64),
+                vehicle,
+                default_soil: normalization.default_soil(),
+                parameters: 0,
+                weights: initial_weights(7, &normalization),
+                normalization,
+                baselines_json: None,
+                reference_json: None,
+                effects: Vec::new(),
+                provenance: Provenance::default(),
+            })
+        })
+        .clone()
+}
+
+/// A predictor that has answered nothing yet.
+pub fn fresh_predictor() -> Predictor {
+    Predictor::new(bundle()).unwrap()
+}
+
+/// The predictor that the servers of this program share, so that terrain is encoded once.
+pub fn predictor() -> Arc<Predictor> {
+    static PREDICTOR: OnceLock<Arc<Predictor>> = OnceLock::new();
+    PREDICTOR.get_or_init(|| Arc::new(fresh_predictor())).clone()
+}
+
+/// A server with changed defaults, and a client of it.
+pub async fn start_with(change: impl FnOnce(&mut Config)) -> (RunningServer, Client) {
+    let mut config = Config::ephemeral();
+    change(&mut config);
+    let server = serve(config, predictor()).await.unwrap();
+    let client = Client::connect(&format!("http://{}", server.grpc_addr)).await.unwrap();
+    (server, client)
+}
+
+/// A server with defaults on free ports, and a client of it.
+pub async fn start() -> (RunningServer, Client) {
+    start_with(|_| {}).await
+}
+
+/// A world as the client uploads it.
+pub fn layers(world: &WorldMap) -> MapLayers {
+    let geometry = world.geometry();
+    MapLayers {
+        id: world.id().into(),
+        version: 1,
+        origin_m: geometry.origin_m,
+        resolution_m: geometry.resolution_m,
+        width: geometry.width,
+        height: geometry.height,
+        elevation_m: world.elevation_m(),
+        semantic_rgb: world.semantic_rgb(),
+    }
+}
+
+/// Opens a session on a map.
+pub async fn open(client: &mut Client, session: &str, map: &str) -> v1::Session {
+    let request =
+        v1::OpenSessionRequest { vehicle_id: "truck".into(), session_id: session.into(), map_id: map.into(), ..Default::default() };
+    client.open_session(request).await.unwrap()
+}
+
+/// Sample `i` of a drive as a measurement.
+pub fn sample(session: &str, drive: &Trajectory, i: usize) -> v1::Measurement {
+    let control = drive.controls[i];
+    let mut message = measurement(session, i as i64 * STEP_NS, drive.states[i].to_array(), [control.speed_m_s, control.second]);
+    message.sequence = i as u64 + 1;
+    message
+}
+
+/// Samples `0..=last` of a drive.
+pub fn samples(session: &str, drive: &Trajectory, last: usize) -> Vec<v1::Measurement> {
+    (0..=last).map(|i| sample(session, drive, i)).collect()
+}
+
+/// Candidates around the recorded commands after sample `i`: sample n steers `n * 0.02` more to the left, within the card.
+pub fn candidates(session: &str, drive: &Trajectory, i: usize, samples: usize, horizon: usize) -> Candidates {
+    let controls = (0..samples)
+        .flat_map(|n| {
+            (0..horizon).flat_map(move |k| {
+                let control = drive.controls[i + k];
+                [control.speed_m_s as f32, (control.second as f32 + 0.02 * n as f32).clamp(-1.0, 1.0)]
+            })
+        })
+        .collect();
+    Candidates::new(session, samples, horizon, controls)
+}
+
+/// What the offline rollout gives after sample `i`, from a predictor that has answered nothing else, on the map read from the file.
+pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_steps: usize) -> Rollout {
+    let drive = &recorded.drive;
+    let history: Vec<HistoryStep> =
+        (i - history_steps..i).map(|j| HistoryStep { state: drive.states[j], control: drive.controls[j] }).collect();
+    fresh_predictor()
+        .rollout(&RolloutQuery {
+            history: &history,
+            start: drive.states[i],
+            controls: &candidates.controls,
+            samples: candidates.samples,
+            horizon: candidates.horizon,
+            map: Some(&recorded.world),
+            soil_correction: SoilCorrection::NONE,
+            variant: Variant::Full,
+        })
+        .unwrap()
+}
+
+/// Bits of the numbers, so that equality means equality.
+pub fn bits(values: &[f32]) -> Vec<u32> {
+    values.iter().map(|v| v.to_bits()).collect()
+}
+
+/// Asserts that a prediction is the rollout, bit for bit.
+pub fn assert_same(prediction: &Prediction, rollout: &Rollout) {
+    assert_eq!((prediction.samples, prediction.steps), (rollout.samples, rollout.horizon));
+    assert!(bits(&prediction.states) == bits(&rollout.states), "states differ");
+    assert!(bits(&prediction.sinkage_m) == bits(&rollout.sinkage_m), "sinkages differ");
+    assert_eq!(prediction.validity, rollout.flags);
+    assert_eq!(prediction.soil.map(f64::to_bits), rollout.soil.map(f64::to_bits));
+}
+
+/// Asserts that a call was refused with this code and names this field.
+pub fn assert_refused<T: core::fmt::Debug>(what: &str, result: Result<T, nesam_client::ClientError>, code: tonic::Code, field: &str) {
+    let error = result.expect_err(what);
+    assert_eq!(error.code(), Some(code), "{what}: {error}");
+    assert_eq!(error.field(), field, "{what}: {error}");
+    assert!(error.to_string().len() > 20, "{what}: {error}");
+}

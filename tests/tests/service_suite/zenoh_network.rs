@@ -1,0 +1,111 @@
+//! Goal: a vehicle behind a Zenoh router gets the same service as one on gRPC. The router is the `zenoh` crate in router mode.
+
+use std::time::Duration;
+
+use nesam_client::zenoh_vehicle::ZenohVehicle;
+use nesam_client::{outcome_label, v1};
+use nesam_server::ZenohMode;
+use prost::Message as _;
+
+use crate::stage::*;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A router on a free port, and its endpoint.
+async fn router() -> (zenoh::Session, String) {
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let endpoint = format!("tcp/127.0.0.1:{port}");
+    let mut config = zenoh::Config::default();
+    config.insert_json5("mode", "\"router\"").unwrap();
+    config.insert_json5("scouting/multicast/enabled", "false").unwrap();
+    config.insert_json5("listen/endpoints", &format!("[{endpoint:?}]")).unwrap();
+    (zenoh::open(config).await.unwrap(), endpoint)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction() {
+    let recorded = recorded();
+    let (router, endpoint) = router().await;
+    let (server, mut client) = start_with(|config| {
+        config.zenoh.enabled = true;
+        config.zenoh.mode = ZenohMode::Client;
+        config.zenoh.listen.clear();
+        config.zenoh.connect = vec![endpoint.clone()];
+        config.zenoh.fleet = "test".into();
+    })
+    .await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "grpc", recorded.world.id()).await;
+    open(&mut client, "truck", recorded.world.id()).await;
+    let vehicle = ZenohVehicle::connect(&endpoint, "test", "truck").await.unwrap();
+    vehicle.wait_for_service(PATIENCE).await.unwrap();
+
+    let last = 50;
+    client.feed(samples("grpc", &recorded.drive, last)).await.unwrap();
+    for i in 0..=last {
+        // Without a session id: the session named like the vehicle of the key.
+        vehicle.publish(&sample("", &recorded.drive, i)).await.unwrap();
+        let answer = vehicle.answer(PATIENCE).await.unwrap().expect("an answer on the status key");
+        assert_eq!((outcome_label(&answer), answer.sequence, answer.session_id.as_str()), ("APPLIED", i as u64 + 1, "truck"));
+    }
+    let by_grpc = client.predict(candidates("grpc", &recorded.drive, last, 3, 32)).await.unwrap();
+    let by_zenoh = client.predict(candidates("truck", &recorded.drive, last, 3, 32)).await.unwrap();
+    assert!(bits(&by_grpc.states) == bits(&by_zenoh.states));
+    assert_same(&by_zenoh, &offline(&recorded, last, &candidates("truck", &recorded.drive, last, 3, 32), 31));
+    // The queryable gives the same bytes.
+    let queried = vehicle.predict(&candidates("", &recorded.drive, last, 3, 32)).await.unwrap();
+    assert!(bits(&queried.states) == bits(&by_zenoh.states));
+    assert_eq!(queried.provenance, by_zenoh.provenance);
+
+    refuses_bad_payloads(&vehicle, &recorded, &mut client).await;
+    vehicle.close().await.unwrap();
+    server.shutdown().await;
+    router.close().await.unwrap();
+}
+
+/// Payloads that are no measurement, are spoofed, or are a bad query are answered and change nothing.
+async fn refuses_bad_payloads(vehicle: &ZenohVehicle, recorded: &Recorded, client: &mut nesam_client::Client) {
+    let before = (client.session("truck").await.unwrap(), client.session("grpc").await.unwrap());
+    let mut not_finite = sample("", &recorded.drive, 51);
+    not_finite.state.as_mut().unwrap().position_m.as_mut().unwrap().z = f64::NAN;
+    let missing = v1::Measurement { command: None, ..sample("", &recorded.drive, 51) };
+    let spoofed = v1::Measurement { session_id: "grpc".into(), ..sample("", &recorded.drive, 51) };
+    let nobody = v1::Measurement { session_id: "nobody".into(), ..sample("", &recorded.drive, 51) };
+    for (what, payload, label, field, code) in [
+        ("garbage", vec![0xff; 40], "REJECTED", "", 3),
+        ("oversize", vec![0; 1 << 17], "REJECTED", "", 3),
+        ("truncated", sample("", &recorded.drive, 51).encode_to_vec()[..60].to_vec(), "REJECTED", "", 3),
+        ("not finite", not_finite.encode_to_vec(), "NOT_FINITE", "", 0),
+        ("without command", missing.encode_to_vec(), "REJECTED", "command", 3),
+        ("unknown session", nobody.encode_to_vec(), "REJECTED", "session_id", 5),
+        ("late", sample("", &recorded.drive, 3).encode_to_vec(), "DUPLICATE", "", 0),
+    ] {
+        vehicle.publish_bytes(payload).await.unwrap();
+        let answer = vehicle.answer(PATIENCE).await.unwrap().expect(what);
+        assert_eq!(outcome_label(&answer), label, "{what}");
+        if let Some(v1::measurement_answer::Outcome::Rejected(rejected)) = answer.outcome {
+            assert_eq!((rejected.field.as_str(), rejected.code), (field, code), "{what}: {}", rejected.message);
+        }
+    }
+    // The session of another vehicle cannot be fed through this vehicle's key. ("grpc" belongs to a vehicle of another name.)
+    let other = v1::OpenSessionRequest { vehicle_id: "other".into(), ..Default::default() };
+    client.open_session(other).await.unwrap();
+    vehicle.publish(&v1::Measurement { session_id: "other".into(), ..spoofed }).await.unwrap();
+    let answer = vehicle.answer(PATIENCE).await.unwrap().unwrap();
+    assert!(matches!(answer.outcome, Some(v1::measurement_answer::Outcome::Rejected(r)) if r.field == "session_id" && r.code == 3));
+    assert_eq!(client.session("other").await.unwrap().history_steps, 0);
+
+    let refused = vehicle.predict(&candidates("nobody", &recorded.drive, 50, 1, 1)).await;
+    assert_refused("query of an unknown session", refused, tonic::Code::NotFound, "session_id");
+    let mut long = candidates("", &recorded.drive, 50, 1, 33);
+    assert_refused("query with K = 33", vehicle.predict(&long).await, tonic::Code::InvalidArgument, "horizon");
+    long.horizon = 32;
+    assert_refused("query with too many numbers", vehicle.predict(&long).await, tonic::Code::InvalidArgument, "controls");
+    assert_eq!((client.session("truck").await.unwrap(), client.session("grpc").await.unwrap()), before);
+
+    // Fields that this version does not know are ignored: field 1000, varint 1.
+    let mut newer = sample("", &recorded.drive, 51).encode_to_vec();
+    newer.extend([0xc0, 0x3e, 0x01]);
+    vehicle.publish_bytes(newer).await.unwrap();
+    assert_eq!(outcome_label(&vehicle.answer(PATIENCE).await.unwrap().unwrap()), "APPLIED");
+}
