@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
-use nesam_physics::{Control, SOIL_DIM, Vehicle};
+use nesam_physics::{Control, SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
 use crate::constant_velocity::constant_velocity;
@@ -113,7 +113,7 @@ fn nesam(
         samples: 1,
         horizon: window.horizon,
         map,
-        soil_correction: [0.0; SOIL_DIM],
+        soil_correction: SoilCorrection::NONE,
         variant,
     };
     let rollout =

@@ -11,7 +11,7 @@ use nesam_model::dims::HIDDEN;
 use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
 use nesam_model::{GroundSource, Predictor, RolloutQuery, Variant, history_actuators};
 use nesam_physics::step::StepModel;
-use nesam_physics::{SOIL_DIM, VehicleState};
+use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::{Pose2, WorldMap};
 
 /// Terrain tokens as the predictor sees them.
@@ -58,7 +58,7 @@ fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
         samples: 1,
         horizon: 32,
         map,
-        soil_correction: [0.0; SOIL_DIM],
+        soil_correction: SoilCorrection::NONE,
         variant,
     };
     let fast = predictor.rollout(&query).expect("a valid query");
@@ -114,7 +114,7 @@ fn property_row_of_a_batch_equals_the_row_alone() {
         samples,
         horizon,
         map: Some(&map),
-        soil_correction: [0.0; SOIL_DIM],
+        soil_correction: SoilCorrection::NONE,
         variant: Variant::Full,
     };
     let batch = predictor.rollout(&query).expect("a valid query");

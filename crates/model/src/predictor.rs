@@ -15,7 +15,7 @@ use crate::encoder::TerrainEncoders;
 use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
 use crate::ground::{GroundSource, history_actuators};
 use crate::rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
-use crate::soil_coordinates::{corrected, from_raw};
+use crate::soil_coordinates::from_raw;
 use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
 use crate::terrain_tokens::{TerrainProjection, TerrainToken, TerrainTokens, VALUES};
@@ -298,7 +298,7 @@ impl Predictor {
     }
 
     fn soil(&self, token: &TerrainToken, query: &RolloutQuery<'_>) -> [f64; SOIL_DIM] {
-        corrected(&from_raw(&raw_soil(token)), &query.soil_correction)
+        query.soil_correction.apply(&from_raw(&raw_soil(token)))
     }
 
     /// Advances up to sixteen samples by one step; returns their wheel sinkages, m.
@@ -438,7 +438,7 @@ fn validate(query: &RolloutQuery<'_>) -> Result<(), ModelError> {
     if !query.start.to_array().iter().all(|v| v.is_finite()) {
         return fail("start", "holds a number that is not finite".into());
     }
-    if !query.soil_correction.iter().all(|v| v.is_finite()) {
+    if !query.soil_correction.delta.iter().all(|v| v.is_finite()) {
         return fail("soil_correction", "holds a number that is not finite".into());
     }
     let finite = |step: &HistoryStep| {

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, WHEELS};
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
 
 /// One step of the recent past: the measured state and the command applied from it (one token of the paper, §III-B).
@@ -41,8 +41,8 @@ pub struct RolloutQuery<'a> {
     pub horizon: usize,
     /// Ground; `None` = unknown map: flat ground through the wheels and the default soil prior, flagged.
     pub map: Option<&'a Arc<WorldMap>>,
-    /// Correction Δθ of the soil prior in physical units (paper Alg. 1), zero before any update.
-    pub soil_correction: [f64; SOIL_DIM],
+    /// Correction Δθ of the soil prior (paper Alg. 1), `SoilCorrection::NONE` before any update.
+    pub soil_correction: SoilCorrection,
     /// Ablation.
     pub variant: Variant,
 }

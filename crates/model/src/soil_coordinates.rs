@@ -3,10 +3,8 @@
 //! Network and optimiser work on raw numbers; a sigmoid between the admissible bounds, in the logarithm for the scale-like parameters,
 //! makes every raw number an admissible soil, so no clip is needed inside the prior.
 
+pub use nesam_physics::SOIL_LOGARITHMIC as LOGARITHMIC;
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM};
-
-/// Parameters that vary over decades are bounded in their logarithm: k_phi, k_c, c, k_shear; n and phi are bounded linearly.
-pub const LOGARITHMIC: [bool; SOIL_DIM] = [true, true, false, true, false, true];
 
 /// Bounds of parameter `i` in the coordinate that the sigmoid runs over.
 pub fn span(i: usize) -> (f64, f64) {
@@ -31,11 +29,6 @@ pub fn to_raw(theta: &[f64; SOIL_DIM]) -> [f32; SOIL_DIM] {
         let share = ((value - low) / (high - low)).clamp(1e-4, 1.0 - 1e-4);
         (share / (1.0 - share)).ln() as f32
     })
-}
-
-/// θ̄ + Δθ, clipped to the bounds (paper Alg. 1).
-pub fn corrected(prior: &[f64; SOIL_DIM], correction: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
-    core::array::from_fn(|i| (prior[i] + correction[i]).clamp(SOIL_BOUNDS[i].0, SOIL_BOUNDS[i].1))
 }
 
 #[cfg(test)]

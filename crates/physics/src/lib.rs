@@ -6,6 +6,7 @@ pub mod effects;
 pub mod linear;
 pub mod scalar;
 mod soil;
+mod soil_correction;
 mod state;
 pub mod step;
 pub mod terramechanics;
@@ -14,5 +15,6 @@ mod vehicle;
 
 pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
+pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};
 pub use state::{Control, DT_S, STATE_DIM, VehicleState, wrap_angle};
 pub use vehicle::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};

@@ -7,7 +7,7 @@ use clap::{Args, ValueEnum};
 use nesam_evaluation::report::{LinePlot, Page, Series};
 use nesam_evaluation::{Truth, Window, horizontal_distance, pose_of};
 use nesam_model::{MAX_HORIZON, Predictor, Rollout, RolloutQuery, Variant, flag};
-use nesam_physics::{Control, SOIL_DIM, SOIL_NAMES};
+use nesam_physics::{Control, SOIL_NAMES, SoilCorrection};
 use nesam_terrain::WorldMap;
 use serde_json::{Map, Value, json};
 
@@ -178,7 +178,7 @@ fn rollout(
         samples: 1,
         horizon: controls.len(),
         map,
-        soil_correction: [0.0; SOIL_DIM],
+        soil_correction: SoilCorrection::NONE,
         variant,
     };
     predictor.rollout(&query).or_failed()
