@@ -1,0 +1,99 @@
+//! Settings of the filter and what each of them does.
+
+use nesam_physics::{SOIL_DIM, SoilCoordinates};
+
+use crate::AdaptationError;
+use crate::noise::{ChannelNoise, VelocityNoise};
+
+/// Longest buffer, so that the innovation covariance stays small.
+const BUFFER_MAX: usize = 64;
+/// More passes than this do not help: the iteration has converged or never will.
+const LINEARISATIONS_MAX: usize = 10;
+
+/// Settings of a [`crate::SoilFilter`].
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct FilterConfig {
+    /// Transitions B of one update. Longer buffers average noise and cost latency: the soil is B steps old at worst. 1 to 64.
+    pub buffer: usize,
+    /// Coordinates of the estimate and of the two standard deviations below.
+    pub coordinates: SoilCoordinates,
+    /// Standard deviations of P₀: how wrong the soil prior may be. Larger: faster first reaction, and more of the error of the model
+    /// taken for soil.
+    pub prior_sd: [f64; SOIL_DIM],
+    /// Standard deviations of Q_B: how far the soil relative to its prior may move within one buffer. Larger: follows a change of ground
+    /// faster, and never settles.
+    pub process_sd: [f64; SOIL_DIM],
+    /// R_B. Too small: the filter becomes certain of a wrong soil (NIS over its degrees of freedom well above 1); too large: it learns slowly.
+    pub noise: VelocityNoise,
+    /// A buffer whose NIS would be exceeded with less than this probability is rejected. 0 accepts everything.
+    pub gate_tail_probability: f64,
+    /// Beyond Algorithm 1: times that one buffer is linearised at most, 1 to 10 (Gauss-Newton on the same posterior; 1 = once, at Δθ⁻). Soil acts
+    /// far from linearly: a single large step overshoots, and its covariance is certain of where it landed.
+    pub linearisations: usize,
+    /// Beyond Algorithm 1: the correction stops where every θ_k of the buffer is clipped, instead of running on behind the bound, where H
+    /// is zero and nothing would bring it back; and Q_B inflates no variance beyond that of P₀ while the drive excites nothing.
+    pub bounded: bool,
+}
+
+impl Default for FilterConfig {
+    /// Relative corrections of the scale-like parameters, bounded. P₀ is the spread of soils within a semantic class and its neighbours
+    /// (a factor of two in the moduli, 0.15 in n, 5 degrees of friction); Q_B lets a tenth of it go in a buffer.
+    fn default() -> Self {
+        let prior_sd = [0.7, 0.7, 0.15, 0.5, 0.08, 0.4];
+        Self {
+            buffer: 10,
+            coordinates: SoilCoordinates::Logarithmic,
+            prior_sd,
+            process_sd: prior_sd.map(|sd| 0.1 * sd),
+            noise: default_noise(),
+            gate_tail_probability: 1e-9,
+            linearisations: 4,
+            bounded: true,
+        }
+    }
+}
+
+impl FilterConfig {
+    /// Algorithm 1 word for word: Δθ in physical units, one linearisation, nothing held at a bound, P⁻ = P⁺ + Q_B without a cap.
+    pub fn literal() -> Self {
+        let prior_sd = [1.0e6, 3.0e3, 0.15, 1.5e3, 0.08, 0.008];
+        Self {
+            coordinates: SoilCoordinates::Physical,
+            prior_sd,
+            process_sd: prior_sd.map(|sd| 0.1 * sd),
+            linearisations: 1,
+            bounded: false,
+            ..Self::default()
+        }
+    }
+
+    /// Refuses settings that no filter can run with.
+    ///
+    /// # Errors
+    /// `AdaptationError::Config` naming the setting.
+    pub fn check(&self) -> Result<(), AdaptationError> {
+        let fail = |setting, reason: String| Err(AdaptationError::Config { setting, reason });
+        if self.buffer == 0 || self.buffer > BUFFER_MAX {
+            return fail("buffer", format!("is {}, allowed are 1 to {BUFFER_MAX} transitions", self.buffer));
+        }
+        if !self.prior_sd.iter().all(|v| v.is_finite() && *v > 0.0) {
+            return fail("prior_sd", format!("is {:?}; all six must be positive", self.prior_sd));
+        }
+        if !self.process_sd.iter().all(|v| v.is_finite() && *v >= 0.0) {
+            return fail("process_sd", format!("is {:?}; all six must be at least 0", self.process_sd));
+        }
+        if !(0.0..1.0).contains(&self.gate_tail_probability) {
+            return fail("gate_tail_probability", format!("is {}, it must lie in [0, 1)", self.gate_tail_probability));
+        }
+        if self.linearisations == 0 || self.linearisations > LINEARISATIONS_MAX {
+            return fail("linearisations", format!("is {}, allowed are 1 to {LINEARISATIONS_MAX}", self.linearisations));
+        }
+        self.noise.check()
+    }
+}
+
+/// Noise to start from when nothing was estimated for a bundle: velocity sensors of a few centimetres per second and a model error as large.
+fn default_noise() -> VelocityNoise {
+    let of = |white_sd, coloured_sd| ChannelNoise { white_sd, coloured_sd, correlation: 0.6 };
+    VelocityNoise { channels: [of(0.05, 0.03), of(0.05, 0.03), of(0.06, 0.03), of(0.05, 0.03), of(0.05, 0.03), of(0.02, 0.01)] }
+}

@@ -1,0 +1,38 @@
+//! What can go wrong in the filter.
+
+use crate::VELOCITY_DIM;
+
+/// Errors of this crate. After any of them the estimate is what it was before.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum AdaptationError {
+    /// A transition or a prediction from it holds a number that is not finite.
+    #[error("{what} of transition {index} of the buffer is not finite; the buffer starts anew")]
+    NotFinite {
+        /// `input`, `measurement` or `prediction`.
+        what: &'static str,
+        /// Place in the buffer.
+        index: usize,
+    },
+    /// The innovation covariance S = H P Hᵀ + R is not positive definite.
+    #[error("the innovation covariance of {rows} rows is not positive definite; every channel of the noise needs a positive white part")]
+    SingularInnovation {
+        /// Rows of S.
+        rows: usize,
+    },
+    /// A setting of the filter is unusable.
+    #[error("filter setting `{setting}` {reason}")]
+    Config {
+        /// The setting.
+        setting: &'static str,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// Too few differences to estimate the noise from.
+    #[error("{found} consecutive transitions are too few to estimate the noise of {VELOCITY_DIM} channels, at least {needed} are needed")]
+    TooFewTransitions {
+        /// Transitions given.
+        found: usize,
+        /// Transitions needed.
+        needed: usize,
+    },
+}

@@ -1,0 +1,244 @@
+//! Algorithm 1: buffer, one update per full buffer, gate.
+
+use nalgebra::{DMatrix, DVector, SVector};
+use nesam_physics::step::StepModel;
+use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCorrection};
+
+use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_velocity};
+use crate::update::{SoilMatrix, kalman_update};
+use crate::{AdaptationError, FilterConfig, chi_square_tail};
+
+/// Share of the prior variance below which a parameter counts as learned.
+const LEARNED_SHARE: f64 = 0.5;
+/// Share of the prior standard deviation below which another linearisation would change nothing.
+const CONVERGED_SHARE: f64 = 1e-3;
+
+type SoilVector = SVector<f64, SOIL_DIM>;
+
+/// What is known of the soil correction.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SoilPosterior {
+    /// Δθ⁺.
+    pub correction: SoilCorrection,
+    /// P⁺, in the coordinates of the correction.
+    pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
+    /// Whether the drive has told something of each parameter: its variance is below half of the prior one. Where it is false, a consumer
+    /// should say "not learned" instead of a number; k_phi and k_c for instance act through one sum on a vehicle of one wheel width.
+    pub learned: [bool; SOIL_DIM],
+}
+
+impl SoilPosterior {
+    /// Standard deviation of each parameter in physical units where the prior is `prior`, to first order.
+    pub fn sd(&self, prior: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
+        let slope = self.correction.coordinates.slope(&self.correction.apply(prior));
+        core::array::from_fn(|i| slope[i] * self.covariance[i][i].sqrt())
+    }
+}
+
+/// What came of a full buffer.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SoilUpdate {
+    /// The estimate from now on; the one from before when the buffer was rejected.
+    pub posterior: SoilPosterior,
+    /// Y - Ŷ, row 6 k + c for channel c of transition k.
+    pub innovation: Vec<f64>,
+    /// Normalised innovation squared.
+    pub nis: f64,
+    /// Degrees of freedom of the NIS, 6 B.
+    pub dof: usize,
+    /// The gate refused the buffer.
+    pub rejected: bool,
+}
+
+/// The soil filter of one drive.
+#[derive(Clone, Debug)]
+pub struct SoilFilter {
+    config: FilterConfig,
+    noise: DMatrix<f64>,
+    delta: SoilVector,
+    covariance: SoilMatrix,
+    buffer: Vec<BufferedTransition>,
+}
+
+impl SoilFilter {
+    /// A filter that knows the prior only: Δθ = 0, P = P₀.
+    ///
+    /// # Errors
+    /// `AdaptationError::Config` naming the setting that is unusable.
+    pub fn new(config: FilterConfig) -> Result<Self, AdaptationError> {
+        config.check()?;
+        Ok(Self {
+            noise: config.noise.covariance(config.buffer),
+            delta: SVector::zeros(),
+            covariance: diagonal(&config.prior_sd),
+            buffer: Vec::with_capacity(config.buffer),
+            config,
+        })
+    }
+
+    /// Settings.
+    pub fn config(&self) -> &FilterConfig {
+        &self.config
+    }
+
+    /// The present estimate.
+    pub fn posterior(&self) -> SoilPosterior {
+        let p = &self.covariance;
+        SoilPosterior {
+            correction: self.correction(),
+            covariance: core::array::from_fn(|r| core::array::from_fn(|c| p[(r, c)])),
+            learned: core::array::from_fn(|i| p[(i, i)] < LEARNED_SHARE * self.config.prior_sd[i].powi(2)),
+        }
+    }
+
+    /// Transitions that wait for the next update.
+    pub fn buffered(&self) -> usize {
+        self.buffer.len()
+    }
+
+    /// Takes one transition; the B-th makes an update, which empties the buffer.
+    ///
+    /// Transitions of a buffer must follow each other without a gap: after one, call [`SoilFilter::clear_buffer`] first.
+    ///
+    /// # Errors
+    /// `NotFinite` or `SingularInnovation`; the estimate is unchanged and the buffer is empty.
+    pub fn push(&mut self, model: &StepModel, transition: BufferedTransition) -> Result<Option<SoilUpdate>, AdaptationError> {
+        if let Some(what) = not_finite(&transition) {
+            let index = self.buffer.len();
+            self.buffer.clear();
+            return Err(AdaptationError::NotFinite { what, index });
+        }
+        self.buffer.push(transition);
+        if self.buffer.len() < self.config.buffer {
+            return Ok(None);
+        }
+        let buffer = core::mem::take(&mut self.buffer);
+        let outcome = self.update(model, &buffer);
+        self.buffer = buffer;
+        self.buffer.clear();
+        outcome.map(Some)
+    }
+
+    /// Forgets the transitions that wait: measurements were lost, so the next one does not follow the last.
+    pub fn clear_buffer(&mut self) {
+        self.buffer.clear();
+    }
+
+    fn correction(&self) -> SoilCorrection {
+        self.corrected_by(&self.delta)
+    }
+
+    fn corrected_by(&self, delta: &SoilVector) -> SoilCorrection {
+        SoilCorrection { coordinates: self.config.coordinates, delta: core::array::from_fn(|i| delta[i]) }
+    }
+
+    /// Lines "Δθ⁻ ← Δθ⁺" to "P⁺" of Algorithm 1. NIS and gate belong to the linearisation at Δθ⁻; later ones, where the settings ask for
+    /// them, solve for the same posterior from a better point: e_i = Y - Ŷ(Δ_i) - H_i (Δθ⁻ - Δ_i).
+    fn update(&mut self, model: &StepModel, buffer: &[BufferedTransition]) -> Result<SoilUpdate, AdaptationError> {
+        let (prior, before) = (self.inflated(), self.delta);
+        let first = linearise(model, buffer, &self.correction())?;
+        let mut step = kalman_update(&prior, &first.jacobian, &self.noise, &first.innovation)?;
+        let (nis, dof) = (step.nis, first.innovation.len());
+        let rejected = chi_square_tail(dof, nis) < self.config.gate_tail_probability;
+        if !rejected {
+            let mut delta = self.held(before + step.change, buffer);
+            let mut last_move = step.change;
+            for _ in 1..self.config.linearisations {
+                if (0..SOIL_DIM).all(|i| last_move[i].abs() < CONVERGED_SHARE * self.config.prior_sd[i]) {
+                    break;
+                }
+                let again = linearise(model, buffer, &self.corrected_by(&delta))?;
+                let innovation = &again.innovation - &again.jacobian * (before - delta);
+                step = kalman_update(&prior, &again.jacobian, &self.noise, &innovation)?;
+                let next = self.held(before + step.change, buffer);
+                last_move = next - delta;
+                delta = next;
+            }
+            self.delta = delta;
+            self.covariance = step.covariance;
+        }
+        let innovation = first.innovation.iter().copied().collect();
+        Ok(SoilUpdate { posterior: self.posterior(), innovation, nis, dof, rejected })
+    }
+
+    /// P⁻ = P⁺ + Q_B; with `bounded`, no variance above that of P₀. Rows and columns are scaled together, so correlations stay.
+    fn inflated(&self) -> SoilMatrix {
+        let prior = self.covariance + diagonal(&self.config.process_sd);
+        if !self.config.bounded {
+            return prior;
+        }
+        let scale: [f64; SOIL_DIM] = core::array::from_fn(|i| (self.config.prior_sd[i] / prior[(i, i)].sqrt()).min(1.0));
+        SoilMatrix::from_fn(|r, c| prior[(r, c)] * scale[r] * scale[c])
+    }
+
+    /// The correction, with `bounded` moved to where at least one transition of the buffer is not clipped beyond its bound.
+    fn held(&self, delta: SoilVector, buffer: &[BufferedTransition]) -> SoilVector {
+        if !self.config.bounded {
+            return delta;
+        }
+        let [low, high] = [SOIL_BOUNDS.map(|b| b.0), SOIL_BOUNDS.map(|b| b.1)];
+        let coordinates = self.config.coordinates;
+        let mut reach = [[f64::INFINITY; SOIL_DIM], [f64::NEG_INFINITY; SOIL_DIM]];
+        for transition in buffer {
+            let prior = transition.input.soil.to_array();
+            let (down, up) = (coordinates.between(&prior, &low), coordinates.between(&prior, &high));
+            for i in 0..SOIL_DIM {
+                reach[0][i] = reach[0][i].min(down[i]);
+                reach[1][i] = reach[1][i].max(up[i]);
+            }
+        }
+        SoilVector::from_fn(|i, _| delta[i].max(reach[0][i]).min(reach[1][i]))
+    }
+}
+
+/// Y - Ŷ and H of a buffer at one correction.
+struct Linearisation {
+    innovation: DVector<f64>,
+    jacobian: DMatrix<f64>,
+}
+
+fn linearise(model: &StepModel, buffer: &[BufferedTransition], correction: &SoilCorrection) -> Result<Linearisation, AdaptationError> {
+    let rows = buffer.len() * VELOCITY_DIM;
+    let (mut innovation, mut jacobian) = (DVector::zeros(rows), DMatrix::zeros(rows, SOIL_DIM));
+    for (index, transition) in buffer.iter().enumerate() {
+        let predicted = predict_velocity(model, transition, correction);
+        if !predicted.velocity.iter().chain(predicted.jacobian.as_flattened()).all(|v| v.is_finite()) {
+            return Err(AdaptationError::NotFinite { what: "prediction", index });
+        }
+        for c in 0..VELOCITY_DIM {
+            let row = index * VELOCITY_DIM + c;
+            innovation[row] = transition.measured_next[c] - predicted.velocity[c];
+            for i in 0..SOIL_DIM {
+                jacobian[(row, i)] = predicted.jacobian[c][i];
+            }
+        }
+    }
+    Ok(Linearisation { innovation, jacobian })
+}
+
+fn diagonal(sd: &[f64; SOIL_DIM]) -> SoilMatrix {
+    SoilMatrix::from_diagonal(&SVector::from_fn(|i, _| sd[i] * sd[i]))
+}
+
+/// Names the part of a transition that is not finite.
+fn not_finite(transition: &BufferedTransition) -> Option<&'static str> {
+    let input = &transition.input;
+    let wheels = &input.wheels;
+    let ground = input.ground.iter().flat_map(|g| [g.height_m, g.slope_ahead, g.slope_left]);
+    let scalars = [wheels.rim_follow, wheels.rim_gain, wheels.overspeed_limit_m_s, wheels.speed_m_s];
+    let mut numbers = input
+        .state
+        .to_array()
+        .into_iter()
+        .chain(input.soil.to_array())
+        .chain(input.sinkage_log_ratio)
+        .chain(wheels.angle_rad)
+        .chain(wheels.rim_base_m_s)
+        .chain(scalars)
+        .chain(ground)
+        .chain(transition.residual);
+    if !numbers.all(f64::is_finite) {
+        return Some("input");
+    }
+    (!transition.measured_next.iter().all(|v| v.is_finite())).then_some("measurement")
+}

@@ -1,0 +1,81 @@
+//! One-step predictions of the velocities and how they depend on the soil correction.
+
+use nesam_physics::driveline::WheelCommand;
+use nesam_physics::scalar::Dual;
+use nesam_physics::step::{Ground, StepInput, StepModel};
+use nesam_physics::{Real, SOIL_DIM, STATE_DIM, Soil, SoilCorrection};
+
+/// Channels of y = [v, ω].
+pub const VELOCITY_DIM: usize = 6;
+
+/// Where the velocities begin in the state vector.
+const VELOCITY_AT: usize = STATE_DIM - VELOCITY_DIM;
+
+/// A number and its derivatives with respect to the six entries of Δθ.
+type SoilDual = Dual<f64, SOIL_DIM>;
+
+/// One measured transition (x_k, u_k, m_k) → y_{k+1}, with everything the network says of it.
+#[derive(Clone, Copy, Debug)]
+pub struct BufferedTransition {
+    /// Input of the physics: measured state x_k, what the drive line makes of u_k, sinkage ratios, ground, and the *prior* soil θ̄(m_k).
+    pub input: StepInput<f64>,
+    /// Learned state residual Δx_res of the step.
+    pub residual: [f64; STATE_DIM],
+    /// Measured y_{k+1} = [v, ω] in Body, m/s and rad/s.
+    pub measured_next: [f64; VELOCITY_DIM],
+}
+
+/// Predicted velocities after one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct VelocityPrediction {
+    /// ŷ_{k+1}, m/s and rad/s.
+    pub velocity: [f64; VELOCITY_DIM],
+    /// ∂ŷ/∂Δθ, one row per channel; a column is zero where the clip holds the parameter.
+    pub jacobian: [[f64; SOIL_DIM]; VELOCITY_DIM],
+}
+
+/// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
+pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
+    let delta: [SoilDual; SOIL_DIM] = core::array::from_fn(|i| SoilDual::variable(correction.delta[i], i));
+    let soil = correction.coordinates.correct(&transition.input.soil.to_array(), &delta);
+    let increment = model.step(&with_soil(&transition.input, Soil::from_array(soil))).increment.to_array();
+    let state = transition.input.state.to_array();
+    VelocityPrediction {
+        velocity: core::array::from_fn(|c| {
+            let at = VELOCITY_AT + c;
+            state[at] + increment[at].re + transition.residual[at]
+        }),
+        jacobian: core::array::from_fn(|c| increment[VELOCITY_AT + c].eps),
+    }
+}
+
+impl BufferedTransition {
+    /// y - ŷ at a correction.
+    pub fn innovation(&self, model: &StepModel, correction: &SoilCorrection) -> [f64; VELOCITY_DIM] {
+        let predicted = predict_velocity(model, self, correction).velocity;
+        core::array::from_fn(|c| self.measured_next[c] - predicted[c])
+    }
+}
+
+/// The input with another soil, in the scalar of that soil; everything else is constant.
+fn with_soil<T: Real>(input: &StepInput<f64>, soil: Soil<T>) -> StepInput<T> {
+    let wheels = &input.wheels;
+    StepInput {
+        state: input.state.map(T::lit),
+        wheels: WheelCommand {
+            angle_rad: wheels.angle_rad.map(T::lit),
+            rim_base_m_s: wheels.rim_base_m_s.map(T::lit),
+            rim_follow: T::lit(wheels.rim_follow),
+            rim_gain: T::lit(wheels.rim_gain),
+            overspeed_limit_m_s: T::lit(wheels.overspeed_limit_m_s),
+            speed_m_s: T::lit(wheels.speed_m_s),
+        },
+        sinkage_log_ratio: input.sinkage_log_ratio.map(T::lit),
+        soil,
+        ground: input.ground.map(|g| Ground {
+            height_m: T::lit(g.height_m),
+            slope_ahead: T::lit(g.slope_ahead),
+            slope_left: T::lit(g.slope_left),
+        }),
+    }
+}
