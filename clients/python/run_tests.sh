@@ -15,4 +15,4 @@ venv=$root/target/python-client
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --upgrade "$here[test]"
 # The tests run from their own folder, so that the installed package is tested and not the source folder.
 cd "$here/tests"
-exec "$venv/bin/python" -m pytest -q -p no:cacheprovider --rootdir "$here" --server "$server" "$@"
+exec "$venv/bin/python" -m pytest -q -p no:cacheprovider -c "$here/pyproject.toml" "$here/tests" --server "$server" "$@"
