@@ -1,0 +1,81 @@
+#pragma once
+
+#include <chrono>
+#include <cstdint>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include <nesam/error.hpp>
+#include <nesam/session.hpp>
+#include <nesam/terrain.hpp>
+#include <nesam/types.hpp>
+
+namespace nesam {
+
+/// Settings of a connection.
+struct ClientOptions {
+  /// Longest wait of a call that brings no timeout of its own.
+  std::chrono::nanoseconds timeout = std::chrono::seconds(10);
+  /// Longest wait of a map upload that brings none.
+  std::chrono::nanoseconds upload_timeout = std::chrono::seconds(120);
+  /// Longest wait of `~Session` for the answer to its close.
+  std::chrono::nanoseconds close_timeout = std::chrono::seconds(1);
+  /// Interval of keep-alive pings; a server that has gone is noticed after about twice this.
+  std::chrono::milliseconds keepalive = std::chrono::seconds(20);
+  /// Largest reply, bytes. 4096 samples x 16 steps take 4 MiB with all channels and the sinkage.
+  int reply_bytes_max = 64 << 20;
+  /// Whether to honour the proxy that the environment names. Off: planners talk to a machine nearby.
+  bool use_proxy = false;
+};
+
+/// A connection to a nesam server. Cheap calls, safe from several threads at once.
+///
+/// The connection is made with the first call and again after a failure; a call on a server that cannot be reached fails with UNAVAILABLE. It is neither
+/// encrypted nor authenticated: keep it on a trusted network or put a proxy before the server.
+class Client {
+ public:
+  /// `target` is `host:port`. Nothing is sent yet.
+  explicit Client(const std::string& target, ClientOptions options = {});
+  Client(Client&&) noexcept;
+  Client& operator=(Client&&) noexcept;
+  ~Client();
+
+  /// Waits for a connection. DEADLINE_EXCEEDED: none in time.
+  Result<void> connect(std::chrono::nanoseconds timeout);
+
+  /// Opens a session.
+  ///
+  /// INVALID_ARGUMENT: a bad name, a vehicle card that the bundle was not trained for, a bad initial measurement. NOT_FOUND: unknown map. ALREADY_EXISTS: the
+  /// session is open. RESOURCE_EXHAUSTED: too many sessions.
+  Result<Session> open(const OpenOptions& options, Timeout timeout = {});
+
+  /// Takes over a session that is open already; the returned object closes it when it goes. NOT_FOUND: unknown session.
+  Result<Session> attach(const std::string& session_id, Timeout timeout = {});
+
+  /// Reads a session. NOT_FOUND: unknown session.
+  Result<SessionStatus> session(const std::string& session_id, Timeout timeout = {}) const;
+
+  /// The open sessions, by session id.
+  Result<std::vector<SessionStatus>> sessions(Timeout timeout = {}) const;
+
+  /// Closes a session by name. NOT_FOUND: unknown session.
+  Result<void> close(const std::string& session_id, Timeout timeout = {});
+
+  /// Uploads a map in tiles.
+  ///
+  /// INVALID_ARGUMENT: a layer does not have the shape of the geometry, or the server refuses a field. ALREADY_EXISTS: the map is there in this or a newer
+  /// version. RESOURCE_EXHAUSTED: too many maps, pixels or simultaneous uploads.
+  Result<MapDescription> upload_map(const Map& map, Timeout timeout = {});
+
+  /// The maps that the server holds, by id.
+  Result<std::vector<MapDescription>> maps(Timeout timeout = {}) const;
+
+  /// Forgets a map. NOT_FOUND: unknown map. FAILED_PRECONDITION: a session drives on it.
+  Result<void> delete_map(const std::string& map_id, Timeout timeout = {});
+
+ private:
+  std::shared_ptr<detail::Core> core_;
+};
+
+}  // namespace nesam

@@ -1,0 +1,83 @@
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <optional>
+#include <string>
+#include <variant>
+
+#include <nesam/error.hpp>
+#include <nesam/types.hpp>
+
+namespace nesam {
+
+/// What a vehicle knows at one instant.
+struct Measurement {
+  /// Instant of the state, ns of the vehicle's clock; only differences matter.
+  std::int64_t stamp_ns = 0;
+  /// Increases by at least 1 with each measurement; 0 = not numbered. Resending is always safe.
+  std::uint64_t sequence = 0;
+  /// Pose in World, twist in Body.
+  VehicleState state;
+  /// Command that the vehicle applies from this instant on.
+  Control command;
+  /// Speeds of the four wheels about their axles, rad/s, positive forward, where measured.
+  std::optional<std::array<double, 4>> wheel_speed_rad_s;
+  /// Road-wheel angles of the front left and front right wheel, rad, positive left, where measured.
+  std::optional<std::array<double, 2>> road_wheel_angle_rad;
+};
+
+/// The measurement is the newest step of the history.
+struct Applied {
+  std::uint32_t history_steps = 0;  ///< Steps in the history now, 1 to 32.
+};
+/// Accepted, but denser than the 0.1 s grid of the model: it waits for the next grid point.
+struct Buffered {
+  double next_step_in_s = 0.0;
+};
+/// This stamp or sequence number was accepted before. Nothing changed.
+struct Duplicate {};
+/// The stamp or the sequence number lies before the newest accepted one. Nothing changed.
+struct TooOld {
+  double behind_s = 0.0;  ///< 0 when only the sequence number is old.
+};
+/// A number is NaN or infinite. Nothing changed.
+struct NotFinite {
+  std::string field;  ///< For example `state.velocity_m_s.x`.
+};
+/// In the history, but refused by the soil filter because it disagrees too much with the prediction.
+struct Gated {
+  double nis = 0.0;  ///< Normalised innovation squared, -.
+};
+/// Applied after a pause of more than 1.5 steps: the history starts again here.
+struct Gap {
+  double gap_s = 0.0;
+};
+/// Not a valid measurement for this session. Nothing changed.
+struct Rejected {
+  Code code = Code::unknown;
+  std::string field;
+  std::string message;
+};
+/// An outcome that this version of the client does not know.
+struct Unrecognised {};
+
+/// The answer to one measurement.
+struct MeasurementAnswer {
+  std::string session_id;
+  std::uint64_t sequence = 0;       ///< Copied from the measurement.
+  std::int64_t stamp_ns = 0;        ///< Copied from the measurement.
+  std::uint64_t history_epoch = 0;  ///< After this measurement.
+  std::uint64_t soil_epoch = 0;     ///< After this measurement.
+  std::variant<Applied, Buffered, Duplicate, TooOld, NotFinite, Gated, Gap, Rejected, Unrecognised> outcome = Unrecognised{};
+
+  /// The outcome if it is of this type, else null.
+  template <class T>
+  const T* is() const noexcept {
+    return std::get_if<T>(&outcome);
+  }
+  /// Whether the measurement changed the session: Applied, Buffered, Gated or Gap.
+  bool accepted() const noexcept { return is<Applied>() || is<Buffered>() || is<Gated>() || is<Gap>(); }
+};
+
+}  // namespace nesam

@@ -1,0 +1,13 @@
+#pragma once
+
+// Everything of the client.
+
+#include <nesam/client.hpp>
+#include <nesam/error.hpp>
+#include <nesam/measurement.hpp>
+#include <nesam/measurement_stream.hpp>
+#include <nesam/prediction.hpp>
+#include <nesam/session.hpp>
+#include <nesam/span.hpp>
+#include <nesam/terrain.hpp>
+#include <nesam/types.hpp>

@@ -1,0 +1,95 @@
+#pragma once
+
+#include <cstdint>
+#include <optional>
+#include <vector>
+
+#include <nesam/span.hpp>
+#include <nesam/types.hpp>
+
+namespace nesam {
+
+/// Channel of a predicted state: the order of the 12-vector and the bit of a channel mask. m, rad, m/s (Body), rad/s (Body).
+enum class Channel : std::uint32_t { x, y, z, roll, pitch, yaw, vx, vy, vz, wx, wy, wz };
+
+/// The bit of a channel in a mask.
+constexpr std::uint32_t bit(Channel channel) noexcept { return std::uint32_t{1} << static_cast<std::uint32_t>(channel); }
+
+/// All twelve channels.
+constexpr std::uint32_t all_channels = 0xfff;
+
+/// Bits of `Prediction::validity`. 0 = nothing to say against the sample.
+enum Validity : std::uint32_t {
+  validity_not_finite = 1,          ///< A state of this sample is not finite; the other samples are unaffected.
+  validity_off_map = 2,             ///< The sample left the known map.
+  validity_no_map = 4,              ///< The session has no map: flat ground and the default soil were used.
+  validity_speed_untrained = 8,     ///< A speed command lies outside the trained range.
+  validity_steering_untrained = 16, ///< A second command lies outside the trained range.
+  validity_slope_untrained = 32,    ///< Roll or pitch lies outside the trained range.
+  validity_overturned = 64,         ///< |roll| or |pitch| over 60 degrees.
+};
+
+/// Whether the measured history of the session may speak for the start state.
+enum class HistoryUse {
+  measured = 1,  ///< The history precedes the start. A given start is taken to hold at the newest measurement and replaces its state.
+  none = 2,      ///< The start stands alone, as for a what-if question at another place.
+};
+
+/// A batch of candidate command sequences.
+struct PredictRequest {
+  /// Shape (N, K, 2): speed in m/s, second command in the unit of the vehicle card. N 1 to 4096, K 1 to 32. Only read during the call.
+  View3<const float> controls;
+  /// State to start from; absent = the newest measured step.
+  std::optional<VehicleState> start;
+  HistoryUse history_use = HistoryUse::measured;
+  /// Channels to return, a sum of `bit(Channel)`; 0 = all twelve.
+  std::uint32_t channels = 0;
+  /// Returns the steps stride, 2 stride, ... up to K.
+  std::uint32_t stride = 1;
+  /// Also return the sinkage of the four wheels.
+  bool wheel_sinkage = false;
+  /// Copied to the reply; for the caller's own use.
+  std::uint64_t tag = 0;
+};
+
+/// The predicted states and what they were computed from.
+class Prediction {
+ public:
+  /// Shape (N, floor(K / stride), C) with C = number of channels asked for, in the order of `Channel`; yaw in (-pi, pi]. Step k (from 0) is the state
+  /// (k + 1) stride x 0.1 s after the start. Valid as long as this object is neither changed nor moved from.
+  View3<const float> states() const noexcept { return {states_storage, samples, steps, channel_count()}; }
+  /// Sinkage of the wheels, m, shape (N, floor(K / stride), 4); empty unless asked for.
+  View3<const float> sinkage_m() const noexcept {
+    return sinkage_storage_m.empty() ? View3<const float>{} : View3<const float>{sinkage_storage_m, samples, steps, 4};
+  }
+  /// Column of a channel in `states()`; absent when it was not asked for.
+  std::optional<std::size_t> column(Channel channel) const noexcept;
+  /// Number of channels returned.
+  std::size_t channel_count() const noexcept;
+
+  std::uint64_t tag = 0;
+  std::size_t samples = 0;
+  std::size_t steps = 0;
+  /// Channels returned, a sum of `bit(Channel)`.
+  std::uint32_t channels = 0;
+  std::vector<float> states_storage;
+  std::vector<float> sinkage_storage_m;
+  /// One word for each sample: the sum of its `Validity` bits.
+  std::vector<std::uint32_t> validity;
+  /// State that the rollout started from.
+  VehicleState start;
+  /// Measured steps that preceded the start, 0 to 31.
+  std::uint32_t history_steps = 0;
+  /// Soil used under the start: prior plus correction, clipped to the admissible range.
+  SoilVector soil;
+  /// Variance of that soil to first order, units of `SoilVector` squared; absent while no filter runs.
+  std::optional<SoilVector> soil_variance;
+  /// Time between the arrival of the session's newest measurement and the start of this computation, s; absent before the first.
+  std::optional<double> measurement_age_s;
+  Provenance provenance;
+  /// Time that the request waited for the engine and time that the engine computed, s.
+  double queue_s = 0.0;
+  double compute_s = 0.0;
+};
+
+}  // namespace nesam

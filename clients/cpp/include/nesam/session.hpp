@@ -1,0 +1,84 @@
+#pragma once
+
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include <nesam/error.hpp>
+#include <nesam/measurement.hpp>
+#include <nesam/measurement_stream.hpp>
+#include <nesam/prediction.hpp>
+#include <nesam/span.hpp>
+#include <nesam/types.hpp>
+
+namespace nesam {
+
+namespace detail {
+class Core;
+struct SessionImpl;
+}  // namespace detail
+
+/// What to open.
+struct OpenOptions {
+  /// 1 to 64 of A-Z a-z 0-9 _ . -
+  std::string vehicle_id;
+  /// Name of the session, same characters; empty = the vehicle id.
+  std::string session_id;
+  /// Name of the vehicle card that the caller expects; empty = whatever the bundle was trained for.
+  std::string vehicle_card;
+  /// Uploaded map to drive on; empty = flat ground and the default soil, and every prediction says so (`validity_no_map`).
+  std::string map_id;
+  /// First measurement, if there is one already.
+  std::optional<Measurement> initial;
+};
+
+/// An open session, closed when this object goes (unless `detach`ed): the service forgets the vehicle's history then.
+///
+/// All methods may be called from several threads at once. The object keeps the connection of its `Client` alive. A moved-from session may only be assigned to
+/// or destroyed.
+class Session {
+ public:
+  Session(Session&& other) noexcept;
+  Session& operator=(Session&& other) noexcept;
+  /// Closes the session if it is still open, waiting at most `ClientOptions::close_timeout`; a failure is ignored.
+  ~Session();
+
+  const std::string& id() const noexcept;
+  /// Vehicle card of the server's bundle: ranges and meaning of the commands.
+  const VehicleCard& vehicle() const noexcept;
+
+  /// The session as the service holds it now. NOT_FOUND: it was closed.
+  Result<SessionStatus> status(Timeout timeout = {}) const;
+
+  /// Rolls N candidate command sequences K steps of 0.1 s ahead. Only reads the session. The first prediction at a new place takes longer, because the
+  /// service encodes the terrain there.
+  ///
+  /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: the session was closed. FAILED_PRECONDITION: no start state and no measurement yet, or the
+  /// measured position lies outside the map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not in time.
+  Result<Prediction> predict(const PredictRequest& request, Timeout timeout = {}) const;
+
+  /// Opens a stream of measurements into this session, for senders that do not wait for each answer. UNAVAILABLE comes out of its first `receive`.
+  Result<MeasurementStream> measurements() const;
+
+  /// Sends one measurement and waits for its answer, on a stream that stays open between calls.
+  ///
+  /// DEADLINE_EXCEEDED and UNAVAILABLE leave open whether the measurement was applied; sending it again is safe and answered with `Duplicate` if it was.
+  Result<MeasurementAnswer> send(const Measurement& measurement, Timeout timeout = {});
+
+  /// Sends several measurements at once and waits for all answers, in order. The timeout holds for all of them together; errors as for one.
+  Result<std::vector<MeasurementAnswer>> send(Span<const Measurement> measurements, Timeout timeout = {});
+
+  /// Closes the session. NOT_FOUND: it was closed already. After a failure other than NOT_FOUND the destructor tries once more.
+  Result<void> close(Timeout timeout = {});
+
+  /// Leaves the session open on the server when this object goes. Returns its id, for `Client::attach`.
+  std::string detach() noexcept;
+
+ private:
+  friend class Client;
+  explicit Session(std::unique_ptr<detail::SessionImpl> impl);
+  std::unique_ptr<detail::SessionImpl> impl_;
+};
+
+}  // namespace nesam

@@ -1,0 +1,90 @@
+#!/usr/bin/env bash
+# Builds the C++ client and tests it against a running server.
+#
+# Usage: run_tests.sh <nesam binary> [more arguments of `nesam serve`, for example --bundle DIR]
+# Environment: NESAM_SANITIZE (for example address,undefined) builds with sanitizers, in a folder of its own; JOBS parallel compilers (default 2).
+# Exit code: 0 passed, 1 failed, 2 wrong usage or missing packages.
+set -euo pipefail
+
+here="$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)"
+root="$(cd "$here/../.." && pwd)"
+build="$root/target/cpp-client${NESAM_SANITIZE:+-${NESAM_SANITIZE//,/-}}"
+
+if [ $# -lt 1 ] || [ ! -x "$1" ]; then
+  echo "usage: run_tests.sh <nesam binary> [arguments of nesam serve]" >&2
+  exit 2
+fi
+binary="$(cd "$(dirname "$1")" && pwd)/$(basename "$1")"
+shift
+
+packages=(g++ cmake make pkg-config protobuf-compiler protobuf-compiler-grpc libprotobuf-dev libgrpc++-dev)
+tools_present() {
+  local tool
+  for tool in g++ cmake make pkg-config protoc grpc_cpp_plugin; do
+    command -v "$tool" > /dev/null || return 1
+  done
+  pkg-config --exists grpc++ protobuf
+}
+if ! tools_present; then
+  if [ "$(id -u)" -eq 0 ] && command -v apt-get > /dev/null; then
+    apt-get update -qq
+    DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends "${packages[@]}" > /dev/null
+  else
+    echo "run_tests.sh: install these packages first: ${packages[*]}" >&2
+    exit 2
+  fi
+fi
+
+# The build yields to whatever else the machine does.
+jobs="${JOBS:-2}"
+cmake -S "$here" -B "$build" -DNESAM_SANITIZE="${NESAM_SANITIZE:-}" -DNESAM_BUILD_EXAMPLES=OFF -DCMAKE_INSTALL_LIBDIR=lib > /dev/null
+nice -n 15 cmake --build "$build" -j "$jobs"
+# The example is built as a stranger would: against the installed package.
+cmake --install "$build" --prefix "$build/prefix" > /dev/null
+cmake -S "$here/examples" -B "$build/examples" -DCMAKE_BUILD_TYPE=Release -DCMAKE_PREFIX_PATH="$build/prefix" > /dev/null
+nice -n 15 cmake --build "$build/examples" -j "$jobs"
+
+scratch="$(mktemp -d)"
+server=""
+stop_server() {
+  [ -n "$server" ] || return 0
+  kill -TERM "$server" 2> /dev/null || true
+  local status=0
+  wait "$server" || status=$?
+  server=""
+  return "$status"
+}
+clean_up() {
+  stop_server || true
+  rm -rf "$scratch"
+}
+trap clean_up EXIT
+
+# The server takes a free port and says which on its standard output.
+"$binary" serve --grpc 127.0.0.1:0 --no-http --no-zenoh "$@" > "$scratch/server.out" 2> "$scratch/server.log" &
+server=$!
+address=""
+for _ in $(seq 600); do
+  address="$(sed -n 's/^grpc  *\([^ ]*\)$/\1/p' "$scratch/server.out")"
+  [ -z "$address" ] || break
+  kill -0 "$server" 2> /dev/null || break
+  sleep 0.1
+done
+if [ -z "$address" ]; then
+  echo "run_tests.sh: the server did not start:" >&2
+  cat "$scratch/server.out" "$scratch/server.log" >&2
+  exit 1
+fi
+
+failed=no
+timeout 300 "$build/client_test" "$address" || failed=yes
+timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
+stop_server || {
+  echo "run_tests.sh: the server did not stop cleanly" >&2
+  failed=yes
+}
+if [ "$failed" = yes ]; then
+  echo "run_tests.sh: log of the server:" >&2
+  tail -n 40 "$scratch/server.log" >&2
+  exit 1
+fi

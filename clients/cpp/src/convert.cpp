@@ -1,0 +1,240 @@
+#include "convert.hpp"
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <utility>
+
+namespace nesam::detail {
+
+static_assert(std::numeric_limits<float>::is_iec559 && sizeof(float) == 4, "packed arrays are IEEE 754 binary32");
+
+namespace {
+
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ == __ORDER_BIG_ENDIAN__
+constexpr bool little_endian = false;
+#else
+constexpr bool little_endian = true;
+#endif
+
+/// Turns the bytes of each value round on a big-endian machine.
+void swap_if_needed(char* bytes, std::size_t values) {
+  if constexpr (!little_endian) {
+    for (std::size_t i = 0; i < values; ++i, bytes += 4) {
+      std::swap(bytes[0], bytes[3]);
+      std::swap(bytes[1], bytes[2]);
+    }
+  }
+  (void)bytes;
+  (void)values;
+}
+
+void set(v1::Vector3* message, const std::array<double, 3>& vector) {
+  message->set_x(vector[0]);
+  message->set_y(vector[1]);
+  message->set_z(vector[2]);
+}
+
+void set(v1::VehicleState* message, const VehicleState& state) {
+  set(message->mutable_position_m(), state.position_m);
+  set(message->mutable_attitude_rad(), state.attitude_rad);
+  set(message->mutable_velocity_m_s(), state.velocity_m_s);
+  set(message->mutable_angular_velocity_rad_s(), state.angular_velocity_rad_s);
+}
+
+std::array<double, 3> from_message(const v1::Vector3& message) { return {message.x(), message.y(), message.z()}; }
+
+VehicleState from_message(const v1::VehicleState& message) {
+  return {from_message(message.position_m()), from_message(message.attitude_rad()), from_message(message.velocity_m_s()),
+          from_message(message.angular_velocity_rad_s())};
+}
+
+SoilVector from_message(const v1::SoilVector& message) {
+  return {message.k_phi(), message.k_c(), message.n(), message.c_pa(), message.phi_rad(), message.k_shear_m()};
+}
+
+SoilCorrection from_message(const v1::SoilCorrection& message) {
+  SoilCorrection correction;
+  const int coordinates = static_cast<int>(message.coordinates());
+  correction.coordinates = coordinates == 1 || coordinates == 2 ? static_cast<SoilCoordinates>(coordinates) : SoilCoordinates::unspecified;
+  correction.delta = from_message(message.delta());
+  if (message.has_variance()) correction.variance = from_message(message.variance());
+  const int known = std::min(static_cast<int>(correction.learned.size()), message.learned_size());
+  for (int i = 0; i < known; ++i) correction.learned[static_cast<std::size_t>(i)] = message.learned(i);
+  return correction;
+}
+
+Provenance from_message(const v1::Provenance& message) {
+  return {message.history_epoch(), message.soil_epoch(), message.map_id(), message.map_version(), message.map_hash(), message.bundle_name(),
+          message.bundle_hash()};
+}
+
+VehicleCard from_message(const v1::VehicleCard& message) {
+  VehicleCard card;
+  card.name = message.name();
+  const int second = static_cast<int>(message.second());
+  card.second = second >= 1 && second <= 3 ? static_cast<SecondCommand>(second) : SecondCommand::unspecified;
+  card.speed_min_m_s = message.speed_min_m_s();
+  card.speed_max_m_s = message.speed_max_m_s();
+  card.second_min = message.second_min();
+  card.second_max = message.second_max();
+  card.wheelbase_m = message.wheelbase_m();
+  card.road_wheel_angle_max_rad = message.road_wheel_angle_max_rad();
+  return card;
+}
+
+}  // namespace
+
+Code code_from(int code) noexcept { return code >= 1 && code <= 16 ? static_cast<Code>(code) : Code::unknown; }
+
+void pack(Span<const float> values, std::string& bytes) {
+  if (values.empty()) return;
+  const std::size_t before = bytes.size();
+  bytes.resize(before + 4 * values.size());
+  std::memcpy(&bytes[before], values.data(), 4 * values.size());
+  swap_if_needed(&bytes[before], values.size());
+}
+
+std::vector<float> unpack(const std::string& bytes) {
+  std::vector<float> values(bytes.size() / 4);
+  if (values.empty()) return values;
+  if constexpr (little_endian) {
+    std::memcpy(values.data(), bytes.data(), 4 * values.size());
+  } else {
+    std::string copy = bytes;
+    swap_if_needed(&copy[0], values.size());
+    std::memcpy(values.data(), copy.data(), 4 * values.size());
+  }
+  return values;
+}
+
+v1::Measurement to_message(const std::string& session_id, const Measurement& measurement) {
+  v1::Measurement message;
+  message.set_session_id(session_id);
+  message.set_sequence(measurement.sequence);
+  message.set_stamp_ns(measurement.stamp_ns);
+  set(message.mutable_state(), measurement.state);
+  message.mutable_command()->set_speed_m_s(measurement.command.speed_m_s);
+  message.mutable_command()->set_second(measurement.command.second);
+  if (measurement.wheel_speed_rad_s) {
+    for (const double speed : *measurement.wheel_speed_rad_s) message.mutable_wheels()->add_speed_rad_s(speed);
+  }
+  if (measurement.road_wheel_angle_rad) {
+    for (const double angle : *measurement.road_wheel_angle_rad) message.mutable_wheels()->add_road_wheel_angle_rad(angle);
+  }
+  return message;
+}
+
+v1::OpenSessionRequest to_message(const OpenOptions& options) {
+  v1::OpenSessionRequest message;
+  message.set_vehicle_id(options.vehicle_id);
+  message.set_session_id(options.session_id);
+  message.set_vehicle_card(options.vehicle_card);
+  message.set_map_id(options.map_id);
+  if (options.initial) *message.mutable_initial() = to_message(std::string(), *options.initial);
+  return message;
+}
+
+v1::PredictRequest to_message(const std::string& session_id, const PredictRequest& request) {
+  v1::PredictRequest message;
+  message.set_session_id(session_id);
+  if (request.start) set(message.mutable_start(), *request.start);
+  message.set_history_use(request.history_use == HistoryUse::none ? v1::HISTORY_USE_NONE : v1::HISTORY_USE_MEASURED);
+  message.set_samples(static_cast<std::uint32_t>(request.controls.samples()));
+  message.set_horizon(static_cast<std::uint32_t>(request.controls.steps()));
+  pack(request.controls.values(), *message.mutable_controls());
+  message.mutable_output()->set_channels(request.channels);
+  message.mutable_output()->set_stride(request.stride);
+  message.mutable_output()->set_wheel_sinkage(request.wheel_sinkage);
+  message.set_tag(request.tag);
+  return message;
+}
+
+v1::MapHeader to_header(const Map& map) {
+  v1::MapHeader header;
+  header.set_map_id(map.id);
+  header.set_version(map.version);
+  header.set_origin_x_m(map.geometry.origin_m[0]);
+  header.set_origin_y_m(map.geometry.origin_m[1]);
+  header.set_resolution_m(map.geometry.resolution_m);
+  header.set_width(map.geometry.width);
+  header.set_height(map.geometry.height);
+  header.set_semantic(!map.semantic_rgb.empty());
+  return header;
+}
+
+SessionStatus from_message(const v1::Session& message) {
+  SessionStatus status;
+  status.session_id = message.session_id();
+  status.vehicle_id = message.vehicle_id();
+  status.provenance = from_message(message.provenance());
+  status.vehicle = from_message(message.vehicle());
+  status.history_steps = message.history_steps();
+  if (message.has_last_stamp_ns()) status.last_stamp_ns = message.last_stamp_ns();
+  if (message.has_last_sequence()) status.last_sequence = message.last_sequence();
+  if (message.has_state()) status.state = from_message(message.state());
+  if (message.has_command()) status.command = Control{message.command().speed_m_s(), message.command().second()};
+  status.soil_correction = from_message(message.soil_correction());
+  return status;
+}
+
+MeasurementAnswer from_message(const v1::MeasurementAnswer& message) {
+  MeasurementAnswer answer;
+  answer.session_id = message.session_id();
+  answer.sequence = message.sequence();
+  answer.stamp_ns = message.stamp_ns();
+  answer.history_epoch = message.history_epoch();
+  answer.soil_epoch = message.soil_epoch();
+  switch (message.outcome_case()) {
+    case v1::MeasurementAnswer::kApplied: answer.outcome = Applied{message.applied().history_steps()}; break;
+    case v1::MeasurementAnswer::kBuffered: answer.outcome = Buffered{message.buffered().next_step_in_s()}; break;
+    case v1::MeasurementAnswer::kDuplicate: answer.outcome = Duplicate{}; break;
+    case v1::MeasurementAnswer::kTooOld: answer.outcome = TooOld{message.too_old().behind_s()}; break;
+    case v1::MeasurementAnswer::kNotFinite: answer.outcome = NotFinite{message.not_finite().field()}; break;
+    case v1::MeasurementAnswer::kGated: answer.outcome = Gated{message.gated().nis()}; break;
+    case v1::MeasurementAnswer::kGap: answer.outcome = Gap{message.gap().gap_s()}; break;
+    case v1::MeasurementAnswer::kRejected:
+      answer.outcome = Rejected{code_from(message.rejected().code()), message.rejected().field(), message.rejected().message()};
+      break;
+    case v1::MeasurementAnswer::OUTCOME_NOT_SET: answer.outcome = Unrecognised{}; break;
+  }
+  return answer;
+}
+
+MapDescription from_message(const v1::MapDescription& message) {
+  MapDescription description;
+  description.id = message.map_id();
+  description.version = message.version();
+  description.hash = message.hash();
+  description.geometry = {{message.origin_x_m(), message.origin_y_m()}, message.resolution_m(), message.width(), message.height()};
+  description.semantic = message.semantic();
+  return description;
+}
+
+Result<Prediction> from_message(const v1::PredictReply& message, const PredictRequest& request) {
+  Prediction prediction;
+  prediction.tag = message.tag();
+  prediction.samples = message.samples();
+  prediction.steps = message.steps();
+  prediction.channels = message.channels();
+  const std::size_t points = prediction.samples * prediction.steps;
+  const bool fits = prediction.samples == request.controls.samples() && message.states().size() == 4 * points * prediction.channel_count() &&
+                    message.sinkage_m().size() == (request.wheel_sinkage ? 16 * points : 0) &&
+                    static_cast<std::size_t>(message.validity_size()) == prediction.samples;
+  if (!fits) return Error(Code::internal, "states", "the reply does not have the shape that was asked for; client and server may differ in version");
+  prediction.states_storage = unpack(message.states());
+  prediction.sinkage_storage_m = unpack(message.sinkage_m());
+  prediction.validity.assign(message.validity().begin(), message.validity().end());
+  prediction.start = from_message(message.start());
+  prediction.history_steps = message.history_steps();
+  prediction.soil = from_message(message.soil());
+  if (message.has_soil_variance()) prediction.soil_variance = from_message(message.soil_variance());
+  if (message.has_measurement_age_s()) prediction.measurement_age_s = message.measurement_age_s();
+  prediction.provenance = from_message(message.provenance());
+  prediction.queue_s = message.queue_s();
+  prediction.compute_s = message.compute_s();
+  return prediction;
+}
+
+}  // namespace nesam::detail

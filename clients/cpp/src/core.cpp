@@ -1,0 +1,82 @@
+#include "core.hpp"
+
+#include <climits>
+#include <limits>
+#include <utility>
+
+#include "convert.hpp"
+
+namespace nesam::detail {
+
+namespace {
+
+/// Trailing metadata in which the service names the field at fault.
+constexpr const char* field_metadata = "nesam-field";
+
+std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const ClientOptions& options) {
+  grpc::ChannelArguments arguments;
+  arguments.SetMaxReceiveMessageSize(options.reply_bytes_max);
+  arguments.SetInt(GRPC_ARG_ENABLE_HTTP_PROXY, options.use_proxy ? 1 : 0);
+  const auto keepalive_ms = static_cast<int>(std::clamp<std::chrono::milliseconds::rep>(options.keepalive.count(), 1, INT_MAX));
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, keepalive_ms);
+  arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, keepalive_ms);
+  // A stream may rest for long between two measurements; pings must go on then.
+  arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
+  return grpc::CreateCustomChannel(target, grpc::InsecureChannelCredentials(), arguments);
+}
+
+/// What is wrong with the shape of the controls, before anything is copied. The limits themselves are the server's.
+std::string shape_fault(const View3<const float>& controls) {
+  if (controls.channels() != 2) return "has " + std::to_string(controls.channels()) + " channels, 2 are needed";
+  if (!controls.fits()) {
+    return "has " + std::to_string(controls.values().size()) + " numbers, which is not samples x steps x 2 = " + std::to_string(controls.samples()) + " x " +
+           std::to_string(controls.steps()) + " x 2";
+  }
+  constexpr std::size_t largest = std::numeric_limits<std::uint32_t>::max();
+  if (controls.samples() > largest || controls.steps() > largest) return "has more than 2^32 - 1 samples or steps";
+  return {};
+}
+
+}  // namespace
+
+Error error_from(const grpc::Status& status, const grpc::ClientContext& context) {
+  const auto& metadata = context.GetServerTrailingMetadata();
+  const auto entry = metadata.find(field_metadata);
+  std::string field = entry == metadata.end() ? std::string() : std::string(entry->second.data(), entry->second.size());
+  return Error(code_from(static_cast<int>(status.error_code())), std::move(field), status.error_message());
+}
+
+Core::Core(const std::string& target, const ClientOptions& settings)
+    : options(settings),
+      channel(make_channel(target, settings)),
+      sessions(v1::Sessions::NewStub(channel)),
+      prediction(v1::Prediction::NewStub(channel)),
+      measurements(v1::Measurements::NewStub(channel)),
+      terrain(v1::Terrain::NewStub(channel)) {}
+
+Result<SessionStatus> Core::session(const std::string& id, Timeout timeout) const {
+  v1::GetSessionRequest request;
+  request.set_session_id(id);
+  auto reply = call(*sessions, &v1::Sessions::Stub::Get, request, timeout);
+  if (!reply) return reply.error();
+  return from_message(*reply);
+}
+
+Result<void> Core::close(const std::string& id, Timeout timeout) const {
+  v1::CloseSessionRequest request;
+  request.set_session_id(id);
+  auto reply = call(*sessions, &v1::Sessions::Stub::Close, request, timeout);
+  if (!reply) return reply.error();
+  return {};
+}
+
+Result<Prediction> Core::predict(const std::string& id, const PredictRequest& request, Timeout timeout) const {
+  if (std::string fault = shape_fault(request.controls); !fault.empty()) {
+    return Error(Code::invalid_argument, "controls", "`controls`: " + fault);
+  }
+  auto reply = call(*prediction, &v1::Prediction::Stub::Predict, to_message(id, request), timeout);
+  if (!reply) return reply.error();
+  return from_message(*reply, request);
+}
+
+}  // namespace nesam::detail

@@ -1,0 +1,60 @@
+#pragma once
+
+#include <algorithm>
+#include <chrono>
+#include <memory>
+#include <string>
+
+#include <grpcpp/grpcpp.h>
+
+#include <nesam/client.hpp>
+#include "nesam/v1/measurements.grpc.pb.h"
+#include "nesam/v1/prediction.grpc.pb.h"
+#include "nesam/v1/sessions.grpc.pb.h"
+#include "nesam/v1/terrain.grpc.pb.h"
+
+namespace nesam::detail {
+
+/// The failure that a status and its trailing metadata describe.
+Error error_from(const grpc::Status& status, const grpc::ClientContext& context);
+
+/// A timeout that can be added to any clock without overflow.
+inline std::chrono::nanoseconds bounded(std::chrono::nanoseconds timeout) {
+  return std::clamp<std::chrono::nanoseconds>(timeout, std::chrono::nanoseconds(0), std::chrono::hours(24 * 365));
+}
+
+/// Connection and stubs, shared by a client, its sessions and their streams.
+class Core {
+ public:
+  Core(const std::string& target, const ClientOptions& settings);
+
+  /// Calls a unary method of a stub.
+  template <class Stub, class Request, class Reply>
+  Result<Reply> call(Stub& stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Reply*), const Request& request,
+                     Timeout timeout) const {
+    grpc::ClientContext context;
+    context.set_deadline(deadline(timeout.value_or(options.timeout)));
+    Reply reply;
+    const grpc::Status status = (stub.*method)(&context, request, &reply);
+    if (!status.ok()) return error_from(status, context);
+    return reply;
+  }
+
+  static std::chrono::system_clock::time_point deadline(std::chrono::nanoseconds timeout) {
+    return std::chrono::system_clock::now() + std::chrono::duration_cast<std::chrono::system_clock::duration>(bounded(timeout));
+  }
+
+  Result<SessionStatus> session(const std::string& id, Timeout timeout) const;
+  Result<void> close(const std::string& id, Timeout timeout) const;
+  Result<Prediction> predict(const std::string& id, const PredictRequest& request, Timeout timeout) const;
+  Result<MapDescription> upload(const Map& map, Timeout timeout) const;
+
+  const ClientOptions options;
+  const std::shared_ptr<grpc::Channel> channel;
+  const std::unique_ptr<v1::Sessions::Stub> sessions;
+  const std::unique_ptr<v1::Prediction::Stub> prediction;
+  const std::unique_ptr<v1::Measurements::Stub> measurements;
+  const std::unique_ptr<v1::Terrain::Stub> terrain;
+};
+
+}  // namespace nesam::detail

@@ -1,0 +1,515 @@
+// Goal: the client against a real server, method by method; every bad input must come back as the right typed error and leave the session as it was.
+// Method: one session on an uploaded flat map, one without a map. Expected values are exact where the protocol promises them (echoes, shapes, codes, fields,
+// equal bits of a row in any batch) and loose where only physics does.
+//
+// Usage: client_test HOST:PORT        Exit code 0 when everything passed, 1 when something failed, 2 for wrong usage.
+
+#include <nesam/nesam.hpp>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <cstdio>
+#include <cstring>
+#include <functional>
+#include <iostream>
+#include <limits>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using namespace std::chrono_literals;
+
+int passed = 0;
+int failed = 0;
+const char* current = "";
+
+void check(bool holds, const std::string& what) {
+  if (holds) {
+    ++passed;
+    return;
+  }
+  ++failed;
+  std::cerr << "FAILED " << current << ": " << what << "\n";
+}
+
+template <class T>
+void check_error(const nesam::Result<T>& result, nesam::Code code, const std::string& field, const std::string& what) {
+  if (result.ok()) return check(false, what + ": succeeded, " + nesam::name(code) + " was expected");
+  const nesam::Error& error = result.error();
+  const bool right = error.code() == code && error.field() == field;
+  check(right, what + ": expected " + nesam::name(code) + " of `" + field + "`, got `" + error.field() + "`, " + error.what());
+}
+
+constexpr float nan_f = std::numeric_limits<float>::quiet_NaN();
+constexpr double nan_d = std::numeric_limits<double>::quiet_NaN();
+constexpr std::int64_t grid_ns = 100'000'000;
+
+/// Names that no other run uses, so that the test can be repeated against a server that keeps running.
+std::string unique(const std::string& name) {
+  static const auto run = std::chrono::system_clock::now().time_since_epoch().count();
+  return name + "-" + std::to_string(run);
+}
+
+/// A flat map, 40 m x 40 m around the origin, of one colour.
+struct FlatMap {
+  static constexpr std::uint32_t side = 81;
+  std::vector<float> elevation_m = std::vector<float>(std::size_t{side} * side, 0.0F);
+  std::vector<std::uint8_t> rgb = std::vector<std::uint8_t>(std::size_t{3} * side * side, 120);
+
+  nesam::Map view(const std::string& id, std::uint64_t version) const {
+    nesam::Map map;
+    map.id = id;
+    map.version = version;
+    map.geometry = {{-20.0, -20.0}, 0.5, side, side};
+    map.elevation_m = elevation_m;
+    map.semantic_rgb = rgb;
+    return map;
+  }
+};
+
+/// Straight ahead at 1 m/s along x, step by step of 0.1 s.
+nesam::Measurement cruise(int step, const nesam::VehicleCard& card) {
+  nesam::Measurement measurement;
+  measurement.stamp_ns = 1'000'000'000 + step * grid_ns;
+  measurement.sequence = static_cast<std::uint64_t>(step) + 1;
+  measurement.state.position_m = {0.1 * step, 0.0, 0.5};
+  measurement.state.velocity_m_s = {1.0, 0.0, 0.0};
+  measurement.command = {std::min(1.0, card.speed_max_m_s), 0.0};
+  return measurement;
+}
+
+/// Admitted commands that differ in every entry, shape (samples, horizon, 2).
+std::vector<float> varied_controls(std::size_t samples, std::size_t horizon, const nesam::VehicleCard& card) {
+  std::vector<float> controls;
+  for (std::size_t i = 0; i < samples * horizon; ++i) {
+    const double speed_share = 0.25 + 0.2 * std::sin(0.37 * static_cast<double>(i));
+    const double second_share = 0.5 + 0.3 * std::sin(0.11 * static_cast<double>(i));
+    const double slowest_m_s = std::max(0.0, card.speed_min_m_s);
+    controls.push_back(static_cast<float>(slowest_m_s + speed_share * (std::min(card.speed_max_m_s, 6.0) - slowest_m_s)));
+    controls.push_back(static_cast<float>(card.second_min + second_share * (card.second_max - card.second_min)));
+  }
+  return controls;
+}
+
+nesam::PredictRequest request_of(const std::vector<float>& controls, std::size_t samples, std::size_t horizon) {
+  nesam::PredictRequest request;
+  request.controls = {nesam::Span<const float>(controls), samples, horizon, 2};
+  return request;
+}
+
+bool equal_bits(nesam::Span<const float> a, nesam::Span<const float> b) {
+  return a.size() == b.size() && !a.empty() && std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0;
+}
+
+void analytic_views_index_row_major() {
+  std::vector<float> values(2 * 3 * 4);
+  for (std::size_t i = 0; i < values.size(); ++i) values[i] = static_cast<float>(i);
+  const nesam::View3<float> view(values, 2, 3, 4);
+  const nesam::View3<const float> read = view;
+  check(view.fits() && read.fits(), "the shape fits");
+  check(read(1, 2, 3) == 23.0F && read(0, 1, 0) == 4.0F, "an entry");
+  check(read.sample(1).size() == 12 && read.sample(1)[0] == 12.0F && read.step(1, 1)[2] == 18.0F, "a sample and a step");
+  const nesam::Span<const float> span = values;
+  check(!nesam::View3<const float>(span, 2, 3, 5).fits() && !nesam::View3<const float>(span, 0, 3, 4).fits(), "wrong shapes do not fit");
+  const std::size_t huge = std::numeric_limits<std::size_t>::max();
+  check(!nesam::View3<const float>(span, huge, huge, 2).fits() && nesam::View3<const float>().fits(), "a product that overflows does not fit");
+}
+
+void analytic_channels_have_columns() {
+  nesam::Prediction prediction;
+  prediction.channels = nesam::bit(nesam::Channel::x) | nesam::bit(nesam::Channel::yaw) | nesam::bit(nesam::Channel::wz);
+  check(prediction.channel_count() == 3 && prediction.column(nesam::Channel::yaw) == 1 && prediction.column(nesam::Channel::wz) == 2, "columns");
+  check(!prediction.column(nesam::Channel::y), "a channel that was not asked for");
+}
+
+void service_maps(nesam::Client& client) {
+  const FlatMap flat;
+  const std::string id = unique("flat");
+  const auto described = client.upload_map(flat.view(id, 1));
+  check(described.ok(), described.ok() ? "" : described.error().what());
+  if (!described) return;
+  check(described->id == id && described->version == 1 && described->semantic && described->hash.size() == 64, "description");
+  check(described->geometry.width == FlatMap::side && described->geometry.origin_m[0] == -20.0 && described->geometry.resolution_m == 0.5, "geometry");
+  check_error(client.upload_map(flat.view(id, 1)), nesam::Code::already_exists, "map_id", "the same version again");
+  check_error(client.upload_map(flat.view(id, 0)), nesam::Code::invalid_argument, "header.version", "version 0");
+  check_error(client.upload_map(flat.view("not/a/name", 1)), nesam::Code::invalid_argument, "header.map_id", "a bad name");
+  nesam::Map small = flat.view(id, 2);
+  small.geometry.height = FlatMap::side + 1;
+  check_error(client.upload_map(small), nesam::Code::invalid_argument, "elevation_m", "a layer too small for its geometry");
+  const auto maps = client.maps();
+  check(maps.ok() && std::any_of(maps->begin(), maps->end(), [&](const auto& map) { return map.id == id && map.version == 1; }), "the list has it");
+
+  // More than one tile: 700 x 700 cells of 7 bytes are 3.4 MB.
+  const std::uint32_t side = 700;
+  const std::vector<float> elevation_m(std::size_t{side} * side, 1.0F);
+  const std::vector<std::uint8_t> rgb(std::size_t{3} * side * side, 90);
+  const std::string large_id = unique("large");
+  const nesam::Map large{large_id, 3, {{0.0, 0.0}, 0.1, side, side}, elevation_m, rgb};
+  const auto uploaded = client.upload_map(large);
+  check(uploaded.ok() && uploaded->version == 3, uploaded.ok() ? "large map" : uploaded.error().what());
+
+  nesam::OpenOptions options;
+  options.vehicle_id = unique("mapper");
+  options.map_id = id;
+  {
+    const auto session = client.open(options);
+    check(session.ok(), session.ok() ? "" : session.error().what());
+    check_error(client.delete_map(id), nesam::Code::failed_precondition, "map_id", "deleting a map in use");
+  }
+  check(client.delete_map(id).ok() && client.delete_map(large_id).ok(), "deleting unused maps");
+  check_error(client.delete_map(id), nesam::Code::not_found, "map_id", "deleting an unknown map");
+}
+
+void service_sessions_are_raii(nesam::Client& client) {
+  nesam::OpenOptions options;
+  options.vehicle_id = unique("raii");
+  {
+    auto session = client.open(options);
+    check(session.ok() && session->id() == options.vehicle_id, session.ok() ? "id" : session.error().what());
+    check_error(client.open(options), nesam::Code::already_exists, "session_id", "opening twice");
+    const nesam::Session moved = std::move(*session);
+    check(moved.status().ok(), "open after a move");
+    const auto sessions = client.sessions();
+    check(sessions.ok() && std::any_of(sessions->begin(), sessions->end(), [&](const auto& s) { return s.session_id == moved.id(); }), "the list has it");
+  }
+  check_error(client.session(options.vehicle_id), nesam::Code::not_found, "session_id", "closed by the destructor");
+
+  std::string id;
+  {
+    auto session = client.open(options);
+    check(session.ok(), "opening again");
+    if (session) id = session->detach();
+  }
+  auto attached = client.attach(id);
+  check(attached.ok() && attached->close().ok(), "left open by detach, closed by attach");
+  if (attached) check_error(attached->close(), nesam::Code::not_found, "session_id", "closing twice");
+  check_error(client.attach(id), nesam::Code::not_found, "session_id", "attaching to a closed session");
+
+  options.vehicle_id = unique("first");
+  {
+    auto first = client.open(options);
+    nesam::OpenOptions other = options;
+    other.vehicle_id = unique("second");
+    auto second = client.open(other);
+    if (first && second) *first = std::move(*second);
+    check_error(client.session(options.vehicle_id), nesam::Code::not_found, "session_id", "the replaced session is closed");
+    check(client.session(other.vehicle_id).ok(), "the session that replaced it is open");
+  }
+
+  options.vehicle_id = "";
+  check_error(client.open(options), nesam::Code::invalid_argument, "vehicle_id", "no name");
+  options.vehicle_id = unique("raii");
+  options.map_id = "no-such-map";
+  check_error(client.open(options), nesam::Code::not_found, "map_id", "an unknown map");
+}
+
+void service_measurements_get_typed_answers(nesam::Session& session) {
+  const nesam::VehicleCard& card = session.vehicle();
+  for (int step = 0; step < 5; ++step) {
+    const auto answer = session.send(cruise(step, card));
+    check(answer.ok() && answer->accepted() && answer->sequence == static_cast<std::uint64_t>(step) + 1, answer.ok() ? "echo" : answer.error().what());
+    if (!answer) return;
+    check(answer->session_id == session.id() && answer->stamp_ns == cruise(step, card).stamp_ns, "echo of id and stamp");
+    check(answer->history_epoch == static_cast<std::uint64_t>(step) + 1, "epoch");
+    if (const auto* applied = answer->is<nesam::Applied>()) check(applied->history_steps == static_cast<std::uint32_t>(step) + 1, "history steps");
+  }
+  // Several at once: denser than the grid, again, too late, not finite, out of the card, on the grid.
+  std::vector<nesam::Measurement> batch(6, cruise(4, card));
+  batch[0].stamp_ns += grid_ns / 10;
+  batch[0].sequence = 6;
+  batch[2].stamp_ns -= 3 * grid_ns + 1;
+  batch[3] = cruise(5, card);
+  batch[3].sequence = 7;
+  batch[3].state.velocity_m_s[0] = nan_d;
+  batch[4] = cruise(5, card);
+  batch[4].sequence = 8;
+  batch[4].command.speed_m_s = card.speed_max_m_s + 1.0;
+  batch[5] = cruise(5, card);
+  batch[5].sequence = 9;
+  batch[5].wheel_speed_rad_s = {2.0, 2.0, 2.0, 2.0};
+  const auto answers = session.send(nesam::Span<const nesam::Measurement>(batch));
+  check(answers.ok() && answers->size() == batch.size(), answers.ok() ? "one answer each" : answers.error().what());
+  if (!answers || answers->size() != batch.size()) return;
+  const auto* buffered = (*answers)[0].is<nesam::Buffered>();
+  check(buffered && std::abs(buffered->next_step_in_s - 0.09) < 1e-6, "BUFFERED");
+  check((*answers)[1].is<nesam::Duplicate>() && !(*answers)[1].accepted(), "DUPLICATE");
+  const auto* old = (*answers)[2].is<nesam::TooOld>();
+  check(old && std::abs(old->behind_s - 0.31) < 1e-6, "TOO_OLD");
+  const auto* not_finite = (*answers)[3].is<nesam::NotFinite>();
+  check(not_finite && not_finite->field == "state.velocity_m_s.x", "NOT_FINITE");
+  const auto* rejected = (*answers)[4].is<nesam::Rejected>();
+  check(rejected && rejected->code == nesam::Code::invalid_argument && rejected->field == "command.speed_m_s" && !rejected->message.empty(), "REJECTED");
+  check((*answers)[5].accepted() && (*answers)[5].history_epoch == 6, "bad measurements before it changed nothing");
+  const auto status = session.status();
+  check(status.ok() && status->history_steps == 6 && status->last_sequence == 9 && status->last_stamp_ns == batch[5].stamp_ns, "status");
+  check(status.ok() && status->state && status->state->position_m[0] == batch[5].state.position_m[0], "state of the newest step");
+}
+
+void service_streams_of_measurements(nesam::Client& client) {
+  nesam::OpenOptions options;
+  options.vehicle_id = unique("streamer");
+  auto session = client.open(options);
+  check(session.ok(), session.ok() ? "" : session.error().what());
+  if (!session) return;
+  auto stream = session->measurements();
+  check(stream.ok(), "stream");
+  if (!stream) return;
+  check_error(stream->receive(20ms), nesam::Code::deadline_exceeded, "", "nothing sent yet");
+  // One thread sends, this one collects.
+  constexpr int count = 300;
+  const nesam::VehicleCard card = session->vehicle();
+  bool all_sent = true;
+  std::thread sender([&] {
+    for (int step = 0; step < count; ++step) all_sent = stream->send(cruise(step, card)).ok() && all_sent;
+  });
+  int in_order = 0;
+  for (int step = 0; step < count; ++step) {
+    const auto answer = stream->receive(10s);
+    in_order += answer.ok() && answer->accepted() && answer->sequence == static_cast<std::uint64_t>(step) + 1 ? 1 : 0;
+  }
+  sender.join();
+  check(all_sent && in_order == count && stream->unanswered().empty(), std::to_string(in_order) + " of 300 answers in order");
+
+  nesam::Measurement late = cruise(count + 20, card);
+  check(stream->send(late).ok(), "after a pause");
+  const auto gap = stream->receive(10s);
+  check(gap.ok() && gap->is<nesam::Gap>() && std::abs(gap->is<nesam::Gap>()->gap_s - 2.1) < 1e-6, "GAP");
+  // Nobody collects: the limit holds, and the answers are still there afterwards.
+  std::size_t queued = 0;
+  while (queued <= nesam::MeasurementStream::pending_max && stream->send(late).ok()) ++queued;
+  check(queued == nesam::MeasurementStream::pending_max, "limit of uncollected answers");
+  check_error(stream->send(late), nesam::Code::resource_exhausted, "", "beyond the limit");
+  check(stream->finish(10s).ok(), "finish");
+  std::size_t duplicates = 0;
+  while (true) {
+    const auto answer = stream->receive(1s);
+    if (!answer) {
+      check_error(answer, nesam::Code::failed_precondition, "", "all answers were collected");
+      break;
+    }
+    duplicates += answer->is<nesam::Duplicate>() ? 1 : 0;
+  }
+  check(duplicates == queued, "every measurement was answered before the end");
+  check_error(stream->send(late), nesam::Code::failed_precondition, "", "sending after the end");
+
+  // A stream outlives its session on the server: measurements are refused one by one.
+  auto orphan = session->measurements();
+  check(orphan.ok() && session->close().ok(), "close under a stream");
+  check(orphan->send(late).ok(), "queued");
+  const auto refused = orphan->receive(10s);
+  const auto* rejected = refused.ok() ? refused->is<nesam::Rejected>() : nullptr;
+  check(rejected && rejected->code == nesam::Code::not_found && rejected->field == "session_id", "REJECTED with NOT_FOUND");
+}
+
+void service_predictions(const nesam::Session& session, const std::string& map_id) {
+  constexpr std::size_t samples = 7;
+  constexpr std::size_t horizon = 32;
+  const auto controls = varied_controls(samples, horizon, session.vehicle());
+  nesam::PredictRequest request = request_of(controls, samples, horizon);
+  request.wheel_sinkage = true;
+  request.tag = 77;
+  const auto batch = session.predict(request);
+  check(batch.ok(), batch.ok() ? "" : batch.error().what());
+  if (!batch) return;
+  const auto states = batch->states();
+  check(states.samples() == samples && states.steps() == horizon && states.channels() == 12 && states.fits(), "shape of the states");
+  check(batch->sinkage_m().channels() == 4 && batch->sinkage_m().fits(), "shape of the sinkage");
+  check(std::all_of(states.values().begin(), states.values().end(), [](float v) { return std::isfinite(v); }), "finite states");
+  check(batch->tag == 77 && batch->channels == nesam::all_channels && batch->validity.size() == samples, "tag, channels, validity");
+  check(batch->history_steps == 5 && batch->start.position_m[0] == 0.5, "starts at the newest measurement");
+  check(batch->provenance.map_id == map_id && batch->provenance.history_epoch == 6 && batch->provenance.bundle_hash.size() == 64, "provenance");
+  check(batch->soil.k_phi > 0.0 && batch->measurement_age_s && *batch->measurement_age_s >= 0.0 && batch->compute_s > 0.0, "soil, age, time");
+  const auto off_map = [](std::uint32_t bits) { return (bits & (nesam::validity_off_map | nesam::validity_no_map)) != 0; };
+  check(std::none_of(batch->validity.begin(), batch->validity.end(), off_map), "on the map");
+  // 3.2 s at 1 m/s and more from x = 0.5 m; generous, because the model is what the bundle says.
+  check(states(0, horizon - 1, 0) > 0.5F && states(0, horizon - 1, 0) < 25.0F, "moves forward: x = " + std::to_string(states(0, horizon - 1, 0)) + " m");
+
+  for (const std::size_t n : {std::size_t{0}, std::size_t{3}, samples - 1}) {
+    const std::vector<float> row(request.controls.sample(n).begin(), request.controls.sample(n).end());
+    nesam::PredictRequest alone = request_of(row, 1, horizon);
+    alone.wheel_sinkage = true;
+    const auto single = session.predict(alone);
+    check(single.ok() && equal_bits(single->states().sample(0), states.sample(n)), "row " + std::to_string(n) + " alone has the bits of the batch");
+    check(single.ok() && equal_bits(single->sinkage_m().sample(0), batch->sinkage_m().sample(n)), "sinkage of row " + std::to_string(n));
+  }
+
+  nesam::PredictRequest selection = request_of(controls, samples, horizon);
+  selection.channels = nesam::bit(nesam::Channel::y) | nesam::bit(nesam::Channel::vx);
+  selection.stride = 5;
+  const auto some = session.predict(selection);
+  check(some.ok() && some->states().steps() == 6 && some->states().channels() == 2 && some->sinkage_m().values().empty(), "shape of a selection");
+  bool equal = some.ok();
+  for (std::size_t n = 0; equal && n < samples; ++n) {
+    for (std::size_t k = 0; k < 6; ++k) {
+      equal = equal && some->states()(n, k, 0) == states(n, 5 * k + 4, 1) && some->states()(n, k, *some->column(nesam::Channel::vx)) == states(n, 5 * k + 4, 6);
+    }
+  }
+  check(equal, "a selection is a part of the whole");
+
+  nesam::PredictRequest elsewhere = request_of(controls, samples, horizon);
+  elsewhere.start = batch->start;
+  elsewhere.start->position_m[0] = -5.0;
+  elsewhere.history_use = nesam::HistoryUse::none;
+  const auto what_if = session.predict(elsewhere);
+  check(what_if.ok() && what_if->history_steps == 0 && what_if->start.position_m[0] == -5.0, "a start of its own");
+}
+
+void service_bad_predictions_are_refused(const nesam::Session& session, nesam::Client& client) {
+  constexpr auto invalid = nesam::Code::invalid_argument;
+  const nesam::VehicleCard& card = session.vehicle();
+  const auto before = session.status();
+  auto controls = varied_controls(3, 4, card);
+  controls[(2 * 4 + 3) * 2] = nan_f;
+  check_error(session.predict(request_of(controls, 3, 4)), invalid, "controls[2, 3]", "a control that is NaN");
+  controls[(2 * 4 + 3) * 2] = static_cast<float>(card.speed_max_m_s + 1.0);
+  check_error(session.predict(request_of(controls, 3, 4)), invalid, "controls[2, 3].speed_m_s", "a speed beyond the card");
+  check_error(session.predict(request_of(controls, 3, 5)), invalid, "controls", "controls that do not fit their shape");
+  nesam::PredictRequest three_channels;
+  three_channels.controls = {nesam::Span<const float>(controls), 2, 4, 3};
+  check_error(session.predict(three_channels), invalid, "controls", "three numbers for each command");
+  const auto longer = varied_controls(2, 33, card);
+  check_error(session.predict(request_of(longer, 2, 33)), invalid, "horizon", "K = 33");
+  check_error(session.predict(nesam::PredictRequest{{{}, 0, 0, 2}, {}, nesam::HistoryUse::measured, 0, 1, false, 0}), invalid, "samples", "N = 0");
+  const auto wider = varied_controls(4097, 1, card);
+  check_error(session.predict(request_of(wider, 4097, 1)), invalid, "samples", "N = 4097");
+  const auto good = varied_controls(2, 8, card);
+  nesam::PredictRequest request = request_of(good, 2, 8);
+  request.stride = 9;
+  check_error(session.predict(request), invalid, "output.stride", "a stride beyond the horizon");
+  request = request_of(good, 2, 8);
+  request.channels = 1U << 12;
+  check_error(session.predict(request), invalid, "output.channels", "an unknown channel");
+  request = request_of(good, 2, 8);
+  request.start = nesam::VehicleState{};
+  request.start->position_m = {1000.0, 0.0, 0.0};
+  check_error(session.predict(request), invalid, "start.position_m", "a start outside the map");
+  request.start->position_m = {nan_d, 0.0, 0.0};
+  check_error(session.predict(request), invalid, "start.position_m.x", "a start that is NaN");
+  check_error(session.predict(request_of(good, 2, 8), 0ns), nesam::Code::deadline_exceeded, "", "no time at all");
+
+  nesam::OpenOptions options;
+  options.vehicle_id = unique("blank");
+  auto blank = client.open(options);
+  if (blank) {
+    check_error(blank->predict(request_of(good, 2, 8)), nesam::Code::failed_precondition, "start", "neither start nor measurement");
+    check(blank->close().ok(), "close");
+    check_error(blank->predict(request_of(good, 2, 8)), nesam::Code::not_found, "session_id", "an unknown session");
+  } else {
+    check(false, blank.error().what());
+  }
+  const auto after = session.status();
+  check(before.ok() && after.ok() && before->provenance.history_epoch == after->provenance.history_epoch, "the session is as it was");
+}
+
+void service_sessions_without_a_map(nesam::Client& client) {
+  nesam::OpenOptions options;
+  options.vehicle_id = unique("unmapped");
+  auto session = client.open(options);
+  check(session.ok(), session.ok() ? "" : session.error().what());
+  if (!session) return;
+  const auto controls = varied_controls(1, 8, session->vehicle());
+  nesam::PredictRequest request = request_of(controls, 1, 8);
+  request.start = nesam::VehicleState{};
+  const auto prediction = session->predict(request);
+  check(prediction.ok() && prediction->provenance.map_id.empty() && !prediction->measurement_age_s, prediction.ok() ? "no map" : prediction.error().what());
+  check(prediction.ok() && (prediction->validity[0] & nesam::validity_no_map) != 0, "NO_MAP is said");
+}
+
+void service_threads_share_a_session(const nesam::Session& session) {
+  const auto controls = varied_controls(4, 16, session.vehicle());
+  const auto expected = session.predict(request_of(controls, 4, 16));
+  check(expected.ok(), expected.ok() ? "" : expected.error().what());
+  if (!expected) return;
+  std::vector<int> right(4, 0);
+  std::vector<std::thread> threads;
+  for (int& count : right) {
+    threads.emplace_back([&] {
+      for (int i = 0; i < 5; ++i) {
+        const auto prediction = session.predict(request_of(controls, 4, 16));
+        count += prediction.ok() && equal_bits(prediction->states().values(), expected->states().values()) ? 1 : 0;
+      }
+    });
+  }
+  for (std::thread& thread : threads) thread.join();
+  check(right == std::vector<int>(4, 5), "equal bits from four threads");
+}
+
+void service_nobody_listens() {
+  // Port 1 is reserved and not served on a usual machine.
+  nesam::Client client("127.0.0.1:1");
+  check_error(client.sessions(2s), nesam::Code::unavailable, "", "a call");
+  check_error(client.connect(50ms), nesam::Code::deadline_exceeded, "", "a connection");
+  bool thrown = false;
+  try {
+    (void)client.sessions(2s).value();
+  } catch (const nesam::Error& error) {
+    thrown = error.code() == nesam::Code::unavailable && error.retryable();
+  }
+  check(thrown, "value() throws the error in this thread");
+}
+
+void run(const char* name, const std::function<void()>& test) {
+  current = name;
+  const int failed_before = failed;
+  const auto begin = std::chrono::steady_clock::now();
+  try {
+    test();
+  } catch (const std::exception& error) {
+    check(false, std::string("threw ") + error.what());
+  }
+  const auto took = std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::steady_clock::now() - begin);
+  std::cout << (failed == failed_before ? "ok      " : "FAILED  ") << name << " (" << took.count() << " ms)" << std::endl;
+}
+
+void run_all(nesam::Client& client) {
+  run("service_maps", [&] { service_maps(client); });
+  run("service_sessions_are_raii", [&] { service_sessions_are_raii(client); });
+  const FlatMap flat;
+  const std::string map_id = unique("ground");
+  client.upload_map(flat.view(map_id, 1)).value();
+  {
+    nesam::OpenOptions options;
+    options.vehicle_id = unique("truck");
+    options.map_id = map_id;
+    nesam::Session session = std::move(client.open(options).value());
+    run("service_measurements_get_typed_answers", [&] { service_measurements_get_typed_answers(session); });
+    run("service_predictions", [&] { service_predictions(session, map_id); });
+    run("service_bad_predictions_are_refused", [&] { service_bad_predictions_are_refused(session, client); });
+    run("service_threads_share_a_session", [&] { service_threads_share_a_session(session); });
+  }
+  client.delete_map(map_id).value();
+  run("service_streams_of_measurements", [&] { service_streams_of_measurements(client); });
+  run("service_sessions_without_a_map", [&] { service_sessions_without_a_map(client); });
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  if (argc != 2) {
+    std::fprintf(stderr, "usage: client_test HOST:PORT\n");
+    return 2;
+  }
+  run("analytic_views_index_row_major", analytic_views_index_row_major);
+  run("analytic_channels_have_columns", analytic_channels_have_columns);
+  run("service_nobody_listens", service_nobody_listens);
+  nesam::ClientOptions options;
+  // The first prediction on a new map encodes its terrain, perhaps on a busy machine.
+  options.timeout = 60s;
+  nesam::Client client(argv[1], options);
+  current = "connect";
+  const auto connected = client.connect(30s);
+  check(connected.ok(), connected.ok() ? "" : connected.error().what());
+  if (connected) {
+    try {
+      run_all(client);
+    } catch (const std::exception& error) {
+      check(false, std::string("threw ") + error.what());
+    }
+  }
+  std::printf("%d passed, %d failed\n", passed, failed);
+  return failed == 0 ? 0 : 1;
+}
