@@ -4,6 +4,7 @@
 //! Hanamoto (1961); Wong, *Theory of Ground Vehicles*, ch. 2; Ishigami et al., J. Field Robotics 24 (2007); Jia et al. (2011) for the
 //! isotropic combination of longitudinal and lateral shear.
 
+mod bulldozing;
 mod gauss;
 mod load_balance;
 mod pressure_sinkage;
@@ -11,6 +12,7 @@ mod shear;
 mod slip;
 mod wheel;
 
+pub use bulldozing::{BearingCapacity, ContactArc, front_bulldozing, side_bulldozing, side_mobilisation, side_resistance};
 pub use gauss::GaussRule;
 pub use load_balance::{Support, balance_sinkage};
 pub use pressure_sinkage::{bekker_sinkage, normal_stress};

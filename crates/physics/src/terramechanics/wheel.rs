@@ -2,6 +2,7 @@
 
 use crate::scalar::Real;
 use crate::soil::Soil;
+use crate::terramechanics::bulldozing::{ContactArc, side_bulldozing};
 use crate::terramechanics::gauss::GaussRule;
 use crate::terramechanics::pressure_sinkage::normal_stress;
 use crate::terramechanics::shear::{mohr_coulomb, shear_fraction};
@@ -27,14 +28,16 @@ pub struct WheelGeometry {
     pub c2: f64,
     /// Recovery λ of the exit angle θ_2 = -acos(1 - λ z / r); 0 = the soil does not spring back.
     pub recovery: f64,
+    /// Unit weight γ of the soil that the side wall pushes aside, N/m³; `None` = no side bulldozing.
+    pub side_soil_unit_weight_n_m3: Option<f64>,
     /// Quadrature.
     pub rule: GaussRule,
 }
 
 impl WheelGeometry {
-    /// Wheel with the coefficients of Ishigami (2007) and five quadrature nodes.
+    /// Wheel with the coefficients of Ishigami (2007), five quadrature nodes, and no side bulldozing.
     pub fn new(radius_m: f64, width_m: f64) -> Self {
-        Self { radius_m, width_m, c1: 0.4, c2: 0.15, recovery: 0.0, rule: GaussRule::new(5) }
+        Self { radius_m, width_m, c1: 0.4, c2: 0.15, recovery: 0.0, side_soil_unit_weight_n_m3: None, rule: GaussRule::new(5) }
     }
 }
 
@@ -45,7 +48,7 @@ pub struct WheelWrench<T> {
     pub thrust_n: T,
     /// Compaction resistance R = r b ∫ σ sin θ dθ, N.
     pub resistance_n: T,
-    /// Side force of the soil on the wheel, -r b ∫ τ_y dθ, N.
+    /// Side force of the soil on the wheel, -r b ∫ τ_y dθ, N, and that of side bulldozing where it is asked for.
     pub side_n: T,
     /// Normal force W = r b ∫ (σ cos θ + τ_x sin θ) dθ, N.
     pub normal_n: T,
@@ -73,8 +76,8 @@ fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
 /// Integrates normal and shear stress over the contact arc at a given sinkage (m).
 ///
 /// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - λz/r); maximum stress at θ_m = (c_1 + c_2 |s|) θ_1. Shear displacement
-/// j_x = r [(θ_1 - θ) - (v_x / rΩ)(sin θ_1 - sin θ)], j_y = r (v_y / rΩ)(θ_1 - θ), combined isotropically (Jia 2011). Neglects
-/// bulldozing at the side wall and the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
+/// j_x = r [(θ_1 - θ) - (v_x / rΩ)(sin θ_1 - sin θ)], j_y = r (v_y / rΩ)(θ_1 - θ), combined isotropically (Jia 2011). Side
+/// bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
 #[inline(always)]
 pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &ContactMotion<T>, soil: &Soil<T>) -> WheelWrench<T> {
     let radius = wheel.radius_m;
@@ -112,10 +115,18 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
         }
     }
     let area = T::lit(radius * wheel.width_m);
+    let sheared_n = sum.side_n * area;
+    let side_n = match wheel.side_soil_unit_weight_n_m3 {
+        None => sheared_n,
+        Some(unit_weight) => {
+            let arc = ContactArc { entry_rad: entry, exit_rad: exit, cos_entry };
+            sheared_n + side_bulldozing(wheel, unit_weight, &arc, motion, soil)
+        }
+    };
     WheelWrench {
         thrust_n: sum.thrust_n * area,
         resistance_n: sum.resistance_n * area,
-        side_n: sum.side_n * area,
+        side_n,
         normal_n: sum.normal_n * area,
         torque_n_m: sum.torque_n_m * area * T::lit(radius),
     }
