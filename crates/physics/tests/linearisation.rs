@@ -2,9 +2,9 @@
 mod common;
 
 use common::{Drive, robot, truck};
+use nesam_physics::driveline::WheelCommand;
 use nesam_physics::scalar::Dual;
 use nesam_physics::step::{Ground, StepInput};
-use nesam_physics::driveline::WheelCommand;
 use nesam_physics::{Control, Real, Soil, VehicleState};
 
 const N: usize = 9;
@@ -17,14 +17,22 @@ fn jacobian(drive: &Drive, control: &Control<f64>) -> [[f64; N]; N] {
     let x = input.state.to_array();
     let index = [2, 3, 4, 6, 7, 8, 9, 10, 11];
     let mut state = [D::lit(0.0); 12];
-    for i in 0..12 { state[i] = c(x[i]); }
-    for (k, &i) in index.iter().enumerate() { state[i] = D::variable(x[i], k); }
+    for i in 0..12 {
+        state[i] = c(x[i]);
+    }
+    for (k, &i) in index.iter().enumerate() {
+        state[i] = D::variable(x[i], k);
+    }
     let w = input.wheels;
     let dual = StepInput {
         state: VehicleState::from_array(state),
         wheels: WheelCommand {
-            angle_rad: w.angle_rad.map(c), rim_base_m_s: w.rim_base_m_s.map(c), rim_follow: c(w.rim_follow), rim_gain: c(w.rim_gain),
-            overspeed_limit_m_s: c(w.overspeed_limit_m_s), speed_m_s: c(w.speed_m_s),
+            angle_rad: w.angle_rad.map(c),
+            rim_base_m_s: w.rim_base_m_s.map(c),
+            rim_follow: c(w.rim_follow),
+            rim_gain: c(w.rim_gain),
+            overspeed_limit_m_s: c(w.overspeed_limit_m_s),
+            speed_m_s: c(w.speed_m_s),
         },
         sinkage_log_ratio: [c(0.0); 4],
         soil: Soil::from_array(input.soil.to_array().map(c)),
@@ -46,12 +54,18 @@ fn property_a_step_does_not_amplify_small_changes() {
             let mut growth = 1.0;
             for _ in 0..40 {
                 let mut n = [0.0; N];
-                for r in 0..N { for c in 0..N { n[r] += j[r][c] * v[c]; } }
+                for r in 0..N {
+                    for c in 0..N {
+                        n[r] += j[r][c] * v[c];
+                    }
+                }
                 let norm = n.iter().map(|x| x * x).sum::<f64>().sqrt();
                 growth = norm / v.iter().map(|x| x * x).sum::<f64>().sqrt();
                 v = n.map(|x| x / norm);
             }
-            if k % 10 == 0 { println!("{} k {k}: {growth} {v:.2?}", drive.model.vehicle().name); }
+            if k % 10 == 0 {
+                println!("{} k {k}: {growth} {v:.2?}", drive.model.vehicle().name);
+            }
             drive.step(control.speed_m_s, control.second);
         }
     }

@@ -42,9 +42,12 @@ fn published_fixed_sinkage_rows_match_the_reference_quadrature() {
     assert_eq!(rows.len(), 15);
     for row in rows {
         let motion = ContactMotion::from_slip(number(&row, "slip"), 0.0);
-        let got = wheel_wrench(&wheel(number(&row, "r"), number(&row, "b")), number(&row, "z"), &motion, &soil(row["soil"].as_str().unwrap()));
+        let got =
+            wheel_wrench(&wheel(number(&row, "r"), number(&row, "b")), number(&row, "z"), &motion, &soil(row["soil"].as_str().unwrap()));
         let scale = number(&row, "W");
-        for (value, key) in [(got.normal_n, "W"), (got.drawbar_n(), "DP"), (got.thrust_n, "H"), (got.resistance_n, "R"), (got.torque_n_m, "T")] {
+        for (value, key) in
+            [(got.normal_n, "W"), (got.drawbar_n(), "DP"), (got.thrust_n, "H"), (got.resistance_n, "R"), (got.torque_n_m, "T")]
+        {
             close(value, number(&row, key), scale, 2e-6, &format!("{key} of {row}"));
         }
     }
@@ -62,7 +65,9 @@ fn published_load_balanced_rows_match_the_reference_root() {
         let z = balance_sinkage(&geometry, &Support { preload_n: load, rate_n_m: 0.0 }, &motion, &soil);
         let got = wheel_wrench(&geometry, z, &motion, &soil);
         close(z, number(&row, "z"), number(&row, "z"), 1e-3, &format!("z of {row}"));
-        for (value, key) in [(got.normal_n, "W"), (got.drawbar_n(), "DP"), (got.thrust_n, "H"), (got.resistance_n, "R"), (got.torque_n_m, "T")] {
+        for (value, key) in
+            [(got.normal_n, "W"), (got.drawbar_n(), "DP"), (got.thrust_n, "H"), (got.resistance_n, "R"), (got.torque_n_m, "T")]
+        {
             close(value, number(&row, key), load, 1e-3, &format!("{key} of {row}"));
         }
     }
