@@ -76,5 +76,6 @@ def driven(client, hills):
     client.upload_map(hills)
     client.open_session("truck", map_id="hills")
     answers = client.measure(straight("truck", 40))
-    assert [a.outcome for a in answers] == ["APPLIED"] * 40
+    # The soil filter may gate a buffer of this made-up drive; its measurements still enter the history.
+    assert len(answers) == 40 and {a.outcome for a in answers} <= {"APPLIED", "GATED"}
     return client

@@ -25,6 +25,8 @@ const EXAMPLES: &str = "Examples:
   nesam demo                                  the whole loop: server, drive, planner, live table
   nesam evaluate --set nominal --split test   score the shipped model against measured drives
   nesam evaluate --data ROOT --set NAME --html report.html
+  nesam diagnose --data ROOT --set NAME       which physical effect does the model lack here?
+  nesam adapt --data ROOT --set NAME          what learning the soil while driving gains there
   nesam predict --trajectory n0005 --at 6.2   one rollout as JSON
   nesam serve                                 answer planners and vehicles until interrupted
   nesam inspect deploy/bundles/NAME           what a bundle holds and where it comes from
@@ -40,6 +42,10 @@ enum Command {
     Serve(commands::serve::ServeArgs),
     /// Score models against measured drives, with intervals and plots
     Evaluate(commands::evaluate::EvaluateArgs),
+    /// Find the effect that the model lacks, and try it on other drives (first cut: not reliable yet)
+    Diagnose(commands::diagnose::DiagnoseArgs),
+    /// Learn the soil while driving: fixed against adapted predictions on measured drives
+    Adapt(commands::adapt::AdaptArgs),
     /// Predict once from an instant of a recorded drive: JSON, CSV or plots
     Predict(commands::predict::PredictArgs),
     /// Train a bundle on the train split of a set
@@ -65,6 +71,8 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Demo(args)) => commands::demo::run(&args),
         Some(Command::Serve(args)) => commands::serve::run(&args),
         Some(Command::Evaluate(args)) => commands::evaluate::run(&args),
+        Some(Command::Diagnose(args)) => commands::diagnose::run(&args),
+        Some(Command::Adapt(args)) => commands::adapt::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),
         Some(Command::Inspect(args)) => commands::inspect::run(&args),

@@ -117,7 +117,7 @@ pub fn predictor_for(mut bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Pre
             "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained",
             bundle.name, own.name, given.name
         );
-        bundle.vehicle = given.clone();
+        bundle.vehicle = given.with_effects(&bundle.effects);
     }
     Ok(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?))
 }

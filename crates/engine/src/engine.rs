@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use nesam_adaptation::{AdaptationError, FilterConfig, SoilFilter};
 use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
 
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
@@ -23,6 +24,8 @@ pub type Logged = (u64, Command);
 pub struct Engine {
     predictor: Arc<Predictor>,
     limits: Limits,
+    /// The filter that every session starts with.
+    filter: SoilFilter,
     step_ns: i64,
     sessions: BTreeMap<String, Session>,
     maps: MapRegistry,
@@ -37,10 +40,20 @@ impl core::fmt::Debug for Engine {
 }
 
 impl Engine {
-    /// An engine without sessions.
+    /// An engine without sessions, with the soil filter's default settings.
     pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Self {
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
-        Self { predictor, limits, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None }
+        let filter = SoilFilter::new(FilterConfig::default()).expect("the default settings are usable; this is a bug");
+        Self { predictor, limits, filter, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None }
+    }
+
+    /// Sessions opened from now on learn the soil with these settings.
+    ///
+    /// # Errors
+    /// `AdaptationError::Config` naming the setting that is unusable.
+    pub fn with_filter(mut self, config: FilterConfig) -> Result<Self, AdaptationError> {
+        self.filter = SoilFilter::new(config)?;
+        Ok(self)
     }
 
     /// Tells a sink what happens from now on.
@@ -113,13 +126,14 @@ impl Engine {
             let reason = format!("{} sessions are open, the limit; close one", self.sessions.len());
             return Err(EngineError::Exhausted { field: "session_id".into(), reason });
         }
-        let mut session = Session::new(id, &open.vehicle, map);
+        let mut session = Session::new(id, &open.vehicle, map, self.filter.clone());
         if let Some(initial) = &open.initial {
             let rules = Rules { step_ns: self.step_ns, vehicle: card, limits: &self.limits };
             let outcome = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
             if let crate::Outcome::NotFinite { field } = outcome {
                 return Err(EngineError::invalid(format!("initial.{field}"), "is not finite"));
             }
+            session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), outcome);
         }
         let view = self.view(&session);
         self.sessions.insert(id.clone(), session);
@@ -144,6 +158,8 @@ impl Engine {
         let soil_epoch = session.soil().epoch;
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
         let outcome = session.observe(measurement, now_ns, rules)?;
+        let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
+        let outcome = session.learn(&self.predictor, map.as_ref(), outcome);
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
         if soil.epoch != soil_epoch {
             self.emit(Event::SoilChanged { session: id.into(), soil });

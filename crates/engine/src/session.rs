@@ -1,10 +1,17 @@
 //! What the service remembers of one vehicle.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
-use nesam_model::{HISTORY, HistoryStep};
-use nesam_physics::{SOIL_DIM, SoilCorrection, Vehicle};
+use nesam_adaptation::SoilFilter;
+use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_physics::Vehicle;
+use nesam_terrain::WorldMap;
 
+mod soil;
+
+use self::soil::SoilLearner;
+pub use self::soil::SoilState;
 use crate::error::EngineError;
 use crate::grid::{Place, StepGrid};
 use crate::limits::{Limits, outside_card};
@@ -12,29 +19,6 @@ use crate::measurement::{Measurement, Outcome};
 
 /// Accepted stamps that are remembered to tell a resent measurement from a late one.
 const RECENT_STAMPS: usize = 256;
-
-/// What was learned of the soil in this session.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct SoilState {
-    /// Counts the updates; 0 = none yet.
-    pub epoch: u64,
-    /// Stamp of the last measurement that went in, ns of the vehicle's clock.
-    pub stamp_ns: Option<i64>,
-    /// Correction Δθ of the soil prior, zero before any update.
-    pub correction: SoilCorrection,
-    /// Variance of the correction in its coordinates; `None` while no filter runs.
-    pub variance: Option<[f64; SOIL_DIM]>,
-    /// Whether the drive has told something of each parameter.
-    pub learned: [bool; SOIL_DIM],
-}
-
-impl SoilState {
-    /// Variance of a corrected soil in physical units squared, to first order.
-    pub fn variance_at(&self, soil: &[f64; SOIL_DIM]) -> Option<[f64; SOIL_DIM]> {
-        let slope = self.correction.coordinates.slope(soil);
-        self.variance.map(|variance| core::array::from_fn(|i| slope[i] * slope[i] * variance[i]))
-    }
-}
 
 /// A session: identity, recent measured motion, soil.
 #[derive(Clone, Debug)]
@@ -50,6 +34,7 @@ pub struct Session {
     /// Engine clock when the newest step of the history arrived, ns.
     arrived_ns: u64,
     history_epoch: u64,
+    learner: SoilLearner,
     soil: SoilState,
 }
 
@@ -65,8 +50,9 @@ pub struct Rules<'a> {
 }
 
 impl Session {
-    /// A session without history.
-    pub fn new(id: &str, vehicle: &str, map: Option<&str>) -> Self {
+    /// A session without history, whose soil filter knows the prior only.
+    pub fn new(id: &str, vehicle: &str, map: Option<&str>, filter: SoilFilter) -> Self {
+        let learner = SoilLearner::new(filter);
         Self {
             id: id.into(),
             vehicle: vehicle.into(),
@@ -77,7 +63,8 @@ impl Session {
             last_sequence: None,
             arrived_ns: 0,
             history_epoch: 0,
-            soil: SoilState::default(),
+            soil: learner.state(0, None),
+            learner,
         }
     }
 
@@ -151,6 +138,26 @@ impl Session {
         self.history_epoch += 1;
         self.arrived_ns = now_ns;
         outcome
+    }
+
+    /// Lets the soil filter learn from the step that an observation has just made; every B-th step makes an update (paper Alg. 1). The
+    /// step stays in the history when the filter refuses its buffer: then the outcome says so.
+    pub fn learn(&mut self, predictor: &Predictor, map: Option<&Arc<WorldMap>>, outcome: Outcome) -> Outcome {
+        match outcome {
+            Outcome::Applied => {}
+            Outcome::Gap { .. } => self.learner.forget_open(),
+            _ => return outcome,
+        }
+        let stamp_ns = self.last_stamp_ns();
+        let Some((newest, before)) = self.history.make_contiguous().split_last() else { return outcome };
+        match self.learner.step(predictor, before, newest, map) {
+            None => outcome,
+            Some(update) if update.rejected => Outcome::Gated { nis: update.nis },
+            Some(_) => {
+                self.soil = self.learner.state(self.soil.epoch + 1, stamp_ns);
+                outcome
+            }
+        }
     }
 
     /// Name of the session.

@@ -10,9 +10,15 @@
 //!    intervals from a bootstrap over whole drives ([`Resamples`]);
 //! 4. [`Evaluation`] writes the JSON, [`report`] the HTML, [`write_predictions`] every predicted pose.
 //!
+//! `nesam adapt` puts one step between: [`adapt_all`] runs the soil filter over the drives, and [`WindowPredictor::Adapted`] predicts each
+//! window with what was learned by its start.
+//!
 //! Distances are in metres and angles in radians inside; scores of angles are in degrees, as their keys say.
 #![forbid(unsafe_code)]
 
+mod adapt;
+mod adapt_output;
+mod adapt_settings;
 mod baselines;
 mod bootstrap;
 mod constant_velocity;
@@ -33,6 +39,9 @@ mod slices;
 mod test_vehicle;
 mod windows;
 
+pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, estimate_noise};
+pub use adapt_output::Adaptation;
+pub use adapt_settings::{Coordinates, FilterSettings, NoiseSettings, noise_settings};
 pub use baselines::Baselines;
 pub use bootstrap::{DEFAULT_RESAMPLES, Resamples, median, quantile_sorted};
 pub use constant_velocity::constant_velocity;

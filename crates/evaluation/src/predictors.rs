@@ -6,6 +6,7 @@ use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
 use nesam_physics::{Control, SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
+use crate::adapt::DriveAdaptation;
 use crate::constant_velocity::constant_velocity;
 use crate::dimension::{POSE_DIM, pose_of};
 use crate::error::EvaluationError;
@@ -23,6 +24,13 @@ pub enum WindowPredictor {
         predictor: Arc<Predictor>,
         /// Ablation.
         variant: Variant,
+    },
+    /// The bundle's model with the soil that was learned up to the start of each window.
+    Adapted {
+        /// Loaded bundle.
+        predictor: Arc<Predictor>,
+        /// What the filter made of each drive, in the order of the drives.
+        filtered: Arc<Vec<DriveAdaptation>>,
     },
     /// The kinematic baseline with its fit.
     Kinematic {
@@ -68,7 +76,7 @@ impl WindowPredictor {
     /// Number of fitted or learned parameters.
     pub fn parameters(&self) -> usize {
         match self {
-            Self::Nesam { predictor, .. } => predictor.bundle().parameters,
+            Self::Nesam { predictor, .. } | Self::Adapted { predictor, .. } => predictor.bundle().parameters,
             Self::Kinematic { .. } => KINEMATIC_PARAMETERS,
             Self::ConstantVelocity => 0,
         }
@@ -84,7 +92,11 @@ impl WindowPredictor {
         let future = &drive.controls[window.start..window.start + window.horizon];
         let poses = match self {
             Self::Nesam { predictor, variant } => {
-                return nesam(predictor, *variant, window, future, map);
+                return nesam(predictor, *variant, SoilCorrection::NONE, window, future, map);
+            }
+            Self::Adapted { predictor, filtered } => {
+                let correction = filtered[window.drive].correction_at(window.start);
+                return nesam(predictor, Variant::Full, correction, window, future, map);
             }
             Self::Kinematic { model, vehicle } => {
                 let past = &drive.controls[window.first_history..window.start];
@@ -99,6 +111,7 @@ impl WindowPredictor {
 fn nesam(
     predictor: &Predictor,
     variant: Variant,
+    soil_correction: SoilCorrection,
     window: &Window<'_>,
     future: &[Control<f64>],
     map: Option<&Arc<WorldMap>>,
@@ -113,7 +126,7 @@ fn nesam(
         samples: 1,
         horizon: window.horizon,
         map,
-        soil_correction: SoilCorrection::NONE,
+        soil_correction,
         variant,
     };
     let rollout =

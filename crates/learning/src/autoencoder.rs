@@ -104,7 +104,13 @@ impl Autoencoder {
 ///
 /// # Errors
 /// A candle error.
-pub fn pretrain(name: &str, places: &Places, scale: &PatchScale, plan: &PretrainPlan, mut progress: impl FnMut(usize, f32)) -> Result<Pretrained> {
+pub fn pretrain(
+    name: &str,
+    places: &Places,
+    scale: &PatchScale,
+    plan: &PretrainPlan,
+    mut progress: impl FnMut(usize, f32),
+) -> Result<Pretrained> {
     let channels = if name == "elevation" { 1 } else { 3 };
     let mut rng = ChaCha8Rng::seed_from_u64(plan.seed);
     let autoencoder = Autoencoder::new(name, channels, &mut rng)?;

@@ -201,7 +201,10 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
 
 impl TerrainProvider for PathTerrain<'_, '_> {
     fn history(&mut self) -> Result<Tensor> {
-        self.past.as_ref().map(|past| past.tokens.as_tensor().clone()).ok_or_else(|| candle_core::Error::Msg("a batch without history has no history tokens".into()))
+        self.past
+            .as_ref()
+            .map(|past| past.tokens.as_tensor().clone())
+            .ok_or_else(|| candle_core::Error::Msg("a batch without history has no history tokens".into()))
     }
 
     fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {

@@ -70,7 +70,12 @@ fn rollout_error(model: &StepModel, drive: &Drive, i: usize, soil: &Soil<f64>, s
 }
 
 /// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error before and after, m.
-pub fn calibrate_driveline(vehicle: &mut Vehicle, drives: &[&Drive], scales: &Normalization, mut progress: impl FnMut(&str, f64, f64)) -> [f64; 2] {
+pub fn calibrate_driveline(
+    vehicle: &mut Vehicle,
+    drives: &[&Drive],
+    scales: &Normalization,
+    mut progress: impl FnMut(&str, f64, f64),
+) -> [f64; 2] {
     if vehicle.second == SecondCommand::YawRateRadS {
         let error = symbolic_error(vehicle, drives, scales, 40);
         return [error, error];

@@ -8,9 +8,9 @@ use std::sync::Arc;
 
 use half::f16;
 use half::slice::HalfFloatSliceExt;
+use nesam_model::HistoryStep;
 use nesam_model::dims::{CONTEXT, FEATURES};
 use nesam_model::encoder::{EncoderScratch, TerrainEncoders};
-use nesam_model::HistoryStep;
 use nesam_physics::{Control, VehicleState, wrap_angle};
 use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
 use rayon::prelude::*;

@@ -98,7 +98,12 @@ pub fn run(
         scales: &scales,
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
     };
-    reporter.line(&format!("{} drives train, {} validate, {} parameters", set.train.len(), validation_at.len(), weights.parameters("") - weights.parameters("encoder.")));
+    reporter.line(&format!(
+        "{} drives train, {} validate, {} parameters",
+        set.train.len(),
+        validation_at.len(),
+        weights.parameters("") - weights.parameters("encoder.")
+    ));
     reporter.stage("training", recipe.plan.steps);
     let plan = TrainingPlan { folder: recipe.out.join("checkpoint"), ..recipe.plan.clone() };
     let trained = train(
@@ -121,6 +126,8 @@ pub fn run(
         normalization: scales,
         weights: trained.weights,
         baselines_json,
+        reference_json: None,
+        effects: Vec::new(),
         provenance: Provenance {
             command: recipe.command.clone(),
             seed: plan.seed,
@@ -173,7 +180,8 @@ fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s:
         done += 1;
         reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
     });
-    reporter.line(&format!("drive line calibrated: symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", vehicle.driveline));
+    reporter
+        .line(&format!("drive line calibrated: symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", vehicle.driveline));
     scales
 }
 

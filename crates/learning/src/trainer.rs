@@ -188,8 +188,14 @@ pub fn train(
     mut report: impl FnMut(&EpochReport),
 ) -> std::result::Result<Trained, TrainingError> {
     let starts = window_starts(set, plan)?;
-    let mut checkpoint = if resume { Checkpoint::load(&plan.folder)? } else { None }
-        .unwrap_or_else(|| Checkpoint { step: 0, best_score: f64::INFINITY, best: weights.clone(), latest: weights.clone(), adam: Adam::default(), curve: Vec::new() });
+    let mut checkpoint = if resume { Checkpoint::load(&plan.folder)? } else { None }.unwrap_or_else(|| Checkpoint {
+        step: 0,
+        best_score: f64::INFINITY,
+        best: weights.clone(),
+        latest: weights.clone(),
+        adam: Adam::default(),
+        curve: Vec::new(),
+    });
     let network = Network::from_weights(&checkpoint.latest)?;
     let pools: Vec<rayon::ThreadPool> = (0..plan.shards)
         .map(|_| rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread can be started; this is a bug"))
@@ -338,7 +344,8 @@ impl Checkpoint {
             let path = folder.join(name);
             std::fs::read(&path).map_err(|e| fail(&path, e.to_string()))
         };
-        let arrays = |name: &str| -> std::result::Result<Weights, TrainingError> { Ok(Weights::from_bytes(&read(name)?, &folder.join(name))?) };
+        let arrays =
+            |name: &str| -> std::result::Result<Weights, TrainingError> { Ok(Weights::from_bytes(&read(name)?, &folder.join(name))?) };
         let state: serde_json::Value = serde_json::from_slice(&read("state.json")?).map_err(|e| fail(&state_path, e.to_string()))?;
         let missing = |key: &str| fail(&state_path, format!("`{key}` is missing"));
         Ok(Some(Self {

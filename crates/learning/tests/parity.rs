@@ -30,7 +30,10 @@ impl FromPredictor<'_> {
         let tokens = self.predictor.terrain_tokens(self.map, poses);
         let context: Vec<f32> = tokens.iter().flat_map(|t| t[..HIDDEN].to_vec()).collect();
         let soil: Vec<f32> = tokens.iter().flat_map(|t| t[HIDDEN..].to_vec()).collect();
-        Ok((Tensor::from_vec(context, (poses.len(), HIDDEN), &Device::Cpu)?, Tensor::from_vec(soil, (poses.len(), SOIL_DIM), &Device::Cpu)?))
+        Ok((
+            Tensor::from_vec(context, (poses.len(), HIDDEN), &Device::Cpu)?,
+            Tensor::from_vec(soil, (poses.len(), SOIL_DIM), &Device::Cpu)?,
+        ))
     }
 }
 
@@ -141,7 +144,8 @@ fn analytic_cached_attention_equals_attention_over_everything() {
     for t in 12..20 {
         let token = x.narrow(1, t, 1).and_then(|t| t.contiguous()).expect("a slice");
         let step = network.transformer(&token, &mut cache, None).expect("runs");
-        let error = (step - whole.narrow(1, t, 1).expect("a slice")).and_then(|d| d.abs()?.max_all()?.to_scalar::<f32>()).expect("a number");
+        let error =
+            (step - whole.narrow(1, t, 1).expect("a slice")).and_then(|d| d.abs()?.max_all()?.to_scalar::<f32>()).expect("a number");
         assert!(error < 1e-4, "token {t}: {error}");
     }
 }

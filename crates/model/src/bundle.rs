@@ -3,11 +3,13 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use nesam_physics::effects::Effect;
 use nesam_physics::{SOIL_DIM, Vehicle};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
 use crate::ModelError;
+use crate::effects_file;
 use crate::normalization::Normalization;
 use crate::weights::Weights;
 
@@ -19,6 +21,7 @@ const VEHICLE: &str = "vehicle.json";
 const NORMALIZATION: &str = "normalization.toml";
 const EFFECTS: &str = "effects.toml";
 const BASELINES: &str = "baselines.json";
+const REFERENCE: &str = "reference.json";
 const REQUIRED: [&str; 4] = [WEIGHTS, VEHICLE, NORMALIZATION, EFFECTS];
 
 /// Where a bundle comes from; shown by `inspect`, copied into every report.
@@ -58,8 +61,10 @@ pub struct ModelBundle {
     pub name: String,
     /// SHA-256 (hex) of the manifest, which holds the hash of every file.
     pub hash: String,
-    /// The vehicle the bundle was trained for.
+    /// The vehicle the bundle was trained for, with the bundle's effects.
     pub vehicle: Vehicle,
+    /// Effects on top of the vehicle card, as `effects.toml` lists them; [`ModelBundle::vehicle`] has them already.
+    pub effects: Vec<Effect>,
     /// Soil used where there is no map or no semantics, order of `SOIL_NAMES`.
     pub default_soil: [f64; SOIL_DIM],
     /// Trainable parameters of the kinodynamic model (without the frozen encoders).
@@ -70,6 +75,8 @@ pub struct ModelBundle {
     pub weights: Weights,
     /// Fitted baselines as JSON, if the bundle carries them.
     pub baselines_json: Option<String>,
+    /// What a diagnosis must know of the model's usual errors as JSON, if the bundle carries it.
+    pub reference_json: Option<String>,
     /// Where the bundle comes from.
     pub provenance: Provenance,
 }
@@ -121,7 +128,9 @@ impl ModelBundle {
             let bytes = folder.read(name)?;
             let found = sha256_hex(&bytes);
             if found != *expected {
-                return Err(folder.fail(name, format!("has SHA-256 {found}, the manifest says {expected}: the file was changed or damaged")));
+                return Err(
+                    folder.fail(name, format!("has SHA-256 {found}, the manifest says {expected}: the file was changed or damaged"))
+                );
             }
             files.insert(name.as_str(), bytes);
         }
@@ -136,18 +145,30 @@ impl ModelBundle {
         let normalization: Normalization =
             toml::from_str(&text_of(NORMALIZATION)?).map_err(|e| folder.fail(NORMALIZATION, format!("is not readable: {e}")))?;
         let vehicle = nesam_vehicle_card::from_json(&text_of(VEHICLE)?).map_err(|e| folder.fail(VEHICLE, e.to_string()))?;
+        let effects = effects_file::read(&text_of(EFFECTS)?).map_err(|reason| folder.fail(EFFECTS, reason))?;
         let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;
+        let reference_json = take(REFERENCE).map(|bytes| folder.text(REFERENCE, bytes)).transpose()?;
         Ok(Self {
             name: manifest.name,
             hash,
-            vehicle,
+            vehicle: vehicle.with_effects(&effects),
+            effects,
             default_soil: normalization.default_soil(),
             parameters: weights.parameters("") - weights.parameters("encoder."),
             normalization,
             weights,
             baselines_json,
+            reference_json,
             provenance: manifest.provenance,
         })
+    }
+
+    /// This bundle with further effects on its vehicle.
+    pub fn with_effects(&self, effects: &[Effect]) -> Self {
+        let mut patched = self.clone();
+        patched.vehicle = self.vehicle.with_effects(effects);
+        patched.effects.extend_from_slice(effects);
+        patched
     }
 
     /// Writes the bundle into a folder (created if absent; files of an older bundle there are replaced) and sets [`ModelBundle::hash`].
@@ -162,10 +183,13 @@ impl ModelBundle {
             (WEIGHTS, self.weights.to_bytes()),
             (VEHICLE, nesam_vehicle_card::to_json(&self.vehicle).into_bytes()),
             (NORMALIZATION, normalization.into_bytes()),
-            (EFFECTS, b"# Effects found by `nesam diagnose`; none yet.\neffects = []\n".to_vec()),
+            (EFFECTS, effects_file::write(&self.effects).into_bytes()),
         ];
         if let Some(json) = &self.baselines_json {
             files.push((BASELINES, json.clone().into_bytes()));
+        }
+        if let Some(json) = &self.reference_json {
+            files.push((REFERENCE, json.clone().into_bytes()));
         }
         for (name, bytes) in &files {
             folder.write(name, bytes)?;

@@ -4,6 +4,7 @@
 //! (row, column, channel). Each output row is computed from a zero-padded copy, so the inner loops have no branches.
 
 use nesam_terrain::{PATCH_PX, Patch};
+use wide::f32x8;
 
 use crate::ModelError;
 use crate::dims::{CONTEXT, FEATURE_CHANNELS, FEATURES};
@@ -11,8 +12,6 @@ use crate::weights::Weights;
 
 /// Filters of the three layers.
 pub const ENCODER_WIDTHS: [usize; 3] = [8, 16, FEATURE_CHANNELS];
-/// The third layer's 18 filters padded to whole vectors.
-const PADDED: usize = 24;
 /// Names of the two encoders and their input channels.
 pub const ENCODERS: [(&str, usize); 2] = [("elevation", 1), ("semantic", 3)];
 
@@ -22,37 +21,36 @@ pub fn encoder_shapes(name: &str, channels: usize) -> Vec<(String, Vec<usize>)> 
     (0..3)
         .flat_map(|l| {
             let layer = format!("encoder.{name}.conv{}", l + 1);
-            [
-                (format!("{layer}.weight"), vec![ENCODER_WIDTHS[l], 9 * inputs[l]]),
-                (format!("{layer}.bias"), vec![ENCODER_WIDTHS[l]]),
-            ]
+            [(format!("{layer}.weight"), vec![ENCODER_WIDTHS[l], 9 * inputs[l]]), (format!("{layer}.bias"), vec![ENCODER_WIDTHS[l]])]
         })
         .collect()
 }
 
-/// One layer: weights transposed to (9 · channels, O) so that the filters are the lanes.
+/// One layer: weights transposed to (9 · channels, 8 V) so that the filters are the lanes of V vectors.
 #[derive(Clone, Debug)]
-struct Layer<const O: usize> {
+struct Layer<const V: usize> {
     channels: usize,
-    weight: Vec<[f32; O]>,
-    bias: [f32; O],
+    weight: Vec<[f32x8; V]>,
+    bias: [f32x8; V],
 }
 
-impl<const O: usize> Layer<O> {
+/// `values(o)` for o < filters as V vectors, zero beyond.
+fn vectors<const V: usize>(filters: usize, values: impl Fn(usize) -> f32) -> [f32x8; V] {
+    core::array::from_fn(|v| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| if v * 8 + l < filters { values(v * 8 + l) } else { 0.0 })))
+}
+
+impl<const V: usize> Layer<V> {
     fn new(weights: &Weights, name: &str, filters: usize, channels: usize) -> Result<Self, ModelError> {
-        let source = weights.get(&format!("{name}.weight"), &[filters, 9 * channels])?;
-        let source_bias = weights.get(&format!("{name}.bias"), &[filters])?;
-        let mut bias = [0.0; O];
-        bias[..filters].copy_from_slice(source_bias);
-        let weight = (0..9 * channels)
-            .map(|k| core::array::from_fn(|o| if o < filters { source[o * 9 * channels + k] } else { 0.0 }))
-            .collect();
-        Ok(Self { channels, weight, bias })
+        let inputs = 9 * channels;
+        let source = weights.get(&format!("{name}.weight"), &[filters, inputs])?;
+        let bias = weights.get(&format!("{name}.bias"), &[filters])?;
+        let weight = (0..inputs).map(|k| vectors(filters, |o| source[o * inputs + k])).collect();
+        Ok(Self { channels, weight, bias: vectors(filters, |o| bias[o]) })
     }
 
-    /// Stride-2 convolution of a padded image ((px + 2)², channels) into `out`((px / 2)², kept filters), with ReLU if asked.
+    /// Stride-2 convolution of a padded image ((px + 2)², channels); `store(row, column, filters)` takes each output pixel.
     /// `P` output pixels are computed together to keep the arithmetic units busy.
-    fn run<const P: usize>(&self, padded: &[f32], px: usize, relu: bool, mut store: impl FnMut(usize, usize, &[f32; O])) {
+    fn run<const P: usize>(&self, padded: &[f32], px: usize, relu: bool, mut store: impl FnMut(usize, usize, &[f32])) {
         let (c, out) = (self.channels, px / 2);
         let stride = (px + 2) * c;
         let run = 3 * c;
@@ -61,23 +59,20 @@ impl<const O: usize> Layer<O> {
                 let mut acc = [self.bias; P];
                 for ky in 0..3 {
                     let start = (2 * oy + ky) * stride + 2 * ox * c;
-                    let pixels: [&[f32]; P] = core::array::from_fn(|p| &padded[start + 2 * p * c..start + 2 * p * c + run]);
+                    // One slice that covers all P neighbourhoods of this row, so that the bounds are checked once.
+                    let pixels = &padded[start..start + 2 * (P - 1) * c + run];
                     for (k, weight) in self.weight[ky * run..(ky + 1) * run].iter().enumerate() {
-                        for p in 0..P {
-                            let x = pixels[p][k];
-                            for o in 0..O {
-                                acc[p][o] = x.mul_add(weight[o], acc[p][o]);
+                        for (p, acc) in acc.iter_mut().enumerate() {
+                            let x = f32x8::splat(pixels[2 * p * c + k]);
+                            for v in 0..V {
+                                acc[v] = x.mul_add(weight[v], acc[v]);
                             }
                         }
                     }
                 }
-                for (p, values) in acc.iter_mut().enumerate() {
-                    if relu {
-                        for v in values.iter_mut() {
-                            *v = v.max(0.0);
-                        }
-                    }
-                    store(oy, ox + p, values);
+                for (p, values) in acc.iter().enumerate() {
+                    let values = values.map(|v| if relu { v.max(f32x8::ZERO) } else { v }.to_array());
+                    store(oy, ox + p, values.as_flattened());
                 }
             }
         }
@@ -87,9 +82,9 @@ impl<const O: usize> Layer<O> {
 /// One encoder.
 #[derive(Clone, Debug)]
 struct Encoder {
-    conv1: Layer<8>,
-    conv2: Layer<16>,
-    conv3: Layer<PADDED>,
+    conv1: Layer<1>,
+    conv2: Layer<2>,
+    conv3: Layer<3>,
 }
 
 /// Both encoders.

@@ -7,6 +7,7 @@
 
 pub mod bundle;
 pub mod dims;
+mod effects_file;
 pub mod encoder;
 mod fused;
 mod ground;

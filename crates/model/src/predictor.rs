@@ -3,12 +3,14 @@
 use std::sync::{Arc, Mutex};
 
 use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::effects::Effect;
 use nesam_physics::scalar::f32x8;
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
 use rayon::prelude::*;
 
+use crate::ModelError;
 use crate::bundle::ModelBundle;
 use crate::dims::{CONTEXT, HIDDEN, HISTORY, MAX_HORIZON, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
@@ -20,7 +22,6 @@ use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
 use crate::terrain_tokens::{TerrainProjection, TerrainToken, TerrainTokens, VALUES};
 use crate::token::{TokenScale, token_entries};
-use crate::ModelError;
 
 /// Maps whose terrain tokens are kept.
 const MAPS_MAX: usize = 16;
@@ -44,11 +45,11 @@ pub enum TerrainMode {
 pub struct Predictor {
     bundle: Arc<ModelBundle>,
     model: StepModel,
-    network: FusedTransformer,
-    projection: TerrainProjection,
+    network: Arc<FusedTransformer>,
+    projection: Arc<TerrainProjection>,
     token_scale: TokenScale,
     mode: TerrainMode,
-    maps: Mutex<Vec<(String, Arc<TerrainTokens>)>>,
+    maps: Arc<Mutex<Vec<(String, Arc<TerrainTokens>)>>>,
 }
 
 /// A measured transition, ready for the physics.
@@ -113,13 +114,29 @@ impl Predictor {
         );
         Ok(Self {
             model: StepModel::new(&bundle.vehicle, scales.dt_s, scales.substeps),
-            network: FusedTransformer::new(weights)?,
-            projection,
+            network: Arc::new(FusedTransformer::new(weights)?),
+            projection: Arc::new(projection),
             token_scale: scales.token_scale(),
             mode,
-            maps: Mutex::default(),
+            maps: Arc::default(),
             bundle,
         })
+    }
+
+    /// The same predictor for the vehicle with further effects. Network and terrain tokens do not depend on them and are shared, so this costs
+    /// little; the bundle's hash stays that of the files it was read from.
+    pub fn with_effects(&self, effects: &[Effect]) -> Self {
+        let bundle = Arc::new(self.bundle.with_effects(effects));
+        let scales = &bundle.normalization;
+        Self {
+            model: StepModel::new(&bundle.vehicle, scales.dt_s, scales.substeps),
+            network: self.network.clone(),
+            projection: self.projection.clone(),
+            token_scale: scales.token_scale(),
+            mode: self.mode,
+            maps: self.maps.clone(),
+            bundle,
+        }
     }
 
     /// The bundle behind the predictions.
@@ -198,7 +215,13 @@ impl Predictor {
     /// nominal soil θ̄. Nothing of it depends on the soil correction, so ∂ŷ/∂Δθ flows through the physics alone (paper Alg. 1).
     ///
     /// `history` are the measured steps before x_k, as in [`RolloutQuery`].
-    pub fn transition(&self, history: &[HistoryStep], state: &VehicleState<f64>, control: &Control<f64>, map: Option<&Arc<WorldMap>>) -> Transition {
+    pub fn transition(
+        &self,
+        history: &[HistoryStep],
+        state: &VehicleState<f64>,
+        control: &Control<f64>,
+        map: Option<&Arc<WorldMap>>,
+    ) -> Transition {
         let scales = &self.bundle.normalization;
         let tokens = map.map(|map| self.tokens_of(map));
         let ground = GroundSource::new(map.map(Arc::as_ref), &self.model, state);
@@ -315,11 +338,8 @@ impl Predictor {
         let query = scene.query;
         let last = samples.len() - 1;
         let controls: Vec<Control<f64>> = (0..samples.len()).map(|l| control(query, first + l, k)).collect();
-        let entries: Vec<[f32; STATE_CONTROL]> = samples
-            .iter()
-            .zip(&controls)
-            .map(|(s, control)| self.entries(&s.state, s.previous.as_ref(), control, &scene.ground))
-            .collect();
+        let entries: Vec<[f32; STATE_CONTROL]> =
+            samples.iter().zip(&controls).map(|(s, control)| self.entries(&s.state, s.previous.as_ref(), control, &scene.ground)).collect();
         let entry_lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| core::array::from_fn(|l| entries[l.min(last)][i]));
         let context: [Lane; HIDDEN] = core::array::from_fn(|i| core::array::from_fn(|l| terrain[l.min(last)][i]));
         let (raw_sinkage, raw_residual) = self.network.step(&scene.prefix, cache, &entry_lanes, &context);

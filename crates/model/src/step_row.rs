@@ -58,6 +58,10 @@ pub fn step_input<T: Real>(varying: [T; DIFFERENTIABLE], constant: [T; CONSTANT]
             overspeed_limit_m_s: constant[10],
             speed_m_s: constant[11],
         },
-        ground: core::array::from_fn(|i| Ground { height_m: constant[12 + i], slope_ahead: constant[16 + i], slope_left: constant[20 + i] }),
+        ground: core::array::from_fn(|i| Ground {
+            height_m: constant[12 + i],
+            slope_ahead: constant[16 + i],
+            slope_left: constant[20 + i],
+        }),
     }
 }

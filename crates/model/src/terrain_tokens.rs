@@ -126,7 +126,8 @@ impl TerrainTokens {
                 let mut token = [0.0; VALUES];
                 for (node, weight) in corners.iter().filter(|(_, w)| *w > 0.0) {
                     // Another query may have emptied the cache in between; the node is a pure function of its pose.
-                    let values = nodes.get(node).cloned().unwrap_or_else(|| Arc::new(self.encode(projection, node, &mut Scratch::default())));
+                    let values =
+                        nodes.get(node).cloned().unwrap_or_else(|| Arc::new(self.encode(projection, node, &mut Scratch::default())));
                     for (sum, value) in token.iter_mut().zip(values.iter()) {
                         *sum = weight.mul_add(*value, *sum);
                     }
@@ -154,10 +155,8 @@ impl TerrainTokens {
         if missing.is_empty() {
             return;
         }
-        let encoded: Vec<TerrainToken> = missing
-            .par_iter()
-            .map_init(Scratch::default, |scratch, node| self.encode(projection, node, scratch))
-            .collect();
+        let encoded: Vec<TerrainToken> =
+            missing.par_iter().map_init(Scratch::default, |scratch, node| self.encode(projection, node, scratch)).collect();
         let mut nodes = self.nodes.write().expect("no writer panics; this is a bug");
         if nodes.len() > NODES_MAX {
             nodes.retain(|node, _| wanted.iter().flatten().any(|(w, _)| w == node));

@@ -37,8 +37,23 @@ pub fn token_entries(
     };
     let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
     let height = state.position_m[2] - ground_height_m;
-    [height, state.attitude_rad[0], state.attitude_rad[1], turned, v[0], v[1], v[2], w[0], w[1], w[2], moved[0], moved[1], control[0], control[1]]
-        .map(|x| x as f32)
+    [
+        height,
+        state.attitude_rad[0],
+        state.attitude_rad[1],
+        turned,
+        v[0],
+        v[1],
+        v[2],
+        w[0],
+        w[1],
+        w[2],
+        moved[0],
+        moved[1],
+        control[0],
+        control[1],
+    ]
+    .map(|x| x as f32)
 }
 
 impl TokenScale {
@@ -50,7 +65,19 @@ impl TokenScale {
 
 /// Names of the entries, for reports.
 pub const ENTRY_NAMES: [&str; STATE_CONTROL] = [
-    "height_m", "roll_rad", "pitch_rad", "turned_rad", "v_x_m_s", "v_y_m_s", "v_z_m_s", "w_x_rad_s", "w_y_rad_s", "w_z_rad_s", "ahead_m", "left_m",
-    "speed_command_m_s", "second_command",
+    "height_m",
+    "roll_rad",
+    "pitch_rad",
+    "turned_rad",
+    "v_x_m_s",
+    "v_y_m_s",
+    "v_z_m_s",
+    "w_x_rad_s",
+    "w_y_rad_s",
+    "w_z_rad_s",
+    "ahead_m",
+    "left_m",
+    "speed_command_m_s",
+    "second_command",
 ];
 const _: () = assert!(STATE_DIM + 2 == STATE_CONTROL);

@@ -78,8 +78,7 @@ impl Weights {
             if view.dtype() != Dtype::F32 {
                 return Err(fail(format!("array `{name}` has type {:?}, expected F32", view.dtype())));
             }
-            let values: Vec<f32> =
-                view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
+            let values: Vec<f32> = view.data().chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
             if let Some(at) = values.iter().position(|v| !v.is_finite()) {
                 return Err(fail(format!("array `{name}` holds a number that is not finite at index {at}")));
             }

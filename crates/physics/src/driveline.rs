@@ -85,7 +85,12 @@ pub fn road_wheel_angles(vehicle: &Vehicle, steering: f64) -> [f64; WHEELS] {
 }
 
 /// What the command makes of the wheels over one step, from the mean actuator position of the step.
-pub fn command_wheels<T: Real>(vehicle: &Vehicle, before: &DrivelineState, after: &DrivelineState, control: &Control<f64>) -> WheelCommand<T> {
+pub fn command_wheels<T: Real>(
+    vehicle: &Vehicle,
+    before: &DrivelineState,
+    after: &DrivelineState,
+    control: &Control<f64>,
+) -> WheelCommand<T> {
     let line = &vehicle.driveline;
     let steering = 0.5 * (before.steering + after.steering) + vehicle.effects.steering_offset;
     let skid = vehicle.second == SecondCommand::YawRateRadS;

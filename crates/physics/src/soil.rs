@@ -36,5 +36,4 @@ impl<T: Copy> Soil<T> {
 }
 
 /// Admissible bounds θ_min, θ_max (paper Alg. 1), wide enough for the published soils of Wong's tables from snow to LETE sand.
-pub const SOIL_BOUNDS: [(f64, f64); SOIL_DIM] =
-    [(3.0e4, 1.5e7), (10.0, 2.0e5), (0.1, 1.6), (50.0, 7.0e4), (0.09, 0.75), (0.002, 0.08)];
+pub const SOIL_BOUNDS: [(f64, f64); SOIL_DIM] = [(3.0e4, 1.5e7), (10.0, 2.0e5), (0.1, 1.6), (50.0, 7.0e4), (0.09, 0.75), (0.002, 0.08)];

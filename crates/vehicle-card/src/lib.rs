@@ -151,7 +151,11 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             Second::YawRateRadS => SecondCommand::YawRateRadS,
         },
         command_range: [c.speed_range_m_s, c.second_range],
-        steering: c.steering.map(|t| SteeringTable { command: t.command, front_left_rad: t.front_left_rad, front_right_rad: t.front_right_rad }),
+        steering: c.steering.map(|t| SteeringTable {
+            command: t.command,
+            front_left_rad: t.front_left_rad,
+            front_right_rad: t.front_right_rad,
+        }),
         track_m: c.track_m,
         wheelbase_m: c.wheelbase_m,
         driveline: Driveline {

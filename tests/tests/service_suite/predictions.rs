@@ -1,6 +1,7 @@
 //! Goal: a prediction through the service is the offline rollout, whatever else happens around it.
 
 use nesam_client::v1;
+use nesam_physics::SoilCorrection;
 
 use crate::stage::*;
 
@@ -16,13 +17,14 @@ async fn service_prediction_equals_offline_rollout_bit_for_bit() {
         assert_eq!(fed.len(), i + 1);
         let candidates = candidates("s", &recorded.drive, i, 5, 32);
         let prediction = client.predict(candidates.clone()).await.unwrap();
-        assert_same(&prediction, &offline(&recorded, i, &candidates, history_steps));
+        let (soil, updates) = learned(&recorded, i);
+        assert_same(&prediction, &offline(&recorded, i, &candidates, history_steps, soil));
         assert!(prediction.states.iter().all(|v| v.is_finite()));
         assert_eq!(prediction.history_steps, history_steps);
         assert_eq!(prediction.start, recorded.drive.states[i].to_array());
         assert!(prediction.measurement_age_s.is_some_and(|age| (0.0..60.0).contains(&age)));
         let provenance = &prediction.provenance;
-        assert_eq!((provenance.history_epoch, provenance.soil_epoch, provenance.map_version), (i as u64 + 1, 0, 1));
+        assert_eq!((provenance.history_epoch, provenance.soil_epoch, provenance.map_version), (i as u64 + 1, updates, 1));
         assert_eq!((provenance.map_hash.as_str(), &provenance.bundle_hash), (recorded.world.hash(), &predictor().bundle().hash));
     }
     server.shutdown().await;
@@ -60,15 +62,16 @@ async fn service_given_start_history_use_and_selection() {
     assert_refused("no start", client.predict(query.clone()).await, tonic::Code::FailedPrecondition, "start");
     query.start = Some(recorded.drive.states[i].to_array());
     let alone = client.predict(query.clone()).await.unwrap();
-    assert_same(&alone, &offline(&recorded, i, &query, 0));
+    assert_same(&alone, &offline(&recorded, i, &query, 0, SoilCorrection::NONE));
     assert_eq!(alone.measurement_age_s, None);
 
     client.feed(samples("s", &recorded.drive, i)).await.unwrap();
     let before = client.session("s").await.unwrap();
     let full = client.predict(query.clone()).await.unwrap();
-    assert_same(&full, &offline(&recorded, i, &query, 31));
+    let (soil, _) = learned(&recorded, i);
+    assert_same(&full, &offline(&recorded, i, &query, 31, soil));
     query.use_history = false;
-    assert_same(&client.predict(query.clone()).await.unwrap(), &offline(&recorded, i, &query, 0));
+    assert_same(&client.predict(query.clone()).await.unwrap(), &offline(&recorded, i, &query, 0, soil));
 
     query.use_history = true;
     query.output = v1::OutputSelection { channels: 0b10_0011, stride: 4, wheel_sinkage: false };

@@ -2,7 +2,9 @@
 
 use std::sync::{Arc, OnceLock};
 
+use nesam_adaptation::FilterConfig;
 use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
+use nesam_evaluation::adapt_drive;
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{HistoryStep, ModelBundle, Predictor, Provenance, Rollout, RolloutQuery, Variant};
 use nesam_physics::SoilCorrection;
@@ -135,8 +137,15 @@ pub fn candidates(session: &str, drive: &Trajectory, i: usize, samples: usize, h
     Candidates::new(session, samples, horizon, controls)
 }
 
-/// What the offline rollout gives after sample `i`, from a predictor that has answered nothing else, on the map read from the file.
-pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_steps: usize) -> Rollout {
+/// The soil correction that the filter of `nesam adapt` has learned from the samples up to `i`, and the number of updates.
+pub fn learned(recorded: &Recorded, i: usize) -> (SoilCorrection, u64) {
+    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&recorded.world), &FilterConfig::default()).unwrap();
+    let updates = filtered.updates.iter().filter(|u| u.sample <= i && !u.update.rejected).count();
+    (filtered.correction_at(i), updates as u64)
+}
+
+/// What the offline rollout gives after sample `i` with this soil, from a predictor that has answered nothing else, on the map read from the file.
+pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_steps: usize, soil_correction: SoilCorrection) -> Rollout {
     let drive = &recorded.drive;
     let history: Vec<HistoryStep> =
         (i - history_steps..i).map(|j| HistoryStep { state: drive.states[j], control: drive.controls[j] }).collect();
@@ -148,7 +157,7 @@ pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_s
             samples: candidates.samples,
             horizon: candidates.horizon,
             map: Some(&recorded.world),
-            soil_correction: SoilCorrection::NONE,
+            soil_correction,
             variant: Variant::Full,
         })
         .unwrap()

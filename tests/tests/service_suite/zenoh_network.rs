@@ -51,7 +51,7 @@ async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction(
     let by_grpc = client.predict(candidates("grpc", &recorded.drive, last, 3, 32)).await.unwrap();
     let by_zenoh = client.predict(candidates("truck", &recorded.drive, last, 3, 32)).await.unwrap();
     assert!(bits(&by_grpc.states) == bits(&by_zenoh.states));
-    assert_same(&by_zenoh, &offline(&recorded, last, &candidates("truck", &recorded.drive, last, 3, 32), 31));
+    assert_same(&by_zenoh, &offline(&recorded, last, &candidates("truck", &recorded.drive, last, 3, 32), 31, learned(&recorded, last).0));
     // The queryable gives the same bytes.
     let queried = vehicle.predict(&candidates("", &recorded.drive, last, 3, 32)).await.unwrap();
     assert!(bits(&queried.states) == bits(&by_zenoh.states));

@@ -1,7 +1,9 @@
 //! One module per command: its options and `run`.
 
+pub mod adapt;
 pub mod check;
 pub mod demo;
+pub mod diagnose;
 pub mod evaluate;
 pub mod inspect;
 pub mod predict;

@@ -1,5 +1,6 @@
 //! Goal: every kind of measurement gets its typed answer and only accepted ones leave a trace.
 
+use nesam_adaptation::FilterConfig;
 use nesam_physics::{Control, Driveline, SecondCommand, VehicleState};
 
 use super::*;
@@ -49,7 +50,7 @@ fn observe(session: &mut Session, measurement: &Measurement) -> Result<Outcome, 
 
 /// A session with `n` steps.
 fn driven(n: i64) -> Session {
-    let mut session = Session::new("s", "v", None);
+    let mut session = Session::new("s", "v", None, SoilFilter::new(FilterConfig::default()).unwrap());
     for i in 0..n {
         assert_eq!(observe(&mut session, &at(i * STEP_NS)), Ok(Outcome::Applied));
     }

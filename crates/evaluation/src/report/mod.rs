@@ -4,12 +4,14 @@
 //! share one look. Colours are those of Okabe and Ito (2008), distinguishable with any common colour blindness; lines differ by
 //! dash as well.
 
+mod adaptation;
 mod evaluation;
 mod line_plot;
 mod page;
 mod scale;
 mod table;
 
+pub use adaptation::adaptation_page;
 pub use evaluation::evaluation_page;
 pub use line_plot::{LinePlot, Series};
 pub use page::{Page, escape};

@@ -124,6 +124,8 @@ pub fn predictor(scales: &Normalization, weights: Weights) -> Predictor {
         normalization: scales.clone(),
         weights,
         baselines_json: None,
+        reference_json: None,
+        effects: Vec::new(),
         provenance: Provenance::default(),
     };
     Predictor::new(Arc::new(bundle)).expect("all arrays are there")

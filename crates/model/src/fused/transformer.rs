@@ -258,7 +258,8 @@ fn attend_history(queries: &[f32], keys: &[f32], values: &[f32], t: usize, mut s
     for head in 0..HEADS {
         let from = head * HEAD_DIM;
         let query = &queries[t * HIDDEN + from..t * HIDDEN + from + HEAD_DIM];
-        let dot = |s: usize| keys[s * HIDDEN + from..s * HIDDEN + from + HEAD_DIM].iter().zip(query).map(|(k, q)| k * q).sum::<f32>() * scale;
+        let dot =
+            |s: usize| keys[s * HIDDEN + from..s * HIDDEN + from + HEAD_DIM].iter().zip(query).map(|(k, q)| k * q).sum::<f32>() * scale;
         let scores: Vec<f32> = (0..=t).map(dot).collect();
         let top = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
         let weights: Vec<f32> = scores.iter().map(|s| (s - top).exp()).collect();

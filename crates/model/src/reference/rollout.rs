@@ -12,12 +12,12 @@ use nesam_physics::{Control, STATE_DIM, VehicleState, wrap_angle};
 
 use super::network::{KvCache, Network, causal_mask, soil_from_raw};
 use super::physics_op::physics_increment;
+use crate::Normalization;
 use crate::dims::*;
 use crate::ground::GroundSource;
 use crate::rollout::{HistoryStep, Variant};
 use crate::step_row::{CONSTANT, pack_constants};
 use crate::token::token_entries;
-use crate::Normalization;
 
 /// One row of a batch.
 #[derive(Clone, Debug)]
@@ -167,9 +167,8 @@ impl ReferenceRollout<'_> {
         state: &Tensor,
         increment: Option<&Tensor>,
     ) -> Result<Tensor> {
-        let measured: Vec<[f32; STATE_CONTROL]> = (0..rows.len())
-            .map(|b| self.scaled_entries(&rows[b], &states[b], previous[b].as_ref(), &controls[b]))
-            .collect();
+        let measured: Vec<[f32; STATE_CONTROL]> =
+            (0..rows.len()).map(|b| self.scaled_entries(&rows[b], &states[b], previous[b].as_ref(), &controls[b])).collect();
         let measured = rows_tensor(&measured)?;
         let Some(increment) = increment else { return Ok(measured) };
         // Same numbers as `measured`, but as functions of the prediction; only z enters relative to the ground.
@@ -207,10 +206,8 @@ impl ReferenceRollout<'_> {
             Variant::ZeroSinkage => (raw_sinkage.zeros_like()? - 12.0)?,
             _ => (raw_sinkage.tanh()? * f64::from(self.scales.sinkage_log_ratio_max))?,
         };
-        let packed = Tensor::cat(
-            &[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, rows_tensor(constants)?],
-            1,
-        )?;
+        let packed =
+            Tensor::cat(&[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, rows_tensor(constants)?], 1)?;
         // z, roll, pitch are columns 2..5; yaw (5) does not enter the step.
         let symbolic = physics_increment(&packed, self.model)?;
         if self.variant == Variant::NoResidual {

@@ -15,13 +15,7 @@ use core::ops::{Add, Div, Mul, Neg, Sub};
 
 /// A real number as the physics sees it.
 pub trait Real:
-    Copy
-    + core::fmt::Debug
-    + Add<Output = Self>
-    + Sub<Output = Self>
-    + Mul<Output = Self>
-    + Div<Output = Self>
-    + Neg<Output = Self>
+    Copy + core::fmt::Debug + Add<Output = Self> + Sub<Output = Self> + Mul<Output = Self> + Div<Output = Self> + Neg<Output = Self>
 {
     /// The scalar without its derivatives: itself for floats and lanes, the inner value for duals.
     ///

@@ -33,12 +33,7 @@ impl<T: Real> ContactMotion<T> {
     /// From a slip and a lateral ratio alone (rolling wheel), as single-wheel tests state them. `slip > -1`.
     pub fn from_slip(slip: f64, tan_slip_angle: f64) -> Self {
         let travel = if slip >= 0.0 { 1.0 - slip } else { 1.0 / (1.0 + slip) };
-        Self {
-            travel_ratio: T::lit(travel),
-            rim_ratio: T::lit(1.0),
-            lateral_ratio: T::lit(travel * tan_slip_angle),
-            slip: T::lit(slip),
-        }
+        Self { travel_ratio: T::lit(travel), rim_ratio: T::lit(1.0), lateral_ratio: T::lit(travel * tan_slip_angle), slip: T::lit(slip) }
     }
 }
 

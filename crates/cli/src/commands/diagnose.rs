@@ -1,0 +1,234 @@
+//! `nesam diagnose`: from a measured residual to the physical effect that the model lacks.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use clap::Args;
+use nesam_discovery::report::{Report, describe};
+use nesam_discovery::{Candidate, Diagnosis, Options, Reference, Scoring, Stepping, Verdict, diagnose, observe_all};
+use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM};
+use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
+use nesam_physics::effects::Effect;
+
+use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::bundle_path::bundle_dir;
+use crate::failure::{Failure, OrFail};
+use crate::output::{command_line, say};
+use crate::progress::Progress;
+use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+use crate::{interrupt, output};
+
+/// Options of `nesam diagnose`.
+#[derive(Args, Debug)]
+pub struct DiagnoseArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    #[command(flatten)]
+    window: WindowArgs,
+    /// Fit on these drives only and score on the others [default: leave each drive out once]
+    #[arg(long, value_name = "ID,…", value_delimiter = ',')]
+    fit_on: Option<Vec<String>>,
+    /// Effects that are not considered
+    #[arg(long, value_name = "ID,…", value_delimiter = ',')]
+    without: Vec<String>,
+    /// What the change is measured against
+    #[arg(long, value_enum, default_value_t = ReferenceArg::Bundle)]
+    reference: ReferenceArg,
+    /// Measure the reference on the drives of the train split that training left for validation, and put it into the bundle
+    #[arg(long, conflicts_with_all = ["fit_on", "without"])]
+    make_reference: bool,
+    /// Seed of the bootstrap
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Folder for the reports and the patched bundle [default: nesam-out/diagnose-<set>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Write the JSON here instead
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write the HTML report here instead
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum ReferenceArg {
+    /// The change against the frozen bundle.
+    Bundle,
+    /// The physics itself.
+    Physics,
+}
+
+/// Every tenth drive of the sorted train split validates (as in training, which never saw it).
+fn is_validation(index: usize) -> bool {
+    index % 10 == 7
+}
+
+/// Runs the command.
+pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
+    if args.reference == ReferenceArg::Physics {
+        return Err(Failure::input("--reference physics is not supported by this version; use --reference bundle"));
+    }
+    if let Some(unknown) = args.without.iter().find(|id| !Effect::IDS.contains(&id.as_str())) {
+        return Err(Failure::input(format!("--without {unknown}: no such effect; the catalogue has {}", Effect::IDS.join(", "))));
+    }
+    check_model_step(args.data.dt)?;
+    if args.window.horizon > MAX_HORIZON {
+        return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
+    }
+    if args.make_reference { make_reference(args) } else { diagnose_set(args) }
+}
+
+fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
+    if args.data.split != SplitArg::Train {
+        return Err(Failure::input(
+            "--make-reference needs --split train: the reference is measured on validation drives of the train split",
+        ));
+    }
+    interrupt::exit_on_ctrl_c("the bundle is unchanged");
+    let dir = bundle_dir(args.bundle.bundle.as_deref())?;
+    let mut drives = read_drives(&args.data, false)?;
+    let mut order: Vec<usize> = (0..drives.drives.len()).collect();
+    order.sort_by(|a, b| drives.drives[*a].id.cmp(&drives.drives[*b].id));
+    let chosen: Vec<usize> = order.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, d)| d).collect();
+    drives.maps = chosen.iter().map(|&d| drives.maps[d].clone()).collect();
+    drives.drives = chosen.iter().map(|&d| drives.drives[d].clone()).collect();
+    let mut bundle = load_bundle(Some(&dir))?;
+    let predictor = predictor_for(bundle.clone(), &drives.root)?;
+    let progress = Progress::start("validation drives", drives.drives.len());
+    let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
+    progress.finish();
+    let reference = Reference::measure(&predictor.bundle().vehicle, stepping(&bundle), &observed, &drives.root.hash()).or_input()?;
+    if let Some(nulls) = reference.null_groups(5) {
+        say!("null groups of 5 drives: threshold z = {:.2}", nulls.threshold);
+        for (candidate, spread) in Candidate::ALL.iter().zip(&nulls.spread) {
+            say!("  {:<18} null spread {spread:.2}", candidate.label());
+        }
+    }
+    bundle.reference_json = Some(reference.to_json());
+    bundle.save(&dir).or_failed()?;
+    say!("bundle {} now carries the reference of {} drives; its hash is {}", bundle.name, observed.len(), &bundle.hash[..12]);
+    Ok(())
+}
+
+fn stepping(bundle: &ModelBundle) -> Stepping {
+    Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps }
+}
+
+fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
+    interrupt::exit_on_ctrl_c("nothing was written");
+    let drives = read_drives(&args.data, false)?;
+    let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
+    let predictor = predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?;
+    let options = Options {
+        fit_on: args.fit_on.clone(),
+        without: args.without.clone(),
+        scoring: Scoring { horizon: args.window.horizon, history: args.window.history, resamples: DEFAULT_RESAMPLES, seed: args.seed },
+    };
+    let console = Console::default();
+    let found =
+        diagnose(&predictor, &drives.drives, &drives.maps, &options, &|stage, done, total| console.show(stage, done, total)).or_input()?;
+    console.end();
+    let bundle = patched(&predictor, &found, &drives, &out)?;
+    let shown = bundle.as_ref().map(|p| p.display().to_string());
+    let provenance = output::provenance(Some(predictor.bundle()), &drives);
+    let report = Report { set: &drives.set, diagnosis: &found, bundle: shown.as_deref(), provenance: &provenance, dt_s: args.data.dt };
+    summary(&report, &found);
+    let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
+    let (json, html) = (at(&args.json, "diagnose.json"), at(&args.html, "diagnose.html"));
+    output::write_file(&json, report.to_json().as_bytes())?;
+    output::write_file(&html, report.to_html().as_bytes())?;
+    say!("\nwrote {} and {}", json.display(), html.display());
+    Ok(())
+}
+
+/// Writes the bundle with the effect, where one is claimed.
+fn patched(predictor: &Arc<Predictor>, found: &Diagnosis, drives: &Drives, out: &Path) -> Result<Option<PathBuf>, Failure> {
+    let (Verdict::Explained | Verdict::Ambiguous, Some(best)) = (found.verdict, found.selection.claimed()) else { return Ok(None) };
+    let base = predictor.bundle();
+    let mut bundle = base.with_effects(&[best.fit.effect()]);
+    bundle.provenance = Provenance {
+        command: command_line(),
+        data_hash: drives.root.hash(),
+        program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
+        parent: Some(base.hash.clone()),
+        ..base.provenance.clone()
+    };
+    Ok(Some(bundle.save(&out.join("bundle")).or_failed()?))
+}
+
+fn summary(report: &Report<'_>, found: &Diagnosis) {
+    say!("{}: {} - {}", report.set, found.verdict.as_str().to_uppercase(), found.reason);
+    let s = &found.selection;
+    let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
+    say!("\nevidence, soil and offsets projected out (threshold z = {:.2}{p})", s.threshold);
+    for (e, candidate) in Candidate::ALL.iter().enumerate() {
+        let Some(z) = s.z[e] else { continue };
+        let fit = s.ranked.iter().find(|r| r.fit.candidate == *candidate);
+        let fit = fit.map_or(String::new(), |r| {
+            let refused = r.refused.as_ref().map_or(String::new(), |why| format!("; refused: {why}"));
+            format!("  criterion {:+9.1}  weight {:.3}  {}{refused}", r.bic, r.weight, describe(r))
+        });
+        say!("  {:<18} z {z:7.1}{fit}", candidate.label());
+    }
+    for e in &found.estimates {
+        let interval = e.ci95.map_or(String::new(), |[low, high]| format!("[{low:.3}, {high:.3}] "));
+        say!("  {} = {:.3} {interval}{}", e.name, e.value, e.unit);
+    }
+    if let Some(stability) = found.stability {
+        say!("  stability over half-samples of drives {stability:.2}");
+    }
+    let stages = report.stages();
+    if stages.is_empty() {
+        return;
+    }
+    say!(
+        "\n{:<22}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}",
+        "drives not fitted",
+        "x m",
+        "y m",
+        "z m",
+        "roll °",
+        "pitch °",
+        "yaw °",
+        "pos. m",
+        "final m"
+    );
+    for (name, tree) in stages {
+        let numbers: [Option<f64>; POSE_DIM] = tree.mae_mean.to_array();
+        let cells: String = numbers
+            .iter()
+            .chain([&tree.position_m.mean, &tree.position_m.final_])
+            .map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}")))
+            .collect();
+        say!("{name:<22}{cells}");
+    }
+}
+
+/// One progress bar after the other.
+#[derive(Default)]
+struct Console {
+    stage: Mutex<Option<(String, Progress)>>,
+}
+
+impl Console {
+    fn show(&self, stage: &str, done: usize, total: usize) {
+        let Ok(mut now) = self.stage.lock() else { return };
+        if now.as_ref().is_none_or(|(name, _)| name != stage) {
+            if let Some((_, ended)) = now.replace((stage.to_string(), Progress::start(stage, total))) {
+                ended.finish();
+            }
+        }
+        if let Some((_, progress)) = now.as_ref() {
+            progress.set(done);
+        }
+    }
+
+    fn end(&self) {
+        if let Some((_, ended)) = self.stage.lock().ok().and_then(|mut now| now.take()) {
+            ended.finish();
+        }
+    }
+}

@@ -1,0 +1,29 @@
+//! What can go wrong during a diagnosis.
+
+/// Errors of this crate.
+#[derive(Debug, thiserror::Error)]
+pub enum DiscoveryError {
+    /// A drive is too short or stands off its map.
+    #[error("drive `{trajectory}` has no segment of {steps} steps on known ground; leave it out with --trajectories")]
+    NoSegments {
+        /// Drive.
+        trajectory: String,
+        /// Steps of a segment.
+        steps: usize,
+    },
+    /// The reference statistics of the bundle cannot be used.
+    #[error("reference.json: {reason}")]
+    Reference {
+        /// What was wrong and what to do.
+        reason: String,
+    },
+    /// A drive was asked for that the set does not have, or too few are left.
+    #[error("{reason}")]
+    Drives {
+        /// What was wrong and what to do.
+        reason: String,
+    },
+    /// The model refused a window.
+    #[error(transparent)]
+    Evaluation(#[from] nesam_evaluation::EvaluationError),
+}

@@ -1,0 +1,105 @@
+//! Proof on drives that were not fitted: full rollouts of the bundle before, with the best soil alone, and with the effect.
+
+use std::sync::Arc;
+
+use nesam_evaluation::{
+    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, POSE_DIM, PosePath, Resamples, Truth, Window, all_windows, pose_of,
+    score,
+};
+use nesam_model::{Predictor, RolloutQuery, Variant};
+use nesam_physics::SoilCorrection;
+use nesam_physics::effects::Effect;
+use nesam_trajectories::Trajectory;
+use rayon::prelude::*;
+
+/// What was learned without a drive, for that drive.
+#[derive(Clone, Debug)]
+pub struct Learned {
+    /// Best soil correction without an effect.
+    pub soil: SoilCorrection,
+    /// Effects claimed; empty when nothing was.
+    pub effects: Vec<Effect>,
+}
+
+/// Scores on the held-out drives.
+#[derive(Clone, Debug)]
+pub struct HeldOut {
+    /// Before, soil only, after.
+    pub scores: [ModelScore; 3],
+    /// Draws behind the intervals.
+    pub resamples: Resamples,
+}
+
+/// How the rollouts are cut and scored.
+#[derive(Clone, Copy, Debug)]
+pub struct Scoring {
+    /// Steps K.
+    pub horizon: usize,
+    /// Steps of history.
+    pub history: usize,
+    /// Bootstrap draws.
+    pub resamples: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+}
+
+/// Rolls every window of the held-out drives out three times. `learned[i]` belongs to `drives[i]`.
+///
+/// # Errors
+/// `EvaluationError::NoWindows` when no window fits; the first error of the model.
+pub fn score_held_out(
+    predictor: &Predictor,
+    drives: &[Trajectory],
+    maps: &DriveMaps,
+    learned: &[Learned],
+    scoring: &Scoring,
+) -> Result<HeldOut, EvaluationError> {
+    let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
+    let patched: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
+    let paths: Vec<[PosePath; 3]> = windows
+        .par_iter()
+        .map(|w| {
+            let map = maps[w.drive].as_ref();
+            let before = roll_out(predictor, w, map, SoilCorrection::NONE)?;
+            let soil = roll_out(predictor, w, map, learned[w.drive].soil)?;
+            let after = if learned[w.drive].effects.is_empty() {
+                before.clone()
+            } else {
+                roll_out(&patched[w.drive], w, map, SoilCorrection::NONE)?
+            };
+            Ok([before, soil, after])
+        })
+        .collect::<Result<_, EvaluationError>>()?;
+    let resamples = Resamples::draw(drives.len(), scoring.resamples, scoring.seed);
+    let scores = core::array::from_fn(|m| {
+        let paths = paths.iter().map(|p| p[m].clone()).collect();
+        let model = ModelPaths { name: ModelName::Nesam, parameters: predictor.bundle().parameters, paths };
+        score(&model, &windows, Truth::Measured, &resamples)
+    });
+    Ok(HeldOut { scores, resamples })
+}
+
+fn roll_out(
+    predictor: &Predictor,
+    window: &Window<'_>,
+    map: Option<&Arc<nesam_terrain::WorldMap>>,
+    soil_correction: SoilCorrection,
+) -> Result<PosePath, EvaluationError> {
+    let drive = window.trajectory;
+    let controls: Vec<f32> =
+        drive.controls[window.start..window.start + window.horizon].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+    let query = RolloutQuery {
+        history: &window.history(),
+        start: drive.states[window.start],
+        controls: &controls,
+        samples: 1,
+        horizon: window.horizon,
+        map,
+        soil_correction,
+        variant: Variant::Full,
+    };
+    let rollout =
+        predictor.rollout(&query).map_err(|source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source })?;
+    let poses = (0..window.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
+    Ok(PosePath { poses, predicts: [true; POSE_DIM] })
+}

@@ -1,0 +1,188 @@
+//! A twin world: drives of the physics itself on hills, with soil that differs from drive to drive, sensor noise, and a known effect.
+#![allow(dead_code, clippy::unwrap_used)]
+
+use std::sync::{Arc, OnceLock};
+
+use nesam_discovery::{Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
+use nesam_learning::{Drive, initial::initial_weights, scales};
+use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance};
+use nesam_physics::driveline::{DrivelineState, command_wheels, road_wheel_angles};
+use nesam_physics::effects::Effect;
+use nesam_physics::step::{StepInput, StepModel};
+use nesam_physics::{Control, Driveline, SecondCommand, Soil, SoilCorrection, SteeringTable, Vehicle, VehicleState};
+use nesam_terrain::{GridGeometry, WorldMap};
+use nesam_trajectories::{MeasuredChannels, Trajectory, VelocitySource};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, StandardNormal};
+
+/// Samples of a drive.
+const SAMPLES: usize = 200;
+/// Noise of the sensors: position, height, attitude, velocity, angular velocity, road-wheel angle.
+const NOISE: [f64; 6] = [0.015, 0.02, 0.0017, 0.025, 0.002, 0.001];
+/// Standard deviation of the logarithm (or value) of a drive's soil.
+const SOIL_SCATTER: [f64; 6] = [0.15, 0.15, 0.02, 0.15, 0.02, 0.1];
+
+/// The 2.5-tonne car.
+pub fn truck() -> Vehicle {
+    Vehicle {
+        name: "truck".into(),
+        mass_kg: 2493.56,
+        inertia_kg_m2: [[1445.1, 0.0, -23.6], [0.0, 4121.7, 0.0], [-23.6, 0.0, 5026.4]],
+        inertia_estimated: false,
+        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1155], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
+        wheel_radius_m: 0.467,
+        wheel_width_m: 0.254,
+        suspension_n_m: [107e3, 107e3, 236e3, 236e3],
+        suspension_n_s_m: [14.4e3, 14.4e3, 22.4e3, 22.4e3],
+        second: SecondCommand::SteeringNormalised,
+        command_range: [[-2.0, 12.0], [-1.0, 1.0]],
+        steering: Some(SteeringTable { command: vec![-1.0, 1.0], front_left_rad: vec![-0.37, 0.37], front_right_rad: vec![-0.37, 0.37] }),
+        track_m: 1.83,
+        wheelbase_m: 3.2977,
+        driveline: Driveline {
+            steering_lag_s: 0.08,
+            steering_rate_limit_per_s: 3.0,
+            speed_gain: 0.25,
+            speed_integral_gain_per_s: 0.05,
+            speed_integral_leak_s: 5.0,
+            speed_integral_limit_m: 5.0,
+            overspeed_limit_m_s: 1.5,
+        },
+        gravity_m_s2: 9.81,
+        effects: Default::default(),
+    }
+}
+
+/// Hills of a decimetre to half a metre over 140 m.
+pub fn world() -> Arc<WorldMap> {
+    static WORLD: OnceLock<Arc<WorldMap>> = OnceLock::new();
+    WORLD
+        .get_or_init(|| {
+            let (size, resolution) = (281, 0.5);
+            let geometry = GridGeometry { origin_m: [-70.0, -70.0], resolution_m: resolution, width: size, height: size };
+            let height = |i: usize| {
+                let (x, y) = ((i % size) as f64 * resolution, (i / size) as f64 * resolution);
+                (0.5 * (x / 6.0).sin() * (y / 7.0).cos() + 0.15 * (x / 2.5 + y / 3.1).sin()) as f32
+            };
+            Arc::new(WorldMap::from_layers("twin", 1, geometry, (0..size * size).map(height).collect(), None).unwrap())
+        })
+        .clone()
+}
+
+/// A drive of the vehicle with effects; every number follows from the seed.
+pub fn drive(id: &str, seed: u64, effects: &[Effect], soil: &[f64; 6]) -> Trajectory {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
+    let vehicle = truck().with_effects(effects);
+    let model = StepModel::new(&vehicle, 0.1, 2);
+    let world = world();
+    let mut correction = SoilCorrection::NONE;
+    correction.delta = core::array::from_fn(|i| SOIL_SCATTER[i] * normal());
+    let soil = Soil::from_array(correction.apply(soil));
+    let angle = normal() * 3.0;
+    let (sin, cos) = angle.sin_cos();
+    let mut state = VehicleState {
+        position_m: [-20.0 * cos, -20.0 * sin, 0.0],
+        attitude_rad: [0.0, 0.0, angle],
+        velocity_m_s: [2.0, 0.0, 0.0],
+        angular_velocity_rad_s: [0.0; 3],
+    };
+    state.position_m[2] = world.height_m(state.position_m[0], state.position_m[1]).unwrap() + 0.6;
+    let (turn, gain, swell) = (0.25 + 0.1 * normal().abs(), 0.5 + 0.2 * normal().abs(), 0.5 + 0.2 * normal().abs());
+    let command = |k: usize| {
+        let t = 0.1 * k as f64;
+        Control { speed_m_s: 2.4 + 0.7 * (swell * t).sin(), second: (gain * (turn * t + angle).sin()).clamp(-0.9, 0.9) }
+    };
+    let mut actuators = DrivelineState::settled(&command(0));
+    let (mut states, mut controls, mut steering) = (Vec::new(), Vec::new(), Vec::new());
+    for k in 0..SAMPLES + 10 {
+        let control = command(k);
+        if k >= 10 {
+            let x = state.to_array();
+            let sd = |i: usize| NOISE[[0, 0, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4][i]];
+            states.push(VehicleState::from_array(core::array::from_fn(|i| x[i] + sd(i) * normal())));
+            controls.push(control);
+            let angles = road_wheel_angles(&vehicle, actuators.steering + vehicle.effects.steering_offset);
+            steering.push([angles[0] + NOISE[5] * normal(), angles[1] + NOISE[5] * normal()]);
+        }
+        let after = actuators.advance(&vehicle, &control, state.velocity_m_s[0], 0.1);
+        let ground = GroundSource::new(Some(&world), &model, &state).under_wheels(&model, &state, 0.0).0;
+        let wheels = command_wheels(&vehicle, &actuators, &after, &control);
+        let step = model.step(&StepInput { state, wheels, sinkage_log_ratio: [0.0; 4], soil, ground }).increment.to_array();
+        let x = state.to_array();
+        let (sin, cos) = x[5].sin_cos();
+        let mut next: [f64; 12] = core::array::from_fn(|i| x[i] + step[i]);
+        next[0] = x[0] + cos * step[0] - sin * step[1];
+        next[1] = x[1] + sin * step[0] + cos * step[1];
+        (state, actuators) = (VehicleState::from_array(next), after);
+    }
+    Trajectory {
+        id: id.into(),
+        set: "twin".into(),
+        world: Some("twin".into()),
+        split: None,
+        dt_s: 0.1,
+        time_s: (0..SAMPLES).map(|k| 0.1 * k as f64).collect(),
+        states,
+        controls,
+        wheel_speed_rad_s: None,
+        road_wheel_angle_rad: Some(steering),
+        measured: MeasuredChannels {
+            position: true,
+            height: true,
+            attitude: true,
+            linear_velocity: true,
+            velocity_source: VelocitySource::Body,
+            angular_velocity: [true; 3],
+            wheel_speed: false,
+            road_wheel_angle: true,
+        },
+        truth: None,
+    }
+}
+
+/// An untrained bundle whose default soil is that of the twin, with the reference of 16 null drives.
+pub fn bundle() -> ModelBundle {
+    static BUNDLE: OnceLock<ModelBundle> = OnceLock::new();
+    BUNDLE
+        .get_or_init(|| {
+            let soil = [1.3e6, 8.0e3, 0.8, 3.0e3, 0.42, 0.015];
+            let sample = drive("scales", 1, &[], &soil);
+            let scales = scales::measure(&[&Drive::new(sample.id, Some(world()), sample.states, sample.controls)], &truck(), 0.1);
+            let mut bundle = ModelBundle {
+                name: "twin".into(),
+                hash: "0".repeat(64),
+                vehicle: truck(),
+                effects: Vec::new(),
+                default_soil: scales.default_soil(),
+                parameters: 0,
+                weights: initial_weights(7, &scales),
+                normalization: scales,
+                baselines_json: None,
+                reference_json: None,
+                provenance: Provenance::default(),
+            };
+            let drives: Vec<Trajectory> = (0..16).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();
+            let maps = vec![Some(world()); drives.len()];
+            let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
+            let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
+            let reference = Reference::measure(&bundle.vehicle, Stepping { dt_s: 0.1, substeps: 2 }, &observed, "twin").unwrap();
+            bundle.reference_json = Some(reference.to_json());
+            bundle
+        })
+        .clone()
+}
+
+/// Options of a quick diagnosis.
+pub fn options() -> Options {
+    Options { fit_on: None, without: Vec::new(), scoring: Scoring { horizon: 16, history: 16, resamples: 1000, seed: 1 } }
+}
+
+/// Diagnoses four twin drives with effects.
+pub fn diagnose_twin(effects: &[Effect], seed: u64, options: &Options) -> Diagnosis {
+    let bundle = bundle();
+    let drives: Vec<Trajectory> = (0..4).map(|i| drive(&format!("d{i}"), seed + i, effects, &bundle.default_soil)).collect();
+    let predictor = Predictor::new(Arc::new(bundle)).unwrap();
+    diagnose(&predictor, &drives, &vec![Some(world()); drives.len()], options, &|_, _, _| {}).unwrap()
+}

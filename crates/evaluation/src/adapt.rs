@@ -1,0 +1,168 @@
+//! Runs the soil filter over recorded drives: what a session would have learned by each instant.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use nesam_adaptation::{
+    AdaptationError, BufferedTransition, FilterConfig, SoilFilter, SoilPosterior, SoilUpdate, VELOCITY_DIM, VelocityNoise, chi_square_tail,
+};
+use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_physics::{SOIL_DIM, SoilCorrection};
+use nesam_terrain::WorldMap;
+use nesam_trajectories::Trajectory;
+use rayon::prelude::*;
+
+use crate::error::EvaluationError;
+use crate::evaluate::DriveMaps;
+
+/// An update and the instant at which it was known.
+#[derive(Clone, Debug)]
+pub struct TimedUpdate {
+    /// Newest measured sample that went in: windows from here on may use it.
+    pub sample: usize,
+    /// Prior soil θ̄ under that sample.
+    pub prior: [f64; SOIL_DIM],
+    /// The update.
+    pub update: SoilUpdate,
+}
+
+impl TimedUpdate {
+    /// Soil under the vehicle at that instant: prior plus correction, clipped.
+    pub fn soil(&self) -> [f64; SOIL_DIM] {
+        self.update.posterior.correction.apply(&self.prior)
+    }
+}
+
+/// What the filter made of one drive, starting from the prior at its first sample.
+#[derive(Clone, Debug, Default)]
+pub struct DriveAdaptation {
+    /// Updates in order of time, rejected buffers included.
+    pub updates: Vec<TimedUpdate>,
+    /// y - ŷ with the uncorrected prior, in unbroken runs: what the noise of a filter may be estimated from.
+    pub uncorrected: Vec<Vec<[f64; VELOCITY_DIM]>>,
+    /// Buffers that were given up because a number was not finite or S was singular.
+    pub failed: usize,
+}
+
+impl DriveAdaptation {
+    /// The posterior from measurements up to `sample`; `None` before the first update.
+    pub fn at(&self, sample: usize) -> Option<&SoilPosterior> {
+        let known = self.updates.partition_point(|u| u.sample <= sample);
+        known.checked_sub(1).map(|last| &self.updates[last].update.posterior)
+    }
+
+    /// The correction that a prediction from `sample` applies.
+    pub fn correction_at(&self, sample: usize) -> SoilCorrection {
+        self.at(sample).map_or(SoilCorrection::NONE, |posterior| posterior.correction)
+    }
+}
+
+/// Share of buffers whose NIS a consistent filter would give, and how large it is on average.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Consistency {
+    /// Mean of NIS over its degrees of freedom, 1 for a consistent filter; `None` without a buffer.
+    pub nis_mean_over_dof: Option<f64>,
+    /// Median of the same ratio, which a few wild buffers do not move.
+    pub nis_median_over_dof: Option<f64>,
+    /// Share of buffers with NIS inside the two-sided 95 % interval of χ².
+    pub inside_95: Option<f64>,
+    /// Accepted buffers.
+    pub updates: usize,
+    /// Buffers that the gate refused.
+    pub rejected: usize,
+    /// Buffers that were given up because of a number that is not finite.
+    pub failed: usize,
+}
+
+impl Consistency {
+    /// Over all buffers of all drives.
+    pub fn of(drives: &[DriveAdaptation]) -> Self {
+        let all: Vec<&SoilUpdate> = drives.iter().flat_map(|d| d.updates.iter().map(|u| &u.update)).collect();
+        let ratios: Vec<f64> = all.iter().map(|u| u.nis / u.dof as f64).collect();
+        let inside = all.iter().filter(|u| (0.025..=0.975).contains(&chi_square_tail(u.dof, u.nis))).count();
+        let share = |part: f64| (!all.is_empty()).then(|| part / all.len() as f64);
+        let rejected = all.iter().filter(|u| u.rejected).count();
+        Self {
+            nis_mean_over_dof: share(ratios.iter().sum()),
+            nis_median_over_dof: share(1.0).map(|_| crate::median(&ratios)),
+            inside_95: share(inside as f64),
+            updates: all.len() - rejected,
+            rejected,
+            failed: drives.iter().map(|d| d.failed).sum(),
+        }
+    }
+}
+
+/// Runs the filter over every drive, each from the prior, on all cores. `progress` is called with the number of finished drives.
+///
+/// # Errors
+/// `EvaluationError::Filter` when the settings are unusable.
+pub fn adapt_all(
+    predictor: &Predictor,
+    drives: &[Trajectory],
+    maps: &DriveMaps,
+    config: &FilterConfig,
+    progress: &(dyn Fn(usize) + Sync),
+) -> Result<Vec<DriveAdaptation>, EvaluationError> {
+    SoilFilter::new(*config)?;
+    let done = AtomicUsize::new(0);
+    drives
+        .par_iter()
+        .zip(maps)
+        .map(|(drive, map)| {
+            let adapted = adapt_drive(predictor, drive, map.as_ref(), config);
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1);
+            adapted
+        })
+        .collect()
+}
+
+/// Runs the filter over one drive from its first sample, as a session that receives the samples one by one.
+///
+/// A transition with a wheel off the map counts as a gap, and a drive without a map teaches nothing: where the slope of the ground is a guess,
+/// its error would be taken for soil.
+///
+/// # Errors
+/// As [`adapt_all`].
+pub fn adapt_drive(
+    predictor: &Predictor,
+    drive: &Trajectory,
+    map: Option<&Arc<WorldMap>>,
+    config: &FilterConfig,
+) -> Result<DriveAdaptation, EvaluationError> {
+    let mut filter = SoilFilter::new(*config)?;
+    let mut out = DriveAdaptation { uncorrected: vec![Vec::new()], ..DriveAdaptation::default() };
+    let Some(map) = map else { return Ok(out) };
+    let steps: Vec<HistoryStep> =
+        drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect();
+    let model = predictor.step_model();
+    for k in 0..steps.len().saturating_sub(1) {
+        let history = &steps[k.saturating_sub(HISTORY - 1)..k];
+        let measured = predictor.transition(history, &steps[k].state, &steps[k].control, Some(map));
+        if !measured.ground_known {
+            filter.clear_buffer();
+            out.uncorrected.push(Vec::new());
+            continue;
+        }
+        let next = &steps[k + 1].state;
+        let (v, w) = (next.velocity_m_s, next.angular_velocity_rad_s);
+        let transition =
+            BufferedTransition { input: measured.input, residual: measured.residual, measured_next: [v[0], v[1], v[2], w[0], w[1], w[2]] };
+        if let Some(run) = out.uncorrected.last_mut() {
+            run.push(transition.innovation(model, &SoilCorrection::NONE));
+        }
+        match filter.push(model, transition) {
+            Ok(None) => {}
+            Ok(Some(update)) => out.updates.push(TimedUpdate { sample: k + 1, prior: measured.input.soil.to_array(), update }),
+            Err(AdaptationError::NotFinite { .. } | AdaptationError::SingularInnovation { .. }) => out.failed += 1,
+            Err(other) => return Err(other.into()),
+        }
+    }
+    Ok(out)
+}
+
+/// Noise of the model on these drives, where there are transitions enough to say.
+pub fn estimate_noise(drives: &[DriveAdaptation]) -> Option<VelocityNoise> {
+    let runs: Vec<Vec<[f64; VELOCITY_DIM]>> = drives.iter().flat_map(|d| d.uncorrected.iter().cloned()).collect();
+    VelocityNoise::estimate(&runs).ok()
+}
