@@ -60,7 +60,8 @@ clean_up() {
 }
 trap clean_up EXIT
 
-# The server takes a free port and says which on its standard output.
+# The server takes a free port and says which on its standard output; the file is there before the first look at it.
+: > "$scratch/server.out"
 "$binary" serve --grpc 127.0.0.1:0 --no-http --no-zenoh "$@" > "$scratch/server.out" 2> "$scratch/server.log" &
 server=$!
 address=""
