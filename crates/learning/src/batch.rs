@@ -9,6 +9,8 @@ use nesam_model::reference::{Network, Row, TerrainProvider};
 use nesam_model::{GroundSource, Normalization, history_actuators};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use crate::drives::{Drive, Place};
 
@@ -22,6 +24,26 @@ pub struct Window<'a> {
     pub drive: &'a Drive,
     /// Start sample i; prediction starts from its measured state.
     pub start: usize,
+    /// Terrain features left out of the whole window, so that no drive is recognised by a few of them; `None` = all stay.
+    pub dropout: Option<Dropout>,
+}
+
+/// Features that a window is trained without (Srivastava et al. 2014).
+#[derive(Clone, Copy, Debug)]
+pub struct Dropout {
+    /// Share left out, 0..1.
+    pub share: f32,
+    /// Seed of the choice.
+    pub seed: u64,
+}
+
+impl Dropout {
+    /// Factor of each feature: 0, or what keeps the mean.
+    fn factors(&self) -> Vec<f32> {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        let kept = 1.0 / (1.0 - self.share);
+        (0..CONTEXT).map(|_| if rng.random::<f32>() < self.share { 0.0 } else { kept }).collect()
+    }
 }
 
 impl Window<'_> {
@@ -113,12 +135,18 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             context.reserve(rows * CONTEXT);
             for w in windows {
                 first_row.push((context.len() / CONTEXT) as u32);
+                let new_at = [context.len(), past.len()];
                 for i in w.start..=w.last(horizon) {
                     w.drive.push_context(i, &mut context);
                     w.drive.push_semantic(i, &mut semantic);
                 }
                 for i in w.start - history..w.start {
                     w.drive.push_context(i, &mut past);
+                }
+                if let Some(dropout) = &w.dropout {
+                    let factors = dropout.factors();
+                    let rows = context[new_at[0]..].chunks_exact_mut(CONTEXT).chain(past[new_at[1]..].chunks_exact_mut(CONTEXT));
+                    rows.for_each(|row| row.iter_mut().zip(&factors).for_each(|(value, factor)| *value *= factor));
                 }
             }
         }

@@ -48,6 +48,22 @@ impl Drive {
         Self { id, map, states, controls, features: Vec::new() }
     }
 
+    /// The drive seen in a mirror (y becomes -y) over the mirrored `map`: for a vehicle whose two sides are alike, another true drive.
+    pub fn mirrored(&self, map: Option<Arc<WorldMap>>) -> Self {
+        let states = self.states.iter().map(|s| {
+            let ([x, y, z], [roll, pitch, yaw]) = (s.position_m, s.attitude_rad);
+            let ([vx, vy, vz], [wx, wy, wz]) = (s.velocity_m_s, s.angular_velocity_rad_s);
+            VehicleState {
+                position_m: [x, -y, z],
+                attitude_rad: [-roll, pitch, -yaw],
+                velocity_m_s: [vx, -vy, vz],
+                angular_velocity_rad_s: [-wx, wy, -wz],
+            }
+        });
+        let controls = self.controls.iter().map(|c| Control { second: -c.second, ..*c });
+        Self::new(format!("{}-mirrored", self.id), map, states.collect(), controls.collect())
+    }
+
     /// Pose of sample `i`.
     pub fn pose(&self, i: usize) -> Pose2 {
         let s = &self.states[i];

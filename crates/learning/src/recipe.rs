@@ -1,5 +1,6 @@
 //! From a data root to a bundle: the stages of a training run in their order, each resumable.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -10,6 +11,7 @@ use nesam_model::encoder::{ENCODERS, TerrainEncoders};
 use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
 use nesam_physics::Vehicle;
 use nesam_physics::step::StepModel;
+use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, Trajectory};
 
 use crate::autoencoder::{Places, PretrainPlan, pretrain};
@@ -32,6 +34,8 @@ pub struct Recipe {
     pub encoder_batch: usize,
     /// Learning rate of encoder pre-training.
     pub encoder_rate: f64,
+    /// Trains on the mirror image of each drive too; for vehicles whose two sides are alike.
+    pub mirror: bool,
     /// Training plan; its folder is `out/checkpoint`.
     pub plan: TrainingPlan,
     /// Output folder.
@@ -75,9 +79,15 @@ pub fn run(
     let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
         (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
     };
-    let (train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
+    let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
     let mut vehicle = root.vehicle().clone();
     let scales = calibrated(&mut vehicle, &drives, &train_at, recipe.dt_s, reporter);
+
+    if recipe.mirror {
+        let images = mirrored(&drives, &train_at);
+        train_at.extend(drives.len()..drives.len() + images.len());
+        drives.extend(images);
+    }
 
     let mut weights = initial_weights(recipe.plan.seed, &scales);
     if drives.iter().any(|d| d.map.is_some()) {
@@ -165,6 +175,17 @@ fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<Drive
         .map(|t| {
             let map = t.world.as_ref().map(|id| root.world(id)).transpose().map_err(|e| TrainingError::Drives(e.to_string()))?;
             Ok(Drive::new(t.id.clone(), map, t.states.clone(), t.controls.clone()))
+        })
+        .collect()
+}
+
+/// Mirror images of some drives; drives over one map share its image.
+fn mirrored(drives: &[Drive], at: &[usize]) -> Vec<Drive> {
+    let mut maps: HashMap<String, Arc<WorldMap>> = HashMap::new();
+    at.iter()
+        .map(|&i| {
+            let map = drives[i].map.as_ref().map(|map| maps.entry(map.hash().into()).or_insert_with(|| Arc::new(map.mirrored())).clone());
+            drives[i].mirrored(map)
         })
         .collect()
 }

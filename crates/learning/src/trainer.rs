@@ -13,7 +13,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::adam::Adam;
-use crate::batch::{PathTerrain, Window, absolute_errors, rows, state_loss, targets};
+use crate::batch::{Dropout, PathTerrain, Window, absolute_errors, rows, state_loss, targets};
 use crate::drives::Drive;
 use crate::schedule::{cosine, curriculum};
 
@@ -34,6 +34,8 @@ pub struct TrainingPlan {
     pub epoch: usize,
     /// Threads that each take a share of the batch.
     pub shards: usize,
+    /// Share of the terrain features that each window is trained without.
+    pub dropout: f32,
     /// Ablation trained.
     pub variant: Variant,
     /// Where checkpoints go.
@@ -53,9 +55,12 @@ pub struct EpochReport {
     pub step_s: f64,
 }
 
+/// Memory of the running mean of the weights, in steps: about two epochs.
+const AVERAGED_STEPS: f32 = 500.0;
+
 /// Result of a run.
 pub struct Trained {
-    /// Weights with the lowest validation error.
+    /// Running mean of the weights (Polyak & Juditsky 1992) with the lowest validation error.
     pub weights: Weights,
     /// Loss curve.
     pub curve: Vec<EpochReport>,
@@ -142,7 +147,7 @@ impl TrainingSet<'_> {
             .iter()
             .flat_map(|drive| {
                 let first = (HISTORY - 1).min(drive.states.len().saturating_sub(horizon + 1));
-                (first..drive.states.len().saturating_sub(horizon)).step_by(40).map(move |start| Window { drive, start })
+                (first..drive.states.len().saturating_sub(horizon)).step_by(40).map(move |start| Window { drive, start, dropout: None })
             })
             .collect();
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
@@ -193,6 +198,7 @@ pub fn train(
         best_score: f64::INFINITY,
         best: weights.clone(),
         latest: weights.clone(),
+        average: weights.clone(),
         adam: Adam::default(),
         curve: Vec::new(),
     });
@@ -209,25 +215,27 @@ pub fn train(
         let mut windows: Vec<Window<'_>> = Vec::with_capacity(plan.batch);
         for _ in 0..plan.batch {
             let (drive, start) = starts[rng.random_range(0..starts.len())];
-            windows.push(Window { drive, start });
+            let dropout = (plan.dropout > 0.0).then(|| Dropout { share: plan.dropout, seed: rng.random() });
+            windows.push(Window { drive, start, dropout });
         }
         let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
         let history = draw_history(&mut rng, available);
         let (loss, gradients) = parallel_gradients(set, &network, &windows, history, horizon, plan, &pools)?;
         let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0)?;
         checkpoint.step += 1;
+        average_in(&mut checkpoint.average, &network.to_weights()?, checkpoint.step);
         loss_sum += loss;
         loss_count += 1;
         progress(checkpoint.step, loss, norm);
         let stop = interrupted();
         if checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps || stop {
             let step_s = since.elapsed().as_secs_f64() / loss_count as f64;
-            let validation = set.validate(&network, plan.horizon, plan.variant)?;
+            let validation = set.validate(&Network::from_weights(&checkpoint.average)?, plan.horizon, plan.variant)?;
             let line = EpochReport { step: checkpoint.step, loss: loss_sum / loss_count as f32, validation, step_s };
             checkpoint.latest = merged(weights, &network.to_weights()?);
             if score(&validation) < checkpoint.best_score {
                 checkpoint.best_score = score(&validation);
-                checkpoint.best = checkpoint.latest.clone();
+                checkpoint.best = checkpoint.average.clone();
             }
             checkpoint.curve.push(line);
             checkpoint.save(&plan.folder)?;
@@ -290,6 +298,16 @@ fn parallel_gradients(
     Ok((loss, total))
 }
 
+/// Moves the running mean towards the weights after `step` steps; at first it is the plain mean, so that the start is forgotten.
+fn average_in(average: &mut Weights, weights: &Weights, step: usize) {
+    let share = (1.0 / AVERAGED_STEPS).max(1.0 / (0.1 * step as f32 + 1.0));
+    for (name, array) in weights.iter() {
+        if let Some(mean) = average.values_mut(name) {
+            mean.iter_mut().zip(&array.values).for_each(|(m, w)| *m += share * (w - *m));
+        }
+    }
+}
+
 /// `base` with the arrays of `trained` in place of its own.
 fn merged(base: &Weights, trained: &Weights) -> Weights {
     let mut weights = base.clone();
@@ -305,6 +323,7 @@ struct Checkpoint {
     best_score: f64,
     best: Weights,
     latest: Weights,
+    average: Weights,
     adam: Adam,
     curve: Vec<EpochReport>,
 }
@@ -319,6 +338,7 @@ impl Checkpoint {
         let files = [
             ("best.safetensors", self.best.to_bytes()),
             ("latest.safetensors", self.latest.to_bytes()),
+            ("average.safetensors", self.average.to_bytes()),
             ("adam.safetensors", moments.to_bytes()),
             // Written last: a run killed in between resumes from files that agree.
             ("state.json", state.to_string().into_bytes()),
@@ -354,6 +374,7 @@ impl Checkpoint {
             curve: serde_json::from_value(state["curve"].clone()).map_err(|e| fail(&state_path, e.to_string()))?,
             best: arrays("best.safetensors")?,
             latest: arrays("latest.safetensors")?,
+            average: arrays("average.safetensors")?,
             adam: Adam::load(&arrays("adam.safetensors")?),
         }))
     }

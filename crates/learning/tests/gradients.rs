@@ -30,7 +30,7 @@ fn check(mut made: Drive, entries: &[(&str, usize)], tolerance: f64) {
     let model = Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps));
     let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model };
     let network = Network::from_weights(&weights).expect("all arrays are there");
-    let windows = [Window { drive: &made, start: 12 }, Window { drive: &made, start: 30 }];
+    let windows = [12, 30].map(|start| Window { drive: &made, start, dropout: None });
     let gradients = || set.gradients(&network, &windows, 8, 6, Variant::Full).expect("the loss is differentiable");
     let (_, backward) = gradients();
     for &(name, index) in entries {

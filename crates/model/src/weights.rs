@@ -35,6 +35,11 @@ impl Weights {
         self.arrays.iter().map(|(name, array)| (name.as_str(), array))
     }
 
+    /// Values of an array, to be changed in place.
+    pub fn values_mut(&mut self, name: &str) -> Option<&mut [f32]> {
+        self.arrays.get_mut(name).map(|array| array.values.as_mut_slice())
+    }
+
     /// Number of values whose name starts with `prefix`.
     pub fn parameters(&self, prefix: &str) -> usize {
         self.iter().filter(|(name, _)| name.starts_with(prefix)).map(|(_, a)| a.values.len()).sum()

@@ -144,6 +144,18 @@ impl WorldMap {
         Ok(patched.with_soil_classes(self.soil_classes.clone()))
     }
 
+    /// The map seen in a mirror: y becomes -y. What drives on it with mirrored commands moves as the mirror image.
+    pub fn mirrored(&self) -> Self {
+        let GridGeometry { origin_m: [x_m, y_m], resolution_m, width, height } = self.geometry;
+        let north_m = y_m + resolution_m * (height - 1) as f64;
+        let elevation = flipped(&self.elevation_m(), width);
+        let semantic = self.semantic_rgb().map(|rgb| flipped(&rgb, width));
+        let geometry = GridGeometry { origin_m: [x_m, -north_m], ..self.geometry };
+        let mirrored =
+            Self::from_layers(&self.id, self.version, geometry, elevation, semantic).expect("a valid map stays valid; this is a bug");
+        mirrored.with_soil_classes(self.soil_classes.clone())
+    }
+
     /// World id.
     pub fn id(&self) -> &str {
         &self.id
@@ -217,6 +229,11 @@ impl WorldMap {
         let at = self.geometry.bilinear(x_m, y_m);
         self.surface.is_known(at.index, self.geometry.width).then_some(at)
     }
+}
+
+/// Rows in reverse order.
+fn flipped<T: Copy>(cells: &[T], width: usize) -> Vec<T> {
+    cells.chunks(width).rev().flatten().copied().collect()
 }
 
 /// Packs a colour as r | g << 8 | b << 16.

@@ -224,3 +224,19 @@ fn analytic_bad_layers_and_tiles_are_refused() {
     let error = WorldMap::from_layers("a", 1, grid(), spike, None).unwrap_err().to_string();
     assert!(error.contains("row 3, column 7"), "{error}");
 }
+
+#[test]
+fn property_a_mirrored_map_gives_mirrored_patches() {
+    let bumpy = map(|x, y| 0.3 * (0.7 * x).sin() + 0.2 * (0.9 * y + 0.4).cos() + 0.01 * x * y);
+    let image = bumpy.mirrored();
+    assert_eq!(bumpy.height_m(3.21, -4.5).unwrap(), image.height_m(3.21, 4.5).unwrap());
+    let (seen, mirrored) = (patch_at(&bumpy, 1.3, 2.1, 0.4), patch_at(&image, 1.3, -2.1, -0.4));
+    // Bilinear look-ups of the same cells in another order: f32 rounding of heights scaled to ±1.
+    for row in 0..PATCH_PX {
+        for column in 0..PATCH_PX {
+            let (a, b) = (seen.elevation[row * PATCH_PX + column], mirrored.elevation[row * PATCH_PX + PATCH_PX - 1 - column]);
+            assert!((a - b).abs() < 1e-5, "row {row}, column {column}: {a} and {b}");
+        }
+    }
+    assert_eq!(image.mirrored().hash(), bumpy.hash());
+}

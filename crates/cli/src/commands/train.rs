@@ -49,6 +49,12 @@ pub struct TrainArgs {
     /// Peak learning rate
     #[arg(long, default_value_t = 5e-4)]
     lr: f64,
+    /// Share of the terrain features that each window is trained without
+    #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
+    dropout: f32,
+    /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right
+    #[arg(long)]
+    no_mirror: bool,
     /// Seed of weights and batches
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -132,6 +138,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if args.epochs * args.batches * args.batch_size * args.threads == 0 {
         return Err(Failure::input("--epochs, --batches, --batch-size and --threads must be at least 1"));
     }
+    if !(0.0..0.9).contains(&args.dropout) {
+        return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
+    }
     own_threads()?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
     let hash = drives.root.hash();
@@ -147,6 +156,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         encoder_steps: args.encoder_steps,
         encoder_batch: 64,
         encoder_rate: args.encoder_lr,
+        mirror: !args.no_mirror,
         plan: TrainingPlan {
             steps: args.epochs * args.batches,
             batch: args.batch_size,
@@ -155,6 +165,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             seed: args.seed,
             epoch: args.batches,
             shards: args.threads,
+            dropout: args.dropout,
             variant,
             folder: out.join("checkpoint"),
         },

@@ -18,7 +18,7 @@ pub fn truck() -> Vehicle {
         mass_kg: 2493.56,
         inertia_kg_m2: [[1445.1, 0.0, -23.6], [0.0, 4121.7, 0.0], [-23.6, 0.0, 5026.4]],
         inertia_estimated: false,
-        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1155], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
+        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1154], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
         wheel_radius_m: 0.467,
         wheel_width_m: 0.254,
         suspension_n_m: [107e3, 107e3, 236e3, 236e3],
@@ -64,17 +64,22 @@ pub fn striped(relief: f64) -> Arc<WorldMap> {
 
 /// A drive of `n` samples by the symbolic model on the hills.
 pub fn drive(map: Option<&Arc<WorldMap>>, n: usize) -> Drive {
+    drive_on_side(map, n, 1.0)
+}
+
+/// The same with start and steering on the other side for `side` = -1.
+pub fn drive_on_side(map: Option<&Arc<WorldMap>>, n: usize, side: f64) -> Drive {
     let model = StepModel::new(&truck(), 0.1, 4);
     let soil = Soil { k_phi: 1.5e6, k_c: 5e3, n: 0.7, c: 1.7e3, phi: 0.5, k_shear: 0.02 };
     let mut state = VehicleState::zero();
-    state.position_m = [-12.0, -6.0, 0.6 + map.map_or(0.0, |m| m.nearest_height_m(-12.0, -6.0))];
+    state.position_m = [-12.0, -6.0 * side, 0.6 + map.map_or(0.0, |m| m.nearest_height_m(-12.0, -6.0 * side))];
     state.velocity_m_s[0] = 2.0;
     let flat = VehicleState { position_m: [0.0, 0.0, 0.6], ..VehicleState::zero() };
     let mut actuators = DrivelineState { steering: 0.0, speed_error_integral_m: 0.0 };
     let (mut states, mut controls) = (Vec::new(), Vec::new());
     for k in 0..n {
         let t = 0.1 * k as f64;
-        let control = Control { speed_m_s: 2.5 + (0.6 * t).sin(), second: 0.6 * (0.5 * t).sin() };
+        let control = Control { speed_m_s: 2.5 + (0.6 * t).sin(), second: side * 0.6 * (0.5 * t).sin() };
         states.push(state);
         controls.push(control);
         let ground = GroundSource::new(map.map(Arc::as_ref), &model, &flat);

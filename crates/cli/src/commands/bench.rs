@@ -1,0 +1,286 @@
+//! `nesam bench`: what answers cost on this machine.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Instant;
+
+use clap::{Args, Subcommand};
+use nesam_evaluation::{Window, horizontal_distance, pose_of};
+use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, ModelBundle, Predictor, Rollout, RolloutQuery, TerrainMode, Variant};
+use nesam_physics::{Control, SoilCorrection};
+use nesam_terrain::WorldMap;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde_json::json;
+
+use crate::args::{BundleArgs, DataArgs};
+use crate::failure::{Failure, OrFail};
+use crate::output::{provenance, say, write_file};
+use crate::progress::Progress;
+use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+
+/// Options of `nesam bench`.
+#[derive(Args, Debug)]
+pub struct BenchArgs {
+    #[command(subcommand)]
+    what: Bench,
+}
+
+#[derive(Subcommand, Debug)]
+enum Bench {
+    /// Time the queries of a sampling planner, in process and end to end
+    Predict(PredictBench),
+}
+
+#[derive(Args, Debug)]
+struct PredictBench {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    /// Candidate command sequences per query
+    #[arg(long, default_value_t = 1024)]
+    samples: usize,
+    /// Steps per rollout
+    #[arg(long, value_name = "STEPS", default_value_t = 32)]
+    horizon: usize,
+    /// Timed queries of each kind
+    #[arg(long, default_value_t = 30)]
+    queries: usize,
+    /// Seed of poses and commands
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Write the figures as JSON (schema nesam.bench/1)
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Memory of the commands' noise from step to step, as sampling planners draw it.
+const NOISE_MEMORY: f32 = 0.8;
+/// Standard deviation of the noise: speed, m/s, and share of the second command's range.
+const NOISE_SD: [f32; 2] = [0.5, 0.3];
+/// Windows on which the cached terrain is held against the exact one.
+const CHECKED_WINDOWS: usize = 24;
+
+/// Runs the command.
+pub fn run(args: &BenchArgs) -> Result<(), Failure> {
+    match &args.what {
+        Bench::Predict(args) => predict(args),
+    }
+}
+
+fn predict(args: &PredictBench) -> Result<(), Failure> {
+    check_model_step(args.data.dt)?;
+    if args.samples == 0 || args.queries == 0 || !(1..=MAX_HORIZON).contains(&args.horizon) {
+        return Err(Failure::input(format!("--samples and --queries must be at least 1, --horizon 1…{MAX_HORIZON}")));
+    }
+    let drives = read_drives(&args.data, false)?;
+    let bundle = load_bundle(args.bundle.bundle.as_deref())?;
+    let drive = Planner::new(&drives, args)?;
+    let progress = Progress::start("queries", 3 * args.queries);
+    let mut done = 0;
+    let mut time = |predictor: &Predictor, at: usize, seed: u64| -> Result<f64, Failure> {
+        let controls = drive.controls(at, seed);
+        let began = Instant::now();
+        drive.ask(predictor, at, &controls)?;
+        done += 1;
+        progress.set(done);
+        Ok(began.elapsed().as_secs_f64() * 1e3)
+    };
+
+    // One replan after the other along the drive at the rate of the model, on a map that nobody has asked about yet.
+    let fresh = predictor_for(bundle.clone(), &drives.root)?;
+    let steady = (0..args.queries).map(|q| time(&fresh, drive.along(q), args.seed + q as u64)).collect::<Result<Vec<_>, _>>()?;
+    // Poses all over the drive whose surroundings have been asked about before, with other commands.
+    let warm_up =
+        (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries), 1000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
+    let before = drive.map.as_ref().map(|map| fresh.terrain_cache(map));
+    let mut warm =
+        (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries) + 1, 2000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
+    let hit_rate = drive.map.as_ref().zip(before).map(|(map, before)| {
+        let after = fresh.terrain_cache(map);
+        1.0 - (after.encoded - before.encoded) as f64 / (after.looked_up - before.looked_up).max(1) as f64
+    });
+    progress.finish();
+
+    let mut later: Vec<f64> = steady[1..].to_vec();
+    let p50 = percentile(&mut warm, 0.5);
+    let steady_p50 = if later.is_empty() { steady[0] } else { percentile(&mut later, 0.5) };
+    let max_error = interpolation_error(&drives, &bundle, args.horizon)?;
+    let figures = json!({
+        "schema": "nesam.bench/1",
+        "samples": args.samples,
+        "horizon": args.horizon,
+        "path": path(),
+        "threads": rayon::current_num_threads(),
+        "queries": args.queries,
+        "p50_ms": p50,
+        "p99_ms": percentile(&mut warm, 0.99),
+        "cold_ms": steady[0],
+        "warm_up_max_ms": warm_up.iter().copied().fold(0.0, f64::max),
+        "tokens_per_s": (args.samples * args.horizon) as f64 / (p50 * 1e-3),
+        "steady_p50_ms": steady_p50,
+        "terrain_cache": {"hit_rate": hit_rate, "max_error": max_error},
+        "provenance": provenance(Some(&bundle), &drives),
+    });
+    say!(
+        "{} candidates x {} steps on the {} path, {} threads, {} queries",
+        args.samples,
+        args.horizon,
+        path(),
+        rayon::current_num_threads(),
+        args.queries
+    );
+    say!("  warm, new pose and new commands each   p50 {p50:9.1} ms   p99 {:9.1} ms", percentile(&mut warm, 0.99));
+    say!("  replans along a drive, new ground      p50 {steady_p50:9.1} ms");
+    say!("  first query on an unseen map               {:9.1} ms", steady[0]);
+    say!("  tokens per second, warm                    {:9.0}", (args.samples * args.horizon) as f64 / (p50 * 1e-3));
+    if let (Some(hit), Some(error)) = (hit_rate, max_error) {
+        say!(
+            "  terrain cache: {:.1} % hits when warm; interpolation moves predictions by at most {:.2} % of the model's own error",
+            100.0 * hit,
+            100.0 * error
+        );
+    }
+    match &args.json {
+        Some(file) => {
+            write_file(file, (serde_json::to_string_pretty(&figures).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+        }
+        None => Ok(()),
+    }
+}
+
+/// A recorded drive from whose samples queries start.
+struct Planner<'a> {
+    steps: Vec<HistoryStep>,
+    map: Option<Arc<WorldMap>>,
+    range: [[f64; 2]; 2],
+    args: &'a PredictBench,
+}
+
+impl<'a> Planner<'a> {
+    fn new(drives: &Drives, args: &'a PredictBench) -> Result<Self, Failure> {
+        let drive = &drives.drives[0];
+        if drive.states.len() < HISTORY + 8 {
+            return Err(Failure::input(format!("drive `{}` has {} samples, queries need {}", drive.id, drive.states.len(), HISTORY + 8)));
+        }
+        let steps = drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect();
+        Ok(Self { steps, map: drives.maps[0].clone(), range: drives.root.vehicle().command_range, args })
+    }
+
+    /// Sample of the `q`-th replan; starts again at the beginning when the drive ends.
+    fn along(&self, q: usize) -> usize {
+        HISTORY + q % (self.steps.len() - HISTORY - 1)
+    }
+
+    /// Sample of the `q`-th of `count` starts spread over the drive; its successor exists too.
+    fn anywhere(&self, q: usize, count: usize) -> usize {
+        HISTORY + q * (self.steps.len() - HISTORY - 2) / count
+    }
+
+    /// Commands of all candidates: the recorded command with correlated noise, inside the card's range; (samples, horizon, 2).
+    fn controls(&self, at: usize, seed: u64) -> Vec<f32> {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let Control { speed_m_s, second } = self.steps[at].control;
+        let sd = [NOISE_SD[0], NOISE_SD[1] * (self.range[1][1] - self.range[1][0]) as f32 * 0.5];
+        let mut controls = Vec::with_capacity(2 * self.args.samples * self.args.horizon);
+        for _ in 0..self.args.samples {
+            let mut noise = [0f32; 2];
+            for _ in 0..self.args.horizon {
+                for (c, nominal) in [speed_m_s, second].into_iter().enumerate() {
+                    // Uniform of the same variance as a normal deviate.
+                    let fresh = (rng.random::<f32>() - 0.5) * 12f32.sqrt() * sd[c];
+                    noise[c] = NOISE_MEMORY * noise[c] + (1.0 - NOISE_MEMORY * NOISE_MEMORY).sqrt() * fresh;
+                    controls.push((nominal as f32 + noise[c]).clamp(self.range[c][0] as f32, self.range[c][1] as f32));
+                }
+            }
+        }
+        controls
+    }
+
+    fn ask(&self, predictor: &Predictor, at: usize, controls: &[f32]) -> Result<Rollout, Failure> {
+        let query = RolloutQuery {
+            history: &self.steps[..at],
+            start: self.steps[at].state,
+            controls,
+            samples: self.args.samples,
+            horizon: self.args.horizon,
+            map: self.map.as_ref(),
+            soil_correction: SoilCorrection::NONE,
+            variant: Variant::Full,
+        };
+        predictor.rollout(&query).or_failed()
+    }
+}
+
+/// Largest ratio over the six dimensions of what interpolated terrain tokens move a prediction to what the model is off by, both as means over
+/// windows and steps; `None` without a map or when no drive is long enough.
+fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) -> Result<Option<f64>, Failure> {
+    let windows: Vec<Window<'_>> = drives
+        .drives
+        .iter()
+        .enumerate()
+        .filter(|(drive, _)| drives.maps[*drive].is_some())
+        .flat_map(|(drive, trajectory)| {
+            let starts = nesam_trajectories::windows(trajectory.states.len(), horizon, HISTORY);
+            starts.into_iter().map(move |start| Window {
+                trajectory,
+                drive,
+                start,
+                first_history: start + 1 - HISTORY.min(start + 1),
+                horizon,
+            })
+        })
+        .collect();
+    if windows.is_empty() {
+        return Ok(None);
+    }
+    let shared = Arc::new(bundle.clone());
+    let [grid, exact] = [TerrainMode::Grid, TerrainMode::Exact].map(|mode| Predictor::with_terrain(shared.clone(), mode));
+    let (grid, exact) = (grid.or_input()?, exact.or_input()?);
+    let (mut moved, mut off) = ([0.0; 6], [0.0; 6]);
+    for window in windows.iter().step_by(windows.len().div_ceil(CHECKED_WINDOWS)) {
+        let drive = window.trajectory;
+        let controls: Vec<f32> =
+            drive.controls[window.start..window.start + horizon].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
+        let history = window.history();
+        let query = RolloutQuery {
+            history: &history,
+            start: drive.states[window.start],
+            controls: &controls,
+            samples: 1,
+            horizon,
+            map: drives.maps[window.drive].as_ref(),
+            soil_correction: SoilCorrection::NONE,
+            variant: Variant::Full,
+        };
+        let (a, b) = (grid.rollout(&query).or_failed()?, exact.rollout(&query).or_failed()?);
+        for (k, truth) in window.truth(nesam_evaluation::Truth::Measured).iter().enumerate() {
+            let poses = [&a, &b].map(|r| pose_of(&r.state(0, k).map(f64::from)));
+            moved[0] += horizontal_distance(&poses[0], &poses[1]);
+            off[0] += horizontal_distance(&poses[1], truth);
+            for d in 2..6 {
+                moved[d] += (poses[0][d] - poses[1][d]).abs();
+                off[d] += (poses[1][d] - truth[d]).abs().min(core::f64::consts::TAU - (poses[1][d] - truth[d]).abs());
+            }
+        }
+    }
+    Ok([0, 2, 3, 4, 5].into_iter().map(|d| moved[d] / off[d]).reduce(f64::max))
+}
+
+/// Instructions that the kernels were compiled for.
+fn path() -> &'static str {
+    if cfg!(target_feature = "avx512f") {
+        "avx512"
+    } else if cfg!(target_feature = "avx2") {
+        "avx2"
+    } else {
+        "portable"
+    }
+}
+
+/// Value below which a share of the values lies, by rank.
+fn percentile(values: &mut [f64], share: f64) -> f64 {
+    values.sort_by(f64::total_cmp);
+    values[((values.len() as f64 * share).ceil() as usize).clamp(1, values.len()) - 1]
+}
