@@ -29,6 +29,7 @@ const EXAMPLES: &str = "Examples:
   nesam adapt --data ROOT --set NAME          what learning the soil while driving gains there
   nesam predict --trajectory n0005 --at 6.2   one rollout as JSON
   nesam serve                                 answer planners and vehicles until interrupted
+  nesam bench predict                         milliseconds per planner query on this machine
   nesam inspect deploy/bundles/NAME           what a bundle holds and where it comes from
   nesam check ROOT                            what is wrong with a data root, bundle or configuration
 
@@ -50,6 +51,8 @@ enum Command {
     Predict(commands::predict::PredictArgs),
     /// Train a bundle on the train split of a set
     Train(commands::train::TrainArgs),
+    /// Measure what answers cost on this machine
+    Bench(commands::bench::BenchArgs),
     /// Say what a bundle or a data root holds
     Inspect(commands::inspect::InspectArgs),
     /// Say what is wrong with a data root, a bundle or a configuration
@@ -75,6 +78,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Adapt(args)) => commands::adapt::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),
+        Some(Command::Bench(args)) => commands::bench::run(&args),
         Some(Command::Inspect(args)) => commands::inspect::run(&args),
         Some(Command::Check(args)) => commands::check::run(&args),
     }

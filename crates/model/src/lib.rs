@@ -28,7 +28,7 @@ pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
 pub use predictor::{Predictor, TerrainMode, Transition};
 pub use rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
-pub use terrain_tokens::TerrainToken;
+pub use terrain_tokens::{CacheCounts, TerrainToken};
 pub use weights::Weights;
 
 /// What can go wrong with a bundle or a query.

@@ -20,7 +20,7 @@ use crate::rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
-use crate::terrain_tokens::{TerrainProjection, TerrainToken, TerrainTokens, VALUES};
+use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, VALUES};
 use crate::token::{TokenScale, token_entries};
 
 /// Maps whose terrain tokens are kept.
@@ -261,6 +261,11 @@ impl Predictor {
     pub fn terrain_tokens(&self, map: Option<&Arc<WorldMap>>, poses: &[Pose2]) -> Vec<TerrainToken> {
         let tokens = map.map(|map| self.tokens_of(map));
         self.terrain(tokens.as_deref(), poses)
+    }
+
+    /// What was asked of the terrain cache of a map so far.
+    pub fn terrain_cache(&self, map: &Arc<WorldMap>) -> CacheCounts {
+        self.tokens_of(map).counts()
     }
 
     /// The cache of a map, made on first use; the least recently made one goes when there are too many.

@@ -5,6 +5,7 @@
 //! prediction does not depend on what was asked before it. The cache belongs to one map version and one bundle.
 
 use std::collections::HashMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, RwLock};
 
 use nesam_physics::SOIL_DIM;
@@ -88,6 +89,24 @@ impl TerrainProjection {
 pub struct TerrainTokens {
     map: Arc<WorldMap>,
     nodes: RwLock<HashMap<Node, Arc<TerrainToken>>>,
+    looked_up: AtomicU64,
+    encoded: AtomicU64,
+}
+
+/// How often a cache was asked and how often it had to encode.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct CacheCounts {
+    /// Nodes that poses asked for, eight each.
+    pub looked_up: u64,
+    /// Nodes that were not there yet.
+    pub encoded: u64,
+}
+
+impl CacheCounts {
+    /// Share of the lookups that needed no encoding; 1 when nothing was asked.
+    pub fn hit_rate(&self) -> f64 {
+        1.0 - self.encoded as f64 / self.looked_up.max(1) as f64
+    }
 }
 
 /// The eight nodes around a pose and their weights.
@@ -107,12 +126,17 @@ fn corners(pose: &Pose2) -> [(Node, f32); 8] {
 impl TerrainTokens {
     /// An empty cache of a map.
     pub fn new(map: Arc<WorldMap>) -> Self {
-        Self { map, nodes: RwLock::default() }
+        Self { map, nodes: RwLock::default(), looked_up: AtomicU64::new(0), encoded: AtomicU64::new(0) }
     }
 
     /// The map.
     pub fn map(&self) -> &Arc<WorldMap> {
         &self.map
+    }
+
+    /// What was asked of the cache so far.
+    pub fn counts(&self) -> CacheCounts {
+        CacheCounts { looked_up: self.looked_up.load(Ordering::Relaxed), encoded: self.encoded.load(Ordering::Relaxed) }
     }
 
     /// Tokens at poses, interpolated; missing nodes are encoded first, in parallel.
@@ -152,6 +176,8 @@ impl TerrainTokens {
         };
         missing.sort_unstable();
         missing.dedup();
+        self.looked_up.fetch_add(8 * wanted.len() as u64, Ordering::Relaxed);
+        self.encoded.fetch_add(missing.len() as u64, Ordering::Relaxed);
         if missing.is_empty() {
             return;
         }

@@ -1,6 +1,7 @@
 //! One module per command: its options and `run`.
 
 pub mod adapt;
+pub mod bench;
 pub mod check;
 pub mod demo;
 pub mod diagnose;
