@@ -28,6 +28,11 @@ pub fn default_bundle() -> Option<PathBuf> {
     upward("deploy/bundles").into_iter().find_map(|folder| newest(&folder))
 }
 
+/// Folders of shipped baseline bundles.
+pub fn baseline_bundles() -> Vec<PathBuf> {
+    upward("deploy/baselines").first().map(|folder| bundles_in(folder)).unwrap_or_default()
+}
+
 /// The shipped sample of drives, if there is one.
 pub fn sample_root() -> Option<PathBuf> {
     upward("tests/data/chrono_sample").into_iter().next()
@@ -55,8 +60,13 @@ fn upward(relative: &str) -> Vec<PathBuf> {
 }
 
 fn newest(folder: &Path) -> Option<PathBuf> {
-    let mut bundles: Vec<PathBuf> =
-        std::fs::read_dir(folder).ok()?.flatten().map(|e| e.path()).filter(|p| p.join(MANIFEST).is_file()).collect();
+    bundles_in(folder).pop()
+}
+
+/// Bundles in a folder, sorted by name; none when it cannot be read.
+pub fn bundles_in(folder: &Path) -> Vec<PathBuf> {
+    let Ok(entries) = std::fs::read_dir(folder) else { return Vec::new() };
+    let mut bundles: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.join(MANIFEST).is_file()).collect();
     bundles.sort();
-    bundles.pop()
+    bundles
 }

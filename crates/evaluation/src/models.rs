@@ -14,6 +14,12 @@ pub enum ModelName {
     NesamNoResidual,
     /// With wheel sinkage suppressed (paper: "Sinkage = 0").
     NesamZeroSinkage,
+    /// Pure end to end on the same tokens, trained with the same budget.
+    Transformer,
+    /// A kinematic bicycle with the same learned residual.
+    KinematicResidual,
+    /// Newton-Euler on rigid ground with the same learned residual.
+    RigidResidual,
     /// Best-fit bicycle or differential drive.
     Kinematic,
     /// The measured body twist goes on.
@@ -21,11 +27,20 @@ pub enum ModelName {
 }
 
 /// Names of the contract that later versions fill in.
-const RESERVED: [&str; 6] = ["transformer", "tal_elev_sem", "tal_elev", "tal_sem", "kinematic_residual", "rigid_residual"];
+const RESERVED: [&str; 3] = ["tal_elev_sem", "tal_elev", "tal_sem"];
 
 impl ModelName {
     /// Every model of this version, in the order of tables and plots.
-    pub const ALL: [Self; 5] = [Self::Nesam, Self::NesamNoResidual, Self::NesamZeroSinkage, Self::Kinematic, Self::ConstantVelocity];
+    pub const ALL: [Self; 8] = [
+        Self::Nesam,
+        Self::NesamNoResidual,
+        Self::NesamZeroSinkage,
+        Self::Transformer,
+        Self::KinematicResidual,
+        Self::RigidResidual,
+        Self::Kinematic,
+        Self::ConstantVelocity,
+    ];
 
     /// The name in JSON, Parquet and options.
     pub fn as_str(self) -> &'static str {
@@ -33,14 +48,22 @@ impl ModelName {
             Self::Nesam => "nesam",
             Self::NesamNoResidual => "nesam_no_residual",
             Self::NesamZeroSinkage => "nesam_zero_sinkage",
+            Self::Transformer => "transformer",
+            Self::KinematicResidual => "kinematic_residual",
+            Self::RigidResidual => "rigid_residual",
             Self::Kinematic => "kinematic",
             Self::ConstantVelocity => "constant_velocity",
         }
     }
 
-    /// Whether the model needs the weights of a bundle.
+    /// Whether the model needs the weights of the main bundle.
     pub fn is_nesam(self) -> bool {
         matches!(self, Self::Nesam | Self::NesamNoResidual | Self::NesamZeroSinkage)
+    }
+
+    /// Whether the model needs a bundle of its own, trained as a baseline.
+    pub fn is_trained_baseline(self) -> bool {
+        matches!(self, Self::Transformer | Self::KinematicResidual | Self::RigidResidual)
     }
 }
 

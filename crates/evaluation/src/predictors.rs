@@ -63,6 +63,7 @@ impl WindowPredictor {
             ModelName::Nesam => nesam(Variant::Full)?,
             ModelName::NesamNoResidual => nesam(Variant::NoResidual)?,
             ModelName::NesamZeroSinkage => nesam(Variant::ZeroSinkage)?,
+            ModelName::Transformer | ModelName::KinematicResidual | ModelName::RigidResidual => nesam(Variant::Full)?,
             ModelName::ConstantVelocity => Self::ConstantVelocity,
             ModelName::Kinematic => {
                 let model = kinematic.ok_or_else(|| EvaluationError::KinematicNotFitted {

@@ -6,11 +6,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::Instant;
 
-use nesam_model::bundle::sha256_hex;
+use nesam_model::bundle::{sha256_hex, trained_parameters};
 use nesam_model::encoder::{ENCODERS, TerrainEncoders};
 use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
-use nesam_physics::Vehicle;
 use nesam_physics::step::StepModel;
+use nesam_physics::{STATE_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, Trajectory};
 
@@ -18,7 +18,7 @@ use crate::autoencoder::{Places, PretrainPlan, pretrain};
 use crate::calibrate::calibrate_driveline;
 use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
-use crate::scales::measure;
+use crate::scales::{measure, measure_increments};
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
 
 /// What a run is told; the defaults of the command line are in `nesam train --help`.
@@ -81,7 +81,7 @@ pub fn run(
     };
     let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
     let mut vehicle = root.vehicle().clone();
-    let scales = calibrated(&mut vehicle, &drives, &train_at, recipe.dt_s, reporter);
+    let mut scales = calibrated(&mut vehicle, &drives, &train_at, recipe.dt_s, reporter);
 
     if recipe.mirror {
         let images = mirrored(&drives, &train_at);
@@ -90,6 +90,12 @@ pub fn run(
     }
 
     let mut weights = initial_weights(recipe.plan.seed, &scales);
+    if recipe.plan.variant == Variant::Transformer {
+        let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
+        let [mean, sd] = measure_increments(&training);
+        scales.residual_scale = sd;
+        weights.insert("residual.bias", &[STATE_DIM], mean.iter().zip(sd).map(|(m, s)| m / s).collect());
+    }
     if drives.iter().any(|d| d.map.is_some()) {
         for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
             weights.insert(name, &array.shape, array.values.clone());
@@ -112,7 +118,7 @@ pub fn run(
         "{} drives train, {} validate, {} parameters",
         set.train.len(),
         validation_at.len(),
-        weights.parameters("") - weights.parameters("encoder.")
+        trained_parameters(&weights, recipe.plan.variant)
     ));
     reporter.stage("training", recipe.plan.steps);
     let plan = TrainingPlan { folder: recipe.out.join("checkpoint"), ..recipe.plan.clone() };
@@ -130,8 +136,9 @@ pub fn run(
     let mut bundle = ModelBundle {
         name: recipe.name.clone(),
         hash: String::new(),
+        form: recipe.plan.variant,
         default_soil: scales.default_soil(),
-        parameters: trained.weights.parameters("") - trained.weights.parameters("encoder."),
+        parameters: trained_parameters(&trained.weights, recipe.plan.variant),
         vehicle,
         normalization: scales,
         weights: trained.weights,
@@ -267,14 +274,4 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
     }
     std::fs::write(path, bytes).map_err(|e| fail(e.to_string()))
-}
-
-/// The variant a name stands for: `nesam`, `nesam_no_residual`, `nesam_zero_sinkage`.
-pub fn variant_of(name: &str) -> Option<Variant> {
-    match name {
-        "nesam" => Some(Variant::Full),
-        "nesam_no_residual" => Some(Variant::NoResidual),
-        "nesam_zero_sinkage" => Some(Variant::ZeroSinkage),
-        _ => None,
-    }
 }

@@ -5,7 +5,7 @@ use nesam_model::soil_coordinates::to_raw;
 use nesam_model::token::token_entries;
 use nesam_model::{GroundSource, Normalization};
 use nesam_physics::step::StepModel;
-use nesam_physics::{STATE_DIM, Vehicle};
+use nesam_physics::{STATE_DIM, Vehicle, wrap_angle};
 use nesam_terrain::PatchScale;
 
 use crate::drives::Drive;
@@ -18,6 +18,26 @@ const LOSS_SCALE: [f32; STATE_DIM] = [0.15, 0.15, 0.04, 0.012, 0.012, 0.02, 0.15
 
 /// Raw residual of one, per step: what the symbolic step is typically off by.
 const RESIDUAL_SCALE: [f32; STATE_DIM] = [0.02, 0.02, 0.02, 0.01, 0.01, 0.01, 0.1, 0.1, 0.1, 0.1, 0.1, 0.05];
+
+/// Mean and standard deviation of what one step changes: displacement in the heading frame, attitude, velocities; for a form without symbolic half.
+pub fn measure_increments(drives: &[&Drive]) -> [[f32; STATE_DIM]; 2] {
+    let (mut sum, mut squares, mut count) = ([0.0; STATE_DIM], [0.0; STATE_DIM], 0.0);
+    for pair in drives.iter().flat_map(|drive| drive.states.windows(2)) {
+        let (x, next) = (pair[0].to_array(), pair[1].to_array());
+        let mut change: [f64; STATE_DIM] = core::array::from_fn(|i| next[i] - x[i]);
+        let (sin, cos) = x[5].sin_cos();
+        (change[0], change[1]) = (cos * change[0] + sin * change[1], cos * change[1] - sin * change[0]);
+        change[5] = wrap_angle(change[5]);
+        for i in 0..STATE_DIM {
+            sum[i] += change[i];
+            squares[i] += change[i].powi(2);
+        }
+        count += 1.0;
+    }
+    let mean = sum.map(|s| s / count);
+    let sd: [f64; STATE_DIM] = core::array::from_fn(|i| (squares[i] / count - mean[i].powi(2)).max(0.0).sqrt().max(1e-4));
+    [mean, sd].map(|values| values.map(|v| v as f32))
+}
 
 /// Scales of tokens, ranges and losses from the training drives (measured channels only).
 pub fn measure(drives: &[&Drive], vehicle: &Vehicle, dt_s: f64) -> Normalization {

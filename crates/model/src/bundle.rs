@@ -11,6 +11,7 @@ use sha2::{Digest, Sha256};
 use crate::ModelError;
 use crate::effects_file;
 use crate::normalization::Normalization;
+use crate::rollout::Variant;
 use crate::weights::Weights;
 
 /// Version of the layout; another version is refused.
@@ -49,6 +50,9 @@ pub struct Provenance {
 struct Manifest {
     format: String,
     name: String,
+    /// Form of the model.
+    #[serde(default)]
+    model: Variant,
     provenance: Provenance,
     /// SHA-256 of each file.
     files: BTreeMap<String, String>,
@@ -61,6 +65,8 @@ pub struct ModelBundle {
     pub name: String,
     /// SHA-256 (hex) of the manifest, which holds the hash of every file.
     pub hash: String,
+    /// What the weights were trained as.
+    pub form: Variant,
     /// The vehicle the bundle was trained for, with the bundle's effects.
     pub vehicle: Vehicle,
     /// Effects on top of the vehicle card, as `effects.toml` lists them; [`ModelBundle::vehicle`] has them already.
@@ -79,6 +85,12 @@ pub struct ModelBundle {
     pub reference_json: Option<String>,
     /// Where the bundle comes from.
     pub provenance: Provenance,
+}
+
+/// Parameters that training changes in a form of the model: neither encoders nor heads that the form does not have.
+pub fn trained_parameters(weights: &Weights, form: Variant) -> usize {
+    let unused: &[&str] = if form.has_soil() { &["encoder."] } else { &["encoder.", "soil.", "sinkage."] };
+    weights.parameters("") - unused.iter().map(|prefix| weights.parameters(prefix)).sum::<usize>()
 }
 
 /// Lower-case hex SHA-256.
@@ -151,10 +163,11 @@ impl ModelBundle {
         Ok(Self {
             name: manifest.name,
             hash,
+            form: manifest.model,
             vehicle: vehicle.with_effects(&effects),
             effects,
             default_soil: normalization.default_soil(),
-            parameters: weights.parameters("") - weights.parameters("encoder."),
+            parameters: trained_parameters(&weights, manifest.model),
             normalization,
             weights,
             baselines_json,
@@ -197,6 +210,7 @@ impl ModelBundle {
         let manifest = Manifest {
             format: FORMAT.into(),
             name: self.name.clone(),
+            model: self.form,
             provenance: self.provenance.clone(),
             files: files.iter().map(|(name, bytes)| ((*name).to_string(), sha256_hex(bytes))).collect(),
         };

@@ -18,6 +18,7 @@ mod rollout;
 pub mod soil_coordinates;
 mod soil_prior;
 pub mod step_row;
+mod symbolic;
 mod terrain_tokens;
 pub mod token;
 pub mod weights;

@@ -20,6 +20,7 @@ use crate::rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
+use crate::symbolic::symbolic_step;
 use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, VALUES};
 use crate::token::{TokenScale, token_entries};
 
@@ -89,6 +90,7 @@ struct Scene<'a> {
     ground: GroundSource<'a>,
     prefix: Prefix,
     datum_m: f64,
+    variant: Variant,
 }
 
 impl Predictor {
@@ -154,7 +156,9 @@ impl Predictor {
         let tokens = query.map.map(|map| self.tokens_of(map));
         let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
         let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
-        let scene = Scene { query, ground, prefix: self.prefix(history, &ground, tokens.as_deref()), datum_m: query.start.position_m[2] };
+        let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
+        let prefix = self.prefix(history, &ground, tokens.as_deref());
+        let scene = Scene { query, ground, prefix, datum_m: query.start.position_m[2], variant };
 
         let first = control(query, 0, 0);
         let start = Sample {
@@ -358,7 +362,7 @@ impl Predictor {
                 let wheels = command_wheels(self.model.vehicle(), &sample.actuators, &after, control);
                 let (ground, known) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
                 let soil = self.soil(terrain[l], query);
-                let ratio: [f32; WHEELS] = core::array::from_fn(|i| match query.variant {
+                let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                     Variant::ZeroSinkage => NO_SINKAGE,
                     _ => scales.sinkage_log_ratio_max * raw_sinkage[i][l].tanh(),
                 });
@@ -371,13 +375,13 @@ impl Predictor {
             let at = |l: usize| (half + l).min(last);
             let varying = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].1[c])));
             let constant = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].2[c])));
-            let output = self.model.step(&step_input(varying, constant));
-            let increment = output.increment.to_array().map(f32x8::to_array);
-            let sinkages = output.contacts.map(|c| c.sinkage_m.to_array());
+            let (increment, sinkages) = symbolic_step(scene.variant, &self.model, &step_input(varying, constant));
+            let increment = increment.to_array().map(f32x8::to_array);
+            let sinkages = sinkages.map(f32x8::to_array);
             for l in 0..8.min(samples.len() - half) {
                 let lane = half + l;
                 let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
-                    let residual = match query.variant {
+                    let residual = match scene.variant {
                         Variant::NoResidual => 0.0,
                         _ => raw_residual[i][lane] * scales.residual_scale[i],
                     };

@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
+use serde::{Deserialize, Serialize};
 
 /// One step of the recent past: the measured state and the command applied from it (one token of the paper, §III-B).
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -14,16 +15,56 @@ pub struct HistoryStep {
     pub control: Control<f64>,
 }
 
-/// Ablation switches at inference.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+/// Forms of the model: the whole, its ablations, and the baselines that share its tokens and its Transformer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Hash, Serialize, Deserialize)]
 pub enum Variant {
-    /// The whole model.
+    /// The whole model. In a query: the form that the bundle was trained as.
     #[default]
+    #[serde(rename = "nesam")]
     Full,
     /// The learned state residual is switched off (paper: "NeSAM w/o SR").
+    #[serde(rename = "nesam_no_residual")]
     NoResidual,
     /// The wheel sinkage is suppressed (paper: "NeSAM, Sinkage = 0").
+    #[serde(rename = "nesam_zero_sinkage")]
     ZeroSinkage,
+    /// No symbolic half at all: the Transformer says the whole increment (paper: "Transformer").
+    #[serde(rename = "transformer")]
+    Transformer,
+    /// A kinematic bicycle in place of terramechanics and Newton-Euler.
+    #[serde(rename = "kinematic_residual")]
+    KinematicResidual,
+    /// Newton-Euler on rigid ground: no soil, no sinkage.
+    #[serde(rename = "rigid_residual")]
+    RigidResidual,
+}
+
+impl Variant {
+    /// Every form.
+    pub const ALL: [Self; 6] =
+        [Self::Full, Self::NoResidual, Self::ZeroSinkage, Self::Transformer, Self::KinematicResidual, Self::RigidResidual];
+
+    /// Name in manifests, JSON and options.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Full => "nesam",
+            Self::NoResidual => "nesam_no_residual",
+            Self::ZeroSinkage => "nesam_zero_sinkage",
+            Self::Transformer => "transformer",
+            Self::KinematicResidual => "kinematic_residual",
+            Self::RigidResidual => "rigid_residual",
+        }
+    }
+
+    /// The form of a name.
+    pub fn from_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|v| v.as_str() == name)
+    }
+
+    /// Whether soil and terramechanics are part of the form.
+    pub fn has_soil(self) -> bool {
+        matches!(self, Self::Full | Self::NoResidual | Self::ZeroSinkage)
+    }
 }
 
 /// A batch of candidate command sequences from one start state.

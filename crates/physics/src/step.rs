@@ -124,6 +124,11 @@ impl StepModel {
         }
     }
 
+    /// Δt, s.
+    pub fn dt_s(&self) -> f64 {
+        self.dt_s
+    }
+
     /// The vehicle.
     pub fn vehicle(&self) -> &Vehicle {
         &self.vehicle

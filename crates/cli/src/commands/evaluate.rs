@@ -12,6 +12,7 @@ use nesam_model::{MAX_HORIZON, Predictor};
 use nesam_trajectories::Trajectory;
 
 use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
@@ -36,6 +37,9 @@ pub struct EvaluateArgs {
     /// Models to compare [default: all that bundle and data allow]
     #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
     models: Option<Vec<String>>,
+    /// Folder of baselines trained with `nesam train --model …` [default: deploy/baselines, found from the executable]
+    #[arg(long, value_name = "DIR")]
+    baselines: Option<PathBuf>,
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -180,8 +184,22 @@ impl Models {
         };
         let kinematic = if names.contains(&ModelName::Kinematic) { kinematic(args, predictor.as_deref(), drives, training)? } else { None };
         let vehicle = Arc::new(drives.root.vehicle().clone());
+        let trained = trained_baselines(args, names, drives)?;
         let mut ready = Vec::new();
         for &name in names {
+            if name.is_trained_baseline() {
+                match trained.iter().find(|p| p.bundle().form.as_str() == name.as_str()) {
+                    Some(own) => ready.push((name, WindowPredictor::new(name, Some(own), &vehicle, None).or_input()?)),
+                    None if args.models.is_none() => {
+                        eprintln!("note: {name} is left out: no bundle of that form for this vehicle in the folder of baselines")
+                    }
+                    None => {
+                        let hint = "train one with `nesam train --model`, and give its folder with --baselines";
+                        return Err(Failure::input(format!("no bundle of the form {name} for this vehicle; {hint}")));
+                    }
+                }
+                continue;
+            }
             if name == ModelName::Kinematic && kinematic.is_none() && args.models.is_none() {
                 eprintln!(
                     "note: kinematic is left out: the bundle carries no fit for this vehicle and no set of the data root has a train split"
@@ -192,6 +210,22 @@ impl Models {
         }
         Ok(Self { predictor, ready })
     }
+}
+
+/// Bundles of baselines for the vehicle of the data.
+fn trained_baselines(args: &EvaluateArgs, names: &[ModelName], drives: &Drives) -> Result<Vec<Arc<Predictor>>, Failure> {
+    if !names.iter().any(|n| n.is_trained_baseline()) {
+        return Ok(Vec::new());
+    }
+    let folders = args.baselines.as_deref().map_or_else(baseline_bundles, bundles_in);
+    let mut predictors = Vec::new();
+    for folder in folders {
+        let bundle = load_bundle(Some(&folder))?;
+        if bundle.vehicle.name == drives.root.vehicle().name {
+            predictors.push(predictor_for(bundle, &drives.root)?);
+        }
+    }
+    Ok(predictors)
 }
 
 /// The kinematic fit: the bundle's where it is for this vehicle, else a new one on the train split.

@@ -6,8 +6,9 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
-use nesam_learning::recipe::{Recipe, Reporter, run as train, variant_of};
+use nesam_learning::recipe::{Recipe, Reporter, run as train};
 use nesam_learning::{TrainingError, TrainingPlan};
+use nesam_model::Variant;
 
 use crate::args::{DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
@@ -25,7 +26,8 @@ pub struct TrainArgs {
     /// Name of the new bundle [default: <vehicle's first word>-<set>]
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// What to train: nesam, or an ablation with the full budget: nesam_no_residual, nesam_zero_sinkage
+    /// What to train: nesam; an ablation, nesam_no_residual or nesam_zero_sinkage; or a baseline on the same tokens, transformer,
+    /// kinematic_residual or rigid_residual
     #[arg(long, value_name = "MODEL", default_value = "nesam")]
     model: String,
     /// Optimiser steps of the encoders' pre-training
@@ -133,8 +135,8 @@ fn own_threads() -> Result<(), Failure> {
 
 /// Runs the command.
 pub fn run(args: &TrainArgs) -> Result<(), Failure> {
-    let variant = variant_of(&args.model)
-        .ok_or_else(|| Failure::input(format!("no model `{}`; one of nesam, nesam_no_residual, nesam_zero_sinkage", args.model)))?;
+    let variant = Variant::from_name(&args.model)
+        .ok_or_else(|| Failure::input(format!("no model `{}`; one of {}", args.model, Variant::ALL.map(Variant::as_str).join(", "))))?;
     if args.epochs * args.batches * args.batch_size * args.threads == 0 {
         return Err(Failure::input("--epochs, --batches, --batch-size and --threads must be at least 1"));
     }
@@ -147,9 +149,10 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, args.horizon).or_input()?;
     let name = args.name.clone().unwrap_or_else(|| {
         let vehicle = drives.root.vehicle().name.split_whitespace().next().unwrap_or("vehicle").to_lowercase();
-        format!("{vehicle}-{}", drives.set.replace('/', "-"))
+        let form = if variant == Variant::Full { String::new() } else { format!("-{}", variant.as_str().replace('_', "-")) };
+        format!("{vehicle}-{}{form}", drives.set.replace('/', "-"))
     });
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from(format!("nesam-out/train-{}", drives.set.replace('/', "-"))));
+    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("nesam-out").join(format!("train-{name}")));
     let recipe = Recipe {
         name,
         dt_s: args.data.dt,

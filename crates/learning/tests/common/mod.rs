@@ -6,7 +6,7 @@ use std::sync::Arc;
 use nesam_learning::initial::initial_weights;
 use nesam_learning::{Drive, encode_drives, scales};
 use nesam_model::encoder::TerrainEncoders;
-use nesam_model::{GroundSource, ModelBundle, Normalization, Predictor, Provenance, Weights};
+use nesam_model::{GroundSource, ModelBundle, Normalization, Predictor, Provenance, Variant, Weights};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, Driveline, SecondCommand, Soil, SteeringTable, Vehicle, VehicleState};
@@ -123,6 +123,7 @@ pub fn predictor(scales: &Normalization, weights: Weights) -> Predictor {
     let bundle = ModelBundle {
         name: "untrained".into(),
         hash: String::new(),
+        form: Variant::Full,
         vehicle: truck(),
         default_soil: scales.default_soil(),
         parameters: 0,

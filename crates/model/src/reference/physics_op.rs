@@ -6,12 +6,14 @@ use nesam_physics::step::StepModel;
 use std::sync::Arc;
 
 use super::image::values;
+use crate::rollout::Variant;
 use crate::step_row::{COLUMNS, CONSTANT, DIFFERENTIABLE, OUTPUTS, step_input};
+use crate::symbolic::symbolic_step;
 
 const LANES: usize = 8;
 
-struct Step(Arc<StepModel>);
-struct StepGradient(Arc<StepModel>);
+struct Step(Variant, Arc<StepModel>);
+struct StepGradient(Variant, Arc<StepModel>);
 
 /// Columns `from..from + N` of eight rows as lanes; rows past the end repeat the last one.
 fn lanes<const N: usize>(packed: &[f32], base: usize, from: usize) -> [f32x8; N] {
@@ -30,7 +32,7 @@ impl CustomOp1 for Step {
         let mut out = vec![0f32; rows * OUTPUTS];
         for base in (0..rows).step_by(LANES) {
             let input = step_input::<f32x8>(lanes(packed, base, 0), lanes::<CONSTANT>(packed, base, DIFFERENTIABLE));
-            let increment = self.0.step(&input).increment.to_array().map(f32x8::to_array);
+            let increment = symbolic_step(self.0, &self.1, &input).0.to_array().map(f32x8::to_array);
             for lane in 0..LANES.min(rows - base) {
                 for (column, value) in increment.iter().enumerate() {
                     out[(base + lane) * OUTPUTS + column] = value[lane];
@@ -41,7 +43,7 @@ impl CustomOp1 for Step {
     }
 
     fn bwd(&self, arg: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
-        let gradient = StepGradient(self.0.clone());
+        let gradient = StepGradient(self.0, self.1.clone());
         Ok(Some(arg.contiguous()?.apply_op2_no_bwd(&grad.contiguous()?, &gradient)?))
     }
 }
@@ -59,7 +61,7 @@ impl CustomOp2 for StepGradient {
             let varying = lanes::<DIFFERENTIABLE>(packed, base, 0);
             let varying: [Dual<f32x8, DIFFERENTIABLE>; DIFFERENTIABLE] = core::array::from_fn(|k| Dual::variable(varying[k], k));
             let constant = lanes::<CONSTANT>(packed, base, DIFFERENTIABLE).map(Dual::constant);
-            let increment = self.0.step(&step_input(varying, constant)).increment.to_array();
+            let increment = symbolic_step(self.0, &self.1, &step_input(varying, constant)).0.to_array();
             let weight: [f32x8; OUTPUTS] = core::array::from_fn(|o| {
                 f32x8::from(core::array::from_fn::<f32, LANES, _>(|l| upstream[(base + l).min(rows - 1) * OUTPUTS + o]))
             });
@@ -74,14 +76,14 @@ impl CustomOp2 for StepGradient {
     }
 }
 
-/// Increment Δx_NE (rows, 12) of packed step inputs (rows, `COLUMNS`), differentiable in the first `DIFFERENTIABLE` columns.
+/// Increment of the symbolic half of a form (rows, 12) of packed step inputs (rows, `COLUMNS`), differentiable in the first `DIFFERENTIABLE` columns.
 ///
 /// # Errors
 /// A candle error when the tensor is not (rows, `COLUMNS`) of f32 on the CPU.
-pub fn physics_increment(packed: &Tensor, model: &Arc<StepModel>) -> Result<Tensor> {
+pub fn physics_increment(packed: &Tensor, variant: Variant, model: &Arc<StepModel>) -> Result<Tensor> {
     let (_, columns) = packed.dims2()?;
     if columns != COLUMNS {
         bail!("physics step: {columns} columns, expected {COLUMNS}");
     }
-    packed.contiguous()?.apply_op1(Step(model.clone()))
+    packed.contiguous()?.apply_op1(Step(variant, model.clone()))
 }

@@ -63,7 +63,7 @@ pub struct ReferenceRollout<'a> {
     pub model: &'a Arc<StepModel>,
     /// Scales.
     pub scales: &'a Normalization,
-    /// Ablation.
+    /// Form.
     pub variant: Variant,
 }
 
@@ -209,7 +209,7 @@ impl ReferenceRollout<'_> {
         let packed =
             Tensor::cat(&[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, rows_tensor(constants)?], 1)?;
         // z, roll, pitch are columns 2..5; yaw (5) does not enter the step.
-        let symbolic = physics_increment(&packed, self.model)?;
+        let symbolic = physics_increment(&packed, self.variant, self.model)?;
         if self.variant == Variant::NoResidual {
             return Ok(symbolic);
         }

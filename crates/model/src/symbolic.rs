@@ -1,0 +1,55 @@
+//! The half of a form that is not learned: what moves the vehicle before the learned residual is added.
+
+use nesam_physics::step::{StepInput, StepModel};
+use nesam_physics::{Real, Soil, VehicleState, WHEELS};
+
+use crate::rollout::Variant;
+
+/// A floor: a wheel of six kilonewtons sinks by less than a millimetre and grips by Coulomb friction (chosen: as concrete, tan φ = 0.7).
+const FLOOR: Soil<f64> = Soil { k_phi: 5.0e8, k_c: 0.0, n: 1.0, c: 100.0, phi: 0.61, k_shear: 0.005 };
+/// Time in which the bicycle takes up a commanded speed, s (chosen; the residual learns the rest).
+const SPEED_LAG_S: f64 = 0.5;
+
+/// Increment Δx of the symbolic half and the sinkage of each wheel, m.
+#[inline(always)]
+pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepInput<T>) -> (VehicleState<T>, [T; WHEELS]) {
+    match variant {
+        Variant::Full | Variant::NoResidual | Variant::ZeroSinkage => {
+            let output = model.step(input);
+            (output.increment, output.contacts.map(|c| c.sinkage_m))
+        }
+        Variant::RigidResidual => {
+            let soil = Soil::from_array(FLOOR.to_array().map(T::lit));
+            let output = model.step(&StepInput { soil, sinkage_log_ratio: [T::lit(0.0); WHEELS], ..*input });
+            (output.increment, [T::lit(0.0); WHEELS])
+        }
+        Variant::KinematicResidual => (bicycle(model, input), [T::lit(0.0); WHEELS]),
+        Variant::Transformer => (VehicleState::from_array([T::lit(0.0); 12]), [T::lit(0.0); WHEELS]),
+    }
+}
+
+/// A bicycle (or a differential drive) that rolls without slip: speed follows the command with a lag, the turn follows from road-wheel angle and rim
+/// speeds, position and attitude from the velocities. Side speed, vertical speed, roll and pitch rate stay as they are.
+#[inline(always)]
+fn bicycle<T: Real>(model: &StepModel, input: &StepInput<T>) -> VehicleState<T> {
+    let vehicle = model.vehicle();
+    let (dt, zero) = (T::lit(model.dt_s()), T::lit(0.0));
+    let [vx, vy, vz] = input.state.velocity_m_s;
+    let [wx, wy, wz] = input.state.angular_velocity_rad_s;
+    let wheels = &input.wheels;
+    let share = T::lit(1.0 - (-model.dt_s() / SPEED_LAG_S).exp());
+    let faster = (wheels.speed_m_s - vx) * share;
+    let half = T::lit(0.5);
+    let angle = (wheels.angle_rad[0] + wheels.angle_rad[1]) * half;
+    let side = |i: usize, j: usize| (wheels.rim_base_m_s[i] + wheels.rim_base_m_s[j]) * half * (T::lit(1.0) - wheels.rim_follow);
+    let speed = vx + faster * half;
+    let turn = speed * angle.tan() / T::lit(vehicle.wheelbase_m) + (side(1, 3) - side(0, 2)) / T::lit(vehicle.track_m);
+    let turned = (wz + turn) * half * dt;
+    let pitch = input.state.attitude_rad[1];
+    VehicleState {
+        position_m: [speed * dt, vy * dt, (vz - speed * pitch) * dt],
+        attitude_rad: [wx * dt, wy * dt, turned],
+        velocity_m_s: [faster, zero, zero],
+        angular_velocity_rad_s: [zero, zero, turn - wz],
+    }
+}
