@@ -52,7 +52,7 @@ impl SplitArg {
 /// Which model to use.
 #[derive(Args, Clone, Debug)]
 pub struct BundleArgs {
-    /// Model bundle [default: the newest in deploy/bundles, found from the executable]
+    /// Model bundle [default: the one in deploy/bundles for the vehicle, else the newest there; found from the executable]
     #[arg(long, value_name = "DIR")]
     pub bundle: Option<PathBuf>,
 }

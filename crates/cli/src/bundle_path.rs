@@ -28,6 +28,12 @@ pub fn default_bundle() -> Option<PathBuf> {
     upward("deploy/bundles").into_iter().find_map(|folder| newest(&folder))
 }
 
+/// The shipped bundle that was trained for a vehicle, by the name on its card.
+pub fn bundle_of_vehicle(name: &str) -> Option<PathBuf> {
+    let of = |dir: &PathBuf| nesam_vehicle_card::from_json(&std::fs::read_to_string(dir.join("vehicle.json")).ok()?).ok();
+    upward("deploy/bundles").iter().flat_map(|folder| bundles_in(folder)).find(|dir| of(dir).is_some_and(|v| v.name == name))
+}
+
 /// Folders of shipped baseline bundles.
 pub fn baseline_bundles() -> Vec<PathBuf> {
     upward("deploy/baselines").first().map(|folder| bundles_in(folder)).unwrap_or_default()

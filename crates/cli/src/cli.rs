@@ -51,6 +51,8 @@ enum Command {
     Predict(commands::predict::PredictArgs),
     /// Train a bundle on the train split of a set
     Train(commands::train::TrainArgs),
+    /// Compare the physics inside with what a simulator says of wheels and soil
+    Inside(commands::inside::InsideArgs),
     /// Measure what answers cost on this machine
     Bench(commands::bench::BenchArgs),
     /// Say what a bundle or a data root holds
@@ -78,6 +80,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Adapt(args)) => commands::adapt::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),
+        Some(Command::Inside(args)) => commands::inside::run(&args),
         Some(Command::Bench(args)) => commands::bench::run(&args),
         Some(Command::Inspect(args)) => commands::inspect::run(&args),
         Some(Command::Check(args)) => commands::check::run(&args),

@@ -10,7 +10,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, Trajectory};
 
 use crate::args::{DataArgs, SplitArg};
-use crate::bundle_path::{bundle_dir, sample_root};
+use crate::bundle_path::{bundle_dir, bundle_of_vehicle, sample_root};
 use crate::failure::{Failure, OrFail};
 
 /// The drives of one set, with the map of each.
@@ -106,6 +106,12 @@ pub fn maps_of(root: &DataRoot, drives: &[Trajectory]) -> Result<Vec<Option<Arc<
 /// Loads and verifies a bundle.
 pub fn load_bundle(given: Option<&Path>) -> Result<ModelBundle, Failure> {
     ModelBundle::load(&bundle_dir(given)?).or_input()
+}
+
+/// The bundle that is given, else the shipped one for the vehicle of the data root, else the shipped one.
+pub fn load_bundle_for(given: Option<&Path>, root: &DataRoot) -> Result<ModelBundle, Failure> {
+    let own = if given.is_none() { bundle_of_vehicle(&root.vehicle().name) } else { None };
+    load_bundle(given.or(own.as_deref()))
 }
 
 /// A bundle as a predictor of the vehicle of a data root. The bundle's own card is the calibrated one; only where the data root is of

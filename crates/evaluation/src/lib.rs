@@ -26,6 +26,7 @@ mod dimension;
 mod error;
 mod errors;
 mod evaluate;
+mod inside;
 mod kinematic;
 mod kinematic_fit;
 mod models;
@@ -49,6 +50,7 @@ pub use dimension::{DIMENSION_KEYS, POSE_DIM, Pose, absolute_error, horizontal_d
 pub use error::EvaluationError;
 pub use errors::{PosePath, StepError, WindowErrors, path_length_m};
 pub use evaluate::{DriveMaps, HorizonCurve, ModelPaths, ModelScore, path_median_m, predict_all, score};
+pub use inside::{Agreement, Comparison, Pairs, ResidualShare, look_inside};
 pub use kinematic::{KINEMATIC_PARAMETERS, Kinematic};
 pub use models::ModelName;
 pub use output::{Evaluation, Provenance};

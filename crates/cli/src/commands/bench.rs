@@ -17,7 +17,7 @@ use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output::{provenance, say, write_file};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
 
 /// Options of `nesam bench`.
 #[derive(Args, Debug)]
@@ -75,7 +75,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         return Err(Failure::input(format!("--samples and --queries must be at least 1, --horizon 1…{MAX_HORIZON}")));
     }
     let drives = read_drives(&args.data, false)?;
-    let bundle = load_bundle(args.bundle.bundle.as_deref())?;
+    let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?;
     let drive = Planner::new(&drives, args)?;
     let progress = Progress::start("queries", 3 * args.queries);
     let mut done = 0;

@@ -16,7 +16,7 @@ use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives, training_drives, worlds_of};
+use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, training_drives, worlds_of};
 use crate::{interrupt, output};
 
 /// Options of `nesam evaluate`.
@@ -178,7 +178,7 @@ impl Models {
             if args.window.horizon > MAX_HORIZON {
                 return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
             }
-            Some(predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?)
+            Some(predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?)
         } else {
             None
         };
@@ -237,7 +237,7 @@ fn kinematic(
 ) -> Result<Option<Kinematic>, Failure> {
     let bundled = match predictor {
         Some(p) => p.bundle().baselines_json.clone(),
-        None => load_bundle(args.bundle.bundle.as_deref())
+        None => load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)
             .ok()
             .filter(|b| b.vehicle.name == drives.root.vehicle().name)
             .and_then(|b| b.baselines_json),

@@ -15,7 +15,7 @@ use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output;
 use crate::output::say;
-use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
 
 /// Options of `nesam predict`.
 #[derive(Args, Debug)]
@@ -88,7 +88,7 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
         )));
     }
     let window = Window { horizon: controls.len(), ..window };
-    let predictor = predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let map = drives.maps[0].as_ref();
     let rollout = rollout(args, &predictor, &window, &controls, map)?;
     let text = match args.format {

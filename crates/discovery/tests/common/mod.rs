@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 
 use nesam_discovery::{Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_learning::{Drive, initial::initial_weights, scales};
-use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance};
+use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
 use nesam_physics::driveline::{DrivelineState, command_wheels, road_wheel_angles};
 use nesam_physics::effects::Effect;
 use nesam_physics::step::{StepInput, StepModel};
@@ -157,6 +157,7 @@ pub fn bundle() -> ModelBundle {
                 effects: Vec::new(),
                 default_soil: scales.default_soil(),
                 parameters: 0,
+                form: Variant::Full,
                 weights: initial_weights(7, &scales),
                 normalization: scales,
                 baselines_json: None,

@@ -1,0 +1,73 @@
+//! `nesam inside`: is the physics inside real? Sinkage, loads, forces, slip and soil against a simulator's own values.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use nesam_evaluation::look_inside;
+use nesam_trajectories::{SoilTruth, read_ground_truth_soil};
+use serde_json::{Map, Value, json};
+
+use crate::args::{BundleArgs, DataArgs};
+use crate::failure::Failure;
+use crate::output::{provenance, say, write_file};
+use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
+
+/// Options of `nesam inside`.
+#[derive(Args, Debug)]
+pub struct InsideArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    /// Write the figures as JSON (schema nesam.inside/1)
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+const STATE_NAMES: [&str; 12] = ["x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "wx", "wy", "wz"];
+
+/// Runs the command.
+pub fn run(args: &InsideArgs) -> Result<(), Failure> {
+    check_model_step(args.data.dt)?;
+    let drives = read_drives(&args.data, true)?;
+    if drives.drives.iter().all(|d| d.truth.is_none()) {
+        return Err(Failure::input(format!("set `{}` has no gt_ columns: there is nothing to compare the physics with", drives.set)));
+    }
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let (comparison, share) = look_inside(&predictor, &drives.drives, &drives.maps, &true_soils(&drives));
+    say!("{:<28}{:>9}{:>12}{:>12}{:>12}{:>8}{:>8}", "quantity/class", "values", "true mean", "bias", "mean |err|", "corr.", "rank");
+    let mut quantities = Map::new();
+    for (name, pairs) in &comparison {
+        let Some(a) = pairs.agreement() else { continue };
+        let number = |v: f64| if v.abs() >= 100.0 { format!("{v:.0}") } else { format!("{v:.4}") };
+        let part = |v: Option<f64>| v.map_or("–".into(), |v| format!("{v:.2}"));
+        say!(
+            "{name:<28}{:>9}{:>12}{:>12}{:>12}{:>8}{:>8}",
+            a.count,
+            number(a.mean),
+            number(a.bias),
+            number(a.mae),
+            part(a.correlation),
+            part(a.rank_correlation)
+        );
+        quantities.insert(name.clone(), serde_json::to_value(a).expect("numbers serialise; this is a bug"));
+    }
+    let shares: Map<String, Value> = STATE_NAMES.iter().zip(share).map(|(name, s)| ((*name).into(), json!(s))).collect();
+    say!("\nshare of one step's change that the learned residual carries:");
+    say!("{}", STATE_NAMES.iter().zip(share).map(|(name, s)| format!("{name} {:.0} %", 100.0 * s)).collect::<Vec<_>>().join(", "));
+    let Some(file) = &args.json else { return Ok(()) };
+    let document = json!({
+        "schema": "nesam.inside/1",
+        "set": drives.set,
+        "split": args.data.split.as_str(),
+        "quantities": quantities,
+        "residual_share": shares,
+        "provenance": provenance(Some(predictor.bundle()), &drives),
+    });
+    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+}
+
+/// True soils of each drive's world; `None` where the world states none.
+fn true_soils(drives: &Drives) -> Vec<Option<SoilTruth>> {
+    drives.drives.iter().map(|d| read_ground_truth_soil(&drives.root.world_dir(d.world.as_deref()?)).ok()).collect()
+}
