@@ -119,6 +119,22 @@ impl EngineClient {
         }
     }
 
+    /// Copies a session.
+    pub async fn fork(&self, session: &str, copy: &str, budget: Duration) -> Result<SessionView, EngineError> {
+        match self.call(Command::Fork { session: session.into(), copy: copy.into() }, budget).await?.0 {
+            Reply::Session(view) => Ok(*view),
+            _ => Err(mismatch("fork")),
+        }
+    }
+
+    /// Closes the idle sessions and gives their names.
+    pub async fn expire(&self, budget: Duration) -> Result<Vec<String>, EngineError> {
+        match self.call(Command::Expire, budget).await?.0 {
+            Reply::Expired(sessions) => Ok(sessions),
+            _ => Err(mismatch("expire")),
+        }
+    }
+
     /// Closes a session.
     pub async fn close(&self, session: &str, budget: Duration) -> Result<(), EngineError> {
         self.call(Command::Close { session: session.into() }, budget).await.map(|_| ())
@@ -165,7 +181,7 @@ impl EngineClient {
 /// The outcome of a measurement in an engine answer.
 pub fn measured(answer: Answer) -> Result<MeasureAnswer, EngineError> {
     match answer.result? {
-        Reply::Measured(answer) => Ok(answer),
+        Reply::Measured(answer) => Ok(*answer),
         _ => Err(mismatch("measure")),
     }
 }

@@ -116,6 +116,8 @@ pub struct LimitsConfig {
     pub angular_speed_max_rad_s: f64,
     /// Longest pause between two measurements of one session, s.
     pub pause_max_s: f64,
+    /// Time after which a session that nobody feeds and nobody asks is closed, s.
+    pub session_idle_s: f64,
 }
 
 impl Default for GrpcConfig {
@@ -169,6 +171,7 @@ impl Default for LimitsConfig {
             speed_max_m_s: l.speed_max_m_s,
             angular_speed_max_rad_s: l.angular_speed_max_rad_s,
             pause_max_s: l.pause_max_s,
+            session_idle_s: l.session_idle_s,
         }
     }
 }
@@ -189,6 +192,7 @@ impl From<&LimitsConfig> for Limits {
             speed_max_m_s: c.speed_max_m_s,
             angular_speed_max_rad_s: c.angular_speed_max_rad_s,
             pause_max_s: c.pause_max_s,
+            session_idle_s: c.session_idle_s,
         }
     }
 }
@@ -231,6 +235,7 @@ impl Config {
             ("grpc.keepalive_s", self.grpc.keepalive_s),
             ("grpc.drain_s", self.grpc.drain_s),
             ("limits.pause_max_s", self.limits.pause_max_s),
+            ("limits.session_idle_s", self.limits.session_idle_s),
         ];
         for (key, value) in seconds {
             if !(value > 0.0 && value <= 1e6) {

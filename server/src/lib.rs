@@ -10,6 +10,7 @@ mod clock;
 mod config;
 pub mod convert;
 mod error;
+mod expiry;
 mod grpc;
 mod http;
 mod serve;

@@ -18,6 +18,7 @@ use crate::call::EngineClient;
 use crate::clock::MonotonicClock;
 use crate::config::{Config, GrpcConfig};
 use crate::error::ServerError;
+use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::telemetry::Metrics;
@@ -68,13 +69,14 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let http_addr = http_listener.as_ref().map(|listener| local(listener, config.http.listen));
 
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
-    let sink = events.clone();
+    let metrics = Arc::new(Metrics::default());
+    let (sink, counted) = (events.clone(), metrics.clone());
     let engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).with_events(Box::new(move |event| {
+        counted.event(event.label());
         let _ = sink.send(event);
     }));
     let clock = MonotonicClock::default();
     let handle = EngineHandle::spawn(engine, Arc::new(clock));
-    let metrics = Arc::new(Metrics::default());
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
@@ -104,6 +106,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
             }
         })
     });
+    tokio::spawn(expire_sessions(edge.clone()));
     let health = HealthReporter::new();
     report(&health, ServingStatus::Serving).await;
     let grpc = spawn_grpc(grpc_listener, &edge, &health, stopping);

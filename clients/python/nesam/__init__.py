@@ -16,7 +16,7 @@ from ._errors import (
     Unavailable,
 )
 from ._fallback import KinematicFallback
-from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Validity, VehicleCard, WorldMap
+from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Soil, Validity, VehicleCard, WorldMap
 
 __all__ = [
     "CHANNELS",
@@ -36,6 +36,7 @@ __all__ = [
     "Prediction",
     "Provenance",
     "Session",
+    "Soil",
     "Unavailable",
     "Validity",
     "VehicleCard",

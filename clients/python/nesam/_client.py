@@ -94,6 +94,11 @@ class Client:
         """All open sessions, by id."""
         return [_session(s) for s in self._call(self._sessions.List, sessions_pb2.ListSessionsRequest()).sessions]
 
+    def fork_session(self, session_id: str, new_session_id: str) -> t.Session:
+        """Copies a session with its history and soil under another name. Raises NotFound, InvalidArgument, AlreadyExists, Overloaded."""
+        request = sessions_pb2.ForkSessionRequest(session_id=session_id, new_session_id=new_session_id)
+        return _session(self._call(self._sessions.Fork, request))
+
     def close_session(self, session_id: str) -> None:
         """Closes a session and forgets its history. Raises NotFound."""
         self._call(self._sessions.Close, sessions_pb2.CloseSessionRequest(session_id=session_id))
@@ -179,6 +184,9 @@ class Client:
         wheel_sinkage: bool = False,
         timeout_s: Optional[float] = None,
         fallback: Optional[KinematicFallback] = None,
+        start_stamp_ns: Optional[int] = None,
+        sent: Sequence[Tuple[int, Sequence[float]]] = (),
+        half: bool = False,
     ) -> t.Prediction:
         """Rolls candidate command sequences out from the session's newest state, or from `start`.
 
@@ -186,6 +194,9 @@ class Client:
         `use_history` it is taken to hold at the instant of the newest measurement. channels: names from CHANNELS to return, default all.
         stride: returns the steps stride, 2 stride, ... timeout_s: deadline, default that of the client. fallback: answers instead when the
         service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so.
+        start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session forward to it with the commands `sent`,
+        pairs (stamp_ns, (speed, second)) by ascending stamp. half: lets the reply travel as 16-bit numbers; positions are rounded by at most
+        4 mm within 16 m of the start. A fallback does not roll forward.
 
         Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, or it lies off the map), Overloaded, DeadlineExceeded,
         Unavailable; ValueError for arrays of a wrong shape.
@@ -202,8 +213,16 @@ class Client:
             horizon=controls.shape[1],
             controls=controls.tobytes(),
             output=prediction_pb2.OutputSelection(
-                channels=sum(1 << CHANNELS.index(name) for name in names), stride=stride, wheel_sinkage=wheel_sinkage
+                channels=sum(1 << CHANNELS.index(name) for name in names),
+                stride=stride,
+                wheel_sinkage=wheel_sinkage,
+                precision=prediction_pb2.PRECISION_F16 if half else prediction_pb2.PRECISION_F32,
             ),
+            start_stamp_ns=start_stamp_ns,
+            sent=[
+                prediction_pb2.SentCommand(stamp_ns=stamp_ns, command=types_pb2.Control(speed_m_s=command[0], second=command[1]))
+                for stamp_ns, command in sent
+            ],
         )
         try:
             reply = self._call(self._prediction.Predict, request, timeout_s)
@@ -213,7 +232,7 @@ class Client:
                 raise
             return _fallback_prediction(fallback, t.array(known, (12,), "start"), controls, names, stride, error)
         prediction = _prediction(reply, stride)
-        if start is None:
+        if start is None and start_stamp_ns is None:
             self._known_states[session_id] = prediction.start
         return prediction
 
@@ -293,6 +312,7 @@ def _answer(message: measurements_pb2.MeasurementAnswer) -> t.Answer:
         soil_epoch=message.soil_epoch,
         field=getattr(detail, "field", ""),
         message=getattr(detail, "message", ""),
+        soil=t.soil(message.soil_correction) if message.HasField("soil_correction") else None,
     )
 
 
@@ -315,6 +335,7 @@ def _session(message: sessions_pb2.Session) -> t.Session:
         last_sequence=message.last_sequence if message.HasField("last_sequence") else None,
         state=t.state_array(message.state) if message.HasField("state") else None,
         command=np.array([message.command.speed_m_s, message.command.second]) if message.HasField("command") else None,
+        soil=t.soil(message.soil_correction),
     )
 
 
@@ -373,13 +394,22 @@ def _steps_s(steps: int, stride: int) -> np.ndarray:
 def _prediction(reply: prediction_pb2.PredictReply, stride: int) -> t.Prediction:
     channels = tuple(name for i, name in enumerate(CHANNELS) if reply.channels >> i & 1)
     shape = (reply.samples, reply.steps, len(channels))
-    sinkage = np.frombuffer(reply.sinkage_m, dtype="<f4").reshape(reply.samples, reply.steps, 4) if reply.sinkage_m else None
+    start = t.state_array(reply.start)
+    half = reply.precision == prediction_pb2.PRECISION_F16
+    width = "<f2" if half else "<f4"
+    states = np.frombuffer(reply.states, dtype=width).reshape(shape).astype(np.float32, copy=False)
+    if half:
+        # Positions travel as offsets from the start.
+        states = (states + [start[i] if i < 3 else 0.0 for i in map(CHANNELS.index, channels)]).astype(np.float32)
+    sinkage = None
+    if reply.sinkage_m:
+        sinkage = np.frombuffer(reply.sinkage_m, dtype=width).reshape(reply.samples, reply.steps, 4).astype(np.float32, copy=False)
     return t.Prediction(
-        states=np.frombuffer(reply.states, dtype="<f4").reshape(shape),
+        states=states,
         channels=channels,
         steps_s=_steps_s(reply.steps, stride),
         validity=np.array(reply.validity, dtype=np.uint32),
-        start=t.state_array(reply.start),
+        start=start,
         sinkage_m=sinkage,
         history_steps=reply.history_steps,
         soil=t.soil_array(reply.soil),
@@ -388,6 +418,9 @@ def _prediction(reply: prediction_pb2.PredictReply, stride: int) -> t.Prediction
         provenance=t.provenance(reply.provenance),
         queue_s=reply.queue_s,
         compute_s=reply.compute_s,
+        start_stamp_ns=reply.start_stamp_ns if reply.HasField("start_stamp_ns") else None,
+        rolled_forward_steps=reply.rolled_forward_steps,
+        soil_correction=t.soil(reply.soil_correction),
     )
 
 

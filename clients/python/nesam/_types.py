@@ -19,6 +19,7 @@ class Validity(enum.IntFlag):
     STEERING_UNTRAINED = 16
     SLOPE_UNTRAINED = 32
     OVERTURNED = 64
+    SOIL_NOT_LEARNED = 128
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,20 @@ class Provenance:
 
 
 @dataclass(frozen=True)
+class Soil:
+    """What a session knows of the soil: a correction of the prior in the order k_phi k_c n c phi k_shear.
+
+    coordinates: "logarithmic" (natural logarithm of the factor; differences for n and phi) or "physical" (SI). delta: (6,). covariance: (6, 6) or
+    None while no filter runs. learned: (6,) bool, whether the drive has told something of each.
+    """
+
+    coordinates: str
+    delta: np.ndarray
+    covariance: Optional[np.ndarray]
+    learned: np.ndarray
+
+
+@dataclass(frozen=True)
 class Session:
     """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement."""
 
@@ -59,6 +74,7 @@ class Session:
     last_sequence: Optional[int]
     state: Optional[np.ndarray]
     command: Optional[np.ndarray]
+    soil: Soil
 
 
 @dataclass(frozen=True)
@@ -83,7 +99,7 @@ class Answer:
     """The service's answer to one measurement.
 
     outcome: APPLIED, BUFFERED, DUPLICATE, TOO_OLD, NOT_FINITE, GATED, GAP or REJECTED. Only APPLIED, BUFFERED, GATED and GAP changed the session.
-    field and message say what was wrong with a NOT_FINITE or REJECTED one.
+    field and message say what was wrong with a NOT_FINITE or REJECTED one. soil: after this measurement, None when it was rejected.
     """
 
     outcome: str
@@ -94,6 +110,7 @@ class Answer:
     soil_epoch: int
     field: str = ""
     message: str = ""
+    soil: Optional[Soil] = None
 
 
 @dataclass(frozen=True)
@@ -131,7 +148,9 @@ class Prediction:
 
     states: (samples, steps, channels) float32. channels: names of the channels. steps_s: (steps,) time of each returned step after the start, s.
     sinkage_m: (samples, steps, 4) float32 or None. validity: (samples,) uint32 of `Validity` bits. start: (12,).
-    soil: (6,) k_phi k_c n c phi k_shear under the start; soil_variance: (6,) or None while no filter runs.
+    start_stamp_ns: instant of the start by the vehicle's clock, None when a start was given. rolled_forward_steps: steps of 0.1 s from the newest
+    measurement to the start. soil: (6,) k_phi k_c n c phi k_shear under the start; soil_variance: (6,) or None while no filter runs;
+    soil_correction: what the session knew of the soil.
     computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance and
     sinkage_m are None, validity is 0 and `fallback_reason` is the service's error.
     """
@@ -151,6 +170,9 @@ class Prediction:
     compute_s: float
     computed_by: str = "service"
     fallback_reason: Optional[Exception] = None
+    start_stamp_ns: Optional[int] = None
+    rolled_forward_steps: int = 0
+    soil_correction: Optional[Soil] = None
 
 
 def array(values: Sequence[float], shape: Tuple[int, ...], name: str) -> np.ndarray:
@@ -179,6 +201,16 @@ def state_array(message: types_pb2.VehicleState) -> np.ndarray:
 def soil_array(message: types_pb2.SoilVector) -> np.ndarray:
     """(6,) from a soil message."""
     return np.array([message.k_phi, message.k_c, message.n, message.c_pa, message.phi_rad, message.k_shear_m])
+
+
+def soil(message: types_pb2.SoilCorrection) -> Soil:
+    """What is known of the soil from its message."""
+    return Soil(
+        coordinates={1: "physical", 2: "logarithmic"}.get(message.coordinates, "unspecified"),
+        delta=soil_array(message.delta),
+        covariance=np.array(message.covariance).reshape(6, 6) if message.covariance else None,
+        learned=np.array(message.learned, dtype=bool),
+    )
 
 
 def provenance(message: types_pb2.Provenance) -> Provenance:

@@ -48,6 +48,52 @@ def test_service_selection_returns_the_slice(driven):
     np.testing.assert_allclose(part.steps_s, [0.4, 0.8])
 
 
+def test_service_half_precision_is_rounding_only(driven):
+    whole = driven.predict("truck", fan(3, 32), wheel_sinkage=True)
+    half = driven.predict("truck", fan(3, 32), wheel_sinkage=True, half=True)
+    assert half.states.dtype == np.float32 and half.states.shape == whole.states.shape
+    # Eleven significant bits: 2^-11 of the number, of the offset from the start for positions (within 8 m here, so half of 2^-8 m).
+    np.testing.assert_allclose(half.states[..., :3], whole.states[..., :3], rtol=0, atol=2**-9 * 1.01)
+    np.testing.assert_allclose(half.states[..., 3:], whole.states[..., 3:], rtol=2**-10, atol=1e-6)
+    np.testing.assert_allclose(half.sinkage_m, whole.sinkage_m, rtol=2**-10, atol=1e-6)
+
+
+def test_service_prediction_from_now_rolls_forward_with_what_was_sent(driven):
+    step_ns, newest_ns = 100_000_000, 39 * 100_000_000
+    sent = [(newest_ns + i * step_ns, (2.0, 0.05 * i)) for i in range(1, 4)]
+    # The newest measurement says (2.0, 0.0) until the first sent command takes over.
+    before = np.array([[2.0, 0.0], *(command for _, command in sent)], dtype=np.float32)
+    now = driven.predict("truck", fan(3, 5), start_stamp_ns=newest_ns + 4 * step_ns, sent=sent)
+    controls = np.concatenate([np.repeat(before[None], 3, axis=0), fan(3, 5)], axis=1)
+    by_hand = driven.predict("truck", controls)
+    assert (now.states == by_hand.states[:, 4:]).all()
+    assert (now.rolled_forward_steps, now.start_stamp_ns) == (4, newest_ns + 4 * step_ns)
+    np.testing.assert_array_equal(now.start, by_hand.states[0, 3].astype(np.float64))
+    with pytest.raises(nesam.InvalidArgument) as caught:
+        driven.predict("truck", fan(3, 30), start_stamp_ns=newest_ns + 4 * step_ns)
+    assert caught.value.field == "start_stamp_ns" and "2" in caught.value.message
+
+
+def test_service_soil_is_in_every_reply(driven):
+    answer = driven.measure(list(straight("truck", 41))[40:])[0]
+    session, prediction = driven.session("truck"), driven.predict("truck", fan(1, 1))
+    for soil in (answer.soil, session.soil, prediction.soil_correction):
+        assert soil.coordinates == "logarithmic" and soil.learned.dtype == bool
+        assert (soil.delta == session.soil.delta).all() and (soil.covariance == session.soil.covariance).all()
+    assert (np.linalg.eigvalsh(session.soil.covariance) > 0).all()
+
+
+def test_service_forked_session_goes_its_own_way(driven):
+    copy = driven.fork_session("truck", "what-if")
+    assert copy.provenance == driven.session("truck").provenance and copy.vehicle_id == "truck"
+    assert (driven.predict("what-if", fan(2, 4)).states == driven.predict("truck", fan(2, 4)).states).all()
+    driven.measure(list(straight("what-if", 41))[40:])
+    assert driven.session("what-if").provenance.history_epoch == 41 and driven.session("truck").provenance.history_epoch == 40
+    with pytest.raises(nesam.AlreadyExists) as caught:
+        driven.fork_session("truck", "what-if")
+    assert caught.value.field == "new_session_id"
+
+
 def test_service_measurement_answers_are_typed(driven):
     with driven.measurement_stream() as stream:
         again = list(straight("truck", 42))

@@ -65,6 +65,12 @@ impl Client {
         Ok(self.sessions().list(v1::ListSessionsRequest {}).await?.into_inner().sessions)
     }
 
+    /// Copies a session under another name.
+    pub async fn fork_session(&mut self, session: &str, copy: &str) -> Result<v1::Session, ClientError> {
+        let request = v1::ForkSessionRequest { session_id: session.into(), new_session_id: copy.into() };
+        Ok(self.sessions().fork(request).await?.into_inner())
+    }
+
     /// Closes a session.
     pub async fn close_session(&mut self, session: &str) -> Result<(), ClientError> {
         self.sessions().close(v1::CloseSessionRequest { session_id: session.into() }).await?;

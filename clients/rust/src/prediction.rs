@@ -12,6 +12,10 @@ pub struct Candidates {
     pub session: String,
     /// State to start from (x y z roll pitch yaw vx vy vz wx wy wz); `None` = the newest measured one.
     pub start: Option<[f64; 12]>,
+    /// Instant of the vehicle's clock to start from, ns; `None` = that of the newest measured state. Not together with `start`.
+    pub start_stamp_ns: Option<i64>,
+    /// Commands `[speed_m_s, second]` that the vehicle was sent, each with the instant from which it applies it, by ascending instant.
+    pub sent: Vec<(i64, [f64; 2])>,
     /// Whether the measured history precedes the start.
     pub use_history: bool,
     /// N.
@@ -29,8 +33,14 @@ pub struct Candidates {
 impl Candidates {
     /// Candidates from the newest measured state, everything returned.
     pub fn new(session: &str, samples: usize, horizon: usize, controls: Vec<f32>) -> Self {
-        let output = v1::OutputSelection { channels: 0, stride: 0, wheel_sinkage: true };
-        Self { session: session.into(), start: None, use_history: true, samples, horizon, controls, output, tag: 0 }
+        let output = v1::OutputSelection { wheel_sinkage: true, ..Default::default() };
+        let session = session.into();
+        Self { session, start: None, start_stamp_ns: None, sent: Vec::new(), use_history: true, samples, horizon, controls, output, tag: 0 }
+    }
+
+    /// The same candidates from this instant of the vehicle's clock on, when the vehicle was sent these commands before.
+    pub fn starting_at(self, start_stamp_ns: i64, sent: Vec<(i64, [f64; 2])>) -> Self {
+        Self { start_stamp_ns: Some(start_stamp_ns), sent, ..self }
     }
 
     /// The same as message.
@@ -45,8 +55,14 @@ impl Candidates {
             controls: pack(&self.controls),
             output: Some(self.output),
             tag: self.tag,
+            start_stamp_ns: self.start_stamp_ns,
+            sent: self.sent.iter().map(|(stamp_ns, command)| sent_command(*stamp_ns, *command)).collect(),
         }
     }
+}
+
+fn sent_command(stamp_ns: i64, [speed_m_s, second]: [f64; 2]) -> v1::SentCommand {
+    v1::SentCommand { stamp_ns, command: Some(v1::Control { speed_m_s, second }) }
 }
 
 /// Predicted trajectories.
@@ -60,20 +76,26 @@ pub struct Prediction {
     pub steps: usize,
     /// Indices of the channels returned, in the order x y z roll pitch yaw vx vy vz wx wy wz.
     pub channels: Vec<usize>,
-    /// Row-major (samples, steps, channels): m, rad, m/s, rad/s.
+    /// Row-major (samples, steps, channels): m, rad, m/s, rad/s. Positions are in World, also where the reply was packed as f16.
     pub states: Vec<f32>,
     /// Row-major (samples, steps, 4): wheel sinkage, m; empty unless asked for.
     pub sinkage_m: Vec<f32>,
     /// For each sample the sum of its `v1::Validity` bits; 0 = nothing to say against it.
     pub validity: Vec<u32>,
-    /// State that the rollout started from.
+    /// State that the candidates started from.
     pub start: [f64; 12],
+    /// Instant of that state, ns of the vehicle's clock; `None` when it was given.
+    pub start_stamp_ns: Option<i64>,
+    /// Steps of 0.1 s from the newest measured state to the start.
+    pub rolled_forward_steps: usize,
     /// Measured steps before the start.
     pub history_steps: usize,
     /// Soil used under the start, order k_phi, k_c, n, c, phi, k_shear.
     pub soil: [f64; 6],
     /// Variance of that soil; `None` while no filter runs.
     pub soil_variance: Option<[f64; 6]>,
+    /// What the session knew of the soil.
+    pub soil_correction: v1::SoilCorrection,
     /// Time since the newest measurement arrived, s.
     pub measurement_age_s: Option<f64>,
     /// What the prediction was computed from.
@@ -98,18 +120,29 @@ impl Prediction {
         let (samples, steps) = (reply.samples as usize, reply.steps as usize);
         let sinkage = if reply.sinkage_m.is_empty() { 0 } else { samples * steps * 4 };
         let missing = |part: &str| ClientError::protocol(format!("`{part}` is missing"));
+        let start = reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?;
+        let mut states = unpack("states", &reply.states, samples * steps * channels.len(), reply.precision())?;
+        if reply.precision() == v1::Precision::F16 {
+            for row in states.chunks_exact_mut(channels.len().max(1)) {
+                let positions = row.iter_mut().zip(&channels).filter(|(_, channel)| **channel < 3);
+                positions.for_each(|(value, channel)| *value = (f64::from(*value) + start[*channel]) as f32);
+            }
+        }
         Ok(Self {
             tag: reply.tag,
             samples,
             steps,
-            states: unpack("states", &reply.states, samples * steps * channels.len())?,
-            sinkage_m: unpack("sinkage_m", &reply.sinkage_m, sinkage)?,
+            states,
+            sinkage_m: unpack("sinkage_m", &reply.sinkage_m, sinkage, reply.precision())?,
             channels,
             validity: reply.validity.clone(),
-            start: reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?,
+            start,
+            start_stamp_ns: reply.start_stamp_ns,
+            rolled_forward_steps: reply.rolled_forward_steps as usize,
             history_steps: reply.history_steps as usize,
             soil: reply.soil.as_ref().map(soil_array).ok_or_else(|| missing("soil"))?,
             soil_variance: reply.soil_variance.as_ref().map(soil_array),
+            soil_correction: reply.soil_correction.clone().ok_or_else(|| missing("soil_correction"))?,
             measurement_age_s: reply.measurement_age_s,
             provenance: reply.provenance.clone().ok_or_else(|| missing("provenance"))?,
             queue_s: reply.queue_s,

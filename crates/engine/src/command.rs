@@ -7,7 +7,7 @@ use nesam_terrain::WorldMap;
 
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
-use crate::session::SoilState;
+use crate::session::SoilEstimate;
 
 /// A command. The list is closed: what is not here cannot happen to a session.
 #[derive(Clone, Debug)]
@@ -21,11 +21,20 @@ pub enum Command {
     },
     /// Lists the sessions by name. Answer: `Reply::Sessions`.
     List,
+    /// Copies a session. Answer: `Reply::Session`.
+    Fork {
+        /// Name of the session.
+        session: String,
+        /// Name of the copy.
+        copy: String,
+    },
     /// Closes a session. Answer: `Reply::Done`.
     Close {
         /// Name of the session.
         session: String,
     },
+    /// Closes the sessions that were idle for longer than the limit. Answer: `Reply::Expired`.
+    Expire,
     /// Feeds a session. Answer: `Reply::Measured`.
     Measure {
         /// Name of the session.
@@ -65,13 +74,24 @@ impl Command {
             Self::Open(_) => "open",
             Self::Get { .. } => "get",
             Self::List => "list",
+            Self::Fork { .. } => "fork",
             Self::Close { .. } => "close",
+            Self::Expire => "expire",
             Self::Measure { .. } => "measure",
             Self::Predict(_) => "predict",
             Self::PutMap { .. } => "put_map",
             Self::GetMap { .. } => "get_map",
             Self::ListMaps => "list_maps",
             Self::DeleteMap { .. } => "delete_map",
+        }
+    }
+
+    /// The session that this command keeps from being idle: one that is fed or asked. Reading it is no use of it.
+    pub(crate) fn uses(&self) -> Option<&str> {
+        match self {
+            Self::Measure { session, .. } | Self::Fork { session, .. } => Some(session),
+            Self::Predict(query) => Some(&query.session),
+            _ => None,
         }
     }
 }
@@ -98,8 +118,10 @@ pub enum Reply {
     Session(Box<SessionView>),
     /// Sessions.
     Sessions(Vec<SessionView>),
+    /// Names of the sessions that were closed because they were idle.
+    Expired(Vec<String>),
     /// What became of a measurement.
-    Measured(MeasureAnswer),
+    Measured(Box<MeasureAnswer>),
     /// A prediction.
     Predicted(Box<Prediction>),
     /// A map.
@@ -119,8 +141,8 @@ pub struct MeasureAnswer {
     pub history_steps: usize,
     /// Changes of the history since the session was opened.
     pub history_epoch: u64,
-    /// Updates of the soil correction.
-    pub soil_epoch: u64,
+    /// What is known of the soil now.
+    pub soil: SoilEstimate,
 }
 
 /// A session as the outside sees it.
@@ -141,7 +163,7 @@ pub struct SessionView {
     /// Highest accepted sequence number.
     pub last_sequence: Option<u64>,
     /// What was learned of the soil.
-    pub soil: SoilState,
+    pub soil: SoilEstimate,
 }
 
 /// What watchers of the engine hear.
@@ -151,12 +173,27 @@ pub enum Event {
     SoilChanged {
         /// Name of the session.
         session: String,
+        /// Vehicle that it belongs to.
+        vehicle: String,
         /// The new estimate.
-        soil: SoilState,
+        soil: Box<SoilEstimate>,
     },
     /// A session was closed.
     SessionClosed {
         /// Name of the session.
         session: String,
+        /// Because it was idle.
+        expired: bool,
     },
+}
+
+impl Event {
+    /// Name for metrics.
+    pub fn label(&self) -> &'static str {
+        match self {
+            Self::SoilChanged { .. } => "soil_changed",
+            Self::SessionClosed { expired: false, .. } => "session_closed",
+            Self::SessionClosed { expired: true, .. } => "session_expired",
+        }
+    }
 }

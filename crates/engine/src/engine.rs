@@ -5,13 +5,16 @@ use std::sync::Arc;
 
 use nesam_adaptation::{AdaptationError, FilterConfig, SoilFilter};
 use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
+use nesam_physics::VehicleState;
+use nesam_terrain::WorldMap;
 
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
 use crate::error::EngineError;
+use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
-use crate::query::{PredictQuery, Prediction, Provenance};
+use crate::query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
 use crate::session::{Rules, Session};
 
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
@@ -77,7 +80,8 @@ impl Engine {
         &self.limits
     }
 
-    /// Answers one command at one instant of the engine's clock. A refused command changes nothing; a prediction never changes anything.
+    /// Answers one command at one instant of the engine's clock. A refused command changes nothing that an answer shows, and neither does a
+    /// prediction; both only keep the session that they name from being idle.
     ///
     /// # Errors
     /// Any [`EngineError`] that names why the command was refused.
@@ -85,11 +89,16 @@ impl Engine {
         if let Some(log) = &mut self.log {
             log.push((now_ns, command.clone()));
         }
+        if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
+            session.touch(now_ns);
+        }
         match command {
             Command::Open(open) => self.open(now_ns, open),
             Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
             Command::List => Ok(Reply::Sessions(self.sessions.values().map(|s| self.view(s)).collect())),
+            Command::Fork { session, copy } => self.fork(now_ns, session, copy),
             Command::Close { session } => self.close(session),
+            Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
             Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Box::new(p))),
             Command::PutMap { map, base } => {
@@ -119,14 +128,8 @@ impl Engine {
         if let Some(map) = map {
             self.maps.get(map)?;
         }
-        if self.sessions.contains_key(id) {
-            return Err(EngineError::SessionExists { session: id.clone() });
-        }
-        if self.sessions.len() >= self.limits.sessions_max {
-            let reason = format!("{} sessions are open, the limit; close one", self.sessions.len());
-            return Err(EngineError::Exhausted { field: "session_id".into(), reason });
-        }
-        let mut session = Session::new(id, &open.vehicle, map, self.filter.clone());
+        self.check_room("session_id", id)?;
+        let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
         if let Some(initial) = &open.initial {
             let rules = Rules { step_ns: self.step_ns, vehicle: card, limits: &self.limits };
             let outcome = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
@@ -140,11 +143,44 @@ impl Engine {
         Ok(Reply::Session(Box::new(view)))
     }
 
+    /// Whether one more session of this name may be open.
+    fn check_room(&self, field: &'static str, id: &str) -> Result<(), EngineError> {
+        if self.sessions.contains_key(id) {
+            return Err(EngineError::SessionExists { session: id.into(), field });
+        }
+        if self.sessions.len() >= self.limits.sessions_max {
+            let reason = format!("{} sessions are open, the limit; close one", self.sessions.len());
+            return Err(EngineError::Exhausted { field: field.into(), reason });
+        }
+        Ok(())
+    }
+
+    fn fork(&mut self, now_ns: u64, id: &str, copy: &str) -> Result<Reply, EngineError> {
+        let session = self.session(id)?;
+        check_name("new_session_id", copy)?;
+        self.check_room("new_session_id", copy)?;
+        let session = session.fork(copy, now_ns);
+        let view = self.view(&session);
+        self.sessions.insert(copy.into(), session);
+        Ok(Reply::Session(Box::new(view)))
+    }
+
     fn close(&mut self, id: &str) -> Result<Reply, EngineError> {
         self.session(id)?;
         self.sessions.remove(id);
-        self.emit(Event::SessionClosed { session: id.into() });
+        self.emit(Event::SessionClosed { session: id.into(), expired: false });
         Ok(Reply::Done)
+    }
+
+    /// Closes the idle sessions and gives their names.
+    fn expire(&mut self, now_ns: u64) -> Vec<String> {
+        let limit_s = self.limits.session_idle_s;
+        let idle: Vec<String> = self.sessions.values().filter(|s| s.idle_s(now_ns) > limit_s).map(|s| s.id().into()).collect();
+        for id in &idle {
+            self.sessions.remove(id);
+            self.emit(Event::SessionClosed { session: id.clone(), expired: true });
+        }
+        idle
     }
 
     fn measure(&mut self, now_ns: u64, id: &str, vehicle: Option<&str>, measurement: &Measurement) -> Result<Reply, EngineError> {
@@ -155,56 +191,54 @@ impl Engine {
             let reason = format!("session `{id}` belongs to vehicle `{}`, the measurement comes from `{vehicle}`", session.vehicle());
             return Err(EngineError::invalid("session_id", reason));
         }
-        let soil_epoch = session.soil().epoch;
+        let soil_epoch = session.soil().state.epoch;
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
         let outcome = session.observe(measurement, now_ns, rules)?;
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
         let outcome = session.learn(&self.predictor, map.as_ref(), outcome);
+        let vehicle = session.vehicle().to_string();
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
-        if soil.epoch != soil_epoch {
-            self.emit(Event::SoilChanged { session: id.into(), soil });
+        if soil.state.epoch != soil_epoch {
+            self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
         }
-        Ok(Reply::Measured(MeasureAnswer { outcome, history_steps, history_epoch, soil_epoch: soil.epoch }))
+        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, history_steps, history_epoch, soil })))
     }
 
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
         let session = self.session(&query.session)?;
         query.check(&self.limits, &self.predictor.bundle().vehicle)?;
         let map = session.map().map(|id| self.maps.get(id)).transpose()?;
-        let start = match (query.start, session.newest()) {
-            (Some(start), _) => start,
-            (None, Some(newest)) => newest.state,
-            (None, None) => {
-                let reason = "is absent and the session has no measurement yet; give one or send measurements first";
-                return Err(EngineError::NotReady { field: "start".into(), reason: reason.into() });
-            }
+        let start = start_state(session, query, map)?;
+        let newest = session.newest_at().filter(|_| query.start.is_none());
+        let forward = match (&query.instant, newest) {
+            (Some(instant), Some(newest)) => RollForward::plan(instant, newest, self.step_ns, query.horizon, &self.limits)?,
+            _ => RollForward::default(),
         };
-        if let Some(map) = map
-            && !map.contains(start.position_m[0], start.position_m[1])
-        {
-            let [x, y, _] = start.position_m;
-            let reason = format!("({x:.2}, {y:.2}) m lies outside map `{}`", map.id());
-            return Err(match query.start {
-                Some(_) => EngineError::invalid("start.position_m", reason),
-                None => EngineError::NotReady { field: "session_id".into(), reason: format!("the measured position {reason}") },
-            });
-        }
+        let horizon = query.horizon + forward.steps();
+        self.limits.check_shape(query.samples, horizon)?;
         let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
         let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
         let rollout = self.predictor.rollout(&RolloutQuery {
             history: &history,
             start,
-            controls: &query.controls,
+            controls: &forward.prepend(&query.controls, query.horizon),
             samples: query.samples,
-            horizon: query.horizon,
+            horizon,
             map,
-            soil_correction: session.soil().correction,
+            soil_correction: session.soil().state.correction,
             variant: Variant::Full,
         })?;
+        let (rolled, mut rollout) = forward.split(rollout);
+        if session.soil().state.epoch == 0 {
+            rollout.flags.iter_mut().for_each(|flags| *flags |= SOIL_NOT_LEARNED);
+        }
         Ok(Prediction {
-            soil_variance: session.soil().variance_at(&rollout.soil),
+            soil_variance: session.soil().state.variance_at(&rollout.soil),
             rollout,
-            start,
+            start: rolled.unwrap_or(start),
+            start_stamp_ns: newest.map(|newest| newest.stamp_ns.saturating_add(forward.steps() as i64 * self.step_ns)),
+            rolled_forward_steps: forward.steps(),
+            soil: *session.soil(),
             history_steps: history.len(),
             measurement_age_s: session.age_s(now_ns),
             provenance: self.provenance(session),
@@ -223,7 +257,7 @@ impl Engine {
         let bundle = self.predictor.bundle();
         Provenance {
             history_epoch: session.history_epoch(),
-            soil_epoch: session.soil().epoch,
+            soil_epoch: session.soil().state.epoch,
             map: map.map(|m| (m.id().to_string(), m.version(), m.hash().to_string())),
             bundle_name: bundle.name.clone(),
             bundle_hash: bundle.hash.clone(),
@@ -248,6 +282,29 @@ impl Engine {
             sink(event);
         }
     }
+}
+
+/// The given state or the newest measured one, on the map.
+fn start_state(session: &Session, query: &PredictQuery, map: Option<&Arc<WorldMap>>) -> Result<VehicleState<f64>, EngineError> {
+    let start = match (query.start, session.newest()) {
+        (Some(start), _) => start,
+        (None, Some(newest)) => newest.state,
+        (None, None) => {
+            let reason = "is absent and the session has no measurement yet; give one or send measurements first";
+            return Err(EngineError::NotReady { field: "start".into(), reason: reason.into() });
+        }
+    };
+    if let Some(map) = map
+        && !map.contains(start.position_m[0], start.position_m[1])
+    {
+        let [x, y, _] = start.position_m;
+        let reason = format!("({x:.2}, {y:.2}) m lies outside map `{}`", map.id());
+        return Err(match query.start {
+            Some(_) => EngineError::invalid("start.position_m", reason),
+            None => EngineError::NotReady { field: "session_id".into(), reason: format!("the measured position {reason}") },
+        });
+    }
+    Ok(start)
 }
 
 /// Puts the field of an error below a parent field.

@@ -16,6 +16,8 @@ pub enum EngineError {
     SessionExists {
         /// Name asked for.
         session: String,
+        /// Field that asked for it.
+        field: &'static str,
     },
     /// No map of this name was uploaded.
     #[error("map `{map}` is not known; upload it first")]
@@ -108,7 +110,8 @@ impl EngineError {
     pub fn field(&self) -> &str {
         match self {
             Self::Invalid { field, .. } | Self::NotReady { field, .. } | Self::Exhausted { field, .. } => field,
-            Self::UnknownSession { .. } | Self::SessionExists { .. } => "session_id",
+            Self::SessionExists { field, .. } => field,
+            Self::UnknownSession { .. } => "session_id",
             Self::UnknownMap { .. } | Self::MapExists { .. } | Self::MapInUse { .. } => "map_id",
             Self::MapChanged { .. } => "base_version",
             Self::Overloaded { .. } | Self::Expired | Self::Abandoned | Self::Stopped | Self::Internal { .. } => "",

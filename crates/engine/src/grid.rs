@@ -39,6 +39,11 @@ impl StepGrid {
         Self { step_ns, last_ns: stamp_ns, seen_ns: stamp_ns, next_ns: stamp_ns.saturating_add(step_ns) }
     }
 
+    /// Stamp of the last step, ns.
+    pub fn last_ns(&self) -> i64 {
+        self.last_ns
+    }
+
     /// Takes a stamp later than all before and says where it lies. After a gap the caller starts a new grid.
     pub fn take(&mut self, stamp_ns: i64) -> Place {
         let gap_ns = stamp_ns.saturating_sub(self.last_ns);

@@ -89,7 +89,8 @@ impl EngineHandle {
     /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once.
     pub fn submit(&self, mut submission: Submission) {
         submission.submitted_ns = self.clock.now_ns();
-        if let Err((error, submission)) = self.queue.push(submission, &self.limits) {
+        if let Err(refused) = self.queue.push(submission, &self.limits) {
+            let (error, submission) = *refused;
             submission.refuse(error);
         }
     }
@@ -137,7 +138,7 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock) -> Engine {
     loop {
         match queue.next() {
             Turn::Commands(commands) => commands.into_iter().for_each(|submission| answer(&mut engine, submission, clock)),
-            Turn::Prediction(submission) => answer(&mut engine, submission, clock),
+            Turn::Prediction(submission) => answer(&mut engine, *submission, clock),
             Turn::End => return engine,
         }
     }

@@ -53,6 +53,8 @@ pub struct Limits {
     pub angular_speed_max_rad_s: f64,
     /// Longest pause between two measurements of one session, s. A stamp further ahead is taken for a broken clock.
     pub pause_max_s: f64,
+    /// Time after which a session that nobody feeds and nobody asks is closed, s.
+    pub session_idle_s: f64,
 }
 
 impl Default for Limits {
@@ -71,6 +73,7 @@ impl Default for Limits {
             speed_max_m_s: 100.0,
             angular_speed_max_rad_s: 50.0,
             pause_max_s: 86_400.0,
+            session_idle_s: 86_400.0,
         }
     }
 }

@@ -4,7 +4,12 @@ use nesam_model::Rollout;
 use nesam_physics::{Control, SOIL_DIM, Vehicle, VehicleState};
 
 use crate::error::EngineError;
+use crate::forward::StartInstant;
 use crate::limits::{Limits, outside_card};
+use crate::session::SoilEstimate;
+
+/// Bit of `Rollout::flags` that the engine adds to those of the model: the drive has not updated the soil yet, the prior alone speaks.
+pub const SOIL_NOT_LEARNED: u32 = 128;
 
 /// A batch of candidate command sequences from one session.
 #[derive(Clone, Debug, PartialEq)]
@@ -13,6 +18,8 @@ pub struct PredictQuery {
     pub session: String,
     /// State to start from; `None` = the newest measured step.
     pub start: Option<VehicleState<f64>>,
+    /// Instant to start from; `None` = that of the newest measured step. Not together with `start`.
+    pub instant: Option<StartInstant>,
     /// Whether the measured history precedes the start. A given start then replaces the state of the newest step.
     pub use_history: bool,
     /// N.
@@ -45,10 +52,16 @@ pub struct Prediction {
     pub rollout: Rollout,
     /// State that the rollout started from.
     pub start: VehicleState<f64>,
+    /// Instant of that state, ns of the vehicle's clock; `None` when the state was given.
+    pub start_stamp_ns: Option<i64>,
+    /// Steps from the newest measured one to the start.
+    pub rolled_forward_steps: usize,
     /// Measured steps before the start.
     pub history_steps: usize,
     /// Variance of the soil under the start in physical units squared; `None` while no filter runs.
     pub soil_variance: Option<[f64; SOIL_DIM]>,
+    /// What the session knew of the soil.
+    pub soil: SoilEstimate,
     /// Time since the newest measured step arrived, s.
     pub measurement_age_s: Option<f64>,
     /// What it was computed from.
@@ -77,6 +90,11 @@ impl PredictQuery {
                 return Err(EngineError::invalid(format!("{}.{entry}", place()), reason));
             }
         }
-        self.start.as_ref().map_or(Ok(()), |start| limits.check_state("start", start))
+        match (&self.start, &self.instant) {
+            (Some(_), Some(_)) => Err(EngineError::invalid("start", "is given together with `start_stamp_ns`, allowed is one of the two")),
+            (Some(start), None) => limits.check_state("start", start),
+            (None, Some(instant)) => instant.check(vehicle),
+            (None, None) => Ok(()),
+        }
     }
 }

@@ -27,7 +27,7 @@ pub(crate) enum Turn {
     /// All waiting commands, in order of arrival.
     Commands(VecDeque<Submission>),
     /// One prediction, since no command waits.
-    Prediction(Submission),
+    Prediction(Box<Submission>),
     /// Nothing more will come.
     End,
 }
@@ -38,17 +38,17 @@ impl Queue {
     }
 
     /// Adds a command, or gives it back with the reason.
-    pub fn push(&self, submission: Submission, limits: &Limits) -> Result<(), (EngineError, Submission)> {
+    pub fn push(&self, submission: Submission, limits: &Limits) -> Result<(), Box<(EngineError, Submission)>> {
         let mut lanes = self.lock();
         if lanes.stopped {
-            return Err((EngineError::Stopped, submission));
+            return Err(Box::new((EngineError::Stopped, submission)));
         }
         let (lane, limit, kind) = match submission.command {
             Command::Predict(_) => (&mut lanes.predictions, limits.waiting_predictions_max, "predictions"),
             _ => (&mut lanes.commands, limits.waiting_commands_max, "commands"),
         };
         if lane.len() >= limit {
-            return Err((EngineError::Overloaded { kind, waiting: lane.len() }, submission));
+            return Err(Box::new((EngineError::Overloaded { kind, waiting: lane.len() }, submission)));
         }
         lane.push_back(submission);
         self.filled.notify_one();
@@ -66,7 +66,7 @@ impl Queue {
                 return Turn::End;
             }
             if let Some(prediction) = lanes.predictions.pop_front() {
-                return Turn::Prediction(prediction);
+                return Turn::Prediction(Box::new(prediction));
             }
             lanes = self.filled.wait(lanes).expect("no holder of the queue panics; this is a bug");
         }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use nesam_adaptation::SoilFilter;
 use nesam_model::{HISTORY, HistoryStep, Predictor};
-use nesam_physics::Vehicle;
+use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 
 mod soil;
@@ -13,12 +13,22 @@ mod soil;
 use self::soil::SoilLearner;
 pub use self::soil::SoilState;
 use crate::error::EngineError;
+use crate::forward::Newest;
 use crate::grid::{Place, StepGrid};
 use crate::limits::{Limits, outside_card};
 use crate::measurement::{Measurement, Outcome};
 
 /// Accepted stamps that are remembered to tell a resent measurement from a late one.
 const RECENT_STAMPS: usize = 256;
+
+/// What is known of the soil: the estimate and its whole covariance.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SoilEstimate {
+    /// Correction of the prior, its variance, and what of it is learned.
+    pub state: SoilState,
+    /// P⁺, in the coordinates of the correction.
+    pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
+}
 
 /// A session: identity, recent measured motion, soil.
 #[derive(Clone, Debug)]
@@ -33,9 +43,11 @@ pub struct Session {
     last_sequence: Option<u64>,
     /// Engine clock when the newest step of the history arrived, ns.
     arrived_ns: u64,
+    /// Engine clock when the session was fed or asked last, ns.
+    used_ns: u64,
     history_epoch: u64,
     learner: SoilLearner,
-    soil: SoilState,
+    soil: SoilEstimate,
 }
 
 /// What a session needs to judge a measurement.
@@ -51,7 +63,8 @@ pub struct Rules<'a> {
 
 impl Session {
     /// A session without history, whose soil filter knows the prior only.
-    pub fn new(id: &str, vehicle: &str, map: Option<&str>, filter: SoilFilter) -> Self {
+    pub fn new(id: &str, vehicle: &str, map: Option<&str>, filter: SoilFilter, now_ns: u64) -> Self {
+        let covariance = filter.posterior().covariance;
         let learner = SoilLearner::new(filter);
         Self {
             id: id.into(),
@@ -62,8 +75,9 @@ impl Session {
             recent_stamps: VecDeque::with_capacity(RECENT_STAMPS),
             last_sequence: None,
             arrived_ns: 0,
+            used_ns: now_ns,
             history_epoch: 0,
-            soil: learner.state(0, None),
+            soil: SoilEstimate { state: learner.state(0, None), covariance },
             learner,
         }
     }
@@ -153,11 +167,27 @@ impl Session {
         match self.learner.step(predictor, before, newest, map) {
             None => outcome,
             Some(update) if update.rejected => Outcome::Gated { nis: update.nis },
-            Some(_) => {
-                self.soil = self.learner.state(self.soil.epoch + 1, stamp_ns);
+            Some(update) => {
+                let state = self.learner.state(self.soil.state.epoch + 1, stamp_ns);
+                self.soil = SoilEstimate { state, covariance: update.posterior.covariance };
                 outcome
             }
         }
+    }
+
+    /// A copy of everything under another name.
+    pub fn fork(&self, id: &str, now_ns: u64) -> Self {
+        Self { id: id.into(), used_ns: now_ns, ..self.clone() }
+    }
+
+    /// Notes that the session is fed or asked.
+    pub fn touch(&mut self, now_ns: u64) {
+        self.used_ns = now_ns;
+    }
+
+    /// Time since the session was fed or asked last, s.
+    pub fn idle_s(&self, now_ns: u64) -> f64 {
+        now_ns.saturating_sub(self.used_ns) as f64 * 1e-9
     }
 
     /// Name of the session.
@@ -185,6 +215,12 @@ impl Session {
         self.history.back()
     }
 
+    /// Stamp and command of the newest step of the history.
+    pub(crate) fn newest_at(&self) -> Option<Newest> {
+        let (grid, step) = (self.grid.as_ref()?, self.newest()?);
+        Some(Newest { stamp_ns: grid.last_ns(), command: step.control })
+    }
+
     /// Counts the changes of the history.
     pub fn history_epoch(&self) -> u64 {
         self.history_epoch
@@ -201,7 +237,7 @@ impl Session {
     }
 
     /// What was learned of the soil.
-    pub fn soil(&self) -> &SoilState {
+    pub fn soil(&self) -> &SoilEstimate {
         &self.soil
     }
 

@@ -70,8 +70,8 @@ impl WindowErrors {
             self.steps.push(StepError { absolute: absolute_error(&last, true_pose), position_m: horizontal_distance(&last, true_pose) });
         }
         self.not_finite += usize::from(broken);
-        for d in 0..POSE_DIM {
-            self.scored[d] &= path.predicts[d] && measured[d];
+        for (scored, (predicted, measured)) in self.scored.iter_mut().zip(path.predicts.into_iter().zip(measured)) {
+            *scored &= predicted && measured;
         }
         self.trajectory.push(trajectory);
         self.path_m.push(path_length_m(start, truth));

@@ -84,7 +84,7 @@ struct Columns {
 
 fn columns(errors: &WindowErrors) -> Columns {
     let k = errors.horizon as f64;
-    let mut values = vec![Vec::with_capacity(errors.windows()); STATISTICS];
+    let mut values: Vec<Vec<f64>> = (0..STATISTICS).map(|_| Vec::with_capacity(errors.windows())).collect();
     for w in 0..errors.windows() {
         let steps = errors.window(w);
         for d in 0..POSE_DIM {

@@ -4,7 +4,6 @@ use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
-use std::time::Instant;
 
 use nesam_model::bundle::{sha256_hex, trained_parameters};
 use nesam_model::encoder::{ENCODERS, TerrainEncoders};
@@ -74,7 +73,6 @@ pub fn run(
     reporter: &dyn Reporter,
     interrupted: &dyn Fn() -> bool,
 ) -> Result<ModelBundle, TrainingError> {
-    let began = Instant::now();
     let mut drives = load_drives(root, trajectories)?;
     let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
         (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
@@ -150,13 +148,18 @@ pub fn run(
             seed: plan.seed,
             data_hash: data_hash.into(),
             steps: trained.steps as u64,
-            training_s: began.elapsed().as_secs_f64(),
+            training_s: optimisation_s(&trained.curve),
             program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
             parent: None,
         },
     };
     bundle.save(&recipe.out.join("bundle"))?;
     Ok(bundle)
+}
+
+/// Seconds that the optimiser's steps took, over all the runs that a resumed training was made of.
+fn optimisation_s(curve: &[EpochReport]) -> f64 {
+    curve.iter().scan(0, |before, line| Some((line.step - std::mem::replace(before, line.step)) as f64 * line.step_s)).sum()
 }
 
 /// One line of the loss curve for people.

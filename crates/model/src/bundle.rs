@@ -36,7 +36,7 @@ pub struct Provenance {
     pub data_hash: String,
     /// Optimiser steps.
     pub steps: u64,
-    /// Wall time of training, s.
+    /// Time that the optimiser took over all resumed runs, s.
     pub training_s: f64,
     /// Version of the program.
     pub program: String,

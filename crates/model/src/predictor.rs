@@ -41,6 +41,9 @@ pub enum TerrainMode {
     Exact,
 }
 
+/// Hash of a map and its encoded terrain.
+type TokensOfMap = (String, Arc<TerrainTokens>);
+
 /// A loaded bundle that answers rollout queries. `Send + Sync`; shared behind an `Arc`.
 #[derive(Debug)]
 pub struct Predictor {
@@ -50,7 +53,7 @@ pub struct Predictor {
     projection: Arc<TerrainProjection>,
     token_scale: TokenScale,
     mode: TerrainMode,
-    maps: Arc<Mutex<Vec<(String, Arc<TerrainTokens>)>>>,
+    maps: Arc<Mutex<Vec<TokensOfMap>>>,
 }
 
 /// A measured transition, ready for the physics.

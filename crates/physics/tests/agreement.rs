@@ -1,7 +1,7 @@
 //! Goal: one text of the physics, one result: every scalar computes the same numbers and the same derivatives.
 //! Method: the same seeded inputs, a wheel alone and a full step of a truck and of a robot, through `f64`, `f32`, `f32x8`,
 //! `Dual<f64, N>`, `Dual<f32x8, N>`, through num-dual (an independent implementation of dual numbers), and through central
-//! differences. Candle's autograd is compared with the same duals where tensors live, in `crates/learning`.
+//! differences. Candle's autograd is compared with the same duals where tensors live, in `crates/model/tests/autograd.rs`.
 //!
 //! A deviation is |got - want| / (|want| + rms of the column over the samples): relative where a number is of its usual size,
 //! and measured against that size where it happens to be small. Columns are outputs, or single derivatives ∂output/∂input.

@@ -64,7 +64,7 @@ impl GridGeometry {
             return Err(("resolution_m", format!("{} is outside 0.001..=1000 m", self.resolution_m)));
         }
         for (field, side) in [("width", self.width), ("height", self.height)] {
-            if side < 2 || side > MAX_CELLS {
+            if !(2..=MAX_CELLS).contains(&side) {
                 return Err((field, format!("{side} cells, at least 2 are needed")));
             }
         }

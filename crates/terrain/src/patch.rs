@@ -210,11 +210,10 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
         mix_heights(&heights, &cells, centre_m, per_elevation, out);
         let Some(colour) = &map.colour else { continue };
         colours.gather(colour, width, &cells);
-        for channel in 0..3 {
+        for (channel, per_unit) in per_colour.into_iter().enumerate() {
             let at = channel * PIXELS + row * PATCH_PX;
             let out = &mut patch.semantic[at..at + PATCH_PX];
-            let (mean, per_unit) = (scale.semantic_mean[channel], per_colour[channel]);
-            mix_colours(&colours, &cells, 8 * channel as u32, mean, per_unit, out);
+            mix_colours(&colours, &cells, 8 * channel as u32, scale.semantic_mean[channel], per_unit, out);
         }
     }
     if map.colour.is_none() {
@@ -225,23 +224,23 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
 
 #[inline(always)]
 fn mix_heights(z: &Corners<f32>, cells: &RowCells, centre_m: f32, per_unit: f32, out: &mut [f32]) {
-    for column in 0..PATCH_PX {
+    for (column, out) in out[..PATCH_PX].iter_mut().enumerate() {
         let south = z.sw[column] + cells.east[column] * (z.se[column] - z.sw[column]);
         let north = z.nw[column] + cells.east[column] * (z.ne[column] - z.nw[column]);
         let height = south + cells.north[column] * (north - south);
-        out[column] = ((height - centre_m) * per_unit).clamp(-1.0, 1.0);
+        *out = ((height - centre_m) * per_unit).clamp(-1.0, 1.0);
     }
 }
 
 #[inline(always)]
 fn mix_colours(c: &Corners<u32>, cells: &RowCells, shift: u32, mean: f32, per_unit: f32, out: &mut [f32]) {
     let channel = |packed: u32| ((packed >> shift) & 255) as i32 as f32;
-    for column in 0..PATCH_PX {
+    for (column, out) in out[..PATCH_PX].iter_mut().enumerate() {
         let (sw, se) = (channel(c.sw[column]), channel(c.se[column]));
         let (nw, ne) = (channel(c.nw[column]), channel(c.ne[column]));
         let south = sw + cells.east[column] * (se - sw);
         let north = nw + cells.east[column] * (ne - nw);
         let value = south + cells.north[column] * (north - south);
-        out[column] = ((value - mean) * per_unit).clamp(-1.0, 1.0);
+        *out = ((value - mean) * per_unit).clamp(-1.0, 1.0);
     }
 }

@@ -71,6 +71,9 @@ pub struct SoilCorrection {
     /// Whether the drive has told something of each parameter, in the order of SoilVector; a parameter that is not learned has no number to show.
     #[prost(bool, repeated, tag = "4")]
     pub learned: ::prost::alloc::vec::Vec<bool>,
+    /// Covariance of `delta`, shape (6, 6), row-major in the order of SoilVector, in these coordinates; empty while no filter runs.
+    #[prost(double, repeated, tag = "5")]
+    pub covariance: ::prost::alloc::vec::Vec<f64>,
 }
 /// What a reply was computed from. A planner may refuse a reply whose provenance it does not accept.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -214,6 +217,9 @@ pub struct MeasurementAnswer {
     /// Soil epoch after this measurement.
     #[prost(uint64, tag = "5")]
     pub soil_epoch: u64,
+    /// What the session knows of the soil after this measurement; absent when it was rejected.
+    #[prost(message, optional, tag = "6")]
+    pub soil_correction: ::core::option::Option<SoilCorrection>,
     #[prost(
         oneof = "measurement_answer::Outcome",
         tags = "10, 11, 12, 13, 14, 15, 16, 17"
@@ -621,6 +627,24 @@ pub struct PredictRequest {
     /// Copied to the reply; for the client's own use.
     #[prost(uint64, tag = "8")]
     pub tag: u64,
+    /// Instant from which `controls` apply, ns of the vehicle's clock; absent = that of the newest step of the history. The session is rolled forward
+    /// from its newest step to this instant, rounded to the nearest step of 0.1 s. At most half a step before the newest step, and so near after
+    /// it that the steps rolled forward and K together do not exceed the 32 positions of the model. Not together with `start`.
+    #[prost(int64, optional, tag = "9")]
+    pub start_stamp_ns: ::core::option::Option<i64>,
+    /// Commands that the vehicle was sent, by ascending stamp, at most 256; only with `start_stamp_ns`. Each step that is rolled forward uses the one
+    /// that is in effect at its middle; until the first of them that is later than the newest step, that is the command measured with this step.
+    #[prost(message, repeated, tag = "10")]
+    pub sent: ::prost::alloc::vec::Vec<SentCommand>,
+}
+/// A command on its way to the vehicle.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct SentCommand {
+    /// Instant from which the vehicle applies it, ns of the vehicle's clock.
+    #[prost(int64, tag = "1")]
+    pub stamp_ns: i64,
+    #[prost(message, optional, tag = "2")]
+    pub command: ::core::option::Option<Control>,
 }
 /// What the reply carries. The default is everything of the state at every step.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
@@ -634,6 +658,9 @@ pub struct OutputSelection {
     /// Also return the sinkage of the four wheels.
     #[prost(bool, tag = "3")]
     pub wheel_sinkage: bool,
+    /// Width of the numbers in `states` and `sinkage_m`.
+    #[prost(enumeration = "Precision", tag = "4")]
+    pub precision: i32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PredictReply {
@@ -649,22 +676,22 @@ pub struct PredictReply {
     /// Bits of the channels returned, in ascending order of the bit.
     #[prost(uint32, tag = "4")]
     pub channels: u32,
-    /// Packed f32, shape (samples, steps, number of channels): m, rad, m/s, rad/s; yaw in (-pi, pi].
+    /// Packed numbers of the width `precision`, shape (samples, steps, number of channels): m, rad, m/s, rad/s; yaw in (-pi, pi].
     #[prost(bytes = "bytes", tag = "5")]
     pub states: ::prost::bytes::Bytes,
-    /// Packed f32, shape (samples, steps, 4): sinkage of the wheels, m. Empty unless asked for.
+    /// Packed numbers of the width `precision`, shape (samples, steps, 4): sinkage of the wheels, m. Empty unless asked for.
     #[prost(bytes = "bytes", tag = "6")]
     pub sinkage_m: ::prost::bytes::Bytes,
-    /// One word for each sample: the sum of its `Validity` bits.
+    /// One word for each sample: the sum of its `Validity` bits, over all its steps and those rolled forward.
     #[prost(uint32, repeated, tag = "7")]
     pub validity: ::prost::alloc::vec::Vec<u32>,
-    /// State that the rollout started from.
+    /// State that `controls` started from: given, measured, or rolled forward.
     #[prost(message, optional, tag = "8")]
     pub start: ::core::option::Option<VehicleState>,
     /// Measured steps that preceded the start, 0 to 31.
     #[prost(uint32, tag = "9")]
     pub history_steps: u32,
-    /// Soil used under the start: prior plus correction, clipped to the admissible range.
+    /// Soil used under the given or measured start: prior plus correction, clipped to the admissible range.
     #[prost(message, optional, tag = "10")]
     pub soil: ::core::option::Option<SoilVector>,
     /// Variance of that soil, units of SoilVector squared, to first order (diagonal of the covariance); absent while no filter runs.
@@ -681,6 +708,19 @@ pub struct PredictReply {
     /// Time that the engine computed, s.
     #[prost(double, tag = "15")]
     pub compute_s: f64,
+    /// What the session knew of the soil.
+    #[prost(message, optional, tag = "16")]
+    pub soil_correction: ::core::option::Option<SoilCorrection>,
+    /// Steps of 0.1 s that lie between the newest step of the history and `start`: the age of the measurement in the vehicle's own time.
+    #[prost(uint32, tag = "17")]
+    pub rolled_forward_steps: u32,
+    /// Instant of `start`, ns of the vehicle's clock: the stamp of the newest step of the history plus 0.1 s for each step rolled forward. Absent
+    /// when `start` was given.
+    #[prost(int64, optional, tag = "18")]
+    pub start_stamp_ns: ::core::option::Option<i64>,
+    /// Width of the numbers in `states` and `sinkage_m`: PRECISION_F32 or PRECISION_F16.
+    #[prost(enumeration = "Precision", tag = "19")]
+    pub precision: i32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PredictStreamReply {
@@ -746,6 +786,39 @@ impl HistoryUse {
         }
     }
 }
+/// Width of the numbers of a reply.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum Precision {
+    /// Same as PRECISION_F32.
+    Unspecified = 0,
+    F32 = 1,
+    /// IEEE 754 binary16: half of the bytes, eleven significant bits. So that these suffice, x, y and z are then offsets from
+    /// `PredictReply.start.position_m`: rounded by at most 4 mm within 16 m.
+    F16 = 2,
+}
+impl Precision {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "PRECISION_UNSPECIFIED",
+            Self::F32 => "PRECISION_F32",
+            Self::F16 => "PRECISION_F16",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "PRECISION_UNSPECIFIED" => Some(Self::Unspecified),
+            "PRECISION_F32" => Some(Self::F32),
+            "PRECISION_F16" => Some(Self::F16),
+            _ => None,
+        }
+    }
+}
 /// Bits of `PredictReply.validity`. 0 = nothing to say against the sample.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
@@ -765,6 +838,8 @@ pub enum Validity {
     SlopeUntrained = 32,
     /// The vehicle lies on its side or its roof (|roll| or |pitch| over 60 degrees).
     Overturned = 64,
+    /// The drive has not updated the soil yet: the prior alone speaks.
+    SoilNotLearned = 128,
 }
 impl Validity {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -781,6 +856,7 @@ impl Validity {
             Self::SteeringUntrained => "VALIDITY_STEERING_UNTRAINED",
             Self::SlopeUntrained => "VALIDITY_SLOPE_UNTRAINED",
             Self::Overturned => "VALIDITY_OVERTURNED",
+            Self::SoilNotLearned => "VALIDITY_SOIL_NOT_LEARNED",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -794,6 +870,7 @@ impl Validity {
             "VALIDITY_STEERING_UNTRAINED" => Some(Self::SteeringUntrained),
             "VALIDITY_SLOPE_UNTRAINED" => Some(Self::SlopeUntrained),
             "VALIDITY_OVERTURNED" => Some(Self::Overturned),
+            "VALIDITY_SOIL_NOT_LEARNED" => Some(Self::SoilNotLearned),
             _ => None,
         }
     }
@@ -1209,6 +1286,15 @@ pub struct ListSessionsReply {
     pub sessions: ::prost::alloc::vec::Vec<Session>,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ForkSessionRequest {
+    /// Session to copy.
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// Name of the copy: 1 to 64 of A-Z a-z 0-9 _ . -
+    #[prost(string, tag = "2")]
+    pub new_session_id: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct CloseSessionRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
@@ -1283,7 +1369,8 @@ pub mod sessions_client {
     use tonic::codegen::http::Uri;
     /// A session is what the service remembers of one vehicle: its recent measured motion and its soil correction.
     ///
-    /// Field and method names Export, Import and Fork are kept free for sessions that move between servers.
+    /// A session that nobody feeds and nobody asks for longer than the service's limit (`limits.session_idle_s`) is closed by the service.
+    /// Method names Export and Import are kept free for sessions that move between servers.
     #[derive(Debug, Clone)]
     pub struct SessionsClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1414,6 +1501,27 @@ pub mod sessions_client {
             req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Sessions", "List"));
             self.inner.unary(req, path, codec).await
         }
+        /// Copies a session with its history and its soil under a new name, for questions of "what if" that leave the original alone. The copy belongs
+        /// to the same vehicle, drives on the same map and starts with the same epochs. NOT_FOUND: unknown session. INVALID_ARGUMENT: a bad name.
+        /// ALREADY_EXISTS: a session of the new name is open. RESOURCE_EXHAUSTED: too many sessions.
+        pub async fn fork(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ForkSessionRequest>,
+        ) -> std::result::Result<tonic::Response<super::Session>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/nesam.v1.Sessions/Fork");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Sessions", "Fork"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Closes a session and forgets its history. NOT_FOUND: unknown session.
         pub async fn close(
             &mut self,
@@ -1470,6 +1578,13 @@ pub mod sessions_server {
             tonic::Response<super::ListSessionsReply>,
             tonic::Status,
         >;
+        /// Copies a session with its history and its soil under a new name, for questions of "what if" that leave the original alone. The copy belongs
+        /// to the same vehicle, drives on the same map and starts with the same epochs. NOT_FOUND: unknown session. INVALID_ARGUMENT: a bad name.
+        /// ALREADY_EXISTS: a session of the new name is open. RESOURCE_EXHAUSTED: too many sessions.
+        async fn fork(
+            &self,
+            request: tonic::Request<super::ForkSessionRequest>,
+        ) -> std::result::Result<tonic::Response<super::Session>, tonic::Status>;
         /// Closes a session and forgets its history. NOT_FOUND: unknown session.
         async fn close(
             &self,
@@ -1481,7 +1596,8 @@ pub mod sessions_server {
     }
     /// A session is what the service remembers of one vehicle: its recent measured motion and its soil correction.
     ///
-    /// Field and method names Export, Import and Fork are kept free for sessions that move between servers.
+    /// A session that nobody feeds and nobody asks for longer than the service's limit (`limits.session_idle_s`) is closed by the service.
+    /// Method names Export and Import are kept free for sessions that move between servers.
     #[derive(Debug)]
     pub struct SessionsServer<T> {
         inner: Arc<T>,
@@ -1693,6 +1809,51 @@ pub mod sessions_server {
                     };
                     Box::pin(fut)
                 }
+                "/nesam.v1.Sessions/Fork" => {
+                    #[allow(non_camel_case_types)]
+                    struct ForkSvc<T: Sessions>(pub Arc<T>);
+                    impl<
+                        T: Sessions,
+                    > tonic::server::UnaryService<super::ForkSessionRequest>
+                    for ForkSvc<T> {
+                        type Response = super::Session;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ForkSessionRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Sessions>::fork(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ForkSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
                 "/nesam.v1.Sessions/Close" => {
                     #[allow(non_camel_case_types)]
                     struct CloseSvc<T: Sessions>(pub Arc<T>);
@@ -1807,7 +1968,8 @@ pub mod soil_client {
     )]
     use tonic::codegen::*;
     use tonic::codegen::http::Uri;
-    /// What the service has learned of the soil under a vehicle.
+    /// What the service has learned of the soil under a vehicle. Each change is also published over Zenoh, as `SoilEstimate` on
+    /// nesam/v1/<fleet>/<vehicle>/soil.
     #[derive(Debug, Clone)]
     pub struct SoilClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1926,7 +2088,8 @@ pub mod soil_server {
             request: tonic::Request<super::WatchSoilRequest>,
         ) -> std::result::Result<tonic::Response<Self::WatchStream>, tonic::Status>;
     }
-    /// What the service has learned of the soil under a vehicle.
+    /// What the service has learned of the soil under a vehicle. Each change is also published over Zenoh, as `SoilEstimate` on
+    /// nesam/v1/<fleet>/<vehicle>/soil.
     #[derive(Debug)]
     pub struct SoilServer<T> {
         inner: Arc<T>,

@@ -3,7 +3,7 @@
 use nesam_engine::{EngineError, MeasureAnswer, Measurement, Outcome, WheelMeasurement};
 use nesam_proto::v1 as pb;
 
-use super::{code, control, vehicle_state};
+use super::{code, control, soil_correction, vehicle_state};
 
 /// A measurement (its session id is read by the caller).
 ///
@@ -47,7 +47,8 @@ pub fn measurement_answer(message: &pb::Measurement, session: &str, result: Resu
     match result {
         Ok(measured) => {
             answer.history_epoch = measured.history_epoch;
-            answer.soil_epoch = measured.soil_epoch;
+            answer.soil_epoch = measured.soil.state.epoch;
+            answer.soil_correction = Some(soil_correction(&measured.soil));
             answer.outcome = Some(outcome(measured));
         }
         Err(error) => {

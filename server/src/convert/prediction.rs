@@ -1,10 +1,10 @@
 //! Predictions.
 
-use nesam_engine::{EngineError, Limits, PredictQuery, Prediction};
+use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, SentCommand, StartInstant};
 use nesam_physics::{STATE_DIM, WHEELS};
 use nesam_proto::v1 as pb;
 
-use super::{code, decode_f32, encode_f32, provenance, soil_vector, vehicle_state, vehicle_state_message};
+use super::{Precision, code, control, decode_f32, encode, provenance, soil_correction, soil_vector, vehicle_state, vehicle_state_message};
 use crate::call::Timing;
 
 /// What the reply carries.
@@ -16,6 +16,8 @@ pub struct OutputSelection {
     pub stride: usize,
     /// Whether to send the sinkage.
     pub wheel_sinkage: bool,
+    /// Width of the numbers.
+    pub precision: Precision,
 }
 
 const ALL_CHANNELS: u32 = (1 << STATE_DIM) - 1;
@@ -38,7 +40,27 @@ pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(P
         }
     };
     let output = output_selection(&message.output.unwrap_or_default(), horizon)?;
-    Ok((PredictQuery { session: message.session_id.clone(), start, use_history, samples, horizon, controls }, output))
+    let instant = start_instant(message)?;
+    Ok((PredictQuery { session: message.session_id.clone(), start, instant, use_history, samples, horizon, controls }, output))
+}
+
+/// The instant to start from and the commands until then, if one is given.
+fn start_instant(message: &pb::PredictRequest) -> Result<Option<StartInstant>, EngineError> {
+    let Some(stamp_ns) = message.start_stamp_ns else {
+        if message.sent.is_empty() {
+            return Ok(None);
+        }
+        return Err(EngineError::invalid(
+            "start_stamp_ns",
+            format!("is missing, it is needed for the {} commands of `sent`", message.sent.len()),
+        ));
+    };
+    let command = |(i, sent): (usize, &pb::SentCommand)| {
+        let command = sent.command.as_ref().ok_or_else(|| EngineError::invalid(format!("sent[{i}].command"), "is missing"))?;
+        Ok(SentCommand { stamp_ns: sent.stamp_ns, command: control(command) })
+    };
+    let sent = message.sent.iter().enumerate().map(command).collect::<Result<_, EngineError>>()?;
+    Ok(Some(StartInstant { stamp_ns, sent }))
 }
 
 fn output_selection(message: &pb::OutputSelection, horizon: usize) -> Result<OutputSelection, EngineError> {
@@ -51,7 +73,8 @@ fn output_selection(message: &pb::OutputSelection, horizon: usize) -> Result<Out
     if stride > horizon {
         return Err(EngineError::invalid("output.stride", format!("is {stride}, allowed are 0 to horizon = {horizon}")));
     }
-    Ok(OutputSelection { channels, stride, wheel_sinkage: message.wheel_sinkage })
+    let precision = Precision::of_message("output.precision", message.precision)?;
+    Ok(OutputSelection { channels, stride, wheel_sinkage: message.wheel_sinkage, precision })
 }
 
 impl OutputSelection {
@@ -73,11 +96,18 @@ impl OutputSelection {
 
     fn states(&self, prediction: &Prediction) -> bytes::Bytes {
         let rollout = &prediction.rollout;
-        if self.channels == ALL_CHANNELS && self.stride == 1 {
-            return encode_f32(&rollout.states);
+        if self.channels == ALL_CHANNELS && self.stride == 1 && self.precision == Precision::F32 {
+            return encode(&rollout.states, Precision::F32);
         }
         let columns: Vec<usize> = (0..STATE_DIM).filter(|c| self.channels >> c & 1 == 1).collect();
-        encode_f32(&self.pick(&rollout.states, rollout.horizon, STATE_DIM, &columns))
+        let mut picked = self.pick(&rollout.states, rollout.horizon, STATE_DIM, &columns);
+        if self.precision == Precision::F16 {
+            for row in picked.chunks_exact_mut(columns.len()) {
+                let positions = row.iter_mut().zip(&columns).filter(|(_, column)| **column < 3);
+                positions.for_each(|(value, column)| *value = (f64::from(*value) - prediction.start.position_m[*column]) as f32);
+            }
+        }
+        encode(&picked, self.precision)
     }
 
     fn sinkage(&self, prediction: &Prediction) -> bytes::Bytes {
@@ -85,7 +115,7 @@ impl OutputSelection {
             return bytes::Bytes::new();
         }
         let columns: [usize; WHEELS] = core::array::from_fn(|i| i);
-        encode_f32(&self.pick(&prediction.rollout.sinkage_m, prediction.rollout.horizon, WHEELS, &columns))
+        encode(&self.pick(&prediction.rollout.sinkage_m, prediction.rollout.horizon, WHEELS, &columns), self.precision)
     }
 }
 
@@ -107,6 +137,10 @@ pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection,
         provenance: Some(provenance(&prediction.provenance)),
         queue_s: timing.queue_s,
         compute_s: timing.compute_s,
+        soil_correction: Some(soil_correction(&prediction.soil)),
+        rolled_forward_steps: prediction.rolled_forward_steps as u32,
+        start_stamp_ns: prediction.start_stamp_ns,
+        precision: output.precision.to_message().into(),
     }
 }
 
@@ -121,19 +155,12 @@ mod tests {
 
     #[test]
     fn analytic_selection_picks_channels_and_steps() {
-        let output = output_selection(&pb::OutputSelection { channels: 0b10_0000_0001, stride: 2, wheel_sinkage: false }, 5).unwrap();
+        let output = output_selection(&pb::OutputSelection { channels: 0b10_0000_0001, stride: 2, ..Default::default() }, 5).unwrap();
         let (samples, horizon) = (2, 5);
         let values: Vec<f32> = (0..samples * horizon * STATE_DIM).map(|v| v as f32).collect();
         let picked = output.pick(&values, horizon, STATE_DIM, &[0, 9]);
         // Steps 2 and 4 (rows 1 and 3) of both samples.
         assert_eq!(picked, [12.0, 21.0, 36.0, 45.0, 72.0, 81.0, 96.0, 105.0]);
         assert_eq!(output.steps(horizon), 2);
-    }
-
-    #[test]
-    fn analytic_packed_f32_round_trip() {
-        let values = [0.0, -1.5, f32::MAX, f32::MIN_POSITIVE];
-        assert_eq!(decode_f32("x", &encode_f32(&values), 4).unwrap(), values);
-        assert_eq!(decode_f32("x", &[0; 15], 4).unwrap_err().field(), "x");
     }
 }

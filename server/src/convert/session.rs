@@ -1,7 +1,7 @@
 //! Sessions, provenance and soil.
 
 use nesam_engine::EngineError;
-use nesam_engine::{OpenSession, Provenance, SessionView, SoilState};
+use nesam_engine::{OpenSession, Provenance, SessionView, SoilEstimate};
 use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
@@ -88,7 +88,9 @@ pub fn soil_vector(values: &[f64; SOIL_DIM]) -> pb::SoilVector {
     pb::SoilVector { k_phi, k_c, n, c_pa, phi_rad, k_shear_m }
 }
 
-fn soil_correction(soil: &SoilState) -> pb::SoilCorrection {
+/// What is known of the soil as message.
+pub fn soil_correction(soil: &SoilEstimate) -> pb::SoilCorrection {
+    let SoilEstimate { state: soil, covariance } = soil;
     let coordinates = match soil.correction.coordinates {
         SoilCoordinates::Physical => pb::SoilCoordinates::Physical,
         SoilCoordinates::Logarithmic => pb::SoilCoordinates::Logarithmic,
@@ -98,15 +100,16 @@ fn soil_correction(soil: &SoilState) -> pb::SoilCorrection {
         delta: Some(soil_vector(&soil.correction.delta)),
         variance: soil.variance.as_ref().map(soil_vector),
         learned: soil.learned.to_vec(),
+        covariance: covariance.as_flattened().to_vec(),
     }
 }
 
 /// A soil estimate as message.
-pub fn soil_estimate(session: &str, soil: &SoilState) -> pb::SoilEstimate {
+pub fn soil_estimate(session: &str, soil: &SoilEstimate) -> pb::SoilEstimate {
     pb::SoilEstimate {
         session_id: session.into(),
-        soil_epoch: soil.epoch,
-        stamp_ns: soil.stamp_ns,
+        soil_epoch: soil.state.epoch,
+        stamp_ns: soil.state.stamp_ns,
         correction: Some(soil_correction(soil)),
     }
 }

@@ -1,30 +1,8 @@
-//! States, commands and packed arrays.
+//! States and commands.
 
-use bytes::Bytes;
 use nesam_engine::EngineError;
 use nesam_physics::{Control, VehicleState};
 use nesam_proto::v1 as pb;
-
-/// A packed array of little-endian f32.
-///
-/// # Errors
-/// `Invalid` naming `field` when the length is not 4 `count` bytes.
-pub fn decode_f32(field: &str, packed: &[u8], count: usize) -> Result<Vec<f32>, EngineError> {
-    if packed.len() != 4 * count {
-        let reason = format!("has {} bytes, {count} packed f32 take {}", packed.len(), 4 * count);
-        return Err(EngineError::invalid(field, reason));
-    }
-    Ok(packed.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
-}
-
-/// Packs an array as little-endian f32.
-pub fn encode_f32(values: &[f32]) -> Bytes {
-    let mut packed = vec![0; 4 * values.len()];
-    for (bytes, value) in packed.chunks_exact_mut(4).zip(values) {
-        bytes.copy_from_slice(&value.to_le_bytes());
-    }
-    packed.into()
-}
 
 fn vector(path: &str, part: &str, message: Option<pb::Vector3>) -> Result<[f64; 3], EngineError> {
     message.map(|v| [v.x, v.y, v.z]).ok_or_else(|| EngineError::invalid(format!("{path}.{part}"), "is missing"))

@@ -7,7 +7,7 @@ use super::Edge;
 use crate::convert::{open_session, session_view, to_status};
 use crate::telemetry::Transport;
 
-/// Opens, reads, lists and closes sessions.
+/// Opens, reads, lists, copies and closes sessions.
 pub struct Service(pub Edge);
 
 #[tonic::async_trait]
@@ -32,6 +32,15 @@ impl pb::sessions_server::Sessions for Service {
         let views = self.0.engine.list(self.0.budget(&request)).await.map_err(to_status)?;
         let vehicle = &self.0.predictor.bundle().vehicle;
         Ok(Response::new(pb::ListSessionsReply { sessions: views.iter().map(|view| session_view(view, vehicle)).collect() }))
+    }
+
+    async fn fork(&self, request: Request<pb::ForkSessionRequest>) -> Result<Response<pb::Session>, Status> {
+        self.0.engine.metrics().request(Transport::Grpc, "fork");
+        let budget = self.0.budget(&request);
+        let pb::ForkSessionRequest { session_id, new_session_id } = request.into_inner();
+        let view = self.0.engine.fork(&session_id, &new_session_id, budget).await.map_err(to_status)?;
+        tracing::info!(session = session_id, copy = view.session, "session copied");
+        Ok(Response::new(session_view(&view, &self.0.predictor.bundle().vehicle)))
     }
 
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {

@@ -51,8 +51,8 @@ async fn forward(
             }
         };
         let soil = match event {
-            Ok(Event::SoilChanged { session: changed, soil }) if changed == session => soil,
-            Ok(Event::SessionClosed { session: closed }) if closed == session => return,
+            Ok(Event::SoilChanged { session: changed, soil, .. }) if changed == session => *soil,
+            Ok(Event::SessionClosed { session: closed, .. }) if closed == session => return,
             Ok(_) => continue,
             // Too slow a watcher misses changes in between, never the newest.
             Err(RecvError::Lagged(_)) => match edge.engine.get(&session, edge.stream_budget()).await {

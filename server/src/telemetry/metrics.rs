@@ -36,6 +36,7 @@ pub struct Metrics {
     commands: Pairs,
     measurements: Pairs,
     requests: Pairs,
+    events: Mutex<BTreeMap<&'static str, u64>>,
     queue: Histogram,
     prediction: Histogram,
 }
@@ -83,6 +84,13 @@ impl Metrics {
         count(&self.requests, (transport.label(), method));
     }
 
+    /// Counts something that happened to a session.
+    pub fn event(&self, event: &'static str) {
+        if let Ok(mut events) = self.events.lock() {
+            *events.entry(event).or_default() += 1;
+        }
+    }
+
     /// Number of predictions answered.
     pub fn predictions(&self) -> u64 {
         self.prediction.count()
@@ -101,6 +109,12 @@ impl Metrics {
             let Ok(pairs) = pairs.lock() else { continue };
             for ((a, b), value) in pairs.iter() {
                 let _ = writeln!(out, "{name}{{{first}=\"{a}\",{second}=\"{b}\"}} {value}");
+            }
+        }
+        let _ = writeln!(out, "# HELP nesam_events_total What happened to sessions.\n# TYPE nesam_events_total counter");
+        if let Ok(events) = self.events.lock() {
+            for (event, value) in events.iter() {
+                let _ = writeln!(out, "nesam_events_total{{event=\"{event}\"}} {value}");
             }
         }
         self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
@@ -129,6 +143,7 @@ mod tests {
         }
         metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
         metrics.measurement(Transport::Zenoh, "applied");
+        metrics.event("soil_changed");
         let text = metrics.render(3, 4);
         for line in [
             "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
@@ -136,6 +151,7 @@ mod tests {
             "nesam_measurements_total{transport=\"zenoh\",outcome=\"applied\"} 1",
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
+            "nesam_events_total{event=\"soil_changed\"} 1",
             "nesam_waiting_predictions 4",
         ] {
             assert!(text.lines().any(|l| l == line), "{line} is not in\n{text}");

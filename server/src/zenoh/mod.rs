@@ -3,6 +3,7 @@
 mod keys;
 mod measurements;
 mod predict;
+mod soil;
 
 use nesam_engine::EngineError;
 use tokio::sync::mpsc;
@@ -20,6 +21,7 @@ const ANSWERS_WAITING_MAX: usize = 4096;
 pub(crate) struct Bus {
     session: ::zenoh::Session,
     publisher: tokio::task::JoinHandle<()>,
+    soil: tokio::task::JoinHandle<()>,
 }
 
 /// A message to publish: key and payload.
@@ -34,11 +36,12 @@ impl Bus {
         let failed = |error: ::zenoh::Error| ServerError::Zenoh { reason: error.to_string() };
         let session = ::zenoh::open(zenoh_config(config).map_err(failed)?).await.map_err(failed)?;
         let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
+        let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sender.clone()));
         measurements::declare(&session, &config.fleet, edge.engine.clone(), sender).await.map_err(failed)?;
         predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
         let publisher = tokio::spawn(publish(session.clone(), receiver));
         tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
-        Ok(Self { session, publisher })
+        Ok(Self { session, publisher, soil })
     }
 
     /// Leaves the network.
@@ -47,6 +50,7 @@ impl Bus {
             tracing::warn!(%error, "zenoh did not close cleanly");
         }
         self.publisher.abort();
+        self.soil.abort();
     }
 }
 

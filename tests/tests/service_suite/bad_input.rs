@@ -44,7 +44,7 @@ async fn service_bad_predictions_are_refused() {
     };
     let from = |start: v1::VehicleState| v1::PredictRequest { start: Some(start), ..good.clone() };
     let output = |channels, stride| v1::PredictRequest {
-        output: Some(v1::OutputSelection { channels, stride, wheel_sinkage: false }),
+        output: Some(v1::OutputSelection { channels, stride, ..Default::default() }),
         ..good.clone()
     };
     use Code::{InvalidArgument, NotFound};
@@ -170,6 +170,9 @@ async fn service_bad_sessions_are_refused() {
     let good = || v1::OpenSessionRequest { vehicle_id: "new".into(), ..Default::default() };
     let mut not_finite = sample("", &recorded.drive, 0);
     not_finite.command.as_mut().unwrap().second = f64::NAN;
+    let first = || sample("", &recorded.drive, 0);
+    let too_fast = v1::Measurement { state: first().state.map(|state| with_entry(state, 7, -101.0)), ..first() };
+    let wheels = v1::Measurement { wheels: Some(v1::WheelMeasurement { speed_rad_s: vec![1.0; 5], ..Default::default() }), ..first() };
     let incomplete = v1::Measurement { state: None, ..sample("", &recorded.drive, 0) };
     use Code::{AlreadyExists, InvalidArgument, NotFound};
     for (what, request, code, field) in [
@@ -182,6 +185,8 @@ async fn service_bad_sessions_are_refused() {
         ("unknown map", v1::OpenSessionRequest { map_id: "moon".into(), ..good() }, NotFound, "map_id"),
         ("open already", v1::OpenSessionRequest { session_id: "s".into(), ..good() }, AlreadyExists, "session_id"),
         ("initial not finite", v1::OpenSessionRequest { initial: Some(not_finite), ..good() }, InvalidArgument, "initial.command.second"),
+        ("initial too fast", v1::OpenSessionRequest { initial: Some(too_fast), ..good() }, InvalidArgument, "initial.state.velocity_m_s.y"),
+        ("initial wheels", v1::OpenSessionRequest { initial: Some(wheels), ..good() }, InvalidArgument, "initial.wheels.speed_rad_s"),
         ("initial incomplete", v1::OpenSessionRequest { initial: Some(incomplete), ..good() }, InvalidArgument, "initial.state"),
     ] {
         assert_refused(what, client.open_session(request).await, code, field);
@@ -253,6 +258,13 @@ async fn service_bad_maps_are_refused() {
         ("patch without tile", patch(&world.map_id, 1, None), InvalidArgument, "tile"),
         ("patch of another version", patch(&world.map_id, 9, Some(tile())), Aborted, "base_version"),
         ("patch beyond the map", patch(&world.map_id, 1, Some(v1::MapTile { row: world.height, ..tile() })), InvalidArgument, "tile.rows"),
+        ("patch to infinity", patch(&world.map_id, 1, Some(filled(f32::NEG_INFINITY))), InvalidArgument, "tile.elevation_m"),
+        (
+            "patch without its colours",
+            patch(&world.map_id, 1, Some(v1::MapTile { semantic_rgb: vec![0; 35].into(), ..tile() })),
+            InvalidArgument,
+            "tile.semantic_rgb",
+        ),
         ("patch too short", patch(&world.map_id, 1, Some(v1::MapTile { rows: 2, ..tile() })), InvalidArgument, "tile.elevation_m"),
     ] {
         assert_refused(what, client.patch_tile(request).await, code, field);

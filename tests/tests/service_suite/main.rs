@@ -2,10 +2,14 @@
 #![allow(clippy::unwrap_used)]
 
 mod bad_input;
+mod from_now;
 mod lifecycle;
 mod measurements;
 mod overload;
 mod predictions;
+mod random_bytes;
 mod replay;
+mod sessions;
+mod soil;
 mod stage;
 mod zenoh_network;

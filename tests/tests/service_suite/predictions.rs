@@ -74,7 +74,7 @@ async fn service_given_start_history_use_and_selection() {
     assert_same(&client.predict(query.clone()).await.unwrap(), &offline(&recorded, i, &query, 0, soil));
 
     query.use_history = true;
-    query.output = v1::OutputSelection { channels: 0b10_0011, stride: 4, wheel_sinkage: false };
+    query.output = v1::OutputSelection { channels: 0b10_0011, stride: 4, ..Default::default() };
     let part = client.predict(query).await.unwrap();
     assert_eq!((part.steps, part.channels.as_slice(), part.sinkage_m.len()), (2, &[0, 1, 5][..], 0));
     for n in 0..3 {

@@ -34,6 +34,7 @@ fn property_replayed_commands_give_the_same_bytes() {
             call(Command::Predict(PredictQuery {
                 session: candidates.session,
                 start: None,
+                instant: None,
                 use_history: true,
                 samples: 3,
                 horizon: 8,

@@ -12,6 +12,9 @@ use nesam_server::{Config, RunningServer, serve};
 use nesam_terrain::WorldMap;
 use nesam_tests::{sample_root, shipped_bundle};
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory};
+use prost::bytes::Bytes;
+use rand::{RngExt as _, SeedableRng as _};
+use rand_chacha::ChaCha8Rng;
 
 /// Step of the model, ns.
 pub const STEP_NS: i64 = 100_000_000;
@@ -53,6 +56,7 @@ fn bundle() -> Arc<ModelBundle> {
                 vehicle,
                 default_soil: normalization.default_soil(),
                 parameters: 0,
+                form: Variant::Full,
                 weights: initial_weights(7, &normalization),
                 normalization,
                 baselines_json: None,
@@ -163,6 +167,13 @@ pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_s
         .unwrap()
 }
 
+/// Random payloads of 1 to 300 bytes, the same for the same seed.
+pub fn garbage(seed: u64, count: usize) -> Vec<Bytes> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut payload = || -> Bytes { (0..random.random_range(1..300)).map(|_| random.random_range(0..=255_u8)).collect() };
+    (0..count).map(|_| payload()).collect()
+}
+
 /// Bits of the numbers, so that equality means equality.
 pub fn bits(values: &[f32]) -> Vec<u32> {
     values.iter().map(|v| v.to_bits()).collect()
@@ -173,7 +184,10 @@ pub fn assert_same(prediction: &Prediction, rollout: &Rollout) {
     assert_eq!((prediction.samples, prediction.steps), (rollout.samples, rollout.horizon));
     assert!(bits(&prediction.states) == bits(&rollout.states), "states differ");
     assert!(bits(&prediction.sinkage_m) == bits(&rollout.sinkage_m), "sinkages differ");
-    assert_eq!(prediction.validity, rollout.flags);
+    // What the service knows beyond the rollout.
+    let learned = if prediction.provenance.soil_epoch == 0 { v1::Validity::SoilNotLearned as u32 } else { 0 };
+    assert!(prediction.validity.iter().zip(&rollout.flags).all(|(got, flags)| *got == flags | learned));
+    assert_eq!(prediction.validity.len(), rollout.flags.len());
     assert_eq!(prediction.soil.map(f64::to_bits), rollout.soil.map(f64::to_bits));
 }
 

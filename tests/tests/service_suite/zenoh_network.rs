@@ -39,15 +39,35 @@ async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction(
     open(&mut client, "truck", recorded.world.id()).await;
     let vehicle = ZenohVehicle::connect(&endpoint, "test", "truck").await.unwrap();
     vehicle.wait_for_service(PATIENCE).await.unwrap();
+    let soil = router.declare_subscriber("nesam/v1/test/truck/soil").await.unwrap();
 
     let last = 50;
-    client.feed(samples("grpc", &recorded.drive, last)).await.unwrap();
+    let answered = client.feed(samples("grpc", &recorded.drive, last)).await.unwrap();
     for i in 0..=last {
         // Without a session id: the session named like the vehicle of the key.
         vehicle.publish(&sample("", &recorded.drive, i)).await.unwrap();
         let answer = vehicle.answer(PATIENCE).await.unwrap().expect("an answer on the status key");
         assert_eq!((outcome_label(&answer), answer.sequence, answer.session_id.as_str()), ("APPLIED", i as u64 + 1, "truck"));
+        assert_eq!(answer.soil_correction, answered[i].soil_correction, "sample {i}");
     }
+    // Each change was published: those of both sessions, as both belong to the vehicle; the order is that of the updates.
+    for session in ["grpc", "truck"] {
+        let mut epoch = 0;
+        for answer in answered.iter().filter(|answer| answer.soil_epoch > 0) {
+            if answer.soil_epoch == epoch {
+                continue;
+            }
+            epoch = answer.soil_epoch;
+            let published = tokio::time::timeout(PATIENCE, soil.recv_async()).await.expect("in time").unwrap();
+            let estimate = v1::SoilEstimate::decode(published.payload().to_bytes().as_ref()).unwrap();
+            assert_eq!((estimate.session_id.as_str(), estimate.soil_epoch, estimate.stamp_ns), (session, epoch, Some(answer.stamp_ns)));
+            assert_eq!(estimate.correction, answer.soil_correction);
+        }
+    }
+    // The posterior is the same to the last bit, the covariance included.
+    let (one, other) = (client.session("grpc").await.unwrap(), client.session("truck").await.unwrap());
+    assert!(one.provenance.as_ref().unwrap().soil_epoch >= 2 && one.provenance == other.provenance);
+    assert_eq!((one.soil_correction, one.history_steps, one.state), (other.soil_correction, other.history_steps, other.state));
     let by_grpc = client.predict(candidates("grpc", &recorded.drive, last, 3, 32)).await.unwrap();
     let by_zenoh = client.predict(candidates("truck", &recorded.drive, last, 3, 32)).await.unwrap();
     assert!(bits(&by_grpc.states) == bits(&by_zenoh.states));
@@ -57,10 +77,41 @@ async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction(
     assert!(bits(&queried.states) == bits(&by_zenoh.states));
     assert_eq!(queried.provenance, by_zenoh.provenance);
 
+    refuses_random_bytes(&router, &vehicle, &recorded, &mut client).await;
     refuses_bad_payloads(&vehicle, &recorded, &mut client).await;
     vehicle.close().await.unwrap();
     server.shutdown().await;
     router.close().await.unwrap();
+}
+
+/// Random and truncated payloads on every key that the service listens to are answered as such and change nothing.
+async fn refuses_random_bytes(network: &zenoh::Session, vehicle: &ZenohVehicle, recorded: &Recorded, client: &mut nesam_client::Client) {
+    let before = client.list_sessions().await.unwrap();
+    let measurement = sample("", &recorded.drive, 51).encode_to_vec();
+    let truncated = (0..measurement.len()).map(|length| measurement[..length].to_vec());
+    for payload in truncated.chain(garbage(11, 40).into_iter().map(Vec::from)) {
+        vehicle.publish_bytes(payload.clone()).await.unwrap();
+        let answer = vehicle.answer(PATIENCE).await.unwrap().expect("an answer");
+        let Some(v1::measurement_answer::Outcome::Rejected(rejected)) = answer.outcome else { panic!("{payload:?}: {answer:?}") };
+        assert!([3, 5].contains(&rejected.code) && rejected.message.len() > 10, "{payload:?}: {rejected:?}");
+    }
+    // A key that is deleted carries no measurement.
+    network.delete("nesam/v1/test/truck/measurement").await.unwrap();
+    assert_eq!(outcome_label(&vehicle.answer(PATIENCE).await.unwrap().expect("an answer")), "REJECTED");
+
+    let query = candidates("", &recorded.drive, 50, 2, 3).to_message().encode_to_vec();
+    let truncated = (0..query.len()).step_by(5).map(|length| query[..length].to_vec());
+    let mut refused = 0;
+    for payload in truncated.chain(garbage(13, 40).into_iter().map(Vec::from)).chain([vec![0; 1 << 20]]) {
+        let replies = network.get("nesam/v1/test/truck/predict").payload(payload.clone()).await.unwrap();
+        let reply = tokio::time::timeout(PATIENCE, replies.recv_async()).await.expect("in time").expect("a reply");
+        let Err(error) = reply.result() else { continue };
+        let error = v1::PredictError::decode(error.payload().to_bytes().as_ref()).unwrap();
+        assert!(error.code == 3 && error.message.len() > 10, "{payload:?}: {error:?}");
+        refused += 1;
+    }
+    assert!(refused > 40, "{refused} queries were refused");
+    assert_eq!(client.list_sessions().await.unwrap(), before);
 }
 
 /// Payloads that are no measurement, are spoofed, or are a bad query are answered and change nothing.

@@ -27,6 +27,7 @@ enum Validity : std::uint32_t {
   validity_steering_untrained = 16, ///< A second command lies outside the trained range.
   validity_slope_untrained = 32,    ///< Roll or pitch lies outside the trained range.
   validity_overturned = 64,         ///< |roll| or |pitch| over 60 degrees.
+  validity_soil_not_learned = 128,  ///< The drive has not updated the soil yet: the prior alone speaks.
 };
 
 /// Whether the measured history of the session may speak for the start state.

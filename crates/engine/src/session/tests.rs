@@ -50,7 +50,7 @@ fn observe(session: &mut Session, measurement: &Measurement) -> Result<Outcome, 
 
 /// A session with `n` steps.
 fn driven(n: i64) -> Session {
-    let mut session = Session::new("s", "v", None, SoilFilter::new(FilterConfig::default()).unwrap());
+    let mut session = Session::new("s", "v", None, SoilFilter::new(FilterConfig::default()).unwrap(), 0);
     for i in 0..n {
         assert_eq!(observe(&mut session, &at(i * STEP_NS)), Ok(Outcome::Applied));
     }

@@ -52,7 +52,7 @@ pub struct BlockCache {
 impl BlockCache {
     /// An empty cache with room for `horizon` steps.
     pub fn new(horizon: usize) -> Self {
-        let room = || vec![Vec::with_capacity(horizon * HIDDEN); BLOCKS];
+        let room = || (0..BLOCKS).map(|_| Vec::with_capacity(horizon * HIDDEN)).collect();
         Self { keys: room(), values: room(), steps: 0 }
     }
 }
@@ -114,6 +114,7 @@ impl FusedTransformer {
         let first = HISTORY - 1 - tokens;
         let lane = |chunk: usize, l: usize| (chunk * LANES + l).min(tokens.max(1) - 1);
         let chunks = tokens.div_ceil(LANES);
+        let of_chunk = |chunk: usize| chunk * LANES..tokens.min((chunk + 1) * LANES);
         let mut hidden: Vec<Vec<Lane>> = (0..chunks)
             .map(|chunk| {
                 let e = core::array::from_fn(|i| core::array::from_fn(|l| entries[lane(chunk, l)][i]));
@@ -127,20 +128,18 @@ impl FusedTransformer {
             let (mut keys, mut values) = (vec![0f32; tokens * HIDDEN], vec![0f32; tokens * HIDDEN]);
             for (chunk, x) in hidden.iter().enumerate() {
                 let qkv = block.qkv(x);
-                for l in 0..LANES.min(tokens - chunk * LANES) {
-                    let at = (chunk * LANES + l) * HIDDEN;
-                    for o in 0..HIDDEN {
-                        queries[at + o] = qkv[o][l];
-                        keys[at + o] = qkv[HIDDEN + o][l];
-                        values[at + o] = qkv[2 * HIDDEN + o][l];
+                for (l, token) in of_chunk(chunk).enumerate() {
+                    for (part, rows) in [&mut queries, &mut keys, &mut values].into_iter().enumerate() {
+                        let row = &mut rows[token * HIDDEN..(token + 1) * HIDDEN];
+                        row.iter_mut().zip(&qkv[part * HIDDEN..]).for_each(|(number, lane)| *number = lane[l]);
                     }
                 }
             }
             if index + 1 < BLOCKS {
                 for (chunk, x) in hidden.iter_mut().enumerate() {
                     let mut attended = vec![[0f32; LANES]; HIDDEN];
-                    for l in 0..LANES.min(tokens - chunk * LANES) {
-                        attend_history(&queries, &keys, &values, chunk * LANES + l, |o, v| attended[o][l] = v);
+                    for (l, token) in of_chunk(chunk).enumerate() {
+                        attend_history(&queries, &keys, &values, token, |o, v| attended[o][l] = v);
                     }
                     block.finish(x, &attended);
                 }

@@ -225,8 +225,8 @@ impl ReferenceRollout<'_> {
             .zip(rows)
             .map(|(x, row)| {
                 let mut next: [f64; STATE_DIM] = core::array::from_fn(|i| f64::from(x[i]));
-                for i in 0..3 {
-                    next[i] += row.start.position_m[i];
+                for (next, origin_m) in next.iter_mut().zip(row.start.position_m) {
+                    *next += origin_m;
                 }
                 next[5] = wrap_angle(next[5]);
                 VehicleState::from_array(next)

@@ -61,7 +61,8 @@ impl<T: Real, const N: usize> Mul for Dual<T, N> {
     type Output = Self;
     #[inline(always)]
     fn mul(self, other: Self) -> Self {
-        self.zip(other, self.re * other.re, |a, b| a * other.re + self.re * b)
+        let product_rule = |a, b| a * other.re + self.re * b;
+        self.zip(other, self.re * other.re, product_rule)
     }
 }
 impl<T: Real, const N: usize> Div for Dual<T, N> {

@@ -1,0 +1,74 @@
+//! Goal: no damage to a bundle is overlooked or stops the program. Method: every file of the shipped bundle is truncated, overwritten and flipped
+//! bit by bit, first with the hash that the manifest has for it, then with the hash of the damaged file, as a careless hand would leave it.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use nesam_model::ModelBundle;
+use sha2::{Digest as _, Sha256};
+
+const FILES: [&str; 5] = ["baselines.json", "effects.toml", "normalization.toml", "vehicle.json", "weights.safetensors"];
+/// Truncations and flips tried of each file.
+const TRIES: usize = 24;
+
+fn shipped() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal")
+}
+
+fn sha256_hex(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// Copies of one file with something wrong, with words for it.
+fn damaged(whole: &[u8]) -> Vec<(String, Vec<u8>)> {
+    let at = |i: usize| i * whole.len() / TRIES;
+    let truncated = (0..TRIES).map(|i| (format!("cut after {} bytes", at(i)), whole[..at(i)].to_vec()));
+    let flipped = (0..TRIES).map(|i| {
+        let mut bytes = whole.to_vec();
+        bytes[at(i)] ^= 1 << (i % 8);
+        (format!("bit {} of byte {} flipped", i % 8, at(i)), bytes)
+    });
+    let zeros = ("zeros".to_string(), vec![0; whole.len()]);
+    let longer = ("a byte too long".to_string(), [whole, &[0xff]].concat());
+    truncated.chain(flipped).chain([zeros, longer]).collect()
+}
+
+#[test]
+fn regress_every_damaged_file_of_a_bundle_is_named() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for name in FILES.iter().copied().chain(["manifest.toml"]) {
+        fs::copy(shipped().join(name), folder.path().join(name)).expect("the shipped bundle is complete");
+    }
+    ModelBundle::load(folder.path()).expect("the copy is whole");
+    let manifest = fs::read_to_string(shipped().join("manifest.toml")).expect("readable");
+    for name in FILES {
+        let whole = fs::read(shipped().join(name)).expect("readable");
+        for (what, bytes) in damaged(&whole) {
+            fs::write(folder.path().join(name), &bytes).expect("writable");
+            let message = ModelBundle::load(folder.path()).expect_err(&what).to_string();
+            assert!(message.contains(name) && message.contains("SHA-256"), "{name}, {what}: {message}");
+            // With a manifest that agrees, what is left of the file decides. A flipped bit may give another number, a cut of the comment of a
+            // file nothing at all; a cut of an array must be noticed, and nothing may panic.
+            fs::write(folder.path().join("manifest.toml"), manifest.replace(&sha256_hex(&whole), &sha256_hex(&bytes))).expect("writable");
+            let loaded = ModelBundle::load(folder.path());
+            let cut = bytes.len() < whole.len();
+            assert!(loaded.is_err() || !cut || name != "weights.safetensors", "{name}, {what}");
+            if let Err(error) = loaded {
+                assert!(error.to_string().len() > 20, "{name}, {what}: {error}");
+            }
+            fs::write(folder.path().join("manifest.toml"), &manifest).expect("writable");
+        }
+        fs::remove_file(folder.path().join(name)).expect("removable");
+        let message = ModelBundle::load(folder.path()).expect_err("a missing file").to_string();
+        assert!(message.contains(name), "{name}: {message}");
+        fs::write(folder.path().join(name), &whole).expect("writable");
+    }
+    for (what, bytes) in damaged(manifest.as_bytes()) {
+        fs::write(folder.path().join("manifest.toml"), &bytes).expect("writable");
+        // A damaged comment or name of the provenance is no damage to the model; the hash of the bundle tells.
+        match ModelBundle::load(folder.path()) {
+            Ok(bundle) => assert_eq!(bundle.hash, sha256_hex(&bytes), "{what}"),
+            Err(error) => assert!(error.to_string().len() > 20, "{what}: {error}"),
+        }
+    }
+}

@@ -1,0 +1,57 @@
+//! Goal: every B transitions update the soil inside the session, and every reply says what is known of it.
+
+use nesam_adaptation::FilterConfig;
+use nesam_client::{outcome_label, v1};
+
+use crate::stage::*;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_every_reply_carries_soil_and_covariance() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let opened = open(&mut client, "s", recorded.world.id()).await;
+    let prior = opened.soil_correction.unwrap();
+    assert_eq!((prior.delta, prior.covariance.len()), (Some(v1::SoilVector::default()), 36));
+    let mut watch = client.watch_soil("s").await.unwrap();
+    let mut watched = watch.message().await.unwrap().unwrap();
+    assert_eq!((watched.soil_epoch, watched.correction.as_ref()), (0, Some(&prior)));
+
+    let buffer = FilterConfig::default().buffer;
+    let mut stream = client.measure().await.unwrap();
+    let (mut epoch, mut updates) = (0, 0);
+    for i in 0..=5 * buffer {
+        let answer = stream.exchange(sample("s", &recorded.drive, i)).await.unwrap();
+        // The transition from step i - 1 is known when step i is measured, so B of them are full at i = B, 2 B, ...
+        let full = i > 0 && i % buffer == 0;
+        let gated = outcome_label(&answer) == "GATED";
+        assert!(full || !gated, "sample {i}");
+        updates += u64::from(full && !gated);
+        assert_eq!(answer.soil_epoch, updates, "sample {i}");
+        if answer.soil_epoch != epoch {
+            epoch = answer.soil_epoch;
+            watched = watch.message().await.unwrap().unwrap();
+            assert_eq!((watched.soil_epoch, watched.stamp_ns), (epoch, Some(i as i64 * STEP_NS)));
+        }
+        let soil = answer.soil_correction.as_ref();
+        assert_eq!(soil, watched.correction.as_ref(), "sample {i}");
+        if i % 7 == 0 || full {
+            let session = client.session("s").await.unwrap();
+            assert_eq!((soil, session.provenance.unwrap().soil_epoch), (session.soil_correction.as_ref(), epoch));
+            let prediction = client.predict(candidates("s", &recorded.drive, i, 1, 1)).await.unwrap();
+            assert_eq!((soil, prediction.provenance.soil_epoch), (Some(&prediction.soil_correction), epoch));
+            assert_eq!(prediction.validity[0] & v1::Validity::SoilNotLearned as u32 != 0, epoch == 0);
+        }
+    }
+    assert!(updates >= 2, "{updates} updates");
+    let soil = watched.correction.unwrap();
+    assert_ne!(soil.delta, prior.delta);
+    let variance = soil.variance.unwrap();
+    let diagonal = [variance.k_phi, variance.k_c, variance.n, variance.c_pa, variance.phi_rad, variance.k_shear_m];
+    for (r, variance) in diagonal.into_iter().enumerate() {
+        assert_eq!(variance, soil.covariance[7 * r], "the variance is the diagonal");
+        assert!((0..6).all(|c| (soil.covariance[6 * r + c] - soil.covariance[6 * c + r]).abs() <= 1e-12 * (variance * diagonal[c]).sqrt()));
+    }
+    assert_eq!(learned(&recorded, 5 * buffer).1, updates, "the filter of `nesam adapt` made as many");
+    server.shutdown().await;
+}
