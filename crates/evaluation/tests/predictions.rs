@@ -79,7 +79,7 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
         seed: 5,
         resamples: &resamples,
         models: &scores,
-        slices: &slices(&windows, &Default::default()),
+        slices: &slices(&windows, &[None, None, None], 0.4, &Default::default()),
         provenance: &Provenance::default(),
     };
     let json: serde_json::Value = serde_json::from_str(&evaluation.to_json()).unwrap();

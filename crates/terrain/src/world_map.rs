@@ -186,6 +186,16 @@ impl WorldMap {
         &self.soil_classes
     }
 
+    /// The semantic class of the nearest cell, by the palette colour nearest to the cell's (images are not clean); `None` off the map, without a
+    /// semantic layer or without a palette.
+    pub fn soil_class(&self, x_m: f64, y_m: f64) -> Option<&SoilClassRange> {
+        let colour = self.colour.as_ref().filter(|_| self.geometry.contains(x_m, y_m))?;
+        let [column, row] = self.geometry.to_grid(x_m, y_m).map(|v| v.round().max(0.0) as usize);
+        let [r, g, b, _] = colour[row * self.geometry.width + column].to_le_bytes();
+        let distance = |p: [u8; 3]| (0..3).map(|i| (i32::from(p[i]) - i32::from([r, g, b][i])).pow(2)).sum::<i32>();
+        self.soil_classes.iter().filter(|c| c.colour.is_some()).min_by_key(|c| c.colour.map(distance))
+    }
+
     /// Elevation layer as given, row-major, row 0 in the south, NaN = hole, m.
     pub fn elevation_m(&self) -> Vec<f32> {
         let known = |i: usize| self.surface.known.as_ref().is_none_or(|k| k[i]);

@@ -149,6 +149,12 @@ fn chrono_sample_world_agrees_with_its_description() {
     assert_eq!(map.soil_classes()[0].name, "grass");
     assert_eq!(map.soil_classes()[2].colour, Some([214, 190, 140]));
     assert!(map.contains(-40.0, 40.0) && map.contains(40.0, -40.0));
+    assert!(map.soil_class(-40.0, 40.0).is_some() && map.soil_class(40.1, 0.0).is_none());
+    let found: std::collections::BTreeSet<&str> = (0..400)
+        .filter_map(|k| map.soil_class(-38.0 + 4.0 * f64::from(k % 20), -38.0 + 4.0 * f64::from(k / 20)))
+        .map(|c| c.name.as_str())
+        .collect();
+    assert_eq!(found.len(), 5, "all five classes of the world: {found:?}");
     // Steepest 5 % of a world: 18 degrees at most (DATA.md); ours is smoothed over less than their 0.5 m.
     let mut slopes: Vec<f64> = (0..10_000)
         .map(|k| map.ground(-39.0 + 0.78 * f64::from(k % 100), -39.0 + 0.78 * f64::from(k / 100)).unwrap())

@@ -55,6 +55,9 @@ pub struct EvaluateArgs {
     /// Write the HTML report here instead
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
+    /// Also write the tables as Markdown
+    #[arg(long, value_name = "FILE.md")]
+    markdown: Option<PathBuf>,
     /// Also write every predicted pose: model, trajectory, t0, k, x, y, z, roll, pitch, yaw
     #[arg(long, value_name = "FILE.parquet")]
     predictions: Option<PathBuf>,
@@ -104,7 +107,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
     let scores: Vec<ModelScore> = paths.iter().map(|p| score(p, &windows, truth, &resamples)).collect();
     let worlds = training.as_deref().map(worlds_of).unwrap_or_default();
-    let slices = slices(&windows, &worlds);
+    let slices = slices(&windows, &drives.maps, drives.root.vehicle().wheel_radius_m, &worlds);
     let provenance = output::provenance(models.predictor.as_ref().map(|p| p.bundle()), &drives);
     let evaluation = Evaluation {
         set: &drives.set,
@@ -139,6 +142,10 @@ fn write_results(
     output::write_file(&json, evaluation.to_json().as_bytes())?;
     output::write_file(&html, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
+    if let Some(file) = &args.markdown {
+        output::write_file(file, report::evaluation_markdown(evaluation).as_bytes())?;
+        say!("wrote {}", file.display());
+    }
     if let Some(file) = &args.predictions {
         write_predictions(file, paths, windows).or_failed()?;
         say!("wrote {}", file.display());

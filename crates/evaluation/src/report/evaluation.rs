@@ -39,7 +39,7 @@ pub fn evaluation_page(evaluation: &Evaluation<'_>, paths: &[ModelPaths], window
     );
     if !evaluation.slices.is_empty() {
         page.section("Slices")
-            .text("The same windows apart by world, speed and turning (terciles of this set).")
+            .text("The same windows apart by world, class under the start, and terciles of this set by speed, turning, relief and slip.")
             .table(&slice_table(evaluation));
     }
     let p = evaluation.provenance;
@@ -50,6 +50,27 @@ pub fn evaluation_page(evaluation: &Evaluation<'_>, paths: &[ModelPaths], window
         .footer("maps", &p.maps_hash)
         .footer("bootstrap", &format!("{} resamples by drive, seed {}", evaluation.resamples.count(), evaluation.seed));
     page.render()
+}
+
+/// The tables of the page as Markdown, for documents: scores, position, differences, slices.
+pub fn evaluation_markdown(evaluation: &Evaluation<'_>) -> String {
+    let p = evaluation.provenance;
+    let mut out = format!("`{}`, bundle {} {}\n\n", p.command, p.bundle, &p.bundle_hash[..p.bundle_hash.len().min(12)]);
+    let mut tables = vec![
+        mae_table(evaluation, "steps 1…K", |t| t.mae_mean.to_array()),
+        mae_table(evaluation, "step K", |t| t.mae_final.to_array()),
+        position_table(evaluation),
+    ];
+    if evaluation.models.len() > 1 {
+        tables.push(difference_table(evaluation));
+    }
+    if !evaluation.slices.is_empty() {
+        tables.push(slice_table(evaluation));
+    }
+    for table in tables {
+        out += &table.to_markdown();
+    }
+    out
 }
 
 fn number(value: Option<f64>) -> String {

@@ -12,7 +12,7 @@ mod scale;
 mod table;
 
 pub use adaptation::adaptation_page;
-pub use evaluation::evaluation_page;
+pub use evaluation::{evaluation_markdown, evaluation_page};
 pub use line_plot::{LinePlot, Series};
 pub use page::{Page, escape};
 pub use scale::ticks;

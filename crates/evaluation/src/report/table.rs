@@ -44,6 +44,22 @@ impl Table {
         self
     }
 
+    pub(super) fn to_markdown(&self) -> String {
+        let line = |cells: Vec<String>| format!("| {} |\n", cells.join(" | "));
+        let mut out = format!("{}\n\n", self.caption);
+        out += &line(self.head.clone());
+        out += &line(vec!["---".into(); self.head.len()]);
+        for row in &self.rows {
+            let text = |cell: &Cell| {
+                let bold = if cell.best { "**" } else { "" };
+                let space = if cell.small.is_empty() { "" } else { " " };
+                format!("{bold}{}{bold}{space}{}", cell.text, cell.small).replace('|', "\\|")
+            };
+            out += &line(row.iter().map(text).collect());
+        }
+        out + "\n"
+    }
+
     pub(super) fn to_html(&self) -> String {
         let mut html = String::from("<div class=\"scroll\">\n<button data-copy>copy table</button>\n<table>\n");
         let _ = writeln!(html, "<caption>{}</caption>\n<thead><tr>", escape(&self.caption));
