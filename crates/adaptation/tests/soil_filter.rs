@@ -43,6 +43,7 @@ fn truck() -> Vehicle {
             speed_integral_leak_s: 2.0,
             speed_integral_limit_m: 2.0,
             overspeed_limit_m_s: 0.8,
+            rims: Default::default(),
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),
@@ -56,7 +57,7 @@ fn twin(model: &StepModel, true_soil: [f64; SOIL_DIM], prior: [f64; SOIL_DIM], s
     let mut state = VehicleState::zero();
     state.position_m[2] = 0.6;
     state.velocity_m_s[0] = 2.0;
-    let mut actuators = DrivelineState { steering: 0.0, speed_error_integral_m: 0.0 };
+    let mut actuators = DrivelineState::default();
     let mut transitions = Vec::new();
     for k in 0..steps + 10 {
         let t = k as f64 * DT_S;

@@ -156,6 +156,7 @@ fn nesam_vehicle() -> nesam_physics::Vehicle {
             speed_integral_leak_s: 1.0,
             speed_integral_limit_m: 1.0,
             overspeed_limit_m_s: 1.0,
+            rims: Default::default(),
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),

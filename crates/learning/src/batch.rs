@@ -64,7 +64,7 @@ pub fn rows<'a>(windows: &[Window<'a>], history: usize, horizon: usize, model: &
             // Actuators remember longer than the tokens: use all the commands there are, up to the model's full history.
             let actuator_steps = drive.history(i.saturating_sub(nesam_model::HISTORY - 1), i);
             Row {
-                actuators: history_actuators(model, &actuator_steps, &drive.controls[i], dt_s),
+                actuators: history_actuators(model, &actuator_steps, &start, &drive.controls[i], dt_s),
                 history: steps,
                 start,
                 controls: drive.controls[i..i + horizon].to_vec(),

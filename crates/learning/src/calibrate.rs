@@ -7,6 +7,7 @@ use nesam_physics::{SecondCommand, Soil, Vehicle, VehicleState, WHEELS};
 use rayon::prelude::*;
 
 use crate::drives::Drive;
+use crate::rims::fit_rims;
 
 /// Steps of a calibration rollout.
 const HORIZON: usize = 16;
@@ -30,7 +31,7 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
         .map(|drive| {
             let (mut sum, mut count) = (0.0, 0usize);
             let last = drive.states.len().saturating_sub(HORIZON + 1);
-            for i in (8.min(last)..last).step_by(stride) {
+            for i in (8.min(last.saturating_sub(1))..last).step_by(stride) {
                 sum += rollout_error(&model, drive, i, &soil, scales);
                 count += 1;
             }
@@ -43,7 +44,7 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
 fn rollout_error(model: &StepModel, drive: &Drive, i: usize, soil: &Soil<f64>, scales: &Normalization) -> f64 {
     let mut state = drive.states[i];
     let ground = GroundSource::new(drive.map.as_deref(), model, &state);
-    let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &drive.controls[i], scales.dt_s);
+    let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &state, &drive.controls[i], scales.dt_s);
     let mut error = 0.0;
     for k in 0..HORIZON {
         let control = &drive.controls[i + k];
@@ -76,11 +77,14 @@ pub fn calibrate_driveline(
     scales: &Normalization,
     mut progress: impl FnMut(&str, f64, f64),
 ) -> [f64; 2] {
-    if vehicle.second == SecondCommand::YawRateRadS {
-        let error = symbolic_error(vehicle, drives, scales, 40);
-        return [error, error];
-    }
     let before = symbolic_error(vehicle, drives, scales, 40);
+    if vehicle.second == SecondCommand::YawRateRadS {
+        if let Some(servo) = fit_rims(vehicle, drives, scales.dt_s) {
+            vehicle.driveline.rims = servo;
+            progress("rims", servo.speed_gain, servo.turn_efficiency);
+        }
+        return [before, symbolic_error(vehicle, drives, scales, 40)];
+    }
     let mut best = before;
     for round in 0..3 {
         for (name, knob, [low, high]) in KNOBS {

@@ -11,7 +11,7 @@ use half::slice::HalfFloatSliceExt;
 use nesam_model::HistoryStep;
 use nesam_model::dims::{CONTEXT, FEATURES};
 use nesam_model::encoder::{EncoderScratch, TerrainEncoders};
-use nesam_physics::{Control, VehicleState, wrap_angle};
+use nesam_physics::{Control, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
 use rayon::prelude::*;
 
@@ -29,6 +29,8 @@ pub struct Drive {
     pub states: Vec<VehicleState<f64>>,
     /// Commands, valid from each sample to the next.
     pub controls: Vec<Control<f64>>,
+    /// Measured wheel speeds FL, FR, RL, RR, rad/s, where they are known: for calibration only, no input of the model.
+    pub wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,
     /// Contexts (samples, 9216), empty until encoded.
     features: Vec<f16>,
 }
@@ -45,7 +47,7 @@ pub struct Place {
 impl Drive {
     /// A drive without features yet.
     pub fn new(id: String, map: Option<Arc<WorldMap>>, states: Vec<VehicleState<f64>>, controls: Vec<Control<f64>>) -> Self {
-        Self { id, map, states, controls, features: Vec::new() }
+        Self { id, map, states, controls, wheel_speed_rad_s: None, features: Vec::new() }
     }
 
     /// The drive seen in a mirror (y becomes -y) over the mirrored `map`: for a vehicle whose two sides are alike, another true drive.

@@ -12,6 +12,7 @@ pub mod calibrate;
 pub mod drives;
 pub mod initial;
 pub mod recipe;
+pub mod rims;
 pub mod scales;
 pub mod schedule;
 pub mod trainer;

@@ -184,7 +184,9 @@ fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<Drive
         .into_iter()
         .map(|t| {
             let map = t.world.as_ref().map(|id| root.world(id)).transpose().map_err(|e| TrainingError::Drives(e.to_string()))?;
-            Ok(Drive::new(t.id.clone(), map, t.states.clone(), t.controls.clone()))
+            let mut drive = Drive::new(t.id.clone(), map, t.states.clone(), t.controls.clone());
+            drive.wheel_speed_rad_s.clone_from(&t.wheel_speed_rad_s);
+            Ok(drive)
         })
         .collect()
 }
@@ -206,7 +208,8 @@ fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s:
     let scales = measure(&training, vehicle, dt_s);
     reporter.stage("drive line", 12);
     let mut done = 0;
-    let few: Vec<&Drive> = training.iter().copied().step_by((training.len() / 60).max(1)).collect();
+    let samples: usize = training.iter().map(|d| d.states.len()).sum();
+    let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
     let [before, after] = calibrate_driveline(vehicle, &few, &scales, |name, value, error| {
         done += 1;
         reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));

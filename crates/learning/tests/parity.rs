@@ -69,7 +69,7 @@ fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
     let network = Network::from_weights(&weights).expect("all arrays are there");
     let model = Arc::new(StepModel::new(&truck(), scales.dt_s, scales.substeps));
     let row = Row {
-        actuators: history_actuators(&model, &past, &drive.controls[start], 0.1),
+        actuators: history_actuators(&model, &past, &drive.states[start], &drive.controls[start], 0.1),
         history: past.clone(),
         start: drive.states[start],
         controls: drive.controls[start..start + 32].to_vec(),

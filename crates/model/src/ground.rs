@@ -58,7 +58,15 @@ impl<'a> GroundSource<'a> {
 }
 
 /// Actuators at the start of a rollout, rebuilt from the commands and measured speeds of the history.
-pub fn history_actuators(model: &StepModel, history: &[HistoryStep], first: &Control<f64>, dt_s: f64) -> DrivelineState {
-    let initial = DrivelineState::settled(history.first().map_or(first, |step| &step.control));
+/// `start` and `first` are the state and the command at the start itself; they begin a history that is empty.
+pub fn history_actuators(
+    model: &StepModel,
+    history: &[HistoryStep],
+    start: &VehicleState<f64>,
+    first: &Control<f64>,
+    dt_s: f64,
+) -> DrivelineState {
+    let (state, control) = history.first().map_or((start, first), |step| (&step.state, &step.control));
+    let initial = DrivelineState::starting(model.vehicle(), state, control);
     history.iter().fold(initial, |actuators, step| actuators.advance(model.vehicle(), &step.control, step.state.velocity_m_s[0], dt_s))
 }

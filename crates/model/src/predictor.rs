@@ -167,7 +167,7 @@ impl Predictor {
         let start = Sample {
             state: query.start,
             previous: history.last().map(|step| step.state),
-            actuators: history_actuators(&self.model, history, &first, scales.dt_s),
+            actuators: history_actuators(&self.model, history, &query.start, &first, scales.dt_s),
             flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
         };
         let mut samples = vec![start; query.samples];
@@ -239,7 +239,7 @@ impl Predictor {
         let lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| [entries[i]; LANES]);
         let context: [Lane; HIDDEN] = core::array::from_fn(|i| [token[i]; LANES]);
         let (sinkage, residual) = self.network.step(&prefix, &mut BlockCache::new(1), &lanes, &context);
-        let before = history_actuators(&self.model, history, control, scales.dt_s);
+        let before = history_actuators(&self.model, history, state, control, scales.dt_s);
         let after = before.advance(self.model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);
         let soil = from_raw(&raw_soil(&token));
         let (under_wheels, known) = ground.under_wheels(&self.model, state, 0.0);

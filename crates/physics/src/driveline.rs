@@ -1,27 +1,63 @@
 //! The drive line: from commands to rim speeds and road-wheel angles (ADR: how Ω follows from the command).
 //!
 //! A car-like vehicle tracks the commanded speed of its reference point: its drive line holds every rim a little faster or slower than the
-//! ground under it, in proportion to the speed error and to its integral, within a limit. A skid-steer vehicle servoes the rims themselves. The steering
+//! ground under it, in proportion to the speed error and to its integral, within a limit. A skid-steer vehicle servoes the rims themselves
+//! ([`RimServo`](crate::vehicle::RimServo)). The steering
 //! actuator lags the command and is limited in rate. The actuator state depends on commands and measured speed only, so a server
 //! rebuilds it from the history of a session.
 
 use crate::scalar::Real;
-use crate::state::Control;
+use crate::state::{Control, VehicleState};
 use crate::vehicle::{SecondCommand, Vehicle, WHEELS};
 
 /// State of the actuators between steps.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct DrivelineState {
-    /// Position of the steering actuator, in the unit of the second command.
+    /// Position of the steering actuator, in the unit of the second command; of a skid-steer vehicle the turning of the rims, rad/s.
     pub steering: f64,
     /// Leaky integral of the speed error, m.
     pub speed_error_integral_m: f64,
+    /// Mean rim speed of a skid-steer vehicle, m/s.
+    pub rim_speed_m_s: f64,
+    /// What the rims of a skid-steer vehicle are asked for between the two lags: (mean speed m/s, turning rad/s).
+    pub rim_demand: [f64; 2],
 }
 
 impl DrivelineState {
     /// Actuators that have settled on a command.
     pub fn settled(control: &Control<f64>) -> Self {
-        Self { steering: control.second, speed_error_integral_m: 0.0 }
+        Self {
+            steering: control.second,
+            speed_error_integral_m: 0.0,
+            rim_speed_m_s: control.speed_m_s,
+            rim_demand: [control.speed_m_s, control.second],
+        }
+    }
+
+    /// Actuators where the drive begins: a skid-steer vehicle's rims turn as its measured motion tells, a car's have settled on the command.
+    pub fn starting(vehicle: &Vehicle, state: &VehicleState<f64>, control: &Control<f64>) -> Self {
+        if vehicle.second != SecondCommand::YawRateRadS {
+            return Self::settled(control);
+        }
+        let servo = &vehicle.driveline.rims;
+        let turning = (state.angular_velocity_rad_s[2] / servo.turn_efficiency).clamp(-servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
+        let speed = state.velocity_m_s[0];
+        Self { steering: turning, speed_error_integral_m: 0.0, rim_speed_m_s: speed, rim_demand: [speed, turning] }
+    }
+
+    /// The rims of a skid-steer vehicle after `dt_s` under a command.
+    fn advance_rims(&self, vehicle: &Vehicle, control: &Control<f64>, dt_s: f64) -> Self {
+        let servo = &vehicle.driveline.rims;
+        let kept = |lag_s: f64| if lag_s > 0.0 { (-dt_s / lag_s).exp() } else { 0.0 };
+        let (speed, turning) = (kept(servo.speed_lag_s), kept(servo.yaw_lag_s));
+        let target = servo.target(control.speed_m_s, control.second, vehicle.track_m);
+        let demand = [target[0] + speed * (self.rim_demand[0] - target[0]), target[1] + turning * (self.rim_demand[1] - target[1])];
+        Self {
+            steering: demand[1] + turning * (self.steering - demand[1]),
+            speed_error_integral_m: 0.0,
+            rim_speed_m_s: demand[0] + speed * (self.rim_speed_m_s - demand[0]),
+            rim_demand: demand,
+        }
     }
 
     /// Advances the actuators by `dt_s` under a command, given the measured or predicted forward speed.
@@ -29,13 +65,16 @@ impl DrivelineState {
     /// Exact first-order lag for a held command, limited in rate; the integral of the speed error leaks with the card's time constant.
     pub fn advance(&self, vehicle: &Vehicle, control: &Control<f64>, forward_m_s: f64, dt_s: f64) -> Self {
         let line = &vehicle.driveline;
+        if vehicle.second == SecondCommand::YawRateRadS {
+            return self.advance_rims(vehicle, control, dt_s);
+        }
         let travel = line.steering_rate_limit_per_s * dt_s;
         let target = control.second - self.steering;
         let lagged = if line.steering_lag_s > 0.0 { target * (1.0 - (-dt_s / line.steering_lag_s).exp()) } else { target };
         let leak = (-dt_s / line.speed_integral_leak_s).exp();
         let limit = line.speed_integral_limit_m;
         let integral = self.speed_error_integral_m * leak + (control.speed_m_s - forward_m_s) * dt_s;
-        Self { steering: self.steering + lagged.clamp(-travel, travel), speed_error_integral_m: integral.clamp(-limit, limit) }
+        Self { steering: self.steering + lagged.clamp(-travel, travel), speed_error_integral_m: integral.clamp(-limit, limit), ..*self }
     }
 }
 
@@ -97,7 +136,8 @@ pub fn command_wheels<T: Real>(
     let mut base = [line.speed_integral_gain_per_s * before.speed_error_integral_m; WHEELS];
     if skid {
         let half = 0.5 * vehicle.track_m * steering;
-        let (left, right) = (control.speed_m_s - half, control.speed_m_s + half);
+        let speed = 0.5 * (before.rim_speed_m_s + after.rim_speed_m_s);
+        let (left, right) = (speed - half, speed + half);
         base = [left, right, left, right];
     }
     WheelCommand {

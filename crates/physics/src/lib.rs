@@ -17,4 +17,4 @@ pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};
 pub use state::{Control, DT_S, STATE_DIM, VehicleState, wrap_angle};
-pub use vehicle::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};
+pub use vehicle::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};

@@ -45,6 +45,55 @@ pub struct Driveline {
     pub speed_integral_limit_m: f64,
     /// Largest rim over-speed the drive line can hold, m/s.
     pub overspeed_limit_m_s: f64,
+    /// Servo of the rims; of a skid-steer vehicle only.
+    pub rims: RimServo,
+}
+
+/// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then two equal lags in series, for the mean rim speed and for
+/// the turning of the rims (their difference over the track) apart.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct RimServo {
+    /// Mean rim speed per commanded speed, -.
+    pub speed_gain: f64,
+    /// Turning of the rims per commanded yaw rate, -.
+    pub yaw_gain: f64,
+    /// Largest turning of the rims, rad/s.
+    pub yaw_limit_rad_s: f64,
+    /// Largest speed of a rim, m/s; beyond it both sides shrink by the same share.
+    pub rim_limit_m_s: f64,
+    /// Time constant of each lag of the mean rim speed, s.
+    pub speed_lag_s: f64,
+    /// Time constant of each lag of the turning, s.
+    pub yaw_lag_s: f64,
+    /// Yaw rate of the vehicle per turning of the rims, -. Tells how the rims turn at the start of a rollout, when only the vehicle was measured.
+    pub turn_efficiency: f64,
+}
+
+impl Default for RimServo {
+    /// A base that does what it is told, within 0.1 s in turning, on ground where nothing slides.
+    fn default() -> Self {
+        const NONE: f64 = 1e3;
+        Self {
+            speed_gain: 1.0,
+            yaw_gain: 1.0,
+            yaw_limit_rad_s: NONE,
+            rim_limit_m_s: NONE,
+            speed_lag_s: 0.0,
+            yaw_lag_s: 0.05,
+            turn_efficiency: 1.0,
+        }
+    }
+}
+
+impl RimServo {
+    /// Where the rims settle under a commanded twist: (mean rim speed m/s, turning rad/s).
+    pub fn target(&self, speed_m_s: f64, yaw_rate_rad_s: f64, track_m: f64) -> [f64; 2] {
+        let speed = self.speed_gain * speed_m_s;
+        let turning = (self.yaw_gain * yaw_rate_rad_s).clamp(-self.yaw_limit_rad_s, self.yaw_limit_rad_s);
+        let fastest = speed.abs() + 0.5 * track_m * turning.abs();
+        let share = if fastest > self.rim_limit_m_s { self.rim_limit_m_s / fastest } else { 1.0 };
+        [share * speed, share * turning]
+    }
 }
 
 /// A vehicle as the physics sees it. SI; Body FLU with origin at the reference point (the static centre of mass).

@@ -13,7 +13,7 @@
 
 use std::path::Path;
 
-use nesam_physics::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};
+use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
 use serde_json::Value;
 
 use crate::error::TrajectoryError;
@@ -269,5 +269,6 @@ fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, Traje
         speed_integral_leak_s: sheet.positive(&["driveline.speed_integral_leak_s"])?.unwrap_or(2.0),
         speed_integral_limit_m: or(&["driveline.speed_integral_limit_m"], 2.0)?,
         overspeed_limit_m_s: sheet.positive(&["driveline.overspeed_limit_m_s"])?.unwrap_or(if skid { SKID_RIM_LIMIT_M_S } else { 0.8 }),
+        rims: RimServo::default(),
     })
 }

@@ -4,7 +4,7 @@
 //! vehicle as JSON with units in the names.
 #![forbid(unsafe_code)]
 
-use nesam_physics::{Driveline, SecondCommand, SteeringTable, Vehicle, WHEELS};
+use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
 use serde::{Deserialize, Serialize};
 
 /// Format tag of the card.
@@ -65,6 +65,49 @@ struct Line {
     speed_integral_leak_s: f64,
     speed_integral_limit_m: f64,
     overspeed_limit_m_s: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    rims: Option<Rims>,
+}
+
+/// Servo of the rims of a skid-steer vehicle.
+#[derive(Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Rims {
+    speed_gain: f64,
+    yaw_gain: f64,
+    yaw_limit_rad_s: f64,
+    rim_limit_m_s: f64,
+    speed_lag_s: f64,
+    yaw_lag_s: f64,
+    turn_efficiency: f64,
+}
+
+impl From<RimServo> for Rims {
+    fn from(r: RimServo) -> Self {
+        Self {
+            speed_gain: r.speed_gain,
+            yaw_gain: r.yaw_gain,
+            yaw_limit_rad_s: r.yaw_limit_rad_s,
+            rim_limit_m_s: r.rim_limit_m_s,
+            speed_lag_s: r.speed_lag_s,
+            yaw_lag_s: r.yaw_lag_s,
+            turn_efficiency: r.turn_efficiency,
+        }
+    }
+}
+
+impl From<Rims> for RimServo {
+    fn from(r: Rims) -> Self {
+        Self {
+            speed_gain: r.speed_gain,
+            yaw_gain: r.yaw_gain,
+            yaw_limit_rad_s: r.yaw_limit_rad_s,
+            rim_limit_m_s: r.rim_limit_m_s,
+            speed_lag_s: r.speed_lag_s,
+            yaw_lag_s: r.yaw_lag_s,
+            turn_efficiency: r.turn_efficiency,
+        }
+    }
 }
 
 /// The vehicle as a card.
@@ -99,6 +142,7 @@ pub fn to_json(vehicle: &Vehicle) -> String {
             speed_integral_leak_s: v.driveline.speed_integral_leak_s,
             speed_integral_limit_m: v.driveline.speed_integral_limit_m,
             overspeed_limit_m_s: v.driveline.overspeed_limit_m_s,
+            rims: (v.second == SecondCommand::YawRateRadS).then(|| v.driveline.rims.into()),
         },
         gravity_m_s2: v.gravity_m_s2,
     };
@@ -166,6 +210,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             speed_integral_leak_s: c.driveline.speed_integral_leak_s,
             speed_integral_limit_m: c.driveline.speed_integral_limit_m,
             overspeed_limit_m_s: c.driveline.overspeed_limit_m_s,
+            rims: c.driveline.rims.map(Into::into).unwrap_or_default(),
         },
         gravity_m_s2: c.gravity_m_s2,
         effects: Default::default(),

@@ -48,6 +48,7 @@ pub fn truck() -> Vehicle {
             speed_integral_leak_s: 5.0,
             speed_integral_limit_m: 5.0,
             overspeed_limit_m_s: 1.5,
+            rims: Default::default(),
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),

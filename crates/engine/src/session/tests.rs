@@ -29,6 +29,7 @@ fn cart() -> Vehicle {
             steering_rate_limit_per_s: 1.0,
             speed_gain: 0.5,
             overspeed_limit_m_s: 1.0,
+            rims: Default::default(),
             speed_integral_gain_per_s: 0.0,
             speed_integral_leak_s: 1.0,
             speed_integral_limit_m: 0.0,

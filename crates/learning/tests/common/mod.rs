@@ -36,6 +36,7 @@ pub fn truck() -> Vehicle {
             speed_integral_leak_s: 2.0,
             speed_integral_limit_m: 2.0,
             overspeed_limit_m_s: 0.8,
+            rims: Default::default(),
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),
@@ -75,7 +76,7 @@ pub fn drive_on_side(map: Option<&Arc<WorldMap>>, n: usize, side: f64) -> Drive 
     state.position_m = [-12.0, -6.0 * side, 0.6 + map.map_or(0.0, |m| m.nearest_height_m(-12.0, -6.0 * side))];
     state.velocity_m_s[0] = 2.0;
     let flat = VehicleState { position_m: [0.0, 0.0, 0.6], ..VehicleState::zero() };
-    let mut actuators = DrivelineState { steering: 0.0, speed_error_integral_m: 0.0 };
+    let mut actuators = DrivelineState::default();
     let (mut states, mut controls) = (Vec::new(), Vec::new());
     for k in 0..n {
         let t = 0.1 * k as f64;

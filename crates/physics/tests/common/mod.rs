@@ -30,6 +30,7 @@ pub fn truck() -> Vehicle {
             speed_integral_leak_s: 2.0,
             speed_integral_limit_m: 2.0,
             overspeed_limit_m_s: 0.8,
+            rims: Default::default(),
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),
@@ -93,7 +94,7 @@ impl Drive {
         let mut state = VehicleState::zero();
         state.position_m[2] = vehicle.wheel_radius_m - vehicle.wheel_centre_m[0][2];
         state.velocity_m_s[0] = speed_m_s;
-        let actuators = DrivelineState { steering: 0.0, speed_error_integral_m: 0.0 };
+        let actuators = DrivelineState::default();
         Self { model: StepModel::new(&vehicle, DT_S, 2), state, actuators, soil: loam(), slope: [0.0; 2] }
     }
 

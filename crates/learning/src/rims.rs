@@ -1,0 +1,100 @@
+//! Calibration of a skid-steer base's rim servo on measured wheel speeds: what it makes of a commanded twist, apart from what the ground makes of
+//! the rims.
+
+use nesam_physics::driveline::DrivelineState;
+use nesam_physics::{RimServo, Vehicle};
+
+use crate::drives::Drive;
+
+/// A number of the servo that is fitted, with its range.
+type Knob = (fn(&mut RimServo) -> &mut f64, [f64; 2]);
+
+const KNOBS: [Knob; 6] = [
+    (|s| &mut s.speed_gain, [0.1, 5.0]),
+    (|s| &mut s.yaw_gain, [0.1, 5.0]),
+    (|s| &mut s.yaw_limit_rad_s, [0.1, 20.0]),
+    (|s| &mut s.rim_limit_m_s, [0.1, 20.0]),
+    (|s| &mut s.speed_lag_s, [0.01, 2.0]),
+    (|s| &mut s.yaw_lag_s, [0.01, 2.0]),
+];
+
+/// Mean rim speed (m/s) and turning of the rims (rad/s) over a drive.
+fn rim_twists(vehicle: &Vehicle, drive: &Drive) -> Option<Vec<[f64; 2]>> {
+    let side = |w: &[f64; 4], i: usize| 0.5 * (w[i] + w[i + 2]) * vehicle.wheel_radius_m;
+    let twist = |w: &[f64; 4]| [0.5 * (side(w, 0) + side(w, 1)), (side(w, 1) - side(w, 0)) / vehicle.track_m];
+    Some(drive.wheel_speed_rad_s.as_ref()?.iter().map(twist).collect())
+}
+
+/// Mean square error of the rims, (m/s)², when the servo runs freely from each drive's first sample.
+fn servo_error(vehicle: &Vehicle, measured: &[(&Drive, Vec<[f64; 2]>)], dt_s: f64) -> f64 {
+    let (mut sum, mut count) = (0.0, 0usize);
+    for (drive, twists) in measured {
+        let [speed, turning] = twists[0];
+        let mut state = DrivelineState { steering: turning, rim_speed_m_s: speed, rim_demand: twists[0], ..DrivelineState::default() };
+        for (control, twist) in drive.controls.iter().zip(&twists[1..]) {
+            state = state.advance(vehicle, control, 0.0, dt_s);
+            let speed = state.rim_speed_m_s - twist[0];
+            let turning = 0.5 * vehicle.track_m * (state.steering - twist[1]);
+            sum += speed * speed + turning * turning;
+            count += 1;
+        }
+    }
+    sum / count.max(1) as f64
+}
+
+/// The servo that follows the measured wheel speeds best, by coordinate search; `None` where no drive has wheel speeds.
+pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimServo> {
+    let measured: Vec<(&Drive, Vec<[f64; 2]>)> =
+        drives.iter().filter_map(|d| Some((*d, rim_twists(vehicle, d)?))).filter(|(_, twists)| twists.len() > 1).collect();
+    if measured.is_empty() {
+        return None;
+    }
+    let largest = |i: usize| measured.iter().flat_map(|(_, t)| t).map(|t| t[i].abs()).fold(0.1, f64::max);
+    let mut best = vehicle.clone();
+    best.driveline.rims = RimServo {
+        yaw_limit_rad_s: largest(1),
+        rim_limit_m_s: largest(0) + 0.5 * vehicle.track_m * largest(1),
+        speed_lag_s: 0.2,
+        yaw_lag_s: 0.2,
+        ..RimServo::default()
+    };
+    let mut error = servo_error(&best, &measured, dt_s);
+    for round in 0..6 {
+        for (knob, [low, high]) in KNOBS {
+            let mut reach = 0.5 / f64::from(1 << round);
+            while reach > 0.002 {
+                let current = *knob(&mut best.driveline.rims);
+                let mut improved = false;
+                for trial in [current / (1.0 + reach), current * (1.0 + reach)] {
+                    let mut candidate = best.clone();
+                    *knob(&mut candidate.driveline.rims) = trial.clamp(low, high);
+                    let found = servo_error(&candidate, &measured, dt_s);
+                    if found < error {
+                        (best, error, improved) = (candidate, found, true);
+                    }
+                }
+                if !improved {
+                    reach *= 0.5;
+                }
+            }
+        }
+    }
+    let mut servo = best.driveline.rims;
+    if let Some(share) = turn_efficiency(&measured) {
+        servo.turn_efficiency = share;
+    }
+    Some(servo)
+}
+
+/// Yaw rate of the vehicle per turning of its rims, by least squares; `None` if the rims never turn or the vehicle does not follow them.
+fn turn_efficiency(measured: &[(&Drive, Vec<[f64; 2]>)]) -> Option<f64> {
+    let (mut product, mut square) = (0.0, 0.0);
+    for (drive, twists) in measured {
+        for (state, twist) in drive.states.iter().zip(twists) {
+            product += twist[1] * state.angular_velocity_rad_s[2];
+            square += twist[1] * twist[1];
+        }
+    }
+    let share = product / square;
+    (share > 0.05 && share < 2.0).then_some(share)
+}

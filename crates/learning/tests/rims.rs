@@ -1,0 +1,51 @@
+//! The rim servo of a skid-steer base, found from its wheel speeds.
+
+mod common;
+
+use common::truck;
+use nesam_learning::Drive;
+use nesam_learning::rims::fit_rims;
+use nesam_physics::driveline::DrivelineState;
+use nesam_physics::{Control, RimServo, SecondCommand, Vehicle, VehicleState};
+
+/// Goal: the servo is found again. Method: 40 drives of two seconds under drawn twists, wheel speeds from a servo with known numbers whose limits
+/// are reached in some drives and not in others.
+#[test]
+fn analytic_a_known_servo_is_found() {
+    let truth = RimServo {
+        speed_gain: 1.8,
+        yaw_gain: 0.8,
+        yaw_limit_rad_s: 1.8,
+        rim_limit_m_s: 1.0,
+        speed_lag_s: 0.3,
+        yaw_lag_s: 0.4,
+        turn_efficiency: 0.4,
+    };
+    let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, ..truck() };
+    vehicle.driveline.rims = truth;
+    let drives: Vec<Drive> = (0..40).map(|i| made(&vehicle, f64::from(i))).collect();
+    vehicle.driveline.rims = RimServo::default();
+    let found = fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1).unwrap();
+    let close = |a: f64, b: f64| (a / b - 1.0).abs() < 0.05;
+    assert!(close(found.speed_gain, truth.speed_gain) && close(found.yaw_gain, truth.yaw_gain), "{found:?}");
+    assert!(close(found.yaw_limit_rad_s, truth.yaw_limit_rad_s) && close(found.rim_limit_m_s, truth.rim_limit_m_s), "{found:?}");
+    assert!(close(found.speed_lag_s, truth.speed_lag_s) && close(found.yaw_lag_s, truth.yaw_lag_s), "{found:?}");
+    assert!(close(found.turn_efficiency, truth.turn_efficiency), "{found:?}");
+}
+
+fn made(vehicle: &Vehicle, seed: f64) -> Drive {
+    let control = Control { speed_m_s: (1.7 * seed).sin() * 0.7, second: (2.9 * seed + 1.0).sin() * 4.0 };
+    let mut state = DrivelineState::default();
+    let (mut states, mut wheels) = (Vec::new(), Vec::new());
+    for _ in 0..20 {
+        let half = 0.5 * vehicle.track_m * state.steering;
+        let [left, right] = [state.rim_speed_m_s - half, state.rim_speed_m_s + half].map(|v| v / vehicle.wheel_radius_m);
+        wheels.push([left, right, left, right]);
+        let yaw = vehicle.driveline.rims.turn_efficiency * state.steering;
+        states.push(VehicleState { angular_velocity_rad_s: [0.0, 0.0, yaw], ..VehicleState::from_array([0.0; 12]) });
+        state = state.advance(vehicle, &control, 0.0, 0.1);
+    }
+    let mut drive = Drive::new("made".into(), None, states, vec![control; 20]);
+    drive.wheel_speed_rad_s = Some(wheels);
+    drive
+}
