@@ -3,20 +3,36 @@
 use nesam_physics::{SOIL_DIM, SoilCoordinates};
 
 use crate::AdaptationError;
-use crate::noise::{ChannelNoise, VelocityNoise};
+use crate::noise::{BufferNoise, ChannelNoise, VelocityNoise};
+use crate::prediction::VELOCITY_DIM;
 
 /// Longest buffer, so that the innovation covariance stays small.
 const BUFFER_MAX: usize = 64;
 /// More passes than this do not help: the iteration has converged or never will.
 const LINEARISATIONS_MAX: usize = 10;
 
+/// What a buffer is compared with.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub enum Innovation {
+    /// One step from each measured state, as in the paper.
+    OneStep,
+    /// One rollout from the first measured state of the buffer.
+    #[default]
+    Rollout,
+}
+
 /// Settings of a [`crate::SoilFilter`].
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct FilterConfig {
     /// Transitions B of one update. Longer buffers average noise and cost latency: the soil is B steps old at worst. 1 to 64.
     pub buffer: usize,
+    /// Steps whose differences are averaged into one row per channel; divides the buffer. 1 = a row per step, as in the paper. Soil acts slowly,
+    /// vibration and sensor noise do not: means keep what the soil says, and their errors are closer to Gaussian.
+    pub block: usize,
     /// Coordinates of the estimate and of the two standard deviations below.
     pub coordinates: SoilCoordinates,
+    /// What a buffer is compared with. A rollout is closer to what predictions are for, see [`crate::predict_velocities`].
+    pub innovation: Innovation,
     /// Standard deviations of P₀: how wrong the soil prior may be. Larger: faster first reaction, and more of the error of the model
     /// taken for soil.
     pub prior_sd: [f64; SOIL_DIM],
@@ -24,7 +40,18 @@ pub struct FilterConfig {
     /// faster, and never settles.
     pub process_sd: [f64; SOIL_DIM],
     /// R_B. Too small: the filter becomes certain of a wrong soil (NIS over its degrees of freedom well above 1); too large: it learns slowly.
-    pub noise: VelocityNoise,
+    pub noise: BufferNoise,
+    /// Beyond Algorithm 1: consecutive buffers that say together no more than one, at least 1. The model errs alike as long as the vehicle stays on one
+    /// patch of ground, which R_B of single buffers cannot say ([`crate::calibrate`] estimates how many); the update counts R_B this many times (a tempered likelihood). The NIS does not.
+    pub shared_buffers: f64,
+    /// Beyond Algorithm 1: buffers over which the scale of R_B on the present drive is matched to the NIS, at least 1; 0 = R_B as it is. The model errs more on
+    /// ground that it was not trained for; a short memory follows faster and lets single buffers swing the gain.
+    pub scale_memory: f64,
+    /// Beyond Algorithm 1: buffers over which evidence that the correction predicts better than the prior alone is remembered, at least 1; 0 = the correction is
+    /// always used in full. The estimate that goes out is the correction times the probability that it helps.
+    pub trust_memory: f64,
+    /// Log odds, before any evidence, that the correction helps. Lower: less harm on ground that is what it looks like, and a slower start elsewhere.
+    pub trust_log_odds: f64,
     /// A buffer whose NIS would be exceeded with less than this probability is rejected. 0 accepts everything.
     pub gate_tail_probability: f64,
     /// Beyond Algorithm 1: times that one buffer is linearised at most, 1 to 10 (Gauss-Newton on the same posterior; 1 = once, at Δθ⁻). Soil acts
@@ -42,10 +69,16 @@ impl Default for FilterConfig {
         let prior_sd = [0.7, 0.7, 0.15, 0.5, 0.08, 0.4];
         Self {
             buffer: 10,
+            block: 5,
             coordinates: SoilCoordinates::Logarithmic,
+            innovation: Innovation::Rollout,
             prior_sd,
             process_sd: prior_sd.map(|sd| 0.1 * sd),
-            noise: default_noise(),
+            noise: BufferNoise::Channels(default_noise()),
+            shared_buffers: 4.0,
+            scale_memory: 5.0,
+            trust_memory: 10.0,
+            trust_log_odds: -2.0,
             gate_tail_probability: 1e-9,
             linearisations: 4,
             bounded: true,
@@ -59,6 +92,11 @@ impl FilterConfig {
         let prior_sd = [1.0e6, 3.0e3, 0.15, 1.5e3, 0.08, 0.008];
         Self {
             coordinates: SoilCoordinates::Physical,
+            innovation: Innovation::OneStep,
+            block: 1,
+            shared_buffers: 1.0,
+            scale_memory: 0.0,
+            trust_memory: 0.0,
             prior_sd,
             process_sd: prior_sd.map(|sd| 0.1 * sd),
             linearisations: 1,
@@ -88,7 +126,26 @@ impl FilterConfig {
         if self.linearisations == 0 || self.linearisations > LINEARISATIONS_MAX {
             return fail("linearisations", format!("is {}, allowed are 1 to {LINEARISATIONS_MAX}", self.linearisations));
         }
-        self.noise.check()
+        if self.block == 0 || !self.buffer.is_multiple_of(self.block) {
+            return fail("block", format!("is {}; it must divide the buffer of {} transitions", self.block, self.buffer));
+        }
+        if !(self.shared_buffers.is_finite() && self.shared_buffers >= 1.0) {
+            return fail("shared_buffers", format!("is {}, it must be at least 1", self.shared_buffers));
+        }
+        for (setting, memory) in [("scale_memory", self.scale_memory), ("trust_memory", self.trust_memory)] {
+            if !(memory == 0.0 || memory.is_finite() && memory >= 1.0) {
+                return fail(setting, format!("is {memory}, it must be 0 (off) or at least 1 buffer"));
+            }
+        }
+        if !self.trust_log_odds.is_finite() {
+            return fail("trust_log_odds", format!("is {}, it must be finite", self.trust_log_odds));
+        }
+        self.noise.check(self.rows())
+    }
+
+    /// Rows of an innovation, a multiple of the six channels.
+    pub fn rows(&self) -> usize {
+        self.buffer / self.block.max(1) * VELOCITY_DIM
     }
 }
 

@@ -27,6 +27,20 @@ pub enum AdaptationError {
         /// What is wrong with it.
         reason: String,
     },
+    /// Too few buffers to estimate R_B from.
+    #[error("{found} buffers are too few to estimate the covariance of their innovation, at least {needed} are needed; give more drives")]
+    TooFewBuffers {
+        /// Buffers given.
+        found: usize,
+        /// Buffers needed.
+        needed: usize,
+    },
+    /// A file of settings cannot be read.
+    #[error("filter settings: {reason}")]
+    Settings {
+        /// What was wrong.
+        reason: String,
+    },
     /// Too few differences to estimate the noise from.
     #[error("{found} consecutive transitions are too few to estimate the noise of {VELOCITY_DIM} channels, at least {needed} are needed")]
     TooFewTransitions {

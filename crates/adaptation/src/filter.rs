@@ -4,9 +4,11 @@ use nalgebra::{DMatrix, DVector, SVector};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCorrection};
 
-use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_velocity};
+use crate::calibration::UncorrectedBuffer;
+use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_velocities, predict_velocity};
+use crate::trust::{NoiseScale, Trust};
 use crate::update::{SoilMatrix, kalman_update};
-use crate::{AdaptationError, FilterConfig, chi_square_tail};
+use crate::{AdaptationError, FilterConfig, Innovation, chi_square_tail};
 
 /// Share of the prior variance below which a parameter counts as learned.
 const LEARNED_SHARE: f64 = 0.5;
@@ -40,14 +42,18 @@ impl SoilPosterior {
 pub struct SoilUpdate {
     /// The estimate from now on; the one from before when the buffer was rejected.
     pub posterior: SoilPosterior,
-    /// Y - Ŷ, row 6 k + c for channel c of transition k.
+    /// Y - Ŷ, row 6 k + c for channel c of transition or block k.
     pub innovation: Vec<f64>,
     /// Normalised innovation squared.
     pub nis: f64,
-    /// Degrees of freedom of the NIS, 6 B.
+    /// Degrees of freedom of the NIS, 6 B over the block.
     pub dof: usize,
     /// The gate refused the buffer.
     pub rejected: bool,
+    /// Weight of the correction in the posterior, 0 to 1.
+    pub trust: f64,
+    /// Scale of R_B that the NIS was computed with.
+    pub noise_scale: f64,
 }
 
 /// The soil filter of one drive.
@@ -57,6 +63,8 @@ pub struct SoilFilter {
     noise: DMatrix<f64>,
     delta: SoilVector,
     covariance: SoilMatrix,
+    scale: NoiseScale,
+    trust: Trust,
     buffer: Vec<BufferedTransition>,
 }
 
@@ -68,9 +76,11 @@ impl SoilFilter {
     pub fn new(config: FilterConfig) -> Result<Self, AdaptationError> {
         config.check()?;
         Ok(Self {
-            noise: config.noise.covariance(config.buffer),
+            noise: config.noise.covariance(config.buffer, config.block),
             delta: SVector::zeros(),
             covariance: diagonal(&config.prior_sd),
+            scale: NoiseScale::new(config.scale_memory),
+            trust: Trust::new(config.trust_memory, config.trust_log_odds),
             buffer: Vec::with_capacity(config.buffer),
             config,
         })
@@ -81,14 +91,21 @@ impl SoilFilter {
         &self.config
     }
 
-    /// The present estimate.
+    /// The present estimate as it should be used: the average over "the ground is what it looks like" and "it is what was learned", each with its
+    /// probability, and the covariance of that mixture. Without trust ([`FilterConfig::trust_memory`] = 0) it is Δθ⁺ and P⁺.
     pub fn posterior(&self) -> SoilPosterior {
-        let p = &self.covariance;
+        let weight = self.trust.weight();
+        let p = self.covariance + self.delta * self.delta.transpose() * (weight * (1.0 - weight));
         SoilPosterior {
-            correction: self.correction(),
+            correction: self.corrected_by(&(self.delta * weight)),
             covariance: core::array::from_fn(|r| core::array::from_fn(|c| p[(r, c)])),
             learned: core::array::from_fn(|i| p[(i, i)] < LEARNED_SHARE * self.config.prior_sd[i].powi(2)),
         }
+    }
+
+    /// Δθ⁺ of the filter itself, whether it is trusted or not: where the next buffer is to be linearised.
+    pub fn estimate(&self) -> SoilCorrection {
+        self.correction()
     }
 
     /// Transitions that wait for the next update.
@@ -136,29 +153,64 @@ impl SoilFilter {
     /// them, solve for the same posterior from a better point: e_i = Y - Ŷ(Δ_i) - H_i (Δθ⁻ - Δ_i).
     fn update(&mut self, model: &StepModel, buffer: &[BufferedTransition]) -> Result<SoilUpdate, AdaptationError> {
         let (prior, before) = (self.inflated(), self.delta);
-        let first = linearise(model, buffer, &self.correction())?;
-        let mut step = kalman_update(&prior, &first.jacobian, &self.noise, &first.innovation)?;
+        let first = self.linearise(model, buffer, &self.correction())?;
+        let noise_scale = self.scale.value();
+        let noise = &self.noise * noise_scale;
+        let mut step = kalman_update(&prior, &first.jacobian, &noise, &first.innovation)?;
         let (nis, dof) = (step.nis, first.innovation.len());
+        self.scale.observe(nis / dof as f64);
+        let shared = &noise * self.config.shared_buffers;
         let rejected = chi_square_tail(dof, nis) < self.config.gate_tail_probability;
         if !rejected {
+            self.judge(model, buffer, noise_scale)?;
+            if self.config.shared_buffers > 1.0 {
+                step = kalman_update(&prior, &first.jacobian, &shared, &first.innovation)?;
+            }
             let mut delta = self.held(before + step.change, buffer);
             let mut last_move = step.change;
             for _ in 1..self.config.linearisations {
                 if (0..SOIL_DIM).all(|i| last_move[i].abs() < CONVERGED_SHARE * self.config.prior_sd[i]) {
                     break;
                 }
-                let again = linearise(model, buffer, &self.corrected_by(&delta))?;
+                let again = self.linearise(model, buffer, &self.corrected_by(&delta))?;
                 let innovation = &again.innovation - &again.jacobian * (before - delta);
-                step = kalman_update(&prior, &again.jacobian, &self.noise, &innovation)?;
+                step = kalman_update(&prior, &again.jacobian, &shared, &innovation)?;
                 let next = self.held(before + step.change, buffer);
                 last_move = next - delta;
                 delta = next;
             }
             self.delta = delta;
             self.covariance = step.covariance;
+            self.trust.remember(self.delta);
         }
         let innovation = first.innovation.iter().copied().collect();
-        Ok(SoilUpdate { posterior: self.posterior(), innovation, nis, dof, rejected })
+        let trust = self.trust.weight();
+        Ok(SoilUpdate { posterior: self.posterior(), innovation, nis, dof, rejected, trust, noise_scale })
+    }
+
+    /// Lets a buffer say whether an earlier correction predicts it better than the prior alone. Both start from the same transitions: what the network says
+    /// along the rollout stays as it is.
+    fn judge(&mut self, model: &StepModel, buffer: &[BufferedTransition], noise_scale: f64) -> Result<(), AdaptationError> {
+        let Some(candidate) = self.trust.candidate() else { return Ok(()) };
+        let rows = self.noise.nrows();
+        let factor = self.noise.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
+        let squared = |correction: &SoilCorrection| -> Result<f64, AdaptationError> {
+            let innovation = self.linearise(model, buffer, correction)?.innovation;
+            Ok(innovation.dot(&factor.solve(&innovation)))
+        };
+        let (without, with) = (squared(&SoilCorrection::NONE)?, squared(&self.corrected_by(&candidate))?);
+        self.trust.vote(0.5 * (without - with) / (noise_scale * self.config.shared_buffers));
+        Ok(())
+    }
+
+    /// Y - Ŷ and H of a buffer at one correction.
+    fn linearise(
+        &self,
+        model: &StepModel,
+        buffer: &[BufferedTransition],
+        correction: &SoilCorrection,
+    ) -> Result<Linearisation, AdaptationError> {
+        linearise(self.config.innovation, self.config.block, model, buffer, correction)
     }
 
     /// P⁻ = P⁺ + Q_B; with `bounded`, no variance above that of P₀. Rows and columns are scaled together, so correlations stay.
@@ -197,23 +249,42 @@ struct Linearisation {
     jacobian: DMatrix<f64>,
 }
 
-fn linearise(model: &StepModel, buffer: &[BufferedTransition], correction: &SoilCorrection) -> Result<Linearisation, AdaptationError> {
-    let rows = buffer.len() * VELOCITY_DIM;
+fn linearise(
+    kind: Innovation,
+    block: usize,
+    model: &StepModel,
+    buffer: &[BufferedTransition],
+    correction: &SoilCorrection,
+) -> Result<Linearisation, AdaptationError> {
+    let rows = buffer.len() / block * VELOCITY_DIM;
     let (mut innovation, mut jacobian) = (DVector::zeros(rows), DMatrix::zeros(rows, SOIL_DIM));
-    for (index, transition) in buffer.iter().enumerate() {
-        let predicted = predict_velocity(model, transition, correction);
+    let predictions = match kind {
+        Innovation::OneStep => buffer.iter().map(|transition| predict_velocity(model, transition, correction)).collect(),
+        Innovation::Rollout => predict_velocities(model, buffer, correction),
+    };
+    let share = 1.0 / block as f64;
+    for (index, (transition, predicted)) in buffer.iter().zip(predictions).enumerate() {
         if !predicted.velocity.iter().chain(predicted.jacobian.as_flattened()).all(|v| v.is_finite()) {
             return Err(AdaptationError::NotFinite { what: "prediction", index });
         }
         for c in 0..VELOCITY_DIM {
-            let row = index * VELOCITY_DIM + c;
-            innovation[row] = transition.measured_next[c] - predicted.velocity[c];
+            let row = index / block * VELOCITY_DIM + c;
+            innovation[row] += share * (transition.measured_next[c] - predicted.velocity[c]);
             for i in 0..SOIL_DIM {
-                jacobian[(row, i)] = predicted.jacobian[c][i];
+                jacobian[(row, i)] += share * predicted.jacobian[c][i];
             }
         }
     }
     Ok(Linearisation { innovation, jacobian })
+}
+
+/// A buffer at the soil prior as it is: what the noise of a filter is estimated from.
+///
+/// # Errors
+/// `NotFinite` when a prediction is not a number.
+pub fn uncorrected(config: &FilterConfig, model: &StepModel, buffer: &[BufferedTransition]) -> Result<UncorrectedBuffer, AdaptationError> {
+    let at_prior = linearise(config.innovation, config.block, model, buffer, &SoilCorrection::NONE)?;
+    Ok(UncorrectedBuffer { innovation: at_prior.innovation, jacobian: at_prior.jacobian })
 }
 
 fn diagonal(sd: &[f64; SOIL_DIM]) -> SoilMatrix {

@@ -26,6 +26,53 @@ pub struct ChannelNoise {
     pub correlation: f64,
 }
 
+/// R_B: how a full buffer errs when the soil is right.
+#[derive(Clone, Debug, PartialEq)]
+pub enum BufferNoise {
+    /// The same six channels at every step, independent of each other.
+    Channels(VelocityNoise),
+    /// The second moment of the innovations of measured buffers, one row per row of the innovation: growth along a rollout, channels that err together
+    /// and a bias of the model are all in it, and so is the spread of soils that look alike.
+    Sampled(DMatrix<f64>),
+}
+
+impl From<VelocityNoise> for BufferNoise {
+    fn from(noise: VelocityNoise) -> Self {
+        Self::Channels(noise)
+    }
+}
+
+impl BufferNoise {
+    /// R_B of a buffer of `steps` transitions, averaged over blocks, row 6 k + c for channel c of block k.
+    pub(crate) fn covariance(&self, steps: usize, block: usize) -> DMatrix<f64> {
+        let noise = match self {
+            Self::Sampled(moment) => return moment.clone(),
+            Self::Channels(noise) => noise.covariance(steps),
+        };
+        let mean = DMatrix::from_fn(steps / block * VELOCITY_DIM, steps * VELOCITY_DIM, |row, column| {
+            let same = row % VELOCITY_DIM == column % VELOCITY_DIM && column / VELOCITY_DIM / block == row / VELOCITY_DIM;
+            if same { 1.0 / block as f64 } else { 0.0 }
+        });
+        &mean * noise * mean.transpose()
+    }
+
+    /// Refuses what cannot make a covariance of `rows` rows.
+    pub(crate) fn check(&self, rows: usize) -> Result<(), AdaptationError> {
+        let fail = |reason| Err(AdaptationError::Config { setting: "noise", reason });
+        match self {
+            Self::Channels(noise) => noise.check(),
+            Self::Sampled(moment) if moment.shape() != (rows, rows) => fail(format!(
+                "was sampled for {} rows, buffer and block make {rows}; estimate it again for these settings or give the noise of channels",
+                moment.nrows()
+            )),
+            Self::Sampled(moment) if !moment.iter().all(|v| v.is_finite()) || moment.clone().cholesky().is_none() => {
+                fail("is not a positive definite covariance".into())
+            }
+            Self::Sampled(_) => Ok(()),
+        }
+    }
+}
+
 /// Noise of the six channels [v, ω]; channels are independent of each other.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VelocityNoise {

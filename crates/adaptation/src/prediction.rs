@@ -3,7 +3,7 @@
 use nesam_physics::driveline::WheelCommand;
 use nesam_physics::scalar::Dual;
 use nesam_physics::step::{Ground, StepInput, StepModel};
-use nesam_physics::{Real, SOIL_DIM, STATE_DIM, Soil, SoilCorrection};
+use nesam_physics::{Real, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, VehicleState};
 
 /// Channels of y = [v, ω].
 pub const VELOCITY_DIM: usize = 6;
@@ -36,16 +36,45 @@ pub struct VelocityPrediction {
 
 /// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
 pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
+    let start = transition.input.state.to_array().map(SoilDual::constant);
+    prediction_of(&next_state(model, transition, &start, correction))
+}
+
+/// The same after every transition of a buffer, each starting where the prediction before it ended; only the first starts from a
+/// measurement. Ground, actuators and what the network says stay those of the measured path.
+///
+/// A wrong soil shows as what it does to a rollout, a speed or a turn that is too fast or too slow, and the noise of the measured states
+/// enters once instead of at every step, where it looks like slip.
+pub fn predict_velocities(model: &StepModel, buffer: &[BufferedTransition], correction: &SoilCorrection) -> Vec<VelocityPrediction> {
+    let Some(first) = buffer.first() else { return Vec::new() };
+    let mut state = first.input.state.to_array().map(SoilDual::constant);
+    buffer
+        .iter()
+        .map(|transition| {
+            state = next_state(model, transition, &state, correction);
+            prediction_of(&state)
+        })
+        .collect()
+}
+
+/// x̂_{k+1} from x_k; x, y and yaw are carried along without meaning, as the physics reads none of them.
+fn next_state(
+    model: &StepModel,
+    transition: &BufferedTransition,
+    state: &[SoilDual; STATE_DIM],
+    correction: &SoilCorrection,
+) -> [SoilDual; STATE_DIM] {
     let delta: [SoilDual; SOIL_DIM] = core::array::from_fn(|i| SoilDual::variable(correction.delta[i], i));
     let soil = correction.coordinates.correct(&transition.input.soil.to_array(), &delta);
-    let increment = model.step(&with_soil(&transition.input, Soil::from_array(soil))).increment.to_array();
-    let state = transition.input.state.to_array();
+    let input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
+    let increment = model.step(&input).increment.to_array();
+    core::array::from_fn(|i| state[i] + increment[i] + SoilDual::constant(transition.residual[i]))
+}
+
+fn prediction_of(state: &[SoilDual; STATE_DIM]) -> VelocityPrediction {
     VelocityPrediction {
-        velocity: core::array::from_fn(|c| {
-            let at = VELOCITY_AT + c;
-            state[at] + increment[at].re + transition.residual[at]
-        }),
-        jacobian: core::array::from_fn(|c| increment[VELOCITY_AT + c].eps),
+        velocity: core::array::from_fn(|c| state[VELOCITY_AT + c].re),
+        jacobian: core::array::from_fn(|c| state[VELOCITY_AT + c].eps),
     }
 }
 

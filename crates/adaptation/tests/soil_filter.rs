@@ -1,9 +1,10 @@
 //! Goal: the filter is Algorithm 1, finds the soil that it should find, is honest about how well, and is undisturbed by bad input.
 //! Method: twin drives by the same physics on another soil with seeded sensor noise; closed forms; finite differences.
 
+use nalgebra::{DMatrix, DVector};
 use nesam_adaptation::{
-    AdaptationError, BufferedTransition, FilterConfig, SoilFilter, SoilUpdate, VELOCITY_DIM, VelocityNoise, chi_square_tail,
-    predict_velocity,
+    AdaptationError, BufferNoise, BufferedTransition, FilterConfig, Innovation, SoilFilter, SoilUpdate, UncorrectedBuffer, VELOCITY_DIM,
+    VelocityNoise, calibrate, chi_square_tail, predict_velocity,
 };
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{Ground, StepInput, StepModel};
@@ -103,7 +104,10 @@ fn config(coordinates: SoilCoordinates) -> FilterConfig {
         SoilCoordinates::Physical => FilterConfig::literal(),
         SoilCoordinates::Logarithmic => FilterConfig::default(),
     };
-    FilterConfig { noise: VelocityNoise::white(NOISE[0], NOISE[1]), process_sd: [0.0; 6], gate_tail_probability: 0.0, ..base }
+    let noise = VelocityNoise::white(NOISE[0], NOISE[1]).into();
+    let one_step = Innovation::OneStep;
+    let plain = FilterConfig { scale_memory: 0.0, trust_memory: 0.0, shared_buffers: 1.0, ..base };
+    FilterConfig { noise, process_sd: [0.0; 6], gate_tail_probability: 0.0, innovation: one_step, block: 1, ..plain }
 }
 
 fn run(config: FilterConfig, model: &StepModel, transitions: &[BufferedTransition]) -> (SoilFilter, Vec<SoilUpdate>) {
@@ -286,7 +290,7 @@ fn property_estimate_and_variance_stay_where_the_soil_can_be() {
     prior[4] = SOIL_BOUNDS[4].1 - 0.02;
     let mut config = config(SoilCoordinates::Logarithmic);
     config.process_sd = [0.5; 6];
-    let (filter, updates) = run(config, &model, &twin(&model, SOFT, prior, 200, 2));
+    let (filter, updates) = run(config.clone(), &model, &twin(&model, SOFT, prior, 200, 2));
     for update in &updates {
         let delta = update.posterior.correction.delta;
         assert!(delta[4] <= 0.02 + 1e-12 && delta[4] >= SOIL_BOUNDS[4].0 - prior[4] - 1e-12, "{delta:?}");
@@ -340,6 +344,127 @@ fn property_unusable_settings_are_refused_by_name() {
     assert_eq!(refused(FilterConfig { prior_sd: [0.0; 6], ..base() }), "prior_sd");
     assert_eq!(refused(FilterConfig { process_sd: [f64::NAN; 6], ..base() }), "process_sd");
     assert_eq!(refused(FilterConfig { gate_tail_probability: 1.0, ..base() }), "gate_tail_probability");
+    assert_eq!(refused(FilterConfig { block: 3, ..base() }), "block");
+    assert_eq!(refused(FilterConfig { shared_buffers: 0.5, ..base() }), "shared_buffers");
+    assert_eq!(refused(FilterConfig { scale_memory: 0.5, ..base() }), "scale_memory");
+    assert_eq!(refused(FilterConfig { trust_memory: -1.0, ..base() }), "trust_memory");
+    assert_eq!(refused(FilterConfig { trust_log_odds: f64::NAN, ..base() }), "trust_log_odds");
     assert_eq!(refused(FilterConfig { linearisations: 0, ..base() }), "linearisations");
-    assert_eq!(refused(FilterConfig { noise: VelocityNoise::white(0.0, 0.1), ..base() }), "noise");
+    assert_eq!(refused(FilterConfig { noise: VelocityNoise::white(0.0, 0.1).into(), ..base() }), "noise");
+}
+
+#[test]
+fn property_rollouts_and_means_of_steps_find_the_soil_too() {
+    // The twin's states are exact, so a rollout from the first of a buffer errs by the noise of the measured velocities alone.
+    let model = model();
+    let coordinates = SoilCoordinates::Logarithmic;
+    for block in [1, 5] {
+        // Process noise and scale as they ship. Without them the relinearised filter stops beside the truth and is certain of it (NIS/dof 7): ten steps from a
+        // prior this far off are not linear. With rows of single steps it is still too certain (1.3), hence the wider band.
+        let FilterConfig { process_sd, scale_memory, .. } = FilterConfig::default();
+        let settings =
+            FilterConfig { innovation: Innovation::Rollout, block, process_sd, scale_memory, ..config(SoilCoordinates::Logarithmic) };
+        let (mut nis, mut buffers, mut error, mut at_start) = (0.0, 0, 0.0, 0.0);
+        for seed in 0..6 {
+            let transitions = twin(&model, SOFT, LOAM, 300, seed);
+            let (filter, updates) = run(settings.clone(), &model, &transitions);
+            // Several soils move the vehicle alike, so the estimate is judged by what it predicts; one step ahead, on the same drive.
+            let truth = coordinates.between(&LOAM, &SOFT);
+            let away = |delta: [f64; SOIL_DIM]| -> f64 {
+                let of = |t: &BufferedTransition, delta| predict_velocity(&model, t, &SoilCorrection { coordinates, delta }).velocity;
+                let squared = |t: &BufferedTransition| {
+                    let (a, b) = (of(t, delta), of(t, truth));
+                    (0..VELOCITY_DIM).map(|c| ((a[c] - b[c]) / NOISE[c / 3]).powi(2)).sum::<f64>()
+                };
+                (transitions.iter().map(squared).sum::<f64>() / transitions.len() as f64).sqrt()
+            };
+            error += away(filter.posterior().correction.delta) / 6.0;
+            at_start += away([0.0; SOIL_DIM]) / 6.0;
+            assert!(updates.iter().all(|u| u.dof == 60 / block && u.innovation.len() == u.dof));
+            nis += updates[5..].iter().map(|u| u.nis / u.dof as f64).sum::<f64>();
+            buffers += updates.len() - 5;
+        }
+        let nis = nis / f64::from(buffers as u32);
+        println!("block {block}: prediction error {at_start:.3} -> {error:.3} noise widths, NIS/dof {nis:.3}");
+        assert!(error < 0.3 * at_start, "block {block}: {error} of {at_start}");
+        assert!((0.8..if block == 1 { 1.5 } else { 1.25 }).contains(&nis), "block {block}: {nis}");
+    }
+}
+
+#[test]
+fn property_a_correction_is_used_where_it_helps_and_not_where_the_prior_is_right() {
+    let model = model();
+    let trusting = FilterConfig { innovation: Innovation::Rollout, block: 5, ..config(SoilCoordinates::Logarithmic) };
+    let doubting = FilterConfig { trust_memory: 10.0, trust_log_odds: -2.0, ..trusting };
+    for seed in 0..4 {
+        let last = |soil| run(doubting.clone(), &model, &twin(&model, soil, LOAM, 200, seed)).1.pop().unwrap();
+        let (soft, loam) = (last(SOFT), last(LOAM));
+        assert!(soft.trust > 0.95, "seed {seed}: {}", soft.trust);
+        assert!(loam.trust < 0.3, "seed {seed}: {}", loam.trust);
+    }
+}
+
+#[test]
+fn property_noise_that_is_larger_than_told_is_found_by_the_scale() {
+    // Told a fifth of the noise that there is: without the scale NIS over its degrees of freedom is near 25.
+    let model = model();
+    let told = VelocityNoise::white(0.2 * NOISE[0], 0.2 * NOISE[1]).into();
+    let following = FilterConfig { noise: told, scale_memory: 5.0, ..config(SoilCoordinates::Logarithmic) };
+    let (_, updates) = run(following, &model, &twin(&model, LOAM, LOAM, 400, 1));
+    let late = &updates[15..];
+    let mean = late.iter().map(|u| u.nis / u.dof as f64).sum::<f64>() / late.len() as f64;
+    let scale = late.last().unwrap().noise_scale;
+    assert!((0.85..1.15).contains(&mean) && (18.0..33.0).contains(&scale), "{mean} {scale}");
+}
+
+#[test]
+fn property_a_tempered_update_learns_less_and_judges_alike() {
+    let model = model();
+    let transitions = twin(&model, SOFT, LOAM, 10, 1);
+    let of = |shared_buffers| {
+        // One linearisation, at the same point for both: further ones are made elsewhere and need not be ordered.
+        let once = FilterConfig { shared_buffers, linearisations: 1, ..config(SoilCoordinates::Logarithmic) };
+        let (filter, updates) = run(once, &model, &transitions);
+        (filter.posterior(), updates[0].nis)
+    };
+    let ((once, nis), (tempered, same_nis)) = (of(1.0), of(4.0));
+    assert_eq!(nis, same_nis);
+    assert!(
+        (0..SOIL_DIM).all(|i| tempered.covariance[i][i] >= once.covariance[i][i] * (1.0 - 1e-9))
+            && tempered.covariance[0][0] > once.covariance[0][0]
+    );
+}
+
+#[test]
+fn property_noise_and_shared_evidence_are_found_again() {
+    // 300 drives of 20 buffers; the errors of a drive share 0.2 of their standard deviation of 0.224, seed 2.
+    let mut rng = ChaCha8Rng::seed_from_u64(2);
+    let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
+    let mut drives = |by_drive: bool| -> Vec<Vec<UncorrectedBuffer>> {
+        (0..300)
+            .map(|_| {
+                let carried = 0.2 * normal();
+                (0..20)
+                    .map(|_| {
+                        let common = if by_drive { carried } else { 0.2 * normal() };
+                        let innovation = DVector::from_fn(12, |_, _| common + 0.1 * normal());
+                        UncorrectedBuffer { innovation, jacobian: DMatrix::from_element(12, SOIL_DIM, 1.0) }
+                    })
+                    .collect()
+            })
+            .collect()
+    };
+    let (apart, shared) = (drives(false), drives(true));
+    for (found, wanted) in [(calibrate(&apart, &[1.0; 6]).unwrap(), 1.0), (calibrate(&shared, &[1.0; 6]).unwrap(), 20.0)] {
+        let BufferNoise::Sampled(moment) = &found.noise else { panic!("{found:?}") };
+        assert!((moment[(0, 0)] - 0.05).abs() < 8e-3 && (moment[(3, 8)] - 0.04).abs() < 8e-3, "{moment}");
+        assert!((found.shared_buffers / wanted - 1.0).abs() < 0.2, "{} {wanted}", found.shared_buffers);
+        assert_eq!(found.buffers, 6000);
+    }
+    let noise = calibrate(&apart, &[1.0; 6]).unwrap().noise;
+    assert!(SoilFilter::new(FilterConfig { noise: noise.clone(), buffer: 10, block: 5, ..FilterConfig::default() }).is_ok());
+    let misfit = SoilFilter::new(FilterConfig { noise, buffer: 20, block: 5, ..FilterConfig::default() });
+    assert!(matches!(misfit, Err(AdaptationError::Config { setting: "noise", .. })), "{misfit:?}");
+    let few = calibrate(&apart[..5], &[1.0; 6]);
+    assert_eq!(few, Err(AdaptationError::TooFewBuffers { found: 100, needed: 120 }));
 }

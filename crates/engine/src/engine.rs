@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_adaptation::{AdaptationError, FilterConfig, SoilFilter};
+use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
 use nesam_physics::VehicleState;
 use nesam_terrain::WorldMap;
@@ -43,10 +43,14 @@ impl core::fmt::Debug for Engine {
 }
 
 impl Engine {
-    /// An engine without sessions, with the soil filter's default settings.
+    /// An engine without sessions. The soil filter has the settings that the bundle carries; the default ones where it carries none or none that this
+    /// version understands.
     pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Self {
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
-        let filter = SoilFilter::new(FilterConfig::default()).expect("the default settings are usable; this is a bug");
+        let calibrated = predictor.bundle().soil_filter_json.as_deref().and_then(|json| CalibratedFilter::from_json(json).ok());
+        let filter = calibrated.and_then(|c| SoilFilter::new(c.config()).ok());
+        let filter =
+            filter.or_else(|| SoilFilter::new(FilterConfig::default()).ok()).expect("the default settings are usable; this is a bug");
         Self { predictor, limits, filter, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None }
     }
 

@@ -4,7 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nesam_adaptation::{
-    AdaptationError, BufferedTransition, FilterConfig, SoilFilter, SoilPosterior, SoilUpdate, VELOCITY_DIM, VelocityNoise, chi_square_tail,
+    AdaptationError, BufferedTransition, FilterConfig, Innovation, NoiseCalibration, SoilFilter, SoilPosterior, SoilUpdate,
+    UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
 };
 use nesam_model::{HISTORY, HistoryStep, Predictor};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
@@ -38,8 +39,6 @@ impl TimedUpdate {
 pub struct DriveAdaptation {
     /// Updates in order of time, rejected buffers included.
     pub updates: Vec<TimedUpdate>,
-    /// y - ŷ with the uncorrected prior, in unbroken runs: what the noise of a filter may be estimated from.
-    pub uncorrected: Vec<Vec<[f64; VELOCITY_DIM]>>,
     /// Buffers that were given up because a number was not finite or S was singular.
     pub failed: usize,
 }
@@ -104,7 +103,7 @@ pub fn adapt_all(
     config: &FilterConfig,
     progress: &(dyn Fn(usize) + Sync),
 ) -> Result<Vec<DriveAdaptation>, EvaluationError> {
-    SoilFilter::new(*config)?;
+    SoilFilter::new(config.clone())?;
     let done = AtomicUsize::new(0);
     drives
         .par_iter()
@@ -119,7 +118,7 @@ pub fn adapt_all(
 
 /// Runs the filter over one drive from its first sample, as a session that receives the samples one by one.
 ///
-/// A transition with a wheel off the map counts as a gap, and a drive without a map teaches nothing: where the slope of the ground is a guess,
+/// A buffer with a wheel off the map is left out, and a drive without a map teaches nothing: where the slope of the ground is a guess,
 /// its error would be taken for soil.
 ///
 /// # Errors
@@ -130,39 +129,92 @@ pub fn adapt_drive(
     map: Option<&Arc<WorldMap>>,
     config: &FilterConfig,
 ) -> Result<DriveAdaptation, EvaluationError> {
-    let mut filter = SoilFilter::new(*config)?;
-    let mut out = DriveAdaptation { uncorrected: vec![Vec::new()], ..DriveAdaptation::default() };
+    let mut filter = SoilFilter::new(config.clone())?;
+    let mut out = DriveAdaptation::default();
     let Some(map) = map else { return Ok(out) };
-    let steps: Vec<HistoryStep> =
-        drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect();
-    let model = predictor.step_model();
-    for k in 0..steps.len().saturating_sub(1) {
-        let history = &steps[k.saturating_sub(HISTORY - 1)..k];
-        let measured = predictor.transition(history, &steps[k].state, &steps[k].control, Some(map));
-        if !measured.ground_known {
-            filter.clear_buffer();
-            out.uncorrected.push(Vec::new());
-            continue;
-        }
-        let next = &steps[k + 1].state;
-        let (v, w) = (next.velocity_m_s, next.angular_velocity_rad_s);
-        let transition =
-            BufferedTransition { input: measured.input, residual: measured.residual, measured_next: [v[0], v[1], v[2], w[0], w[1], w[2]] };
-        if let Some(run) = out.uncorrected.last_mut() {
-            run.push(transition.innovation(model, &SoilCorrection::NONE));
-        }
-        match filter.push(model, transition) {
-            Ok(None) => {}
-            Ok(Some(update)) => out.updates.push(TimedUpdate { sample: k + 1, prior: measured.input.soil.to_array(), update }),
-            Err(AdaptationError::NotFinite { .. } | AdaptationError::SingularInnovation { .. }) => out.failed += 1,
-            Err(other) => return Err(other.into()),
+    let steps = steps_of(drive);
+    let mut start = 0;
+    while start + config.buffer < steps.len() {
+        let correction = filter.estimate();
+        let buffer = match buffer_at(predictor, &steps, start, config, map, &correction) {
+            Ok(buffer) => buffer,
+            Err(()) => {
+                start += config.buffer; // as a session does
+                continue;
+            }
+        };
+        start += config.buffer;
+        for transition in buffer {
+            match filter.push(predictor.step_model(), transition) {
+                Ok(None) => {}
+                Ok(Some(update)) => {
+                    out.updates.push(TimedUpdate { sample: start, prior: transition.input.soil.to_array(), update });
+                }
+                Err(AdaptationError::NotFinite { .. } | AdaptationError::SingularInnovation { .. }) => {
+                    filter.clear_buffer();
+                    out.failed += 1;
+                    break;
+                }
+                Err(other) => return Err(other.into()),
+            }
         }
     }
     Ok(out)
 }
 
-/// Noise of the model on these drives, where there are transitions enough to say.
-pub fn estimate_noise(drives: &[DriveAdaptation]) -> Option<VelocityNoise> {
-    let runs: Vec<Vec<[f64; VELOCITY_DIM]>> = drives.iter().flat_map(|d| d.uncorrected.iter().cloned()).collect();
-    VelocityNoise::estimate(&runs).ok()
+fn steps_of(drive: &Trajectory) -> Vec<HistoryStep> {
+    drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect()
+}
+
+/// The transitions from sample `start` to `start + B`; an error when one leaves the known map.
+fn buffer_at(
+    predictor: &Predictor,
+    steps: &[HistoryStep],
+    start: usize,
+    config: &FilterConfig,
+    map: &Arc<WorldMap>,
+    correction: &SoilCorrection,
+) -> Result<Vec<BufferedTransition>, ()> {
+    let history = |k: usize| &steps[k.saturating_sub(HISTORY - 1)..k];
+    let range = start..start + config.buffer;
+    let transitions = match config.innovation {
+        Innovation::OneStep => {
+            range.clone().map(|k| predictor.transition(history(k), &steps[k].state, &steps[k].control, Some(map))).collect()
+        }
+        Innovation::Rollout => {
+            let controls: Vec<_> = steps[range.clone()].iter().map(|step| step.control).collect();
+            predictor.transitions_along(history(start), &steps[start].state, &controls, Some(map), correction)
+        }
+    };
+    if !transitions.iter().all(|t| t.ground_known) {
+        return Err(());
+    }
+    let ends = range.map(|k| {
+        let ([vx, vy, vz], [wx, wy, wz]) = (steps[k + 1].state.velocity_m_s, steps[k + 1].state.angular_velocity_rad_s);
+        [vx, vy, vz, wx, wy, wz]
+    });
+    let both = transitions.into_iter().zip(ends);
+    Ok(both.map(|(t, measured_next)| BufferedTransition { input: t.input, residual: t.residual, measured_next }).collect())
+}
+
+/// What these drives, on ground that the model was trained for, say of the filter's noise.
+///
+/// # Errors
+/// `EvaluationError::Filter` when the settings are unusable or the drives too few.
+pub fn calibrate_noise(
+    predictor: &Predictor,
+    drives: &[Trajectory],
+    maps: &DriveMaps,
+    config: &FilterConfig,
+) -> Result<NoiseCalibration, EvaluationError> {
+    config.check()?;
+    let of_drive = |(drive, map): (&Trajectory, &Option<Arc<WorldMap>>)| -> Vec<UncorrectedBuffer> {
+        let Some(map) = map else { return Vec::new() };
+        let steps = steps_of(drive);
+        let starts = (0..steps.len().saturating_sub(config.buffer)).step_by(config.buffer);
+        let buffers = starts.filter_map(|start| buffer_at(predictor, &steps, start, config, map, &SoilCorrection::NONE).ok());
+        buffers.filter_map(|buffer| uncorrected(config, predictor.step_model(), &buffer).ok()).collect()
+    };
+    let buffers: Vec<Vec<UncorrectedBuffer>> = drives.par_iter().zip(maps).map(of_drive).collect();
+    Ok(calibrate(&buffers, &config.prior_sd)?)
 }

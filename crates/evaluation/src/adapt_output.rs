@@ -1,15 +1,14 @@
 //! The JSON of `nesam adapt` (`nesam.adapt/1`).
 
-use nesam_adaptation::{FilterConfig, VelocityNoise};
+use nesam_adaptation::{FilterConfig, FilterSettings};
 use nesam_physics::SOIL_DIM;
 use nesam_trajectories::Trajectory;
 use serde::Serialize;
 
 use crate::adapt::{Consistency, DriveAdaptation};
-use crate::adapt_settings::{FilterSettings, NoiseSettings, noise_settings};
 use crate::evaluate::ModelScore;
 use crate::output::Provenance;
-use crate::score::{ErrorSummary, ErrorTree, PerDimension, PositionError, paired_difference};
+use crate::score::{ErrorSummary, ErrorTree, PerDimension, PositionError, paired_difference, paired_ratio};
 use crate::{Resamples, Truth};
 
 /// Inputs of the JSON and HTML reports of `nesam adapt`.
@@ -37,8 +36,6 @@ pub struct Adaptation<'a> {
     pub filtered: &'a [DriveAdaptation],
     /// Settings of the filter.
     pub filter: &'a FilterConfig,
-    /// Noise of the uncorrected model on these drives.
-    pub noise_estimate: Option<VelocityNoise>,
     /// Seed of the bootstrap.
     pub seed: u64,
     /// Bootstrap draws.
@@ -69,7 +66,7 @@ struct Document<'a> {
     failed: usize,
     difference: Difference,
     filter: FilterSettings,
-    noise_estimate: Option<[NoiseSettings; 6]>,
+    ratio_ci95: ErrorTree<[f64; 2]>,
     bootstrap: Bootstrap,
     provenance: &'a Provenance,
 }
@@ -94,6 +91,8 @@ struct SoilRow<'a> {
     prior: [f64; SOIL_DIM],
     nis_over_dof: f64,
     rejected: bool,
+    trust: f64,
+    noise_scale: f64,
 }
 
 /// Adapted minus fixed on the same windows: negative = adapted is closer.
@@ -114,6 +113,11 @@ impl Adaptation<'_> {
     /// Adapted over fixed, number by number; `None` where either is missing or fixed is 0.
     pub fn ratio(&self) -> ErrorTree<f64> {
         ratio(&self.adapted.summary.tree, &self.fixed.summary.tree)
+    }
+
+    /// 95 % intervals of the ratio, by drive.
+    pub fn ratio_ci95(&self) -> ErrorTree<[f64; 2]> {
+        paired_ratio(&self.adapted.errors, &self.fixed.errors, self.resamples)
     }
 
     /// NIS over all buffers.
@@ -155,7 +159,7 @@ impl Adaptation<'_> {
             failed: consistency.failed,
             difference: Difference { value, ci95 },
             filter: FilterSettings::of(self.filter),
-            noise_estimate: self.noise_estimate.as_ref().map(noise_settings),
+            ratio_ci95: self.ratio_ci95(),
             bootstrap: Bootstrap { by: "trajectory", resamples: self.resamples.count(), seed: self.seed },
             provenance: self.provenance,
         };
@@ -173,6 +177,8 @@ impl Adaptation<'_> {
             prior: timed.prior,
             nis_over_dof: timed.update.nis / timed.update.dof as f64,
             rejected: timed.update.rejected,
+            trust: timed.update.trust,
+            noise_scale: timed.update.noise_scale,
         };
         let rows = self.filtered.iter().enumerate();
         rows.flat_map(|(drive, f)| f.updates.iter().map(move |u| (drive, u))).map(|(drive, u)| row(drive, u)).collect()

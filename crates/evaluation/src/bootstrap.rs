@@ -53,6 +53,21 @@ impl Resamples {
         })
     }
 
+    /// 95 % interval of (mean of `over`) / (mean of `under`), both over the same windows; `None` as in [`Resamples::mean_interval`]. Resamples in which
+    /// nothing is to divide by are left out.
+    pub fn ratio_interval(&self, over: &[f64], under: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
+        let mut sums = vec![[0.0; 2]; self.clusters];
+        for ((&above, &below), &c) in over.iter().zip(under).zip(cluster) {
+            sums[c][0] += above;
+            sums[c][1] += below;
+        }
+        self.interval(|weight| {
+            let pick = |which: usize| -> f64 { sums.iter().zip(weight).map(|(s, &w)| s[which] * f64::from(w)).sum() };
+            let below = pick(1);
+            if below > 0.0 { pick(0) / below } else { f64::NAN }
+        })
+    }
+
     /// 95 % interval of the median over windows; arguments as [`Resamples::mean_interval`]. Rows that are NaN are left out.
     pub fn median_interval(&self, rows: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
         let mut sorted: Vec<(f64, usize)> = rows.iter().copied().zip(cluster.iter().copied()).filter(|(v, _)| !v.is_nan()).collect();

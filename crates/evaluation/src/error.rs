@@ -76,12 +76,6 @@ pub enum EvaluationError {
     /// The soil filter refused its settings.
     #[error(transparent)]
     Filter(#[from] nesam_adaptation::AdaptationError),
-    /// A file of filter settings cannot be used.
-    #[error("filter settings: {reason}")]
-    FilterSettings {
-        /// What was wrong.
-        reason: String,
-    },
     /// A file could not be written or read.
     #[error("{}: {reason}", path.display())]
     File {

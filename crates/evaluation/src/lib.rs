@@ -18,11 +18,11 @@
 
 mod adapt;
 mod adapt_output;
-mod adapt_settings;
 mod baselines;
 mod bootstrap;
 mod constant_velocity;
 mod dimension;
+mod disguise;
 mod error;
 mod errors;
 mod evaluate;
@@ -40,13 +40,13 @@ mod slices;
 mod test_vehicle;
 mod windows;
 
-pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, estimate_noise};
+pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, calibrate_noise};
 pub use adapt_output::Adaptation;
-pub use adapt_settings::{Coordinates, FilterSettings, NoiseSettings, noise_settings};
 pub use baselines::Baselines;
 pub use bootstrap::{DEFAULT_RESAMPLES, Resamples, median, quantile_sorted};
 pub use constant_velocity::constant_velocity;
 pub use dimension::{DIMENSION_KEYS, POSE_DIM, Pose, absolute_error, horizontal_distance, pose_of};
+pub use disguise::Disguise;
 pub use error::EvaluationError;
 pub use errors::{PosePath, StepError, WindowErrors, path_length_m};
 pub use evaluate::{DriveMaps, HorizonCurve, ModelPaths, ModelScore, path_median_m, predict_all, score};
@@ -56,6 +56,6 @@ pub use models::ModelName;
 pub use output::{Evaluation, Provenance};
 pub use predictions::write_predictions;
 pub use predictors::WindowPredictor;
-pub use score::{ErrorSummary, ErrorTree, PATH_FLOOR_M, PerDimension, PositionError, paired_difference, summarise, values};
+pub use score::{ErrorSummary, ErrorTree, PATH_FLOOR_M, PerDimension, PositionError, paired_difference, paired_ratio, summarise, values};
 pub use slices::{Slice, slices};
 pub use windows::{Truth, Window, all_windows};

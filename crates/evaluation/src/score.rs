@@ -152,6 +152,13 @@ pub fn paired_difference(a: &WindowErrors, b: &WindowErrors, resamples: &Resampl
     (difference, interval)
 }
 
+/// 95 % intervals of the ratio of the mean statistics `a / b`, paired by drive: below 1 = `a` is better. The median of relative errors is left out (`null`).
+pub fn paired_ratio(a: &WindowErrors, b: &WindowErrors, resamples: &Resamples) -> ErrorTree<[f64; 2]> {
+    let (ca, cb) = (columns(a), columns(b));
+    let present = |s: usize| s != RATIO && ca.present[s] && cb.present[s];
+    tree(std::array::from_fn(|s| if present(s) { resamples.ratio_interval(&ca.values[s], &cb.values[s], &a.trajectory) } else { None }))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -214,6 +221,7 @@ mod tests {
         let (difference, interval) = paired_difference(&e, &e, &Resamples::draw(2, 1000, 1));
         assert_eq!(difference.mae_mean.x_m, Some(0.0));
         assert_eq!(interval.position_m.final_, Some([0.0, 0.0]));
+        assert_eq!(paired_ratio(&e, &e, &Resamples::draw(2, 1000, 1)).position_m.final_, Some([1.0, 1.0]));
         assert_eq!(difference.mae_mean.z_m, None);
     }
 }

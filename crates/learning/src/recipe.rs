@@ -142,6 +142,7 @@ pub fn run(
         weights: trained.weights,
         baselines_json,
         reference_json: None,
+        soil_filter_json: None,
         effects: Vec::new(),
         provenance: Provenance {
             command: recipe.command.clone(),

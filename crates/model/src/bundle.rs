@@ -23,6 +23,7 @@ const NORMALIZATION: &str = "normalization.toml";
 const EFFECTS: &str = "effects.toml";
 const BASELINES: &str = "baselines.json";
 const REFERENCE: &str = "reference.json";
+const SOIL_FILTER: &str = "soil_filter.json";
 const REQUIRED: [&str; 4] = [WEIGHTS, VEHICLE, NORMALIZATION, EFFECTS];
 
 /// Where a bundle comes from; shown by `inspect`, copied into every report.
@@ -83,6 +84,8 @@ pub struct ModelBundle {
     pub baselines_json: Option<String>,
     /// What a diagnosis must know of the model's usual errors as JSON, if the bundle carries it.
     pub reference_json: Option<String>,
+    /// Settings of the soil filter that were estimated for this model as JSON, if the bundle carries them.
+    pub soil_filter_json: Option<String>,
     /// Where the bundle comes from.
     pub provenance: Provenance,
 }
@@ -160,6 +163,7 @@ impl ModelBundle {
         let effects = effects_file::read(&text_of(EFFECTS)?).map_err(|reason| folder.fail(EFFECTS, reason))?;
         let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;
         let reference_json = take(REFERENCE).map(|bytes| folder.text(REFERENCE, bytes)).transpose()?;
+        let soil_filter_json = take(SOIL_FILTER).map(|bytes| folder.text(SOIL_FILTER, bytes)).transpose()?;
         Ok(Self {
             name: manifest.name,
             hash,
@@ -172,6 +176,7 @@ impl ModelBundle {
             weights,
             baselines_json,
             reference_json,
+            soil_filter_json,
             provenance: manifest.provenance,
         })
     }
@@ -203,6 +208,9 @@ impl ModelBundle {
         }
         if let Some(json) = &self.reference_json {
             files.push((REFERENCE, json.clone().into_bytes()));
+        }
+        if let Some(json) = &self.soil_filter_json {
+            files.push((SOIL_FILTER, json.clone().into_bytes()));
         }
         for (name, bytes) in &files {
             folder.write(name, bytes)?;

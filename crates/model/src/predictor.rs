@@ -5,8 +5,8 @@ use std::sync::{Arc, Mutex};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::effects::Effect;
 use nesam_physics::scalar::f32x8;
-use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::step::StepModel;
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
 use rayon::prelude::*;
 
@@ -23,6 +23,10 @@ use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUM
 use crate::symbolic::symbolic_step;
 use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, VALUES};
 use crate::token::{TokenScale, token_entries};
+
+mod transitions;
+
+pub use self::transitions::Transition;
 
 /// Maps whose terrain tokens are kept.
 const MAPS_MAX: usize = 16;
@@ -54,21 +58,6 @@ pub struct Predictor {
     token_scale: TokenScale,
     mode: TerrainMode,
     maps: Arc<Mutex<Vec<TokensOfMap>>>,
-}
-
-/// A measured transition, ready for the physics.
-#[derive(Clone, Copy, Debug)]
-pub struct Transition {
-    /// Input of the step, in f64, with the nominal soil; heights are those of World.
-    pub input: StepInput<f64>,
-    /// Actuators before and after the step: what an effect in the actuator layer starts from.
-    pub actuators: [DrivelineState; 2],
-    /// Command of the step.
-    pub control: Control<f64>,
-    /// Learned state residual Δx_res: displacement in the heading frame (m), attitude (rad), velocities in Body.
-    pub residual: [f64; STATE_DIM],
-    /// False when a wheel stands off the map.
-    pub ground_known: bool,
 }
 
 /// One candidate while it is rolled out.
@@ -216,47 +205,6 @@ impl Predictor {
     /// The physics with the bundle's vehicle.
     pub fn step_model(&self) -> &StepModel {
         &self.model
-    }
-
-    /// One measured transition (x_k, u_k) as filter and discovery need it: what the network says there, and the input of the physics with the
-    /// nominal soil θ̄. Nothing of it depends on the soil correction, so ∂ŷ/∂Δθ flows through the physics alone (paper Alg. 1).
-    ///
-    /// `history` are the measured steps before x_k, as in [`RolloutQuery`].
-    pub fn transition(
-        &self,
-        history: &[HistoryStep],
-        state: &VehicleState<f64>,
-        control: &Control<f64>,
-        map: Option<&Arc<WorldMap>>,
-    ) -> Transition {
-        let scales = &self.bundle.normalization;
-        let tokens = map.map(|map| self.tokens_of(map));
-        let ground = GroundSource::new(map.map(Arc::as_ref), &self.model, state);
-        let history = &history[history.len().saturating_sub(HISTORY - 1)..];
-        let prefix = self.prefix(history, &ground, tokens.as_deref());
-        let token = self.terrain(tokens.as_deref(), &[pose(state)])[0];
-        let entries = self.entries(state, history.last().map(|step| &step.state), control, &ground);
-        let lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| [entries[i]; LANES]);
-        let context: [Lane; HIDDEN] = core::array::from_fn(|i| [token[i]; LANES]);
-        let (sinkage, residual) = self.network.step(&prefix, &mut BlockCache::new(1), &lanes, &context);
-        let before = history_actuators(&self.model, history, state, control, scales.dt_s);
-        let after = before.advance(self.model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);
-        let soil = from_raw(&raw_soil(&token));
-        let (under_wheels, known) = ground.under_wheels(&self.model, state, 0.0);
-        let ratio = |i: usize| f64::from(scales.sinkage_log_ratio_max * sinkage[i][0].tanh());
-        Transition {
-            input: StepInput {
-                state: *state,
-                wheels: command_wheels(self.model.vehicle(), &before, &after, control),
-                sinkage_log_ratio: core::array::from_fn(ratio),
-                soil: Soil::from_array(soil),
-                ground: under_wheels,
-            },
-            actuators: [before, after],
-            control: *control,
-            residual: core::array::from_fn(|i| f64::from(residual[i][0] * scales.residual_scale[i])),
-            ground_known: known,
-        }
     }
 
     /// Nominal soil θ̄ under a pose (paper §III-B: h_θ of the semantic patch); the stated default without map or semantics.

@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nesam_adaptation::FilterConfig;
+use nesam_adaptation::CalibratedFilter;
 use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
 use nesam_evaluation::adapt_drive;
 use nesam_learning::{Drive, initial::initial_weights, scales};
@@ -61,6 +61,7 @@ fn bundle() -> Arc<ModelBundle> {
                 normalization,
                 baselines_json: None,
                 reference_json: None,
+                soil_filter_json: None,
                 effects: Vec::new(),
                 provenance: Provenance::default(),
             })
@@ -143,7 +144,8 @@ pub fn candidates(session: &str, drive: &Trajectory, i: usize, samples: usize, h
 
 /// The soil correction that the filter of `nesam adapt` has learned from the samples up to `i`, and the number of updates.
 pub fn learned(recorded: &Recorded, i: usize) -> (SoilCorrection, u64) {
-    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&recorded.world), &FilterConfig::default()).unwrap();
+    let carried = bundle().soil_filter_json.as_deref().map(|json| CalibratedFilter::from_json(json).unwrap().config());
+    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&recorded.world), &carried.unwrap_or_default()).unwrap();
     let updates = filtered.updates.iter().filter(|u| u.sample <= i && !u.update.rejected).count();
     (filtered.correction_at(i), updates as u64)
 }

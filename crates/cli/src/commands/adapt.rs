@@ -1,17 +1,21 @@
 //! `nesam adapt`: what learning the soil while driving gains on recorded drives.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::sync::Arc;
 
 use clap::Args;
+use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, FilterSettings, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows, estimate_noise,
-    path_median_m, predict_all, report, score,
+    Adaptation, DEFAULT_RESAMPLES, Disguise, ErrorTree, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows,
+    calibrate_noise, path_median_m, predict_all, report, score,
 };
-use nesam_model::MAX_HORIZON;
+use nesam_model::{MAX_HORIZON, ModelBundle};
 use nesam_physics::SOIL_NAMES;
+use nesam_terrain::WorldMap;
 
-use crate::args::{BundleArgs, DataArgs, WindowArgs};
+use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
@@ -33,6 +37,13 @@ pub struct AdaptArgs {
     /// Algorithm 1 of the paper to the letter: physical units, one linearisation, nothing held at a bound
     #[arg(long)]
     literal: bool,
+    /// Estimate the noise of the soil filter on the drives of the train split that training left for validation, and put it into the bundle; run once
+    /// for every new bundle
+    #[arg(long, conflicts_with = "literal")]
+    calibrate: bool,
+    /// Repaint the map so that the ground is not what it looks like: judges adaptation on drives of the train split, where settings may be chosen
+    #[arg(long, value_enum, value_name = "LOOK", conflicts_with = "calibrate")]
+    disguise: Option<DisguiseArg>,
     /// Score against the noise-free channels, where a set has them
     #[arg(long, value_name = "CHANNELS", value_parser = ["measured", "gt"], default_value = "measured")]
     truth: String,
@@ -50,19 +61,34 @@ pub struct AdaptArgs {
     html: Option<PathBuf>,
 }
 
+/// How the ground is made to look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum DisguiseArg {
+    /// Like the next firmer class.
+    Firmer,
+    /// Like the next softer class.
+    Softer,
+}
+
 /// Runs the command.
 pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
     if args.window.horizon > MAX_HORIZON {
         return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
     }
-    let filter = settings(args)?.over_defaults(args.literal);
+    if args.calibrate {
+        return calibrate(args);
+    }
     interrupt::exit_on_ctrl_c("nothing was written");
     let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
-    let drives = read_drives(&args.data, truth == Truth::Gt)?;
+    let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
+    if let Some(look) = args.disguise {
+        disguise(&mut drives, look)?;
+    }
     let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
     let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
     let predictor = predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?;
+    let filter = filter_of(args, predictor.bundle())?;
     warn_about_velocities(&drives);
 
     let progress = Progress::start("drives filtered", drives.drives.len());
@@ -94,7 +120,6 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         adapted: &adapted,
         filtered: &filtered,
         filter: &filter,
-        noise_estimate: estimate_noise(&filtered),
         seed: args.seed,
         resamples: &resamples,
         provenance: &provenance,
@@ -105,6 +130,77 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     output::write_file(&json, adaptation.to_json().as_bytes())?;
     output::write_file(&html, report::adaptation_page(&adaptation).as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
+    Ok(())
+}
+
+/// Settings in force: those given, over those that the bundle carries, over the defaults. `--literal` takes nothing from the bundle.
+fn filter_of(args: &AdaptArgs, bundle: &ModelBundle) -> Result<FilterConfig, Failure> {
+    let given = settings(args)?;
+    if args.literal {
+        return Ok(given.over_defaults(true));
+    }
+    match &bundle.soil_filter_json {
+        None => {
+            eprintln!(
+                "note: bundle {} carries no noise of the soil filter; defaults stand in (see `nesam adapt --calibrate`)",
+                bundle.name
+            );
+            Ok(given.over_defaults(false))
+        }
+        Some(json) => Ok(given.over(CalibratedFilter::from_json(json).or_input()?.config())),
+    }
+}
+
+/// Every tenth drive of the sorted train split validates (as in training, which never saw it).
+fn is_validation(index: usize) -> bool {
+    index % 10 == 7
+}
+
+/// Repaints the map of every drive, each world once.
+fn disguise(drives: &mut Drives, look: DisguiseArg) -> Result<(), Failure> {
+    let disguise = match look {
+        DisguiseArg::Firmer => Disguise::Firmer,
+        DisguiseArg::Softer => Disguise::Softer,
+    };
+    let mut painted: BTreeMap<String, Arc<WorldMap>> = BTreeMap::new();
+    for map in drives.maps.iter_mut().flatten() {
+        if !painted.contains_key(map.hash()) {
+            let other =
+                disguise.of(map).ok_or_else(|| Failure::input(format!("map {} states no colours of soil classes to repaint", map.id())))?;
+            painted.insert(map.hash().into(), Arc::new(other));
+        }
+        *map = Arc::clone(&painted[map.hash()]);
+    }
+    Ok(())
+}
+
+fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
+    if args.data.split != SplitArg::Train {
+        return Err(Failure::input("--calibrate needs --split train: the noise is estimated on validation drives of the train split"));
+    }
+    interrupt::exit_on_ctrl_c("the bundle is unchanged");
+    let dir = bundle_dir(args.bundle.bundle.as_deref())?;
+    let mut drives = read_drives(&args.data, false)?;
+    let mut order: Vec<usize> = (0..drives.drives.len()).collect();
+    order.sort_by(|a, b| drives.drives[*a].id.cmp(&drives.drives[*b].id));
+    let chosen: Vec<usize> = order.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, d)| d).collect();
+    drives.maps = chosen.iter().map(|&d| drives.maps[d].clone()).collect();
+    drives.drives = chosen.iter().map(|&d| drives.drives[d].clone()).collect();
+    let mut bundle = load_bundle(Some(&dir))?;
+    let predictor = predictor_for(bundle.clone(), &drives.root)?;
+    let config = settings(args)?.over_defaults(false);
+    let found = calibrate_noise(&predictor, &drives.drives, &drives.maps, &config).or_input()?;
+    let calibrated = CalibratedFilter::new(&found, &config, drives.drives.len(), &drives.root.hash());
+    bundle.soil_filter_json = Some(calibrated.to_json());
+    bundle.save(&dir).or_failed()?;
+    say!(
+        "bundle {} now carries the noise of {} buffers of {} drives, {:.1} of which say no more than one; its hash is {}",
+        bundle.name,
+        found.buffers,
+        drives.drives.len(),
+        found.shared_buffers,
+        &bundle.hash[..12]
+    );
     Ok(())
 }
 
@@ -134,14 +230,19 @@ fn print_table(a: &Adaptation<'_>) {
         a.path_m_median,
         a.truth.as_str()
     );
-    let ratio = a.ratio();
+    let rows = [
+        ("fixed", a.fixed.summary.tree, a.fixed.summary.ci95),
+        ("adapted", a.adapted.summary.tree, a.adapted.summary.ci95),
+        ("adapted / fixed", a.ratio(), a.ratio_ci95()),
+    ];
     for (title, last) in [("mean over the horizon", false), ("at the last step", true)] {
-        say!("\n{title:<22}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}", "x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m");
-        for (name, t) in [("fixed", &a.fixed.summary.tree), ("adapted", &a.adapted.summary.tree), ("adapted / fixed", &ratio)] {
-            let six = if last { t.mae_final } else { t.mae_mean }.to_array();
-            let position = if last { t.position_m.final_ } else { t.position_m.mean };
-            let cells: String = six.iter().chain([&position]).map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}"))).collect();
-            say!("{name:<22}{cells}");
+        let head: String = ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>15}")).concat();
+        say!("\n{title:<22}{head}");
+        for (name, value, interval) in &rows {
+            let values = seven(value, last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();
+            let between = |[low, high]: [f64; 2]| format!("{:>15}", format!("{low:.3}…{high:.3}"));
+            let intervals = seven(interval, last).map(|ci| ci.map_or(format!("{:>15}", ""), between)).concat();
+            say!("{name:<22}{values}\n{:<22}{intervals}", "  95 %");
         }
     }
     let c = a.consistency();
@@ -156,6 +257,13 @@ fn print_table(a: &Adaptation<'_>) {
         number(c.inside_95)
     );
     print_soil(a);
+}
+
+/// x, y, z, roll, pitch, yaw and position of a tree, as means or at the last step.
+fn seven<T: Copy>(tree: &ErrorTree<T>, last: bool) -> [Option<T>; 7] {
+    let six = if last { tree.mae_final } else { tree.mae_mean }.to_array();
+    let position = if last { tree.position_m.final_ } else { tree.position_m.mean };
+    std::array::from_fn(|d| six.get(d).copied().unwrap_or(position))
 }
 
 /// Soil at the end of each drive; what was not learned has no number.

@@ -163,6 +163,7 @@ pub fn bundle() -> ModelBundle {
                 normalization: scales,
                 baselines_json: None,
                 reference_json: None,
+                soil_filter_json: None,
                 provenance: Provenance::default(),
             };
             let drives: Vec<Trajectory> = (0..16).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();

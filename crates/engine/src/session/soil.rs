@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use nesam_adaptation::{BufferedTransition, SoilFilter, SoilUpdate};
-use nesam_model::{HistoryStep, Predictor};
+use nesam_adaptation::{BufferedTransition, Innovation, SoilFilter, SoilUpdate};
+use nesam_model::{HISTORY, HistoryStep, Predictor, Transition};
 use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::WorldMap;
 
@@ -34,24 +34,27 @@ impl SoilState {
 #[derive(Clone, Debug)]
 pub(super) struct SoilLearner {
     filter: SoilFilter,
-    /// The transition from the newest step; its end is not measured yet.
-    open: Option<BufferedTransition>,
+    /// Up to 31 steps of history, then the steps of the buffer that fills; empty before the first.
+    steps: Vec<HistoryStep>,
+    /// Place in `steps` where the buffer begins.
+    first: usize,
 }
 
 impl SoilLearner {
     pub(super) fn new(filter: SoilFilter) -> Self {
-        Self { filter, open: None }
+        Self { filter, steps: Vec::new(), first: 0 }
     }
 
     /// The next step does not follow the last one.
     pub(super) fn forget_open(&mut self) {
-        self.open = None;
+        self.steps.clear();
         self.filter.clear_buffer();
     }
 
     /// Takes the newest step with the steps before it. Numbers that are not finite end in an empty buffer and nothing else.
     ///
-    /// Without a map nothing is learned: where the slope of the ground is a guess, its error would be taken for soil.
+    /// Without a map nothing is learned: where the slope of the ground is a guess, its error would be taken for soil. For the same reason a buffer
+    /// with a wheel off the map is left out.
     pub(super) fn step(
         &mut self,
         predictor: &Predictor,
@@ -59,16 +62,47 @@ impl SoilLearner {
         newest: &HistoryStep,
         map: Option<&Arc<WorldMap>>,
     ) -> Option<SoilUpdate> {
-        let map = map?;
-        let update = self.open.take().and_then(|open| {
-            let transition = BufferedTransition { measured_next: velocities(&newest.state), ..open };
-            self.filter.push(predictor.step_model(), transition).unwrap_or(None)
-        });
-        let next = predictor.transition(before, &newest.state, &newest.control, Some(map));
-        if next.ground_known {
-            self.open = Some(BufferedTransition { input: next.input, residual: next.residual, measured_next: [0.0; 6] });
-        } else {
-            self.filter.clear_buffer(); // with a wheel off the map the ground there is a guess
+        let Some(map) = map else {
+            self.forget_open();
+            return None;
+        };
+        if self.steps.is_empty() {
+            self.steps.extend_from_slice(&before[before.len().saturating_sub(HISTORY - 1)..]);
+            self.first = self.steps.len();
+        }
+        self.steps.push(*newest);
+        if self.steps.len() <= self.first + self.filter.config().buffer {
+            return None;
+        }
+        let update = self.learn_from_buffer(predictor, map);
+        self.filter.clear_buffer();
+        // The end of this buffer is the start of the next.
+        self.steps.drain(..self.steps.len().saturating_sub(HISTORY));
+        self.first = self.steps.len() - 1;
+        update
+    }
+
+    fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<SoilUpdate> {
+        let history = |k: usize| &self.steps[k.saturating_sub(HISTORY - 1)..k];
+        let (first, last) = (self.first, self.steps.len() - 1);
+        let transitions: Vec<Transition> = match self.filter.config().innovation {
+            Innovation::OneStep => {
+                (first..last).map(|k| predictor.transition(history(k), &self.steps[k].state, &self.steps[k].control, Some(map))).collect()
+            }
+            Innovation::Rollout => {
+                let controls: Vec<_> = self.steps[first..last].iter().map(|step| step.control).collect();
+                let correction = self.filter.estimate();
+                predictor.transitions_along(history(first), &self.steps[first].state, &controls, Some(map), &correction)
+            }
+        };
+        if !transitions.iter().all(|t| t.ground_known) {
+            return None;
+        }
+        let mut update = None;
+        for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
+            let measured_next = velocities(&end.state);
+            let buffered = BufferedTransition { input: transition.input, residual: transition.residual, measured_next };
+            update = self.filter.push(predictor.step_model(), buffered).ok()?;
         }
         update
     }

@@ -54,7 +54,7 @@ pub fn adaptation_page(adaptation: &Adaptation<'_>) -> String {
         .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
         .footer("data", &p.data_hash)
         .footer("maps", &p.maps_hash)
-        .footer("filter", &serde_json::to_string(&crate::FilterSettings::of(adaptation.filter)).unwrap_or_default())
+        .footer("filter", &serde_json::to_string(&nesam_adaptation::FilterSettings::of(adaptation.filter)).unwrap_or_default())
         .footer("bootstrap", &format!("{} resamples by drive, seed {}", adaptation.resamples.count(), adaptation.seed));
     page.render()
 }
@@ -84,14 +84,13 @@ fn error_table(a: &Adaptation<'_>, last: bool) -> Table {
         }
     }
     let (t, c) = paired_difference(&a.adapted.errors, &a.fixed.errors, a.resamples);
-    let r = a.ratio();
-    let none = vec![None; POSE_DIM + 1];
+    let (r, rc) = (a.ratio(), a.ratio_ci95());
     if last {
         add("difference", join(t.mae_final.to_array(), t.position_m.final_), intervals(&c.mae_final, c.position_m.final_));
-        add("ratio", join(r.mae_final.to_array(), r.position_m.final_), none);
+        add("ratio", join(r.mae_final.to_array(), r.position_m.final_), intervals(&rc.mae_final, rc.position_m.final_));
     } else {
         add("difference", join(t.mae_mean.to_array(), t.position_m.mean), intervals(&c.mae_mean, c.position_m.mean));
-        add("ratio", join(r.mae_mean.to_array(), r.position_m.mean), none);
+        add("ratio", join(r.mae_mean.to_array(), r.position_m.mean), intervals(&rc.mae_mean, rc.position_m.mean));
     }
     table
 }

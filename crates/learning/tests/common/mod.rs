@@ -132,6 +132,7 @@ pub fn predictor(scales: &Normalization, weights: Weights) -> Predictor {
         weights,
         baselines_json: None,
         reference_json: None,
+        soil_filter_json: None,
         effects: Vec::new(),
         provenance: Provenance::default(),
     };

@@ -1,0 +1,115 @@
+//! Measured transitions as filter and discovery need them: what the network says, and the input of the physics.
+
+use std::sync::Arc;
+
+use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::step::StepInput;
+use nesam_physics::{Control, STATE_DIM, Soil, SoilCorrection, VehicleState, WHEELS};
+use nesam_terrain::WorldMap;
+
+use super::{Predictor, Sample, pose, raw_soil};
+use crate::dims::{HIDDEN, HISTORY, STATE_CONTROL};
+use crate::fused::{BlockCache, LANES, Lane};
+use crate::ground::{GroundSource, history_actuators};
+use crate::rollout::HistoryStep;
+use crate::soil_coordinates::from_raw;
+use crate::terrain_tokens::TerrainToken;
+
+/// A measured transition, ready for the physics.
+#[derive(Clone, Copy, Debug)]
+pub struct Transition {
+    /// Input of the step, in f64, with the nominal soil; heights are those of World.
+    pub input: StepInput<f64>,
+    /// Actuators before and after the step: what an effect in the actuator layer starts from.
+    pub actuators: [DrivelineState; 2],
+    /// Command of the step.
+    pub control: Control<f64>,
+    /// Learned state residual Δx_res: displacement in the heading frame (m), attitude (rad), velocities in Body.
+    pub residual: [f64; STATE_DIM],
+    /// False when a wheel stands off the map.
+    pub ground_known: bool,
+}
+
+impl Predictor {
+    /// One measured transition (x_k, u_k) as filter and discovery need it: what the network says there, and the input of the physics with the
+    /// nominal soil θ̄. Nothing of it depends on the soil correction, so ∂ŷ/∂Δθ flows through the physics alone (paper Alg. 1).
+    ///
+    /// `history` are the measured steps before x_k, as in [`crate::RolloutQuery`].
+    pub fn transition(
+        &self,
+        history: &[HistoryStep],
+        state: &VehicleState<f64>,
+        control: &Control<f64>,
+        map: Option<&Arc<WorldMap>>,
+    ) -> Transition {
+        let one = self.transitions_along(history, state, std::slice::from_ref(control), map, &SoilCorrection::NONE);
+        one.into_iter().next().expect("one command makes one transition; this is a bug")
+    }
+
+    /// The transitions of one rollout from a measured state under the commands that followed: network and ground at the *predicted* states, as a
+    /// prediction meets them. A filter that learns from them sees the errors that predictions have, not those of single steps.
+    pub fn transitions_along(
+        &self,
+        history: &[HistoryStep],
+        start: &VehicleState<f64>,
+        controls: &[Control<f64>],
+        map: Option<&Arc<WorldMap>>,
+        correction: &SoilCorrection,
+    ) -> Vec<Transition> {
+        let scales = &self.bundle.normalization;
+        let tokens = map.map(|map| self.tokens_of(map));
+        let ground = GroundSource::new(map.map(Arc::as_ref), &self.model, start);
+        let history = &history[history.len().saturating_sub(HISTORY - 1)..];
+        let prefix = self.prefix(history, &ground, tokens.as_deref());
+        let mut cache = BlockCache::new(controls.len().max(1));
+        let Some(first) = controls.first() else { return Vec::new() };
+        let mut sample = Sample {
+            state: *start,
+            previous: history.last().map(|step| step.state),
+            actuators: history_actuators(&self.model, history, start, first, scales.dt_s),
+            flags: 0,
+        };
+        let step = |control: &Control<f64>| {
+            let token = self.terrain(tokens.as_deref(), &[pose(&sample.state)])[0];
+            let entries = self.entries(&sample.state, sample.previous.as_ref(), control, &ground);
+            let lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| [entries[i]; LANES]);
+            let context: [Lane; HIDDEN] = core::array::from_fn(|i| [token[i]; LANES]);
+            let said = self.network.step(&prefix, &mut cache, &lanes, &context);
+            let transition = self.transition_from(&sample, control, &ground, &token, &said);
+            let soil = correction.apply(&transition.input.soil.to_array());
+            let moved = self.model.step(&StepInput { soil: Soil::from_array(soil), ..transition.input }).increment.to_array();
+            let total = core::array::from_fn(|i| moved[i] + transition.residual[i]);
+            self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
+            transition
+        };
+        controls.iter().map(step).collect()
+    }
+
+    /// A transition from what the network said of it.
+    fn transition_from(
+        &self,
+        sample: &Sample,
+        control: &Control<f64>,
+        ground: &GroundSource<'_>,
+        token: &TerrainToken,
+        (sinkage, residual): &([Lane; WHEELS], [Lane; STATE_DIM]),
+    ) -> Transition {
+        let scales = &self.bundle.normalization;
+        let after = sample.actuators.advance(self.model.vehicle(), control, sample.state.velocity_m_s[0], scales.dt_s);
+        let (under_wheels, known) = ground.under_wheels(&self.model, &sample.state, 0.0);
+        let ratio = |i: usize| f64::from(scales.sinkage_log_ratio_max * sinkage[i][0].tanh());
+        Transition {
+            input: StepInput {
+                state: sample.state,
+                wheels: command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
+                sinkage_log_ratio: core::array::from_fn(ratio),
+                soil: Soil::from_array(from_raw(&raw_soil(token))),
+                ground: under_wheels,
+            },
+            actuators: [sample.actuators, after],
+            control: *control,
+            residual: core::array::from_fn(|i| f64::from(residual[i][0] * scales.residual_scale[i])),
+            ground_known: known,
+        }
+    }
+}
