@@ -254,6 +254,38 @@ fn chrono_a_bundle_made_in_seconds_predicts_and_a_damaged_one_is_refused() {
     assert!(check.status.code() == Some(2) && stdout(&check).contains("weights.safetensors"), "{}", stdout(&check));
 }
 
+/// Goal: on drives of an external simulator the shipped bundle names the steering offset they have, sizes it, writes a bundle that has it, and
+/// finds nothing in drives without an effect. Method: the command on two drives of each; the truth is 0.12.
+#[test]
+fn chrono_diagnose_names_a_steering_offset_and_nothing_without_one() {
+    let here = tempfile::tempdir().unwrap();
+    let root = sample().display().to_string();
+    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal").display().to_string();
+    let run = |set: &str, out: &str| -> Value {
+        let output = nesam(&["diagnose", "--data", &root, "--set", set, "--bundle", &shipped, "--out", out], here.path());
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        serde_json::from_slice(&std::fs::read(here.path().join(out).join("diagnose.json")).unwrap()).unwrap()
+    };
+    let found = run("effect_open/steer_offset", "steer");
+    assert_eq!((found["schema"].as_str(), found["verdict"].as_str()), (Some("nesam.diagnose/1"), Some("explained")), "{}", found["reason"]);
+    let effect = &found["effects"][0];
+    assert_eq!(effect["id"], "steering_offset");
+    let second = &effect["parameters"][0];
+    assert!((second["value"].as_f64().unwrap() - 0.12).abs() < 0.012, "{second}");
+    assert_eq!(second["ci95"].as_array().unwrap().len(), 2);
+    let rivals: f64 = effect["rivals"].as_array().unwrap().iter().map(|r| r["weight"].as_f64().unwrap()).sum();
+    assert!((effect["weight"].as_f64().unwrap() + rivals - 1.0).abs() < 1e-9);
+    let position = |stage: &str| found[stage]["position_m"]["mean"].as_f64().unwrap();
+    assert!(position("after") < 0.8 * position("before") && position("after") < 0.8 * position("soil_only"));
+    let patched = ["predict", "--data", &root, "--set", "nominal", "--bundle", "steer/bundle", "--horizon", "5", "--out", "p.json"];
+    let predicted = nesam(&patched, here.path());
+    assert_eq!(predicted.status.code(), Some(0), "{}", stderr(&predicted));
+
+    let nothing = run("effect_open/null_open", "null");
+    assert_eq!(nothing["verdict"], "none", "{}", nothing["reason"]);
+    assert!(nothing["effects"].as_array().unwrap().is_empty() && nothing["bundle"].is_null());
+}
+
 #[test]
 fn service_serve_says_where_it_listens_and_stops_on_a_signal() {
     let here = tempfile::tempdir().unwrap();

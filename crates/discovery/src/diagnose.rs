@@ -2,21 +2,19 @@
 
 use nesam_evaluation::{DriveMaps, ErrorTree, paired_difference};
 use nesam_model::Predictor;
-use nesam_physics::SoilCorrection;
+use nesam_physics::effects::Layer;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::channels::CHANNELS;
 use crate::error::DiscoveryError;
+use crate::expectation::{Expectation, mean, mean_signature};
+use crate::features::{FEATURES, Prepared, Stepping, prepare};
+use crate::fit::{Bench, Member};
 use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
-use crate::normal::Normal;
-use crate::observe::{ObservedDrive, observe_all};
+use crate::observe::observe_all;
 use crate::reference::Reference;
-use crate::refit::{Bench, Fit, Member, fit_effect, fit_soil};
-use crate::scan::{Prepared, Stepping, prepare, strength};
-use crate::select::{DECISIVE_BIC, Selection, select};
-use crate::whitening::Whitening;
+use crate::select::{DECISIVE_BIC, Ranked, Selection, Yardstick, reselect, select};
 
 /// What the command line says.
 #[derive(Clone, Debug)]
@@ -67,14 +65,14 @@ pub struct Estimate {
     pub ci95: Option<[f64; 2]>,
 }
 
-/// Mean whitened deviation of one channel over the set.
+/// Mean of one statistic over the set against drives without an effect.
 #[derive(Clone, Debug)]
-pub struct ChannelDeviation {
-    /// Channel.
-    pub channel: usize,
-    /// Mean deviation in standard deviations of one segment.
-    pub mean: f64,
-    /// The same divided by what such a mean scatters without an effect.
+pub struct StatisticDeviation {
+    /// Index among [`crate::features::names`].
+    pub statistic: usize,
+    /// Difference from the centre of drives without an effect, in the unit of the statistic.
+    pub difference: f64,
+    /// The same in standard deviations of such a group without an effect.
     pub significance: f64,
 }
 
@@ -99,8 +97,8 @@ pub struct Diagnosis {
     pub learned: Vec<Learned>,
     /// Scores; `None` when no drive is held out.
     pub scores: Option<HeldOut>,
-    /// Deviations by channel.
-    pub channels: Vec<ChannelDeviation>,
+    /// Deviations by statistic.
+    pub statistics: Vec<StatisticDeviation>,
 }
 
 /// Told how far a diagnosis is.
@@ -130,23 +128,30 @@ pub fn diagnose(
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let total = fit_at.len();
     let observed = observe_all(predictor, &fit_drives, &fit_maps, &|done| progress("drives compared with the reference", done, total))?;
-    let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
-    let whitening = Whitening::new(&reference, &available)?;
     let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
-    let bench = Bench { whitening: &whitening, vehicle: &bundle.vehicle, stepping };
-    let prepared: Vec<Prepared> = observed.par_iter().map(|d| prepare(&whitening, &bundle.vehicle, stepping, d)).collect();
+    let scale = reference.segment_scale();
+    let prepared: Vec<Prepared> = observed.par_iter().map(|d| prepare(&scale, &bundle.vehicle, stepping, d)).collect();
+    let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
+    let usable = reference.usable(&available);
+    let yardstick = yardstick(&reference, &usable, total)?;
+    let bench = Bench { vehicle: &bundle.vehicle, stepping };
     let members: Vec<Member<'_>> = observed.iter().zip(&prepared).collect();
 
-    let selection = select(&bench, &reference, &members, &options.without);
-    let without_one = |left_out: usize| -> Vec<Member<'_>> { (0..total).filter(|i| *i != left_out).map(|i| members[i]).collect() };
-    let folds: Vec<usize> = if total > 1 { (0..total).collect() } else { Vec::new() };
-    let learned = learn(&bench, &reference, &members, &selection, options, &folds, drives.len() - total, progress);
-    let estimates = selection.claimed().map_or_else(Vec::new, |best| {
-        let jackknife: Vec<Fit> =
-            folds.par_iter().map(|&d| fit_effect(&bench, &without_one(d), best.fit.candidate, best.fit.values.clone())).collect();
-        estimates(&best.fit, &jackknife, selection.dispersion)
-    });
-    let stability = selection.claimed().map(|best| stability(&members, &selection, best.fit.candidate));
+    progress("hypotheses", 0, 1);
+    let selection = select(&bench, &yardstick, &members, &options.without);
+    let learned = match options.fit_on {
+        Some(_) => {
+            let effects = selection.claimed().map(Ranked::effect).into_iter().collect();
+            vec![Learned { soil: selection.soil, effects }; drives.len() - total]
+        }
+        None if total > 1 => {
+            let fewer = self::yardstick(&reference, &usable, total - 1)?;
+            leave_each_out(&fewer, &members, &selection, &options.without)
+        }
+        None => Vec::new(),
+    };
+    let estimates = selection.claimed().map_or_else(Vec::new, estimates);
+    let stability = selection.claimed().map(|best| stability(&yardstick.expectation, &members, &selection, best.candidate));
 
     let held_at: Vec<usize> = match options.fit_on {
         Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
@@ -167,7 +172,7 @@ pub fn diagnose(
         held_out: held.iter().map(|d| d.id.clone()).collect(),
         learned,
         scores,
-        channels: channel_deviations(&reference, &bench, &observed),
+        statistics: deviations(&yardstick.expectation, &prepared),
         selection,
     })
 }
@@ -186,52 +191,45 @@ fn fitted(drives: &[Trajectory], options: &Options) -> Result<Vec<usize>, Discov
         .collect()
 }
 
-/// What each held-out drive is predicted with: learned without it, selection included.
-#[allow(clippy::too_many_arguments)]
-fn learn(
-    bench: &Bench<'_>,
-    reference: &Reference,
-    members: &[Member<'_>],
-    selection: &Selection,
-    options: &Options,
-    folds: &[usize],
-    held_out: usize,
-    progress: OnProgress<'_>,
-) -> Vec<Learned> {
-    if options.fit_on.is_some() {
-        let effects = selection.claimed().map(|r| r.fit.effect()).into_iter().collect();
-        return vec![Learned { soil: fit_soil(bench, members), effects }; held_out];
-    }
-    folds
-        .iter()
-        .map(|&left_out| {
-            progress("drives left out", left_out + 1, folds.len());
-            let rest: Vec<Member<'_>> = (0..members.len()).filter(|i| *i != left_out).map(|i| members[i]).collect();
-            let fold = if selection.detected() { Some(select(bench, reference, &rest, &options.without)) } else { None };
-            let effects = fold.as_ref().and_then(Selection::claimed).map(|r| r.fit.effect()).into_iter().collect();
-            Learned { soil: fit_soil(bench, &rest), effects }
+fn yardstick(reference: &Reference, usable: &[bool; FEATURES], drives: usize) -> Result<Yardstick, DiscoveryError> {
+    let expectation = reference
+        .expectation(usable, drives)
+        .ok_or_else(|| DiscoveryError::Reference { reason: "has no statistic that is measured in this set".into() })?;
+    Ok(Yardstick { expectation, nulls: reference.null_groups(usable, drives) })
+}
+
+/// What each drive is predicted with: learned without it.
+fn leave_each_out(yardstick: &Yardstick, members: &[Member<'_>], selection: &Selection, without: &[String]) -> Vec<Learned> {
+    (0..members.len())
+        .map(|left_out| {
+            let kept: Vec<usize> = (0..members.len()).filter(|d| *d != left_out).collect();
+            let (soil, effect) = reselect(yardstick, members, &kept, selection, without);
+            Learned { soil, effects: effect.into_iter().collect() }
         })
         .collect()
 }
 
-/// Values with intervals: the wider of the model's own and the jackknife over drives with Student's t.
-fn estimates(fit: &Fit, jackknife: &[Fit], dispersion: f64) -> Vec<Estimate> {
-    const T_975: [f64; 10] = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23];
-    let n = jackknife.len();
-    let free = fit.candidate.free();
-    fit.effect()
+/// How wrong the predicted response to an effect may be as a whole, as a share of it: two accepted pressure laws give drawbar pulls that differ by a
+/// quarter at the same slip, while the angle of a road wheel is geometry (chosen).
+fn scale_sd(layer: Layer) -> f64 {
+    match layer {
+        Layer::Force => 0.25,
+        Layer::Actuator => 0.02,
+    }
+}
+
+fn estimates(best: &Ranked) -> Vec<Estimate> {
+    let (fit, free) = (&best.fit, best.candidate.free());
+    best.candidate
+        .effect(&fit.values)
         .parameters()
         .iter()
         .enumerate()
         .map(|(p, parameter)| {
             let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
-                let mut half = 1.96 * fit.sd[i] * dispersion.sqrt();
-                if n > 1 {
-                    let mean = jackknife.iter().map(|f| f.values[i]).sum::<f64>() / n as f64;
-                    let square = jackknife.iter().map(|f| (f.values[i] - mean).powi(2)).sum::<f64>();
-                    let t = T_975.get(n - 2).copied().unwrap_or(2.1);
-                    half = half.max(t * (square * (n - 1) as f64 / n as f64).sqrt());
-                }
+                // The first value is the magnitude, which answers for the scale of the response.
+                let scale = if i == 0 { 1.96 * scale_sd(best.effect().layer()) * fit.values[i] } else { 0.0 };
+                let half = fit.half_width(i, best.inflation).hypot(scale);
                 [fit.values[i] - half, fit.values[i] + half]
             });
             Estimate { name: parameter.name, unit: parameter.unit, value: parameter.value, ci95 }
@@ -240,15 +238,15 @@ fn estimates(fit: &Fit, jackknife: &[Fit], dispersion: f64) -> Vec<Estimate> {
 }
 
 /// Share of half-samples of the drives whose strongest evidence is for the id of `candidate`.
-fn stability(members: &[Member<'_>], selection: &Selection, candidate: Candidate) -> f64 {
+fn stability(expectation: &Expectation, members: &[Member<'_>], selection: &Selection, candidate: Candidate) -> f64 {
     let n = members.len().min(12);
     let half = n.div_ceil(2);
-    let spread = |e: usize| selection.z[e].map_or(f64::INFINITY, |z| (selection.strength.z[e] / z.max(1e-9)).max(1.0));
     let (mut hits, mut count) = (0usize, 0usize);
     for subset in (0u32..1 << n).filter(|s| s.count_ones() as usize == half) {
-        let chosen = (0..n).filter(|i| subset & (1 << i) != 0).map(|i| &members[i].1.scores);
-        let z = strength(&Normal::sum(chosen).expect("half of the drives is not none; this is a bug")).z;
-        let best = (0..z.len()).max_by(|&a, &b| (z[a] / spread(a)).total_cmp(&(z[b] / spread(b))));
+        let chosen: Vec<&Prepared> = (0..n).filter(|i| subset & (1 << i) != 0).map(|i| members[i].1).collect();
+        let statistics = mean(chosen.iter().map(|p| &p.statistics));
+        let z = expectation.strength(&statistics, &mean_signature(chosen.iter().map(|p| &p.signature))).z;
+        let best = (0..z.len()).filter(|e| selection.z[*e].is_some()).max_by(|&a, &b| z[a].total_cmp(&z[b]));
         hits += usize::from(best.is_some_and(|e| Candidate::ALL[e].id() == candidate.id()));
         count += 1;
     }
@@ -256,28 +254,37 @@ fn stability(members: &[Member<'_>], selection: &Selection, candidate: Candidate
 }
 
 fn verdict(selection: &Selection, scores: Option<&HeldOut>) -> (Verdict, String) {
-    if !selection.detected() {
+    if !selection.differs() {
         return (Verdict::None, "no hypothesis stands out from drives without an effect".into());
+    }
+    if !selection.detected() {
+        let [distance, usual] = selection.distance;
+        return (
+            Verdict::Unexplained,
+            format!(
+                "the drives differ from the reference ({distance:.1} per statistic, usual up to {usual:.1}), but no effect of the catalogue stands out"
+            ),
+        );
+    }
+    if selection.soil_explains() {
+        return (Verdict::None, "another soil explains the drives better than any effect".into());
     }
     let best = &selection.ranked[0];
     if let Some(refused) = &best.refused {
         return (
             Verdict::Unexplained,
-            format!("the drives differ from the reference, but {} cannot be claimed: {refused}", best.fit.candidate.label()),
+            format!("the drives differ from the reference, but {} cannot be claimed: {refused}", best.candidate.label()),
         );
     }
     if let Some(scores) = scores {
         if let Some(reason) = not_proven(scores) {
-            return (Verdict::Unexplained, format!("{} fits, but {reason}", best.fit.candidate.label()));
+            return (Verdict::Unexplained, format!("{} fits, but {reason}", best.candidate.label()));
         }
     }
-    let rival =
-        selection.ranked.iter().skip(1).find(|r| r.fit.candidate.id() != best.fit.candidate.id() && r.bic - best.bic < DECISIVE_BIC);
+    let rival = selection.ranked.iter().skip(1).find(|r| r.candidate.id() != best.candidate.id() && r.bic - best.bic < DECISIVE_BIC);
     match rival {
-        Some(rival) => {
-            (Verdict::Ambiguous, format!("{} and {} explain it about as well", best.fit.candidate.label(), rival.fit.candidate.label()))
-        }
-        None => (Verdict::Explained, format!("{} explains it and helps on drives that were not fitted", best.fit.candidate.label())),
+        Some(rival) => (Verdict::Ambiguous, format!("{} and {} explain it about as well", best.candidate.label(), rival.candidate.label())),
+        None => (Verdict::Explained, format!("{} explains it and helps on drives that were not fitted", best.candidate.label())),
     }
 }
 
@@ -301,27 +308,13 @@ fn not_proven(scores: &HeldOut) -> Option<String> {
     worse.then(|| "an error rises surely on drives that were not fitted".into())
 }
 
-fn channel_deviations(reference: &Reference, bench: &Bench<'_>, observed: &[ObservedDrive]) -> Vec<ChannelDeviation> {
-    let model = bench.stepping.model(bench.vehicle);
-    let mut sums = [[0.0f64; 2]; CHANNELS];
-    for drive in observed {
-        for (s, row) in drive.deviations(&model, &SoilCorrection::NONE).iter().enumerate() {
-            for &c in bench.whitening.used() {
-                sums[c][0] += reference.scaled(c, drive, s, row);
-                sums[c][1] += 1.0;
-            }
-        }
-    }
-    bench
-        .whitening
-        .used()
-        .iter()
-        .map(|&channel| {
-            let [sum, count] = sums[channel];
-            let statistics = &reference.channels[channel];
-            let by_chance = (1.0 + statistics.colour) / (1.0 - statistics.colour) / count;
-            let between = statistics.offset_sd.powi(2) / observed.len() as f64;
-            ChannelDeviation { channel, mean: sum / count, significance: sum / count / (by_chance + between).sqrt() }
-        })
-        .collect()
+fn deviations(expectation: &Expectation, prepared: &[Prepared]) -> Vec<StatisticDeviation> {
+    let statistics = mean(prepared.iter().map(|p| &p.statistics));
+    let (difference, significance) = (expectation.deviation(&statistics), expectation.significance(&statistics));
+    let of = |(i, statistic): (usize, &usize)| StatisticDeviation {
+        statistic: *statistic,
+        difference: difference[i],
+        significance: significance[i],
+    };
+    expectation.used().iter().enumerate().map(of).collect()
 }

@@ -117,11 +117,6 @@ impl ObservedDrive {
         self.starts.par_iter().map(|&start| self.segment(model, soil, start)).collect()
     }
 
-    /// Measured forward speed at the start of a segment, m/s.
-    pub fn speed_m_s(&self, segment: usize) -> f64 {
-        self.states[self.starts[segment]].velocity_m_s[0]
-    }
-
     fn segment(&self, model: &StepModel, soil: &SoilCorrection, start: usize) -> Row {
         let mut row = [0.0; CHANNELS];
         let mut state = self.states[start];
@@ -151,7 +146,8 @@ impl ObservedDrive {
 
     /// Adds the actuator layer of one sample: road-wheel angle, and rim over-speeds with what a drag at the wheel takes from them.
     ///
-    /// A drag torque τ lowers the rim speed until the tread makes up for it: Δ(over-speed) = -(τ / r) / (∂F/∂over-speed).
+    /// A drag torque τ lowers the rim speed until the tread makes up for what the coupling of the axle does not:
+    /// Δ(over-speed) = -(τ at the tread / r) / (∂F/∂over-speed), see `StepModel`.
     fn actuators(&self, model: &StepModel, transition: &Transition, sample: usize, row: &mut Row) {
         let vehicle = model.vehicle();
         let share = 1.0 / SEGMENT_STEPS as f64;
@@ -168,7 +164,11 @@ impl ObservedDrive {
             let centre = [v[0] + w[1] * at[2] - w[2] * at[1], v[1] + w[2] * at[0] - w[0] * at[2]];
             let (sin, cos) = angles[i].sin_cos();
             let forward = cos * centre[0] + sin * centre[1];
-            let drag = vehicle.effects.wheel_drag_n_m[i] / vehicle.wheel_radius_m / self.traction_slope[sample][i];
+            let slope = self.traction_slope[sample][i];
+            let coupling = 2.0 * vehicle.driveline.side_coupling_n_m_s / vehicle.wheel_radius_m.powi(2);
+            let (own, partner) = (vehicle.effects.wheel_drag_n_m[i], vehicle.effects.wheel_drag_n_m[i ^ 1]);
+            let at_tread = own - vehicle.drag_made_up_n_m() - 0.5 * coupling / (slope + coupling) * (own - partner);
+            let drag = at_tread / vehicle.wheel_radius_m / slope;
             let predicted = transition.input.wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum();
             row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - predicted);
         }
@@ -197,11 +197,4 @@ fn deviation(measured: &VehicleState<f64>, predicted: &VehicleState<f64>) -> [f6
         3..=5 => wrap_angle(m[c] - p[c]),
         _ => m[c] - p[c],
     })
-}
-
-impl ObservedDrive {
-    /// Whether a segment begins where the one before it ended.
-    pub fn follows(&self, segment: usize) -> bool {
-        segment > 0 && self.starts[segment] == self.starts[segment - 1] + SEGMENT_STEPS
-    }
 }

@@ -5,8 +5,8 @@ use nesam_evaluation::{DIMENSION_KEYS, ErrorTree, POSE_DIM, Provenance, paired_d
 use serde_json::{Value, json};
 
 use crate::candidates::Candidate;
-use crate::channels;
-use crate::diagnose::{Diagnosis, Verdict};
+use crate::diagnose::{Diagnosis, StatisticDeviation, Verdict};
+use crate::features;
 use crate::select::Ranked;
 
 /// Version of the rule by which a diagnosis stops.
@@ -56,15 +56,17 @@ impl Report<'_> {
             "improvement": improvement.as_ref().map(|(m, _)| m),
             "p_family_wise": d.selection.probability.map(|[p, _]| p),
             "threshold_z": d.selection.threshold,
+            "distance_per_statistic": d.selection.distance[0],
+            "soil_bic_against_none": d.selection.soil_bic,
             "considered": self.considered(),
             "learned_per_held_out_drive": self.learned(),
             "stop_rule": STOP_RULE,
             "provenance": self.provenance,
         });
         let map = document.as_object_mut().expect("an object was built; this is a bug");
-        map.insert("channels".into(), d.channels.iter().map(|c| {
-            json!({"channel": channels::name(c.channel), "layer": channels::layer(c.channel), "mean_sd": c.mean, "significance": c.significance})
-        }).collect());
+        let names = features::names();
+        let statistic = |c: &StatisticDeviation| json!({"statistic": names[c.statistic], "layer": features::layer(c.statistic), "difference": c.difference, "significance": c.significance});
+        map.insert("statistics".into(), d.statistics.iter().map(statistic).collect());
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
     }
 
@@ -77,23 +79,22 @@ impl Report<'_> {
         let class: Vec<&Ranked> = d.selection.ranked.iter().filter(|r| r.refused.is_none()).take(MEMBERS_MAX).collect();
         let total: f64 = class.iter().map(|r| r.weight).sum();
         let Some((best, rivals)) = class.split_first() else { return Vec::new() };
-        let next =
-            d.selection.ranked.iter().skip(1).find(|r| r.fit.candidate.id() != best.fit.candidate.id()).map_or(0.0, |r| r.bic.min(0.0));
+        let next = d.selection.ranked.iter().skip(1).find(|r| r.candidate.id() != best.candidate.id()).map_or(0.0, |r| r.bic.min(0.0));
         let parameters: Vec<Value> =
             d.estimates.iter().map(|e| json!({"name": e.name, "unit": e.unit, "value": e.value, "ci95": e.ci95})).collect();
         let rivals: Vec<Value> = rivals
             .iter()
             .map(|r| {
                 let parameters: Vec<Value> =
-                    r.fit.effect().parameters().iter().map(|p| json!({"name": p.name, "unit": p.unit, "value": p.value})).collect();
-                json!({"id": r.fit.candidate.id(), "weight": r.weight / total, "parameters": parameters})
+                    r.effect().parameters().iter().map(|p| json!({"name": p.name, "unit": p.unit, "value": p.value})).collect();
+                json!({"id": r.candidate.id(), "weight": r.weight / total, "parameters": parameters})
             })
             .collect();
-        let e = Candidate::ALL.iter().position(|c| *c == best.fit.candidate).unwrap_or(0);
+        let e = Candidate::ALL.iter().position(|c| *c == best.candidate).unwrap_or(0);
         vec![json!({
-            "id": best.fit.candidate.id(),
+            "id": best.candidate.id(),
             "weight": best.weight / total,
-            "layer": format!("{:?}", best.fit.effect().layer()).to_lowercase(),
+            "layer": format!("{:?}", best.effect().layer()).to_lowercase(),
             "parameters": parameters,
             "onset_s": null,
             "onset_ci95": null,
@@ -109,9 +110,9 @@ impl Report<'_> {
             .iter()
             .enumerate()
             .map(|(e, c)| {
-                let ranked = s.ranked.iter().find(|r| r.fit.candidate == *c);
-                let parameters = ranked
-                    .map(|r| r.fit.effect().parameters().iter().map(|p| json!({"name": p.name, "value": p.value})).collect::<Vec<_>>());
+                let ranked = s.ranked.iter().find(|r| r.candidate == *c);
+                let parameters =
+                    ranked.map(|r| r.effect().parameters().iter().map(|p| json!({"name": p.name, "value": p.value})).collect::<Vec<_>>());
                 json!({"hypothesis": c.label(), "z": s.z[e], "bic_against_none": ranked.map(|r| r.bic), "weight": ranked.map(|r| r.weight),
                     "parameters": parameters, "refused": ranked.and_then(|r| r.refused.clone())})
             })
@@ -147,11 +148,11 @@ impl Report<'_> {
         );
         let mut page = Page::new(&format!("nesam diagnose: {}", self.set), &lead);
         page.section("What was seen")
-            .text("Mean deviation of measured segments from the frozen reference, by residual layer; significance is against drives without an effect.")
-            .table(&self.channel_table());
+            .text("Statistics of the drives against the frozen reference, by residual layer; significance is against groups of drives without an effect.")
+            .table(&self.statistic_table());
         page.section("What was considered")
             .text(&format!(
-                "Evidence with soil and constant offsets of each drive projected out; below z = {:.2} nothing is claimed.",
+                "Evidence against the scatter of drives without an effect; below z = {:.2} nothing is claimed.",
                 d.selection.threshold
             ))
             .table(&self.hypothesis_table());
@@ -172,18 +173,17 @@ impl Report<'_> {
         page.render()
     }
 
-    fn channel_table(&self) -> Table {
-        let mut table = Table::new(
-            "Deviations, measured minus predicted, largest first",
-            &["channel", "layer", "mean [sd of a segment]", "significance"],
-        );
-        let mut channels: Vec<_> = self.diagnosis.channels.iter().collect();
-        channels.sort_by(|a, b| b.significance.abs().total_cmp(&a.significance.abs()));
-        for c in channels.into_iter().take(12) {
+    fn statistic_table(&self) -> Table {
+        let mut table =
+            Table::new("Statistics of the drives, largest deviation first", &["statistic", "layer", "difference", "significance"]);
+        let names = features::names();
+        let mut statistics: Vec<_> = self.diagnosis.statistics.iter().collect();
+        statistics.sort_by(|a, b| b.significance.abs().total_cmp(&a.significance.abs()));
+        for c in statistics.into_iter().take(12) {
             table.row(vec![
-                channels::name(c.channel).into(),
-                channels::layer(c.channel).into(),
-                format!("{:+.3}", c.mean).into(),
+                names[c.statistic].clone().into(),
+                features::layer(c.statistic).into(),
+                format!("{:+.4}", c.difference).into(),
                 format!("{:+.1}", c.significance).into(),
             ]);
         }
@@ -194,7 +194,7 @@ impl Report<'_> {
         let mut table = Table::new("Hypotheses", &["hypothesis", "z", "criterion against none", "weight", "refit", "refused because"]);
         let s = &self.diagnosis.selection;
         for (e, c) in Candidate::ALL.iter().enumerate() {
-            let ranked = s.ranked.iter().find(|r| r.fit.candidate == *c);
+            let ranked = s.ranked.iter().find(|r| r.candidate == *c);
             let fit = ranked.map_or("-".into(), |r| describe(r));
             table.row(vec![
                 c.label().into(),
@@ -233,6 +233,16 @@ impl Report<'_> {
         self.diagnosis.scores.iter().flat_map(|s| STAGES.into_iter().zip(s.scores.iter().map(|m| &m.summary.tree))).collect()
     }
 
+    /// What the effect gains over the unchanged bundle and over the best soil alone: reduction of each error with its 95 % interval, positive = better.
+    pub fn gains(&self) -> Vec<(&'static str, ErrorTree<f64>, ErrorTree<[f64; 2]>)> {
+        let Some(s) = &self.diagnosis.scores else { return Vec::new() };
+        let against = |i: usize, name| {
+            let (gain, interval) = paired_difference(&s.scores[i].errors, &s.scores[2].errors, &s.resamples);
+            (name, gain, interval)
+        };
+        vec![against(0, "gain over before"), against(1, "gain over soil only")]
+    }
+
     fn curve(&self, scores: &crate::HeldOut, dimension: usize) -> LinePlot {
         let title = DIMENSION_KEYS.get(dimension).copied().unwrap_or("position_m");
         let mut plot = LinePlot::new(title, "time ahead [s]", title);
@@ -250,6 +260,6 @@ impl Report<'_> {
 
 /// A refit in words.
 pub fn describe(ranked: &Ranked) -> String {
-    let parameters: Vec<String> = ranked.fit.effect().parameters().iter().map(|p| format!("{} {:.3}", p.name, p.value)).collect();
+    let parameters: Vec<String> = ranked.effect().parameters().iter().map(|p| format!("{} {:.3}", p.name, p.value)).collect();
     parameters.join(", ")
 }

@@ -28,6 +28,7 @@ pub(crate) fn bicycle() -> Vehicle {
             speed_integral_limit_m: 5.0,
             overspeed_limit_m_s: 2.0,
             rims: Default::default(),
+            side_coupling_n_m_s: 0.0,
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),

@@ -157,6 +157,7 @@ fn nesam_vehicle() -> nesam_physics::Vehicle {
             speed_integral_limit_m: 1.0,
             overspeed_limit_m_s: 1.0,
             rims: Default::default(),
+            side_coupling_n_m_s: 0.0,
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),

@@ -268,7 +268,7 @@ impl StepModel {
         sinkage_m: T,
         slip: T,
     ) -> ([T; 2], WheelContact<T>) {
-        let drag_n = T::lit(self.vehicle.effects.wheel_drag_n_m[wheel] / self.wheel.radius_m);
+        let drag_n = self.drag_at_tread(wheel, wrench.thrust_n * share, load, wheel_motion, &input.soil);
         let opposing = wheel_motion.forward_m_s / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
         let forward_n = wrench.drawbar_n() * share * direction - drag_n * opposing;
         let left_n = wrench.side_n * share;
@@ -280,6 +280,32 @@ impl StepModel {
         let friction = drag_n / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
         let drag = [thrust / over * input.wheels.slip_feedback() + friction.max(T::lit(0.0)), side];
         (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip })
+    }
+}
+
+impl StepModel {
+    /// Force that friction at the wheels of an axle takes from the tread of one of them, N.
+    ///
+    /// The dragged wheel turns slower than its partner, and the coupling of the differential passes torque to it: with drags τ, τ' and the same
+    /// slope s of traction over rim speed at both, τ - κ (τ - τ') / 2 is left to the tread, κ = (2 k / r²) / (s + 2 k / r²). The slope is the tangent of the
+    /// exponential shear law at the mobilised share u of its limit: s = thrust / over-speed · (1 - u) (-ln(1 - u)) / u. What the speed
+    /// controller makes up is subtracted from every drag. Neglects the limit of the coupling and the one between the axles. Without drag nothing is computed.
+    fn drag_at_tread<T: Real>(&self, wheel: usize, thrust_n: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> T {
+        let drags = &self.vehicle.effects.wheel_drag_n_m;
+        if drags.iter().all(|drag| *drag == 0.0) {
+            return T::lit(0.0);
+        }
+        let (own, partner) = (drags[wheel] - self.vehicle.drag_made_up_n_m(), drags[wheel ^ 1] - self.vehicle.drag_made_up_n_m());
+        let r = self.wheel.radius_m;
+        let coupling = T::lit(2.0 * self.vehicle.driveline.side_coupling_n_m_s / (r * r));
+        let over = (motion.rim_speed_m_s - motion.forward_m_s).abs_smooth(0.02);
+        let (sin, cos) = soil.phi.sin_cos();
+        let thrust = thrust_n.abs_smooth(1.0);
+        let mobilised = (thrust / (load_n * sin / cos).relu_smooth(1.0)).min(T::lit(0.95)).max(T::lit(0.05));
+        let free = T::lit(1.0) - mobilised;
+        let slope = thrust / over * free * -free.ln() / mobilised;
+        let passed = coupling / (slope + coupling).max(T::lit(1.0));
+        (T::lit(own) - passed * T::lit(0.5 * (own - partner))) / T::lit(r)
     }
 }
 

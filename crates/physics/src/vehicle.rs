@@ -47,6 +47,8 @@ pub struct Driveline {
     pub overspeed_limit_m_s: f64,
     /// Servo of the rims; of a skid-steer vehicle only.
     pub rims: RimServo,
+    /// Torque that the coupling between the wheels of an axle passes per difference of their speeds, N m s/rad; 0 = open differential.
+    pub side_coupling_n_m_s: f64,
 }
 
 /// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then two equal lags in series, for the mean rim speed and for
@@ -142,6 +144,13 @@ impl Vehicle {
         let weight = self.mass_kg * self.gravity_m_s2;
         let on_front = weight * -rear / (front - rear);
         [0.5 * on_front, 0.5 * on_front, 0.5 * (weight - on_front), 0.5 * (weight - on_front)]
+    }
+
+    /// Torque that the drive adds at each wheel against the friction of all of them, N m: a vehicle that tracks its speed with an integral part holds it
+    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none.
+    pub fn drag_made_up_n_m(&self) -> f64 {
+        let mean = self.effects.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
+        if self.second == SecondCommand::YawRateRadS { 0.0 } else { mean }
     }
 
     /// Whether the command lies in the range of the card (both ends included).

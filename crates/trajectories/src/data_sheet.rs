@@ -270,5 +270,6 @@ fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, Traje
         speed_integral_limit_m: or(&["driveline.speed_integral_limit_m"], 2.0)?,
         overspeed_limit_m_s: sheet.positive(&["driveline.overspeed_limit_m_s"])?.unwrap_or(if skid { SKID_RIM_LIMIT_M_S } else { 0.8 }),
         rims: RimServo::default(),
+        side_coupling_n_m_s: or(&["driveline.lsd_Nm_per_rad_s", "driveline.side_coupling_n_m_s"], 0.0)?,
     })
 }

@@ -67,6 +67,8 @@ struct Line {
     overspeed_limit_m_s: f64,
     #[serde(default, skip_serializing_if = "Option::is_none")]
     rims: Option<Rims>,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    side_coupling_n_m_s: f64,
 }
 
 /// Servo of the rims of a skid-steer vehicle.
@@ -110,6 +112,12 @@ impl From<Rims> for RimServo {
     }
 }
 
+/// An open differential is left out, so that cards written before the coupling was known keep their bytes.
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_zero(value: &f64) -> bool {
+    *value == 0.0
+}
+
 /// The vehicle as a card.
 pub fn to_json(vehicle: &Vehicle) -> String {
     let v = vehicle.clone();
@@ -143,6 +151,7 @@ pub fn to_json(vehicle: &Vehicle) -> String {
             speed_integral_limit_m: v.driveline.speed_integral_limit_m,
             overspeed_limit_m_s: v.driveline.overspeed_limit_m_s,
             rims: (v.second == SecondCommand::YawRateRadS).then(|| v.driveline.rims.into()),
+            side_coupling_n_m_s: v.driveline.side_coupling_n_m_s,
         },
         gravity_m_s2: v.gravity_m_s2,
     };
@@ -171,6 +180,9 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
     ];
     if let Some((key, value)) = positive.iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
         return Err(CardError(format!("`{key}` is {value}, must be positive")));
+    }
+    if !(c.driveline.side_coupling_n_m_s >= 0.0) {
+        return Err(CardError(format!("`driveline.side_coupling_n_m_s` is {}, must not be negative", c.driveline.side_coupling_n_m_s)));
     }
     if let Some(t) = &c.steering {
         let ascending = t.command.windows(2).all(|w| w[0] < w[1]);
@@ -211,6 +223,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             speed_integral_limit_m: c.driveline.speed_integral_limit_m,
             overspeed_limit_m_s: c.driveline.overspeed_limit_m_s,
             rims: c.driveline.rims.map(Into::into).unwrap_or_default(),
+            side_coupling_n_m_s: c.driveline.side_coupling_n_m_s,
         },
         gravity_m_s2: c.gravity_m_s2,
         effects: Default::default(),

@@ -8,6 +8,7 @@ use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Candidate, Diagnosis, Options, Reference, Scoring, Stepping, Verdict, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM};
 use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
+use nesam_physics::Vehicle;
 use nesam_physics::effects::Effect;
 
 use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
@@ -96,12 +97,14 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     drives.maps = chosen.iter().map(|&d| drives.maps[d].clone()).collect();
     drives.drives = chosen.iter().map(|&d| drives.drives[d].clone()).collect();
     let mut bundle = load_bundle(Some(&dir))?;
+    take_coupling(&mut bundle, drives.root.vehicle());
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let progress = Progress::start("validation drives", drives.drives.len());
     let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
     let reference = Reference::measure(&predictor.bundle().vehicle, stepping(&bundle), &observed, &drives.root.hash()).or_input()?;
-    if let Some(nulls) = reference.null_groups(5) {
+    let usable = core::array::from_fn(|f| reference.usable[f]);
+    if let Some(nulls) = reference.null_groups(&usable, 5) {
         say!("null groups of 5 drives: threshold z = {:.2}", nulls.threshold);
         for (candidate, spread) in Candidate::ALL.iter().zip(&nulls.spread) {
             say!("  {:<18} null spread {spread:.2}", candidate.label());
@@ -111,6 +114,16 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     bundle.save(&dir).or_failed()?;
     say!("bundle {} now carries the reference of {} drives; its hash is {}", bundle.name, observed.len(), &bundle.hash[..12]);
     Ok(())
+}
+
+/// A bundle trained before cards told of couplings between wheels learns of it from the data sheet of the same vehicle; without a wheel drag it has no
+/// influence on any prediction.
+fn take_coupling(bundle: &mut ModelBundle, sheet: &Vehicle) {
+    let coupling = sheet.driveline.side_coupling_n_m_s;
+    if bundle.vehicle.name == sheet.name && bundle.vehicle.driveline.side_coupling_n_m_s == 0.0 && coupling > 0.0 {
+        bundle.vehicle.driveline.side_coupling_n_m_s = coupling;
+        say!("the card of the bundle now has the coupling of the data sheet, {coupling} N m s/rad between the wheels of an axle");
+    }
 }
 
 fn stepping(bundle: &ModelBundle) -> Stepping {
@@ -148,7 +161,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
 fn patched(predictor: &Arc<Predictor>, found: &Diagnosis, drives: &Drives, out: &Path) -> Result<Option<PathBuf>, Failure> {
     let (Verdict::Explained | Verdict::Ambiguous, Some(best)) = (found.verdict, found.selection.claimed()) else { return Ok(None) };
     let base = predictor.bundle();
-    let mut bundle = base.with_effects(&[best.fit.effect()]);
+    let mut bundle = base.with_effects(&[best.effect()]);
     bundle.provenance = Provenance {
         command: command_line(),
         data_hash: drives.root.hash(),
@@ -163,10 +176,10 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
     say!("{}: {} - {}", report.set, found.verdict.as_str().to_uppercase(), found.reason);
     let s = &found.selection;
     let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
-    say!("\nevidence, soil and offsets projected out (threshold z = {:.2}{p})", s.threshold);
+    say!("\nevidence against drives without an effect (threshold z = {:.2}{p})", s.threshold);
     for (e, candidate) in Candidate::ALL.iter().enumerate() {
         let Some(z) = s.z[e] else { continue };
-        let fit = s.ranked.iter().find(|r| r.fit.candidate == *candidate);
+        let fit = s.ranked.iter().find(|r| r.candidate == *candidate);
         let fit = fit.map_or(String::new(), |r| {
             let refused = r.refused.as_ref().map_or(String::new(), |why| format!("; refused: {why}"));
             format!("  criterion {:+9.1}  weight {:.3}  {}{refused}", r.bic, r.weight, describe(r))
@@ -204,6 +217,21 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
             .map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}")))
             .collect();
         say!("{name:<22}{cells}");
+    }
+    if found.learned.iter().all(|l| l.effects.is_empty()) {
+        return;
+    }
+    for (name, gain, interval) in report.gains() {
+        let numbers = gain.mae_mean.to_array().into_iter().chain([gain.position_m.mean, gain.position_m.final_]);
+        let ends = interval.mae_mean.to_array().into_iter().chain([interval.position_m.mean, interval.position_m.final_]);
+        let cells: Vec<String> = numbers
+            .zip(ends)
+            .map(|(g, i)| match (g, i) {
+                (Some(g), Some([low, high])) => format!("{g:+.3} [{low:+.3}, {high:+.3}]"),
+                _ => "–".into(),
+            })
+            .collect();
+        say!("{name:<22}{}", cells.join("  "));
     }
 }
 

@@ -49,6 +49,7 @@ pub fn truck() -> Vehicle {
             speed_integral_limit_m: 5.0,
             overspeed_limit_m_s: 1.5,
             rims: Default::default(),
+            side_coupling_n_m_s: 0.0,
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),
@@ -143,7 +144,7 @@ pub fn drive(id: &str, seed: u64, effects: &[Effect], soil: &[f64; 6]) -> Trajec
     }
 }
 
-/// An untrained bundle whose default soil is that of the twin, with the reference of 16 null drives.
+/// An untrained bundle whose default soil is that of the twin, with the reference of 24 null drives.
 pub fn bundle() -> ModelBundle {
     static BUNDLE: OnceLock<ModelBundle> = OnceLock::new();
     BUNDLE
@@ -166,7 +167,7 @@ pub fn bundle() -> ModelBundle {
                 soil_filter_json: None,
                 provenance: Provenance::default(),
             };
-            let drives: Vec<Trajectory> = (0..16).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();
+            let drives: Vec<Trajectory> = (0..24).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();
             let maps = vec![Some(world()); drives.len()];
             let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
@@ -182,10 +183,10 @@ pub fn options() -> Options {
     Options { fit_on: None, without: Vec::new(), scoring: Scoring { horizon: 16, history: 16, resamples: 1000, seed: 1 } }
 }
 
-/// Diagnoses four twin drives with effects.
+/// Diagnoses eight twin drives with effects.
 pub fn diagnose_twin(effects: &[Effect], seed: u64, options: &Options) -> Diagnosis {
     let bundle = bundle();
-    let drives: Vec<Trajectory> = (0..4).map(|i| drive(&format!("d{i}"), seed + i, effects, &bundle.default_soil)).collect();
+    let drives: Vec<Trajectory> = (0..8).map(|i| drive(&format!("d{i}"), seed + i, effects, &bundle.default_soil)).collect();
     let predictor = Predictor::new(Arc::new(bundle)).unwrap();
     diagnose(&predictor, &drives, &vec![Some(world()); drives.len()], options, &|_, _, _| {}).unwrap()
 }

@@ -5,7 +5,11 @@ use crate::vehicle::WHEELS;
 
 /// Wheel drag (catalogue no. 10): F_i = −(τ / r) tanh(v_i / 0.07 m/s) along the wheel's heading, at the contact.
 ///
-/// The rims of a speed-controlled vehicle follow the ground here, so the friction torque appears as the force it takes away from the tread.
+/// The rims of a speed-controlled vehicle follow the ground here, so the friction torque appears as the force it takes away from the tread. What the
+/// coupling of a limited-slip axle passes over is taken from the partner's tread instead, and a
+/// speed controller makes up for the sum, so that the vehicle turns rather than slows (`step.rs`, [`Vehicle::drag_made_up_n_m`]).
+///
+/// [`Vehicle::drag_made_up_n_m`]: crate::Vehicle::drag_made_up_n_m
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct WheelDrag {
     /// Wheel: 0 = front left, 1 = front right, 2 = rear left, 3 = rear right.

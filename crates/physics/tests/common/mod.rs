@@ -31,6 +31,7 @@ pub fn truck() -> Vehicle {
             speed_integral_limit_m: 2.0,
             overspeed_limit_m_s: 0.8,
             rims: Default::default(),
+            side_coupling_n_m_s: 0.0,
         },
         gravity_m_s2: 9.81,
         effects: Default::default(),
