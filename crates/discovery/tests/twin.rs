@@ -16,7 +16,8 @@ fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
 
 fn explained_by(found: &Diagnosis, id: &str) {
     let claimed = found.selection.claimed().map(|r| r.candidate.id());
-    assert_eq!((found.verdict, claimed), (Verdict::Explained, Some(id)), "{}; z {:?}", found.reason, found.selection.z);
+    let told = found.estimates.iter().map(|e| format!("{} {:.4} {:.4?}", e.name, e.value, e.ci95)).collect::<Vec<_>>();
+    assert_eq!((found.verdict, claimed), (Verdict::Explained, Some(id)), "{}; {told:?}; z {:?}", found.reason, found.selection.z);
     let scores = &found.scores.as_ref().unwrap().scores;
     let position = |i: usize| scores[i].summary.tree.position_m.mean.unwrap();
     eprintln!("{id}: position {:.3} -> soil only {:.3} -> after {:.3} m", position(0), position(1), position(2));

@@ -71,7 +71,7 @@ mod tests {
             name: name.into(),
             colour: Some(colour),
             low: [k_phi, 1.0, 1.0, 1.0, 0.5, 0.02],
-            high: [2.0 * k_phi, 1.0, 1.0, 1.0, 0.5, 0.02],
+            high: [k_phi + k_phi, 1.0, 1.0, 1.0, 0.5, 0.02],
         };
         let (mud, sand, grass) = ([84, 68, 52], [200, 180, 140], [88, 122, 52]);
         let shaded = sand.map(|v: u8| (f64::from(v) * 0.9).round() as u8);

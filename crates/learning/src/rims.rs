@@ -49,20 +49,21 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
     if measured.is_empty() {
         return None;
     }
-    let largest = |i: usize| measured.iter().flat_map(|(_, t)| t).map(|t| t[i].abs()).fold(0.1, f64::max);
+    // Limits show as the largest values that were measured: a search that begins there does not take a limit for a small gain.
+    let largest = |of: &dyn Fn(&[f64; 2]) -> f64| measured.iter().flat_map(|(_, t)| t).map(of).fold(0.1, f64::max);
     let mut best = vehicle.clone();
     best.driveline.rims = RimServo {
-        yaw_limit_rad_s: largest(1),
-        rim_limit_m_s: largest(0) + 0.5 * vehicle.track_m * largest(1),
+        yaw_limit_rad_s: largest(&|t| t[1].abs()),
+        rim_limit_m_s: largest(&|t| t[0].abs() + 0.5 * vehicle.track_m * t[1].abs()),
         speed_lag_s: 0.2,
         yaw_lag_s: 0.2,
         ..RimServo::default()
     };
     let mut error = servo_error(&best, &measured, dt_s);
-    for round in 0..6 {
+    for round in 0..16 {
         for (knob, [low, high]) in KNOBS {
-            let mut reach = 0.5 / f64::from(1 << round);
-            while reach > 0.002 {
+            let mut reach = 0.5 / f64::from(1 << round.min(5));
+            while reach > 0.000_5 {
                 let current = *knob(&mut best.driveline.rims);
                 let mut improved = false;
                 for trial in [current / (1.0 + reach), current * (1.0 + reach)] {

@@ -21,7 +21,7 @@ fn analytic_a_known_servo_is_found() {
         yaw_lag_s: 0.4,
         turn_efficiency: 0.4,
     };
-    let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, ..truck() };
+    let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, track_m: 0.55, ..truck() };
     vehicle.driveline.rims = truth;
     let drives: Vec<Drive> = (0..40).map(|i| made(&vehicle, f64::from(i))).collect();
     vehicle.driveline.rims = RimServo::default();

@@ -7,12 +7,17 @@ use std::path::{Path, PathBuf};
 use nesam_model::ModelBundle;
 use sha2::{Digest as _, Sha256};
 
-const FILES: [&str; 5] = ["baselines.json", "effects.toml", "normalization.toml", "vehicle.json", "weights.safetensors"];
 /// Truncations and flips tried of each file.
 const TRIES: usize = 24;
 
 fn shipped() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal")
+}
+
+/// Names of the files that the manifest of the shipped bundle lists.
+fn files() -> Vec<String> {
+    let manifest: toml::Table = fs::read_to_string(shipped().join("manifest.toml")).expect("readable").parse().expect("a manifest");
+    manifest["files"].as_table().expect("files by name").keys().cloned().collect()
 }
 
 fn sha256_hex(bytes: &[u8]) -> String {
@@ -36,12 +41,12 @@ fn damaged(whole: &[u8]) -> Vec<(String, Vec<u8>)> {
 #[test]
 fn regress_every_damaged_file_of_a_bundle_is_named() {
     let folder = tempfile::tempdir().expect("a folder");
-    for name in FILES.iter().copied().chain(["manifest.toml"]) {
+    for name in files().iter().map(String::as_str).chain(["manifest.toml"]) {
         fs::copy(shipped().join(name), folder.path().join(name)).expect("the shipped bundle is complete");
     }
     ModelBundle::load(folder.path()).expect("the copy is whole");
     let manifest = fs::read_to_string(shipped().join("manifest.toml")).expect("readable");
-    for name in FILES {
+    for name in &files() {
         let whole = fs::read(shipped().join(name)).expect("readable");
         for (what, bytes) in damaged(&whole) {
             fs::write(folder.path().join(name), &bytes).expect("writable");

@@ -19,7 +19,7 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives};
 use crate::{interrupt, output};
 
 /// Options of `nesam adapt`.
@@ -87,7 +87,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     }
     let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
     let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
-    let predictor = predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let filter = filter_of(args, predictor.bundle())?;
     warn_about_velocities(&drives);
 

@@ -16,7 +16,7 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{command_line, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives};
 use crate::{interrupt, output};
 
 /// Options of `nesam diagnose`.
@@ -134,7 +134,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
-    let predictor = predictor_for(load_bundle(args.bundle.bundle.as_deref())?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let options = Options {
         fit_on: args.fit_on.clone(),
         without: args.without.clone(),

@@ -144,7 +144,7 @@ pub fn drive(id: &str, seed: u64, effects: &[Effect], soil: &[f64; 6]) -> Trajec
     }
 }
 
-/// An untrained bundle whose default soil is that of the twin, with the reference of 24 null drives.
+/// A bundle of the physics alone, whose default soil is that of the twin, with the reference of 24 null drives.
 pub fn bundle() -> ModelBundle {
     static BUNDLE: OnceLock<ModelBundle> = OnceLock::new();
     BUNDLE
@@ -152,6 +152,11 @@ pub fn bundle() -> ModelBundle {
             let soil = [1.3e6, 8.0e3, 0.8, 3.0e3, 0.42, 0.015];
             let sample = drive("scales", 1, &[], &soil);
             let scales = scales::measure(&[&Drive::new(sample.id, Some(world()), sample.states, sample.controls)], &truck(), 0.1);
+            // A twin differs from the model by its effect, soil and noise alone: the network says nothing.
+            let mut weights = initial_weights(7, &scales);
+            for head in ["sinkage.weight", "residual.weight"] {
+                weights.values_mut(head).unwrap().fill(0.0);
+            }
             let mut bundle = ModelBundle {
                 name: "twin".into(),
                 hash: "0".repeat(64),
@@ -160,7 +165,7 @@ pub fn bundle() -> ModelBundle {
                 default_soil: scales.default_soil(),
                 parameters: 0,
                 form: Variant::Full,
-                weights: initial_weights(7, &scales),
+                weights,
                 normalization: scales,
                 baselines_json: None,
                 reference_json: None,

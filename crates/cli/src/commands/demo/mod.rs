@@ -2,8 +2,9 @@
 //!
 //! The real server starts on loopback. A vehicle task publishes the drive's measurements over Zenoh at the pace at which they were recorded; a
 //! planner task asks the server over gRPC for 64 candidates of 3.2 s in every cycle. What was predicted for the commands that the
-//! driver then gave is compared with what the vehicle then measured.
+//! driver then gave is compared with what the vehicle then measured. At the end, drives of a vehicle that was changed are diagnosed.
 
+mod diagnosis;
 mod ledger;
 mod planner;
 mod stage;
@@ -18,7 +19,7 @@ use clap::Args;
 use crate::args::{BundleArgs, DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
 use crate::output;
-use crate::sources::{Drives, check_model_step, load_bundle, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle_for, read_drives};
 
 use stage::Stage;
 
@@ -41,6 +42,9 @@ pub struct DemoArgs {
     /// Play without pauses: the vehicle waits for the planner, which plans twice per second of the drive
     #[arg(long)]
     fast: bool,
+    /// Do not diagnose the drives of changed vehicles (sets `effect_open/*` of the data root) at the end
+    #[arg(long)]
+    no_diagnosis: bool,
     /// Also write the summary as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -63,12 +67,12 @@ fn positive_seconds(text: &str) -> Result<f64, String> {
 /// Runs the command.
 pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
-    let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
         data.trajectories = Some(vec![id.clone()]);
     }
     let drives = read_drives(&data, false)?;
+    let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?;
     let stage = stage_of(args, &drives)?;
     if bundle.vehicle.name != drives.root.vehicle().name {
         return Err(Failure::input(format!(
@@ -81,10 +85,11 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     super::serve::log_to_stderr("warn");
     let provenance = output::provenance(Some(&bundle), &drives);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
-    let summary = runtime.block_on(stage.play(bundle))?;
+    let summary = runtime.block_on(stage.play(bundle.clone()))?;
     summary.print();
+    let diagnoses = if args.no_diagnosis { Vec::new() } else { diagnosis::close_the_loop(&bundle, &drives, &args.data)? };
     if let Some(file) = &args.json {
-        output::write_file(file, summary.to_json(&provenance).as_bytes())?;
+        output::write_file(file, summary.to_json(&diagnoses, &provenance).as_bytes())?;
     }
     Ok(())
 }

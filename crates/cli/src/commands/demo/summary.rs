@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nesam_evaluation::Provenance;
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::ledger::Score;
 use crate::output::say;
@@ -50,7 +50,7 @@ impl Summary {
     }
 
     /// The figures as JSON.
-    pub fn to_json(&self, provenance: &Provenance) -> String {
+    pub fn to_json(&self, diagnoses: &[Value], provenance: &Provenance) -> String {
         let number = |v: f64| v.is_finite().then_some(v);
         let scores: Vec<_> = self
             .scores
@@ -70,6 +70,7 @@ impl Summary {
             "latency_p99_s": number(self.latency_s[2]),
             "mean_plan_cost": number(self.plan_cost),
             "position_error": scores,
+            "diagnoses": diagnoses,
             "provenance": provenance,
         });
         serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
