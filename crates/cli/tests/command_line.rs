@@ -133,7 +133,7 @@ fn chrono_wrong_input_is_refused_with_exit_code_2() {
     let with = |more: &[&str], words: &[&str]| refused(&[&base[..], more].concat(), here.path(), words);
     with(&["--set", "no_such_set"], &["no_such_set", &set]);
     with(&["--set", &set, "--trajectories", "x9999"], &["x9999"]);
-    with(&["--set", &set, "--inputs", "wheels"], &["wheels", "not supported"]);
+    with(&["--set", &set, "--inputs", "tracks"], &["--inputs", "commands, wheels"]);
     with(&["--set", &set, "--horizon", "0"], &["--horizon", "at least 1"]);
     with(&["--set", &set, "--horizon", "5000"], &["5000 steps", "longest drive"]);
     with(&["--set", &set, "--dt", "0"], &["--dt"]);

@@ -97,6 +97,7 @@ fn roll_out(
         map,
         soil_correction,
         variant: Variant::Full,
+        wheels: None,
     };
     let rollout =
         predictor.rollout(&query).map_err(|source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source })?;

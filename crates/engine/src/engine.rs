@@ -231,6 +231,7 @@ impl Engine {
             map,
             soil_correction: session.soil().state.correction,
             variant: Variant::Full,
+            wheels: None,
         })?;
         let (rolled, mut rollout) = forward.split(rollout);
         if session.soil().state.epoch == 0 {

@@ -39,6 +39,12 @@ pub enum EvaluationError {
         /// Names that can be evaluated.
         choices: String,
     },
+    /// Predictions from measured wheels were asked for where there are none.
+    #[error("drive {trajectory} has no measured wheel speeds, or no angles of its steered wheels; use --inputs commands")]
+    NoWheels {
+        /// Drive.
+        trajectory: String,
+    },
     /// The kinematic baseline needs a fit that is not there.
     #[error("the kinematic baseline was never fitted: {reason}")]
     KinematicNotFitted {

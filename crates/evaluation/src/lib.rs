@@ -55,7 +55,7 @@ pub use kinematic::{KINEMATIC_PARAMETERS, Kinematic};
 pub use models::ModelName;
 pub use output::{Evaluation, Provenance};
 pub use predictions::write_predictions;
-pub use predictors::WindowPredictor;
+pub use predictors::{Inputs, WindowPredictor};
 pub use score::{ErrorSummary, ErrorTree, PATH_FLOOR_M, PerDimension, PositionError, paired_difference, paired_ratio, summarise, values};
 pub use slices::{Slice, slices};
 pub use windows::{Truth, Window, all_windows};

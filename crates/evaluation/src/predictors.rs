@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
-use nesam_physics::{Control, SoilCorrection, Vehicle};
+use nesam_model::{HistoryStep, MeasuredWheels, Predictor, RolloutQuery, Variant};
+use nesam_physics::{Control, SecondCommand, SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
 use crate::adapt::DriveAdaptation;
@@ -15,6 +15,26 @@ use crate::kinematic::{KINEMATIC_PARAMETERS, Kinematic};
 use crate::models::ModelName;
 use crate::windows::Window;
 
+/// What drives a prediction over its horizon.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Inputs {
+    /// The recorded commands: what a planner knows.
+    #[default]
+    Commands,
+    /// The measured wheel speeds and steering angles of the future: for studying the model.
+    Wheels,
+}
+
+impl Inputs {
+    /// As in JSON.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Commands => "commands",
+            Self::Wheels => "wheels",
+        }
+    }
+}
+
 /// A model that is ready to predict windows.
 #[derive(Clone, Debug)]
 pub enum WindowPredictor {
@@ -24,6 +44,8 @@ pub enum WindowPredictor {
         predictor: Arc<Predictor>,
         /// Ablation.
         variant: Variant,
+        /// What drives the prediction.
+        inputs: Inputs,
     },
     /// The bundle's model with the soil that was learned up to the start of each window.
     Adapted {
@@ -54,9 +76,10 @@ impl WindowPredictor {
         predictor: Option<&Arc<Predictor>>,
         vehicle: &Arc<Vehicle>,
         kinematic: Option<Kinematic>,
+        inputs: Inputs,
     ) -> Result<Self, EvaluationError> {
         let nesam = |variant| match predictor {
-            Some(predictor) => Ok(Self::Nesam { predictor: Arc::clone(predictor), variant }),
+            Some(predictor) => Ok(Self::Nesam { predictor: Arc::clone(predictor), variant, inputs }),
             None => Err(EvaluationError::NoBundle { name: name.as_str() }),
         };
         Ok(match name {
@@ -92,12 +115,16 @@ impl WindowPredictor {
         let start = &drive.states[window.start];
         let future = &drive.controls[window.start..window.start + window.horizon];
         let poses = match self {
-            Self::Nesam { predictor, variant } => {
-                return nesam(predictor, *variant, SoilCorrection::NONE, window, future, map);
+            Self::Nesam { predictor, variant, inputs } => {
+                let wheels = match inputs {
+                    Inputs::Commands => None,
+                    Inputs::Wheels => Some(window.measured_wheels(predictor.bundle().vehicle.second != SecondCommand::YawRateRadS)?),
+                };
+                return nesam(predictor, *variant, SoilCorrection::NONE, window, future, wheels.as_deref(), map);
             }
             Self::Adapted { predictor, filtered } => {
                 let correction = filtered[window.drive].correction_at(window.start);
-                return nesam(predictor, Variant::Full, correction, window, future, map);
+                return nesam(predictor, Variant::Full, correction, window, future, None, map);
             }
             Self::Kinematic { model, vehicle } => {
                 let past = &drive.controls[window.first_history..window.start];
@@ -115,6 +142,7 @@ fn nesam(
     soil_correction: SoilCorrection,
     window: &Window<'_>,
     future: &[Control<f64>],
+    wheels: Option<&[MeasuredWheels]>,
     map: Option<&Arc<WorldMap>>,
 ) -> Result<PosePath, EvaluationError> {
     let drive = window.trajectory;
@@ -129,6 +157,7 @@ fn nesam(
         map,
         soil_correction,
         variant,
+        wheels,
     };
     let rollout =
         predictor.rollout(&query).map_err(|source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source })?;
@@ -137,6 +166,29 @@ fn nesam(
 }
 
 impl Window<'_> {
+    /// What the wheels were measured to do over each step of the horizon: the mean of the step's two ends. `steered`: the vehicle has road-wheel angles.
+    ///
+    /// # Errors
+    /// `EvaluationError::NoWheels` naming the drive when wheel speeds, or the angles of steered wheels, were not measured.
+    pub fn measured_wheels(&self, steered: bool) -> Result<Vec<MeasuredWheels>, EvaluationError> {
+        let drive = self.trajectory;
+        let missing = || EvaluationError::NoWheels { trajectory: drive.id.clone() };
+        let speeds = drive.wheel_speed_rad_s.as_ref().ok_or_else(missing)?;
+        let angles = drive.road_wheel_angle_rad.as_ref();
+        if steered && angles.is_none() {
+            return Err(missing());
+        }
+        let mean = |a: f64, b: f64| 0.5 * (a + b);
+        let step = |j: usize| MeasuredWheels {
+            speed_rad_s: core::array::from_fn(|i| mean(speeds[j][i], speeds[j + 1][i])),
+            angle_rad: core::array::from_fn(|i| match angles {
+                Some(angles) if i < 2 => mean(angles[j][i], angles[j + 1][i]),
+                _ => 0.0,
+            }),
+        };
+        Ok((self.start..self.start + self.horizon).map(step).collect())
+    }
+
     /// Measured states and commands before the start, oldest first.
     pub fn history(&self) -> Vec<HistoryStep> {
         (self.first_history..self.start)

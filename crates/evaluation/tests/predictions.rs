@@ -6,8 +6,8 @@ use std::fs::File;
 use std::sync::Arc;
 
 use nesam_evaluation::{
-    Evaluation, ModelName, Provenance, Resamples, Truth, WindowPredictor, all_windows, path_median_m, predict_all, report, score, slices,
-    write_predictions,
+    Evaluation, Inputs, ModelName, Provenance, Resamples, Truth, WindowPredictor, all_windows, path_median_m, predict_all, report, score,
+    slices, write_predictions,
 };
 use nesam_physics::{Control, VehicleState};
 use nesam_trajectories::{MeasuredChannels, Trajectory, VelocitySource};
@@ -126,7 +126,7 @@ fn property_refusals_name_what_was_wrong() {
     let gt = all_windows(&drives, 5, 1, Truth::Gt).unwrap_err().to_string();
     assert!(gt.contains("`short`") && gt.contains("ground-truth"), "{gt}");
     let vehicle = Arc::new(nesam_vehicle());
-    let kinematic = WindowPredictor::new(ModelName::Kinematic, None, &vehicle, None).unwrap_err().to_string();
+    let kinematic = WindowPredictor::new(ModelName::Kinematic, None, &vehicle, None, Inputs::Commands).unwrap_err().to_string();
     assert!(kinematic.contains("never fitted"), "{kinematic}");
     assert!("tal_sem".parse::<ModelName>().unwrap_err().to_string().contains("not part of this version"));
     assert!("nesma".parse::<ModelName>().unwrap_err().to_string().contains("choose from nesam"));

@@ -63,6 +63,7 @@ fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
         map,
         soil_correction: SoilCorrection::NONE,
         variant,
+        wheels: None,
     };
     let fast = predictor.rollout(&query).expect("a valid query");
 
@@ -119,6 +120,7 @@ fn property_row_of_a_batch_equals_the_row_alone() {
         map: Some(&map),
         soil_correction: SoilCorrection::NONE,
         variant: Variant::Full,
+        wheels: None,
     };
     let batch = predictor.rollout(&query).expect("a valid query");
     for n in [0, 7, 16, 36] {

@@ -2,11 +2,14 @@
 
 mod common;
 
-use common::truck;
+use std::sync::Arc;
+
+use common::{drive, lively_weights, measured_scales, predictor, truck};
 use nesam_learning::Drive;
 use nesam_learning::rims::fit_rims;
+use nesam_model::{MeasuredWheels, ModelBundle, Predictor, RolloutQuery, Variant};
 use nesam_physics::driveline::DrivelineState;
-use nesam_physics::{Control, RimServo, SecondCommand, Vehicle, VehicleState};
+use nesam_physics::{Control, RimServo, SecondCommand, SoilCorrection, Vehicle, VehicleState};
 
 /// Goal: the servo is found again. Method: 40 drives of two seconds under drawn twists, wheel speeds from a servo with known numbers whose limits
 /// are reached in some drives and not in others.
@@ -48,4 +51,42 @@ fn made(vehicle: &Vehicle, seed: f64) -> Drive {
     let mut drive = Drive::new("made".into(), None, states, vec![control; 20]);
     drive.wheel_speed_rad_s = Some(wheels);
     drive
+}
+
+/// Goal: wheels that were measured take the place of those that follow from the commands. Method: a servo without lag that already does what it is
+/// told, its rim speeds by hand; the same wheels give the same motion, faster ones another.
+#[test]
+fn analytic_measured_wheels_equal_to_the_commanded_ones_change_nothing() {
+    let sample = drive(None, 40);
+    let scales = measured_scales(&sample);
+    let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, ..truck() };
+    vehicle.driveline.rims = RimServo { yaw_lag_s: 0.0, ..RimServo::default() };
+    let (radius, half) = (vehicle.wheel_radius_m, 0.5 * vehicle.track_m);
+    let of_the_truck = predictor(&scales, lively_weights(&scales));
+    let predictor = Predictor::new(Arc::new(ModelBundle { vehicle, ..of_the_truck.bundle().clone() })).unwrap();
+
+    let start = VehicleState { velocity_m_s: [1.0, 0.0, 0.0], angular_velocity_rad_s: [0.0, 0.0, 0.4], ..sample.states[0] };
+    let controls = [1.0_f32, 0.4].repeat(8);
+    let wheels = |scale: f64| {
+        let [left, right] = [1.0 - half * 0.4, 1.0 + half * 0.4].map(|v| scale * v / radius);
+        [MeasuredWheels { speed_rad_s: [left, right, left, right], angle_rad: [0.0; 4] }; 8]
+    };
+    let end = |wheels: Option<&[MeasuredWheels]>| {
+        let query = RolloutQuery {
+            history: &[],
+            start,
+            controls: &controls,
+            samples: 1,
+            horizon: 8,
+            map: None,
+            soil_correction: SoilCorrection::NONE,
+            variant: Variant::Full,
+            wheels,
+        };
+        predictor.rollout(&query).unwrap().state(0, 7).to_array()
+    };
+    let (commanded, same, faster) = (end(None), end(Some(&wheels(1.0))), end(Some(&wheels(1.2))));
+    let apart = |other: [f32; 12]| commanded.iter().zip(other).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    assert!(apart(same) < 1e-4, "{commanded:?} {same:?}");
+    assert!(apart(faster) > 0.02, "{commanded:?} {faster:?}");
 }

@@ -28,7 +28,7 @@ pub use dims::{HISTORY, MAX_HORIZON};
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
 pub use predictor::{Predictor, TerrainMode, Transition};
-pub use rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
+pub use rollout::{HistoryStep, MeasuredWheels, Rollout, RolloutQuery, Variant, flag};
 pub use terrain_tokens::{CacheCounts, TerrainToken};
 pub use weights::Weights;
 

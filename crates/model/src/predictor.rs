@@ -2,7 +2,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::driveline::{DrivelineState, command_wheels, measured_wheels};
 use nesam_physics::effects::Effect;
 use nesam_physics::scalar::f32x8;
 use nesam_physics::step::StepModel;
@@ -310,7 +310,10 @@ impl Predictor {
             .enumerate()
             .map(|(l, (sample, control))| {
                 let after = sample.actuators.advance(self.model.vehicle(), control, sample.state.velocity_m_s[0], scales.dt_s);
-                let wheels = command_wheels(self.model.vehicle(), &sample.actuators, &after, control);
+                let wheels = match query.wheels {
+                    Some(measured) => measured_wheels(self.model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
+                    None => command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
+                };
                 let (ground, known) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
                 let soil = self.soil(terrain[l], query);
                 let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
@@ -414,6 +417,14 @@ fn validate(query: &RolloutQuery<'_>) -> Result<(), ModelError> {
     }
     if let Some(at) = query.controls.iter().position(|v| !v.is_finite()) {
         return fail("controls", format!("number {at} is not finite"));
+    }
+    if let Some(wheels) = query.wheels {
+        if wheels.len() != query.horizon {
+            return fail("wheels", format!("has {} steps, expected horizon = {}", wheels.len(), query.horizon));
+        }
+        if let Some(at) = wheels.iter().position(|w| !w.speed_rad_s.iter().chain(&w.angle_rad).all(|v| v.is_finite())) {
+            return fail("wheels", format!("step {at} holds a number that is not finite"));
+        }
     }
     if !query.start.to_array().iter().all(|v| v.is_finite()) {
         return fail("start", "holds a number that is not finite".into());

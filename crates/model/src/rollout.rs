@@ -86,6 +86,18 @@ pub struct RolloutQuery<'a> {
     pub soil_correction: SoilCorrection,
     /// Ablation.
     pub variant: Variant,
+    /// What the wheels were measured to do over each of the K steps, for every sample alike, in place of what the drive line makes of the commands;
+    /// for studying the model, no planner knows it.
+    pub wheels: Option<&'a [MeasuredWheels]>,
+}
+
+/// Wheels over one step.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct MeasuredWheels {
+    /// Mean wheel speeds FL, FR, RL, RR, rad/s.
+    pub speed_rad_s: [f64; WHEELS],
+    /// Mean road-wheel angles, rad, positive left.
+    pub angle_rad: [f64; WHEELS],
 }
 
 /// Bits of [`Rollout::flags`], one word per sample.

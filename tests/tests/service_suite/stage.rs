@@ -165,6 +165,7 @@ pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_s
             map: Some(&recorded.world),
             soil_correction,
             variant: Variant::Full,
+            wheels: None,
         })
         .unwrap()
 }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, Disguise, ErrorTree, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows,
+    Adaptation, DEFAULT_RESAMPLES, Disguise, ErrorTree, Inputs, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows,
     calibrate_noise, path_median_m, predict_all, report, score,
 };
 use nesam_model::{MAX_HORIZON, ModelBundle};
@@ -98,7 +98,8 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let models = [
         (
             ModelName::Nesam,
-            WindowPredictor::new(ModelName::Nesam, Some(&predictor), &Arc::new(drives.root.vehicle().clone()), None).or_input()?,
+            WindowPredictor::new(ModelName::Nesam, Some(&predictor), &Arc::new(drives.root.vehicle().clone()), None, Inputs::Commands)
+                .or_input()?,
         ),
         (ModelName::Nesam, WindowPredictor::Adapted { predictor: Arc::clone(&predictor), filtered: Arc::clone(&filtered) }),
     ];

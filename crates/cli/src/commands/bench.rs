@@ -208,6 +208,7 @@ impl<'a> Planner<'a> {
             map: self.map.as_ref(),
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
+            wheels: None,
         };
         predictor.rollout(&query).or_failed()
     }
@@ -253,6 +254,7 @@ fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) ->
             map: drives.maps[window.drive].as_ref(),
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
+            wheels: None,
         };
         let (a, b) = (grid.rollout(&query).or_failed()?, exact.rollout(&query).or_failed()?);
         for (k, truth) in window.truth(nesam_evaluation::Truth::Measured).iter().enumerate() {

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
 use nesam_evaluation::{
-    Baselines, DEFAULT_RESAMPLES, Evaluation, Kinematic, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window, WindowPredictor,
-    all_windows, path_median_m, predict_all, report, score, slices, write_predictions,
+    Baselines, DEFAULT_RESAMPLES, Evaluation, Inputs, Kinematic, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window,
+    WindowPredictor, all_windows, path_median_m, predict_all, report, score, slices, write_predictions,
 };
 use nesam_model::{MAX_HORIZON, Predictor};
 use nesam_trajectories::Trajectory;
@@ -29,8 +29,8 @@ pub struct EvaluateArgs {
     #[command(flatten)]
     window: WindowArgs,
     /// What drives the prediction over the horizon
-    #[arg(long, value_enum, default_value_t = Inputs::Commands)]
-    inputs: Inputs,
+    #[arg(long, value_enum, default_value_t = InputsArg::Commands)]
+    inputs: InputsArg,
     /// What errors are measured against
     #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
     truth: TruthArg,
@@ -64,11 +64,21 @@ pub struct EvaluateArgs {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum Inputs {
+enum InputsArg {
     /// The recorded commands: what a planner knows.
     Commands,
-    /// The measured wheel speeds and steering angles of the future: for studying the model, not for planning.
+    /// The measured wheel speeds and steering angles of the future: for studying the model, not for planning; the baselines that read no wheels keep
+    /// the commands.
     Wheels,
+}
+
+impl From<InputsArg> for Inputs {
+    fn from(inputs: InputsArg) -> Self {
+        match inputs {
+            InputsArg::Commands => Self::Commands,
+            InputsArg::Wheels => Self::Wheels,
+        }
+    }
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -88,9 +98,6 @@ fn at_least_1000(text: &str) -> Result<usize, String> {
 
 /// Runs the command.
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
-    if args.inputs == Inputs::Wheels {
-        return Err(Failure::input("--inputs wheels is not supported by this version; use --inputs commands"));
-    }
     let names = model_names(args)?;
     interrupt::exit_on_ctrl_c("nothing was written");
     let truth = if args.truth == TruthArg::Gt { Truth::Gt } else { Truth::Measured };
@@ -119,7 +126,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         trajectories: drives.drives.len(),
         path_m_median: path_median_m(&windows, truth),
         truth,
-        inputs: "commands",
+        inputs: Inputs::from(args.inputs).as_str(),
         seed: args.seed,
         resamples: &resamples,
         models: &scores,
@@ -196,7 +203,7 @@ impl Models {
         for &name in names {
             if name.is_trained_baseline() {
                 match trained.iter().find(|p| p.bundle().form.as_str() == name.as_str()) {
-                    Some(own) => ready.push((name, WindowPredictor::new(name, Some(own), &vehicle, None).or_input()?)),
+                    Some(own) => ready.push((name, WindowPredictor::new(name, Some(own), &vehicle, None, args.inputs.into()).or_input()?)),
                     None if args.models.is_none() => {
                         eprintln!("note: {name} is left out: no bundle of that form for this vehicle in the folder of baselines")
                     }
@@ -213,7 +220,7 @@ impl Models {
                 );
                 continue;
             }
-            ready.push((name, WindowPredictor::new(name, predictor.as_ref(), &vehicle, kinematic).or_input()?));
+            ready.push((name, WindowPredictor::new(name, predictor.as_ref(), &vehicle, kinematic, args.inputs.into()).or_input()?));
         }
         Ok(Self { predictor, ready })
     }

@@ -180,6 +180,7 @@ fn rollout(
         map,
         soil_correction: SoilCorrection::NONE,
         variant,
+        wheels: None,
     };
     predictor.rollout(&query).or_failed()
 }
