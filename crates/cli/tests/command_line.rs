@@ -134,6 +134,7 @@ fn chrono_wrong_input_is_refused_with_exit_code_2() {
     with(&["--set", "no_such_set"], &["no_such_set", &set]);
     with(&["--set", &set, "--trajectories", "x9999"], &["x9999"]);
     with(&["--set", &set, "--inputs", "tracks"], &["--inputs", "commands, wheels"]);
+    with(&["--set", &set, "--start", "smooth"], &["--start", "measured, gt"]);
     with(&["--set", &set, "--horizon", "0"], &["--horizon", "at least 1"]);
     with(&["--set", &set, "--horizon", "5000"], &["5000 steps", "longest drive"]);
     with(&["--set", &set, "--dt", "0"], &["--dt"]);

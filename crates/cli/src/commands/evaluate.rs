@@ -34,6 +34,9 @@ pub struct EvaluateArgs {
     /// What errors are measured against
     #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
     truth: TruthArg,
+    /// What start and history are taken from; `gt` is for an error budget (how much the noise of the start costs) and implies `--truth gt`
+    #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
+    start: TruthArg,
     /// Models to compare [default: all that bundle and data allow]
     #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
     models: Option<Vec<String>>,
@@ -100,8 +103,12 @@ fn at_least_1000(text: &str) -> Result<usize, String> {
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     let names = model_names(args)?;
     interrupt::exit_on_ctrl_c("nothing was written");
-    let truth = if args.truth == TruthArg::Gt { Truth::Gt } else { Truth::Measured };
-    let drives = read_drives(&args.data, truth == Truth::Gt)?;
+    let noise_free = args.start == TruthArg::Gt;
+    let truth = if noise_free || args.truth == TruthArg::Gt { Truth::Gt } else { Truth::Measured };
+    let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
+    if noise_free {
+        start_noise_free(&mut drives)?;
+    }
     let out = output::out_dir(args.out.as_deref(), "evaluate", &drives.set)?;
     let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
     warn_about_training_drives(args, &drives);
@@ -135,6 +142,17 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     };
     print_table(&evaluation);
     write_results(args, &out, &evaluation, &paths, &windows)
+}
+
+/// Puts the noise-free states in the place of the measured ones.
+fn start_noise_free(drives: &mut Drives) -> Result<(), Failure> {
+    for drive in &mut drives.drives {
+        let truth = drive.truth.as_ref().ok_or_else(|| {
+            Failure::input(format!("--start gt: drive `{}` has no ground-truth channels; use --start measured", drive.id))
+        })?;
+        drive.states.clone_from(&truth.states);
+    }
+    Ok(())
 }
 
 fn write_results(
