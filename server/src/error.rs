@@ -32,6 +32,14 @@ pub enum ServerError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// The bundle's settings of the soil filter cannot be used.
+    #[error("bundle {bundle}: soil_filter.json: {reason}; make it again with `nesam adapt --calibrate`")]
+    SoilFilter {
+        /// Name of the bundle.
+        bundle: String,
+        /// What is wrong with them.
+        reason: String,
+    },
     /// Zenoh does not start.
     #[error("zenoh does not start: {reason}; check `zenoh.listen` and `zenoh.connect`, or set `zenoh.enabled = false`")]
     Zenoh {

@@ -71,10 +71,13 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
     let metrics = Arc::new(Metrics::default());
     let (sink, counted) = (events.clone(), metrics.clone());
-    let engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).with_events(Box::new(move |event| {
-        counted.event(event.label());
-        let _ = sink.send(event);
-    }));
+    let unusable =
+        |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
+    let engine =
+        Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?.with_events(Box::new(move |event| {
+            counted.event(event.label());
+            let _ = sink.send(event);
+        }));
     let clock = MonotonicClock::default();
     let handle = EngineHandle::spawn(engine, Arc::new(clock));
     let (stop, stopping) = watch::channel(false);

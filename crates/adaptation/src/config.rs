@@ -1,6 +1,7 @@
 //! Settings of the filter and what each of them does.
 
 use nesam_physics::{SOIL_DIM, SoilCoordinates};
+use serde::{Deserialize, Serialize};
 
 use crate::AdaptationError;
 use crate::noise::{BufferNoise, ChannelNoise, VelocityNoise};
@@ -12,7 +13,8 @@ const BUFFER_MAX: usize = 64;
 const LINEARISATIONS_MAX: usize = 10;
 
 /// What a buffer is compared with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
 pub enum Innovation {
     /// One step from each measured state, as in the paper.
     OneStep,

@@ -32,5 +32,5 @@ pub use error::AdaptationError;
 pub use filter::{SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
 pub use noise::{BufferNoise, ChannelNoise, VelocityNoise};
 pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocities, predict_velocity};
-pub use settings::{CalibratedFilter, Coordinates, FilterSettings, InnovationKind, NoiseSettings, noise_settings};
+pub use settings::{CalibratedFilter, Coordinates, FilterSettings};
 pub use update::{KalmanStep, kalman_update};

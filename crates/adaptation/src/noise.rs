@@ -1,6 +1,7 @@
 //! How far measured velocities lie from one-step predictions when the soil is right: sensor noise and the error of the model.
 
 use nalgebra::DMatrix;
+use serde::{Deserialize, Serialize};
 
 use crate::AdaptationError;
 use crate::prediction::VELOCITY_DIM;
@@ -16,7 +17,8 @@ const WHITE_SHARE_MIN: f64 = 0.2;
 ///
 /// The coloured part is what keeps a buffer honest: ten predictions that share an error say less than ten that do not, and a filter that
 /// is told otherwise becomes certain of a wrong soil.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct ChannelNoise {
     /// Standard deviation of the part that is independent from step to step, m/s or rad/s.
     pub white_sd: f64,

@@ -25,6 +25,14 @@ pub struct BufferedTransition {
     pub measured_next: [f64; VELOCITY_DIM],
 }
 
+impl BufferedTransition {
+    /// A transition that ended in a measured state.
+    pub fn new(input: StepInput<f64>, residual: [f64; STATE_DIM], end: &VehicleState<f64>) -> Self {
+        let ([vx, vy, vz], [wx, wy, wz]) = (end.velocity_m_s, end.angular_velocity_rad_s);
+        Self { input, residual, measured_next: [vx, vy, vz, wx, wy, wz] }
+    }
+}
+
 /// Predicted velocities after one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct VelocityPrediction {

@@ -25,7 +25,7 @@ pub struct FilterSettings {
     pub coordinates: Option<Coordinates>,
     /// `one_step` or `rollout`.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub innovation: Option<InnovationKind>,
+    pub innovation: Option<Innovation>,
     /// √ of the diagonal of P₀, order of the soil vector.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub prior_sd: Option<[f64; SOIL_DIM]>,
@@ -49,7 +49,7 @@ pub struct FilterSettings {
     pub trust_log_odds: Option<f64>,
     /// R_B of channels: vx, vy, vz, ωx, ωy, ωz.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub noise: Option<[NoiseSettings; VELOCITY_DIM]>,
+    pub noise: Option<[ChannelNoise; VELOCITY_DIM]>,
     /// Tail probability below which a buffer is rejected.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gate_tail_probability: Option<f64>,
@@ -71,33 +71,6 @@ pub enum Coordinates {
     Logarithmic,
 }
 
-/// What a buffer is compared with.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum InnovationKind {
-    /// As in the paper.
-    OneStep,
-    /// One rollout over the buffer.
-    Rollout,
-}
-
-/// Noise of one channel, m/s or rad/s.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct NoiseSettings {
-    /// Independent from step to step.
-    pub white_sd: f64,
-    /// Carried over from step to step.
-    pub coloured_sd: f64,
-    /// How much of it.
-    pub correlation: f64,
-}
-
-/// Noise as JSON.
-pub fn noise_settings(noise: &VelocityNoise) -> [NoiseSettings; VELOCITY_DIM] {
-    noise.channels.map(|c| NoiseSettings { white_sd: c.white_sd, coloured_sd: c.coloured_sd, correlation: c.correlation })
-}
-
 impl FilterSettings {
     /// Reads a settings file.
     ///
@@ -113,19 +86,15 @@ impl FilterSettings {
             SoilCoordinates::Physical => Coordinates::Physical,
             SoilCoordinates::Logarithmic => Coordinates::Logarithmic,
         };
-        let innovation = match config.innovation {
-            Innovation::OneStep => InnovationKind::OneStep,
-            Innovation::Rollout => InnovationKind::Rollout,
-        };
         let (noise, noise_covariance) = match &config.noise {
-            BufferNoise::Channels(noise) => (Some(noise_settings(noise)), None),
+            BufferNoise::Channels(noise) => (Some(noise.channels), None),
             BufferNoise::Sampled(moment) => (None, Some(moment.row_iter().map(|row| row.iter().copied().collect()).collect())),
         };
         Self {
             buffer: Some(config.buffer),
             block: Some(config.block),
             coordinates: Some(coordinates),
-            innovation: Some(innovation),
+            innovation: Some(config.innovation),
             prior_sd: Some(config.prior_sd),
             process_sd: Some(config.process_sd),
             noise_covariance,
@@ -153,24 +122,18 @@ impl FilterSettings {
             Some(Coordinates::Physical) => SoilCoordinates::Physical,
             Some(Coordinates::Logarithmic) => SoilCoordinates::Logarithmic,
         };
-        let innovation = match self.innovation {
-            None => base.innovation,
-            Some(InnovationKind::OneStep) => Innovation::OneStep,
-            Some(InnovationKind::Rollout) => Innovation::Rollout,
-        };
-        let channel = |n: NoiseSettings| ChannelNoise { white_sd: n.white_sd, coloured_sd: n.coloured_sd, correlation: n.correlation };
         let noise = match (&self.noise_covariance, self.noise) {
             (Some(rows), _) => {
                 BufferNoise::Sampled(DMatrix::from_fn(rows.len(), rows.len(), |r, c| rows[r].get(c).copied().unwrap_or(f64::NAN)))
             }
-            (None, Some(channels)) => BufferNoise::Channels(VelocityNoise { channels: channels.map(channel) }),
+            (None, Some(channels)) => BufferNoise::Channels(VelocityNoise { channels }),
             (None, None) => base.noise,
         };
         FilterConfig {
             buffer: self.buffer.unwrap_or(base.buffer),
             block: self.block.unwrap_or(base.block),
             coordinates,
-            innovation,
+            innovation: self.innovation.unwrap_or(base.innovation),
             prior_sd: self.prior_sd.unwrap_or(base.prior_sd),
             process_sd: self.process_sd.unwrap_or(base.process_sd),
             noise,

@@ -4,6 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
+use nesam_learning::recipe::is_validation;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::DT_S;
 use nesam_terrain::WorldMap;
@@ -66,6 +67,18 @@ pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failur
     }
     let maps = maps_of(&root, &drives)?;
     Ok(Drives { root, set, drives, maps })
+}
+
+/// The drives that training left for validation, for `option`, which does `what` with them; only the train split has any.
+pub fn validation_drives(args: &DataArgs, option: &str, what: &str) -> Result<Drives, Failure> {
+    if args.split != SplitArg::Train {
+        return Err(Failure::input(format!("{option} needs --split train: {what} on validation drives of the train split")));
+    }
+    let mut all = read_drives(args, false)?;
+    let mut sorted: Vec<(Trajectory, Option<Arc<WorldMap>>)> = all.drives.into_iter().zip(all.maps).collect();
+    sorted.sort_by(|(a, _), (b, _)| a.id.cmp(&b.id));
+    (all.drives, all.maps) = sorted.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, drive)| drive).unzip();
+    Ok(all)
 }
 
 /// Training drives to fit baselines on: of the same set, else of the first set of the root that has a train split; `None` when none has.

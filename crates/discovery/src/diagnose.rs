@@ -1,6 +1,6 @@
 //! The whole diagnosis of a set: detect, select, refit, prove on drives that were not fitted.
 
-use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, ErrorTree, paired_difference};
+use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, paired_difference};
 use nesam_model::Predictor;
 use nesam_physics::effects::Layer;
 use nesam_trajectories::Trajectory;
@@ -291,19 +291,17 @@ fn verdict(selection: &Selection, scores: Option<&HeldOut>) -> (Verdict, String)
 /// Why the proof on held-out drives fails: nothing improves surely, or something worsens surely by more than 2 %.
 fn not_proven(scores: &HeldOut) -> Option<String> {
     let [before, soil, after] = &scores.scores;
-    let numbers = |t: &ErrorTree<f64>| [t.mae_mean.to_array().to_vec(), vec![t.position_m.mean]].concat();
-    let ends = |t: &ErrorTree<[f64; 2]>| [t.mae_mean.to_array().to_vec(), vec![t.position_m.mean]].concat();
     for against in [soil, before] {
         let (_, interval) = paired_difference(&against.errors, &after.errors, &scores.resamples);
-        if !ends(&interval).iter().flatten().any(|[low, _]| *low > 0.0) {
+        if !interval.row(false).iter().flatten().any(|[low, _]| *low > 0.0) {
             return Some("no error falls surely on drives that were not fitted".into());
         }
     }
     let (difference, interval) = paired_difference(&after.errors, &before.errors, &scores.resamples);
-    let base = numbers(&before.summary.tree);
     let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
-    numbers(&difference).iter().zip(ends(&interval)).zip(&base).zip(names).find_map(|(((d, i), b), name)| match (d, i, b) {
-        (Some(d), Some([low, _]), Some(b)) if low > 0.0 && *d > 0.02 * b => {
+    let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(before.summary.tree.row(false));
+    rows.zip(names).find_map(|(((d, i), b), name)| match (d, i, b) {
+        (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > 0.02 * b => {
             Some(format!("the error of {name} rises surely on drives that were not fitted, from {b:.4} by {d:.4}"))
         }
         _ => None,

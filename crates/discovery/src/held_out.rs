@@ -1,12 +1,9 @@
 //! Proof on drives that were not fitted: full rollouts of the bundle before, with the best soil alone, and with the effect.
 
-use std::sync::Arc;
-
 use nesam_evaluation::{
-    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, POSE_DIM, PosePath, Resamples, Truth, Window, all_windows, pose_of,
-    score,
+    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, all_windows, roll_out, score,
 };
-use nesam_model::{Predictor, RolloutQuery, Variant};
+use nesam_model::{Predictor, Variant};
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::Effect;
 use nesam_trajectories::Trajectory;
@@ -60,13 +57,10 @@ pub fn score_held_out(
         .par_iter()
         .map(|w| {
             let map = maps[w.drive].as_ref();
-            let before = roll_out(predictor, w, map, SoilCorrection::NONE)?;
-            let soil = roll_out(predictor, w, map, learned[w.drive].soil)?;
-            let after = if learned[w.drive].effects.is_empty() {
-                before.clone()
-            } else {
-                roll_out(&patched[w.drive], w, map, SoilCorrection::NONE)?
-            };
+            let with = |predictor: &Predictor, soil| roll_out(predictor, Variant::Full, soil, w, None, map);
+            let before = with(predictor, SoilCorrection::NONE)?;
+            let soil = with(predictor, learned[w.drive].soil)?;
+            let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&patched[w.drive], SoilCorrection::NONE)? };
             Ok([before, soil, after])
         })
         .collect::<Result<_, EvaluationError>>()?;
@@ -77,30 +71,4 @@ pub fn score_held_out(
         score(&model, &windows, Truth::Measured, &resamples)
     });
     Ok(HeldOut { scores, resamples })
-}
-
-fn roll_out(
-    predictor: &Predictor,
-    window: &Window<'_>,
-    map: Option<&Arc<nesam_terrain::WorldMap>>,
-    soil_correction: SoilCorrection,
-) -> Result<PosePath, EvaluationError> {
-    let drive = window.trajectory;
-    let controls: Vec<f32> =
-        drive.controls[window.start..window.start + window.horizon].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
-    let query = RolloutQuery {
-        history: &window.history(),
-        start: drive.states[window.start],
-        controls: &controls,
-        samples: 1,
-        horizon: window.horizon,
-        map,
-        soil_correction,
-        variant: Variant::Full,
-        wheels: None,
-    };
-    let rollout =
-        predictor.rollout(&query).map_err(|source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source })?;
-    let poses = (0..window.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
-    Ok(PosePath { poses, predicts: [true; POSE_DIM] })
 }

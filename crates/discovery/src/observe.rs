@@ -6,8 +6,8 @@
 
 use std::sync::Arc;
 
-use nesam_evaluation::DriveMaps;
-use nesam_model::{GroundSource, HistoryStep, Predictor, Transition};
+use nesam_evaluation::{DriveMaps, history_steps};
+use nesam_model::{GroundSource, Predictor, Transition};
 use nesam_physics::driveline::{command_wheels, road_wheel_angles};
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{STATE_DIM, Soil, SoilCorrection, VehicleState, WHEELS, wrap_angle};
@@ -67,7 +67,7 @@ pub fn observe_all(
 /// # Errors
 /// `DiscoveryError::NoSegments` when no segment fits on known ground.
 pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<WorldMap>>) -> Result<ObservedDrive, DiscoveryError> {
-    let steps: Vec<HistoryStep> = drive.states.iter().zip(&drive.controls).map(|(s, c)| HistoryStep { state: *s, control: *c }).collect();
+    let steps = history_steps(drive);
     let transitions: Vec<Transition> = (0..steps.len().saturating_sub(1))
         .into_par_iter()
         .map(|k| predictor.transition(&steps[..k], &steps[k].state, &steps[k].control, map))
@@ -165,10 +165,7 @@ impl ObservedDrive {
             let (sin, cos) = angles[i].sin_cos();
             let forward = cos * centre[0] + sin * centre[1];
             let slope = self.traction_slope[sample][i];
-            let coupling = 2.0 * vehicle.driveline.side_coupling_n_m_s / vehicle.wheel_radius_m.powi(2);
-            let (own, partner) = (vehicle.effects.wheel_drag_n_m[i], vehicle.effects.wheel_drag_n_m[i ^ 1]);
-            let at_tread = own - vehicle.drag_made_up_n_m() - 0.5 * coupling / (slope + coupling) * (own - partner);
-            let drag = at_tread / vehicle.wheel_radius_m / slope;
+            let drag = vehicle.drag_at_tread_n_m(i, slope) / vehicle.wheel_radius_m / slope;
             let predicted = transition.input.wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum();
             row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - predicted);
         }

@@ -43,15 +43,18 @@ impl core::fmt::Debug for Engine {
 }
 
 impl Engine {
-    /// An engine without sessions. The soil filter has the settings that the bundle carries; the default ones where it carries none or none that this
-    /// version understands.
-    pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Self {
+    /// An engine without sessions. The soil filter has the settings that the bundle carries, the default ones where it carries none.
+    ///
+    /// # Errors
+    /// `AdaptationError` when the settings that the bundle carries are not readable or not usable.
+    pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Result<Self, AdaptationError> {
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
-        let calibrated = predictor.bundle().soil_filter_json.as_deref().and_then(|json| CalibratedFilter::from_json(json).ok());
-        let filter = calibrated.and_then(|c| SoilFilter::new(c.config()).ok());
-        let filter =
-            filter.or_else(|| SoilFilter::new(FilterConfig::default()).ok()).expect("the default settings are usable; this is a bug");
-        Self { predictor, limits, filter, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None }
+        let config = match &predictor.bundle().soil_filter_json {
+            Some(json) => CalibratedFilter::from_json(json)?.config(),
+            None => FilterConfig::default(),
+        };
+        let filter = SoilFilter::new(config)?;
+        Ok(Self { predictor, limits, filter, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None })
     }
 
     /// Sessions opened from now on learn the soil with these settings.

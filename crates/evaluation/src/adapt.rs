@@ -7,7 +7,7 @@ use nesam_adaptation::{
     AdaptationError, BufferedTransition, FilterConfig, Innovation, NoiseCalibration, SoilFilter, SoilPosterior, SoilUpdate,
     UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
 };
-use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_model::{HistoryStep, Predictor};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -15,6 +15,7 @@ use rayon::prelude::*;
 
 use crate::error::EvaluationError;
 use crate::evaluate::DriveMaps;
+use crate::windows::history_steps;
 
 /// An update and the instant at which it was known.
 #[derive(Clone, Debug)]
@@ -132,19 +133,13 @@ pub fn adapt_drive(
     let mut filter = SoilFilter::new(config.clone())?;
     let mut out = DriveAdaptation::default();
     let Some(map) = map else { return Ok(out) };
-    let steps = steps_of(drive);
+    let steps = history_steps(drive);
     let mut start = 0;
     while start + config.buffer < steps.len() {
         let correction = filter.estimate();
-        let buffer = match buffer_at(predictor, &steps, start, config, map, &correction) {
-            Ok(buffer) => buffer,
-            Err(()) => {
-                start += config.buffer; // as a session does
-                continue;
-            }
-        };
+        let buffer = buffer_at(predictor, &steps, start, config, map, &correction);
         start += config.buffer;
-        for transition in buffer {
+        for transition in buffer.into_iter().flatten() {
             match filter.push(predictor.step_model(), transition) {
                 Ok(None) => {}
                 Ok(Some(update)) => {
@@ -162,11 +157,7 @@ pub fn adapt_drive(
     Ok(out)
 }
 
-fn steps_of(drive: &Trajectory) -> Vec<HistoryStep> {
-    drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect()
-}
-
-/// The transitions from sample `start` to `start + B`; an error when one leaves the known map.
+/// The transitions from sample `start` to `start + B`; `None` when one leaves the known map.
 fn buffer_at(
     predictor: &Predictor,
     steps: &[HistoryStep],
@@ -174,27 +165,11 @@ fn buffer_at(
     config: &FilterConfig,
     map: &Arc<WorldMap>,
     correction: &SoilCorrection,
-) -> Result<Vec<BufferedTransition>, ()> {
-    let history = |k: usize| &steps[k.saturating_sub(HISTORY - 1)..k];
-    let range = start..start + config.buffer;
-    let transitions = match config.innovation {
-        Innovation::OneStep => {
-            range.clone().map(|k| predictor.transition(history(k), &steps[k].state, &steps[k].control, Some(map))).collect()
-        }
-        Innovation::Rollout => {
-            let controls: Vec<_> = steps[range.clone()].iter().map(|step| step.control).collect();
-            predictor.transitions_along(history(start), &steps[start].state, &controls, Some(map), correction)
-        }
-    };
-    if !transitions.iter().all(|t| t.ground_known) {
-        return Err(());
-    }
-    let ends = range.map(|k| {
-        let ([vx, vy, vz], [wx, wy, wz]) = (steps[k + 1].state.velocity_m_s, steps[k + 1].state.angular_velocity_rad_s);
-        [vx, vy, vz, wx, wy, wz]
-    });
-    let both = transitions.into_iter().zip(ends);
-    Ok(both.map(|(t, measured_next)| BufferedTransition { input: t.input, residual: t.residual, measured_next }).collect())
+) -> Option<Vec<BufferedTransition>> {
+    let along = (config.innovation == Innovation::Rollout).then_some(correction);
+    let transitions = predictor.measured_transitions(steps, start..start + config.buffer, along, map)?;
+    let both = transitions.into_iter().zip(&steps[start + 1..]);
+    Some(both.map(|(t, end)| BufferedTransition::new(t.input, t.residual, &end.state)).collect())
 }
 
 /// What these drives, on ground that the model was trained for, say of the filter's noise.
@@ -210,9 +185,9 @@ pub fn calibrate_noise(
     config.check()?;
     let of_drive = |(drive, map): (&Trajectory, &Option<Arc<WorldMap>>)| -> Vec<UncorrectedBuffer> {
         let Some(map) = map else { return Vec::new() };
-        let steps = steps_of(drive);
+        let steps = history_steps(drive);
         let starts = (0..steps.len().saturating_sub(config.buffer)).step_by(config.buffer);
-        let buffers = starts.filter_map(|start| buffer_at(predictor, &steps, start, config, map, &SoilCorrection::NONE).ok());
+        let buffers = starts.filter_map(|start| buffer_at(predictor, &steps, start, config, map, &SoilCorrection::NONE));
         buffers.filter_map(|buffer| uncorrected(config, predictor.step_model(), &buffer).ok()).collect()
     };
     let buffers: Vec<Vec<UncorrectedBuffer>> = drives.par_iter().zip(maps).map(of_drive).collect();

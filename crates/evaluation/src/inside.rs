@@ -3,12 +3,14 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_model::{HISTORY, Predictor};
 use nesam_physics::{SOIL_DIM, STATE_DIM, WHEELS};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{SoilTruth, Trajectory};
 use rayon::prelude::*;
 use serde::Serialize;
+
+use crate::windows::history_steps;
 
 /// Samples between two comparisons: suspension and ground decorrelate in less than a second.
 const EVERY: usize = 8;
@@ -132,8 +134,7 @@ fn drive_inside(
     let mut out = Comparison::new();
     let mut sums = [[0.0; 2]; STATE_DIM];
     let Some(truth) = &drive.truth else { return (out, sums) };
-    let steps: Vec<HistoryStep> =
-        drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect();
+    let steps = history_steps(drive);
     for i in (HISTORY..steps.len().saturating_sub(1)).step_by(EVERY) {
         let transition = predictor.transition(&steps[i + 1 - HISTORY..i], &steps[i].state, &steps[i].control, map);
         let output = predictor.step_model().step(&transition.input);

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nesam_model::{HistoryStep, MeasuredWheels, Predictor, RolloutQuery, Variant};
-use nesam_physics::{Control, SecondCommand, SoilCorrection, Vehicle};
+use nesam_physics::{SecondCommand, SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
 use crate::adapt::DriveAdaptation;
@@ -120,11 +120,11 @@ impl WindowPredictor {
                     Inputs::Commands => None,
                     Inputs::Wheels => Some(window.measured_wheels(predictor.bundle().vehicle.second != SecondCommand::YawRateRadS)?),
                 };
-                return nesam(predictor, *variant, SoilCorrection::NONE, window, future, wheels.as_deref(), map);
+                return roll_out(predictor, *variant, SoilCorrection::NONE, window, wheels.as_deref(), map);
             }
             Self::Adapted { predictor, filtered } => {
                 let correction = filtered[window.drive].correction_at(window.start);
-                return nesam(predictor, Variant::Full, correction, window, future, None, map);
+                return roll_out(predictor, Variant::Full, correction, window, None, map);
             }
             Self::Kinematic { model, vehicle } => {
                 let past = &drive.controls[window.first_history..window.start];
@@ -136,17 +136,21 @@ impl WindowPredictor {
     }
 }
 
-fn nesam(
+/// Rolls the model out from the start of a window under its recorded commands.
+///
+/// # Errors
+/// `EvaluationError::Model` naming drive and window when the model refuses the query.
+pub fn roll_out(
     predictor: &Predictor,
     variant: Variant,
     soil_correction: SoilCorrection,
     window: &Window<'_>,
-    future: &[Control<f64>],
     wheels: Option<&[MeasuredWheels]>,
     map: Option<&Arc<WorldMap>>,
 ) -> Result<PosePath, EvaluationError> {
     let drive = window.trajectory;
     let history = window.history();
+    let future = &drive.controls[window.start..window.start + window.horizon];
     let controls: Vec<f32> = future.iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
     let query = RolloutQuery {
         history: &history,

@@ -61,6 +61,15 @@ pub struct ErrorTree<T> {
     pub position_m: PositionError<T>,
 }
 
+impl<T: Copy> ErrorTree<T> {
+    /// The row of a table: x, y, z, roll, pitch, yaw and horizontal position, as means over the horizon or at the last step.
+    pub fn row(&self, last: bool) -> [Option<T>; POSE_DIM + 1] {
+        let six = if last { &self.mae_final } else { &self.mae_mean }.to_array();
+        let position = if last { self.position_m.final_ } else { self.position_m.mean };
+        core::array::from_fn(|d| six.get(d).copied().unwrap_or(position))
+    }
+}
+
 /// `ERR` of the JSON contract.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct ErrorSummary {

@@ -1,5 +1,6 @@
 //! The windows that are scored, and the truth that they are scored against.
 
+use nesam_model::HistoryStep;
 use nesam_trajectories::Trajectory;
 
 use crate::dimension::{Pose, pose_of};
@@ -38,6 +39,11 @@ pub struct Window<'a> {
     pub first_history: usize,
     /// Steps K.
     pub horizon: usize,
+}
+
+/// Measured states and commands of a whole drive, oldest first.
+pub fn history_steps(drive: &Trajectory) -> Vec<HistoryStep> {
+    drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect()
 }
 
 impl Window<'_> {

@@ -103,6 +103,11 @@ pub struct CacheCounts {
 }
 
 impl CacheCounts {
+    /// What was asked since `before`.
+    pub fn since(&self, before: Self) -> Self {
+        Self { looked_up: self.looked_up - before.looked_up, encoded: self.encoded - before.encoded }
+    }
+
     /// Share of the lookups that needed no encoding; 1 when nothing was asked.
     pub fn hit_rate(&self) -> f64 {
         1.0 - self.encoded as f64 / self.looked_up.max(1) as f64

@@ -284,28 +284,21 @@ impl StepModel {
 }
 
 impl StepModel {
-    /// Force that friction at the wheels of an axle takes from the tread of one of them, N.
+    /// Force that friction at the wheels of an axle takes from the tread of one of them, N ([`Vehicle::drag_at_tread_n_m`]).
     ///
-    /// The dragged wheel turns slower than its partner, and the coupling of the differential passes torque to it: with drags τ, τ' and the same
-    /// slope s of traction over rim speed at both, τ - κ (τ - τ') / 2 is left to the tread, κ = (2 k / r²) / (s + 2 k / r²). The slope is the tangent of the
-    /// exponential shear law at the mobilised share u of its limit: s = thrust / over-speed · (1 - u) (-ln(1 - u)) / u. What the speed
-    /// controller makes up is subtracted from every drag. Neglects the limit of the coupling and the one between the axles. Without drag nothing is computed.
+    /// The slope of traction is the tangent of the exponential shear law at the mobilised share u of its limit: thrust / over-speed · (1 - u) (-ln(1 - u)) / u.
+    /// Without drag nothing is computed.
     fn drag_at_tread<T: Real>(&self, wheel: usize, thrust_n: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> T {
-        let drags = &self.vehicle.effects.wheel_drag_n_m;
-        if drags.iter().all(|drag| *drag == 0.0) {
+        if self.vehicle.effects.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
             return T::lit(0.0);
         }
-        let (own, partner) = (drags[wheel] - self.vehicle.drag_made_up_n_m(), drags[wheel ^ 1] - self.vehicle.drag_made_up_n_m());
-        let r = self.wheel.radius_m;
-        let coupling = T::lit(2.0 * self.vehicle.driveline.side_coupling_n_m_s / (r * r));
         let over = (motion.rim_speed_m_s - motion.forward_m_s).abs_smooth(0.02);
         let (sin, cos) = soil.phi.sin_cos();
         let thrust = thrust_n.abs_smooth(1.0);
         let mobilised = (thrust / (load_n * sin / cos).relu_smooth(1.0)).min(T::lit(0.95)).max(T::lit(0.05));
         let free = T::lit(1.0) - mobilised;
         let slope = thrust / over * free * -free.ln() / mobilised;
-        let passed = coupling / (slope + coupling).max(T::lit(1.0));
-        (T::lit(own) - passed * T::lit(0.5 * (own - partner))) / T::lit(r)
+        self.vehicle.drag_at_tread_n_m(wheel, slope) / T::lit(self.wheel.radius_m)
     }
 }
 

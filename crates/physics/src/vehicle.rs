@@ -1,6 +1,7 @@
 //! What the physics must know of a vehicle.
 
 use crate::effects::EffectTerms;
+use crate::scalar::Real;
 use crate::state::Control;
 
 /// Number of wheels of the platforms served.
@@ -151,6 +152,19 @@ impl Vehicle {
     pub fn drag_made_up_n_m(&self) -> f64 {
         let mean = self.effects.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
         if self.second == SecondCommand::YawRateRadS { 0.0 } else { mean }
+    }
+
+    /// Friction torque that is left to the tread of a wheel, N m, for a slope of traction over rim speed of `slope_n_s_m`, the same at both wheels of the
+    /// axle.
+    ///
+    /// What the speed controller makes up is subtracted from every drag. The dragged wheel turns slower than its partner, and the coupling of the
+    /// differential passes torque to it: with drags τ, τ' and a slope s, τ - κ (τ - τ') / 2 is left, κ = (2 k / r²) / (s + 2 k / r²). Neglects the limit
+    /// of the coupling and the one between the axles.
+    pub fn drag_at_tread_n_m<T: Real>(&self, wheel: usize, slope_n_s_m: T) -> T {
+        let [own, partner] = [wheel, wheel ^ 1].map(|w| self.effects.wheel_drag_n_m[w] - self.drag_made_up_n_m());
+        let coupling = T::lit(2.0 * self.driveline.side_coupling_n_m_s / (self.wheel_radius_m * self.wheel_radius_m));
+        let passed = coupling / (slope_n_s_m + coupling).max(T::lit(1.0));
+        T::lit(own) - passed * T::lit(0.5 * (own - partner))
     }
 
     /// Whether the command lies in the range of the card (both ends included).

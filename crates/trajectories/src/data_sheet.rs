@@ -257,9 +257,9 @@ fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, Traje
         let value = sheet.number(keys)?.unwrap_or(default);
         if value >= 0.0 { Ok(value) } else { Err(sheet.wrong(keys[0], format!("{value} is negative"))) }
     };
-    let lag = if skid { 0.1 } else { 0.0 };
+    let steering_lag_s = or(&["steering.actuator.time_constant_s", "driveline.steering_lag_s"], if skid { 0.1 } else { 0.0 })?;
     Ok(Driveline {
-        steering_lag_s: or(&["steering.actuator.time_constant_s", "driveline.steering_lag_s"], lag)?,
+        steering_lag_s,
         steering_rate_limit_per_s: or(
             &["steering.actuator.rate_limit_per_s", "driveline.steering_rate_limit_per_s"],
             UNLIMITED_RATE_PER_S,
@@ -269,7 +269,8 @@ fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, Traje
         speed_integral_leak_s: sheet.positive(&["driveline.speed_integral_leak_s"])?.unwrap_or(2.0),
         speed_integral_limit_m: or(&["driveline.speed_integral_limit_m"], 2.0)?,
         overspeed_limit_m_s: sheet.positive(&["driveline.overspeed_limit_m_s"])?.unwrap_or(if skid { SKID_RIM_LIMIT_M_S } else { 0.8 }),
-        rims: RimServo::default(),
+        // Two lags of half the time each.
+        rims: RimServo { yaw_lag_s: 0.5 * steering_lag_s, ..RimServo::default() },
         side_coupling_n_m_s: or(&["driveline.lsd_Nm_per_rad_s", "driveline.side_coupling_n_m_s"], 0.0)?,
     })
 }

@@ -65,15 +65,15 @@ struct Line {
     speed_integral_leak_s: f64,
     speed_integral_limit_m: f64,
     overspeed_limit_m_s: f64,
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    rims: Option<Rims>,
+    #[serde(default, with = "Rims", skip_serializing_if = "is_identity")]
+    rims: RimServo,
     #[serde(default, skip_serializing_if = "is_zero")]
     side_coupling_n_m_s: f64,
 }
 
 /// Servo of the rims of a skid-steer vehicle.
 #[derive(Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
+#[serde(remote = "RimServo", deny_unknown_fields)]
 struct Rims {
     speed_gain: f64,
     yaw_gain: f64,
@@ -84,32 +84,9 @@ struct Rims {
     turn_efficiency: f64,
 }
 
-impl From<RimServo> for Rims {
-    fn from(r: RimServo) -> Self {
-        Self {
-            speed_gain: r.speed_gain,
-            yaw_gain: r.yaw_gain,
-            yaw_limit_rad_s: r.yaw_limit_rad_s,
-            rim_limit_m_s: r.rim_limit_m_s,
-            speed_lag_s: r.speed_lag_s,
-            yaw_lag_s: r.yaw_lag_s,
-            turn_efficiency: r.turn_efficiency,
-        }
-    }
-}
-
-impl From<Rims> for RimServo {
-    fn from(r: Rims) -> Self {
-        Self {
-            speed_gain: r.speed_gain,
-            yaw_gain: r.yaw_gain,
-            yaw_limit_rad_s: r.yaw_limit_rad_s,
-            rim_limit_m_s: r.rim_limit_m_s,
-            speed_lag_s: r.speed_lag_s,
-            yaw_lag_s: r.yaw_lag_s,
-            turn_efficiency: r.turn_efficiency,
-        }
-    }
+/// A base that does what it is told is left out, so that the cards of cars know nothing of it.
+fn is_identity(rims: &RimServo) -> bool {
+    *rims == RimServo::default()
 }
 
 /// An open differential is left out, so that cards written before the coupling was known keep their bytes.
@@ -150,7 +127,7 @@ pub fn to_json(vehicle: &Vehicle) -> String {
             speed_integral_leak_s: v.driveline.speed_integral_leak_s,
             speed_integral_limit_m: v.driveline.speed_integral_limit_m,
             overspeed_limit_m_s: v.driveline.overspeed_limit_m_s,
-            rims: (v.second == SecondCommand::YawRateRadS).then(|| v.driveline.rims.into()),
+            rims: v.driveline.rims,
             side_coupling_n_m_s: v.driveline.side_coupling_n_m_s,
         },
         gravity_m_s2: v.gravity_m_s2,
@@ -222,7 +199,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             speed_integral_leak_s: c.driveline.speed_integral_leak_s,
             speed_integral_limit_m: c.driveline.speed_integral_limit_m,
             overspeed_limit_m_s: c.driveline.overspeed_limit_m_s,
-            rims: c.driveline.rims.map(Into::into).unwrap_or_default(),
+            rims: c.driveline.rims,
             side_coupling_n_m_s: c.driveline.side_coupling_n_m_s,
         },
         gravity_m_s2: c.gravity_m_s2,

@@ -9,7 +9,7 @@ use crate::stage::*;
 #[test]
 fn property_replayed_commands_give_the_same_bytes() {
     let recorded = recorded();
-    let mut engine = Engine::new(predictor(), Limits::default());
+    let mut engine = Engine::new(predictor(), Limits::default()).unwrap();
     engine.start_recording();
     let clock = Arc::new(ManualClock::default());
     let handle = EngineHandle::spawn(engine, clock.clone());
@@ -48,7 +48,7 @@ fn property_replayed_commands_give_the_same_bytes() {
 
     let log = handle.stop().expect("the engine's thread ended well").take_recording();
     assert_eq!(log.len(), first.len());
-    let mut again = Engine::new(Arc::new(fresh_predictor()), Limits::default());
+    let mut again = Engine::new(Arc::new(fresh_predictor()), Limits::default()).unwrap();
     for ((now_ns, command), answer) in log.iter().zip(&first) {
         // Debug prints every float with as many digits as its bits need.
         assert!(&format!("{:?}", again.execute(*now_ns, command)) == answer, "command {} at {now_ns} ns", command.label());

@@ -40,7 +40,7 @@ async fn service_idle_sessions_are_closed_and_used_ones_stay() {
 
 #[test]
 fn property_the_idle_limit_holds_at_the_edge() {
-    let mut engine = Engine::new(predictor(), Limits { session_idle_s: 2.0, ..Limits::default() });
+    let mut engine = Engine::new(predictor(), Limits { session_idle_s: 2.0, ..Limits::default() }).unwrap();
     let second = 1_000_000_000;
     let open = |vehicle: &str| Command::Open(OpenSession { vehicle: vehicle.into(), ..Default::default() });
     engine.execute(0, &open("a")).unwrap();

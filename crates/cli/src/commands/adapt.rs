@@ -7,19 +7,19 @@ use std::sync::Arc;
 use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, Disguise, ErrorTree, Inputs, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows,
-    calibrate_noise, path_median_m, predict_all, report, score,
+    Adaptation, DEFAULT_RESAMPLES, Disguise, Inputs, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows, calibrate_noise,
+    path_median_m, predict_all, report, score,
 };
 use nesam_model::{MAX_HORIZON, ModelBundle};
 use nesam_physics::SOIL_NAMES;
 use nesam_terrain::WorldMap;
 
-use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Options of `nesam adapt`.
@@ -152,11 +152,6 @@ fn filter_of(args: &AdaptArgs, bundle: &ModelBundle) -> Result<FilterConfig, Fai
     }
 }
 
-/// Every tenth drive of the sorted train split validates (as in training, which never saw it).
-fn is_validation(index: usize) -> bool {
-    index % 10 == 7
-}
-
 /// Repaints the map of every drive, each world once.
 fn disguise(drives: &mut Drives, look: DisguiseArg) -> Result<(), Failure> {
     let disguise = match look {
@@ -176,17 +171,9 @@ fn disguise(drives: &mut Drives, look: DisguiseArg) -> Result<(), Failure> {
 }
 
 fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
-    if args.data.split != SplitArg::Train {
-        return Err(Failure::input("--calibrate needs --split train: the noise is estimated on validation drives of the train split"));
-    }
     interrupt::exit_on_ctrl_c("the bundle is unchanged");
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
-    let mut drives = read_drives(&args.data, false)?;
-    let mut order: Vec<usize> = (0..drives.drives.len()).collect();
-    order.sort_by(|a, b| drives.drives[*a].id.cmp(&drives.drives[*b].id));
-    let chosen: Vec<usize> = order.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, d)| d).collect();
-    drives.maps = chosen.iter().map(|&d| drives.maps[d].clone()).collect();
-    drives.drives = chosen.iter().map(|&d| drives.drives[d].clone()).collect();
+    let drives = validation_drives(&args.data, "--calibrate", "the noise is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let config = settings(args)?.over_defaults(false);
@@ -240,9 +227,9 @@ fn print_table(a: &Adaptation<'_>) {
         let head: String = ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>15}")).concat();
         say!("\n{title:<22}{head}");
         for (name, value, interval) in &rows {
-            let values = seven(value, last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();
+            let values = value.row(last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();
             let between = |[low, high]: [f64; 2]| format!("{:>15}", format!("{low:.3}…{high:.3}"));
-            let intervals = seven(interval, last).map(|ci| ci.map_or(format!("{:>15}", ""), between)).concat();
+            let intervals = interval.row(last).map(|ci| ci.map_or(format!("{:>15}", ""), between)).concat();
             say!("{name:<22}{values}\n{:<22}{intervals}", "  95 %");
         }
     }
@@ -258,13 +245,6 @@ fn print_table(a: &Adaptation<'_>) {
         number(c.inside_95)
     );
     print_soil(a);
-}
-
-/// x, y, z, roll, pitch, yaw and position of a tree, as means or at the last step.
-fn seven<T: Copy>(tree: &ErrorTree<T>, last: bool) -> [Option<T>; 7] {
-    let six = if last { tree.mae_final } else { tree.mae_mean }.to_array();
-    let position = if last { tree.position_m.final_ } else { tree.position_m.mean };
-    std::array::from_fn(|d| six.get(d).copied().unwrap_or(position))
 }
 
 /// Soil at the end of each drive; what was not learned has no number.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use clap::{Args, Subcommand};
-use nesam_evaluation::{Window, horizontal_distance, pose_of};
+use nesam_evaluation::{Pose, Truth, absolute_error, all_windows, history_steps, horizontal_distance, roll_out};
 use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, ModelBundle, Predictor, Rollout, RolloutQuery, TerrainMode, Variant};
 use nesam_physics::{Control, SoilCorrection};
 use nesam_terrain::WorldMap;
@@ -97,10 +97,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
     let before = drive.map.as_ref().map(|map| fresh.terrain_cache(map));
     let mut warm =
         (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries) + 1, 2000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
-    let hit_rate = drive.map.as_ref().zip(before).map(|(map, before)| {
-        let after = fresh.terrain_cache(map);
-        1.0 - (after.encoded - before.encoded) as f64 / (after.looked_up - before.looked_up).max(1) as f64
-    });
+    let hit_rate = drive.map.as_ref().zip(before).map(|(map, before)| fresh.terrain_cache(map).since(before).hit_rate());
     progress.finish();
 
     let mut later: Vec<f64> = steady[1..].to_vec();
@@ -164,8 +161,7 @@ impl<'a> Planner<'a> {
         if drive.states.len() < HISTORY + 8 {
             return Err(Failure::input(format!("drive `{}` has {} samples, queries need {}", drive.id, drive.states.len(), HISTORY + 8)));
         }
-        let steps = drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect();
-        Ok(Self { steps, map: drives.maps[0].clone(), range: drives.root.vehicle().command_range, args })
+        Ok(Self { steps: history_steps(drive), map: drives.maps[0].clone(), range: drives.root.vehicle().command_range, args })
     }
 
     /// Sample of the `q`-th replan; starts again at the beginning when the drive ends.
@@ -217,57 +213,32 @@ impl<'a> Planner<'a> {
 /// Largest ratio over the six dimensions of what interpolated terrain tokens move a prediction to what the model is off by, both as means over
 /// windows and steps; `None` without a map or when no drive is long enough.
 fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) -> Result<Option<f64>, Failure> {
-    let windows: Vec<Window<'_>> = drives
-        .drives
-        .iter()
-        .enumerate()
-        .filter(|(drive, _)| drives.maps[*drive].is_some())
-        .flat_map(|(drive, trajectory)| {
-            let starts = nesam_trajectories::windows(trajectory.states.len(), horizon, HISTORY);
-            starts.into_iter().map(move |start| Window {
-                trajectory,
-                drive,
-                start,
-                first_history: start + 1 - HISTORY.min(start + 1),
-                horizon,
-            })
-        })
-        .collect();
+    let mut windows = all_windows(&drives.drives, horizon, HISTORY, Truth::Measured).unwrap_or_default();
+    windows.retain(|window| drives.maps[window.drive].is_some());
     if windows.is_empty() {
         return Ok(None);
     }
     let shared = Arc::new(bundle.clone());
     let [grid, exact] = [TerrainMode::Grid, TerrainMode::Exact].map(|mode| Predictor::with_terrain(shared.clone(), mode));
     let (grid, exact) = (grid.or_input()?, exact.or_input()?);
-    let (mut moved, mut off) = ([0.0; 6], [0.0; 6]);
+    // Horizontal position in the place of x and y, which depend on the heading.
+    let apart = |a: &Pose, b: &Pose| {
+        let [_, _, z, roll, pitch, yaw] = absolute_error(a, b);
+        [horizontal_distance(a, b), z, roll, pitch, yaw]
+    };
+    let (mut moved, mut off) = ([0.0; 5], [0.0; 5]);
     for window in windows.iter().step_by(windows.len().div_ceil(CHECKED_WINDOWS)) {
-        let drive = window.trajectory;
-        let controls: Vec<f32> =
-            drive.controls[window.start..window.start + horizon].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
-        let history = window.history();
-        let query = RolloutQuery {
-            history: &history,
-            start: drive.states[window.start],
-            controls: &controls,
-            samples: 1,
-            horizon,
-            map: drives.maps[window.drive].as_ref(),
-            soil_correction: SoilCorrection::NONE,
-            variant: Variant::Full,
-            wheels: None,
-        };
-        let (a, b) = (grid.rollout(&query).or_failed()?, exact.rollout(&query).or_failed()?);
-        for (k, truth) in window.truth(nesam_evaluation::Truth::Measured).iter().enumerate() {
-            let poses = [&a, &b].map(|r| pose_of(&r.state(0, k).map(f64::from)));
-            moved[0] += horizontal_distance(&poses[0], &poses[1]);
-            off[0] += horizontal_distance(&poses[1], truth);
-            for d in 2..6 {
-                moved[d] += (poses[0][d] - poses[1][d]).abs();
-                off[d] += (poses[1][d] - truth[d]).abs().min(core::f64::consts::TAU - (poses[1][d] - truth[d]).abs());
+        let map = drives.maps[window.drive].as_ref();
+        let [on_grid, exactly] = [&grid, &exact].map(|p| roll_out(p, Variant::Full, SoilCorrection::NONE, window, None, map));
+        for ((a, b), truth) in on_grid.or_failed()?.poses.iter().zip(&exactly.or_failed()?.poses).zip(&window.truth(Truth::Measured)) {
+            let (by_grid, by_model) = (apart(a, b), apart(b, truth));
+            for d in 0..moved.len() {
+                moved[d] += by_grid[d];
+                off[d] += by_model[d];
             }
         }
     }
-    Ok([0, 2, 3, 4, 5].into_iter().map(|d| moved[d] / off[d]).reduce(f64::max))
+    Ok(moved.iter().zip(off).map(|(moved, off)| moved / off).reduce(f64::max))
 }
 
 /// Instructions that the kernels were compiled for.

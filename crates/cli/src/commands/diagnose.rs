@@ -11,12 +11,12 @@ use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
 use nesam_physics::Vehicle;
 use nesam_physics::effects::Effect;
 
-use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{command_line, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Options of `nesam diagnose`.
@@ -62,11 +62,6 @@ enum ReferenceArg {
     Physics,
 }
 
-/// Every tenth drive of the sorted train split validates (as in training, which never saw it).
-fn is_validation(index: usize) -> bool {
-    index % 10 == 7
-}
-
 /// Runs the command.
 pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
     if args.reference == ReferenceArg::Physics {
@@ -83,19 +78,9 @@ pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
 }
 
 fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
-    if args.data.split != SplitArg::Train {
-        return Err(Failure::input(
-            "--make-reference needs --split train: the reference is measured on validation drives of the train split",
-        ));
-    }
     interrupt::exit_on_ctrl_c("the bundle is unchanged");
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
-    let mut drives = read_drives(&args.data, false)?;
-    let mut order: Vec<usize> = (0..drives.drives.len()).collect();
-    order.sort_by(|a, b| drives.drives[*a].id.cmp(&drives.drives[*b].id));
-    let chosen: Vec<usize> = order.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, d)| d).collect();
-    drives.maps = chosen.iter().map(|&d| drives.maps[d].clone()).collect();
-    drives.drives = chosen.iter().map(|&d| drives.drives[d].clone()).collect();
+    let drives = validation_drives(&args.data, "--make-reference", "the reference is measured")?;
     let mut bundle = load_bundle(Some(&dir))?;
     take_coupling(&mut bundle, drives.root.vehicle());
     let predictor = predictor_for(bundle.clone(), &drives.root)?;

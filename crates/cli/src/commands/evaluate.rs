@@ -309,10 +309,8 @@ fn print_table(e: &Evaluation<'_>) {
         );
         for model in e.models {
             let (t, c) = (&model.summary.tree, &model.summary.ci95);
-            let six = if last { t.mae_final } else { t.mae_mean }.to_array();
-            let (position, interval) =
-                if last { (t.position_m.final_, c.position_m.final_) } else { (t.position_m.mean, c.position_m.mean) };
-            let cells: String = six.iter().chain([&position]).map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}"))).collect();
+            let cells: String = t.row(last).map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}"))).concat();
+            let [.., interval] = c.row(last);
             let interval = interval.map_or(String::new(), |[lo, hi]| format!("  [{lo:.3}, {hi:.3}]"));
             say!("{:<22}{cells}{interval}", model.name.as_str());
         }

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use nesam_adaptation::{BufferedTransition, Innovation, SoilFilter, SoilUpdate};
-use nesam_model::{HISTORY, HistoryStep, Predictor, Transition};
-use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
+use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 
 /// What was learned of the soil in this session.
@@ -83,25 +83,12 @@ impl SoilLearner {
     }
 
     fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<SoilUpdate> {
-        let history = |k: usize| &self.steps[k.saturating_sub(HISTORY - 1)..k];
         let (first, last) = (self.first, self.steps.len() - 1);
-        let transitions: Vec<Transition> = match self.filter.config().innovation {
-            Innovation::OneStep => {
-                (first..last).map(|k| predictor.transition(history(k), &self.steps[k].state, &self.steps[k].control, Some(map))).collect()
-            }
-            Innovation::Rollout => {
-                let controls: Vec<_> = self.steps[first..last].iter().map(|step| step.control).collect();
-                let correction = self.filter.estimate();
-                predictor.transitions_along(history(first), &self.steps[first].state, &controls, Some(map), &correction)
-            }
-        };
-        if !transitions.iter().all(|t| t.ground_known) {
-            return None;
-        }
+        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| self.filter.estimate());
+        let transitions = predictor.measured_transitions(&self.steps, first..last, along.as_ref(), map)?;
         let mut update = None;
         for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
-            let measured_next = velocities(&end.state);
-            let buffered = BufferedTransition { input: transition.input, residual: transition.residual, measured_next };
+            let buffered = BufferedTransition::new(transition.input, transition.residual, &end.state);
             update = self.filter.push(predictor.step_model(), buffered).ok()?;
         }
         update
@@ -118,10 +105,4 @@ impl SoilLearner {
             learned: posterior.learned,
         }
     }
-}
-
-/// y = [v, ω] in Body.
-fn velocities(state: &VehicleState<f64>) -> [f64; 6] {
-    let ([vx, vy, vz], [wx, wy, wz]) = (state.velocity_m_s, state.angular_velocity_rad_s);
-    [vx, vy, vz, wx, wy, wz]
 }

@@ -1,5 +1,6 @@
 //! Measured transitions as filter and discovery need them: what the network says, and the input of the physics.
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use nesam_physics::driveline::{DrivelineState, command_wheels};
@@ -69,20 +70,43 @@ impl Predictor {
             actuators: history_actuators(&self.model, history, start, first, scales.dt_s),
             flags: 0,
         };
-        let step = |control: &Control<f64>| {
+        let mut transitions = Vec::with_capacity(controls.len());
+        for control in controls {
             let token = self.terrain(tokens.as_deref(), &[pose(&sample.state)])[0];
             let entries = self.entries(&sample.state, sample.previous.as_ref(), control, &ground);
             let lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| [entries[i]; LANES]);
             let context: [Lane; HIDDEN] = core::array::from_fn(|i| [token[i]; LANES]);
             let said = self.network.step(&prefix, &mut cache, &lanes, &context);
             let transition = self.transition_from(&sample, control, &ground, &token, &said);
+            transitions.push(transition);
+            if transitions.len() == controls.len() {
+                break; // nothing starts from the end of the last one
+            }
             let soil = correction.apply(&transition.input.soil.to_array());
             let moved = self.model.step(&StepInput { soil: Soil::from_array(soil), ..transition.input }).increment.to_array();
             let total = core::array::from_fn(|i| moved[i] + transition.residual[i]);
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
-            transition
+        }
+        transitions
+    }
+
+    /// The transitions that start at `steps[range]`, as the soil filter takes them into one buffer: along one rollout with the correction `along`, or each
+    /// from its own measured state. `None` when a wheel stands off the map, where the slope of the ground is a guess.
+    pub fn measured_transitions(
+        &self,
+        steps: &[HistoryStep],
+        range: Range<usize>,
+        along: Option<&SoilCorrection>,
+        map: &Arc<WorldMap>,
+    ) -> Option<Vec<Transition>> {
+        let transitions: Vec<Transition> = match along {
+            None => range.map(|k| self.transition(&steps[..k], &steps[k].state, &steps[k].control, Some(map))).collect(),
+            Some(correction) => {
+                let controls: Vec<Control<f64>> = steps[range.clone()].iter().map(|step| step.control).collect();
+                self.transitions_along(&steps[..range.start], &steps[range.start].state, &controls, Some(map), correction)
+            }
         };
-        controls.iter().map(step).collect()
+        transitions.iter().all(|t| t.ground_known).then_some(transitions)
     }
 
     /// A transition from what the network said of it.
