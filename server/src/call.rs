@@ -8,7 +8,8 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use nesam_engine::{
-    Answer, Command, EngineError, EngineHandle, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply, SessionView, Submission,
+    Answer, Command, EngineError, EngineHandle, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply, SessionImage, SessionView,
+    Submission,
 };
 use nesam_terrain::WorldMap;
 use tokio::sync::oneshot;
@@ -124,6 +125,22 @@ impl EngineClient {
         match self.call(Command::Fork { session: session.into(), copy: copy.into() }, budget).await?.0 {
             Reply::Session(view) => Ok(*view),
             _ => Err(mismatch("fork")),
+        }
+    }
+
+    /// Copies everything that a session remembers.
+    pub async fn export(&self, session: &str, budget: Duration) -> Result<SessionImage, EngineError> {
+        match self.call(Command::Export { session: session.into() }, budget).await?.0 {
+            Reply::Image(image) => Ok(*image),
+            _ => Err(mismatch("export")),
+        }
+    }
+
+    /// Opens a session from such a copy.
+    pub async fn import(&self, image: SessionImage, session: &str, budget: Duration) -> Result<SessionView, EngineError> {
+        match self.call(Command::Import { image: Box::new(image), session: session.into() }, budget).await?.0 {
+            Reply::Session(view) => Ok(*view),
+            _ => Err(mismatch("import")),
         }
     }
 

@@ -84,6 +84,10 @@ pub struct ZenohConfig {
     pub connect: Vec<String>,
     /// Fleet in the keys `nesam/v1/<fleet>/<vehicle>/...`.
     pub fleet: String,
+    /// Name of this server in the keys `nesam/v1/<fleet>/server/<name>/...`; empty = its Zenoh id.
+    pub name: String,
+    /// Interval at which the status of this server is published, s.
+    pub status_interval_s: f64,
 }
 
 /// What is accepted and held at most; see `nesam_engine::Limits`.
@@ -116,6 +120,10 @@ pub struct LimitsConfig {
     pub angular_speed_max_rad_s: f64,
     /// Longest pause between two measurements of one session, s.
     pub pause_max_s: f64,
+    /// How far behind the newest measurement one may arrive and still be put in its place, s.
+    pub reorder_window_s: f64,
+    /// How much further ahead than time has passed a stamp may lie, s.
+    pub clock_ahead_max_s: f64,
     /// Time after which a session that nobody feeds and nobody asks is closed, s.
     pub session_idle_s: f64,
 }
@@ -150,6 +158,8 @@ impl Default for ZenohConfig {
             listen: vec!["tcp/127.0.0.1:7447".into()],
             connect: Vec::new(),
             fleet: "default".into(),
+            name: String::new(),
+            status_interval_s: 1.0,
         }
     }
 }
@@ -171,6 +181,8 @@ impl Default for LimitsConfig {
             speed_max_m_s: l.speed_max_m_s,
             angular_speed_max_rad_s: l.angular_speed_max_rad_s,
             pause_max_s: l.pause_max_s,
+            reorder_window_s: l.reorder_window_s,
+            clock_ahead_max_s: l.clock_ahead_max_s,
             session_idle_s: l.session_idle_s,
         }
     }
@@ -192,6 +204,8 @@ impl From<&LimitsConfig> for Limits {
             speed_max_m_s: c.speed_max_m_s,
             angular_speed_max_rad_s: c.angular_speed_max_rad_s,
             pause_max_s: c.pause_max_s,
+            reorder_window_s: c.reorder_window_s,
+            clock_ahead_max_s: c.clock_ahead_max_s,
             session_idle_s: c.session_idle_s,
         }
     }
@@ -236,6 +250,8 @@ impl Config {
             ("grpc.drain_s", self.grpc.drain_s),
             ("limits.pause_max_s", self.limits.pause_max_s),
             ("limits.session_idle_s", self.limits.session_idle_s),
+            ("limits.clock_ahead_max_s", self.limits.clock_ahead_max_s),
+            ("zenoh.status_interval_s", self.zenoh.status_interval_s),
         ];
         for (key, value) in seconds {
             if !(value > 0.0 && value <= 1e6) {
@@ -258,6 +274,14 @@ impl Config {
             if value == 0 {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
+        }
+        let window_s = self.limits.reorder_window_s;
+        if !(0.0..=1.0).contains(&window_s) {
+            return Err(ServerError::Value { key: "limits.reorder_window_s", reason: format!("is {window_s}, allowed is 0 to 1 s") });
+        }
+        if !self.zenoh.name.is_empty() {
+            check_name("zenoh.name", &self.zenoh.name)
+                .map_err(|error| ServerError::Value { key: "zenoh.name", reason: error.to_string() })?;
         }
         check_name("zenoh.fleet", &self.zenoh.fleet).map_err(|error| ServerError::Value { key: "zenoh.fleet", reason: error.to_string() })
     }
@@ -296,6 +320,8 @@ mod tests {
             ("[grpc]\nport = 3\n", "port"),
             ("[limits]\nsessions_max = 0\n", "limits.sessions_max"),
             ("[zenoh]\nfleet = \"a/b\"\n", "zenoh.fleet"),
+            ("[zenoh]\nname = \"a/b\"\n", "zenoh.name"),
+            ("[limits]\nreorder_window_s = 1.5\n", "limits.reorder_window_s"),
             ("[zenoh]\nmode = \"king\"\n", "king"),
             ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),
             ("not toml", "default.toml"),

@@ -22,7 +22,7 @@ use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::telemetry::Metrics;
-use crate::zenoh::Bus;
+use crate::zenoh::{Bus, Presence};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
 const EVENTS_KEPT: usize = 1024;
@@ -89,6 +89,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         config: Arc::new(config.grpc),
         events,
         stopping: stopping.clone(),
+        presence: config.zenoh.enabled.then(Presence::default),
     };
     let bus = match config.zenoh.enabled {
         true => match Bus::start(&config.zenoh, &edge).await {

@@ -7,7 +7,7 @@ use nesam_terrain::WorldMap;
 
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
-use crate::session::SoilEstimate;
+use crate::session::{SessionImage, SoilEstimate};
 
 /// A command. The list is closed: what is not here cannot happen to a session.
 #[derive(Clone, Debug)]
@@ -27,6 +27,18 @@ pub enum Command {
         session: String,
         /// Name of the copy.
         copy: String,
+    },
+    /// Copies everything that a session remembers. Answer: `Reply::Image`.
+    Export {
+        /// Name of the session.
+        session: String,
+    },
+    /// Opens a session from such a copy. Answer: `Reply::Session`.
+    Import {
+        /// The copy.
+        image: Box<SessionImage>,
+        /// Name of the session; empty = that of the copy.
+        session: String,
     },
     /// Closes a session. Answer: `Reply::Done`.
     Close {
@@ -75,6 +87,8 @@ impl Command {
             Self::Get { .. } => "get",
             Self::List => "list",
             Self::Fork { .. } => "fork",
+            Self::Export { .. } => "export",
+            Self::Import { .. } => "import",
             Self::Close { .. } => "close",
             Self::Expire => "expire",
             Self::Measure { .. } => "measure",
@@ -89,7 +103,7 @@ impl Command {
     /// The session that this command keeps from being idle: one that is fed or asked. Reading it is no use of it.
     pub(crate) fn uses(&self) -> Option<&str> {
         match self {
-            Self::Measure { session, .. } | Self::Fork { session, .. } => Some(session),
+            Self::Measure { session, .. } | Self::Fork { session, .. } | Self::Export { session } => Some(session),
             Self::Predict(query) => Some(&query.session),
             _ => None,
         }
@@ -118,6 +132,8 @@ pub enum Reply {
     Session(Box<SessionView>),
     /// Sessions.
     Sessions(Vec<SessionView>),
+    /// Everything that a session remembers.
+    Image(Box<SessionImage>),
     /// Names of the sessions that were closed because they were idle.
     Expired(Vec<String>),
     /// What became of a measurement.
@@ -137,6 +153,8 @@ pub enum Reply {
 pub struct MeasureAnswer {
     /// What became of it.
     pub outcome: Outcome,
+    /// It arrived after a later one and was put in its place.
+    pub reordered: bool,
     /// Steps in the history.
     pub history_steps: usize,
     /// Changes of the history since the session was opened.
@@ -162,6 +180,8 @@ pub struct SessionView {
     pub last_stamp_ns: Option<i64>,
     /// Highest accepted sequence number.
     pub last_sequence: Option<u64>,
+    /// Start of the vehicle's software that feeds the session, where it tells.
+    pub boot: Option<u64>,
     /// What was learned of the soil.
     pub soil: SoilEstimate,
 }

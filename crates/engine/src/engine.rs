@@ -15,7 +15,7 @@ use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
 use crate::query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-use crate::session::{Rules, Session};
+use crate::session::{Observed, Rules, Session, SessionImage, refused};
 
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
 pub type EventSink = Box<dyn FnMut(Event) + Send>;
@@ -104,6 +104,8 @@ impl Engine {
             Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
             Command::List => Ok(Reply::Sessions(self.sessions.values().map(|s| self.view(s)).collect())),
             Command::Fork { session, copy } => self.fork(now_ns, session, copy),
+            Command::Export { session } => self.export(now_ns, session),
+            Command::Import { image, session } => self.import(now_ns, image, session),
             Command::Close { session } => self.close(session),
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
@@ -139,11 +141,11 @@ impl Engine {
         let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
         if let Some(initial) = &open.initial {
             let rules = Rules { step_ns: self.step_ns, vehicle: card, limits: &self.limits };
-            let outcome = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
-            if let crate::Outcome::NotFinite { field } = outcome {
+            let observed = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
+            if let crate::Outcome::NotFinite { field } = observed.outcome {
                 return Err(EngineError::invalid(format!("initial.{field}"), "is not finite"));
             }
-            session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), outcome);
+            session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), self.step_ns, observed.outcome);
         }
         let view = self.view(&session);
         self.sessions.insert(id.clone(), session);
@@ -169,6 +171,37 @@ impl Engine {
         let session = session.fork(copy, now_ns);
         let view = self.view(&session);
         self.sessions.insert(copy.into(), session);
+        Ok(Reply::Session(Box::new(view)))
+    }
+
+    fn export(&self, now_ns: u64, id: &str) -> Result<Reply, EngineError> {
+        let session = self.session(id)?;
+        let map = session.map().map(|id| self.maps.get(id)).transpose()?.map(|map| (map.id().to_string(), map.hash().to_string()));
+        Ok(Reply::Image(Box::new(session.image(now_ns, &self.predictor.bundle().hash, map))))
+    }
+
+    fn import(&mut self, now_ns: u64, image: &SessionImage, name: &str) -> Result<Reply, EngineError> {
+        let id = if name.is_empty() { &image.session } else { name };
+        check_name("session_id", id)?;
+        check_name("image", &image.vehicle)?;
+        let bundle = self.predictor.bundle();
+        if image.bundle_hash != bundle.hash {
+            let reason = format!("was exported with bundle {}, this service has {} ({})", image.bundle_hash, bundle.hash, bundle.name);
+            return Err(refused(reason));
+        }
+        if let Some((map, hash)) = &image.map {
+            let held = self.maps.get(map)?;
+            if held.hash() != hash {
+                let reason =
+                    format!("drives on map `{map}` with layers {hash}, the map held here has {}; upload that one first", held.hash());
+                return Err(EngineError::NotReady { field: "image".into(), reason });
+            }
+        }
+        self.check_room("session_id", id)?;
+        let rules = Rules { step_ns: self.step_ns, vehicle: &bundle.vehicle, limits: &self.limits };
+        let session = Session::from_image(id, image, self.filter.clone(), now_ns, rules)?;
+        let view = self.view(&session);
+        self.sessions.insert(id.into(), session);
         Ok(Reply::Session(Box::new(view)))
     }
 
@@ -200,15 +233,15 @@ impl Engine {
         }
         let soil_epoch = session.soil().state.epoch;
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
-        let outcome = session.observe(measurement, now_ns, rules)?;
+        let Observed { outcome, reordered } = session.observe(measurement, now_ns, rules)?;
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
-        let outcome = session.learn(&self.predictor, map.as_ref(), outcome);
+        let outcome = session.learn(&self.predictor, map.as_ref(), self.step_ns, outcome);
         let vehicle = session.vehicle().to_string();
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
         if soil.state.epoch != soil_epoch {
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
         }
-        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, history_steps, history_epoch, soil })))
+        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, history_epoch, soil })))
     }
 
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
@@ -281,6 +314,7 @@ impl Engine {
             newest: session.newest().copied(),
             last_stamp_ns: session.last_stamp_ns(),
             last_sequence: session.last_sequence(),
+            boot: session.boot(),
             soil: *session.soil(),
         }
     }

@@ -39,5 +39,6 @@ pub use handle::{Answer, EngineHandle, Submission};
 pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
+pub use nesam_adaptation::FilterSnapshot;
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-pub use session::{Session, SoilEstimate, SoilState};
+pub use session::{Observed, Session, SessionImage, SoilEstimate, SoilState, TrackImage};

@@ -1,5 +1,6 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
+mod image;
 mod measurement;
 mod packed;
 mod prediction;
@@ -8,6 +9,7 @@ mod state;
 mod status;
 mod terrain;
 
+pub use image::{image_bytes, session_image};
 pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};
 pub use prediction::{OutputSelection, predict_error, predict_query, predict_reply};

@@ -35,6 +35,8 @@ pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
         history_steps: view.history_steps as u32,
         last_stamp_ns: view.last_stamp_ns,
         last_sequence: view.last_sequence,
+        boot_id: view.boot,
+        vehicle_alive: None,
         state: view.newest.as_ref().map(|step| vehicle_state_message(&step.state)),
         command: view.newest.as_ref().map(|step| control_message(&step.control)),
         soil_correction: Some(soil_correction(&view.soil)),

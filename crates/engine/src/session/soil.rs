@@ -45,6 +45,16 @@ impl SoilLearner {
         Self { filter, steps: Vec::new(), first: 0 }
     }
 
+    /// The filter, the steps that it holds, and where its open buffer begins among them.
+    pub(super) fn parts(&self) -> (&SoilFilter, &[HistoryStep], usize) {
+        (&self.filter, &self.steps, if self.steps.is_empty() { 0 } else { self.first })
+    }
+
+    /// The inverse of [`SoilLearner::parts`].
+    pub(super) fn from_parts(filter: SoilFilter, steps: Vec<HistoryStep>, first: usize) -> Self {
+        Self { filter, steps, first }
+    }
+
     /// The next step does not follow the last one.
     pub(super) fn forget_open(&mut self) {
         self.steps.clear();
