@@ -5,7 +5,7 @@ use std::path::Path;
 
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
-use nesam_engine::{Limits, check_name};
+use nesam_engine::{FleetSoilSettings, Limits, check_name};
 use serde::{Deserialize, Serialize};
 
 use crate::error::ServerError;
@@ -22,6 +22,8 @@ pub struct Config {
     pub zenoh: ZenohConfig,
     /// What is accepted and held at most.
     pub limits: LimitsConfig,
+    /// Soil map of the fleet.
+    pub fleet_soil: FleetSoilConfig,
 }
 
 /// gRPC.
@@ -88,6 +90,26 @@ pub struct ZenohConfig {
     pub name: String,
     /// Interval at which the status of this server is published, s.
     pub status_interval_s: f64,
+}
+
+/// Soil map of the fleet; see `nesam_engine::FleetSoilSettings`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FleetSoilConfig {
+    /// Whether sessions share what they learn of the ground.
+    pub enabled: bool,
+    /// Edge of a cell, m.
+    pub cell_m: f64,
+    /// Time after which evidence counts half, s.
+    pub half_life_s: f64,
+    /// Distance over which evidence loses the factor e, m.
+    pub reach_m: f64,
+    /// Distance between colours over which evidence loses the factor e, levels of 255.
+    pub colour_reach: f64,
+    /// Process noise, as share of the standard deviations of the prior.
+    pub process_share: f64,
+    /// Cells held at most.
+    pub cells_max: usize,
 }
 
 /// What is accepted and held at most; see `nesam_engine::Limits`.
@@ -160,6 +182,34 @@ impl Default for ZenohConfig {
             fleet: "default".into(),
             name: String::new(),
             status_interval_s: 1.0,
+        }
+    }
+}
+
+impl Default for FleetSoilConfig {
+    fn default() -> Self {
+        let s = FleetSoilSettings::default();
+        Self {
+            enabled: false,
+            cell_m: s.cell_m,
+            half_life_s: s.half_life_s,
+            reach_m: s.reach_m,
+            colour_reach: s.colour_reach,
+            process_share: s.process_share,
+            cells_max: s.cells_max,
+        }
+    }
+}
+
+impl From<&FleetSoilConfig> for FleetSoilSettings {
+    fn from(c: &FleetSoilConfig) -> Self {
+        Self {
+            cell_m: c.cell_m,
+            half_life_s: c.half_life_s,
+            reach_m: c.reach_m,
+            colour_reach: c.colour_reach,
+            process_share: c.process_share,
+            cells_max: c.cells_max,
         }
     }
 }
@@ -275,6 +325,9 @@ impl Config {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
         }
+        FleetSoilSettings::from(&self.fleet_soil)
+            .check()
+            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
         let window_s = self.limits.reorder_window_s;
         if !(0.0..=1.0).contains(&window_s) {
             return Err(ServerError::Value { key: "limits.reorder_window_s", reason: format!("is {window_s}, allowed is 0 to 1 s") });
@@ -322,6 +375,7 @@ mod tests {
             ("[zenoh]\nfleet = \"a/b\"\n", "zenoh.fleet"),
             ("[zenoh]\nname = \"a/b\"\n", "zenoh.name"),
             ("[limits]\nreorder_window_s = 1.5\n", "limits.reorder_window_s"),
+            ("[fleet_soil]\nreach_m = -1.0\n", "reach_m"),
             ("[zenoh]\nmode = \"king\"\n", "king"),
             ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),
             ("not toml", "default.toml"),

@@ -172,6 +172,12 @@ impl Client {
         Ok(replies)
     }
 
+    /// What the fleet has learned of the ground; an empty name means all maps.
+    pub async fn fleet_soil(&mut self, map: &str) -> Result<v1::FleetSoilMap, ClientError> {
+        let mut soil = v1::soil_client::SoilClient::new(self.channel());
+        Ok(soil.map(v1::FleetSoilRequest { map_id: map.into() }).await?.into_inner())
+    }
+
     /// Watches the soil estimate of a session.
     pub async fn watch_soil(&mut self, session: &str) -> Result<tonic::Streaming<v1::SoilEstimate>, ClientError> {
         let mut client = v1::soil_client::SoilClient::new(self.channel.clone());

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nesam_model::HistoryStep;
 use nesam_terrain::WorldMap;
 
+use crate::fleet::FleetCell;
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
 use crate::session::{SessionImage, SoilEstimate};
@@ -56,6 +57,11 @@ pub enum Command {
         /// The measurement.
         measurement: Measurement,
     },
+    /// Reads the soil map of the fleet. Answer: `Reply::FleetSoil`.
+    FleetSoil {
+        /// World map; empty = all.
+        map: String,
+    },
     /// Rolls candidates out. Answer: `Reply::Predicted`.
     Predict(PredictQuery),
     /// Takes a new map or a new version. Answer: `Reply::Map`.
@@ -92,6 +98,7 @@ impl Command {
             Self::Close { .. } => "close",
             Self::Expire => "expire",
             Self::Measure { .. } => "measure",
+            Self::FleetSoil { .. } => "fleet_soil",
             Self::Predict(_) => "predict",
             Self::PutMap { .. } => "put_map",
             Self::GetMap { .. } => "get_map",
@@ -138,6 +145,8 @@ pub enum Reply {
     Expired(Vec<String>),
     /// What became of a measurement.
     Measured(Box<MeasureAnswer>),
+    /// Edge of a cell in m, and the cells with evidence, by map, colour and place.
+    FleetSoil(f64, Vec<FleetCell>),
     /// A prediction.
     Predicted(Box<Prediction>),
     /// A map.
@@ -198,6 +207,13 @@ pub enum Event {
         /// The new estimate.
         soil: Box<SoilEstimate>,
     },
+    /// A session has brought evidence into the soil map of the fleet.
+    FleetSoilChanged {
+        /// Edge of a cell, m.
+        cell_m: f64,
+        /// The cell that changed.
+        cell: Box<FleetCell>,
+    },
     /// A session was closed.
     SessionClosed {
         /// Name of the session.
@@ -212,6 +228,7 @@ impl Event {
     pub fn label(&self) -> &'static str {
         match self {
             Self::SoilChanged { .. } => "soil_changed",
+            Self::FleetSoilChanged { .. } => "fleet_soil_changed",
             Self::SessionClosed { expired: false, .. } => "session_closed",
             Self::SessionClosed { expired: true, .. } => "session_expired",
         }

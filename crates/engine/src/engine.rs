@@ -4,12 +4,14 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
+use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
 use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
 use nesam_physics::VehicleState;
 use nesam_terrain::WorldMap;
 
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
 use crate::error::EngineError;
+use crate::fleet::{Fleet, FleetCell};
 use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
@@ -32,6 +34,8 @@ pub struct Engine {
     step_ns: i64,
     sessions: BTreeMap<String, Session>,
     maps: MapRegistry,
+    /// Soil map of the fleet; `None` = every session begins from the prior alone.
+    fleet: Option<Fleet>,
     events: Option<EventSink>,
     log: Option<Vec<Logged>>,
 }
@@ -54,7 +58,17 @@ impl Engine {
             None => FilterConfig::default(),
         };
         let filter = SoilFilter::new(config)?;
-        Ok(Self { predictor, limits, filter, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None })
+        Ok(Self {
+            predictor,
+            limits,
+            filter,
+            step_ns,
+            sessions: BTreeMap::new(),
+            maps: MapRegistry::default(),
+            fleet: None,
+            events: None,
+            log: None,
+        })
     }
 
     /// Sessions opened from now on learn the soil with these settings.
@@ -63,6 +77,15 @@ impl Engine {
     /// `AdaptationError::Config` naming the setting that is unusable.
     pub fn with_filter(mut self, config: FilterConfig) -> Result<Self, AdaptationError> {
         self.filter = SoilFilter::new(config)?;
+        Ok(self)
+    }
+
+    /// Sessions share from now on what they learn of the ground: one that begins where others were starts from what they learned.
+    ///
+    /// # Errors
+    /// `FleetSoilError::Setting` naming the setting that is unusable.
+    pub fn with_fleet_soil(mut self, settings: FleetSoilSettings) -> Result<Self, FleetSoilError> {
+        self.fleet = Some(Fleet::new(settings)?);
         Ok(self)
     }
 
@@ -109,6 +132,7 @@ impl Engine {
             Command::Close { session } => self.close(session),
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
+            Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
             Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Box::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
@@ -235,9 +259,22 @@ impl Engine {
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
         let Observed { outcome, reordered } = session.observe(measurement, now_ns, rules)?;
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
+        if let (Some(fleet), Some(map)) = (&mut self.fleet, &map)
+            && let Some(position_m) = session.begins_at()
+            && let Some(prior) = fleet.prior(map, position_m, self.filter.config(), now_ns)
+        {
+            session.begin_from(&prior);
+        }
         let outcome = session.learn(&self.predictor, map.as_ref(), self.step_ns, outcome);
-        let vehicle = session.vehicle().to_string();
+        let (vehicle, brought) = (session.vehicle().to_string(), session.take_brought());
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
+        if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
+            let cell_m = fleet.cell_m();
+            let changed: Vec<FleetCell> = brought.iter().filter_map(|brought| fleet.add(map, brought, now_ns)).collect();
+            for cell in changed {
+                self.emit(Event::FleetSoilChanged { cell_m, cell: Box::new(cell) });
+            }
+        }
         if soil.state.epoch != soil_epoch {
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
         }
@@ -284,6 +321,14 @@ impl Engine {
             measurement_age_s: session.age_s(now_ns),
             provenance: self.provenance(session),
         })
+    }
+
+    fn fleet_soil(&self, now_ns: u64, map: &str) -> Result<Reply, EngineError> {
+        let Some(fleet) = &self.fleet else {
+            let reason = "the service keeps no soil map of the fleet; set `fleet_soil.enabled` in its configuration";
+            return Err(EngineError::NotReady { field: "map_id".into(), reason: reason.into() });
+        };
+        Ok(Reply::FleetSoil(fleet.cell_m(), fleet.cells(map, now_ns)))
     }
 
     fn delete_map(&mut self, id: &str) -> Result<Reply, EngineError> {

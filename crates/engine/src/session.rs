@@ -4,6 +4,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nesam_adaptation::SoilFilter;
+use nesam_fleet_soil::FleetPrior;
 use nesam_model::{HistoryStep, Predictor};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
@@ -20,6 +21,7 @@ use self::soil::SoilLearner;
 pub use self::soil::SoilState;
 use self::track::{Taken, Track};
 use crate::error::EngineError;
+use crate::fleet::Brought;
 use crate::forward::Newest;
 use crate::limits::{Limits, outside_card};
 use crate::measurement::{Measurement, Outcome};
@@ -61,6 +63,18 @@ pub struct Session {
     history_epoch: u64,
     learner: SoilLearner,
     soil: SoilEstimate,
+    fleet: FleetPart,
+}
+
+/// What a session has to do with the soil map of the fleet.
+#[derive(Clone, Debug, PartialEq)]
+struct FleetPart {
+    /// It has not asked yet what the fleet knows of the ground that it begins on.
+    asks: bool,
+    /// What it learns goes into the map; not for copies, whose evidence would count twice.
+    brings: bool,
+    /// What it has brought since it was last asked.
+    brought: Vec<Brought>,
 }
 
 /// What leaves the reorder window.
@@ -111,6 +125,7 @@ impl Session {
             history_epoch: 0,
             soil: SoilEstimate { state: learner.state(0, None), covariance },
             learner,
+            fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
         }
     }
 
@@ -231,7 +246,8 @@ impl Session {
         self.settled.push(step);
         let stamp_ns = self.settled.grid.map(|grid| grid.last_ns());
         let (newest, before) = self.settled.history.make_contiguous().split_last()?;
-        let update = self.learner.step(predictor, before, newest, map)?;
+        let (update, brought) = self.learner.step(predictor, before, newest, map)?;
+        self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
         if update.rejected {
             return Some(update.nis);
         }
@@ -240,9 +256,30 @@ impl Session {
         None
     }
 
-    /// A copy of everything under another name.
+    /// Position at which the session begins, once it has one; then never again. World, m.
+    pub(crate) fn begins_at(&mut self) -> Option<[f64; 2]> {
+        let [x, y, _] = self.newest().filter(|_| self.fleet.asks)?.state.position_m;
+        self.fleet.asks = false;
+        Some([x, y])
+    }
+
+    /// Begins from what the fleet knows of the ground.
+    pub(crate) fn begin_from(&mut self, prior: &FleetPrior) {
+        if self.learner.begin_from(prior) {
+            let state = self.learner.state(self.soil.state.epoch + 1, None);
+            self.soil = SoilEstimate { state, covariance: self.learner.covariance() };
+        }
+    }
+
+    /// What the session has brought for the map of the fleet since the last time.
+    pub(crate) fn take_brought(&mut self) -> Vec<Brought> {
+        core::mem::take(&mut self.fleet.brought)
+    }
+
+    /// A copy of everything under another name. What it learns does not go into the soil map of the fleet.
     pub fn fork(&self, id: &str, now_ns: u64) -> Self {
-        Self { id: id.into(), used_ns: now_ns, ..self.clone() }
+        let fleet = FleetPart { brings: false, ..self.fleet.clone() };
+        Self { id: id.into(), used_ns: now_ns, fleet, ..self.clone() }
     }
 
     /// Notes that the session is fed or asked.

@@ -2292,6 +2292,49 @@ pub struct SoilEstimate {
     #[prost(message, optional, tag = "4")]
     pub correction: ::core::option::Option<SoilCorrection>,
 }
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FleetSoilRequest {
+    /// World map; empty = all.
+    #[prost(string, tag = "1")]
+    pub map_id: ::prost::alloc::string::String,
+}
+/// Evidence of the soil by place and by what the ground looks like, brought by the sessions of a service. A session that begins on such ground starts from it.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FleetSoilMap {
+    /// Edge of a cell, m.
+    #[prost(double, tag = "1")]
+    pub cell_m: f64,
+    /// By map, colour and place.
+    #[prost(message, repeated, tag = "2")]
+    pub cells: ::prost::alloc::vec::Vec<FleetSoilCell>,
+}
+/// Evidence on the correction of the soil prior, in the coordinates of `SoilCorrection`: information matrix and vector, without any prior.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FleetSoilCell {
+    /// World map.
+    #[prost(string, tag = "1")]
+    pub map_id: ::prost::alloc::string::String,
+    /// Colour of the semantic map, 0xRRGGBB, in steps of 16 levels.
+    #[prost(uint32, tag = "2")]
+    pub colour_rgb: u32,
+    /// floor(x / cell) and floor(y / cell) in World.
+    #[prost(sint32, tag = "3")]
+    pub column: i32,
+    #[prost(sint32, tag = "4")]
+    pub row: i32,
+    /// Shape (6, 6), row-major in the order of SoilVector.
+    #[prost(double, repeated, tag = "5")]
+    pub information: ::prost::alloc::vec::Vec<f64>,
+    /// Information times mean.
+    #[prost(message, optional, tag = "6")]
+    pub vector: ::core::option::Option<SoilVector>,
+    /// Buffers of a filter that went in, aged to the last one.
+    #[prost(double, tag = "7")]
+    pub buffers: f64,
+    /// Time since the last one, s; until now the evidence ages on.
+    #[prost(double, tag = "8")]
+    pub age_s: f64,
+}
 /// Generated client implementations.
 pub mod soil_client {
     #![allow(
@@ -2396,6 +2439,26 @@ pub mod soil_client {
             req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Soil", "Watch"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// Reads what the fleet has learned of the ground. Each change is also published over Zenoh, as `FleetSoilMap` with the cell that changed, on
+        /// nesam/v1/<fleet>/soil_map. FAILED_PRECONDITION: the service keeps no such map.
+        pub async fn map(
+            &mut self,
+            request: impl tonic::IntoRequest<super::FleetSoilRequest>,
+        ) -> std::result::Result<tonic::Response<super::FleetSoilMap>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/nesam.v1.Soil/Map");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Soil", "Map"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -2422,6 +2485,12 @@ pub mod soil_server {
             &self,
             request: tonic::Request<super::WatchSoilRequest>,
         ) -> std::result::Result<tonic::Response<Self::WatchStream>, tonic::Status>;
+        /// Reads what the fleet has learned of the ground. Each change is also published over Zenoh, as `FleetSoilMap` with the cell that changed, on
+        /// nesam/v1/<fleet>/soil_map. FAILED_PRECONDITION: the service keeps no such map.
+        async fn map(
+            &self,
+            request: tonic::Request<super::FleetSoilRequest>,
+        ) -> std::result::Result<tonic::Response<super::FleetSoilMap>, tonic::Status>;
     }
     /// What the service has learned of the soil under a vehicle. Each change is also published over Zenoh, as `SoilEstimate` on
     /// nesam/v1/<fleet>/<vehicle>/soil.
@@ -2543,6 +2612,49 @@ pub mod soil_server {
                                 max_encoding_message_size,
                             );
                         let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/nesam.v1.Soil/Map" => {
+                    #[allow(non_camel_case_types)]
+                    struct MapSvc<T: Soil>(pub Arc<T>);
+                    impl<T: Soil> tonic::server::UnaryService<super::FleetSoilRequest>
+                    for MapSvc<T> {
+                        type Response = super::FleetSoilMap;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::FleetSoilRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Soil>::map(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = MapSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
                         Ok(res)
                     };
                     Box::pin(fut)

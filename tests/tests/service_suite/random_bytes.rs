@@ -91,6 +91,7 @@ fn valid_message(path: &str, recorded: &Recorded, map: &str) -> Vec<u8> {
             .to_message()
             .encode_to_vec(),
         "Stream" => sample("s", &recorded.drive, 40).encode_to_vec(),
+        "Map" => v1::FleetSoilRequest { map_id: session_id() }.encode_to_vec(),
         "Watch" => v1::WatchSoilRequest { session_id: session_id() }.encode_to_vec(),
         "UploadMap" => {
             let header = v1::MapHeader { map_id: "m".into(), version: 1, resolution_m: 1.0, width: 2, height: 2, ..Default::default() };

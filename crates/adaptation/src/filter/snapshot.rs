@@ -34,6 +34,12 @@ impl SoilFilter {
         }
     }
 
+    /// P⁻ of the next update: P⁺ with the process noise of a buffer, in the coordinates of the correction.
+    pub fn predicted_covariance(&self) -> [[f64; SOIL_DIM]; SOIL_DIM] {
+        let predicted = self.inflated();
+        core::array::from_fn(|r| core::array::from_fn(|c| predicted[(r, c)]))
+    }
+
     /// A filter with these settings that goes on, bit for bit, where the one of the snapshot stood. The buffer is empty.
     ///
     /// # Errors

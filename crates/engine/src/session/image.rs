@@ -6,7 +6,7 @@ use nesam_model::{HISTORY, HistoryStep};
 use super::order::Order;
 use super::soil::SoilLearner;
 use super::track::Track;
-use super::{OPEN_MAX, Rules, Session, SoilEstimate};
+use super::{FleetPart, OPEN_MAX, Rules, Session, SoilEstimate};
 use crate::error::EngineError;
 use crate::grid::StepGrid;
 use crate::limits::outside_card;
@@ -137,6 +137,7 @@ impl Session {
             history_epoch: image.history_epoch,
             learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first),
             soil: image.soil,
+            fleet: FleetPart { asks: false, brings: true, brought: Vec::new() },
         })
     }
 }
