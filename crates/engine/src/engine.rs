@@ -163,6 +163,9 @@ impl Engine {
         }
         self.check_room("session_id", id)?;
         let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
+        if self.drives(&open.vehicle) {
+            session.bring_nothing();
+        }
         if let Some(initial) = &open.initial {
             let rules = Rules { step_ns: self.step_ns, vehicle: card, limits: &self.limits };
             let observed = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
@@ -174,6 +177,11 @@ impl Engine {
         let view = self.view(&session);
         self.sessions.insert(id.clone(), session);
         Ok(Reply::Session(Box::new(view)))
+    }
+
+    /// Whether a session of this vehicle is open.
+    fn drives(&self, vehicle: &str) -> bool {
+        self.sessions.values().any(|session| session.vehicle() == vehicle)
     }
 
     /// Whether one more session of this name may be open.
@@ -223,7 +231,10 @@ impl Engine {
         }
         self.check_room("session_id", id)?;
         let rules = Rules { step_ns: self.step_ns, vehicle: &bundle.vehicle, limits: &self.limits };
-        let session = Session::from_image(id, image, self.filter.clone(), now_ns, rules)?;
+        let mut session = Session::from_image(id, image, self.filter.clone(), now_ns, rules)?;
+        if self.drives(&image.vehicle) {
+            session.bring_nothing();
+        }
         let view = self.view(&session);
         self.sessions.insert(id.into(), session);
         Ok(Reply::Session(Box::new(view)))

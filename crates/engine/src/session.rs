@@ -71,7 +71,7 @@ pub struct Session {
 struct FleetPart {
     /// It has not asked yet what the fleet knows of the ground that it begins on.
     asks: bool,
-    /// What it learns goes into the map; not for copies, whose evidence would count twice.
+    /// What it learns goes into the map; not for copies and further sessions of one vehicle, whose evidence would count twice.
     brings: bool,
     /// What it has brought since it was last asked.
     brought: Vec<Brought>,
@@ -271,6 +271,11 @@ impl Session {
         }
     }
 
+    /// What the session learns does not go into the soil map of the fleet.
+    pub(crate) fn bring_nothing(&mut self) {
+        self.fleet.brings = false;
+    }
+
     /// What the session has brought for the map of the fleet since the last time.
     pub(crate) fn take_brought(&mut self) -> Vec<Brought> {
         core::mem::take(&mut self.fleet.brought)
@@ -278,8 +283,9 @@ impl Session {
 
     /// A copy of everything under another name. What it learns does not go into the soil map of the fleet.
     pub fn fork(&self, id: &str, now_ns: u64) -> Self {
-        let fleet = FleetPart { brings: false, ..self.fleet.clone() };
-        Self { id: id.into(), used_ns: now_ns, fleet, ..self.clone() }
+        let mut copy = Self { id: id.into(), used_ns: now_ns, ..self.clone() };
+        copy.bring_nothing();
+        copy
     }
 
     /// Notes that the session is fed or asked.
