@@ -38,6 +38,12 @@ async fn metrics(State(state): State<HttpState>) -> Response {
         "# HELP nesam_uptime_seconds Time since the start.\n# TYPE nesam_uptime_seconds gauge\nnesam_uptime_seconds {}\n",
         state.clock.elapsed().as_secs_f64()
     );
+    if let Some(presence) = &state.edge.presence {
+        text += &format!(
+            "# HELP nesam_vehicles_alive Vehicles whose Zenoh liveliness token is there.\n# TYPE nesam_vehicles_alive gauge\nnesam_vehicles_alive {}\n",
+            presence.count()
+        );
+    }
     ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
 }
 
@@ -62,6 +68,7 @@ async fn status(State(state): State<HttpState>) -> Response {
                 "history_steps": s.history_steps,
                 "history_epoch": s.provenance.history_epoch,
                 "soil_epoch": s.provenance.soil_epoch,
+                "vehicle_alive": state.edge.presence.as_ref().map(|presence| presence.is_alive(&s.vehicle)),
                 "position_m": s.newest.as_ref().map(|n| n.state.position_m),
             })
         })

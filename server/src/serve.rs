@@ -22,7 +22,7 @@ use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::telemetry::Metrics;
-use crate::zenoh::Bus;
+use crate::zenoh::{Bus, Presence};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
 const EVENTS_KEPT: usize = 1024;
@@ -73,11 +73,16 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (sink, counted) = (events.clone(), metrics.clone());
     let unusable =
         |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
-    let engine =
-        Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?.with_events(Box::new(move |event| {
-            counted.event(event.label());
-            let _ = sink.send(event);
-        }));
+    let mut engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?;
+    if config.fleet_soil.enabled {
+        engine = engine
+            .with_fleet_soil((&config.fleet_soil).into())
+            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
+    }
+    let engine = engine.with_events(Box::new(move |event| {
+        counted.event(event.label());
+        let _ = sink.send(event);
+    }));
     let clock = MonotonicClock::default();
     let handle = EngineHandle::spawn(engine, Arc::new(clock));
     let (stop, stopping) = watch::channel(false);
@@ -89,6 +94,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         config: Arc::new(config.grpc),
         events,
         stopping: stopping.clone(),
+        presence: config.zenoh.enabled.then(Presence::default),
     };
     let bus = match config.zenoh.enabled {
         true => match Bus::start(&config.zenoh, &edge).await {
