@@ -28,6 +28,8 @@ pub struct SoilEstimate {
     pub state: SoilState,
     /// P⁺, in the coordinates of the correction.
     pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
+    /// How many times the model's noise counts on this ground as far as the drive has told; 1 before the first update.
+    pub noise_scale: f64,
 }
 
 /// A session: identity, recent measured motion, soil.
@@ -77,7 +79,7 @@ impl Session {
             arrived_ns: 0,
             used_ns: now_ns,
             history_epoch: 0,
-            soil: SoilEstimate { state: learner.state(0, None), covariance },
+            soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0 },
             learner,
         }
     }
@@ -169,7 +171,7 @@ impl Session {
             Some(update) if update.rejected => Outcome::Gated { nis: update.nis },
             Some(update) => {
                 let state = self.learner.state(self.soil.state.epoch + 1, stamp_ns);
-                self.soil = SoilEstimate { state, covariance: update.posterior.covariance };
+                self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale };
                 outcome
             }
         }

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod bad_input;
+mod extras;
 mod from_now;
 mod lifecycle;
 mod measurements;
