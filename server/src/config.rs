@@ -124,6 +124,12 @@ pub struct LimitsConfig {
     pub horizon_max: usize,
     /// Samples times steps of one prediction.
     pub sample_steps_max: usize,
+    /// Samples of one prediction with Jacobians.
+    pub jacobian_samples_max: usize,
+    /// Samples of one prediction with covariance.
+    pub covariance_samples_max: usize,
+    /// What-if soils of one prediction.
+    pub soils_max: usize,
     /// Uploaded maps.
     pub maps_max: usize,
     /// Cells of one map.
@@ -222,6 +228,9 @@ impl Default for LimitsConfig {
             samples_max: l.samples_max,
             horizon_max: l.horizon_max,
             sample_steps_max: l.sample_steps_max,
+            jacobian_samples_max: l.jacobian_samples_max,
+            covariance_samples_max: l.covariance_samples_max,
+            soils_max: l.soils_max,
             maps_max: l.maps_max,
             map_cells_max: l.map_cells_max,
             map_cells_total_max: l.map_cells_total_max,
@@ -245,6 +254,9 @@ impl From<&LimitsConfig> for Limits {
             samples_max: c.samples_max,
             horizon_max: c.horizon_max,
             sample_steps_max: c.sample_steps_max,
+            jacobian_samples_max: c.jacobian_samples_max,
+            covariance_samples_max: c.covariance_samples_max,
+            soils_max: c.soils_max,
             maps_max: c.maps_max,
             map_cells_max: c.map_cells_max,
             map_cells_total_max: c.map_cells_total_max,

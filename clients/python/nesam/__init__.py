@@ -15,6 +15,7 @@ from ._errors import (
     Overloaded,
     Unavailable,
 )
+from ._extras import ExtraOutputs, Extras
 from ._fallback import KinematicFallback
 from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Soil, Validity, VehicleCard, WorldMap
 
@@ -24,6 +25,8 @@ __all__ = [
     "Answer",
     "Client",
     "DeadlineExceeded",
+    "ExtraOutputs",
+    "Extras",
     "FailedPrecondition",
     "InvalidArgument",
     "KinematicFallback",

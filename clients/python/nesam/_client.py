@@ -9,6 +9,7 @@ import numpy as np
 
 from . import _types as t
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable, from_rpc
+from ._extras import Extras, extra_outputs
 from ._fallback import KinematicFallback
 from .v1 import (
     measurements_pb2,
@@ -198,6 +199,7 @@ class Client:
         start_stamp_ns: Optional[int] = None,
         sent: Sequence[Tuple[int, Sequence[float]]] = (),
         half: bool = False,
+        extras: Optional[Extras] = None,
     ) -> t.Prediction:
         """Rolls candidate command sequences out from the session's newest state, or from `start`.
 
@@ -207,7 +209,8 @@ class Client:
         service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so.
         start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session forward to it with the commands `sent`,
         pairs (stamp_ns, (speed, second)) by ascending stamp. half: lets the reply travel as 16-bit numbers; positions are rounded by at most
-        4 mm within 16 m of the start. A fallback does not roll forward.
+        4 mm within 16 m of the start. A fallback does not roll forward. extras: Jacobians, covariance, risk and what-if soils; the answer is in
+        `Prediction.extras`, a fallback has none.
 
         Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, or it lies off the map), Overloaded, DeadlineExceeded,
         Unavailable; ValueError for arrays of a wrong shape.
@@ -234,6 +237,7 @@ class Client:
                 prediction_pb2.SentCommand(stamp_ns=stamp_ns, command=types_pb2.Control(speed_m_s=command[0], second=command[1]))
                 for stamp_ns, command in sent
             ],
+            extras=None if extras is None else extras.message(),
         )
         try:
             reply = self._call(self._prediction.Predict, request, timeout_s)
@@ -242,7 +246,7 @@ class Client:
             if fallback is None or known is None:
                 raise
             return _fallback_prediction(fallback, t.array(known, (12,), "start"), controls, names, stride, error)
-        prediction = _prediction(reply, stride)
+        prediction = _prediction(reply, stride, controls.shape[1], extras)
         if start is None and start_stamp_ns is None:
             self._known_states[session_id] = prediction.start
         return prediction
@@ -406,9 +410,11 @@ def _steps_s(steps: int, stride: int) -> np.ndarray:
     return 0.1 * max(1, stride) * np.arange(1, steps + 1)
 
 
-def _prediction(reply: prediction_pb2.PredictReply, stride: int) -> t.Prediction:
+def _prediction(reply: prediction_pb2.PredictReply, stride: int, horizon: int, extras: Optional[Extras]) -> t.Prediction:
     channels = tuple(name for i, name in enumerate(CHANNELS) if reply.channels >> i & 1)
-    shape = (reply.samples, reply.steps, len(channels))
+    what_if = extras is not None and extras.what_if
+    rows = (reply.soil_groups, reply.samples) if what_if else (reply.samples,)
+    shape = (*rows, reply.steps, len(channels))
     start = t.state_array(reply.start)
     half = reply.precision == prediction_pb2.PRECISION_F16
     width = "<f2" if half else "<f4"
@@ -418,12 +424,12 @@ def _prediction(reply: prediction_pb2.PredictReply, stride: int) -> t.Prediction
         states = (states + [start[i] if i < 3 else 0.0 for i in map(CHANNELS.index, channels)]).astype(np.float32)
     sinkage = None
     if reply.sinkage_m:
-        sinkage = np.frombuffer(reply.sinkage_m, dtype=width).reshape(reply.samples, reply.steps, 4).astype(np.float32, copy=False)
+        sinkage = np.frombuffer(reply.sinkage_m, dtype=width).reshape(*rows, reply.steps, 4).astype(np.float32, copy=False)
     return t.Prediction(
         states=states,
         channels=channels,
         steps_s=_steps_s(reply.steps, stride),
-        validity=np.array(reply.validity, dtype=np.uint32),
+        validity=np.array(reply.validity, dtype=np.uint32).reshape(rows),
         start=start,
         sinkage_m=sinkage,
         history_steps=reply.history_steps,
@@ -436,6 +442,7 @@ def _prediction(reply: prediction_pb2.PredictReply, stride: int) -> t.Prediction
         start_stamp_ns=reply.start_stamp_ns if reply.HasField("start_stamp_ns") else None,
         rolled_forward_steps=reply.rolled_forward_steps,
         soil_correction=t.soil(reply.soil_correction),
+        extras=None if extras is None else extra_outputs(reply, horizon, what_if),
     )
 
 

@@ -6,6 +6,7 @@ from typing import Optional, Sequence, Tuple
 
 import numpy as np
 
+from ._extras import ExtraOutputs
 from .v1 import types_pb2
 
 
@@ -159,7 +160,8 @@ class Prediction:
     sinkage_m: (samples, steps, 4) float32 or None. validity: (samples,) uint32 of `Validity` bits. start: (12,).
     start_stamp_ns: instant of the start by the vehicle's clock, None when a start was given. rolled_forward_steps: steps of 0.1 s from the newest
     measurement to the start. soil: (6,) k_phi k_c n c phi k_shear under the start; soil_variance: (6,) or None while no filter runs;
-    soil_correction: what the session knew of the soil.
+    soil_correction: what the session knew of the soil. extras: what `Extras` asked for; with what-if soils, states, sinkage_m and validity have a first
+    dimension more, one group for each soil.
     computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance and
     sinkage_m are None, validity is 0 and `fallback_reason` is the service's error.
     """
@@ -182,6 +184,7 @@ class Prediction:
     start_stamp_ns: Optional[int] = None
     rolled_forward_steps: int = 0
     soil_correction: Optional[Soil] = None
+    extras: Optional[ExtraOutputs] = None
 
 
 def array(values: Sequence[float], shape: Tuple[int, ...], name: str) -> np.ndarray:

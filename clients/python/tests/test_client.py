@@ -74,6 +74,52 @@ def test_service_prediction_from_now_rolls_forward_with_what_was_sent(driven):
     assert caught.value.field == "start_stamp_ns" and "2" in caught.value.message
 
 
+def test_service_extras_have_shapes_and_agree_with_each_other(driven):
+    plain = driven.predict("truck", fan(2, 6))
+    asked = nesam.Extras(jacobians=True, risk=True)
+    full = driven.predict("truck", fan(2, 6), extras=asked, stride=2)
+    assert (full.states == plain.states[:, 1::2]).all() and plain.extras is None
+    extras = full.extras
+    assert extras.jacobian_start.shape == (2, 3, 12, 12) and extras.jacobian_soil.shape == (2, 3, 12, 6)
+    assert extras.jacobian_controls.shape == (2, 3, 12, 6, 2) and extras.covariance is None
+    # The second step does not know the third command; the state moves with its start.
+    assert (extras.jacobian_controls[:, 0, :, 2:] == 0).all() and (extras.jacobian_controls[:, 2, 0, 0] != 0).any()
+    # A start further ahead is an end further ahead; not one to one, as the network sees how far the vehicle has come since the last measurement.
+    np.testing.assert_allclose(extras.jacobian_start[:, :, 0, 0], 1.0, atol=0.3)
+    assert extras.wheel_load_n.shape == extras.wheel_slip.shape == (2, 3, 4)
+    # A 2.5-tonne car on gentle hills.
+    np.testing.assert_allclose(extras.wheel_load_n.sum(axis=-1), 24_460, rtol=0.3)
+    assert ((extras.load_transfer_ratio >= 0) & (extras.load_transfer_ratio <= 1)).all() and extras.traction_reserve.shape == (2, 3)
+
+
+def test_service_what_if_soils_are_groups(driven):
+    plain = driven.predict("truck", fan(3, 8))
+    deltas = np.zeros((2, 6))
+    deltas[1, 3] = -1.0
+    soils = driven.predict("truck", fan(3, 8), extras=nesam.Extras(soil_deltas=deltas))
+    assert soils.states.shape == (2, 3, 8, 12) and soils.validity.shape == (2, 3)
+    assert (soils.states[0] == plain.states).all() and (soils.states[1] != plain.states).any()
+    sigma = driven.predict("truck", fan(3, 8), extras=nesam.Extras(soil_sigma_points=True, risk=True))
+    assert sigma.states.shape == (13, 3, 8, 12) and sigma.extras.traction_reserve.shape == (13, 3, 8)
+    assert (sigma.states[0] == plain.states).all()
+    with pytest.raises(ValueError, match="soil_deltas"):
+        driven.predict("truck", fan(1, 1), extras=nesam.Extras(soil_deltas=np.zeros(6)))
+    with pytest.raises(nesam.InvalidArgument) as caught:
+        driven.predict("truck", fan(9, 1), extras=nesam.Extras(jacobians=True))
+    assert caught.value.field == "extras.jacobians"
+
+
+def test_service_covariance_grows_and_is_symmetric(driven):
+    prediction = driven.predict("truck", fan(2, 32), extras=nesam.Extras(covariance=True))
+    covariance = prediction.extras.covariance.astype(np.float64)
+    assert covariance.shape == (2, 32, 12, 12) and prediction.extras.region_90_single.shape == (6,)
+    np.testing.assert_array_equal(covariance, np.swapaxes(covariance, 2, 3))
+    size = np.sqrt(np.diagonal(covariance, axis1=2, axis2=3))
+    correlation = covariance / (size[..., :, None] * size[..., None, :])
+    assert np.linalg.eigvalsh(correlation).min() > -1e-5
+    assert (size[:, 31, :2] > size[:, 7, :2]).all() and prediction.extras.region_90_planar > 0
+
+
 def test_service_soil_is_in_every_reply(driven):
     answer = driven.measure(list(straight("truck", 41))[40:])[0]
     session, prediction = driven.session("truck"), driven.predict("truck", fan(1, 1))

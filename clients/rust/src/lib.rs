@@ -34,4 +34,4 @@ pub use map::MapLayers;
 pub use measure::MeasurementStream;
 pub use message::{measurement, outcome_label, state_array, state_message};
 pub use nesam_proto::v1;
-pub use prediction::{Candidates, Prediction};
+pub use prediction::{Candidates, ExtraOutputs, Prediction};

@@ -26,6 +26,8 @@ pub struct Candidates {
     pub controls: Vec<f32>,
     /// What to return.
     pub output: v1::OutputSelection,
+    /// What to compute beyond the states.
+    pub extras: Option<v1::PredictExtras>,
     /// Copied to the prediction.
     pub tag: u64,
 }
@@ -35,7 +37,19 @@ impl Candidates {
     pub fn new(session: &str, samples: usize, horizon: usize, controls: Vec<f32>) -> Self {
         let output = v1::OutputSelection { wheel_sinkage: true, ..Default::default() };
         let session = session.into();
-        Self { session, start: None, start_stamp_ns: None, sent: Vec::new(), use_history: true, samples, horizon, controls, output, tag: 0 }
+        Self {
+            session,
+            start: None,
+            start_stamp_ns: None,
+            sent: Vec::new(),
+            use_history: true,
+            samples,
+            horizon,
+            controls,
+            output,
+            extras: None,
+            tag: 0,
+        }
     }
 
     /// The same candidates from this instant of the vehicle's clock on, when the vehicle was sent these commands before.
@@ -57,6 +71,7 @@ impl Candidates {
             tag: self.tag,
             start_stamp_ns: self.start_stamp_ns,
             sent: self.sent.iter().map(|(stamp_ns, command)| sent_command(*stamp_ns, *command)).collect(),
+            extras: self.extras.clone(),
         }
     }
 }
@@ -104,6 +119,53 @@ pub struct Prediction {
     pub queue_s: f64,
     /// Time of the computation, s.
     pub compute_s: f64,
+    /// Groups of trajectories, one for each what-if soil: `states`, `sinkage_m`, `validity` and risk have `soil_groups * samples` rows.
+    pub soil_groups: usize,
+    /// Jacobians, covariance and risk; empty arrays unless asked for.
+    pub extras: ExtraOutputs,
+}
+
+/// What was computed beyond the states, row-major; empty unless asked for. The fields and their shapes are those of `v1::PredictReply`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct ExtraOutputs {
+    /// (samples, steps, 12, 12).
+    pub jacobian_start: Vec<f32>,
+    /// (samples, steps, 12, horizon, 2).
+    pub jacobian_controls: Vec<f32>,
+    /// (samples, steps, 12, 6).
+    pub jacobian_soil: Vec<f32>,
+    /// (samples, steps, 12, 12).
+    pub covariance: Vec<f32>,
+    /// Squared Mahalanobis radius that holds 90 % of the measured (x, y).
+    pub region_90_planar: f64,
+    /// The same of x, y, z, roll, pitch, yaw alone.
+    pub region_90_single: Vec<f64>,
+    /// N, (rows, steps, 4).
+    pub wheel_load_n: Vec<f32>,
+    /// (rows, steps, 4).
+    pub wheel_slip: Vec<f32>,
+    /// (rows, steps).
+    pub load_transfer_ratio: Vec<f32>,
+    /// (rows, steps).
+    pub traction_reserve: Vec<f32>,
+}
+
+impl ExtraOutputs {
+    fn from_message(reply: &v1::PredictReply) -> Result<Self, ClientError> {
+        let of = |name: &str, packed: &[u8]| unpack(name, packed, packed.len() / 4, v1::Precision::F32);
+        Ok(Self {
+            jacobian_start: of("jacobian_start", &reply.jacobian_start)?,
+            jacobian_controls: of("jacobian_controls", &reply.jacobian_controls)?,
+            jacobian_soil: of("jacobian_soil", &reply.jacobian_soil)?,
+            covariance: of("covariance", &reply.covariance)?,
+            region_90_planar: reply.region_90_planar,
+            region_90_single: reply.region_90_single.clone(),
+            wheel_load_n: of("wheel_load_n", &reply.wheel_load_n)?,
+            wheel_slip: of("wheel_slip", &reply.wheel_slip)?,
+            load_transfer_ratio: of("load_transfer_ratio", &reply.load_transfer_ratio)?,
+            traction_reserve: of("traction_reserve", &reply.traction_reserve)?,
+        })
+    }
 }
 
 fn soil_array(soil: &v1::SoilVector) -> [f64; 6] {
@@ -118,10 +180,12 @@ impl Prediction {
     pub fn from_message(reply: &v1::PredictReply) -> Result<Self, ClientError> {
         let channels: Vec<usize> = (0..12).filter(|i| reply.channels >> i & 1 == 1).collect();
         let (samples, steps) = (reply.samples as usize, reply.steps as usize);
-        let sinkage = if reply.sinkage_m.is_empty() { 0 } else { samples * steps * 4 };
+        let soil_groups = (reply.soil_groups as usize).max(1);
+        let rows = soil_groups * samples;
+        let sinkage = if reply.sinkage_m.is_empty() { 0 } else { rows * steps * 4 };
         let missing = |part: &str| ClientError::protocol(format!("`{part}` is missing"));
         let start = reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?;
-        let mut states = unpack("states", &reply.states, samples * steps * channels.len(), reply.precision())?;
+        let mut states = unpack("states", &reply.states, rows * steps * channels.len(), reply.precision())?;
         if reply.precision() == v1::Precision::F16 {
             for row in states.chunks_exact_mut(channels.len().max(1)) {
                 let positions = row.iter_mut().zip(&channels).filter(|(_, channel)| **channel < 3);
@@ -147,15 +211,18 @@ impl Prediction {
             provenance: reply.provenance.clone().ok_or_else(|| missing("provenance"))?,
             queue_s: reply.queue_s,
             compute_s: reply.compute_s,
+            soil_groups,
+            extras: ExtraOutputs::from_message(reply)?,
         })
     }
 
-    /// Returned channels of sample `n` at returned step `k` (0-based).
+    /// Returned channels of row `n` at returned step `k` (0-based); row = soil group times samples plus sample.
     ///
     /// # Panics
     /// When `n` or `k` is out of range.
     pub fn state(&self, n: usize, k: usize) -> &[f32] {
-        assert!(n < self.samples && k < self.steps, "sample {n}, step {k} of {} x {}", self.samples, self.steps);
+        let rows = self.soil_groups * self.samples;
+        assert!(n < rows && k < self.steps, "row {n}, step {k} of {rows} x {}", self.steps);
         let width = self.channels.len();
         let at = (n * self.steps + k) * width;
         &self.states[at..at + width]

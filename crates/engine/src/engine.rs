@@ -5,12 +5,13 @@ use std::sync::Arc;
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
-use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
+use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant};
 use nesam_physics::VehicleState;
 use nesam_terrain::WorldMap;
 
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
 use crate::error::EngineError;
+use crate::extras::ExtraOutputs;
 use crate::fleet::{Fleet, FleetCell};
 use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
@@ -31,6 +32,8 @@ pub struct Engine {
     limits: Limits,
     /// The filter that every session starts with.
     filter: SoilFilter,
+    /// What the bundle knows of its own errors.
+    noise: Option<RolloutNoise>,
     step_ns: i64,
     sessions: BTreeMap<String, Session>,
     maps: MapRegistry,
@@ -50,7 +53,7 @@ impl Engine {
     /// An engine without sessions. The soil filter has the settings that the bundle carries, the default ones where it carries none.
     ///
     /// # Errors
-    /// `AdaptationError` when the settings that the bundle carries are not readable or not usable.
+    /// `AdaptationError` when the settings or the noise that the bundle carries are not readable or not usable.
     pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Result<Self, AdaptationError> {
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
         let config = match &predictor.bundle().soil_filter_json {
@@ -58,10 +61,13 @@ impl Engine {
             None => FilterConfig::default(),
         };
         let filter = SoilFilter::new(config)?;
+        let unreadable = |error: ModelError| AdaptationError::Settings { reason: error.to_string() };
+        let noise = predictor.bundle().rollout_noise_json.as_deref().map(RolloutNoise::from_json).transpose().map_err(unreadable)?;
         Ok(Self {
             predictor,
             limits,
             filter,
+            noise,
             step_ns,
             sessions: BTreeMap::new(),
             maps: MapRegistry::default(),
@@ -303,20 +309,33 @@ impl Engine {
             _ => RollForward::default(),
         };
         let horizon = query.horizon + forward.steps();
-        self.limits.check_shape(query.samples, horizon)?;
+        let soils = query.extras.corrections(session.soil());
+        self.limits.check_shape(query.samples * soils.len().max(1), horizon)?;
         let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
         let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
-        let rollout = self.predictor.rollout(&RolloutQuery {
+        let controls = forward.prepend(&query.controls, query.horizon);
+        let asked = RolloutQuery {
             history: &history,
             start,
-            controls: &forward.prepend(&query.controls, query.horizon),
+            controls: &controls,
             samples: query.samples,
             horizon,
             map,
             soil_correction: session.soil().state.correction,
             variant: Variant::Full,
             wheels: None,
-        })?;
+        };
+        let (rollout, risk) = self.predictor.rollout_with(&asked, &RolloutExtras { soils: &soils, risk: query.extras.risk })?;
+        let mut extras = ExtraOutputs {
+            soil_groups: soils.len().max(1),
+            risk: risk.map(|risk| forward.split_risk(risk, horizon)),
+            ..Default::default()
+        };
+        if query.extras.derived() {
+            let linearisations = self.predictor.linearise(&asked)?;
+            (extras.jacobians, extras.covariance) =
+                query.extras.derive(&linearisations, forward.steps(), session.soil(), self.noise.as_ref())?;
+        }
         let (rolled, mut rollout) = forward.split(rollout);
         if session.soil().state.epoch == 0 {
             rollout.flags.iter_mut().for_each(|flags| *flags |= SOIL_NOT_LEARNED);
@@ -331,6 +350,7 @@ impl Engine {
             history_steps: history.len(),
             measurement_age_s: session.age_s(now_ns),
             provenance: self.provenance(session),
+            extras,
         })
     }
 

@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use nesam_model::{MAX_HORIZON, Rollout};
+use nesam_model::{MAX_HORIZON, RiskOutputs, Rollout};
 use nesam_physics::{Control, STATE_DIM, Vehicle, VehicleState, WHEELS};
 
 use crate::error::EngineError;
@@ -122,14 +122,28 @@ impl RollForward {
         controls.chunks_exact(2 * horizon).flat_map(|sample| before.iter().chain(sample)).copied().collect()
     }
 
+    /// Rows of `width` numbers after the steps rolled forward, of samples of `horizon` rows.
+    fn tail(&self, values: &[f32], horizon: usize, width: usize) -> Vec<f32> {
+        values.chunks_exact(horizon * width).flat_map(|sample| &sample[self.steps() * width..]).copied().collect()
+    }
+
+    /// Takes the steps off risk outputs of `horizon` steps.
+    pub fn split_risk(&self, risk: RiskOutputs, horizon: usize) -> RiskOutputs {
+        let of = |values: &[f32], width: usize| self.tail(values, horizon, width);
+        RiskOutputs {
+            wheel_load_n: of(&risk.wheel_load_n, WHEELS),
+            wheel_slip: of(&risk.wheel_slip, WHEELS),
+            load_transfer_ratio: of(&risk.load_transfer_ratio, 1),
+            traction_reserve: of(&risk.traction_reserve, 1),
+        }
+    }
+
     /// Takes the steps off a rollout again, and gives the state after them: every sample has the same, since it had the same commands.
     pub fn split(&self, rollout: Rollout) -> (Option<VehicleState<f64>>, Rollout) {
         let Some(last) = self.steps().checked_sub(1) else { return (None, rollout) };
         let start = VehicleState::from_array(rollout.state(0, last).to_array().map(f64::from));
-        let tail = |values: &[f32], width: usize| -> Vec<f32> {
-            values.chunks_exact(rollout.horizon * width).flat_map(|sample| &sample[self.steps() * width..]).copied().collect()
-        };
-        let (states, sinkage_m) = (tail(&rollout.states, STATE_DIM), tail(&rollout.sinkage_m, WHEELS));
+        let (states, sinkage_m) =
+            (self.tail(&rollout.states, rollout.horizon, STATE_DIM), self.tail(&rollout.sinkage_m, rollout.horizon, WHEELS));
         (Some(start), Rollout { states, sinkage_m, horizon: rollout.horizon - self.steps(), ..rollout })
     }
 }

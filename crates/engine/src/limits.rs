@@ -35,6 +35,12 @@ pub struct Limits {
     pub horizon_max: usize,
     /// Product N K of one prediction, the budget of one turn of the engine.
     pub sample_steps_max: usize,
+    /// Samples of one prediction with Jacobians; each takes about as long as a hundred without.
+    pub jacobian_samples_max: usize,
+    /// Samples of one prediction with covariance; each takes a quarter of a Jacobian's time.
+    pub covariance_samples_max: usize,
+    /// What-if soils of one prediction.
+    pub soils_max: usize,
     /// Uploaded maps.
     pub maps_max: usize,
     /// Cells of one map.
@@ -71,6 +77,9 @@ impl Default for Limits {
             samples_max: 4096,
             horizon_max: MAX_HORIZON,
             sample_steps_max: 65_536,
+            jacobian_samples_max: 8,
+            covariance_samples_max: 64,
+            soils_max: 16,
             maps_max: 64,
             map_cells_max: nesam_terrain::MAX_CELLS,
             map_cells_total_max: 4 * nesam_terrain::MAX_CELLS,

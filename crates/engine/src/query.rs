@@ -4,6 +4,7 @@ use nesam_model::Rollout;
 use nesam_physics::{Control, SOIL_DIM, Vehicle, VehicleState};
 
 use crate::error::EngineError;
+use crate::extras::{ExtraOutputs, PredictExtras};
 use crate::forward::StartInstant;
 use crate::limits::{Limits, outside_card};
 use crate::session::SoilEstimate;
@@ -28,6 +29,8 @@ pub struct PredictQuery {
     pub horizon: usize,
     /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the card.
     pub controls: Vec<f32>,
+    /// What to compute beyond the states.
+    pub extras: PredictExtras,
 }
 
 /// What a prediction was computed from.
@@ -48,7 +51,7 @@ pub struct Provenance {
 /// An answered prediction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
-    /// Predicted states, sinkages, flags and the soil under the start.
+    /// Predicted states, sinkages, flags and the soil under the start; one row for each sample of each group of what-if soils.
     pub rollout: Rollout,
     /// State that the rollout started from.
     pub start: VehicleState<f64>,
@@ -66,6 +69,8 @@ pub struct Prediction {
     pub measurement_age_s: Option<f64>,
     /// What it was computed from.
     pub provenance: Provenance,
+    /// What was asked for beyond the states.
+    pub extras: ExtraOutputs,
 }
 
 impl PredictQuery {
@@ -75,6 +80,7 @@ impl PredictQuery {
     /// `EngineError::Invalid` naming the field and the limit.
     pub fn check(&self, limits: &Limits, vehicle: &Vehicle) -> Result<(), EngineError> {
         limits.check_shape(self.samples, self.horizon)?;
+        self.extras.check(limits, self.samples)?;
         let expected = self.samples * self.horizon * 2;
         if self.controls.len() != expected {
             let reason = format!("has {} numbers, samples x horizon x 2 = {expected} are needed", self.controls.len());

@@ -36,6 +36,8 @@ pub struct SoilEstimate {
     pub state: SoilState,
     /// P⁺, in the coordinates of the correction.
     pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
+    /// How many times the model's noise counts on this ground as far as the drive has told; 1 before the first update.
+    pub noise_scale: f64,
 }
 
 /// A session: identity, recent measured motion, soil.
@@ -123,7 +125,7 @@ impl Session {
             arrived_ns: 0,
             used_ns: now_ns,
             history_epoch: 0,
-            soil: SoilEstimate { state: learner.state(0, None), covariance },
+            soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0 },
             learner,
             fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
         }
@@ -252,7 +254,7 @@ impl Session {
             return Some(update.nis);
         }
         let state = self.learner.state(self.soil.state.epoch + 1, stamp_ns);
-        self.soil = SoilEstimate { state, covariance: update.posterior.covariance };
+        self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale };
         None
     }
 
@@ -267,7 +269,7 @@ impl Session {
     pub(crate) fn begin_from(&mut self, prior: &FleetPrior) {
         if self.learner.begin_from(prior) {
             let state = self.learner.state(self.soil.state.epoch + 1, None);
-            self.soil = SoilEstimate { state, covariance: self.learner.covariance() };
+            self.soil = SoilEstimate { state, covariance: self.learner.covariance(), ..self.soil };
         }
     }
 

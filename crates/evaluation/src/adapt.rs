@@ -51,6 +51,12 @@ impl DriveAdaptation {
         known.checked_sub(1).map(|last| &self.updates[last].update.posterior)
     }
 
+    /// How many times the model's noise counts as far as measurements up to `sample` tell; 1 before the first update.
+    pub fn noise_scale_at(&self, sample: usize) -> f64 {
+        let known = self.updates.partition_point(|u| u.sample <= sample);
+        known.checked_sub(1).map_or(1.0, |last| self.updates[last].update.noise_scale)
+    }
+
     /// The correction that a prediction from `sample` applies.
     pub fn correction_at(&self, sample: usize) -> SoilCorrection {
         self.at(sample).map_or(SoilCorrection::NONE, |posterior| posterior.correction)

@@ -150,6 +150,7 @@ pub fn run(
         baselines_json,
         reference_json: None,
         soil_filter_json: None,
+        rollout_noise_json: None,
         effects: Vec::new(),
         provenance: Provenance {
             command: recipe.command.clone(),

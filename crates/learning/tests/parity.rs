@@ -122,13 +122,16 @@ fn property_row_of_a_batch_equals_the_row_alone() {
         variant: Variant::Full,
         wheels: None,
     };
-    let batch = predictor.rollout(&query).expect("a valid query");
-    for n in [0, 7, 16, 36] {
-        let own = &controls[n * horizon * 2..(n + 1) * horizon * 2];
-        let alone = predictor.rollout(&RolloutQuery { controls: own, samples: 1, ..query.clone() }).expect("a valid query");
-        for k in 0..horizon {
-            assert_eq!(batch.state(n, k), alone.state(0, k), "row {n}, step {k}");
-            assert_eq!(batch.sinkage(n, k), alone.sinkage(0, k));
+    // Without a history the actuators begin as each row's own first command says.
+    for query in [query.clone(), RolloutQuery { history: &[], ..query }] {
+        let batch = predictor.rollout(&query).expect("a valid query");
+        for n in [0, 7, 16, 36] {
+            let own = &controls[n * horizon * 2..(n + 1) * horizon * 2];
+            let alone = predictor.rollout(&RolloutQuery { controls: own, samples: 1, ..query.clone() }).expect("a valid query");
+            for k in 0..horizon {
+                assert_eq!(batch.state(n, k), alone.state(0, k), "row {n}, step {k}, history of {}", query.history.len());
+                assert_eq!(batch.sinkage(n, k), alone.sinkage(0, k));
+            }
         }
     }
 }

@@ -24,6 +24,7 @@ const EFFECTS: &str = "effects.toml";
 const BASELINES: &str = "baselines.json";
 const REFERENCE: &str = "reference.json";
 const SOIL_FILTER: &str = "soil_filter.json";
+const ROLLOUT_NOISE: &str = "rollout_noise.json";
 const REQUIRED: [&str; 4] = [WEIGHTS, VEHICLE, NORMALIZATION, EFFECTS];
 
 /// Where a bundle comes from; shown by `inspect`, copied into every report.
@@ -86,6 +87,8 @@ pub struct ModelBundle {
     pub reference_json: Option<String>,
     /// Settings of the soil filter that were estimated for this model as JSON, if the bundle carries them.
     pub soil_filter_json: Option<String>,
+    /// Covariance of the model's own errors along a rollout as JSON, if the bundle carries it ([`crate::RolloutNoise`]).
+    pub rollout_noise_json: Option<String>,
     /// Where the bundle comes from.
     pub provenance: Provenance,
 }
@@ -164,6 +167,7 @@ impl ModelBundle {
         let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;
         let reference_json = take(REFERENCE).map(|bytes| folder.text(REFERENCE, bytes)).transpose()?;
         let soil_filter_json = take(SOIL_FILTER).map(|bytes| folder.text(SOIL_FILTER, bytes)).transpose()?;
+        let rollout_noise_json = take(ROLLOUT_NOISE).map(|bytes| folder.text(ROLLOUT_NOISE, bytes)).transpose()?;
         Ok(Self {
             name: manifest.name,
             hash,
@@ -177,6 +181,7 @@ impl ModelBundle {
             baselines_json,
             reference_json,
             soil_filter_json,
+            rollout_noise_json,
             provenance: manifest.provenance,
         })
     }
@@ -211,6 +216,9 @@ impl ModelBundle {
         }
         if let Some(json) = &self.soil_filter_json {
             files.push((SOIL_FILTER, json.clone().into_bytes()));
+        }
+        if let Some(json) = &self.rollout_noise_json {
+            files.push((ROLLOUT_NOISE, json.clone().into_bytes()));
         }
         for (name, bytes) in &files {
             folder.write(name, bytes)?;

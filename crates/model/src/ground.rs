@@ -2,7 +2,7 @@
 
 use nesam_physics::driveline::DrivelineState;
 use nesam_physics::step::{Ground, StepModel};
-use nesam_physics::{Control, VehicleState, WHEELS};
+use nesam_physics::{Control, Real, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
 
 use crate::rollout::HistoryStep;
@@ -43,18 +43,26 @@ impl<'a> GroundSource<'a> {
 
     /// Ground under each wheel in the heading frame, heights relative to `datum_m`; false when a wheel is off the map.
     pub fn under_wheels(&self, model: &StepModel, state: &VehicleState<f64>, datum_m: f64) -> ([Ground<f64>; WHEELS], bool) {
-        let [roll, pitch, yaw] = state.attitude_rad;
-        let (sin, cos) = yaw.sin_cos();
+        let (sin, cos) = state.attitude_rad[2].sin_cos();
         let mut known = true;
-        let ground = model.wheel_offsets_heading(roll, pitch).map(|offset| {
-            let x = state.position_m[0] + cos * offset[0] - sin * offset[1];
-            let y = state.position_m[1] + sin * offset[0] + cos * offset[1];
+        let ground = wheel_points(model, state).map(|[x, y]| {
             let (height, [slope_x, slope_y], inside) = self.at(x, y);
             known &= inside;
             Ground { height_m: height - datum_m, slope_ahead: cos * slope_x + sin * slope_y, slope_left: cos * slope_y - sin * slope_x }
         });
         (ground, known)
     }
+}
+
+/// Points of World under the wheel centres of a state, (x, y) each, m.
+pub(crate) fn wheel_points<T: Real>(model: &StepModel, state: &VehicleState<T>) -> [[T; 2]; WHEELS] {
+    let [roll, pitch, yaw] = state.attitude_rad;
+    let (sin, cos) = yaw.sin_cos();
+    model.wheel_offsets_heading(roll, pitch).map(|offset| {
+        let x = state.position_m[0] + cos * offset[0] - sin * offset[1];
+        let y = state.position_m[1] + sin * offset[0] + cos * offset[1];
+        [x, y]
+    })
 }
 
 /// Actuators at the start of a rollout, rebuilt from the commands and measured speeds of the history.

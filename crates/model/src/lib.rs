@@ -15,10 +15,12 @@ pub mod normalization;
 mod predictor;
 pub mod reference;
 mod rollout;
+pub mod rollout_noise;
 pub mod soil_coordinates;
 mod soil_prior;
 pub mod step_row;
 mod symbolic;
+mod tangent;
 mod terrain_tokens;
 pub mod token;
 pub mod weights;
@@ -28,7 +30,9 @@ pub use dims::{HISTORY, MAX_HORIZON};
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
 pub use predictor::{Predictor, TerrainMode, Transition};
-pub use rollout::{HistoryStep, MeasuredWheels, Rollout, RolloutQuery, Variant, flag};
+pub use rollout::{HistoryStep, MeasuredWheels, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
+pub use rollout_noise::RolloutNoise;
+pub use tangent::{Linearisation, StateJacobian};
 pub use terrain_tokens::{CacheCounts, TerrainToken};
 pub use weights::Weights;
 
@@ -57,6 +61,12 @@ pub enum ModelError {
         /// Field at fault.
         field: &'static str,
         /// What was wrong and the limit.
+        reason: String,
+    },
+    /// What a bundle says of its own errors cannot be used.
+    #[error("rollout_noise.json: {reason}")]
+    RolloutNoise {
+        /// What was wrong and what was expected.
         reason: String,
     },
     /// candle reported an error.

@@ -6,17 +6,17 @@ use nesam_physics::driveline::{DrivelineState, command_wheels, measured_wheels};
 use nesam_physics::effects::Effect;
 use nesam_physics::scalar::f32x8;
 use nesam_physics::step::StepModel;
-use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
 use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::bundle::ModelBundle;
-use crate::dims::{CONTEXT, HIDDEN, HISTORY, MAX_HORIZON, STATE_CONTROL};
+use crate::dims::{CONTEXT, HIDDEN, HISTORY, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
 use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
 use crate::ground::{GroundSource, history_actuators};
-use crate::rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
+use crate::rollout::{HistoryStep, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
@@ -24,14 +24,19 @@ use crate::symbolic::symbolic_step;
 use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, VALUES};
 use crate::token::{TokenScale, token_entries};
 
+mod linearise;
+mod risk;
 mod transitions;
+mod validate;
 
+use self::risk::RiskRow;
 pub use self::transitions::Transition;
+use self::validate::{validate, validate_extras};
 
 /// Maps whose terrain tokens are kept.
 const MAPS_MAX: usize = 16;
 /// Sinkage log-ratio that suppresses the sinkage (ablation "Sinkage = 0").
-const NO_SINKAGE: f32 = -12.0;
+pub(crate) const NO_SINKAGE: f32 = -12.0;
 /// |roll| or |pitch| beyond which a vehicle counts as overturned, rad.
 const OVERTURNED_RAD: f64 = 60.0 * core::f64::consts::PI / 180.0;
 
@@ -73,7 +78,15 @@ struct Sample {
 struct BlockOutput<'a> {
     samples: &'a mut [Sample],
     cache: &'a mut BlockCache,
-    sinkage: Vec<[f32; WHEELS]>,
+    wheels: Vec<StepRow>,
+}
+
+/// What a step tells of one sample beyond its state.
+#[derive(Clone, Copy, Debug, Default)]
+struct StepRow {
+    sinkage_m: [f32; WHEELS],
+    /// Zero unless asked for.
+    risk: RiskRow,
 }
 
 /// Everything of a query that is the same for all samples.
@@ -83,6 +96,21 @@ struct Scene<'a> {
     prefix: Prefix,
     datum_m: f64,
     variant: Variant,
+    /// Soil correction of each group of samples.
+    soils: &'a [SoilCorrection],
+    risk: bool,
+}
+
+impl Scene<'_> {
+    /// Command of a row in step `k`: every group of samples has the same.
+    fn control(&self, row: usize, k: usize) -> Control<f64> {
+        control(self.query, row % self.query.samples, k)
+    }
+
+    /// Soil of a row where the terrain says this.
+    fn soil(&self, row: usize, token: &TerrainToken) -> [f64; SOIL_DIM] {
+        self.soils[row / self.query.samples].apply(&from_raw(&raw_soil(token)))
+    }
 }
 
 impl Predictor {
@@ -141,41 +169,58 @@ impl Predictor {
     /// Rolls every candidate out from the start. Row n of a batch equals the query of n alone, bit for bit.
     ///
     /// # Errors
-    /// `ModelError::Query` naming the field when shapes disagree, the horizon is 0 or above [`MAX_HORIZON`], or a number is not finite.
+    /// `ModelError::Query` naming the field when shapes disagree, the horizon is 0 or above [`crate::MAX_HORIZON`], or a number is not finite.
     pub fn rollout(&self, query: &RolloutQuery<'_>) -> Result<Rollout, ModelError> {
+        self.rollout_with(query, &RolloutExtras::default()).map(|(rollout, _)| rollout)
+    }
+
+    /// The same with what-if soils and, where they are asked for, risk outputs. States do not depend on whether risk is asked for, and a what-if soil
+    /// that equals the query's correction gives the rollout of the query, both bit for bit.
+    ///
+    /// # Errors
+    /// As [`Predictor::rollout`]; also naming `soils` when a correction is not finite, and `risk` when the form has no soil.
+    pub fn rollout_with(&self, query: &RolloutQuery<'_>, extras: &RolloutExtras<'_>) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
         validate(query)?;
+        validate_extras(extras)?;
         let scales = &self.bundle.normalization;
         let tokens = query.map.map(|map| self.tokens_of(map));
         let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
         let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
         let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
+        if extras.risk && !variant.has_soil() {
+            return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
+        }
         let prefix = if variant.remembers() { self.prefix(history, &ground, tokens.as_deref()) } else { Prefix::default() };
-        let scene = Scene { query, ground, prefix, datum_m: query.start.position_m[2], variant };
+        let soils = if extras.soils.is_empty() { core::slice::from_ref(&query.soil_correction) } else { extras.soils };
+        let scene = Scene { query, ground, prefix, datum_m: query.start.position_m[2], variant, soils, risk: extras.risk };
+        let rows = soils.len() * query.samples;
 
-        let first = control(query, 0, 0);
-        let start = Sample {
+        // Without a history the actuators begin as a row's own first command says, so rows stay independent.
+        let start = |row: usize| Sample {
             state: query.start,
             previous: history.last().map(|step| step.state),
-            actuators: history_actuators(&self.model, history, &query.start, &first, scales.dt_s),
+            actuators: history_actuators(&self.model, history, &query.start, &scene.control(row, 0), scales.dt_s),
             flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
         };
-        let mut samples = vec![start; query.samples];
-        let mut caches = vec![BlockCache::new(query.horizon); query.samples.div_ceil(LANES)];
+        let shared = start(0);
+        let mut samples: Vec<Sample> = (0..rows).map(|row| if history.is_empty() { start(row) } else { shared }).collect();
+        let mut caches = vec![BlockCache::new(query.horizon); rows.div_ceil(LANES)];
         let mut rollout = Rollout {
-            states: vec![0.0; query.samples * query.horizon * STATE_DIM],
-            sinkage_m: vec![0.0; query.samples * query.horizon * WHEELS],
+            states: vec![0.0; rows * query.horizon * STATE_DIM],
+            sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
             flags: Vec::new(),
             soil: [0.0; SOIL_DIM],
-            samples: query.samples,
+            samples: rows,
             horizon: query.horizon,
         };
+        let mut risk = extras.risk.then(|| RiskOutputs::zero(rows * query.horizon));
         for k in 0..query.horizon {
             // Samples still stand together at the first step: one lookup serves all.
             let distinct = if k == 0 { 1 } else { samples.len() };
             let poses: Vec<Pose2> = samples[..distinct].iter().map(|s| pose(&s.state)).collect();
             let terrain = self.terrain(tokens.as_deref(), &poses);
             if k == 0 {
-                rollout.soil = self.soil(&terrain[0], query);
+                rollout.soil = query.soil_correction.apply(&from_raw(&raw_soil(&terrain[0])));
             }
             let blocks: Vec<BlockOutput<'_>> = samples
                 .par_chunks_mut(LANES)
@@ -183,8 +228,8 @@ impl Predictor {
                 .enumerate()
                 .map(|(block, (samples, cache))| {
                     let tokens: Vec<&TerrainToken> = (0..samples.len()).map(|l| &terrain[(block * LANES + l).min(distinct - 1)]).collect();
-                    let sinkage = self.step_block(&scene, block * LANES, k, samples, cache, &tokens);
-                    BlockOutput { samples, cache, sinkage }
+                    let wheels = self.step_block(&scene, block * LANES, k, samples, cache, &tokens);
+                    BlockOutput { samples, cache, wheels }
                 })
                 .collect();
             for (block, output) in blocks.iter().enumerate() {
@@ -194,12 +239,15 @@ impl Predictor {
                     for (out, value) in rollout.states[row * STATE_DIM..].iter_mut().zip(sample.state.to_array()) {
                         *out = value as f32;
                     }
-                    rollout.sinkage_m[row * WHEELS..(row + 1) * WHEELS].copy_from_slice(&output.sinkage[lane]);
+                    rollout.sinkage_m[row * WHEELS..(row + 1) * WHEELS].copy_from_slice(&output.wheels[lane].sinkage_m);
+                    if let Some(risk) = &mut risk {
+                        risk.put(row, &output.wheels[lane].risk);
+                    }
                 }
             }
         }
         rollout.flags = samples.iter().map(|s| s.flags).collect();
-        Ok(rollout)
+        Ok((rollout, risk))
     }
 
     /// The physics with the bundle's vehicle.
@@ -280,11 +328,7 @@ impl Predictor {
         self.token_scale.apply(raw)
     }
 
-    fn soil(&self, token: &TerrainToken, query: &RolloutQuery<'_>) -> [f64; SOIL_DIM] {
-        query.soil_correction.apply(&from_raw(&raw_soil(token)))
-    }
-
-    /// Advances up to sixteen samples by one step; returns their wheel sinkages, m.
+    /// Advances up to sixteen samples by one step; returns what their wheels did.
     fn step_block(
         &self,
         scene: &Scene<'_>,
@@ -293,11 +337,11 @@ impl Predictor {
         samples: &mut [Sample],
         cache: &mut BlockCache,
         terrain: &[&TerrainToken],
-    ) -> Vec<[f32; WHEELS]> {
+    ) -> Vec<StepRow> {
         let scales = &self.bundle.normalization;
         let query = scene.query;
         let last = samples.len() - 1;
-        let controls: Vec<Control<f64>> = (0..samples.len()).map(|l| control(query, first + l, k)).collect();
+        let controls: Vec<Control<f64>> = (0..samples.len()).map(|l| scene.control(first + l, k)).collect();
         let entries: Vec<[f32; STATE_CONTROL]> =
             samples.iter().zip(&controls).map(|(s, control)| self.entries(&s.state, s.previous.as_ref(), control, &scene.ground)).collect();
         let entry_lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| core::array::from_fn(|l| entries[l.min(last)][i]));
@@ -318,7 +362,7 @@ impl Predictor {
                     None => command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
                 };
                 let (ground, known) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
-                let soil = self.soil(terrain[l], query);
+                let soil = scene.soil(first + l, terrain[l]);
                 let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                     Variant::ZeroSinkage => NO_SINKAGE,
                     _ => scales.sinkage_log_ratio_max * raw_sinkage[i][l].tanh(),
@@ -327,14 +371,16 @@ impl Predictor {
             })
             .collect();
 
-        let mut sinkage = vec![[0.0; WHEELS]; samples.len()];
+        let mut wheels = vec![StepRow::default(); samples.len()];
         for half in (0..samples.len()).step_by(8) {
             let at = |l: usize| (half + l).min(last);
             let varying = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].1[c])));
             let constant = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].2[c])));
-            let (increment, sinkages) = symbolic_step(scene.variant, &self.model, &step_input(varying, constant));
-            let increment = increment.to_array().map(f32x8::to_array);
-            let sinkages = sinkages.map(f32x8::to_array);
+            let input = step_input(varying, constant);
+            let output = symbolic_step(scene.variant, &self.model, &input);
+            let increment = output.increment.to_array().map(f32x8::to_array);
+            let sinkages = output.contacts.map(|contact| contact.sinkage_m.to_array());
+            let risks = scene.risk.then(|| risk::of_lanes(&self.model, &input, &output.contacts));
             for l in 0..8.min(samples.len() - half) {
                 let lane = half + l;
                 let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
@@ -344,12 +390,13 @@ impl Predictor {
                     };
                     f64::from(increment[i][l] + residual)
                 });
-                sinkage[lane] = core::array::from_fn(|w| sinkages[w][l]);
+                wheels[lane].sinkage_m = core::array::from_fn(|w| sinkages[w][l]);
+                wheels[lane].risk = risks.map_or_else(RiskRow::default, |risks| risks[l]);
                 let (after, _, _, known) = rows[lane];
                 self.advance(&mut samples[lane], &total, after, known, &controls[lane]);
             }
         }
-        sinkage
+        wheels
     }
 
     /// x' = x + Δx, actuators and flags.
@@ -403,43 +450,4 @@ fn varying_row(state: &VehicleState<f64>, datum_m: f64, ratio: &[f32; WHEELS], s
         c if c < SOIL_AT => ratio[c - SINKAGE_AT],
         c => soil[c - SOIL_AT] as f32,
     })
-}
-
-fn validate(query: &RolloutQuery<'_>) -> Result<(), ModelError> {
-    let fail = |field, reason: String| Err(ModelError::Query { field, reason });
-    if query.samples == 0 {
-        return fail("samples", "is 0, at least one candidate is needed".into());
-    }
-    if query.horizon == 0 || query.horizon > MAX_HORIZON {
-        return fail("horizon", format!("is {}, the model has positions for 1..={MAX_HORIZON} steps", query.horizon));
-    }
-    let expected = query.samples * query.horizon * 2;
-    if query.controls.len() != expected {
-        let reason = format!("has {} numbers, expected samples × horizon × 2 = {expected}", query.controls.len());
-        return fail("controls", reason);
-    }
-    if let Some(at) = query.controls.iter().position(|v| !v.is_finite()) {
-        return fail("controls", format!("number {at} is not finite"));
-    }
-    if let Some(wheels) = query.wheels {
-        if wheels.len() != query.horizon {
-            return fail("wheels", format!("has {} steps, expected horizon = {}", wheels.len(), query.horizon));
-        }
-        if let Some(at) = wheels.iter().position(|w| !w.speed_rad_s.iter().chain(&w.angle_rad).all(|v| v.is_finite())) {
-            return fail("wheels", format!("step {at} holds a number that is not finite"));
-        }
-    }
-    if !query.start.to_array().iter().all(|v| v.is_finite()) {
-        return fail("start", "holds a number that is not finite".into());
-    }
-    if !query.soil_correction.delta.iter().all(|v| v.is_finite()) {
-        return fail("soil_correction", "holds a number that is not finite".into());
-    }
-    let finite = |step: &HistoryStep| {
-        step.state.to_array().iter().all(|v| v.is_finite()) && step.control.speed_m_s.is_finite() && step.control.second.is_finite()
-    };
-    match query.history.iter().position(|step| !finite(step)) {
-        Some(at) => fail("history", format!("step {at} holds a number that is not finite")),
-        None => Ok(()),
-    }
 }

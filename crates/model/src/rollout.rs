@@ -143,6 +143,29 @@ pub struct MeasuredWheels {
     pub angle_rad: [f64; WHEELS],
 }
 
+/// What a rollout computes beyond its states. The default is nothing, and costs nothing.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct RolloutExtras<'a> {
+    /// What-if soils S: corrections in place of the query's, each for all N samples. The rollout then has S N rows, the samples of the first soil
+    /// first. Empty = the query's own correction alone.
+    pub soils: &'a [SoilCorrection],
+    /// Whether to compute [`RiskOutputs`]; only forms with soil can.
+    pub risk: bool,
+}
+
+/// How near each step is to a limit, row-major (samples, horizon) or (samples, horizon, 4) with the wheels FL, FR, RL, RR.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct RiskOutputs {
+    /// Loads of the wheels, N.
+    pub wheel_load_n: Vec<f32>,
+    /// Slips of the wheels, -1 (locked) to 1 (spinning on the spot).
+    pub wheel_slip: Vec<f32>,
+    /// Lateral load-transfer ratio, see [`nesam_physics::risk::load_transfer_ratio`].
+    pub load_transfer_ratio: Vec<f32>,
+    /// Traction reserve over weight, see [`nesam_physics::step::StepModel::traction_reserve`].
+    pub traction_reserve: Vec<f32>,
+}
+
 /// Bits of [`Rollout::flags`], one word per sample.
 pub mod flag {
     /// A state of this sample is not finite; the other samples are unaffected.

@@ -1,6 +1,6 @@
 //! The half of a form that is not learned: what moves the vehicle before the learned residual is added.
 
-use nesam_physics::step::{StepInput, StepModel};
+use nesam_physics::step::{StepInput, StepModel, StepOutput, WheelContact};
 use nesam_physics::{Real, Soil, VehicleState, WHEELS};
 
 use crate::rollout::Variant;
@@ -10,22 +10,21 @@ const FLOOR: Soil<f64> = Soil { k_phi: 5.0e8, k_c: 0.0, n: 1.0, c: 100.0, phi: 0
 /// Time in which the bicycle takes up a commanded speed, s (chosen; the residual learns the rest).
 const SPEED_LAG_S: f64 = 0.5;
 
-/// Increment Δx of the symbolic half and the sinkage of each wheel, m.
+/// Increment Δx of the symbolic half and the contacts of the wheels; all zero where a form has no soil.
 #[inline(always)]
-pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepInput<T>) -> (VehicleState<T>, [T; WHEELS]) {
+pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepInput<T>) -> StepOutput<T> {
+    let zero = T::lit(0.0);
+    let none = WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero };
+    let without_soil = |increment| StepOutput { increment, contacts: [none; WHEELS] };
     match variant {
-        Variant::Full | Variant::NoResidual | Variant::ZeroSinkage => {
-            let output = model.step(input);
-            (output.increment, output.contacts.map(|c| c.sinkage_m))
-        }
+        Variant::Full | Variant::NoResidual | Variant::ZeroSinkage => model.step(input),
         Variant::RigidResidual => {
             let soil = Soil::from_array(FLOOR.to_array().map(T::lit));
-            let output = model.step(&StepInput { soil, sinkage_log_ratio: [T::lit(0.0); WHEELS], ..*input });
-            (output.increment, [T::lit(0.0); WHEELS])
+            without_soil(model.step(&StepInput { soil, sinkage_log_ratio: [zero; WHEELS], ..*input }).increment)
         }
-        Variant::KinematicResidual => (bicycle(model, input), [T::lit(0.0); WHEELS]),
+        Variant::KinematicResidual => without_soil(bicycle(model, input)),
         Variant::Transformer | Variant::TalElevSem | Variant::TalElev | Variant::TalSem => {
-            (VehicleState::from_array([T::lit(0.0); 12]), [T::lit(0.0); WHEELS])
+            without_soil(VehicleState::from_array([zero; 12]))
         }
     }
 }

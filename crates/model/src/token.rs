@@ -4,7 +4,7 @@
 //! twelve entries are: height of the reference point above the ground under it, roll, pitch, change of yaw since the last token, linear and angular
 //! velocity in Body, and the displacement since the last token in the last heading frame.
 
-use nesam_physics::{STATE_DIM, VehicleState, wrap_angle};
+use nesam_physics::{Real, STATE_DIM, VehicleState, wrap_angle};
 
 use crate::dims::STATE_CONTROL;
 
@@ -27,33 +27,30 @@ pub fn token_entries(
     ground_height_m: f64,
     dt_s: f64,
 ) -> [f32; STATE_CONTROL] {
+    entries_of(state, previous, control, ground_height_m, dt_s, wrap_angle).map(|x| x as f32)
+}
+
+/// The same in any scalar; `wrap` brings an angle into (-pi, pi].
+pub fn entries_of<T: Real>(
+    state: &VehicleState<T>,
+    previous: Option<&VehicleState<T>>,
+    control: [T; 2],
+    ground_height_m: T,
+    dt_s: f64,
+    wrap: impl Fn(T) -> T,
+) -> [T; STATE_CONTROL] {
+    let dt = T::lit(dt_s);
     let (turned, moved) = match previous {
         Some(p) => {
             let (sin, cos) = p.attitude_rad[2].sin_cos();
             let (dx, dy) = (state.position_m[0] - p.position_m[0], state.position_m[1] - p.position_m[1]);
-            (wrap_angle(state.attitude_rad[2] - p.attitude_rad[2]), [cos * dx + sin * dy, cos * dy - sin * dx])
+            (wrap(state.attitude_rad[2] - p.attitude_rad[2]), [cos * dx + sin * dy, cos * dy - sin * dx])
         }
-        None => (state.angular_velocity_rad_s[2] * dt_s, [state.velocity_m_s[0] * dt_s, state.velocity_m_s[1] * dt_s]),
+        None => (state.angular_velocity_rad_s[2] * dt, [state.velocity_m_s[0] * dt, state.velocity_m_s[1] * dt]),
     };
-    let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
+    let (a, v, w) = (state.attitude_rad, state.velocity_m_s, state.angular_velocity_rad_s);
     let height = state.position_m[2] - ground_height_m;
-    [
-        height,
-        state.attitude_rad[0],
-        state.attitude_rad[1],
-        turned,
-        v[0],
-        v[1],
-        v[2],
-        w[0],
-        w[1],
-        w[2],
-        moved[0],
-        moved[1],
-        control[0],
-        control[1],
-    ]
-    .map(|x| x as f32)
+    [height, a[0], a[1], turned, v[0], v[1], v[2], w[0], w[1], w[2], moved[0], moved[1], control[0], control[1]]
 }
 
 impl TokenScale {

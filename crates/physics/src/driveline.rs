@@ -10,51 +10,69 @@ use crate::scalar::Real;
 use crate::state::{Control, VehicleState};
 use crate::vehicle::{SecondCommand, Vehicle, WHEELS};
 
-/// State of the actuators between steps.
+/// State of the actuators between steps, in floats or in duals over them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct DrivelineState {
+pub struct DrivelineState<T = f64> {
     /// Position of the steering actuator, in the unit of the second command; of a skid-steer vehicle the turning of the rims, rad/s.
-    pub steering: f64,
+    pub steering: T,
     /// Leaky integral of the speed error, m.
-    pub speed_error_integral_m: f64,
+    pub speed_error_integral_m: T,
     /// Mean rim speed of a skid-steer vehicle, m/s.
-    pub rim_speed_m_s: f64,
+    pub rim_speed_m_s: T,
     /// What the rims of a skid-steer vehicle are asked for between the two lags: (mean speed m/s, turning rad/s).
-    pub rim_demand: [f64; 2],
+    pub rim_demand: [T; 2],
 }
 
-impl DrivelineState {
+/// The number held between two constants.
+fn clamp<T: Real>(x: T, low: f64, high: f64) -> T {
+    x.max(T::lit(low)).min(T::lit(high))
+}
+
+impl<T: Copy> DrivelineState<T> {
+    /// The same actuators in another scalar.
+    pub fn map<U>(&self, f: impl Fn(T) -> U) -> DrivelineState<U> {
+        DrivelineState {
+            steering: f(self.steering),
+            speed_error_integral_m: f(self.speed_error_integral_m),
+            rim_speed_m_s: f(self.rim_speed_m_s),
+            rim_demand: self.rim_demand.map(f),
+        }
+    }
+}
+
+impl<T: Real<Value = f64>> DrivelineState<T> {
     /// Actuators that have settled on a command.
-    pub fn settled(control: &Control<f64>) -> Self {
+    pub fn settled(control: &Control<T>) -> Self {
         Self {
             steering: control.second,
-            speed_error_integral_m: 0.0,
+            speed_error_integral_m: T::lit(0.0),
             rim_speed_m_s: control.speed_m_s,
             rim_demand: [control.speed_m_s, control.second],
         }
     }
 
     /// Actuators where the drive begins: a skid-steer vehicle's rims turn as its measured motion tells, a car's have settled on the command.
-    pub fn starting(vehicle: &Vehicle, state: &VehicleState<f64>, control: &Control<f64>) -> Self {
+    pub fn starting(vehicle: &Vehicle, state: &VehicleState<T>, control: &Control<T>) -> Self {
         if vehicle.second != SecondCommand::YawRateRadS {
             return Self::settled(control);
         }
         let servo = &vehicle.driveline.rims;
-        let turning = (state.angular_velocity_rad_s[2] / servo.turn_efficiency).clamp(-servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
+        let measured = state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency);
+        let turning = clamp(measured, -servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
         let speed = state.velocity_m_s[0];
-        Self { steering: turning, speed_error_integral_m: 0.0, rim_speed_m_s: speed, rim_demand: [speed, turning] }
+        Self { steering: turning, speed_error_integral_m: T::lit(0.0), rim_speed_m_s: speed, rim_demand: [speed, turning] }
     }
 
     /// The rims of a skid-steer vehicle after `dt_s` under a command.
-    fn advance_rims(&self, vehicle: &Vehicle, control: &Control<f64>, dt_s: f64) -> Self {
+    fn advance_rims(&self, vehicle: &Vehicle, control: &Control<T>, dt_s: f64) -> Self {
         let servo = &vehicle.driveline.rims;
-        let kept = |lag_s: f64| if lag_s > 0.0 { (-dt_s / lag_s).exp() } else { 0.0 };
+        let kept = |lag_s: f64| T::lit(if lag_s > 0.0 { (-dt_s / lag_s).exp() } else { 0.0 });
         let (speed, turning) = (kept(servo.speed_lag_s), kept(servo.yaw_lag_s));
         let target = servo.target(control.speed_m_s, control.second, vehicle.track_m);
         let demand = [target[0] + speed * (self.rim_demand[0] - target[0]), target[1] + turning * (self.rim_demand[1] - target[1])];
         Self {
             steering: demand[1] + turning * (self.steering - demand[1]),
-            speed_error_integral_m: 0.0,
+            speed_error_integral_m: T::lit(0.0),
             rim_speed_m_s: demand[0] + speed * (self.rim_speed_m_s - demand[0]),
             rim_demand: demand,
         }
@@ -63,18 +81,18 @@ impl DrivelineState {
     /// Advances the actuators by `dt_s` under a command, given the measured or predicted forward speed.
     ///
     /// Exact first-order lag for a held command, limited in rate; the integral of the speed error leaks with the card's time constant.
-    pub fn advance(&self, vehicle: &Vehicle, control: &Control<f64>, forward_m_s: f64, dt_s: f64) -> Self {
+    pub fn advance(&self, vehicle: &Vehicle, control: &Control<T>, forward_m_s: T, dt_s: f64) -> Self {
         let line = &vehicle.driveline;
         if vehicle.second == SecondCommand::YawRateRadS {
             return self.advance_rims(vehicle, control, dt_s);
         }
         let travel = line.steering_rate_limit_per_s * dt_s;
         let target = control.second - self.steering;
-        let lagged = if line.steering_lag_s > 0.0 { target * (1.0 - (-dt_s / line.steering_lag_s).exp()) } else { target };
-        let leak = (-dt_s / line.speed_integral_leak_s).exp();
+        let lagged = if line.steering_lag_s > 0.0 { target * T::lit(1.0 - (-dt_s / line.steering_lag_s).exp()) } else { target };
+        let leak = T::lit((-dt_s / line.speed_integral_leak_s).exp());
         let limit = line.speed_integral_limit_m;
-        let integral = self.speed_error_integral_m * leak + (control.speed_m_s - forward_m_s) * dt_s;
-        Self { steering: self.steering + lagged.clamp(-travel, travel), speed_error_integral_m: integral.clamp(-limit, limit), ..*self }
+        let integral = self.speed_error_integral_m * leak + (control.speed_m_s - forward_m_s) * T::lit(dt_s);
+        Self { steering: self.steering + clamp(lagged, -travel, travel), speed_error_integral_m: clamp(integral, -limit, limit), ..*self }
     }
 }
 
@@ -96,57 +114,78 @@ pub struct WheelCommand<T> {
 }
 
 /// Linear interpolation in an ascending table, held at its ends.
-fn interpolate(x: f64, grid: &[f64], values: &[f64]) -> f64 {
+fn interpolate<T: Real<Value = f64>>(x: T, grid: &[f64], values: &[f64]) -> T {
     let last = grid.len() - 1;
-    if x <= grid[0] {
-        return values[0];
+    let at = x.value();
+    if at <= grid[0] {
+        return T::lit(values[0]);
     }
-    if x >= grid[last] {
-        return values[last];
+    if at >= grid[last] {
+        return T::lit(values[last]);
     }
-    let i = grid.partition_point(|&g| g <= x) - 1;
-    let share = (x - grid[i]) / (grid[i + 1] - grid[i]);
-    values[i] + share * (values[i + 1] - values[i])
+    let i = grid.partition_point(|&g| g <= at) - 1;
+    let share = (x - T::lit(grid[i])) / T::lit(grid[i + 1] - grid[i]);
+    T::lit(values[i]) + share * T::lit(values[i + 1] - values[i])
 }
 
 /// Road-wheel angles FL, FR, RL, RR of an actuator position, rad.
-pub fn road_wheel_angles(vehicle: &Vehicle, steering: f64) -> [f64; WHEELS] {
+pub fn road_wheel_angles<T: Real<Value = f64>>(vehicle: &Vehicle, steering: T) -> [T; WHEELS] {
+    let zero = T::lit(0.0);
     match (&vehicle.steering, vehicle.second) {
         (Some(table), SecondCommand::SteeringNormalised) => [
             interpolate(steering, &table.command, &table.front_left_rad),
             interpolate(steering, &table.command, &table.front_right_rad),
-            0.0,
-            0.0,
+            zero,
+            zero,
         ],
-        (_, SecondCommand::RoadWheelAngleRad) => [steering, steering, 0.0, 0.0],
-        _ => [0.0; WHEELS],
+        (_, SecondCommand::RoadWheelAngleRad) => [steering, steering, zero, zero],
+        _ => [zero; WHEELS],
     }
 }
 
-/// What the command makes of the wheels over one step, from the mean actuator position of the step.
+/// What the command makes of the wheels over one step, from the mean actuator position of the step; constants in the scalar of the step.
 pub fn command_wheels<T: Real>(
     vehicle: &Vehicle,
     before: &DrivelineState,
     after: &DrivelineState,
     control: &Control<f64>,
 ) -> WheelCommand<T> {
+    let told = differentiable_wheels(vehicle, before, after, control);
+    WheelCommand {
+        angle_rad: told.angle_rad.map(T::lit),
+        rim_base_m_s: told.rim_base_m_s.map(T::lit),
+        rim_follow: T::lit(told.rim_follow),
+        rim_gain: T::lit(told.rim_gain),
+        overspeed_limit_m_s: T::lit(told.overspeed_limit_m_s),
+        speed_m_s: T::lit(told.speed_m_s),
+    }
+}
+
+/// The same with the derivatives that actuators and command carry: what a Jacobian in the commands needs.
+pub fn differentiable_wheels<T: Real<Value = f64>>(
+    vehicle: &Vehicle,
+    before: &DrivelineState<T>,
+    after: &DrivelineState<T>,
+    control: &Control<T>,
+) -> WheelCommand<T> {
     let line = &vehicle.driveline;
-    let steering = 0.5 * (before.steering + after.steering) + vehicle.effects.steering_offset;
+    let half = T::lit(0.5);
+    let steering = half * (before.steering + after.steering) + T::lit(vehicle.effects.steering_offset);
     let skid = vehicle.second == SecondCommand::YawRateRadS;
-    let mut base = [line.speed_integral_gain_per_s * before.speed_error_integral_m; WHEELS];
+    let mut base = [T::lit(line.speed_integral_gain_per_s) * before.speed_error_integral_m; WHEELS];
     if skid {
-        let half = 0.5 * vehicle.track_m * steering;
-        let speed = 0.5 * (before.rim_speed_m_s + after.rim_speed_m_s);
-        let (left, right) = (speed - half, speed + half);
+        let half_turn = T::lit(0.5 * vehicle.track_m) * steering;
+        let speed = half * (before.rim_speed_m_s + after.rim_speed_m_s);
+        let (left, right) = (speed - half_turn, speed + half_turn);
         base = [left, right, left, right];
     }
     WheelCommand {
-        angle_rad: road_wheel_angles(vehicle, steering).map(T::lit),
-        rim_base_m_s: base.map(T::lit),
+        angle_rad: road_wheel_angles(vehicle, steering),
+        rim_base_m_s: base,
         rim_follow: T::lit(if skid { 0.0 } else { 1.0 }),
         rim_gain: T::lit(if skid { 0.0 } else { line.speed_gain }),
         overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s),
-        speed_m_s: T::lit(control.speed_m_s),
+        speed_m_s: control.speed_m_s,
     }
 }
 

@@ -4,6 +4,7 @@
 pub mod driveline;
 pub mod effects;
 pub mod linear;
+pub mod risk;
 pub mod scalar;
 mod soil;
 mod soil_correction;

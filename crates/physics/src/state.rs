@@ -66,6 +66,13 @@ pub struct Control<T> {
     pub second: T,
 }
 
+impl<T: Copy> Control<T> {
+    /// The same command in another scalar.
+    pub fn map<U>(&self, f: impl Fn(T) -> U) -> Control<U> {
+        Control { speed_m_s: f(self.speed_m_s), second: f(self.second) }
+    }
+}
+
 /// Wraps an angle into (-pi, pi].
 pub fn wrap_angle(angle_rad: f64) -> f64 {
     let wrapped = angle_rad.rem_euclid(core::f64::consts::TAU);

@@ -67,9 +67,9 @@ pub struct StepOutput<T> {
 #[derive(Clone, Debug)]
 pub struct StepModel {
     vehicle: Vehicle,
-    wheel: WheelGeometry,
+    pub(crate) wheel: WheelGeometry,
     static_load_n: [f64; WHEELS],
-    body: RigidBody,
+    pub(crate) body: RigidBody,
     substeps: usize,
     dt_s: f64,
 }
@@ -79,8 +79,8 @@ const DRAG_SPEED_M_S: f64 = 0.07;
 
 /// Mass, inertia about the reference point, and centre of mass, effects included.
 #[derive(Clone, Debug)]
-struct RigidBody {
-    mass_kg: f64,
+pub(crate) struct RigidBody {
+    pub(crate) mass_kg: f64,
     inertia_kg_m2: [[f64; 3]; 3],
     centre_m: [f64; 3],
     /// M [c]×, the lower left block of the spatial inertia.

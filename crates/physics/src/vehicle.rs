@@ -90,11 +90,14 @@ impl Default for RimServo {
 
 impl RimServo {
     /// Where the rims settle under a commanded twist: (mean rim speed m/s, turning rad/s).
-    pub fn target(&self, speed_m_s: f64, yaw_rate_rad_s: f64, track_m: f64) -> [f64; 2] {
-        let speed = self.speed_gain * speed_m_s;
-        let turning = (self.yaw_gain * yaw_rate_rad_s).clamp(-self.yaw_limit_rad_s, self.yaw_limit_rad_s);
-        let fastest = speed.abs() + 0.5 * track_m * turning.abs();
-        let share = if fastest > self.rim_limit_m_s { self.rim_limit_m_s / fastest } else { 1.0 };
+    pub fn target<T: Real>(&self, speed_m_s: T, yaw_rate_rad_s: T, track_m: f64) -> [T; 2] {
+        let size = |x: T| T::select_ge0(x, x, -x);
+        let speed = T::lit(self.speed_gain) * speed_m_s;
+        let limit = self.yaw_limit_rad_s;
+        let turning = (T::lit(self.yaw_gain) * yaw_rate_rad_s).max(T::lit(-limit)).min(T::lit(limit));
+        let fastest = size(speed) + T::lit(0.5 * track_m) * size(turning);
+        let limit = T::lit(self.rim_limit_m_s);
+        let share = T::select_ge0(limit - fastest, T::lit(1.0), limit / fastest);
         [share * speed, share * turning]
     }
 }

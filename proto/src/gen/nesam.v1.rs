@@ -671,6 +671,37 @@ pub struct PredictRequest {
     /// that is in effect at its middle; until the first of them that is later than the newest step, that is the command measured with this step.
     #[prost(message, repeated, tag = "10")]
     pub sent: ::prost::alloc::vec::Vec<SentCommand>,
+    /// What to compute beyond the states; absent = nothing, and nothing is spent on it.
+    #[prost(message, optional, tag = "11")]
+    pub extras: ::core::option::Option<PredictExtras>,
+}
+/// Jacobians, covariance, risk and what-if soils. `OutputSelection.stride` picks their steps too, `channels` and `precision` do not apply to them:
+/// states have all twelve entries in the order x y z roll pitch yaw vx vy vz wx wy wz (World, velocities in Body), numbers are f32.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct PredictExtras {
+    /// Derivatives of every returned state. At most 8 samples (server configuration), not together with what-if soils.
+    #[prost(bool, tag = "1")]
+    pub jacobians: bool,
+    /// Covariance of every returned state. At most 64 samples (server configuration), not together with what-if soils. FAILED_PRECONDITION when the
+    /// bundle does not know its errors.
+    #[prost(bool, tag = "2")]
+    pub covariance: bool,
+    /// Covariance of the start, packed f32, shape (12, 12), symmetric positive semi-definite, units of the state squared; empty = that of a measured state
+    /// as the bundle knows it. Only with `covariance`.
+    #[prost(bytes = "bytes", tag = "3")]
+    pub start_covariance: ::prost::bytes::Bytes,
+    /// Wheel loads, wheel slips, load transfer and traction reserve of every returned step.
+    #[prost(bool, tag = "4")]
+    pub risk: bool,
+    /// What-if soils: packed f32, shape (S, 6), 1 to 16 (server configuration) corrections that are added to the session's, in its coordinates and in
+    /// the order of SoilVector. Each makes a group of N trajectories; S N counts against the limits of N and N K.
+    #[prost(bytes = "bytes", tag = "5")]
+    pub soil_deltas: ::prost::bytes::Bytes,
+    /// Instead: thirteen groups for the sigma points of what the session knows of the soil. First the estimate, then estimate plus and minus sqrt(6) times each
+    /// column of the lower Cholesky factor of its covariance. Mean and covariance over the last twelve groups, equally weighted, are those of
+    /// the unscented transform.
+    #[prost(bool, tag = "6")]
+    pub soil_sigma_points: bool,
 }
 /// A command on its way to the vehicle.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
@@ -756,6 +787,43 @@ pub struct PredictReply {
     /// Width of the numbers in `states` and `sinkage_m`: PRECISION_F32 or PRECISION_F16.
     #[prost(enumeration = "Precision", tag = "19")]
     pub precision: i32,
+    /// Groups of trajectories S, 1 without what-if soils. `states`, `sinkage_m`, `validity` and the risk outputs have S N rows, the samples of the first
+    /// group first, and `samples` stays N.
+    #[prost(uint32, tag = "20")]
+    pub soil_groups: u32,
+    /// Derivatives of the states with the terrain held as the rollout met it: context and soil prior at each pose, ground as the plane under each wheel. In the
+    /// measured or given state, before any rolling forward: packed f32, shape (samples, steps, 12, 12). NaN after a state that is not finite.
+    #[prost(bytes = "bytes", tag = "21")]
+    pub jacobian_start: ::prost::bytes::Bytes,
+    /// In the commands: packed f32, shape (samples, steps, 12, horizon, 2). Zero for commands that come later.
+    #[prost(bytes = "bytes", tag = "22")]
+    pub jacobian_controls: ::prost::bytes::Bytes,
+    /// In the session's soil correction, in its coordinates: packed f32, shape (samples, steps, 12, 6).
+    #[prost(bytes = "bytes", tag = "23")]
+    pub jacobian_soil: ::prost::bytes::Bytes,
+    /// Covariance of what would be measured, packed f32, shape (samples, steps, 12, 12): start and soil through the derivatives, plus the errors of the
+    /// model that were calibrated for the bundle.
+    #[prost(bytes = "bytes", tag = "24")]
+    pub covariance: ::prost::bytes::Bytes,
+    /// 90 % of the measured (x, y) lie where d' P^-1 d is at most this, d their distance from the predicted ones, P the 2 x 2 block of `covariance`.
+    #[prost(double, tag = "25")]
+    pub region_90_planar: f64,
+    /// The same for x, y, z, roll, pitch and yaw alone: d^2 / variance is at most this.
+    #[prost(double, repeated, tag = "26")]
+    pub region_90_single: ::prost::alloc::vec::Vec<f64>,
+    /// Loads of the four wheels, N, packed f32, shape (S N, steps, 4).
+    #[prost(bytes = "bytes", tag = "27")]
+    pub wheel_load_n: ::prost::bytes::Bytes,
+    /// Slips of the four wheels, -1 (locked) to 1 (spinning on the spot), packed f32, shape (S N, steps, 4).
+    #[prost(bytes = "bytes", tag = "28")]
+    pub wheel_slip: ::prost::bytes::Bytes,
+    /// |left - right| over the sum of the wheel loads, 0 even, 1 one side carries nothing; packed f32, shape (S N, steps).
+    #[prost(bytes = "bytes", tag = "29")]
+    pub load_transfer_ratio: ::prost::bytes::Bytes,
+    /// Drawbar pull that the wheels could give at a slip of 0.8 less what the slope asks for, over the weight: below 0 the vehicle gets stuck. Packed f32,
+    /// shape (S N, steps).
+    #[prost(bytes = "bytes", tag = "30")]
+    pub traction_reserve: ::prost::bytes::Bytes,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PredictStreamReply {
@@ -1363,6 +1431,9 @@ pub struct SessionContent {
     /// Posterior that the session gives out.
     #[prost(message, optional, tag = "24")]
     pub soil: ::core::option::Option<SoilCorrection>,
+    /// Scale of the filter's noise at the newest update.
+    #[prost(double, tag = "25")]
+    pub soil_noise_scale: f64,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TrackImage {

@@ -78,6 +78,7 @@ fn content(image: &SessionImage) -> pb::SessionContent {
         soil_epoch: image.soil.state.epoch,
         soil_stamp_ns: image.soil.state.stamp_ns,
         soil: Some(soil_correction(&image.soil)),
+        soil_noise_scale: image.soil.noise_scale,
     }
 }
 
@@ -158,7 +159,7 @@ fn from_soil(content: &pb::SessionContent) -> Result<SoilEstimate, EngineError> 
         variance: soil.variance.as_ref().map(vector),
         learned: array(&soil.learned)?,
     };
-    Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)? })
+    Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)?, noise_scale: content.soil_noise_scale })
 }
 
 fn from_track(track: Option<&pb::TrackImage>) -> Result<TrackImage, EngineError> {

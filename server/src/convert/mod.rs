@@ -1,5 +1,6 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
+mod extras;
 mod image;
 mod measurement;
 mod packed;

@@ -4,6 +4,7 @@ use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, SentCommand, S
 use nesam_physics::{STATE_DIM, WHEELS};
 use nesam_proto::v1 as pb;
 
+use super::extras::{predict_extras, put_extras};
 use super::{Precision, code, control, decode_f32, encode, provenance, soil_correction, soil_vector, vehicle_state, vehicle_state_message};
 use crate::call::Timing;
 
@@ -41,7 +42,8 @@ pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(P
     };
     let output = output_selection(&message.output.unwrap_or_default(), horizon)?;
     let instant = start_instant(message)?;
-    Ok((PredictQuery { session: message.session_id.clone(), start, instant, use_history, samples, horizon, controls }, output))
+    let extras = message.extras.as_ref().map(predict_extras).transpose()?.unwrap_or_default();
+    Ok((PredictQuery { session: message.session_id.clone(), start, instant, use_history, samples, horizon, controls, extras }, output))
 }
 
 /// The instant to start from and the commands until then, if one is given.
@@ -83,6 +85,15 @@ impl OutputSelection {
         horizon / self.stride
     }
 
+    /// Every stride-th step of rows of `width` numbers, packed as f32.
+    pub(super) fn steps_of(&self, values: &[f32], horizon: usize, width: usize) -> bytes::Bytes {
+        if self.stride == 1 || values.is_empty() {
+            return encode(values, Precision::F32);
+        }
+        let columns: Vec<usize> = (0..width).collect();
+        encode(&self.pick(values, horizon, width, &columns), Precision::F32)
+    }
+
     /// Picks every stride-th step and the given columns of rows of `width` numbers.
     fn pick(&self, values: &[f32], horizon: usize, width: usize, columns: &[usize]) -> Vec<f32> {
         let mut picked = Vec::with_capacity(values.len() / width / self.stride * columns.len());
@@ -121,9 +132,10 @@ impl OutputSelection {
 
 /// The reply to a query.
 pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection, timing: Timing) -> pb::PredictReply {
-    pb::PredictReply {
+    let groups = prediction.extras.soil_groups.max(1);
+    let mut reply = pb::PredictReply {
         tag,
-        samples: prediction.rollout.samples as u32,
+        samples: (prediction.rollout.samples / groups) as u32,
         steps: output.steps(prediction.rollout.horizon) as u32,
         channels: output.channels,
         states: output.states(prediction),
@@ -141,7 +153,11 @@ pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection,
         rolled_forward_steps: prediction.rolled_forward_steps as u32,
         start_stamp_ns: prediction.start_stamp_ns,
         precision: output.precision.to_message().into(),
-    }
+        soil_groups: groups as u32,
+        ..Default::default()
+    };
+    put_extras(&mut reply, &prediction.extras, prediction.rollout.horizon, output);
+    reply
 }
 
 /// A refusal inside a stream or a Zenoh reply.

@@ -92,7 +92,7 @@ pub fn soil_vector(values: &[f64; SOIL_DIM]) -> pb::SoilVector {
 
 /// What is known of the soil as message.
 pub fn soil_correction(soil: &SoilEstimate) -> pb::SoilCorrection {
-    let SoilEstimate { state: soil, covariance } = soil;
+    let SoilEstimate { state: soil, covariance, .. } = soil;
     let coordinates = match soil.correction.coordinates {
         SoilCoordinates::Physical => pb::SoilCoordinates::Physical,
         SoilCoordinates::Logarithmic => pb::SoilCoordinates::Logarithmic,

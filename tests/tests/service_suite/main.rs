@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod bad_input;
+mod extras;
 mod fleet_soil;
 mod from_now;
 mod lifecycle;

@@ -2,7 +2,9 @@
 
 use std::sync::Arc;
 
-use nesam_engine::{Command, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PredictQuery, WheelMeasurement};
+use nesam_engine::{
+    Command, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PredictExtras, PredictQuery, WheelMeasurement,
+};
 
 use crate::stage::*;
 
@@ -40,6 +42,7 @@ fn property_replayed_commands_give_the_same_bytes() {
                 samples: 3,
                 horizon: 8,
                 controls: candidates.controls,
+                extras: PredictExtras { jacobians: i % 32 == 7, risk: true, ..Default::default() },
             }));
         }
     }

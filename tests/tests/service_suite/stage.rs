@@ -64,6 +64,7 @@ fn bundle() -> Arc<ModelBundle> {
                 baselines_json: None,
                 reference_json: None,
                 soil_filter_json: None,
+                rollout_noise_json: None,
                 effects: Vec::new(),
                 provenance: Provenance::default(),
             })

@@ -11,6 +11,7 @@ use nesam_evaluation::{
 use nesam_model::{MAX_HORIZON, Predictor};
 use nesam_trajectories::Trajectory;
 
+use super::coverage;
 use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
 use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
@@ -23,11 +24,28 @@ use crate::{interrupt, output};
 #[derive(Args, Debug)]
 pub struct EvaluateArgs {
     #[command(flatten)]
-    data: DataArgs,
+    pub(super) data: DataArgs,
     #[command(flatten)]
-    bundle: BundleArgs,
+    pub(super) bundle: BundleArgs,
     #[command(flatten)]
-    window: WindowArgs,
+    pub(super) window: WindowArgs,
+    /// Instead of errors, the share of windows that the 90 % regions of the predicted covariance hold
+    #[arg(long)]
+    coverage: bool,
+    /// Estimate the covariance of the model's errors on the drives of the train split that training left for validation, and put it into the bundle; run
+    /// once for every new bundle, after `nesam adapt --calibrate`
+    #[arg(long, conflicts_with = "coverage")]
+    calibrate_coverage: bool,
+    /// Standard deviations of a measured state for --calibrate-coverage: x y z m, roll pitch yaw rad, vx vy vz m/s, wx wy wz rad/s [default: those of the
+    /// Chrono data]
+    #[arg(
+        long,
+        value_name = "SD,…",
+        value_delimiter = ',',
+        default_value = "0.015,0.015,0.02,0.001745,0.001745,0.001745,0.025,0.025,0.025,0.002,0.002,0.002",
+        hide_default_value = true
+    )]
+    pub(super) start_sd: Vec<f64>,
     /// What drives the prediction over the horizon
     #[arg(long, value_enum, default_value_t = InputsArg::Commands)]
     inputs: InputsArg,
@@ -45,16 +63,16 @@ pub struct EvaluateArgs {
     baselines: Option<PathBuf>,
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
-    seed: u64,
+    pub(super) seed: u64,
     /// Bootstrap draws
     #[arg(long, default_value_t = DEFAULT_RESAMPLES, value_parser = at_least_1000)]
-    resamples: usize,
+    pub(super) resamples: usize,
     /// Folder for evaluate.json and evaluate.html [default: nesam-out/evaluate-<set>]
     #[arg(long, value_name = "DIR")]
-    out: Option<PathBuf>,
+    pub(super) out: Option<PathBuf>,
     /// Write the JSON here instead
     #[arg(long, value_name = "FILE")]
-    json: Option<PathBuf>,
+    pub(super) json: Option<PathBuf>,
     /// Write the HTML report here instead
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
@@ -101,6 +119,11 @@ fn at_least_1000(text: &str) -> Result<usize, String> {
 
 /// Runs the command.
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
+    if args.coverage || args.calibrate_coverage {
+        check_model_step(args.data.dt)?;
+        check_horizon(args)?;
+        return if args.coverage { coverage::run(args) } else { coverage::calibrate(args) };
+    }
     let names = model_names(args)?;
     interrupt::exit_on_ctrl_c("nothing was written");
     let noise_free = args.start == TruthArg::Gt;
@@ -142,6 +165,13 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     };
     print_table(&evaluation);
     write_results(args, &out, &evaluation, &paths, &windows)
+}
+
+fn check_horizon(args: &EvaluateArgs) -> Result<(), Failure> {
+    if args.window.horizon <= MAX_HORIZON {
+        return Ok(());
+    }
+    Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)))
 }
 
 /// Puts the noise-free states in the place of the measured ones.
@@ -207,9 +237,7 @@ impl Models {
     fn prepare(args: &EvaluateArgs, names: &[ModelName], drives: &Drives, training: Option<&[Trajectory]>) -> Result<Self, Failure> {
         let predictor = if names.iter().any(|n| n.is_nesam()) {
             check_model_step(args.data.dt)?;
-            if args.window.horizon > MAX_HORIZON {
-                return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
-            }
+            check_horizon(args)?;
             Some(predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?)
         } else {
             None

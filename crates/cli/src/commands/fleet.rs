@@ -4,7 +4,9 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use clap::Args;
-use nesam_engine::{Command, Engine, FleetSoilSettings, Limits, Measurement, OpenSession, PredictQuery, Reply, WheelMeasurement};
+use nesam_engine::{
+    Command, Engine, FleetSoilSettings, Limits, Measurement, OpenSession, PredictExtras, PredictQuery, Reply, WheelMeasurement,
+};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, PosePath, Resamples, Truth, Window, WindowErrors, pose_of};
 use nesam_model::{MAX_HORIZON, Predictor};
 use nesam_terrain::WorldMap;
@@ -151,7 +153,16 @@ fn feed(engine: &mut Engine, now_ns: u64, vehicle: &str, drive: &Trajectory, sam
 /// Poses after steps 1…K from the newest measurement, with the commands of the drive.
 fn predict(engine: &mut Engine, now_ns: u64, drive: &Trajectory, sample: usize, horizon: usize) -> Result<Vec<[f64; POSE_DIM]>, Failure> {
     let controls = drive.controls[sample..sample + horizon].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
-    let query = PredictQuery { session: "driver".into(), start: None, instant: None, use_history: true, samples: 1, horizon, controls };
+    let query = PredictQuery {
+        session: "driver".into(),
+        start: None,
+        instant: None,
+        use_history: true,
+        samples: 1,
+        horizon,
+        extras: PredictExtras::default(),
+        controls,
+    };
     match engine.execute(now_ns, &Command::Predict(query)).or_failed()? {
         Reply::Predicted(prediction) => Ok((0..horizon).map(|k| pose_of(&prediction.rollout.state(0, k).map(f64::from))).collect()),
         _ => Err(Failure::Failed("the engine answered a prediction with another reply; this is a bug".into())),

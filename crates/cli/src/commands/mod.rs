@@ -3,6 +3,7 @@
 pub mod adapt;
 pub mod bench;
 pub mod check;
+mod coverage;
 pub mod demo;
 pub mod diagnose;
 pub mod evaluate;

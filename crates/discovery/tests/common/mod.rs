@@ -170,6 +170,7 @@ pub fn bundle() -> ModelBundle {
                 baselines_json: None,
                 reference_json: None,
                 soil_filter_json: None,
+                rollout_noise_json: None,
                 provenance: Provenance::default(),
             };
             let drives: Vec<Trajectory> = (0..24).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();

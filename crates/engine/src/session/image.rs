@@ -162,6 +162,7 @@ impl SessionImage {
             ("an impossible buffer", self.filter_steps.len() <= self.filter_first + buffer),
             ("too many starts", self.ended_boots.len() <= super::order::ENDED_BOOTS_MAX),
             ("a soil that is not finite", self.soil.covariance.as_flattened().iter().all(|v| v.is_finite())),
+            ("a noise scale that is not positive", self.soil.noise_scale > 0.0 && self.soil.noise_scale.is_finite()),
             ("a soil that is not finite", self.soil.state.correction.delta.iter().all(|v| v.is_finite())),
         ];
         if let Some((what, _)) = possible.iter().find(|(_, holds)| !holds) {

@@ -134,6 +134,7 @@ pub fn predictor(scales: &Normalization, weights: Weights) -> Predictor {
         baselines_json: None,
         reference_json: None,
         soil_filter_json: None,
+        rollout_noise_json: None,
         effects: Vec::new(),
         provenance: Provenance::default(),
     };

@@ -4,4 +4,5 @@ mod lanes;
 mod transformer;
 
 pub use lanes::{LANES, Lane};
+pub(crate) use transformer::{Block, Dense};
 pub use transformer::{BlockCache, FusedTransformer, Prefix};

@@ -7,38 +7,38 @@ use crate::weights::Weights;
 use nesam_physics::{STATE_DIM, WHEELS};
 
 #[derive(Clone, Debug)]
-struct Dense {
-    weight: Vec<f32>,
-    bias: Vec<f32>,
+pub(crate) struct Dense {
+    pub(crate) weight: Vec<f32>,
+    pub(crate) bias: Vec<f32>,
 }
 
 #[derive(Clone, Debug)]
-struct Block {
-    norm1: Dense,
-    qkv: Dense,
-    out: Dense,
-    norm2: Dense,
-    up: Dense,
-    down: Dense,
+pub(crate) struct Block {
+    pub(crate) norm1: Dense,
+    pub(crate) qkv: Dense,
+    pub(crate) out: Dense,
+    pub(crate) norm2: Dense,
+    pub(crate) up: Dense,
+    pub(crate) down: Dense,
 }
 
 /// Weights of token embedding, Transformer and heads.
 #[derive(Clone, Debug)]
 pub struct FusedTransformer {
-    token: Dense,
-    position: Vec<f32>,
-    blocks: Vec<Block>,
-    norm: Dense,
-    sinkage: Dense,
-    residual: Dense,
+    pub(crate) token: Dense,
+    pub(crate) position: Vec<f32>,
+    pub(crate) blocks: Vec<Block>,
+    pub(crate) norm: Dense,
+    pub(crate) sinkage: Dense,
+    pub(crate) residual: Dense,
 }
 
 /// Keys and values of the measured history, computed once per query and shared by all samples: per block (positions, 128).
 #[derive(Clone, Debug, Default)]
 pub struct Prefix {
-    keys: Vec<Vec<f32>>,
-    values: Vec<Vec<f32>>,
-    tokens: usize,
+    pub(crate) keys: Vec<Vec<f32>>,
+    pub(crate) values: Vec<Vec<f32>>,
+    pub(crate) tokens: usize,
 }
 
 /// Keys and values of the rollout of one block of samples: per Transformer block (steps, 128) lanes.

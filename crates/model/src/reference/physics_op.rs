@@ -32,7 +32,7 @@ impl CustomOp1 for Step {
         let mut out = vec![0f32; rows * OUTPUTS];
         for base in (0..rows).step_by(LANES) {
             let input = step_input::<f32x8>(lanes(packed, base, 0), lanes::<CONSTANT>(packed, base, DIFFERENTIABLE));
-            let increment = symbolic_step(self.0, &self.1, &input).0.to_array().map(f32x8::to_array);
+            let increment = symbolic_step(self.0, &self.1, &input).increment.to_array().map(f32x8::to_array);
             for lane in 0..LANES.min(rows - base) {
                 for (column, value) in increment.iter().enumerate() {
                     out[(base + lane) * OUTPUTS + column] = value[lane];
@@ -61,7 +61,7 @@ impl CustomOp2 for StepGradient {
             let varying = lanes::<DIFFERENTIABLE>(packed, base, 0);
             let varying: [Dual<f32x8, DIFFERENTIABLE>; DIFFERENTIABLE] = core::array::from_fn(|k| Dual::variable(varying[k], k));
             let constant = lanes::<CONSTANT>(packed, base, DIFFERENTIABLE).map(Dual::constant);
-            let increment = symbolic_step(self.0, &self.1, &step_input(varying, constant)).0.to_array();
+            let increment = symbolic_step(self.0, &self.1, &step_input(varying, constant)).increment.to_array();
             let weight: [f32x8; OUTPUTS] = core::array::from_fn(|o| {
                 f32x8::from(core::array::from_fn::<f32, LANES, _>(|l| upstream[(base + l).min(rows - 1) * OUTPUTS + o]))
             });

@@ -1,0 +1,136 @@
+//! `nesam evaluate --coverage` and `--calibrate-coverage`: whether predicted covariances are honest.
+
+use nesam_adaptation::{CalibratedFilter, FilterConfig};
+use nesam_evaluation::{
+    LinearisedWindow, Resamples, SoilKnowledge, StepCoverage, Truth, adapt_all, all_windows, calibrate_rollout_noise, coverage,
+    linearise_windows,
+};
+use nesam_model::rollout_noise::{SoilCovariance, StateCovariance};
+use nesam_model::{ModelBundle, Predictor, RolloutNoise};
+use nesam_physics::STATE_DIM;
+
+use super::evaluate::EvaluateArgs;
+use crate::bundle_path::bundle_dir;
+use crate::failure::{Failure, OrFail};
+use crate::output::say;
+use crate::progress::Progress;
+use crate::sources::{Drives, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::{interrupt, output};
+
+/// Share of windows that the 90 % regions hold, with the soil prior and with what the drive has taught.
+pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
+    interrupt::exit_on_ctrl_c("nothing was written");
+    let drives = read_drives(&args.data, false)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let noise = noise_of(predictor.bundle())?;
+    let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
+    let [prior, learned] = [false, true].map(|learned| windows_of(args, &drives, &predictor, &noise.start_covariance(), learned));
+    let [prior, learned] = [coverage(&prior?, &noise, &resamples), coverage(&learned?, &noise, &resamples)];
+    say!("{} ({}): share of windows inside the 90 % region, {} drives", drives.set, args.data.split.as_str(), drives.drives.len());
+    print_table("soil prior", &prior);
+    print_table("soil as learned", &learned);
+    let provenance = output::provenance(Some(predictor.bundle()), &drives);
+    // `prior`: soil prior as it is, with its covariance; `learned`: what a session knew of the soil and of the model's errors at the start of each window.
+    let document = serde_json::json!({
+        "schema": "nesam.coverage/1",
+        "set": drives.set,
+        "split": args.data.split.as_str(),
+        "trajectories": drives.drives.len(),
+        "prior": prior,
+        "learned": learned,
+        "provenance": provenance,
+    });
+    let out = output::out_dir(args.out.as_deref(), "coverage", &drives.set)?;
+    let file = args.json.clone().unwrap_or_else(|| out.join("coverage.json"));
+    let text = serde_json::to_string_pretty(&document).or_failed()?;
+    output::write_file(&file, text.as_bytes())?;
+    say!("\nwrote {}", file.display());
+    Ok(())
+}
+
+/// Estimates what the bundle does not know of itself on validation drives, and puts it into the bundle.
+pub fn calibrate(args: &EvaluateArgs) -> Result<(), Failure> {
+    interrupt::exit_on_ctrl_c("the bundle is unchanged");
+    let dir = bundle_dir(args.bundle.bundle.as_deref())?;
+    let start_sd: [f64; STATE_DIM] = args
+        .start_sd
+        .as_slice()
+        .try_into()
+        .map_err(|_| Failure::input(format!("--start-sd has {} numbers, {STATE_DIM} are needed", args.start_sd.len())))?;
+    let drives = validation_drives(&args.data, "--calibrate-coverage", "the covariance is estimated")?;
+    let mut bundle = load_bundle(Some(&dir))?;
+    let predictor = predictor_for(bundle.clone(), &drives.root)?;
+    let start = RolloutNoise::new(start_sd, &[]).start_covariance();
+    let windows = windows_of(args, &drives, &predictor, &start, true)?;
+    let none = || Failure::input("no window of the validation drives could be rolled out".to_string());
+    let mut noise = calibrate_rollout_noise(&windows, start_sd).ok_or_else(none)?;
+    (noise.drives, noise.data_hash) = (drives.drives.len(), drives.root.hash());
+    bundle.rollout_noise_json = Some(noise.to_json());
+    bundle.save(&dir).or_failed()?;
+    say!(
+        "bundle {} now carries the covariance of its errors over {} steps from {} windows of {} drives; squared radius of the 90 % region {:.2} (x, y), {} (single); its hash is {}",
+        bundle.name,
+        noise.steps(),
+        noise.windows,
+        noise.drives,
+        noise.region_90_planar,
+        noise.region_90_single.map(|r| format!("{r:.2}")).join(" "),
+        &bundle.hash[..12]
+    );
+    Ok(())
+}
+
+fn noise_of(bundle: &ModelBundle) -> Result<RolloutNoise, Failure> {
+    let hint = "run `nesam evaluate --calibrate-coverage --split train` on its training data";
+    let json = bundle
+        .rollout_noise_json
+        .as_deref()
+        .ok_or_else(|| Failure::input(format!("bundle {} does not know the covariance of its errors; {hint}", bundle.name)))?;
+    RolloutNoise::from_json(json).or_input()
+}
+
+/// Every window, linearised with the soil prior or with what the soil filter had learned by its start.
+fn windows_of(
+    args: &EvaluateArgs,
+    drives: &Drives,
+    predictor: &Predictor,
+    start: &StateCovariance,
+    learned: bool,
+) -> Result<Vec<LinearisedWindow>, Failure> {
+    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, Truth::Measured).or_input()?;
+    let filter = match &predictor.bundle().soil_filter_json {
+        Some(json) => CalibratedFilter::from_json(json).or_input()?.config(),
+        None => FilterConfig::default(),
+    };
+    let prior: SoilCovariance = core::array::from_fn(|r| core::array::from_fn(|c| if r == c { filter.prior_sd[r].powi(2) } else { 0.0 }));
+    let filtered = match learned {
+        false => Vec::new(),
+        true => adapt_all(predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?,
+    };
+    let soil = if learned { SoilKnowledge::Learned(&filtered, &prior) } else { SoilKnowledge::Prior(&prior) };
+    let progress = Progress::start("windows linearised", windows.len());
+    let linearised = linearise_windows(predictor, &windows, &drives.maps, start, soil, &|done| progress.set(done)).or_failed()?;
+    progress.finish();
+    Ok(linearised)
+}
+
+fn print_table(title: &str, steps: &[StepCoverage]) {
+    say!(
+        "\n{title:<18}{:>8}{:>24}{:>10}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}",
+        "windows",
+        "(x, y) [95 %]",
+        "radius m",
+        "x",
+        "y",
+        "z",
+        "roll",
+        "pitch",
+        "yaw"
+    );
+    for step in steps {
+        let interval = step.planar.ci95.map_or(String::new(), |[low, high]| format!(" [{low:.3}, {high:.3}]"));
+        let single: String = step.single.iter().map(|(_, share)| format!("{:>9.3}", share.inside)).collect();
+        let planar = format!("{:.3}{interval}", step.planar.inside);
+        say!("{:<18}{:>8}{planar:>24}{:>10.3}{single}", format!("k = {}", step.step), step.windows, step.radius_m_median);
+    }
+}

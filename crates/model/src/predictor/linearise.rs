@@ -1,0 +1,61 @@
+//! Linearisations of rollouts.
+
+use std::sync::Arc;
+
+use nesam_physics::VehicleState;
+use rayon::prelude::*;
+
+use super::{Predictor, control, pose, raw_soil, validate};
+use crate::ModelError;
+use crate::dims::HISTORY;
+use crate::ground::{GroundSource, history_actuators, wheel_points};
+use crate::rollout::{RolloutQuery, Variant};
+use crate::soil_coordinates::from_raw;
+use crate::tangent::{ExactTransformer, Linearisation, Plane, Scenery, TangentRollout};
+
+impl Predictor {
+    /// The samples of a query in f64, ready for their derivatives; one linearisation for each. The states differ from those of
+    /// [`Predictor::rollout`] by the rounding of f32.
+    ///
+    /// # Errors
+    /// As [`Predictor::rollout`].
+    pub fn linearise<'a>(&'a self, query: &RolloutQuery<'a>) -> Result<Vec<Linearisation<'a>>, ModelError> {
+        validate(query)?;
+        let scales = &self.bundle.normalization;
+        let tokens = query.map.map(|map| self.tokens_of(map));
+        let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
+        let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
+        let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
+        if !variant.remembers() {
+            let reason = format!("a model of the form `{}` has no derivatives", variant.as_str());
+            return Err(ModelError::Query { field: "variant", reason });
+        }
+        let first = control(query, 0, 0);
+        let shared = Arc::new(TangentRollout {
+            model: &self.model,
+            network: ExactTransformer(&self.network),
+            scales,
+            variant,
+            prefix: self.prefix(history, &ground, tokens.as_deref()),
+            coordinates: query.soil_correction.coordinates,
+            wheels: query.wheels,
+            previous: history.last().map(|step| step.state),
+            actuators: (!history.is_empty()).then(|| history_actuators(&self.model, history, &query.start, &first, scales.dt_s)),
+        });
+        let look = |state: &VehicleState<f64>| {
+            let token = self.terrain(tokens.as_deref(), &[pose(state)])[0];
+            let plane = |x: f64, y: f64| Plane::at(&ground, x, y);
+            Scenery {
+                token,
+                prior: from_raw(&raw_soil(&token)),
+                reference: plane(state.position_m[0], state.position_m[1]),
+                wheels: wheel_points(&self.model, state).map(|[x, y]| plane(x, y)),
+            }
+        };
+        let of_sample = |n: usize| {
+            let controls = (0..query.horizon).map(|k| control(query, n, k)).collect();
+            Linearisation::roll_out(Arc::clone(&shared), &query.start, controls, query.soil_correction.delta, look)
+        };
+        Ok((0..query.samples).into_par_iter().map(of_sample).collect())
+    }
+}

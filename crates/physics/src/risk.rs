@@ -1,0 +1,58 @@
+//! How near a step is to a limit: load transfer towards a roll-over, traction left before the vehicle is stuck.
+
+use crate::scalar::Real;
+use crate::step::{StepInput, StepModel, WheelContact};
+use crate::terramechanics::{ContactMotion, Support, balance_sinkage, wheel_wrench};
+use crate::vehicle::WHEELS;
+
+/// Slip at which the traction that is left is counted (chosen: beyond it a wheel digs more than it pulls).
+pub const RESERVE_SLIP: f64 = 0.8;
+/// Speed around which the direction of travel changes its sign, m/s (chosen, as for slip).
+const DIRECTION_SPEED_M_S: f64 = 0.05;
+
+/// Lateral load-transfer ratio |ΣF_left - ΣF_right| / ΣF of the wheel loads FL, FR, RL, RR in N: 0 = even, 1 = one side carries nothing.
+///
+/// Source: the static and quasi-static rollover indices of road vehicles (e.g. Rajamani, *Vehicle Dynamics and Control*, ch. 15). Loads are those of the
+/// contacts, so suspension, slope and the vehicle's motion are in it; compliance of the tyres and a second axle's own limit are not.
+pub fn load_transfer_ratio<T: Real>(load_n: &[T; WHEELS]) -> T {
+    let [front_left, front_right, rear_left, rear_right] = *load_n;
+    let difference = front_left + rear_left - front_right - rear_right;
+    T::select_ge0(difference, difference, -difference) / (front_left + front_right + rear_left + rear_right)
+}
+
+impl StepModel {
+    /// Traction reserve ρ = Σ DP_i(s*) / (M g) - d sin γ: drawbar pull that all wheels could give at their present loads, less what the slope asks
+    /// for, over the weight. Below 0 the vehicle cannot hold its speed at any slip: it slows down until it is stuck (an immobilisation margin).
+    ///
+    /// DP_i(s*) = thrust - compaction resistance of wheel i (Wong, *Theory of Ground Vehicles*, ch. 2) at slip s* = [`RESERVE_SLIP`], at the sinkage that
+    /// carries the wheel's load with this slip, times the learned ratio; γ is the climb of the body's x axis, d in (-1, 1) the direction of travel (0 at
+    /// rest). Drawbar pull over weight equals the tangent of the steepest slope that a vehicle climbs, hence the unit. Neglects side forces, the torque limit
+    /// of the drive and obstacles. `contacts` are those of the step with this input.
+    pub fn traction_reserve<T: Real>(&self, input: &StepInput<T>, contacts: &[WheelContact<T>; WHEELS]) -> T {
+        let motion = ContactMotion::<T>::from_slip(RESERVE_SLIP, 0.0);
+        let mut pull_n = T::lit(0.0);
+        for (contact, log_ratio) in contacts.iter().zip(input.sinkage_log_ratio) {
+            let support = Support { preload_n: contact.normal_n, rate_n_m: T::lit(0.0) };
+            let sinkage = balance_sinkage(&self.wheel, &support, &motion, &input.soil) * log_ratio.exp();
+            let wrench = wheel_wrench(&self.wheel, sinkage, &motion, &input.soil);
+            pull_n = pull_n + wrench.drawbar_n() * contact.normal_n / wrench.normal_n.relu_smooth(1.0);
+        }
+        let speed = input.state.velocity_m_s[0];
+        let direction = speed / speed.abs_smooth(DIRECTION_SPEED_M_S);
+        // Pitch is positive nose down, so the body climbs by -pitch.
+        let climb = -input.state.attitude_rad[1].sin_cos().0;
+        pull_n / T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2) - direction * climb
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_load_transfer_of_even_and_one_sided_loads() {
+        assert_eq!(load_transfer_ratio(&[5.0, 5.0, 7.0, 7.0]), 0.0);
+        assert_eq!(load_transfer_ratio(&[0.0, 5.0, 0.0, 7.0]), 1.0);
+        assert_eq!(load_transfer_ratio(&[3.0, 1.0, 3.0, 1.0]), 0.5);
+    }
+}
