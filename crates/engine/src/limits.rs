@@ -37,7 +37,7 @@ pub struct Limits {
     pub sample_steps_max: usize,
     /// Samples of one prediction with Jacobians; each takes about as long as a hundred without.
     pub jacobian_samples_max: usize,
-    /// Samples of one prediction with covariance; each takes a quarter of a Jacobian's time.
+    /// Samples of one prediction with covariance; each takes a third of a Jacobian's time.
     pub covariance_samples_max: usize,
     /// What-if soils of one prediction.
     pub soils_max: usize,
