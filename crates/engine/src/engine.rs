@@ -225,18 +225,19 @@ impl Engine {
         self.limits.check_shape(query.samples, horizon)?;
         let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
         let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
-        let rollout = self.predictor.rollout(&RolloutQuery {
+        let controls = forward.prepend(&query.controls, query.horizon);
+        let asked = RolloutQuery {
             history: &history,
             start,
-            controls: &forward.prepend(&query.controls, query.horizon),
+            controls: &controls,
             samples: query.samples,
             horizon,
             map,
             soil_correction: session.soil().state.correction,
             variant: Variant::Full,
             wheels: None,
-        })?;
-        let (rolled, mut rollout) = forward.split(rollout);
+        };
+        let (rolled, mut rollout) = forward.split(self.predictor.rollout_on(&asked, &session.soil_field(map))?);
         if session.soil().state.epoch == 0 {
             rollout.flags.iter_mut().for_each(|flags| *flags |= SOIL_NOT_LEARNED);
         }

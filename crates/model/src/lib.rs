@@ -16,6 +16,7 @@ mod predictor;
 pub mod reference;
 mod rollout;
 pub mod soil_coordinates;
+mod soil_field;
 mod soil_prior;
 pub mod step_row;
 mod symbolic;
@@ -29,6 +30,7 @@ pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
 pub use predictor::{Predictor, TerrainMode, Transition};
 pub use rollout::{HistoryStep, MeasuredWheels, Rollout, RolloutQuery, Variant, flag};
+pub use soil_field::{SoilByClass, SoilField};
 pub use terrain_tokens::{CacheCounts, TerrainToken};
 pub use weights::Weights;
 

@@ -18,6 +18,7 @@ use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
 use crate::ground::{GroundSource, history_actuators};
 use crate::rollout::{HistoryStep, Rollout, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
+use crate::soil_field::SoilField;
 use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
 use crate::symbolic::symbolic_step;
@@ -79,6 +80,7 @@ struct BlockOutput<'a> {
 /// Everything of a query that is the same for all samples.
 struct Scene<'a> {
     query: &'a RolloutQuery<'a>,
+    soil: &'a dyn SoilField,
     ground: GroundSource<'a>,
     prefix: Prefix,
     datum_m: f64,
@@ -143,6 +145,14 @@ impl Predictor {
     /// # Errors
     /// `ModelError::Query` naming the field when shapes disagree, the horizon is 0 or above [`MAX_HORIZON`], or a number is not finite.
     pub fn rollout(&self, query: &RolloutQuery<'_>) -> Result<Rollout, ModelError> {
+        self.rollout_on(query, &query.soil_correction)
+    }
+
+    /// The same on a soil that may differ from place to place and from sample to sample; the correction of the query stands aside.
+    ///
+    /// # Errors
+    /// As [`Predictor::rollout`].
+    pub fn rollout_on(&self, query: &RolloutQuery<'_>, soil: &dyn SoilField) -> Result<Rollout, ModelError> {
         validate(query)?;
         let scales = &self.bundle.normalization;
         let tokens = query.map.map(|map| self.tokens_of(map));
@@ -150,7 +160,7 @@ impl Predictor {
         let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
         let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
         let prefix = self.prefix(history, &ground, tokens.as_deref());
-        let scene = Scene { query, ground, prefix, datum_m: query.start.position_m[2], variant };
+        let scene = Scene { query, soil, ground, prefix, datum_m: query.start.position_m[2], variant };
 
         let first = control(query, 0, 0);
         let start = Sample {
@@ -175,7 +185,7 @@ impl Predictor {
             let poses: Vec<Pose2> = samples[..distinct].iter().map(|s| pose(&s.state)).collect();
             let terrain = self.terrain(tokens.as_deref(), &poses);
             if k == 0 {
-                rollout.soil = self.soil(&terrain[0], query);
+                rollout.soil = under(soil, 0, &start, &terrain[0]);
             }
             let blocks: Vec<BlockOutput<'_>> = samples
                 .par_chunks_mut(LANES)
@@ -280,10 +290,6 @@ impl Predictor {
         self.token_scale.apply(raw)
     }
 
-    fn soil(&self, token: &TerrainToken, query: &RolloutQuery<'_>) -> [f64; SOIL_DIM] {
-        query.soil_correction.apply(&from_raw(&raw_soil(token)))
-    }
-
     /// Advances up to sixteen samples by one step; returns their wheel sinkages, m.
     fn step_block(
         &self,
@@ -315,7 +321,7 @@ impl Predictor {
                     None => command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
                 };
                 let (ground, known) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
-                let soil = self.soil(terrain[l], query);
+                let soil = under(scene.soil, first + l, sample, terrain[l]);
                 let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                     Variant::ZeroSinkage => NO_SINKAGE,
                     _ => scales.sinkage_log_ratio_max * raw_sinkage[i][l].tanh(),
@@ -379,6 +385,11 @@ impl Predictor {
 
 fn pose(state: &VehicleState<f64>) -> Pose2 {
     Pose2 { x_m: state.position_m[0], y_m: state.position_m[1], yaw_rad: state.attitude_rad[2] }
+}
+
+/// Soil under a sample.
+fn under(field: &dyn SoilField, sample: usize, at: &Sample, token: &TerrainToken) -> [f64; SOIL_DIM] {
+    field.soil(sample, [at.state.position_m[0], at.state.position_m[1]], &from_raw(&raw_soil(token)))
 }
 
 fn raw_soil(token: &TerrainToken) -> [f32; SOIL_DIM] {

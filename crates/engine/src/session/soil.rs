@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nesam_adaptation::{BufferedTransition, Innovation, SoilFilter, SoilUpdate};
-use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_model::{HISTORY, HistoryStep, Predictor, SoilByClass, SoilField};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 
@@ -84,17 +84,26 @@ impl SoilLearner {
 
     fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<SoilUpdate> {
         let (first, last) = (self.first, self.steps.len() - 1);
-        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| self.filter.estimate());
-        let transitions = predictor.measured_transitions(&self.steps, first..last, along.as_ref(), map)?;
+        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| SoilByClass::new(Some(map), self.filter.estimates()));
+        let along = along.as_ref().map(|soil| soil as &dyn SoilField);
+        let transitions = predictor.measured_transitions(&self.steps, first..last, along, map)?;
         let mut update = None;
         for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
-            let buffered = BufferedTransition::new(transition.input, transition.residual, &end.state);
+            let [x, y, _] = transition.input.state.position_m;
+            let ground_class = SoilByClass::class_at(Some(map), [x, y]);
+            let buffered =
+                BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end.state) };
             update = self.filter.push(predictor.step_model(), buffered).ok()?;
         }
         update
     }
 
-    /// What the filter says now.
+    /// The soil that predictions meet: the posterior of every class of ground that the map tells apart.
+    pub(super) fn field(&self, map: Option<&Arc<WorldMap>>) -> SoilByClass {
+        SoilByClass::new(map, self.filter.posteriors().iter().map(|p| p.correction).collect())
+    }
+
+    /// What the filter says now of the ground under the vehicle.
     pub(super) fn state(&self, epoch: u64, stamp_ns: Option<i64>) -> SoilState {
         let posterior = self.filter.posterior();
         SoilState {
