@@ -4,11 +4,14 @@ use nesam_physics::{SOIL_DIM, SoilCoordinates};
 use serde::{Deserialize, Serialize};
 
 use crate::AdaptationError;
-use crate::noise::{BufferNoise, ChannelNoise, VelocityNoise};
+use crate::conditions::NoiseConditions;
+use crate::noise::{BufferNoise, ChannelNoise, SharedError, VelocityNoise};
 use crate::prediction::VELOCITY_DIM;
 
 /// Longest buffer, so that the innovation covariance stays small.
 const BUFFER_MAX: usize = 64;
+/// More classes would make the update dear.
+const CLASSES_MAX: usize = 16;
 /// More passes than this do not help: the iteration has converged or never will.
 const LINEARISATIONS_MAX: usize = 10;
 
@@ -43,6 +46,24 @@ pub struct FilterConfig {
     pub process_sd: [f64; SOIL_DIM],
     /// R_B. Too small: the filter becomes certain of a wrong soil (NIS over its degrees of freedom well above 1); too large: it learns slowly.
     pub noise: BufferNoise,
+    /// Beyond Algorithm 1: how R_B grows with speed, turning, relief and softness ([`crate::calibrate`]); `None` = one R_B for all. Without it smooth
+    /// driving counts too little and rough driving too much.
+    pub noise_conditions: Option<NoiseConditions>,
+    /// Beyond Algorithm 1: the part of R_B that carries on from buffer to buffer, estimated beside the soil; `None` = all buffers err independently, or, with
+    /// `shared_buffers`, are counted less. With it a constant error of the model is not taken for soil and NIS is honest.
+    pub shared_error: Option<SharedError>,
+    /// Beyond Algorithm 1: degrees of freedom ν of Student's t in place of the normal distribution, 0 = normal. A buffer with a large NIS has its noise
+    /// counted (ν + NIS)/(ν + dof) times. Smaller: wild buffers teach less.
+    pub tail_dof: f64,
+    /// Beyond Algorithm 1: a buffer from which no parameter could learn more than this share of its prior information, max_i P₀_ii (Hᵀ R_B⁻¹ H)_ii, leaves the
+    /// estimate as it is. 0 = every buffer counts.
+    pub excitation_min: f64,
+    /// Beyond Algorithm 1: classes of ground with a correction of their own, 1 to 16; the first is that of ground that tells no class, further ones than there are
+    /// count as the first. 1 = one correction for all, as in the paper.
+    pub classes: usize,
+    /// Share of P₀ and Q_B that each class has for itself, 0 to 1; the rest is common, so that a class that was never driven on follows the others. 0 = all
+    /// classes are one; 1 = they say nothing of each other.
+    pub class_share: f64,
     /// Beyond Algorithm 1: consecutive buffers that say together no more than one, at least 1. The model errs alike as long as the vehicle stays on one
     /// patch of ground, which R_B of single buffers cannot say ([`crate::calibrate`] estimates how many); the update counts R_B this many times (a tempered likelihood). The NIS does not.
     pub shared_buffers: f64,
@@ -60,7 +81,8 @@ pub struct FilterConfig {
     /// far from linearly: a single large step overshoots, and its covariance is certain of where it landed.
     pub linearisations: usize,
     /// Beyond Algorithm 1: the correction stops where every θ_k of the buffer is clipped, instead of running on behind the bound, where H
-    /// is zero and nothing would bring it back; and Q_B inflates no variance beyond that of P₀ while the drive excites nothing.
+    /// is zero and nothing would bring it back; and the soil tends back to its prior as fast as Q_B lets it go (ρ² = 1 - Q_B/P₀), so that no variance exceeds
+    /// that of P₀ while the drive excites nothing.
     pub bounded: bool,
 }
 
@@ -77,6 +99,12 @@ impl Default for FilterConfig {
             prior_sd,
             process_sd: prior_sd.map(|sd| 0.1 * sd),
             noise: BufferNoise::Channels(default_noise()),
+            noise_conditions: None,
+            shared_error: None,
+            tail_dof: 0.0,
+            excitation_min: 1e-3,
+            classes: 1,
+            class_share: 0.25,
             shared_buffers: 4.0,
             scale_memory: 5.0,
             trust_memory: 10.0,
@@ -99,6 +127,9 @@ impl FilterConfig {
             shared_buffers: 1.0,
             scale_memory: 0.0,
             trust_memory: 0.0,
+            excitation_min: 0.0,
+            classes: 1,
+            class_share: 0.0,
             prior_sd,
             process_sd: prior_sd.map(|sd| 0.1 * sd),
             linearisations: 1,
@@ -142,7 +173,24 @@ impl FilterConfig {
         if !self.trust_log_odds.is_finite() {
             return fail("trust_log_odds", format!("is {}, it must be finite", self.trust_log_odds));
         }
-        self.noise.check(self.rows())
+        if !(1..=CLASSES_MAX).contains(&self.classes) {
+            return fail("classes", format!("is {}, allowed are 1 to {CLASSES_MAX}", self.classes));
+        }
+        if !(0.0..=1.0).contains(&self.class_share) {
+            return fail("class_share", format!("is {}, it must lie in [0, 1]", self.class_share));
+        }
+        for (setting, value) in [("tail_dof", self.tail_dof), ("excitation_min", self.excitation_min)] {
+            if !(value.is_finite() && value >= 0.0) {
+                return fail(setting, format!("is {value}, it must be at least 0"));
+            }
+        }
+        if let Some(conditions) = &self.noise_conditions
+            && !conditions.mean.iter().chain(&conditions.slope).all(|v| v.is_finite())
+        {
+            return fail("noise_conditions", format!("is {conditions:?}; all numbers must be finite"));
+        }
+        self.noise.check(self.rows())?;
+        self.shared_error.as_ref().map_or(Ok(()), |shared| shared.check(&self.noise.covariance(self.buffer, self.block)))
     }
 
     /// Rows of an innovation, a multiple of the six channels.

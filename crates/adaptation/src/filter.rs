@@ -1,25 +1,24 @@
 //! Algorithm 1: buffer, one update per full buffer, gate.
 
-use nalgebra::{DMatrix, DVector, SVector};
+use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCorrection};
 
 use crate::calibration::UncorrectedBuffer;
-use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_velocities, predict_velocity};
+use crate::conditions::conditions;
+use crate::joint::{JointState, Linearisation, correction_of};
+use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_along};
 use crate::trust::{NoiseScale, Trust};
-use crate::update::{SoilMatrix, kalman_update};
-use crate::{AdaptationError, FilterConfig, Innovation, chi_square_tail};
+use crate::{AdaptationError, FilterConfig, Innovation, KalmanStep, chi_square_tail};
 
 mod snapshot;
 
-pub use snapshot::FilterSnapshot;
+pub use snapshot::{ClassBelief, FilterSnapshot, JointSnapshot};
 
 /// Share of the prior variance below which a parameter counts as learned.
 const LEARNED_SHARE: f64 = 0.5;
 /// Share of the prior standard deviation below which another linearisation would change nothing.
 const CONVERGED_SHARE: f64 = 1e-3;
-
-type SoilVector = SVector<f64, SOIL_DIM>;
 
 /// What is known of the soil correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -54,9 +53,15 @@ pub struct SoilUpdate {
     pub dof: usize,
     /// The gate refused the buffer.
     pub rejected: bool,
+    /// The drive told something of the soil; where it did not, the estimate stays as it was.
+    pub excited: bool,
+    /// max_i P₀_ii (Hᵀ R_B⁻¹ H)_ii, what the buffer could tell at most, in units of what the prior tells.
+    pub excitation: f64,
+    /// Logarithm of the likelihood of the buffer before it was learned from, up to a constant: compares settings on the same buffers.
+    pub log_likelihood: f64,
     /// Weight of the correction in the posterior, 0 to 1.
     pub trust: f64,
-    /// Scale of R_B that the NIS was computed with.
+    /// Factor on R_B that the NIS was computed with, conditions included.
     pub noise_scale: f64,
 }
 
@@ -64,12 +69,17 @@ pub struct SoilUpdate {
 #[derive(Clone, Debug)]
 pub struct SoilFilter {
     config: FilterConfig,
+    /// R_B, and what of it single buffers err by.
     noise: DMatrix<f64>,
-    delta: SoilVector,
-    covariance: SoilMatrix,
+    rest: DMatrix<f64>,
+    state: JointState,
+    /// The same model with the soil known to be the prior; judges the correction where errors carry on.
+    plain: JointState,
     scale: NoiseScale,
     trust: Trust,
     buffer: Vec<BufferedTransition>,
+    /// Class of the ground under the newest transition.
+    here: usize,
 }
 
 impl SoilFilter {
@@ -79,13 +89,16 @@ impl SoilFilter {
     /// `AdaptationError::Config` naming the setting that is unusable.
     pub fn new(config: FilterConfig) -> Result<Self, AdaptationError> {
         config.check()?;
+        let noise = config.noise.covariance(config.buffer, config.block);
         Ok(Self {
-            noise: config.noise.covariance(config.buffer, config.block),
-            delta: SVector::zeros(),
-            covariance: diagonal(&config.prior_sd),
+            rest: config.shared_error.as_ref().map_or_else(|| noise.clone(), |s| s.rest(&noise)),
+            noise,
+            state: JointState::prior(&config),
+            plain: JointState::without_soil(&config),
             scale: NoiseScale::new(config.scale_memory),
             trust: Trust::new(config.trust_memory, config.trust_log_odds),
             buffer: Vec::with_capacity(config.buffer),
+            here: 0,
             config,
         })
     }
@@ -95,21 +108,45 @@ impl SoilFilter {
         &self.config
     }
 
-    /// The present estimate as it should be used: the average over "the ground is what it looks like" and "it is what was learned", each with its
-    /// probability, and the covariance of that mixture. Without trust ([`FilterConfig::trust_memory`] = 0) it is Δθ⁺ and P⁺.
+    /// The present estimate of the ground under the newest transition as it should be used: the average over "the ground is what it looks like" and "it is what
+    /// was learned", each with its probability, and the covariance of that mixture. Without trust ([`FilterConfig::trust_memory`] = 0) it is Δθ⁺ and P⁺.
     pub fn posterior(&self) -> SoilPosterior {
+        self.posterior_of(self.here)
+    }
+
+    /// The same of one class of ground.
+    pub fn posterior_of(&self, class: usize) -> SoilPosterior {
+        let class = if class < self.config.classes { class } else { 0 };
         let weight = self.trust.weight();
-        let p = self.covariance + self.delta * self.delta.transpose() * (weight * (1.0 - weight));
+        let mut correction = correction_of(&self.state.soils(), class, &self.config);
+        let delta = SVector::<f64, SOIL_DIM>::from(correction.delta);
+        let p = self.state.soil_covariance(class) + delta * delta.transpose() * (weight * (1.0 - weight));
+        correction.delta = correction.delta.map(|d| weight * d);
         SoilPosterior {
-            correction: self.corrected_by(&(self.delta * weight)),
+            correction,
             covariance: core::array::from_fn(|r| core::array::from_fn(|c| p[(r, c)])),
             learned: core::array::from_fn(|i| p[(i, i)] < LEARNED_SHARE * self.config.prior_sd[i].powi(2)),
         }
     }
 
-    /// Δθ⁺ of the filter itself, whether it is trusted or not: where the next buffer is to be linearised.
+    /// The posteriors of all classes, see [`FilterConfig::classes`].
+    pub fn posteriors(&self) -> Vec<SoilPosterior> {
+        (0..self.config.classes).map(|class| self.posterior_of(class)).collect()
+    }
+
+    /// Δθ⁺ of the filter itself for every class, whether it is trusted or not: where the next buffer is to be linearised.
+    pub fn estimates(&self) -> Vec<SoilCorrection> {
+        (0..self.config.classes).map(|class| correction_of(&self.state.soils(), class, &self.config)).collect()
+    }
+
+    /// The same of the ground under the newest transition.
     pub fn estimate(&self) -> SoilCorrection {
-        self.correction()
+        correction_of(&self.state.soils(), self.here, &self.config)
+    }
+
+    /// P⁺ of that estimate, in its coordinates.
+    pub fn covariance(&self) -> SMatrix<f64, SOIL_DIM, SOIL_DIM> {
+        self.state.soil_covariance(if self.here < self.config.classes { self.here } else { 0 })
     }
 
     /// Transitions that wait for the next update.
@@ -129,6 +166,7 @@ impl SoilFilter {
             self.buffer.clear();
             return Err(AdaptationError::NotFinite { what, index });
         }
+        self.here = transition.ground_class;
         self.buffer.push(transition);
         if self.buffer.len() < self.config.buffer {
             return Ok(None);
@@ -145,137 +183,170 @@ impl SoilFilter {
         self.buffer.clear();
     }
 
-    fn correction(&self) -> SoilCorrection {
-        self.corrected_by(&self.delta)
-    }
-
-    fn corrected_by(&self, delta: &SoilVector) -> SoilCorrection {
-        SoilCorrection { coordinates: self.config.coordinates, delta: core::array::from_fn(|i| delta[i]) }
-    }
-
     /// Lines "Δθ⁻ ← Δθ⁺" to "P⁺" of Algorithm 1. NIS and gate belong to the linearisation at Δθ⁻; later ones, where the settings ask for
-    /// them, solve for the same posterior from a better point: e_i = Y - Ŷ(Δ_i) - H_i (Δθ⁻ - Δ_i).
+    /// them, solve for the same posterior from a better point: e_i = Y - Ŷ(Δ_i) - H_i (Δθ⁻ - Δ_i). Differences and H are divided by the root of the factor
+    /// on R_B, so that what carries on is the same number in every buffer.
     fn update(&mut self, model: &StepModel, buffer: &[BufferedTransition]) -> Result<SoilUpdate, AdaptationError> {
-        let (prior, before) = (self.inflated(), self.delta);
-        let first = self.linearise(model, buffer, &self.correction())?;
-        let noise_scale = self.scale.value();
-        let noise = &self.noise * noise_scale;
-        let mut step = kalman_update(&prior, &first.jacobian, &noise, &first.innovation)?;
-        let (nis, dof) = (step.nis, first.innovation.len());
+        let ahead = self.state.predicted(&self.config);
+        let before = ahead.soils();
+        let factor = self.config.noise_conditions.map_or(1.0, |c| c.factor(&conditions(buffer)));
+        let noise_scale = self.scale.value() * factor;
+        let unit = noise_scale.sqrt().recip();
+        let raw = self.linearise(model, buffer, &before)?;
+        let innovation = raw.innovation.iter().copied().collect();
+        let first = raw.scaled(unit);
+        let judged = ahead.step(&first, &before, &self.rest)?;
+        let (nis, dof) = (judged.nis, first.innovation.len());
+        let excitation = self.excitation(&first.jacobian)?;
         self.scale.observe(nis / dof as f64);
-        let shared = &noise * self.config.shared_buffers;
         let rejected = chi_square_tail(dof, nis) < self.config.gate_tail_probability;
-        if !rejected {
-            self.judge(model, buffer, noise_scale)?;
-            if self.config.shared_buffers > 1.0 {
-                step = kalman_update(&prior, &first.jacobian, &shared, &first.innovation)?;
-            }
-            let mut delta = self.held(before + step.change, buffer);
-            let mut last_move = step.change;
+        let excited = excitation >= self.config.excitation_min;
+        if !rejected && excited {
+            self.judge(model, buffer, unit, &judged)?;
+            let tail = if self.config.tail_dof > 0.0 { (self.config.tail_dof + nis) / (self.config.tail_dof + dof as f64) } else { 1.0 };
+            let noise = &self.rest * (self.config.shared_buffers * tail.max(1.0));
+            let mut linear = first;
+            let mut step = ahead.step(&linear, &before, &noise)?;
+            let mut delta = self.held(ahead.moved_soils(&step), buffer);
+            let mut last_move = &delta - before;
             for _ in 1..self.config.linearisations {
-                if (0..SOIL_DIM).all(|i| last_move[i].abs() < CONVERGED_SHARE * self.config.prior_sd[i]) {
+                if last_move.iter().enumerate().all(|(i, v)| v.abs() < CONVERGED_SHARE * self.config.prior_sd[i % SOIL_DIM]) {
                     break;
                 }
-                let again = self.linearise(model, buffer, &self.corrected_by(&delta))?;
-                let innovation = &again.innovation - &again.jacobian * (before - delta);
-                step = kalman_update(&prior, &again.jacobian, &shared, &innovation)?;
-                let next = self.held(before + step.change, buffer);
-                last_move = next - delta;
+                linear = self.linearise(model, buffer, &delta)?.scaled(unit);
+                step = ahead.step(&linear, &delta, &noise)?;
+                let next = self.held(ahead.moved_soils(&step), buffer);
+                last_move = &next - &delta;
                 delta = next;
             }
-            self.delta = delta;
-            self.covariance = step.covariance;
-            self.trust.remember(self.delta);
+            self.state = ahead.after(&step, &linear, &noise, &delta);
+            self.trust.remember(delta);
         }
-        let innovation = first.innovation.iter().copied().collect();
+        let log_likelihood = -0.5 * (nis + judged.log_det + dof as f64 * noise_scale.ln());
         let trust = self.trust.weight();
-        Ok(SoilUpdate { posterior: self.posterior(), innovation, nis, dof, rejected, trust, noise_scale })
+        Ok(SoilUpdate {
+            posterior: self.posterior(),
+            innovation,
+            nis,
+            dof,
+            rejected,
+            excited,
+            excitation,
+            log_likelihood,
+            trust,
+            noise_scale,
+        })
     }
 
-    /// Lets a buffer say whether an earlier correction predicts it better than the prior alone. Both start from the same transitions: what the network says
-    /// along the rollout stays as it is.
-    fn judge(&mut self, model: &StepModel, buffer: &[BufferedTransition], noise_scale: f64) -> Result<(), AdaptationError> {
+    /// max_i P₀_ii (Hᵀ R_B⁻¹ H)_ii: what a buffer could tell of the parameter that it tells most of, in units of what the prior tells.
+    fn excitation(&self, jacobian: &DMatrix<f64>) -> Result<f64, AdaptationError> {
+        let rows = self.noise.nrows();
+        let factor = self.noise.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
+        let weighed = factor.solve(jacobian);
+        let told = |i: usize| self.config.prior_sd[i % SOIL_DIM].powi(2) * jacobian.column(i).dot(&weighed.column(i));
+        Ok((0..jacobian.ncols()).map(told).fold(0.0, f64::max))
+    }
+
+    /// Lets a buffer say whether what was learned predicts it better than the prior alone. Both start from the same transitions: what the network says
+    /// along the rollout stays as it is. Where errors carry on, both follow them and their predictive likelihoods are compared; else an earlier
+    /// correction is compared with none.
+    fn judge(&mut self, model: &StepModel, buffer: &[BufferedTransition], unit: f64, judged: &KalmanStep) -> Result<(), AdaptationError> {
+        if self.config.trust_memory == 0.0 {
+            return Ok(());
+        }
+        let none = DVector::zeros(SOIL_DIM * self.config.classes);
+        if self.config.shared_error.is_some() {
+            let at_prior = self.linearise(model, buffer, &none)?.scaled(unit);
+            let ahead = self.plain.predicted_without_soil(&self.config);
+            let step = ahead.step(&at_prior, &none, &self.rest)?;
+            self.trust.vote(0.5 * (step.nis + step.log_det - judged.nis - judged.log_det));
+            self.plain = ahead.after(&step, &at_prior, &self.rest, &none);
+            return Ok(());
+        }
         let Some(candidate) = self.trust.candidate() else { return Ok(()) };
         let rows = self.noise.nrows();
         let factor = self.noise.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
-        let squared = |correction: &SoilCorrection| -> Result<f64, AdaptationError> {
-            let innovation = self.linearise(model, buffer, correction)?.innovation;
+        let squared = |correction: &DVector<f64>| -> Result<f64, AdaptationError> {
+            let innovation = self.linearise(model, buffer, correction)?.scaled(unit).innovation;
             Ok(innovation.dot(&factor.solve(&innovation)))
         };
-        let (without, with) = (squared(&SoilCorrection::NONE)?, squared(&self.corrected_by(&candidate))?);
-        self.trust.vote(0.5 * (without - with) / (noise_scale * self.config.shared_buffers));
+        let (without, with) = (squared(&none)?, squared(&candidate)?);
+        self.trust.vote(0.5 * (without - with) / self.config.shared_buffers);
         Ok(())
     }
 
     /// Y - Ŷ and H of a buffer at one correction.
-    fn linearise(
-        &self,
-        model: &StepModel,
-        buffer: &[BufferedTransition],
-        correction: &SoilCorrection,
-    ) -> Result<Linearisation, AdaptationError> {
-        linearise(self.config.innovation, self.config.block, model, buffer, correction)
+    fn linearise(&self, model: &StepModel, buffer: &[BufferedTransition], at: &DVector<f64>) -> Result<Linearisation, AdaptationError> {
+        linearise(&self.config, model, buffer, at)
     }
 
-    /// P⁻ = P⁺ + Q_B; with `bounded`, no variance above that of P₀. Rows and columns are scaled together, so correlations stay.
-    fn inflated(&self) -> SoilMatrix {
-        let prior = self.covariance + diagonal(&self.config.process_sd);
+    /// The corrections, with `bounded` moved to where at least one transition of the buffer on that class is not clipped beyond its bound.
+    fn held(&self, mut soils: DVector<f64>, buffer: &[BufferedTransition]) -> DVector<f64> {
         if !self.config.bounded {
-            return prior;
-        }
-        let scale: [f64; SOIL_DIM] = core::array::from_fn(|i| (self.config.prior_sd[i] / prior[(i, i)].sqrt()).min(1.0));
-        SoilMatrix::from_fn(|r, c| prior[(r, c)] * scale[r] * scale[c])
-    }
-
-    /// The correction, with `bounded` moved to where at least one transition of the buffer is not clipped beyond its bound.
-    fn held(&self, delta: SoilVector, buffer: &[BufferedTransition]) -> SoilVector {
-        if !self.config.bounded {
-            return delta;
+            return soils;
         }
         let [low, high] = [SOIL_BOUNDS.map(|b| b.0), SOIL_BOUNDS.map(|b| b.1)];
         let coordinates = self.config.coordinates;
-        let mut reach = [[f64::INFINITY; SOIL_DIM], [f64::NEG_INFINITY; SOIL_DIM]];
-        for transition in buffer {
-            let prior = transition.input.soil.to_array();
-            let (down, up) = (coordinates.between(&prior, &low), coordinates.between(&prior, &high));
+        for class in classes_in(buffer, self.config.classes) {
+            let mut reach = [[f64::INFINITY; SOIL_DIM], [f64::NEG_INFINITY; SOIL_DIM]];
+            for transition in buffer.iter().filter(|t| class_of(t, self.config.classes) == class) {
+                let prior = transition.input.soil.to_array();
+                let (down, up) = (coordinates.between(&prior, &low), coordinates.between(&prior, &high));
+                for i in 0..SOIL_DIM {
+                    reach[0][i] = reach[0][i].min(down[i]);
+                    reach[1][i] = reach[1][i].max(up[i]);
+                }
+            }
             for i in 0..SOIL_DIM {
-                reach[0][i] = reach[0][i].min(down[i]);
-                reach[1][i] = reach[1][i].max(up[i]);
+                let at = SOIL_DIM * class + i;
+                soils[at] = soils[at].max(reach[0][i]).min(reach[1][i]);
             }
         }
-        SoilVector::from_fn(|i, _| delta[i].max(reach[0][i]).min(reach[1][i]))
+        soils
     }
 }
 
-/// Y - Ŷ and H of a buffer at one correction.
-struct Linearisation {
-    innovation: DVector<f64>,
-    jacobian: DMatrix<f64>,
+/// Class of a transition; those that the filter does not keep apart are the first.
+fn class_of(transition: &BufferedTransition, classes: usize) -> usize {
+    if transition.ground_class < classes { transition.ground_class } else { 0 }
+}
+
+/// Classes that occur in a buffer, ascending.
+fn classes_in(buffer: &[BufferedTransition], classes: usize) -> Vec<usize> {
+    (0..classes).filter(|class| buffer.iter().any(|t| class_of(t, classes) == *class)).collect()
 }
 
 fn linearise(
-    kind: Innovation,
-    block: usize,
+    config: &FilterConfig,
     model: &StepModel,
     buffer: &[BufferedTransition],
-    correction: &SoilCorrection,
+    at: &DVector<f64>,
 ) -> Result<Linearisation, AdaptationError> {
+    let (block, classes) = (config.block, config.classes);
     let rows = buffer.len() / block * VELOCITY_DIM;
-    let (mut innovation, mut jacobian) = (DVector::zeros(rows), DMatrix::zeros(rows, SOIL_DIM));
-    let predictions = match kind {
-        Innovation::OneStep => buffer.iter().map(|transition| predict_velocity(model, transition, correction)).collect(),
-        Innovation::Rollout => predict_velocities(model, buffer, correction),
-    };
+    let (mut innovation, mut jacobian) = (DVector::zeros(rows), DMatrix::zeros(rows, SOIL_DIM * classes));
+    let correction = |t: &BufferedTransition| correction_of(at, class_of(t, classes), config);
     let share = 1.0 / block as f64;
-    for (index, (transition, predicted)) in buffer.iter().zip(predictions).enumerate() {
-        if !predicted.velocity.iter().chain(predicted.jacobian.as_flattened()).all(|v| v.is_finite()) {
-            return Err(AdaptationError::NotFinite { what: "prediction", index });
-        }
-        for c in 0..VELOCITY_DIM {
-            let row = index / block * VELOCITY_DIM + c;
-            innovation[row] += share * (transition.measured_next[c] - predicted.velocity[c]);
-            for i in 0..SOIL_DIM {
-                jacobian[(row, i)] += share * predicted.jacobian[c][i];
+    for (pass, class) in classes_in(buffer, classes).into_iter().enumerate() {
+        let varies = |t: &BufferedTransition| class_of(t, classes) == class;
+        let predictions = match config.innovation {
+            Innovation::OneStep => {
+                buffer.iter().flat_map(|t| predict_along(model, std::slice::from_ref(t), &correction, &varies)).collect()
+            }
+            Innovation::Rollout => predict_along(model, buffer, &correction, &varies),
+        };
+        for (index, (transition, predicted)) in buffer.iter().zip(predictions).enumerate() {
+            if !predicted.velocity.iter().chain(predicted.jacobian.as_flattened()).all(|v| v.is_finite()) {
+                return Err(AdaptationError::NotFinite { what: "prediction", index });
+            }
+            for c in 0..VELOCITY_DIM {
+                let row = index / block * VELOCITY_DIM + c;
+                if pass == 0 {
+                    innovation[row] += share * (transition.measured_next[c] - predicted.velocity[c]);
+                }
+                for i in 0..SOIL_DIM {
+                    jacobian[(row, SOIL_DIM * class + i)] += share * predicted.jacobian[c][i];
+                }
             }
         }
     }
@@ -287,12 +358,9 @@ fn linearise(
 /// # Errors
 /// `NotFinite` when a prediction is not a number.
 pub fn uncorrected(config: &FilterConfig, model: &StepModel, buffer: &[BufferedTransition]) -> Result<UncorrectedBuffer, AdaptationError> {
-    let at_prior = linearise(config.innovation, config.block, model, buffer, &SoilCorrection::NONE)?;
-    Ok(UncorrectedBuffer { innovation: at_prior.innovation, jacobian: at_prior.jacobian })
-}
-
-fn diagonal(sd: &[f64; SOIL_DIM]) -> SoilMatrix {
-    SoilMatrix::from_diagonal(&SVector::from_fn(|i, _| sd[i] * sd[i]))
+    let one = FilterConfig { classes: 1, class_share: 0.0, ..config.clone() };
+    let at_prior = linearise(&one, model, buffer, &DVector::zeros(SOIL_DIM))?;
+    Ok(UncorrectedBuffer { innovation: at_prior.innovation, jacobian: at_prior.jacobian, conditions: conditions(buffer) })
 }
 
 /// Names the part of a transition that is not finite.

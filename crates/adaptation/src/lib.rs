@@ -16,9 +16,11 @@
 
 mod calibration;
 mod chi_square;
+mod conditions;
 mod config;
 mod error;
 mod filter;
+mod joint;
 mod noise;
 mod prediction;
 mod settings;
@@ -27,10 +29,11 @@ mod update;
 
 pub use calibration::{NoiseCalibration, UncorrectedBuffer, calibrate};
 pub use chi_square::chi_square_tail;
+pub use conditions::{CONDITIONS, NoiseConditions, conditions};
 pub use config::{FilterConfig, Innovation};
 pub use error::AdaptationError;
-pub use filter::{FilterSnapshot, SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
-pub use noise::{BufferNoise, ChannelNoise, VelocityNoise};
+pub use filter::{ClassBelief, FilterSnapshot, JointSnapshot, SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
+pub use noise::{BufferNoise, ChannelNoise, SharedError, VelocityNoise};
 pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocities, predict_velocity};
 pub use settings::{CalibratedFilter, Coordinates, FilterSettings};
 pub use update::{KalmanStep, kalman_update};

@@ -38,6 +38,38 @@ pub enum BufferNoise {
     Sampled(DMatrix<f64>),
 }
 
+/// The part of R_B that is the same error of the model from buffer to buffer, E[e_k e_{k+l}ᵀ] = a^l B: a first-order autoregressive state beside the soil.
+#[derive(Clone, Debug, PartialEq)]
+pub struct SharedError {
+    /// B, row by row as R_B; R_B - B must be a covariance.
+    pub covariance: DMatrix<f64>,
+    /// a, correlation from one buffer to the next, -.
+    pub correlation: f64,
+}
+
+impl SharedError {
+    /// R_B - B, what single buffers err by.
+    pub(crate) fn rest(&self, noise: &DMatrix<f64>) -> DMatrix<f64> {
+        noise - &self.covariance
+    }
+
+    /// Refuses what leaves no noise to single buffers.
+    pub(crate) fn check(&self, noise: &DMatrix<f64>) -> Result<(), AdaptationError> {
+        let fail = |reason: String| Err(AdaptationError::Config { setting: "shared_error", reason });
+        if self.covariance.shape() != noise.shape() {
+            return fail(format!("has {} rows, R_B has {}", self.covariance.nrows(), noise.nrows()));
+        }
+        if !(0.0..1.0).contains(&self.correlation) {
+            return fail(format!("has a correlation of {}, it must lie in [0, 1)", self.correlation));
+        }
+        let finite = self.covariance.iter().all(|v| v.is_finite());
+        if !finite || self.rest(noise).cholesky().is_none() {
+            return fail("is not a part of R_B that leaves a positive definite rest".into());
+        }
+        Ok(())
+    }
+}
+
 impl From<VelocityNoise> for BufferNoise {
     fn from(noise: VelocityNoise) -> Self {
         Self::Channels(noise)
@@ -46,7 +78,7 @@ impl From<VelocityNoise> for BufferNoise {
 
 impl BufferNoise {
     /// R_B of a buffer of `steps` transitions, averaged over blocks, row 6 k + c for channel c of block k.
-    pub(crate) fn covariance(&self, steps: usize, block: usize) -> DMatrix<f64> {
+    pub fn covariance(&self, steps: usize, block: usize) -> DMatrix<f64> {
         let noise = match self {
             Self::Sampled(moment) => return moment.clone(),
             Self::Channels(noise) => noise.covariance(steps),

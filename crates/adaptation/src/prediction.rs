@@ -23,13 +23,15 @@ pub struct BufferedTransition {
     pub residual: [f64; STATE_DIM],
     /// Measured y_{k+1} = [v, ω] in Body, m/s and rad/s.
     pub measured_next: [f64; VELOCITY_DIM],
+    /// Class of the ground by its look; 0 = not told. Each class has a correction of its own, see [`crate::FilterConfig::classes`].
+    pub ground_class: usize,
 }
 
 impl BufferedTransition {
     /// A transition that ended in a measured state.
     pub fn new(input: StepInput<f64>, residual: [f64; STATE_DIM], end: &VehicleState<f64>) -> Self {
         let ([vx, vy, vz], [wx, wy, wz]) = (end.velocity_m_s, end.angular_velocity_rad_s);
-        Self { input, residual, measured_next: [vx, vy, vz, wx, wy, wz] }
+        Self { input, residual, measured_next: [vx, vy, vz, wx, wy, wz], ground_class: 0 }
     }
 }
 
@@ -45,7 +47,7 @@ pub struct VelocityPrediction {
 /// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
 pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
     let start = transition.input.state.to_array().map(SoilDual::constant);
-    prediction_of(&next_state(model, transition, &start, correction))
+    prediction_of(&next_state(model, transition, &start, correction, true))
 }
 
 /// The same after every transition of a buffer, each starting where the prediction before it ended; only the first starts from a
@@ -54,12 +56,23 @@ pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, corr
 /// A wrong soil shows as what it does to a rollout, a speed or a turn that is too fast or too slow, and the noise of the measured states
 /// enters once instead of at every step, where it looks like slip.
 pub fn predict_velocities(model: &StepModel, buffer: &[BufferedTransition], correction: &SoilCorrection) -> Vec<VelocityPrediction> {
+    predict_along(model, buffer, &|_| *correction, &|_| true)
+}
+
+/// The same where the correction differs from class to class of the ground. Derivatives are those with respect to the corrections of the transitions for which
+/// `varies` is true.
+pub(crate) fn predict_along(
+    model: &StepModel,
+    buffer: &[BufferedTransition],
+    correction: &dyn Fn(&BufferedTransition) -> SoilCorrection,
+    varies: &dyn Fn(&BufferedTransition) -> bool,
+) -> Vec<VelocityPrediction> {
     let Some(first) = buffer.first() else { return Vec::new() };
     let mut state = first.input.state.to_array().map(SoilDual::constant);
     buffer
         .iter()
         .map(|transition| {
-            state = next_state(model, transition, &state, correction);
+            state = next_state(model, transition, &state, &correction(transition), varies(transition));
             prediction_of(&state)
         })
         .collect()
@@ -71,8 +84,10 @@ fn next_state(
     transition: &BufferedTransition,
     state: &[SoilDual; STATE_DIM],
     correction: &SoilCorrection,
+    varies: bool,
 ) -> [SoilDual; STATE_DIM] {
-    let delta: [SoilDual; SOIL_DIM] = core::array::from_fn(|i| SoilDual::variable(correction.delta[i], i));
+    let delta: [SoilDual; SOIL_DIM] =
+        core::array::from_fn(|i| if varies { SoilDual::variable(correction.delta[i], i) } else { SoilDual::constant(correction.delta[i]) });
     let soil = correction.coordinates.correct(&transition.input.soil.to_array(), &delta);
     let input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
     let increment = model.step(&input).increment.to_array();

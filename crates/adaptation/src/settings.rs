@@ -5,9 +5,10 @@ use nesam_physics::{SOIL_DIM, SoilCoordinates};
 use serde::{Deserialize, Serialize};
 
 use crate::calibration::NoiseCalibration;
+use crate::conditions::NoiseConditions;
 use crate::config::{FilterConfig, Innovation};
 use crate::error::AdaptationError;
-use crate::noise::{BufferNoise, ChannelNoise, VelocityNoise};
+use crate::noise::{BufferNoise, ChannelNoise, SharedError, VelocityNoise};
 use crate::prediction::VELOCITY_DIM;
 
 /// Settings of the soil filter; what is absent in a file stays as it is by default. See `FilterConfig` for what each does.
@@ -35,6 +36,27 @@ pub struct FilterSettings {
     /// R_B of buffers as they were measured, row by row; goes before `noise`.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise_covariance: Option<Vec<Vec<f64>>>,
+    /// How R_B grows with what the vehicle does.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub noise_conditions: Option<NoiseConditions>,
+    /// The part of R_B that carries on from buffer to buffer, row by row; an empty list = none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub shared_error_covariance: Option<Vec<Vec<f64>>>,
+    /// Its correlation from one buffer to the next.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub shared_error_correlation: Option<f64>,
+    /// Degrees of freedom of Student's t, 0 = normal.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub tail_dof: Option<f64>,
+    /// Least share of the prior information that a buffer must add.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub excitation_min: Option<f64>,
+    /// Classes of ground with a correction of their own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub classes: Option<usize>,
+    /// Share of the prior that each has for itself.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub class_share: Option<f64>,
     /// Buffers that say no more than one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shared_buffers: Option<f64>,
@@ -88,7 +110,7 @@ impl FilterSettings {
         };
         let (noise, noise_covariance) = match &config.noise {
             BufferNoise::Channels(noise) => (Some(noise.channels), None),
-            BufferNoise::Sampled(moment) => (None, Some(moment.row_iter().map(|row| row.iter().copied().collect()).collect())),
+            BufferNoise::Sampled(moment) => (None, Some(rows_of(moment))),
         };
         Self {
             buffer: Some(config.buffer),
@@ -98,6 +120,13 @@ impl FilterSettings {
             prior_sd: Some(config.prior_sd),
             process_sd: Some(config.process_sd),
             noise_covariance,
+            noise_conditions: config.noise_conditions,
+            shared_error_covariance: config.shared_error.as_ref().map(|s| rows_of(&s.covariance)),
+            shared_error_correlation: config.shared_error.as_ref().map(|s| s.correlation),
+            tail_dof: Some(config.tail_dof),
+            excitation_min: Some(config.excitation_min),
+            classes: Some(config.classes),
+            class_share: Some(config.class_share),
             shared_buffers: Some(config.shared_buffers),
             scale_memory: Some(config.scale_memory),
             trust_memory: Some(config.trust_memory),
@@ -123,13 +152,23 @@ impl FilterSettings {
             Some(Coordinates::Logarithmic) => SoilCoordinates::Logarithmic,
         };
         let noise = match (&self.noise_covariance, self.noise) {
-            (Some(rows), _) => {
-                BufferNoise::Sampled(DMatrix::from_fn(rows.len(), rows.len(), |r, c| rows[r].get(c).copied().unwrap_or(f64::NAN)))
-            }
+            (Some(rows), _) => BufferNoise::Sampled(matrix_of(rows)),
             (None, Some(channels)) => BufferNoise::Channels(VelocityNoise { channels }),
             (None, None) => base.noise,
         };
+        let shared_error = match (&self.shared_error_covariance, self.shared_error_correlation) {
+            (Some(rows), _) if rows.is_empty() => None,
+            (Some(rows), correlation) => Some(SharedError { covariance: matrix_of(rows), correlation: correlation.unwrap_or(f64::NAN) }),
+            (None, Some(correlation)) => base.shared_error.map(|s| SharedError { correlation, ..s }),
+            (None, None) => base.shared_error,
+        };
         FilterConfig {
+            noise_conditions: self.noise_conditions.or(base.noise_conditions),
+            shared_error,
+            tail_dof: self.tail_dof.unwrap_or(base.tail_dof),
+            excitation_min: self.excitation_min.unwrap_or(base.excitation_min),
+            classes: self.classes.unwrap_or(base.classes),
+            class_share: self.class_share.unwrap_or(base.class_share),
             buffer: self.buffer.unwrap_or(base.buffer),
             block: self.block.unwrap_or(base.block),
             coordinates,
@@ -146,6 +185,15 @@ impl FilterSettings {
             bounded: self.bounded.unwrap_or(base.bounded),
         }
     }
+}
+
+fn rows_of(matrix: &DMatrix<f64>) -> Vec<Vec<f64>> {
+    matrix.row_iter().map(|row| row.iter().copied().collect()).collect()
+}
+
+/// A square matrix; what is missing is not a number and refused later.
+fn matrix_of(rows: &[Vec<f64>]) -> DMatrix<f64> {
+    DMatrix::from_fn(rows.len(), rows.len(), |r, c| rows[r].get(c).copied().unwrap_or(f64::NAN))
 }
 
 /// Schema of [`CalibratedFilter`].
@@ -167,17 +215,30 @@ pub struct CalibratedFilter {
 }
 
 impl CalibratedFilter {
-    /// What was estimated and the shape of the buffers it was estimated for; other settings stay defaults and are not written down.
-    pub fn new(found: &NoiseCalibration, shape: &FilterConfig, drives: usize, data_hash: &str) -> Self {
-        let all = FilterSettings::of(&FilterConfig { noise: found.noise.clone(), ..shape.clone() });
+    /// What was estimated, the shape of the buffers it was estimated for, and the settings that were `given`; all others stay defaults and are not written
+    /// down. What carries on from buffer to buffer is a state of its own, unless an empty `shared_error_covariance` was given: then repeated evidence
+    /// is counted less.
+    pub fn new(found: &NoiseCalibration, given: &FilterSettings, drives: usize, data_hash: &str) -> Self {
+        let counted_less = given.shared_error_covariance.as_ref().is_some_and(Vec::is_empty);
+        let config = FilterConfig {
+            noise: found.noise.clone(),
+            noise_conditions: found.conditions,
+            shared_error: (!counted_less).then(|| found.shared_error.clone()),
+            shared_buffers: if counted_less { found.shared_buffers } else { 1.0 },
+            ..given.over_defaults(false)
+        };
+        let all = FilterSettings::of(&config);
         let settings = FilterSettings {
             buffer: all.buffer,
             block: all.block,
             innovation: all.innovation,
             noise: all.noise,
             noise_covariance: all.noise_covariance,
-            shared_buffers: Some(found.shared_buffers),
-            ..FilterSettings::default()
+            noise_conditions: all.noise_conditions,
+            shared_error_covariance: all.shared_error_covariance,
+            shared_error_correlation: all.shared_error_correlation,
+            shared_buffers: all.shared_buffers,
+            ..given.clone()
         };
         Self { schema: SCHEMA.into(), settings, drives, buffers: found.buffers, data_hash: data_hash.into() }
     }
@@ -221,9 +282,18 @@ mod tests {
         assert_eq!(some, FilterConfig { buffer: 20, ..FilterConfig::default() });
         let sampled = FilterConfig { noise: BufferNoise::Sampled(DMatrix::identity(12, 12)), ..FilterConfig::default() };
         assert_eq!(FilterSettings::of(&sampled).over(FilterConfig::literal()), sampled);
-        let found = NoiseCalibration { noise: sampled.noise.clone(), shared_buffers: sampled.shared_buffers, buffers: 700 };
-        let carried = CalibratedFilter::new(&found, &sampled, 30, "hash");
-        assert_eq!(CalibratedFilter::from_json(&carried.to_json()).unwrap().config(), sampled);
+        let shared_error = SharedError { covariance: DMatrix::identity(12, 12) * 0.2, correlation: 0.6 };
+        let conditions = Some(NoiseConditions { mean: [1.0; 4], slope: [0.1; 4] });
+        let sampled =
+            FilterConfig { shared_error: Some(shared_error.clone()), noise_conditions: conditions, shared_buffers: 1.0, ..sampled };
+        assert_eq!(FilterSettings::of(&sampled).over(FilterConfig::literal()), sampled);
+        let found = NoiseCalibration { noise: sampled.noise.clone(), shared_buffers: 4.0, shared_error, conditions, buffers: 700 };
+        let given = FilterSettings { trust_memory: Some(7.0), ..FilterSettings::default() };
+        let carried = CalibratedFilter::new(&found, &given, 30, "hash");
+        assert_eq!(CalibratedFilter::from_json(&carried.to_json()).unwrap().config(), FilterConfig { trust_memory: 7.0, ..sampled });
+        let counted_less = FilterSettings { shared_error_covariance: Some(Vec::new()), ..FilterSettings::default() };
+        let config = CalibratedFilter::new(&found, &counted_less, 30, "hash").config();
+        assert_eq!((config.shared_error, config.shared_buffers), (None, 4.0));
         let error = FilterSettings::from_json(r#"{"bufer": 20}"#).unwrap_err().to_string();
         assert!(error.contains("bufer"), "{error}");
     }

@@ -2,19 +2,18 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::SVector;
-use nesam_physics::SOIL_DIM;
+use nalgebra::DVector;
 
 /// Buffers between a correction and the buffer that judges it: predictions reach about three buffers ahead, onto ground that taught nothing yet.
 const LEAD: usize = 2;
+/// Corrections that are kept to be judged.
+pub(crate) const JUDGED: usize = LEAD + 1;
 /// What one buffer may say for or against a correction, in units of log odds; a wild buffer says no more.
 const VOTE_MAX: f64 = 2.0;
 /// NIS over its degrees of freedom beyond which a buffer says no more of the scale.
 const RATIO_MAX: f64 = 10.0;
 /// Bounds of the scale of R_B.
 const SCALE: (f64, f64) = (0.5, 30.0);
-
-type SoilVector = SVector<f64, SOIL_DIM>;
 
 /// Scale of R_B on this drive. R_B comes from ground that the model was trained for; elsewhere the model errs more, and a filter that does not know takes
 /// the rest for soil. Covariance matching: the scale follows the mean of NIS over its degrees of freedom. Each NIS is judged with the scale of the
@@ -55,7 +54,7 @@ pub(crate) struct Trust {
     memory: f64,
     prior_log_odds: f64,
     log_odds: f64,
-    corrections: VecDeque<SoilVector>,
+    corrections: VecDeque<DVector<f64>>,
 }
 
 impl Trust {
@@ -70,8 +69,8 @@ impl Trust {
     }
 
     /// The correction that the present buffer judges; `None` as long as there is none that old.
-    pub(crate) fn candidate(&self) -> Option<SoilVector> {
-        if self.memory > 0.0 && self.corrections.len() > LEAD { self.corrections.front().copied() } else { None }
+    pub(crate) fn candidate(&self) -> Option<DVector<f64>> {
+        if self.memory > 0.0 && self.corrections.len() > LEAD { self.corrections.front().cloned() } else { None }
     }
 
     /// Takes the log likelihood of a buffer with [`Trust::candidate`] over that without it.
@@ -83,20 +82,20 @@ impl Trust {
     }
 
     /// Log odds and the corrections that later buffers judge, oldest first.
-    pub(crate) fn state(&self) -> (f64, &VecDeque<SoilVector>) {
+    pub(crate) fn state(&self) -> (f64, &VecDeque<DVector<f64>>) {
         (self.log_odds, &self.corrections)
     }
 
     /// Puts both where a snapshot had them.
-    pub(crate) fn restore(&mut self, log_odds: f64, corrections: VecDeque<SoilVector>) {
+    pub(crate) fn restore(&mut self, log_odds: f64, corrections: VecDeque<DVector<f64>>) {
         (self.log_odds, self.corrections) = (log_odds, corrections);
     }
 
     /// Remembers the correction after a buffer.
-    pub(crate) fn remember(&mut self, correction: SoilVector) {
+    pub(crate) fn remember(&mut self, correction: DVector<f64>) {
         if self.memory > 0.0 {
             self.corrections.push_back(correction);
-            while self.corrections.len() > LEAD + 1 {
+            while self.corrections.len() > JUDGED {
                 self.corrections.pop_front();
             }
         }
@@ -126,7 +125,7 @@ mod tests {
         let mut trust = Trust::new(10.0, 0.0);
         for k in 1..=4 {
             assert_eq!(trust.candidate().map(|c| c[0]), (k > 3).then_some(1.0), "{k}");
-            trust.remember(SoilVector::repeat(f64::from(k)));
+            trust.remember(DVector::repeat(6, f64::from(k)));
         }
     }
 

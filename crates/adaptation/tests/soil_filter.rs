@@ -1,125 +1,18 @@
 //! Goal: the filter is Algorithm 1, finds the soil that it should find, is honest about how well, and is undisturbed by bad input.
 //! Method: twin drives by the same physics on another soil with seeded sensor noise; closed forms; finite differences.
 
+mod common;
+
+use common::{LOAM, NOISE, SOFT, config, model, run, twin};
 use nalgebra::{DMatrix, DVector};
 use nesam_adaptation::{
-    AdaptationError, BufferNoise, BufferedTransition, FilterConfig, Innovation, SoilFilter, SoilUpdate, UncorrectedBuffer, VELOCITY_DIM,
+    AdaptationError, BufferNoise, BufferedTransition, FilterConfig, Innovation, SharedError, SoilFilter, UncorrectedBuffer, VELOCITY_DIM,
     VelocityNoise, calibrate, chi_square_tail, predict_velocity,
 };
-use nesam_physics::driveline::{DrivelineState, command_wheels};
-use nesam_physics::step::{Ground, StepInput, StepModel};
-use nesam_physics::{
-    Control, DT_S, Driveline, SOIL_BOUNDS, SOIL_DIM, SecondCommand, Soil, SoilCoordinates, SoilCorrection, SteeringTable, Vehicle,
-    VehicleState,
-};
+use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCoordinates, SoilCorrection};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
-
-const LOAM: [f64; SOIL_DIM] = [1.5e6, 5.0e3, 0.75, 1.7e3, 0.5, 0.025];
-const SOFT: [f64; SOIL_DIM] = [0.7e6, 4.0e3, 0.9, 1.1e3, 0.42, 0.033];
-const NOISE: [f64; 2] = [0.02, 0.005];
-
-fn truck() -> Vehicle {
-    Vehicle {
-        name: "truck".into(),
-        mass_kg: 2493.56,
-        inertia_kg_m2: [[1445.1, 0.0, -23.6], [0.0, 4121.7, 0.0], [-23.6, 0.0, 5026.4]],
-        inertia_estimated: false,
-        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1155], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
-        wheel_radius_m: 0.467,
-        wheel_width_m: 0.254,
-        suspension_n_m: [107e3, 107e3, 236e3, 236e3],
-        suspension_n_s_m: [14.4e3, 14.4e3, 22.4e3, 22.4e3],
-        second: SecondCommand::SteeringNormalised,
-        command_range: [[-2.0, 12.0], [-1.0, 1.0]],
-        steering: Some(SteeringTable { command: vec![-1.0, 1.0], front_left_rad: vec![-0.37, 0.37], front_right_rad: vec![-0.37, 0.37] }),
-        track_m: 1.83,
-        wheelbase_m: 3.2977,
-        driveline: Driveline {
-            steering_lag_s: 0.08,
-            steering_rate_limit_per_s: 3.0,
-            speed_gain: 0.15,
-            speed_integral_gain_per_s: 0.0,
-            speed_integral_leak_s: 2.0,
-            speed_integral_limit_m: 2.0,
-            overspeed_limit_m_s: 0.8,
-            rims: Default::default(),
-            side_coupling_n_m_s: 0.0,
-        },
-        gravity_m_s2: 9.81,
-        effects: Default::default(),
-    }
-}
-
-/// Transitions of a drive on `true_soil` over waves of ground, as seen by a model that believes in `prior`. The start of each transition is
-/// known exactly, the velocities after it are measured with the noise that the filter is told.
-fn twin(model: &StepModel, true_soil: [f64; SOIL_DIM], prior: [f64; SOIL_DIM], steps: usize, seed: u64) -> Vec<BufferedTransition> {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    let mut state = VehicleState::zero();
-    state.position_m[2] = 0.6;
-    state.velocity_m_s[0] = 2.0;
-    let mut actuators = DrivelineState::default();
-    let mut transitions = Vec::new();
-    for k in 0..steps + 10 {
-        let t = k as f64 * DT_S;
-        let control = Control { speed_m_s: 2.5 + 1.2 * (1.1 * t).sin(), second: 0.8 * (0.7 * t + seed as f64).sin() };
-        let after = actuators.advance(model.vehicle(), &control, state.velocity_m_s[0], DT_S);
-        let slope = 0.12 * (0.25 * t).sin();
-        let input = StepInput {
-            state,
-            wheels: command_wheels(model.vehicle(), &actuators, &after, &control),
-            sinkage_log_ratio: [0.0; 4],
-            soil: Soil::from_array(true_soil),
-            // A slope that turns with the vehicle: the ground passes under the reference point.
-            ground: model.wheel_offsets_heading(state.attitude_rad[0], state.attitude_rad[1]).map(|offset| Ground {
-                height_m: slope * offset[0],
-                slope_ahead: slope,
-                slope_left: 0.0,
-            }),
-        };
-        let increment = model.step(&input).increment;
-        let (x, dx) = (state.to_array(), increment.to_array());
-        state = VehicleState::from_array(core::array::from_fn(|i| x[i] + dx[i]));
-        actuators = after;
-        if k < 10 {
-            continue; // settling
-        }
-        let next = state.to_array();
-        let mut noisy = |c: usize| {
-            let unit: f64 = StandardNormal.sample(&mut rng);
-            next[6 + c] + NOISE[c / 3] * unit
-        };
-        let measured_next = core::array::from_fn(&mut noisy);
-        transitions.push(BufferedTransition {
-            input: StepInput { soil: Soil::from_array(prior), ..input },
-            residual: [0.0; 12],
-            measured_next,
-        });
-    }
-    transitions
-}
-
-fn config(coordinates: SoilCoordinates) -> FilterConfig {
-    let base = match coordinates {
-        SoilCoordinates::Physical => FilterConfig::literal(),
-        SoilCoordinates::Logarithmic => FilterConfig::default(),
-    };
-    let noise = VelocityNoise::white(NOISE[0], NOISE[1]).into();
-    let one_step = Innovation::OneStep;
-    let plain = FilterConfig { scale_memory: 0.0, trust_memory: 0.0, shared_buffers: 1.0, ..base };
-    FilterConfig { noise, process_sd: [0.0; 6], gate_tail_probability: 0.0, innovation: one_step, block: 1, ..plain }
-}
-
-fn run(config: FilterConfig, model: &StepModel, transitions: &[BufferedTransition]) -> (SoilFilter, Vec<SoilUpdate>) {
-    let mut filter = SoilFilter::new(config).unwrap();
-    let updates = transitions.iter().filter_map(|t| filter.push(model, *t).unwrap()).collect();
-    (filter, updates)
-}
-
-fn model() -> StepModel {
-    StepModel::new(&truck(), DT_S, 2)
-}
 
 #[test]
 fn analytic_jacobian_equals_finite_differences() {
@@ -352,6 +245,12 @@ fn property_unusable_settings_are_refused_by_name() {
     assert_eq!(refused(FilterConfig { trust_log_odds: f64::NAN, ..base() }), "trust_log_odds");
     assert_eq!(refused(FilterConfig { linearisations: 0, ..base() }), "linearisations");
     assert_eq!(refused(FilterConfig { noise: VelocityNoise::white(0.0, 0.1).into(), ..base() }), "noise");
+    assert_eq!(refused(FilterConfig { classes: 0, ..base() }), "classes");
+    assert_eq!(refused(FilterConfig { class_share: 1.5, ..base() }), "class_share");
+    assert_eq!(refused(FilterConfig { tail_dof: -1.0, ..base() }), "tail_dof");
+    assert_eq!(refused(FilterConfig { excitation_min: f64::NAN, ..base() }), "excitation_min");
+    let all_of_it = SharedError { covariance: DMatrix::identity(12, 12), correlation: 0.5 };
+    assert_eq!(refused(FilterConfig { shared_error: Some(all_of_it), ..base() }), "shared_error");
 }
 
 #[test]
@@ -449,23 +348,29 @@ fn property_noise_and_shared_evidence_are_found_again() {
                     .map(|_| {
                         let common = if by_drive { carried } else { 0.2 * normal() };
                         let innovation = DVector::from_fn(12, |_, _| common + 0.1 * normal());
-                        UncorrectedBuffer { innovation, jacobian: DMatrix::from_element(12, SOIL_DIM, 1.0) }
+                        UncorrectedBuffer { innovation, jacobian: DMatrix::from_element(12, SOIL_DIM, 1.0), conditions: [0.0; 4] }
                     })
                     .collect()
             })
             .collect()
     };
     let (apart, shared) = (drives(false), drives(true));
-    for (found, wanted) in [(calibrate(&apart, &[1.0; 6]).unwrap(), 1.0), (calibrate(&shared, &[1.0; 6]).unwrap(), 20.0)] {
+    for (found, wanted) in [(calibrate(&apart, &[1.0; 6], false).unwrap(), 1.0), (calibrate(&shared, &[1.0; 6], false).unwrap(), 20.0)] {
         let BufferNoise::Sampled(moment) = &found.noise else { panic!("{found:?}") };
         assert!((moment[(0, 0)] - 0.05).abs() < 8e-3 && (moment[(3, 8)] - 0.04).abs() < 8e-3, "{moment}");
         assert!((found.shared_buffers / wanted - 1.0).abs() < 0.2, "{} {wanted}", found.shared_buffers);
+        // The same as a state: all of the common 0.04, up to the 0.9 that a direction may lose, or none.
+        let SharedError { covariance, correlation } = &found.shared_error;
+        assert!(
+            if wanted > 1.0 { covariance[(0, 5)] > 0.033 && *correlation > 0.9 } else { (covariance[(0, 5)] * correlation).abs() < 3e-3 },
+            "{covariance} {correlation}"
+        );
         assert_eq!(found.buffers, 6000);
     }
-    let noise = calibrate(&apart, &[1.0; 6]).unwrap().noise;
+    let noise = calibrate(&apart, &[1.0; 6], false).unwrap().noise;
     assert!(SoilFilter::new(FilterConfig { noise: noise.clone(), buffer: 10, block: 5, ..FilterConfig::default() }).is_ok());
     let misfit = SoilFilter::new(FilterConfig { noise, buffer: 20, block: 5, ..FilterConfig::default() });
     assert!(matches!(misfit, Err(AdaptationError::Config { setting: "noise", .. })), "{misfit:?}");
-    let few = calibrate(&apart[..5], &[1.0; 6]);
+    let few = calibrate(&apart[..5], &[1.0; 6], false);
     assert_eq!(few, Err(AdaptationError::TooFewBuffers { found: 100, needed: 120 }));
 }

@@ -325,7 +325,9 @@ impl Engine {
             variant: Variant::Full,
             wheels: None,
         };
-        let (rollout, risk) = self.predictor.rollout_with(&asked, &RolloutExtras { soils: &soils, risk: query.extras.risk })?;
+        let learned = session.soil_field(map);
+        let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk };
+        let (rollout, risk) = self.predictor.rollout_with(&asked, &asked_extras)?;
         let mut extras = ExtraOutputs {
             soil_groups: soils.len().max(1),
             risk: risk.map(|risk| forward.split_risk(risk, horizon)),

@@ -43,7 +43,7 @@ pub use handle::{Answer, EngineHandle, Submission};
 pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
-pub use nesam_adaptation::FilterSnapshot;
+pub use nesam_adaptation::{FilterSnapshot, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
 pub use session::{Observed, Session, SessionImage, SoilEstimate, SoilState, TrackImage};

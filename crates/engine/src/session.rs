@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use nesam_adaptation::SoilFilter;
 use nesam_fleet_soil::FleetPrior;
-use nesam_model::{HistoryStep, Predictor};
+use nesam_model::{HistoryStep, Predictor, SoilByClass};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 
@@ -354,6 +354,11 @@ impl Session {
     /// What was learned of the soil.
     pub fn soil(&self) -> &SoilEstimate {
         &self.soil
+    }
+
+    /// The soil that predictions meet on a map: every class of ground as far as it was learned.
+    pub(crate) fn soil_field(&self, map: Option<&Arc<WorldMap>>) -> SoilByClass {
+        self.learner.field(map)
     }
 
     /// Time since the newest step of the history arrived, s; `None` before the first.

@@ -7,7 +7,7 @@ use nesam_adaptation::{
     AdaptationError, BufferedTransition, FilterConfig, Innovation, NoiseCalibration, SoilFilter, SoilPosterior, SoilUpdate,
     UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
 };
-use nesam_model::{HistoryStep, Predictor};
+use nesam_model::{HistoryStep, Predictor, SoilByClass, SoilField, Transition};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -26,6 +26,10 @@ pub struct TimedUpdate {
     pub prior: [f64; SOIL_DIM],
     /// The update.
     pub update: SoilUpdate,
+    /// Class of the ground under that sample: 0 = not known, i + 1 = class i of the map.
+    pub class: usize,
+    /// Corrections of all classes from then on.
+    pub corrections: Vec<SoilCorrection>,
 }
 
 impl TimedUpdate {
@@ -57,9 +61,15 @@ impl DriveAdaptation {
         known.checked_sub(1).map_or(1.0, |last| self.updates[last].update.noise_scale)
     }
 
-    /// The correction that a prediction from `sample` applies.
+    /// The correction that a prediction from `sample` applies where the vehicle was then.
     pub fn correction_at(&self, sample: usize) -> SoilCorrection {
         self.at(sample).map_or(SoilCorrection::NONE, |posterior| posterior.correction)
+    }
+
+    /// The corrections that a prediction from `sample` applies along its way.
+    pub fn soil_at(&self, sample: usize, map: Option<&Arc<WorldMap>>) -> SoilByClass {
+        let known = self.updates.partition_point(|u| u.sample <= sample);
+        SoilByClass::new(map, known.checked_sub(1).map_or(Vec::new(), |last| self.updates[last].corrections.clone()))
     }
 }
 
@@ -142,14 +152,16 @@ pub fn adapt_drive(
     let steps = history_steps(drive);
     let mut start = 0;
     while start + config.buffer < steps.len() {
-        let correction = filter.estimate();
-        let buffer = buffer_at(predictor, &steps, start, config, map, &correction);
+        let soil = SoilByClass::new(Some(map), filter.estimates());
+        let buffer = buffer_at(predictor, &steps, start, config, map, &soil);
         start += config.buffer;
         for transition in buffer.into_iter().flatten() {
             match filter.push(predictor.step_model(), transition) {
                 Ok(None) => {}
                 Ok(Some(update)) => {
-                    out.updates.push(TimedUpdate { sample: start, prior: transition.input.soil.to_array(), update });
+                    let corrections = filter.posteriors().iter().map(|p| p.correction).collect();
+                    let (prior, class) = (transition.input.soil.to_array(), transition.ground_class);
+                    out.updates.push(TimedUpdate { sample: start, prior, update, class, corrections });
                 }
                 Err(AdaptationError::NotFinite { .. } | AdaptationError::SingularInnovation { .. }) => {
                     filter.clear_buffer();
@@ -170,12 +182,17 @@ fn buffer_at(
     start: usize,
     config: &FilterConfig,
     map: &Arc<WorldMap>,
-    correction: &SoilCorrection,
+    soil: &dyn SoilField,
 ) -> Option<Vec<BufferedTransition>> {
-    let along = (config.innovation == Innovation::Rollout).then_some(correction);
+    let along = (config.innovation == Innovation::Rollout).then_some(soil);
     let transitions = predictor.measured_transitions(steps, start..start + config.buffer, along, map)?;
     let both = transitions.into_iter().zip(&steps[start + 1..]);
-    Some(both.map(|(t, end)| BufferedTransition::new(t.input, t.residual, &end.state)).collect())
+    let seen = |(t, end): (Transition, &HistoryStep)| {
+        let [x, y, _] = t.input.state.position_m;
+        let ground_class = SoilByClass::class_at(Some(map), [x, y]);
+        BufferedTransition { ground_class, ..BufferedTransition::new(t.input, t.residual, &end.state) }
+    };
+    Some(both.map(seen).collect())
 }
 
 /// What these drives, on ground that the model was trained for, say of the filter's noise.
@@ -187,6 +204,7 @@ pub fn calibrate_noise(
     drives: &[Trajectory],
     maps: &DriveMaps,
     config: &FilterConfig,
+    by_conditions: bool,
 ) -> Result<NoiseCalibration, EvaluationError> {
     config.check()?;
     let of_drive = |(drive, map): (&Trajectory, &Option<Arc<WorldMap>>)| -> Vec<UncorrectedBuffer> {
@@ -197,5 +215,5 @@ pub fn calibrate_noise(
         buffers.filter_map(|buffer| uncorrected(config, predictor.step_model(), &buffer).ok()).collect()
     };
     let buffers: Vec<Vec<UncorrectedBuffer>> = drives.par_iter().zip(maps).map(of_drive).collect();
-    Ok(calibrate(&buffers, &config.prior_sd)?)
+    Ok(calibrate(&buffers, &config.prior_sd, by_conditions)?)
 }

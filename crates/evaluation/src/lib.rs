@@ -38,12 +38,15 @@ mod predictors;
 pub mod report;
 mod score;
 mod slices;
+mod soil_ceiling;
 #[cfg(test)]
 mod test_vehicle;
+mod true_soil;
+mod twin;
 mod windows;
 
 pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, calibrate_noise};
-pub use adapt_output::Adaptation;
+pub use adapt_output::{Adaptation, Part, Row};
 pub use baselines::Baselines;
 pub use bootstrap::{DEFAULT_RESAMPLES, Resamples, median, quantile_sorted};
 pub use constant_velocity::constant_velocity;
@@ -59,7 +62,10 @@ pub use kinematic::{KINEMATIC_PARAMETERS, Kinematic};
 pub use models::ModelName;
 pub use output::{Evaluation, Provenance};
 pub use predictions::write_predictions;
-pub use predictors::{Inputs, WindowPredictor, roll_out};
+pub use predictors::{Inputs, WindowPredictor, roll_out, roll_out_on};
 pub use score::{ErrorSummary, ErrorTree, PATH_FLOOR_M, PerDimension, PositionError, paired_difference, paired_ratio, summarise, values};
 pub use slices::{Slice, slices};
+pub use soil_ceiling::{BestCorrection, best_correction};
+pub use true_soil::TrueSoil;
+pub use twin::{TwinPlan, TwinReport, run_twins, run_twins_against};
 pub use windows::{Truth, Window, all_windows, history_steps};

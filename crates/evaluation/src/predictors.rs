@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nesam_model::{HistoryStep, MeasuredWheels, Predictor, RolloutQuery, Variant};
+use nesam_model::{HistoryStep, MeasuredWheels, Predictor, RolloutQuery, SoilField, Variant};
 use nesam_physics::{SecondCommand, SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
@@ -54,6 +54,13 @@ pub enum WindowPredictor {
         /// What the filter made of each drive, in the order of the drives.
         filtered: Arc<Vec<DriveAdaptation>>,
     },
+    /// The bundle's model on a soil that is given for each drive: what a perfect filter would know.
+    OnSoil {
+        /// Loaded bundle.
+        predictor: Arc<Predictor>,
+        /// Soil of each drive, in the order of the drives.
+        soils: Arc<Vec<Arc<dyn SoilField>>>,
+    },
     /// The kinematic baseline with its fit.
     Kinematic {
         /// Fitted parameters.
@@ -101,7 +108,9 @@ impl WindowPredictor {
     /// Number of fitted or learned parameters.
     pub fn parameters(&self) -> usize {
         match self {
-            Self::Nesam { predictor, .. } | Self::Adapted { predictor, .. } => predictor.bundle().parameters,
+            Self::Nesam { predictor, .. } | Self::Adapted { predictor, .. } | Self::OnSoil { predictor, .. } => {
+                predictor.bundle().parameters
+            }
             Self::Kinematic { .. } => KINEMATIC_PARAMETERS,
             Self::ConstantVelocity => 0,
         }
@@ -124,8 +133,11 @@ impl WindowPredictor {
                 return roll_out(predictor, *variant, SoilCorrection::NONE, window, wheels.as_deref(), map);
             }
             Self::Adapted { predictor, filtered } => {
-                let correction = filtered[window.drive].correction_at(window.start);
-                return roll_out(predictor, Variant::Full, correction, window, None, map);
+                let soil = filtered[window.drive].soil_at(window.start, map);
+                return roll_out_on(predictor, Variant::Full, &soil, window, None, map);
+            }
+            Self::OnSoil { predictor, soils } => {
+                return roll_out_on(predictor, Variant::Full, soils[window.drive].as_ref(), window, None, map);
             }
             Self::Kinematic { model, vehicle } => {
                 let past = &drive.controls[window.first_history..window.start];
@@ -149,6 +161,21 @@ pub fn roll_out(
     wheels: Option<&[MeasuredWheels]>,
     map: Option<&Arc<WorldMap>>,
 ) -> Result<PosePath, EvaluationError> {
+    roll_out_on(predictor, variant, &soil_correction, window, wheels, map)
+}
+
+/// The same on a soil that may differ from place to place.
+///
+/// # Errors
+/// As [`roll_out`].
+pub fn roll_out_on(
+    predictor: &Predictor,
+    variant: Variant,
+    soil: &dyn SoilField,
+    window: &Window<'_>,
+    wheels: Option<&[MeasuredWheels]>,
+    map: Option<&Arc<WorldMap>>,
+) -> Result<PosePath, EvaluationError> {
     let drive = window.trajectory;
     let history = window.history();
     let future = &drive.controls[window.start..window.start + window.horizon];
@@ -160,12 +187,15 @@ pub fn roll_out(
         samples: 1,
         horizon: window.horizon,
         map,
-        soil_correction,
+        soil_correction: SoilCorrection::NONE,
         variant,
         wheels,
     };
-    let rollout =
-        predictor.rollout(&query).map_err(|source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source })?;
+    let rollout = predictor.rollout_on(&query, soil).map_err(|source| EvaluationError::Model {
+        trajectory: drive.id.clone(),
+        start: window.start,
+        source,
+    })?;
     let poses = (0..window.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
     Ok(PosePath { poses, predicts: [true; POSE_DIM] })
 }

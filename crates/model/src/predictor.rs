@@ -18,6 +18,7 @@ use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
 use crate::ground::{GroundSource, history_actuators};
 use crate::rollout::{HistoryStep, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
+use crate::soil_field::SoilField;
 use crate::soil_prior::SoilPrior;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
 use crate::symbolic::symbolic_step;
@@ -92,24 +93,31 @@ struct StepRow {
 /// Everything of a query that is the same for all samples.
 struct Scene<'a> {
     query: &'a RolloutQuery<'a>,
+    soil: &'a dyn SoilField,
     ground: GroundSource<'a>,
     prefix: Prefix,
     datum_m: f64,
     variant: Variant,
-    /// Soil correction of each group of samples.
-    soils: &'a [SoilCorrection],
     risk: bool,
+}
+
+/// A correction for each group of `samples` rows.
+#[derive(Debug)]
+struct SoilPerGroup<'a> {
+    soils: &'a [SoilCorrection],
+    samples: usize,
+}
+
+impl SoilField for SoilPerGroup<'_> {
+    fn soil(&self, row: usize, _position_m: [f64; 2], prior: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
+        self.soils[row / self.samples].apply(prior)
+    }
 }
 
 impl Scene<'_> {
     /// Command of a row in step `k`: every group of samples has the same.
     fn control(&self, row: usize, k: usize) -> Control<f64> {
         control(self.query, row % self.query.samples, k)
-    }
-
-    /// Soil of a row where the terrain says this.
-    fn soil(&self, row: usize, token: &TerrainToken) -> [f64; SOIL_DIM] {
-        self.soils[row / self.query.samples].apply(&from_raw(&raw_soil(token)))
     }
 }
 
@@ -174,6 +182,14 @@ impl Predictor {
         self.rollout_with(query, &RolloutExtras::default()).map(|(rollout, _)| rollout)
     }
 
+    /// The same on a soil that may differ from place to place and from sample to sample; the correction of the query stands aside.
+    ///
+    /// # Errors
+    /// As [`Predictor::rollout`].
+    pub fn rollout_on(&self, query: &RolloutQuery<'_>, soil: &dyn SoilField) -> Result<Rollout, ModelError> {
+        self.rollout_with(query, &RolloutExtras { field: Some(soil), ..Default::default() }).map(|(rollout, _)| rollout)
+    }
+
     /// The same with what-if soils and, where they are asked for, risk outputs. States do not depend on whether risk is asked for, and a what-if soil
     /// that equals the query's correction gives the rollout of the query, both bit for bit.
     ///
@@ -191,9 +207,10 @@ impl Predictor {
             return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
         }
         let prefix = if variant.remembers() { self.prefix(history, &ground, tokens.as_deref()) } else { Prefix::default() };
-        let soils = if extras.soils.is_empty() { core::slice::from_ref(&query.soil_correction) } else { extras.soils };
-        let scene = Scene { query, ground, prefix, datum_m: query.start.position_m[2], variant, soils, risk: extras.risk };
-        let rows = soils.len() * query.samples;
+        let what_if = SoilPerGroup { soils: extras.soils, samples: query.samples };
+        let soil: &dyn SoilField = if extras.soils.is_empty() { extras.field.unwrap_or(&query.soil_correction) } else { &what_if };
+        let scene = Scene { query, soil, ground, prefix, datum_m: query.start.position_m[2], variant, risk: extras.risk };
+        let rows = extras.soils.len().max(1) * query.samples;
 
         // Without a history the actuators begin as a row's own first command says, so rows stay independent.
         let start = |row: usize| Sample {
@@ -220,7 +237,7 @@ impl Predictor {
             let poses: Vec<Pose2> = samples[..distinct].iter().map(|s| pose(&s.state)).collect();
             let terrain = self.terrain(tokens.as_deref(), &poses);
             if k == 0 {
-                rollout.soil = query.soil_correction.apply(&from_raw(&raw_soil(&terrain[0])));
+                rollout.soil = under(soil, 0, &samples[0], &terrain[0]);
             }
             let blocks: Vec<BlockOutput<'_>> = samples
                 .par_chunks_mut(LANES)
@@ -362,7 +379,7 @@ impl Predictor {
                     None => command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
                 };
                 let (ground, known) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
-                let soil = scene.soil(first + l, terrain[l]);
+                let soil = under(scene.soil, first + l, sample, terrain[l]);
                 let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                     Variant::ZeroSinkage => NO_SINKAGE,
                     _ => scales.sinkage_log_ratio_max * raw_sinkage[i][l].tanh(),
@@ -429,6 +446,11 @@ impl Predictor {
 
 fn pose(state: &VehicleState<f64>) -> Pose2 {
     Pose2 { x_m: state.position_m[0], y_m: state.position_m[1], yaw_rad: state.attitude_rad[2] }
+}
+
+/// Soil under a sample.
+fn under(field: &dyn SoilField, sample: usize, at: &Sample, token: &TerrainToken) -> [f64; SOIL_DIM] {
+    field.soil(sample, [at.state.position_m[0], at.state.position_m[1]], &from_raw(&raw_soil(token)))
 }
 
 fn raw_soil(token: &TerrainToken) -> [f32; SOIL_DIM] {

@@ -4,6 +4,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 use crate::dims::{CONTEXT, FEATURES};
+use crate::soil_field::SoilField;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
 use serde::{Deserialize, Serialize};
@@ -146,7 +147,9 @@ pub struct MeasuredWheels {
 /// What a rollout computes beyond its states. The default is nothing, and costs nothing.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct RolloutExtras<'a> {
-    /// What-if soils S: corrections in place of the query's, each for all N samples. The rollout then has S N rows, the samples of the first soil
+    /// Soil that may differ from place to place, in place of the query's correction.
+    pub field: Option<&'a dyn SoilField>,
+    /// What-if soils S: corrections in place of the query's and of the field, each for all N samples. The rollout then has S N rows, the samples of the first soil
     /// first. Empty = the query's own correction alone.
     pub soils: &'a [SoilCorrection],
     /// Whether to compute [`RiskOutputs`]; only forms with soil can.

@@ -189,11 +189,17 @@ impl WorldMap {
     /// The semantic class of the nearest cell, by the palette colour nearest to the cell's (images are not clean); `None` off the map, without a
     /// semantic layer or without a palette.
     pub fn soil_class(&self, x_m: f64, y_m: f64) -> Option<&SoilClassRange> {
+        self.soil_class_index(x_m, y_m).map(|index| &self.soil_classes[index])
+    }
+
+    /// The same as an index into [`WorldMap::soil_classes`].
+    pub fn soil_class_index(&self, x_m: f64, y_m: f64) -> Option<usize> {
         let colour = self.colour.as_ref().filter(|_| self.geometry.contains(x_m, y_m))?;
         let [column, row] = self.geometry.to_grid(x_m, y_m).map(|v| v.round().max(0.0) as usize);
         let [r, g, b, _] = colour[row * self.geometry.width + column].to_le_bytes();
         let distance = |p: [u8; 3]| (0..3).map(|i| (i32::from(p[i]) - i32::from([r, g, b][i])).pow(2)).sum::<i32>();
-        self.soil_classes.iter().filter(|c| c.colour.is_some()).min_by_key(|c| c.colour.map(distance))
+        let coloured = self.soil_classes.iter().enumerate().filter_map(|(index, class)| Some((index, distance(class.colour?))));
+        coloured.min_by_key(|(_, away)| *away).map(|(index, _)| index)
     }
 
     /// Elevation layer as given, row-major, row 0 in the south, NaN = hole, m.

@@ -1471,12 +1471,12 @@ pub struct MeasurementImage {
     #[prost(double, repeated, tag = "6")]
     pub road_wheel_angle_rad: ::prost::alloc::vec::Vec<f64>,
 }
-/// State of the soil filter between two buffers.
+/// State of the soil filter between two buffers. Mean and covariance are those of the corrections of all classes of ground, one after the other, and of the
+/// shared error where the filter follows one: shapes (n) and (n, n), row-major.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct FilterImage {
     #[prost(double, repeated, tag = "1")]
-    pub delta: ::prost::alloc::vec::Vec<f64>,
-    /// Shape (6, 6), row-major.
+    pub mean: ::prost::alloc::vec::Vec<f64>,
     #[prost(double, repeated, tag = "2")]
     pub covariance: ::prost::alloc::vec::Vec<f64>,
     /// Scale of R_B.
@@ -1484,9 +1484,17 @@ pub struct FilterImage {
     pub noise_scale: f64,
     #[prost(double, tag = "4")]
     pub trust_log_odds: f64,
-    /// Corrections that later buffers judge, shape (n, 6), oldest first.
+    /// Corrections that later buffers judge, shape (corrections, 6 classes), oldest first.
     #[prost(double, repeated, tag = "5")]
     pub trust_corrections: ::prost::alloc::vec::Vec<f64>,
+    /// The same as 1 and 2 with the soil known to be the prior.
+    #[prost(double, repeated, tag = "6")]
+    pub plain_mean: ::prost::alloc::vec::Vec<f64>,
+    #[prost(double, repeated, tag = "7")]
+    pub plain_covariance: ::prost::alloc::vec::Vec<f64>,
+    /// Class of the ground under the newest transition.
+    #[prost(uint32, tag = "8")]
+    pub ground_class: u32,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct OpenSessionRequest {

@@ -1,7 +1,7 @@
 //! Exported sessions: bytes with a version and a checksum.
 
 use nesam_engine::{
-    EngineError, FilterSnapshot, Measurement, SessionImage, SoilEstimate, SoilState, StepGrid, TrackImage, WheelMeasurement,
+    EngineError, FilterSnapshot, JointSnapshot, Measurement, SessionImage, SoilEstimate, SoilState, StepGrid, TrackImage, WheelMeasurement,
 };
 use nesam_model::HistoryStep;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCoordinates, SoilCorrection, VehicleState};
@@ -69,11 +69,14 @@ fn content(image: &SessionImage) -> pb::SessionContent {
         filter_steps: image.filter_steps.iter().map(step).collect(),
         filter_first: image.filter_first as u32,
         filter: Some(pb::FilterImage {
-            delta: image.filter.delta.to_vec(),
-            covariance: image.filter.covariance.as_flattened().to_vec(),
+            mean: image.filter.state.mean.clone(),
+            covariance: image.filter.state.covariance.clone(),
             noise_scale: image.filter.noise_scale,
             trust_log_odds: image.filter.trust_log_odds,
-            trust_corrections: image.filter.trust_corrections.as_flattened().to_vec(),
+            trust_corrections: image.filter.trust_corrections.clone(),
+            plain_mean: image.filter.plain.mean.clone(),
+            plain_covariance: image.filter.plain.covariance.clone(),
+            ground_class: image.filter.ground_class as u32,
         }),
         soil_epoch: image.soil.state.epoch,
         soil_stamp_ns: image.soil.state.stamp_ns,
@@ -133,11 +136,12 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
         filter_steps: content.filter_steps.iter().map(from_step).collect::<Result<_, _>>()?,
         filter_first: content.filter_first as usize,
         filter: FilterSnapshot {
-            delta: array(&filter.delta)?,
-            covariance: matrix(&filter.covariance)?,
+            state: JointSnapshot { mean: filter.mean.clone(), covariance: filter.covariance.clone() },
+            plain: JointSnapshot { mean: filter.plain_mean.clone(), covariance: filter.plain_covariance.clone() },
             noise_scale: filter.noise_scale,
             trust_log_odds: filter.trust_log_odds,
-            trust_corrections: filter.trust_corrections.chunks(SOIL_DIM).map(array).collect::<Result<_, _>>()?,
+            trust_corrections: filter.trust_corrections.clone(),
+            ground_class: filter.ground_class as usize,
         },
         soil: from_soil(content)?,
     })

@@ -148,7 +148,10 @@ pub fn candidates(session: &str, drive: &Trajectory, i: usize, samples: usize, h
 /// The soil correction that the filter of `nesam adapt` has learned from what is final when sample `i` is the newest, and the number of updates.
 pub fn learned(recorded: &Recorded, i: usize) -> (SoilCorrection, u64) {
     let carried = bundle().soil_filter_json.as_deref().map(|json| CalibratedFilter::from_json(json).unwrap().config());
-    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&recorded.world), &carried.unwrap_or_default()).unwrap();
+    // A map that was uploaded tells no classes of ground.
+    let world = &recorded.world;
+    let uploaded = WorldMap::from_layers(world.id(), 1, *world.geometry(), world.elevation_m(), world.semantic_rgb()).unwrap();
+    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&Arc::new(uploaded)), &carried.unwrap_or_default()).unwrap();
     let i = i.saturating_sub(OPEN_STEPS);
     let updates = filtered.updates.iter().filter(|u| u.sample <= i && !u.update.rejected).count();
     (filtered.correction_at(i), updates as u64)

@@ -1,20 +1,24 @@
 //! `nesam adapt`: what learning the soil while driving gains on recorded drives.
 
+mod alternatives;
+
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, Disguise, Inputs, ModelName, Resamples, Truth, WindowPredictor, adapt_all, all_windows, calibrate_noise,
-    path_median_m, predict_all, report, score,
+    Adaptation, DEFAULT_RESAMPLES, Disguise, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, ModelName, Resamples, Truth,
+    WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score,
 };
-use nesam_model::{MAX_HORIZON, ModelBundle};
+use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
 use nesam_terrain::WorldMap;
+use nesam_trajectories::Trajectory;
 
-use crate::args::{BundleArgs, DataArgs, WindowArgs};
+use self::alternatives::Scene;
+use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
@@ -41,9 +45,21 @@ pub struct AdaptArgs {
     /// for every new bundle
     #[arg(long, conflicts_with = "literal")]
     calibrate: bool,
+    /// With --calibrate: follow errors that carry on from buffer to buffer as a state, instead of counting repeated evidence less
+    #[arg(long, requires = "calibrate")]
+    follow_errors: bool,
     /// Repaint the map so that the ground is not what it looks like: judges adaptation on drives of the train split, where settings may be chosen
     #[arg(long, value_enum, value_name = "LOOK", conflicts_with = "calibrate")]
     disguise: Option<DisguiseArg>,
+    /// Further predictors in the same table
+    #[arg(long, value_enum, value_name = "NAME,…", value_delimiter = ',', conflicts_with = "calibrate")]
+    also: Vec<AlsoArg>,
+    /// Drives to score apart from the rest, e.g. those that no setting was chosen on
+    #[arg(long, value_name = "ID,…", value_delimiter = ',', conflicts_with = "calibrate")]
+    apart: Vec<String>,
+    /// A set on ground that is what it looks like: prints how much of the gap to it is closed
+    #[arg(long, value_name = "SET", conflicts_with = "calibrate")]
+    reference: Option<String>,
     /// Score against the noise-free channels, where a set has them
     #[arg(long, value_name = "CHANNELS", value_parser = ["measured", "gt"], default_value = "measured")]
     truth: String,
@@ -59,6 +75,22 @@ pub struct AdaptArgs {
     /// Write the HTML report here instead
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
+}
+
+/// Degrees of freedom of Student's t that a calibrated filter has (chosen on validation drives and o01-o06 of `ood_soil`).
+const TAIL_DOF: f64 = 4.0;
+
+/// What else is scored.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+pub(super) enum AlsoArg {
+    /// Algorithm 1 of the paper to the letter.
+    Literal,
+    /// The simulator's own soil in place of the prior (`oracle_soil`); only where a world states it.
+    OracleSoil,
+    /// The one correction of each drive that predicts the very windows best that it is scored on: a ceiling, takes a minute for ten drives.
+    BestConstant,
+    /// The same with a correction for each class of ground; takes minutes.
+    BestByClass,
 }
 
 /// How the ground is made to look.
@@ -88,7 +120,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
     let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
-    let filter = filter_of(args, predictor.bundle())?;
+    let filter = filter_in_force(&settings_file(args.filter.as_deref())?, args.literal, predictor.bundle())?;
     warn_about_velocities(&drives);
 
     let progress = Progress::start("drives filtered", drives.drives.len());
@@ -96,11 +128,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     progress.finish();
     let filtered = Arc::new(filtered);
     let models = [
-        (
-            ModelName::Nesam,
-            WindowPredictor::new(ModelName::Nesam, Some(&predictor), &Arc::new(drives.root.vehicle().clone()), None, Inputs::Commands)
-                .or_input()?,
-        ),
+        (ModelName::Nesam, WindowPredictor::Nesam { predictor: Arc::clone(&predictor), variant: Variant::Full, inputs: Inputs::Commands }),
         (ModelName::Nesam, WindowPredictor::Adapted { predictor: Arc::clone(&predictor), filtered: Arc::clone(&filtered) }),
     ];
     let progress = Progress::start("windows predicted", windows.len());
@@ -108,6 +136,10 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     progress.finish();
     let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed);
     let [fixed, adapted] = [0, 1].map(|i| score(&paths[i], &windows, truth, &resamples));
+    let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth, resamples: &resamples };
+    let others = args.also.iter().map(|also| scene.row(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
+    let apart = apart(&drives.drives, &args.apart)?;
+    let reference = args.reference.as_deref().map(|set| Ok((set, reference(args, set, &predictor)?))).transpose()?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let adaptation = Adaptation {
         set: &drives.set,
@@ -116,9 +148,14 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         dt_s: args.data.dt,
         path_m_median: path_median_m(&windows, truth),
         truth,
+        starts_s: &windows.iter().map(nesam_evaluation::Window::start_time_s).collect::<Vec<_>>(),
+        maps: &drives.maps,
         drives: &drives.drives,
         fixed: &fixed,
         adapted: &adapted,
+        others: &others,
+        apart: &apart,
+        reference: reference.as_ref().map(|(set, summary)| (*set, summary)),
         filtered: &filtered,
         filter: &filter,
         seed: args.seed,
@@ -134,10 +171,29 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     Ok(())
 }
 
+/// Indices of the drives that are to be scored apart.
+fn apart(drives: &[Trajectory], ids: &[String]) -> Result<Vec<usize>, Failure> {
+    let place = |id: &String| {
+        drives.iter().position(|d| d.id == *id).ok_or_else(|| Failure::input(format!("--apart {id}: not among the drives that are scored")))
+    };
+    ids.iter().map(place).collect()
+}
+
+/// What the model scores with its soil prior on another set.
+fn reference(args: &AdaptArgs, set: &str, predictor: &Arc<Predictor>) -> Result<ErrorSummary, Failure> {
+    let data = DataArgs { set: Some(set.into()), trajectories: None, split: SplitArg::All, ..args.data.clone() };
+    let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
+    let drives = read_drives(&data, truth == Truth::Gt)?;
+    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
+    let none = Arc::new(vec![DriveAdaptation::default(); drives.drives.len()]);
+    let model = [(ModelName::Nesam, WindowPredictor::Adapted { predictor: Arc::clone(predictor), filtered: none })];
+    let paths = predict_all(&model, &windows, &drives.maps, &|_| {}).or_failed()?;
+    Ok(score(&paths[0], &windows, truth, &Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed)).summary)
+}
+
 /// Settings in force: those given, over those that the bundle carries, over the defaults. `--literal` takes nothing from the bundle.
-fn filter_of(args: &AdaptArgs, bundle: &ModelBundle) -> Result<FilterConfig, Failure> {
-    let given = settings(args)?;
-    if args.literal {
+pub(super) fn filter_in_force(given: &FilterSettings, literal: bool, bundle: &ModelBundle) -> Result<FilterConfig, Failure> {
+    if literal {
         return Ok(given.over_defaults(true));
     }
     match &bundle.soil_filter_json {
@@ -176,24 +232,31 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let drives = validation_drives(&args.data, "--calibrate", "the noise is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
-    let config = settings(args)?.over_defaults(false);
-    let found = calibrate_noise(&predictor, &drives.drives, &drives.maps, &config).or_input()?;
-    let calibrated = CalibratedFilter::new(&found, &config, drives.drives.len(), &drives.root.hash());
+    let mut given = settings_file(args.filter.as_deref())?;
+    given.tail_dof.get_or_insert(TAIL_DOF);
+    if !args.follow_errors {
+        given.shared_error_covariance = Some(Vec::new());
+    }
+    let config = given.over_defaults(false);
+    let found = calibrate_noise(&predictor, &drives.drives, &drives.maps, &config, true).or_input()?;
+    let calibrated = CalibratedFilter::new(&found, &given, drives.drives.len(), &drives.root.hash());
     bundle.soil_filter_json = Some(calibrated.to_json());
     bundle.save(&dir).or_failed()?;
     say!(
-        "bundle {} now carries the noise of {} buffers of {} drives, {:.1} of which say no more than one; its hash is {}",
+        "bundle {} now carries the noise of {} buffers of {} drives, {:.1} of which say no more than one (or: correlated by {:.2}); its hash is {}",
         bundle.name,
         found.buffers,
         drives.drives.len(),
         found.shared_buffers,
+        found.shared_error.correlation,
         &bundle.hash[..12]
     );
     Ok(())
 }
 
-fn settings(args: &AdaptArgs) -> Result<FilterSettings, Failure> {
-    let Some(file) = &args.filter else { return Ok(FilterSettings::default()) };
+/// Settings of a file, or none.
+pub(super) fn settings_file(file: Option<&Path>) -> Result<FilterSettings, Failure> {
+    let Some(file) = file else { return Ok(FilterSettings::default()) };
     let text = std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?;
     FilterSettings::from_json(&text).map_err(|e| Failure::input(format!("{}: {e}", file.display())))
 }
@@ -218,20 +281,22 @@ fn print_table(a: &Adaptation<'_>) {
         a.path_m_median,
         a.truth.as_str()
     );
-    let rows = [
-        ("fixed", a.fixed.summary.tree, a.fixed.summary.ci95),
-        ("adapted", a.adapted.summary.tree, a.adapted.summary.ci95),
-        ("adapted / fixed", a.ratio(), a.ratio_ci95()),
-    ];
-    for (title, last) in [("mean over the horizon", false), ("at the last step", true)] {
-        let head: String = ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>15}")).concat();
-        say!("\n{title:<22}{head}");
-        for (name, value, interval) in &rows {
-            let values = value.row(last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();
-            let between = |[low, high]: [f64; 2]| format!("{:>15}", format!("{low:.3}…{high:.3}"));
-            let intervals = interval.row(last).map(|ci| ci.map_or(format!("{:>15}", ""), between)).concat();
-            say!("{name:<22}{values}\n{:<22}{intervals}", "  95 %");
-        }
+    let scored = a.models().map(|(key, score)| (key.to_string(), score.summary.tree, Some(score.summary.ci95)));
+    let mut rows: Vec<_> = scored.chain([("adapted / fixed".to_string(), a.ratio(), Some(a.ratio_ci95()))]).collect();
+    if let Some((set, _)) = a.reference {
+        let closed = a.models().skip(1).filter_map(|(key, score)| Some((format!("gap closed, {key}"), a.closed(score)?, None)));
+        rows.extend(closed);
+        say!("gap = fixed here minus fixed on {set}");
+    }
+    for last in [false, true] {
+        say!("");
+        print_errors(if last { "at the last step" } else { "mean over the horizon" }, &rows, last);
+    }
+    for part in a.parts() {
+        let scored = a.models().map(|(key, _)| (key.to_string(), part.models[key].tree, Some(part.models[key].ci95)));
+        let rows: Vec<_> = scored.chain([("adapted / fixed".to_string(), part.ratio, Some(part.ratio_ci95))]).collect();
+        say!("\nonly {}", part.trajectories.join(", "));
+        print_errors("mean over the horizon", &rows, false);
     }
     let c = a.consistency();
     let number = |v: Option<f64>| v.map_or("–".into(), |v| format!("{v:.2}"));
@@ -245,6 +310,22 @@ fn print_table(a: &Adaptation<'_>) {
         number(c.inside_95)
     );
     print_soil(a);
+}
+
+/// A predictor, its errors and their intervals.
+type ErrorRow = (String, ErrorTree<f64>, Option<ErrorTree<[f64; 2]>>);
+
+fn print_errors(title: &str, rows: &[ErrorRow], last: bool) {
+    let head: String = ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>15}")).concat();
+    say!("{title:<26}{head}");
+    for (name, value, interval) in rows {
+        let values = value.row(last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();
+        say!("{name:<26}{values}");
+        let Some(interval) = interval else { continue };
+        let between = |[low, high]: [f64; 2]| format!("{:>15}", format!("{low:.3}…{high:.3}"));
+        let intervals = interval.row(last).map(|ci| ci.map_or(format!("{:>15}", ""), between)).concat();
+        say!("{:<26}{intervals}", "  95 %");
+    }
 }
 
 /// Soil at the end of each drive; what was not learned has no number.

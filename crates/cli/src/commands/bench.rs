@@ -1,4 +1,6 @@
-//! `nesam bench`: what answers cost on this machine.
+//! `nesam bench`: what answers cost on this machine, and whether the soil filter knows how wrong it is.
+
+mod consistency;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -30,6 +32,8 @@ pub struct BenchArgs {
 enum Bench {
     /// Time the queries of a sampling planner, in process and end to end
     Predict(PredictBench),
+    /// Simulate drives on known soils and hold what the soil filter says of its errors against them (NEES, NIS, coverage)
+    Consistency(consistency::ConsistencyBench),
 }
 
 #[derive(Args, Debug)]
@@ -66,6 +70,7 @@ const CHECKED_WINDOWS: usize = 24;
 pub fn run(args: &BenchArgs) -> Result<(), Failure> {
     match &args.what {
         Bench::Predict(args) => predict(args),
+        Bench::Consistency(args) => consistency::run(args),
     }
 }
 

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use nesam_adaptation::{BufferedTransition, FilterSnapshot, Innovation, SoilFilter, SoilUpdate};
+use nesam_adaptation::{BufferedTransition, ClassBelief, Innovation, SoilFilter, SoilUpdate};
 use nesam_fleet_soil::{FleetPrior, Increment, SoilBelief};
-use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_model::{HISTORY, HistoryStep, Predictor, SoilByClass, SoilField};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 
@@ -12,8 +12,6 @@ use crate::fleet::Brought;
 
 /// What the fleet may say at most on whether the correction helps, log odds: a vehicle that finds it wrong unlearns it within a few buffers. Chosen.
 const VOTES_MAX: f64 = 4.0;
-/// Corrections that the filter keeps to be judged; the prior of the fleet is judged from the first buffer on.
-const JUDGED: usize = 3;
 
 /// What was learned of the soil in this session.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -103,41 +101,39 @@ impl SoilLearner {
     /// The update of the full buffer and, where it was not refused, what it knows more than its prior.
     fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<(SoilUpdate, Option<Brought>)> {
         let (first, last) = (self.first, self.steps.len() - 1);
-        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| self.filter.estimate());
-        let transitions = predictor.measured_transitions(&self.steps, first..last, along.as_ref(), map)?;
-        let (before, predicted) = (self.filter.snapshot(), self.filter.predicted_covariance());
+        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| SoilByClass::new(Some(map), self.filter.estimates()));
+        let along = along.as_ref().map(|soil| soil as &dyn SoilField);
+        let transitions = predictor.measured_transitions(&self.steps, first..last, along, map)?;
+        let (predicted, log_odds) = (self.filter.predicted_beliefs(), self.filter.snapshot().trust_log_odds);
         let mut update = None;
         for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
-            let buffered = BufferedTransition::new(transition.input, transition.residual, &end.state);
+            let [x, y, _] = transition.input.state.position_m;
+            let ground_class = SoilByClass::class_at(Some(map), [x, y]);
+            let buffered =
+                BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end.state) };
             update = self.filter.push(predictor.step_model(), buffered).ok()?;
         }
         let update = update?;
         let [x, y, _] = self.steps[(first + last) / 2].state.position_m;
-        let increment = if update.rejected { None } else { self.increment(&before, predicted) };
+        let increment = if update.rejected { None } else { self.increment(&predicted, log_odds) };
         Some((update, increment.map(|increment| Brought { position_m: [x, y], increment })))
     }
 
-    /// What the last update knows more than its prior, and how it voted on whether the correction helps.
-    fn increment(&self, before: &FilterSnapshot, predicted: [[f64; SOIL_DIM]; SOIL_DIM]) -> Option<Increment> {
+    /// What the last update knows more than it was predicted, and how it voted on whether the correction helps.
+    fn increment(&self, predicted: &[ClassBelief], log_odds: f64) -> Option<Increment> {
         let (after, config) = (self.filter.snapshot(), self.filter.config());
         let kept = 1.0 - 1.0 / config.trust_memory.max(1.0);
-        let over = |snapshot: &FilterSnapshot| snapshot.trust_log_odds - config.trust_log_odds;
-        let vote = if config.trust_memory > 0.0 { over(&after) - kept * over(before) } else { 0.0 };
-        let prior = SoilBelief { delta: before.delta, covariance: predicted };
-        Increment::between(&prior, &SoilBelief { delta: after.delta, covariance: after.covariance }, vote).ok()
+        let over = |log_odds: f64| log_odds - config.trust_log_odds;
+        let vote = if config.trust_memory > 0.0 { over(after.trust_log_odds) - kept * over(log_odds) } else { 0.0 };
+        let prior = predicted.get(after.ground_class).or(predicted.first())?;
+        Increment::between(&soil_belief(prior), &soil_belief(&self.filter.belief()), vote).ok()
     }
 
     /// Begins from what the fleet knows. Says whether it does.
     pub(super) fn begin_from(&mut self, prior: &FleetPrior) -> bool {
-        let config = self.filter.config();
-        let snapshot = FilterSnapshot {
-            delta: prior.belief.delta,
-            covariance: prior.belief.covariance,
-            trust_log_odds: config.trust_log_odds + prior.votes.clamp(-VOTES_MAX, VOTES_MAX),
-            trust_corrections: vec![prior.belief.delta; JUDGED],
-            ..self.filter.snapshot()
-        };
-        self.filter.clone().restored(&snapshot).map(|filter| self.filter = filter).is_ok()
+        let belief = ClassBelief { delta: prior.belief.delta, covariance: prior.belief.covariance };
+        let log_odds = self.filter.config().trust_log_odds + prior.votes.clamp(-VOTES_MAX, VOTES_MAX);
+        self.filter.begun_from(&belief, log_odds).map(|filter| self.filter = filter).is_some()
     }
 
     /// P⁺ as the filter gives it out.
@@ -145,7 +141,12 @@ impl SoilLearner {
         self.filter.posterior().covariance
     }
 
-    /// What the filter says now.
+    /// The soil that predictions meet: the posterior of every class of ground that the map tells apart.
+    pub(super) fn field(&self, map: Option<&Arc<WorldMap>>) -> SoilByClass {
+        SoilByClass::new(map, self.filter.posteriors().iter().map(|p| p.correction).collect())
+    }
+
+    /// What the filter says now of the ground under the vehicle.
     pub(super) fn state(&self, epoch: u64, stamp_ns: Option<i64>) -> SoilState {
         let posterior = self.filter.posterior();
         SoilState {
@@ -156,4 +157,8 @@ impl SoilLearner {
             learned: posterior.learned,
         }
     }
+}
+
+fn soil_belief(belief: &ClassBelief) -> SoilBelief {
+    SoilBelief { delta: belief.delta, covariance: belief.covariance }
 }

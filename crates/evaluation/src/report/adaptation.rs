@@ -1,5 +1,6 @@
 //! The report of `nesam adapt`.
 
+use nesam_adaptation::{SoilUpdate, chi_square_tail};
 use nesam_physics::{SOIL_DIM, SOIL_LOGARITHMIC, SOIL_NAMES};
 
 use crate::adapt_output::Adaptation;
@@ -42,7 +43,15 @@ pub fn adaptation_page(adaptation: &Adaptation<'_>) -> String {
         share(c.nis_median_over_dof),
         share(c.inside_95),
     ));
-    page.plots(&[nis_plot(adaptation)], "NIS over degrees of freedom of every buffer; a consistent filter stays near 1.");
+    page.plots(
+        &[nis_plot(adaptation), trust_plot(adaptation), scale_plot(adaptation)],
+        "NIS over degrees of freedom of every buffer: a consistent filter stays near 1, and a buffer above the gate is rejected. Trust is the weight of the correction \
+         against the prior alone, noise the factor on R_B in force.",
+    );
+    page.section("Error over the drive").plots(
+        &over_time_plots(adaptation),
+        "Mean absolute error of the windows that start at a time, over all drives: what learning gains as it goes on.",
+    );
     page.section("Soil over time").plots(
         &soil_plots(adaptation),
         "Soil under the vehicle: the dashed line is the prior, the band one standard deviation of the posterior. Moduli, cohesion and shear modulus as \
@@ -75,7 +84,7 @@ fn error_table(a: &Adaptation<'_>, last: bool) -> Table {
         }));
         table.row(row);
     };
-    for (name, model) in [("fixed", a.fixed), ("adapted", a.adapted)] {
+    for (name, model) in a.models() {
         let (t, c) = (&model.summary.tree, &model.summary.ci95);
         if last {
             add(name, join(t.mae_final.to_array(), t.position_m.final_), intervals(&c.mae_final, c.position_m.final_));
@@ -108,20 +117,74 @@ fn horizon_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
     let plot = |(d, name, unit): (usize, &str, &str)| {
         let mut plot = LinePlot::new(name, "time ahead [s]", &format!("mean absolute error [{unit}]"));
         plot.from_zero = true;
-        plot.series = [line("fixed", 1, a.fixed, d), line("adapted", 2, a.adapted, d)].into_iter().flatten().collect();
+        plot.series = a.models().enumerate().filter_map(|(i, (name, model))| line(name, i + 1, model, d)).collect();
         plot
     };
     panels.into_iter().filter(|(d, _, _)| a.fixed.curves[*d].is_some()).map(plot).collect()
 }
 
 fn nis_plot(a: &Adaptation<'_>) -> LinePlot {
-    let mut plot = LinePlot::new("NIS over degrees of freedom", "time in the drive [s]", "NIS / dof [-]");
+    let mut plot = by_buffer(a, "NIS over degrees of freedom", "NIS / dof [-]", |u| u.nis / u.dof as f64);
+    if let Some(gate) = gate_over_dof(a) {
+        let end_s = plot.series.iter().flat_map(|s| &s.points).map(|p| p.0).fold(0.0, f64::max);
+        plot.series.push(Series::line("gate", 0, vec![(0.0, gate), (end_s, gate)]));
+    }
+    plot
+}
+
+/// Smallest NIS over degrees of freedom that the gate refuses; `None` without a gate.
+fn gate_over_dof(a: &Adaptation<'_>) -> Option<f64> {
+    let dof = a.filter.rows();
+    let share = Some(a.filter.gate_tail_probability).filter(|p| *p > 0.0)?;
+    let (mut low, mut high) = (0.0, 1000.0);
+    for _ in 0..60 {
+        let middle = 0.5 * (low + high);
+        if chi_square_tail(dof, middle * dof as f64) < share { high = middle } else { low = middle }
+    }
+    Some(high)
+}
+
+fn trust_plot(a: &Adaptation<'_>) -> LinePlot {
+    by_buffer(a, "trust in the correction", "weight [-]", |u| u.trust)
+}
+
+fn scale_plot(a: &Adaptation<'_>) -> LinePlot {
+    by_buffer(a, "noise", "factor on R_B [-]", |u| u.noise_scale)
+}
+
+fn by_buffer(a: &Adaptation<'_>, title: &str, label: &str, value: impl Fn(&SoilUpdate) -> f64) -> LinePlot {
+    let mut plot = LinePlot::new(title, "time in the drive [s]", label);
     plot.from_zero = true;
     for (drive, filtered) in a.filtered.iter().enumerate().take(DRIVES_PLOTTED) {
-        let points = filtered.updates.iter().map(|u| (a.time_s(drive, u.sample), u.update.nis / u.update.dof as f64)).collect();
+        let points = filtered.updates.iter().map(|u| (a.time_s(drive, u.sample), value(&u.update))).collect();
         plot.series.push(Series::line(&a.drives[drive].id, drive + 1, points));
     }
     plot
+}
+
+/// Error against the time at which the windows start, by step of five seconds.
+fn over_time_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
+    const EVERY_S: f64 = 5.0;
+    let panels = [(POSE_DIM, "horizontal position", "m"), (5, "yaw", "deg"), (2, "z", "m")];
+    let line = |name: &str, colour: usize, model: &ModelScore, d: usize| {
+        let mut bins: Vec<[f64; 2]> = Vec::new();
+        for (w, start_s) in a.starts_s.iter().enumerate().take(model.errors.windows()) {
+            let steps = model.errors.window(w);
+            let bin = (start_s / EVERY_S) as usize;
+            bins.resize(bins.len().max(bin + 1), [0.0; 2]);
+            bins[bin][0] += steps.iter().map(|s| if d < POSE_DIM { s.absolute[d] } else { s.position_m }).sum::<f64>() / steps.len() as f64;
+            bins[bin][1] += 1.0;
+        }
+        let point = |(bin, [sum, count]): (usize, &[f64; 2])| ((bin as f64 + 0.5) * EVERY_S, sum / count);
+        Series::line(name, colour, bins.iter().enumerate().filter(|(_, b)| b[1] > 0.0).map(point).collect())
+    };
+    let plot = |(d, name, unit): (usize, &str, &str)| {
+        let mut plot = LinePlot::new(name, "start of the window in the drive [s]", &format!("mean absolute error [{unit}]"));
+        plot.from_zero = true;
+        plot.series = a.models().enumerate().map(|(i, (name, model))| line(name, i + 1, model, d)).collect();
+        plot
+    };
+    panels.into_iter().filter(|(d, _, _)| a.fixed.curves[*d].is_some()).map(plot).collect()
 }
 
 fn soil_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {

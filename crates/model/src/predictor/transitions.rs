@@ -8,12 +8,13 @@ use nesam_physics::step::StepInput;
 use nesam_physics::{Control, STATE_DIM, Soil, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
 
-use super::{Predictor, Sample, pose, raw_soil};
+use super::{Predictor, Sample, pose, raw_soil, under};
 use crate::dims::{HIDDEN, HISTORY, STATE_CONTROL};
 use crate::fused::{BlockCache, LANES, Lane};
 use crate::ground::{GroundSource, history_actuators};
 use crate::rollout::HistoryStep;
 use crate::soil_coordinates::from_raw;
+use crate::soil_field::SoilField;
 use crate::terrain_tokens::TerrainToken;
 
 /// A measured transition, ready for the physics.
@@ -47,7 +48,7 @@ impl Predictor {
         one.into_iter().next().expect("one command makes one transition; this is a bug")
     }
 
-    /// The transitions of one rollout from a measured state under the commands that followed: network and ground at the *predicted* states, as a
+    /// The transitions of one rollout from a measured state under the commands that followed on a given soil: network and ground at the *predicted* states, as a
     /// prediction meets them. A filter that learns from them sees the errors that predictions have, not those of single steps.
     pub fn transitions_along(
         &self,
@@ -55,7 +56,7 @@ impl Predictor {
         start: &VehicleState<f64>,
         controls: &[Control<f64>],
         map: Option<&Arc<WorldMap>>,
-        correction: &SoilCorrection,
+        soil: &dyn SoilField,
     ) -> Vec<Transition> {
         let scales = &self.bundle.normalization;
         let tokens = map.map(|map| self.tokens_of(map));
@@ -82,7 +83,7 @@ impl Predictor {
             if transitions.len() == controls.len() {
                 break; // nothing starts from the end of the last one
             }
-            let soil = correction.apply(&transition.input.soil.to_array());
+            let soil = under(soil, 0, &sample, &token);
             let moved = self.model.step(&StepInput { soil: Soil::from_array(soil), ..transition.input }).increment.to_array();
             let total = core::array::from_fn(|i| moved[i] + transition.residual[i]);
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
@@ -90,20 +91,20 @@ impl Predictor {
         transitions
     }
 
-    /// The transitions that start at `steps[range]`, as the soil filter takes them into one buffer: along one rollout with the correction `along`, or each
+    /// The transitions that start at `steps[range]`, as the soil filter takes them into one buffer: along one rollout on the soil `along`, or each
     /// from its own measured state. `None` when a wheel stands off the map, where the slope of the ground is a guess.
     pub fn measured_transitions(
         &self,
         steps: &[HistoryStep],
         range: Range<usize>,
-        along: Option<&SoilCorrection>,
+        along: Option<&dyn SoilField>,
         map: &Arc<WorldMap>,
     ) -> Option<Vec<Transition>> {
         let transitions: Vec<Transition> = match along {
             None => range.map(|k| self.transition(&steps[..k], &steps[k].state, &steps[k].control, Some(map))).collect(),
-            Some(correction) => {
+            Some(soil) => {
                 let controls: Vec<Control<f64>> = steps[range.clone()].iter().map(|step| step.control).collect();
-                self.transitions_along(&steps[..range.start], &steps[range.start].state, &controls, Some(map), correction)
+                self.transitions_along(&steps[..range.start], &steps[range.start].state, &controls, Some(map), soil)
             }
         };
         transitions.iter().all(|t| t.ground_known).then_some(transitions)
