@@ -122,8 +122,8 @@ pub enum Reply {
     Expired(Vec<String>),
     /// What became of a measurement.
     Measured(Box<MeasureAnswer>),
-    /// A prediction.
-    Predicted(Box<Prediction>),
+    /// A prediction; shared, because a recording keeps it too.
+    Predicted(Arc<Prediction>),
     /// A map.
     Map(Arc<WorldMap>),
     /// Maps.

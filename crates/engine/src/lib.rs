@@ -40,4 +40,4 @@ pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-pub use session::{Session, SoilEstimate, SoilState};
+pub use session::{BufferTest, Session, SoilEstimate, SoilState};

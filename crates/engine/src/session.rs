@@ -11,7 +11,7 @@ use nesam_terrain::WorldMap;
 mod soil;
 
 use self::soil::SoilLearner;
-pub use self::soil::SoilState;
+pub use self::soil::{BufferTest, SoilState};
 use crate::error::EngineError;
 use crate::forward::Newest;
 use crate::grid::{Place, StepGrid};
@@ -164,15 +164,16 @@ impl Session {
         }
         let stamp_ns = self.last_stamp_ns();
         let Some((newest, before)) = self.history.make_contiguous().split_last() else { return outcome };
-        match self.learner.step(predictor, before, newest, map) {
-            None => outcome,
-            Some(update) if update.rejected => Outcome::Gated { nis: update.nis },
-            Some(update) => {
-                let state = self.learner.state(self.soil.state.epoch + 1, stamp_ns);
-                self.soil = SoilEstimate { state, covariance: update.posterior.covariance };
-                outcome
-            }
+        let Some(update) = self.learner.step(predictor, before, newest, map) else { return outcome };
+        let judged = self.soil.state.last_buffer.map_or(0, |last| last.judged) + 1;
+        let last_buffer = Some(BufferTest { judged, nis: update.nis, dof: update.dof, rejected: update.rejected });
+        if update.rejected {
+            self.soil.state.last_buffer = last_buffer;
+            return Outcome::Gated { nis: update.nis };
         }
+        let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, stamp_ns) };
+        self.soil = SoilEstimate { state, covariance: update.posterior.covariance };
+        outcome
     }
 
     /// A copy of everything under another name.
