@@ -1,7 +1,7 @@
 //! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
@@ -22,6 +22,8 @@ pub struct Config {
     pub zenoh: ZenohConfig,
     /// What is accepted and held at most.
     pub limits: LimitsConfig,
+    /// Recording.
+    pub recording: RecordingConfig,
 }
 
 /// gRPC.
@@ -84,6 +86,22 @@ pub struct ZenohConfig {
     pub connect: Vec<String>,
     /// Fleet in the keys `nesam/v1/<fleet>/<vehicle>/...`.
     pub fleet: String,
+}
+
+/// Recording of everything that the engine does, for `nesam replay`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RecordingConfig {
+    /// Whether to record.
+    pub enabled: bool,
+    /// Folder for the files; made if needed.
+    pub directory: PathBuf,
+    /// Size at which a file is finished and the next one begun, bytes.
+    pub part_bytes_max: u64,
+    /// Size of all files of a run at which recording ends, bytes.
+    pub bytes_max: u64,
+    /// Commands and answers that may wait for the disk, bytes; more are dropped.
+    pub queue_bytes_max: u64,
 }
 
 /// What is accepted and held at most; see `nesam_engine::Limits`.
@@ -151,6 +169,12 @@ impl Default for ZenohConfig {
             connect: Vec::new(),
             fleet: "default".into(),
         }
+    }
+}
+
+impl Default for RecordingConfig {
+    fn default() -> Self {
+        Self { enabled: false, directory: "recordings".into(), part_bytes_max: 1 << 30, bytes_max: 16 << 30, queue_bytes_max: 256 << 20 }
     }
 }
 
@@ -253,6 +277,9 @@ impl Config {
             ("limits.sample_steps_max", self.limits.sample_steps_max),
             ("limits.waiting_predictions_max", self.limits.waiting_predictions_max),
             ("limits.waiting_commands_max", self.limits.waiting_commands_max),
+            ("recording.part_bytes_max", usize::from(self.recording.part_bytes_max > 0)),
+            ("recording.bytes_max", usize::from(self.recording.bytes_max > 0)),
+            ("recording.queue_bytes_max", usize::from(self.recording.queue_bytes_max > 0)),
         ];
         for (key, value) in counts {
             if value == 0 {

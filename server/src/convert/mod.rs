@@ -1,5 +1,6 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
+mod command;
 mod measurement;
 mod packed;
 mod prediction;
@@ -7,7 +8,9 @@ mod session;
 mod state;
 mod status;
 mod terrain;
+mod terrain_message;
 
+pub use command::{measurement_message, open_message, predict_message};
 pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};
 pub use prediction::{OutputSelection, predict_error, predict_query, predict_reply};
@@ -15,3 +18,4 @@ pub use session::{open_session, provenance, session_view, soil_correction, soil_
 pub use state::{control, control_message, vehicle_state, vehicle_state_message};
 pub use status::{FIELD_METADATA, code, to_status};
 pub use terrain::{MapBuilder, description, patched};
+pub(crate) use terrain_message::{changed_tile, upload};

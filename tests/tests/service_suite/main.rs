@@ -8,6 +8,7 @@ mod measurements;
 mod overload;
 mod predictions;
 mod random_bytes;
+mod recording;
 mod replay;
 mod sessions;
 mod soil;

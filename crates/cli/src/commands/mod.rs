@@ -9,5 +9,6 @@ pub mod evaluate;
 pub mod inside;
 pub mod inspect;
 pub mod predict;
+pub mod replay;
 pub mod serve;
 pub mod train;
