@@ -8,7 +8,8 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use nesam_engine::{
-    Answer, Command, EngineError, EngineHandle, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply, SessionView, Submission,
+    Answer, Command, EngineError, EngineHandle, FleetCell, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply, SessionImage,
+    SessionView, Submission,
 };
 use nesam_terrain::WorldMap;
 use tokio::sync::oneshot;
@@ -124,6 +125,30 @@ impl EngineClient {
         match self.call(Command::Fork { session: session.into(), copy: copy.into() }, budget).await?.0 {
             Reply::Session(view) => Ok(*view),
             _ => Err(mismatch("fork")),
+        }
+    }
+
+    /// Reads the soil map of the fleet: edge of a cell in m, and the cells.
+    pub async fn fleet_soil(&self, map: &str, budget: Duration) -> Result<(f64, Vec<FleetCell>), EngineError> {
+        match self.call(Command::FleetSoil { map: map.into() }, budget).await?.0 {
+            Reply::FleetSoil(cell_m, cells) => Ok((cell_m, cells)),
+            _ => Err(mismatch("fleet_soil")),
+        }
+    }
+
+    /// Copies everything that a session remembers.
+    pub async fn export(&self, session: &str, budget: Duration) -> Result<SessionImage, EngineError> {
+        match self.call(Command::Export { session: session.into() }, budget).await?.0 {
+            Reply::Image(image) => Ok(*image),
+            _ => Err(mismatch("export")),
+        }
+    }
+
+    /// Opens a session from such a copy.
+    pub async fn import(&self, image: SessionImage, session: &str, budget: Duration) -> Result<SessionView, EngineError> {
+        match self.call(Command::Import { image: Box::new(image), session: session.into() }, budget).await?.0 {
+            Reply::Session(view) => Ok(*view),
+            _ => Err(mismatch("import")),
         }
     }
 

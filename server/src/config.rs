@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
-use nesam_engine::{Limits, check_name};
+use nesam_engine::{FleetSoilSettings, Limits, check_name};
 use serde::{Deserialize, Serialize};
 
 use crate::error::ServerError;
@@ -22,6 +22,8 @@ pub struct Config {
     pub zenoh: ZenohConfig,
     /// What is accepted and held at most.
     pub limits: LimitsConfig,
+    /// Soil map of the fleet.
+    pub fleet_soil: FleetSoilConfig,
     /// Recording.
     pub recording: RecordingConfig,
 }
@@ -86,6 +88,30 @@ pub struct ZenohConfig {
     pub connect: Vec<String>,
     /// Fleet in the keys `nesam/v1/<fleet>/<vehicle>/...`.
     pub fleet: String,
+    /// Name of this server in the keys `nesam/v1/<fleet>/server/<name>/...`; empty = its Zenoh id.
+    pub name: String,
+    /// Interval at which the status of this server is published, s.
+    pub status_interval_s: f64,
+}
+
+/// Soil map of the fleet; see `nesam_engine::FleetSoilSettings`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FleetSoilConfig {
+    /// Whether sessions share what they learn of the ground.
+    pub enabled: bool,
+    /// Edge of a cell, m.
+    pub cell_m: f64,
+    /// Time after which evidence counts half, s.
+    pub half_life_s: f64,
+    /// Distance over which evidence loses the factor e, m.
+    pub reach_m: f64,
+    /// Distance between colours over which evidence loses the factor e, levels of 255.
+    pub colour_reach: f64,
+    /// Process noise, as share of the standard deviations of the prior.
+    pub process_share: f64,
+    /// Cells held at most.
+    pub cells_max: usize,
 }
 
 /// Recording of everything that the engine does, for `nesam replay`.
@@ -134,6 +160,10 @@ pub struct LimitsConfig {
     pub angular_speed_max_rad_s: f64,
     /// Longest pause between two measurements of one session, s.
     pub pause_max_s: f64,
+    /// How far behind the newest measurement one may arrive and still be put in its place, s.
+    pub reorder_window_s: f64,
+    /// How much further ahead than time has passed a stamp may lie, s.
+    pub clock_ahead_max_s: f64,
     /// Time after which a session that nobody feeds and nobody asks is closed, s.
     pub session_idle_s: f64,
 }
@@ -168,6 +198,36 @@ impl Default for ZenohConfig {
             listen: vec!["tcp/127.0.0.1:7447".into()],
             connect: Vec::new(),
             fleet: "default".into(),
+            name: String::new(),
+            status_interval_s: 1.0,
+        }
+    }
+}
+
+impl Default for FleetSoilConfig {
+    fn default() -> Self {
+        let s = FleetSoilSettings::default();
+        Self {
+            enabled: false,
+            cell_m: s.cell_m,
+            half_life_s: s.half_life_s,
+            reach_m: s.reach_m,
+            colour_reach: s.colour_reach,
+            process_share: s.process_share,
+            cells_max: s.cells_max,
+        }
+    }
+}
+
+impl From<&FleetSoilConfig> for FleetSoilSettings {
+    fn from(c: &FleetSoilConfig) -> Self {
+        Self {
+            cell_m: c.cell_m,
+            half_life_s: c.half_life_s,
+            reach_m: c.reach_m,
+            colour_reach: c.colour_reach,
+            process_share: c.process_share,
+            cells_max: c.cells_max,
         }
     }
 }
@@ -195,6 +255,8 @@ impl Default for LimitsConfig {
             speed_max_m_s: l.speed_max_m_s,
             angular_speed_max_rad_s: l.angular_speed_max_rad_s,
             pause_max_s: l.pause_max_s,
+            reorder_window_s: l.reorder_window_s,
+            clock_ahead_max_s: l.clock_ahead_max_s,
             session_idle_s: l.session_idle_s,
         }
     }
@@ -216,6 +278,8 @@ impl From<&LimitsConfig> for Limits {
             speed_max_m_s: c.speed_max_m_s,
             angular_speed_max_rad_s: c.angular_speed_max_rad_s,
             pause_max_s: c.pause_max_s,
+            reorder_window_s: c.reorder_window_s,
+            clock_ahead_max_s: c.clock_ahead_max_s,
             session_idle_s: c.session_idle_s,
         }
     }
@@ -260,6 +324,8 @@ impl Config {
             ("grpc.drain_s", self.grpc.drain_s),
             ("limits.pause_max_s", self.limits.pause_max_s),
             ("limits.session_idle_s", self.limits.session_idle_s),
+            ("limits.clock_ahead_max_s", self.limits.clock_ahead_max_s),
+            ("zenoh.status_interval_s", self.zenoh.status_interval_s),
         ];
         for (key, value) in seconds {
             if !(value > 0.0 && value <= 1e6) {
@@ -285,6 +351,17 @@ impl Config {
             if value == 0 {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
+        }
+        FleetSoilSettings::from(&self.fleet_soil)
+            .check()
+            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
+        let window_s = self.limits.reorder_window_s;
+        if !(0.0..=1.0).contains(&window_s) {
+            return Err(ServerError::Value { key: "limits.reorder_window_s", reason: format!("is {window_s}, allowed is 0 to 1 s") });
+        }
+        if !self.zenoh.name.is_empty() {
+            check_name("zenoh.name", &self.zenoh.name)
+                .map_err(|error| ServerError::Value { key: "zenoh.name", reason: error.to_string() })?;
         }
         check_name("zenoh.fleet", &self.zenoh.fleet).map_err(|error| ServerError::Value { key: "zenoh.fleet", reason: error.to_string() })
     }
@@ -323,6 +400,9 @@ mod tests {
             ("[grpc]\nport = 3\n", "port"),
             ("[limits]\nsessions_max = 0\n", "limits.sessions_max"),
             ("[zenoh]\nfleet = \"a/b\"\n", "zenoh.fleet"),
+            ("[zenoh]\nname = \"a/b\"\n", "zenoh.name"),
+            ("[limits]\nreorder_window_s = 1.5\n", "limits.reorder_window_s"),
+            ("[fleet_soil]\nreach_m = -1.0\n", "reach_m"),
             ("[zenoh]\nmode = \"king\"\n", "king"),
             ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),
             ("not toml", "default.toml"),

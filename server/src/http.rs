@@ -56,6 +56,12 @@ async fn metrics(State(state): State<HttpState>) -> Response {
             text += &format!("# HELP {name} {help}\n# TYPE {name} counter\n{name} {value}\n");
         }
     }
+    if let Some(presence) = &state.edge.presence {
+        text += &format!(
+            "# HELP nesam_vehicles_alive Vehicles whose Zenoh liveliness token is there.\n# TYPE nesam_vehicles_alive gauge\nnesam_vehicles_alive {}\n",
+            presence.count()
+        );
+    }
     ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
 }
 
@@ -80,6 +86,7 @@ async fn status(State(state): State<HttpState>) -> Response {
                 "history_steps": s.history_steps,
                 "history_epoch": s.provenance.history_epoch,
                 "soil_epoch": s.provenance.soil_epoch,
+                "vehicle_alive": state.edge.presence.as_ref().map(|presence| presence.is_alive(&s.vehicle)),
                 "position_m": s.newest.as_ref().map(|n| n.state.position_m),
             })
         })

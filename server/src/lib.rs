@@ -20,7 +20,7 @@ mod web;
 mod zenoh;
 
 pub use clock::MonotonicClock;
-pub use config::{Config, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, ZenohConfig, ZenohMode};
+pub use config::{Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, ZenohConfig, ZenohMode};
 pub use error::ServerError;
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;

@@ -23,7 +23,7 @@ use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
 use crate::telemetry::Metrics;
-use crate::zenoh::Bus;
+use crate::zenoh::{Bus, Presence};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
 const EVENTS_KEPT: usize = 1024;
@@ -75,15 +75,20 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (sink, counted) = (events.clone(), metrics.clone());
     let unusable =
         |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
-    let engine =
-        Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?.with_events(Box::new(move |event| {
-            counted.event(event.label());
-            let _ = sink.send(event);
-        }));
+    let mut engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?;
+    if config.fleet_soil.enabled {
+        engine = engine
+            .with_fleet_soil((&config.fleet_soil).into())
+            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
+    }
+    let engine = engine.with_events(Box::new(move |event| {
+        counted.event(event.label());
+        let _ = sink.send(event);
+    }));
     let clock = MonotonicClock::default();
     let (recorder, tap) = match config.recording.enabled {
         true => {
-            let header = RecordingHeader::of_run(predictor.bundle(), &config.limits, clock.now_ns());
+            let header = RecordingHeader::of_run(predictor.bundle(), &config.limits, &config.fleet_soil, clock.now_ns());
             let started = Recorder::start(&config.recording, header, predictor.bundle().vehicle.clone());
             let (recorder, tap) = started.map_err(|source| ServerError::Recording { source })?;
             (Some(Arc::new(recorder)), Some(tap))
@@ -100,6 +105,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         config: Arc::new(config.grpc),
         events,
         stopping: stopping.clone(),
+        presence: config.zenoh.enabled.then(Presence::default),
     };
     let bus = match config.zenoh.enabled {
         true => match Bus::start(&config.zenoh, &edge).await {

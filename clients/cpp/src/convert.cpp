@@ -114,6 +114,7 @@ v1::Measurement to_message(const std::string& session_id, const Measurement& mea
   message.set_session_id(session_id);
   message.set_sequence(measurement.sequence);
   message.set_stamp_ns(measurement.stamp_ns);
+  message.set_boot_id(measurement.boot_id);
   set(message.mutable_state(), measurement.state);
   message.mutable_command()->set_speed_m_s(measurement.command.speed_m_s);
   message.mutable_command()->set_second(measurement.command.second);
@@ -183,6 +184,7 @@ MeasurementAnswer from_message(const v1::MeasurementAnswer& message) {
   MeasurementAnswer answer;
   answer.session_id = message.session_id();
   answer.sequence = message.sequence();
+  answer.reordered = message.reordered();
   answer.stamp_ns = message.stamp_ns();
   answer.history_epoch = message.history_epoch();
   answer.soil_epoch = message.soil_epoch();
@@ -194,6 +196,9 @@ MeasurementAnswer from_message(const v1::MeasurementAnswer& message) {
     case v1::MeasurementAnswer::kNotFinite: answer.outcome = NotFinite{message.not_finite().field()}; break;
     case v1::MeasurementAnswer::kGated: answer.outcome = Gated{message.gated().nis()}; break;
     case v1::MeasurementAnswer::kGap: answer.outcome = Gap{message.gap().gap_s()}; break;
+    case v1::MeasurementAnswer::kFuture: answer.outcome = Future{message.future().ahead_s()}; break;
+    case v1::MeasurementAnswer::kClockJump: answer.outcome = ClockJump{message.clock_jump().jump_s()}; break;
+    case v1::MeasurementAnswer::kRestarted: answer.outcome = Restarted{}; break;
     case v1::MeasurementAnswer::kRejected:
       answer.outcome = Rejected{code_from(message.rejected().code()), message.rejected().field(), message.rejected().message()};
       break;

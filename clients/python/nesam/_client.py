@@ -99,6 +99,17 @@ class Client:
         request = sessions_pb2.ForkSessionRequest(session_id=session_id, new_session_id=new_session_id)
         return _session(self._call(self._sessions.Fork, request))
 
+    def export_session(self, session_id: str) -> bytes:
+        """Everything that a session remembers, for `import_session` here or on another server with the same bundle. Raises NotFound."""
+        return self._call(self._sessions.Export, sessions_pb2.ExportSessionRequest(session_id=session_id)).image
+
+    def import_session(self, image: bytes, session_id: str = "") -> t.Session:
+        """Opens a session from an export; it answers as the original would, bit for bit. An empty name keeps that of the exported one.
+
+        Raises InvalidArgument (damaged, another version, another bundle), NotFound (map), FailedPrecondition (the map has other layers), AlreadyExists.
+        """
+        return _session(self._call(self._sessions.Import, sessions_pb2.ImportSessionRequest(image=image, session_id=session_id)))
+
     def close_session(self, session_id: str) -> None:
         """Closes a session and forgets its history. Raises NotFound."""
         self._call(self._sessions.Close, sessions_pb2.CloseSessionRequest(session_id=session_id))
@@ -168,7 +179,7 @@ class Client:
         return MeasurementStream(self)
 
     def _remember(self, measurement: t.Measurement, answer: t.Answer) -> None:
-        if answer.outcome in ("APPLIED", "GAP", "GATED"):
+        if answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered:
             self._known_states[measurement.session_id] = np.asarray(measurement.state, dtype=np.float64)
 
     # Predictions
@@ -294,6 +305,7 @@ def _measurement_message(measurement: t.Measurement) -> measurements_pb2.Measure
         session_id=measurement.session_id,
         sequence=measurement.sequence,
         stamp_ns=measurement.stamp_ns,
+        boot_id=measurement.boot_id,
         state=t.state_message(measurement.state),
         command=types_pb2.Control(speed_m_s=command[0], second=command[1]),
         wheels=wheels,
@@ -313,6 +325,7 @@ def _answer(message: measurements_pb2.MeasurementAnswer) -> t.Answer:
         field=getattr(detail, "field", ""),
         message=getattr(detail, "message", ""),
         soil=t.soil(message.soil_correction) if message.HasField("soil_correction") else None,
+        reordered=message.reordered,
     )
 
 
@@ -336,6 +349,8 @@ def _session(message: sessions_pb2.Session) -> t.Session:
         state=t.state_array(message.state) if message.HasField("state") else None,
         command=np.array([message.command.speed_m_s, message.command.second]) if message.HasField("command") else None,
         soil=t.soil(message.soil_correction),
+        boot_id=message.boot_id if message.HasField("boot_id") else None,
+        vehicle_alive=message.vehicle_alive if message.HasField("vehicle_alive") else None,
     )
 
 

@@ -63,7 +63,10 @@ class Soil:
 
 @dataclass(frozen=True)
 class Session:
-    """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement."""
+    """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
+
+    boot_id: start of the vehicle's software, None when it does not tell. vehicle_alive: whether the vehicle's Zenoh token is there, None without Zenoh.
+    """
 
     session_id: str
     vehicle_id: str
@@ -75,6 +78,8 @@ class Session:
     state: Optional[np.ndarray]
     command: Optional[np.ndarray]
     soil: Soil
+    boot_id: Optional[int] = None
+    vehicle_alive: Optional[bool] = None
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,8 @@ class Measurement:
     """What a vehicle measures at one instant.
 
     state: (12,), pose in World, twist in Body. command: (speed m/s, second in the unit of the vehicle card), applied from this instant on.
-    stamp_ns: the vehicle's clock. sequence: 0 = not numbered. wheel_speed_rad_s: (4,) FL FR RL RR; road_wheel_angle_rad: (2,) left, right.
+    stamp_ns: the vehicle's clock. sequence: 0 = not numbered. boot_id: any number that differs from start to start of the vehicle's software, 0 = not
+    told; another one begins a new history and keeps the soil. wheel_speed_rad_s: (4,) FL FR RL RR; road_wheel_angle_rad: (2,) left, right.
     """
 
     session_id: str
@@ -92,13 +98,15 @@ class Measurement:
     sequence: int = 0
     wheel_speed_rad_s: Optional[Sequence[float]] = None
     road_wheel_angle_rad: Optional[Sequence[float]] = None
+    boot_id: int = 0
 
 
 @dataclass(frozen=True)
 class Answer:
     """The service's answer to one measurement.
 
-    outcome: APPLIED, BUFFERED, DUPLICATE, TOO_OLD, NOT_FINITE, GATED, GAP or REJECTED. Only APPLIED, BUFFERED, GATED and GAP changed the session.
+    outcome: APPLIED, BUFFERED, GATED, GAP, CLOCK_JUMP or RESTARTED, which changed the session, or DUPLICATE, TOO_OLD, FUTURE, NOT_FINITE or REJECTED, which
+    did not. reordered: it arrived after a later one and was put in its place.
     field and message say what was wrong with a NOT_FINITE or REJECTED one. soil: after this measurement, None when it was rejected.
     """
 
@@ -111,6 +119,7 @@ class Answer:
     field: str = ""
     message: str = ""
     soil: Optional[Soil] = None
+    reordered: bool = False
 
 
 @dataclass(frozen=True)

@@ -71,6 +71,18 @@ impl Client {
         Ok(self.sessions().fork(request).await?.into_inner())
     }
 
+    /// Everything that a session remembers, for [`Client::import_session`] here or elsewhere.
+    pub async fn export_session(&mut self, session: &str) -> Result<Vec<u8>, ClientError> {
+        let request = v1::ExportSessionRequest { session_id: session.into() };
+        Ok(self.sessions().export(request).await?.into_inner().image.into())
+    }
+
+    /// Opens a session from an export; an empty name keeps that of the exported one.
+    pub async fn import_session(&mut self, image: Vec<u8>, session: &str) -> Result<v1::Session, ClientError> {
+        let request = v1::ImportSessionRequest { image: image.into(), session_id: session.into() };
+        Ok(self.sessions().import(request).await?.into_inner())
+    }
+
     /// Closes a session.
     pub async fn close_session(&mut self, session: &str) -> Result<(), ClientError> {
         self.sessions().close(v1::CloseSessionRequest { session_id: session.into() }).await?;
@@ -158,6 +170,12 @@ impl Client {
             replies.push(reply);
         }
         Ok(replies)
+    }
+
+    /// What the fleet has learned of the ground; an empty name means all maps.
+    pub async fn fleet_soil(&mut self, map: &str) -> Result<v1::FleetSoilMap, ClientError> {
+        let mut soil = v1::soil_client::SoilClient::new(self.channel());
+        Ok(soil.map(v1::FleetSoilRequest { map_id: map.into() }).await?.into_inner())
     }
 
     /// Watches the soil estimate of a session.

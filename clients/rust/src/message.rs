@@ -27,6 +27,7 @@ pub fn measurement(session: &str, stamp_ns: i64, state: [f64; 12], command: [f64
         state: Some(state_message(state)),
         command: Some(v1::Control { speed_m_s: command[0], second: command[1] }),
         wheels: None,
+        boot_id: 0,
     }
 }
 
@@ -41,6 +42,9 @@ pub fn outcome_label(answer: &v1::MeasurementAnswer) -> &'static str {
         Some(Outcome::NotFinite(_)) => "NOT_FINITE",
         Some(Outcome::Gated(_)) => "GATED",
         Some(Outcome::Gap(_)) => "GAP",
+        Some(Outcome::Future(_)) => "FUTURE",
+        Some(Outcome::ClockJump(_)) => "CLOCK_JUMP",
+        Some(Outcome::Restarted(_)) => "RESTARTED",
         Some(Outcome::Rejected(_)) => "REJECTED",
         None => "UNKNOWN",
     }

@@ -1,10 +1,11 @@
-//! The vehicle's side over Zenoh: publishes measurements, hears their answers, may ask for predictions.
+//! The vehicle's side over Zenoh: publishes measurements, hears their answers, says that it is there, may ask for predictions.
 
 use std::time::Duration;
 
 use nesam_proto::v1;
 use prost::Message as _;
 use zenoh::handlers::FifoChannelHandler;
+use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
 use zenoh::qos::CongestionControl;
 use zenoh::sample::Sample;
@@ -19,6 +20,8 @@ pub struct ZenohVehicle {
     measurement_key: String,
     predict_key: String,
     answers: Subscriber<FifoChannelHandler<Sample>>,
+    /// Tells the network that this vehicle is there; goes with it.
+    _alive: LivelinessToken,
 }
 
 fn failed(error: impl core::fmt::Display) -> ClientError {
@@ -38,7 +41,8 @@ impl ZenohVehicle {
         let session = zenoh::open(config).await.map_err(failed)?;
         let key = |topic: &str| format!("nesam/v1/{fleet}/{vehicle}/{topic}");
         let answers = session.declare_subscriber(key("status")).await.map_err(failed)?;
-        Ok(Self { session, measurement_key: key("measurement"), predict_key: key("predict"), answers })
+        let alive = session.liveliness().declare_token(key("alive")).await.map_err(failed)?;
+        Ok(Self { session, measurement_key: key("measurement"), predict_key: key("predict"), answers, _alive: alive })
     }
 
     /// Publishes a measurement; waits while the network is congested rather than losing it.

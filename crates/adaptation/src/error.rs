@@ -8,7 +8,7 @@ pub enum AdaptationError {
     /// A transition or a prediction from it holds a number that is not finite.
     #[error("{what} of transition {index} of the buffer is not finite; the buffer starts anew")]
     NotFinite {
-        /// `input`, `measurement` or `prediction`.
+        /// `input`, `measurement`, `prediction` or `snapshot`.
         what: &'static str,
         /// Place in the buffer.
         index: usize,

@@ -10,6 +10,10 @@ use crate::trust::{NoiseScale, Trust};
 use crate::update::{SoilMatrix, kalman_update};
 use crate::{AdaptationError, FilterConfig, Innovation, chi_square_tail};
 
+mod snapshot;
+
+pub use snapshot::FilterSnapshot;
+
 /// Share of the prior variance below which a parameter counts as learned.
 const LEARNED_SHARE: f64 = 0.5;
 /// Share of the prior standard deviation below which another linearisation would change nothing.

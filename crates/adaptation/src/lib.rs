@@ -29,7 +29,7 @@ pub use calibration::{NoiseCalibration, UncorrectedBuffer, calibrate};
 pub use chi_square::chi_square_tail;
 pub use config::{FilterConfig, Innovation};
 pub use error::AdaptationError;
-pub use filter::{SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
+pub use filter::{FilterSnapshot, SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
 pub use noise::{BufferNoise, ChannelNoise, VelocityNoise};
 pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocities, predict_velocity};
 pub use settings::{CalibratedFilter, Coordinates, FilterSettings};

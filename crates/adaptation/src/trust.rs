@@ -35,6 +35,11 @@ impl NoiseScale {
         self.value
     }
 
+    /// Puts the scale where a snapshot had it.
+    pub(crate) fn restore(&mut self, value: f64) {
+        self.value = value.clamp(SCALE.0, SCALE.1);
+    }
+
     pub(crate) fn observe(&mut self, nis_over_dof: f64) {
         if self.memory > 0.0 {
             self.value = (self.value * (1.0 + (nis_over_dof.min(RATIO_MAX) - 1.0) / self.memory)).clamp(SCALE.0, SCALE.1);
@@ -75,6 +80,16 @@ impl Trust {
             let kept = 1.0 - 1.0 / self.memory.max(1.0);
             self.log_odds = self.prior_log_odds + kept * (self.log_odds - self.prior_log_odds) + log_ratio.clamp(-VOTE_MAX, VOTE_MAX);
         }
+    }
+
+    /// Log odds and the corrections that later buffers judge, oldest first.
+    pub(crate) fn state(&self) -> (f64, &VecDeque<SoilVector>) {
+        (self.log_odds, &self.corrections)
+    }
+
+    /// Puts both where a snapshot had them.
+    pub(crate) fn restore(&mut self, log_odds: f64, corrections: VecDeque<SoilVector>) {
+        (self.log_odds, self.corrections) = (log_odds, corrections);
     }
 
     /// Remembers the correction after a buffer.

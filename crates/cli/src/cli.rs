@@ -49,6 +49,8 @@ enum Command {
     Diagnose(commands::diagnose::DiagnoseArgs),
     /// Learn the soil while driving: fixed against adapted predictions on measured drives
     Adapt(commands::adapt::AdaptArgs),
+    /// Start on ground that another vehicle has driven: with its soil map against without
+    Fleet(commands::fleet::FleetArgs),
     /// Predict once from an instant of a recorded drive: JSON, CSV or plots
     Predict(commands::predict::PredictArgs),
     /// Repeat a recorded run and compare every answer, or drive recorded drives through a bad radio link
@@ -82,6 +84,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Evaluate(args)) => commands::evaluate::run(&args),
         Some(Command::Diagnose(args)) => commands::diagnose::run(&args),
         Some(Command::Adapt(args)) => commands::adapt::run(&args),
+        Some(Command::Fleet(args)) => commands::fleet::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
         Some(Command::Replay(args)) => commands::replay::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),

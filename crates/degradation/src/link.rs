@@ -83,6 +83,7 @@ pub fn degraded(drive: &Trajectory, spec: &Degradation, seed: u64) -> Link {
             true_s: sample.time_s,
             measurement: Measurement {
                 sequence: Some(index as u64 + 1),
+                boot: None,
                 stamp_ns: (stamp_s * 1e9).round() as i64,
                 state: sample.state,
                 command: sample.command,

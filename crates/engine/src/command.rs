@@ -5,9 +5,10 @@ use std::sync::Arc;
 use nesam_model::HistoryStep;
 use nesam_terrain::WorldMap;
 
+use crate::fleet::FleetCell;
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
-use crate::session::SoilEstimate;
+use crate::session::{SessionImage, SoilEstimate};
 
 /// A command. The list is closed: what is not here cannot happen to a session.
 #[derive(Clone, Debug)]
@@ -28,6 +29,18 @@ pub enum Command {
         /// Name of the copy.
         copy: String,
     },
+    /// Copies everything that a session remembers. Answer: `Reply::Image`.
+    Export {
+        /// Name of the session.
+        session: String,
+    },
+    /// Opens a session from such a copy. Answer: `Reply::Session`.
+    Import {
+        /// The copy.
+        image: Box<SessionImage>,
+        /// Name of the session; empty = that of the copy.
+        session: String,
+    },
     /// Closes a session. Answer: `Reply::Done`.
     Close {
         /// Name of the session.
@@ -43,6 +56,11 @@ pub enum Command {
         vehicle: Option<String>,
         /// The measurement.
         measurement: Measurement,
+    },
+    /// Reads the soil map of the fleet. Answer: `Reply::FleetSoil`.
+    FleetSoil {
+        /// World map; empty = all.
+        map: String,
     },
     /// Rolls candidates out. Answer: `Reply::Predicted`.
     Predict(PredictQuery),
@@ -75,9 +93,12 @@ impl Command {
             Self::Get { .. } => "get",
             Self::List => "list",
             Self::Fork { .. } => "fork",
+            Self::Export { .. } => "export",
+            Self::Import { .. } => "import",
             Self::Close { .. } => "close",
             Self::Expire => "expire",
             Self::Measure { .. } => "measure",
+            Self::FleetSoil { .. } => "fleet_soil",
             Self::Predict(_) => "predict",
             Self::PutMap { .. } => "put_map",
             Self::GetMap { .. } => "get_map",
@@ -89,7 +110,7 @@ impl Command {
     /// The session that this command keeps from being idle: one that is fed or asked. Reading it is no use of it.
     pub(crate) fn uses(&self) -> Option<&str> {
         match self {
-            Self::Measure { session, .. } | Self::Fork { session, .. } => Some(session),
+            Self::Measure { session, .. } | Self::Fork { session, .. } | Self::Export { session } => Some(session),
             Self::Predict(query) => Some(&query.session),
             _ => None,
         }
@@ -118,10 +139,14 @@ pub enum Reply {
     Session(Box<SessionView>),
     /// Sessions.
     Sessions(Vec<SessionView>),
+    /// Everything that a session remembers.
+    Image(Box<SessionImage>),
     /// Names of the sessions that were closed because they were idle.
     Expired(Vec<String>),
     /// What became of a measurement.
     Measured(Box<MeasureAnswer>),
+    /// Edge of a cell in m, and the cells with evidence, by map, colour and place.
+    FleetSoil(f64, Vec<FleetCell>),
     /// A prediction; shared, because a recording keeps it too.
     Predicted(Arc<Prediction>),
     /// A map.
@@ -137,6 +162,8 @@ pub enum Reply {
 pub struct MeasureAnswer {
     /// What became of it.
     pub outcome: Outcome,
+    /// It arrived after a later one and was put in its place.
+    pub reordered: bool,
     /// Steps in the history.
     pub history_steps: usize,
     /// Changes of the history since the session was opened.
@@ -162,6 +189,8 @@ pub struct SessionView {
     pub last_stamp_ns: Option<i64>,
     /// Highest accepted sequence number.
     pub last_sequence: Option<u64>,
+    /// Start of the vehicle's software that feeds the session, where it tells.
+    pub boot: Option<u64>,
     /// What was learned of the soil.
     pub soil: SoilEstimate,
 }
@@ -178,6 +207,13 @@ pub enum Event {
         /// The new estimate.
         soil: Box<SoilEstimate>,
     },
+    /// A session has brought evidence into the soil map of the fleet.
+    FleetSoilChanged {
+        /// Edge of a cell, m.
+        cell_m: f64,
+        /// The cell that changed.
+        cell: Box<FleetCell>,
+    },
     /// A session was closed.
     SessionClosed {
         /// Name of the session.
@@ -192,6 +228,7 @@ impl Event {
     pub fn label(&self) -> &'static str {
         match self {
             Self::SoilChanged { .. } => "soil_changed",
+            Self::FleetSoilChanged { .. } => "fleet_soil_changed",
             Self::SessionClosed { expired: false, .. } => "session_closed",
             Self::SessionClosed { expired: true, .. } => "session_expired",
         }

@@ -4,18 +4,20 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
+use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
 use nesam_model::{HistoryStep, Predictor, RolloutQuery, Variant};
 use nesam_physics::VehicleState;
 use nesam_terrain::WorldMap;
 
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
 use crate::error::EngineError;
+use crate::fleet::{Fleet, FleetCell};
 use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
 use crate::query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-use crate::session::{Rules, Session};
+use crate::session::{Observed, Rules, Session, SessionImage, refused};
 
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
 pub type EventSink = Box<dyn FnMut(Event) + Send>;
@@ -32,6 +34,8 @@ pub struct Engine {
     step_ns: i64,
     sessions: BTreeMap<String, Session>,
     maps: MapRegistry,
+    /// Soil map of the fleet; `None` = every session begins from the prior alone.
+    fleet: Option<Fleet>,
     events: Option<EventSink>,
     log: Option<Vec<Logged>>,
 }
@@ -54,7 +58,17 @@ impl Engine {
             None => FilterConfig::default(),
         };
         let filter = SoilFilter::new(config)?;
-        Ok(Self { predictor, limits, filter, step_ns, sessions: BTreeMap::new(), maps: MapRegistry::default(), events: None, log: None })
+        Ok(Self {
+            predictor,
+            limits,
+            filter,
+            step_ns,
+            sessions: BTreeMap::new(),
+            maps: MapRegistry::default(),
+            fleet: None,
+            events: None,
+            log: None,
+        })
     }
 
     /// Sessions opened from now on learn the soil with these settings.
@@ -63,6 +77,15 @@ impl Engine {
     /// `AdaptationError::Config` naming the setting that is unusable.
     pub fn with_filter(mut self, config: FilterConfig) -> Result<Self, AdaptationError> {
         self.filter = SoilFilter::new(config)?;
+        Ok(self)
+    }
+
+    /// Sessions share from now on what they learn of the ground: one that begins where others were starts from what they learned.
+    ///
+    /// # Errors
+    /// `FleetSoilError::Setting` naming the setting that is unusable.
+    pub fn with_fleet_soil(mut self, settings: FleetSoilSettings) -> Result<Self, FleetSoilError> {
+        self.fleet = Some(Fleet::new(settings)?);
         Ok(self)
     }
 
@@ -104,9 +127,12 @@ impl Engine {
             Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
             Command::List => Ok(Reply::Sessions(self.sessions.values().map(|s| self.view(s)).collect())),
             Command::Fork { session, copy } => self.fork(now_ns, session, copy),
+            Command::Export { session } => self.export(now_ns, session),
+            Command::Import { image, session } => self.import(now_ns, image, session),
             Command::Close { session } => self.close(session),
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
+            Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
             Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
@@ -137,17 +163,25 @@ impl Engine {
         }
         self.check_room("session_id", id)?;
         let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
+        if self.drives(&open.vehicle) {
+            session.bring_nothing();
+        }
         if let Some(initial) = &open.initial {
             let rules = Rules { step_ns: self.step_ns, vehicle: card, limits: &self.limits };
-            let outcome = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
-            if let crate::Outcome::NotFinite { field } = outcome {
+            let observed = session.observe(initial, now_ns, rules).map_err(|e| below("initial", e))?;
+            if let crate::Outcome::NotFinite { field } = observed.outcome {
                 return Err(EngineError::invalid(format!("initial.{field}"), "is not finite"));
             }
-            session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), outcome);
+            session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), self.step_ns, observed.outcome);
         }
         let view = self.view(&session);
         self.sessions.insert(id.clone(), session);
         Ok(Reply::Session(Box::new(view)))
+    }
+
+    /// Whether a session of this vehicle is open.
+    fn drives(&self, vehicle: &str) -> bool {
+        self.sessions.values().any(|session| session.vehicle() == vehicle)
     }
 
     /// Whether one more session of this name may be open.
@@ -169,6 +203,40 @@ impl Engine {
         let session = session.fork(copy, now_ns);
         let view = self.view(&session);
         self.sessions.insert(copy.into(), session);
+        Ok(Reply::Session(Box::new(view)))
+    }
+
+    fn export(&self, now_ns: u64, id: &str) -> Result<Reply, EngineError> {
+        let session = self.session(id)?;
+        let map = session.map().map(|id| self.maps.get(id)).transpose()?.map(|map| (map.id().to_string(), map.hash().to_string()));
+        Ok(Reply::Image(Box::new(session.image(now_ns, &self.predictor.bundle().hash, map))))
+    }
+
+    fn import(&mut self, now_ns: u64, image: &SessionImage, name: &str) -> Result<Reply, EngineError> {
+        let id = if name.is_empty() { &image.session } else { name };
+        check_name("session_id", id)?;
+        check_name("image", &image.vehicle)?;
+        let bundle = self.predictor.bundle();
+        if image.bundle_hash != bundle.hash {
+            let reason = format!("was exported with bundle {}, this service has {} ({})", image.bundle_hash, bundle.hash, bundle.name);
+            return Err(refused(reason));
+        }
+        if let Some((map, hash)) = &image.map {
+            let held = self.maps.get(map)?;
+            if held.hash() != hash {
+                let reason =
+                    format!("drives on map `{map}` with layers {hash}, the map held here has {}; upload that one first", held.hash());
+                return Err(EngineError::NotReady { field: "image".into(), reason });
+            }
+        }
+        self.check_room("session_id", id)?;
+        let rules = Rules { step_ns: self.step_ns, vehicle: &bundle.vehicle, limits: &self.limits };
+        let mut session = Session::from_image(id, image, self.filter.clone(), now_ns, rules)?;
+        if self.drives(&image.vehicle) {
+            session.bring_nothing();
+        }
+        let view = self.view(&session);
+        self.sessions.insert(id.into(), session);
         Ok(Reply::Session(Box::new(view)))
     }
 
@@ -200,15 +268,28 @@ impl Engine {
         }
         let soil_epoch = session.soil().state.epoch;
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
-        let outcome = session.observe(measurement, now_ns, rules)?;
+        let Observed { outcome, reordered } = session.observe(measurement, now_ns, rules)?;
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
-        let outcome = session.learn(&self.predictor, map.as_ref(), outcome);
-        let vehicle = session.vehicle().to_string();
+        if let (Some(fleet), Some(map)) = (&mut self.fleet, &map)
+            && let Some(position_m) = session.begins_at()
+            && let Some(prior) = fleet.prior(map, position_m, self.filter.config(), now_ns)
+        {
+            session.begin_from(&prior);
+        }
+        let outcome = session.learn(&self.predictor, map.as_ref(), self.step_ns, outcome);
+        let (vehicle, brought) = (session.vehicle().to_string(), session.take_brought());
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
+        if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
+            let cell_m = fleet.cell_m();
+            let changed: Vec<FleetCell> = brought.iter().filter_map(|brought| fleet.add(map, brought, now_ns)).collect();
+            for cell in changed {
+                self.emit(Event::FleetSoilChanged { cell_m, cell: Box::new(cell) });
+            }
+        }
         if soil.state.epoch != soil_epoch {
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
         }
-        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, history_steps, history_epoch, soil })))
+        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, history_epoch, soil })))
     }
 
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
@@ -253,6 +334,14 @@ impl Engine {
         })
     }
 
+    fn fleet_soil(&self, now_ns: u64, map: &str) -> Result<Reply, EngineError> {
+        let Some(fleet) = &self.fleet else {
+            let reason = "the service keeps no soil map of the fleet; set `fleet_soil.enabled` in its configuration";
+            return Err(EngineError::NotReady { field: "map_id".into(), reason: reason.into() });
+        };
+        Ok(Reply::FleetSoil(fleet.cell_m(), fleet.cells(map, now_ns)))
+    }
+
     fn delete_map(&mut self, id: &str) -> Result<Reply, EngineError> {
         if let Some(user) = self.sessions.values().find(|s| s.map() == Some(id)) {
             return Err(EngineError::MapInUse { map: id.into(), session: user.id().into() });
@@ -281,6 +370,7 @@ impl Engine {
             newest: session.newest().copied(),
             last_stamp_ns: session.last_stamp_ns(),
             last_sequence: session.last_sequence(),
+            boot: session.boot(),
             soil: *session.soil(),
         }
     }

@@ -53,6 +53,13 @@ pub struct Limits {
     pub angular_speed_max_rad_s: f64,
     /// Longest pause between two measurements of one session, s. A stamp further ahead is taken for a broken clock.
     pub pause_max_s: f64,
+    /// How far behind the newest measurement one may arrive and still be put in its place, s; at most 1. Later ones are refused. Measurements inside this window
+    /// count for predictions at once, but the soil filter sees them only when they have left it: the soil is older by as much. 0 = every measurement
+    /// behind the newest is refused.
+    pub reorder_window_s: f64,
+    /// How much further ahead than time has passed a stamp may lie, s, before the clock counts as wrong. Larger: one wrong stamp makes more of the following
+    /// ones look late. Smaller: a vehicle that sends its backlog after a pause loses a measurement.
+    pub clock_ahead_max_s: f64,
     /// Time after which a session that nobody feeds and nobody asks is closed, s.
     pub session_idle_s: f64,
 }
@@ -73,12 +80,19 @@ impl Default for Limits {
             speed_max_m_s: 100.0,
             angular_speed_max_rad_s: 50.0,
             pause_max_s: 86_400.0,
+            reorder_window_s: 0.2,
+            clock_ahead_max_s: 10.0,
             session_idle_s: 86_400.0,
         }
     }
 }
 
 impl Limits {
+    /// The reorder window, ns.
+    pub fn reorder_window_ns(&self) -> i64 {
+        (self.reorder_window_s.clamp(0.0, 1.0) * 1e9).round() as i64
+    }
+
     /// Checks N, K and N K.
     ///
     /// # Errors

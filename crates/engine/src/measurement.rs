@@ -7,6 +7,8 @@ use nesam_physics::{Control, VehicleState, WHEELS};
 pub struct Measurement {
     /// Position in the vehicle's own numbering; `None` = not numbered.
     pub sequence: Option<u64>,
+    /// Start of the vehicle's software that the numbers and stamps belong to; `None` = not told.
+    pub boot: Option<u64>,
     /// Instant of the state, ns of the vehicle's clock.
     pub stamp_ns: i64,
     /// Measured state: pose in World, twist in Body.
@@ -29,16 +31,16 @@ pub struct WheelMeasurement {
 /// What became of a measurement.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Outcome {
-    /// It is the newest step of the history.
+    /// It ends a step of the history.
     Applied,
-    /// Accepted, but denser than the grid of the model; it waits for the next grid point.
+    /// Accepted, but denser than the grid of the model; the step at the next grid point is made of it and the next measurement.
     Buffered {
         /// Time until then, s.
         next_step_in_s: f64,
     },
     /// Accepted before; nothing changed.
     Duplicate,
-    /// Before the newest accepted one; nothing changed.
+    /// Behind the window before the newest accepted one, numbered against the order of the stamps, or of a former start of the vehicle; nothing changed.
     TooOld {
         /// How far its stamp lies behind, s; 0 when only the sequence number is old.
         behind_s: f64,
@@ -48,7 +50,19 @@ pub enum Outcome {
         /// Path of the number below the measurement.
         field: String,
     },
-    /// In the history, but refused by the soil filter.
+    /// Further ahead of the last one than time has passed since; nothing changed. A second one in a row proves that the clock was set.
+    Future {
+        /// How far its stamp lies ahead of where the last one and the time since then put it, s.
+        ahead_s: f64,
+    },
+    /// Applied after the vehicle's clock was set; the history starts again here.
+    ClockJump {
+        /// By how much, s; negative = back.
+        jump_s: f64,
+    },
+    /// Applied after the vehicle was restarted; the history starts again here, the soil stays.
+    Restarted,
+    /// In the history, but the buffer that became final with it was refused by the soil filter.
     Gated {
         /// Normalised innovation squared, -.
         nis: f64,
@@ -63,7 +77,7 @@ pub enum Outcome {
 impl Outcome {
     /// Whether the measurement changed the session.
     pub fn accepted(&self) -> bool {
-        !matches!(self, Self::Duplicate | Self::TooOld { .. } | Self::NotFinite { .. })
+        !matches!(self, Self::Duplicate | Self::TooOld { .. } | Self::NotFinite { .. } | Self::Future { .. })
     }
 
     /// Name for metrics and logs.
@@ -76,6 +90,9 @@ impl Outcome {
             Self::NotFinite { .. } => "not_finite",
             Self::Gated { .. } => "gated",
             Self::Gap { .. } => "gap",
+            Self::Future { .. } => "future",
+            Self::ClockJump { .. } => "clock_jump",
+            Self::Restarted => "restarted",
         }
     }
 }

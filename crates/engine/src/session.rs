@@ -4,22 +4,30 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nesam_adaptation::SoilFilter;
-use nesam_model::{HISTORY, HistoryStep, Predictor};
+use nesam_fleet_soil::FleetPrior;
+use nesam_model::{HistoryStep, Predictor};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 
+mod image;
+mod order;
 mod soil;
+mod track;
 
+pub(crate) use self::image::refused;
+pub use self::image::{SessionImage, TrackImage};
+use self::order::{Order, Verdict};
 use self::soil::SoilLearner;
 pub use self::soil::{BufferTest, SoilState};
+use self::track::{Taken, Track};
 use crate::error::EngineError;
+use crate::fleet::Brought;
 use crate::forward::Newest;
-use crate::grid::{Place, StepGrid};
 use crate::limits::{Limits, outside_card};
 use crate::measurement::{Measurement, Outcome};
 
-/// Accepted stamps that are remembered to tell a resent measurement from a late one.
-const RECENT_STAMPS: usize = 256;
+/// Measurements that the reorder window holds at most; more become final early. 200 Hz over the longest window.
+const OPEN_MAX: usize = 200;
 
 /// What is known of the soil: the estimate and its whole covariance.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -31,23 +39,60 @@ pub struct SoilEstimate {
 }
 
 /// A session: identity, recent measured motion, soil.
+///
+/// Measurements inside the reorder window are open: one that arrives late is put in its place among them, and the steps are made again. What has left the window is
+/// final, and only then does the soil filter see it; so the posterior depends on the stamps and not on the order of arrival.
 #[derive(Clone, Debug)]
 pub struct Session {
     id: String,
     vehicle: String,
     map: Option<String>,
-    /// Oldest first; the newest is the start of the next prediction.
-    history: VecDeque<HistoryStep>,
-    grid: Option<StepGrid>,
-    recent_stamps: VecDeque<i64>,
-    last_sequence: Option<u64>,
+    /// Every accepted measurement; the newest step is the start of the next prediction.
+    live: Track,
+    /// Those that are final.
+    settled: Track,
+    /// Those that are not, by ascending stamp.
+    open: VecDeque<Measurement>,
+    /// Those that became final and wait for the soil filter.
+    leaving: VecDeque<Leaving>,
+    order: Order,
     /// Engine clock when the newest step of the history arrived, ns.
-    arrived_ns: u64,
+    arrived_ns: i64,
     /// Engine clock when the session was fed or asked last, ns.
     used_ns: u64,
     history_epoch: u64,
     learner: SoilLearner,
     soil: SoilEstimate,
+    fleet: FleetPart,
+}
+
+/// What a session has to do with the soil map of the fleet.
+#[derive(Clone, Debug, PartialEq)]
+struct FleetPart {
+    /// It has not asked yet what the fleet knows of the ground that it begins on.
+    asks: bool,
+    /// What it learns goes into the map; not for copies and further sessions of one vehicle, whose evidence would count twice.
+    brings: bool,
+    /// What it has brought since it was last asked.
+    brought: Vec<Brought>,
+}
+
+/// What leaves the reorder window.
+#[derive(Clone, Debug, PartialEq)]
+enum Leaving {
+    /// A measurement.
+    Measured(Measurement),
+    /// The end of a line: what follows is another clock or another start of the vehicle.
+    End,
+}
+
+/// What became of a measurement.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Observed {
+    /// Outcome.
+    pub outcome: Outcome,
+    /// It arrived after a later one and was put in its place.
+    pub reordered: bool,
 }
 
 /// What a session needs to judge a measurement.
@@ -70,115 +115,180 @@ impl Session {
             id: id.into(),
             vehicle: vehicle.into(),
             map: map.map(Into::into),
-            history: VecDeque::with_capacity(HISTORY),
-            grid: None,
-            recent_stamps: VecDeque::with_capacity(RECENT_STAMPS),
-            last_sequence: None,
+            live: Track::default(),
+            settled: Track::default(),
+            open: VecDeque::new(),
+            leaving: VecDeque::new(),
+            order: Order::default(),
             arrived_ns: 0,
             used_ns: now_ns,
             history_epoch: 0,
             soil: SoilEstimate { state: learner.state(0, None), covariance },
             learner,
+            fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
         }
     }
 
-    /// Takes one measurement. Only an outcome that is `accepted` changes the session.
+    /// Takes one measurement. One that is not `accepted` leaves no trace but the suspicion that a clock was set.
     ///
     /// # Errors
     /// `EngineError::Invalid` naming the entry that is implausible or outside the card; the session is unchanged.
-    pub fn observe(&mut self, measurement: &Measurement, now_ns: u64, rules: Rules<'_>) -> Result<Outcome, EngineError> {
+    pub fn observe(&mut self, measurement: &Measurement, now_ns: u64, rules: Rules<'_>) -> Result<Observed, EngineError> {
+        let refused = |outcome| Ok(Observed { outcome, reordered: false });
         if let Some(field) = measurement.not_finite() {
-            return Ok(Outcome::NotFinite { field });
+            return refused(Outcome::NotFinite { field });
         }
         rules.limits.check_state("state", &measurement.state)?;
         if let Some((entry, reason)) = outside_card(rules.vehicle, &measurement.command) {
             return Err(EngineError::invalid(format!("command.{entry}"), reason));
         }
-        if let Some(refused) = self.judge_order(measurement, rules)? {
-            return Ok(refused);
+        match self.order.judge(measurement, now_ns, rules.step_ns, rules.limits)? {
+            Verdict::Refuse(outcome) => refused(outcome),
+            Verdict::Accept => Ok(self.accept(measurement, now_ns, rules)),
+            Verdict::Begin(outcome) => {
+                self.begin(measurement.boot);
+                Ok(Observed { outcome, ..self.accept(measurement, now_ns, rules) })
+            }
         }
-        Ok(self.accept(measurement, now_ns, rules.step_ns))
     }
 
-    /// Duplicates and late measurements.
-    fn judge_order(&self, measurement: &Measurement, rules: Rules<'_>) -> Result<Option<Outcome>, EngineError> {
-        let stamp = measurement.stamp_ns;
-        let repeated = measurement.sequence.is_some() && measurement.sequence == self.last_sequence;
-        if repeated || self.recent_stamps.contains(&stamp) {
-            return Ok(Some(Outcome::Duplicate));
-        }
-        let Some(last) = self.last_stamp_ns() else { return Ok(None) };
-        if stamp < last {
-            return Ok(Some(Outcome::TooOld { behind_s: seconds(last.saturating_sub(stamp)) }));
-        }
-        if let (Some(sequence), Some(last_sequence)) = (measurement.sequence, self.last_sequence)
-            && sequence < last_sequence
-        {
-            return Ok(Some(Outcome::TooOld { behind_s: 0.0 }));
-        }
-        let ahead_s = seconds(stamp.saturating_sub(last));
-        if ahead_s > rules.limits.pause_max_s {
-            let limit = rules.limits.pause_max_s;
-            let reason = format!("lies {ahead_s} s after the last one, allowed are {limit} s; open a new session after a longer pause");
-            return Err(EngineError::invalid("stamp_ns", reason));
-        }
-        Ok(None)
+    /// Ends the present line. What was open becomes final, what was learned of the soil stays.
+    fn begin(&mut self, boot: Option<u64>) {
+        self.leaving.extend(self.open.drain(..).map(Leaving::Measured));
+        self.leaving.push_back(Leaving::End);
+        self.order.begin(boot);
+        self.live = Track::default();
     }
 
-    fn accept(&mut self, measurement: &Measurement, now_ns: u64, step_ns: i64) -> Outcome {
-        if self.recent_stamps.len() == RECENT_STAMPS {
-            self.recent_stamps.pop_front();
-        }
-        self.recent_stamps.push_back(measurement.stamp_ns);
-        self.last_sequence = measurement.sequence.or(self.last_sequence);
-        let stamp_ns = measurement.stamp_ns;
-        let outcome = match self.grid.as_mut().map(|grid| grid.take(stamp_ns)) {
-            Some(Place::Between { remaining_ns }) => return Outcome::Buffered { next_step_in_s: seconds(remaining_ns) },
-            Some(Place::Step) => Outcome::Applied,
-            Some(Place::Gap { gap_ns }) => {
-                self.grid = Some(StepGrid::start(stamp_ns, step_ns));
-                self.history.clear();
-                Outcome::Gap { gap_s: seconds(gap_ns) }
-            }
-            None => {
-                self.grid = Some(StepGrid::start(stamp_ns, step_ns));
-                Outcome::Applied
-            }
+    fn accept(&mut self, measurement: &Measurement, now_ns: u64, rules: Rules<'_>) -> Observed {
+        let newest = self.order.accept(measurement, now_ns);
+        let taken = if newest {
+            self.open.push_back(*measurement);
+            self.live.advance(measurement, rules.step_ns)
+        } else {
+            let place = self.open.partition_point(|other| other.stamp_ns < measurement.stamp_ns);
+            self.open.insert(place, *measurement);
+            self.remake(measurement.stamp_ns, rules.step_ns)
         };
-        if self.history.len() == HISTORY {
-            self.history.pop_front();
+        if !newest || !matches!(taken, Taken::Waiting(_)) {
+            self.history_epoch += 1;
         }
-        self.history.push_back(HistoryStep { state: measurement.state, control: measurement.command });
-        self.history_epoch += 1;
-        self.arrived_ns = now_ns;
+        if newest && !matches!(taken, Taken::Waiting(_)) {
+            self.arrived_ns = now_ns as i64;
+        }
+        self.close_window(rules.limits.reorder_window_ns());
+        let outcome = match taken {
+            Taken::Steps(..) => Outcome::Applied,
+            Taken::AfterGap(_, gap_ns) => Outcome::Gap { gap_s: seconds(gap_ns) },
+            Taken::Waiting(remaining_ns) => Outcome::Buffered { next_step_in_s: seconds(remaining_ns) },
+        };
+        Observed { outcome, reordered: !newest }
+    }
+
+    /// Makes the live steps again and says what the measurement with this stamp made.
+    fn remake(&mut self, stamp_ns: i64, step_ns: i64) -> Taken {
+        let mut live = self.settled.clone();
+        for leaving in &self.leaving {
+            match leaving {
+                Leaving::Measured(measurement) => drop(live.advance(measurement, step_ns)),
+                Leaving::End => live = Track::default(),
+            }
+        }
+        let mut made = Taken::Waiting(0);
+        for measurement in &self.open {
+            let taken = live.advance(measurement, step_ns);
+            if measurement.stamp_ns == stamp_ns {
+                made = taken;
+            }
+        }
+        self.live = live;
+        made
+    }
+
+    /// Lets go what lies behind the window before the newest measurement.
+    fn close_window(&mut self, window_ns: i64) {
+        let edge_ns = self.order.newest_ns().map_or(i64::MIN, |newest| newest.saturating_sub(window_ns));
+        while let Some(first) = self.open.front().filter(|first| first.stamp_ns <= edge_ns || self.open.len() > OPEN_MAX) {
+            self.order.final_ns = Some(first.stamp_ns);
+            self.leaving.extend(self.open.pop_front().map(Leaving::Measured));
+        }
+    }
+
+    /// Lets the soil filter learn from what has become final with an observation; every B-th step makes an update (paper Alg. 1). The steps
+    /// stay in the history when the filter refuses its buffer: then the outcome says so.
+    pub fn learn(&mut self, predictor: &Predictor, map: Option<&Arc<WorldMap>>, step_ns: i64, outcome: Outcome) -> Outcome {
+        let mut outcome = outcome;
+        while let Some(leaving) = self.leaving.pop_front() {
+            let Leaving::Measured(measurement) = leaving else {
+                self.settled = Track::default();
+                self.learner.forget_open();
+                continue;
+            };
+            let (first, second) = match self.settled.take(&measurement, step_ns) {
+                Taken::Waiting(_) => continue,
+                Taken::Steps(first, second) => (first, second),
+                Taken::AfterGap(first, _) => {
+                    self.learner.forget_open();
+                    (first, None)
+                }
+            };
+            for step in [Some(first), second].into_iter().flatten() {
+                if let Some(nis) = self.learn_step(step, predictor, map) {
+                    outcome = Outcome::Gated { nis };
+                }
+            }
+        }
         outcome
     }
 
-    /// Lets the soil filter learn from the step that an observation has just made; every B-th step makes an update (paper Alg. 1). The
-    /// step stays in the history when the filter refuses its buffer: then the outcome says so.
-    pub fn learn(&mut self, predictor: &Predictor, map: Option<&Arc<WorldMap>>, outcome: Outcome) -> Outcome {
-        match outcome {
-            Outcome::Applied => {}
-            Outcome::Gap { .. } => self.learner.forget_open(),
-            _ => return outcome,
-        }
-        let stamp_ns = self.last_stamp_ns();
-        let Some((newest, before)) = self.history.make_contiguous().split_last() else { return outcome };
-        let Some(update) = self.learner.step(predictor, before, newest, map) else { return outcome };
+    /// Lets the filter learn from one final step; NIS of the buffer that it ended if that was refused.
+    fn learn_step(&mut self, step: HistoryStep, predictor: &Predictor, map: Option<&Arc<WorldMap>>) -> Option<f64> {
+        self.settled.push(step);
+        let stamp_ns = self.settled.grid.map(|grid| grid.last_ns());
+        let (newest, before) = self.settled.history.make_contiguous().split_last()?;
+        let (update, brought) = self.learner.step(predictor, before, newest, map)?;
+        self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
         let judged = self.soil.state.last_buffer.map_or(0, |last| last.judged) + 1;
         let last_buffer = Some(BufferTest { judged, nis: update.nis, dof: update.dof, rejected: update.rejected });
         if update.rejected {
             self.soil.state.last_buffer = last_buffer;
-            return Outcome::Gated { nis: update.nis };
+            return Some(update.nis);
         }
         let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, stamp_ns) };
         self.soil = SoilEstimate { state, covariance: update.posterior.covariance };
-        outcome
+        None
     }
 
-    /// A copy of everything under another name.
+    /// Position at which the session begins, once it has one; then never again. World, m.
+    pub(crate) fn begins_at(&mut self) -> Option<[f64; 2]> {
+        let [x, y, _] = self.newest().filter(|_| self.fleet.asks)?.state.position_m;
+        self.fleet.asks = false;
+        Some([x, y])
+    }
+
+    /// Begins from what the fleet knows of the ground.
+    pub(crate) fn begin_from(&mut self, prior: &FleetPrior) {
+        if self.learner.begin_from(prior) {
+            let state = self.learner.state(self.soil.state.epoch + 1, None);
+            self.soil = SoilEstimate { state, covariance: self.learner.covariance() };
+        }
+    }
+
+    /// What the session learns does not go into the soil map of the fleet.
+    pub(crate) fn bring_nothing(&mut self) {
+        self.fleet.brings = false;
+    }
+
+    /// What the session has brought for the map of the fleet since the last time.
+    pub(crate) fn take_brought(&mut self) -> Vec<Brought> {
+        core::mem::take(&mut self.fleet.brought)
+    }
+
+    /// A copy of everything under another name. What it learns does not go into the soil map of the fleet.
     pub fn fork(&self, id: &str, now_ns: u64) -> Self {
-        Self { id: id.into(), used_ns: now_ns, ..self.clone() }
+        let mut copy = Self { id: id.into(), used_ns: now_ns, ..self.clone() };
+        copy.bring_nothing();
+        copy
     }
 
     /// Notes that the session is fed or asked.
@@ -208,17 +318,17 @@ impl Session {
 
     /// Measured steps, oldest first, the newest included; at most 32.
     pub fn history(&self) -> &VecDeque<HistoryStep> {
-        &self.history
+        &self.live.history
     }
 
     /// Newest step of the history.
     pub fn newest(&self) -> Option<&HistoryStep> {
-        self.history.back()
+        self.live.history.back()
     }
 
     /// Stamp and command of the newest step of the history.
     pub(crate) fn newest_at(&self) -> Option<Newest> {
-        let (grid, step) = (self.grid.as_ref()?, self.newest()?);
+        let (grid, step) = (self.live.grid.as_ref()?, self.newest()?);
         Some(Newest { stamp_ns: grid.last_ns(), command: step.control })
     }
 
@@ -229,12 +339,17 @@ impl Session {
 
     /// Stamp of the newest accepted measurement, ns of the vehicle's clock.
     pub fn last_stamp_ns(&self) -> Option<i64> {
-        self.recent_stamps.back().copied()
+        self.order.newest_ns()
     }
 
-    /// Sequence number of the newest accepted measurement that had one.
+    /// Highest accepted sequence number.
     pub fn last_sequence(&self) -> Option<u64> {
-        self.last_sequence
+        self.order.last_sequence
+    }
+
+    /// Start of the vehicle's software that feeds the session, where it tells.
+    pub fn boot(&self) -> Option<u64> {
+        self.order.boot
     }
 
     /// What was learned of the soil.
@@ -244,7 +359,7 @@ impl Session {
 
     /// Time since the newest step of the history arrived, s; `None` before the first.
     pub fn age_s(&self, now_ns: u64) -> Option<f64> {
-        self.newest().map(|_| now_ns.saturating_sub(self.arrived_ns) as f64 * 1e-9)
+        self.newest().map(|_| seconds((now_ns as i64).saturating_sub(self.arrived_ns).max(0)))
     }
 }
 

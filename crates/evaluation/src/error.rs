@@ -31,14 +31,6 @@ pub enum EvaluationError {
         /// Names that can be evaluated.
         choices: String,
     },
-    /// A model name is reserved, but this version cannot evaluate it.
-    #[error("model `{name}` is not part of this version; choose from {choices}")]
-    ModelNotAvailable {
-        /// Name as given.
-        name: String,
-        /// Names that can be evaluated.
-        choices: String,
-    },
     /// Predictions from measured wheels were asked for where there are none.
     #[error("drive {trajectory} has no measured wheel speeds, or no angles of its steered wheels; use --inputs commands")]
     NoWheels {

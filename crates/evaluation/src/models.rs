@@ -10,34 +10,46 @@ use crate::error::EvaluationError;
 pub enum ModelName {
     /// The whole model.
     Nesam,
-    /// Without the learned state residual (paper: "w/o SR").
+    /// Without the learned state residual (paper: "w/o SR"), retrained where there is a bundle of that form.
     NesamNoResidual,
-    /// With wheel sinkage suppressed (paper: "Sinkage = 0").
+    /// With wheel sinkage suppressed (paper: "Sinkage = 0"), retrained where there is a bundle of that form.
     NesamZeroSinkage,
+    /// The whole model whose residual is switched off at inference only.
+    NesamNoResidualSwitch,
+    /// The whole model whose sinkage is suppressed at inference only.
+    NesamZeroSinkageSwitch,
     /// Pure end to end on the same tokens, trained with the same budget.
     Transformer,
     /// A kinematic bicycle with the same learned residual.
     KinematicResidual,
     /// Newton-Euler on rigid ground with the same learned residual.
     RigidResidual,
+    /// Terrain-Attentive Learning on elevation and semantics.
+    TalElevSem,
+    /// Terrain-Attentive Learning on elevation.
+    TalElev,
+    /// Terrain-Attentive Learning on semantics.
+    TalSem,
     /// Best-fit bicycle or differential drive.
     Kinematic,
     /// The measured body twist goes on.
     ConstantVelocity,
 }
 
-/// Names of the contract that later versions fill in.
-const RESERVED: [&str; 3] = ["tal_elev_sem", "tal_elev", "tal_sem"];
-
 impl ModelName {
     /// Every model of this version, in the order of tables and plots.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 13] = [
         Self::Nesam,
         Self::NesamNoResidual,
         Self::NesamZeroSinkage,
+        Self::NesamNoResidualSwitch,
+        Self::NesamZeroSinkageSwitch,
         Self::Transformer,
         Self::KinematicResidual,
         Self::RigidResidual,
+        Self::TalElevSem,
+        Self::TalElev,
+        Self::TalSem,
         Self::Kinematic,
         Self::ConstantVelocity,
     ];
@@ -48,9 +60,14 @@ impl ModelName {
             Self::Nesam => "nesam",
             Self::NesamNoResidual => "nesam_no_residual",
             Self::NesamZeroSinkage => "nesam_zero_sinkage",
+            Self::NesamNoResidualSwitch => "nesam_no_residual_switch",
+            Self::NesamZeroSinkageSwitch => "nesam_zero_sinkage_switch",
             Self::Transformer => "transformer",
             Self::KinematicResidual => "kinematic_residual",
             Self::RigidResidual => "rigid_residual",
+            Self::TalElevSem => "tal_elev_sem",
+            Self::TalElev => "tal_elev",
+            Self::TalSem => "tal_sem",
             Self::Kinematic => "kinematic",
             Self::ConstantVelocity => "constant_velocity",
         }
@@ -58,12 +75,22 @@ impl ModelName {
 
     /// Whether the model needs the weights of the main bundle.
     pub fn is_nesam(self) -> bool {
-        matches!(self, Self::Nesam | Self::NesamNoResidual | Self::NesamZeroSinkage)
+        self == Self::Nesam || self.is_ablation() || self.is_switch()
+    }
+
+    /// Whether the model is a form of the main one that is better retrained.
+    pub fn is_ablation(self) -> bool {
+        matches!(self, Self::NesamNoResidual | Self::NesamZeroSinkage)
+    }
+
+    /// Whether the model is the main bundle with a part switched off.
+    pub fn is_switch(self) -> bool {
+        matches!(self, Self::NesamNoResidualSwitch | Self::NesamZeroSinkageSwitch)
     }
 
     /// Whether the model needs a bundle of its own, trained as a baseline.
     pub fn is_trained_baseline(self) -> bool {
-        matches!(self, Self::Transformer | Self::KinematicResidual | Self::RigidResidual)
+        matches!(self, Self::Transformer | Self::KinematicResidual | Self::RigidResidual | Self::TalElevSem | Self::TalElev | Self::TalSem)
     }
 }
 
@@ -81,11 +108,6 @@ impl FromStr for ModelName {
             return Ok(found);
         }
         let choices = Self::ALL.map(Self::as_str).join(", ");
-        let name = name.to_string();
-        Err(if RESERVED.contains(&name.as_str()) {
-            EvaluationError::ModelNotAvailable { name, choices }
-        } else {
-            EvaluationError::UnknownModel { name, choices }
-        })
+        Err(EvaluationError::UnknownModel { name: name.to_string(), choices })
     }
 }

@@ -84,9 +84,8 @@ impl WindowPredictor {
         };
         Ok(match name {
             ModelName::Nesam => nesam(Variant::Full)?,
-            ModelName::NesamNoResidual => nesam(Variant::NoResidual)?,
-            ModelName::NesamZeroSinkage => nesam(Variant::ZeroSinkage)?,
-            ModelName::Transformer | ModelName::KinematicResidual | ModelName::RigidResidual => nesam(Variant::Full)?,
+            ModelName::NesamNoResidual | ModelName::NesamNoResidualSwitch => nesam(Variant::NoResidual)?,
+            ModelName::NesamZeroSinkage | ModelName::NesamZeroSinkageSwitch => nesam(Variant::ZeroSinkage)?,
             ModelName::ConstantVelocity => Self::ConstantVelocity,
             ModelName::Kinematic => {
                 let model = kinematic.ok_or_else(|| EvaluationError::KinematicNotFitted {
@@ -94,6 +93,8 @@ impl WindowPredictor {
                 })?;
                 Self::Kinematic { model, vehicle: Arc::clone(vehicle) }
             }
+            // A trained baseline is the form that its own bundle was trained as.
+            _ => nesam(Variant::Full)?,
         })
     }
 

@@ -128,7 +128,6 @@ fn property_refusals_name_what_was_wrong() {
     let vehicle = Arc::new(nesam_vehicle());
     let kinematic = WindowPredictor::new(ModelName::Kinematic, None, &vehicle, None, Inputs::Commands).unwrap_err().to_string();
     assert!(kinematic.contains("never fitted"), "{kinematic}");
-    assert!("tal_sem".parse::<ModelName>().unwrap_err().to_string().contains("not part of this version"));
     assert!("nesma".parse::<ModelName>().unwrap_err().to_string().contains("choose from nesam"));
 }
 

@@ -137,7 +137,7 @@ pub fn pretrain(
                 gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
             }
         }
-        adam.update(&autoencoder.variables, &gradients, crate::schedule::cosine(plan.rate, step, plan.steps), 1.0)?;
+        adam.update(&autoencoder.variables, &gradients, crate::schedule::cosine(plan.rate, step, plan.steps), 1.0, 0.0)?;
         let loss = loss.to_scalar::<f32>()?;
         if step * 10 >= plan.steps * 9 {
             let mean = images.mean_all()?;

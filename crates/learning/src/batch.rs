@@ -6,13 +6,14 @@ use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, HIDDEN};
 use nesam_model::reference::{Network, Row, TerrainProvider};
-use nesam_model::{GroundSource, Normalization, history_actuators};
+use nesam_model::{GroundSource, Normalization, Variant, history_actuators};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::drives::{Drive, Place};
+use crate::pooling::Pooling;
 
 /// Samples past the window in which a fast prediction may find its place.
 const AHEAD: usize = 8;
@@ -38,11 +39,43 @@ pub struct Dropout {
 }
 
 impl Dropout {
-    /// Factor of each feature: 0, or what keeps the mean.
-    fn factors(&self) -> Vec<f32> {
+    /// Factor of each of `n` features: 0, or what keeps the mean.
+    fn factors(&self, n: usize) -> Vec<f32> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         let kept = 1.0 / (1.0 - self.share);
-        (0..CONTEXT).map(|_| if rng.random::<f32>() < self.share { 0.0 } else { kept }).collect()
+        (0..n).map(|_| if rng.random::<f32>() < self.share { 0.0 } else { kept }).collect()
+    }
+}
+
+/// What of the terrain a form reads, and how.
+#[derive(Clone, Copy, Debug)]
+pub struct Sight<'a> {
+    /// Form.
+    pub variant: Variant,
+    /// Sharing of W_c.
+    pub pooling: &'a Pooling,
+    /// Soil where there is no map, raw.
+    pub default_soil: [f32; SOIL_DIM],
+}
+
+impl Sight<'_> {
+    /// Factor of each pooled feature in a window; `None` = one for all.
+    fn factors(&self, dropout: Option<Dropout>) -> Option<Vec<f32>> {
+        let unseen = self.variant.unseen();
+        if dropout.is_none() && unseen.is_empty() {
+            return None;
+        }
+        let width = self.pooling.width();
+        let mut factors = dropout.map_or_else(|| vec![1.0; width], |dropout| dropout.factors(width));
+        factors[unseen.start * width / CONTEXT..unseen.end * width / CONTEXT].fill(0.0);
+        Some(factors)
+    }
+
+    /// W_c for pooled contexts, (128, width).
+    fn projection(&self, network: &Network) -> Result<Tensor> {
+        let full: Vec<f32> = network.token_context().flatten_all()?.to_vec1()?;
+        let pooled = full.chunks_exact(CONTEXT).flat_map(|row| self.pooling.sum(row)).collect();
+        Tensor::from_vec(pooled, (HIDDEN, self.pooling.width()), &Device::Cpu)
     }
 }
 
@@ -99,7 +132,7 @@ pub fn state_loss(predicted: &Tensor, target: &Tensor, scales: &Normalization) -
     ((error.sqr()? + 1.0)?.sqrt()? - 1.0)?.sum(1)?.mean_all()
 }
 
-/// Contexts and their projection, cut from the graph: the rollout reads the leaf, and the gradient of W_c is one product at the end.
+/// Pooled contexts and their projection, cut from the graph: the rollout reads the leaf, and the gradient of W_c is one product at the end.
 struct Projected {
     context: Tensor,
     tokens: Var,
@@ -109,16 +142,15 @@ struct Projected {
 pub struct PathTerrain<'a, 'w> {
     windows: &'w [Window<'a>],
     horizon: usize,
-    /// Contexts and their tokens of the history, and of the samples ahead: (rows, 9216) and (rows, 128).
+    /// Contexts and their tokens of the history, and of the samples ahead: (rows, width) and (rows, 128).
     past: Option<Projected>,
     ahead: Projected,
-    /// Raw soil with its graph, and the leaf that the rollout reads.
-    soil_graph: Tensor,
-    soils: Var,
+    /// Raw soil of the samples ahead with its graph, and the leaf that the rollout reads; `None` where the form or the drives have none.
+    soil: Option<(Tensor, Var)>,
     /// First row of each window in the table ahead.
     first_row: Vec<u32>,
     has_map: bool,
-    default_soil: [f32; SOIL_DIM],
+    sight: Sight<'a>,
 }
 
 impl<'a, 'w> PathTerrain<'a, 'w> {
@@ -126,56 +158,60 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
     ///
     /// # Errors
     /// A candle error.
-    pub fn new(network: &Network, windows: &'w [Window<'a>], history: usize, horizon: usize, scales: &Normalization) -> Result<Self> {
+    pub fn new(network: &Network, windows: &'w [Window<'a>], history: usize, horizon: usize, sight: Sight<'a>) -> Result<Self> {
+        let (variant, width) = (sight.variant, sight.pooling.width());
         let has_map = windows.iter().all(|w| w.drive.has_features());
         let rows: usize = windows.iter().map(|w| w.last(horizon) - w.start + 1).sum();
         let (mut context, mut past, mut semantic) = (Vec::new(), Vec::new(), Vec::new());
         let mut first_row = Vec::with_capacity(windows.len());
         if has_map {
-            context.reserve(rows * CONTEXT);
+            context.reserve(rows * width);
             for w in windows {
-                first_row.push((context.len() / CONTEXT) as u32);
+                first_row.push((context.len() / width) as u32);
                 let new_at = [context.len(), past.len()];
                 for i in w.start..=w.last(horizon) {
                     w.drive.push_context(i, &mut context);
-                    w.drive.push_semantic(i, &mut semantic);
+                    if variant.has_soil() {
+                        w.drive.push_semantic(i, &mut semantic);
+                    }
                 }
                 for i in w.start - history..w.start {
                     w.drive.push_context(i, &mut past);
                 }
-                if let Some(dropout) = &w.dropout {
-                    let factors = dropout.factors();
-                    let rows = context[new_at[0]..].chunks_exact_mut(CONTEXT).chain(past[new_at[1]..].chunks_exact_mut(CONTEXT));
+                let rows = context[new_at[0]..].chunks_exact_mut(width).chain(past[new_at[1]..].chunks_exact_mut(width));
+                if let Some(factors) = sight.factors(w.dropout) {
                     rows.for_each(|row| row.iter_mut().zip(&factors).for_each(|(value, factor)| *value *= factor));
                 }
             }
         }
         let device = &Device::Cpu;
+        let projection = sight.projection(network)?.t()?;
         let project = |values: Vec<f32>, rows: usize| -> Result<Projected> {
             if !has_map {
                 let tokens = Var::zeros((rows, HIDDEN), DType::F32, device)?;
                 return Ok(Projected { context: Tensor::zeros((rows, 1), DType::F32, device)?, tokens });
             }
-            let context = Tensor::from_vec(values, (rows, CONTEXT), device)?;
-            let tokens = Var::from_tensor(&network.context_token(&context)?.detach())?;
+            let context = Tensor::from_vec(values, (rows, width), device)?;
+            let tokens = Var::from_tensor(&context.matmul(&projection)?)?;
             Ok(Projected { context, tokens })
         };
         let past_rows = windows.len() * history;
-        let soil_graph = if has_map {
-            network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?
+        let soil = if has_map && variant.has_soil() {
+            let graph = network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?;
+            let leaf = Var::from_tensor(&graph.detach())?;
+            Some((graph, leaf))
         } else {
-            Tensor::zeros((1, SOIL_DIM), DType::F32, device)?
+            None
         };
         Ok(Self {
             windows,
             horizon,
             past: if past_rows > 0 { Some(project(past, past_rows)?) } else { None },
             ahead: project(context, if has_map { rows } else { 1 })?,
-            soils: Var::from_tensor(&soil_graph.detach())?,
-            soil_graph,
+            soil,
             first_row,
             has_map,
-            default_soil: scales.default_soil_raw,
+            sight,
         })
     }
 
@@ -198,10 +234,14 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             }
         }
         if let Some(projection) = projection {
-            gradients.insert("token.context.weight".into(), projection.flatten_all()?.to_vec1()?);
+            // Steepest descent among the weights that are equal within a block: each gets the block's mean gradient, upstream · mean feature.
+            let pooled: Vec<Vec<f32>> = projection.to_vec2()?;
+            gradients.insert("token.context.weight".into(), pooled.iter().flat_map(|row| self.sight.pooling.spread(row)).collect());
         }
-        if let Some(upstream) = store.get(&self.soils) {
-            let pulled = (&self.soil_graph * upstream.detach())?.sum_all()?.backward()?;
+        if let Some((graph, leaf)) = &self.soil
+            && let Some(upstream) = store.get(leaf)
+        {
+            let pulled = (graph * upstream.detach())?.sum_all()?.backward()?;
             for (name, var) in network.variables.iter().filter(|(name, _)| name.starts_with("soil.")) {
                 if let Some(gradient) = pulled.get(var) {
                     gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
@@ -236,14 +276,19 @@ impl TerrainProvider for PathTerrain<'_, '_> {
     }
 
     fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
+        let n = states.len();
+        let default_soil =
+            || Tensor::from_slice(&self.sight.default_soil, (1, SOIL_DIM), &Device::Cpu)?.broadcast_as((n, SOIL_DIM))?.contiguous();
         if !self.has_map {
-            let n = states.len();
-            let soil = Tensor::from_slice(&self.default_soil, (1, SOIL_DIM), &Device::Cpu)?.broadcast_as((n, SOIL_DIM))?.contiguous()?;
-            return Ok((Tensor::zeros((n, HIDDEN), DType::F32, &Device::Cpu)?, soil));
+            return Ok((Tensor::zeros((n, HIDDEN), DType::F32, &Device::Cpu)?, default_soil()?));
         }
         let places: Vec<Place> =
             self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();
-        Ok((self.interpolate(&self.ahead.tokens, &places)?, self.interpolate(&self.soils, &places)?))
+        let soil = match &self.soil {
+            Some((_, leaf)) => self.interpolate(leaf, &places)?,
+            None => default_soil()?,
+        };
+        Ok((self.interpolate(&self.ahead.tokens, &places)?, soil))
     }
 }
 

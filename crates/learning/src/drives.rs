@@ -15,6 +15,8 @@ use nesam_physics::{Control, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
 use rayon::prelude::*;
 
+use crate::pooling::Pooling;
+
 /// Metres that one radian of heading counts when places are compared.
 const METRES_PER_RADIAN: f64 = 2.0;
 
@@ -31,8 +33,10 @@ pub struct Drive {
     pub controls: Vec<Control<f64>>,
     /// Measured wheel speeds FL, FR, RL, RR, rad/s, where they are known: for calibration only, no input of the model.
     pub wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,
-    /// Contexts (samples, 9216), empty until encoded.
-    features: Vec<f16>,
+    /// Pooled contexts (samples, width of the pooling), empty until encoded.
+    contexts: Vec<f16>,
+    /// Semantic features (samples, 16, 16, 18), for the soil prior.
+    semantics: Vec<f16>,
 }
 
 /// A place on the driven path: share `1 - share` of sample `at`, `share` of the next one.
@@ -47,7 +51,7 @@ pub struct Place {
 impl Drive {
     /// A drive without features yet.
     pub fn new(id: String, map: Option<Arc<WorldMap>>, states: Vec<VehicleState<f64>>, controls: Vec<Control<f64>>) -> Self {
-        Self { id, map, states, controls, wheel_speed_rad_s: None, features: Vec::new() }
+        Self { id, map, states, controls, wheel_speed_rad_s: None, contexts: Vec::new(), semantics: Vec::new() }
     }
 
     /// The drive seen in a mirror (y becomes -y) over the mirrored `map`: for a vehicle whose two sides are alike, another true drive.
@@ -77,25 +81,19 @@ impl Drive {
         (from..to).map(|j| HistoryStep { state: self.states[j], control: self.controls[j] }).collect()
     }
 
-    /// Whether contexts exist (a map, and `encode` was called).
+    /// Whether contexts exist (a map, and `encode_drives` was called).
     pub fn has_features(&self) -> bool {
-        !self.features.is_empty()
+        !self.contexts.is_empty()
     }
 
-    /// Appends the context of sample `i`, (9216), to `out`.
+    /// Appends the pooled context of sample `i` to `out`.
     pub fn push_context(&self, i: usize, out: &mut Vec<f32>) {
-        self.push(&self.features[i * CONTEXT..(i + 1) * CONTEXT], out);
+        push(&self.contexts, self.states.len(), i, out);
     }
 
     /// Appends the semantic features of sample `i`, (16, 16, 18), to `out`.
     pub fn push_semantic(&self, i: usize, out: &mut Vec<f32>) {
-        self.push(&self.features[i * CONTEXT + FEATURES..(i + 1) * CONTEXT], out);
-    }
-
-    fn push(&self, features: &[f16], out: &mut Vec<f32>) {
-        let at = out.len();
-        out.resize(at + features.len(), 0.0);
-        features.convert_to_f32_slice(&mut out[at..]);
+        push(&self.semantics, self.states.len(), i, out);
     }
 
     /// Where on the path, among samples `first ..= last`, a predicted state is nearest.
@@ -122,20 +120,37 @@ impl Drive {
     }
 }
 
+/// Appends row `i` of `rows` equal rows.
+fn push(values: &[f16], rows: usize, i: usize, out: &mut Vec<f32>) {
+    let width = values.len() / rows;
+    let at = out.len();
+    out.resize(at + width, 0.0);
+    values[i * width..(i + 1) * width].convert_to_f32_slice(&mut out[at..]);
+}
+
 /// Computes the contexts of all drives with a map, in parallel; `progress(done)` counts samples.
-pub fn encode_drives(drives: &mut [Drive], encoders: &TerrainEncoders, scale: &PatchScale, progress: impl Fn(usize) + Sync) {
+pub fn encode_drives(
+    drives: &mut [Drive],
+    encoders: &TerrainEncoders,
+    scale: &PatchScale,
+    pooling: &Pooling,
+    progress: impl Fn(usize) + Sync,
+) {
     drives.par_iter_mut().for_each_init(
         || (Patch::new(), EncoderScratch::default(), vec![0f32; CONTEXT]),
         |(patch, scratch, context), drive| {
             let Some(map) = drive.map.clone() else { return };
-            let mut features = vec![f16::ZERO; drive.states.len() * CONTEXT];
-            for (i, slot) in features.chunks_exact_mut(CONTEXT).enumerate() {
+            let samples = drive.states.len();
+            let (mut contexts, mut semantics) = (vec![f16::ZERO; samples * pooling.width()], vec![f16::ZERO; samples * FEATURES]);
+            let slots = contexts.chunks_exact_mut(pooling.width()).zip(semantics.chunks_exact_mut(FEATURES));
+            for (i, (pooled, semantic)) in slots.enumerate() {
                 sample_patch(&map, drive.pose(i), scale, patch);
                 encoders.encode(patch, scratch, context);
-                slot.convert_from_f32_slice(context);
+                pooled.convert_from_f32_slice(&pooling.mean(context));
+                semantic.convert_from_f32_slice(&context[FEATURES..]);
             }
-            drive.features = features;
-            progress(drive.states.len());
+            (drive.contexts, drive.semantics) = (contexts, semantics);
+            progress(samples);
         },
     );
 }

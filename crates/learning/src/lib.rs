@@ -11,6 +11,7 @@ pub mod batch;
 pub mod calibrate;
 pub mod drives;
 pub mod initial;
+pub mod pooling;
 pub mod recipe;
 pub mod rims;
 pub mod scales;
@@ -18,4 +19,5 @@ pub mod schedule;
 pub mod trainer;
 
 pub use drives::{Drive, encode_drives};
+pub use pooling::Pooling;
 pub use trainer::{EpochReport, Trained, TrainingError, TrainingPlan, TrainingSet, train};

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nesam_model::bundle::{sha256_hex, trained_parameters};
+use nesam_model::dims::CONTEXT;
 use nesam_model::encoder::{ENCODERS, TerrainEncoders};
 use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
 use nesam_physics::step::StepModel;
@@ -17,6 +18,7 @@ use crate::autoencoder::{Places, PretrainPlan, pretrain};
 use crate::calibrate::calibrate_driveline;
 use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
+use crate::pooling::Pooling;
 use crate::scales::{measure, measure_increments};
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
 
@@ -35,6 +37,8 @@ pub struct Recipe {
     pub encoder_rate: f64,
     /// Trains on the mirror image of each drive too; for vehicles whose two sides are alike.
     pub mirror: bool,
+    /// Cells that share a weight of the terrain projection.
+    pub pooling: Pooling,
     /// Training plan; its folder is `out/checkpoint`.
     pub plan: TrainingPlan,
     /// Output folder.
@@ -89,7 +93,8 @@ pub fn run(
     }
 
     let mut weights = initial_weights(recipe.plan.seed, &scales);
-    if recipe.plan.variant == Variant::Transformer {
+    prepare_projection(&mut weights, &recipe.pooling, recipe.plan.variant);
+    if recipe.plan.variant.is_end_to_end() {
         let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
         let [mean, sd] = measure_increments(&training);
         scales.residual_scale = sd;
@@ -102,7 +107,7 @@ pub fn run(
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
-        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), |n| {
+        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), &recipe.pooling, |n| {
             reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
         });
     }
@@ -112,6 +117,7 @@ pub fn run(
         validation: if validation_at.is_empty() { &train_at } else { &validation_at }.iter().map(|&i| &drives[i]).collect(),
         scales: &scales,
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
+        pooling: recipe.pooling.clone(),
     };
     reporter.line(&format!(
         "{} drives train, {} validate, {} parameters",
@@ -157,6 +163,17 @@ pub fn run(
     };
     bundle.save(&recipe.out.join("bundle"))?;
     Ok(bundle)
+}
+
+/// Makes W_c equal within the blocks that share a weight, and zero for what the form does not see: training on nothing leaves that so, and the
+/// trained bundle ignores it.
+fn prepare_projection(weights: &mut Weights, pooling: &Pooling, variant: Variant) {
+    let projection = weights.values_mut("token.context.weight").expect("the projection is part of every network; this is a bug");
+    for row in projection.chunks_exact_mut(CONTEXT) {
+        let means = pooling.mean(row);
+        row.iter_mut().zip(pooling.spread(&means)).for_each(|(weight, mean)| *weight = mean);
+        row[variant.unseen()].fill(0.0);
+    }
 }
 
 /// Seconds that the optimiser's steps took, over all the runs that a resumed training was made of.

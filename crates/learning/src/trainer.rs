@@ -13,8 +13,9 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::adam::Adam;
-use crate::batch::{Dropout, PathTerrain, Window, absolute_errors, rows, state_loss, targets};
+use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, targets};
 use crate::drives::Drive;
+use crate::pooling::Pooling;
 use crate::schedule::{cosine, curriculum};
 
 /// What a training run was told.
@@ -36,6 +37,8 @@ pub struct TrainingPlan {
     pub shards: usize,
     /// Share of the terrain features that each window is trained without.
     pub dropout: f32,
+    /// Decoupled decay of the weight matrices per unit of learning rate (Loshchilov & Hutter 2019).
+    pub decay: f32,
     /// Ablation trained.
     pub variant: Variant,
     /// Where checkpoints go.
@@ -106,9 +109,15 @@ pub struct TrainingSet<'a> {
     pub scales: &'a Normalization,
     /// Physics.
     pub model: Arc<StepModel>,
+    /// Sharing of W_c; its weights are equal within blocks from the start.
+    pub pooling: Pooling,
 }
 
 impl TrainingSet<'_> {
+    fn sight(&self, variant: Variant) -> Sight<'_> {
+        Sight { variant, pooling: &self.pooling, default_soil: self.scales.default_soil_raw }
+    }
+
     /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1) and its gradient in every trainable array.
     ///
     /// # Errors
@@ -123,7 +132,7 @@ impl TrainingSet<'_> {
     ) -> Result<(f32, HashMap<String, Vec<f32>>)> {
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
         let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
-        let mut terrain = PathTerrain::new(network, windows, history, horizon, self.scales)?;
+        let mut terrain = PathTerrain::new(network, windows, history, horizon, self.sight(variant))?;
         let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;
         for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
             total = (total + state_loss(&step.state, &targets(windows, k)?, self.scales)?)?;
@@ -154,9 +163,10 @@ impl TrainingSet<'_> {
         let mut sums = [0.0; 5];
         let mut count = 0.0;
         for windows in windows.chunks(64) {
-            let history = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
+            let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
+            let history = steps_needed(variant, available);
             let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
-            let mut terrain = PathTerrain::new(network, windows, history, horizon, self.scales)?;
+            let mut terrain = PathTerrain::new(network, windows, history, horizon, self.sight(variant))?;
             for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
                 let errors = absolute_errors(&step.state, &targets(windows, k)?)?;
                 for (sum, e) in sums.iter_mut().zip(errors) {
@@ -177,6 +187,11 @@ fn score(errors: &[f64; 5]) -> f64 {
 /// Steps of history for a training step: all of it mostly, less one time in six, so that a fresh session predicts well too.
 fn draw_history(rng: &mut ChaCha8Rng, available: usize) -> usize {
     if rng.random_range(0..6) > 0 { available } else { rng.random_range(0..=available) }
+}
+
+/// Steps of history that a form reads out of those there are: one, for the motion before the start, where it remembers nothing.
+fn steps_needed(variant: Variant, available: usize) -> usize {
+    if variant.remembers() { available } else { available.min(1) }
 }
 
 /// Trains from `weights`; resumes from the folder's checkpoint if asked. `progress(step, loss, norm)` after each step, `report` after each epoch.
@@ -219,9 +234,9 @@ pub fn train(
             windows.push(Window { drive, start, dropout });
         }
         let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
-        let history = draw_history(&mut rng, available);
+        let history = steps_needed(plan.variant, draw_history(&mut rng, available));
         let (loss, gradients) = parallel_gradients(set, &network, &windows, history, horizon, plan, &pools)?;
-        let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0)?;
+        let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0, plan.decay)?;
         checkpoint.step += 1;
         average_in(&mut checkpoint.average, &network.to_weights()?, checkpoint.step);
         loss_sum += loss;

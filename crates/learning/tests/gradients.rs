@@ -6,7 +6,7 @@ mod common;
 use std::sync::Arc;
 
 use candle_core::Tensor;
-use common::{drive, encoded, measured_scales, striped, truck};
+use common::{drive, encoded, measured_scales, single_cells, striped, truck};
 use nesam_learning::batch::Window;
 use nesam_learning::initial::initial_weights;
 use nesam_learning::{Drive, TrainingSet};
@@ -28,7 +28,7 @@ fn check(mut made: Drive, entries: &[(&str, usize)], tolerance: f64) {
     let mut vehicle = truck();
     vehicle.driveline.speed_integral_gain_per_s = 0.0;
     let model = Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps));
-    let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model };
+    let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model, pooling: single_cells() };
     let network = Network::from_weights(&weights).expect("all arrays are there");
     let windows = [12, 30].map(|start| Window { drive: &made, start, dropout: None });
     let gradients = || set.gradients(&network, &windows, 8, 6, Variant::Full).expect("the loss is differentiable");

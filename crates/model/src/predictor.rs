@@ -149,7 +149,7 @@ impl Predictor {
         let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
         let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
         let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
-        let prefix = self.prefix(history, &ground, tokens.as_deref());
+        let prefix = if variant.remembers() { self.prefix(history, &ground, tokens.as_deref()) } else { Prefix::default() };
         let scene = Scene { query, ground, prefix, datum_m: query.start.position_m[2], variant };
 
         let first = control(query, 0, 0);
@@ -302,6 +302,9 @@ impl Predictor {
             samples.iter().zip(&controls).map(|(s, control)| self.entries(&s.state, s.previous.as_ref(), control, &scene.ground)).collect();
         let entry_lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| core::array::from_fn(|l| entries[l.min(last)][i]));
         let context: [Lane; HIDDEN] = core::array::from_fn(|i| core::array::from_fn(|l| terrain[l.min(last)][i]));
+        if !scene.variant.remembers() {
+            *cache = BlockCache::new(1);
+        }
         let (raw_sinkage, raw_residual) = self.network.step(&scene.prefix, cache, &entry_lanes, &context);
 
         let rows: Vec<(DrivelineState, [f32; DIFFERENTIABLE], [f32; CONSTANT], bool)> = samples

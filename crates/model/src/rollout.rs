@@ -1,7 +1,9 @@
 //! The K-step rollout: queries, results and validity flags.
 
+use std::ops::Range;
 use std::sync::Arc;
 
+use crate::dims::{CONTEXT, FEATURES};
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
 use serde::{Deserialize, Serialize};
@@ -37,12 +39,31 @@ pub enum Variant {
     /// Newton-Euler on rigid ground: no soil, no sinkage.
     #[serde(rename = "rigid_residual")]
     RigidResidual,
+    /// Terrain-Attentive Learning (Datar et al. 2024) on elevation and semantics: state, command and the terrain under the vehicle give the next
+    /// state, without memory of what was measured before.
+    #[serde(rename = "tal_elev_sem")]
+    TalElevSem,
+    /// The same on elevation alone.
+    #[serde(rename = "tal_elev")]
+    TalElev,
+    /// The same on semantics alone.
+    #[serde(rename = "tal_sem")]
+    TalSem,
 }
 
 impl Variant {
     /// Every form.
-    pub const ALL: [Self; 6] =
-        [Self::Full, Self::NoResidual, Self::ZeroSinkage, Self::Transformer, Self::KinematicResidual, Self::RigidResidual];
+    pub const ALL: [Self; 9] = [
+        Self::Full,
+        Self::NoResidual,
+        Self::ZeroSinkage,
+        Self::Transformer,
+        Self::KinematicResidual,
+        Self::RigidResidual,
+        Self::TalElevSem,
+        Self::TalElev,
+        Self::TalSem,
+    ];
 
     /// Name in manifests, JSON and options.
     pub fn as_str(self) -> &'static str {
@@ -53,6 +74,9 @@ impl Variant {
             Self::Transformer => "transformer",
             Self::KinematicResidual => "kinematic_residual",
             Self::RigidResidual => "rigid_residual",
+            Self::TalElevSem => "tal_elev_sem",
+            Self::TalElev => "tal_elev",
+            Self::TalSem => "tal_sem",
         }
     }
 
@@ -64,6 +88,25 @@ impl Variant {
     /// Whether soil and terramechanics are part of the form.
     pub fn has_soil(self) -> bool {
         matches!(self, Self::Full | Self::NoResidual | Self::ZeroSinkage)
+    }
+
+    /// Whether the network says the whole increment, with no symbolic half.
+    pub fn is_end_to_end(self) -> bool {
+        matches!(self, Self::Transformer) || !self.remembers()
+    }
+
+    /// Whether a step sees the tokens before its own.
+    pub fn remembers(self) -> bool {
+        !matches!(self, Self::TalElevSem | Self::TalElev | Self::TalSem)
+    }
+
+    /// The part of the terrain context z_e ‖ z_s that the form does not see.
+    pub fn unseen(self) -> Range<usize> {
+        match self {
+            Self::TalSem => 0..FEATURES,
+            Self::TalElev => FEATURES..CONTEXT,
+            _ => 0..0,
+        }
     }
 }
 

@@ -24,7 +24,9 @@ pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepI
             (output.increment, [T::lit(0.0); WHEELS])
         }
         Variant::KinematicResidual => (bicycle(model, input), [T::lit(0.0); WHEELS]),
-        Variant::Transformer => (VehicleState::from_array([T::lit(0.0); 12]), [T::lit(0.0); WHEELS]),
+        Variant::Transformer | Variant::TalElevSem | Variant::TalElev | Variant::TalSem => {
+            (VehicleState::from_array([T::lit(0.0); 12]), [T::lit(0.0); WHEELS])
+        }
     }
 }
 

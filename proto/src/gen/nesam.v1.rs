@@ -174,7 +174,8 @@ pub struct Measurement {
     /// Session to feed. On Zenoh it may be empty: the session named like the vehicle of the key.
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// Increases by at least 1 with each measurement; 0 = not numbered. Resending is always safe.
+    /// Increases by at least 1 with each measurement, in the order of the stamps; 0 = not numbered. Resending is always safe. Numbers make it certain
+    /// whether a clock was set back or a measurement is late: a vehicle should send them.
     #[prost(uint64, tag = "2")]
     pub sequence: u64,
     /// Instant of the state, ns of the vehicle's clock.
@@ -189,6 +190,10 @@ pub struct Measurement {
     /// Wheels, where the vehicle measures them.
     #[prost(message, optional, tag = "6")]
     pub wheels: ::core::option::Option<WheelMeasurement>,
+    /// Start of the vehicle's software that `sequence` and `stamp_ns` belong to: any number that differs from start to start, for example a random one;
+    /// 0 = not told. Another one than before begins a new history, keeps the soil, and ends the old start: its late measurements are TOO_OLD.
+    #[prost(uint64, tag = "7")]
+    pub boot_id: u64,
 }
 /// Optional measurements of the wheels.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -220,9 +225,12 @@ pub struct MeasurementAnswer {
     /// What the session knows of the soil after this measurement; absent when it was rejected.
     #[prost(message, optional, tag = "6")]
     pub soil_correction: ::core::option::Option<SoilCorrection>,
+    /// It arrived after a later one and was put in its place; the outcome says what it is there.
+    #[prost(bool, tag = "7")]
+    pub reordered: bool,
     #[prost(
         oneof = "measurement_answer::Outcome",
-        tags = "10, 11, 12, 13, 14, 15, 16, 17"
+        tags = "10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20"
     )]
     pub outcome: ::core::option::Option<measurement_answer::Outcome>,
 }
@@ -246,16 +254,23 @@ pub mod measurement_answer {
         Gap(super::Gap),
         #[prost(message, tag = "17")]
         Rejected(super::Rejected),
+        #[prost(message, tag = "18")]
+        Future(super::Future),
+        #[prost(message, tag = "19")]
+        ClockJump(super::ClockJump),
+        #[prost(message, tag = "20")]
+        Restarted(super::Restarted),
     }
 }
-/// The measurement is the newest step of the history.
+/// The measurement ended a step of the history: it is one, or one lies between it and the measurement before, where the vehicle measures more often
+/// than every 0.1 s.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Applied {
     /// Steps in the history now, 1 to 32.
     #[prost(uint32, tag = "1")]
     pub history_steps: u32,
 }
-/// Accepted, but denser than the 0.1 s grid of the model: it moves the watermark and waits for the next grid point.
+/// Accepted, but denser than the 0.1 s grid of the model: the step at the next grid point is made of it and the measurement after it.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Buffered {
     /// Time until the next grid point, s.
@@ -265,7 +280,8 @@ pub struct Buffered {
 /// This stamp or sequence number was accepted before. Nothing changed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Duplicate {}
-/// The stamp or the sequence number lies before the newest accepted one. Nothing changed.
+/// The stamp lies behind the reorder window (`limits.reorder_window_s` before the newest accepted one), the sequence number contradicts the order of
+/// the stamps, or the vehicle has been restarted since. Nothing changed.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct TooOld {
     /// How far the stamp lies before the newest one, s (0 when only the sequence number is old).
@@ -279,7 +295,8 @@ pub struct NotFinite {
     #[prost(string, tag = "1")]
     pub field: ::prost::alloc::string::String,
 }
-/// Applied to the history, but refused by the soil filter because it disagrees too much with the prediction.
+/// Applied to the history; but a buffer of steps left the reorder window with it and was refused by the soil filter, because it disagrees too much with
+/// the prediction.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Gated {
     /// Normalised innovation squared, without unit.
@@ -293,6 +310,24 @@ pub struct Gap {
     #[prost(double, tag = "1")]
     pub gap_s: f64,
 }
+/// The stamp lies further ahead of the last one than time has passed since (`limits.clock_ahead_max_s`). Nothing changed. If the next one goes on from
+/// here, the vehicle's clock was set: it is answered by ClockJump.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct Future {
+    /// How far the stamp lies ahead of where the last one and the time since then put it, s.
+    #[prost(double, tag = "1")]
+    pub ahead_s: f64,
+}
+/// Applied after the vehicle's clock was set: the history starts again here, the soil stays.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct ClockJump {
+    /// By how much it was set, s; negative = back.
+    #[prost(double, tag = "1")]
+    pub jump_s: f64,
+}
+/// Applied after a restart of the vehicle, told by `boot_id` or by numbers that begin again: the history starts again here, the soil stays.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Restarted {}
 /// Not a valid measurement for this session. Nothing changed.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Rejected {
@@ -1283,6 +1318,134 @@ pub struct Refusal {
     #[prost(string, tag = "3")]
     pub message: ::prost::alloc::string::String,
 }
+/// The bytes that Sessions.Export gives and Sessions.Import takes. Not for clients: the format may change with its version.
+///
+/// Everything is stored as it is held, so that an imported session goes on bit for bit.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SessionImage {
+    /// Version of the format, 1.
+    #[prost(uint32, tag = "1")]
+    pub version: u32,
+    /// SHA-256 of `content`.
+    #[prost(bytes = "bytes", tag = "2")]
+    pub checksum: ::prost::bytes::Bytes,
+    /// A SessionContent.
+    #[prost(bytes = "bytes", tag = "3")]
+    pub content: ::prost::bytes::Bytes,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SessionContent {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    #[prost(string, tag = "2")]
+    pub vehicle_id: ::prost::alloc::string::String,
+    /// SHA-256 (hex) of the manifest of the model bundle.
+    #[prost(string, tag = "3")]
+    pub bundle_hash: ::prost::alloc::string::String,
+    /// All settings of the soil filter, as text; compared, not read.
+    #[prost(string, tag = "4")]
+    pub filter_settings: ::prost::alloc::string::String,
+    /// Map of the session; empty = none.
+    #[prost(string, tag = "5")]
+    pub map_id: ::prost::alloc::string::String,
+    /// SHA-256 (hex) of the layers of that map.
+    #[prost(string, tag = "6")]
+    pub map_hash: ::prost::alloc::string::String,
+    #[prost(message, optional, tag = "7")]
+    pub live: ::core::option::Option<TrackImage>,
+    #[prost(message, optional, tag = "8")]
+    pub settled: ::core::option::Option<TrackImage>,
+    /// Measurements inside the reorder window, by ascending stamp.
+    #[prost(message, repeated, tag = "9")]
+    pub open: ::prost::alloc::vec::Vec<MeasurementImage>,
+    /// Accepted stamps, ascending, and the number of each; 0 = not numbered.
+    #[prost(sint64, repeated, tag = "10")]
+    pub recent_stamp_ns: ::prost::alloc::vec::Vec<i64>,
+    #[prost(uint64, repeated, tag = "11")]
+    pub recent_sequence: ::prost::alloc::vec::Vec<u64>,
+    #[prost(uint64, optional, tag = "12")]
+    pub last_sequence: ::core::option::Option<u64>,
+    #[prost(uint64, optional, tag = "13")]
+    pub boot_id: ::core::option::Option<u64>,
+    #[prost(uint64, repeated, tag = "14")]
+    pub ended_boots: ::prost::alloc::vec::Vec<u64>,
+    #[prost(sint64, optional, tag = "15")]
+    pub final_ns: ::core::option::Option<i64>,
+    /// Ages of the newest measurement and of the newest step when the session was exported, ns; absent before the first.
+    #[prost(uint64, optional, tag = "16")]
+    pub newest_age_ns: ::core::option::Option<u64>,
+    #[prost(uint64, optional, tag = "17")]
+    pub step_age_ns: ::core::option::Option<u64>,
+    #[prost(uint64, tag = "18")]
+    pub history_epoch: u64,
+    /// Steps that the soil filter holds, and where its open buffer begins.
+    #[prost(message, repeated, tag = "19")]
+    pub filter_steps: ::prost::alloc::vec::Vec<StepImage>,
+    #[prost(uint32, tag = "20")]
+    pub filter_first: u32,
+    #[prost(message, optional, tag = "21")]
+    pub filter: ::core::option::Option<FilterImage>,
+    #[prost(uint64, tag = "22")]
+    pub soil_epoch: u64,
+    #[prost(sint64, optional, tag = "23")]
+    pub soil_stamp_ns: ::core::option::Option<i64>,
+    /// Posterior that the session gives out.
+    #[prost(message, optional, tag = "24")]
+    pub soil: ::core::option::Option<SoilCorrection>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct TrackImage {
+    /// Step, last step, last stamp and next grid point, ns; empty before the first measurement.
+    #[prost(sint64, repeated, tag = "1")]
+    pub grid_ns: ::prost::alloc::vec::Vec<i64>,
+    /// Newest measurement; absent before the first.
+    #[prost(message, optional, tag = "2")]
+    pub before: ::core::option::Option<MeasurementImage>,
+    /// Oldest first.
+    #[prost(message, repeated, tag = "3")]
+    pub history: ::prost::alloc::vec::Vec<StepImage>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct StepImage {
+    /// x y z roll pitch yaw vx vy vz wx wy wz.
+    #[prost(double, repeated, tag = "1")]
+    pub state: ::prost::alloc::vec::Vec<f64>,
+    /// Speed command and second command.
+    #[prost(double, repeated, tag = "2")]
+    pub command: ::prost::alloc::vec::Vec<f64>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct MeasurementImage {
+    #[prost(sint64, tag = "1")]
+    pub stamp_ns: i64,
+    #[prost(uint64, tag = "2")]
+    pub sequence: u64,
+    #[prost(uint64, tag = "3")]
+    pub boot_id: u64,
+    #[prost(message, optional, tag = "4")]
+    pub step: ::core::option::Option<StepImage>,
+    #[prost(double, repeated, tag = "5")]
+    pub wheel_speed_rad_s: ::prost::alloc::vec::Vec<f64>,
+    #[prost(double, repeated, tag = "6")]
+    pub road_wheel_angle_rad: ::prost::alloc::vec::Vec<f64>,
+}
+/// State of the soil filter between two buffers.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FilterImage {
+    #[prost(double, repeated, tag = "1")]
+    pub delta: ::prost::alloc::vec::Vec<f64>,
+    /// Shape (6, 6), row-major.
+    #[prost(double, repeated, tag = "2")]
+    pub covariance: ::prost::alloc::vec::Vec<f64>,
+    /// Scale of R_B.
+    #[prost(double, tag = "3")]
+    pub noise_scale: f64,
+    #[prost(double, tag = "4")]
+    pub trust_log_odds: f64,
+    /// Corrections that later buffers judge, shape (n, 6), oldest first.
+    #[prost(double, repeated, tag = "5")]
+    pub trust_corrections: ::prost::alloc::vec::Vec<f64>,
+}
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct OpenSessionRequest {
     /// Vehicle, as in the Zenoh key `nesam/v1/<fleet>/<vehicle>/...`: 1 to 64 of A-Z a-z 0-9 _ . -
@@ -1324,6 +1487,26 @@ pub struct ForkSessionRequest {
     pub new_session_id: ::prost::alloc::string::String,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ExportSessionRequest {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ExportSessionReply {
+    /// Opaque: only Import reads it. Version and checksum are inside; about 20 kB.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub image: ::prost::bytes::Bytes,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ImportSessionRequest {
+    /// What Export gave.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub image: ::prost::bytes::Bytes,
+    /// Name of the session; empty = that of the exported one.
+    #[prost(string, tag = "2")]
+    pub session_id: ::prost::alloc::string::String,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct CloseSessionRequest {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
@@ -1360,6 +1543,12 @@ pub struct Session {
     /// What was learned of the soil.
     #[prost(message, optional, tag = "10")]
     pub soil_correction: ::core::option::Option<SoilCorrection>,
+    /// Start of the vehicle's software that feeds the session; absent when the vehicle does not tell.
+    #[prost(uint64, optional, tag = "11")]
+    pub boot_id: ::core::option::Option<u64>,
+    /// Whether the vehicle's Zenoh liveliness token `nesam/v1/<fleet>/<vehicle>/alive` is there; absent when the server takes no part in a Zenoh network.
+    #[prost(bool, optional, tag = "12")]
+    pub vehicle_alive: ::core::option::Option<bool>,
 }
 /// The part of the vehicle card that a client needs to form valid commands.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1399,7 +1588,6 @@ pub mod sessions_client {
     /// A session is what the service remembers of one vehicle: its recent measured motion and its soil correction.
     ///
     /// A session that nobody feeds and nobody asks for longer than the service's limit (`limits.session_idle_s`) is closed by the service.
-    /// Method names Export and Import are kept free for sessions that move between servers.
     #[derive(Debug, Clone)]
     pub struct SessionsClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1551,6 +1739,49 @@ pub mod sessions_client {
             req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Sessions", "Fork"));
             self.inner.unary(req, path, codec).await
         }
+        /// Gives everything that a session remembers, for Import on another server or at another time. The session stays open. NOT_FOUND: unknown session.
+        pub async fn export(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ExportSessionRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ExportSessionReply>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/nesam.v1.Sessions/Export");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Sessions", "Export"));
+            self.inner.unary(req, path, codec).await
+        }
+        /// Opens a session from an export; from then on it answers as the original would, bit for bit. INVALID_ARGUMENT naming `image`: damaged or cut
+        /// bytes, another version of the format, another bundle, other settings of the soil filter. INVALID_ARGUMENT: a bad name. NOT_FOUND: the map is not
+        /// uploaded. FAILED_PRECONDITION: the map has other layers. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as Open.
+        pub async fn import(
+            &mut self,
+            request: impl tonic::IntoRequest<super::ImportSessionRequest>,
+        ) -> std::result::Result<tonic::Response<super::Session>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/nesam.v1.Sessions/Import");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Sessions", "Import"));
+            self.inner.unary(req, path, codec).await
+        }
         /// Closes a session and forgets its history. NOT_FOUND: unknown session.
         pub async fn close(
             &mut self,
@@ -1614,6 +1845,21 @@ pub mod sessions_server {
             &self,
             request: tonic::Request<super::ForkSessionRequest>,
         ) -> std::result::Result<tonic::Response<super::Session>, tonic::Status>;
+        /// Gives everything that a session remembers, for Import on another server or at another time. The session stays open. NOT_FOUND: unknown session.
+        async fn export(
+            &self,
+            request: tonic::Request<super::ExportSessionRequest>,
+        ) -> std::result::Result<
+            tonic::Response<super::ExportSessionReply>,
+            tonic::Status,
+        >;
+        /// Opens a session from an export; from then on it answers as the original would, bit for bit. INVALID_ARGUMENT naming `image`: damaged or cut
+        /// bytes, another version of the format, another bundle, other settings of the soil filter. INVALID_ARGUMENT: a bad name. NOT_FOUND: the map is not
+        /// uploaded. FAILED_PRECONDITION: the map has other layers. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as Open.
+        async fn import(
+            &self,
+            request: tonic::Request<super::ImportSessionRequest>,
+        ) -> std::result::Result<tonic::Response<super::Session>, tonic::Status>;
         /// Closes a session and forgets its history. NOT_FOUND: unknown session.
         async fn close(
             &self,
@@ -1626,7 +1872,6 @@ pub mod sessions_server {
     /// A session is what the service remembers of one vehicle: its recent measured motion and its soil correction.
     ///
     /// A session that nobody feeds and nobody asks for longer than the service's limit (`limits.session_idle_s`) is closed by the service.
-    /// Method names Export and Import are kept free for sessions that move between servers.
     #[derive(Debug)]
     pub struct SessionsServer<T> {
         inner: Arc<T>,
@@ -1883,6 +2128,96 @@ pub mod sessions_server {
                     };
                     Box::pin(fut)
                 }
+                "/nesam.v1.Sessions/Export" => {
+                    #[allow(non_camel_case_types)]
+                    struct ExportSvc<T: Sessions>(pub Arc<T>);
+                    impl<
+                        T: Sessions,
+                    > tonic::server::UnaryService<super::ExportSessionRequest>
+                    for ExportSvc<T> {
+                        type Response = super::ExportSessionReply;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ExportSessionRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Sessions>::export(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ExportSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                "/nesam.v1.Sessions/Import" => {
+                    #[allow(non_camel_case_types)]
+                    struct ImportSvc<T: Sessions>(pub Arc<T>);
+                    impl<
+                        T: Sessions,
+                    > tonic::server::UnaryService<super::ImportSessionRequest>
+                    for ImportSvc<T> {
+                        type Response = super::Session;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::ImportSessionRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Sessions>::import(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = ImportSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
                 "/nesam.v1.Sessions/Close" => {
                     #[allow(non_camel_case_types)]
                     struct CloseSvc<T: Sessions>(pub Arc<T>);
@@ -1985,6 +2320,49 @@ pub struct SoilEstimate {
     pub stamp_ns: ::core::option::Option<i64>,
     #[prost(message, optional, tag = "4")]
     pub correction: ::core::option::Option<SoilCorrection>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FleetSoilRequest {
+    /// World map; empty = all.
+    #[prost(string, tag = "1")]
+    pub map_id: ::prost::alloc::string::String,
+}
+/// Evidence of the soil by place and by what the ground looks like, brought by the sessions of a service. A session that begins on such ground starts from it.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FleetSoilMap {
+    /// Edge of a cell, m.
+    #[prost(double, tag = "1")]
+    pub cell_m: f64,
+    /// By map, colour and place.
+    #[prost(message, repeated, tag = "2")]
+    pub cells: ::prost::alloc::vec::Vec<FleetSoilCell>,
+}
+/// Evidence on the correction of the soil prior, in the coordinates of `SoilCorrection`: information matrix and vector, without any prior.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FleetSoilCell {
+    /// World map.
+    #[prost(string, tag = "1")]
+    pub map_id: ::prost::alloc::string::String,
+    /// Colour of the semantic map, 0xRRGGBB, in steps of 16 levels.
+    #[prost(uint32, tag = "2")]
+    pub colour_rgb: u32,
+    /// floor(x / cell) and floor(y / cell) in World.
+    #[prost(sint32, tag = "3")]
+    pub column: i32,
+    #[prost(sint32, tag = "4")]
+    pub row: i32,
+    /// Shape (6, 6), row-major in the order of SoilVector.
+    #[prost(double, repeated, tag = "5")]
+    pub information: ::prost::alloc::vec::Vec<f64>,
+    /// Information times mean.
+    #[prost(message, optional, tag = "6")]
+    pub vector: ::core::option::Option<SoilVector>,
+    /// Buffers of a filter that went in, aged to the last one.
+    #[prost(double, tag = "7")]
+    pub buffers: f64,
+    /// Time since the last one, s; until now the evidence ages on.
+    #[prost(double, tag = "8")]
+    pub age_s: f64,
 }
 /// Generated client implementations.
 pub mod soil_client {
@@ -2090,6 +2468,26 @@ pub mod soil_client {
             req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Soil", "Watch"));
             self.inner.server_streaming(req, path, codec).await
         }
+        /// Reads what the fleet has learned of the ground. Each change is also published over Zenoh, as `FleetSoilMap` with the cell that changed, on
+        /// nesam/v1/<fleet>/soil_map. FAILED_PRECONDITION: the service keeps no such map.
+        pub async fn map(
+            &mut self,
+            request: impl tonic::IntoRequest<super::FleetSoilRequest>,
+        ) -> std::result::Result<tonic::Response<super::FleetSoilMap>, tonic::Status> {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/nesam.v1.Soil/Map");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Soil", "Map"));
+            self.inner.unary(req, path, codec).await
+        }
     }
 }
 /// Generated server implementations.
@@ -2116,6 +2514,12 @@ pub mod soil_server {
             &self,
             request: tonic::Request<super::WatchSoilRequest>,
         ) -> std::result::Result<tonic::Response<Self::WatchStream>, tonic::Status>;
+        /// Reads what the fleet has learned of the ground. Each change is also published over Zenoh, as `FleetSoilMap` with the cell that changed, on
+        /// nesam/v1/<fleet>/soil_map. FAILED_PRECONDITION: the service keeps no such map.
+        async fn map(
+            &self,
+            request: tonic::Request<super::FleetSoilRequest>,
+        ) -> std::result::Result<tonic::Response<super::FleetSoilMap>, tonic::Status>;
     }
     /// What the service has learned of the soil under a vehicle. Each change is also published over Zenoh, as `SoilEstimate` on
     /// nesam/v1/<fleet>/<vehicle>/soil.
@@ -2241,6 +2645,49 @@ pub mod soil_server {
                     };
                     Box::pin(fut)
                 }
+                "/nesam.v1.Soil/Map" => {
+                    #[allow(non_camel_case_types)]
+                    struct MapSvc<T: Soil>(pub Arc<T>);
+                    impl<T: Soil> tonic::server::UnaryService<super::FleetSoilRequest>
+                    for MapSvc<T> {
+                        type Response = super::FleetSoilMap;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::Response>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::FleetSoilRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Soil>::map(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = MapSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.unary(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
                 _ => {
                     Box::pin(async move {
                         let mut response = http::Response::new(
@@ -2280,6 +2727,49 @@ pub mod soil_server {
     impl<T> tonic::server::NamedService for SoilServer<T> {
         const NAME: &'static str = SERVICE_NAME;
     }
+}
+/// What a server publishes about itself over Zenoh on nesam/v1/<fleet>/server/<name>/status, at an interval and when a vehicle comes or goes. While it is
+/// there it also holds the liveliness token nesam/v1/<fleet>/server/<name>/alive; vehicles hold nesam/v1/<fleet>/<vehicle>/alive.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ServerStatus {
+    /// Name of the server in the keys.
+    #[prost(string, tag = "1")]
+    pub name: ::prost::alloc::string::String,
+    /// Time since the server was started, s.
+    #[prost(double, tag = "2")]
+    pub uptime_s: f64,
+    /// Name of the model bundle.
+    #[prost(string, tag = "3")]
+    pub bundle_name: ::prost::alloc::string::String,
+    /// SHA-256 (hex) of the manifest of the model bundle.
+    #[prost(string, tag = "4")]
+    pub bundle_hash: ::prost::alloc::string::String,
+    /// Open sessions, by session id.
+    #[prost(message, repeated, tag = "5")]
+    pub sessions: ::prost::alloc::vec::Vec<SessionStatus>,
+    /// Vehicles whose liveliness token is there, by name, whether they have a session or not.
+    #[prost(string, repeated, tag = "6")]
+    pub vehicles_alive: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// One session of a server.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct SessionStatus {
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    #[prost(string, tag = "2")]
+    pub vehicle_id: ::prost::alloc::string::String,
+    /// Stamp of the newest accepted measurement, ns of the vehicle's clock; absent before the first.
+    #[prost(int64, optional, tag = "3")]
+    pub last_stamp_ns: ::core::option::Option<i64>,
+    /// Counts the changes of the history.
+    #[prost(uint64, tag = "4")]
+    pub history_epoch: u64,
+    /// Counts the updates of the soil.
+    #[prost(uint64, tag = "5")]
+    pub soil_epoch: u64,
+    /// Whether the vehicle's liveliness token is there.
+    #[prost(bool, tag = "6")]
+    pub vehicle_alive: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct UploadMapRequest {

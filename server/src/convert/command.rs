@@ -7,12 +7,13 @@ use super::{Precision, control_message, encode, vehicle_state_message};
 
 /// The message that brings a measurement to a session.
 pub fn measurement_message(session: &str, measurement: &Measurement) -> pb::Measurement {
-    let Measurement { sequence, stamp_ns, state, command, wheels } = measurement;
+    let Measurement { sequence, boot, stamp_ns, state, command, wheels } = measurement;
     let WheelMeasurement { speed_rad_s, road_wheel_angle_rad } = wheels;
     let measured = speed_rad_s.is_some() || road_wheel_angle_rad.is_some();
     pb::Measurement {
         session_id: session.into(),
         sequence: sequence.unwrap_or(0),
+        boot_id: boot.unwrap_or(0),
         stamp_ns: *stamp_ns,
         state: Some(vehicle_state_message(state)),
         command: Some(control_message(command)),
@@ -64,7 +65,7 @@ mod tests {
 
     fn some_measurement(sequence: Option<u64>, wheels: WheelMeasurement) -> Measurement {
         let state = VehicleState::from_array(core::array::from_fn(|i| 0.1 * i as f64 - 1.0 / 3.0));
-        Measurement { sequence, stamp_ns: -7, state, command: Control { speed_m_s: 2.5, second: -0.25 }, wheels }
+        Measurement { sequence, boot: sequence, stamp_ns: -7, state, command: Control { speed_m_s: 2.5, second: -0.25 }, wheels }
     }
 
     #[test]

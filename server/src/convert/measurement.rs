@@ -16,6 +16,7 @@ pub fn measurement(message: &pb::Measurement) -> Result<Measurement, EngineError
     let wheels = message.wheels.as_ref().map(wheel_measurement).transpose()?.unwrap_or_default();
     Ok(Measurement {
         sequence: (message.sequence != 0).then_some(message.sequence),
+        boot: (message.boot_id != 0).then_some(message.boot_id),
         stamp_ns: message.stamp_ns,
         state: vehicle_state("state", state)?,
         command: control(command),
@@ -47,6 +48,7 @@ pub fn measurement_answer(message: &pb::Measurement, session: &str, result: Resu
     match result {
         Ok(measured) => {
             answer.history_epoch = measured.history_epoch;
+            answer.reordered = measured.reordered;
             answer.soil_epoch = measured.soil.state.epoch;
             answer.soil_correction = Some(soil_correction(&measured.soil));
             answer.outcome = Some(outcome(measured));
@@ -69,5 +71,8 @@ fn outcome(measured: MeasureAnswer) -> pb::measurement_answer::Outcome {
         Outcome::NotFinite { field } => Message::NotFinite(pb::NotFinite { field }),
         Outcome::Gated { nis } => Message::Gated(pb::Gated { nis }),
         Outcome::Gap { gap_s } => Message::Gap(pb::Gap { gap_s }),
+        Outcome::Future { ahead_s } => Message::Future(pb::Future { ahead_s }),
+        Outcome::ClockJump { jump_s } => Message::ClockJump(pb::ClockJump { jump_s }),
+        Outcome::Restarted => Message::Restarted(pb::Restarted {}),
     }
 }

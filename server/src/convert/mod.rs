@@ -1,6 +1,7 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
 mod command;
+mod image;
 mod measurement;
 mod packed;
 mod prediction;
@@ -11,10 +12,11 @@ mod terrain;
 mod terrain_message;
 
 pub use command::{measurement_message, open_message, predict_message};
+pub use image::{image_bytes, session_image};
 pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};
 pub use prediction::{OutputSelection, predict_error, predict_query, predict_reply};
-pub use session::{open_session, provenance, session_view, soil_correction, soil_estimate, soil_vector};
+pub use session::{fleet_soil_map, open_session, provenance, session_view, soil_correction, soil_estimate, soil_vector};
 pub use state::{control, control_message, vehicle_state, vehicle_state_message};
 pub use status::{FIELD_METADATA, code, to_status};
 pub use terrain::{MapBuilder, description, patched};

@@ -1,7 +1,7 @@
 //! Sessions, provenance and soil.
 
 use nesam_engine::EngineError;
-use nesam_engine::{OpenSession, Provenance, SessionView, SoilEstimate};
+use nesam_engine::{FleetCell, OpenSession, Provenance, SessionView, SoilEstimate};
 use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
@@ -35,6 +35,8 @@ pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
         history_steps: view.history_steps as u32,
         last_stamp_ns: view.last_stamp_ns,
         last_sequence: view.last_sequence,
+        boot_id: view.boot,
+        vehicle_alive: None,
         state: view.newest.as_ref().map(|step| vehicle_state_message(&step.state)),
         command: view.newest.as_ref().map(|step| control_message(&step.control)),
         soil_correction: Some(soil_correction(&view.soil)),
@@ -102,6 +104,24 @@ pub fn soil_correction(soil: &SoilEstimate) -> pb::SoilCorrection {
         learned: soil.learned.to_vec(),
         covariance: covariance.as_flattened().to_vec(),
     }
+}
+
+/// The soil map of the fleet, or a part of it, as message.
+pub fn fleet_soil_map(cell_m: f64, cells: &[FleetCell]) -> pb::FleetSoilMap {
+    let cell = |cell: &FleetCell| {
+        let [red, green, blue] = cell.key.colour.map(u32::from);
+        pb::FleetSoilCell {
+            map_id: cell.key.map.clone(),
+            colour_rgb: red << 16 | green << 8 | blue,
+            column: cell.key.cell[0],
+            row: cell.key.cell[1],
+            information: cell.evidence.information().as_flattened().to_vec(),
+            vector: Some(soil_vector(&cell.evidence.vector())),
+            buffers: cell.evidence.buffers(),
+            age_s: cell.age_s,
+        }
+    };
+    pb::FleetSoilMap { cell_m, cells: cells.iter().map(cell).collect() }
 }
 
 /// A soil estimate as message.

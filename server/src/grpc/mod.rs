@@ -21,6 +21,7 @@ use tonic::service::Routes;
 
 use crate::call::EngineClient;
 use crate::config::GrpcConfig;
+use crate::zenoh::Presence;
 
 pub(crate) use prediction::predict;
 
@@ -39,6 +40,8 @@ pub(crate) struct Edge {
     pub events: broadcast::Sender<Event>,
     pub stopping: watch::Receiver<bool>,
     pub uploads: Arc<Semaphore>,
+    /// Vehicles in the Zenoh network; `None` without one.
+    pub presence: Option<Presence>,
 }
 
 impl Edge {
@@ -53,6 +56,9 @@ impl Edge {
     }
 }
 
+/// Largest exported session, bytes.
+const IMAGE_BYTES_MAX: usize = 256 << 10;
+
 /// Resolves when the server stops.
 pub(crate) async fn stopped(mut stopping: watch::Receiver<bool>) {
     let _ = stopping.wait_for(|stop| *stop).await;
@@ -62,7 +68,7 @@ pub(crate) async fn stopped(mut stopping: watch::Receiver<bool>) {
 pub(crate) fn routes(edge: &Edge) -> Routes {
     let controls = 8 * edge.engine.handle().limits().sample_steps_max + SMALL_MESSAGE;
     let tiles = edge.config.tile_bytes_max;
-    Routes::new(pb::sessions_server::SessionsServer::new(sessions::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE))
+    Routes::new(pb::sessions_server::SessionsServer::new(sessions::Service(edge.clone())).max_decoding_message_size(IMAGE_BYTES_MAX))
         .add_service(pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(controls))
         .add_service(
             pb::measurements_server::MeasurementsServer::new(measurements::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE),

@@ -1,14 +1,23 @@
 //! nesam.v1.Sessions.
 
+use nesam_engine::SessionView;
 use nesam_proto::v1 as pb;
 use tonic::{Request, Response, Status};
 
 use super::Edge;
-use crate::convert::{open_session, session_view, to_status};
+use crate::convert::{image_bytes, open_session, session_image, session_view, to_status};
 use crate::telemetry::Transport;
 
-/// Opens, reads, lists, copies and closes sessions.
+/// Opens, reads, lists, copies, moves and closes sessions.
 pub struct Service(pub Edge);
+
+impl Edge {
+    /// A session as message, with what the Zenoh network says of its vehicle.
+    fn session(&self, view: &SessionView) -> pb::Session {
+        let vehicle_alive = self.presence.as_ref().map(|presence| presence.is_alive(&view.vehicle));
+        pb::Session { vehicle_alive, ..session_view(view, &self.predictor.bundle().vehicle) }
+    }
+}
 
 #[tonic::async_trait]
 impl pb::sessions_server::Sessions for Service {
@@ -18,20 +27,19 @@ impl pb::sessions_server::Sessions for Service {
         let open = open_session(request.get_ref()).map_err(to_status)?;
         let view = self.0.engine.open(open, budget).await.map_err(to_status)?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session opened");
-        Ok(Response::new(session_view(&view, &self.0.predictor.bundle().vehicle)))
+        Ok(Response::new(self.0.session(&view)))
     }
 
     async fn get(&self, request: Request<pb::GetSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "get");
         let view = self.0.engine.get(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(to_status)?;
-        Ok(Response::new(session_view(&view, &self.0.predictor.bundle().vehicle)))
+        Ok(Response::new(self.0.session(&view)))
     }
 
     async fn list(&self, request: Request<pb::ListSessionsRequest>) -> Result<Response<pb::ListSessionsReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "list");
         let views = self.0.engine.list(self.0.budget(&request)).await.map_err(to_status)?;
-        let vehicle = &self.0.predictor.bundle().vehicle;
-        Ok(Response::new(pb::ListSessionsReply { sessions: views.iter().map(|view| session_view(view, vehicle)).collect() }))
+        Ok(Response::new(pb::ListSessionsReply { sessions: views.iter().map(|view| self.0.session(view)).collect() }))
     }
 
     async fn fork(&self, request: Request<pb::ForkSessionRequest>) -> Result<Response<pb::Session>, Status> {
@@ -40,7 +48,23 @@ impl pb::sessions_server::Sessions for Service {
         let pb::ForkSessionRequest { session_id, new_session_id } = request.into_inner();
         let view = self.0.engine.fork(&session_id, &new_session_id, budget).await.map_err(to_status)?;
         tracing::info!(session = session_id, copy = view.session, "session copied");
-        Ok(Response::new(session_view(&view, &self.0.predictor.bundle().vehicle)))
+        Ok(Response::new(self.0.session(&view)))
+    }
+
+    async fn export(&self, request: Request<pb::ExportSessionRequest>) -> Result<Response<pb::ExportSessionReply>, Status> {
+        self.0.engine.metrics().request(Transport::Grpc, "export");
+        let image = self.0.engine.export(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(to_status)?;
+        Ok(Response::new(pb::ExportSessionReply { image: image_bytes(&image).into() }))
+    }
+
+    async fn import(&self, request: Request<pb::ImportSessionRequest>) -> Result<Response<pb::Session>, Status> {
+        self.0.engine.metrics().request(Transport::Grpc, "import");
+        let budget = self.0.budget(&request);
+        let pb::ImportSessionRequest { image, session_id } = request.into_inner();
+        let image = session_image(&image).map_err(to_status)?;
+        let view = self.0.engine.import(image, &session_id, budget).await.map_err(to_status)?;
+        tracing::info!(session = view.session, vehicle = view.vehicle, "session imported");
+        Ok(Response::new(self.0.session(&view)))
     }
 
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {

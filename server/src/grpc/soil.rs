@@ -8,7 +8,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
 use super::{Edge, ReplyStream, stopped};
-use crate::convert::{soil_estimate, to_status};
+use crate::convert::{fleet_soil_map, soil_estimate, to_status};
 use crate::telemetry::Transport;
 
 /// Tells watchers what is learned of the soil.
@@ -29,6 +29,12 @@ impl pb::soil_server::Soil for Service {
         let _ = sender.try_send(Ok(soil_estimate(&session, &view.soil)));
         tokio::spawn(forward(edge, session, events, sender));
         Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
+    }
+
+    async fn map(&self, request: Request<pb::FleetSoilRequest>) -> Result<Response<pb::FleetSoilMap>, Status> {
+        self.0.engine.metrics().request(Transport::Grpc, "fleet_soil");
+        let (cell_m, cells) = self.0.engine.fleet_soil(&request.get_ref().map_id, self.0.budget(&request)).await.map_err(to_status)?;
+        Ok(Response::new(fleet_soil_map(cell_m, &cells)))
     }
 }
 

@@ -11,7 +11,8 @@ use super::command::Entry;
 use super::topic::Topic;
 use crate::call::Timing;
 use crate::convert::{
-    OutputSelection, code, description, measurement_answer, measurement_message, predict_error, predict_reply, session_view, soil_estimate,
+    OutputSelection, code, description, fleet_soil_map, image_bytes, measurement_answer, measurement_message, predict_error, predict_reply,
+    session_view, soil_estimate,
 };
 
 /// The answer to a command. It is the same whenever the command is executed again at the same instant, but for `timing`.
@@ -47,6 +48,8 @@ fn reply_entry(command: &Command, reply: &Reply, vehicle: &Vehicle, timing: Timi
         Reply::Measured(answer) => {
             (Topic::MeasurementAnswer, measurement_answer(&pb::Measurement::default(), "", Ok((**answer).clone())).encode_to_vec())
         }
+        Reply::Image(image) => (Topic::Exported, pb::ExportSessionReply { image: image_bytes(image).into() }.encode_to_vec()),
+        Reply::FleetSoil(cell_m, cells) => (Topic::FleetSoilMap, fleet_soil_map(*cell_m, cells).encode_to_vec()),
         Reply::Predicted(prediction) => {
             (Topic::Prediction, predict_reply(0, prediction, OutputSelection::EVERYTHING, timing).encode_to_vec())
         }
@@ -84,7 +87,7 @@ impl SoilEpochs {
                 let known = self.0.insert(session.clone(), epoch).unwrap_or(0);
                 (epoch != known).then(|| (Topic::Soil, soil_estimate(session, &answer.soil).encode_to_vec()))
             }
-            (Command::Fork { .. }, Ok(Reply::Session(view))) => {
+            (Command::Fork { .. } | Command::Import { .. }, Ok(Reply::Session(view))) => {
                 self.0.insert(view.session.clone(), view.provenance.soil_epoch);
                 None
             }

@@ -10,7 +10,8 @@ use prost::Message as _;
 
 use super::topic::Topic;
 use crate::convert::{
-    MapBuilder, changed_tile, measurement, measurement_message, open_message, open_session, patched, predict_message, predict_query, upload,
+    MapBuilder, changed_tile, image_bytes, measurement, measurement_message, open_message, open_session, patched, predict_message,
+    predict_query, session_image, upload,
 };
 
 /// A message and its topic.
@@ -46,6 +47,12 @@ pub(crate) fn to_entries(command: &Command, maps: &HeldMaps) -> Vec<Entry> {
             let message = pb::ForkSessionRequest { session_id: session.clone(), new_session_id: copy.clone() };
             one(Topic::Fork, message.encode_to_vec())
         }
+        Command::Export { session } => one(Topic::Export, pb::ExportSessionRequest { session_id: session.clone() }.encode_to_vec()),
+        Command::Import { image, session } => {
+            let message = pb::ImportSessionRequest { image: image_bytes(image).into(), session_id: session.clone() };
+            one(Topic::Import, message.encode_to_vec())
+        }
+        Command::FleetSoil { map } => one(Topic::FleetSoil, pb::FleetSoilRequest { map_id: map.clone() }.encode_to_vec()),
         Command::Close { session } => one(Topic::Close, pb::CloseSessionRequest { session_id: session.clone() }.encode_to_vec()),
         Command::Expire => one(Topic::Expire, pb::ExpireSessionsRequest {}.encode_to_vec()),
         Command::Measure { session, vehicle, measurement } => {
@@ -90,6 +97,12 @@ pub(crate) fn of_entries(entries: &[Entry], limits: &Limits, maps: &HeldMaps) ->
             let pb::ForkSessionRequest { session_id, new_session_id } = read(data)?;
             Ok(Command::Fork { session: session_id, copy: new_session_id })
         }
+        [(Topic::Export, data)] => Ok(Command::Export { session: read::<pb::ExportSessionRequest>(data)?.session_id }),
+        [(Topic::Import, data)] => {
+            let pb::ImportSessionRequest { image, session_id } = read(data)?;
+            Ok(Command::Import { image: session_image(&image).map_err(|e| e.to_string())?.into(), session: session_id })
+        }
+        [(Topic::FleetSoil, data)] => Ok(Command::FleetSoil { map: read::<pb::FleetSoilRequest>(data)?.map_id }),
         [(Topic::Close, data)] => Ok(Command::Close { session: read::<pb::CloseSessionRequest>(data)?.session_id }),
         [(Topic::Expire, _)] => Ok(Command::Expire),
         [(Topic::Measurement, data)] => measure(data, None),

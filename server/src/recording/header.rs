@@ -7,7 +7,7 @@ use std::time::{SystemTime, UNIX_EPOCH};
 use nesam_model::ModelBundle;
 
 use super::error::RecordingError;
-use crate::config::LimitsConfig;
+use crate::config::{FleetSoilConfig, LimitsConfig};
 
 /// Name of the metadata record that begins every part.
 pub(crate) const HEADER: &str = "nesam.recording";
@@ -29,6 +29,8 @@ pub struct RecordingHeader {
     pub vehicle: String,
     /// Limits in force.
     pub limits: LimitsConfig,
+    /// Soil map of the fleet.
+    pub fleet_soil: FleetSoilConfig,
     /// Settings of the soil filter that the bundle carries, JSON; empty = the defaults of the program.
     pub soil_filter: String,
     /// Processor and the vector units that decide which kernels compute.
@@ -41,7 +43,7 @@ pub struct RecordingHeader {
 
 impl RecordingHeader {
     /// The header of a run that starts now.
-    pub fn of_run(bundle: &ModelBundle, limits: &LimitsConfig, engine_now_ns: u64) -> Self {
+    pub fn of_run(bundle: &ModelBundle, limits: &LimitsConfig, fleet_soil: &FleetSoilConfig, engine_now_ns: u64) -> Self {
         let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
         let now_ns = u64::try_from(since.as_nanos()).unwrap_or(0);
         Self {
@@ -50,6 +52,7 @@ impl RecordingHeader {
             bundle_hash: bundle.hash.clone(),
             vehicle: bundle.vehicle.name.clone(),
             limits: limits.clone(),
+            fleet_soil: fleet_soil.clone(),
             soil_filter: bundle.soil_filter_json.clone().unwrap_or_default(),
             machine: Self::this_machine(),
             clock_zero_unix_ns: now_ns.saturating_sub(engine_now_ns),
@@ -80,6 +83,7 @@ impl RecordingHeader {
     /// The metadata of part `part`.
     pub(crate) fn to_metadata(&self, part: u32) -> BTreeMap<String, String> {
         let limits = serde_json::to_string(&self.limits).expect("numbers always serialise; this is a bug");
+        let fleet_soil = serde_json::to_string(&self.fleet_soil).expect("numbers always serialise; this is a bug");
         let pairs = [
             ("schema", SCHEMA.to_string()),
             ("program", self.program.clone()),
@@ -87,6 +91,7 @@ impl RecordingHeader {
             ("bundle_hash", self.bundle_hash.clone()),
             ("vehicle", self.vehicle.clone()),
             ("limits", limits),
+            ("fleet_soil", fleet_soil),
             ("soil_filter", self.soil_filter.clone()),
             ("machine", self.machine.clone()),
             ("clock_zero_unix_ns", self.clock_zero_unix_ns.to_string()),
@@ -114,12 +119,14 @@ impl RecordingHeader {
         };
         let wrong = |key: &str| RecordingError::unusable(path, format!("`{key}` in the description of the run is not readable"));
         let limits: LimitsConfig = serde_json::from_str(&text("limits")?).map_err(|_| wrong("limits"))?;
+        let fleet_soil: FleetSoilConfig = serde_json::from_str(&text("fleet_soil")?).map_err(|_| wrong("fleet_soil"))?;
         let header = Self {
             program: text("program")?,
             bundle: text("bundle")?,
             bundle_hash: text("bundle_hash")?,
             vehicle: text("vehicle")?,
             limits,
+            fleet_soil,
             soil_filter: text("soil_filter")?,
             machine: text("machine")?,
             clock_zero_unix_ns: text("clock_zero_unix_ns")?.parse().map_err(|_| wrong("clock_zero_unix_ns"))?,
@@ -173,6 +180,7 @@ mod tests {
             bundle_hash: "h".into(),
             vehicle: "v".into(),
             limits: LimitsConfig::default(),
+            fleet_soil: FleetSoilConfig::default(),
             soil_filter: String::new(),
             machine: RecordingHeader::this_machine(),
             clock_zero_unix_ns: 7,

@@ -104,8 +104,11 @@ pub fn replay(
     }
     let limits = Limits::from(&header.limits);
     let run = header.run.clone();
-    let engine = Engine::new(predictor, limits.clone());
-    let engine = engine.map_err(|error| RecordingError::Engine { bundle: bundle.name.clone(), reason: error.to_string() })?;
+    let unusable = |reason: String| RecordingError::Engine { bundle: bundle.name.clone(), reason };
+    let mut engine = Engine::new(predictor, limits.clone()).map_err(|error| unusable(error.to_string()))?;
+    if header.fleet_soil.enabled {
+        engine = engine.with_fleet_soil((&header.fleet_soil).into()).map_err(|error| unusable(error.to_string()))?;
+    }
     let mut again = Again { engine, limits, maps: HeldMaps::default(), descriptors: Descriptors::of_program() };
     let mut report = ReplayReport { kinds: BTreeMap::new(), first_difference: None, span_s: 0.0, ending: None };
     let mut first_ns = None;
@@ -204,7 +207,12 @@ fn session_of(command: &nesam_engine::Command) -> &str {
                 &open.session
             }
         }
-        Command::Get { session } | Command::Fork { session, .. } | Command::Close { session } | Command::Measure { session, .. } => session,
+        Command::Get { session }
+        | Command::Fork { session, .. }
+        | Command::Export { session }
+        | Command::Import { session, .. }
+        | Command::Close { session }
+        | Command::Measure { session, .. } => session,
         Command::Predict(query) => &query.session,
         _ => "",
     }

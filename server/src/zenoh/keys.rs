@@ -10,6 +10,16 @@ pub fn of_vehicle(fleet: &str, vehicle: &str, topic: &str) -> String {
     format!("nesam/v1/{fleet}/{vehicle}/{topic}")
 }
 
+/// Key of a topic of the whole fleet.
+pub fn of_fleet(fleet: &str, topic: &str) -> String {
+    format!("nesam/v1/{fleet}/{topic}")
+}
+
+/// Key of a topic of one server; one level deeper than those of vehicles, so that no vehicle can be taken for it.
+pub fn of_server(fleet: &str, server: &str, topic: &str) -> String {
+    format!("nesam/v1/{fleet}/server/{server}/{topic}")
+}
+
 /// The vehicle in a key.
 pub fn vehicle(key: &str) -> &str {
     key.split('/').nth(3).unwrap_or_default()

@@ -3,7 +3,12 @@
 mod keys;
 mod measurements;
 mod predict;
+mod presence;
 mod soil;
+
+pub(crate) use presence::Presence;
+
+use std::time::Duration;
 
 use nesam_engine::EngineError;
 use tokio::sync::mpsc;
@@ -22,13 +27,16 @@ pub(crate) struct Bus {
     session: ::zenoh::Session,
     publisher: tokio::task::JoinHandle<()>,
     soil: tokio::task::JoinHandle<()>,
+    status: tokio::task::JoinHandle<()>,
+    /// Tells the network that this server is there; goes with it.
+    _token: ::zenoh::liveliness::LivelinessToken,
 }
 
 /// A message to publish: key and payload.
 type Outgoing = (String, Vec<u8>);
 
 impl Bus {
-    /// Joins the network and declares subscriber, publisher and queryable.
+    /// Joins the network and declares subscriber, publisher, queryable and liveliness token.
     pub async fn start(config: &ZenohConfig, edge: &Edge) -> Result<Self, ServerError> {
         if tokio::runtime::Handle::current().runtime_flavor() == tokio::runtime::RuntimeFlavor::CurrentThread {
             return Err(ServerError::Runtime);
@@ -37,11 +45,17 @@ impl Bus {
         let session = ::zenoh::open(zenoh_config(config).map_err(failed)?).await.map_err(failed)?;
         let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
         let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sender.clone()));
-        measurements::declare(&session, &config.fleet, edge.engine.clone(), sender).await.map_err(failed)?;
+        let name = if config.name.is_empty() { session.zid().to_string() } else { config.name.clone() };
+        measurements::declare(&session, &config.fleet, edge.engine.clone(), sender.clone()).await.map_err(failed)?;
         predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
+        let presence = edge.presence.clone().unwrap_or_default();
+        let token = presence::declare(&session, &config.fleet, &name, presence.clone()).await.map_err(failed)?;
+        let key = keys::of_server(&config.fleet, &name, "status");
+        let interval = Duration::from_secs_f64(config.status_interval_s);
+        let status = tokio::spawn(presence::publish_status(edge.clone(), presence, key, name, interval, sender));
         let publisher = tokio::spawn(publish(session.clone(), receiver));
         tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
-        Ok(Self { session, publisher, soil })
+        Ok(Self { session, publisher, soil, status, _token: token })
     }
 
     /// Leaves the network.
@@ -51,6 +65,7 @@ impl Bus {
         }
         self.publisher.abort();
         self.soil.abort();
+        self.status.abort();
     }
 }
 

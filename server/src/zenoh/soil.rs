@@ -1,11 +1,11 @@
-//! Soil estimates over Zenoh: each change is published on `.../soil`.
+//! Soil over Zenoh: each change of an estimate is published on `.../<vehicle>/soil`, each change of the map of the fleet on `.../soil_map`.
 
 use nesam_engine::Event;
 use tokio::sync::broadcast::{self, error::RecvError};
 use tokio::sync::mpsc;
 
 use super::{Outgoing, encode, keys};
-use crate::convert::soil_estimate;
+use crate::convert::{fleet_soil_map, soil_estimate};
 
 /// Hands every change over to the publisher, as long as there are events and a publisher.
 pub async fn publish_changes(mut events: broadcast::Receiver<Event>, fleet: String, sender: mpsc::Sender<Outgoing>) {
@@ -14,6 +14,12 @@ pub async fn publish_changes(mut events: broadcast::Receiver<Event>, fleet: Stri
             Ok(Event::SoilChanged { session, vehicle, soil }) => {
                 let key = keys::of_vehicle(&fleet, &vehicle, "soil");
                 if sender.send((key, encode(&soil_estimate(&session, &soil)))).await.is_err() {
+                    return;
+                }
+            }
+            Ok(Event::FleetSoilChanged { cell_m, cell }) => {
+                let message = fleet_soil_map(cell_m, std::slice::from_ref(&*cell));
+                if sender.send((keys::of_fleet(&fleet, "soil_map"), encode(&message))).await.is_err() {
                     return;
                 }
             }

@@ -2,15 +2,20 @@
 #![allow(clippy::unwrap_used)]
 
 mod bad_input;
+mod fleet_soil;
 mod from_now;
 mod lifecycle;
 mod measurements;
+mod moving;
 mod overload;
 mod predictions;
 mod random_bytes;
 mod recording;
+mod reorder;
 mod replay;
 mod sessions;
 mod soil;
 mod stage;
+mod streams;
 mod zenoh_network;
+mod zenoh_presence;

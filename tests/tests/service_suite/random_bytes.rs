@@ -78,12 +78,20 @@ fn valid_message(path: &str, recorded: &Recorded, map: &str) -> Vec<u8> {
         // The vehicle has the name of an open session, so that the beginning without `session_id` is refused too.
         "Open" => v1::OpenSessionRequest { vehicle_id: session_id(), session_id: "new".into(), ..Default::default() }.encode_to_vec(),
         "Fork" => v1::ForkSessionRequest { session_id: session_id(), new_session_id: "new".into() }.encode_to_vec(),
+        "Export" => v1::ExportSessionRequest { session_id: session_id() }.encode_to_vec(),
+        // Complete but empty: exports with content are changed one by one in `moving`.
+        "Import" => {
+            let checksum = <sha2::Sha256 as sha2::Digest>::digest(b"").to_vec();
+            let image = v1::SessionImage { version: 1, checksum: checksum.into(), content: Bytes::new() }.encode_to_vec();
+            v1::ImportSessionRequest { image: image.into(), session_id: "new".into() }.encode_to_vec()
+        }
         "Close" => v1::CloseSessionRequest { session_id: session_id() }.encode_to_vec(),
         "Predict" | "PredictStream" => candidates("s", &recorded.drive, 39, 2, 3)
             .starting_at(39 * STEP_NS, vec![(40 * STEP_NS, [1.0, 0.0])])
             .to_message()
             .encode_to_vec(),
         "Stream" => sample("s", &recorded.drive, 40).encode_to_vec(),
+        "Map" => v1::FleetSoilRequest { map_id: session_id() }.encode_to_vec(),
         "Watch" => v1::WatchSoilRequest { session_id: session_id() }.encode_to_vec(),
         "UploadMap" => {
             let header = v1::MapHeader { map_id: "m".into(), version: 1, resolution_m: 1.0, width: 2, height: 2, ..Default::default() };

@@ -23,6 +23,7 @@ fn property_replayed_commands_give_the_same_bytes() {
     for i in (0..40).chain([38, 20, 60]) {
         let measurement = Measurement {
             sequence: None,
+            boot: None,
             stamp_ns: i as i64 * STEP_NS,
             state: recorded.drive.states[i],
             command: recorded.drive.controls[i],

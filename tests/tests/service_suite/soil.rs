@@ -20,10 +20,11 @@ async fn service_every_reply_carries_soil_and_covariance() {
     let buffer = FilterConfig::default().buffer;
     let mut stream = client.measure().await.unwrap();
     let (mut epoch, mut updates) = (0, 0);
-    for i in 0..=5 * buffer {
+    for i in 0..=5 * buffer + OPEN_STEPS {
         let answer = stream.exchange(sample("s", &recorded.drive, i)).await.unwrap();
-        // The transition from step i - 1 is known when step i is measured, so B of them are full at i = B, 2 B, ...
-        let full = i > 0 && i % buffer == 0;
+        // The transition from step j - 1 is known when step j is final, so B of them are full at j = B, 2 B, ...
+        let last = i.saturating_sub(OPEN_STEPS);
+        let full = last > 0 && last % buffer == 0;
         let gated = outcome_label(&answer) == "GATED";
         assert!(full || !gated, "sample {i}");
         updates += u64::from(full && !gated);
@@ -31,7 +32,7 @@ async fn service_every_reply_carries_soil_and_covariance() {
         if answer.soil_epoch != epoch {
             epoch = answer.soil_epoch;
             watched = watch.message().await.unwrap().unwrap();
-            assert_eq!((watched.soil_epoch, watched.stamp_ns), (epoch, Some(i as i64 * STEP_NS)));
+            assert_eq!((watched.soil_epoch, watched.stamp_ns), (epoch, Some(last as i64 * STEP_NS)));
         }
         let soil = answer.soil_correction.as_ref();
         assert_eq!(soil, watched.correction.as_ref(), "sample {i}");
@@ -52,6 +53,6 @@ async fn service_every_reply_carries_soil_and_covariance() {
         assert_eq!(variance, soil.covariance[7 * r], "the variance is the diagonal");
         assert!((0..6).all(|c| (soil.covariance[6 * r + c] - soil.covariance[6 * c + r]).abs() <= 1e-12 * (variance * diagonal[c]).sqrt()));
     }
-    assert_eq!(learned(&recorded, 5 * buffer).1, updates, "the filter of `nesam adapt` made as many");
+    assert_eq!(learned(&recorded, 5 * buffer + OPEN_STEPS).1, updates, "the filter of `nesam adapt` made as many");
     server.shutdown().await;
 }

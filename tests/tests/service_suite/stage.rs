@@ -18,6 +18,8 @@ use rand_chacha::ChaCha8Rng;
 
 /// Step of the model, ns.
 pub const STEP_NS: i64 = 100_000_000;
+/// Steps that the reorder window keeps from the soil filter at the rate of the model.
+pub const OPEN_STEPS: usize = 2;
 /// Test drive of the committed sample.
 pub const DRIVE: &str = "n0005";
 
@@ -142,10 +144,11 @@ pub fn candidates(session: &str, drive: &Trajectory, i: usize, samples: usize, h
     Candidates::new(session, samples, horizon, controls)
 }
 
-/// The soil correction that the filter of `nesam adapt` has learned from the samples up to `i`, and the number of updates.
+/// The soil correction that the filter of `nesam adapt` has learned from what is final when sample `i` is the newest, and the number of updates.
 pub fn learned(recorded: &Recorded, i: usize) -> (SoilCorrection, u64) {
     let carried = bundle().soil_filter_json.as_deref().map(|json| CalibratedFilter::from_json(json).unwrap().config());
     let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&recorded.world), &carried.unwrap_or_default()).unwrap();
+    let i = i.saturating_sub(OPEN_STEPS);
     let updates = filtered.updates.iter().filter(|u| u.sample <= i && !u.update.rejected).count();
     (filtered.correction_at(i), updates as u64)
 }

@@ -17,6 +17,8 @@ struct Measurement {
   std::int64_t stamp_ns = 0;
   /// Increases by at least 1 with each measurement; 0 = not numbered. Resending is always safe.
   std::uint64_t sequence = 0;
+  /// Start of the vehicle's software that stamps and numbers belong to: differs from start to start; 0 = not told. Another one begins a new history and keeps the soil.
+  std::uint64_t boot_id = 0;
   /// Pose in World, twist in Body.
   VehicleState state;
   /// Command that the vehicle applies from this instant on.
@@ -27,7 +29,7 @@ struct Measurement {
   std::optional<std::array<double, 2>> road_wheel_angle_rad;
 };
 
-/// The measurement is the newest step of the history.
+/// The measurement ended a step of the history.
 struct Applied {
   std::uint32_t history_steps = 0;  ///< Steps in the history now, 1 to 32.
 };
@@ -37,7 +39,7 @@ struct Buffered {
 };
 /// This stamp or sequence number was accepted before. Nothing changed.
 struct Duplicate {};
-/// The stamp or the sequence number lies before the newest accepted one. Nothing changed.
+/// Behind the reorder window, numbered against the order of the stamps, or of a former start of the vehicle. Nothing changed.
 struct TooOld {
   double behind_s = 0.0;  ///< 0 when only the sequence number is old.
 };
@@ -53,6 +55,16 @@ struct Gated {
 struct Gap {
   double gap_s = 0.0;
 };
+/// Further ahead of the last one than time has passed since. Nothing changed.
+struct Future {
+  double ahead_s = 0.0;
+};
+/// Applied after the vehicle's clock was set: the history starts again here, the soil stays.
+struct ClockJump {
+  double jump_s = 0.0;  ///< Negative = back.
+};
+/// Applied after a restart of the vehicle: the history starts again here, the soil stays.
+struct Restarted {};
 /// Not a valid measurement for this session. Nothing changed.
 struct Rejected {
   Code code = Code::unknown;
@@ -69,15 +81,18 @@ struct MeasurementAnswer {
   std::int64_t stamp_ns = 0;        ///< Copied from the measurement.
   std::uint64_t history_epoch = 0;  ///< After this measurement.
   std::uint64_t soil_epoch = 0;     ///< After this measurement.
-  std::variant<Applied, Buffered, Duplicate, TooOld, NotFinite, Gated, Gap, Rejected, Unrecognised> outcome = Unrecognised{};
+  bool reordered = false;           ///< It arrived after a later one and was put in its place.
+  std::variant<Applied, Buffered, Duplicate, TooOld, NotFinite, Gated, Gap, Future, ClockJump, Restarted, Rejected, Unrecognised> outcome = Unrecognised{};
 
   /// The outcome if it is of this type, else null.
   template <class T>
   const T* is() const noexcept {
     return std::get_if<T>(&outcome);
   }
-  /// Whether the measurement changed the session: Applied, Buffered, Gated or Gap.
-  bool accepted() const noexcept { return is<Applied>() || is<Buffered>() || is<Gated>() || is<Gap>(); }
+  /// Whether the measurement changed the session: Applied, Buffered, Gated, Gap, ClockJump or Restarted.
+  bool accepted() const noexcept {
+    return is<Applied>() || is<Buffered>() || is<Gated>() || is<Gap>() || is<ClockJump>() || is<Restarted>();
+  }
 };
 
 }  // namespace nesam

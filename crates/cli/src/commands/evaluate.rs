@@ -218,18 +218,28 @@ impl Models {
         let vehicle = Arc::new(drives.root.vehicle().clone());
         let trained = trained_baselines(args, names, drives)?;
         let mut ready = Vec::new();
+        let own_bundle = |name: ModelName| {
+            let mut own = trained.iter().filter(|_| name.is_ablation() || name.is_trained_baseline());
+            own.find(|p| p.bundle().form.as_str() == name.as_str())
+        };
+        let retrained = names.iter().any(|n| n.is_ablation() && own_bundle(*n).is_some());
         for &name in names {
+            if name.is_switch() && args.models.is_none() && !retrained {
+                continue; // the ablations are the switches then
+            }
+            if let Some(own) = own_bundle(name) {
+                ready.push((name, WindowPredictor::new(name, Some(own), &vehicle, None, args.inputs.into()).or_input()?));
+                continue;
+            }
+            if name.is_ablation() {
+                eprintln!("note: {name} is the switch at inference: no bundle of that form for this vehicle in the folder of baselines");
+            }
             if name.is_trained_baseline() {
-                match trained.iter().find(|p| p.bundle().form.as_str() == name.as_str()) {
-                    Some(own) => ready.push((name, WindowPredictor::new(name, Some(own), &vehicle, None, args.inputs.into()).or_input()?)),
-                    None if args.models.is_none() => {
-                        eprintln!("note: {name} is left out: no bundle of that form for this vehicle in the folder of baselines")
-                    }
-                    None => {
-                        let hint = "train one with `nesam train --model`, and give its folder with --baselines";
-                        return Err(Failure::input(format!("no bundle of the form {name} for this vehicle; {hint}")));
-                    }
+                if args.models.is_some() {
+                    let hint = "train one with `nesam train --model`, and give its folder with --baselines";
+                    return Err(Failure::input(format!("no bundle of the form {name} for this vehicle; {hint}")));
                 }
+                eprintln!("note: {name} is left out: no bundle of that form for this vehicle in the folder of baselines");
                 continue;
             }
             if name == ModelName::Kinematic && kinematic.is_none() && args.models.is_none() {
@@ -246,7 +256,7 @@ impl Models {
 
 /// Bundles of baselines for the vehicle of the data.
 fn trained_baselines(args: &EvaluateArgs, names: &[ModelName], drives: &Drives) -> Result<Vec<Arc<Predictor>>, Failure> {
-    if !names.iter().any(|n| n.is_trained_baseline()) {
+    if !names.iter().any(|n| n.is_trained_baseline() || n.is_ablation()) {
         return Ok(Vec::new());
     }
     let folders = args.baselines.as_deref().map_or_else(baseline_bundles, bundles_in);

@@ -6,6 +6,7 @@ pub mod check;
 pub mod demo;
 pub mod diagnose;
 pub mod evaluate;
+pub mod fleet;
 pub mod inside;
 pub mod inspect;
 pub mod predict;

@@ -7,7 +7,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use clap::Args;
 use nesam_evaluation::Baselines;
 use nesam_learning::recipe::{Recipe, Reporter, run as train};
-use nesam_learning::{TrainingError, TrainingPlan};
+use nesam_learning::{Pooling, TrainingError, TrainingPlan};
 use nesam_model::Variant;
 
 use crate::args::{DataArgs, SplitArg};
@@ -54,6 +54,12 @@ pub struct TrainArgs {
     /// Share of the terrain features that each window is trained without
     #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
     dropout: f32,
+    /// Cells of the 16 × 16 terrain features, per side, that share one weight: 1, 2, 4, 8 or 16; more of them learn fewer places by heart
+    #[arg(long, value_name = "CELLS", default_value_t = 1)]
+    pool: usize,
+    /// Decay of the weights, per unit of learning rate
+    #[arg(long, value_name = "RATE", default_value_t = 0.0)]
+    decay: f32,
     /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right
     #[arg(long)]
     no_mirror: bool,
@@ -143,6 +149,10 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if !(0.0..0.9).contains(&args.dropout) {
         return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
     }
+    let pooling = Pooling::new(args.pool).ok_or_else(|| Failure::input(format!("--pool {} is none of 1, 2, 4, 8, 16", args.pool)))?;
+    if !(0.0..100.0).contains(&args.decay) {
+        return Err(Failure::input(format!("--decay {} is not in 0..100", args.decay)));
+    }
     own_threads()?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
     let hash = drives.root.hash();
@@ -160,6 +170,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         encoder_batch: 64,
         encoder_rate: args.encoder_lr,
         mirror: !args.no_mirror,
+        pooling,
         plan: TrainingPlan {
             steps: args.epochs * args.batches,
             batch: args.batch_size,
@@ -169,6 +180,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             epoch: args.batches,
             shards: args.threads,
             dropout: args.dropout,
+            decay: args.decay,
             variant,
             folder: out.join("checkpoint"),
         },

@@ -2,10 +2,18 @@
 
 use std::sync::Arc;
 
-use nesam_adaptation::{BufferedTransition, Innovation, SoilFilter, SoilUpdate};
+use nesam_adaptation::{BufferedTransition, FilterSnapshot, Innovation, SoilFilter, SoilUpdate};
+use nesam_fleet_soil::{FleetPrior, Increment, SoilBelief};
 use nesam_model::{HISTORY, HistoryStep, Predictor};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
+
+use crate::fleet::Brought;
+
+/// What the fleet may say at most on whether the correction helps, log odds: a vehicle that finds it wrong unlearns it within a few buffers. Chosen.
+const VOTES_MAX: f64 = 4.0;
+/// Corrections that the filter keeps to be judged; the prior of the fleet is judged from the first buffer on.
+const JUDGED: usize = 3;
 
 /// What was learned of the soil in this session.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -60,6 +68,16 @@ impl SoilLearner {
         Self { filter, steps: Vec::new(), first: 0 }
     }
 
+    /// The filter, the steps that it holds, and where its open buffer begins among them.
+    pub(super) fn parts(&self) -> (&SoilFilter, &[HistoryStep], usize) {
+        (&self.filter, &self.steps, if self.steps.is_empty() { 0 } else { self.first })
+    }
+
+    /// The inverse of [`SoilLearner::parts`].
+    pub(super) fn from_parts(filter: SoilFilter, steps: Vec<HistoryStep>, first: usize) -> Self {
+        Self { filter, steps, first }
+    }
+
     /// The next step does not follow the last one.
     pub(super) fn forget_open(&mut self) {
         self.steps.clear();
@@ -76,7 +94,7 @@ impl SoilLearner {
         before: &[HistoryStep],
         newest: &HistoryStep,
         map: Option<&Arc<WorldMap>>,
-    ) -> Option<SoilUpdate> {
+    ) -> Option<(SoilUpdate, Option<Brought>)> {
         let Some(map) = map else {
             self.forget_open();
             return None;
@@ -97,16 +115,49 @@ impl SoilLearner {
         update
     }
 
-    fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<SoilUpdate> {
+    /// The update of the full buffer and, where it was not refused, what it knows more than its prior.
+    fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<(SoilUpdate, Option<Brought>)> {
         let (first, last) = (self.first, self.steps.len() - 1);
         let along = (self.filter.config().innovation == Innovation::Rollout).then(|| self.filter.estimate());
         let transitions = predictor.measured_transitions(&self.steps, first..last, along.as_ref(), map)?;
+        let (before, predicted) = (self.filter.snapshot(), self.filter.predicted_covariance());
         let mut update = None;
         for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
             let buffered = BufferedTransition::new(transition.input, transition.residual, &end.state);
             update = self.filter.push(predictor.step_model(), buffered).ok()?;
         }
-        update
+        let update = update?;
+        let [x, y, _] = self.steps[(first + last) / 2].state.position_m;
+        let increment = if update.rejected { None } else { self.increment(&before, predicted) };
+        Some((update, increment.map(|increment| Brought { position_m: [x, y], increment })))
+    }
+
+    /// What the last update knows more than its prior, and how it voted on whether the correction helps.
+    fn increment(&self, before: &FilterSnapshot, predicted: [[f64; SOIL_DIM]; SOIL_DIM]) -> Option<Increment> {
+        let (after, config) = (self.filter.snapshot(), self.filter.config());
+        let kept = 1.0 - 1.0 / config.trust_memory.max(1.0);
+        let over = |snapshot: &FilterSnapshot| snapshot.trust_log_odds - config.trust_log_odds;
+        let vote = if config.trust_memory > 0.0 { over(&after) - kept * over(before) } else { 0.0 };
+        let prior = SoilBelief { delta: before.delta, covariance: predicted };
+        Increment::between(&prior, &SoilBelief { delta: after.delta, covariance: after.covariance }, vote).ok()
+    }
+
+    /// Begins from what the fleet knows. Says whether it does.
+    pub(super) fn begin_from(&mut self, prior: &FleetPrior) -> bool {
+        let config = self.filter.config();
+        let snapshot = FilterSnapshot {
+            delta: prior.belief.delta,
+            covariance: prior.belief.covariance,
+            trust_log_odds: config.trust_log_odds + prior.votes.clamp(-VOTES_MAX, VOTES_MAX),
+            trust_corrections: vec![prior.belief.delta; JUDGED],
+            ..self.filter.snapshot()
+        };
+        self.filter.clone().restored(&snapshot).map(|filter| self.filter = filter).is_ok()
+    }
+
+    /// P⁺ as the filter gives it out.
+    pub(super) fn covariance(&self) -> [[f64; SOIL_DIM]; SOIL_DIM] {
+        self.filter.posterior().covariance
     }
 
     /// What the filter says now.

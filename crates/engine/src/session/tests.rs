@@ -1,6 +1,7 @@
 //! Goal: every kind of measurement gets its typed answer and only accepted ones leave a trace.
 
 use nesam_adaptation::FilterConfig;
+use nesam_model::HISTORY;
 use nesam_physics::{Control, Driveline, SecondCommand, VehicleState};
 
 use super::*;
@@ -42,12 +43,29 @@ fn cart() -> Vehicle {
 
 fn at(stamp_ns: i64) -> Measurement {
     let mut state = VehicleState::zero();
-    state.position_m[0] = stamp_ns as f64 * 1e-9;
-    Measurement { sequence: None, stamp_ns, state, command: Control { speed_m_s: 1.0, second: 0.0 }, wheels: WheelMeasurement::default() }
+    state.position_m[0] = (stamp_ns % (10_000 * STEP_NS)) as f64 * 1e-9;
+    let command = Control { speed_m_s: 1.0, second: 0.0 };
+    Measurement { sequence: None, boot: None, stamp_ns, state, command, wheels: WheelMeasurement::default() }
+}
+
+fn numbered(stamp_ns: i64, sequence: u64) -> Measurement {
+    Measurement { sequence: Some(sequence), ..at(stamp_ns) }
+}
+
+fn observe_at(session: &mut Session, measurement: &Measurement, now_ns: u64) -> Result<Outcome, EngineError> {
+    let rules = Rules { step_ns: STEP_NS, vehicle: &cart(), limits: &Limits::default() };
+    session.observe(measurement, now_ns, rules).map(|observed| observed.outcome)
 }
 
 fn observe(session: &mut Session, measurement: &Measurement) -> Result<Outcome, EngineError> {
-    session.observe(measurement, 0, Rules { step_ns: STEP_NS, vehicle: &cart(), limits: &Limits::default() })
+    observe_at(session, measurement, 0)
+}
+
+/// Everything that a refused measurement may not change: all but the suspicion that a clock was set.
+fn trace(session: &Session) -> String {
+    let mut session = session.clone();
+    session.order.suspect = None;
+    format!("{session:?}")
 }
 
 /// A session with `n` steps.
@@ -71,16 +89,89 @@ fn analytic_history_holds_the_newest_32_steps() {
 #[test]
 fn analytic_resent_and_late_measurements_change_nothing() {
     let mut session = driven(5);
-    let before = format!("{session:?}");
+    let before = trace(&session);
     for i in 0..5 {
         assert_eq!(observe(&mut session, &at(i * STEP_NS)), Ok(Outcome::Duplicate));
     }
+    // The newest is 0.4 s: the window ends at 0.2 s, and what lies on its edge is final.
     assert_eq!(observe(&mut session, &at(STEP_NS / 2)), Ok(Outcome::TooOld { behind_s: seconds(350_000_000) }));
-    let numbered = Measurement { sequence: Some(7), ..at(5 * STEP_NS) };
-    assert_eq!(format!("{session:?}"), before);
-    assert_eq!(observe(&mut session, &numbered), Ok(Outcome::Applied));
-    assert_eq!(observe(&mut session, &Measurement { sequence: Some(7), ..at(6 * STEP_NS) }), Ok(Outcome::Duplicate));
-    assert_eq!(observe(&mut session, &Measurement { sequence: Some(6), ..at(6 * STEP_NS) }), Ok(Outcome::TooOld { behind_s: 0.0 }));
+    assert_eq!(trace(&session), before);
+    assert_eq!(observe(&mut session, &numbered(5 * STEP_NS, 7)), Ok(Outcome::Applied));
+    assert_eq!(observe(&mut session, &numbered(6 * STEP_NS, 7)), Ok(Outcome::Duplicate));
+    assert_eq!(observe(&mut session, &numbered(6 * STEP_NS, 6)), Ok(Outcome::TooOld { behind_s: 0.0 }));
+}
+
+#[test]
+fn analytic_the_window_holds_at_its_edge() {
+    let window_ns = Limits::default().reorder_window_ns();
+    for (behind_ns, outcome) in [(window_ns, "too_old"), (window_ns - 1, "buffered")] {
+        let mut session = driven(7);
+        let newest_ns = 6 * STEP_NS + STEP_NS / 2;
+        observe(&mut session, &at(newest_ns)).unwrap();
+        assert_eq!(observe(&mut session, &at(newest_ns - behind_ns)).unwrap().label(), outcome, "{behind_ns} ns behind");
+    }
+}
+
+#[test]
+fn analytic_a_late_measurement_heals_the_gap_that_it_left() {
+    let (whole, mut healed) = (driven(9), driven(7));
+    assert_eq!(observe(&mut healed, &at(8 * STEP_NS)), Ok(Outcome::Gap { gap_s: 0.2 }));
+    assert_eq!(healed.history().len(), 1);
+    let rules = Rules { step_ns: STEP_NS, vehicle: &cart(), limits: &Limits::default() };
+    let late = healed.observe(&at(7 * STEP_NS), 0, rules).unwrap();
+    assert_eq!(late, Observed { outcome: Outcome::Applied, reordered: true });
+    assert_eq!((healed.history(), healed.newest_at().unwrap().stamp_ns), (whole.history(), 8 * STEP_NS));
+}
+
+#[test]
+fn analytic_a_restarted_vehicle_begins_anew_and_its_former_life_is_over() {
+    let boot = |boot: u64, i: i64| Measurement { boot: Some(boot), ..numbered(i * STEP_NS, i as u64 + 1) };
+    let mut session = driven(0);
+    for i in 100..120 {
+        assert_eq!(observe(&mut session, &boot(77, i)), Ok(Outcome::Applied));
+    }
+    assert_eq!(observe(&mut session, &boot(5, 0)), Ok(Outcome::Restarted));
+    assert_eq!((session.history().len(), session.last_stamp_ns(), session.last_sequence(), session.boot()), (1, Some(0), Some(1), Some(5)));
+    assert_eq!(observe(&mut session, &boot(5, 1)), Ok(Outcome::Applied));
+    let before = trace(&session);
+    assert!(matches!(observe(&mut session, &boot(77, 120)), Ok(Outcome::TooOld { .. })));
+    assert_eq!(trace(&session), before);
+    // Without an id the numbers say it, the second time: these stamps go on, the numbers begin again.
+    assert_eq!(observe(&mut session, &numbered(8 * STEP_NS, 900)).map(|o| o.label()), Ok("gap"));
+    assert_eq!(observe(&mut session, &numbered(9 * STEP_NS, 1)), Ok(Outcome::TooOld { behind_s: 0.0 }));
+    assert_eq!(observe(&mut session, &numbered(10 * STEP_NS, 2)), Ok(Outcome::Restarted));
+    assert_eq!(observe(&mut session, &numbered(11 * STEP_NS, 3)), Ok(Outcome::Applied));
+    assert_eq!(session.history().len(), 2);
+}
+
+#[test]
+fn analytic_clocks_that_jump_are_believed_the_second_time() {
+    let year_ns = 31_536_000_000_000_000;
+    // Ahead, at once: one wrong stamp is refused, a second one in a row is a clock that was set.
+    let mut session = driven(5);
+    let ahead = seconds(year_ns + STEP_NS);
+    assert_eq!(observe(&mut session, &at(year_ns + 5 * STEP_NS)), Ok(Outcome::Future { ahead_s: ahead }));
+    assert_eq!(observe(&mut session, &at(5 * STEP_NS)), Ok(Outcome::Applied), "one wrong stamp does no harm");
+    observe(&mut session, &at(year_ns)).unwrap();
+    let jumped = observe(&mut session, &at(year_ns + STEP_NS)).unwrap();
+    assert_eq!((jumped.label(), session.history().len()), ("clock_jump", 1));
+    // Back, numbered on: the same.
+    let mut session = driven(0);
+    for i in 0..5 {
+        observe(&mut session, &numbered((i + 900) * STEP_NS, i as u64 + 1)).unwrap();
+    }
+    assert_eq!(observe(&mut session, &numbered(100 * STEP_NS, 6)).map(|o| o.label()), Ok("too_old"));
+    assert_eq!(observe(&mut session, &numbered(101 * STEP_NS, 7)), Ok(Outcome::ClockJump { jump_s: seconds(-803 * STEP_NS) }));
+    // Back, without numbers: the stamps have to keep pace with the arrivals, as those of a burst do not.
+    let mut session = driven(1);
+    observe(&mut session, &at(100 * STEP_NS)).unwrap();
+    let burst: Vec<_> = (10..60).map(|i| observe(&mut session, &at(i * STEP_NS)).unwrap().label()).collect();
+    assert!(burst.iter().all(|label| *label == "too_old"));
+    let paced: Vec<_> = (10..17).map(|i| observe_at(&mut session, &at(i * STEP_NS), (i * STEP_NS) as u64).unwrap().label()).collect();
+    assert_eq!(paced, ["too_old", "too_old", "too_old", "too_old", "too_old", "clock_jump", "applied"]);
+    // A pause that time has passed for is a gap, however long.
+    let mut session = driven(1);
+    assert_eq!(observe_at(&mut session, &at(36_000 * STEP_NS), 3_600_000_000_000).map(|o| o.label()), Ok("gap"));
 }
 
 #[test]
@@ -99,7 +190,7 @@ fn analytic_dense_stamps_are_thinned_and_gaps_restart_the_history() {
 #[test]
 fn property_no_bad_number_gets_in() {
     let mut session = driven(3);
-    let before = format!("{session:?}");
+    let before = trace(&session);
     for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
         for i in 0..12 {
             let mut x = at(3 * STEP_NS).state.to_array();
@@ -114,10 +205,12 @@ fn property_no_bad_number_gets_in() {
     for (measurement, field) in [
         (Measurement { command: Control { speed_m_s: 3.01, second: 0.0 }, ..at(3 * STEP_NS) }, "command.speed_m_s"),
         (Measurement { command: Control { speed_m_s: 3.0, second: -0.51 }, ..at(3 * STEP_NS) }, "command.second"),
-        (Measurement { stamp_ns: i64::MAX, ..at(3 * STEP_NS) }, "stamp_ns"),
-        (at(i64::MAX), "state.position_m.x"),
+        (Measurement { state: VehicleState { position_m: [1e7, 0.0, 0.0], ..at(0).state }, ..at(3 * STEP_NS) }, "state.position_m.x"),
     ] {
         assert_eq!(observe(&mut session, &measurement).unwrap_err().field(), field);
     }
-    assert_eq!(format!("{session:?}"), before);
+    let last = Measurement { stamp_ns: i64::MAX, ..at(3 * STEP_NS) };
+    assert_eq!(observe(&mut session, &last).map(|o| o.label()), Ok("future"));
+    assert_eq!(observe(&mut session, &last).map(|o| o.label()), Ok("future"));
+    assert_eq!(trace(&session), before);
 }

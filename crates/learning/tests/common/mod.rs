@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use nesam_learning::initial::initial_weights;
-use nesam_learning::{Drive, encode_drives, scales};
+use nesam_learning::{Drive, Pooling, encode_drives, scales};
 use nesam_model::encoder::TerrainEncoders;
 use nesam_model::{GroundSource, ModelBundle, Normalization, Predictor, Provenance, Variant, Weights};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
@@ -140,9 +140,14 @@ pub fn predictor(scales: &Normalization, weights: Weights) -> Predictor {
     Predictor::new(Arc::new(bundle)).expect("all arrays are there")
 }
 
+/// No sharing of the terrain projection.
+pub fn single_cells() -> Pooling {
+    Pooling::new(1).expect("single cells tile everything")
+}
+
 /// The drive with its contexts.
 pub fn encoded(mut drive: Drive, weights: &Weights, scales: &Normalization) -> Drive {
     let encoders = TerrainEncoders::new(weights).expect("all arrays are there");
-    encode_drives(core::slice::from_mut(&mut drive), &encoders, &scales.patch_scale(), |_| {});
+    encode_drives(core::slice::from_mut(&mut drive), &encoders, &scales.patch_scale(), &single_cells(), |_| {});
     drive
 }

@@ -167,12 +167,9 @@ impl Network {
         Ok(weights)
     }
 
-    /// W_c c: (rows, context = 9216) -> (rows, 128).
-    ///
-    /// # Errors
-    /// A candle error when shapes disagree.
-    pub fn context_token(&self, context: &Tensor) -> Result<Tensor> {
-        context.matmul(&self.token_context.t()?)
+    /// W_c, (128, context = 9216).
+    pub fn token_context(&self) -> &Tensor {
+        &self.token_context
     }
 
     /// Embedding of tokens: scaled state and control entries (rows, 14) and W_c c (rows, 128) -> (rows, 128), without position.

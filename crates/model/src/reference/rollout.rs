@@ -83,7 +83,8 @@ impl ReferenceRollout<'_> {
     /// A candle error, also of the provider.
     pub fn run(&self, rows: &[Row<'_>], horizon: usize, provider: &mut dyn TerrainProvider) -> Result<Vec<PredictedStep>> {
         let batch = rows.len();
-        let mut cache = self.prefill(rows, provider)?;
+        let remembers = self.variant.remembers();
+        let mut cache = if remembers { self.prefill(rows, provider)? } else { KvCache::new() };
         let mut states: Vec<VehicleState<f64>> = rows.iter().map(|r| r.start).collect();
         let mut previous: Vec<Option<VehicleState<f64>>> = rows.iter().map(|r| r.history.last().map(|h| h.state)).collect();
         let mut actuators: Vec<DrivelineState> = rows.iter().map(|r| r.actuators).collect();
@@ -103,7 +104,11 @@ impl ReferenceRollout<'_> {
             let controls: Vec<Control<f64>> = rows.iter().map(|r| r.controls[k]).collect();
             let entries = self.entries(rows, &states, &previous, &controls, &state, last_increment.as_ref())?;
             let (context, raw_soil) = provider.at(k, &states)?;
-            let token = self.network.embed(&entries, &context)?.broadcast_add(&self.network.positions(first_position + k, 1)?)?;
+            let position = if remembers { first_position + k } else { first_position };
+            let token = self.network.embed(&entries, &context)?.broadcast_add(&self.network.positions(position, 1)?)?;
+            if !remembers {
+                cache.clear();
+            }
             let hidden = self.network.transformer(&token.unsqueeze(1)?, &mut cache, None)?.squeeze(1)?;
             let (raw_sinkage, raw_residual) = self.network.heads(&hidden)?;
 

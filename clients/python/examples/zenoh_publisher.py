@@ -1,0 +1,116 @@
+"""A vehicle that reports over Zenoh: copy this and replace `measured` by what the vehicle measures.
+
+    python zenoh_publisher.py --connect tcp/127.0.0.1:7447 --fleet default --vehicle truck-1 --rate 50 --seconds 10
+
+A session named like the vehicle has to be open (over gRPC). Every measurement carries its number and the id of this start of the program, so that the service
+can tell repeated, late and lost measurements, a clock that was set, and a restart apart. It answers each one on `.../status`; what it has no answer to
+may be sent again at any time.
+"""
+
+import argparse
+import math
+import random
+import sys
+import time
+
+import zenoh
+from nesam.v1 import measurements_pb2, types_pb2
+
+
+class ZenohVehicle:
+    """A vehicle in a Zenoh network. While it exists, its liveliness token `nesam/v1/<fleet>/<vehicle>/alive` tells everybody that it is there."""
+
+    def __init__(self, endpoint: str, fleet: str, vehicle: str, on_answer):
+        config = zenoh.Config()
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", f'["{endpoint}"]')
+        config.insert_json5("scouting/multicast/enabled", "false")
+        key = f"nesam/v1/{fleet}/{vehicle}"
+        self._session = zenoh.open(config)
+        self._token = self._session.liveliness().declare_token(f"{key}/alive")
+        # `BLOCK` waits while the network is congested rather than losing a measurement; a vehicle whose control loop must not wait leaves it out.
+        self._publisher = self._session.declare_publisher(f"{key}/measurement", congestion_control=zenoh.CongestionControl.BLOCK)
+        self._answers = self._session.declare_subscriber(f"{key}/status", lambda sample: on_answer(answer_of(sample)))
+        self._boot_id = random.getrandbits(63) | 1
+        self._sequence = 0
+
+    def heard(self) -> bool:
+        """Whether a service listens to the measurements."""
+        return self._publisher.matching_status.matching
+
+    def publish(self, stamp_ns: int, state, command) -> measurements_pb2.Measurement:
+        """Sends one measurement: the vehicle's clock, x y z roll pitch yaw vx vy vz wx wy wz, and (speed, second command) applied from now on."""
+        self._sequence += 1
+        vectors = [types_pb2.Vector3(x=state[i], y=state[i + 1], z=state[i + 2]) for i in (0, 3, 6, 9)]
+        measurement = measurements_pb2.Measurement(
+            sequence=self._sequence,
+            boot_id=self._boot_id,
+            stamp_ns=stamp_ns,
+            state=types_pb2.VehicleState(
+                position_m=vectors[0], attitude_rad=vectors[1], velocity_m_s=vectors[2], angular_velocity_rad_s=vectors[3]
+            ),
+            command=types_pb2.Control(speed_m_s=command[0], second=command[1]),
+        )
+        self.send(measurement)
+        return measurement
+
+    def send(self, measurement: measurements_pb2.Measurement) -> None:
+        """Sends a measurement as it is, for instance once more."""
+        self._publisher.put(measurement.SerializeToString())
+
+    def close(self) -> None:
+        """Leaves the network; the token goes with it."""
+        self._session.close()
+
+
+def answer_of(sample) -> measurements_pb2.MeasurementAnswer:
+    """The answer in a sample."""
+    answer = measurements_pb2.MeasurementAnswer()
+    answer.ParseFromString(sample.payload.to_bytes())
+    return answer
+
+
+def measured(t_s: float):
+    """State and command of a made-up vehicle on a circle of 20 m at 2 m/s. Replace this."""
+    speed, radius = 2.0, 20.0
+    yaw = speed * t_s / radius
+    position = [radius * math.sin(yaw), radius * (1.0 - math.cos(yaw)), 0.6]
+    yaw = math.remainder(yaw, math.tau)
+    return [*position, 0.0, 0.0, yaw, speed, 0.0, 0.0, 0.0, 0.0, speed / radius], [speed, 0.1]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Publishes measurements of a made-up vehicle over Zenoh.")
+    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="endpoint of the router or server")
+    parser.add_argument("--fleet", default="default")
+    parser.add_argument("--vehicle", default="truck-1")
+    parser.add_argument("--rate", type=float, default=50.0, help="measurements per second, 10 to 200")
+    parser.add_argument("--seconds", type=float, default=10.0)
+    arguments = parser.parse_args()
+    counts = {}
+
+    def on_answer(answer):
+        kind = (answer.WhichOneof("outcome") or "unknown").upper()
+        counts[kind] = counts.get(kind, 0) + 1
+        if kind == "REJECTED":
+            print(f"measurement {answer.sequence}: {answer.rejected.message}", file=sys.stderr)
+
+    vehicle = ZenohVehicle(arguments.connect, arguments.fleet, arguments.vehicle, on_answer)
+    while not vehicle.heard():
+        time.sleep(0.05)
+    start = time.monotonic()
+    count = int(arguments.seconds * arguments.rate)
+    for i in range(count):
+        due = i / arguments.rate
+        time.sleep(max(0.0, start + due - time.monotonic()))
+        vehicle.publish(time.time_ns(), *measured(due))
+    deadline = time.monotonic() + 5.0
+    while sum(counts.values()) < count and time.monotonic() < deadline:
+        time.sleep(0.05)
+    vehicle.close()
+    print("  ".join(f"{kind} {n}" for kind, n in sorted(counts.items())))
+    return 0 if sum(counts.values()) == count else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

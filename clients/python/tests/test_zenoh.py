@@ -1,0 +1,117 @@
+"""The example publisher of examples/zenoh_publisher.py against a real server that is the Zenoh router of its network."""
+
+import importlib.util
+import queue
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import nesam
+
+zenoh = pytest.importorskip("zenoh")
+
+EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "zenoh_publisher.py"
+STEP_NS = 100_000_000
+
+
+@pytest.fixture
+def network(request, tmp_path):
+    """A server in router mode: its gRPC client and the endpoint of the router."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    config = tmp_path / "router.toml"
+    config.write_text(f'[zenoh]\nmode = "router"\nlisten = ["{endpoint}"]\nfleet = "python"\nname = "router"\n')
+    bundle = request.config.getoption("--bundle")
+    command = [request.config.getoption("--server"), "serve", "--config", str(config), "--grpc", "127.0.0.1:0", "--no-http"]
+    process = subprocess.Popen(command + (["--bundle", bundle] if bundle else []), stdout=subprocess.PIPE, text=True)
+    address = None
+    for line in process.stdout:
+        words = line.split()
+        if words[:1] == ["grpc"]:
+            address = words[1]
+        if words[:1] == ["ready;"]:
+            break
+    assert address, f"{command} did not start"
+    threading.Thread(target=process.stdout.read, daemon=True).start()
+    with nesam.Client(address, timeout_s=60.0) as client:
+        yield client, endpoint
+    process.terminate()
+    assert process.wait(timeout=30) == 0, "the server did not shut down cleanly"
+
+
+def load_example():
+    spec = importlib.util.spec_from_file_location("zenoh_publisher", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def until(holds, what):
+    deadline = time.monotonic() + 20.0
+    while not holds():
+        assert time.monotonic() < deadline, what
+        time.sleep(0.05)
+
+
+def test_service_the_example_runs_as_it_stands(network):
+    client, endpoint = network
+    client.open_session("truck-7")
+    command = [sys.executable, str(EXAMPLE), "--connect", endpoint, "--fleet", "python", "--vehicle", "truck-7", "--rate", "50", "--seconds", "3"]
+    printed = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert printed.returncode == 0, printed
+    counts = dict(zip(printed.stdout.split()[::2], map(int, printed.stdout.split()[1::2])))
+    # On a busy machine the publisher itself may pause for longer than a step and a half.
+    assert set(counts) <= {"APPLIED", "BUFFERED", "GAP"} and sum(counts.values()) == 150 and counts["APPLIED"] >= 15, counts
+    session = client.session("truck-7")
+    assert session.last_sequence == 150 and session.boot_id
+
+
+def test_service_reordering_repetition_gap_and_restart_over_zenoh(network):
+    client, endpoint = network
+    client.open_session("truck-8")
+    assert client.session("truck-8").vehicle_alive is False
+    example, answers = load_example(), queue.Queue()
+    vehicle = example.ZenohVehicle(endpoint, "python", "truck-8", answers.put)
+    until(vehicle.heard, "nobody listens")
+    until(lambda: client.session("truck-8").vehicle_alive, "the token was not seen")
+
+    def exchange(measurement):
+        answer = answers.get(timeout=20.0)
+        assert (answer.sequence, answer.stamp_ns) == (measurement.sequence, measurement.stamp_ns)
+        return answer.WhichOneof("outcome").upper(), answer.reordered
+
+    sent = []
+    for i in range(6):
+        sent.append(vehicle.publish(i * STEP_NS, *example.measured(0.1 * i)))
+        assert exchange(sent[-1]) == ("APPLIED", False)
+    vehicle.send(sent[5])
+    assert exchange(sent[5]) == ("DUPLICATE", False)
+    # Number 7 is held back on its way and arrives after number 8.
+    vehicle.send = lambda measurement: None
+    held = vehicle.publish(6 * STEP_NS, *example.measured(0.6))
+    del vehicle.send
+    later = vehicle.publish(7 * STEP_NS, *example.measured(0.7))
+    assert exchange(later) == ("GAP", False)
+    vehicle.send(held)
+    assert exchange(held) == ("APPLIED", True)
+    assert client.session("truck-8").history_steps == 8
+    vehicle.close()
+    until(lambda: not client.session("truck-8").vehicle_alive, "the token stayed")
+
+    again = example.ZenohVehicle(endpoint, "python", "truck-8", answers.put)
+    until(again.heard, "nobody listens")
+    assert exchange(again.publish(0, *example.measured(0.8))) == ("RESTARTED", False)
+    assert exchange(again.publish(STEP_NS, *example.measured(0.9))) == ("APPLIED", False)
+    again.send(later)
+    assert exchange(later) == ("TOO_OLD", False)
+    session = client.session("truck-8")
+    assert (session.history_steps, session.last_sequence) == (2, 2)
+    np.testing.assert_allclose(session.state, example.measured(0.9)[0])
+    again.close()

@@ -1,0 +1,193 @@
+//! Which measurements continue the line of a session: duplicates, late ones, clocks that jump, vehicles that restart.
+
+use std::collections::VecDeque;
+
+use crate::error::EngineError;
+use crate::limits::Limits;
+use crate::measurement::{Measurement, Outcome};
+
+/// Accepted stamps that are remembered to tell a resent measurement from a late one.
+pub(super) const RECENT_MAX: usize = 256;
+/// Former starts of the vehicle's software that are remembered to refuse their late measurements.
+pub(super) const ENDED_BOOTS_MAX: usize = 8;
+/// Consecutive measurements off the line that prove a new one.
+const PROOF_COUNT: u32 = 2;
+/// Where numbers prove nothing: time of arrival over which the stamps have to keep pace with the arrivals, s and measurements.
+const PROOF_PACE: (f64, u32) = (0.5, 3);
+
+/// What to do with a measurement.
+#[derive(Clone, Debug, PartialEq)]
+pub(super) enum Verdict {
+    /// It belongs to the line.
+    Accept,
+    /// It does not; nothing changes.
+    Refuse(Outcome),
+    /// A new line begins with it.
+    Begin(Outcome),
+}
+
+/// An accepted stamp and its number.
+pub(super) type Numbered = (i64, Option<u64>);
+
+/// Why a measurement does not continue the line.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum OffLine {
+    /// Behind the window.
+    Late,
+    /// Further ahead than time has passed.
+    Ahead,
+    /// Numbered against the order of the stamps.
+    Renumbered,
+}
+
+/// Measurements off the line that follow each other: one of them is an error, several are a clock that was set or a vehicle that was restarted.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Suspect {
+    kind: OffLine,
+    first_stamp_ns: i64,
+    first_arrival_ns: u64,
+    last: Numbered,
+    count: u32,
+}
+
+/// The line of accepted measurements.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(super) struct Order {
+    /// By ascending stamp.
+    pub(super) recent: VecDeque<Numbered>,
+    /// Highest accepted number.
+    pub(super) last_sequence: Option<u64>,
+    /// Present start of the vehicle's software, where it is told.
+    pub(super) boot: Option<u64>,
+    /// Starts before it, oldest first.
+    pub(super) ended_boots: VecDeque<u64>,
+    /// Engine clock when the newest measurement arrived, ns.
+    pub(super) newest_arrival_ns: i64,
+    /// Newest stamp that is final: nothing comes before it any more.
+    pub(super) final_ns: Option<i64>,
+    pub(super) suspect: Option<Suspect>,
+}
+
+impl Order {
+    /// Newest accepted stamp, ns.
+    pub(super) fn newest_ns(&self) -> Option<i64> {
+        self.recent.back().map(|(stamp_ns, _)| *stamp_ns)
+    }
+
+    /// Judges a measurement that arrives now; only notes what is off the line.
+    ///
+    /// # Errors
+    /// `EngineError::Invalid` when the vehicle was silent for longer than `pause_max_s`.
+    pub(super) fn judge(&mut self, measurement: &Measurement, now_ns: u64, step_ns: i64, limits: &Limits) -> Result<Verdict, EngineError> {
+        let stamp_ns = measurement.stamp_ns;
+        let behind_s = self.newest_ns().map_or(0.0, |newest| seconds(newest.saturating_sub(stamp_ns)).max(0.0));
+        if let Some(boot) = measurement.boot {
+            if self.ended_boots.contains(&boot) {
+                return Ok(Verdict::Refuse(Outcome::TooOld { behind_s }));
+            }
+            if self.boot.is_some_and(|present| present != boot) {
+                return Ok(Verdict::Begin(Outcome::Restarted));
+            }
+        }
+        let Some(newest_ns) = self.newest_ns() else { return Ok(Verdict::Accept) };
+        let resent = measurement.sequence.is_some() && measurement.sequence == self.last_sequence;
+        let place = self.recent.partition_point(|(recent_ns, _)| *recent_ns < stamp_ns);
+        if resent || self.recent.get(place).is_some_and(|(recent_ns, _)| *recent_ns == stamp_ns) {
+            return Ok(Verdict::Refuse(Outcome::Duplicate));
+        }
+        let ahead_s = seconds(stamp_ns.saturating_sub(newest_ns));
+        let silent_s = seconds((now_ns as i64).saturating_sub(self.newest_arrival_ns).max(0));
+        let edge_ns = newest_ns.saturating_sub(limits.reorder_window_ns()).max(self.final_ns.unwrap_or(i64::MIN));
+        let off = if stamp_ns <= edge_ns {
+            OffLine::Late
+        } else if self.numbered_against(place, measurement.sequence) {
+            OffLine::Renumbered
+        } else if ahead_s - silent_s > limits.clock_ahead_max_s {
+            OffLine::Ahead
+        } else if ahead_s > limits.pause_max_s {
+            let limit = limits.pause_max_s;
+            let reason = format!("lies {ahead_s} s after the last one, allowed are {limit} s; open a new session after a longer pause");
+            return Err(EngineError::invalid("stamp_ns", reason));
+        } else {
+            return Ok(Verdict::Accept);
+        };
+        let renewed = self.suspects(off, measurement, now_ns, step_ns);
+        Ok(match off {
+            _ if renewed && (off == OffLine::Renumbered || self.numbered_again(measurement)) => Verdict::Begin(Outcome::Restarted),
+            _ if renewed => Verdict::Begin(Outcome::ClockJump { jump_s: ahead_s - silent_s }),
+            OffLine::Late | OffLine::Renumbered => Verdict::Refuse(Outcome::TooOld { behind_s }),
+            OffLine::Ahead => Verdict::Refuse(Outcome::Future { ahead_s: ahead_s - silent_s }),
+        })
+    }
+
+    /// Whether a number at this place contradicts its neighbours.
+    fn numbered_against(&self, place: usize, sequence: Option<u64>) -> bool {
+        let Some(sequence) = sequence else { return false };
+        let before = self.recent.iter().take(place).rev().find_map(|(_, number)| *number);
+        let after = self.recent.iter().skip(place).find_map(|(_, number)| *number);
+        before.is_some_and(|before| before >= sequence) || after.is_some_and(|after| after <= sequence)
+    }
+
+    /// Whether the number says that the vehicle began to count anew.
+    fn numbered_again(&self, measurement: &Measurement) -> bool {
+        matches!((measurement.sequence, self.last_sequence), (Some(number), Some(last)) if number <= last)
+    }
+
+    /// Notes a measurement off the line and says whether enough of them agree on a new one.
+    ///
+    /// Two in a row do, if they lie ahead, or if their numbers are fresh or contradict the stamps: late ones of the old line are never so. Otherwise
+    /// the stamps have to keep pace with the arrivals, as no burst of resent measurements does.
+    fn suspects(&mut self, kind: OffLine, measurement: &Measurement, now_ns: u64, step_ns: i64) -> bool {
+        let here: Numbered = (measurement.stamp_ns, measurement.sequence);
+        let follows = |last: Numbered| {
+            let interval = here.0.saturating_sub(last.0);
+            interval > 0 && interval <= step_ns / 2 * 3 && here.1.zip(last.1).is_none_or(|(number, before)| number > before)
+        };
+        let suspect = match self.suspect {
+            Some(suspect) if suspect.kind == kind && follows(suspect.last) => Suspect { last: here, count: suspect.count + 1, ..suspect },
+            _ => Suspect { kind, first_stamp_ns: here.0, first_arrival_ns: now_ns, last: here, count: 1 },
+        };
+        self.suspect = Some(suspect);
+        let fresh = matches!((measurement.sequence, self.last_sequence), (Some(number), Some(last)) if number > last);
+        if kind != OffLine::Late || fresh {
+            return suspect.count >= PROOF_COUNT;
+        }
+        let elapsed_s = now_ns.saturating_sub(suspect.first_arrival_ns) as f64 * 1e-9;
+        let advance_s = seconds(here.0.saturating_sub(suspect.first_stamp_ns));
+        let paced = advance_s >= 0.5 * elapsed_s && advance_s <= 2.0 * elapsed_s;
+        elapsed_s >= PROOF_PACE.0 && suspect.count >= PROOF_PACE.1 && paced
+    }
+
+    /// Notes an accepted measurement. Says whether it is the newest.
+    pub(super) fn accept(&mut self, measurement: &Measurement, now_ns: u64) -> bool {
+        let place = self.recent.partition_point(|(recent_ns, _)| *recent_ns < measurement.stamp_ns);
+        let newest = place == self.recent.len();
+        self.recent.insert(place, (measurement.stamp_ns, measurement.sequence));
+        if self.recent.len() > RECENT_MAX {
+            self.recent.pop_front();
+        }
+        self.last_sequence = self.last_sequence.max(measurement.sequence);
+        self.boot = measurement.boot.or(self.boot);
+        self.suspect = None;
+        if newest {
+            self.newest_arrival_ns = now_ns as i64;
+        }
+        newest
+    }
+
+    /// Forgets the line: the next measurement begins another one.
+    pub(super) fn begin(&mut self, boot: Option<u64>) {
+        let mut ended_boots = core::mem::take(&mut self.ended_boots);
+        if let Some(ended) = self.boot.filter(|present| boot.is_some_and(|boot| boot != *present)) {
+            ended_boots.push_back(ended);
+            if ended_boots.len() > ENDED_BOOTS_MAX {
+                ended_boots.pop_front();
+            }
+        }
+        *self = Self { boot: boot.or(self.boot), ended_boots, ..Self::default() };
+    }
+}
+
+fn seconds(ns: i64) -> f64 {
+    ns as f64 * 1e-9
+}

@@ -1,0 +1,98 @@
+//! Who is there: liveliness tokens of the vehicles, the token and the status of this server.
+
+use std::collections::BTreeSet;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use ::zenoh::sample::{Sample, SampleKind};
+use nesam_proto::v1 as pb;
+use tokio::sync::{Notify, mpsc};
+
+use super::{Outgoing, encode, keys};
+use crate::grpc::Edge;
+
+/// Tokens that are remembered; a network that shows more is not one of vehicles.
+const VEHICLES_MAX: usize = 4096;
+
+/// The vehicles whose liveliness token is there. Shared between Zenoh, gRPC and the metrics.
+#[derive(Clone, Debug, Default)]
+pub struct Presence {
+    alive: Arc<Mutex<BTreeSet<String>>>,
+    changed: Arc<Notify>,
+}
+
+impl Presence {
+    /// Whether a vehicle is there.
+    pub fn is_alive(&self, vehicle: &str) -> bool {
+        self.alive.lock().is_ok_and(|alive| alive.contains(vehicle))
+    }
+
+    /// The vehicles that are there, by name.
+    pub fn vehicles(&self) -> Vec<String> {
+        self.alive.lock().map(|alive| alive.iter().cloned().collect()).unwrap_or_default()
+    }
+
+    /// Number of vehicles that are there.
+    pub fn count(&self) -> usize {
+        self.alive.lock().map_or(0, |alive| alive.len())
+    }
+
+    fn note(&self, vehicle: &str, alive: bool) {
+        let Ok(mut vehicles) = self.alive.lock() else { return };
+        let changed = if alive { vehicles.len() < VEHICLES_MAX && vehicles.insert(vehicle.into()) } else { vehicles.remove(vehicle) };
+        drop(vehicles);
+        if changed {
+            tracing::info!(vehicle, alive, "vehicle token");
+            self.changed.notify_one();
+        }
+    }
+}
+
+/// Holds the token of this server and watches those of the vehicles, including those that are there already.
+pub async fn declare(
+    session: &::zenoh::Session,
+    fleet: &str,
+    name: &str,
+    presence: Presence,
+) -> Result<::zenoh::liveliness::LivelinessToken, ::zenoh::Error> {
+    let watcher = session.liveliness().declare_subscriber(keys::all_vehicles(fleet, "alive")).history(true);
+    let watcher =
+        watcher.callback(move |sample: Sample| presence.note(keys::vehicle(sample.key_expr().as_str()), sample.kind() == SampleKind::Put));
+    watcher.background().await?;
+    session.liveliness().declare_token(keys::of_server(fleet, name, "alive")).await
+}
+
+/// Publishes the status of this server at an interval and when a vehicle comes or goes, as long as there is a publisher.
+pub async fn publish_status(edge: Edge, presence: Presence, key: String, name: String, interval: Duration, sender: mpsc::Sender<Outgoing>) {
+    let started = Instant::now();
+    let mut tick = tokio::time::interval(interval);
+    tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    loop {
+        tokio::select! {
+            _ = tick.tick() => {}
+            () = presence.changed.notified() => {}
+        }
+        // An engine that is too busy to list its sessions says nothing this time.
+        let Ok(views) = edge.engine.list(edge.stream_budget()).await else { continue };
+        let sessions = views.iter().map(|view| pb::SessionStatus {
+            session_id: view.session.clone(),
+            vehicle_id: view.vehicle.clone(),
+            last_stamp_ns: view.last_stamp_ns,
+            history_epoch: view.provenance.history_epoch,
+            soil_epoch: view.provenance.soil_epoch,
+            vehicle_alive: presence.is_alive(&view.vehicle),
+        });
+        let bundle = edge.predictor.bundle();
+        let status = pb::ServerStatus {
+            name: name.clone(),
+            uptime_s: started.elapsed().as_secs_f64(),
+            bundle_name: bundle.name.clone(),
+            bundle_hash: bundle.hash.clone(),
+            sessions: sessions.collect(),
+            vehicles_alive: presence.vehicles(),
+        };
+        if sender.send((key.clone(), encode(&status))).await.is_err() {
+            return;
+        }
+    }
+}

@@ -1,0 +1,100 @@
+//! Goal: a session that is exported and imported, on the same or another server, answers as the original, bit for bit; anything else than an export is refused.
+
+use nesam_client::{outcome_label, v1};
+use prost::Message as _;
+use tonic::Code;
+
+use crate::stage::*;
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_an_imported_session_goes_on_as_the_original() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    let (other_server, mut other) = start().await;
+    for client in [&mut client, &mut other] {
+        client.upload_map(&layers(&recorded.world)).await.unwrap();
+    }
+    open(&mut client, "s", recorded.world.id()).await;
+    // In the middle of a buffer, with measurements in the window and one of them missing.
+    let missing = 46;
+    client.feed(samples("s", &recorded.drive, 47).into_iter().filter(|m| m.sequence != missing + 1).collect()).await.unwrap();
+    let image = client.export_session("s").await.unwrap();
+    assert!(image.len() < 64 << 10, "{} bytes", image.len());
+    assert_refused("open already", client.import_session(image.clone(), "").await, Code::AlreadyExists, "session_id");
+    let moved = other.import_session(image.clone(), "").await.unwrap();
+    assert_eq!(moved, client.session("s").await.unwrap());
+    let copy = client.import_session(image, "copy").await.unwrap();
+    assert_eq!(v1::Session { session_id: "s".into(), ..copy }, moved);
+    // All three drive on: first what is missing, then a resent one, then the rest.
+    let rest =
+        |session: &str| [missing as usize, 47].into_iter().chain(48..=90).map(|i| sample(session, &recorded.drive, i)).collect::<Vec<_>>();
+    let original = client.feed(rest("s")).await.unwrap();
+    let copied = client.feed(rest("copy")).await.unwrap();
+    let moved = other.feed(rest("s")).await.unwrap();
+    assert_eq!([0, 1, 2].map(|i| outcome_label(&original[i])), ["APPLIED", "DUPLICATE", "APPLIED"]);
+    assert_eq!(original, moved);
+    assert!(original.iter().zip(&copied).all(|(a, b)| (&a.outcome, &a.soil_correction) == (&b.outcome, &b.soil_correction)));
+    let query = candidates("s", &recorded.drive, 90, 3, 32);
+    let (here, there) = (client.predict(query.clone()).await.unwrap(), other.predict(query.clone()).await.unwrap());
+    assert!(here.provenance.soil_epoch >= 5 && here.provenance == there.provenance);
+    assert!(bits(&here.states) == bits(&there.states) && bits(&here.sinkage_m) == bits(&there.sinkage_m));
+    assert_same(&there, &offline(&recorded, 90, &query, 31, learned(&recorded, 90).0));
+    server.shutdown().await;
+    other_server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_damaged_foreign_and_old_exports_are_refused() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "s", recorded.world.id()).await;
+    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let image = client.export_session("s").await.unwrap();
+    let before = client.list_sessions().await.unwrap();
+    assert_refused("unknown session", client.export_session("nobody").await, Code::NotFound, "session_id");
+    assert_refused("empty", client.import_session(vec![], "t").await, Code::InvalidArgument, "image");
+    assert_refused("a path", client.import_session(image.clone(), "../t").await, Code::InvalidArgument, "session_id");
+    for i in (0..image.len()).step_by(image.len() / 60) {
+        assert_refused("cut", client.import_session(image[..i].to_vec(), "t").await, Code::InvalidArgument, "image");
+        let mut damaged = image.clone();
+        damaged[i] ^= 0x10;
+        assert_refused("damaged", client.import_session(damaged, "t").await, Code::InvalidArgument, "image");
+    }
+    // Changes with a checksum that fits: what a stranger could send.
+    let outer = v1::SessionImage::decode(image.as_slice()).unwrap();
+    let content = v1::SessionContent::decode(outer.content.clone()).unwrap();
+    let sealed = |change: &dyn Fn(&mut v1::SessionContent)| {
+        let mut content = content.clone();
+        change(&mut content);
+        let content = content.encode_to_vec();
+        let checksum = <sha2::Sha256 as sha2::Digest>::digest(&content).to_vec();
+        v1::SessionImage { version: 1, checksum: checksum.into(), content: content.into() }.encode_to_vec()
+    };
+    let newer = v1::SessionImage { version: 2, ..outer }.encode_to_vec();
+    type Change<'a> = &'a dyn Fn(&mut v1::SessionContent);
+    let changes: [(&str, Change<'_>); 11] = [
+        ("bundle", &|c| c.bundle_hash = "0".repeat(64)),
+        ("filter", &|c| c.filter_settings.push('x')),
+        ("NaN state", &|c| c.live.as_mut().unwrap().history[3].state[1] = f64::NAN),
+        ("short state", &|c| c.open[0].step.as_mut().unwrap().state.truncate(11)),
+        ("NaN covariance", &|c| c.filter.as_mut().unwrap().covariance[7] = f64::NAN),
+        ("command", &|c| c.filter_steps[0].command[0] = 1e3),
+        ("stamps", &|c| c.recent_stamp_ns.reverse()),
+        ("numbers", &|c| c.recent_sequence.truncate(3)),
+        ("grid", &|c| c.settled.as_mut().unwrap().grid_ns[0] = 0),
+        ("buffer", &|c| c.filter_first = 1 << 30),
+        ("no soil", &|c| c.soil = None),
+    ];
+    assert_refused("newer", client.import_session(newer, "t").await, Code::InvalidArgument, "image");
+    for (what, change) in changes {
+        assert_refused(what, client.import_session(sealed(change), "t").await, Code::InvalidArgument, "image");
+    }
+    let other_map = sealed(&|c| c.map_hash = "0".repeat(64));
+    assert_refused("another map", client.import_session(other_map, "t").await, Code::FailedPrecondition, "image");
+    let no_map = sealed(&|c| c.map_id = "nowhere".into());
+    assert_refused("unknown map", client.import_session(no_map, "t").await, Code::NotFound, "map_id");
+    assert_eq!(client.list_sessions().await.unwrap(), before);
+    client.import_session(sealed(&|_| ()), "t").await.unwrap();
+    server.shutdown().await;
+}
