@@ -23,6 +23,7 @@ async fn record(folder: &Path, change: impl FnOnce(&mut Config)) -> Vec<PathBuf>
     let recorded = recorded();
     let (server, mut client) = start_with(|config| {
         (config.recording.enabled, config.recording.directory) = (true, folder.into());
+        config.fleet_soil.enabled = true;
         change(config);
     })
     .await;
@@ -34,6 +35,10 @@ async fn record(folder: &Path, change: impl FnOnce(&mut Config)) -> Vec<PathBuf>
     client.predict(candidates("s", &recorded.drive, FED, 2, 4).starting_at((FED as i64 + 2) * STEP_NS, vec![])).await.unwrap();
     assert_refused("nobody", client.predict(candidates("nobody", &recorded.drive, 0, 1, 1)).await, Code::NotFound, "session_id");
     client.fork_session("s", "t").await.unwrap();
+    let image = client.export_session("s").await.unwrap();
+    client.import_session(image, "u").await.unwrap();
+    client.predict(candidates("u", &recorded.drive, FED, 1, 8)).await.unwrap();
+    assert!(!client.fleet_soil("").await.unwrap().cells.is_empty());
     let tile = v1::MapTile {
         row: 7,
         column: 9,
@@ -99,8 +104,9 @@ async fn service_a_recorded_run_comes_out_bit_for_bit() {
     assert!(report.all_equal());
     assert_eq!(report.ending, Some(Ending::Finished { reason: "stopped".into(), dropped_commands: 0 }));
     let count = |kind: &str| report.kinds.get(kind).map_or(0, |kind| kind.equal);
-    assert_eq!((count("measure"), count("predict"), count("put_map")), (FED as u64 + 1 + 21, 4, 2));
+    assert_eq!((count("measure"), count("predict"), count("put_map")), (FED as u64 + 1 + 21, 5, 2));
     assert_eq!((count("open"), count("fork"), count("close"), count("get"), count("list"), count("delete_map")), (1, 1, 1, 1, 1, 1));
+    assert_eq!((count("export"), count("import"), count("fleet_soil")), (1, 1, 1));
     // A viewer finds our messages with their schemas, and the soil on a topic of its own.
     let mut reader = Reader::new(std::fs::File::open(&parts[0]).unwrap());
     let (mut schemas, mut topics, mut seen) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::<String, usize>::new());
