@@ -166,9 +166,9 @@ impl EngineClient {
     }
 
     /// Predicts.
-    pub async fn predict(&self, query: PredictQuery, budget: Duration) -> Result<(Prediction, Timing), EngineError> {
+    pub async fn predict(&self, query: PredictQuery, budget: Duration) -> Result<(Arc<Prediction>, Timing), EngineError> {
         match self.call(Command::Predict(query), budget).await? {
-            (Reply::Predicted(prediction), timing) => Ok((*prediction, timing)),
+            (Reply::Predicted(prediction), timing) => Ok((prediction, timing)),
             _ => Err(mismatch("predict")),
         }
     }

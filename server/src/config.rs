@@ -1,7 +1,7 @@
 //! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
 
 use std::net::{Ipv4Addr, SocketAddr};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
@@ -24,6 +24,8 @@ pub struct Config {
     pub limits: LimitsConfig,
     /// Soil map of the fleet.
     pub fleet_soil: FleetSoilConfig,
+    /// Recording.
+    pub recording: RecordingConfig,
 }
 
 /// gRPC.
@@ -110,6 +112,22 @@ pub struct FleetSoilConfig {
     pub process_share: f64,
     /// Cells held at most.
     pub cells_max: usize,
+}
+
+/// Recording of everything that the engine does, for `nesam replay`.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RecordingConfig {
+    /// Whether to record.
+    pub enabled: bool,
+    /// Folder for the files; made if needed.
+    pub directory: PathBuf,
+    /// Size at which a file is finished and the next one begun, bytes.
+    pub part_bytes_max: u64,
+    /// Size of all files of a run at which recording ends, bytes.
+    pub bytes_max: u64,
+    /// Commands and answers that may wait for the disk, bytes; more are dropped.
+    pub queue_bytes_max: u64,
 }
 
 /// What is accepted and held at most; see `nesam_engine::Limits`.
@@ -217,6 +235,12 @@ impl From<&FleetSoilConfig> for FleetSoilSettings {
             process_share: c.process_share,
             cells_max: c.cells_max,
         }
+    }
+}
+
+impl Default for RecordingConfig {
+    fn default() -> Self {
+        Self { enabled: false, directory: "recordings".into(), part_bytes_max: 1 << 30, bytes_max: 16 << 30, queue_bytes_max: 256 << 20 }
     }
 }
 
@@ -331,6 +355,9 @@ impl Config {
             ("limits.sample_steps_max", self.limits.sample_steps_max),
             ("limits.waiting_predictions_max", self.limits.waiting_predictions_max),
             ("limits.waiting_commands_max", self.limits.waiting_commands_max),
+            ("recording.part_bytes_max", usize::from(self.recording.part_bytes_max > 0)),
+            ("recording.bytes_max", usize::from(self.recording.bytes_max > 0)),
+            ("recording.queue_bytes_max", usize::from(self.recording.queue_bytes_max > 0)),
         ];
         for (key, value) in counts {
             if value == 0 {
@@ -356,7 +383,7 @@ impl Config {
 mod tests {
     use super::*;
 
-    fn repository() -> std::path::PathBuf {
+    fn repository() -> PathBuf {
         Path::new(env!("CARGO_MANIFEST_DIR")).parent().unwrap().into()
     }
 

@@ -40,6 +40,12 @@ pub enum ServerError {
         /// What is wrong with them.
         reason: String,
     },
+    /// The recording cannot be begun.
+    #[error("recording does not start: {source}; choose another folder (`recording.directory`, --record)")]
+    Recording {
+        /// What is wrong.
+        source: crate::recording::RecordingError,
+    },
     /// Zenoh does not start.
     #[error("zenoh does not start: {reason}; check `zenoh.listen` and `zenoh.connect`, or set `zenoh.enabled = false`")]
     Zenoh {

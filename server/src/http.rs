@@ -1,5 +1,6 @@
 //! HTTP: `/metrics` for Prometheus, `/status` as JSON, `/health` for load balancers, and the pages of `web`.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use axum::extract::State;
@@ -11,12 +12,14 @@ use serde_json::json;
 
 use crate::clock::MonotonicClock;
 use crate::grpc::Edge;
+use crate::recording::Recorder;
 
 /// What the HTTP side reads.
 #[derive(Clone)]
 pub(crate) struct HttpState {
     pub edge: Edge,
     pub clock: MonotonicClock,
+    pub recorder: Option<Arc<Recorder>>,
 }
 
 const STATUS_DEADLINE: Duration = Duration::from_secs(5);
@@ -38,6 +41,21 @@ async fn metrics(State(state): State<HttpState>) -> Response {
         "# HELP nesam_uptime_seconds Time since the start.\n# TYPE nesam_uptime_seconds gauge\nnesam_uptime_seconds {}\n",
         state.clock.elapsed().as_secs_f64()
     );
+    if let Some(recorder) = &state.recorder {
+        let counts = recorder.counts();
+        for (name, help, value) in [
+            ("commands", "Commands written to the recording.", counts.recorded),
+            (
+                "dropped_commands",
+                "Commands missing in the recording because the disk could not follow or a limit was reached.",
+                counts.dropped,
+            ),
+            ("bytes", "Bytes written to the recording.", counts.bytes),
+        ] {
+            let name = format!("nesam_recording_{name}_total");
+            text += &format!("# HELP {name} {help}\n# TYPE {name} counter\n{name} {value}\n");
+        }
+    }
     if let Some(presence) = &state.edge.presence {
         text += &format!(
             "# HELP nesam_vehicles_alive Vehicles whose Zenoh liveliness token is there.\n# TYPE nesam_vehicles_alive gauge\nnesam_vehicles_alive {}\n",
@@ -80,6 +98,10 @@ async fn status(State(state): State<HttpState>) -> Response {
         "bundle": {"name": bundle.name, "hash": bundle.hash, "vehicle": bundle.vehicle.name},
         "waiting": {"commands": commands, "predictions": predictions},
         "predictions": state.edge.engine.metrics().predictions(),
+        "recording": state.recorder.as_ref().map(|recorder| {
+            let counts = recorder.counts();
+            json!({"files": recorder.parts(), "commands": counts.recorded, "dropped_commands": counts.dropped, "bytes": counts.bytes, "ended": counts.ended})
+        }),
         "sessions": sessions,
     });
     Json(body).into_response()

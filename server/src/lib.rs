@@ -13,13 +13,14 @@ mod error;
 mod expiry;
 mod grpc;
 mod http;
+pub mod recording;
 mod serve;
 mod telemetry;
 mod web;
 mod zenoh;
 
 pub use clock::MonotonicClock;
-pub use config::{Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, ZenohConfig, ZenohMode};
+pub use config::{Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, ZenohConfig, ZenohMode};
 pub use error::ServerError;
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;

@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
-use nesam_engine::{Engine, EngineHandle, Event, Limits};
+use nesam_engine::{Clock as _, Engine, EngineHandle, Event, Limits};
 use nesam_model::Predictor;
 use nesam_proto::v1 as pb;
 use tokio::net::TcpListener;
@@ -21,6 +21,7 @@ use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
+use crate::recording::{Recorder, RecordingHeader};
 use crate::telemetry::Metrics;
 use crate::zenoh::{Bus, Presence};
 
@@ -44,6 +45,7 @@ pub struct RunningServer {
     grpc: JoinHandle<()>,
     http: Option<JoinHandle<()>>,
     bus: Option<Bus>,
+    recorder: Option<Arc<Recorder>>,
     drain: Duration,
 }
 
@@ -84,7 +86,16 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         let _ = sink.send(event);
     }));
     let clock = MonotonicClock::default();
-    let handle = EngineHandle::spawn(engine, Arc::new(clock));
+    let (recorder, tap) = match config.recording.enabled {
+        true => {
+            let header = RecordingHeader::of_run(predictor.bundle(), &config.limits, &config.fleet_soil, clock.now_ns());
+            let started = Recorder::start(&config.recording, header, predictor.bundle().vehicle.clone());
+            let (recorder, tap) = started.map_err(|source| ServerError::Recording { source })?;
+            (Some(Arc::new(recorder)), Some(tap))
+        }
+        false => (None, None),
+    };
+    let handle = EngineHandle::spawn_tapped(engine, Arc::new(clock), tap);
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
@@ -107,7 +118,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         false => None,
     };
     let http = http_listener.map(|listener| {
-        let router = http::router(HttpState { edge: edge.clone(), clock });
+        let router = http::router(HttpState { edge: edge.clone(), clock, recorder: recorder.clone() });
         let stopping = stopping.clone();
         tokio::spawn(async move {
             if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
@@ -119,8 +130,8 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let health = HealthReporter::new();
     report(&health, ServingStatus::Serving).await;
     let grpc = spawn_grpc(grpc_listener, &edge, &health, stopping);
-    tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), "serving");
-    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, drain })
+    tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), "serving");
+    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, drain })
 }
 
 async fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, ServerError> {
@@ -178,7 +189,13 @@ impl RunningServer {
         &self.metrics
     }
 
-    /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements.
+    /// The recording, where there is one.
+    pub fn recorder(&self) -> Option<&Recorder> {
+        self.recorder.as_deref()
+    }
+
+    /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements, the
+    /// recording is written to its end.
     pub async fn shutdown(mut self) {
         report(&self.health, ServingStatus::NotServing).await;
         if let Some(bus) = self.bus.take() {
@@ -191,8 +208,16 @@ impl RunningServer {
                 task.abort();
             }
         }
-        let handle = self.handle;
-        let _ = tokio::task::spawn_blocking(move || handle.stop()).await;
+        let (handle, recorder) = (self.handle, self.recorder);
+        let _ = tokio::task::spawn_blocking(move || {
+            handle.stop();
+            if let Some(recorder) = recorder {
+                recorder.join();
+                let counts = recorder.counts();
+                tracing::info!(commands = counts.recorded, dropped = counts.dropped, bytes = counts.bytes, "recording finished");
+            }
+        })
+        .await;
         tracing::info!("stopped");
     }
 

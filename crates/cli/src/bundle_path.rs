@@ -34,6 +34,12 @@ pub fn bundle_of_vehicle(name: &str) -> Option<PathBuf> {
     upward("deploy/bundles").iter().flat_map(|folder| bundles_in(folder)).find(|dir| of(dir).is_some_and(|v| v.name == name))
 }
 
+/// The shipped bundle of this hash, which is that of its manifest.
+pub fn bundle_of_hash(hash: &str) -> Option<PathBuf> {
+    let of = |dir: &PathBuf| std::fs::read(dir.join(MANIFEST)).ok().map(|manifest| nesam_model::bundle::sha256_hex(&manifest));
+    upward("deploy/bundles").iter().flat_map(|folder| bundles_in(folder)).find(|dir| of(dir).as_deref() == Some(hash))
+}
+
 /// Folders of shipped baseline bundles.
 pub fn baseline_bundles() -> Vec<PathBuf> {
     upward("deploy/baselines").first().map(|folder| bundles_in(folder)).unwrap_or_default()

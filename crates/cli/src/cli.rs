@@ -29,6 +29,8 @@ const EXAMPLES: &str = "Examples:
   nesam adapt --data ROOT --set NAME          what learning the soil while driving gains there
   nesam predict --trajectory n0005 --at 6.2   one rollout as JSON
   nesam serve                                 answer planners and vehicles until interrupted
+  nesam serve --record DIR                    the same, and write all of it down
+  nesam replay DIR                            does it give the same answers here, bit for bit?
   nesam bench predict                         milliseconds per planner query on this machine
   nesam inspect deploy/bundles/NAME           what a bundle holds and where it comes from
   nesam check ROOT                            what is wrong with a data root, bundle or configuration
@@ -51,6 +53,8 @@ enum Command {
     Fleet(commands::fleet::FleetArgs),
     /// Predict once from an instant of a recorded drive: JSON, CSV or plots
     Predict(commands::predict::PredictArgs),
+    /// Repeat a recorded run and compare every answer, or drive recorded drives through a bad radio link
+    Replay(commands::replay::ReplayArgs),
     /// Train a bundle on the train split of a set
     Train(commands::train::TrainArgs),
     /// Compare the physics inside with what a simulator says of wheels and soil
@@ -82,6 +86,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Adapt(args)) => commands::adapt::run(&args),
         Some(Command::Fleet(args)) => commands::fleet::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
+        Some(Command::Replay(args)) => commands::replay::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),
         Some(Command::Inside(args)) => commands::inside::run(&args),
         Some(Command::Bench(args)) => commands::bench::run(&args),

@@ -147,8 +147,8 @@ pub enum Reply {
     Measured(Box<MeasureAnswer>),
     /// Edge of a cell in m, and the cells with evidence, by map, colour and place.
     FleetSoil(f64, Vec<FleetCell>),
-    /// A prediction.
-    Predicted(Box<Prediction>),
+    /// A prediction; shared, because a recording keeps it too.
+    Predicted(Arc<Prediction>),
     /// A map.
     Map(Arc<WorldMap>),
     /// Maps.

@@ -139,7 +139,7 @@ impl Engine {
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
             Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
-            Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Box::new(p))),
+            Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
                 Ok(Reply::Map(map.clone()))

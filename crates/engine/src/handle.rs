@@ -53,6 +53,24 @@ pub struct Answer {
     pub busy_ns: u64,
 }
 
+/// A command that the engine's thread has answered, for a recording.
+#[derive(Clone, Debug)]
+pub struct Executed {
+    /// Instant at which it was executed, ns of the engine's clock.
+    pub now_ns: u64,
+    /// The command.
+    pub command: Command,
+    /// Reply or refusal. `Abandoned` and `Expired` say that the prediction was not computed at all.
+    pub result: Result<Reply, EngineError>,
+    /// Time in the queue, ns.
+    pub queued_ns: u64,
+    /// Time in the engine, ns.
+    pub busy_ns: u64,
+}
+
+/// Hears of every command after its answer was sent, in the order of execution; called on the engine's thread, so it must not wait.
+pub type Tap = Box<dyn FnMut(Executed) + Send>;
+
 /// The way to an engine that runs on a thread of its own. Clones share the engine.
 #[derive(Clone)]
 pub struct EngineHandle {
@@ -74,13 +92,22 @@ impl EngineHandle {
     /// # Panics
     /// When the system refuses to start a thread.
     pub fn spawn(engine: Engine, clock: Arc<dyn Clock>) -> Self {
+        Self::spawn_tapped(engine, clock, None)
+    }
+
+    /// The same with somebody who hears every executed command. Executing these commands again at their instants, on an engine with the same
+    /// predictor and limits, gives the same answers.
+    ///
+    /// # Panics
+    /// When the system refuses to start a thread.
+    pub fn spawn_tapped(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
         let queue = Arc::new(Queue::default());
         let limits = Arc::new(engine.limits().clone());
         let thread = std::thread::Builder::new()
             .name("nesam-engine".into())
             .spawn({
                 let (queue, clock) = (queue.clone(), clock.clone());
-                move || run(engine, &queue, clock.as_ref())
+                move || run(engine, &queue, clock.as_ref(), tap)
             })
             .expect("the system starts a thread");
         Self { queue, clock, limits, thread: Arc::new(Mutex::new(Some(thread))) }
@@ -134,18 +161,27 @@ impl EngineHandle {
 }
 
 /// The thread's loop.
-fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock) -> Engine {
+fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap>) -> Engine {
     loop {
         match queue.next() {
-            Turn::Commands(commands) => commands.into_iter().for_each(|submission| answer(&mut engine, submission, clock)),
-            Turn::Prediction(submission) => answer(&mut engine, *submission, clock),
+            Turn::Commands(commands) => commands.into_iter().for_each(|submission| answer(&mut engine, submission, clock, &mut tap)),
+            Turn::Prediction(submission) => answer(&mut engine, *submission, clock, &mut tap),
             Turn::End => return engine,
         }
     }
 }
 
-/// Executes one submission. A panic inside is a bug of ours; it costs that command, not the service.
-fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock) {
+/// Executes a command. A panic inside is a bug of ours; it costs that command, not the service.
+///
+/// # Errors
+/// Any [`EngineError`]; `Internal` after a panic.
+pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
+    catch_unwind(AssertUnwindSafe(|| engine.execute(now_ns, command)))
+        .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
+}
+
+/// Executes one submission and answers it; a recording hears of it last.
+fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock, tap: &mut Option<Tap>) {
     let Submission { command, deadline_ns, abandoned, reply, submitted_ns } = submission;
     let now_ns = clock.now_ns();
     let is_prediction = matches!(command, Command::Predict(_));
@@ -154,9 +190,12 @@ fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock) {
     } else if is_prediction && deadline_ns.is_some_and(|deadline| now_ns > deadline) {
         Err(EngineError::Expired)
     } else {
-        catch_unwind(AssertUnwindSafe(|| engine.execute(now_ns, &command)))
-            .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
+        execute_guarded(engine, now_ns, &command)
     };
-    let busy_ns = clock.now_ns().saturating_sub(now_ns);
-    reply(Answer { result, queued_ns: now_ns.saturating_sub(submitted_ns), busy_ns });
+    let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
+    let heard = tap.as_ref().map(|_| result.clone());
+    reply(Answer { result, queued_ns, busy_ns });
+    if let (Some(tap), Some(result)) = (tap, heard) {
+        tap(Executed { now_ns, command, result, queued_ns, busy_ns });
+    }
 }

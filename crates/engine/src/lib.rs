@@ -2,7 +2,7 @@
 //!
 //! The service keeps a [`Session`] for each vehicle: the last measured steps, the map it drives on, the correction of its soil. Everything that
 //! reads or changes a session is a [`Command`]; [`Engine::execute`] answers one command at one instant and does nothing else: no network, no
-//! thread, no clock. The same commands at the same instants give the same answers, so a run can be recorded ([`Engine::start_recording`]) and
+//! thread, no clock. The same commands at the same instants give the same answers, so a run can be recorded ([`EngineHandle::spawn_tapped`]) and
 //! replayed bit for bit.
 //!
 //! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own. Measurements overtake predictions there: a planner that
@@ -39,11 +39,11 @@ pub use extras::{CovarianceQuery, Covariances, ExtraOutputs, Jacobians, PredictE
 pub use fleet::FleetCell;
 pub use forward::{SENT_COMMANDS_MAX, SentCommand, StartInstant};
 pub use grid::StepGrid;
-pub use handle::{Answer, EngineHandle, Submission};
+pub use handle::{Answer, EngineHandle, Executed, Submission, Tap, execute_guarded};
 pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FilterSnapshot, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-pub use session::{Observed, Session, SessionImage, SoilEstimate, SoilState, TrackImage};
+pub use session::{BufferTest, Observed, Session, SessionImage, SoilEstimate, SoilState, TrackImage};

@@ -18,7 +18,7 @@ pub(crate) use self::image::refused;
 pub use self::image::{SessionImage, TrackImage};
 use self::order::{Order, Verdict};
 use self::soil::SoilLearner;
-pub use self::soil::SoilState;
+pub use self::soil::{BufferTest, SoilState};
 use self::track::{Taken, Track};
 use crate::error::EngineError;
 use crate::fleet::Brought;
@@ -250,10 +250,13 @@ impl Session {
         let (newest, before) = self.settled.history.make_contiguous().split_last()?;
         let (update, brought) = self.learner.step(predictor, before, newest, map)?;
         self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
+        let judged = self.soil.state.last_buffer.map_or(0, |last| last.judged) + 1;
+        let last_buffer = Some(BufferTest { judged, nis: update.nis, dof: update.dof, rejected: update.rejected });
         if update.rejected {
+            self.soil.state.last_buffer = last_buffer;
             return Some(update.nis);
         }
-        let state = self.learner.state(self.soil.state.epoch + 1, stamp_ns);
+        let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, stamp_ns) };
         self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale };
         None
     }

@@ -1357,6 +1357,35 @@ pub mod prediction_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+/// Where the measurement that follows came from: only for one that came over Zenoh, whose key names a vehicle.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct MeasurementSource {
+    /// Vehicle of the key.
+    #[prost(string, tag = "1")]
+    pub vehicle_id: ::prost::alloc::string::String,
+}
+/// The service looked for sessions that nobody uses.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ExpireSessionsRequest {}
+/// What it closed.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct ExpireSessionsReply {
+    #[prost(string, repeated, tag = "1")]
+    pub session_ids: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// A command that was refused. Refused measurements and predictions have answers of their own.
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct Refusal {
+    /// Code of google.rpc.Code.
+    #[prost(int32, tag = "1")]
+    pub code: i32,
+    /// Path of the field at fault, empty when none is.
+    #[prost(string, tag = "2")]
+    pub field: ::prost::alloc::string::String,
+    /// What was wrong and what is allowed.
+    #[prost(string, tag = "3")]
+    pub message: ::prost::alloc::string::String,
+}
 /// The bytes that Sessions.Export gives and Sessions.Import takes. Not for clients: the format may change with its version.
 ///
 /// Everything is stored as it is held, so that an imported session goes on bit for bit.

@@ -162,6 +162,7 @@ fn from_soil(content: &pb::SessionContent) -> Result<SoilEstimate, EngineError> 
         correction: SoilCorrection { coordinates, delta },
         variance: soil.variance.as_ref().map(vector),
         learned: array(&soil.learned)?,
+        last_buffer: None,
     };
     Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)?, noise_scale: content.soil_noise_scale })
 }

@@ -1,5 +1,6 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
+mod command;
 mod extras;
 mod image;
 mod measurement;
@@ -9,7 +10,9 @@ mod session;
 mod state;
 mod status;
 mod terrain;
+mod terrain_message;
 
+pub use command::{measurement_message, open_message, predict_message};
 pub use image::{image_bytes, session_image};
 pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};
@@ -18,3 +21,4 @@ pub use session::{fleet_soil_map, open_session, provenance, session_view, soil_c
 pub use state::{control, control_message, vehicle_state, vehicle_state_message};
 pub use status::{FIELD_METADATA, code, to_status};
 pub use terrain::{MapBuilder, description, patched};
+pub(crate) use terrain_message::{changed_tile, upload};

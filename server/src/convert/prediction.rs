@@ -80,6 +80,9 @@ fn output_selection(message: &pb::OutputSelection, horizon: usize) -> Result<Out
 }
 
 impl OutputSelection {
+    /// All there is, as the engine computed it.
+    pub const EVERYTHING: Self = Self { channels: ALL_CHANNELS, stride: 1, wheel_sinkage: true, precision: Precision::F32 };
+
     /// Steps returned of a horizon.
     fn steps(&self, horizon: usize) -> usize {
         horizon / self.stride

@@ -11,6 +11,7 @@ mod moving;
 mod overload;
 mod predictions;
 mod random_bytes;
+mod recording;
 mod reorder;
 mod replay;
 mod sessions;

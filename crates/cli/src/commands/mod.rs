@@ -11,5 +11,6 @@ pub mod fleet;
 pub mod inside;
 pub mod inspect;
 pub mod predict;
+pub mod replay;
 pub mod serve;
 pub mod train;

@@ -44,6 +44,10 @@ pub struct ServeArgs {
     /// Fleet in the Zenoh keys nesam/v1/<fleet>/<vehicle>/...
     #[arg(long, value_name = "NAME")]
     fleet: Option<String>,
+    /// Write all that the engine does into MCAP files in this folder, maps and answers included: repeat it with `nesam replay`, look at it with any
+    /// MCAP viewer. Writing never delays an answer; what the disk cannot follow is dropped and counted
+    #[arg(long, value_name = "DIR")]
+    record: Option<PathBuf>,
 }
 
 /// Runs the command.
@@ -93,6 +97,10 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
     if let Some(fleet) = &args.fleet {
         config.zenoh.fleet.clone_from(fleet);
     }
+    if let Some(folder) = &args.record {
+        config.recording.enabled = true;
+        config.recording.directory.clone_from(folder);
+    }
     config.check().or_input()?;
     Ok(config)
 }
@@ -106,6 +114,9 @@ fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     }
     if zenoh.enabled {
         say!("zenoh {} keys nesam/v1/{}/<vehicle>/...", [&zenoh.listen[..], &zenoh.connect[..]].concat().join(","), zenoh.fleet);
+    }
+    for part in server.recorder().iter().flat_map(|recorder| recorder.parts()) {
+        say!("record {}", part.display());
     }
     say!("ready; ctrl-c stops");
 }

@@ -26,6 +26,21 @@ pub struct SoilState {
     pub variance: Option<[f64; SOIL_DIM]>,
     /// Whether the drive has told something of each parameter.
     pub learned: [bool; SOIL_DIM],
+    /// How well the last full buffer agreed with the prediction, whether it was taken or refused; `None` before the first.
+    pub last_buffer: Option<BufferTest>,
+}
+
+/// The test of a full buffer of the soil filter.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct BufferTest {
+    /// Counts the full buffers of the session from 1, refused ones too.
+    pub judged: u64,
+    /// Normalised innovation squared.
+    pub nis: f64,
+    /// Its degrees of freedom.
+    pub dof: usize,
+    /// The gate refused it.
+    pub rejected: bool,
 }
 
 impl SoilState {
@@ -155,6 +170,7 @@ impl SoilLearner {
             correction: posterior.correction,
             variance: Some(core::array::from_fn(|i| posterior.covariance[i][i])),
             learned: posterior.learned,
+            last_buffer: None,
         }
     }
 }

@@ -1,0 +1,124 @@
+//! Repeats a recording and says what came out differently.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use nesam_model::{ModelBundle, Predictor};
+use nesam_server::recording::{Ending, KindCount, Recording, RecordingError, RecordingHeader, ReplayReport, replay};
+use serde_json::json;
+
+use super::ReplayArgs;
+use crate::bundle_path::bundle_of_hash;
+use crate::failure::{Failure, OrFail};
+use crate::interrupt;
+use crate::output::{self, say};
+use crate::sources::load_bundle;
+
+/// Time between two lines of progress.
+const SAY_EVERY: Duration = Duration::from_secs(10);
+
+/// Runs the command on recordings.
+pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
+    interrupt::exit_on_ctrl_c("the replay was not finished");
+    let mut recording = Recording::open(&args.recording).or_input()?;
+    let header = recording.header().clone();
+    let bundle = Arc::new(load(args.bundle.bundle.as_deref(), &header)?);
+    let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?);
+    let started = Instant::now();
+    let mut said = started;
+    let mut progress = |commands: u64| {
+        if said.elapsed() >= SAY_EVERY {
+            said = Instant::now();
+            eprintln!("commands replayed: {commands} after {:.0} s", started.elapsed().as_secs_f64());
+        }
+    };
+    let report = replay(&mut recording, predictor, args.force, &mut progress).map_err(|error| {
+        let other_bundle = matches!(error, RecordingError::Bundle { .. });
+        let hint = if other_bundle { "; give its bundle with --bundle DIR, or --force" } else { "" };
+        Failure::Input(format!("{error}{hint}"))
+    })?;
+    print(&header, &report);
+    if let Some(file) = &args.json {
+        output::write_file(file, to_json(&header, &bundle, &report, &args.recording).as_bytes())?;
+    }
+    let total = report.total();
+    if !report.all_equal() {
+        return Err(Failure::Failed(match total.different {
+            0 => "the recording is damaged".into(),
+            different => format!("{different} of {} answers differ", total.commands - total.not_executed),
+        }));
+    }
+    Ok(())
+}
+
+/// The given bundle, else the shipped one with the recorded hash.
+fn load(given: Option<&Path>, header: &RecordingHeader) -> Result<ModelBundle, Failure> {
+    let found = if given.is_none() { bundle_of_hash(&header.bundle_hash) } else { None };
+    if given.is_none() && found.is_none() {
+        return Err(Failure::input(format!(
+            "the recording was made with bundle {} {}, which is not in deploy/bundles; give it with --bundle DIR",
+            header.bundle, header.bundle_hash
+        )));
+    }
+    load_bundle(given.or(found.as_deref()))
+}
+
+fn print(header: &RecordingHeader, report: &ReplayReport) {
+    say!("{}: {} with bundle {} on {}, {:.1} s", header.run, header.program, header.bundle, header.machine, report.span_s);
+    say!("{:<14}{:>12}{:>12}{:>12}{:>14}", "command", "recorded", "equal", "different", "not executed");
+    let row = |name: &str, count: &KindCount| {
+        say!("{name:<14}{:>12}{:>12}{:>12}{:>14}", count.commands, count.equal, count.different, count.not_executed);
+    };
+    for (kind, count) in &report.kinds {
+        row(kind, count);
+    }
+    row("all", &report.total());
+    if let Some(first) = &report.first_difference {
+        let session = if first.session.is_empty() { String::new() } else { format!(", session {}", first.session) };
+        say!("\nfirst difference: command {} ({}{session}) at {:.3} s, {}", first.command, first.kind, first.time_s, first.message);
+        say!("  {}: recorded {}, now {}", first.field.field, first.field.recorded, first.field.replayed);
+        for (what, here, there) in here_and_there(header).into_iter().filter(|(_, here, there)| here != there) {
+            say!("  note: the {what} is {here}, recorded with {there}; last bits may differ for that alone");
+        }
+    }
+    match &report.ending {
+        Some(Ending::Finished { dropped_commands: 0, .. }) | None => {}
+        Some(Ending::Finished { reason, dropped_commands }) => {
+            say!("note: the recording ends because: {reason}; {dropped_commands} commands are not in it");
+        }
+        Some(Ending::CutOff) => say!("note: the recording was not finished (server killed, or file cut off); replayed as far as it goes"),
+        Some(Ending::Damaged { reason }) => say!("note: the recording is damaged: {reason}; replayed as far as it goes"),
+        Some(Ending::Missing { commands, first }) => {
+            say!("note: {commands} commands from {first} on are missing, the disk could not follow; replayed until there");
+        }
+    }
+}
+
+/// What decides over last bits: (what, here, in the recording).
+fn here_and_there(header: &RecordingHeader) -> [(&'static str, String, String); 2] {
+    [
+        ("program", RecordingHeader::this_program(), header.program.clone()),
+        ("machine", RecordingHeader::this_machine(), header.machine.clone()),
+    ]
+}
+
+fn to_json(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport, files: &[PathBuf]) -> String {
+    let document = json!({
+        "schema": "nesam.replay/1",
+        "run": header.run,
+        "files": files,
+        "all_equal": report.all_equal(),
+        "total": report.total(),
+        "kinds": report.kinds,
+        "first_difference": report.first_difference,
+        "ending": report.ending,
+        "span_s": report.span_s,
+        "recorded": {"program": header.program, "machine": header.machine, "bundle": header.bundle, "bundle_hash": header.bundle_hash},
+        "replayed": {
+            "program": RecordingHeader::this_program(), "machine": RecordingHeader::this_machine(),
+            "bundle": bundle.name, "bundle_hash": bundle.hash,
+        },
+    });
+    serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+}
