@@ -7,7 +7,7 @@ use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCorrection};
 use crate::calibration::UncorrectedBuffer;
 use crate::conditions::conditions;
 use crate::joint::{JointState, Linearisation, correction_of};
-use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_along};
+use crate::prediction::{BufferedTransition, VELOCITY_DIM, predict_along, velocities_along};
 use crate::trust::{NoiseScale, Trust};
 use crate::{AdaptationError, FilterConfig, Innovation, KalmanStep, chi_square_tail};
 
@@ -267,7 +267,7 @@ impl SoilFilter {
         let rows = self.noise.nrows();
         let factor = self.noise.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
         let squared = |correction: &DVector<f64>| -> Result<f64, AdaptationError> {
-            let innovation = self.linearise(model, buffer, correction)?.scaled(unit).innovation;
+            let innovation = innovation(&self.config, model, buffer, correction)? * unit;
             Ok(innovation.dot(&factor.solve(&innovation)))
         };
         let (without, with) = (squared(&none)?, squared(&candidate)?);
@@ -351,6 +351,30 @@ fn linearise(
         }
     }
     Ok(Linearisation { innovation, jacobian })
+}
+
+/// Y - Ŷ of a buffer at one correction.
+fn innovation(
+    config: &FilterConfig,
+    model: &StepModel,
+    buffer: &[BufferedTransition],
+    at: &DVector<f64>,
+) -> Result<DVector<f64>, AdaptationError> {
+    let correction = |t: &BufferedTransition| correction_of(at, class_of(t, config.classes), config);
+    let predicted: Vec<[f64; VELOCITY_DIM]> = match config.innovation {
+        Innovation::OneStep => buffer.iter().flat_map(|t| velocities_along(model, std::slice::from_ref(t), &correction)).collect(),
+        Innovation::Rollout => velocities_along(model, buffer, &correction),
+    };
+    if let Some(index) = predicted.iter().position(|velocity| !velocity.iter().all(|v| v.is_finite())) {
+        return Err(AdaptationError::NotFinite { what: "prediction", index });
+    }
+    let mut innovation = DVector::zeros(buffer.len() / config.block * VELOCITY_DIM);
+    for (index, (transition, velocity)) in buffer.iter().zip(predicted).enumerate() {
+        for c in 0..VELOCITY_DIM {
+            innovation[index / config.block * VELOCITY_DIM + c] += (transition.measured_next[c] - velocity[c]) / config.block as f64;
+        }
+    }
+    Ok(innovation)
 }
 
 /// A buffer at the soil prior as it is: what the noise of a filter is estimated from.

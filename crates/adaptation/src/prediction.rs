@@ -47,7 +47,7 @@ pub struct VelocityPrediction {
 /// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
 pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
     let start = transition.input.state.to_array().map(SoilDual::constant);
-    prediction_of(&next_state(model, transition, &start, correction, true))
+    prediction_of(&next_state(model, transition, &start, correction, &variables(correction)))
 }
 
 /// The same after every transition of a buffer, each starting where the prediction before it ended; only the first starts from a
@@ -72,26 +72,47 @@ pub(crate) fn predict_along(
     buffer
         .iter()
         .map(|transition| {
-            state = next_state(model, transition, &state, &correction(transition), varies(transition));
+            let correction = correction(transition);
+            let delta = if varies(transition) { variables(&correction) } else { correction.delta.map(SoilDual::constant) };
+            state = next_state(model, transition, &state, &correction, &delta);
             prediction_of(&state)
         })
         .collect()
 }
 
-/// x̂_{k+1} from x_k; x, y and yaw are carried along without meaning, as the physics reads none of them.
-fn next_state(
+/// The velocities of [`predict_along`] alone.
+pub(crate) fn velocities_along(
+    model: &StepModel,
+    buffer: &[BufferedTransition],
+    correction: &dyn Fn(&BufferedTransition) -> SoilCorrection,
+) -> Vec<[f64; VELOCITY_DIM]> {
+    let Some(first) = buffer.first() else { return Vec::new() };
+    let mut state = first.input.state.to_array();
+    let velocities = buffer.iter().map(|transition| {
+        let correction = correction(transition);
+        state = next_state(model, transition, &state, &correction, &correction.delta);
+        core::array::from_fn(|c| state[VELOCITY_AT + c])
+    });
+    velocities.collect()
+}
+
+fn variables(correction: &SoilCorrection) -> [SoilDual; SOIL_DIM] {
+    core::array::from_fn(|i| SoilDual::variable(correction.delta[i], i))
+}
+
+/// x̂_{k+1} from x_k where Δθ is `delta`, in the coordinates of the correction; x, y and yaw are carried along without meaning, as the physics reads none of
+/// them.
+fn next_state<T: Real>(
     model: &StepModel,
     transition: &BufferedTransition,
-    state: &[SoilDual; STATE_DIM],
+    state: &[T; STATE_DIM],
     correction: &SoilCorrection,
-    varies: bool,
-) -> [SoilDual; STATE_DIM] {
-    let delta: [SoilDual; SOIL_DIM] =
-        core::array::from_fn(|i| if varies { SoilDual::variable(correction.delta[i], i) } else { SoilDual::constant(correction.delta[i]) });
-    let soil = correction.coordinates.correct(&transition.input.soil.to_array(), &delta);
+    delta: &[T; SOIL_DIM],
+) -> [T; STATE_DIM] {
+    let soil = correction.coordinates.correct(&transition.input.soil.to_array(), delta);
     let input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
     let increment = model.step(&input).increment.to_array();
-    core::array::from_fn(|i| state[i] + increment[i] + SoilDual::constant(transition.residual[i]))
+    core::array::from_fn(|i| state[i] + increment[i] + T::lit(transition.residual[i]))
 }
 
 fn prediction_of(state: &[SoilDual; STATE_DIM]) -> VelocityPrediction {
