@@ -130,7 +130,9 @@ impl ObservedDrive {
                 ground: ground.under_wheels(model, &state, 0.0).0,
                 ..transition.input
             };
-            state = advanced(&state, &model.step(&input).increment.to_array(), &transition.residual);
+            let increment = model.step(&input).increment.to_array();
+            let total: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + transition.residual[i]);
+            state = VehicleState::from_array(state.advanced(&total));
             for (b, [from, to]) in BINS.iter().enumerate() {
                 if (*from..=*to).contains(&(j + 1)) {
                     let share = 1.0 / (to - from + 1) as f64;
@@ -170,17 +172,6 @@ impl ObservedDrive {
             row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - predicted);
         }
     }
-}
-
-/// x + Δx_NE + Δx_res.
-fn advanced(state: &VehicleState<f64>, increment: &[f64; STATE_DIM], residual: &[f64; STATE_DIM]) -> VehicleState<f64> {
-    let x = state.to_array();
-    let d: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + residual[i]);
-    let (sin, cos) = x[5].sin_cos();
-    let mut next: [f64; STATE_DIM] = core::array::from_fn(|i| x[i] + d[i]);
-    next[0] = x[0] + cos * d[0] - sin * d[1];
-    next[1] = x[1] + sin * d[0] + cos * d[1];
-    VehicleState::from_array(next)
 }
 
 /// Measured minus predicted, positions in the measured heading frame, angles wrapped.

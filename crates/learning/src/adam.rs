@@ -9,12 +9,6 @@ const BETA1: f32 = 0.9;
 const BETA2: f32 = 0.999;
 const EPS: f32 = 1e-8;
 
-/// Zero in place of a number too small to be normal: arithmetic with those costs a hundred times more, and moments of features that are nearly
-/// always dark decay into them by the hundred thousand.
-fn normal(x: f32) -> f32 {
-    if x.abs() < f32::MIN_POSITIVE { 0.0 } else { x }
-}
-
 /// Optimiser state.
 #[derive(Clone, Debug, Default)]
 pub struct Adam {
@@ -57,8 +51,8 @@ impl Adam {
             let kept = if name.ends_with(".weight") && !name.contains("norm") { 1.0 - rate as f32 * decay } else { 1.0 };
             for (((value, g), m), v) in values.iter_mut().zip(gradient).zip(m).zip(v) {
                 let g = g * shrink;
-                *m = normal(BETA1 * *m + (1.0 - BETA1) * g);
-                *v = normal(BETA2 * *v + (1.0 - BETA2) * g * g);
+                *m = BETA1 * *m + (1.0 - BETA1) * g;
+                *v = BETA2 * *v + (1.0 - BETA2) * g * g;
                 *value = *value * kept - rate as f32 * (*m / correct1) / ((*v / correct2).sqrt() + EPS);
             }
             var.set(&Tensor::from_vec(values, var.dims(), var.device())?)?;

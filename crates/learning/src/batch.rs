@@ -73,6 +73,9 @@ impl Sight<'_> {
 
     /// W_c for pooled contexts, (128, width).
     fn projection(&self, network: &Network) -> Result<Tensor> {
+        if self.pooling.cells() == 1 {
+            return Ok(network.token_context().detach());
+        }
         let full: Vec<f32> = network.token_context().flatten_all()?.to_vec1()?;
         let pooled = full.chunks_exact(CONTEXT).flat_map(|row| self.pooling.sum(row)).collect();
         Tensor::from_vec(pooled, (HIDDEN, self.pooling.width()), &Device::Cpu)
@@ -185,14 +188,14 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             }
         }
         let device = &Device::Cpu;
-        let projection = sight.projection(network)?.t()?;
+        let projection = if has_map { Some(sight.projection(network)?.t()?) } else { None };
         let project = |values: Vec<f32>, rows: usize| -> Result<Projected> {
-            if !has_map {
+            let Some(projection) = &projection else {
                 let tokens = Var::zeros((rows, HIDDEN), DType::F32, device)?;
                 return Ok(Projected { context: Tensor::zeros((rows, 1), DType::F32, device)?, tokens });
-            }
+            };
             let context = Tensor::from_vec(values, (rows, width), device)?;
-            let tokens = Var::from_tensor(&context.matmul(&projection)?)?;
+            let tokens = Var::from_tensor(&context.matmul(projection)?)?;
             Ok(Projected { context, tokens })
         };
         let past_rows = windows.len() * history;

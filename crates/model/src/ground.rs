@@ -43,15 +43,20 @@ impl<'a> GroundSource<'a> {
 
     /// Ground under each wheel in the heading frame, heights relative to `datum_m`; false when a wheel is off the map.
     pub fn under_wheels(&self, model: &StepModel, state: &VehicleState<f64>, datum_m: f64) -> ([Ground<f64>; WHEELS], bool) {
-        let (sin, cos) = state.attitude_rad[2].sin_cos();
+        let turn = state.attitude_rad[2].sin_cos();
         let mut known = true;
         let ground = wheel_points(model, state).map(|[x, y]| {
-            let (height, [slope_x, slope_y], inside) = self.at(x, y);
+            let (height, slope, inside) = self.at(x, y);
             known &= inside;
-            Ground { height_m: height - datum_m, slope_ahead: cos * slope_x + sin * slope_y, slope_left: cos * slope_y - sin * slope_x }
+            in_heading(turn, height - datum_m, slope)
         });
         (ground, known)
     }
+}
+
+/// Ground of a height and a slope in World (∂z/∂x, ∂z/∂y), seen from a heading of the given sine and cosine.
+pub(crate) fn in_heading<T: Real>((sin, cos): (T, T), height_m: T, [east, north]: [T; 2]) -> Ground<T> {
+    Ground { height_m, slope_ahead: cos * east + sin * north, slope_left: cos * north - sin * east }
 }
 
 /// Points of World under the wheel centres of a state, (x, y) each, m.

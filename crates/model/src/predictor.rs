@@ -202,11 +202,11 @@ impl Predictor {
         let tokens = query.map.map(|map| self.tokens_of(map));
         let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
         let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
-        let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
+        let variant = self.form_of(query);
         if extras.risk && !variant.has_soil() {
             return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
         }
-        let prefix = if variant.remembers() { self.prefix(history, &ground, tokens.as_deref()) } else { Prefix::default() };
+        let prefix = self.prefix(variant, history, &ground, tokens.as_deref());
         let what_if = SoilPerGroup { soils: extras.soils, samples: query.samples };
         let soil: &dyn SoilField = if extras.soils.is_empty() { extras.field.unwrap_or(&query.soil_correction) } else { &what_if };
         let scene = Scene { query, soil, ground, prefix, datum_m: query.start.position_m[2], variant, risk: extras.risk };
@@ -221,7 +221,7 @@ impl Predictor {
         };
         let shared = start(0);
         let mut samples: Vec<Sample> = (0..rows).map(|row| if history.is_empty() { start(row) } else { shared }).collect();
-        let mut caches = vec![BlockCache::new(query.horizon); rows.div_ceil(LANES)];
+        let mut caches = vec![BlockCache::new(query.horizon, variant.remembers()); rows.div_ceil(LANES)];
         let mut rollout = Rollout {
             states: vec![0.0; rows * query.horizon * STATE_DIM],
             sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
@@ -265,6 +265,11 @@ impl Predictor {
         }
         rollout.flags = samples.iter().map(|s| s.flags).collect();
         Ok((rollout, risk))
+    }
+
+    /// Form that a query asks for.
+    fn form_of(&self, query: &RolloutQuery<'_>) -> Variant {
+        if query.variant == Variant::Full { self.bundle.form } else { query.variant }
     }
 
     /// The physics with the bundle's vehicle.
@@ -317,8 +322,11 @@ impl Predictor {
         terrain
     }
 
-    /// Encodes the measured history.
-    fn prefix(&self, history: &[HistoryStep], ground: &GroundSource<'_>, tokens: Option<&TerrainTokens>) -> Prefix {
+    /// Encodes the measured history for a form that remembers it.
+    fn prefix(&self, variant: Variant, history: &[HistoryStep], ground: &GroundSource<'_>, tokens: Option<&TerrainTokens>) -> Prefix {
+        if !variant.remembers() {
+            return Prefix::default();
+        }
         let poses: Vec<Pose2> = history.iter().map(|step| pose(&step.state)).collect();
         let terrain = self.terrain(tokens, &poses);
         let entries: Vec<[f32; STATE_CONTROL]> = history
@@ -363,9 +371,6 @@ impl Predictor {
             samples.iter().zip(&controls).map(|(s, control)| self.entries(&s.state, s.previous.as_ref(), control, &scene.ground)).collect();
         let entry_lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| core::array::from_fn(|l| entries[l.min(last)][i]));
         let context: [Lane; HIDDEN] = core::array::from_fn(|i| core::array::from_fn(|l| terrain[l.min(last)][i]));
-        if !scene.variant.remembers() {
-            *cache = BlockCache::new(1);
-        }
         let (raw_sinkage, raw_residual) = self.network.step(&scene.prefix, cache, &entry_lanes, &context);
 
         let rows: Vec<(DrivelineState, [f32; DIFFERENTIABLE], [f32; CONSTANT], bool)> = samples
@@ -420,11 +425,7 @@ impl Predictor {
     fn advance(&self, sample: &mut Sample, increment: &[f64; STATE_DIM], actuators: DrivelineState, known: bool, control: &Control<f64>) {
         let scales = &self.bundle.normalization;
         let before = sample.state;
-        let (sin, cos) = before.attitude_rad[2].sin_cos();
-        let x = before.to_array();
-        let mut next: [f64; STATE_DIM] = core::array::from_fn(|i| x[i] + increment[i]);
-        next[0] = x[0] + cos * increment[0] - sin * increment[1];
-        next[1] = x[1] + sin * increment[0] + cos * increment[1];
+        let mut next = before.advanced(increment);
         next[5] = wrap_angle(next[5]);
         let tilt = next[3].abs().max(next[4].abs());
         let outside = |v: f64, range: [f64; 2]| v < range[0] || v > range[1];

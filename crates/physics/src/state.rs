@@ -53,6 +53,17 @@ impl<T: Real> VehicleState<T> {
     pub fn zero() -> Self {
         Self::from_array([T::lit(0.0); STATE_DIM])
     }
+
+    /// x + Δx in the order of [`VehicleState::to_array`], the horizontal displacement of the increment turned from the heading frame into World. The yaw is
+    /// not wrapped.
+    pub fn advanced(&self, increment: &[T; STATE_DIM]) -> [T; STATE_DIM] {
+        let x = self.to_array();
+        let (sin, cos) = x[5].sin_cos();
+        let mut next: [T; STATE_DIM] = core::array::from_fn(|i| x[i] + increment[i]);
+        next[0] = x[0] + cos * increment[0] - sin * increment[1];
+        next[1] = x[1] + sin * increment[0] + cos * increment[1];
+        next
+    }
 }
 
 /// Command u of one interval: forward speed and steering.

@@ -10,11 +10,12 @@ mod common;
 #[path = "common/oracle_dual.rs"]
 mod oracle_dual;
 
-use common::{INPUTS, VARIABLES, robot, spread, truck, unflatten};
+use common::{INPUTS, VARIABLES, spread, unflatten};
 use nesam_physics::scalar::{Dual, f32x8};
 use nesam_physics::step::StepModel;
 use nesam_physics::terramechanics::{WheelGeometry, WheelMotion, wheel_wrench};
 use nesam_physics::{DT_S, Real, Soil, Vehicle};
+use nesam_test_vehicles::{robot, truck};
 use oracle_dual::Nd;
 
 const LANES: usize = 8;

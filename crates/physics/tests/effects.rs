@@ -3,8 +3,9 @@
 
 mod common;
 
-use common::{Drive, truck};
+use common::Drive;
 use nesam_physics::effects::{Effect, Payload, SteeringOffset, WheelDrag};
+use nesam_test_vehicles::truck;
 
 const EXAMPLES: [Effect; 3] = [
     Effect::Payload(Payload { mass_kg: 600.0, at_m: [-1.4, 0.0, 0.77] }),

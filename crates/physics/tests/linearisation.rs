@@ -1,11 +1,12 @@
 //! Goal: the derivatives of a step, which training and filter rely on, are those of the step, and a step does not amplify them.
 mod common;
 
-use common::{Drive, robot, truck};
+use common::Drive;
 use nesam_physics::driveline::WheelCommand;
 use nesam_physics::scalar::Dual;
 use nesam_physics::step::{Ground, StepInput};
 use nesam_physics::{Control, Real, Soil, VehicleState};
+use nesam_test_vehicles::{robot, truck};
 
 const N: usize = 9;
 

@@ -4,10 +4,11 @@
 
 mod common;
 
-use common::{Drive, INPUTS, robot, spread, truck, unflatten};
+use common::{Drive, INPUTS, spread, unflatten};
 use nesam_physics::step::{Ground, StepInput, StepModel};
 use nesam_physics::vec3::dot;
 use nesam_physics::{DT_S, SecondCommand, Vehicle, VehicleState};
+use nesam_test_vehicles::{robot, truck};
 use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;

@@ -2,9 +2,10 @@
 
 mod common;
 
-use common::{Drive, robot, truck};
+use common::Drive;
 use nesam_physics::risk::load_transfer_ratio;
 use nesam_physics::step::WheelContact;
+use nesam_test_vehicles::{robot, truck};
 
 /// A vehicle that has come to rest on a plane, and its contacts.
 fn at_rest(vehicle: nesam_physics::Vehicle, slope: [f64; 2]) -> (Drive, [WheelContact<f64>; 4]) {

@@ -3,8 +3,9 @@
 
 mod common;
 
-use common::{Drive, robot, truck};
+use common::Drive;
 use nesam_physics::step::StepModel;
+use nesam_test_vehicles::{robot, truck};
 
 #[test]
 fn analytic_weight_is_carried_at_rest() {

@@ -3,7 +3,8 @@
 use nesam_adaptation::{BufferedTransition, FilterConfig, Innovation, SoilFilter, SoilUpdate, VelocityNoise};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{Ground, StepInput, StepModel};
-use nesam_physics::{Control, DT_S, Driveline, SOIL_DIM, SecondCommand, Soil, SoilCoordinates, SteeringTable, Vehicle, VehicleState};
+use nesam_physics::{Control, DT_S, SOIL_DIM, Soil, SoilCoordinates, VehicleState};
+pub use nesam_test_vehicles::truck;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -11,38 +12,6 @@ use rand_distr::{Distribution, StandardNormal};
 pub const LOAM: [f64; SOIL_DIM] = [1.5e6, 5.0e3, 0.75, 1.7e3, 0.5, 0.025];
 pub const SOFT: [f64; SOIL_DIM] = [0.7e6, 4.0e3, 0.9, 1.1e3, 0.42, 0.033];
 pub const NOISE: [f64; 2] = [0.02, 0.005];
-
-pub fn truck() -> Vehicle {
-    Vehicle {
-        name: "truck".into(),
-        mass_kg: 2493.56,
-        inertia_kg_m2: [[1445.1, 0.0, -23.6], [0.0, 4121.7, 0.0], [-23.6, 0.0, 5026.4]],
-        inertia_estimated: false,
-        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1155], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
-        wheel_radius_m: 0.467,
-        wheel_width_m: 0.254,
-        suspension_n_m: [107e3, 107e3, 236e3, 236e3],
-        suspension_n_s_m: [14.4e3, 14.4e3, 22.4e3, 22.4e3],
-        second: SecondCommand::SteeringNormalised,
-        command_range: [[-2.0, 12.0], [-1.0, 1.0]],
-        steering: Some(SteeringTable { command: vec![-1.0, 1.0], front_left_rad: vec![-0.37, 0.37], front_right_rad: vec![-0.37, 0.37] }),
-        track_m: 1.83,
-        wheelbase_m: 3.2977,
-        driveline: Driveline {
-            steering_lag_s: 0.08,
-            steering_rate_limit_per_s: 3.0,
-            speed_gain: 0.15,
-            speed_integral_gain_per_s: 0.0,
-            speed_integral_leak_s: 2.0,
-            speed_integral_limit_m: 2.0,
-            overspeed_limit_m_s: 0.8,
-            rims: Default::default(),
-            side_coupling_n_m_s: 0.0,
-        },
-        gravity_m_s2: 9.81,
-        effects: Default::default(),
-    }
-}
 
 /// Transitions of a drive on `true_soil` over waves of ground, as seen by a model that believes in `prior`. The start of each transition is
 /// known exactly, the velocities after it are measured with the noise that the filter is told.

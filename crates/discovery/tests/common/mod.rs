@@ -9,7 +9,7 @@ use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
 use nesam_physics::driveline::{DrivelineState, command_wheels, road_wheel_angles};
 use nesam_physics::effects::Effect;
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{Control, Driveline, SecondCommand, Soil, SoilCorrection, SteeringTable, Vehicle, VehicleState};
+use nesam_physics::{Control, Driveline, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
 use nesam_trajectories::{MeasuredChannels, Trajectory, VelocitySource};
 use rand::SeedableRng;
@@ -23,37 +23,18 @@ const NOISE: [f64; 6] = [0.015, 0.02, 0.0017, 0.025, 0.002, 0.001];
 /// Standard deviation of the logarithm (or value) of a drive's soil.
 const SOIL_SCATTER: [f64; 6] = [0.15, 0.15, 0.02, 0.15, 0.02, 0.1];
 
-/// The 2.5-tonne car.
+/// The car with a firm speed controller.
 pub fn truck() -> Vehicle {
-    Vehicle {
-        name: "truck".into(),
-        mass_kg: 2493.56,
-        inertia_kg_m2: [[1445.1, 0.0, -23.6], [0.0, 4121.7, 0.0], [-23.6, 0.0, 5026.4]],
-        inertia_estimated: false,
-        wheel_centre_m: [[1.5949, 0.9176, -0.1154], [1.5949, -0.9176, -0.1155], [-1.7028, 0.91, -0.1818], [-1.7028, -0.91, -0.1818]],
-        wheel_radius_m: 0.467,
-        wheel_width_m: 0.254,
-        suspension_n_m: [107e3, 107e3, 236e3, 236e3],
-        suspension_n_s_m: [14.4e3, 14.4e3, 22.4e3, 22.4e3],
-        second: SecondCommand::SteeringNormalised,
-        command_range: [[-2.0, 12.0], [-1.0, 1.0]],
-        steering: Some(SteeringTable { command: vec![-1.0, 1.0], front_left_rad: vec![-0.37, 0.37], front_right_rad: vec![-0.37, 0.37] }),
-        track_m: 1.83,
-        wheelbase_m: 3.2977,
-        driveline: Driveline {
-            steering_lag_s: 0.08,
-            steering_rate_limit_per_s: 3.0,
-            speed_gain: 0.25,
-            speed_integral_gain_per_s: 0.05,
-            speed_integral_leak_s: 5.0,
-            speed_integral_limit_m: 5.0,
-            overspeed_limit_m_s: 1.5,
-            rims: Default::default(),
-            side_coupling_n_m_s: 0.0,
-        },
-        gravity_m_s2: 9.81,
-        effects: Default::default(),
-    }
+    let car = nesam_test_vehicles::truck();
+    let driveline = Driveline {
+        speed_gain: 0.25,
+        speed_integral_gain_per_s: 0.05,
+        speed_integral_leak_s: 5.0,
+        speed_integral_limit_m: 5.0,
+        overspeed_limit_m_s: 1.5,
+        ..car.driveline
+    };
+    Vehicle { driveline, ..car }
 }
 
 /// Hills of a decimetre to half a metre over 140 m.

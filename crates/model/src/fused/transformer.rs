@@ -47,13 +47,20 @@ pub struct BlockCache {
     keys: Vec<Vec<Lane>>,
     values: Vec<Vec<Lane>>,
     steps: usize,
+    remembers: bool,
 }
 
 impl BlockCache {
-    /// An empty cache with room for `horizon` steps.
-    pub fn new(horizon: usize) -> Self {
-        let room = || (0..BLOCKS).map(|_| Vec::with_capacity(horizon * HIDDEN)).collect();
-        Self { keys: room(), values: room(), steps: 0 }
+    /// An empty cache with room for `horizon` steps; one that does not remember holds a single step at a time.
+    pub fn new(horizon: usize, remembers: bool) -> Self {
+        let steps = if remembers { horizon } else { 1 };
+        let room = || (0..BLOCKS).map(|_| Vec::with_capacity(steps * HIDDEN)).collect();
+        Self { keys: room(), values: room(), steps: 0, remembers }
+    }
+
+    fn clear(&mut self) {
+        self.keys.iter_mut().chain(&mut self.values).for_each(Vec::clear);
+        self.steps = 0;
     }
 }
 
@@ -158,6 +165,9 @@ impl FusedTransformer {
         entries: &[Lane; STATE_CONTROL],
         context: &[Lane; HIDDEN],
     ) -> ([Lane; WHEELS], [Lane; STATE_DIM]) {
+        if !cache.remembers {
+            cache.clear();
+        }
         let position = HISTORY - 1 + cache.steps;
         let mut x = self.embed(entries, context, |_| position);
         for (index, block) in self.blocks.iter().enumerate() {

@@ -9,7 +9,7 @@ use super::{Predictor, control, pose, raw_soil, validate};
 use crate::ModelError;
 use crate::dims::HISTORY;
 use crate::ground::{GroundSource, history_actuators, wheel_points};
-use crate::rollout::{RolloutQuery, Variant};
+use crate::rollout::RolloutQuery;
 use crate::soil_coordinates::from_raw;
 use crate::tangent::{ExactTransformer, Linearisation, Plane, Scenery, TangentRollout};
 
@@ -25,7 +25,7 @@ impl Predictor {
         let tokens = query.map.map(|map| self.tokens_of(map));
         let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
         let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
-        let variant = if query.variant == Variant::Full { self.bundle.form } else { query.variant };
+        let variant = self.form_of(query);
         if !variant.remembers() {
             let reason = format!("a model of the form `{}` has no derivatives", variant.as_str());
             return Err(ModelError::Query { field: "variant", reason });
@@ -36,7 +36,7 @@ impl Predictor {
             network: ExactTransformer(&self.network),
             scales,
             variant,
-            prefix: self.prefix(history, &ground, tokens.as_deref()),
+            prefix: self.prefix(variant, history, &ground, tokens.as_deref()),
             coordinates: query.soil_correction.coordinates,
             wheels: query.wheels,
             previous: history.last().map(|step| step.state),

@@ -62,8 +62,8 @@ impl Predictor {
         let tokens = map.map(|map| self.tokens_of(map));
         let ground = GroundSource::new(map.map(Arc::as_ref), &self.model, start);
         let history = &history[history.len().saturating_sub(HISTORY - 1)..];
-        let prefix = self.prefix(history, &ground, tokens.as_deref());
-        let mut cache = BlockCache::new(controls.len().max(1));
+        let prefix = self.prefix(self.bundle.form, history, &ground, tokens.as_deref());
+        let mut cache = BlockCache::new(controls.len(), self.bundle.form.remembers());
         let Some(first) = controls.first() else { return Vec::new() };
         let mut sample = Sample {
             state: *start,

@@ -104,11 +104,7 @@ impl TangentRollout<'_> {
         let learned =
             |i: usize| if self.variant == Variant::NoResidual { T::lit(0.0) } else { residual[i] * lit(scales.residual_scale[i]) };
         let total: [T; STATE_DIM] = core::array::from_fn(|i| moved[i] + learned(i));
-        let x = state.to_array();
-        let (sin, cos) = x[5].sin_cos();
-        let mut next: [T; STATE_DIM] = core::array::from_fn(|i| x[i] + total[i]);
-        next[0] = x[0] + cos * total[0] - sin * total[1];
-        next[1] = x[1] + sin * total[0] + cos * total[1];
+        let mut next = state.advanced(&total);
         next[5] = next[5].wrapped();
         Motion { state: VehicleState::from_array(next), previous: Some(*state), actuators: after }
     }

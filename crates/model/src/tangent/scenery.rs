@@ -3,7 +3,7 @@
 use nesam_physics::step::{Ground, StepModel};
 use nesam_physics::{SOIL_DIM, VehicleState, WHEELS};
 
-use crate::ground::{GroundSource, wheel_points};
+use crate::ground::{GroundSource, in_heading, wheel_points};
 use crate::tangent::Number;
 use crate::terrain_tokens::TerrainToken;
 
@@ -46,15 +46,11 @@ pub struct Scenery {
 impl Scenery {
     /// Ground under each wheel of a state near the one that the planes were taken at, in the heading frame.
     pub fn under_wheels<T: Number>(&self, model: &StepModel, state: &VehicleState<T>) -> [Ground<T>; WHEELS] {
-        let (sin, cos) = state.attitude_rad[2].sin_cos();
+        let turn = state.attitude_rad[2].sin_cos();
         let points = wheel_points(model, state);
         core::array::from_fn(|i| {
-            let [east, north] = self.wheels[i].slope.map(T::lit);
-            Ground {
-                height_m: self.wheels[i].height_m(points[i][0], points[i][1]),
-                slope_ahead: cos * east + sin * north,
-                slope_left: cos * north - sin * east,
-            }
+            let plane = &self.wheels[i];
+            in_heading(turn, plane.height_m(points[i][0], points[i][1]), plane.slope.map(T::lit))
         })
     }
 }
