@@ -115,7 +115,7 @@ impl StepModel {
     /// Prepares a vehicle for steps of `dt_s` seconds in `substeps` sub-steps (2 is enough for 0.1 s, see the convergence test).
     pub fn new(vehicle: &Vehicle, dt_s: f64, substeps: usize) -> Self {
         Self {
-            wheel: WheelGeometry::new(vehicle.wheel_radius_m, vehicle.wheel_width_m),
+            wheel: WheelGeometry::new(vehicle.wheel_radius_m, vehicle.wheel_width_m).with_law(vehicle.contact_law),
             static_load_n: vehicle.static_load_n(),
             body: RigidBody::new(vehicle),
             vehicle: vehicle.clone(),

@@ -3,6 +3,7 @@
 use crate::effects::EffectTerms;
 use crate::scalar::Real;
 use crate::state::Control;
+use crate::terramechanics::ContactLaw;
 
 /// Number of wheels of the platforms served.
 pub const WHEELS: usize = 4;
@@ -135,6 +136,8 @@ pub struct Vehicle {
     pub wheelbase_m: f64,
     /// Drive line.
     pub driveline: Driveline,
+    /// How the soil acts on the wheels.
+    pub contact_law: ContactLaw,
     /// Gravity, m/s².
     pub gravity_m_s2: f64,
     /// What effects add; all zero for a vehicle as its card says.
