@@ -12,10 +12,10 @@ use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::bundle::ModelBundle;
-use crate::dims::{CONTEXT, HIDDEN, HISTORY, STATE_CONTROL};
+use crate::dims::{CONTEXT, HIDDEN, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
 use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
-use crate::ground::{GroundSource, actuators_along};
+use crate::ground::GroundSource;
 use crate::rollout::{HistoryStep, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;

@@ -94,19 +94,19 @@ fn property_the_ends_of_every_range_stay_finite() {
 
 #[test]
 fn property_the_mirror_image_of_every_effect_mirrors_the_drive() {
-    for vehicle in [truck(), robot()] {
-        let mut vehicle = vehicle;
+    // Sizes are those of a car: a robot of 50 kg gets a tenth.
+    for (mut vehicle, share) in [(truck(), 1.0), (robot(), 0.1)] {
         // The card's wheels are not quite symmetric, nor is its inertia.
         for i in [1, 3] {
             let [x, y, z] = vehicle.wheel_centre_m[i - 1];
             vehicle.wheel_centre_m[i] = [x, -y, z];
         }
-        for effect in Effect::examples() {
+        for effect in Effect::examples().iter().map(|e| e.scaled(share)) {
             let left = drive(&vehicle, &[effect], 0.5, 20).to_array();
             let right = drive(&vehicle, &[mirrored(&effect)], -0.5, 20).to_array();
             for (i, (l, r)) in left.iter().zip(right).enumerate() {
                 let sign = if [1, 3, 5, 7, 9, 11].contains(&i) { -1.0 } else { 1.0 };
-                assert!((l - sign * r).abs() < 1e-7, "{} on {}, channel {i}: {l} {r}", effect.id(), vehicle.name);
+                assert!((l - sign * r).abs() < 1e-6, "{} on {}, channel {i}: {l} {r}", effect.id(), vehicle.name);
             }
         }
     }
@@ -147,7 +147,7 @@ fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
         ("front_bulldozing", 6, -1.0),
         ("side_bulldozing", 5, 1.0),
         ("roll_stiffness", 3, -1.0),
-        ("pitch_stiffness", 4, 1.0),
+        ("pitch_stiffness", 4, -1.0),
         ("map_tilt", 4, 1.0),
         ("map_offset", 2, 1.0),
         ("soil_drift", 2, -1.0),

@@ -8,7 +8,7 @@ effect! {
     /// Forces below the cap are untouched, those beyond it keep their direction.
     struct FrictionCap = "friction_cap" in Force {
         /// μ, -.
-        mu: ("-", [0.05, 3.0], 0.25, Limit),
+        mu: ("-", [0.02, 3.0], 0.06, Limit),
     }
     |effect, terms| terms.force.friction_cap_inverse = terms.force.friction_cap_inverse.max(1.0 / effect.mu)
 }
