@@ -93,6 +93,20 @@ fn property_engine_has_no_network_and_no_wall_clock() {
     });
 }
 
+/// The plant is a second opinion: whatever it shared with the model could be wrong in both.
+#[test]
+fn property_the_plant_shares_no_code_with_the_model() {
+    let own: BTreeSet<String> = direct().into_keys().filter(|name| name != "nesam-plant").collect();
+    let reached = reached("nesam-plant");
+    let shared: Vec<&String> = reached.iter().filter(|name| own.contains(*name)).collect();
+    assert!(shared.is_empty(), "the plant reaches {shared:?}");
+    for_each_source("tests/plant", |path, text| {
+        for forbidden in ["nesam_physics", "crates/physics", "include!"] {
+            assert!(!text.contains(forbidden), "{} uses {forbidden}", path.display());
+        }
+    });
+}
+
 #[test]
 fn property_nobody_imports_tests_benches_or_the_command_line() {
     for (package, dependencies) in direct() {

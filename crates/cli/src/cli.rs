@@ -51,6 +51,10 @@ enum Command {
     Adapt(commands::adapt::AdaptArgs),
     /// Start on ground that another vehicle has driven: with its soil map against without
     Fleet(commands::fleet::FleetArgs),
+    /// Drive laps in closed loop on a simulated vehicle: fixed against adapted soil, an oracle and a kinematic model
+    Navigate(commands::navigate::NavigateArgs),
+    /// The simulated vehicle of `navigate`: compare it with recorded drives, write drives with hidden effects, let it answer over UDP
+    Plant(commands::plant::PlantArgs),
     /// Predict once from an instant of a recorded drive: JSON, CSV or plots
     Predict(commands::predict::PredictArgs),
     /// Repeat a recorded run and compare every answer, or drive recorded drives through a bad radio link
@@ -85,6 +89,8 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Diagnose(args)) => commands::diagnose::run(&args),
         Some(Command::Adapt(args)) => commands::adapt::run(&args),
         Some(Command::Fleet(args)) => commands::fleet::run(&args),
+        Some(Command::Navigate(args)) => commands::navigate::run(&args),
+        Some(Command::Plant(args)) => commands::plant::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
         Some(Command::Replay(args)) => commands::replay::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),

@@ -10,6 +10,8 @@ pub mod evaluate;
 pub mod fleet;
 pub mod inside;
 pub mod inspect;
+pub mod navigate;
+pub mod plant;
 pub mod predict;
 pub mod replay;
 pub mod serve;

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use nesam_client::zenoh_vehicle::ZenohVehicle;
-use nesam_client::{Candidates, Client, MapLayers, Prediction, v1};
+use nesam_client::{Candidates, Client, Prediction, v1};
 use nesam_model::ModelBundle;
 use nesam_physics::Control;
 use nesam_server::{Config, RunningServer, termination};
@@ -20,6 +20,7 @@ use super::vehicle::{FAST_STRIDE, Player};
 use crate::commands::serve;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
+use crate::sources::map_layers;
 
 /// Name of the vehicle, its session and its fleet.
 const NAME: &str = "demo";
@@ -131,7 +132,7 @@ impl Stage {
     async fn prepare(&self, client: &mut Client) -> Result<(), Failure> {
         let mut map_id = String::new();
         if let Some(map) = &self.map {
-            let uploaded = client.upload_map(&layers(map)).await.or_failed()?;
+            let uploaded = client.upload_map(&map_layers(map)).await.or_failed()?;
             say!("map       {} uploaded, {} x {} cells of {} m", uploaded.map_id, uploaded.width, uploaded.height, uploaded.resolution_m);
             map_id = uploaded.map_id;
         }
@@ -165,7 +166,7 @@ impl Stage {
                     .map(|row| [0, 1, 3, 4].map(|c| column(&prediction, row / HORIZON, row % HORIZON, c)))
                     .collect();
                 let path: Vec<[f64; 2]> = drive.states[at + 1..=at + HORIZON].iter().map(|s| [s.position_m[0], s.position_m[1]]).collect();
-                let decision = planner.decide(&poses, &prediction.validity, &path);
+                let Some(decision) = planner.decide(&poses, &prediction.validity, &path) else { continue };
                 // A measurement that arrived while the request travelled moves the start; then the driver's commands are of another instant.
                 let same_start = prediction.start[..2] == drive.states[at].position_m[..2];
                 let Ok(mut state) = shared.lock() else { break };
@@ -231,20 +232,6 @@ async fn live_table(drive: Arc<Trajectory>, applied: watch::Receiver<Option<usiz
             number(plan.map(|c| c.second), 10, 2),
             number(latency, 12, 1),
         );
-    }
-}
-
-fn layers(map: &WorldMap) -> MapLayers {
-    let g = map.geometry();
-    MapLayers {
-        id: map.id().into(),
-        version: 1,
-        origin_m: g.origin_m,
-        resolution_m: g.resolution_m,
-        width: g.width,
-        height: g.height,
-        elevation_m: map.elevation_m(),
-        semantic_rgb: map.semantic_rgb(),
     }
 }
 

@@ -1,0 +1,53 @@
+"""A plant for `nesam navigate --plant ADDRESS:PORT`: the smallest simulator that speaks the protocol of docs/plant-adapter.md.
+
+    python3 plant_stub.py 127.0.0.1:5599
+
+Put your simulator where `Bicycle` is: `reset` sets the vehicle down at rest, `step` holds a command for 0.1 s, `state` gives
+x y z roll pitch yaw (World, m and rad), velocity and angular velocity (Body, m/s and rad/s).
+"""
+
+import json
+import math
+import socket
+import sys
+
+
+class Bicycle:
+    """A car on a level floor: the speed follows its command within half a second, the wheels do not slip."""
+
+    def reset(self, world, seed, x_m, y_m, yaw_rad):
+        self.pose, self.speed, self.rate = [x_m, y_m, yaw_rad], 0.0, 0.0
+
+    def step(self, speed_m_s, second):
+        for _ in range(10):
+            self.speed += 0.01 / 0.5 * (speed_m_s - self.speed)
+            self.rate = self.speed * math.tan(0.37 * second) / 3.3
+            x, y, yaw = self.pose
+            self.pose = [x + 0.01 * self.speed * math.cos(yaw), y + 0.01 * self.speed * math.sin(yaw), yaw + 0.01 * self.rate]
+
+    def state(self):
+        x, y, yaw = self.pose
+        yaw = math.remainder(yaw, math.tau)
+        # The reference point of the car lies 1.7 m ahead of the rear axle, about which it turns.
+        return [x, y, 0.6, 0.0, 0.0, yaw, self.speed, 1.7 * self.rate, 0.0, 0.0, 0.0, self.rate]
+
+
+def main(address):
+    host, port = address.rsplit(":", 1)
+    plug = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    plug.bind((host, int(port)))
+    plant, last = Bicycle(), None
+    while True:
+        request, sender = plug.recvfrom(2048)
+        request = json.loads(request)
+        if last is None or last["id"] != request["id"]:  # asked again: answer again, move nothing
+            if request["type"] == "reset":
+                plant.reset(*(request[key] for key in ("world", "seed", "x_m", "y_m", "yaw_rad")))
+            else:
+                plant.step(request["speed_m_s"], request["second"])
+            last = {"nesam_plant": 1, "id": request["id"], "state": plant.state()}
+        plug.sendto(json.dumps(last).encode(), sender)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:5599")

@@ -1,0 +1,304 @@
+//! `nesam navigate`: laps of a closed path on a simulated vehicle, with predictions from the service and without.
+
+mod stage;
+
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use clap::{Args, ValueEnum};
+use nesam_navigation::{MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, TrackingCost};
+use nesam_physics::{Vehicle, driveline::road_wheel_angles};
+use nesam_plant::HiddenEffects;
+use nesam_terrain::WorldMap;
+use nesam_trajectories::{DataRoot, read_ground_truth_soil};
+use serde_json::{Value, json};
+
+use crate::args::{BundleArgs, DataArgs, SplitArg};
+use crate::failure::{Failure, OrFail};
+use crate::output::{self, say};
+use crate::progress::Progress;
+use crate::sources::{load_bundle_for, open_root};
+
+use stage::Stage;
+
+/// Correlation of the planner's noise from step to step, its standard deviation (m/s; share of full steering) and the temperature of its weights.
+const NOISE_CORRELATION: f64 = 0.8;
+const NOISE_SD: [f64; 2] = [0.4, 0.16];
+const TEMPERATURE: f64 = 0.1;
+/// Admitted speed commands: what the training drives cover, m/s.
+const SPEED_LIMITS_M_S: [f64; 2] = [0.5, 4.0];
+/// Weights of progress and tilt against the squared distance from the path.
+const LAG_WEIGHT: f64 = 0.1;
+const TILT_WEIGHT: f64 = 2.0;
+/// Worlds of the scenario, where the data root has them.
+const SCENARIO: [&str; 5] = ["w35", "w36", "w37", "w38", "w39"];
+/// Steps of a candidate at most: one of the 32 positions of the model is the step whose command is already on its way.
+const HORIZON_MAX: usize = 31;
+
+/// Options of `nesam navigate`.
+#[derive(Args, Debug)]
+pub struct NavigateArgs {
+    /// Data root with the vehicle's data sheet and worlds with true soil [default: the sample shipped with the repository]
+    #[arg(long, value_name = "ROOT")]
+    data: Option<PathBuf>,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    /// Worlds to drive in [default: w35 to w39 where there are any, else every world with true soil]
+    #[arg(long, value_name = "ID,…", value_delimiter = ',')]
+    worlds: Option<Vec<String>>,
+    /// Where predictions come from
+    #[arg(long, value_enum, value_name = "NAME,…", value_delimiter = ',', default_values_t = Configuration::ALL)]
+    configurations: Vec<Configuration>,
+    /// Laps per configuration: worlds and both starts in turn, then the next seed
+    #[arg(long, default_value_t = 30)]
+    runs: usize,
+    /// First seed of sensors and planner; all configurations drive the same seeds
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Candidate sequences of a plan
+    #[arg(long, value_name = "N", default_value_t = 128)]
+    candidates: usize,
+    /// Steps of a candidate, 1 to 31
+    #[arg(long, value_name = "STEPS", default_value_t = 30)]
+    horizon: usize,
+    /// Steps of 0.1 s from plan to plan
+    #[arg(long, value_name = "STEPS", default_value_t = 2)]
+    plan_every: usize,
+    /// Wanted speed, m/s
+    #[arg(long, value_name = "M/S", default_value_t = 3.0)]
+    speed: f64,
+    /// Hidden effect of the vehicle, told to the plant only; may be given several times (`nesam plant effects` lists them)
+    #[arg(long, value_name = "ID=MAGNITUDE")]
+    effect: Vec<String>,
+    /// Drive another simulator that speaks the plant protocol over UDP (docs/plant-adapter.md)
+    #[arg(long, value_name = "ADDRESS:PORT", conflicts_with = "effect")]
+    plant: Option<SocketAddr>,
+    /// Folder for one file per lap; laps that are there already are not driven again [default: nesam-out/navigate-laps]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Write the results as JSON
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write a report with the paths as HTML
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
+}
+
+/// Where predictions come from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Configuration {
+    /// The service, soil prior as it is.
+    Fixed,
+    /// The service, learning the soil while driving.
+    Adapted,
+    /// The service, told the true soil.
+    Oracle,
+    /// A fitted bicycle on the map, no service.
+    Kinematic,
+}
+
+impl Configuration {
+    const ALL: [Self; 4] = [Self::Fixed, Self::Adapted, Self::Oracle, Self::Kinematic];
+
+    /// As in the JSON.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Fixed => "fixed",
+            Self::Adapted => "adapted",
+            Self::Oracle => "oracle",
+            Self::Kinematic => "kinematic",
+        }
+    }
+}
+
+/// One lap to drive.
+pub struct Task {
+    pub configuration: Configuration,
+    pub world: String,
+    pub soil: SoilKind,
+    /// Half turns from phi = 0.
+    pub start: usize,
+    pub seed: u64,
+}
+
+impl Task {
+    fn file_name(&self) -> String {
+        format!("{}-{}-start{}-seed{}.json", self.configuration.as_str(), self.world, self.start, self.seed)
+    }
+}
+
+/// Runs the command.
+pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
+    check(args)?;
+    let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
+    let asked =
+        DataArgs { data: args.data.clone(), set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
+    let (root, path) = open_root(&asked)?;
+    let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &root)?;
+    let worlds = worlds_of(args, &root)?;
+    let tasks = tasks_of(args, &worlds);
+    let settings = settings_of(args, &bundle.hash);
+    let out = output::out_dir(args.out.as_deref(), "navigate", "laps")?;
+    super::serve::log_to_stderr("error");
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
+    let provenance = vec![
+        ("command".to_string(), output::command_line()),
+        ("version".to_string(), format!("nesam {}", env!("CARGO_PKG_VERSION"))),
+        ("bundle".to_string(), format!("{} {}", bundle.name, bundle.hash)),
+        ("plant".to_string(), args.plant.map_or("built in".into(), |address| address.to_string())),
+    ];
+    let mut stage = Stage::new(args, root, path, bundle, effects)?;
+    let progress = Progress::start("laps", tasks.len());
+    let mut runs = Vec::new();
+    for (done, task) in tasks.iter().enumerate() {
+        let file = out.join(task.file_name());
+        let known = earlier(&file, &settings);
+        let run = match known {
+            Some(run) => run,
+            None => {
+                let run = runtime.block_on(stage.drive(task))?;
+                let text = serde_json::to_string_pretty(&json!({ "settings": settings, "run": &run })).or_failed()?;
+                output::write_file(&file, text.as_bytes())?;
+                run
+            }
+        };
+        progress.set_with(done + 1, &format!("{} {} {}", task.configuration.as_str(), task.world, run.lap.end));
+        runs.push(run);
+    }
+    runtime.block_on(stage.stop());
+    progress.finish();
+    report(args, NavigationReport { runs, settings, provenance })
+}
+
+fn check(args: &NavigateArgs) -> Result<(), Failure> {
+    let counts = [("--runs", args.runs, 1, 10_000), ("--candidates", args.candidates, 2, 2048), ("--plan-every", args.plan_every, 1, 20)];
+    let wrong = counts.iter().find(|(_, value, low, high)| !(low..=high).contains(&value));
+    if let Some((option, value, low, high)) = wrong {
+        return Err(Failure::input(format!("{option} {value} is not {low} to {high}")));
+    }
+    if args.horizon == 0 || args.horizon > HORIZON_MAX || args.plan_every > args.horizon {
+        return Err(Failure::input(format!("--horizon {} is not 1 to {HORIZON_MAX}, or shorter than --plan-every", args.horizon)));
+    }
+    if !(SPEED_LIMITS_M_S[0]..=SPEED_LIMITS_M_S[1]).contains(&args.speed) {
+        return Err(Failure::input(format!("--speed {} is not {} to {} m/s", args.speed, SPEED_LIMITS_M_S[0], SPEED_LIMITS_M_S[1])));
+    }
+    Ok(())
+}
+
+/// The worlds to drive in, with the kind of their soil.
+fn worlds_of(args: &NavigateArgs, root: &DataRoot) -> Result<Vec<(String, SoilKind)>, Failure> {
+    let there = root.world_ids();
+    let scenario: Vec<String> = SCENARIO.iter().map(|w| (*w).to_string()).filter(|w| there.contains(w)).collect();
+    let with_truth = |world: &String| root.world_dir(world).join("gt_soil.json").exists();
+    let chosen = match &args.worlds {
+        Some(given) => given.clone(),
+        None if !scenario.is_empty() => scenario,
+        None => there.into_iter().filter(with_truth).collect(),
+    };
+    if chosen.is_empty() {
+        return Err(Failure::input("the data root has no world with true soil (gt_soil.json) to drive in"));
+    }
+    chosen.into_iter().map(|world| Ok((world.clone(), soil_kind(&root.world_dir(&world), &*root.world(&world).or_input()?)?))).collect()
+}
+
+/// Compares the true sinkage modulus of every region with what its class promises.
+fn soil_kind(world_dir: &Path, map: &WorldMap) -> Result<SoilKind, Failure> {
+    if !world_dir.join("gt_soil.json").exists() {
+        return Ok(SoilKind::Nominal);
+    }
+    let truth = read_ground_truth_soil(world_dir).or_input()?;
+    let (mut softer, mut firmer) = (false, false);
+    for region in &truth.regions {
+        let Some(class) = map.soil_classes().iter().find(|c| c.name == region.class) else { continue };
+        softer |= region.soil.k_phi < class.low[0];
+        firmer |= region.soil.k_phi > class.high[0];
+    }
+    Ok(match (softer, firmer) {
+        (true, false) => SoilKind::Soft,
+        (false, true) => SoilKind::Firm,
+        (true, true) => SoilKind::Mixed,
+        (false, false) => SoilKind::Nominal,
+    })
+}
+
+/// Laps in the order in which they are driven: an interrupted command has about as many of each configuration.
+fn tasks_of(args: &NavigateArgs, worlds: &[(String, SoilKind)]) -> Vec<Task> {
+    let places = 2 * worlds.len();
+    (0..args.runs)
+        .flat_map(|i| {
+            let (world, soil) = &worlds[i % worlds.len()];
+            let (start, seed) = ((i % places) / worlds.len(), args.seed + (i / places) as u64);
+            args.configurations.iter().map(move |c| Task { configuration: *c, world: world.clone(), soil: *soil, start, seed })
+        })
+        .collect()
+}
+
+fn settings_of(args: &NavigateArgs, bundle_hash: &str) -> Value {
+    json!({
+        "bundle_hash": bundle_hash,
+        "candidates": args.candidates,
+        "horizon": args.horizon,
+        "plan_every": args.plan_every,
+        "cost": cost_of(args),
+        "noise_sd": NOISE_SD,
+        "noise_correlation": NOISE_CORRELATION,
+        "temperature": TEMPERATURE,
+        "speed_limits_m_s": SPEED_LIMITS_M_S,
+        "effect": args.effect,
+        "plant": args.plant.map(|address| address.to_string()),
+    })
+}
+
+fn cost_of(args: &NavigateArgs) -> TrackingCost {
+    TrackingCost { speed_m_s: args.speed, lag: LAG_WEIGHT, tilt: TILT_WEIGHT }
+}
+
+fn mppi_of(args: &NavigateArgs, vehicle: &Vehicle) -> MppiSettings {
+    let [low, high] = vehicle.command_range[1];
+    let half = 0.5 * (high - low);
+    MppiSettings {
+        candidates: args.candidates,
+        limits: [SPEED_LIMITS_M_S, [low, high]],
+        noise_sd: [NOISE_SD[0], NOISE_SD[1] * half],
+        noise_correlation: NOISE_CORRELATION,
+        temperature: TEMPERATURE,
+    }
+}
+
+/// Steering that follows the mean curvature of the path on ground that does not give.
+fn steering_guess(vehicle: &Vehicle, path: &ReferencePath) -> f64 {
+    let full = vehicle.command_range[1][1];
+    let [left, right, ..] = road_wheel_angles(vehicle, full);
+    let angle = (vehicle.wheelbase_m * std::f64::consts::TAU / path.length_m()).atan();
+    (full * 2.0 * angle / (left + right)).min(full)
+}
+
+/// A lap that was driven before with the same settings.
+fn earlier(file: &Path, settings: &Value) -> Option<Run> {
+    let read: Value = serde_json::from_slice(&std::fs::read(file).ok()?).ok()?;
+    let same = read.get("settings") == Some(settings);
+    if !same {
+        eprintln!("{} was driven with other settings; it is driven again", file.display());
+    }
+    same.then(|| serde_json::from_value(read.get("run")?.clone()).ok()).flatten()
+}
+
+fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> {
+    let widths = [8, 10, 5, 16, 13, 27, 12, 12, 12, 20];
+    let line = |cells: Vec<&str>| {
+        let padded = cells.iter().zip(widths).enumerate().map(|(i, (c, w))| if i < 2 { format!("{c:<w$}") } else { format!("{c:>w$}") });
+        say!("{}", padded.collect::<String>());
+    };
+    line(NavigationReport::HEAD.to_vec());
+    for row in report.rows() {
+        line(row.iter().map(String::as_str).collect());
+    }
+    if let Some(file) = &args.json {
+        let text = serde_json::to_string_pretty(&report.to_json()).or_failed()? + "\n";
+        output::write_file(file, text.as_bytes())?;
+    }
+    if let Some(file) = &args.html {
+        output::write_file(file, report.page().render().as_bytes())?;
+    }
+    Ok(())
+}

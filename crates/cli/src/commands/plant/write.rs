@@ -1,0 +1,136 @@
+//! `nesam plant write`: drives of the plant as a data root, for commands that read recorded drives.
+
+use std::f64::consts::TAU;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clap::Args;
+use nesam_plant::{Command, Drive, DriveRecorder, Ground, HiddenEffects, Plant, PlantVehicle, Sensors, write_set};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::{effects_of, root_of};
+use crate::bundle_path::inside_bundle;
+use crate::failure::{Failure, OrFail};
+use crate::output::say;
+use crate::progress::Progress;
+
+/// Steps at rest and of straight acceleration before a drive begins.
+const BEFORE: [usize; 2] = [10, 15];
+/// A drive ends this close to the edge of the ground, m.
+const BORDER_M: f64 = 4.0;
+/// Starts lie inside a square of this half edge about the origin of World, m.
+const START_M: f64 = 22.0;
+
+/// Options of `nesam plant write`.
+#[derive(Args, Debug)]
+pub struct WriteArgs {
+    /// Data root with the vehicle's data sheet and worlds with true soil [default: the sample shipped with the repository]
+    #[arg(long, value_name = "ROOT")]
+    data: Option<PathBuf>,
+    /// Data root to write; its vehicle and worlds are copied from the other one
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Set to write
+    #[arg(long, value_name = "NAME", default_value = "plant")]
+    set: String,
+    /// Worlds, one drive after the other
+    #[arg(long, value_name = "ID,…", value_delimiter = ',', required = true)]
+    worlds: Vec<String>,
+    /// Drives
+    #[arg(long, default_value_t = 5)]
+    drives: usize,
+    /// Length of a drive
+    #[arg(long, value_name = "SECONDS", default_value_t = 25.0)]
+    seconds: f64,
+    /// Hidden effect of the vehicle; may be given several times (`nesam plant effects` lists them)
+    #[arg(long, value_name = "ID=MAGNITUDE")]
+    effect: Vec<String>,
+    /// First seed; commands, starts and sensor noise follow from it
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+}
+
+/// Runs the command.
+pub fn run(args: &WriteArgs) -> Result<(), Failure> {
+    if !(1.0..=600.0).contains(&args.seconds) || args.drives == 0 || args.drives > 10_000 {
+        return Err(Failure::input("--seconds must be 1 to 600 and --drives 1 to 10000"));
+    }
+    let plain = |part: &str| !part.is_empty() && part != ".." && part.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c));
+    if !args.set.split('/').all(plain) || !args.worlds.iter().all(|w| plain(w)) {
+        return Err(Failure::input("--set and --worlds must be plain names"));
+    }
+    let root = root_of(args.data.as_ref())?;
+    if inside_bundle(&args.out) {
+        return Err(Failure::input(format!("--out {} lies in a bundle, which no command may change", args.out.display())));
+    }
+    let effects = effects_of(&args.effect)?;
+    let vehicle = Arc::new(PlantVehicle::of_root(&root).or_input()?);
+    copy_vehicle_and_worlds(&root, &args.out, &args.worlds)?;
+    let progress = Progress::start("drives", args.drives);
+    let mut drives = Vec::new();
+    for i in 0..args.drives {
+        let world = &args.worlds[i % args.worlds.len()];
+        let ground = Arc::new(Ground::read(&root.join("worlds").join(world)).or_input()?);
+        let seed = args.seed + i as u64;
+        drives.push(drive(&vehicle, &ground, &effects, world, seed, args.seconds));
+        progress.set(i + 1);
+    }
+    progress.finish();
+    write_set(&args.out.join(&args.set), &drives).or_failed()?;
+    say!("{} drives in {}", drives.len(), args.out.join(&args.set).display());
+    Ok(())
+}
+
+/// A drive after the recipe of the recorded ones: sinusoids in steering and speed, in rad/s.
+fn drive(vehicle: &Arc<PlantVehicle>, ground: &Arc<Ground>, effects: &HiddenEffects, world: &str, seed: u64, seconds: f64) -> Drive {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut uniform = |low: f64, high: f64| rng.random_range(low..high);
+    let (steering_rate, speed_rate) = (uniform(0.1, 0.5), uniform(0.1, 2.5));
+    let (slowest, fastest) = (uniform(1.0, 2.0), uniform(3.0, 4.0));
+    let side = if uniform(0.0, 1.0) < 0.5 { -1.0 } else { 1.0 };
+    let (x, y, yaw) = (uniform(-START_M, START_M), uniform(-START_M, START_M), uniform(0.0, TAU));
+    let command = |t: f64| Command {
+        speed_m_s: 0.5 * (slowest + fastest) + 0.5 * (fastest - slowest) * (speed_rate * t).sin(),
+        steering: side * (steering_rate * t).sin(),
+    };
+    let mut plant = Plant::at_rest(Arc::clone(vehicle), Arc::clone(ground), *effects, x, y, yaw);
+    for (steps, speed_m_s) in BEFORE.into_iter().zip([0.0, command(0.0).speed_m_s]) {
+        (0..steps).for_each(|_| plant.advance(Command { speed_m_s, steering: 0.0 }));
+    }
+    let (mut sensors, mut recorder) = (Sensors::new(seed, effects), DriveRecorder::default());
+    for k in 0..=(10.0 * seconds) as usize {
+        let truth = plant.truth();
+        let near_edge = [-BORDER_M, BORDER_M].iter().any(|dx| ground.height_m(truth.state[0] + dx, truth.state[1]).is_none())
+            || [-BORDER_M, BORDER_M].iter().any(|dy| ground.height_m(truth.state[0], truth.state[1] + dy).is_none());
+        if near_edge {
+            break;
+        }
+        let now = command(0.1 * k as f64);
+        recorder.sample(&sensors.read(&truth), &truth, now);
+        plant.advance(now);
+    }
+    recorder.finish(&format!("p{seed:04}"), world, "test")
+}
+
+fn copy_vehicle_and_worlds(from: &Path, to: &Path, worlds: &[String]) -> Result<(), Failure> {
+    let fail = |e: std::io::Error| Failure::Failed(format!("cannot copy to {}: {e}", to.display()));
+    std::fs::create_dir_all(to).map_err(fail)?;
+    copy_files(from, to, &|name| name.starts_with("vehicle_") && name.ends_with(".json")).map_err(fail)?;
+    for world in worlds {
+        let folder = to.join("worlds").join(world);
+        std::fs::create_dir_all(&folder).map_err(fail)?;
+        copy_files(&from.join("worlds").join(world), &folder, &|_| true).map_err(fail)?;
+    }
+    Ok(())
+}
+
+fn copy_files(from: &Path, to: &Path, wanted: &dyn Fn(&str) -> bool) -> std::io::Result<()> {
+    for entry in std::fs::read_dir(from)? {
+        let entry = entry?;
+        if entry.file_type()?.is_file() && entry.file_name().to_str().is_some_and(wanted) {
+            std::fs::copy(entry.path(), to.join(entry.file_name()))?;
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,30 @@
+//! What can end a lap early.
+
+use nesam_client::ClientError;
+
+/// Failure of a lap. A vehicle that leaves its path or gets stuck is a result and no failure.
+#[derive(Debug, thiserror::Error)]
+pub enum NavigationError {
+    /// The service refused or went away.
+    #[error("service: {0}")]
+    Service(#[from] ClientError),
+    /// The plant did not answer, or not as the protocol says.
+    #[error("plant {address}: {reason}")]
+    Plant {
+        /// Where it was expected.
+        address: String,
+        /// What was wrong.
+        reason: String,
+    },
+    /// The built-in plant cannot be made.
+    #[error(transparent)]
+    BuiltIn(#[from] nesam_plant::PlantError),
+    /// A setting out of range.
+    #[error("{setting}: {reason}")]
+    Setting {
+        /// Its name.
+        setting: &'static str,
+        /// What is allowed.
+        reason: String,
+    },
+}

@@ -1,0 +1,32 @@
+//! Closed-loop path tracking: a sampling planner that knows the model only through the client API drives a plant that knows nothing of the model.
+//!
+//! One [`run`](run_lap) is a lap of a closed [`ReferencePath`]. Every 0.1 s of the plant's time the plant is measured, the measurement goes to the
+//! service, and every few steps the [`Mppi`] planner asks a [`Forecaster`] what its candidates would do *from the next step on*: the command of the present
+//! step has already been sent. All time is the plant's: planning costs none of it, and the same seeds give the same lap.
+#![forbid(unsafe_code)]
+
+mod error;
+mod forecast;
+mod lap;
+mod link;
+mod mppi;
+mod oracle;
+mod reference_path;
+mod remote;
+mod report;
+mod score;
+mod session;
+mod tracker;
+
+pub use error::NavigationError;
+pub use forecast::{Forecaster, KinematicForecaster, Situation};
+pub use lap::{Lap, LapPlan, run_lap};
+pub use link::{BuiltInPlant, PlantLink, Reading, Start};
+pub use mppi::{Decision, Mppi, MppiSettings};
+pub use oracle::SoilAhead;
+pub use reference_path::ReferencePath;
+pub use remote::RemotePlant;
+pub use report::{NavigationReport, SoilKind};
+pub use score::{Figures, Ratio, Run, Summary, configuration_names, ratio, summarise};
+pub use session::{ServedForecaster, session_request};
+pub use tracker::TrackingCost;

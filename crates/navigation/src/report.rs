@@ -1,0 +1,240 @@
+//! JSON (`nesam.navigate/1`) and HTML of closed-loop runs.
+
+use nesam_evaluation::report::{LinePlot, Page, Series, Table};
+use serde::{Deserialize, Serialize};
+use serde_json::{Map, Value, json};
+
+use crate::lap::Lap;
+use crate::reference_path::ReferencePath;
+use crate::score::{Figures, Ratio, Run, Summary, configuration_names, ratio, summarise};
+
+/// How the true soil of a world differs from what its classes promise.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SoilKind {
+    /// Softer everywhere.
+    Soft,
+    /// Firmer everywhere.
+    Firm,
+    /// Some softer, some firmer.
+    Mixed,
+    /// As promised, or not known.
+    Nominal,
+}
+
+impl SoilKind {
+    /// All, in the order of reports.
+    pub const ALL: [Self; 4] = [Self::Soft, Self::Firm, Self::Mixed, Self::Nominal];
+
+    /// As in JSON.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Soft => "soft",
+            Self::Firm => "firm",
+            Self::Mixed => "mixed",
+            Self::Nominal => "nominal",
+        }
+    }
+}
+
+/// The configuration that others are compared with.
+const BASE: &str = "fixed";
+/// Quantities that are compared.
+const COMPARED: [(&str, fn(&Lap) -> f64); 4] = [
+    ("hausdorff_m", |lap| lap.hausdorff_m),
+    ("off_path_m", |lap| lap.off_path_mean_m),
+    ("roll_deg", |lap| lap.roll_deg),
+    ("pitch_deg", |lap| lap.pitch_deg),
+];
+
+/// All runs of a command.
+#[derive(Clone, Debug)]
+pub struct NavigationReport {
+    /// Runs.
+    pub runs: Vec<Run>,
+    /// Settings of planner and scenario, for the JSON.
+    pub settings: Value,
+    /// What the numbers were made from: name and value, for JSON and footer.
+    pub provenance: Vec<(String, String)>,
+}
+
+impl NavigationReport {
+    /// The JSON of the contract, extended by intervals, kinds of soil and comparisons with `fixed`.
+    pub fn to_json(&self) -> Value {
+        let configurations: Map<String, Value> = configuration_names(&self.runs)
+            .iter()
+            .filter_map(|name| {
+                let mut value = summarise(&self.runs, name, None).map(|s| of_summary(&s))?;
+                let kinds: Map<String, Value> = SoilKind::ALL
+                    .iter()
+                    .filter_map(|kind| Some((kind.as_str().to_string(), of_summary(&summarise(&self.runs, name, Some(*kind))?))))
+                    .collect();
+                value["by_soil"] = Value::Object(kinds);
+                value["over_fixed"] = self.comparisons(name);
+                Some((name.clone(), value))
+            })
+            .collect();
+        let provenance: Map<String, Value> = self.provenance.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
+        let each = self.runs.iter().map(|run| {
+            let mut value = json!(run);
+            // The driven paths are in the HTML and in the files of the runs.
+            value["lap"].as_object_mut().map(|lap| lap.remove("path"));
+            value
+        });
+        json!({
+            "schema": "nesam.navigate/1",
+            "runs": self.runs.len(),
+            "configurations": configurations,
+            "settings": self.settings,
+            "provenance": provenance,
+            "each": each.collect::<Vec<_>>(),
+        })
+    }
+
+    /// Ratios of a configuration over `fixed` on all soils and on each kind.
+    fn comparisons(&self, name: &str) -> Value {
+        let kinds = std::iter::once(None).chain(SoilKind::ALL.map(Some));
+        let of_kind = |kind: Option<SoilKind>| {
+            let quantities: Map<String, Value> = COMPARED
+                .iter()
+                .filter_map(|(key, of)| Some(((*key).to_string(), json!(ratio(&self.runs, name, BASE, kind, *of)?))))
+                .collect();
+            (kind.map_or("all", SoilKind::as_str).to_string(), Value::Object(quantities))
+        };
+        let object: Map<String, Value> = kinds.map(of_kind).filter(|(_, v)| v.as_object().is_some_and(|o| !o.is_empty())).collect();
+        Value::Object(object)
+    }
+
+    /// The table as rows of texts: soil, configuration, runs, completion, time, Hausdorff, mean distance, roll, pitch, Hausdorff over fixed.
+    pub fn rows(&self) -> Vec<[String; 10]> {
+        let kinds: Vec<Option<SoilKind>> = std::iter::once(None).chain(SoilKind::ALL.map(Some)).collect();
+        let mut rows = Vec::new();
+        for kind in kinds {
+            for name in configuration_names(&self.runs) {
+                let Some(s) = summarise(&self.runs, &name, kind) else { continue };
+                let against = ratio(&self.runs, &name, BASE, kind, |lap| lap.hausdorff_m).filter(|_| name != BASE);
+                rows.push([
+                    kind.map_or("all", SoilKind::as_str).to_string(),
+                    name,
+                    s.runs.to_string(),
+                    format!("{:.0} % [{:.0}, {:.0}]", 100.0 * s.completion, 100.0 * s.completion_ci95[0], 100.0 * s.completion_ci95[1]),
+                    mean_sd(&s.time_s, 1),
+                    with_interval(&s.hausdorff_m, 2),
+                    mean_sd(&s.off_path_m, 2),
+                    mean_sd(&s.roll_deg, 2),
+                    mean_sd(&s.pitch_deg, 2),
+                    against.map_or("–".into(), |r| ratio_text(&r)),
+                ]);
+            }
+        }
+        rows
+    }
+
+    /// Heads of the columns of [`NavigationReport::rows`].
+    pub const HEAD: [&'static str; 10] =
+        ["soil", "model", "runs", "completed", "time s", "Hausdorff m", "off path m", "|roll| °", "|pitch| °", "Hausdorff / fixed"];
+
+    /// The HTML page.
+    pub fn page(&self) -> Page {
+        let names = configuration_names(&self.runs);
+        let lead = format!(
+            "{} laps of a closed path on deformable soil, driven by one sampling planner whose predictions come from {}. Mean ± standard deviation; intervals \
+             95 %, bootstrap over world and start.",
+            self.runs.len(),
+            names.join(", ")
+        );
+        let mut page = Page::new("Closed-loop driving", &lead);
+        let mut table =
+            Table::new("Completed = the whole lap in time, never more than 5 m off. Time over completed laps only.", &Self::HEAD);
+        for row in self.rows() {
+            table.row(row.into_iter().map(Into::into).collect());
+        }
+        page.section("What came of it").table(&table);
+        let path = ReferencePath::of_ood_soil();
+        let reference: Vec<(f64, f64)> = path.points_between(0.0, std::f64::consts::TAU, 0.5).iter().map(|[x, y]| (*x, *y)).collect();
+        let mut worlds: Vec<(&str, SoilKind)> = self.runs.iter().map(|r| (r.world.as_str(), r.soil)).collect();
+        worlds.sort_unstable();
+        worlds.dedup();
+        page.section("Paths driven");
+        for name in &names {
+            let plots: Vec<LinePlot> = worlds.iter().map(|(world, soil)| self.plot(name, world, *soil, &reference)).collect();
+            page.plots(&plots, &format!("{name}: the path to follow (ink) and every lap (colour), x east and y north in m."));
+        }
+        for (name, value) in &self.provenance {
+            page.footer(name, value);
+        }
+        page.footer("settings", &self.settings.to_string());
+        page
+    }
+
+    fn plot(&self, name: &str, world: &str, soil: SoilKind, reference: &[(f64, f64)]) -> LinePlot {
+        let mut plot = LinePlot::new(&format!("{world} ({}), {name}", soil.as_str()), "x m", "y m");
+        plot.equal_aspect = true;
+        plot.series.push(Series::line("path to follow", 0, reference.to_vec()));
+        for run in self.runs.iter().filter(|r| r.configuration == name && r.world == world) {
+            let points = run.lap.path.iter().map(|[x, y]| (*x, *y)).collect();
+            let label = format!("start {}, seed {}: {}", run.start, run.seed, run.lap.end);
+            plot.series.push(Series::line(&label, 1 + (run.seed as usize + 3 * run.start) % 6, points));
+        }
+        plot
+    }
+}
+
+fn of_summary(s: &Summary) -> Value {
+    let figures = |f: &Figures| json!({ "mean": finite(f.mean), "sd": finite(f.sd), "ci95": f.ci95 });
+    json!({
+        "runs": s.runs,
+        "places": s.places,
+        "completion": s.completion,
+        "completion_ci95": s.completion_ci95,
+        "time_s": figures(&s.time_s),
+        "hausdorff_m": figures(&s.hausdorff_m),
+        "off_path_m": figures(&s.off_path_m),
+        "roll_deg": figures(&s.roll_deg),
+        "pitch_deg": figures(&s.pitch_deg),
+    })
+}
+
+/// Null where no run counts.
+fn finite(value: f64) -> Option<f64> {
+    Some(value).filter(|v| v.is_finite())
+}
+
+fn mean_sd(f: &Figures, digits: usize) -> String {
+    if f.mean.is_finite() { format!("{:.digits$} ± {:.digits$}", f.mean, f.sd) } else { "–".into() }
+}
+
+fn with_interval(f: &Figures, digits: usize) -> String {
+    let interval = f.ci95.map_or(String::new(), |[low, high]| format!(" [{low:.digits$}, {high:.digits$}]"));
+    mean_sd(f, digits) + &interval
+}
+
+fn ratio_text(r: &Ratio) -> String {
+    let interval = r.ci95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
+    format!("{:.2}{interval}", r.ratio)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::score::tests::run;
+
+    #[test]
+    fn property_json_keeps_the_contract() {
+        let runs = vec![run("fixed", "a", 0, 1, 2.0, false), run("adapted", "a", 0, 1, 1.0, true)];
+        let report = NavigationReport { runs, settings: json!({}), provenance: vec![("command".into(), "nesam navigate".into())] };
+        let value = report.to_json();
+        assert_eq!(value["schema"], "nesam.navigate/1");
+        for name in ["fixed", "adapted"] {
+            let of = &value["configurations"][name];
+            assert!(of["completion"].is_number());
+            for quantity in ["time_s", "hausdorff_m", "roll_deg", "pitch_deg"] {
+                assert!(of[quantity].get("mean").is_some() && of[quantity].get("sd").is_some(), "{name}.{quantity}");
+            }
+        }
+        assert!(value["configurations"]["fixed"]["time_s"]["mean"].is_null(), "no lap of `fixed` was completed");
+        assert_eq!(value["configurations"]["adapted"]["over_fixed"]["soft"]["hausdorff_m"]["ratio"], 0.5);
+        let html = report.page().render();
+        assert!(html.contains("path to follow") && html.contains("off_path") && !html.contains("http://"));
+    }
+}

@@ -1,0 +1,209 @@
+//! From laps to figures with intervals.
+
+use nesam_evaluation::{DEFAULT_RESAMPLES, Resamples};
+use serde::{Deserialize, Serialize};
+
+use crate::lap::Lap;
+use crate::report::SoilKind;
+
+/// Seed of the bootstrap.
+const BOOTSTRAP_SEED: u64 = 1;
+/// Standard normal quantile of a 95 % interval.
+const Z_95: f64 = 1.959_963_985;
+
+/// A lap with what was driven.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Run {
+    /// Configuration of the planner's model.
+    pub configuration: String,
+    /// World.
+    pub world: String,
+    /// How its soil differs from what it looks like.
+    pub soil: SoilKind,
+    /// Half turns from phi = 0 at the start.
+    pub start: usize,
+    /// Seed.
+    pub seed: u64,
+    /// What came of it.
+    pub lap: Lap,
+}
+
+impl Run {
+    /// Runs of one world and start share path and soil: they are one piece of evidence.
+    fn place(&self) -> (String, usize) {
+        (self.world.clone(), self.start)
+    }
+}
+
+/// Mean, standard deviation over runs and 95 % interval of the mean (percentile bootstrap over places = world and start).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Figures {
+    /// Mean; NaN without runs.
+    pub mean: f64,
+    /// Standard deviation over runs.
+    pub sd: f64,
+    /// Interval of the mean; `None` with fewer than two places.
+    pub ci95: Option<[f64; 2]>,
+}
+
+/// Figures of one configuration on one kind of soil.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Summary {
+    /// Runs.
+    pub runs: usize,
+    /// Places (world and start) that they come from.
+    pub places: usize,
+    /// Share of completed laps.
+    pub completion: f64,
+    /// Its 95 % interval (Wilson, as if runs were independent).
+    pub completion_ci95: [f64; 2],
+    /// Over completed laps only, s.
+    pub time_s: Figures,
+    /// m.
+    pub hausdorff_m: Figures,
+    /// Mean distance from the path, m.
+    pub off_path_m: Figures,
+    /// Mean |roll|, degrees.
+    pub roll_deg: Figures,
+    /// Mean |pitch|, degrees.
+    pub pitch_deg: Figures,
+}
+
+/// Ratio of means of two configurations over the runs that both have, with a 95 % interval (bootstrap over places).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+pub struct Ratio {
+    /// Ratio of means.
+    pub ratio: f64,
+    /// Interval.
+    pub ci95: Option<[f64; 2]>,
+    /// Pairs.
+    pub pairs: usize,
+}
+
+/// Names of the configurations that occur, in the order given by the first run of each.
+pub fn configuration_names(runs: &[Run]) -> Vec<String> {
+    let mut names: Vec<String> = Vec::new();
+    for run in runs {
+        if !names.contains(&run.configuration) {
+            names.push(run.configuration.clone());
+        }
+    }
+    names
+}
+
+/// Figures of the runs of a configuration; `None` where there are none.
+pub fn summarise(runs: &[Run], configuration: &str, soil: Option<SoilKind>) -> Option<Summary> {
+    let chosen: Vec<&Run> = runs.iter().filter(|r| r.configuration == configuration && soil.is_none_or(|soil| r.soil == soil)).collect();
+    if chosen.is_empty() {
+        return None;
+    }
+    let completed: Vec<&Run> = chosen.iter().filter(|r| r.lap.completed).copied().collect();
+    let completion = completed.len() as f64 / chosen.len() as f64;
+    Some(Summary {
+        runs: chosen.len(),
+        places: places(&chosen).1,
+        completion,
+        completion_ci95: wilson(completion, chosen.len()),
+        time_s: figures(&completed, |lap| lap.time_s),
+        hausdorff_m: figures(&chosen, |lap| lap.hausdorff_m),
+        off_path_m: figures(&chosen, |lap| lap.off_path_mean_m),
+        roll_deg: figures(&chosen, |lap| lap.roll_deg),
+        pitch_deg: figures(&chosen, |lap| lap.pitch_deg),
+    })
+}
+
+/// Ratio of a quantity between two configurations, over runs of the same world, start and seed.
+pub fn ratio(runs: &[Run], over: &str, under: &str, soil: Option<SoilKind>, of: fn(&Lap) -> f64) -> Option<Ratio> {
+    let same = |a: &Run, b: &Run| a.place() == b.place() && a.seed == b.seed;
+    let is = |r: &Run, name: &str| r.configuration == name && soil.is_none_or(|soil| r.soil == soil);
+    let pairs: Vec<(&Run, &Run)> =
+        runs.iter().filter(|r| is(r, over)).filter_map(|a| runs.iter().find(|b| is(b, under) && same(a, b)).map(|b| (a, b))).collect();
+    let (above, below): (Vec<f64>, Vec<f64>) = pairs.iter().map(|(a, b)| (of(&a.lap), of(&b.lap))).unzip();
+    let total: f64 = below.iter().sum();
+    if pairs.is_empty() || total <= 0.0 {
+        return None;
+    }
+    let firsts: Vec<&Run> = pairs.iter().map(|(a, _)| *a).collect();
+    let (cluster, count) = places(&firsts);
+    let ci95 = Resamples::draw(count, DEFAULT_RESAMPLES, BOOTSTRAP_SEED).ratio_interval(&above, &below, &cluster);
+    Some(Ratio { ratio: above.iter().sum::<f64>() / total, ci95, pairs: pairs.len() })
+}
+
+/// The place of each run as an index, and how many there are.
+fn places(runs: &[&Run]) -> (Vec<usize>, usize) {
+    let mut known: Vec<(String, usize)> = Vec::new();
+    let index = runs.iter().map(|run| {
+        let place = run.place();
+        known.iter().position(|k| *k == place).unwrap_or_else(|| {
+            known.push(place);
+            known.len() - 1
+        })
+    });
+    let index = index.collect();
+    (index, known.len())
+}
+
+fn figures(runs: &[&Run], of: fn(&Lap) -> f64) -> Figures {
+    let values: Vec<f64> = runs.iter().map(|r| of(&r.lap)).collect();
+    let count = values.len() as f64;
+    let mean = values.iter().sum::<f64>() / count;
+    let sd = (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0)).sqrt();
+    let (cluster, places) = places(runs);
+    Figures { mean, sd, ci95: Resamples::draw(places, DEFAULT_RESAMPLES, BOOTSTRAP_SEED).mean_interval(&values, &cluster) }
+}
+
+/// Wilson's score interval of a share.
+fn wilson(share: f64, count: usize) -> [f64; 2] {
+    let n = count as f64;
+    let squared = Z_95 * Z_95;
+    let middle = (share + squared / (2.0 * n)) / (1.0 + squared / n);
+    let half = Z_95 / (1.0 + squared / n) * (share * (1.0 - share) / n + squared / (4.0 * n * n)).sqrt();
+    [(middle - half).max(0.0), (middle + half).min(1.0)]
+}
+
+#[cfg(test)]
+pub(crate) mod tests {
+    use super::*;
+
+    pub(crate) fn run(configuration: &str, world: &str, start: usize, seed: u64, hausdorff_m: f64, completed: bool) -> Run {
+        let lap = Lap {
+            completed,
+            end: if completed { "complete" } else { "off_path" }.into(),
+            time_s: 50.0,
+            progress: 1.0,
+            hausdorff_m,
+            off_path_mean_m: 0.3 * hausdorff_m,
+            roll_deg: 2.0,
+            pitch_deg: 3.0,
+            measurements: Default::default(),
+            soil_delta: None,
+            path: vec![[23.5, 0.0], [23.0, 2.0]],
+        };
+        Run { configuration: configuration.into(), world: world.into(), soil: SoilKind::Soft, start, seed, lap }
+    }
+
+    #[test]
+    fn analytic_means_ratios_and_completion() {
+        let mut runs = Vec::new();
+        for (world, base) in [("a", 1.0), ("b", 2.0)] {
+            for seed in 0..3 {
+                runs.push(run("fixed", world, 0, seed, 2.0 * base, seed > 0));
+                runs.push(run("adapted", world, 0, seed, base, true));
+            }
+        }
+        let fixed = summarise(&runs, "fixed", None).unwrap();
+        assert!((fixed.hausdorff_m.mean - 3.0).abs() < 1e-12 && (fixed.completion - 4.0 / 6.0).abs() < 1e-12 && fixed.places == 2);
+        let against = ratio(&runs, "adapted", "fixed", Some(SoilKind::Soft), |lap| lap.hausdorff_m).unwrap();
+        // Every pair has the ratio one half, so every resample has it.
+        assert!(against.pairs == 6 && (against.ratio - 0.5).abs() < 1e-12);
+        assert!(against.ci95.unwrap().iter().all(|v| (v - 0.5).abs() < 1e-12));
+        assert!(summarise(&runs, "fixed", Some(SoilKind::Firm)).is_none() && configuration_names(&runs) == ["fixed", "adapted"]);
+    }
+
+    /// Wilson (1927), as tabulated for 0 of 10: 0 to 0.2775; for 5 of 10: 0.2366 to 0.7634.
+    #[test]
+    fn published_wilson_interval() {
+        let close = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]).abs() < 1e-4 && (a[1] - b[1]).abs() < 1e-4;
+        assert!(close(wilson(0.0, 10), [0.0, 0.2775]) && close(wilson(0.5, 10), [0.2366, 0.7634]));
+    }
+}
