@@ -5,9 +5,10 @@ use nesam_evaluation::{
 };
 use nesam_model::{Predictor, Variant};
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::Effect;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
+
+use crate::observe::Timed;
 
 /// What was learned without a drive, for that drive.
 #[derive(Clone, Debug)]
@@ -15,7 +16,7 @@ pub struct Learned {
     /// Best soil correction without an effect.
     pub soil: SoilCorrection,
     /// Effects claimed; empty when nothing was.
-    pub effects: Vec<Effect>,
+    pub effects: Vec<Timed>,
 }
 
 /// Scores on the held-out drives.
@@ -52,7 +53,8 @@ pub fn score_held_out(
     scoring: &Scoring,
 ) -> Result<HeldOut, EvaluationError> {
     let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
-    let patched: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
+    let patched: Vec<Predictor> =
+        learned.iter().map(|l| predictor.with_effects(&l.effects.iter().map(|e| e.effect).collect::<Vec<_>>())).collect();
     let paths: Vec<[PosePath; 3]> = windows
         .par_iter()
         .map(|w| {
