@@ -2,7 +2,7 @@
 
 use std::sync::LazyLock;
 
-use nesam_physics::effects::{Effect, Layer};
+use nesam_physics::effects::{Effect, Layer, Scaling};
 
 /// A parameter that a refit estimates.
 #[derive(Clone, Copy, Debug)]
@@ -17,10 +17,6 @@ pub struct Free {
     pub step: f64,
 }
 
-fn free(parameter: usize, mean: f64, sd: f64, step: f64) -> Free {
-    Free { parameter, mean, sd, step }
-}
-
 /// One line of the catalogue: what a hypothesis is and which sizes it is tried at first.
 #[derive(Clone, Debug)]
 struct Line {
@@ -31,40 +27,82 @@ struct Line {
     /// Parameters of the effects whose shares span the hypothesis near zero.
     columns: Vec<Vec<f64>>,
     free: Vec<Free>,
+    /// How each free parameter grows with the share of its column.
+    scalings: Vec<Scaling>,
+    /// Whether columns are differentiated forward from zero, because the effect has no counterpart of the other sign.
+    forward: bool,
     /// Whether the first column has a share above zero only.
     positive: bool,
 }
 
-static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| {
-    let drag = ["FL", "FR", "RL", "RR"].into_iter().enumerate().map(|(i, variant)| Line {
-        id: "wheel_drag",
-        variant,
-        layer: Layer::Force,
-        columns: vec![vec![i as f64, 500.0]],
-        free: vec![free(1, 0.0, 2000.0, 100.0)],
-        positive: true,
-    });
-    let offset = Line {
-        id: "steering_offset",
-        variant: "",
-        layer: Layer::Actuator,
-        columns: vec![vec![0.05]],
-        free: vec![free(0, 0.0, 0.2, 0.02)],
-        positive: false,
+static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| Effect::examples().iter().flat_map(lines_of).collect());
+
+/// Hypotheses of one id: each size of an effect is a column of its own; a wheel drag is one hypothesis for each wheel.
+fn lines_of(example: &Effect) -> Vec<Line> {
+    match example.id() {
+        "payload" => vec![payload()],
+        "wheel_drag" => {
+            let line = |(i, variant)| Line {
+                id: "wheel_drag",
+                variant,
+                layer: Layer::Force,
+                columns: vec![vec![i as f64, 500.0]],
+                free: vec![Free { parameter: 1, mean: 0.0, sd: 2000.0, step: 100.0 }],
+                scalings: vec![Scaling::Size],
+                forward: true,
+                positive: true,
+            };
+            ["FL", "FR", "RL", "RR"].into_iter().enumerate().map(line).collect()
+        }
+        _ => vec![line_of(example)],
+    }
+}
+
+fn line_of(example: &Effect) -> Line {
+    let (quantities, values) = (example.quantities(), example.values());
+    let sized: Vec<usize> = (0..values.len()).filter(|i| quantities[*i].scaling != Scaling::Held).collect();
+    let column = |one: usize| {
+        let absent = |i: usize| i != one && quantities[i].scaling == Scaling::Size;
+        (0..values.len()).map(|i| if absent(i) { 0.0 } else { values[i] }).collect::<Vec<f64>>()
     };
-    std::iter::once(payload()).chain(drag).chain([offset]).collect()
-});
+    let free = sized
+        .iter()
+        .map(|i| {
+            let size = values[*i].abs();
+            match quantities[*i].scaling {
+                Scaling::Factor => Free { parameter: *i, mean: 1.0, sd: 2.0, step: 0.05 },
+                Scaling::Limit => Free { parameter: *i, mean: size, sd: 4.0 * size, step: 0.1 * size },
+                _ => Free { parameter: *i, mean: 0.0, sd: SHARE_SD * size, step: 0.2 * size },
+            }
+        })
+        .collect();
+    let first = &quantities[sized[0]];
+    let size = first.scaling == Scaling::Size;
+    Line {
+        id: example.id(),
+        variant: "",
+        layer: example.layer(),
+        columns: sized.iter().map(|i| column(*i)).collect(),
+        free,
+        scalings: sized.iter().map(|i| quantities[*i].scaling).collect(),
+        forward: first.scaling == Scaling::Limit || size && first.range[0] > -values[sized[0]].abs(),
+        positive: first.scaling == Scaling::Limit || size && first.range[0] >= 0.0,
+    }
+}
 
 /// A load lies on the floor, the bed or the roof and within the wheelbase or a little behind it (chosen). A payload enters to first order through m, m x,
 /// m y and m z.
 fn payload() -> Line {
     let at = |x: f64, y: f64, z: f64| vec![250.0, x, y, z];
+    let free = |parameter, mean, sd, step| Free { parameter, mean, sd, step };
     Line {
         id: "payload",
         variant: "",
         layer: Layer::Force,
         columns: vec![at(0.0, 0.0, 0.0), at(1.5, 0.0, 0.0), at(0.0, 0.8, 0.0), at(0.0, 0.0, 1.0)],
         free: vec![free(0, 0.0, 1500.0, 100.0), free(1, 0.0, 1.5, 0.3), free(2, 0.0, 0.5, 0.2), free(3, 0.6, 0.4, 0.3)],
+        scalings: vec![Scaling::Size; 4],
+        forward: false,
         positive: false,
     }
 }
@@ -134,6 +172,11 @@ impl Candidate {
         &self.line.free
     }
 
+    /// Whether columns are differentiated forward from zero.
+    pub fn forward(&self) -> bool {
+        self.line.forward
+    }
+
     /// Whether the first column has shares above zero only.
     pub fn positive(&self) -> bool {
         self.line.positive
@@ -156,7 +199,7 @@ impl Candidate {
     /// Free parameters per unit share of a hypothesis with one column; `None` for one whose parameters are not proportional to shares.
     pub fn unit(&self) -> Option<f64> {
         match (self.line.columns.as_slice(), self.line.free.as_slice()) {
-            ([column], [f]) => Some(column[f.parameter]),
+            ([column], [f]) if self.line.scalings[0] == Scaling::Size => Some(column[f.parameter]),
             _ => None,
         }
     }
@@ -166,8 +209,11 @@ impl Candidate {
         if self.id() == "payload" {
             return payload_start(&self.line.columns, shares);
         }
-        // Each column scales its own free parameters; the others of a column are zero.
-        self.line.free.iter().map(|f| shares.iter().zip(&self.line.columns).map(|(s, c)| s * c[f.parameter]).sum()).collect()
+        let of = |(i, f): (usize, &Free)| {
+            let [low, high] = self.range(i);
+            self.line.scalings[i].apply(self.line.columns[i][f.parameter], shares[i]).clamp(low, high)
+        };
+        self.line.free.iter().enumerate().map(of).collect()
     }
 
     /// Physical range of a free parameter.

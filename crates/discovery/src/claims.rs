@@ -212,7 +212,7 @@ impl Case<'_> {
     }
 
     /// Deviations of the drives with effects, for plots.
-    pub fn deviations_with(&self, effects: &[crate::observe::Timed]) -> Vec<Vec<Row>> {
+    pub fn deviations_with(&self, effects: &[nesam_physics::effects::ScheduledEffect]) -> Vec<Vec<Row>> {
         self.prepared.iter().map(|p| p.drive.deviations(&self.bench, effects, &SoilCorrection::NONE)).collect()
     }
 }
@@ -237,7 +237,7 @@ fn class(yardstick: &Yardstick, selection: &Selection, i: usize) -> (f64, Vec<Me
 /// angle of a road wheel and the integral of a gyro are geometry.
 fn scale_sd(layer: Layer) -> f64 {
     match layer {
-        Layer::Force => 0.12,
+        Layer::Force | Layer::Soil => 0.12,
         _ => 0.02,
     }
 }

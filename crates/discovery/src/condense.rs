@@ -13,7 +13,8 @@ use rayon::prelude::*;
 use crate::candidates::{Candidate, column_count};
 use crate::channels::{CHANNELS, Row};
 use crate::metric::Metric;
-use crate::observe::{Bench, ObservedDrive, Timed};
+use crate::observe::{Bench, ObservedDrive};
+use nesam_physics::effects::ScheduledEffect;
 
 /// Prior standard deviation of a soil correction common to a drive, logarithmic coordinates: ln k_phi, ln k_c, n, ln c, phi (rad), ln k_shear.
 /// Twice the spread of Wong's published soils within a class of ground (chosen), because a claim must not rest on soil that is a little unusual.
@@ -47,15 +48,15 @@ pub struct Condensed {
 
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.
 pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[Candidate]) -> Signatures {
-    let at = |effect: Option<Timed>, soil: &SoilCorrection| drive.deviations(bench, effect.as_slice(), soil);
+    let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| drive.deviations(bench, effect.as_slice(), soil);
     let base = at(None, &SoilCorrection::NONE);
     let forms: Vec<(nesam_physics::effects::Effect, bool)> =
-        catalogue.iter().flat_map(|c| c.linear_form().into_iter().map(|e| (e, c.positive())).collect::<Vec<_>>()).collect();
+        catalogue.iter().flat_map(|c| c.linear_form().into_iter().map(|e| (e, c.forward())).collect::<Vec<_>>()).collect();
     let columns = forms
         .par_iter()
-        .map(|(effect, positive)| {
-            let side = |share: f64| at(Some(Timed { effect: effect.scaled(share), onset_s: 0.0 }), &SoilCorrection::NONE);
-            if *positive { difference(&base, &side(1.0), 1.0) } else { difference(&side(-1.0), &side(1.0), 0.5) }
+        .map(|(effect, forward)| {
+            let side = |share: f64| at(Some(ScheduledEffect { effect: effect.scaled(share), onset_s: 0.0 }), &SoilCorrection::NONE);
+            if *forward { difference(&base, &side(1.0), 1.0) } else { difference(&side(-1.0), &side(1.0), 0.5) }
         })
         .collect();
     let soil = (0..SOIL_DIM)

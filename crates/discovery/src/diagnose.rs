@@ -79,7 +79,7 @@ pub struct Diagnosis {
     /// Parameters of all claimed effects.
     pub estimates: Vec<Estimate>,
     /// The claimed effects; empty when nothing is claimed.
-    pub claimed: Vec<crate::observe::Timed>,
+    pub claimed: Vec<nesam_physics::effects::ScheduledEffect>,
     /// Ids of fitted drives.
     pub fit_on: Vec<String>,
     /// Ids of scored drives.
@@ -391,7 +391,7 @@ fn proven(judgement: &Judgement, scores: Option<&HeldOut>) -> (Verdict, String) 
     };
     let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
     // A wrong sensor shows in the sensors; whether predictions from it get better is another question.
-    let must_help = claimed.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Actuator));
+    let must_help = claimed.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Actuator | Layer::Soil));
     match not_proven(scores, must_help) {
         Some(reason) => (Verdict::Unexplained, format!("{} fits, but {reason}", claimed[0].candidate.label())),
         None if must_help => (judgement.verdict, format!("{}; it helps on drives that were not fitted", judgement.reason)),

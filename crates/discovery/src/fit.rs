@@ -8,7 +8,8 @@ use rayon::prelude::*;
 use crate::candidates::Candidate;
 use crate::condense::{Condensed, Signatures, difference, profiled};
 use crate::metric::Metric;
-use crate::observe::{Bench, ObservedDrive, Timed};
+use crate::observe::{Bench, ObservedDrive};
+use nesam_physics::effects::ScheduledEffect;
 
 const ITERATIONS: usize = 5;
 /// Steps below this share of a standard deviation end the iteration.
@@ -51,12 +52,12 @@ pub struct Fit {
 
 impl Fit {
     /// The effects with their fitted parameters.
-    pub fn effects(&self) -> Vec<Timed> {
+    pub fn effects(&self) -> Vec<ScheduledEffect> {
         timed(&self.terms, &self.values)
     }
 
     /// The effects that one step without a drive gives.
-    pub fn effects_without(&self, drive: usize) -> Vec<Timed> {
+    pub fn effects_without(&self, drive: usize) -> Vec<ScheduledEffect> {
         let values = self.jackknife.get(drive).unwrap_or(&self.values);
         let mut values = values.clone();
         for (term, values) in self.terms.iter().zip(&mut values) {
@@ -77,8 +78,8 @@ impl Fit {
     }
 }
 
-fn timed(terms: &[Term], values: &[Vec<f64>]) -> Vec<Timed> {
-    terms.iter().zip(values).map(|(t, v)| Timed { effect: t.candidate.effect(v), onset_s: t.onset_s }).collect()
+fn timed(terms: &[Term], values: &[Vec<f64>]) -> Vec<ScheduledEffect> {
+    terms.iter().zip(values).map(|(t, v)| ScheduledEffect { effect: t.candidate.effect(v), onset_s: t.onset_s }).collect()
 }
 
 /// Fits terms from starting values. `offset` is the share of each parameter that drives without an effect show, in the unit of the parameter.

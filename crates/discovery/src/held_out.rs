@@ -8,7 +8,7 @@ use nesam_physics::SoilCorrection;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
-use crate::observe::Timed;
+use nesam_physics::effects::ScheduledEffect;
 
 /// What was learned without a drive, for that drive.
 #[derive(Clone, Debug)]
@@ -16,7 +16,7 @@ pub struct Learned {
     /// Best soil correction without an effect.
     pub soil: SoilCorrection,
     /// Effects claimed; empty when nothing was.
-    pub effects: Vec<Timed>,
+    pub effects: Vec<ScheduledEffect>,
 }
 
 /// Scores on the held-out drives.
@@ -53,8 +53,7 @@ pub fn score_held_out(
     scoring: &Scoring,
 ) -> Result<HeldOut, EvaluationError> {
     let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
-    let patched: Vec<Predictor> =
-        learned.iter().map(|l| predictor.with_effects(&l.effects.iter().map(|e| e.effect).collect::<Vec<_>>())).collect();
+    let patched: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
     let paths: Vec<[PosePath; 3]> = windows
         .par_iter()
         .map(|w| {

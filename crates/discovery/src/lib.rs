@@ -42,5 +42,5 @@ pub use diagnose::{Diagnosis, Judge, Judgement, OnProgress, Options, Verdict, di
 pub use error::DiscoveryError;
 pub use held_out::{HeldOut, Learned, Scoring};
 pub use metric::Metric;
-pub use observe::{Bench, ObservedDrive, Stepping, Timed, observe, observe_all};
+pub use observe::{Bench, ObservedDrive, Stepping, observe, observe_all};
 pub use reference::{DRIVES_MIN, NullGroups, Reference};

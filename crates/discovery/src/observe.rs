@@ -8,10 +8,10 @@ use std::sync::Arc;
 
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, Predictor, Transition};
-use nesam_physics::driveline::{DrivelineState, command_wheels, road_wheel_angles};
-use nesam_physics::effects::Effect;
+use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{STATE_DIM, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{SOIL_DIM, STATE_DIM, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
@@ -48,15 +48,6 @@ pub struct Bench<'a> {
     pub vehicle: &'a Vehicle,
     /// Physics.
     pub stepping: Stepping,
-}
-
-/// An effect that acts from some time of a drive on.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Timed {
-    /// The effect.
-    pub effect: Effect,
-    /// When it begins, s since the start of the drive; 0 = always there.
-    pub onset_s: f64,
 }
 
 /// A measured drive, prepared: nothing of it depends on an effect or a soil correction.
@@ -159,7 +150,7 @@ fn traction_slopes(model: &StepModel, transition: &Transition) -> [f64; WHEELS] 
 
 impl ObservedDrive {
     /// Measured minus predicted for every segment, with effects (each from its onset on) and a soil correction. One row per segment.
-    pub fn deviations(&self, bench: &Bench<'_>, effects: &[Timed], soil: &SoilCorrection) -> Vec<Row> {
+    pub fn deviations(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], soil: &SoilCorrection) -> Vec<Row> {
         let acting = |start: usize| -> u32 {
             let time_s = start as f64 * bench.stepping.dt_s;
             effects.iter().enumerate().map(|(i, e)| u32::from(e.onset_s <= time_s) << i).sum()
@@ -191,20 +182,21 @@ impl ObservedDrive {
 
     fn reading(&self, bench: &Bench<'_>, effects: &[Effect]) -> Reading {
         let vehicle = bench.vehicle.with_effects(effects);
-        let states = self.states.clone();
+        let states: Vec<VehicleState<f64>> = self.states.iter().map(|s| vehicle.effects.sensor.to_true(s)).collect();
+        let model = bench.stepping.model(&vehicle);
         let mut now = DrivelineState::starting(&vehicle, &states[0], &self.transitions[0].control);
         let actuators = self
             .transitions
             .iter()
             .zip(&states)
             .map(|(transition, state)| {
-                let after = now.advance(&vehicle, &transition.control, state.velocity_m_s[0], bench.stepping.dt_s);
+                let after = now.advance(&vehicle, &transition.control, state.velocity_m_s[0], model.dt_s());
                 let pair = [now, after];
                 now = after;
                 pair
             })
             .collect();
-        Reading { model: bench.stepping.model(&vehicle), actuators, states }
+        Reading { model, actuators, states }
     }
 
     /// The drive as a vehicle with effects would have driven it under the recorded commands, in place of what `drive` records.
@@ -212,7 +204,7 @@ impl ObservedDrive {
     /// x'_{k+1} = x'_k + step(x'_k with effects) + residual_k + e_k, where e_k is what the recorded drive did beyond the physics at step k, so that no effect
     /// gives the recording back. Soil and what the network says stay those of the recorded place. Wheel speeds and road-wheel angles move by what the
     /// physics says of them.
-    pub fn driven_again(&self, bench: &Bench<'_>, effects: &[Timed], drive: &mut Trajectory) {
+    pub fn driven_again(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], drive: &mut Trajectory) {
         let dt_s = bench.stepping.dt_s;
         let plain = self.reading(bench, &[]);
         let on: Vec<Effect> = effects.iter().map(|e| e.effect).collect();
@@ -223,9 +215,9 @@ impl ObservedDrive {
         let mut state = self.states[0];
         for (k, transition) in self.transitions.iter().enumerate() {
             let model = if k as f64 * dt_s >= onset_s { &changed } else { &plain.model };
-            let recorded = self.increment(&plain.model, transition, &self.states[k], &plain.actuators[k]);
+            let recorded = self.increment(&plain.model, k, dt_s, &self.states[k], &plain.actuators[k]);
             let after = actuators.advance(model.vehicle(), &transition.control, state.velocity_m_s[0], dt_s);
-            let driven = self.increment(model, transition, &state, &[actuators, after]);
+            let driven = self.increment(model, k, dt_s, &state, &[actuators, after]);
             self.move_wheels(k, (&plain.model, &self.states[k], &plain.actuators[k]), (model, &state, &[actuators, after]), drive);
             // The recorded increment in its own heading frame, with what the physics says of the difference.
             let total = core::array::from_fn(|i| between(&self.states[k], &self.states[k + 1])[i] + driven[i] - recorded[i]);
@@ -238,18 +230,27 @@ impl ObservedDrive {
     fn increment(
         &self,
         model: &StepModel,
-        transition: &Transition,
+        k: usize,
+        dt_s: f64,
         state: &VehicleState<f64>,
         actuators: &[DrivelineState; 2],
     ) -> [f64; STATE_DIM] {
+        let transition = &self.transitions[k];
         let ground = GroundSource::new(self.map.as_deref(), model, state);
         let input = StepInput {
             state: *state,
             wheels: command_wheels(model.vehicle(), &actuators[0], &actuators[1], &transition.control),
+            soil: Soil::from_array(self.soil_at(model, &SoilCorrection::NONE, k, dt_s)),
             ground: ground.under_wheels(model, state, 0.0).0,
             ..transition.input
         };
         model.step(&input).increment.to_array()
+    }
+
+    /// Soil of a sample with a correction and what effects change of it in time.
+    fn soil_at(&self, model: &StepModel, soil: &SoilCorrection, k: usize, dt_s: f64) -> [f64; SOIL_DIM] {
+        let nominal = soil.apply(&self.transitions[k].input.soil.to_array());
+        model.vehicle().effects.soil.drifted(nominal, Some(k as f64 * dt_s))
     }
 
     /// Moves the recorded wheel speeds and road-wheel angles of a sample by what the physics says of the difference between two ways to drive.
@@ -275,7 +276,7 @@ impl ObservedDrive {
     fn segment(&self, bench: &Bench<'_>, reading: &Reading, soil: &SoilCorrection, start: usize) -> Row {
         let (model, states) = (&reading.model, &reading.states);
         let mut row = [0.0; CHANNELS];
-        add_consistency(&states[start..=start + SEGMENT_STEPS], bench.stepping.dt_s, &mut row);
+        add_consistency(&states[start..=start + SEGMENT_STEPS], model.dt_s(), &mut row);
         let mut state = states[start];
         let ground = GroundSource::new(self.map.as_deref(), model, &state);
         for (j, transition) in self.transitions[start..start + SEGMENT_STEPS].iter().enumerate() {
@@ -284,7 +285,7 @@ impl ObservedDrive {
             let input = StepInput {
                 state,
                 wheels: command_wheels(model.vehicle(), before, after, &transition.control),
-                soil: Soil::from_array(soil.apply(&transition.input.soil.to_array())),
+                soil: Soil::from_array(self.soil_at(model, soil, start + j, bench.stepping.dt_s)),
                 ground: ground.under_wheels(model, &state, 0.0).0,
                 ..transition.input
             };
@@ -311,7 +312,7 @@ impl ObservedDrive {
     fn actuators(&self, reading: &Reading, transition: &Transition, sample: usize, j: usize, row: &mut Row) {
         let vehicle = reading.model.vehicle();
         let [before, after] = &reading.actuators[sample];
-        let mut angles = road_wheel_angles(vehicle, before.steering + vehicle.effects.steering_offset);
+        let mut angles = before.road_wheel_angles(vehicle);
         if let Some(measured) = self.road_wheel_angle_rad.as_ref().map(|m| m[sample]) {
             let bin = usize::from(j >= BINS[0][1]);
             let share = 1.0 / (BINS[bin][1] - BINS[bin][0] + 1) as f64;
@@ -327,10 +328,14 @@ impl ObservedDrive {
             let at = vehicle.wheel_centre_m[i];
             let centre = [v[0] + w[1] * at[2] - w[2] * at[1], v[1] + w[2] * at[0] - w[0] * at[2]];
             let (sin, cos) = angles[i].sin_cos();
-            let forward = cos * centre[0] + sin * centre[1];
+            let own = cos * centre[0] + sin * centre[1];
+            // A locked axle turns both rims at the mean of what their own ground asks for; Ω is read as a speed of the card's radius.
+            let middle = own + cos * 0.5 * w[2] * (at[1] - vehicle.wheel_centre_m[i ^ 1][1]);
+            let forward = own + vehicle.effects.actuator.lock * (middle - own);
             let slope = self.traction_slope[sample][i];
             let drag = vehicle.drag_at_tread_n_m(i, slope) / vehicle.wheel_radius_m / slope;
-            let predicted = wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum();
+            let radius = 1.0 + vehicle.effects.force.radius_relative[i / 2];
+            let predicted = (wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum()) / radius;
             row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - predicted);
         }
     }

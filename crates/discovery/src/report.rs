@@ -262,5 +262,5 @@ fn effect_json(finding: &Finding) -> Value {
 }
 
 fn layer_name(layer: Layer) -> String {
-    format!("{layer:?}").to_lowercase()
+    layer.as_str().into()
 }

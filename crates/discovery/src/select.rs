@@ -90,7 +90,7 @@ impl Selection {
 /// give forces that differ by a quarter, mostly by a common factor that a fit takes up.
 pub fn mismatch(layer: Layer) -> f64 {
     match layer {
-        Layer::Force => 0.12,
+        Layer::Force | Layer::Soil => 0.12,
         _ => 0.04,
     }
 }

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use nesam_physics::driveline::{DrivelineState, command_wheels, measured_wheels};
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::{Phases, ScheduledEffect};
 use nesam_physics::scalar::f32x8;
 use nesam_physics::step::StepModel;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS, wrap_angle};
@@ -15,7 +15,7 @@ use crate::bundle::ModelBundle;
 use crate::dims::{CONTEXT, HIDDEN, HISTORY, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
 use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
-use crate::ground::{GroundSource, history_actuators};
+use crate::ground::{GroundSource, actuators_along};
 use crate::rollout::{HistoryStep, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
@@ -26,10 +26,13 @@ use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, Terrai
 use crate::token::{TokenScale, token_entries};
 
 mod linearise;
+mod observed;
 mod risk;
 mod transitions;
 mod validate;
 
+pub(crate) use self::observed::LogClock;
+use self::observed::reported;
 use self::risk::RiskRow;
 pub use self::transitions::Transition;
 use self::validate::{validate, validate_extras};
@@ -58,7 +61,9 @@ type TokensOfMap = (String, Arc<TerrainTokens>);
 #[derive(Debug)]
 pub struct Predictor {
     bundle: Arc<ModelBundle>,
-    model: StepModel,
+    physics: Phases<StepModel>,
+    /// Some effect makes measured states differ from true ones.
+    sensors_err: bool,
     network: Arc<FusedTransformer>,
     projection: Arc<TerrainProjection>,
     token_scale: TokenScale,
@@ -99,6 +104,7 @@ struct Scene<'a> {
     datum_m: f64,
     variant: Variant,
     risk: bool,
+    clock: LogClock,
 }
 
 /// A correction for each group of `samples` rows.
@@ -142,8 +148,10 @@ impl Predictor {
             SoilPrior::new(weights)?,
             scales.patch_scale(),
         );
+        let physics = phases(&bundle);
         Ok(Self {
-            model: StepModel::new(&bundle.vehicle, scales.dt_s, scales.substeps),
+            sensors_err: physics.any(sensors_err),
+            physics,
             network: Arc::new(FusedTransformer::new(weights)?),
             projection: Arc::new(projection),
             token_scale: scales.token_scale(),
@@ -155,11 +163,13 @@ impl Predictor {
 
     /// The same predictor for the vehicle with further effects. Network and terrain tokens do not depend on them and are shared, so this costs
     /// little; the bundle's hash stays that of the files it was read from.
-    pub fn with_effects(&self, effects: &[Effect]) -> Self {
+    pub fn with_effects<E: Copy + Into<ScheduledEffect>>(&self, effects: &[E]) -> Self {
         let bundle = Arc::new(self.bundle.with_effects(effects));
         let scales = &bundle.normalization;
+        let physics = phases(&bundle);
         Self {
-            model: StepModel::new(&bundle.vehicle, scales.dt_s, scales.substeps),
+            sensors_err: physics.any(sensors_err),
+            physics,
             network: self.network.clone(),
             projection: self.projection.clone(),
             token_scale: scales.token_scale(),
@@ -200,23 +210,25 @@ impl Predictor {
         validate_extras(extras)?;
         let scales = &self.bundle.normalization;
         let tokens = query.map.map(|map| self.tokens_of(map));
-        let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
-        let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
+        let clock = LogClock { start_s: query.start_time_s, dt_s: scales.dt_s };
+        let (history, start_state) = self.true_motion(query.history, &query.start, clock);
+        let history = history.as_ref();
+        let ground = GroundSource::new(query.map.map(Arc::as_ref), self.physics.at(clock.start_s), &start_state);
         let variant = self.form_of(query);
         if extras.risk && !variant.has_soil() {
             return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
         }
-        let prefix = self.prefix(variant, history, &ground, tokens.as_deref());
+        let prefix = self.prefix(variant, history, &ground, tokens.as_deref(), clock);
         let what_if = SoilPerGroup { soils: extras.soils, samples: query.samples };
         let soil: &dyn SoilField = if extras.soils.is_empty() { extras.field.unwrap_or(&query.soil_correction) } else { &what_if };
-        let scene = Scene { query, soil, ground, prefix, datum_m: query.start.position_m[2], variant, risk: extras.risk };
+        let scene = Scene { query, soil, ground, prefix, datum_m: start_state.position_m[2], variant, risk: extras.risk, clock };
         let rows = extras.soils.len().max(1) * query.samples;
 
         // Without a history the actuators begin as a row's own first command says, so rows stay independent.
         let start = |row: usize| Sample {
-            state: query.start,
+            state: start_state,
             previous: history.last().map(|step| step.state),
-            actuators: history_actuators(&self.model, history, &query.start, &scene.control(row, 0), scales.dt_s),
+            actuators: self.actuators(history, &start_state, &scene.control(row, 0), clock),
             flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
         };
         let shared = start(0);
@@ -237,7 +249,7 @@ impl Predictor {
             let poses: Vec<Pose2> = samples[..distinct].iter().map(|s| pose(&s.state)).collect();
             let terrain = self.terrain(tokens.as_deref(), &poses);
             if k == 0 {
-                rollout.soil = under(soil, 0, &samples[0], &terrain[0]);
+                rollout.soil = self.soil_at(under(soil, 0, &samples[0], &terrain[0]), clock.before(0));
             }
             let blocks: Vec<BlockOutput<'_>> = samples
                 .par_chunks_mut(LANES)
@@ -249,11 +261,12 @@ impl Predictor {
                     BlockOutput { samples, cache, wheels }
                 })
                 .collect();
+            let sensors = &self.physics.at(clock.after(k + 1)).vehicle().effects.sensor;
             for (block, output) in blocks.iter().enumerate() {
                 let _ = &output.cache;
                 for (lane, sample) in output.samples.iter().enumerate() {
                     let row = (block * LANES + lane) * query.horizon + k;
-                    for (out, value) in rollout.states[row * STATE_DIM..].iter_mut().zip(sample.state.to_array()) {
+                    for (out, value) in rollout.states[row * STATE_DIM..].iter_mut().zip(reported(sensors, &sample.state).to_array()) {
                         *out = value as f32;
                     }
                     rollout.sinkage_m[row * WHEELS..(row + 1) * WHEELS].copy_from_slice(&output.wheels[lane].sinkage_m);
@@ -272,9 +285,9 @@ impl Predictor {
         if query.variant == Variant::Full { self.bundle.form } else { query.variant }
     }
 
-    /// The physics with the bundle's vehicle.
+    /// The physics with the bundle's vehicle, all of its effects begun.
     pub fn step_model(&self) -> &StepModel {
-        &self.model
+        self.physics.last()
     }
 
     /// Nominal soil θ̄ under a pose (paper §III-B: h_θ of the semantic patch); the stated default without map or semantics.
@@ -323,7 +336,14 @@ impl Predictor {
     }
 
     /// Encodes the measured history for a form that remembers it.
-    fn prefix(&self, variant: Variant, history: &[HistoryStep], ground: &GroundSource<'_>, tokens: Option<&TerrainTokens>) -> Prefix {
+    fn prefix(
+        &self,
+        variant: Variant,
+        history: &[HistoryStep],
+        ground: &GroundSource<'_>,
+        tokens: Option<&TerrainTokens>,
+        clock: LogClock,
+    ) -> Prefix {
         if !variant.remembers() {
             return Prefix::default();
         }
@@ -334,7 +354,8 @@ impl Predictor {
             .enumerate()
             .map(|(j, step)| {
                 let previous = j.checked_sub(1).map(|j| history[j].state);
-                self.entries(&step.state, previous.as_ref(), &step.control, ground)
+                let model = self.physics.at(clock.before(history.len() - j));
+                self.entries(model, &step.state, previous.as_ref(), &step.control, ground)
             })
             .collect();
         let contexts: Vec<[f32; HIDDEN]> = terrain.iter().map(|t| core::array::from_fn(|i| t[i])).collect();
@@ -343,12 +364,13 @@ impl Predictor {
 
     fn entries(
         &self,
+        model: &StepModel,
         state: &VehicleState<f64>,
         previous: Option<&VehicleState<f64>>,
         control: &Control<f64>,
         ground: &GroundSource<'_>,
     ) -> [f32; STATE_CONTROL] {
-        let (height, _, _) = ground.at(state.position_m[0], state.position_m[1]);
+        let (height, _, _) = ground.at(&model.vehicle().effects.map, state.position_m[0], state.position_m[1]);
         let raw = token_entries(state, previous, [control.speed_m_s, control.second], height, self.bundle.normalization.dt_s);
         self.token_scale.apply(raw)
     }
@@ -365,10 +387,15 @@ impl Predictor {
     ) -> Vec<StepRow> {
         let scales = &self.bundle.normalization;
         let query = scene.query;
+        let time_s = scene.clock.after(k);
+        let model = self.physics.at(time_s);
         let last = samples.len() - 1;
         let controls: Vec<Control<f64>> = (0..samples.len()).map(|l| scene.control(first + l, k)).collect();
-        let entries: Vec<[f32; STATE_CONTROL]> =
-            samples.iter().zip(&controls).map(|(s, control)| self.entries(&s.state, s.previous.as_ref(), control, &scene.ground)).collect();
+        let entries: Vec<[f32; STATE_CONTROL]> = samples
+            .iter()
+            .zip(&controls)
+            .map(|(s, control)| self.entries(model, &s.state, s.previous.as_ref(), control, &scene.ground))
+            .collect();
         let entry_lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| core::array::from_fn(|l| entries[l.min(last)][i]));
         let context: [Lane; HIDDEN] = core::array::from_fn(|i| core::array::from_fn(|l| terrain[l.min(last)][i]));
         let (raw_sinkage, raw_residual) = self.network.step(&scene.prefix, cache, &entry_lanes, &context);
@@ -378,18 +405,23 @@ impl Predictor {
             .zip(&controls)
             .enumerate()
             .map(|(l, (sample, control))| {
-                let after = sample.actuators.advance(self.model.vehicle(), control, sample.state.velocity_m_s[0], scales.dt_s);
+                let after = sample.actuators.advance(model.vehicle(), control, sample.state.velocity_m_s[0], model.dt_s());
                 let wheels = match query.wheels {
-                    Some(measured) => measured_wheels(self.model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
-                    None => command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
+                    Some(measured) => measured_wheels(model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
+                    None => command_wheels(model.vehicle(), &sample.actuators, &after, control),
                 };
-                let (ground, known) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
-                let soil = under(scene.soil, first + l, sample, terrain[l]);
+                let (ground, known) = scene.ground.under_wheels(model, &sample.state, scene.datum_m);
+                let soil = self.soil_at(under(scene.soil, first + l, sample, terrain[l]), time_s);
                 let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                     Variant::ZeroSinkage => NO_SINKAGE,
                     _ => scales.sinkage_log_ratio_max * raw_sinkage[i][l].tanh(),
                 });
-                (after, varying_row(&sample.state, scene.datum_m, &ratio, &soil), pack_constants(&wheels, &ground), known)
+                (
+                    after,
+                    varying_row(&sample.state, scene.datum_m, &ratio, &soil),
+                    pack_constants(&wheels, &ground, sample.state.attitude_rad[2]),
+                    known,
+                )
             })
             .collect();
 
@@ -399,10 +431,10 @@ impl Predictor {
             let varying = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].1[c])));
             let constant = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].2[c])));
             let input = step_input(varying, constant);
-            let output = symbolic_step(scene.variant, &self.model, &input);
+            let output = symbolic_step(scene.variant, model, &input);
             let increment = output.increment.to_array().map(f32x8::to_array);
             let sinkages = output.contacts.map(|contact| contact.sinkage_m.to_array());
-            let risks = scene.risk.then(|| risk::of_lanes(&self.model, &input, &output.contacts));
+            let risks = scene.risk.then(|| risk::of_lanes(model, &input, &output.contacts));
             for l in 0..8.min(samples.len() - half) {
                 let lane = half + l;
                 let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
@@ -443,6 +475,16 @@ impl Predictor {
         sample.previous = Some(before);
         sample.actuators = actuators;
     }
+}
+
+/// The physics of a bundle in each phase between the onsets of its effects.
+fn phases(bundle: &ModelBundle) -> Phases<StepModel> {
+    let scales = &bundle.normalization;
+    Phases::new(&bundle.vehicle, &bundle.effects, |vehicle| StepModel::new(vehicle, scales.dt_s, scales.substeps))
+}
+
+fn sensors_err(model: &StepModel) -> bool {
+    model.vehicle().effects.sensor.alters_states()
 }
 
 fn pose(state: &VehicleState<f64>) -> Pose2 {

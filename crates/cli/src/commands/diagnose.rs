@@ -164,8 +164,7 @@ fn patched(predictor: &Arc<Predictor>, found: &Diagnosis, drives: &Drives, out: 
         return Ok(None);
     }
     let base = predictor.bundle();
-    let effects: Vec<Effect> = found.claimed.iter().map(|e| e.effect).collect();
-    let mut bundle = base.with_effects(&effects);
+    let mut bundle = base.with_effects(&found.claimed);
     bundle.provenance = Provenance {
         command: command_line(),
         data_hash: drives.root.hash(),

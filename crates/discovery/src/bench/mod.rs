@@ -20,7 +20,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use nesam_model::Predictor;
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 
@@ -29,7 +29,7 @@ pub use score::{Outcome, Scores, scores};
 
 use crate::diagnose::{Judge, judge};
 use crate::error::DiscoveryError;
-use crate::observe::{Bench, Stepping, Timed, observe, observe_all};
+use crate::observe::{Bench, Stepping, observe, observe_all};
 
 /// Drives of a pseudo-vehicle.
 pub const DRIVES: usize = 5;
@@ -92,16 +92,17 @@ pub fn plan() -> Vec<Hidden> {
         outside(C::SteeringWarp(0.08)),
         outside(C::VelocityRipple(0.15)),
     ];
-    let forces: [(&'static str, &[f64], usize); 9] = [
+    let forces: [(&'static str, &[f64], usize); 10] = [
         ("payload", &[500.0, -1.0, 0.0, 0.7], 0),
         ("wheel_drag", &[1.0, 900.0], 1),
-        ("linear_drag", &[150.0], 0),
+        ("linear_drag", &[200.0], 0),
         ("quadratic_drag", &[60.0], 0),
-        ("rolling_resistance", &[0.02], 0),
+        ("rolling_resistance", &[0.03], 0),
+        ("tow", &[800.0, 0.0], 0),
         ("cg_forward", &[0.15], 0),
         ("cg_lateral", &[0.1], 0),
-        ("wind", &[500.0, 300.0], 0),
-        ("slip_sinkage", &[0.2], 0),
+        ("tyre_radius_rear", &[0.03], 0),
+        ("slip_sinkage", &[1.0], 0),
     ];
     plan.extend(forces.into_iter().filter_map(|(id, values, scored)| driven(id, values, scored)));
     for (id, size, change) in [
@@ -159,7 +160,8 @@ impl Stage<'_> {
         for &m in &members {
             let (mut drive, mut map) = (self.drives[m].clone(), self.maps[m].clone());
             if !hidden.driven.is_empty() {
-                let effects: Vec<Timed> = hidden.driven.iter().map(|e| Timed { effect: *e, onset_s: hidden.onset_s }).collect();
+                let effects: Vec<ScheduledEffect> =
+                    hidden.driven.iter().map(|e| ScheduledEffect { effect: *e, onset_s: hidden.onset_s }).collect();
                 observe(self.predictor, &drive, map.as_ref())?.driven_again(&bench, &effects, &mut drive);
             }
             for change in &hidden.changes {

@@ -66,7 +66,7 @@ impl<T: Real> WheelWrench<T> {
 
 /// Angle whose cosine is 1 - depth / r, with its sine; exact and smooth for 0 < depth < 2 r.
 #[inline(always)]
-fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
+pub(super) fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
     let cos = T::lit(1.0) - depth_share;
     let sin = (depth_share * (T::lit(2.0) - depth_share)).sqrt();
     // tan(θ/2) = sin / (1 + cos): no branch at θ = π/2.
