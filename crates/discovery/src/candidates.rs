@@ -107,6 +107,9 @@ fn payload() -> Line {
     }
 }
 
+/// Least mass from which the size of a payload is looked for, kg (chosen).
+const PAYLOAD_START_KG: f64 = 200.0;
+
 /// One hypothesis: an effect of the catalogue, for a wheel drag at one wheel.
 #[derive(Clone, Copy, Debug)]
 pub struct Candidate {
@@ -218,17 +221,17 @@ impl Candidate {
 
     /// Physical range of a free parameter.
     pub fn range(&self, i: usize) -> [f64; 2] {
-        self.of(&self.line.columns[0]).parameters()[self.line.free[i].parameter].range
+        let range = self.of(&self.line.columns[0]).parameters()[self.line.free[i].parameter].range;
+        if self.id() == "payload" && i == 0 { [0.0, range[1]] } else { range }
     }
 
     /// Moves values into the physical range; true where the range holds one of them.
     pub fn clamp(&self, values: &mut [f64]) -> Vec<bool> {
-        let parameters = self.effect(values).parameters();
-        self.free()
-            .iter()
-            .zip(values)
-            .map(|(f, value)| {
-                let [low, high] = parameters[f.parameter].range;
+        let ranges: Vec<[f64; 2]> = (0..values.len()).map(|i| self.range(i)).collect();
+        values
+            .iter_mut()
+            .zip(ranges)
+            .map(|(value, [low, high])| {
                 let margin = 0.01 * (high - low);
                 let held = *value <= low + if low < 0.0 { margin } else { 0.0 } || *value >= high - margin;
                 *value = value.clamp(low, high);
@@ -246,7 +249,8 @@ fn payload_start(columns: &[Vec<f64>], shares: &[f64]) -> Vec<f64> {
             moment[axis] += share * column[0] * column[1 + axis];
         }
     }
-    let mass_kg = if mass.abs() < 100.0 { 100f64.copysign(mass) } else { mass };
+    // A load that was taken away would look the same on the other side; a payload is there.
+    let mass_kg = mass.max(PAYLOAD_START_KG);
     let at = |axis: usize, reach: f64| (moment[axis] / mass_kg).clamp(-reach, reach);
     vec![mass_kg, at(0, 2.0), at(1, 0.8), at(2, 1.2)]
 }

@@ -1,18 +1,20 @@
 //! From a selection to claims: onset, size with interval, stability over sub-samples of drives, and the reasons why a claim is refused.
 
+use std::collections::BTreeMap;
+
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::Layer;
+use nesam_physics::effects::{Layer, ScheduledEffect};
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::channels::Row;
+use crate::channels::{self, Row};
 use crate::condense::{Condensed, condense};
 use crate::evidence::Group;
 use crate::fit::{Fit, Prepared, Term, fit};
 use crate::metric::Metric;
 use crate::observe::Bench;
 use crate::onset::{self, Onset};
-use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick};
+use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick};
 
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
 /// pass for this one on a drive, but seldom with the same size on all.
@@ -23,6 +25,8 @@ const STABILITY_MIN: f64 = 0.6;
 const STABILITY_DRIVES: usize = 10;
 /// Contenders for which an onset is looked for.
 const ONSET_CONTENDERS: usize = 3;
+/// Criterion within which a rival is sized through the physics before it is judged.
+const SETTLED: f64 = 40.0;
 /// Student's t for the thirty drives behind a reference.
 const T_NULLS: f64 = 2.05;
 const T_975: [f64; 10] = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23];
@@ -74,6 +78,17 @@ pub struct Finding {
     pub rivals: Vec<Member>,
     /// Why it is not claimed.
     pub refused: Option<String>,
+}
+
+/// Course of a channel over the drives.
+#[derive(Clone, Debug)]
+pub struct Trace {
+    /// The channel.
+    pub channel: usize,
+    /// Mean deviation by time (s), without effects.
+    pub before: Vec<(f64, f64)>,
+    /// The same with the claimed effects.
+    pub after: Vec<(f64, f64)>,
 }
 
 /// A set of drives, ready to be judged.
@@ -167,6 +182,39 @@ impl Case<'_> {
         fit(&self.bench, &self.metric, &drives, &terms, start, &offset)
     }
 
+    /// Scores of what fitted effects leave.
+    fn left(&self, yardstick: &Yardstick, fit: &Fit) -> Group {
+        let effects = fit.effects();
+        let condensed: Vec<Condensed> = self
+            .prepared
+            .par_iter()
+            .map(|p| condense(&self.metric, &p.drive.deviations(&self.bench, &effects, &SoilCorrection::NONE), &p.signatures))
+            .collect();
+        yardstick.group(condensed.iter())
+    }
+
+    /// Compares the first chosen effect with its closest rivals once more, each sized through the physics, because a large delay or drag is no multiple of a small one.
+    /// The best comes first, the others remain its rivals; what is left is that of the fit.
+    pub fn settle(&self, yardstick: &Yardstick, selection: &mut Selection, onsets: &[Option<Onset>]) {
+        let Some(&first) = selection.chosen.first() else { return };
+        let before = yardstick.group(self.condensed());
+        let close = selection.rivals[0].iter().filter(|r| r.difference < SETTLED).take(2 * RIVALS_MAX).map(|r| r.hypothesis);
+        let members: Vec<usize> = std::iter::once(first).chain(close).collect();
+        let with = |h: usize| -> Vec<usize> { std::iter::once(h).chain(selection.chosen[1..].iter().copied()).collect() };
+        let left: Vec<Group> = members.iter().map(|h| self.left(yardstick, &self.size(yardstick, &before, &with(*h), onsets))).collect();
+        let z = |k: usize, j: usize| yardstick.after_fit(&left[j], &before, &with(members[j]), members[k]).0;
+        let difference = |j: usize, k: usize| z(j, k).powi(2) - z(k, j).powi(2);
+        let best = (1..members.len()).fold(0, |best, k| if difference(best, k) < 0.0 { k } else { best });
+        let mut rivals: Vec<Rival> =
+            (0..members.len()).filter(|k| *k != best).map(|k| Rival { hypothesis: members[k], difference: difference(best, k) }).collect();
+        rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
+        selection.chosen = with(members[best]);
+        let far = selection.rivals[0].iter().filter(|r| !members.contains(&r.hypothesis)).cloned();
+        rivals.extend(far);
+        selection.rivals[0] = rivals;
+        selection.remaining = yardstick.remaining_after_fit(&left[best], &before, &selection.chosen);
+    }
+
     /// Findings of a selection, in its order, refused or not.
     pub fn findings(&self, yardstick: &Yardstick, selection: &Selection, onsets: &[Option<Onset>], fit: &Fit) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
@@ -211,9 +259,34 @@ impl Case<'_> {
         hits as f64 / subsets.len().max(1) as f64
     }
 
-    /// Deviations of the drives with effects, for plots.
-    pub fn deviations_with(&self, effects: &[nesam_physics::effects::ScheduledEffect]) -> Vec<Vec<Row>> {
-        self.prepared.iter().map(|p| p.drive.deviations(&self.bench, effects, &SoilCorrection::NONE)).collect()
+    /// Course of the most unusual channel of each residual layer, before and with effects.
+    pub fn traces(&self, selection: &Selection, effects: &[ScheduledEffect]) -> Vec<Trace> {
+        let with: Vec<Vec<Row>> = if effects.is_empty() {
+            self.rows.clone()
+        } else {
+            self.prepared.iter().map(|p| p.drive.deviations(&self.bench, effects, &SoilCorrection::NONE)).collect()
+        };
+        let levels = &self.metric.channels;
+        ["actuator", "force", "kinematic", "map"]
+            .into_iter()
+            .filter_map(|layer| {
+                let own = (0..levels.len()).filter(|i| channels::layer(levels[*i]) == layer);
+                let i = own.max_by(|a, b| selection.levels[*a].total_cmp(&selection.levels[*b]))?;
+                Some(Trace { channel: levels[i], before: self.course(&self.rows, i), after: self.course(&with, i) })
+            })
+            .collect()
+    }
+
+    /// Mean over the drives of the deviation of a compared channel from its usual level, by time (s).
+    fn course(&self, rows: &[Vec<Row>], i: usize) -> Vec<(f64, f64)> {
+        let mut sums: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
+        for (prepared, rows) in self.prepared.iter().zip(rows) {
+            for (start, row) in prepared.drive.starts.iter().zip(rows) {
+                let sum = sums.entry(*start).or_default();
+                *sum = (sum.0 + row[self.metric.channels[i]] - self.metric.centre[i], sum.1 + 1.0);
+            }
+        }
+        sums.into_iter().map(|(start, (sum, count))| (start as f64 * self.bench.stepping.dt_s, sum / count)).collect()
     }
 }
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 
 use crate::candidates::{Candidate, catalogue};
 use crate::channels::Row;
-use crate::claims::{Case, Estimate, Finding};
+use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::{best_soil, condense, signatures};
 use crate::error::DiscoveryError;
 use crate::evidence::Nulls;
@@ -22,6 +22,8 @@ use crate::select::{Selection, Yardstick};
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
 const LEFT_MAX: f64 = 0.35;
+/// The same where every claimed effect is geometry, such as a steering ratio or a gyro bias.
+const LEFT_MAX_GEOMETRY: f64 = 0.15;
 
 /// What the command line says.
 #[derive(Clone, Debug)]
@@ -72,6 +74,10 @@ pub struct Diagnosis {
     pub channels: Vec<usize>,
     /// Mean deviation of each compared channel from its usual level, in its unit.
     pub levels: Vec<f64>,
+    /// Course of the most unusual channel of each residual layer.
+    pub traces: Vec<Trace>,
+    /// The strongest hypothesis that was not chosen, where something was claimed: sized alone, as a control.
+    pub placebo: Option<Candidate>,
     /// Judgement on all fitted drives together.
     pub selection: Selection,
     /// Chosen effects, refused or not.
@@ -205,6 +211,7 @@ impl Judgement {
 /// Detects, selects and sizes, without the proof.
 pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     let (mut selection, onsets) = case.select(yardstick);
+    case.settle(yardstick, &mut selection, &onsets);
     let mut left_out = Vec::new();
     loop {
         if selection.chosen.is_empty() {
@@ -220,6 +227,7 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
             Some(i) if findings.len() > 1 => {
                 left_out.push(findings.remove(i));
                 selection.drop_chosen(yardstick, &group, i);
+                case.settle(yardstick, &mut selection, &onsets);
             }
             _ => {
                 let (verdict, reason) = provisional(&selection, &findings);
@@ -251,7 +259,8 @@ fn provisional(selection: &Selection, findings: &[Finding]) -> (Verdict, String)
     }
     let (left, what) = &selection.remaining;
     let share = left / selection.largest().max(1e-9);
-    if *left >= selection.threshold && share > LEFT_MAX {
+    let force = findings.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Soil));
+    if *left >= selection.threshold && share > if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY } {
         return (
             Verdict::Unexplained,
             format!(
@@ -315,7 +324,16 @@ pub fn diagnose(
     let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
-    let scores = if held.is_empty() { None } else { Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?) };
+    let placebo = placebo(&case, &yardstick, &judgement);
+    let placebo_learned = placebo.as_ref().map(|(_, fit)| {
+        let of = |d: usize| if options.fit_on.is_some() { fit.effects() } else { fit.effects_without(d) };
+        (0..held.len()).map(|d| Learned { soil: SoilCorrection::NONE, effects: of(d) }).collect::<Vec<_>>()
+    });
+    let scores = if held.is_empty() {
+        None
+    } else {
+        Some(score_held_out(predictor, &held, &held_maps, &learned, placebo_learned.as_deref(), &options.scoring)?)
+    };
     let (verdict, reason) = proven(&judgement, scores.as_ref());
     let claimed = if matches!(verdict, Verdict::Explained | Verdict::Ambiguous) {
         judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects()))
@@ -330,6 +348,8 @@ pub fn diagnose(
     Ok(Diagnosis {
         verdict,
         reason,
+        traces: case.traces(&judgement.selection, &claimed),
+        placebo: placebo.map(|(candidate, _)| candidate),
         levels: levels(&case),
         catalogue: yardstick.catalogue,
         channels,
@@ -382,6 +402,27 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
             Learned { soil, effects }
         })
         .collect()
+}
+
+/// The strongest hypothesis that is neither chosen nor a rival nor of a chosen id, sized alone; `None` when nothing is claimed.
+fn placebo(case: &Case<'_>, yardstick: &Yardstick, judgement: &Judgement) -> Option<(Candidate, Fit)> {
+    let claimed = judgement.claimed();
+    let named: Vec<&str> = claimed
+        .iter()
+        .flat_map(|i| {
+            let f = &judgement.findings[*i];
+            f.rivals.iter().map(|r| r.candidate.id()).chain([f.candidate.id()])
+        })
+        .collect();
+    if named.is_empty() {
+        return None;
+    }
+    let z = &judgement.selection.z;
+    let open = (0..z.len()).filter(|h| z[*h].is_some() && !named.contains(&yardstick.catalogue[*h].id()));
+    let strongest = open.max_by(|a, b| z[*a].unwrap_or(0.0).total_cmp(&z[*b].unwrap_or(0.0)))?;
+    let group = yardstick.group(case.condensed());
+    let onsets = vec![None; yardstick.catalogue.len()];
+    Some((yardstick.catalogue[strongest], case.size(yardstick, &group, &[strongest], &onsets)))
 }
 
 /// Verdict after the proof on held-out drives.

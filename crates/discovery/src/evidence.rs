@@ -10,6 +10,9 @@ use crate::candidates::SHARE_SD;
 use crate::condense::Condensed;
 use crate::tail::{equivalent_z, ln_chi_square_tail};
 
+/// Least scatter of the scores of a block of several columns, as a ratio of variances to what the metric says (chosen).
+const BLOCK_FLOOR: f64 = 0.3;
+
 /// What drives without an effect say of each column.
 #[derive(Clone, Debug)]
 pub struct Nulls {
@@ -101,11 +104,17 @@ pub struct Remainder {
 impl Group {
     /// Evidence of a block of columns after `fitted` have been fitted. The predicted response of what was fitted is believed to a share `mismatch`.
     pub fn remainder(&self, fitted: &[usize], block: &[usize], mismatch: f64) -> Remainder {
+        self.remainder_since(self, fitted, block, mismatch)
+    }
+
+    /// The same where the fit went through the physics: these are the scores of what it left, `before` those that it started from, which say how much was
+    /// to be explained.
+    pub fn remainder_since(&self, before: &Group, fitted: &[usize], block: &[usize], mismatch: f64) -> Remainder {
         let own = self.information.select_rows(block);
         let pull = self.projection(fitted, block);
         let fitted_score = self.score.select_rows(fitted);
-        let explained = &pull * &fitted_score;
-        let score = self.score.select_rows(block) - &explained;
+        let score = self.score.select_rows(block) - &pull * &fitted_score;
+        let explained = &pull * before.score.select_rows(fitted);
         let mut information = own.select_columns(block);
         if !fitted.is_empty() {
             information -= &pull * self.information.select_rows(fitted).select_columns(block);
@@ -119,6 +128,10 @@ impl Group {
         for i in 0..block.len() {
             covariance[(i, i)] += (mismatch * explained[i]).powi(2) + 1e-12 + 1e-6 * self.information[(block[i], block[i])];
             information[(i, i)] = information[(i, i)].max(1e-12);
+        }
+        if block.len() > 1 {
+            // Thirty null drives tell little of the least scattered direction of a block.
+            covariance += &information * BLOCK_FLOOR;
         }
         let mut penalised = information;
         for i in 0..block.len() {
@@ -154,5 +167,62 @@ impl Group {
     /// Shares of a set of columns fitted together.
     pub fn joint_shares(&self, columns: &[usize]) -> Vec<f64> {
         self.remainder(&[], columns, 0.0).shares
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
+
+    /// Information of two columns at a cosine of 0.8 and one apart from them.
+    fn information() -> DMatrix<f64> {
+        DMatrix::from_row_slice(3, 3, &[100.0, 80.0, 0.0, 80.0, 100.0, 0.0, 0.0, 0.0, 50.0])
+    }
+
+    /// A drive with a share of the first column; its scores scatter four times as much as the information says.
+    fn drive(rng: &mut ChaCha8Rng, share: f64) -> Condensed {
+        let lower = information().cholesky().unwrap().l();
+        let mut noise = DVector::zeros(3);
+        for i in 0..3 {
+            // Sum of twelve uniform deviates, Irwin and Hall: variance one.
+            noise[i] = (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0;
+        }
+        Condensed {
+            score: 2.0 * lower * noise + information().column(0) * share,
+            information: information(),
+            square: 0.0,
+            soil_score: DVector::zeros(0),
+            soil_information: DMatrix::zeros(0, 0),
+        }
+    }
+
+    #[test]
+    fn analytic_the_scatter_of_null_drives_is_the_measure_of_evidence() {
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let nulls: Vec<Condensed> = (0..400).map(|_| drive(&mut rng, 0.0)).collect();
+        let nulls = Nulls::new(&nulls.iter().collect::<Vec<_>>()).unwrap();
+        assert!((nulls.dispersion(0) - 4.0).abs() < 0.8, "{}", nulls.dispersion(0));
+        let group: Vec<Condensed> = (0..5).map(|_| drive(&mut rng, 1.0)).collect();
+        let group = nulls.group(group.iter());
+        // Five drives with a share of 1: score 500 with a variance of 5 · 4 · 100, z = 11.
+        let found = group.remainder(&[], &[0], 0.0);
+        assert!((found.z - 11.2).abs() < 3.0 && (found.shares[0] - 1.0).abs() < 0.3, "{found:?}");
+        assert!(group.remainder(&[], &[2], 0.0).z < 3.5);
+    }
+
+    #[test]
+    fn analytic_a_fitted_cause_leaves_nothing_to_its_shadow_but_not_the_reverse() {
+        let mut rng = ChaCha8Rng::seed_from_u64(2);
+        let nulls: Vec<Condensed> = (0..60).map(|_| drive(&mut rng, 0.0)).collect();
+        let nulls = Nulls::new(&nulls.iter().collect::<Vec<_>>()).unwrap();
+        let group: Vec<Condensed> = (0..5).map(|_| drive(&mut rng, 3.0)).collect();
+        let group = nulls.group(group.iter());
+        assert!(group.remainder(&[], &[1], 0.0).z > 15.0, "the shadow stands out as well");
+        assert!(group.remainder(&[0], &[1], 0.0).z < 3.5);
+        assert!(group.remainder(&[1], &[0], 0.0).z > 8.0);
+        let doubted = group.remainder(&[1], &[0], 0.5).z;
+        assert!(doubted < group.remainder(&[1], &[0], 0.0).z, "a response that is believed less leaves less evidence");
     }
 }

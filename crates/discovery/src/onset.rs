@@ -10,8 +10,8 @@ use rayon::prelude::*;
 const DECISIVE: f64 = 14.0;
 /// Fall of the gain, in dispersions, at the ends of the 95 % interval.
 const INTERVAL: f64 = 3.84;
-/// Segments that must lie before and after an onset, over all drives.
-const SEGMENTS_MIN: usize = 5;
+/// Segments that must lie before and after an onset, on average by drive.
+const SEGMENTS_MIN: usize = 3;
 
 /// An onset with its interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,8 +40,9 @@ pub fn find(
     times.sort_by(f64::total_cmp);
     times.dedup();
     let segments = |at: &dyn Fn(f64) -> bool| drives.iter().flat_map(|d| d.drive.times_s(dt_s)).filter(|t| at(*t)).count();
+    let least = SEGMENTS_MIN * drives.len();
     let candidates: Vec<f64> =
-        times.iter().copied().filter(|t| segments(&|s| s < *t) >= SEGMENTS_MIN && segments(&|s| s >= *t) >= SEGMENTS_MIN).collect();
+        times.iter().copied().filter(|t| segments(&|s| s < *t) >= least && segments(&|s| s >= *t) >= least).collect();
     let starts: Vec<f64> = std::iter::once(f64::NEG_INFINITY).chain(candidates).collect();
     let (mut score, mut information) = (vec![0.0; starts.len()], vec![0.0; starts.len()]);
     let condensed: Vec<_> = drives

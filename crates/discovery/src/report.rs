@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::candidates::Candidate;
 use crate::channels;
-use crate::claims::Finding;
+use crate::claims::{Finding, Trace};
 use crate::diagnose::{Diagnosis, Verdict};
 use crate::manoeuvre;
 
@@ -50,7 +50,7 @@ impl Report<'_> {
             "soil_only": stage(1),
             "after": stage(2),
             "improvement_ci95": improvement.as_ref().map(|(_, i)| i),
-            "controls": {"black_box_refit": null, "placebo_rival": null, "before_onset": null, "free_form": null},
+            "controls": self.controls(),
             "attainable_p": d.selection.probability.map(|[_, attainable]| attainable),
             "bundle": self.bundle,
             "reason": d.reason,
@@ -66,6 +66,27 @@ impl Report<'_> {
         let map = document.as_object_mut().expect("an object was built; this is a bug");
         map.insert("levels".into(), self.levels());
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
+    }
+
+    /// What would expose a fake. No black box is refitted and no free form is offered by this version.
+    fn controls(&self) -> Value {
+        let d = self.diagnosis;
+        let scores = d.scores.as_ref();
+        let placebo = d.placebo.zip(scores.and_then(|s| s.placebo.as_ref())).map(|(candidate, score)| {
+            let mut tree = json!(score.summary);
+            if let Some(map) = tree.as_object_mut() {
+                map.insert("id".into(), json!(candidate.id()));
+            }
+            tree
+        });
+        let early = scores.and_then(|s| s.before_onset.as_ref());
+        json!({
+            "black_box_refit": null,
+            "placebo_rival": placebo,
+            "before_onset": early.map(|[_, after]| &after.summary),
+            "before_onset_without_effect": early.map(|[before, _]| &before.summary),
+            "free_form": null,
+        })
     }
 
     /// Mean deviation of every compared channel and how unusual it is.
@@ -123,6 +144,11 @@ impl Report<'_> {
         page.section("What was seen")
             .text("Mean deviation of every channel from the frozen reference, by residual layer; z is against groups of drives without an effect.")
             .table(&self.level_table());
+        let traces: Vec<LinePlot> = d.traces.iter().map(trace_plot).collect();
+        page.section("The most unusual channel of each layer").plots(
+            &traces,
+            "Mean over the drives of the deviation from the reference in segments of 0.8 s, without and with the claimed effects.",
+        );
         page.section("What was considered")
             .text(&format!(
                 "Evidence against the scatter of drives without an effect; below z = {:.2} nothing is claimed.",
@@ -235,6 +261,16 @@ impl Report<'_> {
         }
         plot
     }
+}
+
+fn trace_plot(trace: &Trace) -> LinePlot {
+    let name = channels::name(trace.channel);
+    let mut plot = LinePlot::new(&format!("{}: {name}", channels::layer(trace.channel)), "time in the drive [s]", &name);
+    plot.series.push(Series::line("before", 1, trace.before.clone()));
+    if trace.after != trace.before {
+        plot.series.push(Series::line("with the effects", 3, trace.after.clone()));
+    }
+    plot
 }
 
 /// An effect in words.

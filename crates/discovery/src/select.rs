@@ -91,7 +91,7 @@ impl Selection {
 pub fn mismatch(layer: Layer) -> f64 {
     match layer {
         Layer::Force | Layer::Soil => 0.12,
-        _ => 0.04,
+        _ => 0.02,
     }
 }
 
@@ -116,9 +116,14 @@ impl Yardstick {
 
     /// Evidence of a hypothesis after others, in units of its null spread; zero for one that has the wrong sign.
     pub fn after(&self, group: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
+        self.after_fit(group, group, fitted, hypothesis)
+    }
+
+    /// The same where `left` are the scores after the fit of `fitted` went through the physics.
+    pub fn after_fit(&self, left: &Group, before: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
         let candidate = &self.catalogue[hypothesis];
         let worst = fitted.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
-        let found = group.remainder(&self.columns(fitted), &candidate.columns(), worst);
+        let found = left.remainder_since(before, &self.columns(fitted), &candidate.columns(), worst);
         if candidate.positive() && found.shares[0] <= 0.0 {
             return (0.0, 0.0);
         }
@@ -222,11 +227,16 @@ impl Yardstick {
 
     /// Largest evidence after the chosen ones, of hypotheses and of channels.
     fn remaining(&self, group: &Group, chosen: &[usize]) -> (f64, String) {
+        self.remaining_after_fit(group, group, chosen)
+    }
+
+    /// The same where `left` are the scores after the fit went through the physics.
+    pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
         let columns = self.columns(chosen);
         let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
-        let hypotheses = self.open(chosen).map(|k| (self.after(group, chosen, k).0, self.catalogue[k].label()));
+        let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
         let levels = self.channels.iter().enumerate().map(|(i, c)| {
-            let z = group.remainder(&columns, &[level_column(*c)], worst).z / self.spread(self.catalogue.len() + i);
+            let z = left.remainder_since(before, &columns, &[level_column(*c)], worst).z / self.spread(self.catalogue.len() + i);
             (z, format!("the level of {}", crate::channels::name(*c)))
         });
         hypotheses.chain(levels).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))

@@ -73,9 +73,10 @@ pub fn apply(change: Change, onset_s: f64, drive: &mut Trajectory, map: Option<A
             Change::SteeringRatio(size) => c.second /= 1.0 + size,
             Change::SteeringDelay(size) => c.second = at(time + steps(size), &|i| controls[i].second),
             Change::SteeringLag(size) => {
+                // The lagged command passes half way between u of this step and of the next at their border, so that its mean over a step is u.
                 let kept = (-drive.dt_s / size).exp();
-                let next = controls[(k + 1).min(controls.len() - 1)].second;
-                c.second = (next - kept * controls[k].second) / (1.0 - kept);
+                let border = |i: usize| 0.5 * (controls[i.saturating_sub(1)].second + controls[i.min(controls.len() - 1)].second);
+                c.second = (border(k + 1) - kept * border(k)) / (1.0 - kept);
             }
             Change::SpeedGain(size) => c.speed_m_s /= 1.0 + size,
             Change::SpeedDelay(size) => c.speed_m_s = at(time + steps(size), &|i| controls[i].speed_m_s),
