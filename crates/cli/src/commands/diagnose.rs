@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use clap::Args;
+use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM};
@@ -96,8 +97,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     progress.finish();
     let text = reference.to_json();
     let judge = Judge::new(reference);
-    let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
-    let channels: Vec<usize> = (0..available.len()).filter(|c| available[*c]).collect();
+    let channels: Vec<usize> = (0..CHANNELS).filter(|c| observed.iter().all(|d| d.available[*c])).collect();
     let yardstick = judge.yardstick(&channels, 5, &[]).or_input()?;
     if let Some(groups) = &yardstick.groups {
         say!("null groups of 5 drives: threshold z = {:.2}", groups.threshold);
