@@ -1,25 +1,8 @@
 //! The catalogue as hypotheses: parameters with priors, a linear form for the first look and the effect itself for the refit.
 
-use core::ops::Range;
+use std::sync::LazyLock;
 
-use nesam_physics::WHEELS;
-use nesam_physics::effects::{Effect, Payload, SteeringOffset, WheelDrag};
-
-/// Version of catalogue and linear forms; the null scores of a reference hold for one version only.
-pub const CATALOGUE: &str = "2";
-/// Columns of the linear form of the whole catalogue.
-pub const COLUMNS: usize = 4 + WHEELS + 1;
-
-/// One hypothesis: an effect, and for a wheel drag which wheel.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Candidate {
-    /// A mass carried along.
-    Payload,
-    /// Friction at one wheel.
-    WheelDrag(usize),
-    /// A constant offset of the steering.
-    SteeringOffset,
-}
+use nesam_physics::effects::{Effect, Layer, Scaling};
 
 /// A parameter that a refit estimates.
 #[derive(Clone, Copy, Debug)]
@@ -34,112 +17,240 @@ pub struct Free {
     pub step: f64,
 }
 
-const fn free(parameter: usize, mean: f64, sd: f64, step: f64) -> Free {
-    Free { parameter, mean, sd, step }
+/// One line of the catalogue: what a hypothesis is and which sizes it is tried at first.
+#[derive(Clone, Debug)]
+struct Line {
+    id: &'static str,
+    /// Distinguishes hypotheses of one id, such as the wheel that drags.
+    variant: &'static str,
+    layer: Layer,
+    /// Parameters of the effects whose shares span the hypothesis near zero.
+    columns: Vec<Vec<f64>>,
+    free: Vec<Free>,
+    /// How each free parameter grows with the share of its column.
+    scalings: Vec<Scaling>,
+    /// Whether columns are differentiated forward from zero, because the effect has no counterpart of the other sign.
+    forward: bool,
+    /// Whether the first column has a share above zero only.
+    positive: bool,
 }
 
-/// A load lies on the floor, the bed or the roof and within the wheelbase or a little behind it (chosen).
-const PAYLOAD: [Free; 4] = [free(0, 0.0, 1500.0, 100.0), free(1, 0.0, 1.5, 0.3), free(2, 0.0, 0.5, 0.2), free(3, 0.6, 0.4, 0.3)];
-const WHEEL_DRAG: [Free; 1] = [free(1, 0.0, 2000.0, 100.0)];
-const STEERING_OFFSET: [Free; 1] = [free(0, 0.0, 0.2, 0.02)];
+static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| Effect::examples().iter().flat_map(lines_of).collect());
 
-/// Standard deviation of the shares of [`Candidate::linear_form`].
+/// Hypotheses of one id: each size of an effect is a column of its own; a wheel drag is one hypothesis for each wheel.
+fn lines_of(example: &Effect) -> Vec<Line> {
+    match example.id() {
+        "payload" => vec![payload()],
+        "wheel_drag" => {
+            let line = |(i, variant)| Line {
+                id: "wheel_drag",
+                variant,
+                layer: Layer::Force,
+                columns: vec![vec![i as f64, 500.0]],
+                free: vec![Free { parameter: 1, mean: 0.0, sd: 2000.0, step: 100.0 }],
+                scalings: vec![Scaling::Size],
+                forward: true,
+                positive: true,
+            };
+            ["FL", "FR", "RL", "RR"].into_iter().enumerate().map(line).collect()
+        }
+        _ => vec![line_of(example)],
+    }
+}
+
+fn line_of(example: &Effect) -> Line {
+    let (quantities, values) = (example.quantities(), example.values());
+    let sized: Vec<usize> = (0..values.len()).filter(|i| quantities[*i].scaling != Scaling::Held).collect();
+    let column = |one: usize| {
+        let absent = |i: usize| i != one && quantities[i].scaling == Scaling::Size;
+        (0..values.len()).map(|i| if absent(i) { 0.0 } else { values[i] }).collect::<Vec<f64>>()
+    };
+    let free = sized
+        .iter()
+        .map(|i| {
+            let size = values[*i].abs();
+            match quantities[*i].scaling {
+                Scaling::Factor => Free { parameter: *i, mean: 1.0, sd: 2.0, step: 0.05 },
+                Scaling::Limit => Free { parameter: *i, mean: size, sd: 4.0 * size, step: 0.1 * size },
+                _ => Free { parameter: *i, mean: 0.0, sd: SHARE_SD * size, step: 0.2 * size },
+            }
+        })
+        .collect();
+    let first = &quantities[sized[0]];
+    let size = first.scaling == Scaling::Size;
+    Line {
+        id: example.id(),
+        variant: "",
+        layer: example.layer(),
+        columns: sized.iter().map(|i| column(*i)).collect(),
+        free,
+        scalings: sized.iter().map(|i| quantities[*i].scaling).collect(),
+        forward: first.scaling == Scaling::Limit || size && first.range[0] > -values[sized[0]].abs(),
+        positive: first.scaling == Scaling::Limit || size && first.range[0] >= 0.0,
+    }
+}
+
+/// A load lies on the floor, the bed or the roof and within the wheelbase or a little behind it (chosen). A payload enters to first order through m, m x,
+/// m y and m z.
+fn payload() -> Line {
+    let at = |x: f64, y: f64, z: f64| vec![250.0, x, y, z];
+    let free = |parameter, mean, sd, step| Free { parameter, mean, sd, step };
+    Line {
+        id: "payload",
+        variant: "",
+        layer: Layer::Force,
+        columns: vec![at(0.0, 0.0, 0.0), at(1.5, 0.0, 0.0), at(0.0, 0.8, 0.0), at(0.0, 0.0, 1.0)],
+        free: vec![free(0, 0.0, 1500.0, 100.0), free(1, 0.0, 1.5, 0.3), free(2, 0.0, 0.5, 0.2), free(3, 0.6, 0.4, 0.3)],
+        scalings: vec![Scaling::Size; 4],
+        forward: false,
+        positive: false,
+    }
+}
+
+/// Least mass from which the size of a payload is looked for, kg (chosen).
+const PAYLOAD_START_KG: f64 = 200.0;
+
+/// One hypothesis: an effect of the catalogue, for a wheel drag at one wheel.
+#[derive(Clone, Copy, Debug)]
+pub struct Candidate {
+    line: &'static Line,
+    /// Index of its first column among all.
+    first_column: usize,
+}
+
+impl PartialEq for Candidate {
+    fn eq(&self, other: &Self) -> bool {
+        self.first_column == other.first_column
+    }
+}
+
+/// All hypotheses, in the order of their columns.
+pub fn catalogue() -> Vec<Candidate> {
+    let mut first_column = 0;
+    LINES
+        .iter()
+        .map(|line| {
+            let candidate = Candidate { line, first_column };
+            first_column += line.columns.len();
+            candidate
+        })
+        .collect()
+}
+
+/// Number of columns of the linear form of the whole catalogue.
+pub fn column_count() -> usize {
+    LINES.iter().map(|line| line.columns.len()).sum()
+}
+
+/// Standard deviation of the shares of a linear form.
 pub const SHARE_SD: f64 = 3.0;
 
 impl Candidate {
-    /// All hypotheses in the order of the linear columns.
-    pub const ALL: [Self; WHEELS + 2] =
-        [Self::Payload, Self::WheelDrag(0), Self::WheelDrag(1), Self::WheelDrag(2), Self::WheelDrag(3), Self::SteeringOffset];
-
     /// Id of the effect.
-    pub fn id(self) -> &'static str {
-        match self {
-            Self::Payload => "payload",
-            Self::WheelDrag(_) => "wheel_drag",
-            Self::SteeringOffset => "steering_offset",
-        }
+    pub fn id(&self) -> &'static str {
+        self.line.id
     }
 
-    /// Id and wheel, for tables.
-    pub fn label(self) -> String {
-        match self {
-            Self::WheelDrag(i) => format!("wheel_drag {}", ["FL", "FR", "RL", "RR"][i]),
-            other => other.id().into(),
-        }
+    /// Id and variant, for tables.
+    pub fn label(&self) -> String {
+        if self.line.variant.is_empty() { self.id().into() } else { format!("{} {}", self.id(), self.line.variant) }
     }
 
-    /// Columns of this hypothesis in the linear form of the catalogue.
-    pub fn columns(self) -> Range<usize> {
-        match self {
-            Self::Payload => 0..4,
-            Self::WheelDrag(i) => 4 + i..5 + i,
-            Self::SteeringOffset => COLUMNS - 1..COLUMNS,
-        }
+    /// Its columns in the linear form of the catalogue.
+    pub fn columns(&self) -> Vec<usize> {
+        (self.first_column..self.first_column + self.line.columns.len()).collect()
     }
 
-    /// Effects whose shares span the hypothesis near zero. A payload enters to first order through m, m x, m y and m z.
-    pub fn linear_form(self) -> Vec<Effect> {
-        match self {
-            Self::Payload => [[0.0, 0.0, 0.0], [1.5, 0.0, 0.0], [0.0, 0.8, 0.0], [0.0, 0.0, 1.0]]
-                .map(|at_m| Effect::Payload(Payload { mass_kg: 250.0, at_m }))
-                .to_vec(),
-            Self::WheelDrag(wheel) => vec![Effect::WheelDrag(WheelDrag { wheel, torque_n_m: 500.0 })],
-            Self::SteeringOffset => vec![Effect::SteeringOffset(SteeringOffset { second: 0.05 })],
-        }
+    /// Effects whose shares span the hypothesis near zero.
+    pub fn linear_form(&self) -> Vec<Effect> {
+        self.line.columns.iter().map(|values| self.of(values)).collect()
+    }
+
+    fn of(&self, values: &[f64]) -> Effect {
+        Effect::from_parameters(self.id(), values).expect("the catalogue has the parameters of its effects; this is a bug")
     }
 
     /// Parameters to estimate.
-    pub fn free(self) -> &'static [Free] {
-        match self {
-            Self::Payload => &PAYLOAD,
-            Self::WheelDrag(_) => &WHEEL_DRAG,
-            Self::SteeringOffset => &STEERING_OFFSET,
-        }
+    pub fn free(&self) -> &'static [Free] {
+        &self.line.free
+    }
+
+    /// Whether columns are differentiated forward from zero.
+    pub fn forward(&self) -> bool {
+        self.line.forward
+    }
+
+    /// Whether the first column has shares above zero only.
+    pub fn positive(&self) -> bool {
+        self.line.positive
+    }
+
+    /// Layer of the effect.
+    pub fn layer(&self) -> Layer {
+        self.line.layer
     }
 
     /// The effect with given values of the free parameters.
-    pub fn effect(self, values: &[f64]) -> Effect {
-        match self {
-            Self::Payload => Effect::Payload(Payload { mass_kg: values[0], at_m: [values[1], values[2], values[3]] }),
-            Self::WheelDrag(wheel) => Effect::WheelDrag(WheelDrag { wheel, torque_n_m: values[0] }),
-            Self::SteeringOffset => Effect::SteeringOffset(SteeringOffset { second: values[0] }),
+    pub fn effect(&self, values: &[f64]) -> Effect {
+        let mut all = self.line.columns[0].clone();
+        for (f, value) in self.line.free.iter().zip(values) {
+            all[f.parameter] = *value;
+        }
+        self.of(&all)
+    }
+
+    /// Free parameters per unit share of a hypothesis with one column; `None` for one whose parameters are not proportional to shares.
+    pub fn unit(&self) -> Option<f64> {
+        match (self.line.columns.as_slice(), self.line.free.as_slice()) {
+            ([column], [f]) if self.line.scalings[0] == Scaling::Size => Some(column[f.parameter]),
+            _ => None,
         }
     }
 
     /// Where a refit begins: the shares of the linear form as physical parameters.
-    pub fn start(self, shares: &[f64]) -> Vec<f64> {
-        match self {
-            Self::Payload => {
-                let (mut mass, mut moment) = (0.0f64, [0.0; 3]);
-                for (share, effect) in shares.iter().zip(self.linear_form()) {
-                    let Effect::Payload(p) = effect else { continue };
-                    mass += share * p.mass_kg;
-                    for axis in 0..3 {
-                        moment[axis] += share * p.mass_kg * p.at_m[axis];
-                    }
-                }
-                let mass_kg = if mass.abs() < 100.0 { 100f64.copysign(mass) } else { mass };
-                let at = |axis: usize, reach: f64| (moment[axis] / mass_kg).clamp(-reach, reach);
-                vec![mass_kg, at(0, 2.0), at(1, 0.8), at(2, 1.2)]
-            }
-            Self::WheelDrag(_) => vec![500.0 * shares[0]],
-            Self::SteeringOffset => vec![0.05 * shares[0]],
+    pub fn start(&self, shares: &[f64]) -> Vec<f64> {
+        if self.id() == "payload" {
+            return payload_start(&self.line.columns, shares);
         }
+        let of = |(i, f): (usize, &Free)| {
+            let [low, high] = self.range(i);
+            self.line.scalings[i].apply(self.line.columns[i][f.parameter], shares[i]).clamp(low, high)
+        };
+        self.line.free.iter().enumerate().map(of).collect()
+    }
+
+    /// Physical range of a free parameter.
+    pub fn range(&self, i: usize) -> [f64; 2] {
+        let range = self.of(&self.line.columns[0]).parameters()[self.line.free[i].parameter].range;
+        if self.id() == "payload" && i == 0 { [0.0, range[1]] } else { range }
     }
 
     /// Moves values into the physical range; true where the range holds one of them.
-    pub fn clamp(self, values: &mut [f64]) -> Vec<bool> {
-        let parameters = self.effect(values).parameters();
-        self.free()
-            .iter()
-            .zip(values)
-            .map(|(f, value)| {
-                let [low, high] = parameters[f.parameter].range;
+    pub fn clamp(&self, values: &mut [f64]) -> Vec<bool> {
+        let ranges: Vec<[f64; 2]> = (0..values.len()).map(|i| self.range(i)).collect();
+        values
+            .iter_mut()
+            .zip(ranges)
+            .map(|(value, [low, high])| {
                 let margin = 0.01 * (high - low);
-                let held = *value <= low + margin || *value >= high - margin;
+                let held = *value <= low + if low < 0.0 { margin } else { 0.0 } || *value >= high - margin;
                 *value = value.clamp(low, high);
                 held
             })
             .collect()
     }
+}
+
+fn payload_start(columns: &[Vec<f64>], shares: &[f64]) -> Vec<f64> {
+    let (mut mass, mut moment) = (0.0f64, [0.0; 3]);
+    for (share, column) in shares.iter().zip(columns) {
+        mass += share * column[0];
+        for axis in 0..3 {
+            moment[axis] += share * column[0] * column[1 + axis];
+        }
+    }
+    // A load that was taken away would look the same on the other side; a payload is there.
+    let mass_kg = mass.max(PAYLOAD_START_KG);
+    let at = |axis: usize, reach: f64| (moment[axis] / mass_kg).clamp(-reach, reach);
+    vec![mass_kg, at(0, 2.0), at(1, 0.8), at(2, 1.2)]
 }

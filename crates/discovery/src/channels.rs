@@ -1,4 +1,4 @@
-//! What is compared: mean deviations of a measured segment from its prediction, channel by channel, each in one residual layer.
+//! What is compared: deviations of a measured segment from its prediction, and of its channels from one another, each in one residual layer.
 
 use nesam_physics::WHEELS;
 use nesam_trajectories::MeasuredChannels;
@@ -9,12 +9,16 @@ pub const SEGMENT_STEPS: usize = 8;
 pub const BINS: [[usize; 2]; 2] = [[1, 4], [5, SEGMENT_STEPS]];
 /// State channels per bin.
 pub const STATE_CHANNELS: usize = 12;
-/// Index of the steering channel.
+/// Index of the first steering channel, one per bin.
 pub const STEERING_AT: usize = STATE_CHANNELS * BINS.len();
 /// Index of the first rim channel.
-pub const RIM_AT: usize = STEERING_AT + 1;
+pub const RIM_AT: usize = STEERING_AT + BINS.len();
+/// Index of the first channel that compares displacement with velocity: ahead, left, up.
+pub const PATH_AT: usize = RIM_AT + WHEELS;
+/// Index of the first channel that compares the change of attitude with the angular velocity: roll, pitch, yaw.
+pub const TURN_AT: usize = PATH_AT + 3;
 /// Number of channels.
-pub const CHANNELS: usize = RIM_AT + WHEELS;
+pub const CHANNELS: usize = TURN_AT + 3;
 
 /// Deviations of one segment, measured minus predicted.
 pub type Row = [f64; CHANNELS];
@@ -22,22 +26,25 @@ pub type Row = [f64; CHANNELS];
 const STATE_NAMES: [&str; STATE_CHANNELS] =
     ["forward_m", "left_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "vx_m_s", "vy_m_s", "vz_m_s", "wx_rad_s", "wy_rad_s", "wz_rad_s"];
 const WHEEL_NAMES: [&str; WHEELS] = ["fl", "fr", "rl", "rr"];
+const BIN_NAMES: [&str; BINS.len()] = ["early", "late"];
 
-/// Name of a channel with its unit, for instance `late_pitch_rad` or `rim_rr_m_s`.
+/// Name of a channel with its unit, for instance `late_pitch_rad`, `rim_rr_m_s` or `turn_minus_gyro_yaw_rad`.
 pub fn name(channel: usize) -> String {
     match channel {
-        c if c < STEERING_AT => format!("{}_{}", ["early", "late"][c / STATE_CHANNELS], STATE_NAMES[c % STATE_CHANNELS]),
-        STEERING_AT => "road_wheel_angle_rad".into(),
-        c => format!("rim_{}_m_s", WHEEL_NAMES[c - RIM_AT]),
+        c if c < STEERING_AT => format!("{}_{}", BIN_NAMES[c / STATE_CHANNELS], STATE_NAMES[c % STATE_CHANNELS]),
+        c if c < RIM_AT => format!("{}_road_wheel_angle_rad", BIN_NAMES[c - STEERING_AT]),
+        c if c < PATH_AT => format!("rim_{}_m_s", WHEEL_NAMES[c - RIM_AT]),
+        c if c < TURN_AT => format!("path_minus_velocity_{}_m", ["ahead", "left", "up"][c - PATH_AT]),
+        c => format!("turn_minus_gyro_{}_rad", ["roll", "pitch", "yaw"][(c - TURN_AT).min(2)]),
     }
 }
 
-/// Residual layer of a channel: `kinematic`, `map`, `force` or `actuator`.
+/// Residual layer of a channel: `actuator`, `force`, `kinematic` or `map`.
 pub fn layer(channel: usize) -> &'static str {
     match channel {
+        c if c >= PATH_AT => "kinematic",
         c if c >= STEERING_AT => "actuator",
         c => match c % STATE_CHANNELS {
-            0 | 1 | 5 => "kinematic",
             2..=4 => "map",
             _ => "force",
         },
@@ -47,23 +54,13 @@ pub fn layer(channel: usize) -> &'static str {
 /// Which channels a drive measures; an estimated channel is not compared.
 pub fn available(measured: &MeasuredChannels) -> [bool; CHANNELS] {
     let w = measured.angular_velocity;
-    let state = [
-        measured.position,
-        measured.position,
-        measured.height,
-        measured.attitude,
-        measured.attitude,
-        measured.attitude,
-        measured.linear_velocity,
-        measured.linear_velocity,
-        measured.linear_velocity,
-        w[0],
-        w[1],
-        w[2],
-    ];
+    let (position, height, attitude, velocity) = (measured.position, measured.height, measured.attitude, measured.linear_velocity);
+    let state = [position, position, height, attitude, attitude, attitude, velocity, velocity, velocity, w[0], w[1], w[2]];
     core::array::from_fn(|c| match c {
         c if c < STEERING_AT => state[c % STATE_CHANNELS],
-        STEERING_AT => measured.road_wheel_angle,
-        _ => measured.wheel_speed && measured.linear_velocity,
+        c if c < RIM_AT => measured.road_wheel_angle,
+        c if c < PATH_AT => measured.wheel_speed && velocity,
+        c if c < TURN_AT => position && velocity && attitude && (height || c < PATH_AT + 2),
+        _ => attitude && w.iter().all(|w| *w),
     })
 }

@@ -1,20 +1,29 @@
 //! The whole diagnosis of a set: detect, select, refit, prove on drives that were not fitted.
 
 use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, paired_difference};
-use nesam_model::Predictor;
+use nesam_model::{ModelBundle, Predictor};
+use nesam_physics::SoilCorrection;
 use nesam_physics::effects::Layer;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
-use crate::candidates::Candidate;
+use crate::candidates::{Candidate, catalogue};
+use crate::channels::Row;
+use crate::claims::{Case, Estimate, Finding, Trace};
+use crate::condense::{best_soil, condense, signatures};
 use crate::error::DiscoveryError;
-use crate::expectation::{Expectation, mean, mean_signature};
-use crate::features::{FEATURES, Prepared, Stepping, prepare};
-use crate::fit::{Bench, Member};
+use crate::evidence::Nulls;
+use crate::fit::{Fit, Prepared};
 use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
-use crate::observe::observe_all;
-use crate::reference::Reference;
-use crate::select::{DECISIVE_BIC, Ranked, Selection, Yardstick, reselect, select};
+use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
+use crate::reference::{NullGroups, Reference};
+use crate::select::{Selection, Yardstick};
+
+/// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
+/// exact, but most of what is different must be explained before anything is claimed.
+const LEFT_MAX: f64 = 0.35;
+/// The same where every claimed effect is geometry, such as a steering ratio or a gyro bias.
+const LEFT_MAX_GEOMETRY: f64 = 0.15;
 
 /// What the command line says.
 #[derive(Clone, Debug)]
@@ -32,7 +41,7 @@ pub struct Options {
 pub enum Verdict {
     /// Nothing differs from the reference beyond chance.
     None,
-    /// One effect explains it and helps on drives that were not fitted.
+    /// One effect, or several together, explain it and help on drives that were not fitted.
     Explained,
     /// Several effects explain it about as well.
     Ambiguous,
@@ -52,30 +61,6 @@ impl Verdict {
     }
 }
 
-/// A parameter of a claimed effect.
-#[derive(Clone, Debug)]
-pub struct Estimate {
-    /// Name.
-    pub name: &'static str,
-    /// Unit.
-    pub unit: &'static str,
-    /// Value.
-    pub value: f64,
-    /// 95 % interval; `None` for a choice such as the wheel.
-    pub ci95: Option<[f64; 2]>,
-}
-
-/// Mean of one statistic over the set against drives without an effect.
-#[derive(Clone, Debug)]
-pub struct StatisticDeviation {
-    /// Index among [`crate::features::names`].
-    pub statistic: usize,
-    /// Difference from the centre of drives without an effect, in the unit of the statistic.
-    pub difference: f64,
-    /// The same in standard deviations of such a group without an effect.
-    pub significance: f64,
-}
-
 /// Everything that was found.
 #[derive(Debug)]
 pub struct Diagnosis {
@@ -83,12 +68,24 @@ pub struct Diagnosis {
     pub verdict: Verdict,
     /// Why, in one sentence.
     pub reason: String,
+    /// All hypotheses, in the order of the selection's evidence.
+    pub catalogue: Vec<Candidate>,
+    /// Channels that were compared, in the order of the selection's levels.
+    pub channels: Vec<usize>,
+    /// Mean deviation of each compared channel from its usual level, in its unit.
+    pub levels: Vec<f64>,
+    /// Course of the most unusual channel of each residual layer.
+    pub traces: Vec<Trace>,
+    /// The strongest hypothesis that was not chosen, where something was claimed: sized alone, as a control.
+    pub placebo: Option<Candidate>,
     /// Judgement on all fitted drives together.
     pub selection: Selection,
-    /// Parameters of the claimed effect.
+    /// Chosen effects, refused or not.
+    pub findings: Vec<Finding>,
+    /// Parameters of all claimed effects.
     pub estimates: Vec<Estimate>,
-    /// Share of sub-samples of drives that point at the claimed id.
-    pub stability: Option<f64>,
+    /// The claimed effects; empty when nothing is claimed.
+    pub claimed: Vec<nesam_physics::effects::ScheduledEffect>,
     /// Ids of fitted drives.
     pub fit_on: Vec<String>,
     /// Ids of scored drives.
@@ -97,12 +94,190 @@ pub struct Diagnosis {
     pub learned: Vec<Learned>,
     /// Scores; `None` when no drive is held out.
     pub scores: Option<HeldOut>,
-    /// Deviations by statistic.
-    pub statistics: Vec<StatisticDeviation>,
+}
+
+impl Diagnosis {
+    /// The claimed findings.
+    pub fn claims(&self) -> impl Iterator<Item = &Finding> {
+        let any = matches!(self.verdict, Verdict::Explained | Verdict::Ambiguous);
+        self.findings.iter().filter(move |f| any && f.refused.is_none())
+    }
 }
 
 /// Told how far a diagnosis is.
 pub type OnProgress<'a> = &'a (dyn Fn(&str, usize, usize) + Sync);
+
+/// What a diagnosis is made with: the reference of a bundle, read once.
+#[derive(Clone, Debug)]
+pub struct Judge {
+    reference: Reference,
+    nulls: Vec<crate::condense::Condensed>,
+}
+
+impl Judge {
+    /// From the reference that a bundle carries.
+    ///
+    /// # Errors
+    /// `DiscoveryError::Reference` without a usable reference.
+    pub fn of(bundle: &ModelBundle) -> Result<Self, DiscoveryError> {
+        let text = bundle.reference_json.as_deref().ok_or_else(|| DiscoveryError::Reference {
+            reason: format!(
+                "bundle {} carries none; make it with `nesam diagnose --make-reference --bundle DIR --data ROOT --set NAME --split train`",
+                bundle.name
+            ),
+        })?;
+        Ok(Self::new(Reference::from_json(text)?))
+    }
+
+    /// From a reference.
+    pub fn new(reference: Reference) -> Self {
+        let nulls = reference.condensed();
+        Self { reference, nulls }
+    }
+
+    /// The same without some drives of the reference: what a pseudo-vehicle made of them is judged by.
+    pub fn without(&self, ids: &[&str]) -> Self {
+        let mut reference = self.reference.clone();
+        reference.drives.retain(|d| !ids.contains(&d.trajectory.as_str()));
+        Self::new(reference)
+    }
+
+    /// Ids of the drives behind the reference.
+    pub fn drives(&self) -> Vec<String> {
+        self.reference.drives.iter().map(|d| d.trajectory.clone()).collect()
+    }
+
+    /// What `drives` drives are compared with.
+    ///
+    /// # Errors
+    /// `DiscoveryError::Reference` with fewer than four null drives.
+    pub fn yardstick(&self, channels: &[usize], drives: usize, without: &[String]) -> Result<Yardstick, DiscoveryError> {
+        let nulls = Nulls::new(&self.nulls.iter().collect::<Vec<_>>())
+            .ok_or_else(|| DiscoveryError::Reference { reason: "has too few drives".into() })?;
+        let catalogue = catalogue();
+        let groups = NullGroups::draw(&self.nulls, &catalogue, channels, drives);
+        let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
+        Ok(Yardstick { nulls, groups, channels: channels.to_vec(), catalogue, considered })
+    }
+
+    /// Compares observed drives with the reference.
+    ///
+    /// # Errors
+    /// As [`Reference::metric`].
+    pub fn case<'a>(&self, bench: Bench<'a>, observed: Vec<ObservedDrive>, progress: OnProgress<'_>) -> Result<Case<'a>, DiscoveryError> {
+        let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
+        let metric = self.reference.metric(&available)?;
+        let catalogue = catalogue();
+        let total = observed.len();
+        let rows: Vec<Vec<Row>> = observed.iter().map(|d| d.deviations(&bench, &[], &SoilCorrection::NONE)).collect();
+        let prepared = observed
+            .into_iter()
+            .zip(&rows)
+            .enumerate()
+            .map(|(done, (drive, rows))| {
+                progress("drives held against every effect", done, total);
+                let signatures = signatures(&bench, &drive, &catalogue);
+                let condensed = condense(&metric, rows, &signatures);
+                Prepared { drive, signatures, condensed }
+            })
+            .collect();
+        Ok(Case { bench, metric, prepared, rows })
+    }
+}
+
+/// A judgement without the proof on held-out drives.
+#[derive(Debug)]
+pub struct Judgement {
+    /// Selection on all fitted drives.
+    pub selection: Selection,
+    /// Findings, refused or not.
+    pub findings: Vec<Finding>,
+    /// Fit of all chosen effects together; `None` when nothing was chosen.
+    pub fit: Option<Fit>,
+    /// Verdict before the proof.
+    pub verdict: Verdict,
+    /// Why.
+    pub reason: String,
+}
+
+impl Judgement {
+    /// Positions in the findings of those that may be claimed.
+    pub fn claimed(&self) -> Vec<usize> {
+        let any = matches!(self.verdict, Verdict::Explained | Verdict::Ambiguous);
+        (0..self.findings.len()).filter(|i| any && self.findings[*i].refused.is_none()).collect()
+    }
+}
+
+/// Detects, selects and sizes, without the proof.
+pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
+    let (mut selection, onsets) = case.select(yardstick);
+    case.settle(yardstick, &mut selection, &onsets);
+    let mut left_out = Vec::new();
+    loop {
+        if selection.chosen.is_empty() {
+            let (verdict, reason) = nothing_chosen(&selection, &left_out);
+            return Judgement { selection, findings: left_out, fit: None, verdict, reason };
+        }
+        let group = yardstick.group(case.condensed());
+        let fit = case.size(yardstick, &group, &selection.chosen, &onsets);
+        let mut findings = case.findings(yardstick, &selection, &onsets, &fit);
+        // A further effect that may not be claimed is dropped and the others are sized again without it.
+        let dropped = findings.iter().rposition(|f| f.refused.is_some());
+        match dropped {
+            Some(i) if findings.len() > 1 => {
+                left_out.push(findings.remove(i));
+                selection.drop_chosen(yardstick, &group, i);
+                case.settle(yardstick, &mut selection, &onsets);
+            }
+            _ => {
+                let (verdict, reason) = provisional(&selection, &findings);
+                findings.extend(left_out);
+                return Judgement { selection, findings, fit: Some(fit), verdict, reason };
+            }
+        }
+    }
+}
+
+fn nothing_chosen(selection: &Selection, _left_out: &[Finding]) -> (Verdict, String) {
+    if selection.differs() {
+        let (z, what) = &selection.remaining;
+        return (
+            Verdict::Unexplained,
+            format!("the drives differ from the reference, most in {what} (z = {z:.1}), but no effect of the catalogue stands out"),
+        );
+    }
+    (Verdict::None, "nothing stands out from drives without an effect".into())
+}
+
+fn provisional(selection: &Selection, findings: &[Finding]) -> (Verdict, String) {
+    let first = &findings[0];
+    if let Some(refused) = &first.refused {
+        return (
+            Verdict::Unexplained,
+            format!("the drives differ from the reference, but {} cannot be claimed: {refused}", first.candidate.label()),
+        );
+    }
+    let (left, what) = &selection.remaining;
+    let share = left / selection.largest().max(1e-9);
+    let force = findings.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Soil));
+    if *left >= selection.threshold && share > if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY } {
+        return (
+            Verdict::Unexplained,
+            format!(
+                "{} explains too little: {what} still stands out with z = {left:.1} of {:.1}",
+                first.candidate.label(),
+                selection.largest()
+            ),
+        );
+    }
+    let named: Vec<String> = findings.iter().map(|f| f.candidate.label()).collect();
+    let rivals: Vec<String> = findings.iter().flat_map(|f| &f.rivals).map(|m| m.candidate.label()).collect();
+    if rivals.is_empty() {
+        (Verdict::Explained, format!("{} explains it", named.join(" with ")))
+    } else {
+        (Verdict::Ambiguous, format!("{} explains it, but {} would do about as well", named.join(" with "), rivals.join(" or ")))
+    }
+}
 
 /// Diagnoses a set with the reference that the predictor's bundle carries.
 ///
@@ -116,42 +291,30 @@ pub fn diagnose(
     progress: OnProgress<'_>,
 ) -> Result<Diagnosis, DiscoveryError> {
     let bundle = predictor.bundle();
-    let reference = bundle.reference_json.as_deref().ok_or_else(|| DiscoveryError::Reference {
-        reason: format!(
-            "bundle {} carries none; make it with `nesam diagnose --make-reference --bundle DIR --data ROOT --set NAME --split train`",
-            bundle.name
-        ),
-    })?;
-    let reference = Reference::from_json(reference)?;
+    let judge_by = Judge::of(bundle)?;
     let fit_at = fitted(drives, options)?;
     let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let total = fit_at.len();
     let observed = observe_all(predictor, &fit_drives, &fit_maps, &|done| progress("drives compared with the reference", done, total))?;
     let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
-    let scale = reference.segment_scale();
-    let prepared: Vec<Prepared> = observed.par_iter().map(|d| prepare(&scale, &bundle.vehicle, stepping, d)).collect();
-    let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
-    let usable = reference.usable(&available);
-    let yardstick = yardstick(&reference, &usable, total)?;
-    let bench = Bench { vehicle: &bundle.vehicle, stepping };
-    let members: Vec<Member<'_>> = observed.iter().zip(&prepared).collect();
+    let mut case = judge_by.case(Bench { vehicle: &bundle.vehicle, stepping }, observed, progress)?;
+    let channels = case.metric.channels.clone();
+    let yardstick = judge_by.yardstick(&channels, total, &options.without)?;
 
     progress("hypotheses", 0, 1);
-    let selection = select(&bench, &yardstick, &members, &options.without);
+    let judgement = judge(&mut case, &yardstick);
     let learned = match options.fit_on {
         Some(_) => {
-            let effects = selection.claimed().map(Ranked::effect).into_iter().collect();
-            vec![Learned { soil: selection.soil, effects }; drives.len() - total]
+            let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects()));
+            vec![Learned { soil: best_soil(case.condensed()), effects }; drives.len() - total]
         }
         None if total > 1 => {
-            let fewer = self::yardstick(&reference, &usable, total - 1)?;
-            leave_each_out(&fewer, &members, &selection, &options.without)
+            let fewer = judge_by.yardstick(&channels, total - 1, &options.without)?;
+            leave_each_out(&fewer, &case, &judgement)
         }
         None => Vec::new(),
     };
-    let estimates = selection.claimed().map_or_else(Vec::new, estimates);
-    let stability = selection.claimed().map(|best| stability(&yardstick.expectation, &members, &selection, best.candidate));
 
     let held_at: Vec<usize> = match options.fit_on {
         Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
@@ -161,19 +324,43 @@ pub fn diagnose(
     let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
-    let scores = if held.is_empty() { None } else { Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?) };
-    let (verdict, reason) = verdict(&selection, scores.as_ref());
+    let placebo = placebo(&case, &yardstick, &judgement);
+    let placebo_learned = placebo.as_ref().map(|(_, fit)| {
+        let of = |d: usize| if options.fit_on.is_some() { fit.effects() } else { fit.effects_without(d) };
+        (0..held.len()).map(|d| Learned { soil: SoilCorrection::NONE, effects: of(d) }).collect::<Vec<_>>()
+    });
+    let scores = if held.is_empty() {
+        None
+    } else {
+        Some(score_held_out(predictor, &held, &held_maps, &learned, placebo_learned.as_deref(), &options.scoring)?)
+    };
+    let (verdict, reason) = proven(&judgement, scores.as_ref());
+    let claimed = if matches!(verdict, Verdict::Explained | Verdict::Ambiguous) {
+        judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects()))
+    } else {
+        Vec::new()
+    };
+    let estimates = if claimed.is_empty() {
+        Vec::new()
+    } else {
+        judgement.claimed().iter().flat_map(|i| judgement.findings[*i].estimates.clone()).collect()
+    };
     Ok(Diagnosis {
         verdict,
         reason,
+        traces: case.traces(&judgement.selection, &claimed),
+        placebo: placebo.map(|(candidate, _)| candidate),
+        levels: levels(&case),
+        catalogue: yardstick.catalogue,
+        channels,
+        findings: judgement.findings,
+        selection: judgement.selection,
         estimates,
-        stability,
+        claimed,
         fit_on: fit_drives.iter().map(|d| d.id.clone()).collect(),
         held_out: held.iter().map(|d| d.id.clone()).collect(),
         learned,
         scores,
-        statistics: deviations(&yardstick.expectation, &prepared),
-        selection,
     })
 }
 
@@ -191,109 +378,74 @@ fn fitted(drives: &[Trajectory], options: &Options) -> Result<Vec<usize>, Discov
         .collect()
 }
 
-fn yardstick(reference: &Reference, usable: &[bool; FEATURES], drives: usize) -> Result<Yardstick, DiscoveryError> {
-    let expectation = reference
-        .expectation(usable, drives)
-        .ok_or_else(|| DiscoveryError::Reference { reason: "has no statistic that is measured in this set".into() })?;
-    Ok(Yardstick { expectation, nulls: reference.null_groups(usable, drives) })
+/// The fitted effects that are claimed.
+fn keep<T: Clone>(judgement: &Judgement, effects: Vec<T>) -> Vec<T> {
+    judgement.claimed().iter().filter_map(|i| effects.get(*i).cloned()).collect()
 }
 
-/// What each drive is predicted with: learned without it.
-fn leave_each_out(yardstick: &Yardstick, members: &[Member<'_>], selection: &Selection, without: &[String]) -> Vec<Learned> {
-    (0..members.len())
+/// What each drive is predicted with: learned without it. Detection and choice follow from the other drives alone, the size from one step of the whole fit.
+fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement) -> Vec<Learned> {
+    (0..case.prepared.len())
         .map(|left_out| {
-            let kept: Vec<usize> = (0..members.len()).filter(|d| *d != left_out).collect();
-            let (soil, effect) = reselect(yardstick, members, &kept, selection, without);
-            Learned { soil, effects: effect.into_iter().collect() }
-        })
-        .collect()
-}
-
-/// How wrong the predicted response to an effect may be as a whole, as a share of it: two accepted pressure laws give drawbar pulls that differ by a
-/// quarter at the same slip, while the angle of a road wheel is geometry (chosen).
-fn scale_sd(layer: Layer) -> f64 {
-    match layer {
-        Layer::Force | Layer::Soil => 0.25,
-        Layer::Actuator | Layer::Sensor | Layer::Map => 0.02,
-    }
-}
-
-fn estimates(best: &Ranked) -> Vec<Estimate> {
-    let (fit, free) = (&best.fit, best.candidate.free());
-    best.candidate
-        .effect(&fit.values)
-        .parameters()
-        .iter()
-        .enumerate()
-        .map(|(p, parameter)| {
-            let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
-                // The first value is the magnitude, which answers for the scale of the response.
-                let scale = if i == 0 { 1.96 * scale_sd(best.effect().layer()) * fit.values[i] } else { 0.0 };
-                let half = fit.half_width(i, best.inflation).hypot(scale);
-                [fit.values[i] - half, fit.values[i] + half]
+            let others = || (0..case.prepared.len()).filter(|d| *d != left_out).map(|d| &case.prepared[d].condensed);
+            let soil = best_soil(others());
+            let chosen = yardstick.select(&yardstick.group(others())).chosen;
+            let effects = judgement.fit.as_ref().map_or_else(Vec::new, |fit| {
+                let without = fit.effects_without(left_out);
+                judgement
+                    .claimed()
+                    .iter()
+                    .filter(|i| chosen.contains(&judgement.findings[**i].hypothesis))
+                    .filter_map(|i| without.get(*i).copied())
+                    .collect()
             });
-            Estimate { name: parameter.name, unit: parameter.unit, value: parameter.value, ci95 }
+            Learned { soil, effects }
         })
         .collect()
 }
 
-/// Share of half-samples of the drives whose strongest evidence is for the id of `candidate`.
-fn stability(expectation: &Expectation, members: &[Member<'_>], selection: &Selection, candidate: Candidate) -> f64 {
-    let n = members.len().min(12);
-    let half = n.div_ceil(2);
-    let (mut hits, mut count) = (0usize, 0usize);
-    for subset in (0u32..1 << n).filter(|s| s.count_ones() as usize == half) {
-        let chosen: Vec<&Prepared> = (0..n).filter(|i| subset & (1 << i) != 0).map(|i| members[i].1).collect();
-        let statistics = mean(chosen.iter().map(|p| &p.statistics));
-        let z = expectation.strength(&statistics, &mean_signature(chosen.iter().map(|p| &p.signature))).z;
-        let best = (0..z.len()).filter(|e| selection.z[*e].is_some()).max_by(|&a, &b| z[a].total_cmp(&z[b]));
-        hits += usize::from(best.is_some_and(|e| Candidate::ALL[e].id() == candidate.id()));
-        count += 1;
+/// The strongest hypothesis that is neither chosen nor a rival nor of a chosen id, sized alone; `None` when nothing is claimed.
+fn placebo(case: &Case<'_>, yardstick: &Yardstick, judgement: &Judgement) -> Option<(Candidate, Fit)> {
+    let claimed = judgement.claimed();
+    let named: Vec<&str> = claimed
+        .iter()
+        .flat_map(|i| {
+            let f = &judgement.findings[*i];
+            f.rivals.iter().map(|r| r.candidate.id()).chain([f.candidate.id()])
+        })
+        .collect();
+    if named.is_empty() {
+        return None;
     }
-    hits as f64 / count.max(1) as f64
+    let z = &judgement.selection.z;
+    let open = (0..z.len()).filter(|h| z[*h].is_some() && !named.contains(&yardstick.catalogue[*h].id()));
+    let strongest = open.max_by(|a, b| z[*a].unwrap_or(0.0).total_cmp(&z[*b].unwrap_or(0.0)))?;
+    let group = yardstick.group(case.condensed());
+    let onsets = vec![None; yardstick.catalogue.len()];
+    Some((yardstick.catalogue[strongest], case.size(yardstick, &group, &[strongest], &onsets)))
 }
 
-fn verdict(selection: &Selection, scores: Option<&HeldOut>) -> (Verdict, String) {
-    if !selection.differs() {
-        return (Verdict::None, "no hypothesis stands out from drives without an effect".into());
-    }
-    if !selection.detected() {
-        let [distance, usual] = selection.distance;
-        return (
-            Verdict::Unexplained,
-            format!(
-                "the drives differ from the reference ({distance:.1} per statistic, usual up to {usual:.1}), but no effect of the catalogue stands out"
-            ),
-        );
-    }
-    if selection.soil_explains() {
-        return (Verdict::None, "another soil explains the drives better than any effect".into());
-    }
-    let best = &selection.ranked[0];
-    if let Some(refused) = &best.refused {
-        return (
-            Verdict::Unexplained,
-            format!("the drives differ from the reference, but {} cannot be claimed: {refused}", best.candidate.label()),
-        );
-    }
-    if let Some(scores) = scores {
-        if let Some(reason) = not_proven(scores) {
-            return (Verdict::Unexplained, format!("{} fits, but {reason}", best.candidate.label()));
-        }
-    }
-    let rival = selection.ranked.iter().skip(1).find(|r| r.candidate.id() != best.candidate.id() && r.bic - best.bic < DECISIVE_BIC);
-    match rival {
-        Some(rival) => (Verdict::Ambiguous, format!("{} and {} explain it about as well", best.candidate.label(), rival.candidate.label())),
-        None => (Verdict::Explained, format!("{} explains it and helps on drives that were not fitted", best.candidate.label())),
+/// Verdict after the proof on held-out drives.
+fn proven(judgement: &Judgement, scores: Option<&HeldOut>) -> (Verdict, String) {
+    let Some(scores) = scores.filter(|_| !judgement.claimed().is_empty()) else {
+        return (judgement.verdict, judgement.reason.clone());
+    };
+    let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
+    // A wrong sensor shows in the sensors; whether predictions from it get better is another question.
+    let must_help = claimed.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Actuator | Layer::Soil));
+    match not_proven(scores, must_help) {
+        Some(reason) => (Verdict::Unexplained, format!("{} fits, but {reason}", claimed[0].candidate.label())),
+        None if must_help => (judgement.verdict, format!("{}; it helps on drives that were not fitted", judgement.reason)),
+        None => (judgement.verdict, judgement.reason.clone()),
     }
 }
 
-/// Why the proof on held-out drives fails: nothing improves surely, or something worsens surely by more than 2 %.
-fn not_proven(scores: &HeldOut) -> Option<String> {
+/// Why the proof on held-out drives fails: nothing improves surely where it must, or something worsens surely by more than 2 %.
+fn not_proven(scores: &HeldOut, must_help: bool) -> Option<String> {
     let [before, soil, after] = &scores.scores;
     for against in [soil, before] {
         let (_, interval) = paired_difference(&against.errors, &after.errors, &scores.resamples);
-        if !interval.row(false).iter().flatten().any(|[low, _]| *low > 0.0) {
+        if must_help && !interval.row(false).iter().flatten().any(|[low, _]| *low > 0.0) {
             return Some("no error falls surely on drives that were not fitted".into());
         }
     }
@@ -308,13 +460,9 @@ fn not_proven(scores: &HeldOut) -> Option<String> {
     })
 }
 
-fn deviations(expectation: &Expectation, prepared: &[Prepared]) -> Vec<StatisticDeviation> {
-    let statistics = mean(prepared.iter().map(|p| &p.statistics));
-    let (difference, significance) = (expectation.deviation(&statistics), expectation.significance(&statistics));
-    let of = |(i, statistic): (usize, &usize)| StatisticDeviation {
-        statistic: *statistic,
-        difference: difference[i],
-        significance: significance[i],
-    };
-    expectation.used().iter().enumerate().map(of).collect()
+/// Mean deviation of each compared channel from its usual level over all segments.
+fn levels(case: &Case<'_>) -> Vec<f64> {
+    let count = case.rows.iter().map(Vec::len).sum::<usize>().max(1) as f64;
+    let mean = |c: usize| case.rows.par_iter().flatten().map(|r| r[c]).sum::<f64>() / count;
+    case.metric.channels.iter().enumerate().map(|(i, c)| mean(*c) - case.metric.centre[i]).collect()
 }

@@ -1,231 +1,185 @@
-//! The size of an effect: generalised least squares on the mean statistics of a group of drives, by Gauss-Newton through the physics.
+//! The size of effects: generalised least squares on the deviations of a group of drives, by Gauss-Newton through the physics, jointly with the soil of
+//! each drive.
 
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
-use nesam_physics::{SOIL_DIM, SoilCorrection, Vehicle};
+use nalgebra::{DMatrix, DVector};
+use nesam_physics::SoilCorrection;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::channels::{RIM_AT, STEERING_AT};
-use crate::expectation::{Expectation, mean};
-use crate::features::{FEATURES, Prepared, SOIL_SD, Stepping};
-use crate::observe::ObservedDrive;
+use crate::condense::{Condensed, Signatures, difference, profiled};
+use crate::metric::Metric;
+use crate::observe::{Bench, ObservedDrive};
+use nesam_physics::effects::ScheduledEffect;
 
 const ITERATIONS: usize = 5;
-/// Steps below this share of a posterior standard deviation end the iteration.
+/// Steps below this share of a standard deviation end the iteration.
 const CONVERGED: f64 = 0.05;
 
-/// How wrong the predicted shift of a statistic may be, as a share of the observed shift (chosen): the angle of a measured road wheel follows from
-/// the card, a rim under drag from the slope of traction, which is known to a factor.
-fn disbelief(statistic: usize) -> f64 {
-    match statistic {
-        f if f < STEERING_AT => 0.1,
-        STEERING_AT => 0.02,
-        f if (RIM_AT..RIM_AT + 4).contains(&f) => 0.5,
-        _ => 0.15,
-    }
+/// A drive with everything that does not depend on which drives it is judged with.
+#[derive(Clone, Debug)]
+pub struct Prepared {
+    /// The drive.
+    pub drive: ObservedDrive,
+    /// How columns shift its deviations.
+    pub signatures: Signatures,
+    /// What it says.
+    pub condensed: Condensed,
 }
 
-/// What a fit needs besides drives.
-#[derive(Clone, Copy, Debug)]
-pub struct Bench<'a> {
-    /// Vehicle of the reference.
-    pub vehicle: &'a Vehicle,
-    /// Physics.
-    pub stepping: Stepping,
+/// A hypothesis with the time from which it acts.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Term {
+    /// The hypothesis.
+    pub candidate: Candidate,
+    /// When it begins, s; 0 = always there.
+    pub onset_s: f64,
 }
 
-/// A drive to fit.
-pub type Member<'a> = (&'a ObservedDrive, &'a Prepared);
-
-/// The weight of each statistic for one group of drives: the scatter of such groups without an effect, and how far predicted shifts are believed.
-#[derive(Debug)]
-pub struct Weighing<'a> {
-    expectation: &'a Expectation,
-    weight: Cholesky<f64, Dyn>,
-    /// Squared distance of the group without an effect.
-    pub misfit: f64,
-}
-
-/// A fitted hypothesis.
+/// Fitted effects.
 #[derive(Clone, Debug)]
 pub struct Fit {
-    candidate: Candidate,
-    /// Values of the free parameters.
-    pub values: Vec<f64>,
-    /// Posterior standard deviations.
-    pub sd: Vec<f64>,
-    /// Values that one step gives when each drive in turn is left out.
-    pub jackknife: Vec<Vec<f64>>,
+    /// What was fitted.
+    pub terms: Vec<Term>,
+    /// Values of the free parameters of each term.
+    pub values: Vec<Vec<f64>>,
+    /// Posterior standard deviations in the metric.
+    pub sd: Vec<Vec<f64>>,
     /// Whether the physical range holds a parameter.
-    pub held: Vec<bool>,
-    /// Squared distance that is left, prior included.
-    pub misfit: f64,
-    at: Linearised,
-}
-
-/// A soil correction common to all drives that explains them best without an effect.
-#[derive(Clone, Copy, Debug)]
-pub struct SoilFit {
-    /// The correction.
-    pub correction: SoilCorrection,
-    /// Squared distance that is left, prior included.
-    pub misfit: f64,
-}
-
-/// Statistics of each drive at the fitted values, and their derivatives.
-#[derive(Clone, Debug)]
-struct Linearised {
-    statistics: Vec<DVector<f64>>,
-    slopes: Vec<DMatrix<f64>>,
-}
-
-/// A Gauss-Newton step: where it leads, its covariance, and the squared distance that the linearisation promises there.
-struct Step {
-    values: Vec<f64>,
-    covariance: DMatrix<f64>,
-    misfit: f64,
-}
-
-impl<'a> Weighing<'a> {
-    /// For the drives whose statistics are given.
-    pub fn new<'s>(expectation: &'a Expectation, group: impl ExactSizeIterator<Item = &'s DVector<f64>>) -> Self {
-        let observed = expectation.deviation(&mean(group));
-        let doubt = DVector::from_fn(observed.len(), |i, _| (disbelief(expectation.used()[i]) * observed[i]).powi(2));
-        let weight = expectation.weight(Some(&doubt));
-        let misfit = observed.dot(&weight.solve(&observed));
-        Self { expectation, weight, misfit }
-    }
-
-    fn distance(&self, statistics: &DVector<f64>) -> f64 {
-        let residual = self.expectation.deviation(statistics);
-        residual.dot(&self.weight.solve(&residual))
-    }
-
-    /// One step from `values`, on the drives in `kept`; `priors` are mean and standard deviation of each value.
-    fn step(&self, at: &Linearised, kept: &[usize], values: &[f64], priors: &[[f64; 2]]) -> Step {
-        let residual = self.expectation.deviation(&mean(kept.iter().map(|&d| &at.statistics[d])));
-        let all = DMatrix::zeros(FEATURES, values.len());
-        let slope = kept.iter().fold(all, |sum, &d| sum + &at.slopes[d]) / kept.len().max(1) as f64;
-        let slope = slope.select_rows(self.expectation.used());
-        let mut information = slope.tr_mul(&self.weight.solve(&slope));
-        let mut score = -slope.tr_mul(&self.weight.solve(&residual));
-        for (i, [centre, sd]) in priors.iter().enumerate() {
-            information[(i, i)] += sd.powi(-2);
-            score[i] += (centre - values[i]) * sd.powi(-2);
-        }
-        let covariance = information.cholesky().map_or_else(|| DMatrix::zeros(values.len(), values.len()), |c| c.inverse());
-        let moved = &covariance * score;
-        let left = residual + slope * &moved;
-        let values: Vec<f64> = values.iter().zip(moved.iter()).map(|(v, m)| v + m).collect();
-        Step { misfit: left.dot(&self.weight.solve(&left)) + prior_misfit(priors, &values), values, covariance }
-    }
-
-    /// The best soil: one step with the derivatives at the nominal soil, which is where the prior keeps it.
-    pub fn fit_soil(&self, members: &[Member<'_>]) -> SoilFit {
-        let at = Linearised {
-            statistics: members.iter().map(|(_, p)| p.statistics.clone()).collect(),
-            slopes: members.iter().map(|(_, p)| -p.soil.transpose()).collect(),
-        };
-        let kept: Vec<usize> = (0..members.len()).collect();
-        let step = self.step(&at, &kept, &[0.0; SOIL_DIM], &[[0.0, 1.0]; SOIL_DIM]);
-        let mut correction = SoilCorrection::NONE;
-        correction.delta = core::array::from_fn(|i| SOIL_SD[i] * step.values[i]);
-        SoilFit { correction, misfit: step.misfit }
-    }
-
-    /// The size of a hypothesis by Gauss-Newton from a start.
-    pub fn fit(&self, bench: &Bench<'_>, members: &[Member<'_>], candidate: Candidate, start: Vec<f64>) -> Fit {
-        let priors = priors(candidate);
-        let all: Vec<usize> = (0..members.len()).collect();
-        let mut values = start;
-        let mut held = candidate.clamp(&mut values);
-        let mut at = linearised(bench, members, candidate, &values);
-        let mut misfit = self.distance(&mean(at.statistics.iter())) + prior_misfit(&priors, &values);
-        for _ in 0..ITERATIONS {
-            let step = self.step(&at, &all, &values, &priors);
-            let mut share = 1.0;
-            let mut moved = 0.0f64;
-            while share > 0.1 && moved == 0.0 {
-                let mut trial: Vec<f64> = values.iter().zip(&step.values).map(|(v, t)| v + share * (t - v)).collect();
-                let trial_held = candidate.clamp(&mut trial);
-                let statistics: Vec<DVector<f64>> = members.par_iter().map(|m| statistics(bench, *m, candidate, &trial)).collect();
-                let trial_misfit = self.distance(&mean(statistics.iter())) + prior_misfit(&priors, &trial);
-                if trial_misfit < misfit {
-                    let sd = |i: usize| step.covariance[(i, i)].sqrt().max(1e-12);
-                    moved = (0..trial.len()).map(|i| (trial[i] - values[i]).abs() / sd(i)).fold(1e-9, f64::max);
-                    (values, held, misfit) = (trial, trial_held, trial_misfit);
-                    at.statistics = statistics;
-                }
-                share *= 0.4;
-            }
-            if moved < CONVERGED {
-                break;
-            }
-            at = linearised(bench, members, candidate, &values);
-        }
-        let covariance = self.step(&at, &all, &values, &priors).covariance;
-        let others = |d: &usize| -> Vec<usize> { all.iter().copied().filter(|i| i != d).collect() };
-        let jackknife =
-            if all.len() > 1 { all.iter().map(|d| self.step(&at, &others(d), &values, &priors).values).collect() } else { Vec::new() };
-        let sd = (0..values.len()).map(|i| covariance[(i, i)].sqrt()).collect();
-        Fit { candidate, values, sd, jackknife, held, misfit, at }
-    }
-
-    /// Values and squared distance of a fitted hypothesis on a part of its drives: one step from the whole fit's linearisation.
-    pub fn refit(&self, fit: &Fit, kept: &[usize]) -> (Vec<f64>, f64) {
-        let mut step = self.step(&fit.at, kept, &fit.values, &priors(fit.candidate));
-        fit.candidate.clamp(&mut step.values);
-        (step.values, step.misfit)
-    }
-}
-
-fn priors(candidate: Candidate) -> Vec<[f64; 2]> {
-    candidate.free().iter().map(|f| [f.mean, f.sd]).collect()
-}
-
-fn prior_misfit(priors: &[[f64; 2]], values: &[f64]) -> f64 {
-    priors.iter().zip(values).map(|([centre, sd], v)| ((v - centre) / sd).powi(2)).sum()
-}
-
-fn statistics(bench: &Bench<'_>, (drive, prepared): Member<'_>, candidate: Candidate, values: &[f64]) -> DVector<f64> {
-    let vehicle = bench.vehicle.with_effects(&[candidate.effect(values)]);
-    prepared.of(&drive.deviations(&bench.stepping.model(&vehicle), &SoilCorrection::NONE))
-}
-
-fn linearised(bench: &Bench<'_>, members: &[Member<'_>], candidate: Candidate, values: &[f64]) -> Linearised {
-    let free = candidate.free();
-    let (statistics, slopes) = members
-        .par_iter()
-        .map(|member| {
-            let mut slope = DMatrix::zeros(FEATURES, free.len());
-            for (i, f) in free.iter().enumerate() {
-                let at = |sign: f64| {
-                    let mut moved = values.to_vec();
-                    moved[i] += sign * f.step;
-                    statistics(bench, *member, candidate, &moved)
-                };
-                slope.set_column(i, &((at(1.0) - at(-1.0)) / (2.0 * f.step)));
-            }
-            (statistics(bench, *member, candidate, values), slope)
-        })
-        .unzip();
-    Linearised { statistics, slopes }
+    pub held: Vec<Vec<bool>>,
+    /// Values that one step gives when each drive in turn is left out.
+    pub jackknife: Vec<Vec<Vec<f64>>>,
 }
 
 impl Fit {
-    /// Half width of the 95 % interval of a value: the wider of the posterior's and the jackknife's over drives, both with Student's t.
-    pub fn half_width(&self, i: usize, inflation: f64) -> f64 {
-        const T_975: [f64; 10] = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23];
-        /// Student's t for the thirty drives behind a covariance.
-        const T_NULLS: f64 = 2.05;
-        let posterior = T_NULLS * self.sd[i] * inflation;
+    /// The effects with their fitted parameters.
+    pub fn effects(&self) -> Vec<ScheduledEffect> {
+        timed(&self.terms, &self.values)
+    }
+
+    /// The effects that one step without a drive gives.
+    pub fn effects_without(&self, drive: usize) -> Vec<ScheduledEffect> {
+        let values = self.jackknife.get(drive).unwrap_or(&self.values);
+        let mut values = values.clone();
+        for (term, values) in self.terms.iter().zip(&mut values) {
+            term.candidate.clamp(values);
+        }
+        timed(&self.terms, &values)
+    }
+
+    /// Standard deviation of a value over drives, by the jackknife; `None` with fewer than three drives.
+    pub fn jackknife_sd(&self, term: usize, i: usize) -> Option<f64> {
         let n = self.jackknife.len();
         if n < 3 {
-            return posterior;
+            return None;
         }
-        let mean = self.jackknife.iter().map(|v| v[i]).sum::<f64>() / n as f64;
-        let square = self.jackknife.iter().map(|v| (v[i] - mean).powi(2)).sum::<f64>();
-        let t = T_975.get(n - 2).copied().unwrap_or(2.1);
-        posterior.max(t * (square * (n - 1) as f64 / n as f64).sqrt())
+        let mean = self.jackknife.iter().map(|v| v[term][i]).sum::<f64>() / n as f64;
+        let square = self.jackknife.iter().map(|v| (v[term][i] - mean).powi(2)).sum::<f64>();
+        Some((square * (n - 1) as f64 / n as f64).sqrt())
     }
+}
+
+fn timed(terms: &[Term], values: &[Vec<f64>]) -> Vec<ScheduledEffect> {
+    terms.iter().zip(values).map(|(t, v)| ScheduledEffect { effect: t.candidate.effect(v), onset_s: t.onset_s }).collect()
+}
+
+/// Fits terms from starting values. `offset` is the share of each parameter that drives without an effect show, in the unit of the parameter.
+pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], start: Vec<Vec<f64>>, offset: &[f64]) -> Fit {
+    let mut values = start;
+    let mut held = clamp(terms, &mut values);
+    let mut at = linearised(bench, metric, drives, terms, &values);
+    let all: Vec<usize> = (0..drives.len()).collect();
+    let mut covariance = DMatrix::zeros(0, 0);
+    for _ in 0..ITERATIONS {
+        let (moved, spread) = step(terms, &at, &all, &values, &vec![0.0; offset.len()]);
+        covariance = spread;
+        let before = flat(&values);
+        values = shaped(terms, &moved);
+        held = clamp(terms, &mut values);
+        let largest = flat(&values)
+            .iter()
+            .zip(&before)
+            .enumerate()
+            .map(|(i, (a, b))| (a - b).abs() / covariance[(i, i)].sqrt().max(1e-12))
+            .fold(0.0, f64::max);
+        at = linearised(bench, metric, drives, terms, &values);
+        if largest < CONVERGED {
+            break;
+        }
+    }
+    let others = |d: usize| -> Vec<usize> { all.iter().copied().filter(|i| *i != d).collect() };
+    let jackknife = if all.len() > 1 {
+        all.iter().map(|d| shaped(terms, &step(terms, &at, &others(*d), &values, offset).0)).collect()
+    } else {
+        Vec::new()
+    };
+    let sd = shaped(terms, &(0..covariance.nrows()).map(|i| covariance[(i, i)].sqrt()).collect::<Vec<_>>());
+    let centred: Vec<f64> = flat(&values).iter().zip(offset).map(|(v, o)| v - o).collect();
+    let mut values = shaped(terms, &centred);
+    for (held, now) in held.iter_mut().flatten().zip(clamp(terms, &mut values).into_iter().flatten()) {
+        *held |= now;
+    }
+    Fit { terms: terms.to_vec(), values, sd, held, jackknife }
+}
+
+/// Score and information of each drive in the free parameters, soil profiled out.
+fn linearised(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], values: &[Vec<f64>]) -> Vec<Condensed> {
+    drives
+        .par_iter()
+        .map(|prepared| {
+            let at = |values: &[Vec<f64>]| prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
+            let mut columns = Vec::new();
+            for (t, term) in terms.iter().enumerate() {
+                for (i, f) in term.candidate.free().iter().enumerate() {
+                    let side = |sign: f64| {
+                        let mut moved = values.to_vec();
+                        moved[t][i] += sign * f.step;
+                        at(&moved)
+                    };
+                    // A parameter that cannot be negative, such as a delay, is differentiated forward at zero.
+                    let low = term.candidate.range(i)[0];
+                    let (less, factor) = if values[t][i] - f.step < low { (at(values), 1.0 / f.step) } else { (side(-1.0), 0.5 / f.step) };
+                    columns.push(difference(&less, &side(1.0), factor));
+                }
+            }
+            profiled(metric, &at(values), &columns, &prepared.signatures.soil)
+        })
+        .collect()
+}
+
+/// A step from `values` on the drives in `kept`: where it leads, less `offset`, and its covariance in the metric.
+fn step(terms: &[Term], at: &[Condensed], kept: &[usize], values: &[Vec<f64>], offset: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
+    let values = flat(values);
+    let size = values.len();
+    let (mut information, mut score) = (DMatrix::zeros(size, size), DVector::zeros(size));
+    for d in kept {
+        information += &at[*d].information;
+        score += &at[*d].score;
+    }
+    for (i, f) in terms.iter().flat_map(|t| t.candidate.free()).enumerate() {
+        information[(i, i)] += f.sd.powi(-2);
+        score[i] += (f.mean - values[i]) * f.sd.powi(-2);
+    }
+    let covariance = information.cholesky().map_or_else(|| DMatrix::zeros(size, size), |c| c.inverse());
+    let moved = &covariance * score;
+    (values.iter().zip(moved.iter()).zip(offset).map(|((v, m), o)| v + m - o).collect(), covariance)
+}
+
+fn clamp(terms: &[Term], values: &mut [Vec<f64>]) -> Vec<Vec<bool>> {
+    terms.iter().zip(values).map(|(term, values)| term.candidate.clamp(values)).collect()
+}
+
+fn flat(values: &[Vec<f64>]) -> Vec<f64> {
+    values.iter().flatten().copied().collect()
+}
+
+fn shaped(terms: &[Term], flat: &[f64]) -> Vec<Vec<f64>> {
+    let mut rest = flat;
+    terms
+        .iter()
+        .map(|t| {
+            let (own, others) = rest.split_at(t.candidate.free().len());
+            rest = others;
+            own.to_vec()
+        })
+        .collect()
 }

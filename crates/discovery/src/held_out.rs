@@ -1,13 +1,14 @@
 //! Proof on drives that were not fitted: full rollouts of the bundle before, with the best soil alone, and with the effect.
 
 use nesam_evaluation::{
-    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, all_windows, roll_out, score,
+    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, Window, all_windows, roll_out, score,
 };
 use nesam_model::{Predictor, Variant};
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::Effect;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
+
+use nesam_physics::effects::ScheduledEffect;
 
 /// What was learned without a drive, for that drive.
 #[derive(Clone, Debug)]
@@ -15,7 +16,7 @@ pub struct Learned {
     /// Best soil correction without an effect.
     pub soil: SoilCorrection,
     /// Effects claimed; empty when nothing was.
-    pub effects: Vec<Effect>,
+    pub effects: Vec<ScheduledEffect>,
 }
 
 /// Scores on the held-out drives.
@@ -23,6 +24,10 @@ pub struct Learned {
 pub struct HeldOut {
     /// Before, soil only, after.
     pub scores: [ModelScore; 3],
+    /// With the strongest hypothesis that was not chosen, sized alone on the same drives.
+    pub placebo: Option<ModelScore>,
+    /// Before and after on the windows that end before every claimed effect begins; `None` where none does.
+    pub before_onset: Option<[ModelScore; 2]>,
     /// Draws behind the intervals.
     pub resamples: Resamples,
 }
@@ -40,7 +45,7 @@ pub struct Scoring {
     pub seed: u64,
 }
 
-/// Rolls every window of the held-out drives out three times. `learned[i]` belongs to `drives[i]`.
+/// Rolls every window of the held-out drives out before, with the best soil, after, and with what the placebo taught. `learned[i]` belongs to `drives[i]`.
 ///
 /// # Errors
 /// `EvaluationError::NoWindows` when no window fits; the first error of the model.
@@ -49,26 +54,43 @@ pub fn score_held_out(
     drives: &[Trajectory],
     maps: &DriveMaps,
     learned: &[Learned],
+    placebo: Option<&[Learned]>,
     scoring: &Scoring,
 ) -> Result<HeldOut, EvaluationError> {
     let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
-    let patched: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
-    let paths: Vec<[PosePath; 3]> = windows
+    let patched = |learned: &[Learned]| learned.iter().map(|l| predictor.with_effects(&l.effects)).collect::<Vec<Predictor>>();
+    let (after, placebos) = (patched(learned), placebo.map(patched));
+    let paths: Vec<[PosePath; 4]> = windows
         .par_iter()
         .map(|w| {
             let map = maps[w.drive].as_ref();
             let with = |predictor: &Predictor, soil| roll_out(predictor, Variant::Full, soil, w, None, map);
             let before = with(predictor, SoilCorrection::NONE)?;
             let soil = with(predictor, learned[w.drive].soil)?;
-            let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&patched[w.drive], SoilCorrection::NONE)? };
-            Ok([before, soil, after])
+            let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&after[w.drive], SoilCorrection::NONE)? };
+            let placebo = placebos.as_ref().map_or_else(|| Ok(before.clone()), |p| with(&p[w.drive], SoilCorrection::NONE))?;
+            Ok([before, soil, after, placebo])
         })
         .collect::<Result<_, EvaluationError>>()?;
     let resamples = Resamples::draw(drives.len(), scoring.resamples, scoring.seed);
-    let scores = core::array::from_fn(|m| {
-        let paths = paths.iter().map(|p| p[m].clone()).collect();
+    let of = |m: usize, chosen: &[usize]| {
+        let windows: Vec<Window<'_>> = chosen.iter().map(|w| windows[*w]).collect();
+        let paths = chosen.iter().map(|w| paths[*w][m].clone()).collect();
         let model = ModelPaths { name: ModelName::Nesam, parameters: predictor.bundle().parameters, paths };
         score(&model, &windows, Truth::Measured, &resamples)
-    });
-    Ok(HeldOut { scores, resamples })
+    };
+    let all: Vec<usize> = (0..windows.len()).collect();
+    let early: Vec<usize> = all.iter().copied().filter(|w| ends_before_onset(&windows[*w], &learned[windows[*w].drive])).collect();
+    Ok(HeldOut {
+        scores: core::array::from_fn(|m| of(m, &all)),
+        placebo: placebo.map(|_| of(3, &all)),
+        before_onset: (!early.is_empty()).then(|| [of(0, &early), of(2, &early)]),
+        resamples,
+    })
+}
+
+/// Whether a window ends before any of the learned effects begins.
+fn ends_before_onset(window: &Window<'_>, learned: &Learned) -> bool {
+    let end_s = window.since_log_start_s() + window.horizon as f64 * window.trajectory.dt_s;
+    !learned.effects.is_empty() && learned.effects.iter().all(|e| e.onset_s > end_s)
 }

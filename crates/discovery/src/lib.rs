@@ -4,35 +4,43 @@
 //! core alone is further off than most effects are large. The steps are
 //!
 //! 1. [`observe_all`] cuts measured drives into short segments and says what the bundle's physics predicts there ([`channels`] by residual layer);
-//! 2. [`features`] condenses a drive into robust statistics; the drive is the unit of replication;
-//! 3. [`Reference`] is what such statistics usually are, measured on drives that training never saw, with null groups for honest thresholds;
-//! 4. [`expectation`] scores every hypothesis ([`Candidate`]) against the scatter of null drives, which contains soil, roughness and model error;
-//! 5. [`fit`] estimates the size of the strongest, and of another soil, by Gauss-Newton; [`select`] ranks them and refuses what lies at a bound or
-//!    explains too little;
-//! 6. [`held_out`] predicts drives that were not fitted before, with the best soil alone, and with the effect;
-//! 7. [`diagnose`] does all of it, [`report`] writes JSON and HTML.
+//! 2. [`condense`] turns a drive into a score and an information matrix over every column of the catalogue, soil profiled out; the drive is the unit of
+//!    replication;
+//! 3. [`Reference`] is what such scores usually are, measured on drives that training never saw, with null groups for honest thresholds;
+//! 4. [`evidence`] holds the scores of a group of drives against their scatter over null drives, for one hypothesis or after others were fitted;
+//! 5. [`select`] chooses up to three effects with the rivals that the drives cannot tell from them; [`onset`] says when an effect began;
+//! 6. [`fit`] estimates sizes by Gauss-Newton; [`claims`] gives intervals and refuses what lies at a bound, is unstable or explains too little;
+//! 7. [`held_out`] predicts drives that were not fitted before, with the best soil alone, and with the effects;
+//! 8. [`diagnose`] does all of it, [`report`] writes JSON and HTML; [`bench`] measures how often it is right.
 //!
-//! Ground truth is never read. One effect at a time, present from the start of the drives; what is outside the catalogue is to come out unexplained.
+//! Ground truth is never read.
 #![forbid(unsafe_code)]
 
+pub mod bench;
 mod candidates;
 pub mod channels;
+pub mod claims;
+pub mod condense;
+mod consistency;
 mod diagnose;
 mod error;
-pub mod expectation;
-pub mod features;
+pub mod evidence;
 pub mod fit;
 pub mod held_out;
+mod manoeuvre;
+mod metric;
 mod observe;
+pub mod onset;
 mod reference;
 pub mod report;
 pub mod select;
 mod tail;
 
-pub use candidates::{CATALOGUE, Candidate};
-pub use diagnose::{Diagnosis, Estimate, OnProgress, Options, StatisticDeviation, Verdict, diagnose};
+pub use candidates::{Candidate, catalogue};
+pub use claims::Estimate;
+pub use diagnose::{Diagnosis, Judge, Judgement, OnProgress, Options, Verdict, diagnose, judge};
 pub use error::DiscoveryError;
-pub use features::Stepping;
 pub use held_out::{HeldOut, Learned, Scoring};
-pub use observe::{ObservedDrive, observe, observe_all};
+pub use metric::Metric;
+pub use observe::{Bench, ObservedDrive, Stepping, observe, observe_all};
 pub use reference::{DRIVES_MIN, NullGroups, Reference};

@@ -1,4 +1,4 @@
-//! Measured drives as segments of the frozen reference: what the physics predicts there, with or without an effect.
+//! Measured drives as segments of the frozen reference: what the physics predicts there, with or without effects.
 //!
 //! The network is asked once, at every measured sample ([`Predictor::transition`]); its sinkage ratios and residuals are then constants, so
 //! an effect or another soil changes the prediction through the physics alone. A segment starts at a measured state and runs a few steps: long
@@ -8,20 +8,47 @@ use std::sync::Arc;
 
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, Predictor, Transition};
-use nesam_physics::driveline::command_wheels;
+use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{STATE_DIM, Soil, SoilCorrection, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{SOIL_DIM, STATE_DIM, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
 use crate::channels::{BINS, CHANNELS, RIM_AT, Row, SEGMENT_STEPS, STATE_CHANNELS, STEERING_AT, available};
+use crate::consistency::add_consistency;
 use crate::error::DiscoveryError;
 
 /// First sample of the first segment, so that the actuators are known from the commands before it.
 const FIRST_START: usize = 16;
 /// Smallest change of tractive force per rim over-speed that is believed, N per m/s (a wheel in the air has none).
 const TRACTION_SLOPE_FLOOR: f64 = 2000.0;
+
+/// Step and sub-steps of the physics.
+#[derive(Clone, Copy, Debug)]
+pub struct Stepping {
+    /// Step, s.
+    pub dt_s: f64,
+    /// Sub-steps.
+    pub substeps: usize,
+}
+
+impl Stepping {
+    /// The physics of a vehicle.
+    pub fn model(&self, vehicle: &Vehicle) -> StepModel {
+        StepModel::new(vehicle, self.dt_s, self.substeps)
+    }
+}
+
+/// The reference that drives are compared with.
+#[derive(Clone, Copy, Debug)]
+pub struct Bench<'a> {
+    /// Vehicle of the reference.
+    pub vehicle: &'a Vehicle,
+    /// Physics.
+    pub stepping: Stepping,
+}
 
 /// A measured drive, prepared: nothing of it depends on an effect or a soil correction.
 #[derive(Clone, Debug)]
@@ -40,6 +67,16 @@ pub struct ObservedDrive {
     /// ∂(tractive force)/∂(rim over-speed) of each wheel at each sample, N per m/s.
     traction_slope: Vec<[f64; WHEELS]>,
 }
+
+/// A drive as a vehicle with some effects would explain it: its physics, its actuators, and the states behind what was measured.
+struct Reading {
+    model: StepModel,
+    actuators: Vec<[DrivelineState; 2]>,
+    states: Vec<VehicleState<f64>>,
+}
+
+/// Physics, state and actuators of one sample.
+type WayToDrive<'a> = (&'a StepModel, &'a VehicleState<f64>, &'a [DrivelineState; 2]);
 
 /// Prepares drives, world by world, because a predictor keeps terrain features of a few maps only; `done` is called after each drive.
 ///
@@ -112,21 +149,143 @@ fn traction_slopes(model: &StepModel, transition: &Transition) -> [f64; WHEELS] 
 }
 
 impl ObservedDrive {
-    /// Measured minus predicted for every segment, with the vehicle of `model` and a soil correction.
-    pub fn deviations(&self, model: &StepModel, soil: &SoilCorrection) -> Vec<Row> {
-        self.starts.par_iter().map(|&start| self.segment(model, soil, start)).collect()
+    /// Measured minus predicted for every segment, with effects (each from its onset on) and a soil correction. One row per segment.
+    pub fn deviations(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], soil: &SoilCorrection) -> Vec<Row> {
+        let acting = |start: usize| -> u32 {
+            let time_s = start as f64 * bench.stepping.dt_s;
+            effects.iter().enumerate().map(|(i, e)| u32::from(e.onset_s <= time_s) << i).sum()
+        };
+        let mut sets: Vec<u32> = self.starts.iter().map(|&s| acting(s)).collect();
+        sets.sort_unstable();
+        sets.dedup();
+        let readings: Vec<Reading> = sets
+            .iter()
+            .map(|set| {
+                let on: Vec<Effect> = effects.iter().enumerate().filter(|(i, _)| set & (1 << i) != 0).map(|(_, e)| e.effect).collect();
+                self.reading(bench, &on)
+            })
+            .collect();
+        self.starts
+            .par_iter()
+            .map(|&start| {
+                let set = acting(start);
+                let reading = sets.iter().position(|s| *s == set).expect("every segment's set was listed; this is a bug");
+                self.segment(bench, &readings[reading], soil, start)
+            })
+            .collect()
     }
 
-    fn segment(&self, model: &StepModel, soil: &SoilCorrection, start: usize) -> Row {
+    /// Start of each segment, s since the start of the drive.
+    pub fn times_s(&self, dt_s: f64) -> Vec<f64> {
+        self.starts.iter().map(|&s| s as f64 * dt_s).collect()
+    }
+
+    fn reading(&self, bench: &Bench<'_>, effects: &[Effect]) -> Reading {
+        let vehicle = bench.vehicle.with_effects(effects);
+        let states: Vec<VehicleState<f64>> = self.states.iter().map(|s| vehicle.effects.sensor.to_true(s)).collect();
+        let model = bench.stepping.model(&vehicle);
+        let mut now = DrivelineState::starting(&vehicle, &states[0], &self.transitions[0].control);
+        let actuators = self
+            .transitions
+            .iter()
+            .zip(&states)
+            .map(|(transition, state)| {
+                let after = now.advance(&vehicle, &transition.control, state.velocity_m_s[0], model.dt_s());
+                let pair = [now, after];
+                now = after;
+                pair
+            })
+            .collect();
+        Reading { model, actuators, states }
+    }
+
+    /// The drive as a vehicle with effects would have driven it under the recorded commands, in place of what `drive` records.
+    ///
+    /// x'_{k+1} = x'_k + step(x'_k with effects) + residual_k + e_k, where e_k is what the recorded drive did beyond the physics at step k, so that no effect
+    /// gives the recording back. Soil and what the network says stay those of the recorded place. Wheel speeds and road-wheel angles move by what the
+    /// physics says of them.
+    pub fn driven_again(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], drive: &mut Trajectory) {
+        let dt_s = bench.stepping.dt_s;
+        let plain = self.reading(bench, &[]);
+        let on: Vec<Effect> = effects.iter().map(|e| e.effect).collect();
+        let onset_s = effects.iter().map(|e| e.onset_s).fold(0.0, f64::max);
+        let vehicle = bench.vehicle.with_effects(&on);
+        let changed = bench.stepping.model(&vehicle);
+        let mut actuators = plain.actuators[0][0];
+        let mut state = self.states[0];
+        for (k, transition) in self.transitions.iter().enumerate() {
+            let model = if k as f64 * dt_s >= onset_s { &changed } else { &plain.model };
+            let recorded = self.increment(&plain.model, k, dt_s, &self.states[k], &plain.actuators[k]);
+            let after = actuators.advance(model.vehicle(), &transition.control, state.velocity_m_s[0], dt_s);
+            let driven = self.increment(model, k, dt_s, &state, &[actuators, after]);
+            self.move_wheels(k, (&plain.model, &self.states[k], &plain.actuators[k]), (model, &state, &[actuators, after]), drive);
+            // The recorded increment in its own heading frame, with what the physics says of the difference.
+            let total = core::array::from_fn(|i| between(&self.states[k], &self.states[k + 1])[i] + driven[i] - recorded[i]);
+            state = VehicleState::from_array(state.advanced(&total));
+            actuators = after;
+            drive.states[k + 1] = state;
+        }
+    }
+
+    fn increment(
+        &self,
+        model: &StepModel,
+        k: usize,
+        dt_s: f64,
+        state: &VehicleState<f64>,
+        actuators: &[DrivelineState; 2],
+    ) -> [f64; STATE_DIM] {
+        let transition = &self.transitions[k];
+        let ground = GroundSource::new(self.map.as_deref(), model, state);
+        let input = StepInput {
+            state: *state,
+            wheels: command_wheels(model.vehicle(), &actuators[0], &actuators[1], &transition.control),
+            soil: Soil::from_array(self.soil_at(model, &SoilCorrection::NONE, k, dt_s)),
+            ground: ground.under_wheels(model, state, 0.0).0,
+            ..transition.input
+        };
+        model.step(&input).increment.to_array()
+    }
+
+    /// Soil of a sample with a correction and what effects change of it in time.
+    fn soil_at(&self, model: &StepModel, soil: &SoilCorrection, k: usize, dt_s: f64) -> [f64; SOIL_DIM] {
+        let nominal = soil.apply(&self.transitions[k].input.soil.to_array());
+        model.vehicle().effects.soil.drifted(nominal, Some(k as f64 * dt_s))
+    }
+
+    /// Moves the recorded wheel speeds and road-wheel angles of a sample by what the physics says of the difference between two ways to drive.
+    fn move_wheels(&self, k: usize, from: WayToDrive<'_>, to: WayToDrive<'_>, drive: &mut Trajectory) {
+        let of = |(model, state, actuators): WayToDrive<'_>| {
+            let mut row = [0.0; CHANNELS];
+            let reading = Reading { model: model.clone(), actuators: vec![*actuators; k + 1], states: vec![*state; k + 1] };
+            self.actuators(&reading, &self.transitions[k], k, 0, &mut row);
+            row
+        };
+        let (before, after) = (of(from), of(to));
+        if let Some(angles) = &mut drive.road_wheel_angle_rad {
+            let bin = (BINS[0][1] - BINS[0][0] + 1) as f64;
+            angles[k] = angles[k].map(|a| a + bin * (before[STEERING_AT] - after[STEERING_AT]));
+        }
+        if let Some(speeds) = &mut drive.wheel_speed_rad_s {
+            for i in 0..WHEELS {
+                speeds[k][i] += SEGMENT_STEPS as f64 * (before[RIM_AT + i] - after[RIM_AT + i]) / from.0.vehicle().wheel_radius_m;
+            }
+        }
+    }
+
+    fn segment(&self, bench: &Bench<'_>, reading: &Reading, soil: &SoilCorrection, start: usize) -> Row {
+        let (model, states) = (&reading.model, &reading.states);
         let mut row = [0.0; CHANNELS];
-        let mut state = self.states[start];
+        add_consistency(&states[start..=start + SEGMENT_STEPS], model.dt_s(), &mut row);
+        let mut state = states[start];
         let ground = GroundSource::new(self.map.as_deref(), model, &state);
         for (j, transition) in self.transitions[start..start + SEGMENT_STEPS].iter().enumerate() {
-            self.actuators(model, transition, start + j, &mut row);
+            self.actuators(reading, transition, start + j, j, &mut row);
+            let [before, after] = &reading.actuators[start + j];
             let input = StepInput {
                 state,
-                wheels: command_wheels(model.vehicle(), &transition.actuators[0], &transition.actuators[1], &transition.control),
-                soil: Soil::from_array(soil.apply(&transition.input.soil.to_array())),
+                wheels: command_wheels(model.vehicle(), before, after, &transition.control),
+                soil: Soil::from_array(self.soil_at(model, soil, start + j, bench.stepping.dt_s)),
                 ground: ground.under_wheels(model, &state, 0.0).0,
                 ..transition.input
             };
@@ -136,7 +295,7 @@ impl ObservedDrive {
             for (b, [from, to]) in BINS.iter().enumerate() {
                 if (*from..=*to).contains(&(j + 1)) {
                     let share = 1.0 / (to - from + 1) as f64;
-                    let deviation = deviation(&self.states[start + j + 1], &state);
+                    let deviation = deviation(&states[start + j + 1], &state);
                     for c in 0..STATE_CHANNELS {
                         row[b * STATE_CHANNELS + c] += share * deviation[c];
                     }
@@ -146,32 +305,53 @@ impl ObservedDrive {
         row
     }
 
-    /// Adds the actuator layer of one sample: road-wheel angle, and rim over-speeds with what a drag at the wheel takes from them.
+    /// Adds the actuator layer of one sample, step `j` of its segment: road-wheel angle, and rim over-speeds with what a drag at the wheel takes from them.
     ///
     /// A drag torque τ lowers the rim speed until the tread makes up for what the coupling of the axle does not:
     /// Δ(over-speed) = -(τ at the tread / r) / (∂F/∂over-speed), see `StepModel`.
-    fn actuators(&self, model: &StepModel, transition: &Transition, sample: usize, row: &mut Row) {
-        let vehicle = model.vehicle();
-        let share = 1.0 / SEGMENT_STEPS as f64;
-        let mut angles = transition.actuators[0].road_wheel_angles(vehicle);
+    fn actuators(&self, reading: &Reading, transition: &Transition, sample: usize, j: usize, row: &mut Row) {
+        let vehicle = reading.model.vehicle();
+        let [before, after] = &reading.actuators[sample];
+        let mut angles = before.road_wheel_angles(vehicle);
         if let Some(measured) = self.road_wheel_angle_rad.as_ref().map(|m| m[sample]) {
-            row[STEERING_AT] += share * 0.5 * (measured[0] + measured[1] - angles[0] - angles[1]);
+            let bin = usize::from(j >= BINS[0][1]);
+            let share = 1.0 / (BINS[bin][1] - BINS[bin][0] + 1) as f64;
+            row[STEERING_AT + bin] += share * 0.5 * (measured[0] + measured[1] - angles[0] - angles[1]);
             angles[..2].copy_from_slice(&measured);
         }
         let Some(wheel_speed) = self.wheel_speed_rad_s.as_ref().map(|m| m[sample]) else { return };
-        let state = &self.states[sample];
+        let share = 1.0 / SEGMENT_STEPS as f64;
+        let wheels = command_wheels::<f64>(vehicle, before, after, &transition.control);
+        let state = &reading.states[sample];
         let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
         for i in 0..WHEELS {
             let at = vehicle.wheel_centre_m[i];
             let centre = [v[0] + w[1] * at[2] - w[2] * at[1], v[1] + w[2] * at[0] - w[0] * at[2]];
             let (sin, cos) = angles[i].sin_cos();
-            let forward = cos * centre[0] + sin * centre[1];
+            let own = cos * centre[0] + sin * centre[1];
+            // A locked axle turns both rims at the mean of what their own ground asks for; Ω is read as a speed of the card's radius.
+            let middle = own + cos * 0.5 * w[2] * (at[1] - vehicle.wheel_centre_m[i ^ 1][1]);
+            let forward = own + vehicle.effects.actuator.lock * (middle - own);
             let slope = self.traction_slope[sample][i];
             let drag = vehicle.drag_at_tread_n_m(i, slope) / vehicle.wheel_radius_m / slope;
-            let predicted = transition.input.wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum();
+            let radius = 1.0 + vehicle.effects.force.radius_relative[i / 2];
+            let predicted = (wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum()) / radius;
             row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - predicted);
         }
     }
+}
+
+/// Increment from one state to the next in the heading frame of the first, as the physics gives it.
+fn between(first: &VehicleState<f64>, next: &VehicleState<f64>) -> [f64; STATE_DIM] {
+    let (a, b) = (first.to_array(), next.to_array());
+    let (sin, cos) = a[5].sin_cos();
+    let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
+    core::array::from_fn(|i| match i {
+        0 => cos * dx + sin * dy,
+        1 => cos * dy - sin * dx,
+        3..=5 => wrap_angle(b[i] - a[i]),
+        _ => b[i] - a[i],
+    })
 }
 
 /// Measured minus predicted, positions in the measured heading frame, angles wrapped.

@@ -2,17 +2,18 @@
 
 use nesam_evaluation::report::{LinePlot, Page, Series, Table};
 use nesam_evaluation::{DIMENSION_KEYS, ErrorTree, POSE_DIM, Provenance, paired_difference};
+use nesam_physics::effects::Layer;
 use serde_json::{Value, json};
 
 use crate::candidates::Candidate;
-use crate::diagnose::{Diagnosis, StatisticDeviation, Verdict};
-use crate::features;
-use crate::select::Ranked;
+use crate::channels;
+use crate::claims::{Finding, Trace};
+use crate::diagnose::{Diagnosis, Verdict};
+use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
-pub const STOP_RULE: &str = "1: one effect";
+pub const STOP_RULE: &str = "2: up to three effects, pairwise criterion 6, at most 35 % of the largest evidence left";
 const STAGES: [&str; 3] = ["before", "soil only", "after"];
-const MEMBERS_MAX: usize = 3;
 
 /// What a report is made from.
 #[derive(Clone, Copy, Debug)]
@@ -49,74 +50,67 @@ impl Report<'_> {
             "soil_only": stage(1),
             "after": stage(2),
             "improvement_ci95": improvement.as_ref().map(|(_, i)| i),
-            "controls": {"black_box_refit": null, "placebo_rival": null, "before_onset": null, "free_form": null},
+            "controls": self.controls(),
             "attainable_p": d.selection.probability.map(|[_, attainable]| attainable),
             "bundle": self.bundle,
             "reason": d.reason,
             "improvement": improvement.as_ref().map(|(m, _)| m),
             "p_family_wise": d.selection.probability.map(|[p, _]| p),
             "threshold_z": d.selection.threshold,
-            "distance_per_statistic": d.selection.distance[0],
-            "soil_bic_against_none": d.selection.soil_bic,
+            "remaining": {"z": d.selection.remaining.0, "what": d.selection.remaining.1},
             "considered": self.considered(),
             "learned_per_held_out_drive": self.learned(),
             "stop_rule": STOP_RULE,
             "provenance": self.provenance,
         });
         let map = document.as_object_mut().expect("an object was built; this is a bug");
-        let names = features::names();
-        let statistic = |c: &StatisticDeviation| json!({"statistic": names[c.statistic], "layer": features::layer(c.statistic), "difference": c.difference, "significance": c.significance});
-        map.insert("statistics".into(), d.statistics.iter().map(statistic).collect());
+        map.insert("levels".into(), self.levels());
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
     }
 
-    /// The claimed effect with its rivals: an equivalence class of at most three, weights of which sum to 1.
-    fn effects(&self) -> Vec<Value> {
+    /// What would expose a fake. No black box is refitted and no free form is offered by this version.
+    fn controls(&self) -> Value {
         let d = self.diagnosis;
-        if !matches!(d.verdict, Verdict::Explained | Verdict::Ambiguous) {
-            return Vec::new();
-        }
-        let class: Vec<&Ranked> = d.selection.ranked.iter().filter(|r| r.refused.is_none()).take(MEMBERS_MAX).collect();
-        let total: f64 = class.iter().map(|r| r.weight).sum();
-        let Some((best, rivals)) = class.split_first() else { return Vec::new() };
-        let next = d.selection.ranked.iter().skip(1).find(|r| r.candidate.id() != best.candidate.id()).map_or(0.0, |r| r.bic.min(0.0));
-        let parameters: Vec<Value> =
-            d.estimates.iter().map(|e| json!({"name": e.name, "unit": e.unit, "value": e.value, "ci95": e.ci95})).collect();
-        let rivals: Vec<Value> = rivals
-            .iter()
-            .map(|r| {
-                let parameters: Vec<Value> =
-                    r.effect().parameters().iter().map(|p| json!({"name": p.name, "unit": p.unit, "value": p.value})).collect();
-                json!({"id": r.candidate.id(), "weight": r.weight / total, "parameters": parameters})
-            })
-            .collect();
-        let e = Candidate::ALL.iter().position(|c| *c == best.candidate).unwrap_or(0);
-        vec![json!({
-            "id": best.candidate.id(),
-            "weight": best.weight / total,
-            "layer": format!("{:?}", best.effect().layer()).to_lowercase(),
-            "parameters": parameters,
-            "onset_s": null,
-            "onset_ci95": null,
-            "evidence": {"z": d.selection.z[e], "delta_bic": next - best.bic, "stability": d.stability},
-            "rivals": rivals,
-            "separating_manoeuvre": null,
-        })]
+        let scores = d.scores.as_ref();
+        let placebo = d.placebo.zip(scores.and_then(|s| s.placebo.as_ref())).map(|(candidate, score)| {
+            let mut tree = json!(score.summary);
+            if let Some(map) = tree.as_object_mut() {
+                map.insert("id".into(), json!(candidate.id()));
+            }
+            tree
+        });
+        let early = scores.and_then(|s| s.before_onset.as_ref());
+        json!({
+            "black_box_refit": null,
+            "placebo_rival": placebo,
+            "before_onset": early.map(|[_, after]| &after.summary),
+            "before_onset_without_effect": early.map(|[before, _]| &before.summary),
+            "free_form": null,
+        })
+    }
+
+    /// Mean deviation of every compared channel and how unusual it is.
+    fn levels(&self) -> Value {
+        let d = self.diagnosis;
+        let of = |i: usize| {
+            let c = d.channels[i];
+            json!({"channel": channels::name(c), "layer": channels::layer(c), "difference": d.levels[i], "z": d.selection.levels[i]})
+        };
+        (0..d.channels.len()).map(of).collect()
+    }
+
+    /// The claimed effects, each with its rivals: an equivalence class of at most three, weights of which sum to 1.
+    fn effects(&self) -> Vec<Value> {
+        self.diagnosis.claims().map(effect_json).collect()
     }
 
     fn considered(&self) -> Vec<Value> {
-        let s = &self.diagnosis.selection;
-        Candidate::ALL
-            .iter()
-            .enumerate()
-            .map(|(e, c)| {
-                let ranked = s.ranked.iter().find(|r| r.candidate == *c);
-                let parameters =
-                    ranked.map(|r| r.effect().parameters().iter().map(|p| json!({"name": p.name, "value": p.value})).collect::<Vec<_>>());
-                json!({"hypothesis": c.label(), "z": s.z[e], "bic_against_none": ranked.map(|r| r.bic), "weight": ranked.map(|r| r.weight),
-                    "parameters": parameters, "refused": ranked.and_then(|r| r.refused.clone())})
-            })
-            .collect()
+        let d = self.diagnosis;
+        let of = |(e, c): (usize, &Candidate)| {
+            let finding = d.findings.iter().find(|f| f.hypothesis == e);
+            json!({"hypothesis": c.label(), "z": d.selection.z[e], "chosen": finding.is_some(), "refused": finding.and_then(|f| f.refused.clone())})
+        };
+        d.catalogue.iter().enumerate().map(of).collect()
     }
 
     fn learned(&self) -> Vec<Value> {
@@ -128,7 +122,7 @@ impl Report<'_> {
                 let effects: Vec<Value> = l
                     .effects
                     .iter()
-                    .map(|e| json!({"id": e.id(), "values": e.parameters().iter().map(|p| p.value).collect::<Vec<_>>()}))
+                    .map(|e| json!({"id": e.effect.id(), "onset_s": e.onset_s, "values": e.effect.parameters().iter().map(|p| p.value).collect::<Vec<_>>()}))
                     .collect();
                 json!({"trajectory": id, "effects": effects, "soil_correction": l.soil.delta})
             })
@@ -148,8 +142,13 @@ impl Report<'_> {
         );
         let mut page = Page::new(&format!("nesam diagnose: {}", self.set), &lead);
         page.section("What was seen")
-            .text("Statistics of the drives against the frozen reference, by residual layer; significance is against groups of drives without an effect.")
-            .table(&self.statistic_table());
+            .text("Mean deviation of every channel from the frozen reference, by residual layer; z is against groups of drives without an effect.")
+            .table(&self.level_table());
+        let traces: Vec<LinePlot> = d.traces.iter().map(trace_plot).collect();
+        page.section("The most unusual channel of each layer").plots(
+            &traces,
+            "Mean over the drives of the deviation from the reference in segments of 0.8 s, without and with the claimed effects.",
+        );
         page.section("What was considered")
             .text(&format!(
                 "Evidence against the scatter of drives without an effect; below z = {:.2} nothing is claimed.",
@@ -173,36 +172,42 @@ impl Report<'_> {
         page.render()
     }
 
-    fn statistic_table(&self) -> Table {
-        let mut table =
-            Table::new("Statistics of the drives, largest deviation first", &["statistic", "layer", "difference", "significance"]);
-        let names = features::names();
-        let mut statistics: Vec<_> = self.diagnosis.statistics.iter().collect();
-        statistics.sort_by(|a, b| b.significance.abs().total_cmp(&a.significance.abs()));
-        for c in statistics.into_iter().take(12) {
+    fn level_table(&self) -> Table {
+        let mut table = Table::new("Levels of the channels, most unusual first", &["channel", "layer", "difference", "z"]);
+        let d = self.diagnosis;
+        let mut order: Vec<usize> = (0..d.channels.len()).collect();
+        order.sort_by(|a, b| d.selection.levels[*b].total_cmp(&d.selection.levels[*a]));
+        for i in order.into_iter().take(14) {
+            let c = d.channels[i];
             table.row(vec![
-                names[c.statistic].clone().into(),
-                features::layer(c.statistic).into(),
-                format!("{:+.4}", c.difference).into(),
-                format!("{:+.1}", c.significance).into(),
+                channels::name(c).into(),
+                channels::layer(c).into(),
+                format!("{:+.4}", d.levels[i]).into(),
+                format!("{:.1}", d.selection.levels[i]).into(),
             ]);
         }
         table
     }
 
     fn hypothesis_table(&self) -> Table {
-        let mut table = Table::new("Hypotheses", &["hypothesis", "z", "criterion against none", "weight", "refit", "refused because"]);
-        let s = &self.diagnosis.selection;
-        for (e, c) in Candidate::ALL.iter().enumerate() {
-            let ranked = s.ranked.iter().find(|r| r.candidate == *c);
-            let fit = ranked.map_or("-".into(), |r| describe(r));
+        let mut table = Table::new("Hypotheses, strongest evidence first", &["hypothesis", "layer", "z", "size", "outcome"]);
+        let d = self.diagnosis;
+        let mut order: Vec<usize> = (0..d.catalogue.len()).filter(|e| d.selection.z[*e].is_some()).collect();
+        order.sort_by(|a, b| d.selection.z[*b].unwrap_or(0.0).total_cmp(&d.selection.z[*a].unwrap_or(0.0)));
+        for e in order {
+            let finding = d.findings.iter().find(|f| f.hypothesis == e);
+            let rival_of = d.findings.iter().find(|f| f.rivals.iter().any(|r| r.candidate == d.catalogue[e]));
+            let outcome = match (finding, rival_of) {
+                (Some(f), _) => f.refused.clone().map_or("chosen".into(), |why| format!("refused: {why}")),
+                (None, Some(f)) => format!("rival of {}", f.candidate.label()),
+                _ => String::new(),
+            };
             table.row(vec![
-                c.label().into(),
-                s.z[e].map_or("left out".into(), |z| format!("{z:.1}")).into(),
-                ranked.map_or("-".into(), |r| format!("{:+.1}", r.bic)).into(),
-                ranked.map_or("-".into(), |r| format!("{:.3}", r.weight)).into(),
-                fit.into(),
-                ranked.and_then(|r| r.refused.clone()).unwrap_or_default().into(),
+                d.catalogue[e].label().into(),
+                layer_name(d.catalogue[e].layer()).into(),
+                format!("{:.1}", d.selection.z[e].unwrap_or(0.0)).into(),
+                finding.map_or(String::new(), describe).into(),
+                outcome.into(),
             ]);
         }
         table
@@ -258,8 +263,40 @@ impl Report<'_> {
     }
 }
 
-/// A refit in words.
-pub fn describe(ranked: &Ranked) -> String {
-    let parameters: Vec<String> = ranked.effect().parameters().iter().map(|p| format!("{} {:.3}", p.name, p.value)).collect();
-    parameters.join(", ")
+fn trace_plot(trace: &Trace) -> LinePlot {
+    let name = channels::name(trace.channel);
+    let mut plot = LinePlot::new(&format!("{}: {name}", channels::layer(trace.channel)), "time in the drive [s]", &name);
+    plot.series.push(Series::line("before", 1, trace.before.clone()));
+    if trace.after != trace.before {
+        plot.series.push(Series::line("with the effects", 3, trace.after.clone()));
+    }
+    plot
+}
+
+/// An effect in words.
+pub fn describe(finding: &Finding) -> String {
+    let parameters: Vec<String> = finding.estimates.iter().map(|p| format!("{} {:.3}", p.name, p.value)).collect();
+    let onset = finding.onset.map_or(String::new(), |o| format!(" from {:.1} s on", o.at_s));
+    parameters.join(", ") + &onset
+}
+
+fn effect_json(finding: &Finding) -> Value {
+    let parameters: Vec<Value> =
+        finding.estimates.iter().map(|e| json!({"name": e.name, "unit": e.unit, "value": e.value, "ci95": e.ci95})).collect();
+    let rivals: Vec<Value> = finding.rivals.iter().map(|r| json!({"id": r.candidate.id(), "weight": r.weight})).collect();
+    json!({
+        "id": finding.candidate.id(),
+        "weight": finding.weight,
+        "layer": layer_name(finding.candidate.layer()),
+        "parameters": parameters,
+        "onset_s": finding.onset.map(|o| o.at_s),
+        "onset_ci95": finding.onset.map(|o| o.ci95_s),
+        "evidence": {"z": finding.z, "z_after_others": finding.alone, "delta_bic": finding.delta_bic, "stability": finding.stability},
+        "rivals": rivals,
+        "separating_manoeuvre": manoeuvre::separating(finding),
+    })
+}
+
+fn layer_name(layer: Layer) -> String {
+    layer.as_str().into()
 }

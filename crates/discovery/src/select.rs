@@ -1,227 +1,248 @@
-//! Which hypothesis a group of drives supports, if any.
+//! Which effects a group of drives supports, if any: at most three, each with the rivals that the drives cannot tell from it.
+//!
+//! Hypotheses are compared in pairs, by what each leaves to the other. If j is fitted and k still has evidence, but not the reverse, k is preferred:
+//! Δ(j, k) = z²(j after k) - z²(k after j), which for hypotheses of as many parameters is the difference of a cluster-robust information criterion.
 
-use nesam_physics::SoilCorrection;
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::Layer;
 
 use crate::candidates::Candidate;
-use crate::expectation::{Expectation, Strength, mean, mean_signature};
-use crate::features::FEATURES;
-use crate::fit::{Bench, Fit, Member, SoilFit, Weighing};
-use crate::reference::NullGroups;
+use crate::condense::{Condensed, level_column};
+use crate::evidence::{Group, Nulls};
+use crate::reference::{NullGroups, all_evidence};
 
-/// Most hypotheses that are fitted.
-const FITTED: usize = 4;
-/// Share of the strongest evidence below which a hypothesis is not fitted.
-const FITTED_SHARE: f64 = 0.4;
-/// Difference of the information criterion that decides.
-pub const DECISIVE_BIC: f64 = 6.0;
-/// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
-/// pass for this one on a drive, but seldom with the same size on all.
-const MAGNITUDE_HALF_MAX: f64 = 0.7;
-/// Smallest share of the squared distance that a claimed effect explains (chosen).
-const EXPLAINED_MIN: f64 = 0.6;
+/// Difference of the criterion that decides between two hypotheses.
+pub const DECISIVE: f64 = 6.0;
+/// Most effects that one diagnosis names.
+pub const EFFECTS_MAX: usize = 3;
+/// Most rivals of an effect, so that a class has at most three members.
+pub const RIVALS_MAX: usize = 2;
 /// Threshold without null groups: twice that of 28 candidates at 5 % family-wise.
 const THRESHOLD_ALONE: f64 = 6.2;
+/// Share of the strongest gain below which a hypothesis does not compete.
+const COMPETING: f64 = 0.3;
+/// Evidence that a second or third effect needs, as a multiple of the threshold (chosen): the model's answer to the first is not exact.
+const FURTHER: f64 = 1.25;
 
-/// A fitted hypothesis with its criterion.
+/// What a group of drives is compared with.
 #[derive(Clone, Debug)]
-pub struct Ranked {
-    /// The hypothesis.
-    pub candidate: Candidate,
-    /// The fit.
-    pub fit: Fit,
-    /// Information criterion relative to "no effect": negative = better.
-    pub bic: f64,
-    /// Weight among the fitted hypotheses.
-    pub weight: f64,
-    /// Factor by which the fit's own standard deviations are too small: null spread, or what the fit leaves unexplained.
-    pub inflation: f64,
-    /// Why it cannot be claimed.
-    pub refused: Option<String>,
+pub struct Yardstick {
+    /// Scores of drives without an effect.
+    pub nulls: Nulls,
+    /// Null groups of as many drives.
+    pub groups: Option<NullGroups>,
+    /// Channels that are compared.
+    pub channels: Vec<usize>,
+    /// All hypotheses.
+    pub catalogue: Vec<Candidate>,
+    /// Which of them are considered.
+    pub considered: Vec<bool>,
 }
 
-impl Ranked {
-    /// The effect with its fitted parameters.
-    pub fn effect(&self) -> Effect {
-        self.candidate.effect(&self.fit.values)
-    }
+/// A hypothesis that the drives cannot tell from a chosen one.
+#[derive(Clone, Debug)]
+pub struct Rival {
+    /// Index in the catalogue.
+    pub hypothesis: usize,
+    /// Criterion of the chosen one against it, positive = the chosen one is better.
+    pub difference: f64,
 }
 
 /// What a group of drives says.
 #[derive(Clone, Debug)]
 pub struct Selection {
-    /// Evidence by hypothesis in units of its null spread; `None` for those left out.
+    /// Evidence of every hypothesis alone in units of its null spread; `None` for those left out.
     pub z: Vec<Option<f64>>,
+    /// Evidence that the level of each compared channel is unusual.
+    pub levels: Vec<f64>,
     /// Family-wise threshold.
     pub threshold: f64,
     /// Family-wise probability of the largest evidence, and the smallest that could be shown.
     pub probability: Option<[f64; 2]>,
-    /// Squared distance from drives without an effect, per statistic, and the largest that counts as usual.
-    pub distance: [f64; 2],
-    /// Fitted hypotheses, best first; empty when nothing is detected.
-    pub ranked: Vec<Ranked>,
-    /// Criterion of another soil, common to all drives, relative to "no effect".
-    pub soil_bic: Option<f64>,
-    /// Best soil without an effect.
-    pub soil: SoilCorrection,
-    /// Squared distance per statistic that the best fit leaves, in units of what is usual; at least 1.
-    pub dispersion: f64,
+    /// Chosen hypotheses, first found first.
+    pub chosen: Vec<usize>,
+    /// Evidence of each chosen one after the others.
+    pub alone: Vec<f64>,
+    /// Rivals of each chosen one, closest first.
+    pub rivals: Vec<Vec<Rival>>,
+    /// Largest evidence that is left after the chosen ones, and what it is for.
+    pub remaining: (f64, String),
 }
 
 impl Selection {
-    /// The best hypothesis, if it may be claimed.
-    pub fn claimed(&self) -> Option<&Ranked> {
-        self.ranked.first().filter(|r| r.refused.is_none() && !self.soil_explains())
+    /// Largest evidence of anything before fits.
+    pub fn largest(&self) -> f64 {
+        self.z.iter().flatten().chain(&self.levels).copied().fold(0.0, f64::max)
     }
 
-    /// Whether any hypothesis stands out.
-    pub fn detected(&self) -> bool {
-        self.z.iter().flatten().any(|z| *z >= self.threshold)
+    /// Takes the `i`-th chosen hypothesis away again.
+    pub fn drop_chosen(&mut self, yardstick: &Yardstick, group: &Group, i: usize) {
+        self.chosen.remove(i);
+        yardstick.describe(group, self);
     }
 
     /// Whether the drives differ from the reference, known cause or not.
     pub fn differs(&self) -> bool {
-        self.detected() || self.distance[0] > self.distance[1]
-    }
-
-    /// Whether another soil explains the drives at least as well as any effect.
-    pub fn soil_explains(&self) -> bool {
-        let best = self.ranked.first().map_or(0.0, |r| r.bic);
-        self.soil_bic.is_some_and(|soil| soil < -DECISIVE_BIC && soil < best)
+        self.largest() >= self.threshold
     }
 }
 
-/// What a group of drives is compared with.
-#[derive(Clone, Debug)]
-pub struct Yardstick {
-    /// What such a group says without an effect.
-    pub expectation: Expectation,
-    /// Null groups of as many drives.
-    pub nulls: Option<NullGroups>,
+/// How wrong the predicted response to an effect may be, as a share of it (chosen): the angle of a road wheel is geometry, two accepted pressure laws
+/// give forces that differ by a quarter, mostly by a common factor that a fit takes up.
+pub fn mismatch(layer: Layer) -> f64 {
+    match layer {
+        Layer::Force | Layer::Soil => 0.12,
+        _ => 0.02,
+    }
 }
 
 impl Yardstick {
-    fn threshold(&self) -> f64 {
-        self.nulls.as_ref().map_or(THRESHOLD_ALONE, |n| n.threshold)
+    /// Family-wise threshold.
+    pub fn threshold(&self) -> f64 {
+        self.groups.as_ref().map_or(THRESHOLD_ALONE, |n| n.threshold)
     }
 
     fn spread(&self, e: usize) -> f64 {
-        self.nulls.as_ref().map_or(1.0, |n| n.spread[e])
+        self.groups.as_ref().map_or(1.0, |n| n.spread[e])
     }
 
-    /// Evidence of the drives, and each hypothesis' z in units of its null spread; `None` for those in `without`.
-    fn evidence(&self, members: &[Member<'_>], without: &[String]) -> (Strength, Vec<Option<f64>>) {
-        let signature = mean_signature(members.iter().map(|(_, p)| &p.signature));
-        let strength = self.expectation.strength(&mean(members.iter().map(|(_, p)| &p.statistics)), &signature);
-        let kept = |c: &Candidate| !without.iter().any(|id| id == c.id());
-        let z = Candidate::ALL.iter().enumerate().map(|(e, c)| kept(c).then(|| strength.z[e] / self.spread(e))).collect();
-        (strength, z)
+    /// Scores of drives against the nulls.
+    pub fn group<'a>(&self, drives: impl Iterator<Item = &'a Condensed>) -> Group {
+        self.nulls.group(drives)
+    }
+
+    fn columns(&self, hypotheses: &[usize]) -> Vec<usize> {
+        hypotheses.iter().flat_map(|h| self.catalogue[*h].columns()).collect()
+    }
+
+    /// Evidence of a hypothesis after others, in units of its null spread; zero for one that has the wrong sign.
+    pub fn after(&self, group: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
+        self.after_fit(group, group, fitted, hypothesis)
+    }
+
+    /// The same where `left` are the scores after the fit of `fitted` went through the physics.
+    pub fn after_fit(&self, left: &Group, before: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
+        let candidate = &self.catalogue[hypothesis];
+        let worst = fitted.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
+        let found = left.remainder_since(before, &self.columns(fitted), &candidate.columns(), worst);
+        if candidate.positive() && found.shares[0] <= 0.0 {
+            return (0.0, 0.0);
+        }
+        (found.z / self.spread(hypothesis), found.gain)
+    }
+
+    /// Criterion of hypothesis j against k when `others` are fitted too; positive = j is better.
+    pub fn difference(&self, group: &Group, others: &[usize], j: usize, k: usize) -> f64 {
+        let with = |h: usize| others.iter().copied().chain([h]).collect::<Vec<_>>();
+        self.after(group, &with(k), j).0.powi(2) - self.after(group, &with(j), k).0.powi(2)
+    }
+
+    /// Judges a group of drives.
+    pub fn select(&self, group: &Group) -> Selection {
+        let count = self.catalogue.len();
+        let evidence: Vec<f64> =
+            all_evidence(group, &self.catalogue, &self.channels).into_iter().enumerate().map(|(e, z)| z / self.spread(e)).collect();
+        let z: Vec<Option<f64>> = (0..count).map(|e| self.considered[e].then_some(evidence[e])).collect();
+        let levels = evidence[count..].to_vec();
+        let largest = z.iter().flatten().chain(&levels).copied().fold(0.0, f64::max);
+        let mut selection = Selection {
+            z,
+            levels,
+            threshold: self.threshold(),
+            probability: self.groups.as_ref().map(|n| [n.probability(largest), n.attainable()]),
+            chosen: Vec::new(),
+            alone: Vec::new(),
+            rivals: Vec::new(),
+            remaining: (largest, String::new()),
+        };
+        if largest < selection.threshold {
+            return selection;
+        }
+        while selection.chosen.len() < EFFECTS_MAX && selection.remaining.0 >= selection.threshold {
+            let Some(next) = self.next(group, &selection.chosen) else { break };
+            selection.chosen.push(next);
+            self.exchange(group, &mut selection.chosen);
+            selection.remaining = self.remaining(group, &selection.chosen);
+        }
+        self.describe(group, &mut selection);
+        selection
+    }
+
+    /// What speaks for each chosen hypothesis, its rivals, and what is left.
+    fn describe(&self, group: &Group, selection: &mut Selection) {
+        let chosen = selection.chosen.clone();
+        let others = |i: usize| without(&chosen, i);
+        selection.alone = (0..chosen.len()).map(|i| self.after(group, &others(i), chosen[i]).0).collect();
+        selection.rivals = (0..chosen.len()).map(|i| self.rivals(group, &others(i), chosen[i], &chosen)).collect();
+        selection.remaining = self.remaining(group, &chosen);
+    }
+
+    /// The hypothesis that is best added to those chosen.
+    fn next(&self, group: &Group, chosen: &[usize]) -> Option<usize> {
+        let needed = self.threshold() * if chosen.is_empty() { 1.0 } else { FURTHER };
+        let mut contenders: Vec<(usize, f64)> = self
+            .open(chosen)
+            .filter_map(|k| {
+                let (z, gain) = self.after(group, chosen, k);
+                (z >= needed).then_some((k, gain))
+            })
+            .collect();
+        contenders.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let (mut best, top) = *contenders.first()?;
+        for (k, _) in contenders.iter().skip(1).filter(|(_, gain)| *gain >= COMPETING * top) {
+            if self.difference(group, chosen, best, *k) < 0.0 {
+                best = *k;
+            }
+        }
+        Some(best)
+    }
+
+    /// Replaces a chosen hypothesis by one that explains more beside the others: a mixture of two effects may first look like a third.
+    fn exchange(&self, group: &Group, chosen: &mut [usize]) {
+        if chosen.len() < 2 {
+            return;
+        }
+        for i in 0..chosen.len() {
+            let others = without(chosen, i);
+            for k in self.open(chosen).collect::<Vec<_>>() {
+                if self.difference(group, &others, chosen[i], k) < -DECISIVE {
+                    chosen[i] = k;
+                }
+            }
+        }
+    }
+
+    fn open<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
+        (0..self.catalogue.len()).filter(|k| self.considered[*k] && !chosen.contains(k))
+    }
+
+    fn rivals(&self, group: &Group, others: &[usize], j: usize, chosen: &[usize]) -> Vec<Rival> {
+        let mut rivals: Vec<Rival> = self
+            .open(chosen)
+            .filter(|k| self.after(group, others, *k).0 >= self.threshold())
+            .map(|k| Rival { hypothesis: k, difference: self.difference(group, others, j, k) })
+            .collect();
+        rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
+        rivals
+    }
+
+    /// Largest evidence after the chosen ones, of hypotheses and of channels.
+    fn remaining(&self, group: &Group, chosen: &[usize]) -> (f64, String) {
+        self.remaining_after_fit(group, group, chosen)
+    }
+
+    /// The same where `left` are the scores after the fit went through the physics.
+    pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
+        let columns = self.columns(chosen);
+        let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
+        let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
+        let levels = self.channels.iter().enumerate().map(|(i, c)| {
+            let z = left.remainder_since(before, &columns, &[level_column(*c)], worst).z / self.spread(self.catalogue.len() + i);
+            (z, format!("the level of {}", crate::channels::name(*c)))
+        });
+        hypotheses.chain(levels).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
     }
 }
 
-/// Judges a group of drives; hypotheses in `without` are left out.
-pub fn select(bench: &Bench<'_>, yardstick: &Yardstick, members: &[Member<'_>], without: &[String]) -> Selection {
-    let (strength, z) = yardstick.evidence(members, without);
-    let largest = z.iter().flatten().copied().fold(0.0, f64::max);
-    let weighing = Weighing::new(&yardstick.expectation, members.iter().map(|(_, p)| &p.statistics));
-    let soil = weighing.fit_soil(members);
-    let nulls = yardstick.nulls.as_ref();
-    let mut selection = Selection {
-        z,
-        threshold: yardstick.threshold(),
-        probability: nulls.map(|n| [n.probability(largest), n.attainable()]),
-        distance: [strength.distance, nulls.map_or(f64::INFINITY, |n| n.distance)],
-        ranked: Vec::new(),
-        soil_bic: None,
-        soil: soil.correction,
-        dispersion: 1.0,
-    };
-    if selection.detected() {
-        rank(bench, yardstick, &weighing, members, &strength, &soil, &mut selection);
-    }
-    selection
-}
-
-fn rank(
-    bench: &Bench<'_>,
-    yardstick: &Yardstick,
-    weighing: &Weighing<'_>,
-    members: &[Member<'_>],
-    strength: &Strength,
-    soil: &SoilFit,
-    selection: &mut Selection,
-) {
-    let mut order: Vec<(usize, f64)> = selection.z.iter().enumerate().filter_map(|(e, z)| z.map(|z| (e, z))).collect();
-    order.sort_by(|a, b| b.1.total_cmp(&a.1));
-    let strongest = order.first().map_or(0.0, |o| o.1);
-    let fits: Vec<(usize, Fit)> = order
-        .iter()
-        .take(FITTED)
-        .filter(|(_, z)| *z >= FITTED_SHARE * strongest)
-        .map(|(e, _)| (*e, weighing.fit(bench, members, Candidate::ALL[*e], Candidate::ALL[*e].start(&strength.shares[*e]))))
-        .collect();
-    let statistics = yardstick.expectation.used().len() as f64;
-    let usual = selection.distance[1].clamp(1.0, FEATURES as f64);
-    let best = fits.iter().map(|(_, f)| f.misfit).fold(weighing.misfit, f64::min);
-    selection.dispersion = (best / statistics / usual).max(1.0);
-    let criterion = |misfit: f64, values: usize| (misfit - weighing.misfit) / selection.dispersion + values as f64 * statistics.ln();
-    selection.soil_bic = Some(criterion(soil.misfit, soil.correction.delta.len()));
-    let bics: Vec<f64> = fits.iter().map(|(_, f)| criterion(f.misfit, f.values.len())).collect();
-    let lowest = bics.iter().copied().fold(f64::INFINITY, f64::min);
-    let total: f64 = bics.iter().map(|b| (-0.5 * (b - lowest)).exp()).sum();
-    let mut ranked: Vec<Ranked> = fits
-        .into_iter()
-        .zip(bics)
-        .map(|((e, fit), bic)| {
-            let candidate = Candidate::ALL[e];
-            let inflation = yardstick.spread(e).max(selection.dispersion.sqrt());
-            let refused = refusal(candidate, &fit, bic, inflation, 1.0 - fit.misfit / weighing.misfit);
-            Ranked { candidate, bic, weight: (-0.5 * (bic - lowest)).exp() / total, inflation, refused, fit }
-        })
-        .collect();
-    ranked.sort_by(|a, b| a.bic.total_cmp(&b.bic));
-    selection.ranked = ranked;
-}
-
-/// What a part of the drives says by itself, given the fits of all: the best soil, and the effect it would claim.
-///
-/// Detection, choice and size follow from the part; only the point of linearisation is that of the whole.
-pub fn reselect(
-    yardstick: &Yardstick,
-    members: &[Member<'_>],
-    kept: &[usize],
-    whole: &Selection,
-    without: &[String],
-) -> (SoilCorrection, Option<Effect>) {
-    let part: Vec<Member<'_>> = kept.iter().map(|&d| members[d]).collect();
-    let weighing = Weighing::new(&yardstick.expectation, part.iter().map(|(_, p)| &p.statistics));
-    let soil = weighing.fit_soil(&part).correction;
-    let (_, z) = yardstick.evidence(&part, without);
-    if whole.claimed().is_none() || !z.iter().flatten().any(|z| *z >= yardstick.threshold()) {
-        return (soil, None);
-    }
-    let count = yardstick.expectation.used().len() as f64;
-    let criterion = |r: &Ranked| {
-        let (values, misfit) = weighing.refit(&r.fit, kept);
-        (r.candidate.effect(&values), misfit + values.len() as f64 * count.ln())
-    };
-    let best = whole.ranked.iter().filter(|r| r.refused.is_none()).map(criterion).min_by(|a, b| a.1.total_cmp(&b.1));
-    (soil, best.map(|(effect, _)| effect))
-}
-
-/// Why a fit is not claimed even if it is the best.
-fn refusal(candidate: Candidate, fit: &Fit, bic: f64, inflation: f64, explained: f64) -> Option<String> {
-    let names = candidate.effect(&fit.values).parameters();
-    if let Some(i) = fit.held.iter().position(|h| *h) {
-        let p = &names[candidate.free()[i].parameter];
-        return Some(format!("{} = {:.3} {} lies at the end of its physical range", p.name, p.value, p.unit));
-    }
-    if bic > -DECISIVE_BIC {
-        return Some(format!("explains too little for its parameters (criterion {bic:+.1} against no effect)"));
-    }
-    if explained < EXPLAINED_MIN {
-        return Some(format!("explains {:.0} % of what is different", 100.0 * explained));
-    }
-    let relative = fit.half_width(0, inflation) / fit.values[0].abs().max(1e-12);
-    (relative > MAGNITUDE_HALF_MAX).then(|| format!("its size is known to ±{:.0} % only", 100.0 * relative))
+fn without(chosen: &[usize], i: usize) -> Vec<usize> {
+    chosen.iter().enumerate().filter(|(at, _)| *at != i).map(|(_, h)| *h).collect()
 }

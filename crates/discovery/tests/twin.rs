@@ -4,10 +4,10 @@
 
 mod common;
 
-use common::{bundle, diagnose_twin, options};
-use nesam_discovery::{Diagnosis, Verdict};
+use common::{bundle, diagnose_from, diagnose_twin, drive, options, world};
+use nesam_discovery::{Bench, Diagnosis, Stepping, Verdict, observe};
 use nesam_model::ModelBundle;
-use nesam_physics::effects::{Effect, Payload, SteeringOffset, WheelDrag};
+use nesam_physics::effects::{Effect, Payload, ScheduledEffect, SteeringOffset, WheelDrag};
 
 fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
     let e = found.estimates.iter().find(|e| e.name == name).unwrap();
@@ -15,7 +15,7 @@ fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
 }
 
 fn explained_by(found: &Diagnosis, id: &str) {
-    let claimed = found.selection.claimed().map(|r| r.candidate.id());
+    let claimed = found.claims().next().map(|f| f.candidate.id());
     let told = found.estimates.iter().map(|e| format!("{} {:.4} {:.4?}", e.name, e.value, e.ci95)).collect::<Vec<_>>();
     assert_eq!((found.verdict, claimed), (Verdict::Explained, Some(id)), "{}; {told:?}; z {:?}", found.reason, found.selection.z);
     let scores = &found.scores.as_ref().unwrap().scores;
@@ -62,10 +62,39 @@ fn property_nothing_is_claimed_without_an_effect() {
 }
 
 #[test]
+fn property_an_effect_that_begins_midway_is_dated() {
+    let found = diagnose_from(&[Effect::SteeringOffset(SteeringOffset { second: 0.1 })], 10.0, 510, &options());
+    let onset = found.findings.iter().find(|f| f.candidate.id() == "steering_offset").and_then(|f| f.onset).unwrap();
+    assert!((onset.at_s - 10.0).abs() <= 1.0 && onset.ci95_s[0] <= 10.0 && onset.ci95_s[1] >= 10.0, "{onset:?}");
+}
+
+#[test]
+fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
+    let bundle = bundle();
+    let recorded = drive("again", 42, &[], &bundle.default_soil);
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
+    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 } };
+    let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
+    let mut again = recorded.clone();
+    observed.driven_again(&bench, &[], &mut again);
+    for (a, b) in recorded.states.iter().zip(&again.states) {
+        for (a, b) in a.to_array().iter().zip(b.to_array()) {
+            assert!((a - b).abs() < 1e-9, "{a} {b}");
+        }
+    }
+    let drag = ScheduledEffect { effect: Effect::WheelDrag(WheelDrag { wheel: 3, torque_n_m: 900.0 }), onset_s: 0.0 };
+    observed.driven_again(&bench, &[drag], &mut again);
+    let last = recorded.states.len() - 1;
+    let turned = again.states[last].attitude_rad[2] - recorded.states[last].attitude_rad[2];
+    assert!(turned < -0.01, "a drag on the right turns to the right, by {turned}");
+}
+
+#[test]
 fn property_an_effect_left_out_is_never_claimed() {
     let options = nesam_discovery::Options { without: vec!["steering_offset".into()], ..options() };
     let found = diagnose_twin(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })], 500, &options);
-    assert!(found.selection.ranked.iter().all(|r| r.candidate.id() != "steering_offset"));
+    assert!(found.findings.iter().all(|f| f.candidate.id() != "steering_offset"));
+    assert!(found.claimed.iter().all(|e| e.effect.id() != "steering_offset"));
 }
 
 #[test]

@@ -1,6 +1,7 @@
-//! `nesam bench`: what answers cost on this machine, and whether the soil filter knows how wrong it is.
+//! `nesam bench`: what answers cost on this machine, whether the soil filter knows how wrong it is, and how often a diagnosis is right.
 
 mod consistency;
+mod discovery;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -34,6 +35,8 @@ enum Bench {
     Predict(PredictBench),
     /// Simulate drives on known soils and hold what the soil filter says of its errors against them (NEES, NIS, coverage)
     Consistency(consistency::ConsistencyBench),
+    /// Hide effects in validation drives and score what a diagnosis makes of them
+    Discovery(discovery::DiscoveryBench),
 }
 
 #[derive(Args, Debug)]
@@ -71,6 +74,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
     match &args.what {
         Bench::Predict(args) => predict(args),
         Bench::Consistency(args) => consistency::run(args),
+        Bench::Discovery(args) => discovery::run(args),
     }
 }
 

@@ -4,8 +4,9 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
 use clap::Args;
+use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
-use nesam_discovery::{Candidate, Diagnosis, Options, Reference, Scoring, Stepping, Verdict, diagnose, observe_all};
+use nesam_discovery::{Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM};
 use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
 use nesam_physics::Vehicle;
@@ -18,6 +19,9 @@ use crate::output::{command_line, say};
 use crate::progress::Progress;
 use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
+
+/// Hypotheses in the printed table.
+const SHOWN: usize = 12;
 
 /// Options of `nesam diagnose`.
 #[derive(Args, Debug)]
@@ -84,18 +88,30 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let mut bundle = load_bundle(Some(&dir))?;
     take_coupling(&mut bundle, drives.root.vehicle());
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
-    let progress = Progress::start("validation drives", drives.drives.len());
+    let progress = Progress::start("validation drives, as the model sees them", drives.drives.len());
     let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
-    let reference = Reference::measure(&predictor.bundle().vehicle, stepping(&bundle), &observed, &drives.root.hash()).or_input()?;
-    let usable = core::array::from_fn(|f| reference.usable[f]);
-    if let Some(nulls) = reference.null_groups(&usable, 5) {
-        say!("null groups of 5 drives: threshold z = {:.2}", nulls.threshold);
-        for (candidate, spread) in Candidate::ALL.iter().zip(&nulls.spread) {
-            say!("  {:<18} null spread {spread:.2}", candidate.label());
+    let bench = Bench { vehicle: &predictor.bundle().vehicle, stepping: stepping(&bundle) };
+    let progress = Progress::start("validation drives against every effect", observed.len());
+    let reference = Reference::measure(&bench, &observed, &drives.root.hash(), &|done| progress.set(done)).or_input()?;
+    progress.finish();
+    let text = reference.to_json();
+    let judge = Judge::new(reference);
+    let channels: Vec<usize> = (0..CHANNELS).filter(|c| observed.iter().all(|d| d.available[*c])).collect();
+    let yardstick = judge.yardstick(&channels, 5, &[]).or_input()?;
+    if let Some(groups) = &yardstick.groups {
+        say!("null groups of 5 drives: threshold z = {:.2}", groups.threshold);
+        for (candidate, spread) in yardstick.catalogue.iter().zip(&groups.spread) {
+            let column = candidate.columns()[0];
+            say!(
+                "  {:<24} null spread {spread:.2}, dispersion {:.2}, usual share {:+.3}",
+                candidate.label(),
+                yardstick.nulls.dispersion(column),
+                yardstick.nulls.share[column]
+            );
         }
     }
-    bundle.reference_json = Some(reference.to_json());
+    bundle.reference_json = Some(text);
     bundle.save(&dir).or_failed()?;
     say!("bundle {} now carries the reference of {} drives; its hash is {}", bundle.name, observed.len(), &bundle.hash[..12]);
     Ok(())
@@ -144,9 +160,11 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
 
 /// Writes the bundle with the effect, where one is claimed.
 fn patched(predictor: &Arc<Predictor>, found: &Diagnosis, drives: &Drives, out: &Path) -> Result<Option<PathBuf>, Failure> {
-    let (Verdict::Explained | Verdict::Ambiguous, Some(best)) = (found.verdict, found.selection.claimed()) else { return Ok(None) };
+    if found.claimed.is_empty() {
+        return Ok(None);
+    }
     let base = predictor.bundle();
-    let mut bundle = base.with_effects(&[best.effect()]);
+    let mut bundle = base.with_effects(&found.claimed);
     bundle.provenance = Provenance {
         command: command_line(),
         data_hash: drives.root.hash(),
@@ -162,22 +180,29 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
     let s = &found.selection;
     let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
     say!("\nevidence against drives without an effect (threshold z = {:.2}{p})", s.threshold);
-    for (e, candidate) in Candidate::ALL.iter().enumerate() {
-        let Some(z) = s.z[e] else { continue };
-        let fit = s.ranked.iter().find(|r| r.candidate == *candidate);
-        let fit = fit.map_or(String::new(), |r| {
-            let refused = r.refused.as_ref().map_or(String::new(), |why| format!("; refused: {why}"));
-            format!("  criterion {:+9.1}  weight {:.3}  {}{refused}", r.bic, r.weight, describe(r))
-        });
-        say!("  {:<18} z {z:7.1}{fit}", candidate.label());
+    let mut order: Vec<usize> = (0..found.catalogue.len()).filter(|e| s.z[*e].is_some()).collect();
+    order.sort_by(|a, b| s.z[*b].unwrap_or(0.0).total_cmp(&s.z[*a].unwrap_or(0.0)));
+    for e in order.into_iter().take(SHOWN) {
+        say!("  {:<24} z {:7.1}", found.catalogue[e].label(), s.z[e].unwrap_or(0.0));
     }
-    for e in &found.estimates {
-        let interval = e.ci95.map_or(String::new(), |[low, high]| format!("[{low:.3}, {high:.3}] "));
-        say!("  {} = {:.3} {interval}{}", e.name, e.value, e.unit);
+    for f in &found.findings {
+        let rivals: Vec<String> = f.rivals.iter().map(|r| format!("{} ({:.2})", r.candidate.label(), r.weight)).collect();
+        let rivals = if rivals.is_empty() { String::new() } else { format!("; rivals {}", rivals.join(", ")) };
+        let refused = f.refused.as_ref().map_or(String::new(), |why| format!("; refused: {why}"));
+        say!(
+            "{}: z {:.1} after the others, criterion {:+.1}, stability {:.2}; {}{rivals}{refused}",
+            f.candidate.label(),
+            f.alone,
+            f.delta_bic,
+            f.stability,
+            describe(f)
+        );
+        for e in &f.estimates {
+            let interval = e.ci95.map_or(String::new(), |[low, high]| format!("[{low:.4}, {high:.4}] "));
+            say!("  {} = {:.4} {interval}{}", e.name, e.value, e.unit);
+        }
     }
-    if let Some(stability) = found.stability {
-        say!("  stability over half-samples of drives {stability:.2}");
-    }
+    say!("left after that: z = {:.1} in {}", s.remaining.0, s.remaining.1);
     let stages = report.stages();
     if stages.is_empty() {
         return;

@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nesam_discovery::{Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
+use nesam_discovery::{Bench, Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
@@ -55,10 +55,15 @@ pub fn world() -> Arc<WorldMap> {
 
 /// A drive of the vehicle with effects; every number follows from the seed.
 pub fn drive(id: &str, seed: u64, effects: &[Effect], soil: &[f64; 6]) -> Trajectory {
+    drive_from(id, seed, effects, 0.0, soil)
+}
+
+/// The same with effects that begin `onset_s` after the start.
+pub fn drive_from(id: &str, seed: u64, effects: &[Effect], onset_s: f64, soil: &[f64; 6]) -> Trajectory {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
-    let vehicle = truck().with_effects(effects);
-    let model = StepModel::new(&vehicle, 0.1, 2);
+    let (plain, changed) = (truck(), truck().with_effects(effects));
+    let models = [StepModel::new(&plain, 0.1, 2), StepModel::new(&changed, 0.1, 2)];
     let world = world();
     let mut correction = SoilCorrection::NONE;
     correction.delta = core::array::from_fn(|i| SOIL_SCATTER[i] * normal());
@@ -80,18 +85,20 @@ pub fn drive(id: &str, seed: u64, effects: &[Effect], soil: &[f64; 6]) -> Trajec
     let mut actuators = DrivelineState::settled(&command(0));
     let (mut states, mut controls, mut steering) = (Vec::new(), Vec::new(), Vec::new());
     for k in 0..SAMPLES + 10 {
+        let model = &models[usize::from(k as f64 * 0.1 - 1.0 >= onset_s - 1e-9 || onset_s == 0.0)];
+        let vehicle = model.vehicle();
         let control = command(k);
         if k >= 10 {
             let x = state.to_array();
             let sd = |i: usize| NOISE[[0, 0, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4][i]];
             states.push(VehicleState::from_array(core::array::from_fn(|i| x[i] + sd(i) * normal())));
             controls.push(control);
-            let angles = actuators.road_wheel_angles(&vehicle);
+            let angles = actuators.road_wheel_angles(vehicle);
             steering.push([angles[0] + NOISE[5] * normal(), angles[1] + NOISE[5] * normal()]);
         }
-        let after = actuators.advance(&vehicle, &control, state.velocity_m_s[0], 0.1);
-        let ground = GroundSource::new(Some(&world), &model, &state).under_wheels(&model, &state, 0.0).0;
-        let wheels = command_wheels(&vehicle, &actuators, &after, &control);
+        let after = actuators.advance(vehicle, &control, state.velocity_m_s[0], 0.1);
+        let ground = GroundSource::new(Some(&world), model, &state).under_wheels(model, &state, 0.0).0;
+        let wheels = command_wheels(vehicle, &actuators, &after, &control);
         let step = model.step(&StepInput { state, wheels, sinkage_log_ratio: [0.0; 4], soil, ground }).increment.to_array();
         let x = state.to_array();
         let (sin, cos) = x[5].sin_cos();
@@ -158,7 +165,8 @@ pub fn bundle() -> ModelBundle {
             let maps = vec![Some(world()); drives.len()];
             let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
-            let reference = Reference::measure(&bundle.vehicle, Stepping { dt_s: 0.1, substeps: 2 }, &observed, "twin").unwrap();
+            let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 } };
+            let reference = Reference::measure(&bench, &observed, "twin", &|_| {}).unwrap();
             bundle.reference_json = Some(reference.to_json());
             bundle
         })
@@ -172,8 +180,13 @@ pub fn options() -> Options {
 
 /// Diagnoses eight twin drives with effects.
 pub fn diagnose_twin(effects: &[Effect], seed: u64, options: &Options) -> Diagnosis {
+    diagnose_from(effects, 0.0, seed, options)
+}
+
+/// The same with effects that begin `onset_s` after the start.
+pub fn diagnose_from(effects: &[Effect], onset_s: f64, seed: u64, options: &Options) -> Diagnosis {
     let bundle = bundle();
-    let drives: Vec<Trajectory> = (0..8).map(|i| drive(&format!("d{i}"), seed + i, effects, &bundle.default_soil)).collect();
+    let drives: Vec<Trajectory> = (0..8).map(|i| drive_from(&format!("d{i}"), seed + i, effects, onset_s, &bundle.default_soil)).collect();
     let predictor = Predictor::new(Arc::new(bundle)).unwrap();
     diagnose(&predictor, &drives, &vec![Some(world()); drives.len()], options, &|_, _, _| {}).unwrap()
 }

@@ -1,0 +1,154 @@
+//! `nesam bench discovery`: how often a diagnosis is right on drives with hidden effects.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use clap::Args;
+use nesam_discovery::Judge;
+use nesam_discovery::bench::{Hidden, Outcome, Scores, Stage, plan, scores};
+use serde_json::json;
+
+use crate::args::{BundleArgs, DataArgs};
+use crate::failure::{Failure, OrFail};
+use crate::output::{provenance, say, write_file};
+use crate::progress::Progress;
+use crate::sources::{check_model_step, load_bundle_for, predictor_for, validation_drives};
+
+/// Options of `nesam bench discovery`.
+#[derive(Args, Debug)]
+pub(super) struct DiscoveryBench {
+    #[command(flatten)]
+    data: DataArgs,
+    #[command(flatten)]
+    bundle: BundleArgs,
+    /// Sets of the benchmark [default: all]
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    sets: Vec<String>,
+    /// Pseudo-vehicles of five validation drives for each hidden effect; at most as many as the drives make
+    #[arg(long, default_value_t = 1)]
+    groups: usize,
+    /// Take only every n-th hidden effect
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    every_hidden: usize,
+    /// Write the figures as JSON (schema nesam.bench.discovery/1)
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
+    check_model_step(args.data.dt)?;
+    let drives = validation_drives(&args.data, "bench discovery", "effects are hidden")?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let judge = Judge::of(predictor.bundle()).or_input()?;
+    let known = judge.drives();
+    if drives.drives.iter().any(|d| !known.contains(&d.id)) || drives.drives.len() != known.len() {
+        let reason = "these validation drives are not those of the bundle's reference; run `nesam diagnose --make-reference` on them";
+        return Err(Failure::input(reason.to_string()));
+    }
+    let stage = Stage { predictor: &predictor, judge: &judge, drives: &drives.drives, maps: &drives.maps };
+    let runs = chosen(args, stage.groups())?;
+    let progress = Progress::start("pseudo-vehicles", runs.len());
+    let mut outcomes = Vec::new();
+    for (done, (hidden, group)) in runs.iter().enumerate() {
+        outcomes.push(stage.run(hidden, *group).or_failed()?);
+        progress.set(done + 1);
+    }
+    progress.finish();
+    let mut sets: BTreeMap<&str, Vec<&Outcome>> = BTreeMap::new();
+    for outcome in &outcomes {
+        sets.entry(outcome.set).or_default().push(outcome);
+    }
+    let sets: BTreeMap<&str, Scores> = sets.into_iter().map(|(name, runs)| (name, scores(&runs))).collect();
+    print(&outcomes, &sets);
+    let Some(file) = &args.json else { return Ok(()) };
+    let document = json!({
+        "schema": "nesam.bench.discovery/1",
+        "sets": sets,
+        "comparators": {},
+        "runs": outcomes,
+        "provenance": provenance(Some(predictor.bundle()), &drives),
+    });
+    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+}
+
+/// What is run: hidden effects with their group of drives. Without effects every group is tried once, because there are so few.
+fn chosen(args: &DiscoveryBench, groups: usize) -> Result<Vec<(Hidden, usize)>, Failure> {
+    if groups == 0 || args.every_hidden == 0 {
+        return Err(Failure::input("bench discovery needs at least five validation drives and --every-hidden of at least 1".to_string()));
+    }
+    let plan = plan();
+    if let Some(unknown) = args.sets.iter().find(|s| !plan.iter().any(|h| h.set == s.as_str())) {
+        return Err(Failure::input(format!("--sets {unknown}: no such set of the benchmark")));
+    }
+    let wanted = |h: &Hidden| args.sets.is_empty() || args.sets.iter().any(|s| s == h.set);
+    let (nulls, effects): (Vec<Hidden>, Vec<Hidden>) = plan.into_iter().filter(wanted).partition(|h| h.set.starts_with("null"));
+    let effects = effects.into_iter().step_by(args.every_hidden).enumerate();
+    let mut runs: Vec<(Hidden, usize)> =
+        effects.flat_map(|(i, h)| (0..args.groups.min(groups)).map(move |g| (h.clone(), (i + g) % groups))).collect();
+    runs.extend(nulls.into_iter().flat_map(|h| (0..groups).map(move |g| (h.clone(), g))));
+    Ok(runs)
+}
+
+fn print(outcomes: &[Outcome], sets: &BTreeMap<&str, Scores>) {
+    for o in outcomes {
+        let truth: Vec<String> = o.truth.iter().map(|(id, size)| format!("{id} {size}")).collect();
+        let claims: Vec<String> = o
+            .claims
+            .iter()
+            .map(|c| {
+                let values: Vec<String> = c
+                    .parameters
+                    .iter()
+                    .map(|(name, v, ci)| ci.map_or(format!("{name} {v}"), |[l, h]| format!("{name} {v:.4} [{l:.4}, {h:.4}]")))
+                    .collect();
+                let onset = c.onset_s.map_or(String::new(), |t| format!(" from {t:.1} s"));
+                let rivals = if c.rivals.is_empty() { String::new() } else { format!(" or {}", c.rivals.join(" or ")) };
+                format!("{}{rivals}: {}{onset}", c.id, values.join(", "))
+            })
+            .collect();
+        say!(
+            "{:<11} {:<38} {:<12} z {:5.1} of {:.1}  {}  ({:.0} s){}",
+            o.set,
+            truth.join(" + "),
+            o.verdict,
+            o.evidence[0],
+            o.evidence[1],
+            claims.join("; "),
+            o.seconds,
+            if o.claims.is_empty() { format!("  {}", o.reason) } else { String::new() }
+        );
+    }
+    say!(
+        "\n{:<12}{:>5}{:>7}{:>7}{:>9}{:>6}{:>8}{:>8}{:>13}{:>10}{:>9}{:>8}",
+        "set",
+        "runs",
+        "top-1",
+        "class",
+        "coverage",
+        "size",
+        "alarm",
+        "wrong",
+        "unexplained",
+        "size err",
+        "CI cov",
+        "onset"
+    );
+    let show = |v: Option<f64>| v.map_or("–".to_string(), |v| format!("{v:.2}"));
+    for (name, s) in sets {
+        say!(
+            "{name:<12}{:>5}{:>7}{:>7}{:>9}{:>6}{:>8}{:>8}{:>13}{:>10}{:>9}{:>8}",
+            s.runs,
+            show(s.top1),
+            show(s.class_accuracy),
+            show(s.set_coverage),
+            show(s.set_size),
+            show(s.false_alarm),
+            show(Some(s.wrong_claim)),
+            show(Some(s.unexplained)),
+            show(s.magnitude_error_median),
+            show(s.ci_coverage),
+            show(s.onset_error_median_s)
+        );
+    }
+}

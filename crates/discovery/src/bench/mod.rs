@@ -1,0 +1,181 @@
+//! HiddenEffect: how often a diagnosis is right on drives of validation, groups of which pose as vehicles with an effect that nobody declares.
+//!
+//! Each pseudo-vehicle is judged by the reference without its own drives, so nothing of it is known beforehand. The sets:
+//!
+//! | set | what is hidden |
+//! |---|---|
+//! | `actuator`, `sensor`, `map` | one effect of the catalogue in the recording, exact ([`Change`]) |
+//! | `force_twin` | one force or soil effect, driven again by our own physics ([`crate::observe::ObservedDrive::driven_again`]) |
+//! | `onset` | an effect that begins in the middle of the drives |
+//! | `two` | two effects at once |
+//! | `outside` | something that the catalogue does not have |
+//! | `left_out` | an effect of the catalogue, with its id withheld from the diagnosis |
+//! | `null` | nothing |
+//! | `null_noise` | nothing, with twice the noise |
+
+mod change;
+mod score;
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use nesam_model::Predictor;
+use nesam_physics::effects::{Effect, ScheduledEffect};
+use nesam_terrain::WorldMap;
+use nesam_trajectories::Trajectory;
+
+pub use change::{Change, apply};
+pub use score::{Outcome, Scores, scores};
+
+use crate::diagnose::{Judge, judge};
+use crate::error::DiscoveryError;
+use crate::observe::{Bench, Stepping, observe, observe_all};
+
+/// Drives of a pseudo-vehicle.
+pub const DRIVES: usize = 5;
+
+/// What is hidden in a set of drives.
+#[derive(Clone, Debug)]
+pub struct Hidden {
+    /// Set of the benchmark.
+    pub set: &'static str,
+    /// Changes of the recording.
+    pub changes: Vec<Change>,
+    /// Effects under which the drives are driven again.
+    pub driven: Vec<Effect>,
+    /// Ids that are there, with the value of the parameter that is scored.
+    pub truth: Vec<(&'static str, f64)>,
+    /// When it begins, s.
+    pub onset_s: f64,
+    /// Ids withheld from the diagnosis.
+    pub without: Vec<String>,
+}
+
+fn recorded(set: &'static str, id: &'static str, size: f64, change: Change) -> Hidden {
+    Hidden { set, changes: vec![change], driven: Vec::new(), truth: vec![(id, size)], onset_s: 0.0, without: Vec::new() }
+}
+
+fn driven(id: &'static str, values: &[f64], scored: usize) -> Option<Hidden> {
+    let effect = Effect::from_parameters(id, values)?;
+    let truth = vec![(id, values[scored])];
+    Some(Hidden { set: "force_twin", changes: Vec::new(), driven: vec![effect], truth, onset_s: 0.0, without: Vec::new() })
+}
+
+fn outside(change: Change) -> Hidden {
+    Hidden { set: "outside", changes: vec![change], driven: Vec::new(), truth: Vec::new(), onset_s: 0.0, without: Vec::new() }
+}
+
+/// Everything that is hidden, each at the size that the catalogue calls believable on four terrains or about twice that.
+pub fn plan() -> Vec<Hidden> {
+    use Change as C;
+    let mut plan = vec![
+        recorded("actuator", "steering_offset", 0.04, C::SteeringOffset(0.04)),
+        recorded("actuator", "steering_offset", -0.08, C::SteeringOffset(-0.08)),
+        recorded("actuator", "steering_ratio", 0.1, C::SteeringRatio(0.1)),
+        recorded("actuator", "steering_ratio", -0.15, C::SteeringRatio(-0.15)),
+        recorded("actuator", "steering_delay", 0.1, C::SteeringDelay(0.1)),
+        recorded("actuator", "steering_delay", 0.3, C::SteeringDelay(0.3)),
+        recorded("actuator", "steering_lag", 0.2, C::SteeringLag(0.2)),
+        recorded("actuator", "speed_gain", 0.05, C::SpeedGain(0.05)),
+        recorded("actuator", "speed_gain", -0.1, C::SpeedGain(-0.1)),
+        recorded("actuator", "speed_delay", 0.3, C::SpeedDelay(0.3)),
+        recorded("sensor", "gyro_bias", 0.005, C::GyroBias(0.005)),
+        recorded("sensor", "gyro_bias", -0.02, C::GyroBias(-0.02)),
+        recorded("sensor", "gyro_scale", 0.03, C::GyroScale(0.03)),
+        recorded("sensor", "velocity_scale", 0.02, C::VelocityScale(0.02)),
+        recorded("sensor", "position_latency", 0.1, C::PositionLatency(0.1)),
+        recorded("sensor", "lever_arm", 0.4, C::LeverArm(0.4)),
+        recorded("sensor", "mount_angle", 0.02, C::MountRoll(0.02)),
+        recorded("map", "map_offset", 0.04, C::MapOffset(0.04)),
+        recorded("map", "map_tilt", 0.01, C::MapTilt(0.01)),
+        outside(C::GyroCross(0.2)),
+        outside(C::SteeringWarp(0.08)),
+        outside(C::VelocityRipple(0.15)),
+    ];
+    let forces: [(&'static str, &[f64], usize); 10] = [
+        ("payload", &[500.0, -1.0, 0.0, 0.7], 0),
+        ("wheel_drag", &[1.0, 900.0], 1),
+        ("linear_drag", &[200.0], 0),
+        ("quadratic_drag", &[60.0], 0),
+        ("rolling_resistance", &[0.03], 0),
+        ("tow", &[800.0, 0.0], 0),
+        ("cg_forward", &[0.15], 0),
+        ("cg_lateral", &[0.1], 0),
+        ("tyre_radius_rear", &[0.03], 0),
+        ("slip_sinkage", &[1.0], 0),
+    ];
+    plan.extend(forces.into_iter().filter_map(|(id, values, scored)| driven(id, values, scored)));
+    for (id, size, change) in [
+        ("steering_offset", 0.08, C::SteeringOffset(0.08)),
+        ("gyro_bias", 0.02, C::GyroBias(0.02)),
+        ("steering_ratio", 0.15, C::SteeringRatio(0.15)),
+    ] {
+        plan.push(Hidden { onset_s: 11.0, ..recorded("onset", id, size, change) });
+        plan.push(Hidden { without: vec![id.into()], ..recorded("left_out", id, size, change) });
+    }
+    for (first, second) in [
+        (("steering_offset", 0.06, C::SteeringOffset(0.06)), ("gyro_bias", 0.015, C::GyroBias(0.015))),
+        (("steering_ratio", 0.15, C::SteeringRatio(0.15)), ("map_offset", 0.05, C::MapOffset(0.05))),
+        (("speed_gain", -0.1, C::SpeedGain(-0.1)), ("steering_offset", -0.06, C::SteeringOffset(-0.06))),
+    ] {
+        let truth = vec![(first.0, first.1), (second.0, second.1)];
+        plan.push(Hidden { changes: vec![first.2, second.2], truth, ..recorded("two", first.0, first.1, first.2) });
+    }
+    let null = |set, changes| Hidden { set, changes, driven: Vec::new(), truth: Vec::new(), onset_s: 0.0, without: Vec::new() };
+    plan.extend([null("null", Vec::new()), null("null_noise", vec![C::Noise(1.0)])]);
+    plan
+}
+
+/// Drives of validation with their maps, and the model that they are judged by.
+#[derive(Debug)]
+pub struct Stage<'a> {
+    /// The model.
+    pub predictor: &'a Predictor,
+    /// Its reference.
+    pub judge: &'a Judge,
+    /// Drives of the reference.
+    pub drives: &'a [Trajectory],
+    /// Map of each.
+    pub maps: &'a [Option<Arc<WorldMap>>],
+}
+
+impl Stage<'_> {
+    /// Number of disjoint pseudo-vehicles that the drives make.
+    pub fn groups(&self) -> usize {
+        self.drives.len() / DRIVES
+    }
+
+    /// Hides something in a group of drives and diagnoses it.
+    ///
+    /// # Errors
+    /// Those of the diagnosis.
+    pub fn run(&self, hidden: &Hidden, group: usize) -> Result<Outcome, DiscoveryError> {
+        let start = Instant::now();
+        let bundle = self.predictor.bundle();
+        let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
+        let bench = Bench { vehicle: &bundle.vehicle, stepping };
+        // Drives are sorted by id and so by world: every sixth mixes worlds.
+        let members: Vec<usize> = (0..DRIVES).map(|i| i * self.groups() + group % self.groups()).collect();
+        let (mut drives, mut maps) = (Vec::new(), Vec::new());
+        for &m in &members {
+            let (mut drive, mut map) = (self.drives[m].clone(), self.maps[m].clone());
+            if !hidden.driven.is_empty() {
+                let effects: Vec<ScheduledEffect> =
+                    hidden.driven.iter().map(|e| ScheduledEffect { effect: *e, onset_s: hidden.onset_s }).collect();
+                observe(self.predictor, &drive, map.as_ref())?.driven_again(&bench, &effects, &mut drive);
+            }
+            for change in &hidden.changes {
+                map = apply(*change, hidden.onset_s, &mut drive, map);
+            }
+            drives.push(drive);
+            maps.push(map);
+        }
+        let ids: Vec<&str> = drives.iter().map(|d| d.id.as_str()).collect();
+        let judge_by = self.judge.without(&ids);
+        let observed = observe_all(self.predictor, &drives, &maps, &|_| {})?;
+        let mut case = judge_by.case(bench, observed, &|_, _, _| {})?;
+        let yardstick = judge_by.yardstick(&case.metric.channels.clone(), DRIVES, &hidden.without)?;
+        let judgement = judge(&mut case, &yardstick);
+        Ok(Outcome::of(hidden, group, &judgement, start.elapsed().as_secs_f64()))
+    }
+}

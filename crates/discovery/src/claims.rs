@@ -1,0 +1,371 @@
+//! From a selection to claims: onset, size with interval, stability over sub-samples of drives, and the reasons why a claim is refused.
+
+use std::collections::BTreeMap;
+
+use nesam_physics::effects::{Layer, ScheduledEffect};
+use nesam_physics::{SoilCorrection, WHEELS};
+use rayon::prelude::*;
+
+use crate::candidates::Candidate;
+use crate::channels::{self, RIM_AT, Row};
+use crate::condense::{Condensed, condense};
+use crate::evidence::Group;
+use crate::fit::{Fit, Prepared, Term, fit};
+use crate::metric::Metric;
+use crate::observe::Bench;
+use crate::onset::{self, Onset};
+use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick};
+
+/// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
+/// pass for this one on a drive, but seldom with the same size on all.
+const MAGNITUDE_HALF_MAX: f64 = 0.7;
+/// Share of half-samples of the drives that must choose a claimed effect or one of its rivals.
+const STABILITY_MIN: f64 = 0.6;
+/// Drives of which all half-samples are looked at.
+const STABILITY_DRIVES: usize = 10;
+/// Contenders for which an onset is looked for.
+const ONSET_CONTENDERS: usize = 3;
+/// Criterion within which a rival is sized through the physics before it is judged.
+const SETTLED: f64 = 40.0;
+/// Student's t for the thirty drives behind a reference.
+const T_NULLS: f64 = 2.05;
+const T_975: [f64; 10] = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23];
+
+/// A parameter of a claimed effect.
+#[derive(Clone, Debug)]
+pub struct Estimate {
+    /// Name.
+    pub name: &'static str,
+    /// Unit.
+    pub unit: &'static str,
+    /// Value.
+    pub value: f64,
+    /// 95 % interval; `None` for a choice such as the wheel.
+    pub ci95: Option<[f64; 2]>,
+}
+
+/// A member of the class of hypotheses that the drives cannot tell apart.
+#[derive(Clone, Copy, Debug)]
+pub struct Member {
+    /// The hypothesis.
+    pub candidate: Candidate,
+    /// Weight; those of a class sum to one.
+    pub weight: f64,
+}
+
+/// An effect that was chosen, with everything that speaks for and against it.
+#[derive(Clone, Debug)]
+pub struct Finding {
+    /// Index in the catalogue.
+    pub hypothesis: usize,
+    /// The hypothesis.
+    pub candidate: Candidate,
+    /// Weight in its class.
+    pub weight: f64,
+    /// Evidence alone.
+    pub z: f64,
+    /// Evidence after the other effects.
+    pub alone: f64,
+    /// Criterion against the closest hypothesis of another id.
+    pub delta_bic: f64,
+    /// Share of half-samples of the drives that choose it or a rival.
+    pub stability: f64,
+    /// Parameters.
+    pub estimates: Vec<Estimate>,
+    /// When it began; `None` = there from the start.
+    pub onset: Option<Onset>,
+    /// Rivals within the criterion, closest first.
+    pub rivals: Vec<Member>,
+    /// Why it is not claimed.
+    pub refused: Option<String>,
+}
+
+/// Course of a channel over the drives.
+#[derive(Clone, Debug)]
+pub struct Trace {
+    /// The channel.
+    pub channel: usize,
+    /// Mean deviation by time (s), without effects.
+    pub before: Vec<(f64, f64)>,
+    /// The same with the claimed effects.
+    pub after: Vec<(f64, f64)>,
+}
+
+/// A set of drives, ready to be judged.
+#[derive(Debug)]
+pub struct Case<'a> {
+    /// Reference.
+    pub bench: Bench<'a>,
+    /// Metric.
+    pub metric: Metric,
+    /// Drives.
+    pub prepared: Vec<Prepared>,
+    /// Deviations of each drive without any effect.
+    pub rows: Vec<Vec<Row>>,
+}
+
+impl Case<'_> {
+    /// Scores of all drives.
+    pub fn condensed(&self) -> impl Iterator<Item = &Condensed> {
+        self.prepared.iter().map(|p| &p.condensed)
+    }
+
+    /// Selects effects, looks for the onset of the strongest, and lets the columns begin there where an onset is sure.
+    pub fn select(&mut self, yardstick: &Yardstick) -> (Selection, Vec<Option<Onset>>) {
+        let mut onsets: Vec<Option<Onset>> = vec![None; yardstick.catalogue.len()];
+        let selection = yardstick.select(&yardstick.group(self.condensed()));
+        if !selection.differs() {
+            return (selection, onsets);
+        }
+        let group = yardstick.group(self.condensed());
+        let mut contenders: Vec<(usize, f64)> =
+            (0..yardstick.catalogue.len()).filter(|h| yardstick.considered[*h]).map(|h| (h, yardstick.after(&group, &[], h).1)).collect();
+        contenders.sort_by(|a, b| b.1.total_cmp(&a.1));
+        let firsts: Vec<usize> = contenders.iter().take(ONSET_CONTENDERS).filter(|c| c.1 > 0.0).map(|c| c.0).collect();
+        for h in firsts {
+            let columns = yardstick.catalogue[h].columns();
+            let shares = group.remainder(&[], &columns, 0.0).shares;
+            let drives: Vec<&Prepared> = self.prepared.iter().collect();
+            let rows: Vec<&[Row]> = self.rows.iter().map(Vec::as_slice).collect();
+            let dispersion = columns.iter().map(|c| yardstick.nulls.dispersion(*c)).fold(1.0, f64::max);
+            onsets[h] = onset::find(&self.metric, &drives, &rows, self.bench.stepping.dt_s, &columns, &shares, dispersion);
+        }
+        if onsets.iter().all(Option::is_none) {
+            return (selection, onsets);
+        }
+        self.begin_at(yardstick, &onsets);
+        (yardstick.select(&yardstick.group(self.condensed())), onsets)
+    }
+
+    fn begin_at(&mut self, yardstick: &Yardstick, onsets: &[Option<Onset>]) {
+        let (metric, dt_s) = (&self.metric, self.bench.stepping.dt_s);
+        self.prepared.par_iter_mut().zip(&self.rows).for_each(|(prepared, rows)| {
+            let times = prepared.drive.times_s(dt_s);
+            for (h, onset) in onsets.iter().enumerate() {
+                let Some(onset) = onset else { continue };
+                for column in yardstick.catalogue[h].columns() {
+                    for (row, time) in prepared.signatures.columns[column].iter_mut().zip(&times) {
+                        if *time < onset.at_s {
+                            *row = [0.0; crate::channels::CHANNELS];
+                        }
+                    }
+                }
+            }
+            prepared.condensed = condense(metric, rows, &prepared.signatures);
+        });
+    }
+
+    /// Sizes the chosen effects together.
+    pub fn size(&self, yardstick: &Yardstick, group: &Group, chosen: &[usize], onsets: &[Option<Onset>]) -> Fit {
+        let terms: Vec<Term> = chosen
+            .iter()
+            .map(|h| Term { candidate: yardstick.catalogue[*h], onset_s: onsets[*h].map_or(0.0, |o| o.at_s.max(0.0)) })
+            .collect();
+        let columns: Vec<usize> = chosen.iter().flat_map(|h| yardstick.catalogue[*h].columns()).collect();
+        let mut shares = group.joint_shares(&columns);
+        // The size of a force follows from the motion. The rims tell where it acts, but how far they give way follows from the slope of traction, which is
+        // known to a factor.
+        let forces = terms.iter().any(|t| matches!(t.candidate.layer(), Layer::Force | Layer::Soil));
+        let motion = if forces { self.metric.only(|c| !(RIM_AT..RIM_AT + WHEELS).contains(&c)) } else { None };
+        let mut offset = Vec::new();
+        let start = terms
+            .iter()
+            .map(|term| {
+                let own = term.candidate.columns();
+                let rest = shares.split_off(own.len());
+                let start = term.candidate.start(&shares);
+                shares = rest;
+                match term.candidate.unit() {
+                    Some(unit) if !forces => offset.push(unit * yardstick.nulls.share[own[0]]),
+                    _ => offset.extend(term.candidate.free().iter().map(|_| 0.0)),
+                }
+                start
+            })
+            .collect();
+        let drives: Vec<&Prepared> = self.prepared.iter().collect();
+        fit(&self.bench, motion.as_ref().unwrap_or(&self.metric), &drives, &terms, start, &offset)
+    }
+
+    /// Scores of what fitted effects leave.
+    fn left(&self, yardstick: &Yardstick, fit: &Fit) -> Group {
+        let effects = fit.effects();
+        let condensed: Vec<Condensed> = self
+            .prepared
+            .par_iter()
+            .map(|p| condense(&self.metric, &p.drive.deviations(&self.bench, &effects, &SoilCorrection::NONE), &p.signatures))
+            .collect();
+        yardstick.group(condensed.iter())
+    }
+
+    /// Compares the first chosen effect with its closest rivals once more, each sized through the physics, because a large delay or drag is no multiple of a small one.
+    /// The best comes first, the others remain its rivals; what is left is that of the fit.
+    pub fn settle(&self, yardstick: &Yardstick, selection: &mut Selection, onsets: &[Option<Onset>]) {
+        let Some(&first) = selection.chosen.first() else { return };
+        let before = yardstick.group(self.condensed());
+        let close = selection.rivals[0].iter().filter(|r| r.difference < SETTLED).take(2 * RIVALS_MAX).map(|r| r.hypothesis);
+        let members: Vec<usize> = std::iter::once(first).chain(close).collect();
+        let with = |h: usize| -> Vec<usize> { std::iter::once(h).chain(selection.chosen[1..].iter().copied()).collect() };
+        let left: Vec<Group> = members.iter().map(|h| self.left(yardstick, &self.size(yardstick, &before, &with(*h), onsets))).collect();
+        let z = |k: usize, j: usize| yardstick.after_fit(&left[j], &before, &with(members[j]), members[k]).0;
+        let difference = |j: usize, k: usize| z(j, k).powi(2) - z(k, j).powi(2);
+        let best = (1..members.len()).fold(0, |best, k| if difference(best, k) < 0.0 { k } else { best });
+        let mut rivals: Vec<Rival> =
+            (0..members.len()).filter(|k| *k != best).map(|k| Rival { hypothesis: members[k], difference: difference(best, k) }).collect();
+        rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
+        selection.chosen = with(members[best]);
+        let far = selection.rivals[0].iter().filter(|r| !members.contains(&r.hypothesis)).cloned();
+        rivals.extend(far);
+        selection.rivals[0] = rivals;
+        selection.remaining = yardstick.remaining_after_fit(&left[best], &before, &selection.chosen);
+    }
+
+    /// Findings of a selection, in its order, refused or not.
+    pub fn findings(&self, yardstick: &Yardstick, selection: &Selection, onsets: &[Option<Onset>], fit: &Fit) -> Vec<Finding> {
+        let group = yardstick.group(self.condensed());
+        (0..selection.chosen.len())
+            .map(|i| {
+                let hypothesis = selection.chosen[i];
+                let candidate = yardstick.catalogue[hypothesis];
+                let (weight, rivals) = class(yardstick, selection, i);
+                let other = selection.rivals[i].iter().find(|r| yardstick.catalogue[r.hypothesis].id() != candidate.id());
+                let mut finding = Finding {
+                    hypothesis,
+                    candidate,
+                    weight,
+                    z: selection.z[hypothesis].unwrap_or(0.0),
+                    alone: selection.alone[i],
+                    delta_bic: other.map_or(selection.alone[i].powi(2), |r| r.difference),
+                    stability: self.stability(yardstick, candidate.id(), &rivals),
+                    estimates: estimates(&group, fit, i),
+                    onset: onsets[hypothesis],
+                    rivals,
+                    refused: None,
+                };
+                finding.refused = refusal(&finding, fit, i);
+                finding
+            })
+            .collect()
+    }
+
+    /// Share of half-samples of the drives that choose an id or one of its rivals.
+    fn stability(&self, yardstick: &Yardstick, id: &str, rivals: &[Member]) -> f64 {
+        let n = self.prepared.len().min(STABILITY_DRIVES);
+        let half = n.div_ceil(2);
+        let subsets: Vec<u32> = (0u32..1 << n).filter(|s| s.count_ones() as usize == half).collect();
+        let hits = subsets
+            .par_iter()
+            .filter(|subset| {
+                let part = (0..n).filter(|i| **subset & (1 << i) != 0).map(|i| &self.prepared[i].condensed);
+                let chosen = yardstick.select(&yardstick.group(part)).chosen;
+                chosen.iter().map(|h| yardstick.catalogue[*h].id()).any(|c| c == id || rivals.iter().any(|r| r.candidate.id() == c))
+            })
+            .count();
+        hits as f64 / subsets.len().max(1) as f64
+    }
+
+    /// Course of the most unusual channel of each residual layer, before and with effects.
+    pub fn traces(&self, selection: &Selection, effects: &[ScheduledEffect]) -> Vec<Trace> {
+        let with: Vec<Vec<Row>> = if effects.is_empty() {
+            self.rows.clone()
+        } else {
+            self.prepared.iter().map(|p| p.drive.deviations(&self.bench, effects, &SoilCorrection::NONE)).collect()
+        };
+        let levels = &self.metric.channels;
+        ["actuator", "force", "kinematic", "map"]
+            .into_iter()
+            .filter_map(|layer| {
+                let own = (0..levels.len()).filter(|i| channels::layer(levels[*i]) == layer);
+                let i = own.max_by(|a, b| selection.levels[*a].total_cmp(&selection.levels[*b]))?;
+                Some(Trace { channel: levels[i], before: self.course(&self.rows, i), after: self.course(&with, i) })
+            })
+            .collect()
+    }
+
+    /// Mean over the drives of the deviation of a compared channel from its usual level, by time (s).
+    fn course(&self, rows: &[Vec<Row>], i: usize) -> Vec<(f64, f64)> {
+        let mut sums: BTreeMap<usize, (f64, f64)> = BTreeMap::new();
+        for (prepared, rows) in self.prepared.iter().zip(rows) {
+            for (start, row) in prepared.drive.starts.iter().zip(rows) {
+                let sum = sums.entry(*start).or_default();
+                *sum = (sum.0 + row[self.metric.channels[i]] - self.metric.centre[i], sum.1 + 1.0);
+            }
+        }
+        sums.into_iter().map(|(start, (sum, count))| (start as f64 * self.bench.stepping.dt_s, sum / count)).collect()
+    }
+}
+
+/// The class of the `i`-th chosen hypothesis: its weight, and its rivals of other ids with theirs.
+fn class(yardstick: &Yardstick, selection: &Selection, i: usize) -> (f64, Vec<Member>) {
+    let own = yardstick.catalogue[selection.chosen[i]].id();
+    let mut ids = vec![own];
+    let mut close: Vec<(Candidate, f64)> = Vec::new();
+    for rival in selection.rivals[i].iter().filter(|r| r.difference < DECISIVE) {
+        let candidate = yardstick.catalogue[rival.hypothesis];
+        if !ids.contains(&candidate.id()) && close.len() < RIVALS_MAX {
+            ids.push(candidate.id());
+            close.push((candidate, (-0.5 * rival.difference.max(0.0)).exp()));
+        }
+    }
+    let total = 1.0 + close.iter().map(|c| c.1).sum::<f64>();
+    (1.0 / total, close.into_iter().map(|(candidate, weight)| Member { candidate, weight: weight / total }).collect())
+}
+
+/// How wrong the predicted response to an effect may be as a whole, as a share of it (chosen): forces of two accepted pressure laws differ by more, the
+/// angle of a road wheel and the integral of a gyro are geometry.
+fn scale_sd(layer: Layer) -> f64 {
+    match layer {
+        Layer::Force | Layer::Soil => 0.12,
+        _ => 0.02,
+    }
+}
+
+/// Half width of the 95 % interval of a value: the wider of the scatter of null drives and the jackknife over drives.
+fn half_width(group: &Group, fit: &Fit, term: usize, i: usize) -> f64 {
+    let columns = fit.terms[term].candidate.columns();
+    let dispersion = columns.iter().map(|c| group.covariance[(*c, *c)] / group.information[(*c, *c)].max(1e-12)).fold(1.0, f64::max);
+    let posterior = T_NULLS * fit.sd[term][i] * dispersion.sqrt();
+    let t = T_975.get(fit.jackknife.len().saturating_sub(2)).copied().unwrap_or(2.1);
+    fit.jackknife_sd(term, i).map_or(posterior, |sd| posterior.max(t * sd))
+}
+
+fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
+    let candidate = fit.terms[term].candidate;
+    let free = candidate.free();
+    candidate
+        .effect(&fit.values[term])
+        .parameters()
+        .iter()
+        .enumerate()
+        .map(|(p, parameter)| {
+            let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
+                // The first value is the magnitude, which answers for the scale of the response.
+                let scale = if i == 0 { 1.96 * scale_sd(candidate.layer()) * fit.values[term][i] } else { 0.0 };
+                let half = half_width(group, fit, term, i).hypot(scale);
+                [parameter.value - half, parameter.value + half]
+            });
+            Estimate { name: parameter.name, unit: parameter.unit, value: parameter.value, ci95 }
+        })
+        .collect()
+}
+
+/// Why a fit is not claimed even if it is the best.
+fn refusal(finding: &Finding, fit: &Fit, term: usize) -> Option<String> {
+    let free = finding.candidate.free();
+    if let Some(i) = fit.held[term].iter().position(|h| *h) {
+        let e = &finding.estimates[free[i].parameter];
+        return Some(format!("{} = {:.3} {} lies at the end of its physical range", e.name, e.value, e.unit));
+    }
+    if finding.stability < STABILITY_MIN {
+        return Some(format!("only {:.0} % of half-samples of the drives choose it", 100.0 * finding.stability));
+    }
+    // An effect of several magnitudes, such as a wind, is known when one of them is.
+    let relative = free
+        .iter()
+        .filter(|f| {
+            f.parameter == free[0].parameter || finding.candidate.unit().is_none() && f.mean == 0.0 && finding.candidate.id() != "payload"
+        })
+        .filter_map(|f| finding.estimates.get(f.parameter))
+        .filter_map(|e| e.ci95.map(|[low, high]| 0.5 * (high - low) / e.value.abs().max(1e-12)))
+        .fold(f64::INFINITY, f64::min);
+    (relative > MAGNITUDE_HALF_MAX).then(|| format!("its size is known to ±{:.0} % only", 100.0 * relative))
+}
