@@ -2,12 +2,12 @@
 
 use std::collections::BTreeMap;
 
+use nesam_physics::SoilCorrection;
 use nesam_physics::effects::{Layer, ScheduledEffect};
-use nesam_physics::{SoilCorrection, WHEELS};
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::channels::{self, RIM_AT, Row};
+use crate::channels::{self, Row};
 use crate::condense::{Condensed, condense};
 use crate::evidence::Group;
 use crate::fit::{Fit, Prepared, Term, fit};
@@ -146,7 +146,7 @@ impl Case<'_> {
                 for column in yardstick.catalogue[h].columns() {
                     for (row, time) in prepared.signatures.columns[column].iter_mut().zip(&times) {
                         if *time < onset.at_s {
-                            *row = [0.0; crate::channels::CHANNELS];
+                            *row = [0.0; channels::CHANNELS];
                         }
                     }
                 }
@@ -163,10 +163,6 @@ impl Case<'_> {
             .collect();
         let columns: Vec<usize> = chosen.iter().flat_map(|h| yardstick.catalogue[*h].columns()).collect();
         let mut shares = group.joint_shares(&columns);
-        // The size of a force follows from the motion. The rims tell where it acts, but how far they give way follows from the slope of traction, which is
-        // known to a factor.
-        let forces = terms.iter().any(|t| matches!(t.candidate.layer(), Layer::Force | Layer::Soil));
-        let motion = if forces { self.metric.only(|c| !(RIM_AT..RIM_AT + WHEELS).contains(&c)) } else { None };
         let mut offset = Vec::new();
         let start = terms
             .iter()
@@ -176,14 +172,14 @@ impl Case<'_> {
                 let start = term.candidate.start(&shares);
                 shares = rest;
                 match term.candidate.unit() {
-                    Some(unit) if !forces => offset.push(unit * yardstick.nulls.share[own[0]]),
-                    _ => offset.extend(term.candidate.free().iter().map(|_| 0.0)),
+                    Some(unit) => offset.push(unit * yardstick.nulls.share[own[0]]),
+                    None => offset.extend(term.candidate.free().iter().map(|_| 0.0)),
                 }
                 start
             })
             .collect();
         let drives: Vec<&Prepared> = self.prepared.iter().collect();
-        fit(&self.bench, motion.as_ref().unwrap_or(&self.metric), &drives, &terms, start, &offset)
+        fit(&self.bench, &self.metric, &drives, &terms, start, &offset)
     }
 
     /// Scores of what fitted effects leave.

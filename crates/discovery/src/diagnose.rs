@@ -22,7 +22,10 @@ use crate::select::{Selection, Yardstick};
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
 const LEFT_MAX: f64 = 0.35;
-/// The same where every claimed effect is geometry, such as a steering ratio or a gyro bias.
+/// How far beyond the family-wise threshold the largest evidence must be before drives count as different without a known cause (chosen, as in ADR 0008):
+/// one set in twenty without an effect is beyond the threshold itself.
+const UNEXPLAINED_MARGIN: f64 = 1.5;
+/// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
 const LEFT_MAX_GEOMETRY: f64 = 0.15;
 
 /// What the command line says.
@@ -215,7 +218,7 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     let mut left_out = Vec::new();
     loop {
         if selection.chosen.is_empty() {
-            let (verdict, reason) = nothing_chosen(&selection, &left_out);
+            let (verdict, reason) = nothing_chosen(&selection);
             return Judgement { selection, findings: left_out, fit: None, verdict, reason };
         }
         let group = yardstick.group(case.condensed());
@@ -238,7 +241,11 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     }
 }
 
-fn nothing_chosen(selection: &Selection, _left_out: &[Finding]) -> (Verdict, String) {
+fn nothing_chosen(selection: &Selection) -> (Verdict, String) {
+    if !surely_differs(selection) && selection.differs() {
+        let z = selection.largest();
+        return (Verdict::None, format!("the evidence that anything differs is weak (z = {z:.1}), and no effect may be claimed"));
+    }
     if selection.differs() {
         let (z, what) = &selection.remaining;
         return (
@@ -249,8 +256,20 @@ fn nothing_chosen(selection: &Selection, _left_out: &[Finding]) -> (Verdict, Str
     (Verdict::None, "nothing stands out from drives without an effect".into())
 }
 
+/// Whether the drives differ from the reference beyond doubt, so that it must be said even when no cause can be named.
+fn surely_differs(selection: &Selection) -> bool {
+    selection.largest() >= UNEXPLAINED_MARGIN * selection.threshold
+}
+
 fn provisional(selection: &Selection, findings: &[Finding]) -> (Verdict, String) {
     let first = &findings[0];
+    if let Some(refused) = first.refused.as_ref().filter(|_| !surely_differs(selection)) {
+        let (z, label) = (selection.largest(), first.candidate.label());
+        return (
+            Verdict::None,
+            format!("the evidence that anything differs is weak (z = {z:.1}), and {label} cannot be claimed: {refused}"),
+        );
+    }
     if let Some(refused) = &first.refused {
         return (
             Verdict::Unexplained,

@@ -74,17 +74,6 @@ impl Metric {
         Some(Self { channels, centre, within, between, whiten, level })
     }
 
-    /// The same over fewer channels; `None` when none is left.
-    pub fn only(&self, keep: impl Fn(usize) -> bool) -> Option<Self> {
-        let kept: Vec<usize> = (0..self.channels.len()).filter(|i| keep(self.channels[*i])).collect();
-        let part = |of: &DMatrix<f64>| of.select_rows(&kept).select_columns(&kept);
-        let channels: Vec<usize> = kept.iter().map(|i| self.channels[*i]).collect();
-        if channels.is_empty() {
-            return None;
-        }
-        Self::new(channels, self.centre.select_rows(&kept), part(&self.within), part(&self.between))
-    }
-
     /// A deviation from the usual level, whitened. (C)
     pub fn residual(&self, row: &Row) -> DVector<f64> {
         &self.whiten * (self.pick(row) - &self.centre)
