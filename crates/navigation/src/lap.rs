@@ -15,6 +15,9 @@ use crate::tracker::TrackingCost;
 /// Steps at rest before the vehicle is driven off, and steps of straight acceleration before the lap begins (as in the recorded drives).
 const SETTLE_STEPS: usize = 10;
 const ACCELERATION_STEPS: usize = 15;
+/// Share of their travel at the wanted speed that the acceleration steps make good: the vehicle is set down so far behind the beginning of its lap, on the
+/// tangent, that it begins the lap on the path and along it.
+const RUN_UP_SHARE: f64 = 0.5;
 /// A lap is given up this far off the path, m.
 const OFF_PATH_MAX_M: f64 = 5.0;
 /// Longest time of a lap over that at the wanted speed.
@@ -27,9 +30,9 @@ const PAST_MAX: usize = 32;
 /// What is to be driven.
 #[derive(Clone, Debug)]
 pub struct LapPlan {
-    /// Where and with which noise the plant starts.
+    /// World to drive in.
     pub world: String,
-    /// Angle of the path at which the vehicle is set down, rad.
+    /// Angle of the path at which the lap begins, rad.
     pub start_phi: f64,
     /// Seed of sensors and planner.
     pub seed: u64,
@@ -79,12 +82,10 @@ pub struct Lap {
 /// # Errors
 /// `NavigationError` when plant or service fail; leaving the path or getting stuck is a result.
 pub async fn run_lap(plan: &LapPlan, plant: &mut dyn PlantLink, model: &mut Forecaster) -> Result<Lap, NavigationError> {
-    let start = Start {
-        world: plan.world.clone(),
-        seed: plan.seed,
-        position_m: plan.path.point(plan.start_phi),
-        yaw_rad: plan.path.heading(plan.start_phi),
-    };
+    let ([x, y], yaw_rad) = (plan.path.point(plan.start_phi), plan.path.heading(plan.start_phi));
+    let run_up_m = RUN_UP_SHARE * plan.cost.speed_m_s * DT_S * ACCELERATION_STEPS as f64;
+    let position_m = [x - run_up_m * yaw_rad.cos(), y - run_up_m * yaw_rad.sin()];
+    let start = Start { world: plan.world.clone(), seed: plan.seed, position_m, yaw_rad };
     let mut reading = plant.reset(&start)?;
     for _ in 0..SETTLE_STEPS {
         reading = plant.step(Control { speed_m_s: 0.0, second: 0.0 })?;

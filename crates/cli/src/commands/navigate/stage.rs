@@ -27,6 +27,9 @@ const NEVER_EXCITED: f64 = 1e12;
 /// How far stamps may run ahead of the server's clock, s: laps are driven in the plant's time, which passes faster.
 const CLOCK_AHEAD_S: f64 = 1e6;
 
+/// Longest wait of a query, s: on a busy machine a lap takes longer and is the same lap.
+const DEADLINE_S: f64 = 3600.0;
+
 /// A server on loopback with a client and the maps that it holds.
 struct Service {
     server: RunningServer,
@@ -128,6 +131,7 @@ impl<'a> Stage<'a> {
                 let mut config = Config::ephemeral();
                 config.http.enabled = false;
                 config.limits.clock_ahead_max_s = CLOCK_AHEAD_S;
+                config.grpc.deadline_s = DEADLINE_S;
                 let (server, _) = serve::start(config, bundle).await?;
                 let client = Client::connect(&format!("http://{}", server.grpc_addr)).await.or_failed()?;
                 slot.insert(Service { server, client, maps: BTreeSet::new() })
