@@ -185,9 +185,12 @@ impl StepModel {
             }
         }
 
-        let contributions: [Contribution<T>; WHEELS] = core::array::from_fn(|i| self.wheel_contribution(i, state, &tilt, input));
-        for wheel in &contributions {
-            assemble(wheel, v, w, h, &mut lhs, &mut rhs);
+        let mut contacts = [WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero }; WHEELS];
+        // A loop and no closure: a closure would not be inlined, and vectors would lose the instructions of their caller.
+        for (i, contact) in contacts.iter_mut().enumerate() {
+            let wheel = self.wheel_contribution(i, state, &tilt, input);
+            assemble(&wheel, v, w, h, &mut lhs, &mut rhs);
+            *contact = wheel.contact;
         }
         let delta = solve_spd(lhs, rhs.map(|f| f * h));
 
@@ -202,7 +205,7 @@ impl StepModel {
         state.attitude_rad = add(state.attitude_rad, scale(rates, h));
         state.velocity_m_s = add(v, dv);
         state.angular_velocity_rad_s = add(w, dw);
-        contributions.map(|c| c.contact)
+        contacts
     }
 
     /// Forces of one wheel and how they change with its velocity.
@@ -288,6 +291,7 @@ impl StepModel {
     ///
     /// The slope of traction is the tangent of the exponential shear law at the mobilised share u of its limit: thrust / over-speed · (1 - u) (-ln(1 - u)) / u.
     /// Without drag nothing is computed.
+    #[inline(always)]
     fn drag_at_tread<T: Real>(&self, wheel: usize, thrust_n: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> T {
         if self.vehicle.effects.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
             return T::lit(0.0);

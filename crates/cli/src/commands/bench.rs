@@ -113,7 +113,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         "schema": "nesam.bench/1",
         "samples": args.samples,
         "horizon": args.horizon,
-        "path": path(),
+        "path": fresh.path().as_str(),
         "threads": rayon::current_num_threads(),
         "queries": args.queries,
         "p50_ms": p50,
@@ -129,7 +129,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         "{} candidates x {} steps on the {} path, {} threads, {} queries",
         args.samples,
         args.horizon,
-        path(),
+        fresh.path().as_str(),
         rayon::current_num_threads(),
         args.queries
     );
@@ -244,17 +244,6 @@ fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) ->
         }
     }
     Ok(moved.iter().zip(off).map(|(moved, off)| moved / off).reduce(f64::max))
-}
-
-/// Instructions that the kernels were compiled for.
-fn path() -> &'static str {
-    if cfg!(target_feature = "avx512f") {
-        "avx512"
-    } else if cfg!(target_feature = "avx2") {
-        "avx2"
-    } else {
-        "portable"
-    }
 }
 
 /// Value below which a share of the values lies, by rank.

@@ -1,0 +1,237 @@
+//! The arithmetic of the network: rows of features, blocks of samples in lanes.
+//!
+//! A row holds one feature of 16 H samples. Every sample is a lane of its own from the first to the last operation, so its numbers do not depend on its
+//! neighbours, on H or on the path. Everything here is `#[inline(always)]`: it must end up inside a function that is compiled for the vectors' instructions.
+
+use super::elementary::{exp, gelu, silu};
+use super::vector::{Lane, Vector};
+
+/// One feature of 16 H samples.
+pub type Row<const H: usize> = [Lane; H];
+
+/// Rows of weights that a tile computes together.
+pub const PANEL: usize = 8;
+
+/// A matrix packed for [`linear`]: panels of eight outputs, input by input; outputs beyond the last are zero.
+#[derive(Clone, Debug, Default)]
+pub struct Packed {
+    /// (panels, inputs) of eight weights.
+    panels: Vec<[f32; PANEL]>,
+    bias: Vec<[f32; PANEL]>,
+    inputs: usize,
+}
+
+impl Packed {
+    /// From the weight of each (output, input) and the bias of each output.
+    pub fn new(outputs: usize, inputs: usize, weight: impl Fn(usize, usize) -> f32, bias: impl Fn(usize) -> f32) -> Self {
+        let panel = |panel: usize, value: &dyn Fn(usize) -> f32| {
+            core::array::from_fn(|r| if panel * PANEL + r < outputs { value(panel * PANEL + r) } else { 0.0 })
+        };
+        let count = outputs.div_ceil(PANEL);
+        Self {
+            panels: (0..count * inputs).map(|i| panel(i / inputs, &|output| weight(output, i % inputs))).collect(),
+            bias: (0..count).map(|p| panel(p, &bias)).collect(),
+            inputs,
+        }
+    }
+
+    /// From row-major weights (outputs, inputs) and biases (outputs).
+    pub fn from_rows(weight: &[f32], bias: &[f32]) -> Self {
+        let inputs = weight.len() / bias.len();
+        Self::new(bias.len(), inputs, |o, i| weight[o * inputs + i], |o| bias[o])
+    }
+
+    /// Outputs, filled up to whole panels: the rows that [`linear`] writes.
+    pub fn padded_outputs(&self) -> usize {
+        self.bias.len() * PANEL
+    }
+}
+
+/// What becomes of the result of [`linear`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum After {
+    /// y = W x + b.
+    Store,
+    /// y = GELU(W x + b).
+    Gelu,
+    /// y = SiLU(W x + b).
+    Silu,
+    /// y += W x + b.
+    Add,
+}
+
+/// y = W x + b, or what `after` makes of it: `x` (inputs) rows, `y` (padded outputs) rows. Sums run over the inputs in order.
+#[inline(always)]
+pub fn linear<V: Vector, const H: usize>(matrix: &Packed, after: After, x: &[Row<H>], y: &mut [Row<H>]) {
+    linear_of::<V, H, _>(matrix, after, &x[..matrix.inputs], y);
+}
+
+/// The same with inputs that lie anywhere: any collection that gives as many rows as the matrix has inputs.
+#[inline(always)]
+pub fn linear_of<'a, V: Vector, const H: usize, X>(matrix: &Packed, after: After, x: X, y: &mut [Row<H>])
+where
+    X: IntoIterator<Item = &'a Row<H>> + Copy,
+{
+    let panels = matrix.panels.chunks_exact(matrix.inputs).zip(&matrix.bias).zip(y.chunks_exact_mut(PANEL));
+    for ((weights, bias), y) in panels {
+        if V::WIDE {
+            tile::<V, PANEL, H, H>(weights, bias, 0, 0, after, x, y);
+        } else {
+            // Half as many registers, each half as wide.
+            for half in 0..H {
+                tile::<V, 4, 1, H>(weights, bias, 0, half, after, x, y);
+                tile::<V, 4, 1, H>(weights, bias, 4, half, after, x, y);
+            }
+        }
+    }
+}
+
+/// R outputs from `first` of a panel for W of the H vectors of a row from `from`.
+#[inline(always)]
+fn tile<'a, V: Vector, const R: usize, const W: usize, const H: usize>(
+    weights: &[[f32; PANEL]],
+    bias: &[f32; PANEL],
+    first: usize,
+    from: usize,
+    after: After,
+    x: impl IntoIterator<Item = &'a Row<H>>,
+    y: &mut [Row<H>],
+) {
+    let mut sums = [[V::splat(0.0); W]; R];
+    for r in 0..R {
+        sums[r] = [V::splat(bias[first + r]); W];
+    }
+    for (weights, x) in weights.iter().zip(x) {
+        let mut inputs = [V::splat(0.0); W];
+        for w in 0..W {
+            inputs[w] = V::load(&x[from + w].0);
+        }
+        for r in 0..R {
+            let weight = V::splat(weights[first + r]);
+            for w in 0..W {
+                sums[r][w] = weight.mul_add(inputs[w], sums[r][w]);
+            }
+        }
+    }
+    for r in 0..R {
+        for w in 0..W {
+            let out = &mut y[first + r][from + w].0;
+            let value = match after {
+                After::Store => sums[r][w],
+                After::Gelu => gelu(sums[r][w]),
+                After::Silu => silu(sums[r][w]),
+                After::Add => V::load(out).add(sums[r][w]),
+            };
+            value.store(out);
+        }
+    }
+}
+
+/// Layer normalisation over the features. `x`, `y` (features) rows; features are a multiple of four.
+#[inline(always)]
+pub fn layer_norm<V: Vector, const H: usize>(x: &[Row<H>], weight: &[f32], bias: &[f32], eps: f32, y: &mut [Row<H>]) {
+    let share = V::splat(1.0 / x.len() as f32);
+    for h in 0..H {
+        // Four sums at a time, so that an add need not wait for the one before.
+        let mut sums = [V::splat(0.0); 4];
+        for rows in x.chunks_exact(4) {
+            for i in 0..4 {
+                sums[i] = sums[i].add(V::load(&rows[i][h].0));
+            }
+        }
+        let mean = sums[0].add(sums[1]).add(sums[2].add(sums[3])).mul(share);
+        let mut squares = [V::splat(0.0); 4];
+        for rows in x.chunks_exact(4) {
+            for i in 0..4 {
+                let away = V::load(&rows[i][h].0).sub(mean);
+                squares[i] = away.mul_add(away, squares[i]);
+            }
+        }
+        let variance = squares[0].add(squares[1]).add(squares[2].add(squares[3])).mul(share);
+        let inverse = V::splat(1.0).div(variance.add(V::splat(eps)).sqrt());
+        for (((x, y), weight), bias) in x.iter().zip(y.iter_mut()).zip(weight).zip(bias) {
+            V::load(&x[h].0).sub(mean).mul(inverse).mul_add(V::splat(*weight), V::splat(*bias)).store(&mut y[h].0);
+        }
+    }
+}
+
+/// y += row by row.
+#[inline(always)]
+pub fn add_rows<V: Vector, const H: usize>(y: &mut [Row<H>], x: &[Row<H>]) {
+    for (y, x) in y.iter_mut().zip(x) {
+        for h in 0..H {
+            V::load(&y[h].0).add(V::load(&x[h].0)).store(&mut y[h].0);
+        }
+    }
+}
+
+/// Softmax of `scale` · scores over the rows, lane by lane.
+#[inline(always)]
+pub fn softmax<V: Vector, const H: usize>(scores: &mut [Row<H>], scale: f32) {
+    let scale = V::splat(scale);
+    for h in 0..H {
+        let mut top = V::splat(f32::NEG_INFINITY);
+        for row in scores.iter() {
+            top = top.max(V::load(&row[h].0));
+        }
+        let mut total = V::splat(0.0);
+        for row in scores.iter_mut() {
+            let weight = exp(V::load(&row[h].0).sub(top).mul(scale));
+            total = total.add(weight);
+            weight.store(&mut row[h].0);
+        }
+        let share = V::splat(1.0).div(total);
+        for row in scores.iter_mut() {
+            V::load(&row[h].0).mul(share).store(&mut row[h].0);
+        }
+    }
+}
+
+/// scores(t) = Σ_d keys(t, d) query(d) of each sample's own keys: `keys` (tokens) by (stride) rows, of which the first `query.len()` count.
+#[inline(always)]
+pub fn own_scores<V: Vector, const H: usize>(keys: &[Row<H>], stride: usize, query: &[Row<H>], scores: &mut [Row<H>]) {
+    const T: usize = 4;
+    for (group, scores) in scores.chunks_mut(T).enumerate() {
+        for h in 0..H {
+            let mut sums = [V::splat(0.0); T];
+            // Past the last token the cache holds older numbers; their sums are not stored.
+            let tokens: [&[Row<H>]; T] = core::array::from_fn(|t| {
+                let at = (group * T + t.min(scores.len() - 1)) * stride;
+                &keys[at..at + query.len()]
+            });
+            for (d, query) in query.iter().enumerate() {
+                let query = V::load(&query[h].0);
+                for t in 0..T {
+                    sums[t] = V::load(&tokens[t][d][h].0).mul_add(query, sums[t]);
+                }
+            }
+            for (score, sum) in scores.iter_mut().zip(sums) {
+                sum.store(&mut score[h].0);
+            }
+        }
+    }
+}
+
+/// out(d) += Σ_t weights(t) values(t, d) of each sample's own values, laid out as the keys of [`own_scores`].
+#[inline(always)]
+pub fn own_values<V: Vector, const H: usize>(values: &[Row<H>], stride: usize, weights: &[Row<H>], out: &mut [Row<H>]) {
+    const D: usize = 8;
+    for (group, out) in out.chunks_exact_mut(D).enumerate() {
+        for h in 0..H {
+            let mut sums = [V::splat(0.0); D];
+            for d in 0..D {
+                sums[d] = V::load(&out[d][h].0);
+            }
+            for (t, weight) in weights.iter().enumerate() {
+                let weight = V::load(&weight[h].0);
+                let values = &values[t * stride + group * D..][..D];
+                for d in 0..D {
+                    sums[d] = V::load(&values[d][h].0).mul_add(weight, sums[d]);
+                }
+            }
+            for d in 0..D {
+                sums[d].store(&mut out[d][h].0);
+            }
+        }
+    }
+}
