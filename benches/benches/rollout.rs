@@ -28,6 +28,7 @@ fn rollout(c: &mut Criterion) {
             map: Some(&map),
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
+            start_time_s: None,
             wheels: None,
         };
         group.bench_function(format!("{samples} candidates"), |b| b.iter(|| predictor.rollout(&query).expect("a valid query")));

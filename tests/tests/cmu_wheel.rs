@@ -7,7 +7,9 @@
 //! The measurements are not part of the repository; without them these tests say so and pass.
 
 use nesam_physics::Soil;
-use nesam_physics::terramechanics::{GaussRule, Support, WheelGeometry, WheelMotion, WheelWrench, balance_sinkage, wheel_wrench};
+use nesam_physics::terramechanics::{
+    ContactLaw, GaussRule, Support, WheelGeometry, WheelMotion, WheelWrench, balance_sinkage, wheel_wrench,
+};
 use nesam_tests::repository;
 
 /// Unit weight of the authors' soil, N/m³.
@@ -82,9 +84,25 @@ enum Sinkage {
     MeasuredAtLoad,
 }
 
-fn predict(trial: &Trial, how: Sinkage, bulldozing: bool) -> Prediction {
-    let side_soil_unit_weight_n_m3 = bulldozing.then_some(UNIT_WEIGHT_N_M3);
-    let wheel = WheelGeometry { rule: GaussRule::new(24), side_soil_unit_weight_n_m3, ..WheelGeometry::new(0.058, 0.05) };
+/// A model of the wheel and how it is asked.
+#[derive(Clone, Copy)]
+struct Model {
+    law: ContactLaw,
+    bulldozing: bool,
+    how: Sinkage,
+}
+
+impl Model {
+    fn new(how: Sinkage, bulldozing: bool) -> Self {
+        Self { law: ContactLaw::WongReece, bulldozing, how }
+    }
+}
+
+fn predict(trial: &Trial, model: Model) -> Prediction {
+    let how = model.how;
+    let side_soil_unit_weight_n_m3 = model.bulldozing.then_some(UNIT_WEIGHT_N_M3);
+    let plain = WheelGeometry::new(0.058, 0.05).with_law(model.law);
+    let wheel = WheelGeometry { rule: GaussRule::new(24), side_soil_unit_weight_n_m3, ..plain };
     let (sin, cos) = trial.slip_angle_rad.sin_cos();
     // The wheel slides to the right, so that its side force is to the left and positive, as in the measurements.
     let motion = WheelMotion {
@@ -109,10 +127,10 @@ fn predict(trial: &Trial, how: Sinkage, bulldozing: bool) -> Prediction {
 }
 
 /// Root mean squares over trials: drawbar N, side force N, normal force N, sinkage mm.
-fn rmse<'a>(trials: impl Iterator<Item = &'a Trial>, how: Sinkage, bulldozing: bool) -> [f64; 4] {
+fn rmse<'a>(trials: impl Iterator<Item = &'a Trial>, model: Model) -> [f64; 4] {
     let (mut sum, mut count) = ([0.0; 4], 0.0);
     for trial in trials {
-        let p = predict(trial, how, bulldozing);
+        let p = predict(trial, model);
         let errors =
             [p.drawbar_n - trial.drawbar_n, p.side_n - trial.side_n, p.normal_n - trial.normal_n, 1e3 * (p.sinkage_m - trial.sinkage_m)];
         for (s, e) in sum.iter_mut().zip(errors) {
@@ -160,10 +178,10 @@ fn print_tables(trials: &[Trial]) {
         (Sinkage::Measured, "forces at the measured sinkage"),
         (Sinkage::MeasuredAtLoad, "forces at the measured sinkage and load"),
     ] {
-        for bulldozing in [false, true] {
-            println!("RMSE, {name}, {} side bulldozing", if bulldozing { "with" } else { "without" });
+        for (law, bulldozing) in [(ContactLaw::WongReece, false), (ContactLaw::WongReece, true), (ContactLaw::SoilContactModel, false)] {
+            println!("RMSE of {law:?}, {name}, {} side bulldozing", if bulldozing { "with" } else { "without" });
             for (label, member) in groups() {
-                row(&label, rmse(trials.iter().filter(|t| member(t)), how, bulldozing));
+                row(&label, rmse(trials.iter().filter(|t| member(t)), Model { law, bulldozing, how }));
             }
         }
     }
@@ -179,31 +197,36 @@ fn regress_measured_wheel_from_the_load_balance() {
     let Some(trials) = trials() else { return };
     assert_eq!(trials.len(), 378);
     print_tables(&trials);
-    let [drawbar, side, _, sinkage] = rmse(trials.iter(), Sinkage::Balanced, false);
+    let [drawbar, side, _, sinkage] = rmse(trials.iter(), Model::new(Sinkage::Balanced, false));
     pinned("drawbar", drawbar, 6.33578);
     pinned("side", side, 19.43646);
     pinned("sinkage", sinkage, 24.42244);
-    let [_, side, _, _] = rmse(trials.iter(), Sinkage::Balanced, true);
+    let [_, side, _, _] = rmse(trials.iter(), Model::new(Sinkage::Balanced, true));
     pinned("side with bulldozing", side, 17.95807);
+    let other = Model { law: ContactLaw::SoilContactModel, ..Model::new(Sinkage::Balanced, false) };
+    let [drawbar, side, _, sinkage] = rmse(trials.iter(), other);
+    pinned("drawbar, soil contact model", drawbar, 11.69005);
+    pinned("side, soil contact model", side, 19.93);
+    pinned("sinkage, soil contact model", sinkage, 31.07);
 }
 
 #[test]
 fn regress_measured_wheel_at_the_measured_sinkage() {
     let Some(trials) = trials() else { return };
-    let [drawbar, side, ..] = rmse(trials.iter(), Sinkage::Measured, false);
+    let [drawbar, side, ..] = rmse(trials.iter(), Model::new(Sinkage::Measured, false));
     pinned("drawbar", drawbar, 29.72131);
     pinned("side", side, 12.39189);
-    let [_, side, ..] = rmse(trials.iter(), Sinkage::Measured, true);
+    let [_, side, ..] = rmse(trials.iter(), Model::new(Sinkage::Measured, true));
     pinned("side with bulldozing", side, 14.15828);
 }
 
 #[test]
 fn regress_measured_wheel_at_the_measured_sinkage_and_load() {
     let Some(trials) = trials() else { return };
-    let [drawbar, side, ..] = rmse(trials.iter(), Sinkage::MeasuredAtLoad, false);
+    let [drawbar, side, ..] = rmse(trials.iter(), Model::new(Sinkage::MeasuredAtLoad, false));
     pinned("drawbar", drawbar, 7.97421);
     pinned("side", side, 18.93615);
-    let [_, side, ..] = rmse(trials.iter(), Sinkage::MeasuredAtLoad, true);
+    let [_, side, ..] = rmse(trials.iter(), Model::new(Sinkage::MeasuredAtLoad, true));
     pinned("side with bulldozing", side, 18.08530);
 }
 
@@ -211,7 +234,7 @@ fn regress_measured_wheel_at_the_measured_sinkage_and_load() {
 fn property_load_balance_carries_the_measured_load() {
     let Some(trials) = trials() else { return };
     for trial in &trials {
-        let carried = predict(trial, Sinkage::Balanced, false).normal_n;
+        let carried = predict(trial, Model::new(Sinkage::Balanced, false)).normal_n;
         assert!((carried / trial.normal_n - 1.0).abs() < 0.02, "carries {carried} of {} N", trial.normal_n);
     }
 }

@@ -49,6 +49,7 @@ impl Recorded {
             map: Some(&self.world),
             soil_correction: SoilCorrection { delta: [0.1, -0.1, 0.02, 0.1, -0.01, 0.05], ..SoilCorrection::NONE },
             variant: Variant::Full,
+            start_time_s: None,
             wheels: None,
         }
     }

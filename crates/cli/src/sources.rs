@@ -136,7 +136,7 @@ pub fn predictor_for(mut bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Pre
             "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained",
             bundle.name, own.name, given.name
         );
-        bundle.vehicle = given.with_effects(&bundle.effects);
+        bundle.move_to(given);
     }
     Ok(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?))
 }

@@ -213,8 +213,8 @@ fn leave_each_out(yardstick: &Yardstick, members: &[Member<'_>], selection: &Sel
 /// quarter at the same slip, while the angle of a road wheel is geometry (chosen).
 fn scale_sd(layer: Layer) -> f64 {
     match layer {
-        Layer::Force => 0.25,
-        Layer::Actuator => 0.02,
+        Layer::Force | Layer::Soil => 0.25,
+        Layer::Actuator | Layer::Sensor | Layer::Map => 0.02,
     }
 }
 

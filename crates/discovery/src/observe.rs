@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, Predictor, Transition};
-use nesam_physics::driveline::{command_wheels, road_wheel_angles};
+use nesam_physics::driveline::command_wheels;
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{STATE_DIM, Soil, SoilCorrection, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
@@ -153,7 +153,7 @@ impl ObservedDrive {
     fn actuators(&self, model: &StepModel, transition: &Transition, sample: usize, row: &mut Row) {
         let vehicle = model.vehicle();
         let share = 1.0 / SEGMENT_STEPS as f64;
-        let mut angles = road_wheel_angles(vehicle, transition.actuators[0].steering + vehicle.effects.steering_offset);
+        let mut angles = transition.actuators[0].road_wheel_angles(vehicle);
         if let Some(measured) = self.road_wheel_angle_rad.as_ref().map(|m| m[sample]) {
             row[STEERING_AT] += share * 0.5 * (measured[0] + measured[1] - angles[0] - angles[1]);
             angles[..2].copy_from_slice(&measured);

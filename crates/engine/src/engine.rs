@@ -323,6 +323,7 @@ impl Engine {
             map,
             soil_correction: session.soil().state.correction,
             variant: Variant::Full,
+            start_time_s: None,
             wheels: None,
         };
         let learned = session.soil_field(map);

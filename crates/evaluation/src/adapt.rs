@@ -190,7 +190,7 @@ fn buffer_at(
     let seen = |(t, end): (Transition, &HistoryStep)| {
         let [x, y, _] = t.input.state.position_m;
         let ground_class = SoilByClass::class_at(Some(map), [x, y]);
-        BufferedTransition { ground_class, ..BufferedTransition::new(t.input, t.residual, &end.state) }
+        BufferedTransition { ground_class, ..BufferedTransition::new(t.input, t.residual, &predictor.true_state(&end.state)) }
     };
     Some(both.map(seen).collect())
 }

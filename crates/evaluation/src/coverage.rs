@@ -85,6 +85,7 @@ fn linearise(
         map: maps[window.drive].as_ref(),
         soil_correction: correction,
         variant: Variant::Full,
+        start_time_s: Some(window.since_log_start_s()),
         wheels: None,
     };
     let refused = |source| EvaluationError::Model { trajectory: drive.id.clone(), start: window.start, source };

@@ -189,6 +189,7 @@ pub fn roll_out_on(
         map,
         soil_correction: SoilCorrection::NONE,
         variant,
+        start_time_s: Some(window.since_log_start_s()),
         wheels,
     };
     let rollout = predictor.rollout_on(&query, soil).map_err(|source| EvaluationError::Model {

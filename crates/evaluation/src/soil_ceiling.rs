@@ -176,6 +176,7 @@ impl Fit<'_> {
             map: self.map,
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
+            start_time_s: Some(window.since_log_start_s()),
             wheels: None,
         };
         let rollout = self.predictor.rollout_on(&query, soils).map_err(|source| EvaluationError::Model {

@@ -31,6 +31,7 @@ pub(crate) fn bicycle() -> Vehicle {
             side_coupling_n_m_s: 0.0,
         },
         gravity_m_s2: 9.81,
+        contact_law: Default::default(),
         effects: Default::default(),
     }
 }

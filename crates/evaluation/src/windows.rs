@@ -52,6 +52,11 @@ impl Window<'_> {
         self.trajectory.time_s[self.start]
     }
 
+    /// Time of the start since the start of the log, s: what the onsets of effects count from.
+    pub fn since_log_start_s(&self) -> f64 {
+        self.start_time_s() - self.trajectory.time_s[0]
+    }
+
     /// True poses after steps 1…K.
     pub fn truth(&self, truth: Truth) -> Vec<Pose> {
         let range = self.start + 1..=self.start + self.horizon;

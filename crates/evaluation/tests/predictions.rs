@@ -159,6 +159,7 @@ fn nesam_vehicle() -> nesam_physics::Vehicle {
             side_coupling_n_m_s: 0.0,
         },
         gravity_m_s2: 9.81,
+        contact_law: Default::default(),
         effects: Default::default(),
     }
 }

@@ -10,6 +10,7 @@ use nesam_model::dims::CONTEXT;
 use nesam_model::encoder::{ENCODERS, TerrainEncoders};
 use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
 use nesam_physics::step::StepModel;
+use nesam_physics::terramechanics::ContactLaw;
 use nesam_physics::{STATE_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, Trajectory};
@@ -222,20 +223,29 @@ fn mirrored(drives: &[Drive], at: &[usize]) -> Vec<Drive> {
         .collect()
 }
 
-/// Scales, and the drive line of the vehicle fitted on the training drives.
+/// Scales; the drive line of the vehicle is fitted on the training drives under each contact law, and the better pair is kept.
 fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64, reporter: &dyn Reporter) -> Normalization {
     let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
     let scales = measure(&training, vehicle, dt_s);
-    reporter.stage("drive line", 12);
-    let mut done = 0;
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
-    let [before, after] = calibrate_driveline(vehicle, &few, &scales, |name, value, error| {
-        done += 1;
-        reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
-    });
-    reporter
-        .line(&format!("drive line calibrated: symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", vehicle.driveline));
+    let mut best: Option<(f64, Vehicle)> = None;
+    for law in [ContactLaw::WongReece, ContactLaw::SoilContactModel] {
+        let mut candidate = Vehicle { contact_law: law, ..vehicle.clone() };
+        reporter.stage(&format!("drive line, {law:?}"), 12);
+        let mut done = 0;
+        let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, |name, value, error| {
+            done += 1;
+            reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
+        });
+        reporter.line(&format!("{law:?}, symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", candidate.driveline));
+        if best.as_ref().is_none_or(|(error, _)| after < *error) {
+            best = Some((after, candidate));
+        }
+    }
+    if let Some((_, chosen)) = best {
+        *vehicle = chosen;
+    }
     scales
 }
 

@@ -48,7 +48,7 @@ pub fn measure(drives: &[&Drive], vehicle: &Vehicle, dt_s: f64) -> Normalization
         let ground = GroundSource::new(drive.map.as_deref(), &model, &drive.states[0]);
         for i in 1..drive.states.len() {
             let (state, control) = (&drive.states[i], &drive.controls[i]);
-            let (height, _, _) = ground.at(state.position_m[0], state.position_m[1]);
+            let (height, _, _) = ground.at(&vehicle.effects.map, state.position_m[0], state.position_m[1]);
             let entries = token_entries(state, Some(&drive.states[i - 1]), [control.speed_m_s, control.second], height, dt_s);
             for (k, e) in entries.iter().enumerate() {
                 sum[k] += f64::from(*e);

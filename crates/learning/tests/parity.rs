@@ -63,6 +63,7 @@ fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
         map,
         soil_correction: SoilCorrection::NONE,
         variant,
+        start_time_s: None,
         wheels: None,
     };
     let fast = predictor.rollout(&query).expect("a valid query");
@@ -120,6 +121,7 @@ fn property_row_of_a_batch_equals_the_row_alone() {
         map: Some(&map),
         soil_correction: SoilCorrection::NONE,
         variant: Variant::Full,
+        start_time_s: None,
         wheels: None,
     };
     // Without a history the actuators begin as each row's own first command says.

@@ -81,6 +81,7 @@ fn analytic_measured_wheels_equal_to_the_commanded_ones_change_nothing() {
             map: None,
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
+            start_time_s: None,
             wheels,
         };
         predictor.rollout(&query).unwrap().state(0, 7).to_array()

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -69,10 +69,10 @@ pub struct ModelBundle {
     pub hash: String,
     /// What the weights were trained as.
     pub form: Variant,
-    /// The vehicle the bundle was trained for, with the bundle's effects.
+    /// The vehicle the bundle was trained for, with the bundle's effects, all of them begun.
     pub vehicle: Vehicle,
     /// Effects on top of the vehicle card, as `effects.toml` lists them; [`ModelBundle::vehicle`] has them already.
-    pub effects: Vec<Effect>,
+    pub effects: Vec<ScheduledEffect>,
     /// Soil used where there is no map or no semantics, order of `SOIL_NAMES`.
     pub default_soil: [f64; SOIL_DIM],
     /// Trainable parameters of the kinodynamic model (without the frozen encoders).
@@ -102,6 +102,11 @@ pub fn trained_parameters(weights: &Weights, form: Variant) -> usize {
 /// Lower-case hex SHA-256.
 pub fn sha256_hex(bytes: &[u8]) -> String {
     Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
+}
+
+/// Effects without their onsets.
+fn begun(effects: &[ScheduledEffect]) -> Vec<Effect> {
+    effects.iter().map(|e| e.effect).collect()
 }
 
 struct Folder<'a>(&'a Path);
@@ -172,7 +177,7 @@ impl ModelBundle {
             name: manifest.name,
             hash,
             form: manifest.model,
-            vehicle: vehicle.with_effects(&effects),
+            vehicle: vehicle.with_effects(&begun(&effects)),
             effects,
             default_soil: normalization.default_soil(),
             parameters: trained_parameters(&weights, manifest.model),
@@ -186,12 +191,18 @@ impl ModelBundle {
         })
     }
 
-    /// This bundle with further effects on its vehicle.
-    pub fn with_effects(&self, effects: &[Effect]) -> Self {
+    /// This bundle with further effects on its vehicle, each from its onset on; a plain [`Effect`] acts always.
+    pub fn with_effects<E: Copy + Into<ScheduledEffect>>(&self, effects: &[E]) -> Self {
+        let effects: Vec<ScheduledEffect> = effects.iter().map(|e| (*e).into()).collect();
         let mut patched = self.clone();
-        patched.vehicle = self.vehicle.with_effects(effects);
-        patched.effects.extend_from_slice(effects);
+        patched.vehicle = self.vehicle.with_effects(&begun(&effects));
+        patched.effects.extend(effects);
         patched
+    }
+
+    /// Puts the bundle's effects on another vehicle.
+    pub fn move_to(&mut self, vehicle: &Vehicle) {
+        self.vehicle = vehicle.with_effects(&begun(&self.effects));
     }
 
     /// Writes the bundle into a folder (created if absent; files of an older bundle there are replaced) and sets [`ModelBundle::hash`].

@@ -1,6 +1,7 @@
 //! What rollout and training share outside the network: the ground under the wheels and the actuators after the history.
 
 use nesam_physics::driveline::DrivelineState;
+use nesam_physics::effects::MapTerms;
 use nesam_physics::step::{Ground, StepModel};
 use nesam_physics::{Control, Real, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
@@ -30,14 +31,18 @@ impl<'a> GroundSource<'a> {
         }
     }
 
-    /// Ground at a point: height (m), slope along x and y of World, and whether the point is known.
-    pub fn at(&self, x_m: f64, y_m: f64) -> (f64, [f64; 2], bool) {
+    /// Ground at a point: height (m), slope along x and y of World, and whether the point is known. Effects say how the ground differs from the map.
+    pub fn at(&self, effects: &MapTerms, x_m: f64, y_m: f64) -> (f64, [f64; 2], bool) {
         match self {
             Self::Level(height) => (*height, [0.0; 2], true),
-            Self::Map(map) => match map.ground(x_m, y_m) {
-                Some(ground) => (ground.height_m, [ground.slope_x, ground.slope_y], true),
-                None => (map.nearest_height_m(x_m, y_m), [0.0; 2], false),
-            },
+            Self::Map(map) => {
+                let (mapped, known) = match map.ground(x_m, y_m) {
+                    Some(ground) => ((ground.height_m, [ground.slope_x, ground.slope_y]), true),
+                    None => ((map.nearest_height_m(x_m, y_m), [0.0; 2]), false),
+                };
+                let (height, slope) = effects.raised(x_m, y_m, mapped);
+                (height, slope, known)
+            }
         }
     }
 
@@ -46,7 +51,7 @@ impl<'a> GroundSource<'a> {
         let turn = state.attitude_rad[2].sin_cos();
         let mut known = true;
         let ground = wheel_points(model, state).map(|[x, y]| {
-            let (height, slope, inside) = self.at(x, y);
+            let (height, slope, inside) = self.at(&model.vehicle().effects.map, x, y);
             known &= inside;
             in_heading(turn, height - datum_m, slope)
         });
@@ -79,7 +84,21 @@ pub fn history_actuators(
     first: &Control<f64>,
     dt_s: f64,
 ) -> DrivelineState {
+    actuators_along(|_| model, history, start, first, dt_s)
+}
+
+/// The same where effects begin on the way: `model_before(n)` is the physics of the step that begins n steps before the start.
+pub(crate) fn actuators_along<'a>(
+    model_before: impl Fn(usize) -> &'a StepModel,
+    history: &[HistoryStep],
+    start: &VehicleState<f64>,
+    first: &Control<f64>,
+    dt_s: f64,
+) -> DrivelineState {
     let (state, control) = history.first().map_or((start, first), |step| (&step.state, &step.control));
-    let initial = DrivelineState::starting(model.vehicle(), state, control);
-    history.iter().fold(initial, |actuators, step| actuators.advance(model.vehicle(), &step.control, step.state.velocity_m_s[0], dt_s))
+    let initial = DrivelineState::starting(model_before(history.len()).vehicle(), state, control);
+    history.iter().enumerate().fold(initial, |actuators, (j, step)| {
+        let vehicle = model_before(history.len() - j).vehicle();
+        actuators.advance(vehicle, &step.control, step.state.velocity_m_s[0], dt_s)
+    })
 }

@@ -3,7 +3,7 @@
 use std::sync::{Arc, Mutex};
 
 use nesam_physics::driveline::DrivelineState;
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::{Phases, ScheduledEffect};
 use nesam_physics::step::StepModel;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
@@ -13,7 +13,7 @@ use crate::bundle::ModelBundle;
 use crate::dims::{CONTEXT, HIDDEN, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
 use crate::fused::{FusedTransformer, Path, Prefix};
-use crate::ground::GroundSource;
+use crate::ground::{GroundSource, actuators_along};
 use crate::rollout::{HistoryStep, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
@@ -23,12 +23,14 @@ use crate::token::{TokenScale, token_entries};
 
 mod block;
 mod linearise;
+mod observed;
 mod physics;
 mod risk;
 mod rollout;
 mod transitions;
 mod validate;
 
+pub(crate) use self::observed::LogClock;
 pub use self::transitions::Transition;
 use self::validate::validate;
 
@@ -56,7 +58,9 @@ type TokensOfMap = (String, Arc<TerrainTokens>);
 #[derive(Debug)]
 pub struct Predictor {
     bundle: Arc<ModelBundle>,
-    model: StepModel,
+    physics: Phases<StepModel>,
+    /// Some effect makes measured states differ from true ones.
+    sensors_err: bool,
     network: Arc<FusedTransformer>,
     projection: Arc<TerrainProjection>,
     token_scale: TokenScale,
@@ -94,8 +98,10 @@ impl Predictor {
             SoilPrior::new(weights)?,
             scales.patch_scale(),
         );
+        let physics = phases(&bundle);
         Ok(Self {
-            model: StepModel::new(&bundle.vehicle, scales.dt_s, scales.substeps),
+            sensors_err: physics.any(sensors_err),
+            physics,
             network: Arc::new(FusedTransformer::new(weights)?),
             projection: Arc::new(projection),
             token_scale: scales.token_scale(),
@@ -105,13 +111,13 @@ impl Predictor {
         })
     }
 
-    /// The same predictor on other instructions: for measuring, and for holding one path against another.
+    /// The same predictor on other instructions, with caches of its own: for measuring, and for holding one path against another.
     pub fn on_path(&self, path: Path) -> Self {
         Self {
             network: Arc::new(self.network.on(path)),
             projection: Arc::new(self.projection.on(path)),
             maps: Arc::default(),
-            ..self.with_effects(&[])
+            ..self.with_effects::<ScheduledEffect>(&[])
         }
     }
 
@@ -122,11 +128,13 @@ impl Predictor {
 
     /// The same predictor for the vehicle with further effects. Network and terrain tokens do not depend on them and are shared, so this costs
     /// little; the bundle's hash stays that of the files it was read from.
-    pub fn with_effects(&self, effects: &[Effect]) -> Self {
+    pub fn with_effects<E: Copy + Into<ScheduledEffect>>(&self, effects: &[E]) -> Self {
         let bundle = Arc::new(self.bundle.with_effects(effects));
         let scales = &bundle.normalization;
+        let physics = phases(&bundle);
         Self {
-            model: StepModel::new(&bundle.vehicle, scales.dt_s, scales.substeps),
+            sensors_err: physics.any(sensors_err),
+            physics,
             network: self.network.clone(),
             projection: self.projection.clone(),
             token_scale: scales.token_scale(),
@@ -162,9 +170,9 @@ impl Predictor {
         if query.variant == Variant::Full { self.bundle.form } else { query.variant }
     }
 
-    /// The physics with the bundle's vehicle.
+    /// The physics with the bundle's vehicle, all of its effects begun.
     pub fn step_model(&self) -> &StepModel {
-        &self.model
+        self.physics.last()
     }
 
     /// Nominal soil θ̄ under a pose (paper §III-B: h_θ of the semantic patch); the stated default without map or semantics.
@@ -218,7 +226,14 @@ impl Predictor {
     }
 
     /// Encodes the measured history for a form that remembers it.
-    fn prefix(&self, variant: Variant, history: &[HistoryStep], ground: &GroundSource<'_>, tokens: Option<&TerrainTokens>) -> Prefix {
+    fn prefix(
+        &self,
+        variant: Variant,
+        history: &[HistoryStep],
+        ground: &GroundSource<'_>,
+        tokens: Option<&TerrainTokens>,
+        clock: LogClock,
+    ) -> Prefix {
         if !variant.remembers() {
             return Prefix::default();
         }
@@ -229,7 +244,8 @@ impl Predictor {
             .enumerate()
             .map(|(j, step)| {
                 let previous = j.checked_sub(1).map(|j| history[j].state);
-                self.entries(&step.state, previous.as_ref(), &step.control, ground)
+                let model = self.physics.at(clock.before(history.len() - j));
+                self.entries(model, &step.state, previous.as_ref(), &step.control, ground)
             })
             .collect();
         let contexts: Vec<[f32; HIDDEN]> = terrain.iter().map(|t| core::array::from_fn(|i| t[i])).collect();
@@ -238,12 +254,13 @@ impl Predictor {
 
     fn entries(
         &self,
+        model: &StepModel,
         state: &VehicleState<f64>,
         previous: Option<&VehicleState<f64>>,
         control: &Control<f64>,
         ground: &GroundSource<'_>,
     ) -> [f32; STATE_CONTROL] {
-        let (height, _, _) = ground.at(state.position_m[0], state.position_m[1]);
+        let (height, _, _) = ground.at(&model.vehicle().effects.map, state.position_m[0], state.position_m[1]);
         let raw = token_entries(state, previous, [control.speed_m_s, control.second], height, self.bundle.normalization.dt_s);
         self.token_scale.apply(raw)
     }
@@ -270,6 +287,16 @@ impl Predictor {
         sample.previous = Some(before);
         sample.actuators = actuators;
     }
+}
+
+/// The physics of a bundle in each phase between the onsets of its effects.
+fn phases(bundle: &ModelBundle) -> Phases<StepModel> {
+    let scales = &bundle.normalization;
+    Phases::new(&bundle.vehicle, &bundle.effects, |vehicle| StepModel::new(vehicle, scales.dt_s, scales.substeps))
+}
+
+fn sensors_err(model: &StepModel) -> bool {
+    model.vehicle().effects.sensor.alters_states()
 }
 
 fn pose(state: &VehicleState<f64>) -> Pose2 {

@@ -130,6 +130,8 @@ pub struct RolloutQuery<'a> {
     pub soil_correction: SoilCorrection,
     /// Ablation.
     pub variant: Variant,
+    /// Time of the start, s since the start of the log, for effects that begin or drift; `None` = all have begun, and what drifts is at its end.
+    pub start_time_s: Option<f64>,
     /// What the wheels were measured to do over each of the K steps, for every sample alike, in place of what the drive line makes of the commands;
     /// for studying the model, no planner knows it.
     pub wheels: Option<&'a [MeasuredWheels]>,

@@ -12,15 +12,15 @@ pub const STATE_COLUMNS: usize = 9;
 pub const SINKAGE_AT: usize = STATE_COLUMNS;
 /// First column of the soil.
 pub const SOIL_AT: usize = SINKAGE_AT + WHEELS;
-/// Constant columns: wheel angles (4), rim base (4), follow, gain, limit, speed, ground height and two slopes per wheel (12).
-pub const CONSTANT: usize = 24;
+/// Constant columns: wheel angles (4), rim base (4), follow, gain, limit, speed, ground height and two slopes per wheel (12), yaw.
+pub const CONSTANT: usize = 25;
 /// All columns of a row.
 pub const COLUMNS: usize = DIFFERENTIABLE + CONSTANT;
 /// Outputs: the twelve entries of the increment.
 pub const OUTPUTS: usize = 12;
 
 /// Packs the constant columns.
-pub fn pack_constants(wheels: &WheelCommand<f64>, ground: &[Ground<f64>; WHEELS]) -> [f32; CONSTANT] {
+pub fn pack_constants(wheels: &WheelCommand<f64>, ground: &[Ground<f64>; WHEELS], yaw_rad: f64) -> [f32; CONSTANT] {
     let mut row = [0.0; CONSTANT];
     for i in 0..WHEELS {
         row[i] = wheels.angle_rad[i] as f32;
@@ -33,6 +33,7 @@ pub fn pack_constants(wheels: &WheelCommand<f64>, ground: &[Ground<f64>; WHEELS]
     row[9] = wheels.rim_gain as f32;
     row[10] = wheels.overspeed_limit_m_s as f32;
     row[11] = wheels.speed_m_s as f32;
+    row[24] = yaw_rad as f32;
     row
 }
 
@@ -44,7 +45,7 @@ pub fn step_input<T: Real>(varying: [T; DIFFERENTIABLE], constant: [T; CONSTANT]
     StepInput {
         state: VehicleState {
             position_m: [zero, zero, x[0]],
-            attitude_rad: [x[1], x[2], zero],
+            attitude_rad: [x[1], x[2], constant[24]],
             velocity_m_s: [x[3], x[4], x[5]],
             angular_velocity_rad_s: [x[6], x[7], x[8]],
         },

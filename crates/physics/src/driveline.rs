@@ -6,6 +6,7 @@
 //! actuator lags the command and is limited in rate. The actuator state depends on commands and measured speed only, so a server
 //! rebuilds it from the history of a session.
 
+use crate::command_path::CommandPath;
 use crate::scalar::Real;
 use crate::state::{Control, VehicleState};
 use crate::vehicle::{SecondCommand, Vehicle, WHEELS};
@@ -21,6 +22,8 @@ pub struct DrivelineState<T = f64> {
     pub rim_speed_m_s: T,
     /// What the rims of a skid-steer vehicle are asked for between the two lags: (mean speed m/s, turning rad/s).
     pub rim_demand: [T; 2],
+    /// Commands between sender and actuators; followed only where an effect alters them.
+    pub path: CommandPath<T>,
 }
 
 /// The number held between two constants.
@@ -35,7 +38,8 @@ impl<T: Copy> DrivelineState<T> {
             steering: f(self.steering),
             speed_error_integral_m: f(self.speed_error_integral_m),
             rim_speed_m_s: f(self.rim_speed_m_s),
-            rim_demand: self.rim_demand.map(f),
+            rim_demand: self.rim_demand.map(&f),
+            path: self.path.map(f),
         }
     }
 }
@@ -48,6 +52,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
             speed_error_integral_m: T::lit(0.0),
             rim_speed_m_s: control.speed_m_s,
             rim_demand: [control.speed_m_s, control.second],
+            path: CommandPath::settled(control),
         }
     }
 
@@ -60,12 +65,13 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         let measured = state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency);
         let turning = clamp(measured, -servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
         let speed = state.velocity_m_s[0];
-        Self { steering: turning, speed_error_integral_m: T::lit(0.0), rim_speed_m_s: speed, rim_demand: [speed, turning] }
+        let path = CommandPath::settled(control);
+        Self { steering: turning, speed_error_integral_m: T::lit(0.0), rim_speed_m_s: speed, rim_demand: [speed, turning], path }
     }
 
     /// The rims of a skid-steer vehicle after `dt_s` under a command.
     fn advance_rims(&self, vehicle: &Vehicle, control: &Control<T>, dt_s: f64) -> Self {
-        let servo = &vehicle.driveline.rims;
+        let servo = &vehicle.limited_rims();
         let kept = |lag_s: f64| T::lit(if lag_s > 0.0 { (-dt_s / lag_s).exp() } else { 0.0 });
         let (speed, turning) = (kept(servo.speed_lag_s), kept(servo.yaw_lag_s));
         let target = servo.target(control.speed_m_s, control.second, vehicle.track_m);
@@ -75,6 +81,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
             speed_error_integral_m: T::lit(0.0),
             rim_speed_m_s: demand[0] + speed * (self.rim_speed_m_s - demand[0]),
             rim_demand: demand,
+            path: self.path,
         }
     }
 
@@ -82,18 +89,73 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
     ///
     /// Exact first-order lag for a held command, limited in rate; the integral of the speed error leaks with the card's time constant.
     pub fn advance(&self, vehicle: &Vehicle, control: &Control<T>, forward_m_s: T, dt_s: f64) -> Self {
-        let line = &vehicle.driveline;
+        if vehicle.effects.actuator.alters_commands() {
+            return self.advance_altered(vehicle, control, forward_m_s, dt_s);
+        }
         if vehicle.second == SecondCommand::YawRateRadS {
             return self.advance_rims(vehicle, control, dt_s);
         }
-        let travel = line.steering_rate_limit_per_s * dt_s;
-        let target = control.second - self.steering;
-        let lagged = if line.steering_lag_s > 0.0 { target * T::lit(1.0 - (-dt_s / line.steering_lag_s).exp()) } else { target };
+        Self {
+            steering: steered(vehicle, self.steering, control.second, dt_s),
+            speed_error_integral_m: self.integrated(vehicle, control.speed_m_s, forward_m_s, dt_s),
+            ..*self
+        }
+    }
+
+    /// The same where commands arrive late, lagged or enlarged, or leave the steering with play. The way of the commands and a car's steering advance in
+    /// pieces of the step; the rest sees the mean of what arrives.
+    #[cold]
+    #[inline(never)]
+    fn advance_altered(&self, vehicle: &Vehicle, control: &Control<T>, forward_m_s: T, dt_s: f64) -> Self {
+        let skid = vehicle.second == SecondCommand::YawRateRadS;
+        let mut path = self.path;
+        let mut steering = self.steering;
+        let arrived = path.advance(&vehicle.effects.actuator, control, dt_s, |second, piece_s| {
+            if !skid {
+                steering = steered(vehicle, steering, second, piece_s);
+            }
+        });
+        let mut next = if skid {
+            self.advance_rims(vehicle, &arrived, dt_s)
+        } else {
+            Self { steering, speed_error_integral_m: self.integrated(vehicle, arrived.speed_m_s, forward_m_s, dt_s), ..*self }
+        };
+        let half_play = T::lit(0.5 * vehicle.effects.actuator.steering_play);
+        path.play = path.play.max(next.steering - half_play).min(next.steering + half_play);
+        next.path = path;
+        next
+    }
+
+    /// Leaky integral of the speed error after `dt_s`.
+    fn integrated(&self, vehicle: &Vehicle, speed_m_s: T, forward_m_s: T, dt_s: f64) -> T {
+        let line = &vehicle.driveline;
         let leak = T::lit((-dt_s / line.speed_integral_leak_s).exp());
         let limit = line.speed_integral_limit_m;
-        let integral = self.speed_error_integral_m * leak + (control.speed_m_s - forward_m_s) * T::lit(dt_s);
-        Self { steering: self.steering + clamp(lagged, -travel, travel), speed_error_integral_m: clamp(integral, -limit, limit), ..*self }
+        let integral = self.speed_error_integral_m * leak + (speed_m_s - forward_m_s) * T::lit(dt_s);
+        clamp(integral, -limit, limit)
     }
+
+    /// Road-wheel angles FL, FR, RL, RR at an instant, rad.
+    pub fn road_wheel_angles(&self, vehicle: &Vehicle) -> [T; WHEELS] {
+        let position = if vehicle.effects.actuator.steering_play != 0.0 { self.path.play } else { self.steering };
+        road_wheel_angles(vehicle, behind_actuator(vehicle, position))
+    }
+}
+
+/// Position of a car's steering actuator after `dt_s` under a command.
+fn steered<T: Real>(vehicle: &Vehicle, steering: T, command: T, dt_s: f64) -> T {
+    let line = &vehicle.driveline;
+    let travel = line.steering_rate_limit_per_s * dt_s;
+    let target = command - steering;
+    let lagged = if line.steering_lag_s > 0.0 { target * T::lit(1.0 - (-dt_s / line.steering_lag_s).exp()) } else { target };
+    steering + clamp(lagged, -travel, travel)
+}
+
+/// What steering ratio and offset make of a position of the actuator.
+fn behind_actuator<T: Real>(vehicle: &Vehicle, position: T) -> T {
+    let terms = &vehicle.effects.actuator;
+    let position = if terms.steering_ratio != 0.0 { position * T::lit(1.0 + terms.steering_ratio) } else { position };
+    position + T::lit(terms.steering_offset)
 }
 
 /// What the wheels are told during one step; constants of the step (no derivative flows through the actuators).
@@ -170,11 +232,16 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
 ) -> WheelCommand<T> {
     let line = &vehicle.driveline;
     let half = T::lit(0.5);
-    let steering = half * (before.steering + after.steering) + T::lit(vehicle.effects.steering_offset);
+    let actuator = &vehicle.effects.actuator;
+    let position = match actuator.steering_play {
+        0.0 => half * (before.steering + after.steering),
+        _ => half * (before.path.play + after.path.play),
+    };
+    let steering = behind_actuator(vehicle, position);
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let mut base = [T::lit(line.speed_integral_gain_per_s) * before.speed_error_integral_m; WHEELS];
     if skid {
-        let half_turn = T::lit(0.5 * vehicle.track_m) * steering;
+        let half_turn = T::lit(0.5 * (vehicle.track_m + actuator.track_m)) * steering;
         let speed = half * (before.rim_speed_m_s + after.rim_speed_m_s);
         let (left, right) = (speed - half_turn, speed + half_turn);
         base = [left, right, left, right];
@@ -184,8 +251,8 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
         rim_base_m_s: base,
         rim_follow: T::lit(if skid { 0.0 } else { 1.0 }),
         rim_gain: T::lit(if skid { 0.0 } else { line.speed_gain }),
-        overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s),
-        speed_m_s: control.speed_m_s,
+        overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s * (1.0 - actuator.torque_lost)),
+        speed_m_s: if actuator.alters_commands() { after.path.speed_over_step_m_s } else { control.speed_m_s },
     }
 }
 

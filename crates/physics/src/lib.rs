@@ -1,6 +1,7 @@
 //! Bekker-Wong terramechanics and Newton-Euler, once, generic over the scalar.
 #![forbid(unsafe_code)]
 
+mod command_path;
 pub mod driveline;
 pub mod effects;
 pub mod linear;
@@ -10,10 +11,12 @@ mod soil;
 mod soil_correction;
 mod state;
 pub mod step;
+mod step_effects;
 pub mod terramechanics;
 pub mod vec3;
 mod vehicle;
 
+pub use command_path::CommandPath;
 pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};

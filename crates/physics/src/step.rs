@@ -9,6 +9,7 @@ use crate::linear::solve_spd;
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
+use crate::step_effects::Altered;
 use crate::terramechanics::{Support, WheelGeometry, WheelMotion, WheelWrench, balance_sinkage, wheel_wrench};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
@@ -27,7 +28,7 @@ pub struct Ground<T> {
 /// Everything one step depends on.
 #[derive(Clone, Copy, Debug)]
 pub struct StepInput<T> {
-    /// State; x, y and yaw are not read: the step is the same everywhere and in every direction.
+    /// State; x and y are not read, and the yaw only by a force fixed in World: else the step is the same everywhere and in every direction.
     pub state: VehicleState<T>,
     /// What the drive line makes of the command.
     pub wheels: WheelCommand<T>,
@@ -66,8 +67,9 @@ pub struct StepOutput<T> {
 /// A vehicle prepared for stepping: constants derived once.
 #[derive(Clone, Debug)]
 pub struct StepModel {
-    vehicle: Vehicle,
+    pub(crate) vehicle: Vehicle,
     pub(crate) wheel: WheelGeometry,
+    pub(crate) altered: Altered,
     static_load_n: [f64; WHEELS],
     pub(crate) body: RigidBody,
     substeps: usize,
@@ -89,13 +91,18 @@ pub(crate) struct RigidBody {
 
 impl RigidBody {
     fn new(vehicle: &Vehicle) -> Self {
-        let (m, r) = (vehicle.effects.added_mass_kg, vehicle.effects.added_at_m);
+        let force = &vehicle.effects.force;
+        let (m, r) = (force.added_mass_kg, force.added_at_m);
         let mass_kg = vehicle.mass_kg + m;
-        let square = dot(r, r);
-        let inertia_kg_m2 = core::array::from_fn(|i| {
-            core::array::from_fn(|j| vehicle.inertia_kg_m2[i][j] + m * (if i == j { square } else { 0.0 } - r[i] * r[j]))
-        });
-        let centre_m = scale(r, m / mass_kg);
+        let point = |m: f64, r: [f64; 3], i: usize, j: usize| m * (if i == j { dot(r, r) } else { 0.0 } - r[i] * r[j]);
+        let mut inertia_kg_m2: [[f64; 3]; 3] =
+            core::array::from_fn(|i| core::array::from_fn(|j| vehicle.inertia_kg_m2[i][j] + point(m, r, i, j)));
+        let mut centre_m = scale(r, m / mass_kg);
+        let shift = force.centre_shift_m;
+        if shift != [0.0; 3] {
+            inertia_kg_m2 = core::array::from_fn(|i| core::array::from_fn(|j| inertia_kg_m2[i][j] + point(vehicle.mass_kg, shift, i, j)));
+            centre_m = add(centre_m, scale(shift, vehicle.mass_kg / mass_kg));
+        }
         let [x, y, z] = scale(centre_m, mass_kg);
         Self { mass_kg, inertia_kg_m2, centre_m, coupling_kg_m: [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]] }
     }
@@ -114,19 +121,28 @@ struct Contribution<T> {
 impl StepModel {
     /// Prepares a vehicle for steps of `dt_s` seconds in `substeps` sub-steps (2 is enough for 0.1 s, see the convergence test).
     pub fn new(vehicle: &Vehicle, dt_s: f64, substeps: usize) -> Self {
+        let mut wheel = WheelGeometry::new(vehicle.wheel_radius_m, vehicle.wheel_width_m).with_law(vehicle.contact_law);
+        wheel.recovery = (wheel.recovery + vehicle.effects.soil.recovery).max(0.0);
+        wheel.c1 = (wheel.c1 + vehicle.effects.soil.theta_m_shift).max(0.0);
         Self {
-            wheel: WheelGeometry::new(vehicle.wheel_radius_m, vehicle.wheel_width_m),
+            altered: Altered::new(&vehicle.effects, &wheel),
+            wheel,
             static_load_n: vehicle.static_load_n(),
             body: RigidBody::new(vehicle),
             vehicle: vehicle.clone(),
             substeps,
-            dt_s,
+            dt_s: dt_s / (1.0 + vehicle.effects.sensor.clock_drift),
         }
     }
 
-    /// Δt, s.
+    /// Δt, s of true time: that of the log, corrected for its clock.
     pub fn dt_s(&self) -> f64 {
         self.dt_s
+    }
+
+    /// Whether effects add to a step what is kept out of its loop: those parts are functions of their own, compiled for the build's target alone.
+    pub fn is_altered(&self) -> bool {
+        self.altered.on_body || self.altered.on_wheels
     }
 
     /// The vehicle.
@@ -175,6 +191,9 @@ impl StepModel {
         let force = scale(add(carried, scale(cross(w, cross(w, c)), T::lit(-1.0))), mass);
         let torque = add(scale(cross(w, inertia_w), T::lit(-1.0)), scale(cross(c, carried), mass));
         let mut rhs = [force[0], force[1], force[2], torque[0], torque[1], torque[2]];
+        if self.altered.on_body {
+            self.add_body_forces(state, input, &tilt, &mut rhs);
+        }
         let zero = T::lit(0.0);
         let mut lhs = [[zero; 6]; 6];
         for r in 0..3 {
@@ -215,37 +234,44 @@ impl StepModel {
         let centre = self.vehicle.wheel_centre_m[i].map(T::lit);
         let velocity = add(state.velocity_m_s, cross(state.angular_velocity_rad_s, centre));
         let normal = tilt.to_body(normalise([-input.ground[i].slope_ahead, -input.ground[i].slope_left, one]));
-        let (sin, cos) = input.wheels.angle_rad[i].sin_cos();
+        let wheel = self.wheel_at(i);
+        let (sin, cos) = if self.altered.on_wheels { self.yielding_angle(i, state, input) } else { input.wheels.angle_rad[i] }.sin_cos();
         let heading = [cos, sin, T::lit(0.0)];
         let forward = normalise(add(heading, scale(normal, -dot(heading, normal))));
         let left = cross(normal, forward);
 
-        // Distance of the wheel centre from the tangent plane, moved along as the wheel travels over the slope.
-        let offset = tilt.to_heading(centre);
-        let travelled = state.position_m;
-        let ground = input.ground[i].height_m + input.ground[i].slope_ahead * travelled[0] + input.ground[i].slope_left * travelled[1];
-        let slope = one + input.ground[i].slope_ahead.sqr() + input.ground[i].slope_left.sqr();
-        let distance = (travelled[2] + offset[2] - ground) / slope.sqrt();
-
+        let distance = self.distance(i, state, tilt, input);
         let wheel_motion = WheelMotion {
-            rim_speed_m_s: input.wheels.rim_speed_m_s(i, dot(velocity, forward), state.velocity_m_s[0]),
+            rim_speed_m_s: match self.altered.on_wheels {
+                false => input.wheels.rim_speed_m_s(i, dot(velocity, forward), state.velocity_m_s[0]),
+                true => self.altered_rim_speed(i, state, forward, input),
+            },
             forward_m_s: dot(velocity, forward),
             left_m_s: dot(velocity, left),
         };
         let (direction, motion) = wheel_motion.contact();
         let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
-        let ratio = input.sinkage_log_ratio[i].exp();
+        let mut ratio = input.sinkage_log_ratio[i].exp();
         let closing = -dot(velocity, normal);
-        let preload = T::lit(self.static_load_n[i]) + rate * (T::lit(self.wheel.radius_m) - distance) + damper * closing;
+        let mut preload = T::lit(self.static_load_n[i]) + rate * (T::lit(wheel.radius_m) - distance) + damper * closing;
+        let mut soil = input.soil;
+        if self.altered.on_wheels {
+            ratio = ratio * self.digging(motion.slip);
+            preload = preload + self.stabiliser_n(i, state, tilt, input);
+            soil = self.soil_under(i, &Support { preload_n: preload, rate_n_m: rate * ratio }, ratio, &motion, &soil);
+        }
         let support = Support { preload_n: preload, rate_n_m: rate * ratio };
-        let balanced = balance_sinkage(&self.wheel, &support, &motion, &input.soil);
+        let balanced = balance_sinkage(wheel, &support, &motion, &soil);
         let sinkage = balanced * ratio;
         let load = (preload - rate * sinkage).relu_smooth(1.0);
-        let wrench = wheel_wrench(&self.wheel, sinkage, &motion, &input.soil);
+        let wrench = wheel_wrench(wheel, sinkage, &motion, &soil);
         let share = load / wrench.normal_n.relu_smooth(1.0);
-        let soil_rate = (input.soil.n + T::lit(0.5)) * load / balanced;
+        let soil_rate = (soil.n + T::lit(0.5)) * load / balanced;
         let in_series = soil_rate / (soil_rate + rate);
-        let (drag, contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
+        let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
+        if self.altered.on_wheels {
+            self.alter_traction(i, &wheel_motion, &motion, &soil, share, &mut drag, &mut contact);
+        }
         Contribution {
             axes: [forward, left, normal],
             lever: add(centre, scale(normal, -distance)),
@@ -254,6 +280,16 @@ impl StepModel {
             stiffness_n_m: rate * in_series,
             contact,
         }
+    }
+
+    /// Distance of a wheel centre from the tangent plane of its ground, m, moved along as the wheel travels over the slope.
+    #[inline(always)]
+    pub(crate) fn distance<T: Real>(&self, i: usize, state: &VehicleState<T>, tilt: &Tilt<T>, input: &StepInput<T>) -> T {
+        let offset = tilt.to_heading(self.vehicle.wheel_centre_m[i].map(T::lit));
+        let travelled = state.position_m;
+        let ground = input.ground[i].height_m + input.ground[i].slope_ahead * travelled[0] + input.ground[i].slope_left * travelled[1];
+        let slope = T::lit(1.0) + input.ground[i].slope_ahead.sqr() + input.ground[i].slope_left.sqr();
+        (travelled[2] + offset[2] - ground) / slope.sqrt()
     }
 
     /// Tractive forces at the load actually carried, and their secant damping coefficients.
@@ -293,7 +329,7 @@ impl StepModel {
     /// Without drag nothing is computed.
     #[inline(always)]
     fn drag_at_tread<T: Real>(&self, wheel: usize, thrust_n: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> T {
-        if self.vehicle.effects.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
+        if self.vehicle.effects.force.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
             return T::lit(0.0);
         }
         let over = (motion.rim_speed_m_s - motion.forward_m_s).abs_smooth(0.02);

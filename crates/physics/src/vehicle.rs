@@ -3,6 +3,7 @@
 use crate::effects::EffectTerms;
 use crate::scalar::Real;
 use crate::state::Control;
+use crate::terramechanics::ContactLaw;
 
 /// Number of wheels of the platforms served.
 pub const WHEELS: usize = 4;
@@ -135,6 +136,8 @@ pub struct Vehicle {
     pub wheelbase_m: f64,
     /// Drive line.
     pub driveline: Driveline,
+    /// How the soil acts on the wheels.
+    pub contact_law: ContactLaw,
     /// Gravity, m/s².
     pub gravity_m_s2: f64,
     /// What effects add; all zero for a vehicle as its card says.
@@ -153,7 +156,7 @@ impl Vehicle {
     /// Torque that the drive adds at each wheel against the friction of all of them, N m: a vehicle that tracks its speed with an integral part holds it
     /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none.
     pub fn drag_made_up_n_m(&self) -> f64 {
-        let mean = self.effects.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
+        let mean = self.effects.force.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
         if self.second == SecondCommand::YawRateRadS { 0.0 } else { mean }
     }
 
@@ -165,10 +168,19 @@ impl Vehicle {
     /// of the coupling and the one between the axles.
     #[inline(always)]
     pub fn drag_at_tread_n_m<T: Real>(&self, wheel: usize, slope_n_s_m: T) -> T {
-        let [own, partner] = [wheel, wheel ^ 1].map(|w| self.effects.wheel_drag_n_m[w] - self.drag_made_up_n_m());
+        let [own, partner] = [wheel, wheel ^ 1].map(|w| self.effects.force.wheel_drag_n_m[w] - self.drag_made_up_n_m());
         let coupling = T::lit(2.0 * self.driveline.side_coupling_n_m_s / (self.wheel_radius_m * self.wheel_radius_m));
         let passed = coupling / (slope_n_s_m + coupling).max(T::lit(1.0));
         T::lit(own) - passed * T::lit(0.5 * (own - partner))
+    }
+
+    /// Servo of the rims with what the drive still has of its limit.
+    pub fn limited_rims(&self) -> RimServo {
+        let rims = self.driveline.rims;
+        match self.effects.actuator.torque_lost {
+            0.0 => rims,
+            lost => RimServo { rim_limit_m_s: rims.rim_limit_m_s * (1.0 - lost), ..rims },
+        }
     }
 
     /// Whether the command lies in the range of the card (both ends included).

@@ -70,6 +70,7 @@ pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
         wheelbase_m: wheels.wheelbase_m,
         driveline: driveline(&sheet, second)?,
         gravity_m_s2,
+        contact_law: Default::default(),
         effects: Default::default(),
     })
 }

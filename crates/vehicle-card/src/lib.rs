@@ -4,6 +4,7 @@
 //! vehicle as JSON with units in the names.
 #![forbid(unsafe_code)]
 
+use nesam_physics::terramechanics::ContactLaw;
 use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
 use serde::{Deserialize, Serialize};
 
@@ -37,6 +38,8 @@ struct Card {
     wheelbase_m: f64,
     driveline: Line,
     gravity_m_s2: f64,
+    #[serde(default, with = "Law", skip_serializing_if = "is_classical")]
+    contact_law: ContactLaw,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -82,6 +85,20 @@ struct Rims {
     speed_lag_s: f64,
     yaw_lag_s: f64,
     turn_efficiency: f64,
+}
+
+/// How the soil acts on the wheels.
+#[derive(Serialize, Deserialize)]
+#[serde(remote = "ContactLaw", rename_all = "snake_case")]
+enum Law {
+    WongReece,
+    SoilContactModel,
+}
+
+/// The law of the paper is left out, so that cards written before there was another keep their bytes.
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_classical(law: &ContactLaw) -> bool {
+    *law == ContactLaw::WongReece
 }
 
 /// A base that does what it is told is left out, so that the cards of cars know nothing of it.
@@ -131,6 +148,7 @@ pub fn to_json(vehicle: &Vehicle) -> String {
             side_coupling_n_m_s: v.driveline.side_coupling_n_m_s,
         },
         gravity_m_s2: v.gravity_m_s2,
+        contact_law: v.contact_law,
     };
     serde_json::to_string_pretty(&card).expect("plain numbers serialise; this is a bug")
 }
@@ -203,6 +221,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             side_coupling_n_m_s: c.driveline.side_coupling_n_m_s,
         },
         gravity_m_s2: c.gravity_m_s2,
+        contact_law: c.contact_law,
         effects: Default::default(),
     })
 }

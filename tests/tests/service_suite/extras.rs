@@ -42,6 +42,7 @@ async fn service_jacobians_are_those_of_the_model_and_rows_stand_alone() {
         map: Some(&recorded.world),
         soil_correction: learned(&recorded, 60).0,
         variant: Variant::Full,
+        start_time_s: None,
         wheels: None,
     };
     for (n, linearisation) in predictor.linearise(&query).unwrap().iter().enumerate() {

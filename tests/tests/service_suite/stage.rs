@@ -172,6 +172,7 @@ pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_s
             map: Some(&recorded.world),
             soil_correction,
             variant: Variant::Full,
+            start_time_s: None,
             wheels: None,
         })
         .unwrap()

@@ -209,6 +209,7 @@ impl<'a> Planner<'a> {
             map: self.map.as_ref(),
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
+            start_time_s: None,
             wheels: None,
         };
         predictor.rollout(&query).or_failed()

@@ -180,6 +180,7 @@ fn rollout(
         map,
         soil_correction: SoilCorrection::NONE,
         variant,
+        start_time_s: Some(window.since_log_start_s()),
         wheels: None,
     };
     predictor.rollout(&query).or_failed()

@@ -6,7 +6,7 @@ use std::sync::{Arc, OnceLock};
 use nesam_discovery::{Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
-use nesam_physics::driveline::{DrivelineState, command_wheels, road_wheel_angles};
+use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::effects::Effect;
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, Driveline, Soil, SoilCorrection, Vehicle, VehicleState};
@@ -86,7 +86,7 @@ pub fn drive(id: &str, seed: u64, effects: &[Effect], soil: &[f64; 6]) -> Trajec
             let sd = |i: usize| NOISE[[0, 0, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4][i]];
             states.push(VehicleState::from_array(core::array::from_fn(|i| x[i] + sd(i) * normal())));
             controls.push(control);
-            let angles = road_wheel_angles(&vehicle, actuators.steering + vehicle.effects.steering_offset);
+            let angles = actuators.road_wheel_angles(&vehicle);
             steering.push([angles[0] + NOISE[5] * normal(), angles[1] + NOISE[5] * normal()]);
         }
         let after = actuators.advance(&vehicle, &control, state.velocity_m_s[0], 0.1);

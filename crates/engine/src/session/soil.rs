@@ -124,8 +124,8 @@ impl SoilLearner {
         for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
             let [x, y, _] = transition.input.state.position_m;
             let ground_class = SoilByClass::class_at(Some(map), [x, y]);
-            let buffered =
-                BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end.state) };
+            let end = predictor.true_state(&end.state);
+            let buffered = BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end) };
             update = self.filter.push(predictor.step_model(), buffered).ok()?;
         }
         let update = update?;

@@ -37,6 +37,7 @@ fn cart() -> Vehicle {
             speed_integral_limit_m: 0.0,
         },
         gravity_m_s2: 9.81,
+        contact_law: Default::default(),
         effects: Default::default(),
     }
 }

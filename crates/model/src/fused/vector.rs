@@ -136,6 +136,16 @@ impl Path {
         Self::available()[0]
     }
 
+    /// This path, or the one of the build's target where a kernel calls functions that are not inlined: those are compiled for the target alone, so on
+    /// more than it has every vector operation would be a call. The bits are the same.
+    pub fn for_calls(self) -> Self {
+        #[cfg(all(target_arch = "x86_64", target_feature = "avx2", target_feature = "fma"))]
+        if self.0 == Instructions::Avx512 {
+            return Self(Instructions::Avx2);
+        }
+        self
+    }
+
     /// Name in reports: `avx512`, `avx2` or `portable`.
     pub fn as_str(self) -> &'static str {
         match self.0 {

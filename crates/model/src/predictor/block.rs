@@ -4,6 +4,7 @@ use nesam_physics::driveline::{DrivelineState, command_wheels, measured_wheels};
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, WHEELS};
 use nesam_terrain::Pose2;
 
+use super::observed::reported;
 use super::physics::{PhysicsOutput, PhysicsStep};
 use super::risk::RiskRow;
 use super::rollout::Scene;
@@ -77,13 +78,15 @@ impl Predictor {
     fn step_block(&self, scene: &Scene<'_>, block: &mut Block<'_>, cache: &mut Cache, terrain: &[TerrainToken; LANES]) {
         let scales = &self.bundle.normalization;
         let (k, count) = (block.done, block.samples.len());
+        let time_s = scene.clock.after(k);
+        let model = self.physics.at(time_s);
         let last = count - 1;
         // Lanes beyond the last sample repeat it.
         let controls: [Control<f64>; LANES] = core::array::from_fn(|l| scene.control(block.first + l.min(last), k));
         let mut entries = [[Lane::ZERO]; crate::dims::STATE_CONTROL];
         for l in 0..LANES {
             let sample = &block.samples[l.min(last)];
-            let values = self.entries(&sample.state, sample.previous.as_ref(), &controls[l], &scene.ground);
+            let values = self.entries(model, &sample.state, sample.previous.as_ref(), &controls[l], &scene.ground);
             entries.iter_mut().zip(values).for_each(|(row, value)| row[0][l] = value);
         }
         let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane::from_fn(|l| terrain[l][i])]);
@@ -94,25 +97,30 @@ impl Predictor {
         let mut known = [true; LANES];
         for l in 0..LANES {
             let sample = &block.samples[l.min(last)];
-            after[l] = sample.actuators.advance(self.model.vehicle(), &controls[l], sample.state.velocity_m_s[0], scales.dt_s);
+            after[l] = sample.actuators.advance(model.vehicle(), &controls[l], sample.state.velocity_m_s[0], model.dt_s());
             let wheels = match scene.query.wheels {
-                Some(measured) => measured_wheels(self.model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
-                None => command_wheels(self.model.vehicle(), &sample.actuators, &after[l], &controls[l]),
+                Some(measured) => measured_wheels(model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
+                None => command_wheels(model.vehicle(), &sample.actuators, &after[l], &controls[l]),
             };
-            let (ground, inside) = scene.ground.under_wheels(&self.model, &sample.state, scene.datum_m);
+            let (ground, inside) = scene.ground.under_wheels(model, &sample.state, scene.datum_m);
             known[l] = inside;
-            let soil = under(scene.soil, block.first + l.min(last), sample, &terrain[l]);
+            let soil = self.soil_at(under(scene.soil, block.first + l.min(last), sample, &terrain[l]), time_s);
             let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                 Variant::ZeroSinkage => NO_SINKAGE,
                 _ => scales.sinkage_log_ratio_max * said.sinkage[i][0][l],
             });
             let row = varying_row(&sample.state, scene.datum_m, &ratio, &soil);
             varying.iter_mut().zip(row).for_each(|(lane, value)| lane[l] = value);
-            constant.iter_mut().zip(pack_constants(&wheels, &ground)).for_each(|(lane, value)| lane[l] = value);
+            constant
+                .iter_mut()
+                .zip(pack_constants(&wheels, &ground, sample.state.attitude_rad[2]))
+                .for_each(|(lane, value)| lane[l] = value);
         }
 
-        let physics = PhysicsStep { variant: scene.variant, model: &self.model, varying: &varying, constant: &constant, risk: scene.risk };
-        let output = self.network.path().run(physics);
+        let physics = PhysicsStep { variant: scene.variant, model, varying: &varying, constant: &constant, risk: scene.risk };
+        let path = self.network.path();
+        let output = if model.is_altered() { path.for_calls() } else { path }.run(physics);
+        let sensors = &self.physics.at(scene.clock.after(k + 1)).vehicle().effects.sensor;
         for l in 0..count {
             let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
                 let residual = match scene.variant {
@@ -122,16 +130,17 @@ impl Predictor {
                 f64::from(output.increment[i][l] + residual)
             });
             self.advance(&mut block.samples[l], &total, after[l], known[l], &controls[l]);
-            block.write(l, k, scene.query.horizon, &output);
+            let shown = reported(sensors, &block.samples[l].state);
+            block.write(l, k, scene.query.horizon, &shown, &output);
         }
     }
 }
 
 impl Block<'_> {
     /// Writes the state and the wheels of a sample after step `k`.
-    fn write(&mut self, l: usize, k: usize, horizon: usize, output: &PhysicsOutput) {
+    fn write(&mut self, l: usize, k: usize, horizon: usize, state: &VehicleState<f64>, output: &PhysicsOutput) {
         let row = l * horizon + k;
-        for (out, value) in self.states[row * STATE_DIM..(row + 1) * STATE_DIM].iter_mut().zip(self.samples[l].state.to_array()) {
+        for (out, value) in self.states[row * STATE_DIM..(row + 1) * STATE_DIM].iter_mut().zip(state.to_array()) {
             *out = value as f32;
         }
         for (out, lane) in self.sinkage_m[row * WHEELS..(row + 1) * WHEELS].iter_mut().zip(&output.sinkage_m) {

@@ -5,10 +5,9 @@ use std::sync::Arc;
 use nesam_physics::VehicleState;
 use rayon::prelude::*;
 
-use super::{Predictor, control, pose, raw_soil, validate};
+use super::{LogClock, Predictor, control, pose, raw_soil, validate};
 use crate::ModelError;
-use crate::dims::HISTORY;
-use crate::ground::{GroundSource, history_actuators, wheel_points};
+use crate::ground::{GroundSource, wheel_points};
 use crate::rollout::RolloutQuery;
 use crate::soil_coordinates::from_raw;
 use crate::tangent::{ExactTransformer, Linearisation, Plane, Scenery, TangentRollout};
@@ -23,8 +22,10 @@ impl Predictor {
         validate(query)?;
         let scales = &self.bundle.normalization;
         let tokens = query.map.map(|map| self.tokens_of(map));
-        let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
-        let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
+        let clock = LogClock { start_s: query.start_time_s, dt_s: scales.dt_s };
+        let (history, start) = self.true_motion(query.history, &query.start, clock);
+        let history = history.as_ref();
+        let ground = GroundSource::new(query.map.map(Arc::as_ref), self.physics.at(clock.start_s), &start);
         let variant = self.form_of(query);
         if !variant.remembers() {
             let reason = format!("a model of the form `{}` has no derivatives", variant.as_str());
@@ -32,24 +33,26 @@ impl Predictor {
         }
         let first = control(query, 0, 0);
         let shared = Arc::new(TangentRollout {
-            model: &self.model,
+            physics: &self.physics,
+            clock,
             network: ExactTransformer(&self.network),
             scales,
             variant,
-            prefix: self.prefix(variant, history, &ground, tokens.as_deref()),
+            prefix: self.prefix(variant, history, &ground, tokens.as_deref(), clock),
             coordinates: query.soil_correction.coordinates,
             wheels: query.wheels,
             previous: history.last().map(|step| step.state),
-            actuators: (!history.is_empty()).then(|| history_actuators(&self.model, history, &query.start, &first, scales.dt_s)),
+            actuators: (!history.is_empty()).then(|| self.actuators(history, &start, &first, clock)),
         });
-        let look = |state: &VehicleState<f64>| {
+        let look = |k: usize, state: &VehicleState<f64>| {
+            let model = self.physics.at(clock.after(k));
             let token = self.terrain(tokens.as_deref(), &[pose(state)])[0];
-            let plane = |x: f64, y: f64| Plane::at(&ground, x, y);
+            let plane = |x: f64, y: f64| Plane::at(&ground, &model.vehicle().effects.map, x, y);
             Scenery {
                 token,
                 prior: from_raw(&raw_soil(&token)),
                 reference: plane(state.position_m[0], state.position_m[1]),
-                wheels: wheel_points(&self.model, state).map(|[x, y]| plane(x, y)),
+                wheels: wheel_points(model, state).map(|[x, y]| plane(x, y)),
             }
         };
         let of_sample = |n: usize| {

@@ -12,11 +12,10 @@ use rayon::prelude::*;
 use super::block::{Block, Cache};
 use super::risk::RiskRow;
 use super::validate::{validate, validate_extras};
-use super::{Predictor, Sample, control, pose, under};
+use super::{LogClock, Predictor, Sample, control, pose, under};
 use crate::ModelError;
-use crate::dims::HISTORY;
 use crate::fused::{LANES, Prefix};
-use crate::ground::{GroundSource, history_actuators};
+use crate::ground::GroundSource;
 use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_field::SoilField;
 use crate::terrain_tokens::{Node, TerrainTokens};
@@ -30,6 +29,7 @@ pub(super) struct Scene<'a> {
     pub(super) datum_m: f64,
     pub(super) variant: Variant,
     pub(super) risk: bool,
+    pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
     pub(super) caches: Caches,
 }
@@ -94,37 +94,39 @@ impl Predictor {
             return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
         }
         let tokens = query.map.map(|map| self.tokens_of(map));
-        let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
-        let history = &query.history[query.history.len().saturating_sub(HISTORY - 1)..];
+        let clock = LogClock { start_s: query.start_time_s, dt_s: self.bundle.normalization.dt_s };
+        let (history, start_state) = self.true_motion(query.history, &query.start, clock);
+        let history = history.as_ref();
+        let ground = GroundSource::new(query.map.map(Arc::as_ref), self.physics.at(clock.start_s), &start_state);
         let what_if = SoilPerGroup { soils: extras.soils, samples: query.samples };
         let scene = Scene {
             query,
             soil: if extras.soils.is_empty() { extras.field.unwrap_or(&query.soil_correction) } else { &what_if },
-            prefix: self.prefix(variant, history, &ground, tokens.as_deref()),
+            prefix: self.prefix(variant, history, &ground, tokens.as_deref(), clock),
             ground,
-            datum_m: query.start.position_m[2],
+            datum_m: start_state.position_m[2],
             variant,
             risk: extras.risk,
+            clock,
             tokens: tokens.as_deref(),
             caches: Caches { free: Mutex::default(), horizon: query.horizon, remembers: variant.remembers() },
         };
         let rows = extras.soils.len().max(1) * query.samples;
         // Without a history the actuators begin as a row's own first command says, so rows stay independent.
-        let dt_s = self.bundle.normalization.dt_s;
         let start = |row: usize| Sample {
-            state: query.start,
+            state: start_state,
             previous: history.last().map(|step| step.state),
-            actuators: history_actuators(&self.model, history, &query.start, &scene.control(row, 0), dt_s),
+            actuators: self.actuators(history, &start_state, &scene.control(row, 0), clock),
             flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
         };
         let shared = start(0);
         let mut samples: Vec<Sample> = (0..rows).map(|row| if history.is_empty() { start(row) } else { shared }).collect();
-        let under_start = self.terrain(scene.tokens, &[pose(&query.start)])[0];
+        let under_start = self.terrain(scene.tokens, &[pose(&start_state)])[0];
         let mut rollout = Rollout {
             states: vec![0.0; rows * query.horizon * STATE_DIM],
             sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
             flags: Vec::new(),
-            soil: under(scene.soil, 0, &shared, &under_start),
+            soil: self.soil_at(under(scene.soil, 0, &shared, &under_start), clock.before(0)),
             samples: rows,
             horizon: query.horizon,
         };

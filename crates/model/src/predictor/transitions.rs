@@ -8,10 +8,10 @@ use nesam_physics::step::StepInput;
 use nesam_physics::{Control, STATE_DIM, Soil, SoilCorrection, VehicleState};
 use nesam_terrain::WorldMap;
 
-use super::{Predictor, Sample, pose, raw_soil, under};
-use crate::dims::{HIDDEN, HISTORY, STATE_CONTROL};
+use super::{LogClock, Predictor, Sample, pose, raw_soil, under};
+use crate::dims::{HIDDEN, STATE_CONTROL};
 use crate::fused::{BlockCache, LANES, Lane, Row, Said};
-use crate::ground::{GroundSource, history_actuators};
+use crate::ground::GroundSource;
 use crate::rollout::HistoryStep;
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
@@ -49,7 +49,8 @@ impl Predictor {
     }
 
     /// The transitions of one rollout from a measured state under the commands that followed on a given soil: network and ground at the *predicted* states, as a
-    /// prediction meets them. A filter that learns from them sees the errors that predictions have, not those of single steps.
+    /// prediction meets them. A filter that learns from them sees the errors that predictions have, not those of single steps. History and start are
+    /// measured, the states of the transitions true ([`Predictor::true_state`]); every effect has begun.
     pub fn transitions_along(
         &self,
         history: &[HistoryStep],
@@ -58,23 +59,24 @@ impl Predictor {
         map: Option<&Arc<WorldMap>>,
         soil: &dyn SoilField,
     ) -> Vec<Transition> {
-        let scales = &self.bundle.normalization;
+        let clock = LogClock::late(self.bundle.normalization.dt_s);
+        let (history, start) = self.true_motion(history, start, clock);
+        let history = history.as_ref();
         let tokens = map.map(|map| self.tokens_of(map));
-        let ground = GroundSource::new(map.map(Arc::as_ref), &self.model, start);
-        let history = &history[history.len().saturating_sub(HISTORY - 1)..];
-        let prefix = self.prefix(self.bundle.form, history, &ground, tokens.as_deref());
+        let ground = GroundSource::new(map.map(Arc::as_ref), self.step_model(), &start);
+        let prefix = self.prefix(self.bundle.form, history, &ground, tokens.as_deref(), clock);
         let mut cache = BlockCache::new(controls.len(), self.bundle.form.remembers());
         let Some(first) = controls.first() else { return Vec::new() };
         let mut sample = Sample {
-            state: *start,
+            state: start,
             previous: history.last().map(|step| step.state),
-            actuators: history_actuators(&self.model, history, start, first, scales.dt_s),
+            actuators: self.actuators(history, &start, first, clock),
             flags: 0,
         };
         let mut transitions = Vec::with_capacity(controls.len());
         for control in controls {
             let token = self.terrain(tokens.as_deref(), &[pose(&sample.state)])[0];
-            let entries = self.entries(&sample.state, sample.previous.as_ref(), control, &ground);
+            let entries = self.entries(self.step_model(), &sample.state, sample.previous.as_ref(), control, &ground);
             let lanes: [Row<1>; STATE_CONTROL] = entries.map(|entry| [Lane([entry; LANES])]);
             let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane([token[i]; LANES])]);
             let said = self.network.step(&prefix, &mut cache, &lanes, &context);
@@ -83,8 +85,8 @@ impl Predictor {
             if transitions.len() == controls.len() {
                 break; // nothing starts from the end of the last one
             }
-            let soil = under(soil, 0, &sample, &token);
-            let moved = self.model.step(&StepInput { soil: Soil::from_array(soil), ..transition.input }).increment.to_array();
+            let soil = self.soil_at(under(soil, 0, &sample, &token), None);
+            let moved = self.step_model().step(&StepInput { soil: Soil::from_array(soil), ..transition.input }).increment.to_array();
             let total = core::array::from_fn(|i| moved[i] + transition.residual[i]);
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
         }
@@ -119,16 +121,16 @@ impl Predictor {
         token: &TerrainToken,
         said: &Said<1>,
     ) -> Transition {
-        let scales = &self.bundle.normalization;
-        let after = sample.actuators.advance(self.model.vehicle(), control, sample.state.velocity_m_s[0], scales.dt_s);
-        let (under_wheels, known) = ground.under_wheels(&self.model, &sample.state, 0.0);
+        let (scales, model) = (&self.bundle.normalization, self.step_model());
+        let after = sample.actuators.advance(model.vehicle(), control, sample.state.velocity_m_s[0], model.dt_s());
+        let (under_wheels, known) = ground.under_wheels(model, &sample.state, 0.0);
         let ratio = |i: usize| f64::from(scales.sinkage_log_ratio_max * said.sinkage[i][0][0]);
         Transition {
             input: StepInput {
                 state: sample.state,
-                wheels: command_wheels(self.model.vehicle(), &sample.actuators, &after, control),
+                wheels: command_wheels(model.vehicle(), &sample.actuators, &after, control),
                 sinkage_log_ratio: core::array::from_fn(ratio),
-                soil: Soil::from_array(from_raw(&raw_soil(token))),
+                soil: Soil::from_array(self.soil_at(from_raw(&raw_soil(token)), None)),
                 ground: under_wheels,
             },
             actuators: [sample.actuators, after],

@@ -117,7 +117,7 @@ impl ReferenceRollout<'_> {
                 let after = actuators[b].advance(self.model.vehicle(), &controls[b], states[b].velocity_m_s[0], self.scales.dt_s);
                 let wheels = command_wheels(self.model.vehicle(), &actuators[b], &after, &controls[b]);
                 let (ground, _) = row.ground.under_wheels(self.model, &states[b], row.start.position_m[2]);
-                constants.push(pack_constants(&wheels, &ground));
+                constants.push(pack_constants(&wheels, &ground, states[b].attitude_rad[2]));
                 actuators[b] = after;
             }
             let increment = self.increment(&state, &raw_sinkage, &raw_residual, &raw_soil, &constants)?;
@@ -157,7 +157,7 @@ impl ReferenceRollout<'_> {
         previous: Option<&VehicleState<f64>>,
         control: &Control<f64>,
     ) -> [f32; STATE_CONTROL] {
-        let (height, _, _) = row.ground.at(state.position_m[0], state.position_m[1]);
+        let (height, _, _) = row.ground.at(&self.model.vehicle().effects.map, state.position_m[0], state.position_m[1]);
         let entries = token_entries(state, previous, [control.speed_m_s, control.second], height, self.scales.dt_s);
         self.scales.token_scale().apply(entries)
     }
@@ -179,7 +179,8 @@ impl ReferenceRollout<'_> {
         // Same numbers as `measured`, but as functions of the prediction; only z enters relative to the ground.
         let height: Vec<f32> = (0..rows.len())
             .map(|b| {
-                let (ground, _, _) = rows[b].ground.at(states[b].position_m[0], states[b].position_m[1]);
+                let effects = &self.model.vehicle().effects.map;
+                let (ground, _, _) = rows[b].ground.at(effects, states[b].position_m[0], states[b].position_m[1]);
                 (ground - rows[b].start.position_m[2]) as f32
             })
             .collect();

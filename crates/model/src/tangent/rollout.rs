@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use nesam_physics::driveline::{DrivelineState, differentiable_wheels, measured_wheels};
+use nesam_physics::effects::Phases;
 use nesam_physics::scalar::{Dual, Real};
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCoordinates, VehicleState, WHEELS};
@@ -11,6 +12,7 @@ use rayon::prelude::*;
 use crate::dims::CONTROL_DIM;
 use crate::fused::Prefix;
 use crate::normalization::Normalization;
+use crate::predictor::LogClock;
 use crate::rollout::{MeasuredWheels, Variant};
 use crate::symbolic::symbolic_step;
 use crate::tangent::transformer::{ExactCache, ExactTransformer};
@@ -27,7 +29,8 @@ const START_TANGENTS: usize = STATE_DIM + SOIL_DIM;
 /// What all samples of a query share.
 #[derive(Debug)]
 pub struct TangentRollout<'a> {
-    pub model: &'a StepModel,
+    pub physics: &'a Phases<StepModel>,
+    pub clock: LogClock,
     pub network: ExactTransformer<'a>,
     pub scales: &'a Normalization,
     pub variant: Variant,
@@ -59,13 +62,26 @@ impl Motion<f64> {
 }
 
 impl TangentRollout<'_> {
-    /// Where a rollout begins.
+    /// Where a rollout from a measured state begins.
     pub fn initial<T: Number>(&self, start: &VehicleState<T>, first: &Control<T>) -> Motion<T> {
+        let vehicle = self.physics.at(self.clock.start_s).vehicle();
+        let start = vehicle.effects.sensor.to_true(start);
         let actuators = match &self.actuators {
             Some(settled) => settled.map(T::lit),
-            None => DrivelineState::starting(self.model.vehicle(), start, first),
+            None => DrivelineState::starting(vehicle, &start, first),
         };
-        Motion { state: *start, previous: self.previous.map(|state| state.map(T::lit)), actuators }
+        Motion { state: start, previous: self.previous.map(|state| state.map(T::lit)), actuators }
+    }
+
+    /// A true state after `k` steps as the sensors measure it.
+    fn reported<T: Number>(&self, k: usize, state: &VehicleState<T>) -> VehicleState<T> {
+        let sensors = &self.physics.at(self.clock.after(k)).vehicle().effects.sensor;
+        if !sensors.alters_states() {
+            return *state;
+        }
+        let mut measured = sensors.to_measured(state);
+        measured.attitude_rad[2] = measured.attitude_rad[2].wrapped();
+        measured
     }
 
     /// Step `k` from a motion: network, physics, x' = x + Δx.
@@ -78,13 +94,15 @@ impl TangentRollout<'_> {
         scenery: &Scenery,
         cache: &mut ExactCache<T>,
     ) -> Motion<T> {
-        let (state, vehicle, scales) = (&motion.state, self.model.vehicle(), self.scales);
+        let time_s = self.clock.after(k);
+        let model = self.physics.at(time_s);
+        let (state, vehicle, scales) = (&motion.state, model.vehicle(), self.scales);
         let height = scenery.reference.height_m(state.position_m[0], state.position_m[1]);
         let raw = entries_of(state, motion.previous.as_ref(), [control.speed_m_s, control.second], height, scales.dt_s, T::wrapped);
         let lit = |v: f32| T::lit(f64::from(v));
         let entries = core::array::from_fn(|i| (raw[i] - lit(scales.token_mean[i])) / lit(scales.token_scale[i]));
         let (sinkage, residual) = self.network.step(&self.prefix, cache, &entries, &scenery.token);
-        let after = motion.actuators.advance(vehicle, control, state.velocity_m_s[0], scales.dt_s);
+        let after = motion.actuators.advance(vehicle, control, state.velocity_m_s[0], model.dt_s());
         let wheels = match self.wheels {
             Some(measured) => measured_wheels(vehicle, &measured[k].speed_rad_s, &measured[k].angle_rad),
             None => differentiable_wheels(vehicle, &motion.actuators, &after, control),
@@ -97,10 +115,10 @@ impl TangentRollout<'_> {
             state: *state,
             wheels,
             sinkage_log_ratio: core::array::from_fn::<T, WHEELS, _>(ratio),
-            soil: Soil::from_array(self.coordinates.correct(&scenery.prior, delta)),
-            ground: scenery.under_wheels(self.model, state),
+            soil: Soil::from_array(vehicle.effects.soil.drifted(self.coordinates.correct(&scenery.prior, delta), time_s)),
+            ground: scenery.under_wheels(model, state),
         };
-        let moved = symbolic_step(self.variant, self.model, &input).increment.to_array();
+        let moved = symbolic_step(self.variant, model, &input).increment.to_array();
         let learned =
             |i: usize| if self.variant == Variant::NoResidual { T::lit(0.0) } else { residual[i] * lit(scales.residual_scale[i]) };
         let total: [T; STATE_DIM] = core::array::from_fn(|i| moved[i] + learned(i));
@@ -136,6 +154,8 @@ pub struct Linearisation<'a> {
     delta: [f64; SOIL_DIM],
     /// Before each step, and after the last that is finite.
     motions: Vec<Motion<f64>>,
+    /// After each step, as measured.
+    reported: Vec<VehicleState<f64>>,
     cache: ExactCache<f64>,
     start: VehicleState<f64>,
 }
@@ -147,22 +167,24 @@ impl<'a> Linearisation<'a> {
         start: &VehicleState<f64>,
         controls: Vec<Control<f64>>,
         delta: [f64; SOIL_DIM],
-        mut look: impl FnMut(&VehicleState<f64>) -> Scenery,
+        mut look: impl FnMut(usize, &VehicleState<f64>) -> Scenery,
     ) -> Self {
         let mut cache = ExactCache::new();
         let mut motions = vec![shared.initial(start, &controls[0])];
         let mut scenery = Vec::with_capacity(controls.len());
+        let mut reported = Vec::with_capacity(controls.len());
         for (k, control) in controls.iter().enumerate() {
             let motion = motions[k];
-            let seen = look(&motion.state);
+            let seen = look(k, &motion.state);
             let next = shared.step(k, &motion, control, &delta, &seen, &mut cache);
             if !next.state.to_array().iter().all(|v| v.is_finite()) {
                 break;
             }
             scenery.push(seen);
+            reported.push(shared.reported(k + 1, &next.state));
             motions.push(next);
         }
-        Self { shared, scenery, controls, delta, motions, cache, start: *start }
+        Self { shared, scenery, controls, delta, motions, reported, cache, start: *start }
     }
 
     /// Steps asked for, K.
@@ -172,7 +194,7 @@ impl<'a> Linearisation<'a> {
 
     /// Predicted states after steps 1…K, fewer when one is not finite.
     pub fn states(&self) -> impl Iterator<Item = &VehicleState<f64>> {
-        self.motions[1..].iter().map(|motion| &motion.state)
+        self.reported.iter()
     }
 
     /// State that it starts from.
@@ -199,7 +221,7 @@ impl<'a> Linearisation<'a> {
         (from..self.scenery.len())
             .map(|k| {
                 motion = self.shared.step(k, &motion, &control(k), delta, &self.scenery[k], cache);
-                motion.state
+                self.shared.reported(k + 1, &motion.state)
             })
             .collect()
     }

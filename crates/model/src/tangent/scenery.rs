@@ -1,5 +1,6 @@
 //! The terrain along one rollout, held as it was found there.
 
+use nesam_physics::effects::MapTerms;
 use nesam_physics::step::{Ground, StepModel};
 use nesam_physics::{SOIL_DIM, VehicleState, WHEELS};
 
@@ -18,8 +19,8 @@ pub struct Plane {
 
 impl Plane {
     /// The plane at a point; level beyond the map.
-    pub fn at(ground: &GroundSource<'_>, x_m: f64, y_m: f64) -> Self {
-        let (height_m, slope, _) = ground.at(x_m, y_m);
+    pub fn at(ground: &GroundSource<'_>, effects: &MapTerms, x_m: f64, y_m: f64) -> Self {
+        let (height_m, slope, _) = ground.at(effects, x_m, y_m);
         Self { x_m, y_m, height_m, slope }
     }
 

@@ -1,126 +1,165 @@
-//! Physical effects that a base vehicle lacks, each in its own file: equation, source, units, range.
+//! The catalogue: physical effects that a base vehicle lacks, each in its own file with equation, source, units and range.
 //!
-//! An effect states what it changes through [`EffectTerms`], which the step evaluates: a mass that rides along, a drag at a wheel, an
-//! offset of the steering. All terms are zero without effects, so a bundle without effects computes what it always did.
-//! A bundle lists its effects by id and parameters; `nesam diagnose` finds them.
+//! An effect belongs to one [`Layer`], has named [`Parameter`]s, can be [scaled](Effect::scaled) down to nothing and states what it changes through
+//! [`EffectTerms`], which drive line, step, soil, ground and sensors evaluate. All terms are zero without effects, so a vehicle without effects
+//! computes what it always did. A bundle lists its effects by id and parameters, with the instant from which each acts ([`ScheduledEffect`]);
+//! `nesam diagnose` finds them.
+//!
+//! | layer | folder | acts in |
+//! |---|---|---|
+//! | actuator | [`actuator`] | `driveline.rs`: commands to rims and road-wheel angles |
+//! | force | [`force`] | `step.rs`, `step_effects.rs`: body and wheels |
+//! | soil | [`soil`] | the soil vector and the contact coefficients of the wheels |
+//! | sensor | [`sensor`] | [`SensorTerms::to_true`] and [`SensorTerms::to_measured`] around a prediction |
+//! | map | [`map`] | [`MapTerms::raised`], where ground is looked up |
+//!
+//! A new effect is one file in its layer's folder (a struct through the macro `effect!` or an [`Act`] by hand), a term for what it changes, and one
+//! line in `catalogue!` below.
 
-mod payload;
-mod steering_offset;
-mod wheel_drag;
+mod act;
+pub mod actuator;
+pub mod force;
+pub mod map;
+mod schedule;
+pub mod sensor;
+pub mod soil;
 
-pub use payload::Payload;
-pub use steering_offset::SteeringOffset;
-pub use wheel_drag::WheelDrag;
+pub use act::{Act, Parameter, Quantity, Scaling};
+pub use actuator::*;
+pub use force::*;
+pub use map::*;
+pub use schedule::{Phases, ScheduledEffect};
+pub use sensor::*;
+pub use soil::*;
 
-use crate::vehicle::{Vehicle, WHEELS};
+use crate::vehicle::Vehicle;
 
-/// What effects add to the step; all zero by default.
+/// What effects change; all zero by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct EffectTerms {
-    /// Mass added, kg.
-    pub added_mass_kg: f64,
-    /// Where it is, relative to the reference point, Body, m.
-    pub added_at_m: [f64; 3],
-    /// Friction torque at each wheel, N m, opposing its rolling.
-    pub wheel_drag_n_m: [f64; WHEELS],
-    /// Added to the steering command at the actuator, in the unit of the second command.
-    pub steering_offset: f64,
-}
-
-/// One parameter of an effect.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Parameter {
-    /// Name as in reports.
-    pub name: &'static str,
-    /// Unit as in reports.
-    pub unit: &'static str,
-    /// Value.
-    pub value: f64,
-    /// Physical range; an estimate at its end is not accepted.
-    pub range: [f64; 2],
+    /// Commands to rims and angles.
+    pub actuator: ActuatorTerms,
+    /// Body and wheels.
+    pub force: ForceTerms,
+    /// Soil under the wheels.
+    pub soil: SoilTerms,
+    /// True states to measured states.
+    pub sensor: SensorTerms,
+    /// Map to ground.
+    pub map: MapTerms,
 }
 
 /// Layer in which an effect acts; a residual in another layer speaks against it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Layer {
     /// Command to wheel speeds and road-wheel angles.
     Actuator,
     /// Forces on the vehicle.
     Force,
+    /// Soil and its constitutive law.
+    Soil,
+    /// True motion to measured motion.
+    Sensor,
+    /// Map to ground.
+    Map,
 }
 
-/// The catalogue: a closed list, so that every effect is one file and one variant.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Effect {
-    /// A mass carried along.
-    Payload(Payload),
-    /// Friction at one wheel.
-    WheelDrag(WheelDrag),
-    /// A constant offset of the steering.
-    SteeringOffset(SteeringOffset),
+impl Layer {
+    /// As in reports.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Actuator => "actuator",
+            Self::Force => "force",
+            Self::Soil => "soil",
+            Self::Sensor => "sensor",
+            Self::Map => "map",
+        }
+    }
+}
+
+macro_rules! catalogue {
+    ($($effect:ident)*) => {
+        /// An effect of the catalogue: a closed list, so that every effect is one file and one line.
+        #[derive(Clone, Copy, Debug, PartialEq)]
+        pub enum Effect {
+            $(#[doc = concat!("See [`", stringify!($effect), "`].")] $effect($effect),)*
+        }
+
+        impl Effect {
+            /// Ids of the catalogue, in its order.
+            pub const IDS: &'static [&'static str] = &[$($effect::ID),*];
+
+            /// Every effect once, at a size that a good drive shows (catalogue; see [`Quantity::typical`]).
+            pub fn examples() -> Vec<Self> {
+                vec![$(Self::$effect($effect::typical())),*]
+            }
+
+            /// An effect from its id and its parameters in the order of [`Effect::parameters`]; `None` for an unknown id or a wrong number of them.
+            pub fn from_parameters(id: &str, values: &[f64]) -> Option<Self> {
+                match id {
+                    $(id if id == $effect::ID => $effect::from_values(values).map(Self::$effect),)*
+                    _ => None,
+                }
+            }
+
+            /// Id as in `effects.toml` and reports.
+            pub fn id(&self) -> &'static str {
+                match self { $(Self::$effect(_) => $effect::ID),* }
+            }
+
+            /// What the parameters are, in the order of [`Effect::parameters`].
+            pub fn quantities(&self) -> &'static [Quantity] {
+                match self { $(Self::$effect(_) => $effect::QUANTITIES),* }
+            }
+
+            /// Values of the parameters, in the order of [`Effect::parameters`].
+            pub fn values(&self) -> Vec<f64> {
+                match self { $(Self::$effect(e) => e.values()),* }
+            }
+
+            /// Layer in which the effect acts.
+            pub fn layer(&self) -> Layer {
+                match self { $(Self::$effect(_) => $effect::LAYER),* }
+            }
+
+            /// Adds the effect to a vehicle's terms.
+            pub fn add_to(&self, terms: &mut EffectTerms) {
+                match self { $(Self::$effect(e) => e.add_to(terms)),* }
+            }
+        }
+    };
+}
+
+catalogue! {
+    Payload CgForward CgLateral CgHeight LinearDrag QuadraticDrag Tow Wind RollingResistance WheelDrag TorqueLimit
+    SpeedLag SpeedDelay SteeringLag SteeringDelay SteeringOffset SteeringRatio SteeringBacklash SteeringCompliance SpeedGain
+    TyreRadiusFront TyreRadiusRear LockedDifferential SkidSteerTrack
+    SlipSinkage MultiPass ElasticRecovery ThetaMShift Grousers FrontBulldozing SideBulldozing
+    RollStiffness PitchStiffness MapTilt MapOffset SoilDrift
+    GyroBias GyroScale VelocityScale PositionLatency LeverArm MountAngle ClockDrift FrictionCap SoilCrust
 }
 
 impl Effect {
-    /// Ids of the catalogue.
-    pub const IDS: [&'static str; 3] = ["payload", "wheel_drag", "steering_offset"];
-
-    /// An effect from its id and its parameters in the order of [`Effect::parameters`]; `None` for an unknown id or a wrong number of them.
-    pub fn from_parameters(id: &str, values: &[f64]) -> Option<Self> {
-        match (id, values) {
-            ("payload", &[mass_kg, x, y, z]) => Some(Self::Payload(Payload { mass_kg, at_m: [x, y, z] })),
-            ("wheel_drag", &[wheel, torque_n_m]) => Some(Self::WheelDrag(WheelDrag { wheel: wheel as usize, torque_n_m })),
-            ("steering_offset", &[second]) => Some(Self::SteeringOffset(SteeringOffset { second })),
-            _ => None,
-        }
-    }
-
-    /// Id as in `effects.toml` and reports.
-    pub fn id(&self) -> &'static str {
-        match self {
-            Self::Payload(_) => "payload",
-            Self::WheelDrag(_) => "wheel_drag",
-            Self::SteeringOffset(_) => "steering_offset",
-        }
+    /// The effect of an id at the size of [`Effect::examples`].
+    pub fn example(id: &str) -> Option<Self> {
+        Self::examples().into_iter().find(|effect| effect.id() == id)
     }
 
     /// Parameters with units and ranges.
     pub fn parameters(&self) -> Vec<Parameter> {
-        match self {
-            Self::Payload(e) => e.parameters(),
-            Self::WheelDrag(e) => e.parameters(),
-            Self::SteeringOffset(e) => e.parameters(),
-        }
-    }
-
-    /// Layer in which the effect acts.
-    pub fn layer(&self) -> Layer {
-        match self {
-            Self::SteeringOffset(_) => Layer::Actuator,
-            Self::Payload(_) | Self::WheelDrag(_) => Layer::Force,
-        }
+        let of = |(q, value): (&Quantity, f64)| Parameter { name: q.name, unit: q.unit, value, range: q.range };
+        self.quantities().iter().zip(self.values()).map(of).collect()
     }
 
     /// The effect scaled: 0 = absent, 1 = as it is.
     pub fn scaled(&self, share: f64) -> Self {
-        match *self {
-            Self::Payload(e) => Self::Payload(Payload { mass_kg: e.mass_kg * share, ..e }),
-            Self::WheelDrag(e) => Self::WheelDrag(WheelDrag { torque_n_m: e.torque_n_m * share, ..e }),
-            Self::SteeringOffset(e) => Self::SteeringOffset(SteeringOffset { second: e.second * share }),
-        }
-    }
-
-    /// Adds the effect to a vehicle's terms.
-    pub fn add_to(&self, terms: &mut EffectTerms) {
-        match self {
-            Self::Payload(e) => e.add_to(terms),
-            Self::WheelDrag(e) => e.add_to(terms),
-            Self::SteeringOffset(e) => e.add_to(terms),
-        }
+        let values: Vec<f64> = self.quantities().iter().zip(self.values()).map(|(q, value)| q.scaling.apply(value, share)).collect();
+        Self::from_parameters(self.id(), &values).expect("as many values as quantities; this is a bug")
     }
 }
 
 impl Vehicle {
-    /// This vehicle with effects in addition to those it has.
+    /// This vehicle with effects in addition to those it has, all of them begun.
     pub fn with_effects(&self, effects: &[Effect]) -> Self {
         let mut vehicle = self.clone();
         for effect in effects {

@@ -7,7 +7,7 @@
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::terramechanics::slip::ContactMotion;
-use crate::terramechanics::wheel::WheelGeometry;
+use crate::terramechanics::wheel::{WheelGeometry, angle_of_depth};
 
 /// Slip angle within which the side resistance grows to its full size, rad (chosen: about one degree, so that it is smooth at zero).
 const SLIP_ANGLE_SCALE_RAD: f64 = 0.02;
@@ -23,6 +23,15 @@ pub struct ContactArc<T> {
     pub exit_rad: T,
     /// cos θ_1.
     pub cos_entry: T,
+}
+
+impl<T: Real> ContactArc<T> {
+    /// Arc of a wheel at a sinkage, m, with the angles of [`wheel_wrench`](super::wheel_wrench).
+    pub fn of(wheel: &WheelGeometry, sinkage_m: T) -> Self {
+        let share = sinkage_m.max(T::lit(1e-5)).min(T::lit(0.9 * wheel.radius_m)) * T::lit(1.0 / wheel.radius_m);
+        let (entry_rad, _, cos_entry) = angle_of_depth(share);
+        Self { entry_rad, exit_rad: -angle_of_depth(share * T::lit(wheel.recovery) + T::lit(1e-24)).0, cos_entry }
+    }
 }
 
 /// Resistance of the soil per metre of a wall that pushes it aside at depth h, N/m.

@@ -18,4 +18,4 @@ pub use load_balance::{Support, balance_sinkage};
 pub use pressure_sinkage::{bekker_sinkage, normal_stress};
 pub use shear::{mohr_coulomb, shear_fraction};
 pub use slip::{ContactMotion, WheelMotion};
-pub use wheel::{WheelGeometry, WheelWrench, wheel_wrench};
+pub use wheel::{ContactLaw, WheelGeometry, WheelWrench, wheel_wrench};

@@ -14,6 +14,22 @@ const SHEAR_FLOOR_M: f64 = 1e-6;
 const SINKAGE_SHARE_MAX: f64 = 0.9;
 /// Smallest sinkage, m: a wheel off the ground carries no load, but its contact stays differentiable.
 const SINKAGE_FLOOR_M: f64 = 1e-5;
+/// Sliding speed over rim speed around which the direction of sliding turns smoothly (chosen: 5 cm/s at 2.5 m/s).
+const SLIDING_FLOOR: f64 = 0.02;
+/// Recovery λ of the soil contact model (chosen: the elastic part of soils with a stiffness of 4e7 Pa/m under a tonne is a few millimetres).
+const ELASTIC_RECOVERY: f64 = 0.05;
+
+/// How stresses act under the wheel: a family of laws, of which measured drives choose (`nesam train` keeps the one whose symbolic rollouts are better).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ContactLaw {
+    /// Stress normal to the rim with its maximum ahead of the bottom, shear along the rim (Wong & Reece 1967), the law of the paper.
+    #[default]
+    WongReece,
+    /// Pressure by the local depth across the undeformed surface, shear in that surface against the local sliding velocity and mobilised by the
+    /// displacement (soil contact model: Krenn & Gibbesch 2011; Tasora et al. 2019). Compaction brakes the wheel's rotation, not the vehicle, and the
+    /// front of the contact, which slides forwards, brakes what the bottom drives.
+    SoilContactModel,
+}
 
 /// Geometry and contact coefficients of a wheel.
 #[derive(Clone, Debug, PartialEq)]
@@ -30,6 +46,8 @@ pub struct WheelGeometry {
     pub recovery: f64,
     /// Unit weight γ of the soil that the side wall pushes aside, N/m³; `None` = no side bulldozing.
     pub side_soil_unit_weight_n_m3: Option<f64>,
+    /// How stresses act.
+    pub law: ContactLaw,
     /// Quadrature.
     pub rule: GaussRule,
 }
@@ -37,7 +55,16 @@ pub struct WheelGeometry {
 impl WheelGeometry {
     /// Wheel with the coefficients of Ishigami (2007), five quadrature nodes, and no side bulldozing.
     pub fn new(radius_m: f64, width_m: f64) -> Self {
-        Self { radius_m, width_m, c1: 0.4, c2: 0.15, recovery: 0.0, side_soil_unit_weight_n_m3: None, rule: GaussRule::new(5) }
+        let law = ContactLaw::WongReece;
+        Self { radius_m, width_m, c1: 0.4, c2: 0.15, recovery: 0.0, side_soil_unit_weight_n_m3: None, law, rule: GaussRule::new(5) }
+    }
+
+    /// The same wheel under a law, with the coefficients of that law.
+    pub fn with_law(self, law: ContactLaw) -> Self {
+        match law {
+            ContactLaw::WongReece => Self { law, ..self },
+            ContactLaw::SoilContactModel => Self { law, c1: 0.0, c2: 0.0, recovery: ELASTIC_RECOVERY, ..self },
+        }
     }
 }
 
@@ -66,7 +93,7 @@ impl<T: Real> WheelWrench<T> {
 
 /// Angle whose cosine is 1 - depth / r, with its sine; exact and smooth for 0 < depth < 2 r.
 #[inline(always)]
-fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
+pub(super) fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
     let cos = T::lit(1.0) - depth_share;
     let sin = (depth_share * (T::lit(2.0) - depth_share)).sqrt();
     // tan(θ/2) = sin / (1 + cos): no branch at θ = π/2.
@@ -75,9 +102,8 @@ fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
 
 /// Integrates normal and shear stress over the contact arc at a given sinkage (m).
 ///
-/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - λz/r); maximum stress at θ_m = (c_1 + c_2 |s|) θ_1. Shear displacement
-/// j_x = r [(θ_1 - θ) - (v_x / rΩ)(sin θ_1 - sin θ)], j_y = r (v_y / rΩ)(θ_1 - θ), combined isotropically (Jia 2011). Side
-/// bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
+/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - λz/r); maximum stress at θ_m = (c_1 + c_2 |s|) θ_1; directions and shear by the wheel's
+/// [`ContactLaw`]. Side bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
 #[inline(always)]
 pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &ContactMotion<T>, soil: &Soil<T>) -> WheelWrench<T> {
     let radius = wheel.radius_m;
@@ -100,18 +126,26 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
         let strength = mohr_coulomb(sigma, tan_phi, soil);
         let theta_rear = exit + rear * T::lit(t2);
         for (theta, (sin, cos), arc) in [(theta_front, front_trig, front), (theta_rear, theta_rear.sin_cos(), rear)] {
-            let swept = entry - theta;
-            let j_x = (motion.rim_ratio * swept - motion.travel_ratio * (sin_entry - sin)) * T::lit(radius);
-            let j_y = motion.lateral_ratio * swept * T::lit(radius);
-            let j = (j_x * j_x + j_y * j_y + T::lit(SHEAR_FLOOR_M * SHEAR_FLOOR_M)).sqrt();
-            let mobilised = strength * shear_fraction(j, soil);
-            let (tau_x, tau_y) = (mobilised * j_x, mobilised * j_y);
+            let at = ContactPoint { sin, cos, swept: entry - theta, sin_entry };
             let w = arc * T::lit(weight);
-            sum.thrust_n = sum.thrust_n + tau_x * cos * w;
-            sum.resistance_n = sum.resistance_n + sigma * sin * w;
-            sum.side_n = sum.side_n - tau_y * w;
-            sum.normal_n = sum.normal_n + (sigma * cos + tau_x * sin) * w;
-            sum.torque_n_m = sum.torque_n_m + tau_x * w;
+            match wheel.law {
+                ContactLaw::WongReece => {
+                    let [tau_x, tau_y] = shear_along_rim(radius, &at, motion, strength, soil);
+                    sum.thrust_n = sum.thrust_n + tau_x * cos * w;
+                    sum.resistance_n = sum.resistance_n + sigma * sin * w;
+                    sum.side_n = sum.side_n - tau_y * w;
+                    sum.normal_n = sum.normal_n + (sigma * cos + tau_x * sin) * w;
+                    sum.torque_n_m = sum.torque_n_m + tau_x * w;
+                }
+                ContactLaw::SoilContactModel => {
+                    let across = cos * w;
+                    let [tau_x, tau_y] = shear_in_surface(radius, &at, motion, strength, soil);
+                    sum.thrust_n = sum.thrust_n + tau_x * across;
+                    sum.side_n = sum.side_n - tau_y * across;
+                    sum.normal_n = sum.normal_n + sigma * across;
+                    sum.torque_n_m = sum.torque_n_m + (tau_x * cos + sigma * sin) * across;
+                }
+            }
         }
     }
     let area = T::lit(radius * wheel.width_m);
@@ -130,4 +164,35 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
         normal_n: sum.normal_n * area,
         torque_n_m: sum.torque_n_m * area * T::lit(radius),
     }
+}
+
+/// A point of the contact arc: sine and cosine of its angle, the angle swept since the rim entered the soil, and the sine there.
+struct ContactPoint<T> {
+    sin: T,
+    cos: T,
+    swept: T,
+    sin_entry: T,
+}
+
+/// Shear stress (x, y) along the rim, Pa: j_x = r [(θ_1 - θ) - (v_x / rΩ)(sin θ_1 - sin θ)], j_y = r (v_y / rΩ)(θ_1 - θ), combined isotropically (Jia 2011).
+#[inline(always)]
+fn shear_along_rim<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactMotion<T>, strength: T, soil: &Soil<T>) -> [T; 2] {
+    let j_x = (motion.rim_ratio * at.swept - motion.travel_ratio * (at.sin_entry - at.sin)) * T::lit(radius);
+    let j_y = motion.lateral_ratio * at.swept * T::lit(radius);
+    let j = (j_x * j_x + j_y * j_y + T::lit(SHEAR_FLOOR_M * SHEAR_FLOOR_M)).sqrt();
+    let mobilised = strength * shear_fraction(j, soil);
+    [mobilised * j_x, mobilised * j_y]
+}
+
+/// Shear stress (x, y) in the surface of the ground, Pa: against the sliding velocity u = (rΩ cos θ - v_x, -v_y), mobilised by its integral
+/// j_x = r [(sin θ_1 - sin θ) - (v_x / rΩ)(θ_1 - θ)], j_y = r (v_y / rΩ)(θ_1 - θ). Neglects that soil sheared by a front wheel stays sheared, and the path of a
+/// point that slides forth and back.
+#[inline(always)]
+fn shear_in_surface<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactMotion<T>, strength: T, soil: &Soil<T>) -> [T; 2] {
+    let j_x = (motion.rim_ratio * (at.sin_entry - at.sin) - motion.travel_ratio * at.swept) * T::lit(radius);
+    let j_y = motion.lateral_ratio * at.swept * T::lit(radius);
+    let j = (j_x * j_x + j_y * j_y + T::lit(SHEAR_FLOOR_M * SHEAR_FLOOR_M)).sqrt();
+    let (u_x, u_y) = (motion.rim_ratio * at.cos - motion.travel_ratio, motion.lateral_ratio);
+    let mobilised = strength * shear_fraction(j, soil) * j / (u_x * u_x + u_y * u_y + T::lit(SLIDING_FLOOR * SLIDING_FLOOR)).sqrt();
+    [mobilised * u_x, mobilised * u_y]
 }

@@ -1,6 +1,6 @@
 //! Friction at one wheel: a dragging brake, a bad bearing.
 
-use super::{EffectTerms, Parameter};
+use crate::effects::{Act, EffectTerms, Layer, Quantity, Scaling};
 use crate::vehicle::WHEELS;
 
 /// Wheel drag (catalogue no. 10): F_i = −(τ / r) tanh(v_i / 0.07 m/s) along the wheel's heading, at the contact.
@@ -18,15 +18,24 @@ pub struct WheelDrag {
     pub torque_n_m: f64,
 }
 
-impl WheelDrag {
-    pub(super) fn parameters(&self) -> Vec<Parameter> {
-        vec![
-            Parameter { name: "wheel", unit: "index", value: self.wheel as f64, range: [-0.5, WHEELS as f64 - 0.5] },
-            Parameter { name: "torque_nm", unit: "N m", value: self.torque_n_m, range: [-200.0, 4000.0] },
-        ]
+impl Act for WheelDrag {
+    const ID: &'static str = "wheel_drag";
+    const LAYER: Layer = Layer::Force;
+    const QUANTITIES: &'static [Quantity] = &[
+        Quantity::new("wheel", "index", [-0.5, WHEELS as f64 - 0.5], 2.0, Scaling::Held),
+        Quantity::new("torque_nm", "N m", [-200.0, 4000.0], 600.0, Scaling::Size),
+    ];
+
+    fn values(&self) -> Vec<f64> {
+        vec![self.wheel as f64, self.torque_n_m]
     }
 
-    pub(super) fn add_to(&self, terms: &mut EffectTerms) {
-        terms.wheel_drag_n_m[self.wheel.min(WHEELS - 1)] += self.torque_n_m;
+    fn from_values(values: &[f64]) -> Option<Self> {
+        let &[wheel, torque_n_m] = values else { return None };
+        Some(Self { wheel: wheel as usize, torque_n_m })
+    }
+
+    fn add_to(&self, terms: &mut EffectTerms) {
+        terms.force.wheel_drag_n_m[self.wheel.min(WHEELS - 1)] += self.torque_n_m;
     }
 }

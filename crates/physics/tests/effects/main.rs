@@ -1,7 +1,16 @@
 //! Goal: each effect moves the vehicle as mechanics says, and is nothing when scaled to zero.
 //! Method: closed forms of statics and steady turns on level ground.
 
+mod actuator;
+#[path = "../common/mod.rs"]
 mod common;
+mod force;
+mod map;
+mod page;
+mod schedule;
+mod sensor;
+mod soil;
+mod sweep;
 
 use common::Drive;
 use nesam_physics::effects::{Effect, Payload, SteeringOffset, WheelDrag};
@@ -13,6 +22,7 @@ const EXAMPLES: [Effect; 3] = [
     Effect::SteeringOffset(SteeringOffset { second: 0.12 }),
 ];
 
+/// A drive of the truck with effects on level ground, and the loads of its wheels at the end.
 fn settle(effects: &[Effect], speed: f64, second: f64, steps: usize) -> (Drive, [f64; 4]) {
     let mut drive = Drive::new(truck().with_effects(effects), speed);
     let mut loads = [0.0; 4];

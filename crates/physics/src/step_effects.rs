@@ -1,0 +1,196 @@
+//! What effects change within a step: forces on the body, and wheels that are not those of the card.
+//!
+//! The step asks two plain flags; everything here stands out of its line, so a vehicle without effects neither computes nor carries it.
+
+use crate::effects::EffectTerms;
+use crate::scalar::Real;
+use crate::soil::Soil;
+use crate::state::VehicleState;
+use crate::step::{StepInput, StepModel, WheelContact};
+use crate::terramechanics::{
+    ContactArc, ContactMotion, Support, WheelGeometry, WheelMotion, balance_sinkage, front_bulldozing, side_bulldozing,
+};
+use crate::vec3::{Tilt, Vec3, add, cross, dot, scale};
+
+/// Speed around which a resistance of a wheel changes its sign, m/s (chosen, as for wheel drag).
+const RESISTANCE_SPEED_M_S: f64 = 0.07;
+
+/// Which parts of a step effects change.
+#[derive(Clone, Debug)]
+pub(crate) struct Altered {
+    /// A force acts on the body beside those of the wheels.
+    pub(crate) on_body: bool,
+    /// A wheel, its command or its soil is another one.
+    pub(crate) on_wheels: bool,
+    /// Wheels of front and rear axle, where they are not the card's.
+    axles: Option<[WheelGeometry; 2]>,
+}
+
+impl Altered {
+    pub(crate) fn new(effects: &EffectTerms, wheel: &WheelGeometry) -> Self {
+        let (force, actuator) = (&effects.force, &effects.actuator);
+        let resized = force.radius_relative != [0.0; 2];
+        Self {
+            on_body: force.acts_on_body(),
+            on_wheels: force.acts_on_wheels()
+                || effects.soil.acts_on_wheels()
+                || actuator.lock != 0.0
+                || actuator.steering_compliance_rad_n != 0.0,
+            axles: resized.then(|| force.radius_relative.map(|k| WheelGeometry { radius_m: wheel.radius_m * (1.0 + k), ..wheel.clone() })),
+        }
+    }
+}
+
+impl StepModel {
+    /// Geometry of a wheel.
+    #[inline(always)]
+    pub(crate) fn wheel_at(&self, i: usize) -> &WheelGeometry {
+        match &self.altered.axles {
+            None => &self.wheel,
+            Some(axles) => &axles[i / 2],
+        }
+    }
+
+    /// Adds drag, tow and wind to the generalised force (N, N m) about the reference point, Body.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn add_body_forces<T: Real>(&self, state: &VehicleState<T>, input: &StepInput<T>, tilt: &Tilt<T>, rhs: &mut [T; 6]) {
+        let terms = &self.vehicle.effects.force;
+        let v = state.velocity_m_s;
+        let speed = (dot(v, v) + T::lit(1e-12)).sqrt();
+        let drag = T::lit(-terms.linear_drag_n_s_m) - T::lit(terms.quadratic_drag_n_s2_m2) * speed;
+        let mut force = scale(v, drag);
+        force[0] = force[0] - T::lit(terms.tow_n);
+        if terms.wind_n != [0.0; 2] {
+            let [east, north] = terms.wind_n.map(T::lit);
+            let (sin, cos) = (input.state.attitude_rad[2] + state.attitude_rad[2]).sin_cos();
+            force = add(force, tilt.to_body([cos * east + sin * north, cos * north - sin * east, T::lit(0.0)]));
+        }
+        for axis in 0..3 {
+            rhs[axis] = rhs[axis] + force[axis];
+        }
+        rhs[4] = rhs[4] + T::lit(terms.tow_moment_n_m);
+    }
+
+    /// Road-wheel angle under the side force of steady cornering, rad.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn yielding_angle<T: Real>(&self, i: usize, state: &VehicleState<T>, input: &StepInput<T>) -> T {
+        let compliance = self.vehicle.effects.actuator.steering_compliance_rad_n;
+        if i > 1 || compliance == 0.0 {
+            return input.wheels.angle_rad[i];
+        }
+        let [front, rear] = [0, 2].map(|wheel| self.vehicle.wheel_centre_m[wheel][0]);
+        let on_front = self.body.mass_kg * -rear / (front - rear);
+        let side = T::lit(compliance * on_front) * state.velocity_m_s[0] * state.angular_velocity_rad_s[2];
+        input.wheels.angle_rad[i] - side
+    }
+
+    /// Rim speed of a wheel with the heading `forward`, m/s: of another radius, or locked to its partner.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn altered_rim_speed<T: Real>(&self, i: usize, state: &VehicleState<T>, forward: Vec3<T>, input: &StepInput<T>) -> T {
+        let effects = &self.vehicle.effects;
+        let along = |centre: [f64; 3]| dot(add(state.velocity_m_s, cross(state.angular_velocity_rad_s, centre.map(T::lit))), forward);
+        let centre = self.vehicle.wheel_centre_m[i];
+        let own = along(centre);
+        let followed = match effects.actuator.lock {
+            0.0 => own,
+            lock => {
+                let partner = self.vehicle.wheel_centre_m[i ^ 1];
+                let middle = along(core::array::from_fn(|axis| 0.5 * (centre[axis] + partner[axis])));
+                own + T::lit(lock) * (middle - own)
+            }
+        };
+        let rim = input.wheels.rim_speed_m_s(i, followed, state.velocity_m_s[0]);
+        match effects.force.radius_relative[i / 2] {
+            0.0 => rim,
+            relative => rim + input.wheels.rim_base_m_s[i] * (T::lit(1.0) - input.wheels.rim_follow) * T::lit(relative),
+        }
+    }
+
+    /// Sinkage over that which balances the load, from the slip.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn digging<T: Real>(&self, slip: T) -> T {
+        match self.vehicle.effects.soil.slip_sinkage {
+            0.0 => T::lit(1.0),
+            per_slip => (T::lit(1.0) + T::lit(per_slip) * slip.abs_smooth(1e-3)).max(T::lit(0.1)),
+        }
+    }
+
+    /// Force added to a spring against roll and pitch, N.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn stabiliser_n<T: Real>(&self, i: usize, state: &VehicleState<T>, tilt: &Tilt<T>, input: &StepInput<T>) -> T {
+        let [roll, pitch] = self.vehicle.effects.force.roll_pitch_stiffness;
+        if roll == 0.0 && pitch == 0.0 {
+            return T::lit(0.0);
+        }
+        let half = T::lit(0.5);
+        let pressed: [T; 4] = core::array::from_fn(|w| T::lit(self.wheel_at(w).radius_m) - self.distance(w, state, tilt, input));
+        let axle = |w: usize| (pressed[w & 2] + pressed[w & 2 | 1]) * half;
+        let in_roll = (pressed[i] - pressed[i ^ 1]) * half;
+        let in_pitch = (axle(i) - axle(i ^ 2)) * half;
+        (T::lit(roll) * in_roll + T::lit(pitch) * in_pitch) * T::lit(self.vehicle.suspension_n_m[i])
+    }
+
+    /// Soil that a wheel meets, its crust as the mean down to the sinkage of the balance without it.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn soil_under<T: Real>(
+        &self,
+        i: usize,
+        support: &Support<T>,
+        ratio: T,
+        motion: &ContactMotion<T>,
+        soil: &Soil<T>,
+    ) -> Soil<T> {
+        let terms = &self.vehicle.effects.soil;
+        let wheel = self.wheel_at(i);
+        let soil = terms.under_wheel(soil, i > 1, wheel.width_m);
+        if terms.crust[0] == 0.0 {
+            return soil;
+        }
+        let sinkage = balance_sinkage(wheel, support, motion, &soil) * ratio;
+        terms.under_crust(&soil, sinkage)
+    }
+
+    /// Adds resistances of a wheel to its traction, then caps it.
+    #[cold]
+    #[inline(never)]
+    #[allow(clippy::too_many_arguments)]
+    pub(crate) fn alter_traction<T: Real>(
+        &self,
+        i: usize,
+        wheel_motion: &WheelMotion<T>,
+        motion: &ContactMotion<T>,
+        soil: &Soil<T>,
+        share: T,
+        damping: &mut [T; 2],
+        contact: &mut WheelContact<T>,
+    ) {
+        let effects = &self.vehicle.effects;
+        let wheel = self.wheel_at(i);
+        let [front_share, front_weight] = effects.soil.front_bulldozing;
+        let mut resistance = T::lit(effects.force.rolling_resistance) * contact.normal_n;
+        if front_share != 0.0 && i < 2 {
+            resistance = resistance + T::lit(front_share) * front_bulldozing(wheel.width_m, contact.sinkage_m, front_weight, soil);
+        }
+        let speed = wheel_motion.forward_m_s.abs_smooth(RESISTANCE_SPEED_M_S);
+        contact.forward_n = contact.forward_n - resistance * wheel_motion.forward_m_s / speed;
+        damping[0] = damping[0] + (resistance / speed).max(T::lit(0.0));
+        let [side_share, side_weight] = effects.soil.side_bulldozing;
+        if side_share != 0.0 {
+            let arc = ContactArc::of(wheel, contact.sinkage_m);
+            let side = T::lit(side_share) * share * side_bulldozing(wheel, side_weight, &arc, motion, soil);
+            contact.left_n = contact.left_n + side;
+            damping[1] = damping[1] + (-side * wheel_motion.left_m_s).max(T::lit(0.0)) / wheel_motion.left_m_s.abs_smooth(0.02).sqr();
+        }
+        if effects.force.friction_cap_inverse != 0.0 {
+            let tangential = (contact.forward_n.sqr() + contact.left_n.sqr() + T::lit(1.0)).sqrt();
+            let kept = (contact.normal_n * T::lit(1.0 / effects.force.friction_cap_inverse) / tangential).min(T::lit(1.0));
+            (contact.forward_n, contact.left_n) = (contact.forward_n * kept, contact.left_n * kept);
+        }
+    }
+}

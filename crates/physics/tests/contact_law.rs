@@ -1,0 +1,94 @@
+//! Goal: the soil contact model is the law that its nodes obey, marched through the contact one by one.
+//! Method: closed forms where the soil has no strength; a column of soil that the wheel rolls over, in small steps of time.
+
+use nesam_physics::Soil;
+use nesam_physics::terramechanics::{ContactLaw, ContactMotion, GaussRule, WheelGeometry, wheel_wrench};
+
+const RADIUS_M: f64 = 0.467;
+const WIDTH_M: f64 = 0.254;
+
+fn wheel(order: usize) -> WheelGeometry {
+    let plain = WheelGeometry::new(RADIUS_M, WIDTH_M).with_law(ContactLaw::SoilContactModel);
+    WheelGeometry { recovery: 0.0, rule: GaussRule::new(order), ..plain }
+}
+
+fn clay() -> Soil<f64> {
+    Soil { k_phi: 1.2e6, k_c: 8e3, n: 0.8, c: 4e3, phi: 0.4, k_shear: 0.015 }
+}
+
+#[test]
+fn analytic_soil_without_strength_carries_and_brakes_as_the_closed_forms_say() {
+    for (n, z) in [(0.6, 0.02), (1.0, 0.05), (1.2, 0.1)] {
+        let soft = Soil { n, c: 0.0, phi: 0.0, ..clay() };
+        let modulus = soft.k_c / WIDTH_M + soft.k_phi;
+        let got = wheel_wrench(&wheel(24), z, &ContactMotion::from_slip(0.1, 0.05), &soft);
+        // Moment of the pressure about the axle: b ∫ p x dx with x dx = -(d + r - z) dd.
+        let moment = WIDTH_M * modulus * (z.powf(n + 2.0) / (n + 2.0) + (RADIUS_M - z) * z.powf(n + 1.0) / (n + 1.0));
+        assert!((got.torque_n_m / moment - 1.0).abs() < 1e-5, "n = {n}: torque {} N m, closed form {moment}", got.torque_n_m);
+        assert!(got.drawbar_n().abs() < 1e-9 && got.side_n.abs() < 1e-9, "n = {n}: pressure alone pushes along the ground");
+        if n == 1.0 {
+            let entry = (1.0 - z / RADIUS_M).acos();
+            let load = WIDTH_M * modulus * 0.5 * RADIUS_M * RADIUS_M * (entry - entry.sin() * entry.cos());
+            assert!((got.normal_n / load - 1.0).abs() < 1e-5, "load {} N, closed form {load}", got.normal_n);
+        }
+    }
+}
+
+/// Thrust and side force of columns of soil that a wheel rolls over, each sheared by what has slid past it (the law of the nodes).
+fn marched(z: f64, slip: f64, tan_slip_angle: f64, soil: &Soil<f64>) -> [f64; 2] {
+    let (rim, travel) = (1.0, if slip >= 0.0 { 1.0 - slip } else { 1.0 / (1.0 + slip) });
+    let entry = (1.0 - z / RADIUS_M).acos();
+    let modulus = soil.k_c / WIDTH_M + soil.k_phi;
+    let steps = 20_000;
+    let dt = entry * RADIUS_M / rim / f64::from(steps);
+    let (mut slid, mut force) = (0.0, [0.0; 2]);
+    for k in 0..steps {
+        let angle = entry * (1.0 - (f64::from(k) + 0.5) / f64::from(steps));
+        let (ahead, aside) = (rim * angle.cos() - travel, travel * tan_slip_angle);
+        let speed = ahead.hypot(aside);
+        slid += 0.5 * speed * dt;
+        let pressure = modulus * (RADIUS_M * angle.cos() - RADIUS_M + z).powf(soil.n);
+        let shear = (soil.c + pressure * soil.phi.tan()) * (1.0 - (-slid / soil.k_shear).exp());
+        slid += 0.5 * speed * dt;
+        let area = WIDTH_M * RADIUS_M * angle.cos() * entry / f64::from(steps);
+        force[0] += shear * ahead / speed * area;
+        force[1] -= shear * aside / speed * area;
+    }
+    force
+}
+
+#[test]
+fn analytic_forces_are_those_of_columns_of_soil_marched_through_the_contact() {
+    let soil = clay();
+    // Sliding that keeps its direction: displacement and path are the same length, and the closed form is the law of the nodes.
+    for (slip, tan, tolerance) in [(0.4, 0.0, 0.01), (-0.4, 0.0, 0.01), (0.25, 0.0, 0.02), (0.4, 0.3, 0.02), (0.05, 0.3, 0.06)] {
+        let got = wheel_wrench(&wheel(24), 0.05, &ContactMotion::from_slip(slip, tan), &soil);
+        let want = marched(0.05, slip, tan, &soil);
+        for (got, want) in [(got.drawbar_n(), want[0]), (got.side_n, want[1])] {
+            let scale = want.abs().max(0.05 * 6000.0);
+            assert!((got - want).abs() < tolerance * scale, "slip {slip}, tan {tan}: {got:.1} N, marched {want:.1} N");
+        }
+    }
+}
+
+#[test]
+fn analytic_five_nodes_stay_within_a_percent_of_the_load() {
+    for slip in [-0.3, 0.0, 0.05, 0.4] {
+        let motion = ContactMotion::from_slip(slip, 0.1);
+        let [fine, five] = [48, 5].map(|order| wheel_wrench(&wheel(order), 0.06, &motion, &clay()));
+        for (a, b) in [(fine.normal_n, five.normal_n), (fine.thrust_n, five.thrust_n), (fine.side_n, five.side_n)] {
+            assert!((a - b).abs() < 0.01 * fine.normal_n, "slip {slip}: {b:.1} N with five nodes, {a:.1} N with 48");
+        }
+    }
+}
+
+#[test]
+fn property_a_wheel_that_rolls_freely_is_braked_and_traction_grows_with_slip() {
+    let drawbar = |slip: f64| wheel_wrench(&wheel(5), 0.05, &ContactMotion::from_slip(slip, 0.0), &clay()).drawbar_n();
+    assert!(drawbar(0.0) < 0.0, "the front of the contact slides forwards");
+    for pair in [-0.5, -0.2, 0.0, 0.1, 0.2, 0.35].windows(2) {
+        assert!(drawbar(pair[0]) < drawbar(pair[1]), "{} N at {}, {} N at {}", drawbar(pair[0]), pair[0], drawbar(pair[1]), pair[1]);
+    }
+    let side = |tan: f64| wheel_wrench(&wheel(5), 0.05, &ContactMotion::from_slip(0.1, tan), &clay()).side_n;
+    assert!(side(0.2) < 0.0 && (side(0.2) + side(-0.2)).abs() < 1e-9, "the side force opposes sliding, alike on both sides");
+}

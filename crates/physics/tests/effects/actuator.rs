@@ -1,0 +1,176 @@
+//! Goal: commands reach the wheels as each effect says. Method: closed forms of lags, delays and play on the drive line alone.
+
+use nesam_physics::driveline::{DrivelineState, WheelCommand, command_wheels};
+use nesam_physics::effects::*;
+use nesam_physics::{Control, DT_S, SecondCommand, Vehicle};
+use nesam_test_vehicles::{robot, truck};
+
+use crate::common::Drive;
+
+/// What the drive line makes of a sequence of commands after a standstill, step by step.
+fn follow(vehicle: &Vehicle, commands: &[[f64; 2]]) -> Vec<(DrivelineState, WheelCommand<f64>)> {
+    let mut state = DrivelineState::settled(&Control { speed_m_s: 0.0, second: 0.0 });
+    let mut out = Vec::new();
+    for &[speed_m_s, second] in commands {
+        let control = Control { speed_m_s, second };
+        let after = state.advance(vehicle, &control, 0.0, DT_S);
+        out.push((after, command_wheels(vehicle, &state, &after, &control)));
+        state = after;
+    }
+    out
+}
+
+/// A car whose wheels are where they are told to be at once.
+fn direct() -> Vehicle {
+    let mut vehicle = truck();
+    vehicle.second = SecondCommand::RoadWheelAngleRad;
+    (vehicle.driveline.steering_lag_s, vehicle.driveline.steering_rate_limit_per_s) = (0.0, 1e3);
+    vehicle
+}
+
+#[test]
+fn analytic_speed_lag_is_exponential() {
+    let tau = 0.3;
+    let vehicle = truck().with_effects(&[Effect::SpeedLag(SpeedLag { seconds: tau })]);
+    for (k, (_, wheels)) in follow(&vehicle, &[[2.0, 0.0]; 12]).iter().enumerate() {
+        let decay = |t: f64| (-t / tau).exp();
+        let t = k as f64 * DT_S;
+        let mean = 2.0 * (1.0 - tau / DT_S * (decay(t) - decay(t + DT_S)));
+        assert!((wheels.speed_m_s - mean).abs() < 1e-12, "step {k}: {} {mean}", wheels.speed_m_s);
+    }
+}
+
+#[test]
+fn analytic_speed_delay_shifts_by_fractions_of_a_step() {
+    let commands: Vec<[f64; 2]> = (0..12).map(|k| [((k * k) % 7) as f64, 0.0]).collect();
+    let sent = |k: i64| if k < 0 { 0.0 } else { commands[k as usize][0] };
+    let vehicle = truck().with_effects(&[Effect::SpeedDelay(SpeedDelay { seconds: 0.23 })]);
+    for (k, (_, wheels)) in follow(&vehicle, &commands).iter().enumerate() {
+        let k = k as i64;
+        let want = 0.3 * sent(k - 3) + 0.7 * sent(k - 2);
+        assert!((wheels.speed_m_s - want).abs() < 1e-12, "step {k}: {} {want}", wheels.speed_m_s);
+    }
+}
+
+#[test]
+fn analytic_steering_delay_of_whole_steps_shifts_the_angle() {
+    let commands: Vec<[f64; 2]> = (0..12).map(|k| [1.0, 0.02 * ((k * 3) % 5) as f64]).collect();
+    let vehicle = direct().with_effects(&[Effect::SteeringDelay(SteeringDelay { seconds: 0.2 })]);
+    let (shifted, plain) = (follow(&vehicle, &commands), follow(&direct(), &commands));
+    for k in 2..commands.len() {
+        assert!((shifted[k].0.steering - plain[k - 2].0.steering).abs() < 1e-12, "step {k}");
+    }
+}
+
+#[test]
+fn analytic_two_steering_lags_in_series() {
+    let (own, added) = (0.08, 0.2);
+    let mut vehicle = truck().with_effects(&[Effect::SteeringLag(SteeringLag { seconds: added })]);
+    vehicle.driveline.steering_lag_s = own;
+    vehicle.driveline.steering_rate_limit_per_s = 1e3;
+    for (k, (state, _)) in follow(&vehicle, &[[1.0, 0.5]; 10]).iter().enumerate() {
+        let t = (k + 1) as f64 * DT_S;
+        let want = 0.5 * (1.0 - (added * (-t / added).exp() - own * (-t / own).exp()) / (added - own));
+        // A held mean within 10 ms errs in the square of 10 ms over the lags.
+        assert!((state.steering - want).abs() < 5e-4, "step {k}: {} {want}", state.steering);
+    }
+}
+
+#[test]
+fn analytic_a_steering_that_is_neither_late_nor_lagged_goes_its_usual_way() {
+    // A hundredth of play sends the commands through the altered path, whose pieces of the step must make the same step.
+    let play = Effect::SteeringBacklash(SteeringBacklash { second: 1e-9 });
+    let commands: Vec<[f64; 2]> = (0..20).map(|k| [1.0 + 0.1 * k as f64, 0.4 * (k as f64 * 0.4).sin()]).collect();
+    let (with, without) = (follow(&truck().with_effects(&[play]), &commands), follow(&truck(), &commands));
+    for (a, b) in with.iter().zip(&without) {
+        assert!((a.0.steering - b.0.steering).abs() < 1e-12);
+        assert!((a.0.speed_error_integral_m - b.0.speed_error_integral_m).abs() < 1e-12);
+        assert!((a.1.angle_rad[0] - b.1.angle_rad[0]).abs() < 1e-8);
+    }
+}
+
+#[test]
+fn analytic_ratio_and_offset_of_the_road_wheels() {
+    let effects = [Effect::SteeringRatio(SteeringRatio { relative: 0.1 }), Effect::SteeringOffset(SteeringOffset { second: 0.02 })];
+    let wheels = follow(&direct().with_effects(&effects), &[[1.0, 0.2]; 4])[3].1;
+    assert!((wheels.angle_rad[0] - (1.1 * 0.2 + 0.02)).abs() < 1e-12 && wheels.angle_rad[2] == 0.0, "{:?}", wheels.angle_rad);
+}
+
+#[test]
+fn analytic_backlash_is_crossed_at_every_reversal() {
+    let play = 0.1;
+    let vehicle = direct().with_effects(&[Effect::SteeringBacklash(SteeringBacklash { second: play })]);
+    let commands = [[1.0, 0.3], [1.0, 0.3], [1.0, 0.25], [1.0, 0.21], [1.0, 0.1], [1.0, 0.1]];
+    let angles: Vec<f64> = follow(&vehicle, &commands).iter().map(|(state, _)| state.road_wheel_angles(&vehicle)[0]).collect();
+    for (got, want) in angles.iter().zip([0.25, 0.25, 0.25, 0.25, 0.15, 0.15]) {
+        assert!((got - want).abs() < 1e-9, "{angles:?}");
+    }
+}
+
+#[test]
+fn analytic_speed_gain_and_torque_limit_scale_what_the_drive_gets() {
+    let gain = Effect::SpeedGain(SpeedGain { relative: 0.05 });
+    let limit = Effect::TorqueLimit(TorqueLimit { fraction: 0.4 });
+    let wheels = follow(&truck().with_effects(&[gain, limit]), &[[2.0, 0.0]; 3])[2].1;
+    assert!((wheels.speed_m_s - 2.1).abs() < 1e-12);
+    assert!((wheels.overspeed_limit_m_s / truck().driveline.overspeed_limit_m_s - 0.4).abs() < 1e-12);
+}
+
+#[test]
+fn property_a_torque_limit_slows_a_climb() {
+    let climb = |effects: &[Effect]| {
+        let mut drive = Drive::new(truck().with_effects(effects), 2.0);
+        drive.slope = [0.12, 0.0];
+        (0..60).for_each(|_| {
+            drive.step(3.0, 0.0);
+        });
+        drive.state.velocity_m_s[0]
+    };
+    let (whole, left) = (climb(&[]), climb(&[Effect::TorqueLimit(TorqueLimit { fraction: 0.3 })]));
+    assert!(left < 0.95 * whole, "{left} {whole}");
+}
+
+#[test]
+fn analytic_track_of_a_differential_drive() {
+    let vehicle = robot().with_effects(&[Effect::SkidSteerTrack(SkidSteerTrack { metres: 0.1 })]);
+    let (with, without) = (follow(&vehicle, &[[0.5, 1.0]; 30])[29].1, follow(&robot(), &[[0.5, 1.0]; 30])[29].1);
+    let difference = |w: &WheelCommand<f64>| w.rim_base_m_s[1] - w.rim_base_m_s[0];
+    assert!((difference(&with) / difference(&without) - 0.65 / 0.55).abs() < 1e-12);
+}
+
+#[test]
+fn analytic_compliance_is_a_smaller_angle() {
+    let compliance = 8e-6;
+    let turn = |effects: &[Effect], command: &dyn Fn(&Drive) -> f64| {
+        let mut drive = Drive::new(truck().with_effects(effects), 3.0);
+        (0..80).for_each(|_| {
+            let second = command(&drive);
+            drive.step(3.0, second);
+        });
+        drive.state.angular_velocity_rad_s[2]
+    };
+    let compliant = turn(&[Effect::SteeringCompliance(SteeringCompliance { rad_n: compliance })], &|_| 0.6);
+    // The same vehicle told to take back C F_y itself: F_y = M (l_r / L) v ω.
+    let on_front = 2493.56 * 1.7028 / (1.5949 + 1.7028);
+    let told = turn(&[], &|d| 0.6 - compliance * on_front * d.state.velocity_m_s[0] * d.state.angular_velocity_rad_s[2] / 0.37);
+    let plain = turn(&[], &|_| 0.6);
+    assert!((compliant / told - 1.0).abs() < 0.01 && compliant < 0.99 * plain, "{compliant} {told} {plain}");
+}
+
+#[test]
+fn analytic_a_lock_spreads_the_slips_of_an_axle() {
+    let lock = [Effect::LockedDifferential(LockedDifferential { share: 1.0 })];
+    let turn = |effects: &[Effect]| {
+        let mut drive = Drive::new(truck().with_effects(effects), 2.0);
+        let mut contacts = None;
+        (0..60).for_each(|_| contacts = Some(drive.step(2.0, 0.7).contacts));
+        let contacts = contacts.unwrap();
+        (drive.state, contacts[2].slip - contacts[3].slip)
+    };
+    let (open, apart) = turn(&[]);
+    let (locked, spread) = turn(&lock);
+    // Rims turn alike, so inner and outer slip differ by ω times the track over the speed.
+    let want = locked.angular_velocity_rad_s[2] * 1.82 / locked.velocity_m_s[0];
+    assert!(((spread - apart) / want - 1.0).abs() < 0.25, "{spread} {apart} {want}");
+    assert!(locked.angular_velocity_rad_s[2] < open.angular_velocity_rad_s[2], "a lock resists the turn");
+}

@@ -1,0 +1,174 @@
+//! Goal: bodies and wheels obey mechanics under each force effect. Method: closed forms in free space, statics on level and sloping ground, forces of one
+//! sub-step.
+
+use nesam_physics::effects::*;
+use nesam_physics::step::{StepModel, WheelContact};
+use nesam_physics::{Control, Vehicle, VehicleState};
+use nesam_test_vehicles::{robot, truck};
+
+use crate::common::Drive;
+use crate::settle;
+
+/// The truck without weight, high over the ground, moving at a speed and heading; fine sub-steps.
+fn in_space(effects: &[Effect], speed: f64, yaw: f64, seconds: usize) -> Drive {
+    let vehicle = Vehicle { gravity_m_s2: 0.0, ..truck() }.with_effects(effects);
+    let mut drive = Drive::new(vehicle.clone(), speed);
+    drive.model = StepModel::new(&vehicle, 0.1, 40);
+    drive.state.position_m[2] += 50.0;
+    drive.state.attitude_rad[2] = yaw;
+    (0..10 * seconds).for_each(|_| {
+        drive.step(speed, 0.0);
+    });
+    drive
+}
+
+/// The state after a second there.
+pub fn in_free_space(effects: &[Effect], speed: f64) -> VehicleState<f64> {
+    in_space(effects, speed, 0.0, 1).state
+}
+
+/// Contacts at the first instant of a step from the same motion.
+pub fn first_contacts(effects: &[Effect], speed: f64, second: f64, left_m_s: f64) -> [WheelContact<f64>; 4] {
+    let (mut drive, _) = settle(&[], 2.0, 0.0, 40);
+    let vehicle = truck().with_effects(effects);
+    drive.model = StepModel::new(&vehicle, 0.05, 1);
+    drive.state.velocity_m_s[1] = left_m_s;
+    let (input, _) = drive.input(&Control { speed_m_s: speed, second });
+    drive.model.step(&input).contacts
+}
+
+fn world_velocity(state: &VehicleState<f64>) -> [f64; 2] {
+    let (sin, cos) = state.attitude_rad[2].sin_cos();
+    let v = state.velocity_m_s;
+    [cos * v[0] - sin * v[1], sin * v[0] + cos * v[1]]
+}
+
+#[test]
+fn analytic_linear_drag_coasts_down_exponentially() {
+    let v = in_space(&[Effect::LinearDrag(LinearDrag { n_s_m: 400.0 })], 4.0, 0.0, 5).state.velocity_m_s[0];
+    let want = 4.0 * (-400.0 * 5.0 / 2493.56f64).exp();
+    assert!((v / want - 1.0).abs() < 1e-3, "{v} {want}");
+}
+
+#[test]
+fn analytic_quadratic_drag_coasts_down_hyperbolically() {
+    let v = in_space(&[Effect::QuadraticDrag(QuadraticDrag { n_s2_m2: 100.0 })], 4.0, 0.0, 5).state.velocity_m_s[0];
+    let want = 4.0 / (1.0 + 100.0 * 4.0 * 5.0 / 2493.56);
+    assert!((v / want - 1.0).abs() < 1e-3, "{v} {want}");
+}
+
+#[test]
+fn analytic_wind_pushes_in_world_whatever_the_heading() {
+    for yaw in [0.0, 0.8, 2.5, -1.7] {
+        let drive = in_space(&[Effect::Wind(Wind { fx_n: 500.0, fy_n: -300.0 })], 0.0, yaw, 2);
+        let v = world_velocity(&drive.state);
+        for (got, force) in v.iter().zip([500.0, -300.0]) {
+            assert!((got - force * 2.0 / 2493.56).abs() < 1e-3, "yaw {yaw}: {v:?}");
+        }
+    }
+}
+
+#[test]
+fn analytic_tow_is_balanced_by_the_tread_and_pitches_by_its_moment() {
+    let towed = in_space(&[Effect::Tow(Tow { force_n: 800.0, z_m: 0.5 })], 0.0, 0.0, 1).state;
+    assert!((towed.velocity_m_s[0] + 800.0 / 2493.56).abs() < 2e-3, "{}", towed.velocity_m_s[0]);
+    // r × F with r = (0, 0, z) and F = (-T, 0, 0) points along -y: the nose goes up.
+    assert!((towed.angular_velocity_rad_s[1] + 400.0 / 4121.7).abs() < 2e-3, "{}", towed.angular_velocity_rad_s[1]);
+    let forward = |effects: &[Effect]| -> f64 {
+        let (mut drive, _) = settle(effects, 2.0, 0.0, 120);
+        drive.step(2.0, 0.0).contacts.iter().map(|c| c.forward_n).sum()
+    };
+    let pull = forward(&[Effect::Tow(Tow { force_n: 800.0, z_m: 0.0 })]) - forward(&[]);
+    assert!((pull / 800.0 - 1.0).abs() < 0.02, "drawbar pull {pull}");
+}
+
+#[test]
+fn analytic_centre_of_mass_loads_axles_and_sides_by_the_lever_rule() {
+    let weight = 2493.56 * 9.81;
+    let (_, loads) = settle(&[Effect::CgForward(CgForward { metres: 0.2 })], 0.0, 0.0, 100);
+    let front = weight * (1.7028 + 0.2) / (1.5949 + 1.7028);
+    assert!(((loads[0] + loads[1]) / front - 1.0).abs() < 0.02, "front axle {} {front}", loads[0] + loads[1]);
+    let (_, loads) = settle(&[Effect::CgLateral(CgLateral { metres: 0.1 })], 0.0, 0.0, 100);
+    let difference = loads[0] + loads[2] - loads[1] - loads[3];
+    let want = 2.0 * weight * 0.1 / 1.8276;
+    assert!((difference / want - 1.0).abs() < 0.05, "left - right {difference} {want}");
+}
+
+#[test]
+fn analytic_a_higher_centre_of_mass_moves_load_down_a_side_slope() {
+    let angle = 0.1f64;
+    let lower_minus_upper = |effects: &[Effect]| {
+        let mut drive = Drive::new(truck().with_effects(effects), 1.0);
+        drive.slope = [0.0, angle.tan()];
+        drive.state.attitude_rad[0] = angle;
+        let mut loads = [0.0; 4];
+        (0..100).for_each(|_| loads = drive.step(1.0, 0.0).contacts.map(|c| c.normal_n));
+        loads[1] + loads[3] - loads[0] - loads[2]
+    };
+    let moved = lower_minus_upper(&[Effect::CgHeight(CgHeight { metres: 0.3 })]) - lower_minus_upper(&[]);
+    let want = 2.0 * 2493.56 * 9.81 * angle.sin() * 0.3 / 1.8276;
+    assert!((moved / want - 1.0).abs() < 0.08, "{moved} {want}");
+}
+
+#[test]
+fn analytic_rolling_resistance_is_a_share_of_the_load() {
+    let [with, without] = [vec![Effect::RollingResistance(RollingResistance { coefficient: 0.03 })], vec![]]
+        .map(|effects| first_contacts(&effects, 2.0, 0.0, 0.0));
+    for (a, b) in with.iter().zip(&without) {
+        assert!((a.forward_n - b.forward_n + 0.03 * b.normal_n).abs() < 0.01 * 0.03 * b.normal_n, "{} {}", a.forward_n, b.forward_n);
+    }
+}
+
+#[test]
+fn analytic_smaller_front_wheels_lower_the_nose_and_larger_rims_drive_faster() {
+    let pitch = |effects: &[Effect]| settle(effects, 0.0, 0.0, 100).0.state.attitude_rad[1];
+    let lower = pitch(&[Effect::TyreRadiusFront(TyreRadiusFront { relative: -0.05 })]) - pitch(&[]);
+    let want = 0.05 * 0.467 / (1.5949 + 1.7028);
+    assert!((lower / want - 1.0).abs() < 0.15, "{lower} {want}");
+    let speed = |effects: &[Effect]| {
+        let mut drive = Drive::new(robot().with_effects(effects), 0.8);
+        (0..80).for_each(|_| {
+            drive.step(0.8, 0.0);
+        });
+        drive.state.velocity_m_s[0]
+    };
+    let both = [Effect::TyreRadiusFront(TyreRadiusFront { relative: 0.05 }), Effect::TyreRadiusRear(TyreRadiusRear { relative: 0.05 })];
+    let ratio = speed(&both) / speed(&[]);
+    assert!((ratio - 1.05).abs() < 0.01, "{ratio}");
+}
+
+#[test]
+fn analytic_stiffness_against_roll_and_pitch_divides_the_lean_on_hard_ground() {
+    let lean = |effects: &[Effect], load: Effect, axis: usize| {
+        let tilt = |effects: &[Effect]| {
+            let mut drive = Drive::new(truck().with_effects(effects), 0.0);
+            (drive.soil.k_phi, drive.soil.k_c) = (5e8, 0.0);
+            (0..100).for_each(|_| {
+                drive.step(0.0, 0.0);
+            });
+            drive.state.attitude_rad[axis]
+        };
+        let with: Vec<Effect> = effects.iter().copied().chain([load]).collect();
+        tilt(&with) - tilt(effects)
+    };
+    let load = Effect::CgLateral(CgLateral { metres: 0.2 });
+    let ratio = lean(&[Effect::RollStiffness(RollStiffness { relative: 0.5 })], load, 0) / lean(&[], load, 0);
+    assert!((ratio - 1.0 / 1.5).abs() < 0.03, "roll {ratio}");
+    let load = Effect::CgForward(CgForward { metres: 0.3 });
+    let ratio = lean(&[Effect::PitchStiffness(PitchStiffness { relative: 0.5 })], load, 1) / lean(&[], load, 1);
+    // Springs of 107 and 236 kN/m do not pitch about the middle, so heave takes part.
+    assert!((0.6..0.85).contains(&ratio), "pitch {ratio}");
+}
+
+#[test]
+fn analytic_a_friction_cap_holds_at_every_wheel() {
+    let mut drive = Drive::new(truck().with_effects(&[Effect::FrictionCap(FrictionCap { mu: 0.08 })]), 2.0);
+    drive.slope = [0.1, 0.05];
+    for k in 0..30 {
+        for contact in drive.step(3.0, if k < 15 { 0.8 } else { -0.8 }).contacts {
+            assert!(contact.forward_n.hypot(contact.left_n) <= 0.08 * contact.normal_n + 1e-9);
+        }
+    }
+    let bits = |effects: &[Effect]| settle(effects, 2.0, 0.3, 20).0.state.to_array().map(f64::to_bits);
+    assert_eq!(bits(&[Effect::FrictionCap(FrictionCap { mu: 3.0 })]), bits(&[]), "a cap that is not reached changes no bit");
+}
