@@ -13,7 +13,7 @@ use crate::bundle::ModelBundle;
 use crate::dims::{CONTEXT, HIDDEN, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
 use crate::fused::{FusedTransformer, Path, Prefix};
-use crate::ground::{GroundSource, actuators_along};
+use crate::ground::GroundSource;
 use crate::rollout::{HistoryStep, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
@@ -24,6 +24,7 @@ use crate::token::{TokenScale, token_entries};
 mod block;
 mod linearise;
 mod observed;
+mod parts;
 mod physics;
 mod risk;
 mod rollout;
@@ -31,6 +32,7 @@ mod transitions;
 mod validate;
 
 pub(crate) use self::observed::LogClock;
+pub use self::parts::PartTimes;
 pub use self::transitions::Transition;
 use self::validate::validate;
 

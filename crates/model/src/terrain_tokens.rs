@@ -51,7 +51,7 @@ struct Scratch {
     contexts: Vec<f32>,
 }
 
-/// Patches that are projected together: half or whole rows of lanes.
+/// Patches that are projected together: two vectors.
 const BATCH: usize = 2 * LANES;
 
 impl TerrainProjection {
@@ -73,11 +73,7 @@ impl TerrainProjection {
             sample_patch(map, *pose, &self.scale, patch);
             self.encoders.encode(patch, encoder, context);
         }
-        if poses.len() <= LANES {
-            self.path.run(Project::<1> { projection: self, contexts })
-        } else {
-            self.path.run(Project::<2> { projection: self, contexts })
-        }
+        self.path.run(Project { projection: self, contexts })
     }
 
     /// The exact tokens at poses, in parallel.
@@ -89,13 +85,16 @@ impl TerrainProjection {
     }
 }
 
-/// Contexts of up to 16 H patches to their tokens, a patch in each lane.
-struct Project<'a, const H: usize> {
+/// Vectors of a batch.
+const H: usize = BATCH / LANES;
+
+/// Contexts of up to [`BATCH`] patches to their tokens, a patch in each lane.
+struct Project<'a> {
     projection: &'a TerrainProjection,
     contexts: &'a [f32],
 }
 
-impl<const H: usize> Kernel for Project<'_, H> {
+impl Kernel for Project<'_> {
     type Output = Vec<TerrainToken>;
     #[inline(always)]
     fn run<V: Vector>(self) -> Vec<TerrainToken> {

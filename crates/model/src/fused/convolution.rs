@@ -137,3 +137,59 @@ impl<const R: usize> Convolution<R> {
         sums
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::vector::{Kernel, Path};
+    use super::*;
+
+    const PX: usize = 32;
+    const CHANNELS: usize = 3;
+    const FILTERS: usize = 4;
+
+    fn value(i: usize) -> f32 {
+        ((i * 7919 + 13) % 1000) as f32 / 500.0 - 1.0
+    }
+
+    struct Run<'a>(&'a Convolution<2>, &'a Image);
+
+    impl Kernel for Run<'_> {
+        type Output = Vec<f32>;
+        #[inline(always)]
+        fn run<V: Vector>(self) -> Vec<f32> {
+            let out = PX / 2;
+            let mut result = vec![0.0; FILTERS * out * out];
+            self.0.run::<V>(self.1, true, |filter, row, group, pixels| {
+                let at = (filter * out + row) * out + group * LANES;
+                result[at..at + LANES].copy_from_slice(pixels);
+            });
+            result
+        }
+    }
+
+    #[test]
+    fn analytic_convolution_equals_its_sum_on_every_path() {
+        let weight: Vec<f32> = (0..FILTERS * 9 * CHANNELS).map(value).collect();
+        let bias: Vec<f32> = (0..FILTERS).map(|i| value(i + 77)).collect();
+        let pixel = |c: usize, y: usize, x: usize| value(c * PX * PX + y * PX + x + 5);
+        let mut image = Image::new(CHANNELS, PX);
+        for (c, y, group) in (0..CHANNELS).flat_map(|c| (0..PX).flat_map(move |y| (0..PX / LANES).map(move |g| (c, y, g)))) {
+            image.put(c, y, group, &core::array::from_fn(|i| pixel(c, y, group * LANES + i)));
+        }
+        let convolution = Convolution::<2>::new(&weight, &bias, PX);
+        for path in Path::available() {
+            let found = path.run(Run(&convolution, &image));
+            for (i, found) in found.iter().enumerate() {
+                let (filter, oy, ox) = (i / 256, i / 16 % 16, i % 16);
+                let mut sum = f64::from(bias[filter]);
+                for (ky, kx, c) in (0..3).flat_map(|y| (0..3).flat_map(move |x| (0..CHANNELS).map(move |c| (y, x, c)))) {
+                    if let (Some(y), Some(x)) = ((2 * oy + ky).checked_sub(1), (2 * ox + kx).checked_sub(1)) {
+                        let weight = weight[filter * 9 * CHANNELS + (ky * 3 + kx) * CHANNELS + c];
+                        sum += f64::from(weight) * f64::from(pixel(c, y, x));
+                    }
+                }
+                assert!((f64::from(*found) - sum.max(0.0)).abs() < 1e-5, "{} {filter} {oy} {ox}: {found} {sum}", path.as_str());
+            }
+        }
+    }
+}

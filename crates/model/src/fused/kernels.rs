@@ -42,6 +42,7 @@ impl Packed {
     }
 
     /// Outputs, filled up to whole panels: the rows that [`linear`] writes.
+    #[cfg(test)]
     pub fn padded_outputs(&self) -> usize {
         self.bias.len() * PANEL
     }
@@ -232,6 +233,117 @@ pub fn own_values<V: Vector, const H: usize>(values: &[Row<H>], stride: usize, w
             for d in 0..D {
                 sums[d].store(&mut out[d][h].0);
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::vector::{Kernel, LANES, Path};
+    use super::*;
+
+    /// Numbers in (-1, 1), the same for the same seed.
+    fn noise(seed: usize) -> impl FnMut() -> f32 {
+        let mut state = seed as u32 * 747_796_405 + 1;
+        move || {
+            state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (state >> 8) as f32 / 8_388_608.0 - 1.0
+        }
+    }
+
+    fn rows<const H: usize>(count: usize, next: &mut impl FnMut() -> f32) -> Vec<Row<H>> {
+        (0..count).map(|_| core::array::from_fn(|_| Lane::from_fn(|_| next()))).collect()
+    }
+
+    /// Every kernel one after the other on rows of 16 H samples: linear with each ending, layer norm, attention over own keys and values.
+    struct Everything<'a, const H: usize> {
+        matrix: &'a Packed,
+        x: &'a [Row<H>],
+        y: &'a [Row<H>],
+        weight: &'a [f32],
+        tokens: usize,
+    }
+
+    impl<const H: usize> Kernel for Everything<'_, H> {
+        type Output = Vec<Vec<Row<H>>>;
+        #[inline(always)]
+        fn run<V: Vector>(self) -> Self::Output {
+            let mut out = Vec::new();
+            for after in [After::Store, After::Gelu, After::Silu, After::Add] {
+                let mut y = self.y.to_vec();
+                linear::<V, H>(self.matrix, after, self.x, &mut y);
+                out.push(y);
+            }
+            let mut normal = self.x.to_vec();
+            layer_norm::<V, H>(self.x, self.weight, self.weight, 1e-5, &mut normal);
+            out.push(normal);
+            let stride = self.x.len() / self.tokens;
+            let features = stride / 8 * 8;
+            let mut scores = vec![[Lane::ZERO; H]; self.tokens];
+            own_scores::<V, H>(self.x, stride, &self.x[..features], &mut scores);
+            out.push(scores.clone());
+            softmax::<V, H>(&mut scores, 0.5);
+            out.push(scores.clone());
+            let mut sums = self.x[..features].to_vec();
+            own_values::<V, H>(self.x, stride, &scores, &mut sums);
+            out.push(sums);
+            out
+        }
+    }
+
+    fn check<const H: usize>(outputs: usize, inputs: usize, tokens: usize) {
+        let mut next = noise(outputs * 1000 + inputs * 10 + tokens + H);
+        let weights: Vec<f32> = (0..outputs * inputs).map(|_| next()).collect();
+        let bias: Vec<f32> = (0..outputs).map(|_| next()).collect();
+        let matrix = Packed::from_rows(&weights, &bias);
+        let (x, y) = (rows::<H>(inputs, &mut next), rows::<H>(matrix.padded_outputs(), &mut next));
+        let weight: Vec<f32> = (0..inputs).map(|_| next()).collect();
+        let all = |path: Path| path.run(Everything { matrix: &matrix, x: &x, y: &y, weight: &weight, tokens });
+        let found = all(Path::of_target());
+        for path in Path::available() {
+            // Without a fused multiply-add the target's path rounds twice.
+            if cfg!(any(target_feature = "fma", target_arch = "aarch64")) {
+                assert_eq!(all(path), found, "{} and the target's path differ for {outputs} x {inputs}, H = {H}", path.as_str());
+            }
+        }
+        for lane in 0..16 * H {
+            let at = |rows: &[Row<H>], i: usize| f64::from(rows[i][lane / LANES][lane % LANES]);
+            let close = |found: f64, expected: f64, what: &str| {
+                assert!((found - expected).abs() < 1e-5 * (1.0 + expected.abs()) * (inputs as f64).sqrt(), "{what}: {found} {expected}");
+            };
+            for o in 0..outputs {
+                let sum = f64::from(bias[o]) + (0..inputs).map(|i| f64::from(weights[o * inputs + i]) * at(&x, i)).sum::<f64>();
+                close(at(&found[0], o), sum, "linear");
+                close(at(&found[1], o), sum / (1.0 + (-1.595_769_2 * (sum + 0.044_715 * sum.powi(3))).exp()), "gelu");
+                close(at(&found[2], o), sum / (1.0 + (-sum).exp()), "silu");
+                close(at(&found[3], o), at(&y, o) + sum, "add");
+            }
+            let mean = (0..inputs).map(|i| at(&x, i)).sum::<f64>() / inputs as f64;
+            let variance = (0..inputs).map(|i| (at(&x, i) - mean).powi(2)).sum::<f64>() / inputs as f64;
+            for i in 0..inputs {
+                let scaled = (at(&x, i) - mean) / (variance + 1e-5).sqrt() * f64::from(weight[i]) + f64::from(weight[i]);
+                close(at(&found[4], i), scaled, "layer norm");
+            }
+            let stride = inputs / tokens;
+            let features = stride / 8 * 8;
+            let score = |t: usize| (0..features).map(|d| at(&x, t * stride + d) * at(&x, d)).sum::<f64>();
+            let total: f64 = (0..tokens).map(|t| (0.5 * score(t)).exp()).sum();
+            for t in 0..tokens {
+                close(at(&found[5], t), score(t), "score");
+                close(at(&found[6], t), (0.5 * score(t)).exp() / total, "softmax");
+            }
+            for d in 0..features {
+                let sum: f64 = (0..tokens).map(|t| (0.5 * score(t)).exp() / total * at(&x, t * stride + d)).sum();
+                close(at(&found[7], d), at(&x, d) + sum, "values");
+            }
+        }
+    }
+
+    #[test]
+    fn analytic_kernels_equal_plain_sums_on_every_path() {
+        for (outputs, inputs, tokens) in [(8, 32, 1), (16, 128, 4), (3, 40, 5), (24, 36, 3), (1, 64, 7), (128, 12, 1)] {
+            check::<1>(outputs, inputs, tokens);
+            check::<2>(outputs, inputs, tokens);
         }
     }
 }

@@ -1,13 +1,13 @@
 //! Sixteen f32 as one value, in the instructions that the processor has: the only module of this workspace with `unsafe` code.
 //!
-//! A [`Kernel`] is written once over [`Vector`]; [`Path::run`] compiles it for AVX-512, for AVX2 with FMA and for plain floats, and calls the one that was
-//! found to run here. All three do the same IEEE operations in the same order, lane by lane, so they give the same bits (where the target has a fused
-//! multiply-add; elsewhere the portable path rounds twice).
+//! A [`Kernel`] is written once over [`Vector`]; [`Path::run`] compiles it for AVX-512 and for the target of the build (AVX2 with FMA on x86-64, see
+//! `.cargo/config.toml`; whatever `wide` makes of it elsewhere), and calls the one that was found to run here. Both do the same IEEE operations in the same order, lane
+//! by lane, so they give the same bits (where the target has a fused multiply-add; elsewhere its path rounds twice).
 //!
 //! # Why this is sound
 //! Two things need `unsafe`: calling a function that is compiled for instructions which the processor may lack, and the intrinsics themselves. A [`Path`]
-//! other than the portable one exists only after the processor was asked ([`Path::available`]); the vector types are private and reach a kernel only
-//! through [`Path::run`], so an intrinsic is never executed without its instructions. Loads and stores take references to whole arrays, so no pointer can leave
+//! of AVX-512 exists only after the processor was asked ([`Path::available`]); the vector types are private and reach a kernel only through
+//! [`Path::run`], so an intrinsic is never executed without its instructions. Loads and stores take references to whole arrays, so no pointer can leave
 //! its memory.
 //!
 //! AMX would be a further path here, with tiles of bf16 in place of `Vector` in `kernels::linear`; it is not written, since no processor was at hand to run it.
@@ -15,6 +15,8 @@
 
 use core::fmt::Debug;
 use core::ops::{Deref, DerefMut};
+
+use wide::{f32x8, u32x8};
 
 /// Samples of one lane.
 pub const LANES: usize = 16;
@@ -104,9 +106,7 @@ pub trait Kernel {
 enum Instructions {
     #[cfg(target_arch = "x86_64")]
     Avx512,
-    #[cfg(target_arch = "x86_64")]
-    Avx2,
-    Portable,
+    Target,
 }
 
 /// Instructions that the kernels run on, found on this processor.
@@ -118,16 +118,10 @@ impl Path {
     pub fn available() -> Vec<Self> {
         let mut paths = Vec::new();
         #[cfg(target_arch = "x86_64")]
-        {
-            let fma = is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma");
-            if fma && is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") {
-                paths.push(Self(Instructions::Avx512));
-            }
-            if fma {
-                paths.push(Self(Instructions::Avx2));
-            }
+        if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") {
+            paths.push(Self(Instructions::Avx512));
         }
-        paths.push(Self(Instructions::Portable));
+        paths.push(Self(Instructions::Target));
         paths
     }
 
@@ -136,24 +130,19 @@ impl Path {
         Self::available()[0]
     }
 
-    /// This path, or the one of the build's target where a kernel calls functions that are not inlined: those are compiled for the target alone, so on
-    /// more than it has every vector operation would be a call. The bits are the same.
-    pub fn for_calls(self) -> Self {
-        #[cfg(all(target_arch = "x86_64", target_feature = "avx2", target_feature = "fma"))]
-        if self.0 == Instructions::Avx512 {
-            return Self(Instructions::Avx2);
-        }
-        self
+    /// The path of the build's target: for a kernel that calls functions which are not inlined. Those are compiled for the target alone, so with wider vectors
+    /// every operation in them would be a call. The bits are the same.
+    pub fn of_target() -> Self {
+        Self(Instructions::Target)
     }
 
-    /// Name in reports: `avx512`, `avx2` or `portable`.
+    /// Name in reports: `avx512`; for the path of the target `avx2` where it has AVX2, else `portable`.
     pub fn as_str(self) -> &'static str {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
             Instructions::Avx512 => "avx512",
-            #[cfg(target_arch = "x86_64")]
-            Instructions::Avx2 => "avx2",
-            Instructions::Portable => "portable",
+            Instructions::Target if cfg!(target_feature = "avx2") => "avx2",
+            Instructions::Target => "portable",
         }
     }
 
@@ -164,43 +153,48 @@ impl Path {
             // SAFETY: `available` has found these instructions on this processor.
             #[cfg(target_arch = "x86_64")]
             Instructions::Avx512 => unsafe { x86::on_avx512(kernel) },
-            // SAFETY: as above.
-            #[cfg(target_arch = "x86_64")]
-            Instructions::Avx2 => unsafe { x86::on_avx2(kernel) },
-            Instructions::Portable => kernel.run::<Portable>(),
+            Instructions::Target => kernel.run::<Target>(),
         }
     }
 }
 
-/// Sixteen floats, one after the other.
+/// Sixteen floats in what the target of the build has.
 #[derive(Clone, Copy, Debug)]
-struct Portable([f32; LANES]);
+struct Target([f32x8; 2]);
 
-impl Portable {
+impl Target {
     #[inline(always)]
-    fn map(self, f: impl Fn(f32) -> f32) -> Self {
-        Self(self.0.map(f))
+    fn map(self, f: impl Fn(f32x8) -> f32x8) -> Self {
+        Self([f(self.0[0]), f(self.0[1])])
     }
 
     #[inline(always)]
-    fn zip(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
-        Self(core::array::from_fn(|l| f(self.0[l], other.0[l])))
+    fn zip(self, other: Self, f: impl Fn(f32x8, f32x8) -> f32x8) -> Self {
+        Self([f(self.0[0], other.0[0]), f(self.0[1], other.0[1])])
+    }
+
+    #[inline(always)]
+    fn map_bits(self, f: impl Fn(u32x8) -> u32x8) -> Self {
+        self.map(|x| bytemuck::cast(f(bytemuck::cast(x))))
     }
 }
 
-impl Vector for Portable {
+impl Vector for Target {
     const WIDE: bool = false;
     #[inline(always)]
     fn splat(x: f32) -> Self {
-        Self([x; LANES])
+        Self([f32x8::splat(x); 2])
     }
     #[inline(always)]
     fn load(from: &[f32; LANES]) -> Self {
-        Self(*from)
+        let [low, high] = from.as_chunks::<8>().0 else { unreachable!("sixteen is twice eight") };
+        Self([f32x8::from(*low), f32x8::from(*high)])
     }
     #[inline(always)]
     fn store(self, to: &mut [f32; LANES]) {
-        *to = self.0;
+        let (low, high) = to.split_at_mut(8);
+        low.copy_from_slice(&self.0[0].to_array());
+        high.copy_from_slice(&self.0[1].to_array());
     }
     #[inline(always)]
     fn add(self, other: Self) -> Self {
@@ -220,49 +214,48 @@ impl Vector for Portable {
     }
     #[inline(always)]
     fn mul_add(self, by: Self, plus: Self) -> Self {
-        // Without the instruction a fused multiply-add would be a call for every lane.
-        const FUSED: bool = cfg!(any(target_feature = "fma", target_arch = "aarch64"));
-        Self(core::array::from_fn(|l| if FUSED { self.0[l].mul_add(by.0[l], plus.0[l]) } else { self.0[l] * by.0[l] + plus.0[l] }))
+        Self([self.0[0].mul_add(by.0[0], plus.0[0]), self.0[1].mul_add(by.0[1], plus.0[1])])
     }
     #[inline(always)]
     fn max(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a > b { a } else { b })
+        self.zip(other, |a, b| a.simd_gt(b).select(a, b))
     }
     #[inline(always)]
     fn min(self, other: Self) -> Self {
-        self.zip(other, |a, b| if a < b { a } else { b })
+        self.zip(other, |a, b| a.simd_lt(b).select(a, b))
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
-        self.map(f32::sqrt)
+        self.map(f32x8::sqrt)
     }
     #[inline(always)]
     fn round(self) -> Self {
-        self.map(f32::round_ties_even)
+        self.map(f32x8::round_ties_even)
     }
     #[inline(always)]
     fn neg(self) -> Self {
-        self.map(|x| -x)
+        self.map(|x| x ^ f32x8::splat(-0.0))
     }
     #[inline(always)]
     fn abs(self) -> Self {
-        self.map(f32::abs)
+        self.map(f32x8::abs)
     }
     #[inline(always)]
     fn shift_to_exponent(self) -> Self {
-        self.map(|x| f32::from_bits(x.to_bits() << 23))
+        self.map_bits(|bits| bits << 23u32)
     }
     #[inline(always)]
     fn exponent_over_2_23(self) -> Self {
-        self.map(|x| f32::from_bits(x.to_bits() >> 23 | 0x4b00_0000))
+        self.map_bits(|bits| (bits >> 23u32) | u32x8::splat(0x4b00_0000))
     }
     #[inline(always)]
     fn mantissa(self) -> Self {
-        self.map(|x| f32::from_bits(x.to_bits() & 0x007f_ffff | 0x3f00_0000))
+        self.map_bits(|bits| (bits & u32x8::splat(0x007f_ffff)) | u32x8::splat(0x3f00_0000))
     }
     #[inline(always)]
     fn select_ge0(self, a: Self, b: Self) -> Self {
-        Self(core::array::from_fn(|l| if self.0[l] >= 0.0 { a.0[l] } else { b.0[l] }))
+        let half = |i: usize| self.0[i].simd_ge(f32x8::ZERO).select(a.0[i], b.0[i]);
+        Self([half(0), half(1)])
     }
 }
 
@@ -276,25 +269,14 @@ mod x86 {
     #[derive(Clone, Copy, Debug)]
     pub(super) struct Avx512(__m512);
 
-    /// Sixteen floats in two registers.
-    #[derive(Clone, Copy, Debug)]
-    pub(super) struct Avx2([__m256; 2]);
-
     /// # Safety
-    /// The processor has AVX-512 F, DQ and VL, AVX2 and FMA.
-    #[target_feature(enable = "avx512f,avx512dq,avx512vl,avx2,fma")]
+    /// The processor has AVX-512 F, DQ and VL.
+    #[target_feature(enable = "avx512f,avx512dq,avx512vl")]
     pub(super) unsafe fn on_avx512<K: Kernel>(kernel: K) -> K::Output {
         kernel.run::<Avx512>()
     }
 
-    /// # Safety
-    /// The processor has AVX2 and FMA.
-    #[target_feature(enable = "avx2,fma")]
-    pub(super) unsafe fn on_avx2<K: Kernel>(kernel: K) -> K::Output {
-        kernel.run::<Avx2>()
-    }
-
-    // SAFETY of every block in this module: values of these types exist only inside `on_avx512` and `on_avx2`, whose callers have found the instructions.
+    // SAFETY of every block in this module: values of these types exist only inside `on_avx512`, whose caller has found the instructions.
     impl Vector for Avx512 {
         const WIDE: bool = true;
         #[inline(always)]
@@ -372,102 +354,6 @@ mod x86 {
             Self(unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, _mm512_setzero_ps()), b.0, a.0) })
         }
     }
-
-    impl Avx2 {
-        #[inline(always)]
-        fn zip(self, other: Self, f: impl Fn(__m256, __m256) -> __m256) -> Self {
-            Self([f(self.0[0], other.0[0]), f(self.0[1], other.0[1])])
-        }
-    }
-
-    // SAFETY: as above.
-    impl Vector for Avx2 {
-        const WIDE: bool = false;
-        #[inline(always)]
-        fn splat(x: f32) -> Self {
-            Self([unsafe { _mm256_set1_ps(x) }; 2])
-        }
-        #[inline(always)]
-        fn load(from: &[f32; LANES]) -> Self {
-            let (low, high) = from.split_at(8);
-            Self(unsafe { [_mm256_loadu_ps(low.as_ptr()), _mm256_loadu_ps(high.as_ptr())] })
-        }
-        #[inline(always)]
-        fn store(self, to: &mut [f32; LANES]) {
-            let (low, high) = to.split_at_mut(8);
-            unsafe {
-                _mm256_storeu_ps(low.as_mut_ptr(), self.0[0]);
-                _mm256_storeu_ps(high.as_mut_ptr(), self.0[1]);
-            }
-        }
-        #[inline(always)]
-        fn add(self, other: Self) -> Self {
-            Self(unsafe { [_mm256_add_ps(self.0[0], other.0[0]), _mm256_add_ps(self.0[1], other.0[1])] })
-        }
-        #[inline(always)]
-        fn sub(self, other: Self) -> Self {
-            Self(unsafe { [_mm256_sub_ps(self.0[0], other.0[0]), _mm256_sub_ps(self.0[1], other.0[1])] })
-        }
-        #[inline(always)]
-        fn mul(self, other: Self) -> Self {
-            Self(unsafe { [_mm256_mul_ps(self.0[0], other.0[0]), _mm256_mul_ps(self.0[1], other.0[1])] })
-        }
-        #[inline(always)]
-        fn div(self, other: Self) -> Self {
-            Self(unsafe { [_mm256_div_ps(self.0[0], other.0[0]), _mm256_div_ps(self.0[1], other.0[1])] })
-        }
-        #[inline(always)]
-        fn mul_add(self, by: Self, plus: Self) -> Self {
-            Self(unsafe { [_mm256_fmadd_ps(self.0[0], by.0[0], plus.0[0]), _mm256_fmadd_ps(self.0[1], by.0[1], plus.0[1])] })
-        }
-        #[inline(always)]
-        fn max(self, other: Self) -> Self {
-            Self(unsafe { [_mm256_max_ps(self.0[0], other.0[0]), _mm256_max_ps(self.0[1], other.0[1])] })
-        }
-        #[inline(always)]
-        fn min(self, other: Self) -> Self {
-            Self(unsafe { [_mm256_min_ps(self.0[0], other.0[0]), _mm256_min_ps(self.0[1], other.0[1])] })
-        }
-        #[inline(always)]
-        fn sqrt(self) -> Self {
-            Self(unsafe { [_mm256_sqrt_ps(self.0[0]), _mm256_sqrt_ps(self.0[1])] })
-        }
-        #[inline(always)]
-        fn round(self) -> Self {
-            const NEAREST: i32 = _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC;
-            Self(unsafe { [_mm256_round_ps::<NEAREST>(self.0[0]), _mm256_round_ps::<NEAREST>(self.0[1])] })
-        }
-        #[inline(always)]
-        fn neg(self) -> Self {
-            let sign = unsafe { _mm256_set1_ps(-0.0) };
-            Self(unsafe { [_mm256_xor_ps(self.0[0], sign), _mm256_xor_ps(self.0[1], sign)] })
-        }
-        #[inline(always)]
-        fn abs(self) -> Self {
-            let sign = unsafe { _mm256_set1_ps(-0.0) };
-            Self(unsafe { [_mm256_andnot_ps(sign, self.0[0]), _mm256_andnot_ps(sign, self.0[1])] })
-        }
-        #[inline(always)]
-        fn shift_to_exponent(self) -> Self {
-            let shift = |x: __m256| unsafe { _mm256_castsi256_ps(_mm256_slli_epi32::<23>(_mm256_castps_si256(x))) };
-            Self([shift(self.0[0]), shift(self.0[1])])
-        }
-        #[inline(always)]
-        fn exponent_over_2_23(self) -> Self {
-            let shift = |x: __m256| unsafe { _mm256_castsi256_ps(_mm256_srli_epi32::<23>(_mm256_castps_si256(x))) };
-            Self([shift(self.0[0]), shift(self.0[1])]).zip(Self::splat(8_388_608.0), |a, b| unsafe { _mm256_or_ps(a, b) })
-        }
-        #[inline(always)]
-        fn mantissa(self) -> Self {
-            let bits = self.zip(Self::splat(f32::from_bits(0x007f_ffff)), |a, b| unsafe { _mm256_and_ps(a, b) });
-            bits.zip(Self::splat(0.5), |a, b| unsafe { _mm256_or_ps(a, b) })
-        }
-        #[inline(always)]
-        fn select_ge0(self, a: Self, b: Self) -> Self {
-            let half = |i: usize| unsafe { _mm256_blendv_ps(b.0[i], a.0[i], _mm256_cmp_ps::<_CMP_GE_OQ>(self.0[i], _mm256_setzero_ps())) };
-            Self([half(0), half(1)])
-        }
-    }
 }
 
 #[cfg(test)]
@@ -521,9 +407,9 @@ mod tests {
         for round in 0..200 {
             let lanes: [Lane; 3] =
                 core::array::from_fn(|i| Lane::from_fn(|l| if round < 16 && i < 2 { edges[(l * (i + 1) + round) % 16] } else { random() }));
-            let expected = Path(Instructions::Portable).run(Everything(&lanes));
+            let expected = Path::of_target().run(Everything(&lanes));
             for path in Path::available() {
-                assert_eq!(path.run(Everything(&lanes)), expected, "{} differs from portable at {lanes:?}", path.as_str());
+                assert_eq!(path.run(Everything(&lanes)), expected, "{} differs from the target's path at {lanes:?}", path.as_str());
             }
         }
     }

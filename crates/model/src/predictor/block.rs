@@ -5,12 +5,13 @@ use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, WHEELS};
 use nesam_terrain::Pose2;
 
 use super::observed::reported;
+use super::parts::{Part, Watch};
 use super::physics::{PhysicsOutput, PhysicsStep};
 use super::risk::RiskRow;
 use super::rollout::Scene;
 use super::{NO_SINKAGE, Predictor, Sample, TerrainMode, pose, under};
 use crate::dims::HIDDEN;
-use crate::fused::{BlockCache, LANES, Lane, Row};
+use crate::fused::{BlockCache, LANES, Lane, Path, Row};
 use crate::rollout::Variant;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants};
 use crate::terrain_tokens::{Node, TerrainToken, VALUES};
@@ -43,10 +44,12 @@ impl Predictor {
         let mut cache = block.cache.take().unwrap_or_else(|| scene.caches.take());
         let mut terrain = [[0.0; VALUES]; LANES];
         while block.done < scene.query.horizon {
+            let mut watch = Watch::start(scene.clocks);
             if !self.block_terrain(scene, block, &mut terrain) {
                 block.cache = Some(cache);
                 return;
             }
+            watch.add_to(Part::Lookup);
             self.step_block(scene, block, &mut cache, &terrain);
             block.done += 1;
         }
@@ -77,26 +80,27 @@ impl Predictor {
     /// Advances the samples of a block by one step and writes what it gives.
     fn step_block(&self, scene: &Scene<'_>, block: &mut Block<'_>, cache: &mut Cache, terrain: &[TerrainToken; LANES]) {
         let scales = &self.bundle.normalization;
+        let mut watch = Watch::start(scene.clocks);
         let (k, count) = (block.done, block.samples.len());
         let time_s = scene.clock.after(k);
         let model = self.physics.at(time_s);
         let last = count - 1;
-        // Lanes beyond the last sample repeat it.
         let controls: [Control<f64>; LANES] = core::array::from_fn(|l| scene.control(block.first + l.min(last), k));
         let mut entries = [[Lane::ZERO]; crate::dims::STATE_CONTROL];
-        for l in 0..LANES {
-            let sample = &block.samples[l.min(last)];
+        for (l, sample) in block.samples.iter().enumerate() {
             let values = self.entries(model, &sample.state, sample.previous.as_ref(), &controls[l], &scene.ground);
             entries.iter_mut().zip(values).for_each(|(row, value)| row[0][l] = value);
         }
+        entries.iter_mut().for_each(|row| repeat_last(&mut row[0], count));
         let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane::from_fn(|l| terrain[l][i])]);
+        watch.add_to(Part::Rest);
         let said = self.network.step(&scene.prefix, cache, &entries, &context);
+        watch.add_to(Part::Network);
 
         let (mut varying, mut constant) = ([Lane::ZERO; DIFFERENTIABLE], [Lane::ZERO; CONSTANT]);
         let mut after = [DrivelineState::default(); LANES];
         let mut known = [true; LANES];
-        for l in 0..LANES {
-            let sample = &block.samples[l.min(last)];
+        for (l, sample) in block.samples.iter().enumerate() {
             after[l] = sample.actuators.advance(model.vehicle(), &controls[l], sample.state.velocity_m_s[0], model.dt_s());
             let wheels = match scene.query.wheels {
                 Some(measured) => measured_wheels(model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
@@ -104,7 +108,7 @@ impl Predictor {
             };
             let (ground, inside) = scene.ground.under_wheels(model, &sample.state, scene.datum_m);
             known[l] = inside;
-            let soil = self.soil_at(under(scene.soil, block.first + l.min(last), sample, &terrain[l]), time_s);
+            let soil = self.soil_at(under(scene.soil, block.first + l, sample, &terrain[l]), time_s);
             let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
                 Variant::ZeroSinkage => NO_SINKAGE,
                 _ => scales.sinkage_log_ratio_max * said.sinkage[i][0][l],
@@ -117,9 +121,12 @@ impl Predictor {
                 .for_each(|(lane, value)| lane[l] = value);
         }
 
+        varying.iter_mut().chain(&mut constant).for_each(|lane| repeat_last(lane, count));
         let physics = PhysicsStep { variant: scene.variant, model, varying: &varying, constant: &constant, risk: scene.risk };
-        let path = self.network.path();
-        let output = if model.is_altered() { path.for_calls() } else { path }.run(physics);
+        watch.add_to(Part::Rest);
+        let path = if model.is_altered() { Path::of_target() } else { self.network.path() };
+        let output = path.run(physics);
+        watch.add_to(Part::Physics);
         let sensors = &self.physics.at(scene.clock.after(k + 1)).vehicle().effects.sensor;
         for l in 0..count {
             let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
@@ -133,6 +140,7 @@ impl Predictor {
             let shown = reported(sensors, &block.samples[l].state);
             block.write(l, k, scene.query.horizon, &shown, &output);
         }
+        watch.add_to(Part::Rest);
     }
 }
 
@@ -150,6 +158,12 @@ impl Block<'_> {
             self.risk[row] = risk[l];
         }
     }
+}
+
+/// Lets the lanes beyond the last of `count` samples repeat it.
+fn repeat_last(lane: &mut Lane, count: usize) {
+    let last = lane[count - 1];
+    lane[count..].fill(last);
 }
 
 /// The differentiable columns of a step row.

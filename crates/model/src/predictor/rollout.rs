@@ -10,6 +10,7 @@ use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, WHEELS};
 use rayon::prelude::*;
 
 use super::block::{Block, Cache};
+use super::parts::PartClocks;
 use super::risk::RiskRow;
 use super::validate::{validate, validate_extras};
 use super::{LogClock, Predictor, Sample, control, pose, under};
@@ -32,6 +33,7 @@ pub(super) struct Scene<'a> {
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
     pub(super) caches: Caches,
+    pub(super) clocks: Option<&'a PartClocks>,
 }
 
 impl Scene<'_> {
@@ -87,6 +89,16 @@ impl Predictor {
     /// # Errors
     /// As [`Predictor::rollout`]; also naming `soils` when a correction is not finite, and `risk` when the form has no soil.
     pub fn rollout_with(&self, query: &RolloutQuery<'_>, extras: &RolloutExtras<'_>) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
+        self.rollout_timed(query, extras, None)
+    }
+
+    /// The same, with clocks for a bench.
+    pub(super) fn rollout_timed(
+        &self,
+        query: &RolloutQuery<'_>,
+        extras: &RolloutExtras<'_>,
+        clocks: Option<&PartClocks>,
+    ) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
         validate(query)?;
         validate_extras(extras)?;
         let variant = self.form_of(query);
@@ -110,6 +122,7 @@ impl Predictor {
             clock,
             tokens: tokens.as_deref(),
             caches: Caches { free: Mutex::default(), horizon: query.horizon, remembers: variant.remembers() },
+            clocks,
         };
         let rows = extras.soils.len().max(1) * query.samples;
         // Without a history the actuators begin as a row's own first command says, so rows stay independent.
