@@ -14,7 +14,6 @@ const DIRECTION_SPEED_M_S: f64 = 0.05;
 ///
 /// Source: the static and quasi-static rollover indices of road vehicles (e.g. Rajamani, *Vehicle Dynamics and Control*, ch. 15). Loads are those of the
 /// contacts, so suspension, slope and the vehicle's motion are in it; compliance of the tyres and a second axle's own limit are not.
-#[inline(always)]
 pub fn load_transfer_ratio<T: Real>(load_n: &[T; WHEELS]) -> T {
     let [front_left, front_right, rear_left, rear_right] = *load_n;
     let difference = front_left + rear_left - front_right - rear_right;
@@ -29,7 +28,6 @@ impl StepModel {
     /// carries the wheel's load with this slip, times the learned ratio; γ is the climb of the body's x axis, d in (-1, 1) the direction of travel (0 at
     /// rest). Drawbar pull over weight equals the tangent of the steepest slope that a vehicle climbs, hence the unit. Neglects side forces, the torque limit
     /// of the drive and obstacles. `contacts` are those of the step with this input.
-    #[inline(always)]
     pub fn traction_reserve<T: Real>(&self, input: &StepInput<T>, contacts: &[WheelContact<T>; WHEELS]) -> T {
         let motion = ContactMotion::<T>::from_slip(RESERVE_SLIP, 0.0);
         let mut pull_n = T::lit(0.0);

@@ -140,11 +140,6 @@ impl StepModel {
         self.dt_s
     }
 
-    /// Whether effects add to a step what is kept out of its loop: those parts are functions of their own, compiled for the build's target alone.
-    pub fn is_altered(&self) -> bool {
-        self.altered.on_body || self.altered.on_wheels
-    }
-
     /// The vehicle.
     pub fn vehicle(&self) -> &Vehicle {
         &self.vehicle
@@ -204,12 +199,9 @@ impl StepModel {
             }
         }
 
-        let mut contacts = [WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero }; WHEELS];
-        // A loop and no closure: a closure would not be inlined, and vectors would lose the instructions of their caller.
-        for (i, contact) in contacts.iter_mut().enumerate() {
-            let wheel = self.wheel_contribution(i, state, &tilt, input);
-            assemble(&wheel, v, w, h, &mut lhs, &mut rhs);
-            *contact = wheel.contact;
+        let contributions: [Contribution<T>; WHEELS] = core::array::from_fn(|i| self.wheel_contribution(i, state, &tilt, input));
+        for wheel in &contributions {
+            assemble(wheel, v, w, h, &mut lhs, &mut rhs);
         }
         let delta = solve_spd(lhs, rhs.map(|f| f * h));
 
@@ -224,7 +216,7 @@ impl StepModel {
         state.attitude_rad = add(state.attitude_rad, scale(rates, h));
         state.velocity_m_s = add(v, dv);
         state.angular_velocity_rad_s = add(w, dw);
-        contacts
+        contributions.map(|c| c.contact)
     }
 
     /// Forces of one wheel and how they change with its velocity.
@@ -327,7 +319,6 @@ impl StepModel {
     ///
     /// The slope of traction is the tangent of the exponential shear law at the mobilised share u of its limit: thrust / over-speed · (1 - u) (-ln(1 - u)) / u.
     /// Without drag nothing is computed.
-    #[inline(always)]
     fn drag_at_tread<T: Real>(&self, wheel: usize, thrust_n: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> T {
         if self.vehicle.effects.force.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
             return T::lit(0.0);

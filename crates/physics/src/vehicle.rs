@@ -166,7 +166,6 @@ impl Vehicle {
     /// What the speed controller makes up is subtracted from every drag. The dragged wheel turns slower than its partner, and the coupling of the
     /// differential passes torque to it: with drags τ, τ' and a slope s, τ - κ (τ - τ') / 2 is left, κ = (2 k / r²) / (s + 2 k / r²). Neglects the limit
     /// of the coupling and the one between the axles.
-    #[inline(always)]
     pub fn drag_at_tread_n_m<T: Real>(&self, wheel: usize, slope_n_s_m: T) -> T {
         let [own, partner] = [wheel, wheel ^ 1].map(|w| self.effects.force.wheel_drag_n_m[w] - self.drag_made_up_n_m());
         let coupling = T::lit(2.0 * self.driveline.side_coupling_n_m_s / (self.wheel_radius_m * self.wheel_radius_m));

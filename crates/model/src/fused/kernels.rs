@@ -298,12 +298,17 @@ mod tests {
         let matrix = Packed::from_rows(&weights, &bias);
         let (x, y) = (rows::<H>(inputs, &mut next), rows::<H>(matrix.padded_outputs(), &mut next));
         let weight: Vec<f32> = (0..inputs).map(|_| next()).collect();
-        let all = |path: Path| path.run(Everything { matrix: &matrix, x: &x, y: &y, weight: &weight, tokens });
-        let found = all(Path::of_target());
+        let everything = || Everything { matrix: &matrix, x: &x, y: &y, weight: &weight, tokens };
+        let found = Path::run_on_target(everything());
         for path in Path::available() {
             // Without a fused multiply-add the target's path rounds twice.
             if cfg!(any(target_feature = "fma", target_arch = "aarch64")) {
-                assert_eq!(all(path), found, "{} and the target's path differ for {outputs} x {inputs}, H = {H}", path.as_str());
+                assert_eq!(
+                    path.run(everything()),
+                    found,
+                    "{} and the target's path differ for {outputs} x {inputs}, H = {H}",
+                    path.as_str()
+                );
             }
         }
         for lane in 0..16 * H {

@@ -130,10 +130,11 @@ impl Path {
         Self::available()[0]
     }
 
-    /// The path of the build's target: for a kernel that calls functions which are not inlined. Those are compiled for the target alone, so with wider vectors
-    /// every operation in them would be a call. The bits are the same.
-    pub fn of_target() -> Self {
-        Self(Instructions::Target)
+    /// Runs a kernel on the path of the build's target and compiles it for no other: for long kernels (thousands of inlined instructions take minutes to compile) and
+    /// for those that call functions which are not inlined, where wider vectors would be a call each. The bits are the same.
+    #[inline]
+    pub fn run_on_target<K: Kernel>(kernel: K) -> K::Output {
+        kernel.run::<Target>()
     }
 
     /// Name in reports: `avx512`; for the path of the target `avx2` where it has AVX2, else `portable`.
@@ -407,7 +408,7 @@ mod tests {
         for round in 0..200 {
             let lanes: [Lane; 3] =
                 core::array::from_fn(|i| Lane::from_fn(|l| if round < 16 && i < 2 { edges[(l * (i + 1) + round) % 16] } else { random() }));
-            let expected = Path::of_target().run(Everything(&lanes));
+            let expected = Path::run_on_target(Everything(&lanes));
             for path in Path::available() {
                 assert_eq!(path.run(Everything(&lanes)), expected, "{} differs from the target's path at {lanes:?}", path.as_str());
             }

@@ -124,8 +124,7 @@ impl Predictor {
         varying.iter_mut().chain(&mut constant).for_each(|lane| repeat_last(lane, count));
         let physics = PhysicsStep { variant: scene.variant, model, varying: &varying, constant: &constant, risk: scene.risk };
         watch.add_to(Part::Rest);
-        let path = if model.is_altered() { Path::of_target() } else { self.network.path() };
-        let output = path.run(physics);
+        let output = Path::run_on_target(physics);
         watch.add_to(Part::Physics);
         let sensors = &self.physics.at(scene.clock.after(k + 1)).vehicle().effects.sensor;
         for l in 0..count {
