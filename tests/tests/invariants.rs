@@ -131,6 +131,16 @@ fn property_terramechanics_is_written_once() {
     }
 }
 
+#[test]
+fn property_unsafe_code_stands_in_one_module() {
+    for root in ["crates", "server", "clients/rust", "tests", "benches"] {
+        for_each_source(root, |path, text| {
+            let allows = text.contains(&["allow(", "unsafe_code)"].concat());
+            assert!(!allows || path.ends_with("crates/model/src/fused/vector.rs"), "{} allows unsafe code", path.display());
+        });
+    }
+}
+
 /// Calls `f` with every Rust source below a folder of the repository.
 fn for_each_source(folder: &str, mut f: impl FnMut(&Path, &str)) {
     let mut open = vec![repository().join(folder)];

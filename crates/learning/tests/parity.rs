@@ -7,9 +7,10 @@ use std::sync::Arc;
 
 use candle_core::{Device, Result, Tensor};
 use common::{drive, hills, lively_weights, measured_scales, predictor, truck};
+use nesam_learning::Drive;
 use nesam_model::dims::HIDDEN;
 use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
-use nesam_model::{GroundSource, Predictor, RolloutQuery, Variant, history_actuators};
+use nesam_model::{GroundSource, ModelBundle, Normalization, Path, Predictor, RolloutQuery, Variant, Weights, history_actuators};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::{Pose2, WorldMap};
@@ -49,8 +50,11 @@ impl TerrainProvider for FromPredictor<'_> {
 fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
     let drive = drive(map, 80);
     let scales = measured_scales(&drive);
-    let weights = lively_weights(&scales);
-    let predictor = predictor(&scales, weights.clone());
+    compare_weights(map, history, variant, &drive, &scales, lively_weights(&scales));
+}
+
+fn compare_weights(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant, drive: &Drive, scales: &Normalization, weights: Weights) {
+    let predictor = predictor(scales, weights.clone());
     let start = 33;
     let past = drive.history(start - history, start);
     let controls: Vec<f32> = drive.controls[start..start + 32].iter().flat_map(|c| [c.speed_m_s as f32, c.second as f32]).collect();
@@ -78,7 +82,7 @@ fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
         ground: GroundSource::new(map.map(Arc::as_ref), &model, &drive.states[start]),
     };
     let mut provider = FromPredictor { predictor: &predictor, map, history: past.iter().map(|s| pose(&s.state)).collect() };
-    let rollout = ReferenceRollout { network: &network, model: &model, scales: &scales, variant };
+    let rollout = ReferenceRollout { network: &network, model: &model, scales, variant };
     let steps = rollout.run(&[row], 32, &mut provider).expect("the reference runs");
     for (k, step) in steps.iter().enumerate() {
         let mut slow = step.state.to_vec2::<f32>().expect("readable")[0].clone();
@@ -101,6 +105,44 @@ fn property_fast_path_equals_the_reference() {
     compare(Some(&map), 5, Variant::Full);
     compare(Some(&map), 0, Variant::Full);
     compare(None, 31, Variant::Full);
+}
+
+#[test]
+fn property_fast_path_equals_the_reference_on_shipped_weights() {
+    let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/bundles/hmmwv-nominal");
+    let bundle = ModelBundle::load(shipped.as_ref()).expect("a shipped bundle");
+    let map = hills();
+    compare_weights(Some(&map), 31, Variant::Full, &drive(Some(&map), 80), &bundle.normalization, bundle.weights.clone());
+}
+
+#[test]
+fn property_every_path_gives_the_same_bytes() {
+    let map = hills();
+    let drive = drive(Some(&map), 80);
+    let scales = measured_scales(&drive);
+    let fastest = predictor(&scales, lively_weights(&scales));
+    let past = drive.history(2, 33);
+    let (samples, horizon) = (19, 12);
+    let controls: Vec<f32> = (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect();
+    let query = RolloutQuery {
+        history: &past,
+        start: drive.states[33],
+        controls: &controls,
+        samples,
+        horizon,
+        map: Some(&map),
+        soil_correction: SoilCorrection::NONE,
+        variant: Variant::Full,
+        start_time_s: None,
+        wheels: None,
+    };
+    let expected = fastest.rollout(&query).expect("a valid query");
+    // Without a fused multiply-add in the target the portable path rounds otherwise.
+    for path in Path::available().into_iter().filter(|path| cfg!(target_feature = "fma") || *path == fastest.path()) {
+        assert_eq!(fastest.on_path(path).rollout(&query).expect("a valid query"), expected, "on {}", path.as_str());
+    }
+    // A repeated query meets a warm cache, and other threads.
+    assert_eq!(fastest.rollout(&query).expect("a valid query"), expected);
 }
 
 #[test]

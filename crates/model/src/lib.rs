@@ -28,9 +28,10 @@ pub mod weights;
 
 pub use bundle::{ModelBundle, Provenance};
 pub use dims::{HISTORY, MAX_HORIZON};
+pub use fused::Path;
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
-pub use predictor::{Predictor, TerrainMode, Transition};
+pub use predictor::{PartTimes, Predictor, TerrainMode, Transition};
 pub use rollout::{HistoryStep, MeasuredWheels, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 pub use rollout_noise::RolloutNoise;
 pub use soil_field::{SoilByClass, SoilField};

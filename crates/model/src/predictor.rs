@@ -2,40 +2,39 @@
 
 use std::sync::{Arc, Mutex};
 
-use nesam_physics::driveline::{DrivelineState, command_wheels, measured_wheels};
+use nesam_physics::driveline::DrivelineState;
 use nesam_physics::effects::{Phases, ScheduledEffect};
-use nesam_physics::scalar::f32x8;
 use nesam_physics::step::StepModel;
-use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
-use rayon::prelude::*;
 
 use crate::ModelError;
 use crate::bundle::ModelBundle;
 use crate::dims::{CONTEXT, HIDDEN, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
-use crate::fused::{BlockCache, FusedTransformer, LANES, Lane, Prefix};
+use crate::fused::{FusedTransformer, Path, Prefix};
 use crate::ground::GroundSource;
-use crate::rollout::{HistoryStep, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
+use crate::rollout::{HistoryStep, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
 use crate::soil_prior::SoilPrior;
-use crate::step_row::{CONSTANT, DIFFERENTIABLE, SINKAGE_AT, SOIL_AT, STATE_COLUMNS, pack_constants, step_input};
-use crate::symbolic::symbolic_step;
 use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, VALUES};
 use crate::token::{TokenScale, token_entries};
 
+mod block;
 mod linearise;
 mod observed;
+mod parts;
+mod physics;
 mod risk;
+mod rollout;
 mod transitions;
 mod validate;
 
 pub(crate) use self::observed::LogClock;
-use self::observed::reported;
-use self::risk::RiskRow;
+pub use self::parts::PartTimes;
 pub use self::transitions::Transition;
-use self::validate::{validate, validate_extras};
+use self::validate::validate;
 
 /// Maps whose terrain tokens are kept.
 const MAPS_MAX: usize = 16;
@@ -80,53 +79,6 @@ struct Sample {
     flags: u32,
 }
 
-/// What a block of samples writes in one step.
-struct BlockOutput<'a> {
-    samples: &'a mut [Sample],
-    cache: &'a mut BlockCache,
-    wheels: Vec<StepRow>,
-}
-
-/// What a step tells of one sample beyond its state.
-#[derive(Clone, Copy, Debug, Default)]
-struct StepRow {
-    sinkage_m: [f32; WHEELS],
-    /// Zero unless asked for.
-    risk: RiskRow,
-}
-
-/// Everything of a query that is the same for all samples.
-struct Scene<'a> {
-    query: &'a RolloutQuery<'a>,
-    soil: &'a dyn SoilField,
-    ground: GroundSource<'a>,
-    prefix: Prefix,
-    datum_m: f64,
-    variant: Variant,
-    risk: bool,
-    clock: LogClock,
-}
-
-/// A correction for each group of `samples` rows.
-#[derive(Debug)]
-struct SoilPerGroup<'a> {
-    soils: &'a [SoilCorrection],
-    samples: usize,
-}
-
-impl SoilField for SoilPerGroup<'_> {
-    fn soil(&self, row: usize, _position_m: [f64; 2], prior: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
-        self.soils[row / self.samples].apply(prior)
-    }
-}
-
-impl Scene<'_> {
-    /// Command of a row in step `k`: every group of samples has the same.
-    fn control(&self, row: usize, k: usize) -> Control<f64> {
-        control(self.query, row % self.query.samples, k)
-    }
-}
-
 impl Predictor {
     /// Prepares the bundle for inference.
     ///
@@ -159,6 +111,21 @@ impl Predictor {
             maps: Arc::default(),
             bundle,
         })
+    }
+
+    /// The same predictor on other instructions, with caches of its own: for measuring, and for holding one path against another.
+    pub fn on_path(&self, path: Path) -> Self {
+        Self {
+            network: Arc::new(self.network.on(path)),
+            projection: Arc::new(self.projection.on(path)),
+            maps: Arc::default(),
+            ..self.with_effects::<ScheduledEffect>(&[])
+        }
+    }
+
+    /// Instructions that rollouts run on.
+    pub fn path(&self) -> Path {
+        self.network.path()
     }
 
     /// The same predictor for the vehicle with further effects. Network and terrain tokens do not depend on them and are shared, so this costs
@@ -198,86 +165,6 @@ impl Predictor {
     /// As [`Predictor::rollout`].
     pub fn rollout_on(&self, query: &RolloutQuery<'_>, soil: &dyn SoilField) -> Result<Rollout, ModelError> {
         self.rollout_with(query, &RolloutExtras { field: Some(soil), ..Default::default() }).map(|(rollout, _)| rollout)
-    }
-
-    /// The same with what-if soils and, where they are asked for, risk outputs. States do not depend on whether risk is asked for, and a what-if soil
-    /// that equals the query's correction gives the rollout of the query, both bit for bit.
-    ///
-    /// # Errors
-    /// As [`Predictor::rollout`]; also naming `soils` when a correction is not finite, and `risk` when the form has no soil.
-    pub fn rollout_with(&self, query: &RolloutQuery<'_>, extras: &RolloutExtras<'_>) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
-        validate(query)?;
-        validate_extras(extras)?;
-        let scales = &self.bundle.normalization;
-        let tokens = query.map.map(|map| self.tokens_of(map));
-        let clock = LogClock { start_s: query.start_time_s, dt_s: scales.dt_s };
-        let (history, start_state) = self.true_motion(query.history, &query.start, clock);
-        let history = history.as_ref();
-        let ground = GroundSource::new(query.map.map(Arc::as_ref), self.physics.at(clock.start_s), &start_state);
-        let variant = self.form_of(query);
-        if extras.risk && !variant.has_soil() {
-            return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
-        }
-        let prefix = self.prefix(variant, history, &ground, tokens.as_deref(), clock);
-        let what_if = SoilPerGroup { soils: extras.soils, samples: query.samples };
-        let soil: &dyn SoilField = if extras.soils.is_empty() { extras.field.unwrap_or(&query.soil_correction) } else { &what_if };
-        let scene = Scene { query, soil, ground, prefix, datum_m: start_state.position_m[2], variant, risk: extras.risk, clock };
-        let rows = extras.soils.len().max(1) * query.samples;
-
-        // Without a history the actuators begin as a row's own first command says, so rows stay independent.
-        let start = |row: usize| Sample {
-            state: start_state,
-            previous: history.last().map(|step| step.state),
-            actuators: self.actuators(history, &start_state, &scene.control(row, 0), clock),
-            flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
-        };
-        let shared = start(0);
-        let mut samples: Vec<Sample> = (0..rows).map(|row| if history.is_empty() { start(row) } else { shared }).collect();
-        let mut caches = vec![BlockCache::new(query.horizon, variant.remembers()); rows.div_ceil(LANES)];
-        let mut rollout = Rollout {
-            states: vec![0.0; rows * query.horizon * STATE_DIM],
-            sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
-            flags: Vec::new(),
-            soil: [0.0; SOIL_DIM],
-            samples: rows,
-            horizon: query.horizon,
-        };
-        let mut risk = extras.risk.then(|| RiskOutputs::zero(rows * query.horizon));
-        for k in 0..query.horizon {
-            // Samples still stand together at the first step: one lookup serves all.
-            let distinct = if k == 0 { 1 } else { samples.len() };
-            let poses: Vec<Pose2> = samples[..distinct].iter().map(|s| pose(&s.state)).collect();
-            let terrain = self.terrain(tokens.as_deref(), &poses);
-            if k == 0 {
-                rollout.soil = self.soil_at(under(soil, 0, &samples[0], &terrain[0]), clock.before(0));
-            }
-            let blocks: Vec<BlockOutput<'_>> = samples
-                .par_chunks_mut(LANES)
-                .zip(caches.par_iter_mut())
-                .enumerate()
-                .map(|(block, (samples, cache))| {
-                    let tokens: Vec<&TerrainToken> = (0..samples.len()).map(|l| &terrain[(block * LANES + l).min(distinct - 1)]).collect();
-                    let wheels = self.step_block(&scene, block * LANES, k, samples, cache, &tokens);
-                    BlockOutput { samples, cache, wheels }
-                })
-                .collect();
-            let sensors = &self.physics.at(clock.after(k + 1)).vehicle().effects.sensor;
-            for (block, output) in blocks.iter().enumerate() {
-                let _ = &output.cache;
-                for (lane, sample) in output.samples.iter().enumerate() {
-                    let row = (block * LANES + lane) * query.horizon + k;
-                    for (out, value) in rollout.states[row * STATE_DIM..].iter_mut().zip(reported(sensors, &sample.state).to_array()) {
-                        *out = value as f32;
-                    }
-                    rollout.sinkage_m[row * WHEELS..(row + 1) * WHEELS].copy_from_slice(&output.wheels[lane].sinkage_m);
-                    if let Some(risk) = &mut risk {
-                        risk.put(row, &output.wheels[lane].risk);
-                    }
-                }
-            }
-        }
-        rollout.flags = samples.iter().map(|s| s.flags).collect();
-        Ok((rollout, risk))
     }
 
     /// Form that a query asks for.
@@ -325,14 +212,19 @@ impl Predictor {
         let mut terrain = match (tokens, self.mode) {
             (None, _) => vec![[0.0; VALUES]; poses.len()],
             (Some(tokens), TerrainMode::Grid) => tokens.at(&self.projection, poses),
-            (Some(tokens), TerrainMode::Exact) => poses.par_iter().map(|p| self.projection.exact(tokens.map(), *p)).collect(),
+            (Some(tokens), TerrainMode::Exact) => self.projection.exact(tokens.map(), poses),
         };
+        self.default_soil(tokens, &mut terrain);
+        terrain
+    }
+
+    /// Puts the default soil into tokens of a map without semantics, or of none.
+    fn default_soil(&self, tokens: Option<&TerrainTokens>, terrain: &mut [TerrainToken]) {
         if !tokens.is_some_and(|t| t.map().has_semantics()) {
-            for token in &mut terrain {
+            for token in terrain {
                 token[HIDDEN..].copy_from_slice(&self.bundle.normalization.default_soil_raw);
             }
         }
-        terrain
     }
 
     /// Encodes the measured history for a form that remembers it.
@@ -373,84 +265,6 @@ impl Predictor {
         let (height, _, _) = ground.at(&model.vehicle().effects.map, state.position_m[0], state.position_m[1]);
         let raw = token_entries(state, previous, [control.speed_m_s, control.second], height, self.bundle.normalization.dt_s);
         self.token_scale.apply(raw)
-    }
-
-    /// Advances up to sixteen samples by one step; returns what their wheels did.
-    fn step_block(
-        &self,
-        scene: &Scene<'_>,
-        first: usize,
-        k: usize,
-        samples: &mut [Sample],
-        cache: &mut BlockCache,
-        terrain: &[&TerrainToken],
-    ) -> Vec<StepRow> {
-        let scales = &self.bundle.normalization;
-        let query = scene.query;
-        let time_s = scene.clock.after(k);
-        let model = self.physics.at(time_s);
-        let last = samples.len() - 1;
-        let controls: Vec<Control<f64>> = (0..samples.len()).map(|l| scene.control(first + l, k)).collect();
-        let entries: Vec<[f32; STATE_CONTROL]> = samples
-            .iter()
-            .zip(&controls)
-            .map(|(s, control)| self.entries(model, &s.state, s.previous.as_ref(), control, &scene.ground))
-            .collect();
-        let entry_lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| core::array::from_fn(|l| entries[l.min(last)][i]));
-        let context: [Lane; HIDDEN] = core::array::from_fn(|i| core::array::from_fn(|l| terrain[l.min(last)][i]));
-        let (raw_sinkage, raw_residual) = self.network.step(&scene.prefix, cache, &entry_lanes, &context);
-
-        let rows: Vec<(DrivelineState, [f32; DIFFERENTIABLE], [f32; CONSTANT], bool)> = samples
-            .iter()
-            .zip(&controls)
-            .enumerate()
-            .map(|(l, (sample, control))| {
-                let after = sample.actuators.advance(model.vehicle(), control, sample.state.velocity_m_s[0], model.dt_s());
-                let wheels = match query.wheels {
-                    Some(measured) => measured_wheels(model.vehicle(), &measured[k].speed_rad_s, &measured[k].angle_rad),
-                    None => command_wheels(model.vehicle(), &sample.actuators, &after, control),
-                };
-                let (ground, known) = scene.ground.under_wheels(model, &sample.state, scene.datum_m);
-                let soil = self.soil_at(under(scene.soil, first + l, sample, terrain[l]), time_s);
-                let ratio: [f32; WHEELS] = core::array::from_fn(|i| match scene.variant {
-                    Variant::ZeroSinkage => NO_SINKAGE,
-                    _ => scales.sinkage_log_ratio_max * raw_sinkage[i][l].tanh(),
-                });
-                (
-                    after,
-                    varying_row(&sample.state, scene.datum_m, &ratio, &soil),
-                    pack_constants(&wheels, &ground, sample.state.attitude_rad[2]),
-                    known,
-                )
-            })
-            .collect();
-
-        let mut wheels = vec![StepRow::default(); samples.len()];
-        for half in (0..samples.len()).step_by(8) {
-            let at = |l: usize| (half + l).min(last);
-            let varying = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].1[c])));
-            let constant = core::array::from_fn(|c| f32x8::from(core::array::from_fn::<f32, 8, _>(|l| rows[at(l)].2[c])));
-            let input = step_input(varying, constant);
-            let output = symbolic_step(scene.variant, model, &input);
-            let increment = output.increment.to_array().map(f32x8::to_array);
-            let sinkages = output.contacts.map(|contact| contact.sinkage_m.to_array());
-            let risks = scene.risk.then(|| risk::of_lanes(model, &input, &output.contacts));
-            for l in 0..8.min(samples.len() - half) {
-                let lane = half + l;
-                let total: [f64; STATE_DIM] = core::array::from_fn(|i| {
-                    let residual = match scene.variant {
-                        Variant::NoResidual => 0.0,
-                        _ => raw_residual[i][lane] * scales.residual_scale[i],
-                    };
-                    f64::from(increment[i][l] + residual)
-                });
-                wheels[lane].sinkage_m = core::array::from_fn(|w| sinkages[w][l]);
-                wheels[lane].risk = risks.map_or_else(RiskRow::default, |risks| risks[l]);
-                let (after, _, _, known) = rows[lane];
-                self.advance(&mut samples[lane], &total, after, known, &controls[lane]);
-            }
-        }
-        wheels
     }
 
     /// x' = x + Δx, actuators and flags.
@@ -503,16 +317,4 @@ fn raw_soil(token: &TerrainToken) -> [f32; SOIL_DIM] {
 fn control(query: &RolloutQuery<'_>, sample: usize, k: usize) -> Control<f64> {
     let at = (sample * query.horizon + k) * 2;
     Control { speed_m_s: f64::from(query.controls[at]), second: f64::from(query.controls[at + 1]) }
-}
-
-/// The differentiable columns of a step row.
-fn varying_row(state: &VehicleState<f64>, datum_m: f64, ratio: &[f32; WHEELS], soil: &[f64; SOIL_DIM]) -> [f32; DIFFERENTIABLE] {
-    let x = state.to_array();
-    core::array::from_fn(|c| match c {
-        0 => (x[2] - datum_m) as f32,
-        1 | 2 => x[c + 2] as f32,
-        c if c < STATE_COLUMNS => x[c + 3] as f32,
-        c if c < SOIL_AT => ratio[c - SINKAGE_AT],
-        c => soil[c - SOIL_AT] as f32,
-    })
 }

@@ -4,56 +4,63 @@ use nesam_physics::SOIL_DIM;
 
 use crate::ModelError;
 use crate::dims::{FEATURE_CHANNELS, FEATURE_PX, SOIL_PRIOR_PARAMETERS};
+use crate::fused::{After, Lane, Packed, Row, Vector, add_rows, linear, linear_of};
 use crate::weights::Weights;
 
-/// The soil prior head.
+/// Filters of the two convolutions.
+const FILTERS: [usize; 2] = [32, 64];
+/// Width of the hidden layer.
+const HIDDEN_UNITS: usize = 64;
+
+/// The soil prior head, many patches at a time in lanes.
 #[derive(Clone, Debug)]
 pub struct SoilPrior {
-    conv1: Vec<[f32; 32]>,
-    bias1: [f32; 32],
-    conv2: Vec<[f32; 64]>,
-    bias2: [f32; 64],
-    hidden: Vec<f32>,
-    hidden_bias: Vec<f32>,
-    out: Vec<f32>,
-    out_bias: Vec<f32>,
+    conv1: Packed,
+    conv2: Packed,
+    hidden: Packed,
+    out: Packed,
 }
 
-fn silu(x: f32) -> f32 {
-    x / (1.0 + (-x).exp())
-}
-
-fn transposed<const O: usize>(weight: &[f32], inputs: usize) -> Vec<[f32; O]> {
-    (0..inputs).map(|k| core::array::from_fn(|o| weight[o * inputs + k])).collect()
-}
-
-/// Stride-2 3×3 convolution with zero padding and SiLU of an image (px, px, channels).
-fn conv_silu<const O: usize>(image: &[f32], px: usize, channels: usize, weight: &[[f32; O]], bias: &[f32; O]) -> Vec<[f32; O]> {
-    let out = px / 2;
-    let mut result = Vec::with_capacity(out * out);
-    for oy in 0..out {
-        for ox in 0..out {
-            let mut acc = *bias;
-            for ky in 0..3 {
-                let y = (2 * oy + ky) as isize - 1;
-                for kx in 0..3 {
-                    let x = (2 * ox + kx) as isize - 1;
-                    if y < 0 || x < 0 {
-                        continue; // stride 2 on an even size only reaches past the first row and column
-                    }
-                    let at = (y as usize * px + x as usize) * channels;
-                    let rows = &weight[(ky * 3 + kx) * channels..(ky * 3 + kx + 1) * channels];
-                    for (value, row) in image[at..at + channels].iter().zip(rows) {
-                        for o in 0..O {
-                            acc[o] = value.mul_add(row[o], acc[o]);
-                        }
-                    }
-                }
+/// A stride-2 3×3 convolution with zero padding and SiLU of images (px, px, channels) as rows; calls `store(pixel, filters)` for each output pixel.
+#[inline(always)]
+fn convolve<V: Vector, const H: usize>(
+    matrix: &Packed,
+    image: &[Row<H>],
+    px: usize,
+    filters: &mut [Row<H>],
+    mut store: impl FnMut(usize, &[Row<H>]),
+) {
+    let channels = image.len() / (px * px);
+    let black = [Lane::ZERO; H];
+    let mut inputs: Vec<&Row<H>> = vec![&black; 9 * channels];
+    for pixel in 0..px * px / 4 {
+        let (oy, ox) = (pixel / (px / 2), pixel % (px / 2));
+        for (tap, inputs) in inputs.chunks_exact_mut(channels).enumerate() {
+            // Stride 2 on an even size only reaches past the first row and column.
+            let (y, x) = ((2 * oy + tap / 3).checked_sub(1), (2 * ox + tap % 3).checked_sub(1));
+            for (c, input) in inputs.iter_mut().enumerate() {
+                *input = match (y, x) {
+                    (Some(y), Some(x)) => &image[(y * px + x) * channels + c],
+                    _ => &black,
+                };
             }
-            result.push(acc.map(silu));
         }
+        linear_of::<V, H, _>(matrix, After::Silu, Rows(&inputs), filters);
+        store(pixel, filters);
     }
-    result
+}
+
+/// Rows that lie anywhere.
+#[derive(Clone, Copy)]
+struct Rows<'a, 'b, const H: usize>(&'b [&'a Row<H>]);
+
+impl<'a, 'b, const H: usize> IntoIterator for Rows<'a, 'b, H> {
+    type Item = &'a Row<H>;
+    type IntoIter = core::iter::Copied<core::slice::Iter<'b, &'a Row<H>>>;
+    #[inline(always)]
+    fn into_iter(self) -> Self::IntoIter {
+        self.0.iter().copied()
+    }
 }
 
 impl SoilPrior {
@@ -67,34 +74,47 @@ impl SoilPrior {
             let reason = format!("has {parameters} parameters, expected {SOIL_PRIOR_PARAMETERS}");
             return Err(ModelError::Weights { name: "soil".into(), reason });
         }
-        let array = |name: &str, shape: &[usize]| weights.get(name, shape);
-        let bias = |name: &str, n: usize| weights.get(name, &[n]);
+        let layer = |name: &str, outputs: usize, inputs: usize| -> Result<Packed, ModelError> {
+            let weight = weights.get(&format!("soil.{name}.weight"), &[outputs, inputs])?;
+            Ok(Packed::from_rows(weight, weights.get(&format!("soil.{name}.bias"), &[outputs])?))
+        };
         Ok(Self {
-            conv1: transposed(array("soil.conv1.weight", &[32, 9 * FEATURE_CHANNELS])?, 9 * FEATURE_CHANNELS),
-            bias1: bias("soil.conv1.bias", 32)?.try_into().expect("shape was checked; this is a bug"),
-            conv2: transposed(array("soil.conv2.weight", &[64, 9 * 32])?, 9 * 32),
-            bias2: bias("soil.conv2.bias", 64)?.try_into().expect("shape was checked; this is a bug"),
-            hidden: array("soil.hidden.weight", &[64, 64])?.to_vec(),
-            hidden_bias: bias("soil.hidden.bias", 64)?.to_vec(),
-            out: array("soil.out.weight", &[SOIL_DIM, 64])?.to_vec(),
-            out_bias: bias("soil.out.bias", SOIL_DIM)?.to_vec(),
+            conv1: layer("conv1", FILTERS[0], 9 * FEATURE_CHANNELS)?,
+            conv2: layer("conv2", FILTERS[1], 9 * FILTERS[0])?,
+            hidden: layer("hidden", HIDDEN_UNITS, FILTERS[1])?,
+            out: layer("out", SOIL_DIM, HIDDEN_UNITS)?,
         })
     }
 
-    /// Raw soil coordinates of semantic features (16, 16, 18); `soil_coordinates::from_raw` makes them a soil.
-    pub fn raw(&self, features: &[f32]) -> [f32; SOIL_DIM] {
-        let first = conv_silu(features, FEATURE_PX, FEATURE_CHANNELS, &self.conv1, &self.bias1);
-        let second = conv_silu(first.as_flattened(), FEATURE_PX / 2, 32, &self.conv2, &self.bias2);
-        let mut pooled = [0f32; 64];
-        for pixel in &second {
-            for (sum, value) in pooled.iter_mut().zip(pixel) {
-                *sum += value / second.len() as f32;
+    /// Raw soil coordinates (6) of semantic features (16, 16, 18), a patch in each lane; `soil_coordinates::from_raw` makes them a soil.
+    #[inline(always)]
+    pub(crate) fn raw<V: Vector, const H: usize>(&self, features: &[Row<H>]) -> [Row<H>; SOIL_DIM] {
+        let zero = [Lane::ZERO; H];
+        let (half, quarter) = (FEATURE_PX / 2, FEATURE_PX / 4);
+        let mut first = vec![zero; half * half * FILTERS[0]];
+        let mut filters = [zero; FILTERS[0]];
+        convolve::<V, H>(&self.conv1, features, FEATURE_PX, &mut filters, |pixel, filters| {
+            first[pixel * FILTERS[0]..(pixel + 1) * FILTERS[0]].copy_from_slice(filters);
+        });
+        let mut second = vec![zero; quarter * quarter * FILTERS[1]];
+        let mut filters = [zero; FILTERS[1]];
+        convolve::<V, H>(&self.conv2, &first, half, &mut filters, |pixel, filters| {
+            second[pixel * FILTERS[1]..(pixel + 1) * FILTERS[1]].copy_from_slice(filters);
+        });
+        let mut pooled = [zero; FILTERS[1]];
+        for pixel in second.chunks_exact(FILTERS[1]) {
+            add_rows::<V, H>(&mut pooled, pixel);
+        }
+        let share = V::splat(1.0 / (quarter * quarter) as f32);
+        for row in &mut pooled {
+            for h in 0..H {
+                V::load(&row[h].0).mul(share).store(&mut row[h].0);
             }
         }
-        let dense = |weight: &[f32], bias: &[f32], x: &[f32], o: usize| {
-            bias[o] + weight[o * x.len()..(o + 1) * x.len()].iter().zip(x).map(|(w, v)| w * v).sum::<f32>()
-        };
-        let hidden: Vec<f32> = (0..64).map(|o| silu(dense(&self.hidden, &self.hidden_bias, &pooled, o))).collect();
-        core::array::from_fn(|o| dense(&self.out, &self.out_bias, &hidden, o))
+        let mut hidden = [zero; HIDDEN_UNITS];
+        linear::<V, H>(&self.hidden, After::Silu, &pooled, &mut hidden);
+        let mut out = [zero; 8];
+        linear::<V, H>(&self.out, After::Store, &hidden, &mut out);
+        core::array::from_fn(|i| out[i])
     }
 }

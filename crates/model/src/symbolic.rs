@@ -16,17 +16,20 @@ pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepI
     let zero = T::lit(0.0);
     let none = WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero };
     let without_soil = |increment| StepOutput { increment, contacts: [none; WHEELS] };
-    match variant {
-        Variant::Full | Variant::NoResidual | Variant::ZeroSinkage => model.step(input),
+    let input = match variant {
+        Variant::Full | Variant::NoResidual | Variant::ZeroSinkage => *input,
         Variant::RigidResidual => {
             let soil = Soil::from_array(FLOOR.to_array().map(T::lit));
-            without_soil(model.step(&StepInput { soil, sinkage_log_ratio: [zero; WHEELS], ..*input }).increment)
+            StepInput { soil, sinkage_log_ratio: [zero; WHEELS], ..*input }
         }
-        Variant::KinematicResidual => without_soil(bicycle(model, input)),
+        Variant::KinematicResidual => return without_soil(bicycle(model, input)),
         Variant::Transformer | Variant::TalElevSem | Variant::TalElev | Variant::TalSem => {
-            without_soil(VehicleState::from_array([zero; 12]))
+            return without_soil(VehicleState::from_array([zero; 12]));
         }
-    }
+    };
+    // One call for all forms: the step is inlined here, and it is long.
+    let output = model.step(&input);
+    if variant == Variant::RigidResidual { without_soil(output.increment) } else { output }
 }
 
 /// A bicycle (or a differential drive) that rolls without slip: speed follows the command with a lag, the turn follows from road-wheel angle and rim

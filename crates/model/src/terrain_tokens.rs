@@ -4,9 +4,10 @@
 //! a grid in position and heading and interpolated trilinearly between them. Nodes depend on nothing but the map, so a
 //! prediction does not depend on what was asked before it. The cache belongs to one map version and one bundle.
 
-use std::collections::HashMap;
+mod store;
+
+use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, RwLock};
 
 use nesam_physics::SOIL_DIM;
 use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
@@ -14,31 +15,31 @@ use rayon::prelude::*;
 
 use crate::dims::{CONTEXT, FEATURES, HIDDEN};
 use crate::encoder::{EncoderScratch, TerrainEncoders};
+use crate::fused::{After, Kernel, LANES, Lane, Packed, Path, Vector, linear};
 use crate::soil_prior::SoilPrior;
+use store::NodeStore;
 
 /// Spacing of the pose grid: 0.25 m and 5 degrees (interpolation error 4 % of the token's spread on trained encoders).
 pub const GRID_M: f64 = 0.25;
 /// Headings on the grid: one every 5 degrees.
 pub const HEADINGS: i32 = 72;
-/// Nodes after which a cache forgets all it has (0.5 kB each).
-const NODES_MAX: usize = 400_000;
-
 /// Token and soil at one pose: W_c c (128) and raw soil (6).
 pub const VALUES: usize = HIDDEN + SOIL_DIM;
 /// W_c c followed by the raw soil prior.
 pub type TerrainToken = [f32; VALUES];
 
-/// Node of the pose grid.
-type Node = (i32, i32, i32);
+/// Node of the pose grid: x, y, heading.
+pub type Node = (i32, i32, i32);
 
-/// Maps a patch to its token: encoders, projection W_c and soil prior of a bundle.
+/// Maps patches to their tokens: encoders, projection W_c and soil prior of a bundle.
 #[derive(Clone, Debug)]
 pub struct TerrainProjection {
     encoders: TerrainEncoders,
-    /// W_c transposed: (9216) rows of 128.
-    context: Vec<[f32; HIDDEN]>,
+    /// W_c, (128, 9216).
+    context: Packed,
     soil: SoilPrior,
     scale: PatchScale,
+    path: Path,
 }
 
 /// Buffers of one worker.
@@ -46,41 +47,74 @@ pub struct TerrainProjection {
 struct Scratch {
     patch: Patch,
     encoder: EncoderScratch,
-    context: Vec<f32>,
+    /// Contexts of a batch of patches, one after the other.
+    contexts: Vec<f32>,
 }
+
+/// Patches that are projected together: two vectors.
+const BATCH: usize = 2 * LANES;
 
 impl TerrainProjection {
     /// Bundles the parts; `context` is W_c, (128, 9216) row-major.
     pub fn new(encoders: TerrainEncoders, context: &[f32], soil: SoilPrior, scale: PatchScale) -> Self {
-        let context = (0..CONTEXT).map(|k| core::array::from_fn(|o| context[o * CONTEXT + k])).collect();
-        Self { encoders, context, soil, scale }
+        Self { encoders, context: Packed::from_rows(context, &[0.0; HIDDEN]), soil, scale, path: Path::fastest() }
     }
 
-    /// The exact token at a pose.
-    fn token(&self, map: &WorldMap, pose: Pose2, scratch: &mut Scratch) -> TerrainToken {
-        sample_patch(map, pose, &self.scale, &mut scratch.patch);
-        scratch.context.resize(CONTEXT, 0.0);
-        self.encoders.encode(&scratch.patch, &mut scratch.encoder, &mut scratch.context);
-        let mut token = [0.0; VALUES];
-        // Eight partial sums keep the adds independent.
-        let mut sums = [[0f32; HIDDEN]; 2];
-        for (pair, rows) in scratch.context.chunks_exact(2).zip(self.context.chunks_exact(2)) {
-            for half in 0..2 {
-                for o in 0..HIDDEN {
-                    sums[half][o] = pair[half].mul_add(rows[half][o], sums[half][o]);
+    /// The same on another path.
+    pub fn on(&self, path: Path) -> Self {
+        Self { path, encoders: self.encoders.on(path), ..self.clone() }
+    }
+
+    /// The exact tokens at up to [`BATCH`] poses. A pose's token does not depend on the others.
+    fn tokens(&self, map: &WorldMap, poses: &[Pose2], scratch: &mut Scratch) -> Vec<TerrainToken> {
+        let Scratch { patch, encoder, contexts } = scratch;
+        contexts.resize(poses.len() * CONTEXT, 0.0);
+        for (pose, context) in poses.iter().zip(contexts.chunks_exact_mut(CONTEXT)) {
+            sample_patch(map, *pose, &self.scale, patch);
+            self.encoders.encode(patch, encoder, context);
+        }
+        self.path.run(Project { projection: self, contexts })
+    }
+
+    /// The exact tokens at poses, in parallel.
+    pub fn exact(&self, map: &WorldMap, poses: &[Pose2]) -> Vec<TerrainToken> {
+        // Every worker gets a batch, even when that leaves lanes empty.
+        let batch = poses.len().div_ceil(rayon::current_num_threads()).clamp(1, BATCH);
+        let of_batch = |scratch: &mut Scratch, poses: &[Pose2]| self.tokens(map, poses, scratch);
+        poses.par_chunks(batch).map_init(Scratch::default, of_batch).flatten_iter().collect()
+    }
+}
+
+/// Vectors of a batch.
+const H: usize = BATCH / LANES;
+
+/// Contexts of up to [`BATCH`] patches to their tokens, a patch in each lane.
+struct Project<'a> {
+    projection: &'a TerrainProjection,
+    contexts: &'a [f32],
+}
+
+impl Kernel for Project<'_> {
+    type Output = Vec<TerrainToken>;
+    #[inline(always)]
+    fn run<V: Vector>(self) -> Vec<TerrainToken> {
+        let patches = self.contexts.len() / CONTEXT;
+        let mut rows = vec![[Lane::ZERO; H]; CONTEXT];
+        for (group, rows) in rows.chunks_exact_mut(LANES).enumerate() {
+            for (patch, context) in self.contexts.chunks_exact(CONTEXT).enumerate() {
+                for (row, value) in rows.iter_mut().zip(&context[group * LANES..(group + 1) * LANES]) {
+                    row[patch / LANES][patch % LANES] = *value;
                 }
             }
         }
-        for o in 0..HIDDEN {
-            token[o] = sums[0][o] + sums[1][o];
-        }
-        token[HIDDEN..].copy_from_slice(&self.soil.raw(&scratch.context[FEATURES..]));
-        token
-    }
-
-    /// The exact token at a pose, without the cache.
-    pub fn exact(&self, map: &WorldMap, pose: Pose2) -> TerrainToken {
-        self.token(map, pose, &mut Scratch::default())
+        let mut context = [[Lane::ZERO; H]; HIDDEN];
+        linear::<V, H>(&self.projection.context, After::Store, &rows, &mut context);
+        let soil = self.projection.soil.raw::<V, H>(&rows[FEATURES..]);
+        let value = |patch: usize, i: usize| {
+            let row = if i < HIDDEN { &context[i] } else { &soil[i - HIDDEN] };
+            row[patch / LANES][patch % LANES]
+        };
+        (0..patches).map(|patch| core::array::from_fn(|i| value(patch, i))).collect()
     }
 }
 
@@ -88,7 +122,7 @@ impl TerrainProjection {
 #[derive(Debug)]
 pub struct TerrainTokens {
     map: Arc<WorldMap>,
-    nodes: RwLock<HashMap<Node, Arc<TerrainToken>>>,
+    nodes: NodeStore,
     looked_up: AtomicU64,
     encoded: AtomicU64,
 }
@@ -131,7 +165,7 @@ fn corners(pose: &Pose2) -> [(Node, f32); 8] {
 impl TerrainTokens {
     /// An empty cache of a map.
     pub fn new(map: Arc<WorldMap>) -> Self {
-        Self { map, nodes: RwLock::default(), looked_up: AtomicU64::new(0), encoded: AtomicU64::new(0) }
+        Self { map, nodes: NodeStore::default(), looked_up: AtomicU64::new(0), encoded: AtomicU64::new(0) }
     }
 
     /// The map.
@@ -146,52 +180,56 @@ impl TerrainTokens {
 
     /// Tokens at poses, interpolated; missing nodes are encoded first, in parallel.
     pub fn at(&self, projection: &TerrainProjection, poses: &[Pose2]) -> Vec<TerrainToken> {
-        let wanted: Vec<[(Node, f32); 8]> = poses.iter().map(corners).collect();
-        self.encode_missing(projection, &wanted);
-        let nodes = self.nodes.read().expect("no writer panics; this is a bug");
-        wanted
-            .iter()
-            .map(|corners| {
-                let mut token = [0.0; VALUES];
-                for (node, weight) in corners.iter().filter(|(_, w)| *w > 0.0) {
-                    // Another query may have emptied the cache in between; the node is a pure function of its pose.
-                    let values =
-                        nodes.get(node).cloned().unwrap_or_else(|| Arc::new(self.encode(projection, node, &mut Scratch::default())));
-                    for (sum, value) in token.iter_mut().zip(values.iter()) {
-                        *sum = weight.mul_add(*value, *sum);
-                    }
+        let mut tokens = vec![[0.0; VALUES]; poses.len()];
+        loop {
+            let mut missing = Vec::new();
+            self.try_at(poses, &mut tokens, &mut missing);
+            if missing.is_empty() {
+                return tokens;
+            }
+            // Another query may empty the cache in between, rarely; then this one begins again.
+            self.encode(projection, missing);
+        }
+    }
+
+    /// Tokens at poses, interpolated, from the nodes that are there; those that are not are added to `missing`, and then `tokens` are of no use.
+    pub fn try_at(&self, poses: &[Pose2], tokens: &mut [TerrainToken], missing: &mut Vec<Node>) {
+        let nodes = self.nodes.read();
+        for (pose, token) in poses.iter().zip(tokens) {
+            *token = [0.0; VALUES];
+            for (node, weight) in corners(pose) {
+                if weight <= 0.0 {
+                    continue;
                 }
-                token
-            })
-            .collect()
-    }
-
-    /// The exact token at a node.
-    fn encode(&self, projection: &TerrainProjection, node: &Node, scratch: &mut Scratch) -> TerrainToken {
-        let yaw_rad = f64::from(node.2) / f64::from(HEADINGS) * core::f64::consts::TAU;
-        let pose = Pose2 { x_m: f64::from(node.0) * GRID_M, y_m: f64::from(node.1) * GRID_M, yaw_rad };
-        projection.token(&self.map, pose, scratch)
-    }
-
-    fn encode_missing(&self, projection: &TerrainProjection, wanted: &[[(Node, f32); 8]]) {
-        let mut missing: Vec<Node> = {
-            let nodes = self.nodes.read().expect("no writer panics; this is a bug");
-            let used = wanted.iter().flatten().filter(|(_, w)| *w > 0.0).map(|(node, _)| *node);
-            used.filter(|node| !nodes.contains_key(node)).collect()
-        };
-        missing.sort_unstable();
-        missing.dedup();
-        self.looked_up.fetch_add(8 * wanted.len() as u64, Ordering::Relaxed);
-        self.encoded.fetch_add(missing.len() as u64, Ordering::Relaxed);
+                match nodes.get(node) {
+                    Some(values) => {
+                        for (sum, value) in token.iter_mut().zip(values.iter()) {
+                            *sum = weight.mul_add(*value, *sum);
+                        }
+                    }
+                    None => missing.push(node),
+                }
+            }
+        }
         if missing.is_empty() {
-            return;
+            self.looked_up.fetch_add(8 * poses.len() as u64, Ordering::Relaxed);
         }
-        let encoded: Vec<TerrainToken> =
-            missing.par_iter().map_init(Scratch::default, |scratch, node| self.encode(projection, node, scratch)).collect();
-        let mut nodes = self.nodes.write().expect("no writer panics; this is a bug");
-        if nodes.len() > NODES_MAX {
-            nodes.retain(|node, _| wanted.iter().flatten().any(|(w, _)| w == node));
-        }
-        nodes.extend(missing.into_iter().zip(encoded.into_iter().map(Arc::new)));
     }
+
+    /// Encodes nodes, in parallel; those that several poses miss once.
+    pub fn encode(&self, projection: &TerrainProjection, mut missing: Vec<Node>) {
+        // Nodes of one heading stand together.
+        missing.sort_unstable_by_key(|(x, y, heading)| (*heading, *x, *y));
+        missing.dedup();
+        self.encoded.fetch_add(missing.len() as u64, Ordering::Relaxed);
+        let poses: Vec<Pose2> = missing.iter().map(|node| pose_of(*node)).collect();
+        let encoded = projection.exact(&self.map, &poses);
+        self.nodes.insert(missing.into_iter().zip(encoded));
+    }
+}
+
+/// Pose of a node.
+fn pose_of((x, y, heading): Node) -> Pose2 {
+    let yaw_rad = f64::from(heading) / f64::from(HEADINGS) * core::f64::consts::TAU;
+    Pose2 { x_m: f64::from(x) * GRID_M, y_m: f64::from(y) * GRID_M, yaw_rad }
 }

@@ -2,6 +2,7 @@
 
 mod consistency;
 mod discovery;
+mod sweep;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -57,6 +58,15 @@ struct PredictBench {
     /// Seed of poses and commands
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Instructions to run on: avx512, or avx2 (portable where the build has no AVX2) [default: the fastest of this processor]
+    #[arg(long, value_name = "NAME")]
+    path: Option<String>,
+    /// Also time 64 to 2048 candidates on every path of this processor, terrain warm
+    #[arg(long)]
+    sweep: bool,
+    /// Also say where the time goes: lookup, network, physics, the rest
+    #[arg(long)]
+    parts: bool,
     /// Write the figures as JSON (schema nesam.bench/1)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -98,14 +108,16 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
     };
 
     // One replan after the other along the drive at the rate of the model, on a map that nobody has asked about yet.
-    let fresh = predictor_for(bundle.clone(), &drives.root)?;
+    let fresh = sweep::on_path(predictor_for(bundle.clone(), &drives.root)?, args.path.as_deref())?;
     let steady = (0..args.queries).map(|q| time(&fresh, drive.along(q), args.seed + q as u64)).collect::<Result<Vec<_>, _>>()?;
     // Poses all over the drive whose surroundings have been asked about before, with other commands.
     let warm_up =
         (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries), 1000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
     let before = drive.map.as_ref().map(|map| fresh.terrain_cache(map));
+    let processor_before = processor_time_ms();
     let mut warm =
         (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries) + 1, 2000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
+    let processor_ms = processor_time_ms().zip(processor_before).map(|(after, before)| (after - before) / args.queries as f64);
     let hit_rate = drive.map.as_ref().zip(before).map(|(map, before)| fresh.terrain_cache(map).since(before).hit_rate());
     progress.finish();
 
@@ -117,27 +129,37 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         "schema": "nesam.bench/1",
         "samples": args.samples,
         "horizon": args.horizon,
-        "path": path(),
+        "path": fresh.path().as_str(),
         "threads": rayon::current_num_threads(),
         "queries": args.queries,
         "p50_ms": p50,
         "p99_ms": percentile(&mut warm, 0.99),
+        "min_ms": percentile(&mut warm, 0.0),
+        "processor_ms": processor_ms,
         "cold_ms": steady[0],
         "warm_up_max_ms": warm_up.iter().copied().fold(0.0, f64::max),
         "tokens_per_s": (args.samples * args.horizon) as f64 / (p50 * 1e-3),
         "steady_p50_ms": steady_p50,
         "terrain_cache": {"hit_rate": hit_rate, "max_error": max_error},
+        "parts_ms": args.parts.then(|| sweep::parts(&drive, &fresh)).transpose()?,
+        "sweep": args.sweep.then(|| sweep::sweep(&drive, &fresh)).transpose()?,
         "provenance": provenance(Some(&bundle), &drives),
     });
     say!(
         "{} candidates x {} steps on the {} path, {} threads, {} queries",
         args.samples,
         args.horizon,
-        path(),
+        fresh.path().as_str(),
         rayon::current_num_threads(),
         args.queries
     );
     say!("  warm, new pose and new commands each   p50 {p50:9.1} ms   p99 {:9.1} ms", percentile(&mut warm, 0.99));
+    if let Some(processor_ms) = processor_ms {
+        say!(
+            "  the same, processor time of all threads  mean {processor_ms:8.1} ms   fastest {:5.1} ms of wall time",
+            percentile(&mut warm, 0.0)
+        );
+    }
     say!("  replans along a drive, new ground      p50 {steady_p50:9.1} ms");
     say!("  first query on an unseen map               {:9.1} ms", steady[0]);
     say!("  tokens per second, warm                    {:9.0}", (args.samples * args.horizon) as f64 / (p50 * 1e-3));
@@ -185,11 +207,16 @@ impl<'a> Planner<'a> {
 
     /// Commands of all candidates: the recorded command with correlated noise, inside the card's range; (samples, horizon, 2).
     fn controls(&self, at: usize, seed: u64) -> Vec<f32> {
+        self.controls_of(self.args.samples, at, seed)
+    }
+
+    /// The same for another number of candidates.
+    fn controls_of(&self, samples: usize, at: usize, seed: u64) -> Vec<f32> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let Control { speed_m_s, second } = self.steps[at].control;
         let sd = [NOISE_SD[0], NOISE_SD[1] * (self.range[1][1] - self.range[1][0]) as f32 * 0.5];
-        let mut controls = Vec::with_capacity(2 * self.args.samples * self.args.horizon);
-        for _ in 0..self.args.samples {
+        let mut controls = Vec::with_capacity(2 * samples * self.args.horizon);
+        for _ in 0..samples {
             let mut noise = [0f32; 2];
             for _ in 0..self.args.horizon {
                 for (c, nominal) in [speed_m_s, second].into_iter().enumerate() {
@@ -204,19 +231,23 @@ impl<'a> Planner<'a> {
     }
 
     fn ask(&self, predictor: &Predictor, at: usize, controls: &[f32]) -> Result<Rollout, Failure> {
-        let query = RolloutQuery {
+        predictor.rollout(&self.query(at, controls)).or_failed()
+    }
+
+    /// A query of as many candidates as there are commands.
+    fn query<'q>(&'q self, at: usize, controls: &'q [f32]) -> RolloutQuery<'q> {
+        RolloutQuery {
             history: &self.steps[..at],
             start: self.steps[at].state,
             controls,
-            samples: self.args.samples,
+            samples: controls.len() / self.args.horizon / 2,
             horizon: self.args.horizon,
             map: self.map.as_ref(),
             soil_correction: SoilCorrection::NONE,
             variant: Variant::Full,
             start_time_s: None,
             wheels: None,
-        };
-        predictor.rollout(&query).or_failed()
+        }
     }
 }
 
@@ -251,15 +282,13 @@ fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) ->
     Ok(moved.iter().zip(off).map(|(moved, off)| moved / off).reduce(f64::max))
 }
 
-/// Instructions that the kernels were compiled for.
-fn path() -> &'static str {
-    if cfg!(target_feature = "avx512f") {
-        "avx512"
-    } else if cfg!(target_feature = "avx2") {
-        "avx2"
-    } else {
-        "portable"
-    }
+/// Processor time of this process in user mode, all threads, ms; steadier than wall time on a machine that does other things. `None` where the system does
+/// not say.
+fn processor_time_ms() -> Option<f64> {
+    const TICK_MS: f64 = 10.0;
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // Fields after the name in parentheses; user time is the fourteenth of all.
+    text.rsplit_once(')')?.1.split_whitespace().nth(11)?.parse::<f64>().ok().map(|ticks| ticks * TICK_MS)
 }
 
 /// Value below which a share of the values lies, by rank.

@@ -1,8 +1,21 @@
 //! The fast inference path: blocks of samples in lanes, f32, no tensors. Same interface and same numbers, to rounding, as `reference`.
+//!
+//! `vector` holds the instructions, `elementary`, `kernels` and `convolution` the arithmetic, `transformer` and `prefix` the network, `real` the physics in lanes.
 
-mod lanes;
+mod convolution;
+mod elementary;
+mod kernels;
+mod prefix;
+mod real;
 mod transformer;
+mod vector;
 
-pub use lanes::{LANES, Lane};
+pub(crate) use convolution::{Convolution, Image};
+pub use kernels::Row;
+pub(crate) use kernels::{After, Packed, add_rows, linear, linear_of};
+pub use prefix::Prefix;
+pub(crate) use real::Numbers;
 pub(crate) use transformer::{Block, Dense};
-pub use transformer::{BlockCache, FusedTransformer, Prefix};
+pub use transformer::{BlockCache, FusedTransformer, Said};
+pub(crate) use vector::{Kernel, Vector};
+pub use vector::{LANES, Lane, Path};

@@ -1,15 +1,30 @@
 //! The causal Transformer over blocks of samples, with the history shared by all of them.
 
+use super::elementary::tanh;
+use super::kernels::{After, Packed, Row, add_rows, layer_norm, linear, own_scores, own_values, softmax};
+use super::prefix::Prefix;
+use super::vector::{Kernel, Lane, Path, Vector};
 use crate::ModelError;
 use crate::dims::*;
-use crate::fused::lanes::{LANES, Lane, add_assign, gelu, layer_norm, linear, softmax};
 use crate::weights::Weights;
 use nesam_physics::{STATE_DIM, WHEELS};
+
+/// Values that the heads give for a sample: raw residual, then tanh of the raw sinkage.
+const HEAD_VALUES: usize = STATE_DIM + WHEELS;
+/// 1 / √(head width): what scores are scaled by.
+pub(super) const SCORE_SCALE: f32 = 0.176_776_7;
 
 #[derive(Clone, Debug)]
 pub(crate) struct Dense {
     pub(crate) weight: Vec<f32>,
     pub(crate) bias: Vec<f32>,
+    pub(super) packed: Packed,
+}
+
+impl Dense {
+    fn new(weight: &[f32], bias: &[f32]) -> Self {
+        Self { weight: weight.to_vec(), bias: bias.to_vec(), packed: Packed::from_rows(weight, bias) }
+    }
 }
 
 #[derive(Clone, Debug)]
@@ -31,50 +46,76 @@ pub struct FusedTransformer {
     pub(crate) norm: Dense,
     pub(crate) sinkage: Dense,
     pub(crate) residual: Dense,
+    heads: Packed,
+    path: Path,
 }
 
-/// Keys and values of the measured history, computed once per query and shared by all samples: per block (positions, 128).
-#[derive(Clone, Debug, Default)]
-pub struct Prefix {
-    pub(crate) keys: Vec<Vec<f32>>,
-    pub(crate) values: Vec<Vec<f32>>,
-    pub(crate) tokens: usize,
-}
-
-/// Keys and values of the rollout of one block of samples: per Transformer block (steps, 128) lanes.
+/// What the network says of a block of samples.
 #[derive(Clone, Debug)]
-pub struct BlockCache {
-    keys: Vec<Vec<Lane>>,
-    values: Vec<Vec<Lane>>,
+pub struct Said<const H: usize> {
+    /// tanh of the raw sinkage of each wheel.
+    pub sinkage: [Row<H>; WHEELS],
+    /// Raw state residual.
+    pub residual: [Row<H>; STATE_DIM],
+}
+
+/// Keys and values of the rollout of one block of 16 H samples: per Transformer block (steps, 128) rows; and the buffers of a step.
+#[derive(Clone, Debug)]
+pub struct BlockCache<const H: usize> {
+    keys: [Vec<Row<H>>; BLOCKS],
+    values: [Vec<Row<H>>; BLOCKS],
+    room: usize,
     steps: usize,
     remembers: bool,
+    buffers: Buffers<H>,
 }
 
-impl BlockCache {
+#[derive(Clone, Debug)]
+struct Buffers<const H: usize> {
+    x: Vec<Row<H>>,
+    normal: Vec<Row<H>>,
+    qkv: Vec<Row<H>>,
+    attended: Vec<Row<H>>,
+    hidden: Vec<Row<H>>,
+    scores: Vec<Row<H>>,
+}
+
+impl<const H: usize> BlockCache<H> {
     /// An empty cache with room for `horizon` steps; one that does not remember holds a single step at a time.
     pub fn new(horizon: usize, remembers: bool) -> Self {
-        let steps = if remembers { horizon } else { 1 };
-        let room = || (0..BLOCKS).map(|_| Vec::with_capacity(steps * HIDDEN)).collect();
-        Self { keys: room(), values: room(), steps: 0, remembers }
+        let room = if remembers { horizon } else { 1 };
+        let rows = |count: usize| vec![[Lane::ZERO; H]; count];
+        Self {
+            keys: core::array::from_fn(|_| rows(room * HIDDEN)),
+            values: core::array::from_fn(|_| rows(room * HIDDEN)),
+            room,
+            steps: 0,
+            remembers,
+            buffers: Buffers {
+                x: rows(HIDDEN),
+                normal: rows(HIDDEN),
+                qkv: rows(3 * HIDDEN),
+                attended: rows(HIDDEN),
+                hidden: rows(FEED_FORWARD),
+                scores: rows(POSITIONS),
+            },
+        }
     }
 
-    fn clear(&mut self) {
-        self.keys.iter_mut().chain(&mut self.values).for_each(Vec::clear);
+    /// Forgets the steps, for another block of samples.
+    pub fn clear(&mut self) {
         self.steps = 0;
     }
 }
 
 impl FusedTransformer {
-    /// From the arrays of the bundle.
+    /// From the arrays of the bundle, for the fastest path of this processor.
     ///
     /// # Errors
     /// `ModelError::Weights` naming the array at fault.
     pub fn new(weights: &Weights) -> Result<Self, ModelError> {
         let dense = |name: &str, shape: &[usize]| -> Result<Dense, ModelError> {
-            Ok(Dense {
-                weight: weights.get(&format!("{name}.weight"), shape)?.to_vec(),
-                bias: weights.get(&format!("{name}.bias"), &shape[..1])?.to_vec(),
-            })
+            Ok(Dense::new(weights.get(&format!("{name}.weight"), shape)?, weights.get(&format!("{name}.bias"), &shape[..1])?))
         };
         let blocks = (0..BLOCKS)
             .map(|b| {
@@ -89,193 +130,166 @@ impl FusedTransformer {
                 })
             })
             .collect::<Result<_, ModelError>>()?;
+        let sinkage = dense("sinkage", &[WHEELS, HIDDEN])?;
+        let residual = dense("residual", &[STATE_DIM, HIDDEN])?;
+        let heads = Packed::from_rows(&[&residual.weight[..], &sinkage.weight].concat(), &[&residual.bias[..], &sinkage.bias].concat());
         Ok(Self {
-            token: Dense {
-                weight: weights.get("token.state.weight", &[HIDDEN, STATE_CONTROL])?.to_vec(),
-                bias: weights.get("token.bias", &[HIDDEN])?.to_vec(),
-            },
+            token: Dense::new(weights.get("token.state.weight", &[HIDDEN, STATE_CONTROL])?, weights.get("token.bias", &[HIDDEN])?),
             position: weights.get("position", &[POSITIONS, HIDDEN])?.to_vec(),
             blocks,
             norm: dense("norm", &[HIDDEN])?,
-            sinkage: dense("sinkage", &[WHEELS, HIDDEN])?,
-            residual: dense("residual", &[STATE_DIM, HIDDEN])?,
+            sinkage,
+            residual,
+            heads,
+            path: Path::fastest(),
         })
     }
 
-    /// Embeds scaled entries and context tokens at a position: x = W_s entries + b + W_c c + position.
-    fn embed(&self, entries: &[Lane; STATE_CONTROL], context: &[Lane; HIDDEN], position: impl Fn(usize) -> usize) -> Vec<Lane> {
-        let mut x = vec![[0f32; LANES]; HIDDEN];
-        linear(&self.token.weight, &self.token.bias, entries, &mut x);
-        for (o, row) in x.iter_mut().enumerate() {
-            for l in 0..LANES {
-                row[l] += context[o][l] + self.position[position(l).min(POSITIONS - 1) * HIDDEN + o];
-            }
-        }
-        x
+    /// The same on another path.
+    pub fn on(&self, path: Path) -> Self {
+        Self { path, ..self.clone() }
     }
 
-    /// Encodes the measured history: `entries` and `contexts` oldest first, right-aligned so that the next token takes position 31.
-    pub fn prefix(&self, entries: &[[f32; STATE_CONTROL]], contexts: &[[f32; HIDDEN]]) -> Prefix {
-        let tokens = entries.len().min(HISTORY - 1);
-        let (entries, contexts) = (&entries[entries.len() - tokens..], &contexts[contexts.len() - tokens..]);
-        let first = HISTORY - 1 - tokens;
-        let lane = |chunk: usize, l: usize| (chunk * LANES + l).min(tokens.max(1) - 1);
-        let chunks = tokens.div_ceil(LANES);
-        let of_chunk = |chunk: usize| chunk * LANES..tokens.min((chunk + 1) * LANES);
-        let mut hidden: Vec<Vec<Lane>> = (0..chunks)
-            .map(|chunk| {
-                let e = core::array::from_fn(|i| core::array::from_fn(|l| entries[lane(chunk, l)][i]));
-                let c = core::array::from_fn(|i| core::array::from_fn(|l| contexts[lane(chunk, l)][i]));
-                self.embed(&e, &c, |l| first + chunk * LANES + l)
-            })
-            .collect();
-        let mut prefix = Prefix { tokens, ..Prefix::default() };
-        for (index, block) in self.blocks.iter().enumerate() {
-            let mut queries = vec![0f32; tokens * HIDDEN];
-            let (mut keys, mut values) = (vec![0f32; tokens * HIDDEN], vec![0f32; tokens * HIDDEN]);
-            for (chunk, x) in hidden.iter().enumerate() {
-                let qkv = block.qkv(x);
-                for (l, token) in of_chunk(chunk).enumerate() {
-                    for (part, rows) in [&mut queries, &mut keys, &mut values].into_iter().enumerate() {
-                        let row = &mut rows[token * HIDDEN..(token + 1) * HIDDEN];
-                        row.iter_mut().zip(&qkv[part * HIDDEN..]).for_each(|(number, lane)| *number = lane[l]);
-                    }
-                }
-            }
-            if index + 1 < BLOCKS {
-                for (chunk, x) in hidden.iter_mut().enumerate() {
-                    let mut attended = vec![[0f32; LANES]; HIDDEN];
-                    for (l, token) in of_chunk(chunk).enumerate() {
-                        attend_history(&queries, &keys, &values, token, |o, v| attended[o][l] = v);
-                    }
-                    block.finish(x, &attended);
-                }
-            }
-            prefix.keys.push(keys);
-            prefix.values.push(values);
-        }
-        prefix
+    /// Instructions that it runs on.
+    pub fn path(&self) -> Path {
+        self.path
     }
 
-    /// One step of a block of samples: returns raw sinkage (4) and raw residual (12), and extends the cache.
-    pub fn step(
+    /// Embedding of a position.
+    pub(super) fn position(&self, position: usize) -> &[f32] {
+        let at = position.min(POSITIONS - 1) * HIDDEN;
+        &self.position[at..at + HIDDEN]
+    }
+
+    /// One step of a block of samples: scaled entries (14) and context tokens W_c c (128) in, what the network says out; extends the cache.
+    pub fn step<const H: usize>(
         &self,
         prefix: &Prefix,
-        cache: &mut BlockCache,
-        entries: &[Lane; STATE_CONTROL],
-        context: &[Lane; HIDDEN],
-    ) -> ([Lane; WHEELS], [Lane; STATE_DIM]) {
+        cache: &mut BlockCache<H>,
+        entries: &[Row<H>; STATE_CONTROL],
+        context: &[Row<H>; HIDDEN],
+    ) -> Said<H> {
         if !cache.remembers {
             cache.clear();
         }
-        let position = HISTORY - 1 + cache.steps;
-        let mut x = self.embed(entries, context, |_| position);
-        for (index, block) in self.blocks.iter().enumerate() {
-            let qkv = block.qkv(&x);
-            cache.keys[index].extend_from_slice(&qkv[HIDDEN..2 * HIDDEN]);
-            cache.values[index].extend_from_slice(&qkv[2 * HIDDEN..]);
-            let mut attended = vec![[0f32; LANES]; HIDDEN];
-            for head in 0..HEADS {
-                attend(head, &qkv, prefix, cache, index, &mut attended);
-            }
-            block.finish(&mut x, &attended);
-        }
-        cache.steps += 1;
-        let mut normal = vec![[0f32; LANES]; HIDDEN];
-        layer_norm(&x, &self.norm.weight, &self.norm.bias, NORM_EPS, &mut normal);
-        let (mut sinkage, mut residual) = ([[0f32; LANES]; WHEELS], [[0f32; LANES]; STATE_DIM]);
-        linear(&self.sinkage.weight, &self.sinkage.bias, &normal, &mut sinkage);
-        linear(&self.residual.weight, &self.residual.bias, &normal, &mut residual);
-        (sinkage, residual)
+        assert!(cache.steps < cache.room, "a rollout has no more steps than its cache has room for; this is a bug");
+        self.path.run(Step { network: self, prefix, cache, entries, context })
     }
 }
 
-impl Block {
-    /// Queries, keys and values (384) of pre-normalised hidden states.
-    fn qkv(&self, x: &[Lane]) -> Vec<Lane> {
-        let mut normal = vec![[0f32; LANES]; HIDDEN];
-        layer_norm(x, &self.norm1.weight, &self.norm1.bias, NORM_EPS, &mut normal);
-        let mut qkv = vec![[0f32; LANES]; 3 * HIDDEN];
-        linear(&self.qkv.weight, &self.qkv.bias, &normal, &mut qkv);
-        qkv
-    }
+/// One step of a block of samples.
+struct Step<'a, const H: usize> {
+    network: &'a FusedTransformer,
+    prefix: &'a Prefix,
+    cache: &'a mut BlockCache<H>,
+    entries: &'a [Row<H>; STATE_CONTROL],
+    context: &'a [Row<H>; HIDDEN],
+}
 
-    /// Output projection and feed-forward network, both added to x.
-    fn finish(&self, x: &mut [Lane], attended: &[Lane]) {
-        let mut delta = vec![[0f32; LANES]; HIDDEN];
-        linear(&self.out.weight, &self.out.bias, attended, &mut delta);
-        add_assign(x, &delta);
-        layer_norm(x, &self.norm2.weight, &self.norm2.bias, NORM_EPS, &mut delta);
-        let mut hidden = vec![[0f32; LANES]; FEED_FORWARD];
-        linear(&self.up.weight, &self.up.bias, &delta, &mut hidden);
-        gelu(&mut hidden);
-        linear(&self.down.weight, &self.down.bias, &hidden, &mut delta);
-        add_assign(x, &delta);
+impl<const H: usize> Kernel for Step<'_, H> {
+    type Output = Said<H>;
+    #[inline(always)]
+    fn run<V: Vector>(self) -> Said<H> {
+        let Self { network, prefix, cache, entries, context } = self;
+        let step = cache.steps;
+        let BlockCache { keys, values, buffers, .. } = cache;
+        let Buffers { x, normal, qkv, attended, hidden, scores } = buffers;
+        embed::<V, H>(network, Some(HISTORY - 1 + step), entries, context, x);
+        for (index, block) in network.blocks.iter().enumerate() {
+            project::<V, H>(block, x, normal, qkv);
+            let own = step * HIDDEN..(step + 1) * HIDDEN;
+            keys[index][own.clone()].copy_from_slice(&qkv[HIDDEN..2 * HIDDEN]);
+            values[index][own].copy_from_slice(&qkv[2 * HIDDEN..]);
+            let (keys, values) = (&keys[index][..(step + 1) * HIDDEN], &values[index][..(step + 1) * HIDDEN]);
+            for head in 0..HEADS {
+                attend::<V, H>(head, &qkv[..HIDDEN], prefix, index, keys, values, scores, attended);
+            }
+            finish::<V, H>(block, x, attended, normal, hidden);
+        }
+        cache.steps += 1;
+        layer_norm::<V, H>(x, &network.norm.weight, &network.norm.bias, NORM_EPS, normal);
+        let mut said = [[Lane::ZERO; H]; HEAD_VALUES];
+        linear::<V, H>(&network.heads, After::Store, normal, &mut said);
+        let mut sinkage = [[Lane::ZERO; H]; WHEELS];
+        for (wheel, raw) in sinkage.iter_mut().zip(&said[STATE_DIM..]) {
+            for h in 0..H {
+                tanh(V::load(&raw[h].0)).store(&mut wheel[h].0);
+            }
+        }
+        let mut residual = [[Lane::ZERO; H]; STATE_DIM];
+        residual.copy_from_slice(&said[..STATE_DIM]);
+        Said { sinkage, residual }
     }
+}
+
+/// x = W_s entries + b + W_c c + position; without a position, that of each lane stands in `context` already.
+#[inline(always)]
+pub(super) fn embed<V: Vector, const H: usize>(
+    network: &FusedTransformer,
+    position: Option<usize>,
+    entries: &[Row<H>; STATE_CONTROL],
+    context: &[Row<H>; HIDDEN],
+    x: &mut [Row<H>],
+) {
+    linear::<V, H>(&network.token.packed, After::Store, entries, x);
+    add_rows::<V, H>(x, context);
+    let Some(position) = position else { return };
+    for (x, position) in x.iter_mut().zip(network.position(position)) {
+        for h in 0..H {
+            V::load(&x[h].0).add(V::splat(*position)).store(&mut x[h].0);
+        }
+    }
+}
+
+/// Queries, keys and values (384) of pre-normalised hidden states.
+#[inline(always)]
+pub(super) fn project<V: Vector, const H: usize>(block: &Block, x: &[Row<H>], normal: &mut [Row<H>], qkv: &mut [Row<H>]) {
+    layer_norm::<V, H>(x, &block.norm1.weight, &block.norm1.bias, NORM_EPS, normal);
+    linear::<V, H>(&block.qkv.packed, After::Store, normal, qkv);
+}
+
+/// Output projection and feed-forward network, both added to x.
+#[inline(always)]
+pub(super) fn finish<V: Vector, const H: usize>(
+    block: &Block,
+    x: &mut [Row<H>],
+    attended: &[Row<H>],
+    normal: &mut [Row<H>],
+    hidden: &mut [Row<H>],
+) {
+    linear::<V, H>(&block.out.packed, After::Add, attended, x);
+    layer_norm::<V, H>(x, &block.norm2.weight, &block.norm2.bias, NORM_EPS, normal);
+    linear::<V, H>(&block.up.packed, After::Gelu, normal, hidden);
+    linear::<V, H>(&block.down.packed, After::Add, hidden, x);
 }
 
 /// Attention of one head of a block of samples over the shared history and their own steps.
-fn attend(head: usize, qkv: &[Lane], prefix: &Prefix, cache: &BlockCache, block: usize, attended: &mut [Lane]) {
-    let from = head * HEAD_DIM;
-    let scale = 1.0 / (HEAD_DIM as f32).sqrt();
-    let query = &qkv[from..from + HEAD_DIM];
-    let own_steps = cache.keys[block].len() / HIDDEN;
-    let mut scores = vec![[0f32; LANES]; prefix.tokens + own_steps];
-    for (t, score) in scores.iter_mut().enumerate() {
-        let mut sum = [0f32; LANES];
-        if t < prefix.tokens {
-            let key = &prefix.keys[block][t * HIDDEN + from..t * HIDDEN + from + HEAD_DIM];
-            for (k, q) in key.iter().zip(query) {
-                for l in 0..LANES {
-                    sum[l] = k.mul_add(q[l], sum[l]);
-                }
-            }
-        } else {
-            let at = (t - prefix.tokens) * HIDDEN + from;
-            for (k, q) in cache.keys[block][at..at + HEAD_DIM].iter().zip(query) {
-                for l in 0..LANES {
-                    sum[l] = k[l].mul_add(q[l], sum[l]);
-                }
-            }
-        }
-        *score = sum.map(|s| s * scale);
+#[inline(always)]
+#[allow(clippy::too_many_arguments)]
+fn attend<V: Vector, const H: usize>(
+    head: usize,
+    queries: &[Row<H>],
+    prefix: &Prefix,
+    block: usize,
+    keys: &[Row<H>],
+    values: &[Row<H>],
+    scores: &mut [Row<H>],
+    attended: &mut [Row<H>],
+) {
+    let features = head * HEAD_DIM..(head + 1) * HEAD_DIM;
+    let query = &queries[features.clone()];
+    let out = &mut attended[features.clone()];
+    let (shared, own) = (prefix.tokens, keys.len() / HIDDEN);
+    if shared > 0 {
+        // The last panel may reach into the rows of the own steps, which are written after it.
+        linear::<V, H>(&prefix.shared_keys[block][head], After::Store, query, scores);
     }
-    softmax(&mut scores);
-    let out = &mut attended[from..from + HEAD_DIM];
-    for (t, weight) in scores.iter().enumerate() {
-        if t < prefix.tokens {
-            let value = &prefix.values[block][t * HIDDEN + from..t * HIDDEN + from + HEAD_DIM];
-            for (v, o) in value.iter().zip(out.iter_mut()) {
-                for l in 0..LANES {
-                    o[l] = v.mul_add(weight[l], o[l]);
-                }
-            }
-        } else {
-            let at = (t - prefix.tokens) * HIDDEN + from;
-            for (v, o) in cache.values[block][at..at + HEAD_DIM].iter().zip(out.iter_mut()) {
-                for l in 0..LANES {
-                    o[l] = v[l].mul_add(weight[l], o[l]);
-                }
-            }
-        }
+    own_scores::<V, H>(&keys[features.start..], HIDDEN, query, &mut scores[shared..shared + own]);
+    softmax::<V, H>(&mut scores[..shared + own], SCORE_SCALE);
+    if shared > 0 {
+        linear::<V, H>(&prefix.shared_values[block][head], After::Store, &scores[..shared], out);
+    } else {
+        out.fill([Lane::ZERO; H]);
     }
-}
-
-/// Causal attention of history token `t` over tokens 0..=t.
-fn attend_history(queries: &[f32], keys: &[f32], values: &[f32], t: usize, mut store: impl FnMut(usize, f32)) {
-    let scale = 1.0 / (HEAD_DIM as f32).sqrt();
-    for head in 0..HEADS {
-        let from = head * HEAD_DIM;
-        let query = &queries[t * HIDDEN + from..t * HIDDEN + from + HEAD_DIM];
-        let dot =
-            |s: usize| keys[s * HIDDEN + from..s * HIDDEN + from + HEAD_DIM].iter().zip(query).map(|(k, q)| k * q).sum::<f32>() * scale;
-        let scores: Vec<f32> = (0..=t).map(dot).collect();
-        let top = scores.iter().copied().fold(f32::NEG_INFINITY, f32::max);
-        let weights: Vec<f32> = scores.iter().map(|s| (s - top).exp()).collect();
-        let total: f32 = weights.iter().sum();
-        for o in 0..HEAD_DIM {
-            let sum: f32 = weights.iter().enumerate().map(|(s, w)| w * values[s * HIDDEN + from + o]).sum();
-            store(from + o, sum / total);
-        }
-    }
+    own_values::<V, H>(&values[features.start..], HIDDEN, &scores[shared..shared + own], out);
 }

@@ -2,9 +2,9 @@
 
 use nesam_physics::WHEELS;
 use nesam_physics::risk::load_transfer_ratio;
-use nesam_physics::scalar::f32x8;
 use nesam_physics::step::{StepInput, StepModel, WheelContact};
 
+use crate::fused::{LANES, Lane, Numbers, Vector};
 use crate::rollout::RiskOutputs;
 
 /// Risk of one sample in one step.
@@ -16,12 +16,23 @@ pub(super) struct RiskRow {
     traction_reserve: f32,
 }
 
-/// Risk of eight lanes from the step that they have made.
-pub(super) fn of_lanes(model: &StepModel, input: &StepInput<f32x8>, contacts: &[WheelContact<f32x8>; WHEELS]) -> [RiskRow; 8] {
-    let load = contacts.map(|contact| contact.normal_n);
-    let ratio = load_transfer_ratio(&load).to_array();
-    let reserve = model.traction_reserve(input, contacts).to_array();
-    let (load, slip) = (load.map(f32x8::to_array), contacts.map(|contact| contact.slip.to_array()));
+/// Risk of sixteen lanes from the step that they have made.
+#[inline(always)]
+pub(super) fn of_lanes<V: Vector>(
+    model: &StepModel,
+    input: &StepInput<Numbers<V>>,
+    contacts: &[WheelContact<Numbers<V>>; WHEELS],
+) -> [RiskRow; LANES] {
+    let mut loads = [Numbers(V::splat(0.0)); WHEELS];
+    let (mut load, mut slip) = ([Lane::ZERO; WHEELS], [Lane::ZERO; WHEELS]);
+    for (i, contact) in contacts.iter().enumerate() {
+        loads[i] = contact.normal_n;
+        contact.normal_n.0.store(&mut load[i].0);
+        contact.slip.0.store(&mut slip[i].0);
+    }
+    let (mut ratio, mut reserve) = (Lane::ZERO, Lane::ZERO);
+    load_transfer_ratio(&loads).0.store(&mut ratio.0);
+    model.traction_reserve(input, contacts).0.store(&mut reserve.0);
     core::array::from_fn(|lane| RiskRow {
         load_n: load.map(|wheel| wheel[lane]),
         slip: slip.map(|wheel| wheel[lane]),

@@ -5,12 +5,12 @@ use std::sync::Arc;
 
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::StepInput;
-use nesam_physics::{Control, STATE_DIM, Soil, SoilCorrection, VehicleState, WHEELS};
+use nesam_physics::{Control, STATE_DIM, Soil, SoilCorrection, VehicleState};
 use nesam_terrain::WorldMap;
 
 use super::{LogClock, Predictor, Sample, pose, raw_soil, under};
 use crate::dims::{HIDDEN, STATE_CONTROL};
-use crate::fused::{BlockCache, LANES, Lane};
+use crate::fused::{BlockCache, LANES, Lane, Row, Said};
 use crate::ground::GroundSource;
 use crate::rollout::HistoryStep;
 use crate::soil_coordinates::from_raw;
@@ -77,8 +77,8 @@ impl Predictor {
         for control in controls {
             let token = self.terrain(tokens.as_deref(), &[pose(&sample.state)])[0];
             let entries = self.entries(self.step_model(), &sample.state, sample.previous.as_ref(), control, &ground);
-            let lanes: [Lane; STATE_CONTROL] = core::array::from_fn(|i| [entries[i]; LANES]);
-            let context: [Lane; HIDDEN] = core::array::from_fn(|i| [token[i]; LANES]);
+            let lanes: [Row<1>; STATE_CONTROL] = entries.map(|entry| [Lane([entry; LANES])]);
+            let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane([token[i]; LANES])]);
             let said = self.network.step(&prefix, &mut cache, &lanes, &context);
             let transition = self.transition_from(&sample, control, &ground, &token, &said);
             transitions.push(transition);
@@ -119,12 +119,12 @@ impl Predictor {
         control: &Control<f64>,
         ground: &GroundSource<'_>,
         token: &TerrainToken,
-        (sinkage, residual): &([Lane; WHEELS], [Lane; STATE_DIM]),
+        said: &Said<1>,
     ) -> Transition {
         let (scales, model) = (&self.bundle.normalization, self.step_model());
         let after = sample.actuators.advance(model.vehicle(), control, sample.state.velocity_m_s[0], model.dt_s());
         let (under_wheels, known) = ground.under_wheels(model, &sample.state, 0.0);
-        let ratio = |i: usize| f64::from(scales.sinkage_log_ratio_max * sinkage[i][0].tanh());
+        let ratio = |i: usize| f64::from(scales.sinkage_log_ratio_max * said.sinkage[i][0][0]);
         Transition {
             input: StepInput {
                 state: sample.state,
@@ -135,7 +135,7 @@ impl Predictor {
             },
             actuators: [sample.actuators, after],
             control: *control,
-            residual: core::array::from_fn(|i| f64::from(residual[i][0] * scales.residual_scale[i])),
+            residual: core::array::from_fn(|i| f64::from(said.residual[i][0][0] * scales.residual_scale[i])),
             ground_known: known,
         }
     }

@@ -1,0 +1,77 @@
+//! More of `nesam bench predict`: every path and number of candidates, and where the time goes.
+
+use std::time::Instant;
+
+use nesam_model::{Path, Predictor};
+use serde_json::{Value, json};
+
+use super::{Planner, percentile};
+use crate::failure::{Failure, OrFail};
+use crate::output::say;
+
+/// Numbers of candidates that a sweep times.
+const CANDIDATES: [usize; 6] = [64, 128, 256, 512, 1024, 2048];
+/// Timed queries of each; their terrain is warm.
+const QUERIES: usize = 7;
+
+/// The predictor on the path of this name, or as it is.
+pub fn on_path(predictor: Predictor, name: Option<&str>) -> Result<Predictor, Failure> {
+    let Some(name) = name else { return Ok(predictor) };
+    let paths = Path::available();
+    let found = paths.iter().find(|path| path.as_str() == name);
+    let known: Vec<&str> = paths.iter().map(|path| path.as_str()).collect();
+    found
+        .map(|path| predictor.on_path(*path))
+        .ok_or_else(|| Failure::input(format!("--path {name}: this processor has {}", known.join(", "))))
+}
+
+/// Times all numbers of candidates on all paths and prints a table. The paths take turns, so that what else the machine does meets all of them.
+pub fn sweep(drive: &Planner<'_>, predictor: &Predictor) -> Result<Value, Failure> {
+    let predictors: Vec<Predictor> = Path::available().into_iter().map(|path| predictor.on_path(path)).collect();
+    let header: Vec<String> = predictors.iter().map(|p| format!("{:>9} p50      min", p.path().as_str())).collect();
+    say!("  warm, by candidates and path, ms\n       N {}", header.join(" "));
+    let mut rows = Vec::new();
+    for samples in CANDIDATES {
+        let mut times = vec![Vec::new(); predictors.len()];
+        for q in 0..=QUERIES {
+            let at = drive.anywhere(1, 3);
+            let controls = drive.controls_of(samples, at, 3000 + q as u64);
+            for (predictor, times) in predictors.iter().zip(&mut times) {
+                // The first time encodes what is missing.
+                drive.ask(predictor, at, &controls)?;
+                let began = Instant::now();
+                drive.ask(predictor, at, &controls)?;
+                if q > 0 {
+                    times.push(began.elapsed().as_secs_f64() * 1e3);
+                }
+            }
+        }
+        let mut line = format!("    {samples:4} ");
+        for (predictor, times) in predictors.iter().zip(&mut times) {
+            let (p50, min) = (percentile(times, 0.5), percentile(times, 0.0));
+            line += &format!("{p50:13.1} {min:8.1} ");
+            rows.push(json!({"path": predictor.path().as_str(), "samples": samples, "p50_ms": p50, "min_ms": min}));
+        }
+        say!("{}", line.trim_end());
+    }
+    Ok(Value::Array(rows))
+}
+
+/// Processor time of a warm query by parts, medians over queries, ms of all threads together.
+pub fn parts(drive: &Planner<'_>, predictor: &Predictor) -> Result<Value, Failure> {
+    let mut times: [Vec<f64>; 4] = Default::default();
+    for q in 0..QUERIES {
+        let at = drive.anywhere(q, QUERIES);
+        let controls = drive.controls(at, 4000 + q as u64);
+        drive.ask(predictor, at, &controls)?;
+        let (_, parts) = predictor.rollout_by_parts(&drive.query(at, &controls)).or_failed()?;
+        for (times, part) in times.iter_mut().zip([parts.lookup_s, parts.network_s, parts.physics_s, parts.rest_s]) {
+            times.push(part * 1e3);
+        }
+    }
+    let [lookup, network, physics, rest] = times.map(|mut times| percentile(&mut times, 0.5));
+    say!(
+        "  by parts, ms of all threads: lookup {lookup:.1}, network {network:.1}, physics {physics:.1}, ground, actuators and states {rest:.1}"
+    );
+    Ok(json!({"lookup": lookup, "network": network, "physics": physics, "rest": rest}))
+}

@@ -1,0 +1,417 @@
+//! Sixteen f32 as one value, in the instructions that the processor has: the only module of this workspace with `unsafe` code.
+//!
+//! A [`Kernel`] is written once over [`Vector`]; [`Path::run`] compiles it for AVX-512 and for the target of the build (AVX2 with FMA on x86-64, see
+//! `.cargo/config.toml`; whatever `wide` makes of it elsewhere), and calls the one that was found to run here. Both do the same IEEE operations in the same order, lane
+//! by lane, so they give the same bits (where the target has a fused multiply-add; elsewhere its path rounds twice).
+//!
+//! # Why this is sound
+//! Two things need `unsafe`: calling a function that is compiled for instructions which the processor may lack, and the intrinsics themselves. A [`Path`]
+//! of AVX-512 exists only after the processor was asked ([`Path::available`]); the vector types are private and reach a kernel only through
+//! [`Path::run`], so an intrinsic is never executed without its instructions. Loads and stores take references to whole arrays, so no pointer can leave
+//! its memory.
+//!
+//! AMX would be a further path here, with tiles of bf16 in place of `Vector` in `kernels::linear`; it is not written, since no processor was at hand to run it.
+#![allow(unsafe_code)]
+
+use core::fmt::Debug;
+use core::ops::{Deref, DerefMut};
+
+use wide::{f32x8, u32x8};
+
+/// Samples of one lane.
+pub const LANES: usize = 16;
+
+/// One feature of sixteen samples, in a cache line of its own.
+#[repr(C, align(64))]
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Lane(pub [f32; LANES]);
+
+impl Lane {
+    /// All zero.
+    pub const ZERO: Self = Self([0.0; LANES]);
+
+    /// `value(l)` for each sample l.
+    #[inline(always)]
+    pub fn from_fn(value: impl FnMut(usize) -> f32) -> Self {
+        Self(core::array::from_fn(value))
+    }
+}
+
+impl Deref for Lane {
+    type Target = [f32; LANES];
+    #[inline(always)]
+    fn deref(&self) -> &Self::Target {
+        &self.0
+    }
+}
+
+impl DerefMut for Lane {
+    #[inline(always)]
+    fn deref_mut(&mut self) -> &mut Self::Target {
+        &mut self.0
+    }
+}
+
+/// Sixteen f32 in registers. Every operation acts on each lane alone.
+pub trait Vector: Copy + Debug {
+    /// Whether the processor has registers for tiles of eight rows by two vectors.
+    const WIDE: bool;
+    /// x in all lanes.
+    fn splat(x: f32) -> Self;
+    /// From memory.
+    fn load(from: &[f32; LANES]) -> Self;
+    /// To memory.
+    fn store(self, to: &mut [f32; LANES]);
+    /// self + other.
+    fn add(self, other: Self) -> Self;
+    /// self - other.
+    fn sub(self, other: Self) -> Self;
+    /// self · other.
+    fn mul(self, other: Self) -> Self;
+    /// self / other.
+    fn div(self, other: Self) -> Self;
+    /// self · by + plus, rounded once.
+    fn mul_add(self, by: Self, plus: Self) -> Self;
+    /// The larger one; `other` where one is not a number.
+    fn max(self, other: Self) -> Self;
+    /// The smaller one; `other` where one is not a number.
+    fn min(self, other: Self) -> Self;
+    /// Square root.
+    fn sqrt(self) -> Self;
+    /// Nearest integer, ties to even.
+    fn round(self) -> Self;
+    /// -self.
+    fn neg(self) -> Self;
+    /// |self|.
+    fn abs(self) -> Self;
+    /// The bits, shifted left by 23: turns the low bits of a mantissa into an exponent.
+    fn shift_to_exponent(self) -> Self;
+    /// The bits, shifted right by 23, under the bits of 2^23: the biased exponent of a positive number as 2^23 + exponent.
+    fn exponent_over_2_23(self) -> Self;
+    /// The mantissa of a positive normal number, in [1/2, 1).
+    fn mantissa(self) -> Self;
+    /// `a` where self >= 0, else `b`; `b` where self is not a number.
+    fn select_ge0(self, a: Self, b: Self) -> Self;
+}
+
+/// A computation in vectors. `run` must be `#[inline(always)]`, as everything that it calls with vectors, or the instructions do not reach the code.
+pub trait Kernel {
+    /// What it gives back.
+    type Output;
+    /// The computation.
+    fn run<V: Vector>(self) -> Self::Output;
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Instructions {
+    #[cfg(target_arch = "x86_64")]
+    Avx512,
+    Target,
+}
+
+/// Instructions that the kernels run on, found on this processor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Path(Instructions);
+
+impl Path {
+    /// Every path that runs on this processor, the fastest first.
+    pub fn available() -> Vec<Self> {
+        let mut paths = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") {
+            paths.push(Self(Instructions::Avx512));
+        }
+        paths.push(Self(Instructions::Target));
+        paths
+    }
+
+    /// The fastest path of this processor.
+    pub fn fastest() -> Self {
+        Self::available()[0]
+    }
+
+    /// Runs a kernel on the path of the build's target and compiles it for no other: for long kernels (thousands of inlined instructions take minutes to compile) and
+    /// for those that call functions which are not inlined, where wider vectors would be a call each. The bits are the same.
+    #[inline]
+    pub fn run_on_target<K: Kernel>(kernel: K) -> K::Output {
+        kernel.run::<Target>()
+    }
+
+    /// Name in reports: `avx512`; for the path of the target `avx2` where it has AVX2, else `portable`.
+    pub fn as_str(self) -> &'static str {
+        match self.0 {
+            #[cfg(target_arch = "x86_64")]
+            Instructions::Avx512 => "avx512",
+            Instructions::Target if cfg!(target_feature = "avx2") => "avx2",
+            Instructions::Target => "portable",
+        }
+    }
+
+    /// Runs a kernel on this path.
+    #[inline]
+    pub fn run<K: Kernel>(self, kernel: K) -> K::Output {
+        match self.0 {
+            // SAFETY: `available` has found these instructions on this processor.
+            #[cfg(target_arch = "x86_64")]
+            Instructions::Avx512 => unsafe { x86::on_avx512(kernel) },
+            Instructions::Target => kernel.run::<Target>(),
+        }
+    }
+}
+
+/// Sixteen floats in what the target of the build has.
+#[derive(Clone, Copy, Debug)]
+struct Target([f32x8; 2]);
+
+impl Target {
+    #[inline(always)]
+    fn map(self, f: impl Fn(f32x8) -> f32x8) -> Self {
+        Self([f(self.0[0]), f(self.0[1])])
+    }
+
+    #[inline(always)]
+    fn zip(self, other: Self, f: impl Fn(f32x8, f32x8) -> f32x8) -> Self {
+        Self([f(self.0[0], other.0[0]), f(self.0[1], other.0[1])])
+    }
+
+    #[inline(always)]
+    fn map_bits(self, f: impl Fn(u32x8) -> u32x8) -> Self {
+        self.map(|x| bytemuck::cast(f(bytemuck::cast(x))))
+    }
+}
+
+impl Vector for Target {
+    const WIDE: bool = false;
+    #[inline(always)]
+    fn splat(x: f32) -> Self {
+        Self([f32x8::splat(x); 2])
+    }
+    #[inline(always)]
+    fn load(from: &[f32; LANES]) -> Self {
+        let [low, high] = from.as_chunks::<8>().0 else { unreachable!("sixteen is twice eight") };
+        Self([f32x8::from(*low), f32x8::from(*high)])
+    }
+    #[inline(always)]
+    fn store(self, to: &mut [f32; LANES]) {
+        let (low, high) = to.split_at_mut(8);
+        low.copy_from_slice(&self.0[0].to_array());
+        high.copy_from_slice(&self.0[1].to_array());
+    }
+    #[inline(always)]
+    fn add(self, other: Self) -> Self {
+        self.zip(other, |a, b| a + b)
+    }
+    #[inline(always)]
+    fn sub(self, other: Self) -> Self {
+        self.zip(other, |a, b| a - b)
+    }
+    #[inline(always)]
+    fn mul(self, other: Self) -> Self {
+        self.zip(other, |a, b| a * b)
+    }
+    #[inline(always)]
+    fn div(self, other: Self) -> Self {
+        self.zip(other, |a, b| a / b)
+    }
+    #[inline(always)]
+    fn mul_add(self, by: Self, plus: Self) -> Self {
+        Self([self.0[0].mul_add(by.0[0], plus.0[0]), self.0[1].mul_add(by.0[1], plus.0[1])])
+    }
+    #[inline(always)]
+    fn max(self, other: Self) -> Self {
+        self.zip(other, |a, b| a.simd_gt(b).select(a, b))
+    }
+    #[inline(always)]
+    fn min(self, other: Self) -> Self {
+        self.zip(other, |a, b| a.simd_lt(b).select(a, b))
+    }
+    #[inline(always)]
+    fn sqrt(self) -> Self {
+        self.map(f32x8::sqrt)
+    }
+    #[inline(always)]
+    fn round(self) -> Self {
+        self.map(f32x8::round_ties_even)
+    }
+    #[inline(always)]
+    fn neg(self) -> Self {
+        self.map(|x| x ^ f32x8::splat(-0.0))
+    }
+    #[inline(always)]
+    fn abs(self) -> Self {
+        self.map(f32x8::abs)
+    }
+    #[inline(always)]
+    fn shift_to_exponent(self) -> Self {
+        self.map_bits(|bits| bits << 23u32)
+    }
+    #[inline(always)]
+    fn exponent_over_2_23(self) -> Self {
+        self.map_bits(|bits| (bits >> 23u32) | u32x8::splat(0x4b00_0000))
+    }
+    #[inline(always)]
+    fn mantissa(self) -> Self {
+        self.map_bits(|bits| (bits & u32x8::splat(0x007f_ffff)) | u32x8::splat(0x3f00_0000))
+    }
+    #[inline(always)]
+    fn select_ge0(self, a: Self, b: Self) -> Self {
+        let half = |i: usize| self.0[i].simd_ge(f32x8::ZERO).select(a.0[i], b.0[i]);
+        Self([half(0), half(1)])
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+mod x86 {
+    use core::arch::x86_64::*;
+
+    use super::{Kernel, LANES, Vector};
+
+    /// Sixteen floats in one register.
+    #[derive(Clone, Copy, Debug)]
+    pub(super) struct Avx512(__m512);
+
+    /// # Safety
+    /// The processor has AVX-512 F, DQ and VL.
+    #[target_feature(enable = "avx512f,avx512dq,avx512vl")]
+    pub(super) unsafe fn on_avx512<K: Kernel>(kernel: K) -> K::Output {
+        kernel.run::<Avx512>()
+    }
+
+    // SAFETY of every block in this module: values of these types exist only inside `on_avx512`, whose caller has found the instructions.
+    impl Vector for Avx512 {
+        const WIDE: bool = true;
+        #[inline(always)]
+        fn splat(x: f32) -> Self {
+            Self(unsafe { _mm512_set1_ps(x) })
+        }
+        #[inline(always)]
+        fn load(from: &[f32; LANES]) -> Self {
+            Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        fn store(self, to: &mut [f32; LANES]) {
+            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        fn add(self, other: Self) -> Self {
+            Self(unsafe { _mm512_add_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn sub(self, other: Self) -> Self {
+            Self(unsafe { _mm512_sub_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn mul(self, other: Self) -> Self {
+            Self(unsafe { _mm512_mul_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn div(self, other: Self) -> Self {
+            Self(unsafe { _mm512_div_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn mul_add(self, by: Self, plus: Self) -> Self {
+            Self(unsafe { _mm512_fmadd_ps(self.0, by.0, plus.0) })
+        }
+        #[inline(always)]
+        fn max(self, other: Self) -> Self {
+            Self(unsafe { _mm512_max_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn min(self, other: Self) -> Self {
+            Self(unsafe { _mm512_min_ps(self.0, other.0) })
+        }
+        #[inline(always)]
+        fn sqrt(self) -> Self {
+            Self(unsafe { _mm512_sqrt_ps(self.0) })
+        }
+        #[inline(always)]
+        fn round(self) -> Self {
+            Self(unsafe { _mm512_roundscale_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(self.0) })
+        }
+        #[inline(always)]
+        fn neg(self) -> Self {
+            Self(unsafe { _mm512_xor_ps(self.0, _mm512_set1_ps(-0.0)) })
+        }
+        #[inline(always)]
+        fn abs(self) -> Self {
+            Self(unsafe { _mm512_andnot_ps(_mm512_set1_ps(-0.0), self.0) })
+        }
+        #[inline(always)]
+        fn shift_to_exponent(self) -> Self {
+            Self(unsafe { _mm512_castsi512_ps(_mm512_slli_epi32::<23>(_mm512_castps_si512(self.0))) })
+        }
+        #[inline(always)]
+        fn exponent_over_2_23(self) -> Self {
+            let shifted = unsafe { _mm512_castsi512_ps(_mm512_srli_epi32::<23>(_mm512_castps_si512(self.0))) };
+            Self(unsafe { _mm512_or_ps(shifted, _mm512_set1_ps(8_388_608.0)) })
+        }
+        #[inline(always)]
+        fn mantissa(self) -> Self {
+            let bits = unsafe { _mm512_and_ps(self.0, _mm512_set1_ps(f32::from_bits(0x007f_ffff))) };
+            Self(unsafe { _mm512_or_ps(bits, _mm512_set1_ps(0.5)) })
+        }
+        #[inline(always)]
+        fn select_ge0(self, a: Self, b: Self) -> Self {
+            Self(unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, _mm512_setzero_ps()), b.0, a.0) })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Every operation on the same numbers.
+    struct Everything<'a>(&'a [Lane; 3]);
+
+    impl Kernel for Everything<'_> {
+        type Output = Vec<[u32; LANES]>;
+        #[inline(always)]
+        fn run<V: Vector>(self) -> Self::Output {
+            let [a, b, c] = [0, 1, 2].map(|i| V::load(&self.0[i].0));
+            let results = [
+                a.add(b),
+                a.sub(b),
+                a.mul(b),
+                a.div(b),
+                a.mul_add(b, c),
+                a.max(b),
+                a.min(b),
+                a.abs().sqrt(),
+                a.round(),
+                a.neg(),
+                a.abs().mantissa(),
+                a.abs().exponent_over_2_23(),
+                a.add(V::splat(8_388_735.0)).shift_to_exponent(),
+                a.select_ge0(b, c),
+            ];
+            results
+                .iter()
+                .map(|r| {
+                    let mut lane = Lane::ZERO;
+                    r.store(&mut lane.0);
+                    // All numbers that are none count as one.
+                    lane.0.map(|x| if x.is_nan() { u32::MAX } else { x.to_bits() })
+                })
+                .collect()
+        }
+    }
+
+    #[test]
+    fn property_every_path_gives_the_same_bits() {
+        let edges = [0.0, -0.0, 1.0, -1.0, 0.5, 2.5, -2.5, 1e-30, -1e30, f32::INFINITY, f32::NEG_INFINITY, f32::NAN, 3.3, -7.7, 88.0, 1e-6];
+        let mut seed = 12345u32;
+        let mut random = || {
+            seed = seed.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+            (seed >> 8) as f32 / 65536.0 - 128.0
+        };
+        for round in 0..200 {
+            let lanes: [Lane; 3] =
+                core::array::from_fn(|i| Lane::from_fn(|l| if round < 16 && i < 2 { edges[(l * (i + 1) + round) % 16] } else { random() }));
+            let expected = Path::run_on_target(Everything(&lanes));
+            for path in Path::available() {
+                assert_eq!(path.run(Everything(&lanes)), expected, "{} differs from the target's path at {lanes:?}", path.as_str());
+            }
+        }
+    }
+}

@@ -1,0 +1,188 @@
+//! Rollouts of all candidates of a query.
+//!
+//! Blocks of sixteen samples go through the horizon on their own, so that what a block remembers stays near the processor. A block that meets terrain which is
+//! not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they go on. Which block waits for
+//! what changes nothing in the results: a node of the terrain is a function of its pose alone.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, WHEELS};
+use rayon::prelude::*;
+
+use super::block::{Block, Cache};
+use super::parts::PartClocks;
+use super::risk::RiskRow;
+use super::validate::{validate, validate_extras};
+use super::{LogClock, Predictor, Sample, control, pose, under};
+use crate::ModelError;
+use crate::fused::{LANES, Prefix};
+use crate::ground::GroundSource;
+use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
+use crate::soil_field::SoilField;
+use crate::terrain_tokens::{Node, TerrainTokens};
+
+/// Everything of a query that is the same for all samples.
+pub(super) struct Scene<'a> {
+    pub(super) query: &'a RolloutQuery<'a>,
+    pub(super) soil: &'a dyn SoilField,
+    pub(super) ground: GroundSource<'a>,
+    pub(super) prefix: Prefix,
+    pub(super) datum_m: f64,
+    pub(super) variant: Variant,
+    pub(super) risk: bool,
+    pub(super) clock: LogClock,
+    pub(super) tokens: Option<&'a TerrainTokens>,
+    pub(super) caches: Caches,
+    pub(super) clocks: Option<&'a PartClocks>,
+}
+
+impl Scene<'_> {
+    /// Command of a row in step `k`: every group of samples has the same.
+    pub(super) fn control(&self, row: usize, k: usize) -> Control<f64> {
+        control(self.query, row % self.query.samples, k)
+    }
+}
+
+/// Caches of blocks, used again by the next block: as many as there are blocks under way.
+pub(super) struct Caches {
+    free: Mutex<Vec<Cache>>,
+    horizon: usize,
+    remembers: bool,
+}
+
+impl Caches {
+    /// A cache without steps.
+    pub(super) fn take(&self) -> Cache {
+        let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        free.map_or_else(
+            || Cache::new(self.horizon, self.remembers),
+            |mut cache| {
+                cache.clear();
+                cache
+            },
+        )
+    }
+
+    /// Gives one back.
+    pub(super) fn give(&self, cache: Cache) {
+        self.free.lock().unwrap_or_else(PoisonError::into_inner).push(cache);
+    }
+}
+
+/// A correction for each group of `samples` rows.
+#[derive(Debug)]
+struct SoilPerGroup<'a> {
+    soils: &'a [SoilCorrection],
+    samples: usize,
+}
+
+impl SoilField for SoilPerGroup<'_> {
+    fn soil(&self, row: usize, _position_m: [f64; 2], prior: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
+        self.soils[row / self.samples].apply(prior)
+    }
+}
+
+impl Predictor {
+    /// The same with what-if soils and, where they are asked for, risk outputs. States do not depend on whether risk is asked for, and a what-if soil
+    /// that equals the query's correction gives the rollout of the query, both bit for bit.
+    ///
+    /// # Errors
+    /// As [`Predictor::rollout`]; also naming `soils` when a correction is not finite, and `risk` when the form has no soil.
+    pub fn rollout_with(&self, query: &RolloutQuery<'_>, extras: &RolloutExtras<'_>) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
+        self.rollout_timed(query, extras, None)
+    }
+
+    /// The same, with clocks for a bench.
+    pub(super) fn rollout_timed(
+        &self,
+        query: &RolloutQuery<'_>,
+        extras: &RolloutExtras<'_>,
+        clocks: Option<&PartClocks>,
+    ) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
+        validate(query)?;
+        validate_extras(extras)?;
+        let variant = self.form_of(query);
+        if extras.risk && !variant.has_soil() {
+            return Err(ModelError::Query { field: "risk", reason: format!("a model of the form `{}` has no soil", variant.as_str()) });
+        }
+        let tokens = query.map.map(|map| self.tokens_of(map));
+        let clock = LogClock { start_s: query.start_time_s, dt_s: self.bundle.normalization.dt_s };
+        let (history, start_state) = self.true_motion(query.history, &query.start, clock);
+        let history = history.as_ref();
+        let ground = GroundSource::new(query.map.map(Arc::as_ref), self.physics.at(clock.start_s), &start_state);
+        let what_if = SoilPerGroup { soils: extras.soils, samples: query.samples };
+        let scene = Scene {
+            query,
+            soil: if extras.soils.is_empty() { extras.field.unwrap_or(&query.soil_correction) } else { &what_if },
+            prefix: self.prefix(variant, history, &ground, tokens.as_deref(), clock),
+            ground,
+            datum_m: start_state.position_m[2],
+            variant,
+            risk: extras.risk,
+            clock,
+            tokens: tokens.as_deref(),
+            caches: Caches { free: Mutex::default(), horizon: query.horizon, remembers: variant.remembers() },
+            clocks,
+        };
+        let rows = extras.soils.len().max(1) * query.samples;
+        // Without a history the actuators begin as a row's own first command says, so rows stay independent.
+        let start = |row: usize| Sample {
+            state: start_state,
+            previous: history.last().map(|step| step.state),
+            actuators: self.actuators(history, &start_state, &scene.control(row, 0), clock),
+            flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
+        };
+        let shared = start(0);
+        let mut samples: Vec<Sample> = (0..rows).map(|row| if history.is_empty() { start(row) } else { shared }).collect();
+        let under_start = self.terrain(scene.tokens, &[pose(&start_state)])[0];
+        let mut rollout = Rollout {
+            states: vec![0.0; rows * query.horizon * STATE_DIM],
+            sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
+            flags: Vec::new(),
+            soil: self.soil_at(under(scene.soil, 0, &shared, &under_start), clock.before(0)),
+            samples: rows,
+            horizon: query.horizon,
+        };
+        let risk = self.roll_blocks(&scene, &mut samples, &mut rollout);
+        rollout.flags = samples.iter().map(|s| s.flags).collect();
+        Ok((rollout, risk))
+    }
+
+    /// Takes all samples through the horizon.
+    fn roll_blocks(&self, scene: &Scene<'_>, samples: &mut [Sample], rollout: &mut Rollout) -> Option<RiskOutputs> {
+        let (rows, horizon) = (samples.len(), rollout.horizon);
+        let mut blocks: Vec<Block<'_>> = samples
+            .chunks_mut(LANES)
+            .zip(rollout.states.chunks_mut(LANES * horizon * STATE_DIM))
+            .zip(rollout.sinkage_m.chunks_mut(LANES * horizon * WHEELS))
+            .enumerate()
+            .map(|(index, ((samples, states), sinkage_m))| Block {
+                first: index * LANES,
+                done: 0,
+                risk: vec![RiskRow::default(); if scene.risk { samples.len() * horizon } else { 0 }],
+                samples,
+                states,
+                sinkage_m,
+                cache: None,
+                missing: Vec::new(),
+            })
+            .collect();
+        loop {
+            blocks.par_iter_mut().filter(|block| block.done < horizon).for_each(|block| self.advance_block(scene, block));
+            let missing: Vec<Node> = blocks.iter_mut().flat_map(|block| block.missing.drain(..)).collect();
+            match scene.tokens {
+                Some(tokens) if !missing.is_empty() => tokens.encode(&self.projection, missing),
+                _ => break,
+            }
+        }
+        scene.risk.then(|| {
+            let mut risk = RiskOutputs::zero(rows * horizon);
+            for block in &blocks {
+                for (row, values) in block.risk.iter().enumerate() {
+                    risk.put(block.first * horizon + row, values);
+                }
+            }
+            risk
+        })
+    }
+}
