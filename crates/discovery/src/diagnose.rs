@@ -323,18 +323,7 @@ pub fn diagnose(
 
     progress("hypotheses", 0, 1);
     let judgement = judge(&mut case, &yardstick);
-    let learned = match options.fit_on {
-        Some(_) => {
-            let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects()));
-            vec![Learned { soil: best_soil(case.condensed()), effects }; drives.len() - total]
-        }
-        None if total > 1 => {
-            let fewer = judge_by.yardstick(&channels, total - 1, &options.without)?;
-            leave_each_out(&fewer, &case, &judgement)
-        }
-        None => Vec::new(),
-    };
-
+    let learned = learn(&judge_by, &case, &judgement, options, drives.len())?;
     let held_at: Vec<usize> = match options.fit_on {
         Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
         None if total > 1 => (0..drives.len()).collect(),
@@ -380,6 +369,28 @@ pub fn diagnose(
         held_out: held.iter().map(|d| d.id.clone()).collect(),
         learned,
         scores,
+    })
+}
+
+/// What each held-out drive is predicted with, of `drives` drives in all.
+fn learn(
+    judge_by: &Judge,
+    case: &Case<'_>,
+    judgement: &Judgement,
+    options: &Options,
+    drives: usize,
+) -> Result<Vec<Learned>, DiscoveryError> {
+    let total = case.prepared.len();
+    Ok(match options.fit_on {
+        Some(_) => {
+            let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
+            vec![Learned { soil: best_soil(case.condensed()), effects }; drives - total]
+        }
+        None if total > 1 => {
+            let fewer = judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?;
+            leave_each_out(&fewer, case, judgement)
+        }
+        None => Vec::new(),
     })
 }
 
