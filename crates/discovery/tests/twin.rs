@@ -115,7 +115,7 @@ fn property_a_patched_bundle_round_trips_and_an_unpatched_one_keeps_its_bytes() 
     let read = ModelBundle::load(&folder.path().join("patched")).unwrap();
     assert_eq!(
         (read.effects.as_slice(), &read.vehicle),
-        (&effects.map(nesam_physics::effects::ScheduledEffect::from)[..], &base.vehicle.with_effects(&effects))
+        (&effects.map(ScheduledEffect::from)[..], &base.vehicle.with_effects(&effects))
     );
     assert_eq!(read.provenance.parent.as_deref(), Some(base.hash.as_str()));
     assert_ne!(read.hash, base.hash);

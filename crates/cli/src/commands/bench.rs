@@ -108,15 +108,16 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
     };
 
     // One replan after the other along the drive at the rate of the model, on a map that nobody has asked about yet.
-    let fresh = sweep::on_path(predictor_for(bundle.clone(), &drives.root)?, args.path.as_deref())?;
-    let steady = (0..args.queries).map(|q| time(&fresh, drive.along(q), args.seed + q as u64)).collect::<Result<Vec<_>, _>>()?;
+    let chosen = sweep::on_path(predictor_for(bundle.clone(), &drives.root)?, args.path.as_deref())?;
+    let fresh: &Predictor = &chosen;
+    let steady = (0..args.queries).map(|q| time(fresh, drive.along(q), args.seed + q as u64)).collect::<Result<Vec<_>, _>>()?;
     // Poses all over the drive whose surroundings have been asked about before, with other commands.
     let warm_up =
-        (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries), 1000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
+        (0..args.queries).map(|q| time(fresh, drive.anywhere(q, args.queries), 1000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
     let before = drive.map.as_ref().map(|map| fresh.terrain_cache(map));
     let processor_before = processor_time_ms();
     let mut warm =
-        (0..args.queries).map(|q| time(&fresh, drive.anywhere(q, args.queries) + 1, 2000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
+        (0..args.queries).map(|q| time(fresh, drive.anywhere(q, args.queries) + 1, 2000 + q as u64)).collect::<Result<Vec<_>, _>>()?;
     let processor_ms = processor_time_ms().zip(processor_before).map(|(after, before)| (after - before) / args.queries as f64);
     let hit_rate = drive.map.as_ref().zip(before).map(|(map, before)| fresh.terrain_cache(map).since(before).hit_rate());
     progress.finish();
@@ -141,8 +142,8 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         "tokens_per_s": (args.samples * args.horizon) as f64 / (p50 * 1e-3),
         "steady_p50_ms": steady_p50,
         "terrain_cache": {"hit_rate": hit_rate, "max_error": max_error},
-        "parts_ms": args.parts.then(|| sweep::parts(&drive, &fresh)).transpose()?,
-        "sweep": args.sweep.then(|| sweep::sweep(&drive, &fresh)).transpose()?,
+        "parts_ms": args.parts.then(|| sweep::parts(&drive, fresh)).transpose()?,
+        "sweep": args.sweep.then(|| sweep::sweep(&drive, fresh)).transpose()?,
         "provenance": provenance(Some(&bundle), &drives),
     });
     say!(

@@ -1,5 +1,6 @@
 //! More of `nesam bench predict`: every path and number of candidates, and where the time goes.
 
+use std::sync::Arc;
 use std::time::Instant;
 
 use nesam_model::{Path, Predictor};
@@ -15,13 +16,13 @@ const CANDIDATES: [usize; 6] = [64, 128, 256, 512, 1024, 2048];
 const QUERIES: usize = 7;
 
 /// The predictor on the path of this name, or as it is.
-pub fn on_path(predictor: Predictor, name: Option<&str>) -> Result<Predictor, Failure> {
+pub fn on_path(predictor: Arc<Predictor>, name: Option<&str>) -> Result<Arc<Predictor>, Failure> {
     let Some(name) = name else { return Ok(predictor) };
     let paths = Path::available();
     let found = paths.iter().find(|path| path.as_str() == name);
     let known: Vec<&str> = paths.iter().map(|path| path.as_str()).collect();
     found
-        .map(|path| predictor.on_path(*path))
+        .map(|path| Arc::new(predictor.on_path(*path)))
         .ok_or_else(|| Failure::input(format!("--path {name}: this processor has {}", known.join(", "))))
 }
 
