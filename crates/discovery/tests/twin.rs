@@ -113,10 +113,7 @@ fn property_a_patched_bundle_round_trips_and_an_unpatched_one_keeps_its_bytes() 
     patched.provenance.parent = Some(base.hash.clone());
     patched.save(&folder.path().join("patched")).unwrap();
     let read = ModelBundle::load(&folder.path().join("patched")).unwrap();
-    assert_eq!(
-        (read.effects.as_slice(), &read.vehicle),
-        (&effects.map(ScheduledEffect::from)[..], &base.vehicle.with_effects(&effects))
-    );
+    assert_eq!((read.effects.as_slice(), &read.vehicle), (&effects.map(ScheduledEffect::from)[..], &base.vehicle.with_effects(&effects)));
     assert_eq!(read.provenance.parent.as_deref(), Some(base.hash.as_str()));
     assert_ne!(read.hash, base.hash);
     let again = ModelBundle::load(&folder.path().join("base")).unwrap();

@@ -94,7 +94,8 @@ mod tests {
     #[test]
     fn property_nodes_are_found_where_they_were_put() {
         let store = NodeStore::default();
-        let nodes: Vec<Node> = (-20i32..20).flat_map(|x: i32| (-3i32..30).map(move |y: i32| (x * 7, y - x, (x * x + y).rem_euclid(72)))).collect();
+        let nodes: Vec<Node> =
+            (-20i32..20).flat_map(|x: i32| (-3i32..30).map(move |y: i32| (x * 7, y - x, (x * x + y).rem_euclid(72)))).collect();
         let value = |node: &Node| (node.0 * 10_000 + node.1 * 100 + node.2) as f32;
         store.insert(nodes.iter().map(|node| (*node, [value(node); VALUES])));
         let reader = store.read();
