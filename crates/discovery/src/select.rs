@@ -6,6 +6,7 @@
 use nesam_physics::effects::Layer;
 
 use crate::candidates::Candidate;
+use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, level_column};
 use crate::evidence::{Group, Nulls};
 use crate::reference::{NullGroups, all_evidence};
@@ -231,11 +232,16 @@ impl Yardstick {
     }
 
     /// The same where `left` are the scores after the fit went through the physics.
+    ///
+    /// The rims of this drive line follow the ground plus an over-speed and carry no torque (ADR 0003): what a force or a soil does to them is not
+    /// predicted, so their levels do not speak against one.
     pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
         let columns = self.columns(chosen);
         let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
         let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
-        let levels = self.channels.iter().enumerate().map(|(i, c)| {
+        let force = chosen.iter().any(|h| matches!(self.catalogue[*h].layer(), Layer::Force | Layer::Soil));
+        let told = |c: &usize| !(force && (RIM_AT..PATH_AT).contains(c));
+        let levels = self.channels.iter().enumerate().filter(|(_, c)| told(c)).map(|(i, c)| {
             let z = left.remainder_since(before, &columns, &[level_column(*c)], worst).z / self.spread(self.catalogue.len() + i);
             (z, format!("the level of {}", crate::channels::name(*c)))
         });
