@@ -45,7 +45,7 @@ enum Command {
     Serve(commands::serve::ServeArgs),
     /// Score models against measured drives, with intervals and plots
     Evaluate(commands::evaluate::EvaluateArgs),
-    /// Find the effect that the model lacks, and try it on other drives (first cut: not reliable yet)
+    /// Find the effects that the model lacks, and try them on other drives
     Diagnose(commands::diagnose::DiagnoseArgs),
     /// Learn the soil while driving: fixed against adapted predictions on measured drives
     Adapt(commands::adapt::AdaptArgs),
