@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::{Layer, ScheduledEffect};
+use nesam_physics::effects::ScheduledEffect;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
@@ -14,7 +14,7 @@ use crate::fit::{Fit, Prepared, Term, fit};
 use crate::metric::Metric;
 use crate::observe::Bench;
 use crate::onset::{self, Onset};
-use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick};
+use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick, mismatch};
 
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
 /// pass for this one on a drive, but seldom with the same size on all.
@@ -113,11 +113,11 @@ impl Case<'_> {
     /// Selects effects, looks for the onset of the strongest, and lets the columns begin there where an onset is sure.
     pub fn select(&mut self, yardstick: &Yardstick) -> (Selection, Vec<Option<Onset>>) {
         let mut onsets: Vec<Option<Onset>> = vec![None; yardstick.catalogue.len()];
-        let selection = yardstick.select(&yardstick.group(self.condensed()));
+        let group = yardstick.group(self.condensed());
+        let selection = yardstick.select(&group);
         if !selection.differs() {
             return (selection, onsets);
         }
-        let group = yardstick.group(self.condensed());
         let mut contenders: Vec<(usize, f64)> =
             (0..yardstick.catalogue.len()).filter(|h| yardstick.considered[*h]).map(|h| (h, yardstick.after(&group, &[], h).1)).collect();
         contenders.sort_by(|a, b| b.1.total_cmp(&a.1));
@@ -306,15 +306,6 @@ fn class(yardstick: &Yardstick, selection: &Selection, i: usize) -> (f64, Vec<Me
     (1.0 / total, close.into_iter().map(|(candidate, weight)| Member { candidate, weight: weight / total }).collect())
 }
 
-/// How wrong the predicted response to an effect may be as a whole, as a share of it (chosen): forces of two accepted pressure laws differ by more, the
-/// angle of a road wheel and the integral of a gyro are geometry.
-fn scale_sd(layer: Layer) -> f64 {
-    match layer {
-        Layer::Force | Layer::Soil => 0.12,
-        _ => 0.02,
-    }
-}
-
 /// Half width of the 95 % interval of a value: the wider of the scatter of null drives and the jackknife over drives.
 fn half_width(group: &Group, fit: &Fit, term: usize, i: usize) -> f64 {
     let columns = fit.terms[term].candidate.columns();
@@ -335,7 +326,7 @@ fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
         .map(|(p, parameter)| {
             let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
                 // The first value is the magnitude, which answers for the scale of the response.
-                let scale = if i == 0 { 1.96 * scale_sd(candidate.layer()) * fit.values[term][i] } else { 0.0 };
+                let scale = if i == 0 { 1.96 * mismatch(candidate.layer()) * fit.values[term][i] } else { 0.0 };
                 let half = half_width(group, fit, term, i).hypot(scale);
                 [parameter.value - half, parameter.value + half]
             });

@@ -278,7 +278,7 @@ fn provisional(selection: &Selection, findings: &[Finding]) -> (Verdict, String)
     }
     let (left, what) = &selection.remaining;
     let share = left / selection.largest().max(1e-9);
-    let force = findings.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Soil));
+    let force = findings.iter().any(|f| f.candidate.layer().is_force());
     if *left >= selection.threshold && share > if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY } {
         return (
             Verdict::Unexplained,

@@ -90,10 +90,7 @@ impl Selection {
 /// How wrong the predicted response to an effect may be, as a share of it (chosen): the angle of a road wheel is geometry, two accepted pressure laws
 /// give forces that differ by a quarter, mostly by a common factor that a fit takes up.
 pub fn mismatch(layer: Layer) -> f64 {
-    match layer {
-        Layer::Force | Layer::Soil => 0.12,
-        _ => 0.02,
-    }
+    if layer.is_force() { 0.12 } else { 0.02 }
 }
 
 impl Yardstick {
@@ -239,7 +236,7 @@ impl Yardstick {
         let columns = self.columns(chosen);
         let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
         let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
-        let force = chosen.iter().any(|h| matches!(self.catalogue[*h].layer(), Layer::Force | Layer::Soil));
+        let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
         let told = |c: &usize| !(force && (RIM_AT..PATH_AT).contains(c));
         let levels = self.channels.iter().enumerate().filter(|(_, c)| told(c)).map(|(i, c)| {
             let z = left.remainder_since(before, &columns, &[level_column(*c)], worst).z / self.spread(self.catalogue.len() + i);

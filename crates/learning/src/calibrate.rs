@@ -57,12 +57,7 @@ fn rollout_error(model: &StepModel, drive: &Drive, i: usize, soil: &Soil<f64>, s
             ground: ground.under_wheels(model, &state, 0.0).0,
         };
         let increment = model.step(&input).increment;
-        let (sin, cos) = state.attitude_rad[2].sin_cos();
-        let (x, d) = (state.to_array(), increment.to_array());
-        let mut next: [f64; 12] = core::array::from_fn(|c| x[c] + d[c]);
-        next[0] = x[0] + cos * d[0] - sin * d[1];
-        next[1] = x[1] + sin * d[0] + cos * d[1];
-        state = VehicleState::from_array(next);
+        state = VehicleState::from_array(state.advanced(&increment.to_array()));
         actuators = after;
         let measured = drive.states[i + k + 1].position_m;
         error += (state.position_m[0] - measured[0]).hypot(state.position_m[1] - measured[1]) / HORIZON as f64;

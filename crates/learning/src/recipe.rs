@@ -230,7 +230,7 @@ fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s:
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
     let mut best: Option<(f64, Vehicle)> = None;
-    for law in [ContactLaw::WongReece, ContactLaw::SoilContactModel] {
+    for law in ContactLaw::ALL {
         let mut candidate = Vehicle { contact_law: law, ..vehicle.clone() };
         reporter.stage(&format!("drive line, {law:?}"), 12);
         let mut done = 0;

@@ -10,7 +10,9 @@ use common::{drive, hills, lively_weights, measured_scales, predictor, truck};
 use nesam_learning::Drive;
 use nesam_model::dims::HIDDEN;
 use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
-use nesam_model::{GroundSource, ModelBundle, Normalization, Path, Predictor, RolloutQuery, Variant, Weights, history_actuators};
+use nesam_model::{
+    GroundSource, HistoryStep, ModelBundle, Normalization, Path, Predictor, RolloutQuery, Variant, Weights, history_actuators,
+};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::{Pose2, WorldMap};
@@ -115,6 +117,33 @@ fn property_fast_path_equals_the_reference_on_shipped_weights() {
     compare_weights(Some(&map), 31, Variant::Full, &drive(Some(&map), 80), &bundle.normalization, bundle.weights.clone());
 }
 
+/// Commands that differ from candidate to candidate and from step to step, (samples, horizon, 2).
+fn wavy_controls(samples: usize, horizon: usize) -> Vec<f32> {
+    (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect()
+}
+
+/// A query of all candidates from the 33rd sample of a drive on.
+fn from_sample_33<'a>(
+    drive: &Drive,
+    past: &'a [HistoryStep],
+    controls: &'a [f32],
+    samples: usize,
+    map: &'a Arc<WorldMap>,
+) -> RolloutQuery<'a> {
+    RolloutQuery {
+        history: past,
+        start: drive.states[33],
+        controls,
+        samples,
+        horizon: controls.len() / (2 * samples),
+        map: Some(map),
+        soil_correction: SoilCorrection::NONE,
+        variant: Variant::Full,
+        start_time_s: None,
+        wheels: None,
+    }
+}
+
 #[test]
 fn property_every_path_gives_the_same_bytes() {
     let map = hills();
@@ -123,19 +152,8 @@ fn property_every_path_gives_the_same_bytes() {
     let fastest = predictor(&scales, lively_weights(&scales));
     let past = drive.history(2, 33);
     let (samples, horizon) = (19, 12);
-    let controls: Vec<f32> = (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect();
-    let query = RolloutQuery {
-        history: &past,
-        start: drive.states[33],
-        controls: &controls,
-        samples,
-        horizon,
-        map: Some(&map),
-        soil_correction: SoilCorrection::NONE,
-        variant: Variant::Full,
-        start_time_s: None,
-        wheels: None,
-    };
+    let controls = wavy_controls(samples, horizon);
+    let query = from_sample_33(&drive, &past, &controls, samples, &map);
     let expected = fastest.rollout(&query).expect("a valid query");
     // Without a fused multiply-add in the target the portable path rounds otherwise.
     for path in Path::available().into_iter().filter(|path| cfg!(target_feature = "fma") || *path == fastest.path()) {
@@ -153,19 +171,8 @@ fn property_row_of_a_batch_equals_the_row_alone() {
     let predictor = predictor(&scales, lively_weights(&scales));
     let past = drive.history(2, 33);
     let (samples, horizon) = (37, 16);
-    let controls: Vec<f32> = (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect();
-    let query = RolloutQuery {
-        history: &past,
-        start: drive.states[33],
-        controls: &controls,
-        samples,
-        horizon,
-        map: Some(&map),
-        soil_correction: SoilCorrection::NONE,
-        variant: Variant::Full,
-        start_time_s: None,
-        wheels: None,
-    };
+    let controls = wavy_controls(samples, horizon);
+    let query = from_sample_33(&drive, &past, &controls, samples, &map);
     // Without a history the actuators begin as each row's own first command says.
     for query in [query.clone(), RolloutQuery { history: &[], ..query }] {
         let batch = predictor.rollout(&query).expect("a valid query");

@@ -65,6 +65,11 @@ pub enum Layer {
 }
 
 impl Layer {
+    /// Whether its effects act as forces, directly or through the soil: their size hangs on a constitutive law, that of the others on geometry.
+    pub fn is_force(self) -> bool {
+        matches!(self, Self::Force | Self::Soil)
+    }
+
     /// As in reports.
     pub fn as_str(self) -> &'static str {
         match self {

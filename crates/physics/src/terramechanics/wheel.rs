@@ -31,6 +31,11 @@ pub enum ContactLaw {
     SoilContactModel,
 }
 
+impl ContactLaw {
+    /// The family.
+    pub const ALL: [Self; 2] = [Self::WongReece, Self::SoilContactModel];
+}
+
 /// Geometry and contact coefficients of a wheel.
 #[derive(Clone, Debug, PartialEq)]
 pub struct WheelGeometry {
