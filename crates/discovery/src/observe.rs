@@ -10,7 +10,7 @@ use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, Predictor, Transition};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::effects::{Effect, ScheduledEffect};
-use nesam_physics::step::{StepInput, StepModel};
+use nesam_physics::step::{StepInput, StepModel, StepOutput};
 use nesam_physics::{SOIL_DIM, STATE_DIM, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -76,7 +76,7 @@ struct Reading {
 }
 
 /// Physics, state and actuators of one sample.
-type WayToDrive<'a> = (&'a StepModel, &'a VehicleState<f64>, &'a [DrivelineState; 2]);
+type WayToDrive<'a> = (&'a StepModel, &'a VehicleState<f64>, &'a [DrivelineState; 2], &'a StepOutput<f64>);
 
 /// Prepares drives, world by world, because a predictor keeps terrain features of a few maps only; `done` is called after each drive.
 ///
@@ -215,10 +215,12 @@ impl ObservedDrive {
         let mut state = self.states[0];
         for (k, transition) in self.transitions.iter().enumerate() {
             let model = if k as f64 * dt_s >= onset_s { &changed } else { &plain.model };
-            let recorded = self.increment(&plain.model, k, dt_s, &self.states[k], &plain.actuators[k]);
+            let recorded = self.stepped(&plain.model, k, dt_s, &self.states[k], &plain.actuators[k]);
             let after = actuators.advance(model.vehicle(), &transition.control, state.velocity_m_s[0], dt_s);
-            let driven = self.increment(model, k, dt_s, &state, &[actuators, after]);
-            self.move_wheels(k, (&plain.model, &self.states[k], &plain.actuators[k]), (model, &state, &[actuators, after]), drive);
+            let driven = self.stepped(model, k, dt_s, &state, &[actuators, after]);
+            let from = (&plain.model, &self.states[k], &plain.actuators[k], &recorded);
+            self.move_wheels(k, from, (model, &state, &[actuators, after], &driven), drive);
+            let [recorded, driven] = [recorded, driven].map(|s| s.increment.to_array());
             // The recorded increment in its own heading frame, with what the physics says of the difference.
             let total = core::array::from_fn(|i| between(&self.states[k], &self.states[k + 1])[i] + driven[i] - recorded[i]);
             state = VehicleState::from_array(state.advanced(&total));
@@ -227,14 +229,15 @@ impl ObservedDrive {
         }
     }
 
-    fn increment(
+    /// The step that the physics makes of a sample.
+    fn stepped(
         &self,
         model: &StepModel,
         k: usize,
         dt_s: f64,
         state: &VehicleState<f64>,
         actuators: &[DrivelineState; 2],
-    ) -> [f64; STATE_DIM] {
+    ) -> StepOutput<f64> {
         let transition = &self.transitions[k];
         let ground = GroundSource::new(self.map.as_deref(), model, state);
         let input = StepInput {
@@ -244,7 +247,7 @@ impl ObservedDrive {
             ground: ground.under_wheels(model, state, 0.0).0,
             ..transition.input
         };
-        model.step(&input).increment.to_array()
+        model.step(&input)
     }
 
     /// Soil of a sample with a correction and what effects change of it in time.
@@ -255,10 +258,10 @@ impl ObservedDrive {
 
     /// Moves the recorded wheel speeds and road-wheel angles of a sample by what the physics says of the difference between two ways to drive.
     fn move_wheels(&self, k: usize, from: WayToDrive<'_>, to: WayToDrive<'_>, drive: &mut Trajectory) {
-        let of = |(model, state, actuators): WayToDrive<'_>| {
+        let of = |(model, state, actuators, step): WayToDrive<'_>| {
             let mut row = [0.0; CHANNELS];
             let reading = Reading { model: model.clone(), actuators: vec![*actuators; k + 1], states: vec![*state; k + 1] };
-            self.actuators(&reading, &self.transitions[k], k, 0, &mut row);
+            self.actuators(&reading, &self.transitions[k], k, 0, step.contacts.map(|c| c.overspeed_m_s), &mut row);
             row
         };
         let (before, after) = (of(from), of(to));
@@ -280,7 +283,6 @@ impl ObservedDrive {
         let mut state = states[start];
         let ground = GroundSource::new(self.map.as_deref(), model, &state);
         for (j, transition) in self.transitions[start..start + SEGMENT_STEPS].iter().enumerate() {
-            self.actuators(reading, transition, start + j, j, &mut row);
             let [before, after] = &reading.actuators[start + j];
             let input = StepInput {
                 state,
@@ -289,7 +291,9 @@ impl ObservedDrive {
                 ground: ground.under_wheels(model, &state, 0.0).0,
                 ..transition.input
             };
-            let increment = model.step(&input).increment.to_array();
+            let StepOutput { increment, contacts } = model.step(&input);
+            self.actuators(reading, transition, start + j, j, contacts.map(|c| c.overspeed_m_s), &mut row);
+            let increment = increment.to_array();
             let total: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + transition.residual[i]);
             state = VehicleState::from_array(state.advanced(&total));
             for (b, [from, to]) in BINS.iter().enumerate() {
@@ -309,7 +313,8 @@ impl ObservedDrive {
     ///
     /// A drag torque τ lowers the rim speed until the tread makes up for what the coupling of the axle does not:
     /// Δ(over-speed) = -(τ at the tread / r) / (∂F/∂over-speed), see `StepModel`.
-    fn actuators(&self, reading: &Reading, transition: &Transition, sample: usize, j: usize, row: &mut Row) {
+    /// Of a vehicle driven by torque the step knows the over-speeds (`overspeed_m_s`), drags and locks included.
+    fn actuators(&self, reading: &Reading, transition: &Transition, sample: usize, j: usize, overspeed_m_s: [f64; WHEELS], row: &mut Row) {
         let vehicle = reading.model.vehicle();
         let [before, after] = &reading.actuators[sample];
         let mut angles = before.road_wheel_angles(vehicle);
@@ -329,12 +334,16 @@ impl ObservedDrive {
             let centre = [v[0] + w[1] * at[2] - w[2] * at[1], v[1] + w[2] * at[0] - w[0] * at[2]];
             let (sin, cos) = angles[i].sin_cos();
             let own = cos * centre[0] + sin * centre[1];
+            let radius = 1.0 + vehicle.effects.force.radius_relative[i / 2];
+            if vehicle.driveline.torque.is_some() {
+                row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - (own + overspeed_m_s[i]) / radius);
+                continue;
+            }
             // A locked axle turns both rims at the mean of what their own ground asks for; Ω is read as a speed of the card's radius.
             let middle = own + cos * 0.5 * w[2] * (at[1] - vehicle.wheel_centre_m[i ^ 1][1]);
             let forward = own + vehicle.effects.actuator.lock * (middle - own);
             let slope = self.traction_slope[sample][i];
             let drag = vehicle.drag_at_tread_n_m(i, slope) / vehicle.wheel_radius_m / slope;
-            let radius = 1.0 + vehicle.effects.force.radius_relative[i / 2];
             let predicted = (wheels.rim_speed_m_s(i, forward, v[0]) - drag * forward.signum()) / radius;
             row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - predicted);
         }

@@ -29,6 +29,7 @@ pub(crate) fn bicycle() -> Vehicle {
             overspeed_limit_m_s: 2.0,
             rims: Default::default(),
             side_coupling_n_m_s: 0.0,
+            torque: None,
         },
         gravity_m_s2: 9.81,
         contact_law: Default::default(),

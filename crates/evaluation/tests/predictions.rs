@@ -157,6 +157,7 @@ fn nesam_vehicle() -> nesam_physics::Vehicle {
             overspeed_limit_m_s: 1.0,
             rims: Default::default(),
             side_coupling_n_m_s: 0.0,
+            torque: None,
         },
         gravity_m_s2: 9.81,
         contact_law: Default::default(),

@@ -3,7 +3,7 @@
 use nesam_model::{GroundSource, Normalization, history_actuators};
 use nesam_physics::driveline::command_wheels;
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{SecondCommand, Soil, Vehicle, VehicleState, WHEELS};
+use nesam_physics::{SecondCommand, Soil, TORQUE_KNOTS, TorqueDrive, Vehicle, VehicleState, WHEELS};
 use rayon::prelude::*;
 
 use crate::drives::Drive;
@@ -13,14 +13,84 @@ use crate::rims::fit_rims;
 const HORIZON: usize = 16;
 
 /// A number of the drive line that is calibrated, with its range.
-type Knob = (&'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
+pub type Knob = (&'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
 
-const KNOBS: [Knob; 4] = [
+const STEERING: Knob = ("steering_lag_s", |v| &mut v.driveline.steering_lag_s, [0.0, 0.5]);
+
+/// Numbers of a drive that holds its rims at an over-speed.
+const OVERSPEED: [Knob; 4] = [
     ("speed_gain", |v| &mut v.driveline.speed_gain, [0.01, 1.0]),
     ("speed_integral_gain_per_s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 0.5]),
     ("overspeed_limit_m_s", |v| &mut v.driveline.overspeed_limit_m_s, [0.05, 3.0]),
-    ("steering_lag_s", |v| &mut v.driveline.steering_lag_s, [0.0, 0.5]),
+    STEERING,
 ];
+
+/// Numbers of a drive by torque; the gain stands for the torque per demand, which is fixed by the vehicle, and the curve is relative to its middle.
+const TORQUE: [Knob; 12] = [
+    ("speed_gain", |v| &mut v.driveline.speed_gain, [0.05, 5.0]),
+    ("speed_integral_gain_per_s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 2.0]),
+    ("holding_demand_m_s", |v| &mut torque(v).holding_demand_m_s, [0.0, 2.0]),
+    ("speed_integral_leak_s", |v| &mut v.driveline.speed_integral_leak_s, [0.5, 20.0]),
+    ("curve 0", |v| &mut torque(v).curve[0], [0.2, 3.0]),
+    ("curve 1", |v| &mut torque(v).curve[1], [0.2, 3.0]),
+    ("curve 3", |v| &mut torque(v).curve[3], [0.2, 3.0]),
+    ("curve 4", |v| &mut torque(v).curve[4], [0.2, 3.0]),
+    ("closed_n_m", |v| &mut torque(v).closed_n_m, [0.0, 2000.0]),
+    ("brake_ratio", |v| &mut torque(v).brake_ratio, [0.0, 3.0]),
+    ("side_coupling_n_m_s", |v| &mut v.driveline.side_coupling_n_m_s, [0.0, 2000.0]),
+    STEERING,
+];
+
+/// Engine and brakes of a vehicle that has been put under this law.
+fn torque(vehicle: &mut Vehicle) -> &mut TorqueDrive {
+    vehicle.driveline.torque.as_mut().expect("the drive is by torque; this is a bug")
+}
+
+/// How the commands of a car reach its rims before calibration: at an over-speed as its card says, or by a torque that gives 0.4 g per m/s.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DriveLaw {
+    /// Rims at an over-speed.
+    Overspeed,
+    /// Hubs under a torque.
+    Torque,
+}
+
+/// Torque per demand of a drive by torque over weight and radius, s/m.
+const TORQUE_PER_WEIGHT_S_M: f64 = 0.4;
+/// Shares of the samples below the speeds of a torque curve.
+const CURVE_SHARES: [f64; TORQUE_KNOTS] = [0.03, 0.2, 0.5, 0.8, 0.97];
+
+impl DriveLaw {
+    /// Both.
+    pub const ALL: [Self; 2] = [Self::Overspeed, Self::Torque];
+
+    /// The vehicle under this law, uncalibrated; a torque curve has its knots where the drives have their speeds. `None` where they do not move.
+    pub fn of(self, vehicle: &Vehicle, drives: &[&Drive]) -> Option<Vehicle> {
+        let mut vehicle = vehicle.clone();
+        let line = &mut vehicle.driveline;
+        if self == Self::Overspeed {
+            line.torque = None;
+            return Some(vehicle);
+        }
+        let mut speeds: Vec<f64> = drives.iter().flat_map(|d| d.states.iter().map(|s| s.velocity_m_s[0])).filter(|v| *v > 0.0).collect();
+        speeds.sort_by(f64::total_cmp);
+        let last = speeds.len().checked_sub(1)?;
+        let curve_speed_m_s = CURVE_SHARES.map(|share| speeds[(share * last as f64) as usize]);
+        if curve_speed_m_s.windows(2).any(|w| w[1] - w[0] < 1e-3) {
+            return None;
+        }
+        (line.speed_gain, line.speed_integral_gain_per_s, line.speed_integral_leak_s, line.overspeed_limit_m_s) = (1.0, 0.4, 5.0, 3.0);
+        line.torque = Some(TorqueDrive {
+            per_demand_n_m_s_m: TORQUE_PER_WEIGHT_S_M * vehicle.mass_kg * vehicle.gravity_m_s2 * vehicle.wheel_radius_m,
+            holding_demand_m_s: 0.4,
+            closed_n_m: 0.0,
+            brake_ratio: 1.0,
+            curve_speed_m_s,
+            curve: [1.0; TORQUE_KNOTS],
+        });
+        Some(vehicle)
+    }
+}
 
 /// Mean position error (m) over short rollouts of the symbolic model from every `stride`-th sample.
 pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, stride: usize) -> f64 {
@@ -65,6 +135,11 @@ fn rollout_error(model: &StepModel, drive: &Drive, i: usize, soil: &Soil<f64>, s
     error
 }
 
+/// Numbers that are calibrated on a car.
+pub fn knobs(vehicle: &Vehicle) -> &'static [Knob] {
+    if vehicle.driveline.torque.is_some() { &TORQUE } else { &OVERSPEED }
+}
+
 /// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error before and after, m.
 pub fn calibrate_driveline(
     vehicle: &mut Vehicle,
@@ -82,7 +157,7 @@ pub fn calibrate_driveline(
     }
     let mut best = before;
     for round in 0..3 {
-        for (name, knob, [low, high]) in KNOBS {
+        for &(name, knob, [low, high]) in knobs(vehicle) {
             let mut reach = if round == 0 { 0.5 } else { 0.5 / f64::from(2 << round) };
             while reach > 0.02 {
                 let current = *knob(vehicle);

@@ -11,12 +11,12 @@ use nesam_model::encoder::{ENCODERS, TerrainEncoders};
 use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
 use nesam_physics::step::StepModel;
 use nesam_physics::terramechanics::ContactLaw;
-use nesam_physics::{STATE_DIM, Vehicle};
+use nesam_physics::{STATE_DIM, SecondCommand, Vehicle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, Trajectory};
 
 use crate::autoencoder::{Places, PretrainPlan, pretrain};
-use crate::calibrate::calibrate_driveline;
+use crate::calibrate::{DriveLaw, calibrate_driveline, knobs};
 use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
 use crate::pooling::Pooling;
@@ -230,15 +230,19 @@ fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s:
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
     let mut best: Option<(f64, Vehicle)> = None;
-    for law in ContactLaw::ALL {
-        let mut candidate = Vehicle { contact_law: law, ..vehicle.clone() };
-        reporter.stage(&format!("drive line, {law:?}"), 12);
+    let skid = vehicle.second == SecondCommand::YawRateRadS;
+    let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
+    for (law, drive) in ContactLaw::ALL.iter().flat_map(|law| drives_by.iter().map(move |drive| (*law, *drive))) {
+        let Some(start) = drive.of(vehicle, &few) else { continue };
+        let mut candidate = Vehicle { contact_law: law, ..start };
+        let name = format!("{law:?}, {drive:?}");
+        reporter.stage(&format!("drive line, {name}"), 3 * knobs(&candidate).len());
         let mut done = 0;
         let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, |name, value, error| {
             done += 1;
             reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
         });
-        reporter.line(&format!("{law:?}, symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", candidate.driveline));
+        reporter.line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", candidate.driveline));
         if best.as_ref().is_none_or(|(error, _)| after < *error) {
             best = Some((after, candidate));
         }

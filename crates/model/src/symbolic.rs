@@ -14,7 +14,7 @@ const SPEED_LAG_S: f64 = 0.5;
 #[inline(always)]
 pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepInput<T>) -> StepOutput<T> {
     let zero = T::lit(0.0);
-    let none = WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero };
+    let none = WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero, overspeed_m_s: zero };
     let without_soil = |increment| StepOutput { increment, contacts: [none; WHEELS] };
     let input = match variant {
         Variant::Full | Variant::NoResidual | Variant::ZeroSinkage => *input,

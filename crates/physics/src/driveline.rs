@@ -158,6 +158,9 @@ fn behind_actuator<T: Real>(vehicle: &Vehicle, position: T) -> T {
     position + T::lit(terms.steering_offset)
 }
 
+/// Speed command around which the held demand turns its direction, m/s (chosen: a command of zero holds nothing).
+const HOLDING_SPEED_M_S: f64 = 0.1;
+
 /// What the wheels are told during one step; constants of the step (no derivative flows through the actuators).
 #[derive(Clone, Copy, Debug)]
 pub struct WheelCommand<T> {
@@ -240,6 +243,10 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
     let steering = behind_actuator(vehicle, position);
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let mut base = [T::lit(line.speed_integral_gain_per_s) * before.speed_error_integral_m; WHEELS];
+    if let Some(torque) = &line.torque {
+        let held = T::lit(torque.holding_demand_m_s) * control.speed_m_s / control.speed_m_s.abs_smooth(HOLDING_SPEED_M_S);
+        base = base.map(|b| b + held);
+    }
     if skid {
         let half_turn = T::lit(0.5 * (vehicle.track_m + actuator.track_m)) * steering;
         let speed = half * (before.rim_speed_m_s + after.rim_speed_m_s);
@@ -251,7 +258,7 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
         rim_base_m_s: base,
         rim_follow: T::lit(if skid { 0.0 } else { 1.0 }),
         rim_gain: T::lit(if skid { 0.0 } else { line.speed_gain }),
-        overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s * (1.0 - actuator.torque_lost)),
+        overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s * if line.torque.is_some() { 1.0 } else { 1.0 - actuator.torque_lost }),
         speed_m_s: if actuator.alters_commands() { after.path.speed_over_step_m_s } else { control.speed_m_s },
     }
 }
@@ -272,12 +279,23 @@ impl<T: Real> WheelCommand<T> {
     /// Rim speed of wheel `i`, m/s, given its own and the vehicle's forward speed.
     #[inline(always)]
     pub fn rim_speed_m_s(&self, i: usize, wheel_forward_m_s: T, vehicle_forward_m_s: T) -> T {
+        let overspeed = self.demand_m_s(i, vehicle_forward_m_s);
+        self.servo_m_s(i) + self.rim_follow * wheel_forward_m_s + overspeed
+    }
+
+    /// What the speed control demands of wheel `i`, m/s: the over-speed of its rim, or what its torque is proportional to; 0 where the rim is servoed.
+    #[inline(always)]
+    pub fn demand_m_s(&self, i: usize, vehicle_forward_m_s: T) -> T {
         let demand = self.rim_base_m_s[i] * self.rim_follow + self.rim_gain * (self.speed_m_s - vehicle_forward_m_s);
         // Smooth saturation d / sqrt(1 + (d / limit)²): slope one at zero, the limit far out.
         let share = demand / self.overspeed_limit_m_s;
-        let overspeed = demand / (T::lit(1.0) + share * share).sqrt();
-        let servo = self.rim_base_m_s[i] * (T::lit(1.0) - self.rim_follow);
-        servo + self.rim_follow * wheel_forward_m_s + overspeed
+        demand / (T::lit(1.0) + share * share).sqrt()
+    }
+
+    /// Rim speed of wheel `i` where it is servoed or measured, m/s, else 0.
+    #[inline(always)]
+    pub fn servo_m_s(&self, i: usize) -> T {
+        self.rim_base_m_s[i] * (T::lit(1.0) - self.rim_follow)
     }
 
     /// -∂(rim speed - wheel's forward speed)/∂(forward speed): how strongly a gain in speed eats the over-speed.

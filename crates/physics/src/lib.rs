@@ -13,6 +13,7 @@ mod state;
 pub mod step;
 mod step_effects;
 pub mod terramechanics;
+mod torque_drive;
 pub mod vec3;
 mod vehicle;
 
@@ -21,4 +22,4 @@ pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};
 pub use state::{Control, DT_S, STATE_DIM, VehicleState, wrap_angle};
-pub use vehicle::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
+pub use vehicle::{Driveline, RimServo, SecondCommand, SteeringTable, TORQUE_KNOTS, TorqueDrive, Vehicle, WHEELS};

@@ -11,6 +11,7 @@ use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
 use crate::terramechanics::{Support, WheelGeometry, WheelMotion, WheelWrench, balance_sinkage, wheel_wrench};
+use crate::torque_drive::Grip;
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -53,6 +54,8 @@ pub struct WheelContact<T> {
     pub left_n: T,
     /// Slip, -.
     pub slip: T,
+    /// Speed of the rim over that of the ground along the wheel's heading, m/s.
+    pub overspeed_m_s: T,
 }
 
 /// Result of a step.
@@ -233,23 +236,25 @@ impl StepModel {
         let left = cross(normal, forward);
 
         let distance = self.distance(i, state, tilt, input);
-        let wheel_motion = WheelMotion {
-            rim_speed_m_s: match self.altered.on_wheels {
-                false => input.wheels.rim_speed_m_s(i, dot(velocity, forward), state.velocity_m_s[0]),
-                true => self.altered_rim_speed(i, state, forward, input),
-            },
-            forward_m_s: dot(velocity, forward),
-            left_m_s: dot(velocity, left),
-        };
-        let (direction, motion) = wheel_motion.contact();
+        let (forward_m_s, left_m_s) = (dot(velocity, forward), dot(velocity, left));
         let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
         let mut ratio = input.sinkage_log_ratio[i].exp();
         let closing = -dot(velocity, normal);
         let mut preload = T::lit(self.static_load_n[i]) + rate * (T::lit(wheel.radius_m) - distance) + damper * closing;
+        if self.altered.on_wheels {
+            preload = preload + self.stabiliser_n(i, state, tilt, input);
+        }
+        let driven = self.driven(i, preload, forward_m_s, state, input);
+        let rim_speed_m_s = match (&driven, self.altered.on_wheels) {
+            (Some(driven), _) => input.wheels.servo_m_s(i) + input.wheels.rim_follow * (forward_m_s + driven.overspeed_m_s),
+            (None, false) => input.wheels.rim_speed_m_s(i, forward_m_s, state.velocity_m_s[0]),
+            (None, true) => self.altered_rim_speed(i, state, forward, input),
+        };
+        let wheel_motion = WheelMotion { rim_speed_m_s, forward_m_s, left_m_s };
+        let (direction, motion) = wheel_motion.contact();
         let mut soil = input.soil;
         if self.altered.on_wheels {
             ratio = ratio * self.digging(motion.slip);
-            preload = preload + self.stabiliser_n(i, state, tilt, input);
             soil = self.soil_under(i, &Support { preload_n: preload, rate_n_m: rate * ratio }, ratio, &motion, &soil);
         }
         let support = Support { preload_n: preload, rate_n_m: rate * ratio };
@@ -261,6 +266,13 @@ impl StepModel {
         let soil_rate = (soil.n + T::lit(0.5)) * load / balanced;
         let in_series = soil_rate / (soil_rate + rate);
         let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
+        if let Some(driven) = &driven {
+            let grip = Grip::new(wheel, sinkage, load, &soil);
+            let taken = wrench.torque_n_m * share * direction * T::lit(1.0 / wheel.radius_m);
+            let more = grip.carried_on_n(driven.at_rim_n, taken, wrench.thrust_n * share * direction);
+            contact.forward_n = contact.forward_n + input.wheels.rim_follow * more;
+            drag[0] = drag[0] + input.wheels.rim_follow * (driven.damping_n_s_m - drag[0]);
+        }
         if self.altered.on_wheels {
             self.alter_traction(i, &wheel_motion, &motion, &soil, share, &mut drag, &mut contact);
         }
@@ -305,12 +317,13 @@ impl StepModel {
         let left_n = wrench.side_n * share;
         // Secant slopes bound the tangents of the concave shear law, so the implicit step never under-damps.
         let floor = 0.02;
-        let over = (wheel_motion.rim_speed_m_s - wheel_motion.forward_m_s).abs_smooth(floor);
+        let overspeed_m_s = wheel_motion.rim_speed_m_s - wheel_motion.forward_m_s;
+        let over = overspeed_m_s.abs_smooth(floor);
         let thrust = (wrench.thrust_n * share).abs_smooth(1.0);
         let side = left_n.abs_smooth(1.0) / wheel_motion.left_m_s.abs_smooth(floor);
         let friction = drag_n / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
         let drag = [thrust / over * input.wheels.slip_feedback() + friction.max(T::lit(0.0)), side];
-        (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip })
+        (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip, overspeed_m_s })
     }
 }
 
@@ -318,9 +331,10 @@ impl StepModel {
     /// Force that friction at the wheels of an axle takes from the tread of one of them, N ([`Vehicle::drag_at_tread_n_m`]).
     ///
     /// The slope of traction is the tangent of the exponential shear law at the mobilised share u of its limit: thrust / over-speed · (1 - u) (-ln(1 - u)) / u.
-    /// Without drag nothing is computed.
+    /// Without drag, or where it brakes a hub under torque ([`StepModel::driven`]), nothing is computed.
     fn drag_at_tread<T: Real>(&self, wheel: usize, thrust_n: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> T {
-        if self.vehicle.effects.force.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
+        let torque_takes_it = self.vehicle.driveline.torque.is_some();
+        if torque_takes_it || self.vehicle.effects.force.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
             return T::lit(0.0);
         }
         let over = (motion.rim_speed_m_s - motion.forward_m_s).abs_smooth(0.02);

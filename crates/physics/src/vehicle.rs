@@ -51,7 +51,49 @@ pub struct Driveline {
     pub rims: RimServo,
     /// Torque that the coupling between the wheels of an axle passes per difference of their speeds, N m s/rad; 0 = open differential.
     pub side_coupling_n_m_s: f64,
+    /// Engine and brakes of a car whose hubs are driven by a torque; `None` = the rims are held at the demanded over-speed.
+    pub torque: Option<TorqueDrive>,
 }
+
+/// Knots of a torque curve.
+pub const TORQUE_KNOTS: usize = 5;
+
+/// How what the speed control demands becomes a torque at the hubs. The demand (m/s) is `speed_gain` times the speed error, its integral, and what is held
+/// against the usual resistance, all limited by `overspeed_limit_m_s`.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct TorqueDrive {
+    /// Torque of the engine at all wheels together per demand where the curve is 1, N m s/m.
+    pub per_demand_n_m_s_m: f64,
+    /// Demand that holds the usual resistance at no speed error, m/s.
+    pub holding_demand_m_s: f64,
+    /// Torque by which engine and gears brake at no demand, all wheels together, N m.
+    pub closed_n_m: f64,
+    /// Torque of the brakes per negative demand over that of the engine, -.
+    pub brake_ratio: f64,
+    /// Ascending speeds of the curve, m/s.
+    pub curve_speed_m_s: [f64; TORQUE_KNOTS],
+    /// What engine and gears make of a demand at these speeds over `per_demand_n_m_s_m`, -; linear between, held outside.
+    pub curve: [f64; TORQUE_KNOTS],
+}
+
+impl TorqueDrive {
+    /// Torque at all wheels together for a demand (m/s) at a speed (m/s), of an engine that gives `share` of what it should, N m.
+    #[inline(always)]
+    pub fn torque_n_m<T: Real>(&self, demand_m_s: T, speed_m_s: T, share: f64) -> T {
+        let mut factor = T::lit(self.curve[0]);
+        for k in 1..TORQUE_KNOTS {
+            let reach = self.curve_speed_m_s[k] - self.curve_speed_m_s[k - 1];
+            let inside = (speed_m_s - T::lit(self.curve_speed_m_s[k - 1])).max(T::lit(0.0)).min(T::lit(reach));
+            factor = factor + inside * T::lit((self.curve[k] - self.curve[k - 1]) / reach);
+        }
+        let (driving, braking) = (demand_m_s.max(T::lit(0.0)), demand_m_s.min(T::lit(0.0)));
+        let direction = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S);
+        (driving * factor * T::lit(share) + braking * T::lit(self.brake_ratio)) * T::lit(self.per_demand_n_m_s_m) - direction * T::lit(self.closed_n_m)
+    }
+}
+
+/// Speed around which the drag of the engine turns its direction, m/s (chosen).
+const CLOSED_SPEED_M_S: f64 = 0.1;
 
 /// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then two equal lags in series, for the mean rim speed and for
 /// the turning of the rims (their difference over the track) apart.
@@ -154,10 +196,11 @@ impl Vehicle {
     }
 
     /// Torque that the drive adds at each wheel against the friction of all of them, N m: a vehicle that tracks its speed with an integral part holds it
-    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none.
+    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none, one driven by torque as much as its demand grows.
     pub fn drag_made_up_n_m(&self) -> f64 {
         let mean = self.effects.force.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
-        if self.second == SecondCommand::YawRateRadS { 0.0 } else { mean }
+        let makes_up = self.second != SecondCommand::YawRateRadS && self.driveline.torque.is_none();
+        if makes_up { mean } else { 0.0 }
     }
 
     /// Friction torque that is left to the tread of a wheel, N m, for a slope of traction over rim speed of `slope_n_s_m`, the same at both wheels of the

@@ -15,7 +15,7 @@ use nesam_physics::scalar::{Dual, f32x8};
 use nesam_physics::step::StepModel;
 use nesam_physics::terramechanics::{WheelGeometry, WheelMotion, wheel_wrench};
 use nesam_physics::{DT_S, Real, Soil, Vehicle};
-use nesam_test_vehicles::{robot, truck};
+use nesam_test_vehicles::{robot, torque_truck, truck};
 use oracle_dual::Nd;
 
 const LANES: usize = 8;
@@ -279,6 +279,11 @@ fn property_scalars_agree_on_a_wheel_with_side_bulldozing() {
 #[test]
 fn property_scalars_agree_on_a_step_of_the_truck() {
     all_scalars_agree("truck", &StepCase::new(&truck()), &STEP_TOLERANCE);
+}
+
+#[test]
+fn property_scalars_agree_on_a_step_of_the_truck_under_torque() {
+    all_scalars_agree("torque truck", &StepCase::new(&torque_truck()), &STEP_TOLERANCE);
 }
 
 #[test]

@@ -6,7 +6,7 @@ use nesam_physics::driveline::WheelCommand;
 use nesam_physics::scalar::Dual;
 use nesam_physics::step::{Ground, StepInput};
 use nesam_physics::{Control, Real, Soil, VehicleState};
-use nesam_test_vehicles::{robot, truck};
+use nesam_test_vehicles::{robot, torque_truck, truck};
 
 const N: usize = 9;
 
@@ -45,7 +45,7 @@ fn jacobian(drive: &Drive, control: &Control<f64>) -> [[f64; N]; N] {
 
 #[test]
 fn property_a_step_does_not_amplify_small_changes() {
-    for vehicle in [truck(), robot()] {
+    for vehicle in [truck(), torque_truck(), robot()] {
         let mut drive = Drive::new(vehicle, 1.0);
         for k in 0..60 {
             let control = Control { speed_m_s: 1.5, second: 0.5 * (0.1 * k as f64).sin() };

@@ -5,11 +5,11 @@ mod common;
 
 use common::Drive;
 use nesam_physics::step::StepModel;
-use nesam_test_vehicles::{robot, truck};
+use nesam_test_vehicles::{robot, torque_truck, truck};
 
 #[test]
 fn analytic_weight_is_carried_at_rest() {
-    for vehicle in [truck(), robot()] {
+    for vehicle in [truck(), torque_truck(), robot()] {
         let weight = vehicle.mass_kg * vehicle.gravity_m_s2;
         let mut drive = Drive::new(vehicle, 0.0);
         let mut load = 0.0;
@@ -25,7 +25,7 @@ fn analytic_weight_is_carried_at_rest() {
 
 #[test]
 fn property_commanded_speed_is_approached_and_held() {
-    for (vehicle, speed) in [(truck(), 3.0), (robot(), 0.8)] {
+    for (vehicle, speed) in [(truck(), 3.0), (torque_truck(), 3.0), (robot(), 0.8)] {
         let mut drive = Drive::new(vehicle, 0.0);
         for _ in 0..150 {
             drive.step(speed, 0.0);
@@ -38,7 +38,7 @@ fn property_commanded_speed_is_approached_and_held() {
 
 #[test]
 fn property_left_is_left_and_sides_are_mirror_images() {
-    for vehicle in [truck(), robot()] {
+    for vehicle in [truck(), torque_truck(), robot()] {
         let turn = |second: f64| {
             let mut drive = Drive::new(vehicle.clone(), 1.0);
             for _ in 0..40 {

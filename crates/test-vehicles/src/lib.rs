@@ -1,7 +1,8 @@
 //! Vehicles that the tests of several crates drive; figures from the given vehicle cards.
 #![forbid(unsafe_code)]
 
-use nesam_physics::{Driveline, SecondCommand, SteeringTable, Vehicle};
+use nesam_physics::terramechanics::ContactLaw;
+use nesam_physics::{Driveline, SecondCommand, SteeringTable, TorqueDrive, Vehicle};
 
 /// The 2.5-tonne car of the Chrono drives.
 pub fn truck() -> Vehicle {
@@ -30,11 +31,34 @@ pub fn truck() -> Vehicle {
             overspeed_limit_m_s: 0.8,
             rims: Default::default(),
             side_coupling_n_m_s: 0.0,
+            torque: None,
         },
         gravity_m_s2: 9.81,
         contact_law: Default::default(),
         effects: Default::default(),
     }
+}
+
+/// The same car, its hubs under torque, with the figures that its training drives chose, rounded.
+pub fn torque_truck() -> Vehicle {
+    let torque = TorqueDrive {
+        per_demand_n_m_s_m: 4570.0,
+        holding_demand_m_s: 0.5,
+        closed_n_m: 85.0,
+        brake_ratio: 0.64,
+        curve_speed_m_s: [1.1, 1.9, 2.5, 3.2, 3.8],
+        curve: [1.0, 1.3, 1.0, 0.95, 1.0],
+    };
+    let driveline = Driveline {
+        speed_gain: 1.9,
+        speed_integral_gain_per_s: 0.6,
+        speed_integral_leak_s: 2.6,
+        overspeed_limit_m_s: 3.0,
+        side_coupling_n_m_s: 220.0,
+        torque: Some(torque),
+        ..truck().driveline
+    };
+    Vehicle { name: "torque truck".into(), driveline, contact_law: ContactLaw::SoilContactModel, ..truck() }
 }
 
 /// A 50-kg skid-steer robot.

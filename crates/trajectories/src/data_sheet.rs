@@ -273,5 +273,6 @@ fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, Traje
         // Two lags of half the time each.
         rims: RimServo { yaw_lag_s: 0.5 * steering_lag_s, ..RimServo::default() },
         side_coupling_n_m_s: or(&["driveline.lsd_Nm_per_rad_s", "driveline.side_coupling_n_m_s"], 0.0)?,
+        torque: None,
     })
 }

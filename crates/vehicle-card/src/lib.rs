@@ -5,7 +5,7 @@
 #![forbid(unsafe_code)]
 
 use nesam_physics::terramechanics::ContactLaw;
-use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
+use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, TORQUE_KNOTS, TorqueDrive, Vehicle, WHEELS};
 use serde::{Deserialize, Serialize};
 
 /// Format tag of the card.
@@ -72,6 +72,44 @@ struct Line {
     rims: RimServo,
     #[serde(default, skip_serializing_if = "is_zero")]
     side_coupling_n_m_s: f64,
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    torque: Option<Torque>,
+}
+
+/// Engine and brakes.
+#[derive(Clone, Copy, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Torque {
+    per_demand_n_m_s_m: f64,
+    holding_demand_m_s: f64,
+    closed_n_m: f64,
+    brake_ratio: f64,
+    curve_speed_m_s: [f64; TORQUE_KNOTS],
+    curve: [f64; TORQUE_KNOTS],
+}
+
+impl From<TorqueDrive> for Torque {
+    fn from(t: TorqueDrive) -> Self {
+        let TorqueDrive { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve } = t;
+        Self { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve }
+    }
+}
+
+impl From<Torque> for TorqueDrive {
+    fn from(t: Torque) -> Self {
+        let Torque { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve } = t;
+        Self { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve }
+    }
+}
+
+/// What is wrong with engine and brakes, if anything.
+fn torque_at_fault(t: &Torque) -> Option<String> {
+    let numbers = [t.per_demand_n_m_s_m, t.holding_demand_m_s, t.closed_n_m, t.brake_ratio];
+    if numbers.iter().chain(&t.curve).any(|v| !(v.is_finite() && *v >= 0.0)) {
+        return Some("`driveline.torque` has a number that is negative or not finite".into());
+    }
+    let ascending = t.curve_speed_m_s.windows(2).all(|w| w[0] < w[1]);
+    (!ascending).then(|| "`driveline.torque.curve_speed_m_s` must ascend".into())
 }
 
 /// Servo of the rims of a skid-steer vehicle.
@@ -146,6 +184,7 @@ pub fn to_json(vehicle: &Vehicle) -> String {
             overspeed_limit_m_s: v.driveline.overspeed_limit_m_s,
             rims: v.driveline.rims,
             side_coupling_n_m_s: v.driveline.side_coupling_n_m_s,
+            torque: v.driveline.torque.map(Torque::from),
         },
         gravity_m_s2: v.gravity_m_s2,
         contact_law: v.contact_law,
@@ -178,6 +217,9 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
     }
     if !(c.driveline.side_coupling_n_m_s >= 0.0) {
         return Err(CardError(format!("`driveline.side_coupling_n_m_s` is {}, must not be negative", c.driveline.side_coupling_n_m_s)));
+    }
+    if let Some(fault) = c.driveline.torque.as_ref().and_then(torque_at_fault) {
+        return Err(CardError(fault));
     }
     if let Some(t) = &c.steering {
         let ascending = t.command.windows(2).all(|w| w[0] < w[1]);
@@ -219,6 +261,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
             overspeed_limit_m_s: c.driveline.overspeed_limit_m_s,
             rims: c.driveline.rims,
             side_coupling_n_m_s: c.driveline.side_coupling_n_m_s,
+            torque: c.driveline.torque.map(TorqueDrive::from),
         },
         gravity_m_s2: c.gravity_m_s2,
         contact_law: c.contact_law,

@@ -32,6 +32,7 @@ fn cart() -> Vehicle {
             overspeed_limit_m_s: 1.0,
             rims: Default::default(),
             side_coupling_n_m_s: 0.0,
+            torque: None,
             speed_integral_gain_per_s: 0.0,
             speed_integral_leak_s: 1.0,
             speed_integral_limit_m: 0.0,

@@ -4,8 +4,8 @@ use crate::effects::Scaling::Factor;
 use crate::effects::act::effect;
 
 effect! {
-    /// Torque limit (catalogue no. 11): τ = min(τ, f τ_max). The drive line of a speed-controlled car is known by the rim over-speed that it can hold, so
-    /// its limit shrinks to the share f; of a skid-steer vehicle the largest rim speed does.
+    /// Torque limit (catalogue no. 11): τ = min(τ, f τ_max). An engine whose torque is linear in the pedal gives the share f of every torque. A drive line that
+    /// is known by the rim over-speed that it can hold has its limit shrink to the share f, a skid-steer vehicle its largest rim speed.
     struct TorqueLimit = "torque_limit" in Actuator {
         /// Share f of the limit that is left, -.
         fraction: ("-", [0.05, 1.5], 0.4, Factor),

@@ -1,0 +1,144 @@
+//! Goal: a car whose hubs are under torque moves as Newton demands of that torque, whatever the soil does with it.
+//! Method: closed forms of the hub torques (r F + moment of the pressure), limits of grip, couplings and friction at single wheels.
+
+mod common;
+
+use common::Drive;
+use nesam_physics::effects::{Effect, WheelDrag};
+use nesam_physics::step::StepOutput;
+use nesam_physics::terramechanics::ContactLaw;
+use nesam_physics::{Soil, TorqueDrive, Vehicle};
+use nesam_test_vehicles::torque_truck;
+
+/// Soil on which wheels sink two centimetres and hold.
+fn firm() -> Soil<f64> {
+    Soil { k_phi: 1.2e7, k_c: 1e5, n: 1.0, c: 2e4, phi: 0.6, k_shear: 0.005 }
+}
+
+/// The car with a torque that nothing changes: no feedback of speed, flat curve, no engine drag, open differentials.
+fn constant_torque(demand_m_s: f64) -> Vehicle {
+    let car = torque_truck();
+    let torque = car.driveline.torque.map(|t| TorqueDrive { holding_demand_m_s: demand_m_s, closed_n_m: 0.0, curve: [1.0; 5], ..t });
+    let mut driveline = car.driveline.clone();
+    (driveline.speed_gain, driveline.speed_integral_gain_per_s, driveline.side_coupling_n_m_s) = (0.0, 0.0, 0.0);
+    // Far beyond every demand, so that its smooth limit does nothing.
+    driveline.overspeed_limit_m_s = 1e3;
+    Vehicle { driveline: nesam_physics::Driveline { torque, ..driveline }, ..car }
+}
+
+/// The last step and the acceleration over the last second of `seconds`, m/s².
+fn driven(vehicle: Vehicle, soil: Soil<f64>, start_m_s: f64, seconds: usize, second: f64) -> (Drive, StepOutput<f64>, f64) {
+    let mut drive = Drive::new(vehicle, start_m_s);
+    drive.soil = soil;
+    let mut step = None;
+    let mut before = 0.0;
+    for k in 0..10 * seconds {
+        if k == 10 * (seconds - 1) {
+            before = drive.state.velocity_m_s[0];
+        }
+        step = Some(drive.step(2.5, second));
+    }
+    let gained = drive.state.velocity_m_s[0] - before;
+    (drive, step.expect("at least one step"), gained)
+}
+
+/// Moment of a pressure k z^n under a wheel about its axle over the radius, N: b k (z^(n+2) / (n+2) + (r - z) z^(n+1) / (n+1)) / r (`contact_law.rs`).
+fn compaction_n(vehicle: &Vehicle, soil: &Soil<f64>, sinkage_m: f64) -> f64 {
+    let (r, b, z, n) = (vehicle.wheel_radius_m, vehicle.wheel_width_m, sinkage_m, soil.n);
+    b * (soil.k_c / b + soil.k_phi) * (z.powf(n + 2.0) / (n + 2.0) + (r - z) * z.powf(n + 1.0) / (n + 1.0)) / r
+}
+
+#[test]
+fn analytic_firm_ground_turns_torque_into_acceleration() {
+    for law in [ContactLaw::WongReece, ContactLaw::SoilContactModel] {
+        let vehicle = Vehicle { contact_law: law, ..constant_torque(0.6) };
+        let torque_n_m = 0.6 * 4570.0;
+        let (_, step, gained) = driven(vehicle.clone(), firm(), 2.0, 3, 0.0);
+        let lost: f64 = step.contacts.iter().map(|c| compaction_n(&vehicle, &firm(), c.sinkage_m)).sum();
+        let want = (torque_n_m / vehicle.wheel_radius_m - lost) / vehicle.mass_kg;
+        // Wong and Reece's stress has its maximum ahead of the bottom, so that it takes a little less.
+        let off_n = (gained - want).abs() * vehicle.mass_kg;
+        assert!(off_n < 0.08 * lost, "{law:?}: {gained} m/s², torque less compaction of {lost} N gives {want}");
+    }
+}
+
+#[test]
+fn analytic_compaction_is_what_soft_ground_takes_of_the_torque() {
+    let vehicle = constant_torque(1.0);
+    let soft = Soil { k_phi: 1.5e6, k_c: 5e3, n: 0.9, c: 3e3, phi: 0.5, k_shear: 0.015 };
+    let (_, step, gained) = driven(vehicle.clone(), soft, 1.5, 2, 0.0);
+    let lost: f64 = step.contacts.iter().map(|c| compaction_n(&vehicle, &soft, c.sinkage_m)).sum();
+    let want = (4570.0 / vehicle.wheel_radius_m - lost) / vehicle.mass_kg;
+    assert!(lost > 2000.0, "the soil is soft: {lost} N");
+    assert!((gained - want).abs() < 0.12, "{gained} m/s², closed form {want}");
+}
+
+#[test]
+fn analytic_grip_limits_what_a_large_torque_does() {
+    let vehicle = constant_torque(20.0);
+    let loose = Soil { c: 0.0, phi: 0.35, ..firm() };
+    let (_, step, gained) = driven(vehicle.clone(), loose, 2.0, 2, 0.0);
+    let grip = 0.35f64.tan() * vehicle.gravity_m_s2;
+    assert!(gained < grip && gained > 0.7 * grip, "{gained} m/s² of at most {grip}");
+    assert!(step.contacts.iter().all(|c| c.overspeed_m_s > 0.3), "wheels spin: {:?}", step.contacts.map(|c| c.overspeed_m_s));
+}
+
+#[test]
+fn analytic_friction_at_a_wheel_slows_by_its_torque_and_turns() {
+    let free = constant_torque(0.6);
+    let drag = Effect::WheelDrag(WheelDrag { wheel: 3, torque_n_m: 600.0 });
+    let (plain, _, fast) = driven(free.clone(), firm(), 2.0, 2, 0.0);
+    let (dragged, step, slow) = driven(free.with_effects(&[drag]), firm(), 2.0, 2, 0.0);
+    let want = 600.0 / free.wheel_radius_m / free.mass_kg;
+    assert!(((fast - slow) / want - 1.0).abs() < 0.08, "slower by {} m/s², torque over radius and mass {want}", fast - slow);
+    assert!(dragged.state.attitude_rad[2] < -0.002 && plain.state.attitude_rad[2].abs() < 1e-6, "right wheel turns right");
+    assert!(step.contacts[3].overspeed_m_s < step.contacts[2].overspeed_m_s, "the dragged rim turns slower");
+}
+
+#[test]
+fn analytic_couplings_resist_a_turn_by_their_moment() {
+    // Wheels of a turn at yaw rate r differ by r y in speed; the coupling takes c / R² of it at each, a moment of c / R² r Σ y² about the vertical.
+    let open = constant_torque(0.6);
+    let mut coupled = open.clone();
+    coupled.driveline.side_coupling_n_m_s = 220.0;
+    let forces = |vehicle: &Vehicle| {
+        let (mut drive, ..) = driven(open.clone(), firm(), 2.0, 2, 0.4);
+        drive.model = nesam_physics::step::StepModel::new(vehicle, 0.001, 1);
+        let rate = drive.state.angular_velocity_rad_s[2];
+        let step = drive.step(2.5, 0.4);
+        (step.contacts.map(|c| c.forward_n), rate)
+    };
+    let ((without, rate), (with, _)) = (forces(&open), forces(&coupled));
+    for wheel in [2, 3] {
+        let y = open.wheel_centre_m[wheel][1];
+        let want = 220.0 / (open.wheel_radius_m * open.wheel_radius_m) * rate * y;
+        let got = with[wheel] - without[wheel];
+        assert!((got - want).abs() < 0.1 * want.abs(), "rear wheel {wheel}: {got} N, coupling gives {want} N at {rate} rad/s");
+    }
+}
+
+#[test]
+fn property_a_parked_car_stays_on_a_slope_and_rolls_back_slowly_at_most() {
+    let mut drive = Drive::new(torque_truck(), 0.0);
+    drive.soil = firm();
+    drive.slope = [0.1, 0.0];
+    (0..100).for_each(|_| {
+        drive.step(0.0, 0.0);
+    });
+    assert!(drive.state.velocity_m_s[0].abs() < 0.3, "{} m/s", drive.state.velocity_m_s[0]);
+}
+
+#[test]
+fn property_a_slope_slows_the_car_until_the_integral_answers() {
+    let speed_at = |steps: usize| {
+        let mut drive = Drive::new(torque_truck(), 2.5);
+        drive.soil = firm();
+        drive.slope = [0.12, 0.0];
+        (0..steps).for_each(|_| {
+            drive.step(2.5, 0.0);
+        });
+        drive.state.velocity_m_s[0]
+    };
+    let (early, late) = (speed_at(10), speed_at(60));
+    assert!(early < 2.5 && late > 2.0, "after 1 s {early}, after 6 s {late} m/s");
+}
