@@ -117,7 +117,8 @@ impl StepModel {
         let coupling = (line.side_coupling_n_m_s + self.vehicle.effects.actuator.lock * LOCKED_N_M_S) / (radius * radius);
         let speed = state.velocity_m_s[0];
         let demand = input.wheels.demand_m_s(i, speed);
-        let mut at_rim_n = drive.torque_n_m(demand, speed, 1.0 - self.vehicle.effects.actuator.torque_lost) * each - T::lit(coupling) * (forward_m_s - speed);
+        let mut at_rim_n = drive.torque_n_m(demand, speed, 1.0 - self.vehicle.effects.actuator.torque_lost) * each
+            - T::lit(coupling) * (forward_m_s - speed);
 
         let pressed = preload_n.relu_smooth(1.0);
         let alone = bekker_sinkage(pressed, radius, wheel.width_m, &input.soil);

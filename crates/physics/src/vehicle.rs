@@ -88,7 +88,8 @@ impl TorqueDrive {
         }
         let (driving, braking) = (demand_m_s.max(T::lit(0.0)), demand_m_s.min(T::lit(0.0)));
         let direction = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S);
-        (driving * factor * T::lit(share) + braking * T::lit(self.brake_ratio)) * T::lit(self.per_demand_n_m_s_m) - direction * T::lit(self.closed_n_m)
+        (driving * factor * T::lit(share) + braking * T::lit(self.brake_ratio)) * T::lit(self.per_demand_n_m_s_m)
+            - direction * T::lit(self.closed_n_m)
     }
 }
 
