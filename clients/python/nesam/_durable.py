@@ -7,7 +7,10 @@ from typing import Deque, List, Optional, Tuple
 import grpc
 
 from . import _types as t
-from ._errors import DeadlineExceeded, Unavailable
+from ._errors import DeadlineExceeded, NesamError, Unavailable
+
+_BROKEN = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL}
+"""How a connection that broke looks, by itself or through a proxy. Everything else is a refusal."""
 
 
 class DurableStream:
@@ -52,7 +55,9 @@ class DurableStream:
                 self._deliver()
             try:
                 self._durable(self._client.session(self._session_id).durable_place)
-            except Unavailable:
+            except NesamError as error:
+                if error.code not in _BROKEN:
+                    raise
                 self._forget_places()
             if self._kept and time.monotonic() > end:
                 reason = f"{len(self._kept)} measurements are not durable after {timeout_s} s; does the server keep a store?"
@@ -72,11 +77,13 @@ class DurableStream:
         while True:
             try:
                 return self._attempt()
-            except Unavailable:
+            except NesamError as error:
                 self.close()
                 self._forget_places()
-                if time.monotonic() > end:
+                if error.code not in _BROKEN:
                     raise
+                if time.monotonic() > end:
+                    raise Unavailable(error.code, error.field, error.message) from error
                 time.sleep(self._pause_s)
 
     def _attempt(self) -> List[t.Answer]:
