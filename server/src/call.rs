@@ -14,6 +14,7 @@ use nesam_engine::{
 use nesam_terrain::WorldMap;
 use tokio::sync::oneshot;
 
+use crate::access::Directory;
 use crate::telemetry::Metrics;
 
 /// Awaits the engine; one for all handlers, clones share it.
@@ -21,6 +22,7 @@ use crate::telemetry::Metrics;
 pub struct EngineClient {
     handle: EngineHandle,
     metrics: Arc<Metrics>,
+    directory: Directory,
 }
 
 /// How long a prediction waited and computed.
@@ -55,9 +57,9 @@ impl Drop for Pending {
 }
 
 impl EngineClient {
-    /// A client of an engine.
-    pub fn new(handle: EngineHandle, metrics: Arc<Metrics>) -> Self {
-        Self { handle, metrics }
+    /// A client of an engine whose sessions stand in this directory: vehicles compete, not their sessions.
+    pub fn new(handle: EngineHandle, metrics: Arc<Metrics>, directory: Directory) -> Self {
+        Self { handle, metrics, directory }
     }
 
     /// The engine's handle.
@@ -81,6 +83,11 @@ impl EngineClient {
             let _ = sender.send(answer);
         });
         submission.abandoned = Some(abandoned.clone());
+        submission.share = match &submission.command {
+            Command::Predict(query) => self.directory.vehicle(&query.session),
+            Command::Measure { session, .. } => self.directory.vehicle(session),
+            _ => None,
+        };
         submission.deadline_ns = Some(self.handle.now_ns().saturating_add(u64::try_from(budget.as_nanos()).unwrap_or(u64::MAX)));
         self.handle.submit(submission);
         Pending { answer, abandoned }

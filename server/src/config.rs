@@ -1,5 +1,8 @@
 //! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
 
+mod store;
+mod tls;
+
 use std::net::{Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
@@ -8,6 +11,8 @@ use figment::providers::{Format, Serialized, Toml};
 use nesam_engine::{FleetSoilSettings, Limits, check_name};
 use serde::{Deserialize, Serialize};
 
+pub use self::store::StoreConfig;
+pub use self::tls::TlsConfig;
 use crate::error::ServerError;
 
 /// Everything that can be configured. Unknown keys are refused.
@@ -16,6 +21,8 @@ use crate::error::ServerError;
 pub struct Config {
     /// gRPC.
     pub grpc: GrpcConfig,
+    /// TLS of gRPC and who its clients are.
+    pub tls: TlsConfig,
     /// Metrics and status page.
     pub http: HttpConfig,
     /// Zenoh.
@@ -26,6 +33,8 @@ pub struct Config {
     pub fleet_soil: FleetSoilConfig,
     /// Recording.
     pub recording: RecordingConfig,
+    /// Durable sessions.
+    pub store: StoreConfig,
 }
 
 /// gRPC.
@@ -156,8 +165,12 @@ pub struct LimitsConfig {
     pub map_cells_total_max: usize,
     /// Predictions that wait.
     pub waiting_predictions_max: usize,
+    /// Predictions of one vehicle that wait.
+    pub waiting_predictions_per_vehicle_max: usize,
     /// Other commands that wait.
     pub waiting_commands_max: usize,
+    /// Measurements of one vehicle among them.
+    pub waiting_measurements_per_vehicle_max: usize,
     /// |position| along each axis, m.
     pub position_max_m: f64,
     /// |velocity| along each axis, m/s.
@@ -259,7 +272,9 @@ impl Default for LimitsConfig {
             map_cells_max: l.map_cells_max,
             map_cells_total_max: l.map_cells_total_max,
             waiting_predictions_max: l.waiting_predictions_max,
+            waiting_predictions_per_vehicle_max: l.waiting_predictions_per_vehicle_max,
             waiting_commands_max: l.waiting_commands_max,
+            waiting_measurements_per_vehicle_max: l.waiting_measurements_per_vehicle_max,
             position_max_m: l.position_max_m,
             speed_max_m_s: l.speed_max_m_s,
             angular_speed_max_rad_s: l.angular_speed_max_rad_s,
@@ -285,7 +300,9 @@ impl From<&LimitsConfig> for Limits {
             map_cells_max: c.map_cells_max,
             map_cells_total_max: c.map_cells_total_max,
             waiting_predictions_max: c.waiting_predictions_max,
+            waiting_predictions_per_vehicle_max: c.waiting_predictions_per_vehicle_max,
             waiting_commands_max: c.waiting_commands_max,
+            waiting_measurements_per_vehicle_max: c.waiting_measurements_per_vehicle_max,
             position_max_m: c.position_max_m,
             speed_max_m_s: c.speed_max_m_s,
             angular_speed_max_rad_s: c.angular_speed_max_rad_s,
@@ -334,9 +351,11 @@ impl Config {
             ("grpc.upload_deadline_s", self.grpc.upload_deadline_s),
             ("grpc.keepalive_s", self.grpc.keepalive_s),
             ("grpc.drain_s", self.grpc.drain_s),
+            ("tls.handshake_s", self.tls.handshake_s),
             ("limits.pause_max_s", self.limits.pause_max_s),
             ("limits.session_idle_s", self.limits.session_idle_s),
             ("limits.clock_ahead_max_s", self.limits.clock_ahead_max_s),
+            ("store.interval_s", self.store.interval_s),
             ("zenoh.status_interval_s", self.zenoh.status_interval_s),
         ];
         for (key, value) in seconds {
@@ -354,7 +373,9 @@ impl Config {
             ("limits.horizon_max", self.limits.horizon_max),
             ("limits.sample_steps_max", self.limits.sample_steps_max),
             ("limits.waiting_predictions_max", self.limits.waiting_predictions_max),
+            ("limits.waiting_predictions_per_vehicle_max", self.limits.waiting_predictions_per_vehicle_max),
             ("limits.waiting_commands_max", self.limits.waiting_commands_max),
+            ("limits.waiting_measurements_per_vehicle_max", self.limits.waiting_measurements_per_vehicle_max),
             ("recording.part_bytes_max", usize::from(self.recording.part_bytes_max > 0)),
             ("recording.bytes_max", usize::from(self.recording.bytes_max > 0)),
             ("recording.queue_bytes_max", usize::from(self.recording.queue_bytes_max > 0)),
@@ -364,6 +385,8 @@ impl Config {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
         }
+        self.tls.check()?;
+        self.check_side_doors()?;
         FleetSoilSettings::from(&self.fleet_soil)
             .check()
             .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
@@ -376,6 +399,31 @@ impl Config {
                 .map_err(|error| ServerError::Value { key: "zenoh.name", reason: error.to_string() })?;
         }
         check_name("zenoh.fleet", &self.zenoh.fleet).map_err(|error| ServerError::Value { key: "zenoh.fleet", reason: error.to_string() })
+    }
+
+    /// Where clients have to say who they are, nothing else that knows no identities may be open to the network.
+    fn check_side_doors(&self) -> Result<(), ServerError> {
+        if !self.tls.restricts() {
+            return Ok(());
+        }
+        if self.http.enabled && !self.http.listen.ip().is_loopback() {
+            let reason = "is open to the network and knows no identities; with `tls.client_ca` only loopback is allowed".into();
+            return Err(ServerError::Value { key: "http.listen", reason });
+        }
+        let inside = |endpoint: &String| {
+            let address = endpoint.split_once('/').map_or("", |(_, address)| address);
+            address.parse::<SocketAddr>().is_ok_and(|address| address.ip().is_loopback())
+        };
+        if self.zenoh.enabled
+            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !inside(endpoint))
+        {
+            let reason = format!(
+                "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on loopback only, and let a router with \
+                 TLS and access control face the network"
+            );
+            return Err(ServerError::Value { key: "zenoh.listen", reason });
+        }
+        Ok(())
     }
 }
 
@@ -417,6 +465,15 @@ mod tests {
             ("[fleet_soil]\nreach_m = -1.0\n", "reach_m"),
             ("[zenoh]\nmode = \"king\"\n", "king"),
             ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),
+            ("[store]\ninterval_s = 0.0\n", "store.interval_s"),
+            ("[tls]\ncertificate = \"c\"\n", "tls.key"),
+            ("[tls]\ncertificate = \"c\"\nkey = \"k\"\nclient_ca = \"a\"\n", "tls.fleet"),
+            ("[tls]\ncertificate = \"c\"\nkey = \"k\"\nfleet = \"f\"\n", "tls.client_ca"),
+            ("[tls]\ncertificate = \"c\"\nkey = \"k\"\nclient_ca = \"a\"\nfleet = \"f\"\n[http]\nlisten = \"0.0.0.0:1\"\n", "http.listen"),
+            (
+                "[tls]\ncertificate = \"c\"\nkey = \"k\"\nclient_ca = \"a\"\nfleet = \"f\"\n[zenoh]\nlisten = [\"tcp/0.0.0.0:7447\"]\n",
+                "zenoh.listen",
+            ),
             ("not toml", "default.toml"),
         ] {
             let path = dir.join("default.toml");

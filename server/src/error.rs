@@ -46,6 +46,20 @@ pub enum ServerError {
         /// What is wrong.
         source: crate::recording::RecordingError,
     },
+    /// TLS or the rights of the clients cannot be set up.
+    #[error("configuration key `{key}`: {reason}")]
+    Tls {
+        /// Dotted key.
+        key: &'static str,
+        /// What is wrong with its file; never what is in it.
+        reason: String,
+    },
+    /// The store of the sessions cannot be used.
+    #[error("the store {source}; choose another folder (`store.directory`, --store) or mend this one")]
+    Store {
+        /// What is wrong.
+        source: crate::store::StoreError,
+    },
     /// Zenoh does not start.
     #[error("zenoh does not start: {reason}; check `zenoh.listen` and `zenoh.connect`, or set `zenoh.enabled = false`")]
     Zenoh {

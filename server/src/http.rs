@@ -13,6 +13,7 @@ use serde_json::json;
 use crate::clock::MonotonicClock;
 use crate::grpc::Edge;
 use crate::recording::Recorder;
+use crate::store::StoreCounts;
 
 /// What the HTTP side reads.
 #[derive(Clone)]
@@ -56,6 +57,9 @@ async fn metrics(State(state): State<HttpState>) -> Response {
             text += &format!("# HELP {name} {help}\n# TYPE {name} counter\n{name} {value}\n");
         }
     }
+    if let Some(keeper) = &state.edge.keeper {
+        text += &store_metrics(&keeper.counts());
+    }
     if let Some(presence) = &state.edge.presence {
         text += &format!(
             "# HELP nesam_vehicles_alive Vehicles whose Zenoh liveliness token is there.\n# TYPE nesam_vehicles_alive gauge\nnesam_vehicles_alive {}\n",
@@ -63,6 +67,21 @@ async fn metrics(State(state): State<HttpState>) -> Response {
         );
     }
     ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
+}
+
+fn store_metrics(counts: &StoreCounts) -> String {
+    let StoreCounts { commits, failures, bytes, commit_s, waiting } = *counts;
+    [
+        ("commits_total", "counter", "Commits of sessions and maps to the store.", commits as f64),
+        ("failures_total", "counter", "Commits that the store did not take; they are tried again.", failures as f64),
+        ("bytes_total", "counter", "Bytes of sessions and maps committed.", bytes as f64),
+        ("commit_seconds_total", "counter", "Time of all commits together.", commit_s),
+        ("waiting", "gauge", "Sessions and maps that are not durable yet.", waiting as f64),
+    ]
+    .map(|(name, kind, help, value)| {
+        format!("# HELP nesam_store_{name} {help}\n# TYPE nesam_store_{name} {kind}\nnesam_store_{name} {value}\n")
+    })
+    .concat()
 }
 
 async fn health(State(state): State<HttpState>) -> StatusCode {

@@ -5,6 +5,7 @@
 //! puts it into the engine's queue and awaits the answer, `convert` turns that into a message. Handlers do nothing else.
 #![forbid(unsafe_code)]
 
+pub mod access;
 pub mod call;
 mod clock;
 mod config;
@@ -15,12 +16,15 @@ mod grpc;
 mod http;
 pub mod recording;
 mod serve;
+pub mod store;
 mod telemetry;
 mod web;
 mod zenoh;
 
 pub use clock::MonotonicClock;
-pub use config::{Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, ZenohConfig, ZenohMode};
+pub use config::{
+    Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, ZenohConfig, ZenohMode,
+};
 pub use error::ServerError;
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;

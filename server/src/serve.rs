@@ -1,19 +1,22 @@
 //! Starting and stopping everything together.
 
 use std::net::SocketAddr;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
-use nesam_engine::{Clock as _, Engine, EngineHandle, Event, Limits};
+use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Limits, Tap};
 use nesam_model::Predictor;
 use nesam_proto::v1 as pb;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, broadcast, watch};
 use tokio::task::JoinHandle;
+use tonic::transport::ServerTlsConfig;
 use tonic::transport::server::TcpIncoming;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
+use crate::access::{self, Directory};
 use crate::call::EngineClient;
 use crate::clock::MonotonicClock;
 use crate::config::{Config, GrpcConfig};
@@ -22,6 +25,7 @@ use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
+use crate::store::{Keeper, RedbStore, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
 use crate::zenoh::{Bus, Presence};
 
@@ -46,6 +50,7 @@ pub struct RunningServer {
     http: Option<JoinHandle<()>>,
     bus: Option<Bus>,
     recorder: Option<Arc<Recorder>>,
+    keeper: Option<Arc<Keeper>>,
     drain: Duration,
 }
 
@@ -61,6 +66,7 @@ impl core::fmt::Debug for RunningServer {
 /// `ServerError` naming the address or the configuration key at fault; nothing keeps running then.
 pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningServer, ServerError> {
     config.check()?;
+    let (tls, access) = access::load(&config.tls)?;
     // Everything that can fail for want of an address comes before the first thread.
     let grpc_listener = listen(config.grpc.listen, "grpc.listen").await?;
     let http_listener = match config.http.enabled {
@@ -72,7 +78,8 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
 
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
     let metrics = Arc::new(Metrics::default());
-    let (sink, counted) = (events.clone(), metrics.clone());
+    let keeper = config.store.enabled.then(|| Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s))));
+    let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone());
     let unusable =
         |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
     let mut engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?;
@@ -81,36 +88,34 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
             .with_fleet_soil((&config.fleet_soil).into())
             .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
     }
-    let engine = engine.with_events(Box::new(move |event| {
-        counted.event(event.label());
-        let _ = sink.send(event);
-    }));
+    let engine = engine.with_events(sink);
     let clock = MonotonicClock::default();
-    let (recorder, tap) = match config.recording.enabled {
-        true => {
-            let header = RecordingHeader::of_run(predictor.bundle(), &config.limits, &config.fleet_soil, clock.now_ns());
-            let started = Recorder::start(&config.recording, header, predictor.bundle().vehicle.clone());
-            let (recorder, tap) = started.map_err(|source| ServerError::Recording { source })?;
-            (Some(Arc::new(recorder)), Some(tap))
-        }
-        false => (None, None),
-    };
+    let (recorder, tap) = start_recording(&config, &predictor, clock)?;
     let handle = EngineHandle::spawn_tapped(engine, Arc::new(clock), tap);
+    if let Some(keeper) = &keeper
+        && let Err(source) = open_store(&config.store.directory, keeper, &handle).await
+    {
+        handle.stop();
+        return Err(ServerError::Store { source });
+    }
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
-        engine: EngineClient::new(handle.clone(), metrics.clone()),
+        engine: EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()),
         predictor,
         uploads: Arc::new(Semaphore::new(config.grpc.uploads_max)),
         config: Arc::new(config.grpc),
         events,
         stopping: stopping.clone(),
         presence: config.zenoh.enabled.then(Presence::default),
+        keeper: keeper.clone(),
+        access,
     };
     let bus = match config.zenoh.enabled {
         true => match Bus::start(&config.zenoh, &edge).await {
             Ok(bus) => Some(bus),
             Err(error) => {
+                keeper.iter().for_each(|keeper| keeper.finish());
                 handle.stop();
                 return Err(error);
             }
@@ -129,9 +134,59 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     tokio::spawn(expire_sessions(edge.clone()));
     let health = HealthReporter::new();
     report(&health, ServingStatus::Serving).await;
-    let grpc = spawn_grpc(grpc_listener, &edge, &health, stopping);
-    tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), "serving");
-    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, drain })
+    let secure = if edge.access.is_restricted() {
+        "mutual TLS"
+    } else if tls.is_some() {
+        "TLS, clients unknown"
+    } else {
+        "none"
+    };
+    let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping)?;
+    tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
+    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, drain })
+}
+
+/// The recording that the configuration asks for, and the tap that feeds it.
+fn start_recording(
+    config: &Config,
+    predictor: &Predictor,
+    clock: MonotonicClock,
+) -> Result<(Option<Arc<Recorder>>, Option<Tap>), ServerError> {
+    if !config.recording.enabled {
+        return Ok((None, None));
+    }
+    let header = RecordingHeader::of_run(predictor.bundle(), &config.limits, &config.fleet_soil, clock.now_ns());
+    let started = Recorder::start(&config.recording, header, predictor.bundle().vehicle.clone());
+    let (recorder, tap) = started.map_err(|source| ServerError::Recording { source })?;
+    Ok((Some(Arc::new(recorder)), Some(tap)))
+}
+
+/// Where the engine's events go: counters, the directory of sessions, the store, watchers.
+fn event_sink(watchers: broadcast::Sender<Event>, metrics: Arc<Metrics>, keeper: Option<Arc<Keeper>>, directory: Directory) -> EventSink {
+    Box::new(move |event| {
+        metrics.event(event.label());
+        directory.note(&event);
+        if let Some(keeper) = &keeper {
+            keeper.note(&event);
+        }
+        if matches!(event, Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::SessionClosed { .. }) {
+            let _ = watchers.send(event);
+        }
+    })
+}
+
+/// Opens the store, gives the engine what it holds and starts the keeper.
+async fn open_store(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle) -> Result<(), StoreError> {
+    let (folder, keeper, handle) = (folder.to_path_buf(), keeper.clone(), handle.clone());
+    let opened = tokio::task::spawn_blocking(move || {
+        let store = RedbStore::open(&folder)?;
+        let restored = restore(&store.load()?, &handle)?;
+        tracing::info!(folder = %folder.display(), sessions = restored.accepted.len(), maps = restored.maps.len(), "store opened");
+        keeper.start(Box::new(store), handle, restored)
+    });
+    opened
+        .await
+        .unwrap_or_else(|_| Err(StoreError::Content { what: "something".into(), reason: "reading it panicked; this is a bug".into() }))
 }
 
 async fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, ServerError> {
@@ -160,7 +215,13 @@ fn builder(config: &GrpcConfig) -> tonic::transport::Server {
         .http2_max_pending_accept_reset_streams(Some(64))
 }
 
-fn spawn_grpc(listener: TcpListener, edge: &Edge, health: &HealthReporter, stopping: watch::Receiver<bool>) -> JoinHandle<()> {
+fn spawn_grpc(
+    listener: TcpListener,
+    tls: Option<ServerTlsConfig>,
+    edge: &Edge,
+    health: &HealthReporter,
+    stopping: watch::Receiver<bool>,
+) -> Result<JoinHandle<()>, ServerError> {
     let health =
         tonic_health::pb::health_server::HealthServer::new(tonic_health::server::HealthService::from_health_reporter(health.clone()));
     let reflection = tonic_reflection::server::Builder::configure()
@@ -169,13 +230,17 @@ fn spawn_grpc(listener: TcpListener, edge: &Edge, health: &HealthReporter, stopp
         .build_v1()
         .expect("the committed descriptor set decodes; this is a bug");
     let routes = grpc::routes(edge).add_service(health).add_service(reflection);
-    let router = builder(&edge.config).add_routes(routes);
+    let mut builder = builder(&edge.config);
+    if let Some(tls) = tls {
+        builder = builder.tls_config(tls).map_err(|error| ServerError::Tls { key: "tls", reason: error.to_string() })?;
+    }
+    let router = builder.add_routes(routes);
     let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-    tokio::spawn(async move {
+    Ok(tokio::spawn(async move {
         if let Err(error) = router.serve_with_incoming_shutdown(incoming, stopped(stopping)).await {
             tracing::error!(%error, "grpc ended");
         }
-    })
+    }))
 }
 
 impl RunningServer {
@@ -195,7 +260,7 @@ impl RunningServer {
     }
 
     /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements, the
-    /// recording is written to its end.
+    /// recording is written to its end. Sessions of a store are committed before the engine stops.
     pub async fn shutdown(mut self) {
         report(&self.health, ServingStatus::NotServing).await;
         if let Some(bus) = self.bus.take() {
@@ -208,8 +273,11 @@ impl RunningServer {
                 task.abort();
             }
         }
-        let (handle, recorder) = (self.handle, self.recorder);
+        let (handle, recorder, keeper) = (self.handle, self.recorder, self.keeper);
         let _ = tokio::task::spawn_blocking(move || {
+            if let Some(keeper) = keeper {
+                keeper.finish();
+            }
             handle.stop();
             if let Some(recorder) = recorder {
                 recorder.join();

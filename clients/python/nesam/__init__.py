@@ -5,6 +5,7 @@
 """
 
 from ._client import CHANNELS, Client, MeasurementStream
+from ._durable import DurableStream
 from ._errors import (
     AlreadyExists,
     DeadlineExceeded,
@@ -17,7 +18,7 @@ from ._errors import (
 )
 from ._extras import ExtraOutputs, Extras
 from ._fallback import KinematicFallback
-from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Soil, Validity, VehicleCard, WorldMap
+from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Soil, Tls, Validity, VehicleCard, WorldMap
 
 __all__ = [
     "CHANNELS",
@@ -25,6 +26,7 @@ __all__ = [
     "Answer",
     "Client",
     "DeadlineExceeded",
+    "DurableStream",
     "ExtraOutputs",
     "Extras",
     "FailedPrecondition",
@@ -40,6 +42,7 @@ __all__ = [
     "Provenance",
     "Session",
     "Soil",
+    "Tls",
     "Unavailable",
     "Validity",
     "VehicleCard",

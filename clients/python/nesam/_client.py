@@ -8,9 +8,11 @@ import grpc
 import numpy as np
 
 from . import _types as t
+from ._durable import DurableStream
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable, from_rpc
 from ._extras import Extras, extra_outputs
 from ._fallback import KinematicFallback
+from ._routing import VehicleHeader
 from .v1 import (
     measurements_pb2,
     measurements_pb2_grpc,
@@ -34,13 +36,22 @@ _TILE_CELLS = 256 << 10
 class Client:
     """A connection to a service, e.g. `Client("127.0.0.1:50051")`. Threads may share it. Close it, or use it in a `with` block.
 
-    timeout_s: longest wait of a call that gives no other, s.
+    timeout_s: longest wait of a call that gives no other, s. tls: what the client trusts and shows; None = no TLS.
+    vehicle_id: told with every call, for a proxy in front of several servers (deploy/haproxy); "" = not told.
     """
 
-    def __init__(self, address: str, timeout_s: float = 10.0):
+    def __init__(self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = ""):
         self.timeout_s = timeout_s
         options = [("grpc.max_receive_message_length", _REPLY_BYTES_MAX)]
-        self._channel = grpc.insecure_channel(address, options=options)
+        if tls is None:
+            self._channel = grpc.insecure_channel(address, options=options)
+        else:
+            if tls.server_name:
+                options.append(("grpc.ssl_target_name_override", tls.server_name))
+            credentials = grpc.ssl_channel_credentials(tls.authority, tls.key, tls.certificate)
+            self._channel = grpc.secure_channel(address, credentials, options=options)
+        if vehicle_id:
+            self._channel = grpc.intercept_channel(self._channel, VehicleHeader(vehicle_id))
         self._sessions = sessions_pb2_grpc.SessionsStub(self._channel)
         self._prediction = prediction_pb2_grpc.PredictionStub(self._channel)
         self._measurements = measurements_pb2_grpc.MeasurementsStub(self._channel)
@@ -178,6 +189,14 @@ class Client:
     def measurement_stream(self) -> "MeasurementStream":
         """An open stream for a vehicle that reports at its own pace; use it in a `with` block."""
         return MeasurementStream(self)
+
+    def durable_stream(self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2) -> DurableStream:
+        """A stream that keeps measurements until the service has them on stable storage, and sends them again after a crash of the server.
+
+        reconnect_s: longest time without the service before `send` gives up, s. pause_s: time between two attempts, s. The server needs a store
+        (`nesam serve --store DIR`).
+        """
+        return DurableStream(self, session_id, reconnect_s, pause_s)
 
     def _remember(self, measurement: t.Measurement, answer: t.Answer) -> None:
         if answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered:
@@ -330,6 +349,9 @@ def _answer(message: measurements_pb2.MeasurementAnswer) -> t.Answer:
         message=getattr(detail, "message", ""),
         soil=t.soil(message.soil_correction) if message.HasField("soil_correction") else None,
         reordered=message.reordered,
+        place=message.place,
+        durable_place=message.durable_place,
+        code=getattr(detail, "code", 0),
     )
 
 
@@ -355,6 +377,8 @@ def _session(message: sessions_pb2.Session) -> t.Session:
         soil=t.soil(message.soil_correction),
         boot_id=message.boot_id if message.HasField("boot_id") else None,
         vehicle_alive=message.vehicle_alive if message.HasField("vehicle_alive") else None,
+        accepted=message.accepted,
+        durable_place=message.durable_place,
     )
 
 

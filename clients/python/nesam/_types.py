@@ -1,7 +1,7 @@
 """What goes in and what comes out."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Optional, Sequence, Tuple
 
 import numpy as np
@@ -67,6 +67,7 @@ class Session:
     """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
 
     boot_id: start of the vehicle's software, None when it does not tell. vehicle_alive: whether the vehicle's Zenoh token is there, None without Zenoh.
+    accepted: measurements accepted so far; durable_place: how many of them survive a crash of the server, 0 where it keeps no store.
     """
 
     session_id: str
@@ -81,6 +82,19 @@ class Session:
     soil: Soil
     boot_id: Optional[int] = None
     vehicle_alive: Optional[bool] = None
+    accepted: int = 0
+    durable_place: int = 0
+
+
+@dataclass(frozen=True)
+class Tls:
+    """TLS of a client, PEM as bytes: the authority of the server's certificate, and the client's own certificate and key where the server wants to
+    know who it is. server_name: name in the server's certificate, "" = that of the address."""
+
+    authority: bytes
+    certificate: Optional[bytes] = None
+    key: Optional[bytes] = field(default=None, repr=False)
+    server_name: str = ""
 
 
 @dataclass(frozen=True)
@@ -108,7 +122,9 @@ class Answer:
 
     outcome: APPLIED, BUFFERED, GATED, GAP, CLOCK_JUMP or RESTARTED, which changed the session, or DUPLICATE, TOO_OLD, FUTURE, NOT_FINITE or REJECTED, which
     did not. reordered: it arrived after a later one and was put in its place.
-    field and message say what was wrong with a NOT_FINITE or REJECTED one. soil: after this measurement, None when it was rejected.
+    field and message say what was wrong with a NOT_FINITE or REJECTED one, code is its gRPC number. soil: after this measurement, None when it was
+    rejected. place: of the measurement among the accepted ones, 0 when it was refused; it survives a crash of the server as soon as a durable_place
+    reaches it, which is 0 where the server keeps no store.
     """
 
     outcome: str
@@ -121,6 +137,9 @@ class Answer:
     message: str = ""
     soil: Optional[Soil] = None
     reordered: bool = False
+    place: int = 0
+    durable_place: int = 0
+    code: int = 0
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ use crate::error::ClientError;
 use crate::map::MapLayers;
 use crate::measure::{MeasurementStream, WAITING_MAX};
 use crate::prediction::{Candidates, Prediction};
+use crate::tls::Tls;
 
 /// Largest reply accepted, bytes: 64 for each of 131 072 sample-steps, and some room.
 const REPLY_BYTES_MAX: usize = 16 << 20;
@@ -24,9 +25,25 @@ impl Client {
     /// # Errors
     /// `ClientError::Connect` when the address is wrong or nobody answers there.
     pub async fn connect(address: &str) -> Result<Self, ClientError> {
+        Self::connect_over(address, None).await
+    }
+
+    /// Connects over TLS, e.g. to `https://server:50051`.
+    ///
+    /// # Errors
+    /// `ClientError::Connect` as [`Client::connect`], or when the handshake fails.
+    pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
+        Self::connect_over(address, Some(tls)).await
+    }
+
+    async fn connect_over(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {
         let failed = |source| ClientError::Connect { address: address.into(), source };
         let endpoint = Endpoint::from_shared(address.to_string()).map_err(failed)?;
         let endpoint = endpoint.tcp_nodelay(true).initial_stream_window_size(4 << 20).initial_connection_window_size(8 << 20);
+        let endpoint = match tls {
+            Some(tls) => endpoint.tls_config(tls.config()).map_err(failed)?,
+            None => endpoint,
+        };
         Ok(Self { channel: endpoint.connect().await.map_err(failed)? })
     }
 

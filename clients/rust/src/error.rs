@@ -1,5 +1,9 @@
 //! What can go wrong between a client and the service.
 
+use std::time::Duration;
+
+use tonic_types::StatusExt as _;
+
 /// Failure of a call.
 #[derive(Debug, thiserror::Error)]
 pub enum ClientError {
@@ -11,6 +15,14 @@ pub enum ClientError {
         /// What the transport said.
         source: tonic::transport::Error,
     },
+    /// A file of certificates cannot be read.
+    #[error("{}: {source}", path.display())]
+    File {
+        /// File at fault.
+        path: std::path::PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
     /// The service refused.
     #[error("{code:?}: {message}")]
     Refused {
@@ -20,6 +32,8 @@ pub enum ClientError {
         field: String,
         /// What was wrong and what is allowed.
         message: String,
+        /// Pause after which an overloaded service may have room.
+        retry_after: Option<Duration>,
     },
     /// The service answered something that the protocol does not allow.
     #[error("unexpected answer: {reason}")]
@@ -52,6 +66,14 @@ impl ClientError {
         }
     }
 
+    /// Pause after which to ask again, where the service was overloaded.
+    pub fn retry_after(&self) -> Option<Duration> {
+        match self {
+            Self::Refused { retry_after, .. } => *retry_after,
+            _ => None,
+        }
+    }
+
     pub(crate) fn protocol(reason: impl Into<String>) -> Self {
         Self::Protocol { reason: reason.into() }
     }
@@ -60,6 +82,7 @@ impl ClientError {
 impl From<tonic::Status> for ClientError {
     fn from(status: tonic::Status) -> Self {
         let field = status.metadata().get("nesam-field").and_then(|v| v.to_str().ok()).unwrap_or_default().into();
-        Self::Refused { code: status.code(), field, message: status.message().into() }
+        let retry_after = status.get_details_retry_info().and_then(|info| info.retry_delay);
+        Self::Refused { code: status.code(), field, message: status.message().into(), retry_after }
     }
 }

@@ -25,7 +25,9 @@ mod error;
 mod map;
 mod measure;
 mod message;
+mod outbox;
 mod prediction;
+mod tls;
 pub mod zenoh_vehicle;
 
 pub use client::Client;
@@ -34,4 +36,6 @@ pub use map::MapLayers;
 pub use measure::MeasurementStream;
 pub use message::{measurement, outcome_label, state_array, state_message};
 pub use nesam_proto::v1;
+pub use outbox::Outbox;
 pub use prediction::{Candidates, ExtraOutputs, Prediction};
+pub use tls::Tls;

@@ -105,7 +105,7 @@ impl ZenohVehicle {
             Err(error) => {
                 let error = v1::PredictError::decode(error.payload().to_bytes().as_ref());
                 let v1::PredictError { code, field, message, .. } = error.map_err(|error| ClientError::protocol(error.to_string()))?;
-                Err(ClientError::Refused { code: code.into(), field, message })
+                Err(ClientError::Refused { code: code.into(), field, message, retry_after: None })
             }
         }
     }

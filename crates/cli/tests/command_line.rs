@@ -351,3 +351,18 @@ fn service_demo_plays_a_drive_and_compares_predictions() {
     refused(&["demo", "--data", &root, "--bundle", &bundle, "--seconds", "2"], here.path(), &["more than 3.2 s"]);
     refused(&["demo", "--data", &root, "--bundle", &bundle, "--rate", "0"], here.path(), &["--rate", "0.1 to 10"]);
 }
+
+#[test]
+fn service_a_configuration_is_checked_without_serving() {
+    let here = tempfile::tempdir().unwrap();
+    let output = nesam(&["serve", "--check", "--store", "durable"], here.path());
+    let text = stdout(&output);
+    assert_eq!(output.status.code(), Some(0), "{text}{}", stderr(&output));
+    assert!(text.contains("no TLS") && text.contains("durable") && text.ends_with("sound\n"), "{text}");
+    assert!(!here.path().join("durable").exists(), "a check makes nothing");
+    std::fs::write(here.path().join("half.toml"), "[tls]\ncertificate = \"server.pem\"\n").unwrap();
+    refused(&["serve", "--check", "--config", "half.toml"], here.path(), &["tls.certificate", "tls.key"]);
+    std::fs::write(here.path().join("absent.toml"), "[tls]\ncertificate = \"server.pem\"\nkey = \"server.key\"\n").unwrap();
+    refused(&["serve", "--check", "--config", "absent.toml"], here.path(), &["tls.certificate", "server.pem"]);
+    refused(&["serve", "--check", "--config", "nowhere.toml"], here.path(), &["nowhere.toml"]);
+}

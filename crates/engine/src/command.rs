@@ -1,5 +1,6 @@
 //! Everything that can be asked of the engine.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nesam_model::HistoryStep;
@@ -33,6 +34,14 @@ pub enum Command {
     Export {
         /// Name of the session.
         session: String,
+    },
+    /// Reads, all at one instant, what a store keeps of these sessions and maps. It changes nothing, not even what keeps a session from being idle, and
+    /// is no part of a recording. Answer: `Reply::Snapshot`.
+    Snapshot {
+        /// Names of sessions, open or not.
+        sessions: Vec<String>,
+        /// Ids of maps, held or not.
+        maps: Vec<String>,
     },
     /// Opens a session from such a copy. Answer: `Reply::Session`.
     Import {
@@ -94,6 +103,7 @@ impl Command {
             Self::List => "list",
             Self::Fork { .. } => "fork",
             Self::Export { .. } => "export",
+            Self::Snapshot { .. } => "snapshot",
             Self::Import { .. } => "import",
             Self::Close { .. } => "close",
             Self::Expire => "expire",
@@ -141,6 +151,8 @@ pub enum Reply {
     Sessions(Vec<SessionView>),
     /// Everything that a session remembers.
     Image(Box<SessionImage>),
+    /// What a store keeps.
+    Snapshot(Box<Snapshot>),
     /// Names of the sessions that were closed because they were idle.
     Expired(Vec<String>),
     /// What became of a measurement.
@@ -157,6 +169,15 @@ pub enum Reply {
     Done,
 }
 
+/// Sessions and maps as they were at one instant; `None` = not open, not held.
+#[derive(Clone, Debug, Default)]
+pub struct Snapshot {
+    /// Asked sessions, in the order asked.
+    pub sessions: Vec<(String, Option<Box<SessionImage>>)>,
+    /// Asked maps and those of the sessions.
+    pub maps: BTreeMap<String, Option<Arc<WorldMap>>>,
+}
+
 /// What became of a measurement, and where the session stands now.
 #[derive(Clone, Debug, PartialEq)]
 pub struct MeasureAnswer {
@@ -168,6 +189,8 @@ pub struct MeasureAnswer {
     pub history_steps: usize,
     /// Changes of the history since the session was opened.
     pub history_epoch: u64,
+    /// Measurements that the session has accepted, this one included where it was.
+    pub accepted: u64,
     /// What is known of the soil now.
     pub soil: SoilEstimate,
 }
@@ -189,6 +212,8 @@ pub struct SessionView {
     pub last_stamp_ns: Option<i64>,
     /// Highest accepted sequence number.
     pub last_sequence: Option<u64>,
+    /// Measurements accepted so far.
+    pub accepted: u64,
     /// Start of the vehicle's software that feeds the session, where it tells.
     pub boot: Option<u64>,
     /// What was learned of the soil.
@@ -214,6 +239,25 @@ pub enum Event {
         /// The cell that changed.
         cell: Box<FleetCell>,
     },
+    /// A session is there: opened, copied or imported.
+    SessionOpened {
+        /// Name of the session.
+        session: String,
+        /// Vehicle that it belongs to.
+        vehicle: String,
+    },
+    /// A session accepted a measurement.
+    MeasurementAccepted {
+        /// Name of the session.
+        session: String,
+        /// A buffer of the soil filter ended with it.
+        buffer_ended: bool,
+    },
+    /// A map was taken, patched or deleted.
+    MapChanged {
+        /// Id of the map.
+        map: String,
+    },
     /// A session was closed.
     SessionClosed {
         /// Name of the session.
@@ -229,6 +273,9 @@ impl Event {
         match self {
             Self::SoilChanged { .. } => "soil_changed",
             Self::FleetSoilChanged { .. } => "fleet_soil_changed",
+            Self::SessionOpened { .. } => "session_opened",
+            Self::MeasurementAccepted { .. } => "measurement_accepted",
+            Self::MapChanged { .. } => "map_changed",
             Self::SessionClosed { expired: false, .. } => "session_closed",
             Self::SessionClosed { expired: true, .. } => "session_expired",
         }

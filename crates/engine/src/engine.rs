@@ -9,7 +9,7 @@ use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNois
 use nesam_physics::VehicleState;
 use nesam_terrain::WorldMap;
 
-use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
+use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
 use crate::error::EngineError;
 use crate::extras::ExtraOutputs;
 use crate::fleet::{Fleet, FleetCell};
@@ -134,6 +134,7 @@ impl Engine {
             Command::List => Ok(Reply::Sessions(self.sessions.values().map(|s| self.view(s)).collect())),
             Command::Fork { session, copy } => self.fork(now_ns, session, copy),
             Command::Export { session } => self.export(now_ns, session),
+            Command::Snapshot { sessions, maps } => Ok(Reply::Snapshot(Box::new(self.snapshot(now_ns, sessions, maps)))),
             Command::Import { image, session } => self.import(now_ns, image, session),
             Command::Close { session } => self.close(session),
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
@@ -142,6 +143,7 @@ impl Engine {
             Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
+                self.emit(Event::MapChanged { map: map.id().into() });
                 Ok(Reply::Map(map.clone()))
             }
             Command::GetMap { map } => self.maps.get(map).cloned().map(Reply::Map),
@@ -180,9 +182,15 @@ impl Engine {
             }
             session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), self.step_ns, observed.outcome);
         }
+        Ok(self.insert(session))
+    }
+
+    /// Holds a new session.
+    fn insert(&mut self, session: Session) -> Reply {
         let view = self.view(&session);
-        self.sessions.insert(id.clone(), session);
-        Ok(Reply::Session(Box::new(view)))
+        self.emit(Event::SessionOpened { session: view.session.clone(), vehicle: view.vehicle.clone() });
+        self.sessions.insert(view.session.clone(), session);
+        Reply::Session(Box::new(view))
     }
 
     /// Whether a session of this vehicle is open.
@@ -207,15 +215,32 @@ impl Engine {
         check_name("new_session_id", copy)?;
         self.check_room("new_session_id", copy)?;
         let session = session.fork(copy, now_ns);
-        let view = self.view(&session);
-        self.sessions.insert(copy.into(), session);
-        Ok(Reply::Session(Box::new(view)))
+        Ok(self.insert(session))
     }
 
     fn export(&self, now_ns: u64, id: &str) -> Result<Reply, EngineError> {
         let session = self.session(id)?;
-        let map = session.map().map(|id| self.maps.get(id)).transpose()?.map(|map| (map.id().to_string(), map.hash().to_string()));
-        Ok(Reply::Image(Box::new(session.image(now_ns, &self.predictor.bundle().hash, map))))
+        let map = session.map().map(|id| self.maps.get(id)).transpose()?;
+        Ok(Reply::Image(Box::new(self.image(now_ns, session, map))))
+    }
+
+    fn image(&self, now_ns: u64, session: &Session, map: Option<&Arc<WorldMap>>) -> SessionImage {
+        let map = map.map(|map| (map.id().to_string(), map.hash().to_string()));
+        session.image(now_ns, &self.predictor.bundle().hash, map)
+    }
+
+    fn snapshot(&self, now_ns: u64, sessions: &[String], maps: &[String]) -> Snapshot {
+        let held = |id: &str| self.maps.get(id).ok();
+        let mut snapshot = Snapshot { maps: maps.iter().map(|id| (id.clone(), held(id).cloned())).collect(), ..Snapshot::default() };
+        for id in sessions {
+            let session = self.sessions.get(id);
+            let map = session.and_then(Session::map).and_then(held);
+            if let Some(map) = map {
+                snapshot.maps.insert(map.id().into(), Some(Arc::clone(map)));
+            }
+            snapshot.sessions.push((id.clone(), session.map(|session| Box::new(self.image(now_ns, session, map)))));
+        }
+        snapshot
     }
 
     fn import(&mut self, now_ns: u64, image: &SessionImage, name: &str) -> Result<Reply, EngineError> {
@@ -241,9 +266,7 @@ impl Engine {
         if self.drives(&image.vehicle) {
             session.bring_nothing();
         }
-        let view = self.view(&session);
-        self.sessions.insert(id.into(), session);
-        Ok(Reply::Session(Box::new(view)))
+        Ok(self.insert(session))
     }
 
     fn close(&mut self, id: &str) -> Result<Reply, EngineError> {
@@ -272,7 +295,7 @@ impl Engine {
             let reason = format!("session `{id}` belongs to vehicle `{}`, the measurement comes from `{vehicle}`", session.vehicle());
             return Err(EngineError::invalid("session_id", reason));
         }
-        let soil_epoch = session.soil().state.epoch;
+        let before = (session.soil().state, session.accepted());
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
         let Observed { outcome, reordered } = session.observe(measurement, now_ns, rules)?;
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
@@ -285,6 +308,7 @@ impl Engine {
         let outcome = session.learn(&self.predictor, map.as_ref(), self.step_ns, outcome);
         let (vehicle, brought) = (session.vehicle().to_string(), session.take_brought());
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
+        let accepted = session.accepted();
         if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
             let cell_m = fleet.cell_m();
             let changed: Vec<FleetCell> = brought.iter().filter_map(|brought| fleet.add(map, brought, now_ns)).collect();
@@ -292,10 +316,14 @@ impl Engine {
                 self.emit(Event::FleetSoilChanged { cell_m, cell: Box::new(cell) });
             }
         }
-        if soil.state.epoch != soil_epoch {
+        if accepted != before.1 {
+            let buffer_ended = soil.state.last_buffer != before.0.last_buffer;
+            self.emit(Event::MeasurementAccepted { session: id.into(), buffer_ended });
+        }
+        if soil.state.epoch != before.0.epoch {
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
         }
-        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, history_epoch, soil })))
+        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, history_epoch, accepted, soil })))
     }
 
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
@@ -369,7 +397,9 @@ impl Engine {
         if let Some(user) = self.sessions.values().find(|s| s.map() == Some(id)) {
             return Err(EngineError::MapInUse { map: id.into(), session: user.id().into() });
         }
-        self.maps.delete(id).map(|()| Reply::Done)
+        self.maps.delete(id)?;
+        self.emit(Event::MapChanged { map: id.into() });
+        Ok(Reply::Done)
     }
 
     fn provenance(&self, session: &Session) -> Provenance {
@@ -393,6 +423,7 @@ impl Engine {
             newest: session.newest().copied(),
             last_stamp_ns: session.last_stamp_ns(),
             last_sequence: session.last_sequence(),
+            accepted: session.accepted(),
             boot: session.boot(),
             soil: *session.soil(),
         }

@@ -75,13 +75,15 @@ pub enum EngineError {
         /// How much is held and what to do.
         reason: String,
     },
-    /// Too many commands wait.
-    #[error("overloaded: {waiting} {kind} wait, the limit; ask again later or ask for less")]
+    /// Too many commands wait, or so many that the deadline would pass.
+    #[error("overloaded: {waiting} {kind} wait; ask again in {:.0} ms or ask for less", *retry_after_ns as f64 * 1e-6)]
     Overloaded {
         /// What waits: predictions or commands.
         kind: &'static str,
         /// How many.
         waiting: usize,
+        /// Pause after which there may be room, ns.
+        retry_after_ns: u64,
     },
     /// The deadline passed before the computation began.
     #[error("the deadline passed before the prediction was started; ask for fewer samples or allow more time")]

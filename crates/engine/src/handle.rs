@@ -11,6 +11,7 @@ use crate::engine::Engine;
 use crate::error::EngineError;
 use crate::limits::Limits;
 use crate::queue::{Queue, Turn};
+use crate::service_time::work;
 
 /// A command on its way to the engine.
 pub struct Submission {
@@ -22,6 +23,8 @@ pub struct Submission {
     pub abandoned: Option<Arc<AtomicBool>>,
     /// Called once with the answer, on the engine's thread or on the submitter's; it must not wait.
     pub reply: Box<dyn FnOnce(Answer) + Send>,
+    /// Vehicle that the command counts for when vehicles compete; `None` = its session stands for it.
+    pub share: Option<Arc<str>>,
     submitted_ns: u64,
 }
 
@@ -34,7 +37,22 @@ impl core::fmt::Debug for Submission {
 impl Submission {
     /// A command without a deadline.
     pub fn new(command: Command, reply: impl FnOnce(Answer) + Send + 'static) -> Self {
-        Self { command, deadline_ns: None, abandoned: None, reply: Box::new(reply), submitted_ns: 0 }
+        Self { command, deadline_ns: None, abandoned: None, reply: Box::new(reply), share: None, submitted_ns: 0 }
+    }
+
+    /// Whom the command counts for.
+    pub(crate) fn share(&self) -> Arc<str> {
+        let session = || match &self.command {
+            Command::Predict(query) => query.session.as_str(),
+            Command::Measure { session, .. } => session,
+            _ => "",
+        };
+        self.share.clone().unwrap_or_else(|| session().into())
+    }
+
+    /// When it was submitted, ns of the engine's clock.
+    pub(crate) fn submitted_ns(&self) -> u64 {
+        self.submitted_ns
     }
 
     fn refuse(self, error: EngineError) {
@@ -68,7 +86,7 @@ pub struct Executed {
     pub busy_ns: u64,
 }
 
-/// Hears of every command after its answer was sent, in the order of execution; called on the engine's thread, so it must not wait.
+/// Hears of every command but snapshots after its answer was sent, in the order of execution; called on the engine's thread, so it must not wait.
 pub type Tap = Box<dyn FnMut(Executed) + Send>;
 
 /// The way to an engine that runs on a thread of its own. Clones share the engine.
@@ -163,9 +181,19 @@ impl EngineHandle {
 /// The thread's loop.
 fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap>) -> Engine {
     loop {
-        match queue.next() {
-            Turn::Commands(commands) => commands.into_iter().for_each(|submission| answer(&mut engine, submission, clock, &mut tap)),
-            Turn::Prediction(submission) => answer(&mut engine, *submission, clock, &mut tap),
+        match queue.next(|| clock.now_ns()) {
+            Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
+                answer(&mut engine, submission, clock, &mut tap);
+            }),
+            Turn::Prediction(submission) => {
+                let work = match &submission.command {
+                    Command::Predict(query) => work(query),
+                    _ => 1.0,
+                };
+                if let Some(busy_ns) = answer(&mut engine, *submission, clock, &mut tap) {
+                    queue.learn(work, busy_ns);
+                }
+            }
             Turn::End => return engine,
         }
     }
@@ -180,9 +208,9 @@ pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> R
         .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
 }
 
-/// Executes one submission and answers it; a recording hears of it last.
-fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock, tap: &mut Option<Tap>) {
-    let Submission { command, deadline_ns, abandoned, reply, submitted_ns } = submission;
+/// Executes one submission and answers it; a recording hears of it last. Gives the time that it took if it was not refused.
+fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock, tap: &mut Option<Tap>) -> Option<u64> {
+    let Submission { command, deadline_ns, abandoned, reply, submitted_ns, share: _ } = submission;
     let now_ns = clock.now_ns();
     let is_prediction = matches!(command, Command::Predict(_));
     let result = if is_prediction && abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
@@ -193,9 +221,11 @@ fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock, tap: &
         execute_guarded(engine, now_ns, &command)
     };
     let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
-    let heard = tap.as_ref().map(|_| result.clone());
+    let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. })).map(|_| result.clone());
+    let took = result.is_ok().then_some(busy_ns);
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {
         tap(Executed { now_ns, command, result, queued_ns, busy_ns });
     }
+    took
 }

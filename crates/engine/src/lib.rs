@@ -7,7 +7,8 @@
 //!
 //! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own. Measurements overtake predictions there: a planner that
 //! asks for much never delays what a vehicle reports by more than the prediction that is being computed. A full queue is an
-//! [`EngineError::Overloaded`], never a wait and never a panic; a prediction whose asker has gone or whose deadline has passed is skipped.
+//! [`EngineError::Overloaded`], never a wait and never a panic, and so is a prediction that would not be done before its deadline; one whose asker has
+//! gone or whose deadline has passed is skipped. Vehicles share the time for predictions evenly.
 //!
 //! ```text
 //! server ── Command ──► EngineHandle ──► queue ──► Engine::execute ──► Session, Predictor
@@ -20,6 +21,7 @@ mod command;
 mod engine;
 mod error;
 mod extras;
+mod fair;
 mod fleet;
 mod forward;
 mod grid;
@@ -29,10 +31,11 @@ mod maps;
 mod measurement;
 mod query;
 mod queue;
+mod service_time;
 mod session;
 
 pub use clock::{Clock, ManualClock};
-pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView};
+pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
 pub use engine::{Engine, EventSink, Logged};
 pub use error::EngineError;
 pub use extras::{CovarianceQuery, Covariances, ExtraOutputs, Jacobians, PredictExtras, SIGMA_POINTS, WhatIfSoils};

@@ -49,8 +49,12 @@ pub struct Limits {
     pub map_cells_total_max: usize,
     /// Predictions that wait.
     pub waiting_predictions_max: usize,
+    /// Predictions of one vehicle that wait.
+    pub waiting_predictions_per_vehicle_max: usize,
     /// Other commands that wait.
     pub waiting_commands_max: usize,
+    /// Measurements of one vehicle among them.
+    pub waiting_measurements_per_vehicle_max: usize,
     /// |position| along each axis, m.
     pub position_max_m: f64,
     /// |velocity| along each axis, m/s.
@@ -84,7 +88,9 @@ impl Default for Limits {
             map_cells_max: nesam_terrain::MAX_CELLS,
             map_cells_total_max: 4 * nesam_terrain::MAX_CELLS,
             waiting_predictions_max: 64,
+            waiting_predictions_per_vehicle_max: 32,
             waiting_commands_max: 4096,
+            waiting_measurements_per_vehicle_max: 1024,
             position_max_m: 1e6,
             speed_max_m_s: 100.0,
             angular_speed_max_rad_s: 50.0,

@@ -1,12 +1,17 @@
-//! The two lanes in front of the engine.
+//! The two lanes in front of the engine, and what is let in.
 
-use std::collections::VecDeque;
-use std::sync::{Condvar, Mutex, MutexGuard};
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 
 use crate::command::Command;
 use crate::error::EngineError;
+use crate::fair::FairQueue;
 use crate::handle::Submission;
 use crate::limits::Limits;
+use crate::service_time::{ServiceTime, work};
+
+/// Shortest pause that a refused asker is told, ns.
+const RETRY_MIN_NS: u64 = 1_000_000;
 
 /// Commands that wait. Predictions have a lane of their own, so that a flood of them neither delays nor displaces measurements.
 #[derive(Debug, Default)]
@@ -18,8 +23,19 @@ pub(crate) struct Queue {
 #[derive(Debug, Default)]
 struct Lanes {
     commands: VecDeque<Submission>,
-    predictions: VecDeque<Submission>,
+    /// Of the waiting commands, those of each share.
+    commands_of: BTreeMap<Arc<str>, usize>,
+    predictions: FairQueue<Submission>,
+    running: Option<Running>,
+    service_time: ServiceTime,
     stopped: bool,
+}
+
+/// The prediction that the engine computes now.
+#[derive(Clone, Copy, Debug)]
+struct Running {
+    since_ns: u64,
+    expected_ns: u64,
 }
 
 /// What the engine does next.
@@ -37,52 +53,109 @@ impl Queue {
         self.lanes.lock().expect("no holder of the queue panics; this is a bug")
     }
 
-    /// Adds a command, or gives it back with the reason.
+    /// Adds a command, or gives it back with the reason. A prediction is refused at once when it would not be done in time.
     pub fn push(&self, submission: Submission, limits: &Limits) -> Result<(), Box<(EngineError, Submission)>> {
         let mut lanes = self.lock();
         if lanes.stopped {
             return Err(Box::new((EngineError::Stopped, submission)));
         }
-        let (lane, limit, kind) = match submission.command {
-            Command::Predict(_) => (&mut lanes.predictions, limits.waiting_predictions_max, "predictions"),
-            _ => (&mut lanes.commands, limits.waiting_commands_max, "commands"),
+        let admitted = match &submission.command {
+            Command::Predict(query) => lanes.admit(&submission, work(query), limits),
+            _ => lanes.take(&submission, limits).map(|()| 0),
         };
-        if lane.len() >= limit {
-            return Err(Box::new((EngineError::Overloaded { kind, waiting: lane.len() }, submission)));
+        match admitted {
+            Err(error) => return Err(Box::new((error, submission))),
+            Ok(expected_ns) if matches!(submission.command, Command::Predict(_)) => {
+                let share = submission.share();
+                lanes.predictions.push(&share, submission, expected_ns);
+            }
+            Ok(_) => lanes.commands.push_back(submission),
         }
-        lane.push_back(submission);
         self.filled.notify_one();
         Ok(())
     }
 
     /// Waits for the next turn. After `stop`, waiting commands still have their turn and waiting predictions do not.
-    pub fn next(&self) -> Turn {
+    pub fn next(&self, now_ns: impl Fn() -> u64) -> Turn {
         let mut lanes = self.lock();
         loop {
+            lanes.running = None;
             if !lanes.commands.is_empty() {
+                lanes.commands_of.clear();
                 return Turn::Commands(std::mem::take(&mut lanes.commands));
             }
             if lanes.stopped {
                 return Turn::End;
             }
-            if let Some(prediction) = lanes.predictions.pop_front() {
+            if let Some((prediction, expected_ns)) = lanes.predictions.pop() {
+                lanes.running = Some(Running { since_ns: now_ns(), expected_ns });
                 return Turn::Prediction(Box::new(prediction));
             }
             lanes = self.filled.wait(lanes).expect("no holder of the queue panics; this is a bug");
         }
     }
 
+    /// Learns how long a prediction took.
+    pub fn learn(&self, work: f64, busy_ns: u64) {
+        self.lock().service_time.learn(work, busy_ns);
+    }
+
     /// Refuses new commands and gives back the predictions that wait.
-    pub fn stop(&self) -> VecDeque<Submission> {
+    pub fn stop(&self) -> Vec<Submission> {
         let mut lanes = self.lock();
         lanes.stopped = true;
         self.filled.notify_all();
-        std::mem::take(&mut lanes.predictions)
+        lanes.predictions.drain()
     }
 
     /// Waiting commands and predictions.
     pub fn waiting(&self) -> (usize, usize) {
         let lanes = self.lock();
         (lanes.commands.len(), lanes.predictions.len())
+    }
+}
+
+impl Lanes {
+    /// The time that a prediction is expected to take, if it is let in.
+    fn admit(&self, submission: &Submission, work: f64, limits: &Limits) -> Result<u64, EngineError> {
+        let (share, now_ns) = (submission.share(), submission.submitted_ns());
+        let expected_ns = self.service_time.expected_ns(work);
+        let running_ns = self.running.map_or(0, |running| (running.since_ns + running.expected_ns).saturating_sub(now_ns));
+        let wait_ns = running_ns + self.predictions.wait_ns(&share, expected_ns);
+        let refused = |kind, waiting, retry_after_ns: u64| EngineError::Overloaded {
+            kind,
+            waiting,
+            retry_after_ns: retry_after_ns.max(RETRY_MIN_NS),
+        };
+        let (waiting, own) = (self.predictions.len(), self.predictions.len_of(&share));
+        if waiting >= limits.waiting_predictions_max {
+            return Err(refused("predictions", waiting, wait_ns));
+        }
+        if own >= limits.waiting_predictions_per_vehicle_max {
+            return Err(refused("predictions of this vehicle", own, wait_ns));
+        }
+        // Whoever comes while nothing else is to be done is let in whatever is expected: so the estimate stays true.
+        let idle = waiting == 0 && self.running.is_none();
+        let done_ns = now_ns.saturating_add(wait_ns).saturating_add(expected_ns);
+        match submission.deadline_ns {
+            Some(deadline_ns) if !idle && done_ns > deadline_ns => Err(refused("predictions", waiting, done_ns - deadline_ns)),
+            _ => Ok(expected_ns),
+        }
+    }
+
+    /// Lets another command in, unless too many wait.
+    fn take(&mut self, submission: &Submission, limits: &Limits) -> Result<(), EngineError> {
+        let refused = |kind, waiting| EngineError::Overloaded { kind, waiting, retry_after_ns: RETRY_MIN_NS };
+        if self.commands.len() >= limits.waiting_commands_max {
+            return Err(refused("commands", self.commands.len()));
+        }
+        if let Command::Measure { .. } = submission.command {
+            let own = self.commands_of.entry(submission.share()).or_default();
+            if *own >= limits.waiting_measurements_per_vehicle_max {
+                return Err(refused("measurements of this vehicle", *own));
+            }
+            *own += 1;
+        }
+        Ok(())
     }
 }

@@ -63,6 +63,8 @@ pub struct Session {
     /// Engine clock when the session was fed or asked last, ns.
     used_ns: u64,
     history_epoch: u64,
+    /// Accepted measurements.
+    accepted: u64,
     learner: SoilLearner,
     soil: SoilEstimate,
     fleet: FleetPart,
@@ -125,6 +127,7 @@ impl Session {
             arrived_ns: 0,
             used_ns: now_ns,
             history_epoch: 0,
+            accepted: 0,
             soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0 },
             learner,
             fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
@@ -164,6 +167,7 @@ impl Session {
 
     fn accept(&mut self, measurement: &Measurement, now_ns: u64, rules: Rules<'_>) -> Observed {
         let newest = self.order.accept(measurement, now_ns);
+        self.accepted += 1;
         let taken = if newest {
             self.open.push_back(*measurement);
             self.live.advance(measurement, rules.step_ns)
@@ -337,6 +341,11 @@ impl Session {
     /// Counts the changes of the history.
     pub fn history_epoch(&self) -> u64 {
         self.history_epoch
+    }
+
+    /// Measurements accepted so far, those before an export included.
+    pub fn accepted(&self) -> u64 {
+        self.accepted
     }
 
     /// Stamp of the newest accepted measurement, ns of the vehicle's clock.

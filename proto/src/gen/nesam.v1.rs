@@ -228,6 +228,15 @@ pub struct MeasurementAnswer {
     /// It arrived after a later one and was put in its place; the outcome says what it is there.
     #[prost(bool, tag = "7")]
     pub reordered: bool,
+    /// Place of the measurement among those that the session has accepted, counted from 1 in the order of arrival; that of the newest accepted one for a
+    /// duplicate; 0 when it was refused. The measurement is RECEIVED now and DURABLE as soon as an answer of the same run of the server, or
+    /// Sessions.Get, tells a `durable_place` that reaches it. After a reconnect everything that is not known to be durable is sent again.
+    #[prost(uint64, tag = "8")]
+    pub place: u64,
+    /// What the session has accepted up to this place is on stable storage and survives a crash of the server and of its machine. 0 where the server
+    /// keeps no store (`store.enabled`).
+    #[prost(uint64, tag = "9")]
+    pub durable_place: u64,
     #[prost(
         oneof = "measurement_answer::Outcome",
         tags = "10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20"
@@ -1391,7 +1400,7 @@ pub struct Refusal {
 /// Everything is stored as it is held, so that an imported session goes on bit for bit.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct SessionImage {
-    /// Version of the format, 1.
+    /// Version of the format, 2.
     #[prost(uint32, tag = "1")]
     pub version: u32,
     /// SHA-256 of `content`.
@@ -1463,6 +1472,26 @@ pub struct SessionContent {
     /// Scale of the filter's noise at the newest update.
     #[prost(double, tag = "25")]
     pub soil_noise_scale: f64,
+    /// Measurements accepted so far.
+    #[prost(uint64, tag = "26")]
+    pub accepted: u64,
+    /// Newest full buffer that the soil filter judged; absent before the first.
+    #[prost(message, optional, tag = "27")]
+    pub last_buffer: ::core::option::Option<BufferImage>,
+}
+/// The test of a full buffer of the soil filter.
+#[derive(Clone, Copy, PartialEq, ::prost::Message)]
+pub struct BufferImage {
+    /// Counts the buffers from 1.
+    #[prost(uint64, tag = "1")]
+    pub judged: u64,
+    /// Normalised innovation squared and its degrees of freedom.
+    #[prost(double, tag = "2")]
+    pub nis: f64,
+    #[prost(uint32, tag = "3")]
+    pub dof: u32,
+    #[prost(bool, tag = "4")]
+    pub rejected: bool,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TrackImage {
@@ -1628,6 +1657,12 @@ pub struct Session {
     /// Whether the vehicle's Zenoh liveliness token `nesam/v1/<fleet>/<vehicle>/alive` is there; absent when the server takes no part in a Zenoh network.
     #[prost(bool, optional, tag = "12")]
     pub vehicle_alive: ::core::option::Option<bool>,
+    /// Measurements accepted so far: the highest `MeasurementAnswer.place`.
+    #[prost(uint64, tag = "13")]
+    pub accepted: u64,
+    /// As `MeasurementAnswer.durable_place`.
+    #[prost(uint64, tag = "14")]
+    pub durable_place: u64,
 }
 /// The part of the vehicle card that a client needs to form valid commands.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1667,6 +1702,9 @@ pub mod sessions_client {
     /// A session is what the service remembers of one vehicle: its recent measured motion and its soil correction.
     ///
     /// A session that nobody feeds and nobody asks for longer than the service's limit (`limits.session_idle_s`) is closed by the service.
+    ///
+    /// Where the server keeps a store (`store.enabled`), Open, Fork, Import and Close answer when the change is on stable storage, and a restarted server
+    /// has the sessions and their maps again; UNAVAILABLE then says that the change is made but the store has not taken it in time.
     #[derive(Debug, Clone)]
     pub struct SessionsClient<T> {
         inner: tonic::client::Grpc<T>,
@@ -1951,6 +1989,9 @@ pub mod sessions_server {
     /// A session is what the service remembers of one vehicle: its recent measured motion and its soil correction.
     ///
     /// A session that nobody feeds and nobody asks for longer than the service's limit (`limits.session_idle_s`) is closed by the service.
+    ///
+    /// Where the server keeps a store (`store.enabled`), Open, Fork, Import and Close answer when the change is on stable storage, and a restarted server
+    /// has the sessions and their maps again; UNAVAILABLE then says that the change is made but the store has not taken it in time.
     #[derive(Debug)]
     pub struct SessionsServer<T> {
         inner: Arc<T>,

@@ -1,7 +1,8 @@
 //! Exported sessions: bytes with a version and a checksum.
 
 use nesam_engine::{
-    EngineError, FilterSnapshot, JointSnapshot, Measurement, SessionImage, SoilEstimate, SoilState, StepGrid, TrackImage, WheelMeasurement,
+    BufferTest, EngineError, FilterSnapshot, JointSnapshot, Measurement, SessionImage, SoilEstimate, SoilState, StepGrid, TrackImage,
+    WheelMeasurement,
 };
 use nesam_model::HistoryStep;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCoordinates, SoilCorrection, VehicleState};
@@ -12,7 +13,7 @@ use sha2::{Digest as _, Sha256};
 use super::soil_correction;
 
 /// Version of the format. Any change of `SessionContent` needs another one.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 
 fn refused(reason: impl Into<String>) -> EngineError {
     EngineError::invalid("image", reason)
@@ -82,6 +83,13 @@ fn content(image: &SessionImage) -> pb::SessionContent {
         soil_stamp_ns: image.soil.state.stamp_ns,
         soil: Some(soil_correction(&image.soil)),
         soil_noise_scale: image.soil.noise_scale,
+        accepted: image.accepted,
+        last_buffer: image.soil.state.last_buffer.map(|last| pb::BufferImage {
+            judged: last.judged,
+            nis: last.nis,
+            dof: last.dof as u32,
+            rejected: last.rejected,
+        }),
     }
 }
 
@@ -133,6 +141,7 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
         newest_age_ns: content.newest_age_ns.map(age),
         step_age_ns: content.step_age_ns.map(age),
         history_epoch: content.history_epoch,
+        accepted: content.accepted,
         filter_steps: content.filter_steps.iter().map(from_step).collect::<Result<_, _>>()?,
         filter_first: content.filter_first as usize,
         filter: FilterSnapshot {
@@ -162,7 +171,12 @@ fn from_soil(content: &pb::SessionContent) -> Result<SoilEstimate, EngineError> 
         correction: SoilCorrection { coordinates, delta },
         variance: soil.variance.as_ref().map(vector),
         learned: array(&soil.learned)?,
-        last_buffer: None,
+        last_buffer: content.last_buffer.map(|last| BufferTest {
+            judged: last.judged,
+            nis: last.nis,
+            dof: last.dof as usize,
+            rejected: last.rejected,
+        }),
     };
     Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)?, noise_scale: content.soil_noise_scale })
 }

@@ -49,6 +49,8 @@ pub fn measurement_answer(message: &pb::Measurement, session: &str, result: Resu
         Ok(measured) => {
             answer.history_epoch = measured.history_epoch;
             answer.reordered = measured.reordered;
+            let known = measured.outcome.accepted() || measured.outcome == Outcome::Duplicate;
+            answer.place = if known { measured.accepted } else { 0 };
             answer.soil_epoch = measured.soil.state.epoch;
             answer.soil_correction = Some(soil_correction(&measured.soil));
             answer.outcome = Some(outcome(measured));

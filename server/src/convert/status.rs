@@ -1,7 +1,10 @@
 //! Refusals as gRPC status.
 
+use std::time::Duration;
+
 use nesam_engine::EngineError;
 use tonic::{Code, Status};
+use tonic_types::{ErrorDetails, StatusExt as _};
 
 /// Trailing metadata that carries the path of the field at fault.
 pub const FIELD_METADATA: &str = "nesam-field";
@@ -22,12 +25,18 @@ pub fn code(error: &EngineError) -> Code {
     }
 }
 
-/// A refusal as gRPC status: message, code, and the field in the metadata.
+/// A refusal as gRPC status: message, code, the field in the metadata, and for an overload google.rpc.RetryInfo.
 pub fn to_status(error: EngineError) -> Status {
     if matches!(error, EngineError::Internal { .. }) {
         tracing::error!(%error, "internal error");
     }
-    let mut status = Status::new(code(&error), error.to_string());
+    let mut status = match &error {
+        EngineError::Overloaded { retry_after_ns, .. } => {
+            let details = ErrorDetails::with_retry_info(Some(Duration::from_nanos(*retry_after_ns)));
+            Status::with_error_details(code(&error), error.to_string(), details)
+        }
+        _ => Status::new(code(&error), error.to_string()),
+    };
     if let Ok(field) = error.field().parse() {
         status.metadata_mut().insert(FIELD_METADATA, field);
     }

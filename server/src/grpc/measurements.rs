@@ -8,7 +8,8 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{Edge, ReplyStream, stopped};
-use crate::call::{EngineClient, Pending, measured};
+use crate::access::{Caller, Wish};
+use crate::call::{Pending, measured};
 use crate::convert::{measurement, measurement_answer};
 use crate::telemetry::Transport;
 
@@ -16,7 +17,13 @@ use crate::telemetry::Transport;
 pub struct Service(pub Edge);
 
 /// A measurement on its way: in the engine's queue, or refused before.
-type InFlight = (pb::Measurement, Result<Pending, EngineError>);
+type InFlight = (pb::Measurement, Result<Pending, Refused>);
+
+/// Why a measurement did not reach the engine.
+enum Refused {
+    Invalid(EngineError),
+    NoRight(Status),
+}
 
 #[tonic::async_trait]
 impl pb::measurements_server::Measurements for Service {
@@ -24,14 +31,14 @@ impl pb::measurements_server::Measurements for Service {
 
     async fn stream(&self, request: Request<Streaming<pb::Measurement>>) -> Result<Response<Self::StreamStream>, Status> {
         let edge = self.0.clone();
+        let caller = edge.access.caller(&request)?;
         let (sender, receiver) = mpsc::channel(edge.config.measurements_in_flight_max);
-        tokio::spawn(submit_all(edge.clone(), request.into_inner(), sender));
-        let engine = edge.engine;
+        tokio::spawn(submit_all(edge.clone(), caller, request.into_inner(), sender));
         let answers = ReceiverStream::new(receiver).then(move |item: Result<InFlight, Status>| {
-            let engine = engine.clone();
+            let edge = edge.clone();
             async move {
                 match item {
-                    Ok(in_flight) => Ok(answer(&engine, in_flight).await),
+                    Ok(in_flight) => Ok(answer(&edge, in_flight).await),
                     Err(status) => Err(status),
                 }
             }
@@ -41,7 +48,7 @@ impl pb::measurements_server::Measurements for Service {
 }
 
 /// Puts measurements into the queue in order of arrival, without waiting for their answers.
-async fn submit_all(edge: Edge, mut inbound: Streaming<pb::Measurement>, sender: mpsc::Sender<Result<InFlight, Status>>) {
+async fn submit_all(edge: Edge, caller: Caller, mut inbound: Streaming<pb::Measurement>, sender: mpsc::Sender<Result<InFlight, Status>>) {
     let stop = stopped(edge.stopping.clone());
     tokio::pin!(stop);
     loop {
@@ -51,10 +58,7 @@ async fn submit_all(edge: Edge, mut inbound: Streaming<pb::Measurement>, sender:
         };
         let Some(item) = item else { return };
         let item = item.map(|message| {
-            let pending = measurement(&message).map(|measurement| {
-                let command = Command::Measure { session: message.session_id.clone(), vehicle: None, measurement };
-                edge.engine.submit(command, edge.stream_budget())
-            });
+            let pending = submit(&edge, &caller, &message);
             (message, pending)
         });
         let last = item.is_err();
@@ -64,11 +68,28 @@ async fn submit_all(edge: Edge, mut inbound: Streaming<pb::Measurement>, sender:
     }
 }
 
-async fn answer(engine: &EngineClient, (message, pending): InFlight) -> pb::MeasurementAnswer {
+/// Puts one measurement into the queue. The engine looks once more whether the session belongs to the vehicle that the sender may feed.
+fn submit(edge: &Edge, caller: &Caller, message: &pb::Measurement) -> Result<Pending, Refused> {
+    let measurement = measurement(message).map_err(Refused::Invalid)?;
+    let vehicle = caller.may(Wish::ChangeSession(&message.session_id)).map_err(Refused::NoRight)?;
+    let vehicle = vehicle.map(|vehicle| vehicle.to_string());
+    let command = Command::Measure { session: message.session_id.clone(), vehicle, measurement };
+    Ok(edge.engine.submit(command, edge.stream_budget()))
+}
+
+async fn answer(edge: &Edge, (message, pending): InFlight) -> pb::MeasurementAnswer {
     let result = match pending {
         Ok(pending) => measured(pending.await),
-        Err(error) => Err(error),
+        Err(Refused::Invalid(error)) => Err(error),
+        Err(Refused::NoRight(status)) => {
+            edge.engine.metrics().measurement(Transport::Grpc, "rejected");
+            let rejected = pb::Rejected { code: status.code().into(), field: "session_id".into(), message: status.message().into() };
+            let (session_id, sequence, stamp_ns) = (message.session_id, message.sequence, message.stamp_ns);
+            let outcome = Some(pb::measurement_answer::Outcome::Rejected(rejected));
+            return pb::MeasurementAnswer { session_id, sequence, stamp_ns, outcome, ..Default::default() };
+        }
     };
-    engine.metrics().measurement(Transport::Grpc, result.as_ref().map_or("rejected", |m| m.outcome.label()));
-    measurement_answer(&message, &message.session_id, result)
+    edge.engine.metrics().measurement(Transport::Grpc, result.as_ref().map_or("rejected", |m| m.outcome.label()));
+    let durable_place = edge.durable_place(&message.session_id);
+    pb::MeasurementAnswer { durable_place, ..measurement_answer(&message, &message.session_id, result) }
 }

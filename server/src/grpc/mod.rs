@@ -19,8 +19,10 @@ use tokio_stream::Stream;
 use tonic::Status;
 use tonic::service::Routes;
 
+use crate::access::{Access, Wish};
 use crate::call::EngineClient;
 use crate::config::GrpcConfig;
+use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
 
 pub(crate) use prediction::predict;
@@ -42,12 +44,41 @@ pub(crate) struct Edge {
     pub uploads: Arc<Semaphore>,
     /// Vehicles in the Zenoh network; `None` without one.
     pub presence: Option<Presence>,
+    /// The store's side; `None` without a store.
+    pub keeper: Option<Arc<Keeper>>,
+    /// Who may do what.
+    pub access: Access,
 }
 
 impl Edge {
     /// Time that a request may take: what the client allows, at most the configured deadline.
     pub fn budget<T>(&self, request: &tonic::Request<T>) -> Duration {
         deadline::budget(request.metadata(), Duration::from_secs_f64(self.config.deadline_s))
+    }
+
+    /// Refuses a request whose sender has no right to it; gives the vehicle of the session that it is about.
+    ///
+    /// # Errors
+    /// UNAUTHENTICATED, PERMISSION_DENIED or NOT_FOUND.
+    pub fn allow<T>(&self, request: &tonic::Request<T>, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
+        self.access.caller(request).and_then(|caller| caller.may(wish))
+    }
+
+    /// Accepted measurements of a session that are on stable storage; 0 without a store.
+    pub fn durable_place(&self, session: &str) -> u64 {
+        self.keeper.as_ref().map_or(0, |keeper| keeper.durable(session))
+    }
+
+    /// Resolves when the change that was just made is on stable storage, at once without a store.
+    ///
+    /// # Errors
+    /// UNAVAILABLE when the store did not take it within `budget`; the change is made nevertheless.
+    pub async fn settled(&self, key: Key, budget: Duration) -> Result<(), Status> {
+        let Some(keeper) = &self.keeper else { return Ok(()) };
+        if keeper.settled(&key, budget).await {
+            return Ok(());
+        }
+        Err(Status::unavailable("done, but the store did not take it in time: it is not durable yet; look again before asking again"))
     }
 
     /// Time that one message of a stream may take.

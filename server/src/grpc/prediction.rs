@@ -8,6 +8,7 @@ use tokio_stream::StreamExt as _;
 use tonic::{Request, Response, Status, Streaming};
 
 use super::{Edge, ReplyStream, stopped};
+use crate::access::Wish;
 use crate::convert::{predict_error, predict_query, predict_reply, to_status};
 use crate::telemetry::Transport;
 
@@ -32,6 +33,7 @@ pub(crate) async fn predict(edge: &Edge, request: &pb::PredictRequest, budget: D
 impl pb::prediction_server::Prediction for Service {
     async fn predict(&self, request: Request<pb::PredictRequest>) -> Result<Response<pb::PredictReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "predict");
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
         let budget = self.0.budget(&request);
         predict(&self.0, request.get_ref(), budget).await.map(Response::new).map_err(to_status)
     }
@@ -40,6 +42,7 @@ impl pb::prediction_server::Prediction for Service {
 
     async fn predict_stream(&self, request: Request<Streaming<pb::PredictRequest>>) -> Result<Response<Self::PredictStreamStream>, Status> {
         let edge = self.0.clone();
+        let caller = edge.access.caller(&request)?;
         let mut inbound = request.into_inner();
         let (sender, receiver) = tokio::sync::mpsc::channel(1);
         tokio::spawn(async move {
@@ -52,7 +55,10 @@ impl pb::prediction_server::Prediction for Service {
                     () = sender.closed() => None,
                 };
                 let reply = match item {
-                    Some(Ok(request)) => Ok(answer(&edge, &request).await),
+                    Some(Ok(request)) => match caller.may(Wish::ReadSession(&request.session_id)) {
+                        Ok(_) => Ok(answer(&edge, &request).await),
+                        Err(status) => Ok(refused(request.tag, &status)),
+                    },
                     Some(Err(status)) => Err(status),
                     None => return,
                 };
@@ -64,6 +70,12 @@ impl pb::prediction_server::Prediction for Service {
         });
         Ok(Response::new(Box::pin(tokio_stream::wrappers::ReceiverStream::new(receiver))))
     }
+}
+
+/// A request of a stream that its sender has no right to; the stream goes on.
+fn refused(tag: u64, status: &Status) -> pb::PredictStreamReply {
+    let error = pb::PredictError { tag, code: status.code().into(), field: "session_id".into(), message: status.message().into() };
+    pb::PredictStreamReply { outcome: Some(pb::predict_stream_reply::Outcome::Error(error)) }
 }
 
 async fn answer(edge: &Edge, request: &pb::PredictRequest) -> pb::PredictStreamReply {

@@ -5,7 +5,9 @@ use nesam_proto::v1 as pb;
 use tonic::{Request, Response, Status};
 
 use super::Edge;
+use crate::access::Wish;
 use crate::convert::{image_bytes, open_session, session_image, session_view, to_status};
+use crate::store::Key;
 use crate::telemetry::Transport;
 
 /// Opens, reads, lists, copies, moves and closes sessions.
@@ -15,7 +17,8 @@ impl Edge {
     /// A session as message, with what the Zenoh network says of its vehicle.
     fn session(&self, view: &SessionView) -> pb::Session {
         let vehicle_alive = self.presence.as_ref().map(|presence| presence.is_alive(&view.vehicle));
-        pb::Session { vehicle_alive, ..session_view(view, &self.predictor.bundle().vehicle) }
+        let durable_place = self.durable_place(&view.session);
+        pb::Session { vehicle_alive, durable_place, ..session_view(view, &self.predictor.bundle().vehicle) }
     }
 }
 
@@ -24,35 +27,47 @@ impl pb::sessions_server::Sessions for Service {
     async fn open(&self, request: Request<pb::OpenSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "open");
         let budget = self.0.budget(&request);
+        let pb::OpenSessionRequest { vehicle_id: vehicle, session_id: session, .. } = request.get_ref();
+        self.0.allow(&request, Wish::OpenSession { vehicle, session })?;
         let open = open_session(request.get_ref()).map_err(to_status)?;
         let view = self.0.engine.open(open, budget).await.map_err(to_status)?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session opened");
+        self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
     }
 
     async fn get(&self, request: Request<pb::GetSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "get");
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
         let view = self.0.engine.get(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(to_status)?;
         Ok(Response::new(self.0.session(&view)))
     }
 
     async fn list(&self, request: Request<pb::ListSessionsRequest>) -> Result<Response<pb::ListSessionsReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "list");
+        let caller = self.0.access.caller(&request)?;
         let views = self.0.engine.list(self.0.budget(&request)).await.map_err(to_status)?;
-        Ok(Response::new(pb::ListSessionsReply { sessions: views.iter().map(|view| self.0.session(view)).collect() }))
+        let seen = views.iter().filter(|view| caller.sees(&view.vehicle));
+        Ok(Response::new(pb::ListSessionsReply { sessions: seen.map(|view| self.0.session(view)).collect() }))
     }
 
     async fn fork(&self, request: Request<pb::ForkSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "fork");
         let budget = self.0.budget(&request);
+        let caller = self.0.access.caller(&request)?;
         let pb::ForkSessionRequest { session_id, new_session_id } = request.into_inner();
+        if let Some(vehicle) = caller.may(Wish::ChangeSession(&session_id))? {
+            caller.may(Wish::OpenSession { vehicle: &vehicle, session: &new_session_id })?;
+        }
         let view = self.0.engine.fork(&session_id, &new_session_id, budget).await.map_err(to_status)?;
         tracing::info!(session = session_id, copy = view.session, "session copied");
+        self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
     }
 
     async fn export(&self, request: Request<pb::ExportSessionRequest>) -> Result<Response<pb::ExportSessionReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "export");
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
         let image = self.0.engine.export(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(to_status)?;
         Ok(Response::new(pb::ExportSessionReply { image: image_bytes(&image).into() }))
     }
@@ -60,18 +75,25 @@ impl pb::sessions_server::Sessions for Service {
     async fn import(&self, request: Request<pb::ImportSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "import");
         let budget = self.0.budget(&request);
+        let caller = self.0.access.caller(&request)?;
         let pb::ImportSessionRequest { image, session_id } = request.into_inner();
         let image = session_image(&image).map_err(to_status)?;
+        let name = if session_id.is_empty() { &image.session } else { &session_id };
+        caller.may(Wish::OpenSession { vehicle: &image.vehicle, session: name })?;
         let view = self.0.engine.import(image, &session_id, budget).await.map_err(to_status)?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session imported");
+        self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
     }
 
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "close");
-        let session = &request.get_ref().session_id;
-        self.0.engine.close(session, self.0.budget(&request)).await.map_err(to_status)?;
+        let budget = self.0.budget(&request);
+        self.0.allow(&request, Wish::ChangeSession(&request.get_ref().session_id))?;
+        let session = request.into_inner().session_id;
+        self.0.engine.close(&session, budget).await.map_err(to_status)?;
         tracing::info!(session, "session closed");
+        self.0.settled(Key::Session(session), budget).await?;
         Ok(Response::new(pb::CloseSessionReply {}))
     }
 }

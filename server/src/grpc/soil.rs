@@ -8,6 +8,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tonic::{Request, Response, Status};
 
 use super::{Edge, ReplyStream, stopped};
+use crate::access::Wish;
 use crate::convert::{fleet_soil_map, soil_estimate, to_status};
 use crate::telemetry::Transport;
 
@@ -21,6 +22,7 @@ impl pb::soil_server::Soil for Service {
     async fn watch(&self, request: Request<pb::WatchSoilRequest>) -> Result<Response<Self::WatchStream>, Status> {
         let edge = self.0.clone();
         edge.engine.metrics().request(Transport::Grpc, "watch_soil");
+        edge.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
         // Listening starts before reading, so that no change falls between the two.
         let events = edge.events.subscribe();
         let session = request.into_inner().session_id;
@@ -33,6 +35,8 @@ impl pb::soil_server::Soil for Service {
 
     async fn map(&self, request: Request<pb::FleetSoilRequest>) -> Result<Response<pb::FleetSoilMap>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "fleet_soil");
+        // Every member of the fleet reads what the fleet has learned.
+        self.0.access.caller(&request)?;
         let (cell_m, cells) = self.0.engine.fleet_soil(&request.get_ref().map_id, self.0.budget(&request)).await.map_err(to_status)?;
         Ok(Response::new(fleet_soil_map(cell_m, &cells)))
     }

@@ -56,7 +56,7 @@ fn reply_entry(command: &Command, reply: &Reply, vehicle: &Vehicle, timing: Timi
         Reply::Map(map) => (Topic::Map, description(map).encode_to_vec()),
         Reply::Maps(maps) => (Topic::Maps, pb::ListMapsReply { maps: maps.iter().map(|map| description(map)).collect() }.encode_to_vec()),
         Reply::Done if matches!(command, Command::DeleteMap { .. }) => (Topic::MapDeleted, pb::DeleteMapReply {}.encode_to_vec()),
-        Reply::Done => (Topic::Closed, pb::CloseSessionReply {}.encode_to_vec()),
+        Reply::Done | Reply::Snapshot(_) => (Topic::Closed, pb::CloseSessionReply {}.encode_to_vec()),
     }
 }
 

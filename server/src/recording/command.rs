@@ -52,6 +52,8 @@ pub(crate) fn to_entries(command: &Command, maps: &HeldMaps) -> Vec<Entry> {
             let message = pb::ImportSessionRequest { image: image_bytes(image).into(), session_id: session.clone() };
             one(Topic::Import, message.encode_to_vec())
         }
+        // The engine does not tell of snapshots: they change nothing.
+        Command::Snapshot { .. } => Vec::new(),
         Command::FleetSoil { map } => one(Topic::FleetSoil, pb::FleetSoilRequest { map_id: map.clone() }.encode_to_vec()),
         Command::Close { session } => one(Topic::Close, pb::CloseSessionRequest { session_id: session.clone() }.encode_to_vec()),
         Command::Expire => one(Topic::Expire, pb::ExpireSessionsRequest {}.encode_to_vec()),

@@ -7,13 +7,14 @@ use nesam_proto::v1 as pb;
 use tokio::sync::mpsc;
 
 use super::{MEASUREMENT_BYTES_MAX, Outgoing, decode, encode, keys};
-use crate::call::{EngineClient, measured};
+use crate::call::measured;
 use crate::convert::{measurement, measurement_answer};
+use crate::grpc::Edge;
 use crate::telemetry::Transport;
 
 /// Where the answer to one measurement goes.
 struct ReturnPath {
-    engine: EngineClient,
+    edge: Edge,
     sender: mpsc::Sender<Outgoing>,
     status_key: String,
     message: pb::Measurement,
@@ -21,29 +22,24 @@ struct ReturnPath {
 }
 
 /// Feeds every measurement of the fleet to the engine, in order of arrival.
-pub async fn declare(
-    session: &::zenoh::Session,
-    fleet: &str,
-    engine: EngineClient,
-    sender: mpsc::Sender<Outgoing>,
-) -> Result<(), ::zenoh::Error> {
+pub async fn declare(session: &::zenoh::Session, fleet: &str, edge: Edge, sender: mpsc::Sender<Outgoing>) -> Result<(), ::zenoh::Error> {
     let fleet: Arc<str> = fleet.into();
     let subscriber = session.declare_subscriber(keys::all_vehicles(&fleet, "measurement")).callback({
         let fleet = fleet.clone();
-        move |sample| receive(&engine, &sender, &fleet, &sample)
+        move |sample| receive(&edge, &sender, &fleet, &sample)
     });
     subscriber.background().await
 }
 
 /// Runs on a thread of Zenoh, so it only hands over.
-fn receive(engine: &EngineClient, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &::zenoh::sample::Sample) {
-    engine.metrics().request(Transport::Zenoh, "measurement");
+fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &::zenoh::sample::Sample) {
+    edge.engine.metrics().request(Transport::Zenoh, "measurement");
     let vehicle = keys::vehicle(sample.key_expr().as_str());
     let decoded = decode::<pb::Measurement>("nesam.v1.Measurement", &sample.payload().to_bytes(), MEASUREMENT_BYTES_MAX);
     let (message, undecodable) = decoded.map_or_else(|error| (pb::Measurement::default(), Some(error)), |message| (message, None));
     let session = if message.session_id.is_empty() { vehicle.to_string() } else { message.session_id.clone() };
     let path = ReturnPath {
-        engine: engine.clone(),
+        edge: edge.clone(),
         sender: sender.clone(),
         status_key: keys::of_vehicle(fleet, vehicle, "status"),
         message,
@@ -53,8 +49,8 @@ fn receive(engine: &EngineClient, sender: &mpsc::Sender<Outgoing>, fleet: &str, 
         Ok(measurement) => {
             let command = Command::Measure { session, vehicle: Some(vehicle.into()), measurement };
             let label = command.label();
-            engine.handle().submit(Submission::new(command, move |answer: Answer| {
-                path.engine.metrics().engine_answer(label, &answer);
+            edge.engine.handle().submit(Submission::new(command, move |answer: Answer| {
+                path.edge.engine.metrics().engine_answer(label, &answer);
                 path.answer(measured(answer));
             }));
         }
@@ -65,10 +61,11 @@ fn receive(engine: &EngineClient, sender: &mpsc::Sender<Outgoing>, fleet: &str, 
 impl ReturnPath {
     /// Counts and publishes the answer.
     fn answer(self, result: Result<MeasureAnswer, EngineError>) {
-        self.engine.metrics().measurement(Transport::Zenoh, result.as_ref().map_or("rejected", |m| m.outcome.label()));
-        let answer = measurement_answer(&self.message, &self.session, result);
+        self.edge.engine.metrics().measurement(Transport::Zenoh, result.as_ref().map_or("rejected", |m| m.outcome.label()));
+        let durable_place = self.edge.durable_place(&self.session);
+        let answer = pb::MeasurementAnswer { durable_place, ..measurement_answer(&self.message, &self.session, result) };
         if self.sender.try_send((self.status_key, encode(&answer))).is_err() {
-            self.engine.metrics().measurement(Transport::Zenoh, "answer_dropped");
+            self.edge.engine.metrics().measurement(Transport::Zenoh, "answer_dropped");
         }
     }
 }

@@ -46,7 +46,7 @@ impl Bus {
         let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
         let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sender.clone()));
         let name = if config.name.is_empty() { session.zid().to_string() } else { config.name.clone() };
-        measurements::declare(&session, &config.fleet, edge.engine.clone(), sender.clone()).await.map_err(failed)?;
+        measurements::declare(&session, &config.fleet, edge.clone(), sender.clone()).await.map_err(failed)?;
         predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
         let presence = edge.presence.clone().unwrap_or_default();
         let token = presence::declare(&session, &config.fleet, &name, presence.clone()).await.map_err(failed)?;

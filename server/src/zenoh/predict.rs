@@ -1,5 +1,6 @@
 //! Predictions over Zenoh: a queryable on `.../predict`.
 
+use nesam_engine::EngineError;
 use nesam_proto::v1 as pb;
 
 use super::{decode, encode, keys};
@@ -18,6 +19,15 @@ pub async fn declare(session: &::zenoh::Session, fleet: &str, edge: Edge) -> Res
     queryable.background().await
 }
 
+/// Why a session is not asked through the key of a vehicle: it belongs to another one. Routers give rights by key.
+fn foreign(edge: &Edge, session: &str, vehicle: &str) -> Option<EngineError> {
+    let owner = edge.access.directory.vehicle(session).filter(|owner| **owner != *vehicle)?;
+    Some(EngineError::invalid(
+        "session_id",
+        format!("session `{session}` belongs to vehicle `{owner}`, it was asked through the key of `{vehicle}`"),
+    ))
+}
+
 async fn reply(edge: Edge, query: ::zenoh::query::Query) {
     let key = query.key_expr().clone();
     let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
@@ -28,7 +38,10 @@ async fn reply(edge: Edge, query: ::zenoh::query::Query) {
             if request.session_id.is_empty() {
                 request.session_id = keys::vehicle(key.as_str()).into();
             }
-            answer(&edge, &request, edge.stream_budget()).await.map_err(|error| (request.tag, error))
+            match foreign(&edge, &request.session_id, keys::vehicle(key.as_str())) {
+                Some(error) => Err((request.tag, error)),
+                None => answer(&edge, &request, edge.stream_budget()).await.map_err(|error| (request.tag, error)),
+            }
         }
         Err(error) => Err((0, error)),
     };

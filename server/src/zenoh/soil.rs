@@ -23,7 +23,7 @@ pub async fn publish_changes(mut events: broadcast::Receiver<Event>, fleet: Stri
                     return;
                 }
             }
-            Ok(Event::SessionClosed { .. }) => {}
+            Ok(_) => {}
             Err(RecvError::Lagged(missed)) => tracing::warn!(missed, "changes of the soil were not published"),
             Err(RecvError::Closed) => return,
         }

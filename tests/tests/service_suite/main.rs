@@ -14,6 +14,7 @@ mod random_bytes;
 mod recording;
 mod reorder;
 mod replay;
+mod security;
 mod sessions;
 mod soil;
 mod stage;

@@ -30,6 +30,7 @@ async fn service_overload_is_resource_exhausted_and_measurements_get_through() {
             Ok(_) => answered += 1,
             Err(error) => {
                 assert_eq!(error.code(), Some(Code::ResourceExhausted), "{error}");
+                assert!(error.retry_after().is_some_and(|pause| !pause.is_zero() && pause < Duration::from_secs(60)), "{error}");
                 refused += 1;
             }
         }
@@ -71,6 +72,87 @@ async fn service_deadlines_are_honoured_and_abandoned_requests_are_skipped() {
     // None of the late ones was computed.
     client.predict(candidates("s", &recorded.drive, 40, 1, 1)).await.unwrap();
     assert_eq!(server.metrics().predictions(), 2);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_what_would_be_late_is_refused_at_once() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    open(&mut client, "s", "").await;
+    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let heavy = candidates("s", &recorded.drive, 40, 1024, 32);
+    // The server learns how long such a prediction takes.
+    for _ in 0..4 {
+        client.predict(heavy.clone()).await.unwrap();
+    }
+    let begun = Instant::now();
+    client.predict(heavy.clone()).await.unwrap();
+    let takes = begun.elapsed();
+    let before = server.metrics().predictions();
+    // Room for about five of thirty.
+    let asked: Vec<_> = (0..30)
+        .map(|_| {
+            let (mut client, heavy) = (client.clone(), heavy.clone());
+            tokio::spawn(async move {
+                let sent = Instant::now();
+                (client.predict_within(heavy, Some(5 * takes)).await, sent.elapsed())
+            })
+        })
+        .collect();
+    let (mut in_time, mut refused_after) = (0, Vec::new());
+    for task in asked {
+        match task.await.unwrap() {
+            (Ok(_), _) => in_time += 1,
+            (Err(error), took) if error.code() == Some(Code::ResourceExhausted) => {
+                assert!(error.retry_after().is_some(), "{error}");
+                refused_after.push(took);
+            }
+            (Err(error), _) => assert!(matches!(error.code(), Some(Code::DeadlineExceeded | Code::Cancelled)), "{error}"),
+        }
+    }
+    // Most learn at once that they ask in vain; how quickly is a figure of `nesam bench serve`. None of those was computed.
+    refused_after.sort_unstable();
+    assert!(refused_after.len() >= 15 && in_time >= 1, "{in_time} in time, {} refused of 30", refused_after.len());
+    assert!(refused_after[refused_after.len() / 2] < takes.max(Duration::from_millis(50)), "{refused_after:?}, one takes {takes:?}");
+    assert!(server.metrics().predictions() - before <= 15);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_vehicles_share_the_time_evenly() {
+    let recorded = recorded();
+    let (server, mut client) = start_with(|config| config.limits.waiting_predictions_per_vehicle_max = 20).await;
+    for (vehicle, session) in [("greedy", "greedy"), ("greedy", "greedy-too"), ("modest", "modest")] {
+        let request = v1::OpenSessionRequest { vehicle_id: vehicle.into(), session_id: session.into(), ..Default::default() };
+        client.open_session(request).await.unwrap();
+        client.feed(samples(session, &recorded.drive, 40)).await.unwrap();
+    }
+    let question = |session: &str| candidates(session, &recorded.drive, 40, 256, 32);
+    client.predict(question("modest")).await.unwrap();
+    // One vehicle asks for forty predictions through two sessions; the limit holds for the vehicle.
+    let greedy: Vec<_> = (0..40)
+        .map(|i| {
+            let (mut client, question) = (client.clone(), question(["greedy", "greedy-too"][i % 2]));
+            tokio::spawn(async move { client.predict(question).await })
+        })
+        .collect();
+    while server.engine().waiting().1 < 15 {
+        tokio::time::sleep(Duration::from_millis(1)).await;
+    }
+    // The other one asks once: before it come the prediction that runs and one of the greedy vehicle's, and not all of them.
+    let before = server.metrics().predictions();
+    client.predict(question("modest")).await.unwrap();
+    let overtaken = server.metrics().predictions() - before;
+    assert!(overtaken <= 4, "{overtaken} predictions were answered before");
+    let mut refused = 0;
+    for task in greedy {
+        if let Err(error) = task.await.unwrap() {
+            assert!(error.code() == Some(Code::ResourceExhausted) && error.to_string().contains("of this vehicle"), "{error}");
+            refused += 1;
+        }
+    }
+    assert!((1..=25).contains(&refused), "{refused}");
     server.shutdown().await;
 }
 

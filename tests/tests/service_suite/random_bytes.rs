@@ -82,7 +82,7 @@ fn valid_message(path: &str, recorded: &Recorded, map: &str) -> Vec<u8> {
         // Complete but empty: exports with content are changed one by one in `moving`.
         "Import" => {
             let checksum = <sha2::Sha256 as sha2::Digest>::digest(b"").to_vec();
-            let image = v1::SessionImage { version: 1, checksum: checksum.into(), content: Bytes::new() }.encode_to_vec();
+            let image = v1::SessionImage { version: 2, checksum: checksum.into(), content: Bytes::new() }.encode_to_vec();
             v1::ImportSessionRequest { image: image.into(), session_id: "new".into() }.encode_to_vec()
         }
         "Close" => v1::CloseSessionRequest { session_id: session_id() }.encode_to_vec(),

@@ -2,6 +2,7 @@
 
 mod consistency;
 mod discovery;
+mod serve;
 mod sweep;
 
 use std::path::PathBuf;
@@ -38,6 +39,8 @@ enum Bench {
     Consistency(consistency::ConsistencyBench),
     /// Hide effects in validation drives and score what a diagnosis makes of them
     Discovery(discovery::DiscoveryBench),
+    /// Ask a real server for more than it can give, at random instants, and count what comes in time
+    Serve(serve::ServeBench),
 }
 
 #[derive(Args, Debug)]
@@ -85,6 +88,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
         Bench::Predict(args) => predict(args),
         Bench::Consistency(args) => consistency::run(args),
         Bench::Discovery(args) => discovery::run(args),
+        Bench::Serve(args) => serve::run(args),
     }
 }
 

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use clap::Args;
 use nesam_model::{ModelBundle, Predictor};
-use nesam_server::{Config, RunningServer, ZenohConfig, serve, termination};
+use nesam_server::{Config, RunningServer, ZenohConfig, access, serve, termination};
 use tracing_subscriber::EnvFilter;
 
 use crate::args::BundleArgs;
@@ -48,6 +48,14 @@ pub struct ServeArgs {
     /// MCAP viewer. Writing never delays an answer; what the disk cannot follow is dropped and counted
     #[arg(long, value_name = "DIR")]
     record: Option<PathBuf>,
+    /// Keep sessions and maps in this folder, so that a restarted server goes on with them. Opening, copying and closing a session or a map answers when
+    /// the disk has it; each measurement is acknowledged as RECEIVED at once, and as DURABLE when it was committed and synced: when a buffer of the soil
+    /// filter ends, at the latest after `store.interval_s`. Without it nothing outlives the process
+    #[arg(long, value_name = "DIR")]
+    store: Option<PathBuf>,
+    /// Check configuration, certificates, fleet file and bundle, say what is wrong, and serve nothing
+    #[arg(long)]
+    check: bool,
 }
 
 /// Runs the command.
@@ -55,13 +63,21 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
     let config = configuration(args)?;
     log_to_stderr("info");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
-    let zenoh = config.zenoh.clone();
+    if args.check {
+        return checked(&config, bundle);
+    }
+    let (zenoh, store) = (config.zenoh.clone(), config.store.clone());
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(async {
         // The signals are caught before the addresses are printed, so that whoever waits for them can stop the server at once.
         let signal = tokio::spawn(termination());
         let (server, bundle) = start(config, bundle).await?;
         announce(&server, &bundle, &zenoh);
+        match store.enabled {
+            true => say!("store {}; measurements are durable within {} s", store.directory.display(), store.interval_s),
+            false => say!("store none; sessions end with this process"),
+        }
+        say!("ready; ctrl-c stops");
         server
             .run_until(async {
                 let _ = signal.await;
@@ -101,6 +117,10 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
         config.recording.enabled = true;
         config.recording.directory.clone_from(folder);
     }
+    if let Some(folder) = &args.store {
+        config.store.enabled = true;
+        config.store.directory.clone_from(folder);
+    }
     config.check().or_input()?;
     Ok(config)
 }
@@ -118,7 +138,6 @@ fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     for part in server.recorder().iter().flat_map(|recorder| recorder.parts()) {
         say!("record {}", part.display());
     }
-    say!("ready; ctrl-c stops");
 }
 
 /// Structured logs on standard error; `RUST_LOG` changes what is shown.
@@ -131,7 +150,30 @@ pub fn log_to_stderr(default: &str) {
         .try_init();
 }
 
-/// Reads a configuration file and says what is wrong with it.
+/// Says what would be served. Ports are not tried, and a store is not opened: it may be in use by the server that this configuration is meant for.
+fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
+    let (tls, access) = access::load(&config.tls).or_input()?;
+    say!("bundle {} {}", bundle.name, bundle.hash);
+    Predictor::new(Arc::new(bundle)).or_input()?;
+    say!(
+        "grpc   {}, {}",
+        config.grpc.listen,
+        match (tls.is_some(), access.is_restricted()) {
+            (false, _) => "no TLS: everybody on the way reads and changes everything",
+            (true, false) => "TLS; whoever reaches the port may do everything",
+            (true, true) => "mutual TLS; clients have the rights of the fleet file",
+        }
+    );
+    match config.store.enabled {
+        true => say!("store  {}, every {} s at the latest", config.store.directory.display(), config.store.interval_s),
+        false => say!("store  none; sessions end with the process"),
+    }
+    say!("sound");
+    Ok(())
+}
+
+/// Reads a configuration file and the files that it names, and says what is wrong with them.
 pub fn check_configuration(path: &Path) -> Result<(), String> {
-    Config::load(path).map(|_| ()).map_err(|e| crate::failure::chain(&e))
+    let config = Config::load(path).map_err(|e| crate::failure::chain(&e))?;
+    access::load(&config.tls).map(|_| ()).map_err(|e| crate::failure::chain(&e))
 }

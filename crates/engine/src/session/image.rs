@@ -47,6 +47,8 @@ pub struct SessionImage {
     pub step_age_ns: Option<i64>,
     /// Changes of the history.
     pub history_epoch: u64,
+    /// Measurements accepted so far.
+    pub accepted: u64,
     /// Steps that the soil filter holds.
     pub filter_steps: Vec<HistoryStep>,
     /// Where its open buffer begins among them.
@@ -91,6 +93,7 @@ impl Session {
             newest_age_ns: self.order.newest_ns().map(|_| age(*newest_arrival_ns)),
             step_age_ns: self.newest().map(|_| age(self.arrived_ns)),
             history_epoch: self.history_epoch,
+            accepted: self.accepted,
             filter_steps: filter_steps.to_vec(),
             filter_first,
             filter: filter.snapshot(),
@@ -135,6 +138,7 @@ impl Session {
             arrived_ns: arrived(image.step_age_ns),
             used_ns: now_ns,
             history_epoch: image.history_epoch,
+            accepted: image.accepted,
             learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first),
             soil: image.soil,
             fleet: FleetPart { asks: false, brings: true, brought: Vec::new() },

@@ -1,0 +1,110 @@
+"""Measurements that are kept until the service has them on stable storage."""
+
+import time
+from collections import deque
+from typing import Deque, List, Optional, Tuple
+
+import grpc
+
+from . import _types as t
+from ._errors import DeadlineExceeded, NesamError, Unavailable
+
+_BROKEN = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCode.UNKNOWN, grpc.StatusCode.INTERNAL}
+"""How a connection that broke looks, by itself or through a proxy. Everything else is a refusal."""
+
+
+class DurableStream:
+    """A stream of the measurements of one session that outlives crashes of the server; open it with `client.durable_stream`.
+
+    What is not known to be durable is kept and sent again over a new connection; the service drops what it has. Threads must not share it.
+    """
+
+    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float):
+        self._client = client
+        self._session_id = session_id
+        self._reconnect_s = reconnect_s
+        self._pause_s = pause_s
+        self._stream = None
+        # Each measurement with its place, None before it is answered by this run of the server.
+        self._kept: Deque[Tuple[t.Measurement, Optional[int]]] = deque()
+
+    def __enter__(self) -> "DurableStream":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def pending(self) -> List[t.Measurement]:
+        """Measurements that are not known to be durable, oldest first."""
+        return [measurement for measurement, _ in self._kept]
+
+    def send(self, measurement: t.Measurement) -> t.Answer:
+        """Sends one measurement and awaits its answer, over as many connections as it takes.
+
+        Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it.
+        """
+        self._kept.append((measurement, None))
+        return self._deliver()[-1]
+
+    def flush(self, timeout_s: float = 10.0) -> None:
+        """Waits until everything is durable. Raises DeadlineExceeded, also where the server keeps no store, and Unavailable."""
+        end = time.monotonic() + timeout_s
+        while self._kept:
+            if any(place is None for _, place in self._kept):
+                self._deliver()
+            try:
+                self._durable(self._client.session(self._session_id).durable_place)
+            except NesamError as error:
+                if error.code not in _BROKEN:
+                    raise
+                self._forget_places()
+            if self._kept and time.monotonic() > end:
+                reason = f"{len(self._kept)} measurements are not durable after {timeout_s} s; does the server keep a store?"
+                raise DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", reason)
+            if self._kept:
+                time.sleep(min(self._pause_s, 0.05))
+
+    def close(self) -> None:
+        """Says that no more measurements come; what is not durable is in `pending`."""
+        if self._stream is not None:
+            self._stream.close()
+            self._stream = None
+
+    def _deliver(self) -> List[t.Answer]:
+        """Sends what has no answer yet, oldest first."""
+        end = time.monotonic() + self._reconnect_s
+        while True:
+            try:
+                return self._attempt()
+            except NesamError as error:
+                self.close()
+                self._forget_places()
+                if error.code not in _BROKEN:
+                    raise
+                if time.monotonic() > end:
+                    raise Unavailable(error.code, error.field, error.message) from error
+                time.sleep(self._pause_s)
+
+    def _attempt(self) -> List[t.Answer]:
+        if self._stream is None:
+            self._stream = self._client.measurement_stream()
+        answers = []
+        for i, (measurement, place) in enumerate(list(self._kept)):
+            if place is not None:
+                continue
+            answer = self._stream.send(measurement)
+            if answer.code in (grpc.StatusCode.RESOURCE_EXHAUSTED.value[0], grpc.StatusCode.UNAVAILABLE.value[0]):
+                raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", answer.message)
+            self._kept[i] = (measurement, answer.place)
+            answers.append(answer)
+        # A place of 0 is that of a refused measurement, which nobody keeps.
+        self._durable(answers[-1].durable_place if answers else 0)
+        return answers
+
+    def _durable(self, durable_place: int) -> None:
+        self._kept = deque((m, place) for m, place in self._kept if place is None or place > durable_place)
+
+    def _forget_places(self) -> None:
+        """Another run of the server may count otherwise."""
+        self._kept = deque((measurement, None) for measurement, _ in self._kept)

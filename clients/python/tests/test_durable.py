@@ -1,0 +1,70 @@
+"""Goal: a vehicle that keeps what is not durable loses nothing when the server is killed. Method: the real binary, SIGKILL, a restart on its store."""
+
+import socket
+import subprocess
+import threading
+
+import numpy as np
+import pytest
+
+import nesam
+from conftest import straight
+
+
+def free_port():
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
+
+
+@pytest.fixture
+def start(request, tmp_path):
+    """Starts a server on one port and one store, again and again."""
+    binary, bundle = request.config.getoption("--server"), request.config.getoption("--bundle")
+    port, running = free_port(), []
+
+    def started():
+        command = [binary, "serve", "--grpc", f"127.0.0.1:{port}", "--no-http", "--no-zenoh", "--store", str(tmp_path / "store")]
+        process = subprocess.Popen(command + (["--bundle", bundle] if bundle else []), stdout=subprocess.PIPE, text=True)
+        running.append(process)
+        for line in process.stdout:
+            if line.startswith("ready;"):
+                return process, f"127.0.0.1:{port}"
+        pytest.fail(f"{command} did not start")
+
+    yield started
+    for process in running:
+        process.kill()
+        process.wait()
+
+
+def test_service_a_killed_server_costs_nothing(start, hills):
+    drive = list(straight("truck", 60))
+    process, address = start()
+    with nesam.Client(address, timeout_s=60.0) as client:
+        client.upload_map(hills)
+        client.open_session("truck", map_id="hills")
+        with client.durable_stream("truck") as stream:
+            for measurement in drive[:33]:
+                assert stream.send(measurement).outcome in ("APPLIED", "GATED")
+            process.kill()
+            process.wait()
+            pending = len(stream.pending)
+            assert 0 < pending < 33, "some are durable and some are not"
+            restarter = threading.Timer(0.5, start)
+            restarter.start()
+            for measurement in drive[33:]:
+                answer = stream.send(measurement)
+            restarter.join()
+            assert answer.outcome in ("APPLIED", "GATED") and answer.history_epoch == 60
+            stream.flush()
+            assert not stream.pending
+        session = client.session("truck")
+        assert session.accepted == session.durable_place == 60 and session.last_sequence == 60
+        np.testing.assert_array_equal(session.state, drive[-1].state)
+        # The same drive without a crash gives the same soil, bit for bit.
+        client.open_session("truck", session_id="other", map_id="hills")
+        client.measure(nesam.Measurement("other", m.stamp_ns, m.state, m.command, m.sequence) for m in drive)
+        other = client.session("other")
+        np.testing.assert_array_equal(session.soil.delta, other.soil.delta)
+        np.testing.assert_array_equal(session.soil.covariance, other.soil.covariance)

@@ -1,0 +1,114 @@
+//! Measurements that a vehicle keeps until the service has them on stable storage.
+
+use std::collections::VecDeque;
+
+use nesam_proto::v1;
+
+/// Where a measurement stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Progress {
+    /// Not sent, or sent over a connection that broke.
+    Unsent,
+    /// Sent, not answered.
+    Sent,
+    /// Answered: its place among those that the session has accepted.
+    Received(u64),
+}
+
+/// Keeps the measurements of one session until they are durable, so that a crash of the server loses none.
+///
+/// Send what [`Outbox::next_unsent`] gives over one stream at a time, hand every answer to [`Outbox::answered`] in order, and call [`Outbox::reconnected`]
+/// when a new stream is opened: it sends again what is not known to be durable, and the service drops what it has.
+#[derive(Clone, Debug, Default)]
+pub struct Outbox {
+    kept: VecDeque<(v1::Measurement, Progress)>,
+}
+
+impl Outbox {
+    /// Takes a new measurement.
+    pub fn push(&mut self, measurement: v1::Measurement) {
+        self.kept.push_back((measurement, Progress::Unsent));
+    }
+
+    /// The next measurement to send; it counts as sent from now on.
+    pub fn next_unsent(&mut self) -> Option<v1::Measurement> {
+        let (measurement, progress) = self.kept.iter_mut().find(|(_, progress)| *progress == Progress::Unsent)?;
+        *progress = Progress::Sent;
+        Some(measurement.clone())
+    }
+
+    /// Takes the answer to the oldest measurement that was sent and not answered. A refused measurement is not kept, but for one that the service had no room
+    /// for: that is sent again.
+    pub fn answered(&mut self, answer: &v1::MeasurementAnswer) {
+        if let Some(at) = self.kept.iter().position(|(_, progress)| *progress == Progress::Sent) {
+            match &answer.outcome {
+                Some(v1::measurement_answer::Outcome::Rejected(rejected))
+                    if [tonic::Code::ResourceExhausted, tonic::Code::Unavailable].contains(&rejected.code.into()) =>
+                {
+                    self.kept[at].1 = Progress::Unsent;
+                }
+                _ if answer.place == 0 => drop(self.kept.remove(at)),
+                _ => self.kept[at].1 = Progress::Received(answer.place),
+            }
+        }
+        self.durable(answer.durable_place);
+    }
+
+    /// Takes a `durable_place` that this run of the server has told, for example by `Sessions.Get`.
+    pub fn durable(&mut self, place: u64) {
+        self.kept.retain(|(_, progress)| !matches!(progress, Progress::Received(received) if *received <= place));
+    }
+
+    /// A new stream begins, to the same run of the server or another one: everything kept is sent again.
+    pub fn reconnected(&mut self) {
+        self.kept.iter_mut().for_each(|(_, progress)| *progress = Progress::Unsent);
+    }
+
+    /// Measurements that are not known to be durable.
+    pub fn len(&self) -> usize {
+        self.kept.len()
+    }
+
+    /// Whether all are.
+    pub fn is_empty(&self) -> bool {
+        self.kept.is_empty()
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    fn answer(place: u64, durable_place: u64) -> v1::MeasurementAnswer {
+        v1::MeasurementAnswer { place, durable_place, ..Default::default() }
+    }
+
+    fn sequences(outbox: &mut Outbox) -> Vec<u64> {
+        std::iter::from_fn(|| outbox.next_unsent()).map(|m| m.sequence).collect()
+    }
+
+    #[test]
+    fn analytic_only_what_is_durable_is_forgotten() {
+        let mut outbox = Outbox::default();
+        (1..=4).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        assert_eq!(sequences(&mut outbox), [1, 2, 3, 4]);
+        outbox.answered(&answer(1, 0));
+        outbox.answered(&answer(2, 1));
+        assert_eq!(outbox.len(), 3);
+        // Refused for good: not kept. No room: sent again.
+        outbox.answered(&answer(0, 1));
+        let rejected = v1::Rejected { code: 8, ..Default::default() };
+        outbox.answered(&v1::MeasurementAnswer { outcome: Some(v1::measurement_answer::Outcome::Rejected(rejected)), ..answer(0, 1) });
+        assert_eq!(sequences(&mut outbox), [4]);
+        outbox.reconnected();
+        assert_eq!(sequences(&mut outbox), [2, 4]);
+        // A number of another run of the server says nothing before the measurement is answered again.
+        outbox.durable(7);
+        assert_eq!(outbox.len(), 2);
+        outbox.answered(&answer(7, 7));
+        outbox.answered(&answer(8, 7));
+        outbox.durable(8);
+        assert!(outbox.is_empty());
+    }
+}

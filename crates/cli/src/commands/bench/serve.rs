@@ -1,0 +1,240 @@
+//! `nesam bench serve`: what planners get from a server that they ask for more than it can give.
+
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use nesam_client::{Candidates, Client, ClientError, measurement, outcome_label, v1};
+use nesam_server::Config;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde_json::{Value, json};
+use tokio::time::{sleep_until, timeout};
+
+use super::percentile;
+use crate::args::BundleArgs;
+use crate::commands::serve::start;
+use crate::failure::{Failure, OrFail};
+use crate::output::{command_line, say, write_file};
+use crate::sources::load_bundle;
+
+/// Options of `nesam bench serve`.
+#[derive(Args, Debug)]
+pub(super) struct ServeBench {
+    #[command(flatten)]
+    bundle: BundleArgs,
+    /// Vehicles, each with a session, a stream of measurements at 10 Hz and a planner
+    #[arg(long, default_value_t = 4)]
+    vehicles: usize,
+    /// Candidate command sequences per query
+    #[arg(long, default_value_t = 128)]
+    samples: usize,
+    /// Steps per rollout
+    #[arg(long, value_name = "STEPS", default_value_t = 32)]
+    horizon: usize,
+    /// Deadline of a query, ms
+    #[arg(long, default_value_t = 200.0)]
+    deadline_ms: f64,
+    /// Queries asked for, as multiples of what the server answers when four askers wait for each answer before the next question
+    #[arg(long, value_name = "FACTOR,…", value_delimiter = ',', default_values_t = [0.5, 1.0, 2.0, 3.0])]
+    loads: Vec<f64>,
+    /// Duration of each load, s
+    #[arg(long, default_value_t = 8.0)]
+    seconds: f64,
+    /// Seed of the arrivals
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Write the figures as JSON (schema nesam.bench.serve/1)
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// Askers that measure the capacity.
+const ASKERS: usize = 4;
+/// Measurements before the first query.
+const DRIVEN: i64 = 40;
+
+/// What became of the queries of one load.
+#[derive(Debug, Default)]
+struct Tally {
+    /// Latencies of answers in time, of refusals and of the rest, ms.
+    good_ms: Vec<f64>,
+    refused_ms: Vec<f64>,
+    late: usize,
+    measured_ms: Vec<f64>,
+    measurements_refused: usize,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
+    let positive = [args.deadline_ms, args.seconds].iter().chain(&args.loads).all(|v| *v > 0.0 && v.is_finite());
+    if args.vehicles == 0 || args.samples == 0 || args.horizon == 0 || !positive {
+        return Err(Failure::input("all options must be positive".to_string()));
+    }
+    let bundle = load_bundle(args.bundle.bundle.as_deref())?;
+    let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
+    runtime.block_on(measure(args, bundle))
+}
+
+async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<(), Failure> {
+    let (server, bundle) = start(Config::ephemeral(), bundle).await?;
+    let address = format!("http://{}", server.grpc_addr);
+    let mut clients = Vec::new();
+    for vehicle in 0..args.vehicles {
+        let mut client = Client::connect(&address).await.or_failed()?;
+        let name = name(vehicle);
+        client.open_session(v1::OpenSessionRequest { vehicle_id: name.clone(), ..Default::default() }).await.or_failed()?;
+        client.feed((0..DRIVEN).map(|i| step(&name, i)).collect()).await.or_failed()?;
+        clients.push(client);
+    }
+    let capacity_hz = capacity(args, &clients).await?;
+    say!(
+        "{} candidates of {} steps on flat ground, {} vehicles, deadline {} ms",
+        args.samples,
+        args.horizon,
+        args.vehicles,
+        args.deadline_ms
+    );
+    say!("capacity: {capacity_hz:.1} answers/s to {ASKERS} askers");
+    say!(
+        "{:>6} {:>9} {:>11} {:>9} {:>7} {:>14} {:>15} {:>18}",
+        "load",
+        "asked/s",
+        "in time/s",
+        "refused/s",
+        "late/s",
+        "p99 in time ms",
+        "p99 refused ms",
+        "p99 measurement ms"
+    );
+    let mut rows = Vec::new();
+    for load in &args.loads {
+        let mut tally = offer(args, &clients, load * capacity_hz).await?;
+        rows.push(row(*load, args.seconds, &mut tally));
+    }
+    server.shutdown().await;
+    let peak = rows.iter().filter_map(|row| row["in_time_hz"].as_f64()).fold(0.0, f64::max);
+    let last = rows.last().and_then(|row| row["in_time_hz"].as_f64()).unwrap_or(0.0);
+    say!("goodput at the last load: {:.0} % of the peak", 100.0 * last / peak.max(f64::MIN_POSITIVE));
+    let Some(file) = &args.json else { return Ok(()) };
+    let document = json!({
+        "schema": "nesam.bench.serve/1",
+        "samples": args.samples, "horizon": args.horizon, "vehicles": args.vehicles, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
+        "capacity_hz": capacity_hz, "loads": rows, "goodput_share_of_peak": last / peak.max(f64::MIN_POSITIVE),
+        "command": command_line(), "bundle": bundle.name, "bundle_hash": bundle.hash,
+    });
+    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+}
+
+fn name(vehicle: usize) -> String {
+    format!("vehicle-{vehicle}")
+}
+
+/// A measurement of a vehicle that drives straight on.
+fn step(session: &str, i: i64) -> v1::Measurement {
+    let state = [0.2 * i as f64, 0.0, 0.6, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+    v1::Measurement { sequence: i as u64 + 1, ..measurement(session, i * 100_000_000, state, [2.0, 0.0]) }
+}
+
+fn question(args: &ServeBench, vehicle: usize) -> Candidates {
+    let controls = (0..args.samples).flat_map(|n| {
+        let second = 0.4 * n as f32 / args.samples as f32 - 0.2;
+        std::iter::repeat_n([2.0, second], args.horizon).flatten()
+    });
+    Candidates::new(&name(vehicle), args.samples, args.horizon, controls.collect())
+}
+
+/// Answers per second to askers who each wait for an answer before they ask again.
+async fn capacity(args: &ServeBench, clients: &[Client]) -> Result<f64, Failure> {
+    let mut rates = Vec::new();
+    // The first round warms up.
+    for _ in 0..2 {
+        let (begin, time) = (Instant::now(), Duration::from_secs_f64(args.seconds.min(4.0)));
+        let askers = (0..ASKERS).map(|asker| {
+            let (mut client, question) = (clients[asker % clients.len()].clone(), question(args, asker % clients.len()));
+            tokio::spawn(async move {
+                let mut answers = 0_u32;
+                while begin.elapsed() < time {
+                    client.predict(question.clone()).await?;
+                    answers += 1;
+                }
+                Ok::<_, ClientError>(answers)
+            })
+        });
+        let mut answers = 0;
+        for asker in askers.collect::<Vec<_>>() {
+            answers += asker.await.or_failed()?.or_failed()?;
+        }
+        rates.push(f64::from(answers) / begin.elapsed().as_secs_f64());
+    }
+    rates.pop().ok_or_else(|| Failure::Failed("no capacity was measured".into()))
+}
+
+/// Asks at random instants with this mean rate, whatever comes back, while the vehicles report.
+async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Tally, Failure> {
+    let tally = Arc::new(Mutex::new(Tally::default()));
+    let begin = tokio::time::Instant::now();
+    let deadline = Duration::from_secs_f64(args.deadline_ms * 1e-3);
+    let vehicles: Vec<_> = clients
+        .iter()
+        .enumerate()
+        .map(|(v, client)| tokio::spawn(report(client.clone(), name(v), args.seconds, Arc::clone(&tally))))
+        .collect();
+    let mut random = ChaCha8Rng::seed_from_u64(args.seed);
+    let (mut at_s, mut asked) = (0.0, Vec::new());
+    while at_s < args.seconds {
+        let (mut client, question, tally) =
+            (clients[asked.len() % clients.len()].clone(), question(args, asked.len() % clients.len()), Arc::clone(&tally));
+        sleep_until(begin + Duration::from_secs_f64(at_s)).await;
+        asked.push(tokio::spawn(async move {
+            let sent = Instant::now();
+            // The planner's patience is the deadline, however the transport counts it.
+            let outcome = timeout(2 * deadline, client.predict_within(question, Some(deadline))).await;
+            let took_ms = sent.elapsed().as_secs_f64() * 1e3;
+            let Ok(mut tally) = tally.lock() else { return };
+            match outcome {
+                Ok(Ok(_)) if sent.elapsed() <= deadline => tally.good_ms.push(took_ms),
+                Ok(Err(error)) if error.retry_after().is_some() => tally.refused_ms.push(took_ms),
+                _ => tally.late += 1,
+            }
+        }));
+        at_s -= (1.0 - random.random::<f64>()).ln() / rate_hz;
+    }
+    for task in asked.into_iter().chain(vehicles) {
+        task.await.or_failed()?;
+    }
+    Arc::try_unwrap(tally).ok().and_then(|tally| tally.into_inner().ok()).ok_or_else(|| Failure::Failed("an asker panicked".into()))
+}
+
+/// Streams measurements at 10 Hz to a copy of the session, so that every load begins alike.
+async fn report(mut client: Client, session: String, seconds: f64, tally: Arc<Mutex<Tally>>) {
+    let copy = format!("{session}-now");
+    let _ = client.close_session(&copy).await;
+    let Ok(_) = client.fork_session(&session, &copy).await else { return };
+    let Ok(mut stream) = client.measure().await else { return };
+    let begin = tokio::time::Instant::now();
+    for i in 0..(10.0 * seconds) as i64 {
+        sleep_until(begin + Duration::from_millis(100 * i as u64)).await;
+        let sent = Instant::now();
+        let Ok(answer) = stream.exchange(step(&copy, DRIVEN + i)).await else { return };
+        let Ok(mut tally) = tally.lock() else { return };
+        tally.measured_ms.push(sent.elapsed().as_secs_f64() * 1e3);
+        tally.measurements_refused += usize::from(outcome_label(&answer) == "REJECTED");
+    }
+}
+
+fn row(load: f64, seconds: f64, tally: &mut Tally) -> Value {
+    let rate = |count: usize| count as f64 / seconds;
+    let p99 = |times: &mut Vec<f64>| if times.is_empty() { f64::NAN } else { percentile(times, 0.99) };
+    let asked = tally.good_ms.len() + tally.refused_ms.len() + tally.late;
+    let (good, refused, late) = (rate(tally.good_ms.len()), rate(tally.refused_ms.len()), rate(tally.late));
+    let (good_ms, refused_ms, measured_ms) = (p99(&mut tally.good_ms), p99(&mut tally.refused_ms), p99(&mut tally.measured_ms));
+    say!("{load:>6.2} {:>9.1} {good:>11.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refused_ms:>15.2} {measured_ms:>18.1}", rate(asked));
+    let refused_p50_ms = if tally.refused_ms.is_empty() { f64::NAN } else { percentile(&mut tally.refused_ms, 0.5) };
+    json!({
+        "load": load, "asked_hz": rate(asked), "in_time_hz": good, "refused_hz": refused, "late_hz": late,
+        "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "measurement_p99_ms": measured_ms,
+        "measurements": tally.measured_ms.len(), "measurements_refused": tally.measurements_refused,
+    })
+}

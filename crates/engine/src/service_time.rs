@@ -1,0 +1,77 @@
+//! How long a prediction takes, learned from those before it.
+
+use crate::query::PredictQuery;
+use crate::{SIGMA_POINTS, WhatIfSoils};
+
+/// Work of a prediction besides its steps, in sample-steps.
+const FIXED_WORK: f64 = 256.0;
+/// Work of a sample-step with Jacobians and with covariance, in sample-steps (`Limits::jacobian_samples_max`).
+const JACOBIAN_WORK: f64 = 100.0;
+const COVARIANCE_WORK: f64 = 33.0;
+/// Shares of a new time in the estimate, when it is shorter and when it is longer than expected: terrain that is new is encoded once, and that says
+/// nothing of the next prediction.
+const SHORTER: f64 = 0.5;
+const LONGER: f64 = 0.1;
+/// A longer time counts as this many times the expected one at most.
+const OUTLIER: f64 = 4.0;
+
+/// Expected time of a unit of work.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct ServiceTime {
+    /// `None` before the first prediction.
+    ns_per_work: Option<f64>,
+}
+
+/// Work of a prediction, in sample-steps.
+pub(crate) fn work(query: &PredictQuery) -> f64 {
+    let steps = (query.samples * query.horizon) as f64;
+    let extras = &query.extras;
+    let soils = match &extras.soils {
+        WhatIfSoils::Estimate => 1,
+        WhatIfSoils::Added(soils) => 1 + soils.len(),
+        WhatIfSoils::SigmaPoints => SIGMA_POINTS,
+    };
+    let derived = if extras.jacobians { JACOBIAN_WORK } else { 0.0 } + if extras.covariance.is_some() { COVARIANCE_WORK } else { 0.0 };
+    FIXED_WORK + steps * (soils as f64 + derived)
+}
+
+impl ServiceTime {
+    /// Expected time, ns; 0 while nothing is known.
+    pub fn expected_ns(&self, work: f64) -> u64 {
+        self.ns_per_work.map_or(0, |ns| (ns * work) as u64)
+    }
+
+    /// Learns from a prediction that took this long.
+    pub fn learn(&mut self, work: f64, busy_ns: u64) {
+        let seen = busy_ns as f64 / work;
+        self.ns_per_work = Some(match self.ns_per_work {
+            None => seen,
+            Some(held) if seen < held => held + SHORTER * (seen - held),
+            Some(held) => held + LONGER * (seen.min(OUTLIER * held) - held),
+        });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_the_estimate_follows_the_machine_and_forgets_the_cold_start() {
+        let mut time = ServiceTime::default();
+        assert_eq!(time.expected_ns(1e4), 0);
+        // The first prediction encodes terrain: twenty times as long.
+        time.learn(1e4, 20_000_000);
+        for _ in 0..10 {
+            time.learn(1e4, 1_000_000);
+        }
+        assert!((1_000_000..1_050_000).contains(&time.expected_ns(1e4)), "{}", time.expected_ns(1e4));
+        // One that hangs says little, a machine that got slower is followed.
+        time.learn(1e4, 1_000_000_000);
+        assert!(time.expected_ns(1e4) < 1_400_000, "{}", time.expected_ns(1e4));
+        for _ in 0..60 {
+            time.learn(2e4, 4_000_000);
+        }
+        assert!((1_950_000..2_050_000).contains(&time.expected_ns(1e4)), "{}", time.expected_ns(1e4));
+    }
+}

@@ -1,0 +1,165 @@
+//! The fleet file: who there is and what each may do. Whoever is not in it may do nothing, whatever certificate there is: taking a name out of it and
+//! restarting the server revokes a certificate.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::Path;
+
+use nesam_engine::check_name;
+use serde::Deserialize;
+
+use super::identity::Identity;
+
+/// A planner's entry in `vehicles` that stands for all vehicles.
+const ALL: &str = "*";
+
+/// The members of a fleet and their rights.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct FleetFile {
+    /// Names that may do everything.
+    operators: BTreeSet<String>,
+    /// By vehicle id.
+    vehicles: BTreeMap<String, VehicleEntry>,
+    /// By name.
+    planners: BTreeMap<String, PlannerEntry>,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct VehicleEntry {
+    /// Maps that it may upload, patch and delete.
+    maps: BTreeSet<String>,
+}
+
+#[derive(Clone, Debug, Default, PartialEq, Eq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct PlannerEntry {
+    /// Vehicles that it may read and predict; `*` = all.
+    vehicles: BTreeSet<String>,
+    /// Maps that it may upload, patch and delete.
+    maps: BTreeSet<String>,
+}
+
+impl FleetFile {
+    /// Reads the file.
+    ///
+    /// # Errors
+    /// Which entry is wrong.
+    pub fn load(path: &Path) -> Result<Self, String> {
+        let text = std::fs::read_to_string(path).map_err(|error| error.to_string())?;
+        let file: Self = toml::from_str(&text).map_err(|error| error.to_string())?;
+        file.check().map(|()| file)
+    }
+
+    fn check(&self) -> Result<(), String> {
+        let maps = self.vehicles.values().map(|v| &v.maps).chain(self.planners.values().map(|p| &p.maps)).flatten();
+        let names = self.operators.iter().chain(self.vehicles.keys()).chain(self.planners.keys()).chain(maps);
+        for name in names {
+            check_name("name", name).map_err(|error| format!("`{name}`: {error}"))?;
+        }
+        for (planner, entry) in &self.planners {
+            if let Some(unknown) = entry.vehicles.iter().find(|v| *v != ALL && !self.vehicles.contains_key(*v)) {
+                return Err(format!("planner `{planner}` has vehicle `{unknown}`, which is not in the file"));
+            }
+        }
+        Ok(())
+    }
+
+    /// Whether the identity is in the file.
+    pub fn knows(&self, identity: &Identity) -> bool {
+        match identity {
+            Identity::Vehicle(name) => self.vehicles.contains_key(name),
+            Identity::Planner(name) => self.planners.contains_key(name),
+            Identity::Operator(name) => self.operators.contains(name),
+        }
+    }
+
+    /// Whether it may read the sessions of a vehicle and predict from them.
+    pub fn may_read(&self, identity: &Identity, vehicle: &str) -> bool {
+        match identity {
+            Identity::Vehicle(name) => name == vehicle && self.knows(identity),
+            Identity::Planner(name) => {
+                self.planners.get(name).is_some_and(|planner| planner.vehicles.contains(vehicle) || planner.vehicles.contains(ALL))
+            }
+            Identity::Operator(_) => self.knows(identity),
+        }
+    }
+
+    /// Whether it may open, feed, copy, move and close the sessions of a vehicle.
+    pub fn may_change(&self, identity: &Identity, vehicle: &str) -> bool {
+        match identity {
+            Identity::Vehicle(name) => name == vehicle && self.knows(identity),
+            Identity::Planner(_) => false,
+            Identity::Operator(_) => self.knows(identity),
+        }
+    }
+
+    /// Whether it may give a session this name: not that of another vehicle, which would find its own name taken.
+    pub fn may_name(&self, identity: &Identity, session: &str) -> bool {
+        match identity {
+            Identity::Vehicle(name) => name == session || !self.vehicles.contains_key(session),
+            Identity::Planner(_) => false,
+            Identity::Operator(_) => true,
+        }
+    }
+
+    /// Whether it may upload, patch and delete a map.
+    pub fn may_change_map(&self, identity: &Identity, map: &str) -> bool {
+        match identity {
+            Identity::Vehicle(name) => self.vehicles.get(name).is_some_and(|vehicle| vehicle.maps.contains(map)),
+            Identity::Planner(name) => self.planners.get(name).is_some_and(|planner| planner.maps.contains(map)),
+            Identity::Operator(_) => self.knows(identity),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const FILE: &str = r#"
+operators = ["control"]
+[vehicles.truck-7]
+maps = ["truck-7-local"]
+[vehicles.truck-8]
+[planners.mission]
+vehicles = ["truck-7"]
+[planners.dispatch]
+vehicles = ["*"]
+maps = ["quarry"]
+"#;
+
+    #[test]
+    fn analytic_rights_are_those_of_the_table() {
+        let file: FleetFile = toml::from_str(FILE).unwrap();
+        file.check().unwrap();
+        let [seven, eight, nine] = ["truck-7", "truck-8", "truck-9"].map(|name| Identity::Vehicle(name.into()));
+        let [mission, dispatch] = ["mission", "dispatch"].map(|name| Identity::Planner(name.into()));
+        let control = Identity::Operator("control".into());
+        let who = [&seven, &eight, &nine, &mission, &dispatch, &control];
+        let rights = |may: &dyn Fn(&Identity) -> bool| who.map(may);
+        assert_eq!(rights(&|i| file.knows(i)), [true, true, false, true, true, true]);
+        assert_eq!(rights(&|i| file.may_read(i, "truck-7")), [true, false, false, true, true, true]);
+        assert_eq!(rights(&|i| file.may_read(i, "truck-8")), [false, true, false, false, true, true]);
+        assert_eq!(rights(&|i| file.may_read(i, "truck-9")), [false, false, false, false, true, true]);
+        assert_eq!(rights(&|i| file.may_change(i, "truck-7")), [true, false, false, false, false, true]);
+        assert_eq!(rights(&|i| file.may_change_map(i, "truck-7-local")), [true, false, false, false, false, true]);
+        assert_eq!(rights(&|i| file.may_change_map(i, "quarry")), [false, false, false, false, true, true]);
+        assert_eq!(rights(&|i| file.may_name(i, "truck-8")), [false, true, false, false, false, true]);
+        assert!(file.may_name(&seven, "truck-7") && file.may_name(&seven, "what-if"));
+        assert!(!file.knows(&Identity::Operator("truck-7".into())) && !file.may_read(&Identity::Operator("x".into()), "truck-7"));
+    }
+
+    #[test]
+    fn regress_wrong_files_are_refused_with_the_entry() {
+        for (text, part) in [
+            ("[planners.p]\nvehicles = [\"ghost\"]", "ghost"),
+            ("[vehicles.\"a/b\"]", "a/b"),
+            ("operator = [\"x\"]", "operator"),
+            ("[vehicles.a]\nmap = [\"m\"]", "map"),
+        ] {
+            let result = toml::from_str::<FleetFile>(text).map_err(|error| error.to_string()).and_then(|file| file.check());
+            assert!(result.as_ref().is_err_and(|error| error.contains(part)), "{text}: {result:?}");
+        }
+    }
+}

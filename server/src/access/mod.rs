@@ -1,0 +1,178 @@
+//! Who may do what.
+//!
+//! With `tls.client_ca` every client shows a certificate that the CA has signed; its subject alternative name `nesam:<role>:<name>` is who it is, and the
+//! fleet file says what that one may do. Every handler asks [`Access`] before the engine does; what is refused is counted, and logged under the
+//! target `nesam::audit` with who asked for what. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
+
+mod directory;
+mod fleet_file;
+mod identity;
+
+use std::sync::Arc;
+
+use tonic::transport::{Certificate, Identity as ServerIdentity, ServerTlsConfig};
+use tonic::{Request, Status};
+
+pub use self::directory::Directory;
+pub use self::fleet_file::FleetFile;
+pub use self::identity::Identity;
+use crate::config::TlsConfig;
+use crate::error::ServerError;
+
+/// What a caller wants to do with a session, a vehicle or a map.
+#[derive(Clone, Copy, Debug)]
+pub enum Wish<'a> {
+    /// Read an open session, or predict from it.
+    ReadSession(&'a str),
+    /// Feed, copy or close an open session.
+    ChangeSession(&'a str),
+    /// Open a session of a vehicle under a name.
+    OpenSession {
+        /// Vehicle that the session is to belong to.
+        vehicle: &'a str,
+        /// Name of the session; empty = the vehicle's.
+        session: &'a str,
+    },
+    /// Upload, patch or delete a map.
+    ChangeMap(&'a str),
+}
+
+/// Decides.
+#[derive(Clone, Debug, Default)]
+pub struct Access {
+    /// `None` = no client certificates: everybody may do everything.
+    fleet: Option<Arc<FleetFile>>,
+    /// Whose session is whose.
+    pub directory: Directory,
+}
+
+/// Whoever sent a request.
+#[derive(Clone, Debug)]
+pub struct Caller {
+    access: Access,
+    /// `None` = without client certificates.
+    identity: Option<Identity>,
+}
+
+/// TLS of the server and the rights of its clients, from the files of a configuration; `None` = without TLS.
+///
+/// # Errors
+/// `ServerError::Tls` naming the key whose file cannot be used.
+pub fn load(config: &TlsConfig) -> Result<(Option<ServerTlsConfig>, Access), ServerError> {
+    if config.certificate.as_os_str().is_empty() {
+        return Ok((None, Access::default()));
+    }
+    let read = |key: &'static str, path: &std::path::Path| {
+        std::fs::read(path).map_err(|source| ServerError::Tls { key, reason: format!("{}: {source}", path.display()) })
+    };
+    let certificate = read("tls.certificate", &config.certificate)?;
+    // What is in the key file never reaches a message.
+    let key = read("tls.key", &config.key)?;
+    let mut tls = ServerTlsConfig::new()
+        .identity(ServerIdentity::from_pem(certificate, key))
+        .timeout(std::time::Duration::from_secs_f64(config.handshake_s));
+    let mut access = Access::default();
+    if !config.client_ca.as_os_str().is_empty() {
+        tls = tls.client_ca_root(Certificate::from_pem(read("tls.client_ca", &config.client_ca)?));
+        let fleet = FleetFile::load(&config.fleet)
+            .map_err(|reason| ServerError::Tls { key: "tls.fleet", reason: format!("{}: {reason}", config.fleet.display()) })?;
+        access.fleet = Some(Arc::new(fleet));
+    }
+    // The files are tried now: a wrong key is told at the start and not at the first handshake.
+    tonic::transport::Server::builder().tls_config(tls.clone()).map_err(|error| ServerError::Tls { key: "tls", reason: chain(&error) })?;
+    Ok((Some(tls), access))
+}
+
+/// An error with its causes.
+fn chain(error: &dyn std::error::Error) -> String {
+    let causes = std::iter::successors(error.source(), |cause| cause.source());
+    causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"))
+}
+
+impl Access {
+    /// Whether clients have identities.
+    pub fn is_restricted(&self) -> bool {
+        self.fleet.is_some()
+    }
+
+    /// Who sent a request.
+    ///
+    /// # Errors
+    /// UNAUTHENTICATED when the certificate names nobody, PERMISSION_DENIED when it is nobody of the fleet.
+    pub fn caller<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
+        let Some(fleet) = &self.fleet else { return Ok(Caller { access: self.clone(), identity: None }) };
+        let certificates = request.peer_certs().unwrap_or_default();
+        let identity = match certificates.first() {
+            Some(certificate) => Identity::of_certificate(certificate),
+            None => Err("the client shows no certificate".into()),
+        };
+        let identity = identity.map_err(|reason| {
+            let peer = request.remote_addr().map(|address| address.to_string()).unwrap_or_default();
+            tracing::warn!(target: "nesam::audit", peer, reason, "refused: no identity");
+            Status::unauthenticated(reason)
+        })?;
+        if !fleet.knows(&identity) {
+            tracing::warn!(target: "nesam::audit", %identity, "refused: not in the fleet file");
+            return Err(Status::permission_denied(format!("{identity} is not in the fleet file of this server")));
+        }
+        Ok(Caller { access: self.clone(), identity: Some(identity) })
+    }
+}
+
+impl Caller {
+    /// Whether the caller may; where there are identities, the vehicle of the session that the wish is about.
+    ///
+    /// # Errors
+    /// PERMISSION_DENIED, or NOT_FOUND for a session that is not open: then there is nobody whose it could be.
+    pub fn may(&self, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
+        let (fleet, identity) = match (&self.access.fleet, &self.identity) {
+            (Some(fleet), Some(identity)) => (fleet, identity),
+            // Without identities the engine says what is not there.
+            _ => return Ok(None),
+        };
+        let vehicle = self.vehicle_of(wish);
+        let allowed = match (wish, &vehicle) {
+            (Wish::ReadSession(session) | Wish::ChangeSession(session), None) => {
+                return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
+            }
+            (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
+            (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
+            (Wish::OpenSession { vehicle, session }, _) => {
+                let name = if session.is_empty() { vehicle } else { session };
+                fleet.may_change(identity, vehicle) && fleet.may_name(identity, name)
+            }
+            (Wish::ChangeMap(map), _) => fleet.may_change_map(identity, map),
+        };
+        if allowed {
+            return Ok(vehicle);
+        }
+        tracing::warn!(target: "nesam::audit", %identity, ?wish, "refused: no right");
+        Err(Status::permission_denied(format!("{identity} has no right to {wish}; the fleet file of the server gives rights")))
+    }
+
+    /// Whether the caller may read the sessions of a vehicle; nothing is logged.
+    pub fn sees(&self, vehicle: &str) -> bool {
+        match (&self.access.fleet, &self.identity) {
+            (Some(fleet), Some(identity)) => fleet.may_read(identity, vehicle),
+            _ => true,
+        }
+    }
+
+    fn vehicle_of(&self, wish: Wish<'_>) -> Option<Arc<str>> {
+        match wish {
+            Wish::ReadSession(session) | Wish::ChangeSession(session) => self.access.directory.vehicle(session),
+            Wish::OpenSession { .. } | Wish::ChangeMap(_) => None,
+        }
+    }
+}
+
+impl core::fmt::Display for Wish<'_> {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        match self {
+            Self::ReadSession(session) => write!(f, "read session `{session}`"),
+            Self::ChangeSession(session) => write!(f, "change session `{session}`"),
+            Self::OpenSession { vehicle, session } => write!(f, "open session `{session}` of vehicle `{vehicle}`"),
+            Self::ChangeMap(map) => write!(f, "change map `{map}`"),
+        }
+    }
+}

@@ -1,0 +1,310 @@
+//! What is not on stable storage yet, and the thread that brings it there.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use nesam_engine::{Command, EngineHandle, Event, Reply, Snapshot};
+use tokio::sync::watch;
+
+use super::map_bytes::map_bytes;
+use super::restore::{Restored, unix_ns};
+use super::{Change, SessionStore, StoreError, StoredSession};
+use crate::convert::image_bytes;
+
+/// Pause before a commit that failed is tried again.
+const RETRY_AFTER: Duration = Duration::from_secs(1);
+
+/// Accepted measurements of each session in a commit; `None` = the session is gone.
+type Places = BTreeMap<String, Option<u64>>;
+
+/// What can change.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub(crate) enum Key {
+    Session(String),
+    Map(String),
+}
+
+/// A change that is not on stable storage yet. Changes are numbered in the order in which the engine made them.
+#[derive(Clone, Copy, Debug)]
+struct Dirty {
+    /// First and last change that no commit holds.
+    first: u64,
+    latest: u64,
+    due: Instant,
+}
+
+/// Counters of a store.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct StoreCounts {
+    pub commits: u64,
+    pub failures: u64,
+    pub bytes: u64,
+    /// Time of all commits together, s.
+    pub commit_s: f64,
+    /// Sessions and maps that wait for a commit.
+    pub waiting: usize,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    changes: u64,
+    dirty: BTreeMap<Key, Dirty>,
+    /// Accepted measurements of each session that are on stable storage.
+    durable: BTreeMap<String, u64>,
+    /// Last opening or closing of sessions since their last commit: what was read before says nothing of the session of that name now.
+    renamed: BTreeMap<String, u64>,
+    counts: StoreCounts,
+    stopping: bool,
+}
+
+/// Knows what is durable and sees to it that everything becomes so.
+#[derive(Debug)]
+pub(crate) struct Keeper {
+    state: Mutex<State>,
+    changed: Condvar,
+    /// Counts the commits, for those who wait for one.
+    committed: watch::Sender<u64>,
+    interval: Duration,
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+impl Keeper {
+    /// A keeper that only notes until [`Keeper::start`].
+    pub fn new(interval: Duration) -> Self {
+        let (committed, _) = watch::channel(0);
+        Self { state: Mutex::default(), changed: Condvar::new(), committed, interval, thread: Mutex::new(None) }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().expect("no holder of the keeper's state panics; this is a bug")
+    }
+
+    /// Hears the engine; called on its thread.
+    pub fn note(&self, event: &Event) {
+        let (key, wait) = match event {
+            Event::SessionOpened { session, .. } | Event::SessionClosed { session, .. } => (Key::Session(session.clone()), Duration::ZERO),
+            Event::MeasurementAccepted { session, buffer_ended } => {
+                (Key::Session(session.clone()), if *buffer_ended { Duration::ZERO } else { self.interval })
+            }
+            Event::MapChanged { map } => (Key::Map(map.clone()), Duration::ZERO),
+            Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } => return,
+        };
+        let mut state = self.lock();
+        state.changes += 1;
+        let (latest, due) = (state.changes, Instant::now() + wait);
+        let entry = state.dirty.entry(key).or_insert(Dirty { first: latest, latest, due });
+        *entry = Dirty { first: entry.first, latest, due: due.min(entry.due) };
+        if let Event::SessionOpened { session, .. } | Event::SessionClosed { session, .. } = event {
+            state.durable.remove(session);
+            state.renamed.insert(session.clone(), latest);
+        }
+        if wait.is_zero() {
+            self.changed.notify_one();
+        }
+    }
+
+    /// Accepted measurements of a session that are on stable storage.
+    pub fn durable(&self, session: &str) -> u64 {
+        self.lock().durable.get(session).copied().unwrap_or(0)
+    }
+
+    /// Counters.
+    pub fn counts(&self) -> StoreCounts {
+        let state = self.lock();
+        StoreCounts { waiting: state.dirty.len(), ..state.counts }
+    }
+
+    /// Resolves when every change that is noted now of a session or map is on stable storage; says whether that was within `budget`.
+    pub async fn settled(&self, key: &Key, budget: Duration) -> bool {
+        let mut committed = self.committed.subscribe();
+        let Some(latest) = self.lock().dirty.get(key).map(|dirty| dirty.latest) else { return true };
+        let wait = async {
+            while self.lock().dirty.get(key).is_some_and(|dirty| dirty.first <= latest) {
+                if committed.changed().await.is_err() {
+                    return;
+                }
+            }
+        };
+        tokio::time::timeout(budget, wait).await.is_ok()
+    }
+
+    /// Starts the thread. What was restored is durable already.
+    ///
+    /// # Errors
+    /// `StoreError::File` when the system refuses to start a thread.
+    pub fn start(self: &Arc<Self>, store: Box<dyn SessionStore>, engine: EngineHandle, restored: Restored) -> Result<(), StoreError> {
+        let mut state = self.lock();
+        state.dirty.clear();
+        state.renamed.clear();
+        state.durable = restored.accepted;
+        drop(state);
+        let work = Work { keeper: Arc::clone(self), store, engine, maps: restored.maps };
+        let thread = std::thread::Builder::new().name("nesam-store".into()).spawn(move || work.run());
+        let thread = thread.map_err(|source| StoreError::File { path: "thread nesam-store".into(), source })?;
+        if let Ok(mut held) = self.thread.lock() {
+            *held = Some(thread);
+        }
+        Ok(())
+    }
+
+    /// Commits what is left and ends the thread. The engine must still run.
+    pub fn finish(&self) {
+        self.lock().stopping = true;
+        self.changed.notify_all();
+        let thread = self.thread.lock().ok().and_then(|mut thread| thread.take());
+        if thread.is_some_and(|thread| thread.join().is_err()) {
+            tracing::error!("the store's thread panicked; what was not durable is lost; this is a bug");
+        }
+    }
+
+    /// Waits until something is due, or everything once the server stops; nothing when there is nothing left to do.
+    fn next_due(&self) -> BTreeMap<Key, u64> {
+        let mut state = self.lock();
+        loop {
+            let now = Instant::now();
+            let stopping = state.stopping;
+            let due = state.dirty.iter_mut().filter(|(_, dirty)| stopping || dirty.due <= now);
+            let due: BTreeMap<Key, u64> = due
+                .map(|(key, dirty)| {
+                    // What changes while this is committed is due by itself.
+                    dirty.due = now + self.interval;
+                    (key.clone(), dirty.latest)
+                })
+                .collect();
+            if !due.is_empty() || stopping {
+                return due;
+            }
+            let next = state.dirty.values().map(|dirty| dirty.due).min();
+            // Woken by a change that is due at once; what is due later is looked at after an interval at the latest.
+            let pause = next.map_or(self.interval, |next| next.saturating_duration_since(now));
+            (state, _) = self.changed.wait_timeout(state, pause).expect("no holder of the keeper's state panics; this is a bug");
+        }
+    }
+
+    /// Notes a commit of changes up to these.
+    fn committed(&self, due: &BTreeMap<Key, u64>, places: &Places, bytes: u64, took: Duration) {
+        let mut state = self.lock();
+        for (key, written) in due {
+            if let Some(dirty) = state.dirty.get_mut(key) {
+                dirty.first = written + 1;
+                if dirty.latest == *written {
+                    state.dirty.remove(key);
+                }
+            }
+            let Key::Session(session) = key else { continue };
+            if state.renamed.get(session).is_some_and(|renamed| renamed > written) {
+                continue;
+            }
+            state.renamed.remove(session);
+            match places.get(session).copied().flatten() {
+                Some(accepted) => state.durable.insert(session.clone(), accepted),
+                None => state.durable.remove(session),
+            };
+        }
+        state.counts.commits += 1;
+        state.counts.bytes += bytes;
+        state.counts.commit_s += took.as_secs_f64();
+        drop(state);
+        self.committed.send_modify(|commits| *commits += 1);
+    }
+
+    /// Notes that a commit failed; it is tried again. Says whether the server waits for the end.
+    fn failed(&self, due: &BTreeMap<Key, u64>) -> bool {
+        let mut state = self.lock();
+        let again = Instant::now() + RETRY_AFTER;
+        for key in due.keys() {
+            if let Some(dirty) = state.dirty.get_mut(key) {
+                dirty.due = again;
+            }
+        }
+        state.counts.failures += 1;
+        state.stopping
+    }
+}
+
+/// What the thread owns.
+struct Work {
+    keeper: Arc<Keeper>,
+    store: Box<dyn SessionStore>,
+    engine: EngineHandle,
+    /// Hash of each map in the store.
+    maps: BTreeMap<String, String>,
+}
+
+impl Work {
+    /// The thread: commits what is due until everything is written and the server stops.
+    fn run(mut self) {
+        loop {
+            let due = self.keeper.next_due();
+            if due.is_empty() {
+                return;
+            }
+            let begun = Instant::now();
+            match self.write(&due) {
+                Ok((places, bytes)) => self.keeper.committed(&due, &places, bytes, begun.elapsed()),
+                Err(reason) => {
+                    tracing::error!(reason, changes = due.len(), "sessions are not durable: the store did not take them; tried again");
+                    if self.keeper.failed(&due) {
+                        return;
+                    }
+                }
+            }
+        }
+    }
+
+    /// Commits the present state of these sessions and maps: accepted measurements of each session, and the bytes written.
+    fn write(&mut self, due: &BTreeMap<Key, u64>) -> Result<(Places, u64), String> {
+        let snapshot = self.snapshot(due)?;
+        let (mut changes, mut places, mut maps) = (Vec::new(), Places::new(), self.maps.clone());
+        for (id, map) in &snapshot.maps {
+            match map {
+                Some(map) if maps.get(id).map(String::as_str) != Some(map.hash()) => {
+                    maps.insert(id.clone(), map.hash().into());
+                    changes.push(Change::PutMap(id.clone(), map_bytes(map)));
+                }
+                Some(_) => {}
+                None => {
+                    maps.remove(id);
+                    changes.push(Change::RemoveMap(id.clone()));
+                }
+            }
+        }
+        let saved_unix_ns = unix_ns();
+        for (name, image) in snapshot.sessions {
+            places.insert(name.clone(), image.as_ref().map(|image| image.accepted));
+            changes.push(match image {
+                Some(image) => Change::PutSession(StoredSession { name, saved_unix_ns, image: image_bytes(&image) }),
+                None => Change::RemoveSession(name),
+            });
+        }
+        let bytes = changes.iter().map(weight).sum();
+        self.store.commit(&changes).map_err(|error| error.to_string())?;
+        self.maps = maps;
+        Ok((places, bytes))
+    }
+
+    fn snapshot(&self, due: &BTreeMap<Key, u64>) -> Result<Snapshot, String> {
+        let (mut sessions, mut maps) = (Vec::new(), Vec::new());
+        for key in due.keys() {
+            match key {
+                Key::Session(name) => sessions.push(name.clone()),
+                Key::Map(id) => maps.push(id.clone()),
+            }
+        }
+        match self.engine.call(Command::Snapshot { sessions, maps }) {
+            Ok(Reply::Snapshot(snapshot)) => Ok(*snapshot),
+            Ok(_) => Err("the engine answered with another reply; this is a bug".into()),
+            Err(error) => Err(error.to_string()),
+        }
+    }
+}
+
+fn weight(change: &Change) -> u64 {
+    match change {
+        Change::PutSession(session) => session.image.len() as u64,
+        Change::PutMap(_, bytes) => bytes.len() as u64,
+        Change::RemoveSession(_) | Change::RemoveMap(_) => 0,
+    }
+}

@@ -1,0 +1,36 @@
+//! Maps as bytes: the messages that upload them, one after the other, each with its length.
+
+use nesam_engine::Limits;
+use nesam_proto::v1 as pb;
+use nesam_terrain::WorldMap;
+use pb::upload_map_request::Part;
+use prost::Message as _;
+
+use crate::convert::{MapBuilder, upload};
+
+/// The bytes of a map.
+pub fn map_bytes(map: &WorldMap) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    for message in upload(map) {
+        bytes.extend_from_slice(&message.encode_length_delimited_to_vec());
+    }
+    bytes
+}
+
+/// The map in such bytes.
+///
+/// # Errors
+/// What is wrong with them.
+pub fn map_of(bytes: &[u8], limits: &Limits) -> Result<WorldMap, String> {
+    let mut rest = bytes;
+    let mut builder: Option<MapBuilder> = None;
+    while !rest.is_empty() {
+        let message = pb::UploadMapRequest::decode_length_delimited(&mut rest).map_err(|error| error.to_string())?;
+        match (message.part, &mut builder) {
+            (Some(Part::Header(header)), None) => builder = Some(MapBuilder::new(&header, limits).map_err(|e| e.to_string())?),
+            (Some(Part::Tile(tile)), Some(builder)) => builder.add(&tile).map_err(|e| e.to_string())?,
+            _ => return Err("is not one header and tiles".into()),
+        }
+    }
+    builder.ok_or("has no header")?.finish().map_err(|error| error.to_string())
+}

@@ -1,0 +1,103 @@
+//! Sessions that outlive the process.
+//!
+//! The engine knows nothing of disks: it tells what changed ([`nesam_engine::Event`]) and hands out snapshots when asked. The [`Keeper`] notes what
+//! changed, and on a thread of its own asks for snapshots of it and commits them together; a session is due when a buffer of its soil filter has
+//! ended, at the latest `store.interval_s` after its first change. What a commit held is DURABLE, what came after is RECEIVED: a client sends that again after
+//! a crash, and since a snapshot is everything that a session remembers, the estimate goes on bit for bit.
+//!
+//! ```text
+//! engine ── Event ──► Keeper (what is dirty) ── Command::Snapshot ──► engine
+//!                        └── Change ──► SessionStore::commit (fsync) ──► durable places
+//! ```
+
+mod keeper;
+mod map_bytes;
+mod redb;
+mod restore;
+
+use std::path::PathBuf;
+
+pub(crate) use self::keeper::{Keeper, Key, StoreCounts};
+pub use self::redb::RedbStore;
+pub(crate) use self::restore::restore;
+
+/// Something that keeps sessions and maps on stable storage. One process owns a store at a time.
+pub trait SessionStore: Send {
+    /// Everything that is held.
+    ///
+    /// # Errors
+    /// `StoreError` when it cannot be read.
+    fn load(&self) -> Result<Contents, StoreError>;
+
+    /// Makes all changes or none. They are on stable storage when it returns: neither the end of the process nor that of the machine undoes them.
+    ///
+    /// # Errors
+    /// `StoreError` when the changes were not made, or when it is not known whether they were.
+    fn commit(&mut self, changes: &[Change]) -> Result<(), StoreError>;
+}
+
+/// What a store holds.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Contents {
+    /// By name.
+    pub sessions: Vec<StoredSession>,
+    /// Ids and bytes, by id.
+    pub maps: Vec<(String, Vec<u8>)>,
+}
+
+/// A session in a store.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StoredSession {
+    /// Name of the session.
+    pub name: String,
+    /// When it was saved, ns since 1970 by the machine's clock.
+    pub saved_unix_ns: i64,
+    /// A `nesam.v1.SessionImage`.
+    pub image: Vec<u8>,
+}
+
+/// A change of what a store holds.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Change {
+    /// A session, new or not.
+    PutSession(StoredSession),
+    /// No session of this name.
+    RemoveSession(String),
+    /// A map, new or not: id and bytes.
+    PutMap(String, Vec<u8>),
+    /// No map of this id.
+    RemoveMap(String),
+}
+
+/// Why a store cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum StoreError {
+    /// The folder or a file in it cannot be used.
+    #[error("{}: {source}", path.display())]
+    File {
+        /// Path at fault.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// Another process has it.
+    #[error("{} is in use by another server; one store belongs to one server at a time", path.display())]
+    InUse {
+        /// File of the store.
+        path: PathBuf,
+    },
+    /// The database refuses.
+    #[error("database: {reason}")]
+    Database {
+        /// What it said.
+        reason: String,
+    },
+    /// What is held cannot be used.
+    #[error("holds {what}: {reason}")]
+    Content {
+        /// Which session or map.
+        what: String,
+        /// Why, and what to do.
+        reason: String,
+    },
+}

@@ -1,0 +1,118 @@
+//! The store of one machine: one file, one process, fsync at every commit.
+
+use std::path::Path;
+
+use ::redb::{Database, DatabaseError, Durability, ReadableDatabase as _, ReadableTable as _, StorageBackend, TableDefinition};
+
+use super::{Change, Contents, SessionStore, StoreError, StoredSession};
+
+/// Name → when it was saved, image.
+const SESSIONS: TableDefinition<'_, &str, (i64, &[u8])> = TableDefinition::new("sessions");
+/// Id → bytes.
+const MAPS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("maps");
+/// Facts on the store itself.
+const FACTS: TableDefinition<'_, &str, &str> = TableDefinition::new("facts");
+const FORMAT: (&str, &str) = ("format", "nesam.store/1");
+const FILE: &str = "sessions.redb";
+/// Pages that the database keeps in memory, bytes.
+const CACHE_BYTES: usize = 16 << 20;
+
+/// A `redb` database. A commit writes copies of the changed pages, then the root, and syncs the file; the checksums tell a torn commit from a whole one.
+#[derive(Debug)]
+pub struct RedbStore {
+    database: Database,
+}
+
+fn failed(error: impl core::fmt::Display) -> StoreError {
+    StoreError::Database { reason: error.to_string() }
+}
+
+impl RedbStore {
+    /// Opens the store in a folder, and makes both if they are not there.
+    ///
+    /// # Errors
+    /// `StoreError::File` when the folder cannot be made, `InUse` when another process has the store, `Database` when the file is damaged or no store.
+    pub fn open(folder: &Path) -> Result<Self, StoreError> {
+        let at = |path: &Path| {
+            let path = path.to_path_buf();
+            move |source| StoreError::File { path, source }
+        };
+        std::fs::create_dir_all(folder).map_err(at(folder))?;
+        let path = folder.join(FILE);
+        let database = Database::builder().set_cache_size(CACHE_BYTES).create(&path).map_err(|error| match error {
+            DatabaseError::DatabaseAlreadyOpen => StoreError::InUse { path: path.clone() },
+            other => StoreError::Database { reason: format!("{}: {other}", path.display()) },
+        })?;
+        // A new file is there after a power cut only when its folder is on the disk too.
+        std::fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(at(folder))?;
+        Self::prepared(database)
+    }
+
+    /// The same on another backend, for tests of crashes.
+    ///
+    /// # Errors
+    /// As [`RedbStore::open`].
+    pub fn with_backend(backend: impl StorageBackend) -> Result<Self, StoreError> {
+        Self::prepared(Database::builder().set_cache_size(CACHE_BYTES).create_with_backend(backend).map_err(failed)?)
+    }
+
+    /// Makes the tables, or refuses a database of another format.
+    fn prepared(database: Database) -> Result<Self, StoreError> {
+        let transaction = database.begin_write().map_err(failed)?;
+        {
+            let mut facts = transaction.open_table(FACTS).map_err(failed)?;
+            let held = facts.get(FORMAT.0).map_err(failed)?.map(|value| value.value().to_string());
+            match held {
+                Some(held) if held != FORMAT.1 => {
+                    return Err(StoreError::Database { reason: format!("is of format `{held}`, this server reads `{}`", FORMAT.1) });
+                }
+                Some(_) => {}
+                None => drop(facts.insert(FORMAT.0, FORMAT.1).map_err(failed)?),
+            }
+            transaction.open_table(SESSIONS).map_err(failed)?;
+            transaction.open_table(MAPS).map_err(failed)?;
+        }
+        transaction.commit().map_err(failed)?;
+        Ok(Self { database })
+    }
+}
+
+impl SessionStore for RedbStore {
+    fn load(&self) -> Result<Contents, StoreError> {
+        let transaction = self.database.begin_read().map_err(failed)?;
+        let mut contents = Contents::default();
+        for entry in transaction.open_table(SESSIONS).map_err(failed)?.iter().map_err(failed)? {
+            let (name, value) = entry.map_err(failed)?;
+            let (saved_unix_ns, image) = value.value();
+            contents.sessions.push(StoredSession { name: name.value().into(), saved_unix_ns, image: image.to_vec() });
+        }
+        for entry in transaction.open_table(MAPS).map_err(failed)?.iter().map_err(failed)? {
+            let (id, bytes) = entry.map_err(failed)?;
+            contents.maps.push((id.value().into(), bytes.value().to_vec()));
+        }
+        Ok(contents)
+    }
+
+    fn commit(&mut self, changes: &[Change]) -> Result<(), StoreError> {
+        let mut transaction = self.database.begin_write().map_err(failed)?;
+        transaction.set_durability(Durability::Immediate).map_err(failed)?;
+        {
+            let mut sessions = transaction.open_table(SESSIONS).map_err(failed)?;
+            let mut maps = transaction.open_table(MAPS).map_err(failed)?;
+            for change in changes {
+                match change {
+                    Change::PutSession(s) => {
+                        drop(sessions.insert(s.name.as_str(), (s.saved_unix_ns, s.image.as_slice())).map_err(failed)?);
+                    }
+                    Change::RemoveSession(name) => drop(sessions.remove(name.as_str()).map_err(failed)?),
+                    Change::PutMap(id, bytes) => drop(maps.insert(id.as_str(), bytes.as_slice()).map_err(failed)?),
+                    Change::RemoveMap(id) => drop(maps.remove(id.as_str()).map_err(failed)?),
+                }
+            }
+        }
+        transaction.commit().map_err(failed)
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,270 @@
+//! Goal: who may do nothing gets nothing, is told so by a typed status, and leaves no trace; the service goes on. Method: a server with mutual TLS, an
+//! authority and certificates made here, one client for each kind of stranger.
+
+use std::path::Path;
+use std::time::Duration;
+
+use nesam_client::{Client, ClientError, Tls, outcome_label, v1};
+use nesam_server::{Config, RunningServer, serve};
+use prost::bytes::Bytes;
+use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType, date_time_ymd};
+use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
+use tonic::Code;
+
+use crate::stage::*;
+
+const FLEET: &str = r#"
+operators = ["control"]
+[vehicles.truck]
+maps = ["local"]
+[vehicles.other]
+[planners.mission]
+vehicles = ["truck"]
+"#;
+
+/// An authority that signs certificates.
+struct Authority {
+    pem: String,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+impl Authority {
+    fn new() -> Self {
+        let mut params = CertificateParams::new(vec![]).unwrap();
+        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
+        let key = KeyPair::generate().unwrap();
+        let pem = params.self_signed(&key).unwrap().pem();
+        Self { pem, issuer: Issuer::new(params, key) }
+    }
+
+    /// Certificate and key for these names; `expired` = valid until a year ago.
+    fn sign(&self, names: &[SanType], expired: bool) -> (Vec<u8>, Vec<u8>) {
+        let mut params = CertificateParams::new(vec![]).unwrap();
+        params.subject_alt_names = names.to_vec();
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
+        if expired {
+            (params.not_before, params.not_after) = (date_time_ymd(2019, 1, 1), date_time_ymd(2020, 1, 1));
+        }
+        let key = KeyPair::generate().unwrap();
+        let certificate = params.signed_by(&key, &self.issuer).unwrap();
+        (certificate.pem().into_bytes(), key.serialize_pem().into_bytes())
+    }
+}
+
+fn uri(text: &str) -> SanType {
+    SanType::URI(text.try_into().unwrap())
+}
+
+/// A server that knows a fleet.
+struct Stage {
+    server: RunningServer,
+    authority: Authority,
+    _files: tempfile::TempDir,
+}
+
+async fn secured() -> Stage {
+    let (files, authority) = (tempfile::tempdir().unwrap(), Authority::new());
+    let (certificate, key) = authority.sign(&[SanType::DnsName("localhost".try_into().unwrap())], false);
+    let write = |name: &str, bytes: &[u8]| {
+        let path = files.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        path
+    };
+    let mut config = Config::ephemeral();
+    config.tls.certificate = write("server.pem", &certificate);
+    config.tls.key = write("server.key", &key);
+    config.tls.client_ca = write("ca.pem", authority.pem.as_bytes());
+    config.tls.fleet = write("fleet.toml", FLEET.as_bytes());
+    config.tls.handshake_s = 0.5;
+    let server = serve(config, predictor()).await.unwrap();
+    Stage { server, authority, _files: files }
+}
+
+impl Stage {
+    async fn connect(&self, identity: Option<(Vec<u8>, Vec<u8>)>) -> Result<Client, ClientError> {
+        let tls = Tls { authority: self.authority.pem.clone().into_bytes(), identity, server_name: "localhost".into() };
+        Client::connect_tls(&format!("https://{}", self.server.grpc_addr), &tls).await
+    }
+
+    /// A client whose certificate says this.
+    async fn client(&self, name: &str) -> Client {
+        self.connect(Some(self.authority.sign(&[uri(name)], false))).await.unwrap()
+    }
+}
+
+fn open_request(vehicle: &str, session: &str) -> v1::OpenSessionRequest {
+    v1::OpenSessionRequest { vehicle_id: vehicle.into(), session_id: session.into(), ..Default::default() }
+}
+
+/// Asserts PERMISSION_DENIED with the name of whoever asked.
+fn denied<T: core::fmt::Debug>(what: &str, result: Result<T, ClientError>, who: &str) {
+    let error = result.expect_err(what);
+    assert_eq!(error.code(), Some(Code::PermissionDenied), "{what}: {error}");
+    assert!(error.to_string().contains(who), "{what}: {error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_each_client_reaches_its_own_vehicles_only() {
+    let recorded = recorded();
+    let stage = secured().await;
+    let (mut truck, mut other) = (stage.client("nesam:vehicle:truck").await, stage.client("nesam:vehicle:other").await);
+    let (mut planner, mut operator) = (stage.client("nesam:planner:mission").await, stage.client("nesam:operator:control").await);
+
+    // Everybody does what it is there for.
+    operator.upload_map(&layers(&recorded.world)).await.unwrap();
+    let with_map = v1::OpenSessionRequest { map_id: recorded.world.id().into(), ..open_request("truck", "") };
+    truck.open_session(with_map).await.unwrap();
+    let fed = truck.feed(samples("truck", &recorded.drive, 40)).await.unwrap();
+    assert!(fed.iter().all(|answer| outcome_label(answer) == "APPLIED"));
+    other.open_session(open_request("other", "")).await.unwrap();
+    other.feed(samples("other", &recorded.drive, 9)).await.unwrap();
+    let query = candidates("truck", &recorded.drive, 40, 2, 8);
+    let predicted = planner.predict(query.clone()).await.unwrap();
+    assert!(bits(&predicted.states) == bits(&truck.predict(query.clone()).await.unwrap().states));
+    assert_eq!(operator.list_sessions().await.unwrap().len(), 2);
+    let before = operator.list_sessions().await.unwrap();
+
+    // A vehicle that says it is another one, or asks for what is another one's.
+    for client in [&mut other, &mut planner] {
+        let who = if client.session("other").await.is_ok() { "vehicle `other`" } else { "planner `mission`" };
+        denied("open", client.open_session(open_request("truck", "spare")).await, who);
+        denied("close", client.close_session("truck").await, who);
+        denied("fork", client.fork_session("truck", "copy").await, who);
+        denied("import", client.import_session(operator.export_session("truck").await.unwrap(), "copy").await, who);
+        denied("map", client.upload_map(&layers(&recorded.world)).await, who);
+        denied("delete", client.delete_map(recorded.world.id()).await, who);
+        let answers = client.feed(samples("truck", &recorded.drive, 3)).await.unwrap();
+        for answer in answers {
+            let Some(v1::measurement_answer::Outcome::Rejected(rejected)) = answer.outcome else { panic!("{answer:?}") };
+            assert_eq!((rejected.code, rejected.field.as_str()), (Code::PermissionDenied.into(), "session_id"));
+        }
+    }
+    denied("get", other.session("truck").await, "vehicle `other`");
+    denied("export", other.export_session("truck").await, "vehicle `other`");
+    denied("predict", other.predict(query.clone()).await, "vehicle `other`");
+    denied("watch", other.watch_soil("truck").await, "vehicle `other`");
+    denied("a planner without this vehicle", planner.session("other").await, "planner `mission`");
+    denied("another's name", truck.open_session(open_request("truck", "other")).await, "vehicle `truck`");
+    let replies = other.predict_stream(vec![query.to_message(), candidates("other", &recorded.drive, 9, 1, 2).to_message()]).await.unwrap();
+    let codes: Vec<i32> = replies.iter().map(|r| matches!(&r.outcome, Some(v1::predict_stream_reply::Outcome::Reply(_))).into()).collect();
+    assert_eq!(codes, [0, 1], "one request is refused, the stream goes on");
+    assert_refused("not there", other.session("nobody").await, Code::NotFound, "session_id");
+    let seen = |sessions: Vec<v1::Session>| sessions.into_iter().map(|s| s.session_id).collect::<Vec<_>>();
+    assert_eq!(seen(other.list_sessions().await.unwrap()), ["other"]);
+    assert_eq!(seen(planner.list_sessions().await.unwrap()), ["truck"]);
+    assert_eq!(operator.list_sessions().await.unwrap(), before, "nothing of that has left a trace");
+
+    // A replayed measurement changes nothing either.
+    assert_eq!(outcome_label(&truck.feed(vec![sample("truck", &recorded.drive, 40)]).await.unwrap()[0]), "DUPLICATE");
+    stage.server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_strangers_do_not_get_in() {
+    let recorded = recorded();
+    let stage = secured().await;
+    let mut truck = stage.client("nesam:vehicle:truck").await;
+    truck.open_session(open_request("truck", "")).await.unwrap();
+
+    // With a certificate of the right authority that says nothing, too much or somebody who is not in the fleet file.
+    let names: [(&str, Vec<SanType>, Code); 4] = [
+        ("nobody", vec![SanType::DnsName("truck".try_into().unwrap())], Code::Unauthenticated),
+        ("two", vec![uri("nesam:vehicle:truck"), uri("nesam:operator:control")], Code::Unauthenticated),
+        ("a king", vec![uri("nesam:king:control")], Code::Unauthenticated),
+        ("revoked", vec![uri("nesam:vehicle:sold")], Code::PermissionDenied),
+    ];
+    for (what, names, code) in names {
+        let mut client = stage.connect(Some(stage.authority.sign(&names, false))).await.unwrap();
+        let error = client.list_sessions().await.expect_err(what);
+        assert_eq!(error.code(), Some(code), "{what}: {error}");
+    }
+    // With none, an expired one, one of another authority, and without TLS: the handshake fails.
+    let stranger = Authority::new();
+    let operator = [uri("nesam:operator:control")];
+    for (what, identity) in
+        [("none", None), ("expired", Some(stage.authority.sign(&operator, true))), ("foreign", Some(stranger.sign(&operator, false)))]
+    {
+        let refused = match stage.connect(identity).await {
+            Ok(mut client) => client.list_sessions().await.map(|_| ()),
+            Err(error) => Err(error),
+        };
+        assert!(refused.is_err(), "{what}");
+    }
+    let refused = match Client::connect(&format!("http://{}", stage.server.grpc_addr)).await {
+        Ok(mut client) => client.list_sessions().await.map(|_| ()),
+        Err(error) => Err(error),
+    };
+    assert!(refused.is_err(), "without TLS");
+    // A client that trusts another authority does not talk to this server.
+    let tls = Tls { authority: stranger.pem.into_bytes(), identity: None, server_name: "localhost".into() };
+    assert!(Client::connect_tls(&format!("https://{}", stage.server.grpc_addr), &tls).await.is_err());
+
+    // Connections that say nothing, or nonsense, are closed; many of them keep nobody out.
+    let mut silent = Vec::new();
+    for i in 0..64 {
+        let mut socket = tokio::net::TcpStream::connect(stage.server.grpc_addr).await.unwrap();
+        if i % 2 == 1 {
+            socket.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n").await.unwrap();
+        }
+        silent.push(socket);
+    }
+    assert_eq!(truck.feed(samples("truck", &recorded.drive, 9)).await.unwrap().len(), 10);
+    for mut socket in silent {
+        let mut rest = Vec::new();
+        let closed = tokio::time::timeout(Duration::from_secs(5), socket.read_to_end(&mut rest)).await;
+        assert!(closed.is_ok(), "a silent connection is closed after tls.handshake_s");
+    }
+    // Oversize and malformed messages of somebody who may ask.
+    let huge = v1::OpenSessionRequest { vehicle_id: "x".repeat(1 << 20), ..Default::default() };
+    let error = truck.open_session(huge).await.unwrap_err();
+    assert_eq!(error.code(), Some(Code::OutOfRange), "{error}");
+    let image: Bytes = garbage(5, 1).remove(0);
+    assert_refused("an image of garbage", truck.import_session(image.to_vec(), "x").await, Code::InvalidArgument, "image");
+    assert_eq!(truck.session("truck").await.unwrap().history_steps, 10);
+    stage.server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_bad_security_files_are_told_at_the_start() {
+    let files = tempfile::tempdir().unwrap();
+    let authority = Authority::new();
+    let (certificate, key) = authority.sign(&[SanType::DnsName("localhost".try_into().unwrap())], false);
+    let write = |name: &str, bytes: &[u8]| std::fs::write(files.path().join(name), bytes).unwrap();
+    write("server.pem", &certificate);
+    write("server.key", &key);
+    write("ca.pem", authority.pem.as_bytes());
+    write("fleet.toml", FLEET.as_bytes());
+    write("text", b"not PEM");
+    write("ghost.toml", b"[planners.p]\nvehicles = [\"ghost\"]");
+    let at = |name: &str| if name.is_empty() { Default::default() } else { files.path().join(name) };
+    let started = |certificate: &str, key: &str, client_ca: &str, fleet: &str| {
+        let mut config = Config::ephemeral();
+        (config.tls.certificate, config.tls.key) = (at(certificate), at(key));
+        (config.tls.client_ca, config.tls.fleet) = (at(client_ca), at(fleet));
+        serve(config, predictor())
+    };
+    for (files, part) in [
+        (["absent", "server.key", "", ""], "tls.certificate"),
+        (["server.pem", "absent", "", ""], "tls.key"),
+        (["server.pem", "", "", ""], "tls.key"),
+        (["text", "server.key", "", ""], "tls"),
+        (["server.pem", "text", "", ""], "tls"),
+        (["server.pem", "server.key", "ca.pem", ""], "tls.fleet"),
+        (["server.pem", "server.key", "ca.pem", "ghost.toml"], "ghost"),
+        (["server.pem", "server.key", "ca.pem", "absent"], "tls.fleet"),
+        (["server.pem", "server.key", "text", "fleet.toml"], "tls"),
+    ] {
+        let [certificate, key, client_ca, fleet] = files;
+        let message = started(certificate, key, client_ca, fleet).await.expect_err(part).to_string();
+        assert!(message.contains(part), "{files:?}: {message}");
+        assert!(!message.contains("BEGIN") && !message.contains("not PEM"), "no content of a file: {message}");
+    }
+    // TLS without client certificates: the way is private, everybody may do everything.
+    let server = started("server.pem", "server.key", "", "").await.unwrap();
+    let tls = Tls { authority: authority.pem.into_bytes(), identity: None, server_name: "localhost".into() };
+    let mut client = Client::connect_tls(&format!("https://{}", server.grpc_addr), &tls).await.unwrap();
+    client.open_session(open_request("truck", "")).await.unwrap();
+    server.shutdown().await;
+    let unreadable = Tls::from_files(Path::new("/nowhere/ca.pem"), None).unwrap_err().to_string();
+    assert!(unreadable.contains("/nowhere/ca.pem"), "{unreadable}");
+}
