@@ -69,7 +69,7 @@ fn property_candle_stays_in_model_and_learning() {
 
 #[test]
 fn property_the_wire_stays_at_the_edge() {
-    for dependency in ["tonic", "prost", "zenoh", "tonic-prost", "prost-types"] {
+    for dependency in ["tonic", "prost", "zenoh", "tonic-prost", "tonic-types", "prost-types"] {
         only(&["nesam-proto", "nesam-server", "nesam-client"], dependency);
     }
     for crate_name in ["nesam-engine", "nesam-model", "nesam-trajectories", "nesam-learning", "nesam-evaluation"] {
