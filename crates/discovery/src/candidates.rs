@@ -35,7 +35,10 @@ struct Line {
     positive: bool,
 }
 
-static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| Effect::examples().iter().flat_map(lines_of).collect());
+static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| {
+    // The free form has no cause to be named.
+    Effect::examples().iter().filter(|e| !matches!(e, Effect::FreeForm(_))).flat_map(lines_of).collect()
+});
 
 /// Hypotheses of one id: each size of an effect is a column of its own; a wheel drag is one hypothesis for each wheel.
 fn lines_of(example: &Effect) -> Vec<Line> {

@@ -91,6 +91,40 @@ pub struct Trace {
     pub after: Vec<(f64, f64)>,
 }
 
+/// Hypotheses that were compared through the physics: what each, sized on all drives, leaves of each drive.
+#[derive(Clone, Debug)]
+pub struct Settled {
+    /// The hypotheses.
+    pub members: Vec<usize>,
+    /// Hypotheses that were fitted beside each.
+    others: Vec<usize>,
+    /// Scores of what each member leaves, drive by drive.
+    left: Vec<Vec<Condensed>>,
+}
+
+impl Settled {
+    fn with(&self, member: usize) -> Vec<usize> {
+        std::iter::once(self.members[member]).chain(self.others.iter().copied()).collect()
+    }
+
+    /// What a member leaves of the drives for which `inside` holds.
+    fn group(&self, yardstick: &Yardstick, member: usize, inside: impl Fn(usize) -> bool) -> Group {
+        yardstick.group(self.left[member].iter().enumerate().filter(|(d, _)| inside(*d)).map(|(_, c)| c))
+    }
+
+    /// Position of the member that is best on the drives for which `inside` holds, whose scores before any fit are `before`, and the others, closest first.
+    fn compare(&self, yardstick: &Yardstick, before: &Group, inside: impl Fn(usize) -> bool) -> (usize, Vec<Rival>) {
+        let left: Vec<Group> = (0..self.members.len()).map(|m| self.group(yardstick, m, &inside)).collect();
+        let z = |k: usize, j: usize| yardstick.after_fit(&left[j], before, &self.with(j), self.members[k]).0;
+        let difference = |j: usize, k: usize| z(j, k).powi(2) - z(k, j).powi(2);
+        let best = (1..self.members.len()).fold(0, |best, k| if difference(best, k) < 0.0 { k } else { best });
+        let rival = |k: usize| Rival { hypothesis: self.members[k], difference: difference(best, k) };
+        let mut rivals: Vec<Rival> = (0..self.members.len()).filter(|k| *k != best).map(rival).collect();
+        rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
+        (best, rivals)
+    }
+}
+
 /// A set of drives, ready to be judged.
 #[derive(Debug)]
 pub struct Case<'a> {
@@ -182,41 +216,44 @@ impl Case<'_> {
         fit(&self.bench, &self.metric, &drives, &terms, start, &offset)
     }
 
-    /// Scores of what fitted effects leave.
-    fn left(&self, yardstick: &Yardstick, fit: &Fit) -> Group {
+    /// Scores of what fitted effects leave of each drive.
+    fn left(&self, fit: &Fit) -> Vec<Condensed> {
         let effects = fit.effects();
-        let condensed: Vec<Condensed> = self
-            .prepared
+        self.prepared
             .par_iter()
             .map(|p| condense(&self.metric, &p.drive.deviations(&self.bench, &effects, &SoilCorrection::NONE), &p.signatures))
-            .collect();
-        yardstick.group(condensed.iter())
+            .collect()
     }
 
     /// Compares the first chosen effect with its closest rivals once more, each sized through the physics, because a large delay or drag is no multiple of a small one.
-    /// The best comes first, the others remain its rivals; what is left is that of the fit.
-    pub fn settle(&self, yardstick: &Yardstick, selection: &mut Selection, onsets: &[Option<Onset>]) {
-        let Some(&first) = selection.chosen.first() else { return };
+    /// The best comes first, the others remain its rivals; what is left is that of the fit. `None` when nothing was chosen.
+    pub fn settle(&self, yardstick: &Yardstick, selection: &mut Selection, onsets: &[Option<Onset>]) -> Option<Settled> {
+        let &first = selection.chosen.first()?;
         let before = yardstick.group(self.condensed());
         let close = selection.rivals[0].iter().filter(|r| r.difference < SETTLED).take(2 * RIVALS_MAX).map(|r| r.hypothesis);
         let members: Vec<usize> = std::iter::once(first).chain(close).collect();
-        let with = |h: usize| -> Vec<usize> { std::iter::once(h).chain(selection.chosen[1..].iter().copied()).collect() };
-        let left: Vec<Group> = members.iter().map(|h| self.left(yardstick, &self.size(yardstick, &before, &with(*h), onsets))).collect();
-        let z = |k: usize, j: usize| yardstick.after_fit(&left[j], &before, &with(members[j]), members[k]).0;
-        let difference = |j: usize, k: usize| z(j, k).powi(2) - z(k, j).powi(2);
-        let best = (1..members.len()).fold(0, |best, k| if difference(best, k) < 0.0 { k } else { best });
-        let mut rivals: Vec<Rival> =
-            (0..members.len()).filter(|k| *k != best).map(|k| Rival { hypothesis: members[k], difference: difference(best, k) }).collect();
-        rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
-        selection.chosen = with(members[best]);
-        let far = selection.rivals[0].iter().filter(|r| !members.contains(&r.hypothesis)).cloned();
+        let others = selection.chosen[1..].to_vec();
+        let with = |h: usize| -> Vec<usize> { std::iter::once(h).chain(others.iter().copied()).collect() };
+        let left = members.iter().map(|h| self.left(&self.size(yardstick, &before, &with(*h), onsets))).collect();
+        let settled = Settled { members, others, left };
+        let (best, mut rivals) = settled.compare(yardstick, &before, |_| true);
+        selection.chosen = settled.with(best);
+        let far = selection.rivals[0].iter().filter(|r| !settled.members.contains(&r.hypothesis)).cloned();
         rivals.extend(far);
         selection.rivals[0] = rivals;
-        selection.remaining = yardstick.remaining_after_fit(&left[best], &before, &selection.chosen);
+        selection.remaining = yardstick.remaining_after_fit(&settled.group(yardstick, best, |_| true), &before, &selection.chosen);
+        Some(settled)
     }
 
     /// Findings of a selection, in its order, refused or not.
-    pub fn findings(&self, yardstick: &Yardstick, selection: &Selection, onsets: &[Option<Onset>], fit: &Fit) -> Vec<Finding> {
+    pub fn findings(
+        &self,
+        yardstick: &Yardstick,
+        selection: &Selection,
+        onsets: &[Option<Onset>],
+        fit: &Fit,
+        settled: Option<&Settled>,
+    ) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
         (0..selection.chosen.len())
             .map(|i| {
@@ -231,7 +268,7 @@ impl Case<'_> {
                     z: selection.z[hypothesis].unwrap_or(0.0),
                     alone: selection.alone[i],
                     delta_bic: other.map_or(selection.alone[i].powi(2), |r| r.difference),
-                    stability: self.stability(yardstick, candidate.id(), &rivals),
+                    stability: self.stability(yardstick, candidate, &rivals, settled.filter(|_| i == 0)),
                     estimates: estimates(&group, fit, i),
                     onset: onsets[hypothesis],
                     rivals,
@@ -243,17 +280,31 @@ impl Case<'_> {
             .collect()
     }
 
-    /// Share of half-samples of the drives that choose an id or one of its rivals.
-    fn stability(&self, yardstick: &Yardstick, id: &str, rivals: &[Member]) -> f64 {
+    /// Share of half-samples of the drives that choose a hypothesis, one of its rivals, or something that they cannot tell from it.
+    ///
+    /// A half-sample looks at effects near zero, where a large delay is much like a lag. What was compared through the physics on all drives is therefore
+    /// compared in the same way on the half: its choice counts for the class if the hypothesis or a rival of it is best there, or within the
+    /// criterion of the best.
+    fn stability(&self, yardstick: &Yardstick, own: Candidate, rivals: &[Member], settled: Option<&Settled>) -> f64 {
         let n = self.prepared.len().min(STABILITY_DRIVES);
         let half = n.div_ceil(2);
         let subsets: Vec<u32> = (0u32..1 << n).filter(|s| s.count_ones() as usize == half).collect();
+        let in_class = |h: usize| {
+            let id = yardstick.catalogue[h].id();
+            id == own.id() || rivals.iter().any(|r| r.candidate.id() == id)
+        };
         let hits = subsets
             .par_iter()
             .filter(|subset| {
-                let part = (0..n).filter(|i| **subset & (1 << i) != 0).map(|i| &self.prepared[i].condensed);
-                let chosen = yardstick.select(&yardstick.group(part)).chosen;
-                chosen.iter().map(|h| yardstick.catalogue[*h].id()).any(|c| c == id || rivals.iter().any(|r| r.candidate.id() == c))
+                let inside = |i: usize| i < n && **subset & (1 << i) != 0;
+                let part = || yardstick.group((0..n).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
+                let chosen = yardstick.select(&part()).chosen;
+                if chosen.iter().any(|h| in_class(*h)) {
+                    return true;
+                }
+                let Some(settled) = settled.filter(|s| chosen.iter().any(|h| s.members.contains(h))) else { return false };
+                let (best, others) = settled.compare(yardstick, &part(), inside);
+                in_class(settled.members[best]) || others.iter().any(|r| r.difference < DECISIVE && in_class(r.hypothesis))
             })
             .count();
         hits as f64 / subsets.len().max(1) as f64

@@ -1,22 +1,22 @@
 //! The whole diagnosis of a set: detect, select, refit, prove on drives that were not fitted.
 
 use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, paired_difference};
-use nesam_model::{ModelBundle, Predictor};
+use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::Layer;
+use nesam_physics::effects::{Effect, Layer};
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
-use crate::candidates::{Candidate, catalogue};
-use crate::channels::Row;
+use crate::candidates::Candidate;
 use crate::claims::{Case, Estimate, Finding, Trace};
-use crate::condense::{best_soil, condense, signatures};
+use crate::condense::best_soil;
+use crate::controls::{Kind, NullDrives, Setting};
 use crate::error::DiscoveryError;
-use crate::evidence::Nulls;
-use crate::fit::{Fit, Prepared};
-use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
+use crate::fit::Fit;
+use crate::held_out::{HeldOut, Learned, Scoring, score_held_out, score_models};
+use crate::judge::{Judge, case_of, own_yardstick};
 use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
-use crate::reference::{NullGroups, Reference};
+use crate::own_reference;
 use crate::select::{Selection, Yardstick};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
@@ -28,6 +28,16 @@ const UNEXPLAINED_MARGIN: f64 = 1.5;
 /// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
 const LEFT_MAX_GEOMETRY: f64 = 0.15;
 
+/// What drives are held against.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Against {
+    /// The frozen bundle: what has changed against drives that it knows.
+    #[default]
+    Bundle,
+    /// The symbolic model itself: what it lacks on average over these drives.
+    Physics,
+}
+
 /// What the command line says.
 #[derive(Clone, Debug)]
 pub struct Options {
@@ -35,8 +45,12 @@ pub struct Options {
     pub fit_on: Option<Vec<String>>,
     /// Ids of effects that are not considered.
     pub without: Vec<String>,
+    /// What drives are held against.
+    pub against: Against,
     /// Rollouts of the proof.
     pub scoring: Scoring,
+    /// Whether the controls are made too: rivals refitted, a black box, a free form of what is left.
+    pub controls: bool,
 }
 
 /// Outcome for a person in a hurry.
@@ -79,8 +93,12 @@ pub struct Diagnosis {
     pub levels: Vec<f64>,
     /// Course of the most unusual channel of each residual layer.
     pub traces: Vec<Trace>,
-    /// The strongest hypothesis that was not chosen, where something was claimed: sized alone, as a control.
-    pub placebo: Option<Candidate>,
+    /// What each control of the scores is, with the number of its parameters.
+    pub controls: Vec<(Kind, usize)>,
+    /// The free form of what is left by all fitted drives; `None` where it explains nothing on drives it was not fitted on.
+    pub free_form: Option<Effect>,
+    /// The claimed effects on drives that do not have them.
+    pub null_drives: Option<NullDrives>,
     /// Judgement on all fitted drives together.
     pub selection: Selection,
     /// Chosen effects, refused or not.
@@ -110,84 +128,6 @@ impl Diagnosis {
 /// Told how far a diagnosis is.
 pub type OnProgress<'a> = &'a (dyn Fn(&str, usize, usize) + Sync);
 
-/// What a diagnosis is made with: the reference of a bundle, read once.
-#[derive(Clone, Debug)]
-pub struct Judge {
-    reference: Reference,
-    nulls: Vec<crate::condense::Condensed>,
-}
-
-impl Judge {
-    /// From the reference that a bundle carries.
-    ///
-    /// # Errors
-    /// `DiscoveryError::Reference` without a usable reference.
-    pub fn of(bundle: &ModelBundle) -> Result<Self, DiscoveryError> {
-        let text = bundle.reference_json.as_deref().ok_or_else(|| DiscoveryError::Reference {
-            reason: format!(
-                "bundle {} carries none; make it with `nesam diagnose --make-reference --bundle DIR --data ROOT --set NAME --split train`",
-                bundle.name
-            ),
-        })?;
-        Ok(Self::new(Reference::from_json(text)?))
-    }
-
-    /// From a reference.
-    pub fn new(reference: Reference) -> Self {
-        let nulls = reference.condensed();
-        Self { reference, nulls }
-    }
-
-    /// The same without some drives of the reference: what a pseudo-vehicle made of them is judged by.
-    pub fn without(&self, ids: &[&str]) -> Self {
-        let mut reference = self.reference.clone();
-        reference.drives.retain(|d| !ids.contains(&d.trajectory.as_str()));
-        Self::new(reference)
-    }
-
-    /// Ids of the drives behind the reference.
-    pub fn drives(&self) -> Vec<String> {
-        self.reference.drives.iter().map(|d| d.trajectory.clone()).collect()
-    }
-
-    /// What `drives` drives are compared with.
-    ///
-    /// # Errors
-    /// `DiscoveryError::Reference` with fewer than four null drives.
-    pub fn yardstick(&self, channels: &[usize], drives: usize, without: &[String]) -> Result<Yardstick, DiscoveryError> {
-        let nulls = Nulls::new(&self.nulls.iter().collect::<Vec<_>>())
-            .ok_or_else(|| DiscoveryError::Reference { reason: "has too few drives".into() })?;
-        let catalogue = catalogue();
-        let groups = NullGroups::draw(&self.nulls, &catalogue, channels, drives);
-        let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
-        Ok(Yardstick { nulls, groups, channels: channels.to_vec(), catalogue, considered })
-    }
-
-    /// Compares observed drives with the reference.
-    ///
-    /// # Errors
-    /// As [`Reference::metric`].
-    pub fn case<'a>(&self, bench: Bench<'a>, observed: Vec<ObservedDrive>, progress: OnProgress<'_>) -> Result<Case<'a>, DiscoveryError> {
-        let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
-        let metric = self.reference.metric(&available)?;
-        let catalogue = catalogue();
-        let total = observed.len();
-        let rows: Vec<Vec<Row>> = observed.iter().map(|d| d.deviations(&bench, &[], &SoilCorrection::NONE)).collect();
-        let prepared = observed
-            .into_iter()
-            .zip(&rows)
-            .enumerate()
-            .map(|(done, (drive, rows))| {
-                progress("drives held against every effect", done, total);
-                let signatures = signatures(&bench, &drive, &catalogue);
-                let condensed = condense(&metric, rows, &signatures);
-                Prepared { drive, signatures, condensed }
-            })
-            .collect();
-        Ok(Case { bench, metric, prepared, rows })
-    }
-}
-
 /// A judgement without the proof on held-out drives.
 #[derive(Debug)]
 pub struct Judgement {
@@ -214,7 +154,7 @@ impl Judgement {
 /// Detects, selects and sizes, without the proof.
 pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     let (mut selection, onsets) = case.select(yardstick);
-    case.settle(yardstick, &mut selection, &onsets);
+    let mut settled = case.settle(yardstick, &mut selection, &onsets);
     let mut left_out = Vec::new();
     loop {
         if selection.chosen.is_empty() {
@@ -223,14 +163,14 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
         }
         let group = yardstick.group(case.condensed());
         let fit = case.size(yardstick, &group, &selection.chosen, &onsets);
-        let mut findings = case.findings(yardstick, &selection, &onsets, &fit);
+        let mut findings = case.findings(yardstick, &selection, &onsets, &fit, settled.as_ref());
         // A further effect that may not be claimed is dropped and the others are sized again without it.
         let dropped = findings.iter().rposition(|f| f.refused.is_some());
         match dropped {
             Some(i) if findings.len() > 1 => {
                 left_out.push(findings.remove(i));
                 selection.drop_chosen(yardstick, &group, i);
-                case.settle(yardstick, &mut selection, &onsets);
+                settled = case.settle(yardstick, &mut selection, &onsets);
             }
             _ => {
                 let (verdict, reason) = provisional(&selection, &findings);
@@ -309,21 +249,36 @@ pub fn diagnose(
     options: &Options,
     progress: OnProgress<'_>,
 ) -> Result<Diagnosis, DiscoveryError> {
+    let own;
+    let predictor = match options.against {
+        Against::Bundle => predictor,
+        Against::Physics => {
+            own = own_reference::symbolic(predictor.bundle())?;
+            &own
+        }
+    };
     let bundle = predictor.bundle();
-    let judge_by = Judge::of(bundle)?;
+    let judge_by = match options.against {
+        Against::Bundle => Some(Judge::of(bundle)?),
+        Against::Physics => None,
+    };
     let fit_at = fitted(drives, options)?;
     let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let total = fit_at.len();
-    let observed = observe_all(predictor, &fit_drives, &fit_maps, &|done| progress("drives compared with the reference", done, total))?;
+    let observed = observe_all(predictor, &fit_drives, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
     let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
-    let mut case = judge_by.case(Bench { vehicle: &bundle.vehicle, stepping }, observed, progress)?;
-    let channels = case.metric.channels.clone();
-    let yardstick = judge_by.yardstick(&channels, total, &options.without)?;
-
+    let bench = Bench { vehicle: &bundle.vehicle, stepping };
+    let (mut case, yardstick) = held_against(judge_by.as_ref(), bench, observed, options, progress)?;
     progress("hypotheses", 0, 1);
     let judgement = judge(&mut case, &yardstick);
-    let learned = learn(&judge_by, &case, &judgement, options, drives.len())?;
+    let fewer = match &judge_by {
+        Some(judge_by) if options.fit_on.is_none() && total > 1 => {
+            Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?)
+        }
+        _ => None,
+    };
+    let learned = learn(fewer.as_ref().unwrap_or(&yardstick), &case, &judgement, options, drives.len());
     let held_at: Vec<usize> = match options.fit_on {
         Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
         None if total > 1 => (0..drives.len()).collect(),
@@ -332,22 +287,20 @@ pub fn diagnose(
     let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
-    let placebo = placebo(&case, &yardstick, &judgement);
-    let placebo_learned = placebo.as_ref().map(|(_, fit)| {
-        let of = |d: usize| if options.fit_on.is_some() { fit.effects() } else { fit.effects_without(d) };
-        (0..held.len()).map(|d| Learned { soil: SoilCorrection::NONE, effects: of(d) }).collect::<Vec<_>>()
-    });
-    let scores = if held.is_empty() {
-        None
-    } else {
-        Some(score_held_out(predictor, &held, &held_maps, &learned, placebo_learned.as_deref(), &options.scoring)?)
-    };
+    let mut scores = if held.is_empty() { None } else { Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?) };
     let (verdict, reason) = proven(&judgement, scores.as_ref());
-    let claimed = if matches!(verdict, Verdict::Explained | Verdict::Ambiguous) {
-        judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects()))
-    } else {
-        Vec::new()
+    let any = matches!(verdict, Verdict::Explained | Verdict::Ambiguous);
+    let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
+    let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: any, predictor, held_out: &places };
+    let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {
+        Some(scores) => {
+            progress("controls", 0, held.len());
+            score_controls(&setting, scores, &held, &held_maps, options)?
+        }
+        None => (Vec::new(), None),
     };
+    let null_drives = judge_by.as_ref().and_then(|j| setting.on_null_drives(&j.nulls));
+    let claimed = if any { judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects())) } else { Vec::new() };
     let estimates = if claimed.is_empty() {
         Vec::new()
     } else {
@@ -357,10 +310,12 @@ pub fn diagnose(
         verdict,
         reason,
         traces: case.traces(&judgement.selection, &claimed),
-        placebo: placebo.map(|(candidate, _)| candidate),
+        controls,
+        free_form,
+        null_drives,
         levels: levels(&case),
         catalogue: yardstick.catalogue,
-        channels,
+        channels: yardstick.channels,
         findings: judgement.findings,
         selection: judgement.selection,
         estimates,
@@ -372,26 +327,56 @@ pub fn diagnose(
     })
 }
 
-/// What each held-out drive is predicted with, of `drives` drives in all.
-fn learn(
-    judge_by: &Judge,
-    case: &Case<'_>,
-    judgement: &Judgement,
+/// Drives of a case with what they are compared with: a reference, or themselves.
+fn held_against<'a>(
+    judge_by: Option<&Judge>,
+    bench: Bench<'a>,
+    observed: Vec<ObservedDrive>,
     options: &Options,
-    drives: usize,
-) -> Result<Vec<Learned>, DiscoveryError> {
+    progress: OnProgress<'_>,
+) -> Result<(Case<'a>, Yardstick), DiscoveryError> {
+    let total = observed.len();
+    let Some(judge_by) = judge_by else {
+        let case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
+        let yardstick = own_yardstick(&case, &options.without)?;
+        return Ok((case, yardstick));
+    };
+    let case = judge_by.case(bench, observed, progress)?;
+    let yardstick = judge_by.yardstick(&case.metric.channels, total, &options.without)?;
+    Ok((case, yardstick))
+}
+
+/// Kind and number of parameters of each control, and the free form of what all drives leave.
+type Tried = (Vec<(Kind, usize)>, Option<Effect>);
+
+/// Makes the controls and adds their scores on the held-out drives to `scores`.
+fn score_controls(
+    setting: &Setting<'_>,
+    scores: &mut HeldOut,
+    held: &[Trajectory],
+    maps: &DriveMaps,
+    options: &Options,
+) -> Result<Tried, DiscoveryError> {
+    let (made, free_form) = setting.controls()?;
+    for control in &made {
+        let models: Vec<_> = control.predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
+        let score = score_models(held, maps, &models, control.parameters, &options.scoring, &scores.resamples)?;
+        scores.controls.push(score);
+    }
+    Ok((made.iter().map(|c| (c.kind, c.parameters)).collect(), free_form))
+}
+
+/// What each held-out drive is predicted with, of `drives` drives in all; `fewer` judges one drive less than were fitted.
+fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, options: &Options, drives: usize) -> Vec<Learned> {
     let total = case.prepared.len();
-    Ok(match options.fit_on {
+    match options.fit_on {
         Some(_) => {
             let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
             vec![Learned { soil: best_soil(case.condensed()), effects }; drives - total]
         }
-        None if total > 1 => {
-            let fewer = judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?;
-            leave_each_out(&fewer, case, judgement)
-        }
+        None if total > 1 => leave_each_out(fewer, case, judgement),
         None => Vec::new(),
-    })
+    }
 }
 
 /// Indices of the drives to fit on.
@@ -432,27 +417,6 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
             Learned { soil, effects }
         })
         .collect()
-}
-
-/// The strongest hypothesis that is neither chosen nor a rival nor of a chosen id, sized alone; `None` when nothing is claimed.
-fn placebo(case: &Case<'_>, yardstick: &Yardstick, judgement: &Judgement) -> Option<(Candidate, Fit)> {
-    let claimed = judgement.claimed();
-    let named: Vec<&str> = claimed
-        .iter()
-        .flat_map(|i| {
-            let f = &judgement.findings[*i];
-            f.rivals.iter().map(|r| r.candidate.id()).chain([f.candidate.id()])
-        })
-        .collect();
-    if named.is_empty() {
-        return None;
-    }
-    let z = &judgement.selection.z;
-    let open = (0..z.len()).filter(|h| z[*h].is_some() && !named.contains(&yardstick.catalogue[*h].id()));
-    let strongest = open.max_by(|a, b| z[*a].unwrap_or(0.0).total_cmp(&z[*b].unwrap_or(0.0)))?;
-    let group = yardstick.group(case.condensed());
-    let onsets = vec![None; yardstick.catalogue.len()];
-    Some((yardstick.catalogue[strongest], case.size(yardstick, &group, &[strongest], &onsets)))
 }
 
 /// Verdict after the proof on held-out drives.

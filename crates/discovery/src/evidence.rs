@@ -58,6 +58,15 @@ impl Nulls {
         Some(Self { share, typical, total, scatter })
     }
 
+    /// From the drives that are judged, against a model that is right on average: the scatter is theirs about their own mean, the share zero. `None` with
+    /// fewer than four.
+    pub fn about_zero(drives: &[&Condensed]) -> Option<Self> {
+        let measured = Self::new(drives)?;
+        let size = measured.share.len();
+        // The centre is known without drives.
+        Some(Self { share: DVector::zeros(size), total: DVector::from_element(size, f64::INFINITY), ..measured })
+    }
+
     /// A group of drives against these nulls.
     pub fn group<'a>(&self, drives: impl Iterator<Item = &'a Condensed>) -> Group {
         let size = self.share.len();

@@ -6,6 +6,7 @@ use nesam_physics::SoilCorrection;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
+use crate::channels::Row;
 use crate::condense::{Condensed, Signatures, difference, profiled};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
@@ -126,24 +127,31 @@ fn linearised(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &
     drives
         .par_iter()
         .map(|prepared| {
-            let at = |values: &[Vec<f64>]| prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
-            let mut columns = Vec::new();
-            for (t, term) in terms.iter().enumerate() {
-                for (i, f) in term.candidate.free().iter().enumerate() {
-                    let side = |sign: f64| {
-                        let mut moved = values.to_vec();
-                        moved[t][i] += sign * f.step;
-                        at(&moved)
-                    };
-                    // A parameter that cannot be negative, such as a delay, is differentiated forward at zero.
-                    let low = term.candidate.range(i)[0];
-                    let (less, factor) = if values[t][i] - f.step < low { (at(values), 1.0 / f.step) } else { (side(-1.0), 0.5 / f.step) };
-                    columns.push(difference(&less, &side(1.0), factor));
-                }
-            }
-            profiled(metric, &at(values), &columns, &prepared.signatures.soil)
+            let rows = prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
+            let columns = parameter_columns(bench, prepared, terms, values);
+            profiled(metric, &rows, &columns, &prepared.signatures.soil)
         })
         .collect()
+}
+
+/// How the deviations of a drive shift with each free parameter of the terms.
+pub fn parameter_columns(bench: &Bench<'_>, prepared: &Prepared, terms: &[Term], values: &[Vec<f64>]) -> Vec<Vec<Row>> {
+    let at = |values: &[Vec<f64>]| prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
+    let mut columns = Vec::new();
+    for (t, term) in terms.iter().enumerate() {
+        for (i, f) in term.candidate.free().iter().enumerate() {
+            let side = |sign: f64| {
+                let mut moved = values.to_vec();
+                moved[t][i] += sign * f.step;
+                at(&moved)
+            };
+            // A parameter that cannot be negative, such as a delay, is differentiated forward at zero.
+            let low = term.candidate.range(i)[0];
+            let (less, factor) = if values[t][i] - f.step < low { (at(values), 1.0 / f.step) } else { (side(-1.0), 0.5 / f.step) };
+            columns.push(difference(&less, &side(1.0), factor));
+        }
+    }
+    columns
 }
 
 /// A step from `values` on the drives in `kept`: where it leads, less `offset`, and its covariance in the metric.

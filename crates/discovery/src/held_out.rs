@@ -24,8 +24,8 @@ pub struct Learned {
 pub struct HeldOut {
     /// Before, soil only, after.
     pub scores: [ModelScore; 3],
-    /// With the strongest hypothesis that was not chosen, sized alone on the same drives.
-    pub placebo: Option<ModelScore>,
+    /// With each control, in the order of the diagnosis.
+    pub controls: Vec<ModelScore>,
     /// Before and after on the windows that end before every claimed effect begins; `None` where none does.
     pub before_onset: Option<[ModelScore; 2]>,
     /// Draws behind the intervals.
@@ -45,7 +45,7 @@ pub struct Scoring {
     pub seed: u64,
 }
 
-/// Rolls every window of the held-out drives out before, with the best soil, after, and with what the placebo taught. `learned[i]` belongs to `drives[i]`.
+/// Rolls every window of the held-out drives out before, with the best soil, and after. `learned[i]` belongs to `drives[i]`.
 ///
 /// # Errors
 /// `EvaluationError::NoWindows` when no window fits; the first error of the model.
@@ -54,13 +54,11 @@ pub fn score_held_out(
     drives: &[Trajectory],
     maps: &DriveMaps,
     learned: &[Learned],
-    placebo: Option<&[Learned]>,
     scoring: &Scoring,
 ) -> Result<HeldOut, EvaluationError> {
     let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
-    let patched = |learned: &[Learned]| learned.iter().map(|l| predictor.with_effects(&l.effects)).collect::<Vec<Predictor>>();
-    let (after, placebos) = (patched(learned), placebo.map(patched));
-    let paths: Vec<[PosePath; 4]> = windows
+    let after: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
+    let paths: Vec<[PosePath; 3]> = windows
         .par_iter()
         .map(|w| {
             let map = maps[w.drive].as_ref();
@@ -68,8 +66,7 @@ pub fn score_held_out(
             let before = with(predictor, SoilCorrection::NONE)?;
             let soil = with(predictor, learned[w.drive].soil)?;
             let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&after[w.drive], SoilCorrection::NONE)? };
-            let placebo = placebos.as_ref().map_or_else(|| Ok(before.clone()), |p| with(&p[w.drive], SoilCorrection::NONE))?;
-            Ok([before, soil, after, placebo])
+            Ok([before, soil, after])
         })
         .collect::<Result<_, EvaluationError>>()?;
     let resamples = Resamples::draw(drives.len(), scoring.resamples, scoring.seed);
@@ -83,10 +80,31 @@ pub fn score_held_out(
     let early: Vec<usize> = all.iter().copied().filter(|w| ends_before_onset(&windows[*w], &learned[windows[*w].drive])).collect();
     Ok(HeldOut {
         scores: core::array::from_fn(|m| of(m, &all)),
-        placebo: placebo.map(|_| of(3, &all)),
+        controls: Vec::new(),
         before_onset: (!early.is_empty()).then(|| [of(0, &early), of(2, &early)]),
         resamples,
     })
+}
+
+/// The same windows with another model and soil for each drive.
+///
+/// # Errors
+/// As [`score_held_out`].
+pub fn score_models(
+    drives: &[Trajectory],
+    maps: &DriveMaps,
+    models: &[(&Predictor, SoilCorrection)],
+    parameters: usize,
+    scoring: &Scoring,
+    resamples: &Resamples,
+) -> Result<ModelScore, EvaluationError> {
+    let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
+    let roll = |w: &Window<'_>| {
+        let (predictor, soil) = models[w.drive];
+        roll_out(predictor, Variant::Full, soil, w, None, maps[w.drive].as_ref())
+    };
+    let paths = windows.par_iter().map(roll).collect::<Result<_, _>>()?;
+    Ok(score(&ModelPaths { name: ModelName::Nesam, parameters, paths }, &windows, Truth::Measured, resamples))
 }
 
 /// Whether a window ends before any of the learned effects begins.

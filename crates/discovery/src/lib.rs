@@ -11,36 +11,46 @@
 //! 5. [`select`] chooses up to three effects with the rivals that the drives cannot tell from them; [`onset`] says when an effect began;
 //! 6. [`fit`] estimates sizes by Gauss-Newton; [`claims`] gives intervals and refuses what lies at a bound, is unstable or explains too little;
 //! 7. [`held_out`] predicts drives that were not fitted before, with the best soil alone, and with the effects;
-//! 8. [`diagnose`] does all of it, [`report`] writes JSON and HTML; [`bench`] measures how often it is right.
+//! 8. [`controls`] predicts the same drives with what else might explain them: rivals, a black box, a free form of what is left;
+//! 9. [`diagnose`] does all of it, [`report`] writes JSON and HTML; [`bench`] measures how often it is right.
+//!
+//! With [`Against::Physics`] the drives stand for themselves and the symbolic model itself is on trial.
 //!
 //! Ground truth is never read.
 #![forbid(unsafe_code)]
 
 pub mod bench;
+mod black_box;
 mod candidates;
 pub mod channels;
 pub mod claims;
 pub mod condense;
 mod consistency;
+pub mod controls;
 mod diagnose;
 mod error;
 pub mod evidence;
 pub mod fit;
+mod free_form;
 pub mod held_out;
+mod judge;
 mod manoeuvre;
 mod metric;
 mod observe;
 pub mod onset;
+mod own_reference;
 mod reference;
 pub mod report;
+mod ridge;
 pub mod select;
 mod tail;
 
 pub use candidates::{Candidate, catalogue};
 pub use claims::Estimate;
-pub use diagnose::{Diagnosis, Judge, Judgement, OnProgress, Options, Verdict, diagnose, judge};
+pub use diagnose::{Against, Diagnosis, Judgement, OnProgress, Options, Verdict, diagnose, judge};
 pub use error::DiscoveryError;
 pub use held_out::{HeldOut, Learned, Scoring};
+pub use judge::Judge;
 pub use metric::Metric;
 pub use observe::{Bench, ObservedDrive, Stepping, observe, observe_all};
 pub use reference::{DRIVES_MIN, NullGroups, Reference};

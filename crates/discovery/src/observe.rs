@@ -180,6 +180,36 @@ impl ObservedDrive {
         self.starts.iter().map(|&s| s as f64 * dt_s).collect()
     }
 
+    /// Number of samples with a transition.
+    pub fn samples(&self) -> usize {
+        self.transitions.len()
+    }
+
+    /// Last hidden layer of the network at a sample.
+    pub fn hidden(&self, k: usize) -> &[f32] {
+        &self.transitions[k].hidden
+    }
+
+    /// The same drive with something added to what the network says of each sample, per step: displacement in the heading frame (m), attitude (rad), velocities
+    /// in Body.
+    pub fn with_residual(&self, added: impl Fn(usize) -> [f64; STATE_DIM]) -> Self {
+        let mut changed = self.clone();
+        for (k, transition) in changed.transitions.iter_mut().enumerate() {
+            let added = added(k);
+            transition.residual = core::array::from_fn(|i| transition.residual[i] + added[i]);
+        }
+        changed
+    }
+
+    /// Forward speed (m/s), road-wheel angle of the front wheels (rad) and mean slope of the ground ahead and to the left at every sample.
+    pub fn conditions(&self) -> impl Iterator<Item = [f64; 4]> {
+        self.transitions.iter().zip(&self.states).map(|(t, state)| {
+            let mean = |of: &dyn Fn(usize) -> f64, count: usize| (0..count).map(of).sum::<f64>() / count as f64;
+            let slope = [mean(&|i| t.input.ground[i].slope_ahead, WHEELS), mean(&|i| t.input.ground[i].slope_left, WHEELS)];
+            [state.velocity_m_s[0], mean(&|i| t.input.wheels.angle_rad[i], 2), slope[0], slope[1]]
+        })
+    }
+
     fn reading(&self, bench: &Bench<'_>, effects: &[Effect]) -> Reading {
         let vehicle = bench.vehicle.with_effects(effects);
         let states: Vec<VehicleState<f64>> = self.states.iter().map(|s| vehicle.effects.sensor.to_true(s)).collect();

@@ -1,14 +1,15 @@
 //! The JSON (`nesam.diagnose/1`) and the HTML page of a diagnosis.
 
 use nesam_evaluation::report::{LinePlot, Page, Series, Table};
-use nesam_evaluation::{DIMENSION_KEYS, ErrorTree, POSE_DIM, Provenance, paired_difference};
+use nesam_evaluation::{DIMENSION_KEYS, ErrorTree, ModelScore, POSE_DIM, Provenance, paired_difference};
 use nesam_physics::effects::Layer;
 use serde_json::{Value, json};
 
 use crate::candidates::Candidate;
 use crate::channels;
 use crate::claims::{Finding, Trace};
-use crate::diagnose::{Diagnosis, Verdict};
+use crate::controls::Kind;
+use crate::diagnose::{Against, Diagnosis, Verdict};
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
@@ -24,10 +25,14 @@ pub struct Report<'a> {
     pub diagnosis: &'a Diagnosis,
     /// Folder of the patched bundle, where one was written.
     pub bundle: Option<&'a str>,
+    /// Folder of the bundle that has the free form too, where one was written.
+    pub free_form_bundle: Option<&'a str>,
     /// What it was computed from.
     pub provenance: &'a Provenance,
     /// Step of the model, s.
     pub dt_s: f64,
+    /// What the drives were held against.
+    pub against: Against,
 }
 
 impl Report<'_> {
@@ -61,6 +66,7 @@ impl Report<'_> {
             "considered": self.considered(),
             "learned_per_held_out_drive": self.learned(),
             "stop_rule": STOP_RULE,
+            "reference": match self.against { Against::Bundle => "bundle", Against::Physics => "physics" },
             "provenance": self.provenance,
         });
         let map = document.as_object_mut().expect("an object was built; this is a bug");
@@ -68,25 +74,51 @@ impl Report<'_> {
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
     }
 
-    /// What would expose a fake. No black box is refitted and no free form is offered by this version.
+    /// What would expose a fake.
     fn controls(&self) -> Value {
         let d = self.diagnosis;
         let scores = d.scores.as_ref();
-        let placebo = d.placebo.zip(scores.and_then(|s| s.placebo.as_ref())).map(|(candidate, score)| {
-            let mut tree = json!(score.summary);
-            if let Some(map) = tree.as_object_mut() {
-                map.insert("id".into(), json!(candidate.id()));
+        let early = scores.and_then(|s| s.before_onset.as_ref());
+        let of = |wanted: &dyn Fn(&Kind) -> bool| -> Vec<Value> {
+            self.control_scores()
+                .filter(|(kind, ..)| wanted(kind))
+                .map(|(kind, parameters, score)| control_json(kind, parameters, score))
+                .collect()
+        };
+        let free_form = of(&|k| matches!(k, Kind::FreeForm)).pop().map(|mut tree| {
+            if let (Some(map), Some(effect)) = (tree.as_object_mut(), &d.free_form) {
+                let parameters: Vec<Value> =
+                    effect.parameters().iter().map(|p| json!({"name": p.name, "unit": p.unit, "value": p.value})).collect();
+                map.insert("effect".into(), json!({"id": effect.id(), "layer": effect.layer().as_str(), "parameters": parameters}));
+                map.insert("before".into(), json!(scores.map(|s| &s.scores[2].summary)));
+                map.insert("bundle".into(), json!(self.free_form_bundle));
             }
             tree
         });
-        let early = scores.and_then(|s| s.before_onset.as_ref());
+        let null_drives = d.null_drives.as_ref().map(|n| {
+            json!({
+                "drives": n.null.len(),
+                "helped": n.null.iter().filter(|g| **g > 0.0).count(),
+                "mean_gain": mean(&n.null),
+                "mean_gain_on_these_drives": mean(&n.fitted),
+                "unit": "fall of the squared distance of a drive, in the metric of the reference, by the fitted size",
+            })
+        });
         json!({
-            "black_box_refit": null,
-            "placebo_rival": placebo,
+            "black_box_refit": of(&|k| matches!(k, Kind::BlackBox)).pop(),
+            "placebo_rival": of(&|k| matches!(k, Kind::Placebo(_))).pop(),
+            "rivals_refitted": of(&|k| matches!(k, Kind::Rival(_))),
             "before_onset": early.map(|[_, after]| &after.summary),
             "before_onset_without_effect": early.map(|[before, _]| &before.summary),
-            "free_form": null,
+            "free_form": free_form,
+            "null_drives": null_drives,
         })
+    }
+
+    /// Kind, number of parameters and score of each control.
+    fn control_scores(&self) -> impl Iterator<Item = (Kind, usize, &ModelScore)> {
+        let d = self.diagnosis;
+        d.controls.iter().zip(d.scores.iter().flat_map(|s| &s.controls)).map(|((kind, parameters), score)| (*kind, *parameters, score))
     }
 
     /// Mean deviation of every compared channel and how unusual it is.
@@ -161,6 +193,7 @@ impl Report<'_> {
         if let Some(scores) = &d.scores {
             page.section("Error before, with soil alone, after").table(&self.error_table());
             let plots: Vec<LinePlot> = (0..=POSE_DIM).rev().map(|c| self.curve(scores, c)).collect();
+            self.controls_section(&mut page);
             page.section("Error over the horizon")
                 .plots(&plots, "Mean absolute error after each step on drives that were not fitted; bands are 95 % intervals.");
         }
@@ -170,6 +203,46 @@ impl Report<'_> {
             .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
             .footer("data", &p.data_hash);
         page.render()
+    }
+
+    fn controls_section(&self, page: &mut Page) {
+        let rows: Vec<_> = self.control_scores().collect();
+        if rows.is_empty() {
+            return;
+        }
+        let head: Vec<&str> =
+            ["control", "parameters"].into_iter().chain(DIMENSION_KEYS).chain(["position mean", "position at K"]).collect();
+        let mut table = Table::new("Mean absolute error over the horizon on held-out drives", &head);
+        let named = self.stages().into_iter().filter(|(name, _)| *name != STAGES[1]).map(|(name, tree)| (name.to_string(), None, tree));
+        let controls = rows.iter().map(|(kind, parameters, score)| (control_name(kind), Some(*parameters), &score.summary.tree));
+        for (name, parameters, tree) in named.chain(controls) {
+            let numbers = tree.mae_mean.to_array().into_iter().chain([tree.position_m.mean, tree.position_m.final_]);
+            let cells = numbers.map(|v| v.map_or("-".to_string(), |v| format!("{v:.3}")).into());
+            table.row([name.into(), parameters.map_or("-".to_string(), |p| p.to_string()).into()].into_iter().chain(cells).collect());
+        }
+        page.section("Controls that would expose a fake")
+            .text(
+                "The same held-out drives with what else might explain them: the strongest hypothesis that was not named, each rival refitted in the place of the named effect, \
+                 the refitted head of the learned residual (no physics, no effect), and the named effects with a bounded free-form wrench fitted to what they leave, \
+                 which has no cause and no name. A named effect earns its place when it does with a few parameters what the black box needs many for.",
+            )
+            .table(&table);
+        if let Some(n) = &self.diagnosis.null_drives {
+            page.text(&format!(
+                "On {} drives without an effect the same sizes would lower the squared distance of {} (mean change {:+.1} a drive); on these drives the mean is {:+.1}.",
+                n.null.len(),
+                n.null.iter().filter(|g| **g > 0.0).count(),
+                -mean(&n.null),
+                -mean(&n.fitted)
+            ));
+        }
+        if let Some(effect) = &self.diagnosis.free_form {
+            let mut table = Table::new("The free form: coefficients and valid region", &["parameter", "value", "unit"]);
+            for p in effect.parameters() {
+                table.row(vec![p.name.into(), format!("{:.4}", p.value).into(), p.unit.into()]);
+            }
+            page.table(&table);
+        }
     }
 
     fn level_table(&self) -> Table {
@@ -233,6 +306,13 @@ impl Report<'_> {
         table
     }
 
+    /// Name and errors of each control.
+    pub fn control_errors(&self) -> Vec<(String, &ErrorTree<f64>)> {
+        self.control_scores()
+            .map(|(kind, parameters, score)| (format!("{} ({parameters})", control_name(&kind)), &score.summary.tree))
+            .collect()
+    }
+
     /// Name and errors of before, soil only, after.
     pub fn stages(&self) -> Vec<(&'static str, &ErrorTree<f64>)> {
         self.diagnosis.scores.iter().flat_map(|s| STAGES.into_iter().zip(s.scores.iter().map(|m| &m.summary.tree))).collect()
@@ -261,6 +341,31 @@ impl Report<'_> {
         }
         plot
     }
+}
+
+fn mean(values: &[f64]) -> f64 {
+    values.iter().sum::<f64>() / values.len().max(1) as f64
+}
+
+/// A control in words.
+pub fn control_name(kind: &Kind) -> String {
+    match kind {
+        Kind::Placebo(candidate) => format!("placebo: {}", candidate.label()),
+        Kind::Rival(candidate) => format!("rival: {}", candidate.label()),
+        Kind::BlackBox => "black box".into(),
+        Kind::FreeForm => "with free form".into(),
+    }
+}
+
+fn control_json(kind: Kind, parameters: usize, score: &ModelScore) -> Value {
+    let mut tree = json!(score.summary);
+    if let Some(map) = tree.as_object_mut() {
+        map.insert("parameters".into(), json!(parameters));
+        if let Kind::Placebo(candidate) | Kind::Rival(candidate) = kind {
+            map.insert("id".into(), json!(candidate.id()));
+        }
+    }
+    tree
 }
 
 fn trace_plot(trace: &Trace) -> LinePlot {

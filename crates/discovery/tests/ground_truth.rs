@@ -21,9 +21,19 @@ fn report(root: &Path) -> String {
     let drives = root.load_set(&SetQuery::all(SET)).unwrap();
     let maps: Vec<_> = drives.iter().map(|d| d.world.as_deref().map(|w| root.world(w).unwrap())).collect();
     let predictor = Predictor::new(Arc::new(common::bundle())).unwrap();
-    let found = diagnose(&predictor, &drives, &maps, &common::options(), &|_, _, _| {}).unwrap();
+    let found =
+        diagnose(&predictor, &drives, &maps, &nesam_discovery::Options { controls: true, ..common::options() }, &|_, _, _| {}).unwrap();
     let provenance = Provenance::default();
-    Report { set: SET, diagnosis: &found, bundle: None, provenance: &provenance, dt_s: 0.1 }.to_json()
+    Report {
+        set: SET,
+        diagnosis: &found,
+        bundle: None,
+        free_form_bundle: None,
+        provenance: &provenance,
+        dt_s: 0.1,
+        against: Default::default(),
+    }
+    .to_json()
 }
 
 #[test]

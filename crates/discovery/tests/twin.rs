@@ -5,7 +5,8 @@
 mod common;
 
 use common::{bundle, diagnose_from, diagnose_twin, drive, options, world};
-use nesam_discovery::{Bench, Diagnosis, Stepping, Verdict, observe};
+use nesam_discovery::controls::Kind;
+use nesam_discovery::{Against, Bench, Diagnosis, Stepping, Verdict, observe};
 use nesam_model::ModelBundle;
 use nesam_physics::effects::{Effect, Payload, ScheduledEffect, SteeringOffset, WheelDrag};
 
@@ -95,9 +96,51 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
 }
 
 #[test]
-fn property_an_effect_left_out_is_never_claimed() {
-    let options = nesam_discovery::Options { without: vec!["steering_offset".into()], ..options() };
+fn property_controls_stand_beside_a_named_effect() {
+    let options = nesam_discovery::Options { controls: true, ..options() };
     let found = diagnose_twin(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })], 500, &options);
+    let scores = found.scores.as_ref().unwrap();
+    let yaw = |score: &nesam_evaluation::ModelScore| score.summary.tree.mae_mean.yaw_deg.unwrap();
+    let of = |wanted: &dyn Fn(&Kind) -> bool| {
+        let at = found.controls.iter().position(|(kind, _)| wanted(kind)).unwrap();
+        yaw(&scores.controls[at])
+    };
+    let [before, _, after] = scores.scores.each_ref().map(yaw);
+    let (placebo, black_box) = (of(&|k| matches!(k, Kind::Placebo(_))), of(&|k| matches!(k, Kind::BlackBox)));
+    eprintln!("yaw {before:.3} -> after {after:.3}; placebo {placebo:.3}, black box {black_box:.3}");
+    assert!(after < placebo && after < before, "the named effect beats one that is not there");
+    assert!(black_box < before, "a black box learns a part of it");
+    let nulls = found.null_drives.as_ref().unwrap();
+    assert!(nulls.null.iter().all(|g| *g < 0.0), "the effect helps no drive without it: {:?}", nulls.null);
+    assert!(nulls.fitted.iter().sum::<f64>() > 0.0);
+}
+
+#[test]
+fn property_the_model_itself_on_trial_lacks_what_all_drives_have() {
+    // The twin is the symbolic model: without an effect it lacks nothing, and no reference is read.
+    let options = nesam_discovery::Options { against: Against::Physics, ..options() };
+    let found = diagnose_twin(&[], 800, &options);
+    assert!(found.claimed.is_empty(), "{}; z {:?}", found.reason, found.selection.z);
+    let found = diagnose_twin(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })], 500, &options);
+    assert!(explained_by(&found, "steering_offset"));
+    let (second, ci95) = value(&found, "second");
+    assert!((second - 0.08).abs() < 0.008, "{second} {ci95:?}");
+}
+
+#[test]
+fn property_an_effect_left_out_is_never_claimed() {
+    let options =
+        nesam_discovery::Options { without: vec!["steering_offset".into(), "steering_ratio".into()], controls: true, ..options() };
+    let found = diagnose_twin(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })], 500, &options);
+    if found.claimed.is_empty() {
+        // What has no name is taken up by the free form, on drives that it was not fitted on, and gets none.
+        let scores = found.scores.as_ref().unwrap();
+        let free = found.controls.iter().position(|(kind, _)| matches!(kind, Kind::FreeForm)).unwrap();
+        let yaw = |score: &nesam_evaluation::ModelScore| score.summary.tree.mae_mean.yaw_deg.unwrap();
+        let [before, with] = [yaw(&scores.scores[0]), yaw(&scores.controls[free])];
+        assert!(with < 0.8 * before, "{before} -> {with}");
+        assert_eq!(found.free_form.unwrap().id(), "free_form");
+    }
     assert!(found.findings.iter().all(|f| f.candidate.id() != "steering_offset"));
     assert!(found.claimed.iter().all(|e| e.effect.id() != "steering_offset"));
 }

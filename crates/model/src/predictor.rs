@@ -146,6 +146,25 @@ impl Predictor {
         }
     }
 
+    /// The same predictor with changed weights of the residual head: what a refit of the learned residual on few drives can change. `weight` is added to
+    /// the weights (12, 128), `bias` to the biases (12). The bundle's hash stays that of the files it was read from.
+    ///
+    /// # Errors
+    /// `ModelError::Weights` when the bundle has no such head or the changes have another length.
+    pub fn with_residual_head(&self, weight: &[f32], bias: &[f32]) -> Result<Self, ModelError> {
+        let mut bundle = (*self.bundle).clone();
+        for (name, change) in [("residual.weight", weight), ("residual.bias", bias)] {
+            let fail = |reason: &str| ModelError::Weights { name: name.into(), reason: reason.into() };
+            let own = bundle.weights.values_mut(name).ok_or_else(|| fail("is missing"))?;
+            if own.len() != change.len() {
+                return Err(fail("is changed by another number of values than it has"));
+            }
+            own.iter_mut().zip(change).for_each(|(own, change)| *own += change);
+        }
+        let network = Arc::new(FusedTransformer::new(&bundle.weights)?.on(self.network.path()));
+        Ok(Self { network, bundle: Arc::new(bundle), ..self.with_effects::<ScheduledEffect>(&[]) })
+    }
+
     /// The bundle behind the predictions.
     pub fn bundle(&self) -> &ModelBundle {
         &self.bundle

@@ -51,7 +51,7 @@ impl StepModel {
         }
     }
 
-    /// Adds drag, tow and wind to the generalised force (N, N m) about the reference point, Body.
+    /// Adds drag, tow, wind and a free form to the generalised force (N, N m) about the reference point, Body.
     #[cold]
     #[inline(never)]
     pub(crate) fn add_body_forces<T: Real>(&self, state: &VehicleState<T>, input: &StepInput<T>, tilt: &Tilt<T>, rhs: &mut [T; 6]) {
@@ -70,6 +70,14 @@ impl StepModel {
             rhs[axis] = rhs[axis] + force[axis];
         }
         rhs[4] = rhs[4] + T::lit(terms.tow_moment_n_m);
+        if terms.free_form.acts() {
+            let mean = |of: &dyn Fn(usize) -> T, count: usize| (1..count).fold(of(0), |sum, i| sum + of(i)) * T::lit(1.0 / count as f64);
+            let [ahead, left] = [mean(&|i| input.ground[i].slope_ahead, 4), mean(&|i| input.ground[i].slope_left, 4)];
+            let wrench = terms.free_form.at(v[0], mean(&|i| input.wheels.angle_rad[i], 2), ahead, left);
+            for (sum, part) in rhs.iter_mut().zip(wrench.as_flattened()) {
+                *sum = *sum + *part;
+            }
+        }
     }
 
     /// Road-wheel angle under the side force of steady cornering, rad.

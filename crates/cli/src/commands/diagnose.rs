@@ -1,16 +1,16 @@
 //! `nesam diagnose`: from a measured residual to the physical effect that the model lacks.
 
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex};
+use std::sync::Mutex;
 
 use clap::Args;
 use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
-use nesam_discovery::{Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM};
 use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
 use nesam_physics::Vehicle;
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::{Effect, ScheduledEffect};
 
 use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
@@ -44,6 +44,9 @@ pub struct DiagnoseArgs {
     /// Measure the reference on the drives of the train split that training left for validation, and put it into the bundle
     #[arg(long, conflicts_with_all = ["fit_on", "without"])]
     make_reference: bool,
+    /// Leave out the controls: rivals refitted, a black box, a free form of what is left
+    #[arg(long)]
+    no_controls: bool,
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -62,15 +65,21 @@ pub struct DiagnoseArgs {
 enum ReferenceArg {
     /// The change against the frozen bundle.
     Bundle,
-    /// The physics itself.
+    /// The symbolic model itself, the network silent but for its soil prior; at least 8 drives to fit on.
     Physics,
+}
+
+impl From<ReferenceArg> for Against {
+    fn from(reference: ReferenceArg) -> Self {
+        match reference {
+            ReferenceArg::Bundle => Self::Bundle,
+            ReferenceArg::Physics => Self::Physics,
+        }
+    }
 }
 
 /// Runs the command.
 pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
-    if args.reference == ReferenceArg::Physics {
-        return Err(Failure::input("--reference physics is not supported by this version; use --reference bundle"));
-    }
     if let Some(unknown) = args.without.iter().find(|id| !Effect::IDS.contains(&id.as_str())) {
         return Err(Failure::input(format!("--without {unknown}: no such effect; the catalogue has {}", Effect::IDS.join(", "))));
     }
@@ -139,16 +148,35 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let options = Options {
         fit_on: args.fit_on.clone(),
         without: args.without.clone(),
+        against: args.reference.into(),
         scoring: Scoring { horizon: args.window.horizon, history: args.window.history, resamples: DEFAULT_RESAMPLES, seed: args.seed },
+        controls: !args.no_controls,
     };
     let console = Console::default();
     let found =
         diagnose(&predictor, &drives.drives, &drives.maps, &options, &|stage, done, total| console.show(stage, done, total)).or_input()?;
     console.end();
-    let bundle = patched(&predictor, &found, &drives, &out)?;
-    let shown = bundle.as_ref().map(|p| p.display().to_string());
+    let bundle = match found.claimed.as_slice() {
+        [] => None,
+        claimed => Some(patched(&predictor, claimed, &drives, &out.join("bundle"))?),
+    };
+    let with_free_form: Vec<ScheduledEffect> = found.claimed.iter().copied().chain(found.free_form.map(Into::into)).collect();
+    // What silences the network finds is no addition to a network that speaks.
+    let free_form_bundle = match found.free_form.filter(|_| args.reference == ReferenceArg::Bundle) {
+        None => None,
+        Some(_) => Some(patched(&predictor, &with_free_form, &drives, &out.join("bundle-free-form"))?),
+    };
+    let [shown, free_form_bundle] = [bundle, free_form_bundle].map(|b| b.map(|p| p.display().to_string()));
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
-    let report = Report { set: &drives.set, diagnosis: &found, bundle: shown.as_deref(), provenance: &provenance, dt_s: args.data.dt };
+    let report = Report {
+        set: &drives.set,
+        diagnosis: &found,
+        bundle: shown.as_deref(),
+        free_form_bundle: free_form_bundle.as_deref(),
+        provenance: &provenance,
+        dt_s: args.data.dt,
+        against: args.reference.into(),
+    };
     summary(&report, &found);
     let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
     let (json, html) = (at(&args.json, "diagnose.json"), at(&args.html, "diagnose.html"));
@@ -158,13 +186,10 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Writes the bundle with the effect, where one is claimed.
-fn patched(predictor: &Arc<Predictor>, found: &Diagnosis, drives: &Drives, out: &Path) -> Result<Option<PathBuf>, Failure> {
-    if found.claimed.is_empty() {
-        return Ok(None);
-    }
+/// Writes the bundle with effects.
+fn patched(predictor: &Predictor, effects: &[ScheduledEffect], drives: &Drives, to: &Path) -> Result<PathBuf, Failure> {
     let base = predictor.bundle();
-    let mut bundle = base.with_effects(&found.claimed);
+    let mut bundle = base.with_effects(effects);
     bundle.provenance = Provenance {
         command: command_line(),
         data_hash: drives.root.hash(),
@@ -172,14 +197,21 @@ fn patched(predictor: &Arc<Predictor>, found: &Diagnosis, drives: &Drives, out: 
         parent: Some(base.hash.clone()),
         ..base.provenance.clone()
     };
-    Ok(Some(bundle.save(&out.join("bundle")).or_failed()?))
+    bundle.save(to).or_failed()
 }
 
 fn summary(report: &Report<'_>, found: &Diagnosis) {
     say!("{}: {} - {}", report.set, found.verdict.as_str().to_uppercase(), found.reason);
     let s = &found.selection;
     let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
-    say!("\nevidence against drives without an effect (threshold z = {:.2}{p})", s.threshold);
+    say!(
+        "\nevidence against {} (threshold z = {:.2}{p})",
+        match report.against {
+            Against::Bundle => "drives without an effect",
+            Against::Physics => "random signs of the drives",
+        },
+        s.threshold
+    );
     let mut order: Vec<usize> = (0..found.catalogue.len()).filter(|e| s.z[*e].is_some()).collect();
     order.sort_by(|a, b| s.z[*b].unwrap_or(0.0).total_cmp(&s.z[*a].unwrap_or(0.0)));
     for e in order.into_iter().take(SHOWN) {
@@ -208,7 +240,7 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
         return;
     }
     say!(
-        "\n{:<22}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}",
+        "\n{:<28}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}{:>9}",
         "drives not fitted",
         "x m",
         "y m",
@@ -219,14 +251,19 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
         "pos. m",
         "final m"
     );
-    for (name, tree) in stages {
+    let stages = stages.into_iter().map(|(name, tree)| (name.to_string(), tree));
+    for (name, tree) in stages.chain(report.control_errors()) {
         let numbers: [Option<f64>; POSE_DIM] = tree.mae_mean.to_array();
         let cells: String = numbers
             .iter()
             .chain([&tree.position_m.mean, &tree.position_m.final_])
             .map(|v| v.map_or("        –".into(), |v| format!("{v:9.3}")))
             .collect();
-        say!("{name:<22}{cells}");
+        say!("{name:<28}{cells}");
+    }
+    if let Some(n) = &found.null_drives {
+        let helped = n.null.iter().filter(|g| **g > 0.0).count();
+        say!("the same effects on {} drives without one: they would help {helped}", n.null.len());
     }
     if found.learned.iter().all(|l| l.effects.is_empty()) {
         return;

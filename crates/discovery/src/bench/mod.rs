@@ -14,6 +14,7 @@
 //! | `null_noise` | nothing, with twice the noise |
 
 mod change;
+mod comparators;
 mod score;
 
 use std::sync::Arc;
@@ -25,11 +26,18 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 
 pub use change::{Change, apply};
-pub use score::{Outcome, Scores, scores};
+pub use comparators::Comparison;
+pub use score::{MethodScores, Outcome, Scores, clopper_pearson, method_scores, scores};
 
-use crate::diagnose::{Judge, judge};
+use self::comparators::Compared;
+use crate::diagnose::judge;
 use crate::error::DiscoveryError;
+use crate::held_out::Scoring;
+use crate::judge::Judge;
 use crate::observe::{Bench, Stepping, observe, observe_all};
+use rand::SeedableRng;
+use rand::seq::index::sample;
+use rand_chacha::ChaCha8Rng;
 
 /// Drives of a pseudo-vehicle.
 pub const DRIVES: usize = 5;
@@ -145,19 +153,28 @@ impl Stage<'_> {
         self.drives.len() / DRIVES
     }
 
-    /// Hides something in a group of drives and diagnoses it.
+    /// Drives of a group: the first [`Stage::groups`] are disjoint, further ones are drawn at random and overlap with others.
+    fn members(&self, group: usize) -> Vec<usize> {
+        if group < self.groups() {
+            // Drives are sorted by id and so by world: every sixth mixes worlds.
+            return (0..DRIVES).map(|i| i * self.groups() + group).collect();
+        }
+        let mut members = sample(&mut ChaCha8Rng::seed_from_u64(group as u64), self.drives.len(), DRIVES).into_vec();
+        members.sort_unstable();
+        members
+    }
+
+    /// Hides something in a group of drives and diagnoses it; with `scoring`, other methods do so too.
     ///
     /// # Errors
     /// Those of the diagnosis.
-    pub fn run(&self, hidden: &Hidden, group: usize) -> Result<Outcome, DiscoveryError> {
+    pub fn run(&self, hidden: &Hidden, group: usize, scoring: Option<&Scoring>) -> Result<Outcome, DiscoveryError> {
         let start = Instant::now();
         let bundle = self.predictor.bundle();
         let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
         let bench = Bench { vehicle: &bundle.vehicle, stepping };
-        // Drives are sorted by id and so by world: every sixth mixes worlds.
-        let members: Vec<usize> = (0..DRIVES).map(|i| i * self.groups() + group % self.groups()).collect();
         let (mut drives, mut maps) = (Vec::new(), Vec::new());
-        for &m in &members {
+        for m in self.members(group) {
             let (mut drive, mut map) = (self.drives[m].clone(), self.maps[m].clone());
             if !hidden.driven.is_empty() {
                 let effects: Vec<ScheduledEffect> =
@@ -176,6 +193,17 @@ impl Stage<'_> {
         let mut case = judge_by.case(bench, observed, &|_, _, _| {})?;
         let yardstick = judge_by.yardstick(&case.metric.channels.clone(), DRIVES, &hidden.without)?;
         let judgement = judge(&mut case, &yardstick);
-        Ok(Outcome::of(hidden, group, &judgement, start.elapsed().as_secs_f64()))
+        let seconds = start.elapsed().as_secs_f64();
+        let comparisons = match scoring {
+            None => Vec::new(),
+            Some(scoring) => {
+                let (case, yardstick, judgement, predictor) = (&case, &yardstick, &judgement, self.predictor);
+                Compared { predictor, case, yardstick, judgement, hidden, drives: &drives, maps: &maps }.all(scoring)?
+            }
+        };
+        Ok(Outcome { comparisons, ..Outcome::of(hidden, group, &judgement, seconds) })
     }
 }
+
+/// Methods that are compared.
+pub const METHODS: [&str; 7] = ["diagnosis", "oracle", "soil_only", "ridge", "stlsq", "black_box", "free_form"];

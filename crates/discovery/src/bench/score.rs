@@ -2,7 +2,7 @@
 
 use serde::Serialize;
 
-use super::Hidden;
+use super::{Comparison, Hidden};
 use crate::claims::Finding;
 use crate::diagnose::{Judgement, Verdict};
 use crate::report::describe;
@@ -41,6 +41,9 @@ pub struct Outcome {
     pub claims: Vec<Claim>,
     /// Time of the diagnosis, s.
     pub seconds: f64,
+    /// What other methods made of it; empty when they were not asked.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub comparisons: Vec<Comparison>,
 }
 
 impl Outcome {
@@ -66,6 +69,7 @@ impl Outcome {
             evidence: [judgement.selection.largest(), judgement.selection.threshold],
             claims: judgement.claimed().into_iter().map(|i| claim(&judgement.findings[i])).collect(),
             seconds,
+            comparisons: Vec::new(),
         }
     }
 
@@ -127,6 +131,8 @@ pub struct Scores {
     pub set_size: Option<f64>,
     /// Something was claimed where nothing is.
     pub false_alarm: Option<f64>,
+    /// 95 % interval of the rate of false alarms (Clopper and Pearson 1934), as if the groups were independent.
+    pub false_alarm_ci95: Option<[f64; 2]>,
     /// Something was claimed that is not there.
     pub wrong_claim: f64,
     /// Something differs, and nothing was claimed.
@@ -137,7 +143,7 @@ pub struct Scores {
     pub ci_coverage: Option<f64>,
     /// Median error of the onset, s.
     pub onset_error_median_s: Option<f64>,
-    /// Share of the gain of the true effect that is reached; not measured here.
+    /// Share of the gain of the refitted true effects that is reached on drives that were not fitted; `None` without comparators.
     pub share_of_oracle: Option<f64>,
 }
 
@@ -162,11 +168,96 @@ pub fn scores(runs: &[&Outcome]) -> Scores {
         set_coverage: claimable.then(|| share(&Outcome::covered)),
         set_size: mean(&classes),
         false_alarm: null.then(|| share(&|r| !r.claims.is_empty())),
+        false_alarm_ci95: null.then(|| clopper_pearson(runs.iter().filter(|r| !r.claims.is_empty()).count(), runs.len())),
         wrong_claim: share(&Outcome::wrong),
         unexplained: share(&|r| r.verdict == Verdict::Unexplained.as_str()),
         magnitude_error_median: median(&sizes.iter().map(|s| s.0).collect::<Vec<_>>()),
         ci_coverage: mean(&sizes.iter().map(|s| f64::from(u8::from(s.1))).collect::<Vec<_>>()),
         onset_error_median_s: median(&onsets),
-        share_of_oracle: None,
+        share_of_oracle: share_of_oracle(runs, "diagnosis"),
+    }
+}
+
+/// Scores of a method over the runs of a set.
+#[derive(Clone, Debug, Serialize)]
+pub struct MethodScores {
+    /// Runs.
+    pub runs: usize,
+    /// Share of the gain of the oracle.
+    pub share_of_oracle: Option<f64>,
+    /// Mean over runs of (error with the method) / (error before).
+    pub error_ratio: Option<f64>,
+    /// Share of runs with one effect whose strongest name is right.
+    pub top1: Option<f64>,
+    /// Share of null runs in which it names something.
+    pub false_alarm: Option<f64>,
+}
+
+/// Scores of one method over the runs of one set.
+pub fn method_scores(runs: &[&Outcome], method: &str) -> MethodScores {
+    let of: Vec<(&Outcome, &Comparison)> =
+        runs.iter().filter_map(|r| Some((*r, r.comparisons.iter().find(|c| c.method == method)?))).collect();
+    let share = |is: &dyn Fn(&Outcome, &Comparison) -> bool| of.iter().filter(|(r, c)| is(r, c)).count() as f64 / of.len().max(1) as f64;
+    let known = !of.is_empty() && of.iter().all(|(r, _)| !r.truth.is_empty());
+    let null = !of.is_empty() && of.iter().all(|(r, _)| r.set.starts_with("null"));
+    MethodScores {
+        runs: of.len(),
+        share_of_oracle: share_of_oracle(runs, method),
+        error_ratio: (!of.is_empty()).then(|| of.iter().map(|(_, c)| c.error_ratio).sum::<f64>() / of.len() as f64),
+        top1: known.then(|| share(&|r, c| c.named.first().is_some_and(|id| r.truth.iter().any(|(t, _)| t == id)))),
+        false_alarm: null.then(|| share(&|_, c| !c.named.is_empty())),
+    }
+}
+
+/// Sum of the gains of a method over that of the oracle, over the runs that have one; `None` where the oracle gains nothing.
+fn share_of_oracle(runs: &[&Outcome], method: &str) -> Option<f64> {
+    let gain = |r: &Outcome, method: &str| r.comparisons.iter().find(|c| c.method == method).map(|c| 1.0 - c.error_ratio);
+    let pairs: Vec<(f64, f64)> = runs.iter().filter_map(|r| Some((gain(r, method)?, gain(r, "oracle")?))).collect();
+    let best: f64 = pairs.iter().map(|p| p.1).sum();
+    (best > 0.0).then(|| pairs.iter().map(|p| p.0).sum::<f64>() / best)
+}
+
+/// Exact 95 % interval of a rate from `hits` of `runs` (Clopper and Pearson 1934), by bisection of the binomial tails.
+pub fn clopper_pearson(hits: usize, runs: usize) -> [f64; 2] {
+    const TAIL: f64 = 0.025;
+    if runs == 0 {
+        return [0.0, 1.0];
+    }
+    // P(X <= k) for X binomial(runs, p).
+    let below = |k: usize, p: f64| -> f64 {
+        let (mut ln_choose, mut sum) = (0.0f64, 0.0f64);
+        for i in 0..=k {
+            if i > 0 {
+                ln_choose += (((runs - i + 1) as f64) / i as f64).ln();
+            }
+            sum += (ln_choose + i as f64 * p.ln() + (runs - i) as f64 * (-p).ln_1p()).exp();
+        }
+        sum
+    };
+    let root = |is_low: &dyn Fn(f64) -> bool| {
+        let (mut low, mut high) = (0.0, 1.0);
+        for _ in 0..60 {
+            let middle = 0.5 * (low + high);
+            if is_low(middle) { low = middle } else { high = middle }
+        }
+        0.5 * (low + high)
+    };
+    let lower = if hits == 0 { 0.0 } else { root(&|p| 1.0 - below(hits - 1, p) < TAIL) };
+    let upper = if hits == runs { 1.0 } else { root(&|p| below(hits, p) > TAIL) };
+    [lower, upper]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::clopper_pearson;
+
+    #[test]
+    fn published_exact_intervals_of_a_rate() {
+        // 0 of n: upper end 1 - 0.025^(1/n). 5 of 60 and 10 of 10: tables of the exact interval.
+        let close = |got: [f64; 2], want: [f64; 2]| got.iter().zip(want).all(|(g, w)| (g - w).abs() < 5e-4);
+        assert!(close(clopper_pearson(0, 6), [0.0, 1.0 - 0.025f64.powf(1.0 / 6.0)]), "{:?}", clopper_pearson(0, 6));
+        assert!(close(clopper_pearson(0, 60), [0.0, 0.0596]), "{:?}", clopper_pearson(0, 60));
+        assert!(close(clopper_pearson(10, 10), [0.6915, 1.0]), "{:?}", clopper_pearson(10, 10));
+        assert!(close(clopper_pearson(5, 10), [0.1871, 0.8129]), "{:?}", clopper_pearson(5, 10));
     }
 }

@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nesam_discovery::{Bench, Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
@@ -175,7 +175,13 @@ pub fn bundle() -> ModelBundle {
 
 /// Options of a quick diagnosis.
 pub fn options() -> Options {
-    Options { fit_on: None, without: Vec::new(), scoring: Scoring { horizon: 16, history: 16, resamples: 1000, seed: 1 } }
+    Options {
+        fit_on: None,
+        without: Vec::new(),
+        against: Against::Bundle,
+        scoring: Scoring { horizon: 16, history: 16, resamples: 1000, seed: 1 },
+        controls: false,
+    }
 }
 
 /// Diagnoses eight twin drives with effects.

@@ -102,6 +102,11 @@ impl<const H: usize> BlockCache<H> {
         }
     }
 
+    /// What the heads were given at the last step of one of the 16 samples of a lane.
+    pub fn hidden(&self, lane: usize) -> [f32; HIDDEN] {
+        core::array::from_fn(|i| self.buffers.normal[i][0].0[lane])
+    }
+
     /// Forgets the steps, for another block of samples.
     pub fn clear(&mut self) {
         self.steps = 0;

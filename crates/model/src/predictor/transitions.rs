@@ -28,6 +28,8 @@ pub struct Transition {
     pub control: Control<f64>,
     /// Learned state residual Δx_res: displacement in the heading frame (m), attitude (rad), velocities in Body.
     pub residual: [f64; STATE_DIM],
+    /// Last hidden layer of the network, of which the residual is a linear function.
+    pub hidden: [f32; HIDDEN],
     /// False when a wheel stands off the map.
     pub ground_known: bool,
 }
@@ -80,7 +82,7 @@ impl Predictor {
             let lanes: [Row<1>; STATE_CONTROL] = entries.map(|entry| [Lane([entry; LANES])]);
             let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane([token[i]; LANES])]);
             let said = self.network.step(&prefix, &mut cache, &lanes, &context);
-            let transition = self.transition_from(&sample, control, &ground, &token, &said);
+            let transition = Transition { hidden: cache.hidden(0), ..self.transition_from(&sample, control, &ground, &token, &said) };
             transitions.push(transition);
             if transitions.len() == controls.len() {
                 break; // nothing starts from the end of the last one
@@ -136,6 +138,7 @@ impl Predictor {
             actuators: [sample.actuators, after],
             control: *control,
             residual: core::array::from_fn(|i| f64::from(said.residual[i][0][0] * scales.residual_scale[i])),
+            hidden: [0.0; HIDDEN],
             ground_known: known,
         }
     }

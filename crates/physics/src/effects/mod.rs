@@ -142,6 +142,7 @@ catalogue! {
     SlipSinkage MultiPass ElasticRecovery ThetaMShift Grousers FrontBulldozing SideBulldozing
     RollStiffness PitchStiffness MapTilt MapOffset SoilDrift
     GyroBias GyroScale VelocityScale PositionLatency LeverArm MountAngle ClockDrift FrictionCap SoilCrust
+    FreeForm
 }
 
 impl Effect {

@@ -55,7 +55,7 @@ fn mirrored(effect: &Effect) -> Effect {
 
 #[test]
 fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
-    assert_eq!(Effect::IDS.len(), 45);
+    assert_eq!(Effect::IDS.len(), 46);
     for (i, effect) in Effect::examples().iter().enumerate() {
         assert_eq!(Effect::IDS[i], effect.id());
         assert_eq!(Effect::IDS.iter().filter(|id| **id == effect.id()).count(), 1);
@@ -115,7 +115,7 @@ fn property_the_mirror_image_of_every_effect_mirrors_the_drive() {
 #[test]
 fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
     // Channel of the state (x y z roll pitch yaw v ω) and direction, in a left turn while speeding up.
-    const EXPECTED: [(&str, usize, f64); 44] = [
+    const EXPECTED: [(&str, usize, f64); 45] = [
         ("payload", 2, -1.0),
         ("cg_forward", 4, 1.0),
         ("cg_lateral", 3, -1.0),
@@ -160,6 +160,7 @@ fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
         ("clock_drift", 0, -1.0),
         ("friction_cap", 5, -1.0),
         ("soil_crust", 2, -1.0),
+        ("free_form", 6, -1.0),
     ];
     let plain = drive(&truck(), &[], 0.6, 30).to_array();
     let mut wrong = Vec::new();

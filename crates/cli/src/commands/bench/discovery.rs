@@ -4,8 +4,8 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
-use nesam_discovery::Judge;
-use nesam_discovery::bench::{Hidden, Outcome, Scores, Stage, plan, scores};
+use nesam_discovery::bench::{Hidden, METHODS, MethodScores, Outcome, Scores, Stage, method_scores, plan, scores};
+use nesam_discovery::{Judge, Scoring};
 use serde_json::json;
 
 use crate::args::{BundleArgs, DataArgs};
@@ -13,6 +13,9 @@ use crate::failure::{Failure, OrFail};
 use crate::output::{provenance, say, write_file};
 use crate::progress::Progress;
 use crate::sources::{check_model_step, load_bundle_for, predictor_for, validation_drives};
+
+/// Rollouts by which methods are compared.
+const SCORING: Scoring = Scoring { horizon: 32, history: 32, resamples: 10, seed: 1 };
 
 /// Options of `nesam bench discovery`.
 #[derive(Args, Debug)]
@@ -30,6 +33,12 @@ pub(super) struct DiscoveryBench {
     /// Take only every n-th hidden effect
     #[arg(long, value_name = "N", default_value_t = 1)]
     every_hidden: usize,
+    /// Groups without an effect for each null set; the first are disjoint, further ones are drawn at random and overlap [default: the disjoint ones]
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    nulls: usize,
+    /// Let other methods try too: the refitted true effect, soil alone, ridge and STLSQ over the whole catalogue, a black box, a free form
+    #[arg(long)]
+    comparators: bool,
     /// Write the figures as JSON (schema nesam.bench.discovery/1)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -51,7 +60,7 @@ pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
     let progress = Progress::start("pseudo-vehicles", runs.len());
     let mut outcomes = Vec::new();
     for (done, (hidden, group)) in runs.iter().enumerate() {
-        outcomes.push(stage.run(hidden, *group).or_failed()?);
+        outcomes.push(stage.run(hidden, *group, args.comparators.then_some(&SCORING)).or_failed()?);
         progress.set(done + 1);
     }
     progress.finish();
@@ -59,13 +68,19 @@ pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
     for outcome in &outcomes {
         sets.entry(outcome.set).or_default().push(outcome);
     }
+    let compared: Vec<&str> = METHODS.into_iter().filter(|_| args.comparators).collect();
+    let comparators: BTreeMap<&str, BTreeMap<&str, MethodScores>> =
+        compared.iter().map(|m| (*m, sets.iter().map(|(name, runs)| (*name, method_scores(runs, m))).collect())).collect();
     let sets: BTreeMap<&str, Scores> = sets.into_iter().map(|(name, runs)| (name, scores(&runs))).collect();
     print(&outcomes, &sets);
+    if args.comparators {
+        print_comparators(&comparators);
+    }
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.bench.discovery/1",
         "sets": sets,
-        "comparators": {},
+        "comparators": comparators,
         "runs": outcomes,
         "provenance": provenance(Some(predictor.bundle()), &drives),
     });
@@ -86,8 +101,27 @@ fn chosen(args: &DiscoveryBench, groups: usize) -> Result<Vec<(Hidden, usize)>, 
     let effects = effects.into_iter().step_by(args.every_hidden).enumerate();
     let mut runs: Vec<(Hidden, usize)> =
         effects.flat_map(|(i, h)| (0..args.groups.min(groups)).map(move |g| (h.clone(), (i + g) % groups))).collect();
-    runs.extend(nulls.into_iter().flat_map(|h| (0..groups).map(move |g| (h.clone(), g))));
+    let count = if args.nulls == 0 { groups } else { args.nulls };
+    runs.extend(nulls.into_iter().flat_map(|h| (0..count).map(move |g| (h.clone(), g))));
     Ok(runs)
+}
+
+/// Share of the oracle's gain, ratio of errors, and what is named, by method and set.
+fn print_comparators(comparators: &BTreeMap<&str, BTreeMap<&str, MethodScores>>) {
+    say!("\n{:<12}{:<12}{:>6}{:>17}{:>13}{:>7}{:>13}", "method", "set", "runs", "share of oracle", "error ratio", "top-1", "false alarm");
+    let show = |v: Option<f64>| v.map_or("–".to_string(), |v| format!("{v:.2}"));
+    for (method, sets) in comparators {
+        for (set, s) in sets {
+            say!(
+                "{method:<12}{set:<12}{:>6}{:>17}{:>13}{:>7}{:>13}",
+                s.runs,
+                show(s.share_of_oracle),
+                show(s.error_ratio),
+                show(s.top1),
+                show(s.false_alarm)
+            );
+        }
+    }
 }
 
 fn print(outcomes: &[Outcome], sets: &BTreeMap<&str, Scores>) {
@@ -150,5 +184,8 @@ fn print(outcomes: &[Outcome], sets: &BTreeMap<&str, Scores>) {
             show(s.ci_coverage),
             show(s.onset_error_median_s)
         );
+        if let (Some(rate), Some([low, high])) = (s.false_alarm, s.false_alarm_ci95) {
+            say!("{:<12}false alarms {rate:.3} of {} runs, 95 % interval as if they were independent [{low:.3}, {high:.3}]", "", s.runs);
+        }
     }
 }

@@ -3,6 +3,7 @@
 mod cg_forward;
 mod cg_height;
 mod cg_lateral;
+mod free_form;
 mod friction_cap;
 mod linear_drag;
 mod payload;
@@ -19,6 +20,7 @@ mod wind;
 pub use cg_forward::CgForward;
 pub use cg_height::CgHeight;
 pub use cg_lateral::CgLateral;
+pub use free_form::{FREE_FORM_AXES, FREE_FORM_FEATURES, FreeForm};
 pub use friction_cap::FrictionCap;
 pub use linear_drag::LinearDrag;
 pub use payload::Payload;
@@ -63,6 +65,8 @@ pub struct ForceTerms {
     pub roll_pitch_stiffness: [f64; 2],
     /// 1 / μ of a cap on the tangential force of a wheel; 0 = none.
     pub friction_cap_inverse: f64,
+    /// A wrench without a cause.
+    pub free_form: FreeForm,
 }
 
 impl ForceTerms {
@@ -73,6 +77,7 @@ impl ForceTerms {
             || self.tow_n != 0.0
             || self.tow_moment_n_m != 0.0
             || self.wind_n != [0.0; 2]
+            || self.free_form.acts()
     }
 
     /// Whether a wheel is another one than the card's, but for friction torques.
