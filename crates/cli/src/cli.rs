@@ -32,8 +32,9 @@ const EXAMPLES: &str = "Examples:
   nesam serve --record DIR                    the same, and write all of it down
   nesam replay DIR                            does it give the same answers here, bit for bit?
   nesam bench predict                         milliseconds per planner query on this machine
+  nesam import LOG.csv --to ROOT --set NAME --vehicle CARD.json
   nesam inspect deploy/bundles/NAME           what a bundle holds and where it comes from
-  nesam check ROOT                            what is wrong with a data root, bundle or configuration
+  nesam check ROOT                            what is wrong with a data root, bundle or configuration; do units and frames fit?
 
 Exit codes: 0 done, 1 failed, 2 wrong usage or input. `nesam COMMAND --help` explains one command.";
 
@@ -65,6 +66,8 @@ enum Command {
     Inside(commands::inside::InsideArgs),
     /// Measure what answers cost on this machine
     Bench(commands::bench::BenchArgs),
+    /// Turn logs of other tools (CSV, ROS 2 bags) into a set of a data root: columns, units, frames, gaps
+    Import(commands::import::ImportArgs),
     /// Say what a bundle or a data root holds
     Inspect(commands::inspect::InspectArgs),
     /// Say what is wrong with a data root, a bundle or a configuration
@@ -96,6 +99,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Train(args)) => commands::train::run(&args),
         Some(Command::Inside(args)) => commands::inside::run(&args),
         Some(Command::Bench(args)) => commands::bench::run(&args),
+        Some(Command::Import(args)) => commands::import::run(&args),
         Some(Command::Inspect(args)) => commands::inspect::run(&args),
         Some(Command::Check(args)) => commands::check::run(&args),
     }

@@ -2,6 +2,7 @@
 
 mod consistency;
 mod discovery;
+mod page;
 mod serve;
 mod sweep;
 
@@ -73,6 +74,9 @@ struct PredictBench {
     /// Write the figures as JSON (schema nesam.bench/1)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+    /// Write the figures as a page with plots
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
 }
 
 /// Memory of the commands' noise from step to step, as sampling planners draw it.
@@ -174,6 +178,9 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
             100.0 * hit,
             100.0 * error
         );
+    }
+    if let Some(file) = &args.html {
+        write_file(file, page::predict_page(&figures).as_bytes())?;
     }
     match &args.json {
         Some(file) => {

@@ -4,7 +4,9 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
+use nesam_import::{Doubt, card_doubts, doubts};
 use nesam_model::{ModelBundle, Predictor};
+use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, Trajectory};
 
 use crate::args::{DataArgs, SplitArg};
@@ -12,6 +14,9 @@ use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
 use crate::output::say;
 use crate::sources::query;
+
+/// Heights of a vehicle that follows its map spread less than this about their mean, m (chosen; the simulated drives have 0.03).
+const HEIGHT_SPREAD_M: f64 = 0.5;
 
 /// Options of `nesam check`.
 #[derive(Args, Debug)]
@@ -28,12 +33,25 @@ pub struct CheckArgs {
 #[derive(Default)]
 struct Findings {
     errors: Vec<String>,
+    doubts: Vec<String>,
     notes: Vec<String>,
 }
 
 impl Findings {
+    fn verdict(&self) -> String {
+        match (self.errors.len(), self.doubts.len()) {
+            (0, 0) => "sound".into(),
+            (0, doubts) => format!("readable; doubts: {doubts}"),
+            (errors, _) => format!("errors: {errors}"),
+        }
+    }
+
     fn error(&mut self, text: impl Into<String>) {
         self.errors.push(text.into());
+    }
+
+    fn doubt(&mut self, place: &str, doubt: &Doubt) {
+        self.doubts.push(format!("{place}: {}; {}", doubt.what, doubt.advice));
     }
 
     fn note(&mut self, text: impl Into<String>) {
@@ -41,7 +59,7 @@ impl Findings {
     }
 }
 
-/// Runs the command: exit code 2 when anything is wrong.
+/// Runs the command: exit code 2 when anything is wrong. A doubt is no error: what is odd may be true.
 pub fn run(args: &CheckArgs) -> Result<(), Failure> {
     let mut wrong = 0;
     for path in &args.paths {
@@ -51,10 +69,13 @@ pub fn run(args: &CheckArgs) -> Result<(), Failure> {
         for note in &findings.notes {
             say!("  note: {note}");
         }
+        for doubt in &findings.doubts {
+            say!("  doubt: {doubt}");
+        }
         for error in &findings.errors {
             say!("  error: {error}");
         }
-        say!("  {}", if findings.errors.is_empty() { "sound".to_string() } else { format!("errors: {}", findings.errors.len()) });
+        say!("  {}", findings.verdict());
         wrong += findings.errors.len();
     }
     if wrong > 0 {
@@ -109,6 +130,7 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     if root.vehicle().inertia_estimated {
         findings.note(format!("card of `{}` gives no inertia: a box estimate is used", root.vehicle().name));
     }
+    card_doubts(root.vehicle()).iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", root.vehicle().name), doubt));
     if root.sets().is_empty() {
         findings.error("no set: no folder with index.parquet or index.json and samples.parquet");
     }
@@ -125,12 +147,14 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     };
     let samples: usize = drives.iter().map(|d| d.states.len()).sum();
     findings.note(format!("set {set}: {} drives, {samples} samples at {} s", drives.len(), args.dt));
+    doubts(&drives, root.vehicle()).iter().for_each(|doubt| findings.doubt(&format!("set {set}"), doubt));
     let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();
     worlds.sort_unstable();
     worlds.dedup();
     for world in &worlds {
-        if let Err(e) = root.world(world) {
-            findings.error(format!("set {set}: world {world}: {}", chain(&e)));
+        match root.world(world) {
+            Err(e) => findings.error(format!("set {set}: world {world}: {}", chain(&e))),
+            Ok(map) => heights(&drives, world, &map, set, findings),
         }
     }
     let without = drives.iter().filter(|d| d.world.is_none()).count();
@@ -140,6 +164,32 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     let refused: Vec<String> = drives.iter().filter_map(|d| out_of_range(root, d)).collect();
     if let Some(first) = refused.first() {
         findings.note(format!("set {set}: {} drives command beyond the card's range, first {first}", refused.len()));
+    }
+}
+
+/// Whether the drives follow the ground of their map.
+fn heights(drives: &[Trajectory], world: &str, map: &WorldMap, set: &str, findings: &mut Findings) {
+    let there = drives.iter().filter(|d| d.world.as_deref() == Some(world)).flat_map(|d| &d.states);
+    let mut above: Vec<f64> = Vec::new();
+    let mut outside = 0;
+    for [x, y, z] in there.map(|s| s.position_m) {
+        match map.height_m(x, y) {
+            Some(ground) => above.push(z - ground),
+            None => outside += 1,
+        }
+    }
+    if outside * 10 > above.len() {
+        findings.doubts.push(format!(
+            "set {set}: {outside} of {} positions lie off map {world} or in its holes; is it of this place, in this frame?",
+            outside + above.len()
+        ));
+    }
+    let mean = above.iter().sum::<f64>() / above.len().max(1) as f64;
+    let spread = (above.iter().map(|h| (h - mean).powi(2)).sum::<f64>() / above.len().max(1) as f64).sqrt();
+    if spread > HEIGHT_SPREAD_M {
+        findings.doubts.push(format!(
+            "set {set}: heights do not follow map {world}: {mean:.2} ± {spread:.2} m above it; is it of this place, in this frame?"
+        ));
     }
 }
 

@@ -8,6 +8,7 @@ pub mod demo;
 pub mod diagnose;
 pub mod evaluate;
 pub mod fleet;
+pub mod import;
 pub mod inside;
 pub mod inspect;
 pub mod navigate;

@@ -77,8 +77,13 @@ impl LinePlot {
         let (x_range, y_range) = self.ranges();
         let x = Linear::new(x_range, [LEFT, WIDTH - RIGHT]);
         let y = Linear::new(y_range, [HEIGHT - BOTTOM, TOP]);
-        let mut svg =
-            format!("<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{}\">\n", escape(&self.title));
+        let near = if self.equal_aspect { "point" } else { "abscissa" };
+        let mut svg = format!(
+            "<svg class=\"plot\" viewBox=\"0 0 {WIDTH} {HEIGHT}\" role=\"img\" aria-label=\"{}\" data-near=\"{near}\" data-frame=\"{LEFT} {TOP} {} {}\">\n",
+            escape(&self.title),
+            WIDTH - RIGHT,
+            HEIGHT - BOTTOM
+        );
         self.axes(&mut svg, x_range, y_range, &x, &y);
         for s in &self.series {
             draw_band(&mut svg, s, &x, &y);

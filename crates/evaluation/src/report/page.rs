@@ -112,17 +112,51 @@ svg .hit { fill: transparent; stroke: none; } svg .hit:hover { fill: var(--ink);
 .s3 { stroke: var(--c3); fill: var(--c3); } .s4 { stroke: var(--c4); fill: var(--c4); } .s5 { stroke: var(--c5); fill: var(--c5); }
 .s6 { stroke: var(--c6); fill: var(--c6); }
 path.line { fill: none; stroke-width: 2; stroke-linejoin: round; } path.band { stroke: none; fill-opacity: .16; }
+svg .probe { stroke: var(--ink); stroke-opacity: .6; fill: none; pointer-events: none; }
+#note { position: fixed; z-index: 2; background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: .25rem .6rem;
+  font-size: .8rem; font-variant-numeric: tabular-nums; pointer-events: none; box-shadow: 0 1px 6px #0003; }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); color: var(--soft); font-size: .85rem; }
 dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; } dd { margin: 0; overflow-wrap: anywhere; }
-@media print { button { display: none; } }
+@media print { button, #note { display: none; } }
 "#;
 
 const SCRIPT: &str = r#"
-document.querySelectorAll('button[data-copy]').forEach(b => b.addEventListener('click', () => {
+document.querySelectorAll('button[data-copy]').forEach(b => b.addEventListener('click', async () => {
   const rows = [...b.nextElementSibling.querySelectorAll('tr')];
   const text = rows.map(r => [...r.cells].map(c => c.innerText.trim()).join('\t')).join('\n');
-  navigator.clipboard.writeText(text).then(() => { b.textContent = 'copied'; setTimeout(() => b.textContent = 'copy table', 1500); });
+  const say = t => { b.textContent = t; setTimeout(() => b.textContent = 'copy table', 1500); };
+  try { await navigator.clipboard.writeText(text); say('copied'); } catch {
+    // A browser that gives no clipboard to files: the table is selected instead.
+    getSelection().selectAllChildren(b.nextElementSibling); say('selected, press ctrl-c');
+  }
 }));
+const note = document.createElement('div');
+note.id = 'note'; note.hidden = true; document.body.append(note);
+document.querySelectorAll('svg.plot').forEach(svg => {
+  const dots = [...svg.querySelectorAll('circle.hit')].map(c => {
+    const title = c.querySelector('title'), dot = { x: +c.getAttribute('cx'), y: +c.getAttribute('cy'), text: title.textContent };
+    title.remove();
+    return dot;
+  });
+  const probe = document.createElementNS(svg.namespaceURI, 'path');
+  probe.setAttribute('class', 'probe'); svg.append(probe);
+  const leave = () => { note.hidden = true; probe.setAttribute('d', ''); };
+  svg.addEventListener('pointerleave', leave);
+  svg.addEventListener('pointermove', e => {
+    if (!dots.length) return;
+    const p = new DOMPoint(e.clientX, e.clientY).matrixTransform(svg.getScreenCTM().inverse());
+    const far = svg.dataset.near === 'point' ? d => Math.hypot(d.x - p.x, d.y - p.y) : d => Math.abs(d.x - p.x);
+    const near = dots.reduce((a, b) => far(b) < far(a) ? b : a);
+    // Along a curve all lines are read at once; on a path the point that is nearest.
+    const read = svg.dataset.near === 'point' ? [near] : dots.filter(d => Math.abs(d.x - near.x) < .6).sort((a, b) => a.y - b.y);
+    const [, top,, bottom] = svg.dataset.frame.split(' ').map(Number);
+    probe.setAttribute('d', svg.dataset.near === 'point' ? `M${near.x - 5} ${near.y}h10m-5-5v10` : `M${near.x} ${top}V${bottom}`);
+    note.replaceChildren(...read.map(d => Object.assign(document.createElement('div'), { textContent: d.text })));
+    note.hidden = false;
+    note.style.left = `${Math.min(e.clientX + 14, innerWidth - note.offsetWidth - 8)}px`;
+    note.style.top = `${Math.min(e.clientY + 14, innerHeight - note.offsetHeight - 8)}px`;
+  });
+});
 "#;
 
 #[cfg(test)]

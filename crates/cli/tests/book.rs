@@ -1,0 +1,64 @@
+//! Goal: the book leads somewhere. Method: every shell block after `<!-- run -->` is run with the real binary, every link within the book is followed.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+fn repository() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
+}
+
+/// Markdown files of the book, decisions included.
+fn pages() -> Vec<PathBuf> {
+    let docs = repository().join("docs");
+    let of = |folder: PathBuf| std::fs::read_dir(folder).unwrap().flatten().map(|entry| entry.path());
+    of(docs.clone()).chain(of(docs.join("adr"))).filter(|path| path.extension().is_some_and(|e| e == "md")).collect()
+}
+
+/// Shell blocks that are marked to be run.
+fn commands(text: &str) -> Vec<&str> {
+    let blocks = text.split("<!-- run -->\n```sh\n").skip(1);
+    blocks.map(|rest| rest.split("```").next().unwrap()).collect()
+}
+
+#[test]
+fn service_commands_of_the_book_run() {
+    let binary = Path::new(env!("CARGO_BIN_EXE_nesam")).parent().unwrap().to_path_buf();
+    let path = format!("{}:{}", binary.display(), std::env::var("PATH").unwrap_or_default());
+    let mut ran = 0;
+    for page in pages() {
+        let text = std::fs::read_to_string(&page).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        for block in commands(&text) {
+            let output = Command::new("bash")
+                .args(["-euo", "pipefail", "-c", block])
+                .current_dir(folder.path())
+                .env("PATH", &path)
+                .env("REPO", repository())
+                .output()
+                .unwrap();
+            let said = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+            assert!(output.status.success(), "{}:\n{block}\n{said}", page.display());
+            assert!(!said.contains("doubt:"), "{}:\n{block}\n{said}", page.display());
+            ran += 1;
+        }
+    }
+    assert!(ran >= 3, "{ran} blocks were run");
+}
+
+#[test]
+fn property_links_of_the_book_lead_to_files() {
+    for page in pages() {
+        let text = std::fs::read_to_string(&page).unwrap();
+        for link in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
+            let target = link.split('#').next().unwrap_or_default();
+            if !target.is_empty() && !target.contains("://") && !target.contains(' ') {
+                assert!(page.parent().unwrap().join(target).exists(), "{}: `{link}` leads nowhere", page.display());
+            }
+        }
+    }
+    let summary = std::fs::read_to_string(repository().join("docs/SUMMARY.md")).unwrap();
+    for page in pages().iter().filter(|page| page.parent().is_some_and(|folder| folder.ends_with("docs"))) {
+        let name = page.file_name().unwrap().to_string_lossy().into_owned();
+        assert!(name == "SUMMARY.md" || summary.contains(&format!("({name})")), "{name} is not in the book");
+    }
+}

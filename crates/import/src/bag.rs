@@ -1,0 +1,252 @@
+//! ROS 2 bags in MCAP files: odometry, commands and, where it is wanted, another gyro.
+//!
+//! One row per odometry message. Commands hold until the next one, as the vehicle does; a gyro reading counts until the next one. Commands without a
+//! stamp of their own count from when they were recorded, and so does everything when the stamps of the odometry are of another clock.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::BufReader;
+use std::path::Path;
+
+use nesam_mcap::{ReadError, Reader, Record};
+
+use crate::cdr::{Odometry, ackermann, imu, odometry, twist};
+use crate::error::ImportError;
+use crate::log::Log;
+use crate::part::Notes;
+
+/// Stamps further from the recorder's clock than this are of another one, ns.
+const CLOCKS_APART_NS: i64 = 1_000_000_000;
+
+/// Topics to read; `None` = the only one of a type that fits.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Topics {
+    /// nav_msgs/Odometry.
+    pub odometry: Option<String>,
+    /// geometry_msgs/Twist(Stamped) or ackermann_msgs/AckermannDrive(Stamped).
+    pub command: Option<String>,
+    /// sensor_msgs/Imu whose angular velocity replaces that of the odometry; `None` = that of the odometry.
+    pub imu: Option<String>,
+}
+
+const ODOMETRY: &[&str] = &["nav_msgs/msg/Odometry"];
+const COMMANDS: &[&str] = &[
+    "geometry_msgs/msg/Twist",
+    "geometry_msgs/msg/TwistStamped",
+    "ackermann_msgs/msg/AckermannDrive",
+    "ackermann_msgs/msg/AckermannDriveStamped",
+];
+const IMU: &[&str] = &["sensor_msgs/msg/Imu"];
+
+/// Messages of a bag: by topic the type, when each was recorded in ns, and its bytes.
+type Messages = BTreeMap<String, (String, Vec<(i64, Vec<u8>)>)>;
+
+/// Reads a bag as a log with the columns `t x y z qx qy qz qw vbx vby vbz wx wy wz cmd_speed` and `cmd_yaw_rate` or `cmd_road_wheel_angle`.
+///
+/// # Errors
+/// `ImportError::Log` when the file is no MCAP file or compressed, a topic is missing, ambiguous or of another type, or a message is not readable.
+pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportError> {
+    let (messages, mut notes) = messages(path)?;
+    let pick = |wanted: &Option<String>, types: &[&str], option: &str| choose(path, &messages, wanted.as_deref(), types, option);
+    let (_, odometries) = pick(&topics.odometry, ODOMETRY, "--odometry")?;
+    let (kind, commands) = pick(&topics.command, COMMANDS, "--command")?;
+    let gyro = topics.imu.as_ref().map(|_| pick(&topics.imu, IMU, "--imu")).transpose()?;
+
+    let unreadable = |topic: &str, at: usize| ImportError::log(path, format!("{topic} message {at} is not readable as little-endian CDR"));
+    let mut rows: Vec<(i64, Odometry)> = Vec::new();
+    for (at, (recorded_ns, bytes)) in odometries.iter().enumerate() {
+        rows.push((*recorded_ns, odometry(bytes).ok_or_else(|| unreadable("odometry", at))?));
+    }
+    let mut apart: Vec<i64> = rows.iter().map(|(recorded_ns, o)| (recorded_ns - o.stamp_ns).abs()).collect();
+    apart.sort_unstable();
+    let foreign_clock = apart.get(apart.len() / 2).is_some_and(|ns| *ns > CLOCKS_APART_NS);
+    if foreign_clock {
+        notes.push("the stamps of the odometry are of another clock than the recorder's: times of recording are used".into());
+    }
+    let stamped = kind.ends_with("Stamped");
+    let read: fn(&[u8], bool) -> Option<[f64; 2]> = if kind.starts_with("ackermann") { ackermann } else { twist };
+    let mut told: Vec<(i64, [f64; 2])> = Vec::new();
+    for (at, (recorded_ns, bytes)) in commands.iter().enumerate() {
+        told.push((*recorded_ns, read(bytes, stamped).ok_or_else(|| unreadable("command", at))?));
+    }
+    let mut turned: Vec<(i64, [f64; 3])> = Vec::new();
+    for (at, (recorded_ns, bytes)) in gyro.iter().flat_map(|(_, messages)| messages.iter()).enumerate() {
+        let (stamp_ns, rates) = imu(bytes).ok_or_else(|| unreadable("imu", at))?;
+        turned.push((if foreign_clock { *recorded_ns } else { stamp_ns }, rates));
+    }
+    let times: Vec<i64> = rows.iter().map(|(recorded_ns, o)| if foreign_clock { *recorded_ns } else { o.stamp_ns }).collect();
+    Ok((log(path, &times, &rows, (kind, told.as_slice()), gyro.is_some().then_some(turned.as_slice())), notes))
+}
+
+fn log(
+    path: &Path,
+    times: &[i64],
+    rows: &[(i64, Odometry)],
+    (kind, told): (&str, &[(i64, [f64; 2])]),
+    turned: Option<&[(i64, [f64; 3])]>,
+) -> Log {
+    let first = times.iter().min().copied().unwrap_or(0);
+    let mut log = Log { path: path.into(), rows: rows.len(), places: (0..rows.len()).collect(), ..Log::default() };
+    let mut add = |name: &str, of: &dyn Fn(usize) -> Option<f64>| log.numbers.push((name.into(), (0..rows.len()).map(of).collect()));
+    // Nanoseconds since 1970 have more digits than a float.
+    add("t", &|i| Some((times[i] - first) as f64 * 1e-9));
+    for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
+        add(name, &|i| Some(rows[i].1.position[axis]));
+    }
+    for (axis, name) in ["qx", "qy", "qz", "qw"].into_iter().enumerate() {
+        add(name, &|i| Some(rows[i].1.orientation[axis]));
+    }
+    for (axis, name) in ["vbx", "vby", "vbz"].into_iter().enumerate() {
+        add(name, &|i| Some(rows[i].1.linear[axis]));
+    }
+    for (axis, name) in ["wx", "wy", "wz"].into_iter().enumerate() {
+        add(name, &|i| match turned {
+            Some(turned) => held(turned, times[i]).map(|rates| rates[axis]),
+            None => Some(rows[i].1.angular[axis]),
+        });
+    }
+    let second = if kind.starts_with("ackermann") { "cmd_road_wheel_angle" } else { "cmd_yaw_rate" };
+    for (entry, name) in ["cmd_speed", second].into_iter().enumerate() {
+        add(name, &|i| held(told, times[i]).map(|command| command[entry]));
+    }
+    log
+}
+
+/// The last entry at or before an instant; entries ascend in time.
+fn held<T: Copy>(entries: &[(i64, T)], at_ns: i64) -> Option<T> {
+    entries[..entries.partition_point(|(ns, _)| *ns <= at_ns)].last().map(|(_, value)| *value)
+}
+
+fn messages(path: &Path) -> Result<(Messages, Notes), ImportError> {
+    let file = File::open(path).map_err(|source| ImportError::file(path, source))?;
+    let mut reader = Reader::new(BufReader::new(file));
+    let (mut types, mut channels) = (BTreeMap::new(), BTreeMap::new());
+    let (mut messages, mut notes) = (Messages::new(), Notes::new());
+    loop {
+        match reader.next_record() {
+            Ok(Some(Record::Schema { id, name, .. })) => drop(types.insert(id, name)),
+            Ok(Some(Record::Channel { id, schema_id, topic, .. })) => {
+                let name = types.get(&schema_id).cloned().unwrap_or_default();
+                messages.entry(topic.clone()).or_insert((name, Vec::new()));
+                channels.insert(id, topic);
+            }
+            Ok(Some(Record::Message { channel_id, log_time_ns, data, .. })) => {
+                let held = channels.get(&channel_id).and_then(|topic| messages.get_mut(topic));
+                // What is not needed is not kept: bags hold images.
+                if let Some((_, kept)) = held.filter(|(name, _)| [ODOMETRY, COMMANDS, IMU].concat().contains(&name.as_str())) {
+                    kept.push((i64::try_from(log_time_ns).unwrap_or(i64::MAX), data));
+                }
+            }
+            Ok(Some(_)) => {}
+            Ok(None) => break,
+            Err(ReadError::CutOff) => {
+                notes.push("the bag was cut off: what is whole of it is used".into());
+                break;
+            }
+            Err(error) => return Err(ImportError::log(path, error.to_string())),
+        }
+    }
+    messages.values_mut().for_each(|(_, kept)| kept.sort_by_key(|(ns, _)| *ns));
+    Ok((messages, notes))
+}
+
+/// Type and messages of a topic.
+fn choose<'a>(
+    path: &Path,
+    messages: &'a Messages,
+    wanted: Option<&str>,
+    types: &[&str],
+    option: &str,
+) -> Result<(&'a str, &'a [(i64, Vec<u8>)]), ImportError> {
+    let fit: Vec<&String> =
+        messages.iter().filter(|(_, (name, kept))| types.contains(&name.as_str()) && !kept.is_empty()).map(|(t, _)| t).collect();
+    let listed = |topics: &[&String]| topics.iter().map(|t| t.as_str()).collect::<Vec<_>>().join(", ");
+    let topic = match (wanted, fit.as_slice()) {
+        (Some(wanted), _) => fit.iter().find(|topic| topic.as_str() == wanted).copied().ok_or_else(|| {
+            let reason = format!("{option} {wanted}: no such topic with messages of {}; there are {}", types.join(" or "), listed(&fit));
+            ImportError::log(path, reason)
+        })?,
+        (None, [only]) => *only,
+        (None, []) => {
+            let all: Vec<String> = messages.iter().map(|(topic, (name, _))| format!("{topic} ({name})")).collect();
+            return Err(ImportError::log(path, format!("holds no {}; it has {}", types.join(" or "), all.join(", "))));
+        }
+        (None, several) => {
+            return Err(ImportError::log(path, format!("has several topics of that type ({}); choose one with {option}", listed(several))));
+        }
+    };
+    let (name, kept) = &messages[topic];
+    Ok((name, kept))
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_mcap::Writer;
+
+    use super::*;
+    use crate::part::{Options, drives};
+
+    fn odometry_bytes(stamp_ns: i64, x: f64, speed: f64) -> Vec<u8> {
+        let mut body: Vec<u8> =
+            [((stamp_ns / 1_000_000_000) as i32).to_le_bytes(), ((stamp_ns % 1_000_000_000) as i32).to_le_bytes()].concat();
+        for text in ["odom", "base_link"] {
+            body.resize(body.len().next_multiple_of(4), 0);
+            body.extend((text.len() as u32 + 1).to_le_bytes());
+            body.extend(text.as_bytes());
+            body.push(0);
+        }
+        body.resize(body.len().next_multiple_of(8), 0);
+        let mut values = vec![0.0; 85];
+        (values[0], values[6], values[43]) = (x, 1.0, speed);
+        values.iter().for_each(|v: &f64| body.extend(v.to_le_bytes()));
+        [vec![0, 1, 0, 0], body].concat()
+    }
+
+    fn bag(path: &Path, commands: &[&str]) {
+        let mut writer = Writer::create(File::create(path).expect("made"), "ros2", "test").expect("made");
+        let odometry = writer.add_schema("nav_msgs/msg/Odometry", "ros2msg", b"").expect("added");
+        let twist = writer.add_schema("geometry_msgs/msg/Twist", "ros2msg", b"").expect("added");
+        let odometry = writer.add_channel(odometry, "/odom", "cdr").expect("added");
+        let commands: Vec<u16> = commands.iter().map(|topic| writer.add_channel(twist, topic, "cdr").expect("added")).collect();
+        let begin = 1_700_000_000_000_000_000_i64;
+        for i in 0..40_i64 {
+            let at = begin + i * 50_000_000;
+            for channel in commands.iter().filter(|_| i % 10 == 1) {
+                let values: Vec<u8> = [1.0 + i as f64, 0.0, 0.0, 0.0, 0.0, 0.5].iter().flat_map(|v: &f64| v.to_le_bytes()).collect();
+                writer.write(*channel, 0, (at - 1000) as u64, &[vec![0, 1, 0, 0], values].concat()).expect("written");
+            }
+            writer.write(odometry, 0, (at + 2_000_000) as u64, &odometry_bytes(at, 0.1 * i as f64, 2.0)).expect("written");
+        }
+        writer.finish().expect("finished");
+    }
+
+    #[test]
+    fn analytic_a_bag_becomes_a_drive() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        bag(&path, &["/cmd_vel"]);
+        let (log, notes) = read_bag(&path, &Topics::default()).expect("readable");
+        assert!(notes.is_empty(), "{notes:?}");
+        let (drives, notes) = drives(&log, &Options { name: "run".into(), ..Options::default() }).expect("a drive");
+        assert!(notes.iter().any(|note| note.contains("1 of 40 rows left out")), "before the first command: {notes:?}");
+        let column = |name: &str| &drives[0].columns.iter().find(|(held, _)| held == name).expect("there").1;
+        assert!((column("t")[0] - 0.05).abs() < 1e-12);
+        assert_eq!((column("t").len(), column("x")[1], column("vbx")[0]), (39, 0.2, 2.0));
+        assert_eq!((column("cmd_speed")[0], column("cmd_speed")[9], column("cmd_speed")[10]), (2.0, 2.0, 12.0), "held until the next");
+        assert_eq!((column("cmd_yaw_rate")[0], column("yaw")[0]), (0.5, 0.0));
+    }
+
+    #[test]
+    fn analytic_ambiguous_and_missing_topics_are_named() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        bag(&path, &["/cmd_vel", "/joy_vel"]);
+        let told = |topics: Topics| read_bag(&path, &topics).expect_err("ambiguous").to_string();
+        assert!(told(Topics::default()).contains("several topics of that type (/cmd_vel, /joy_vel); choose one with --command"));
+        let other = Topics { command: Some("/x".into()), ..Topics::default() };
+        assert!(told(other).contains("there are /cmd_vel, /joy_vel"));
+        assert!(read_bag(&path, &Topics { command: Some("/joy_vel".into()), ..Topics::default() }).is_ok());
+        std::fs::write(&path, b"SQLite format 3").expect("written");
+        assert!(told(Topics::default()).contains("not an MCAP file"));
+    }
+}
