@@ -184,7 +184,7 @@ fn analytic_a_free_form_is_its_wrench_inside_its_region_and_held_outside() {
     let mut form = FreeForm { speed_low_m_s: 1.0, speed_high_m_s: 3.0, angle_max_rad: 0.4, slope_max: 0.2, ..FreeForm::default() };
     form.wrench[0] = [-100.0, 50.0, 0.0, 1000.0];
     form.wrench[5] = [20.0, 0.0, 500.0, 0.0];
-    let [force, moment] = form.at(2.5, 0.2, 0.1, 0.0);
+    let [force, moment]: [[f64; 3]; 2] = form.at(2.5, 0.2, 0.1, 0.0);
     assert!((force[0] - (-100.0 + 25.0 + 100.0)).abs() < 1e-9 && (moment[2] - 120.0).abs() < 1e-9, "{force:?} {moment:?}");
     assert_eq!(form.at(9.0, 2.0, 5.0, 0.0), form.at(3.0, 0.4, 0.2, 0.0));
     // In free space a constant force accelerates the mass, over a second.
