@@ -5,7 +5,6 @@ use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::{Effect, Layer};
 use nesam_trajectories::Trajectory;
-use rayon::prelude::*;
 
 use crate::candidates::Candidate;
 use crate::claims::{Case, Estimate, Finding, Trace};
@@ -457,6 +456,6 @@ fn not_proven(scores: &HeldOut, must_help: bool) -> Option<String> {
 /// Mean deviation of each compared channel from its usual level over all segments.
 fn levels(case: &Case<'_>) -> Vec<f64> {
     let count = case.rows.iter().map(Vec::len).sum::<usize>().max(1) as f64;
-    let mean = |c: usize| case.rows.par_iter().flatten().map(|r| r[c]).sum::<f64>() / count;
+    let mean = |c: usize| case.rows.iter().flatten().map(|r| r[c]).sum::<f64>() / count;
     case.metric.channels.iter().enumerate().map(|(i, c)| mean(*c) - case.metric.centre[i]).collect()
 }

@@ -96,7 +96,8 @@ impl DriveLaw {
 pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, stride: usize) -> f64 {
     let model = StepModel::new(vehicle, scales.dt_s, scales.substeps);
     let soil = Soil::from_array(scales.default_soil());
-    let (sum, count) = drives
+    // Summed in the order of the drives, so that calibrating again gives the same bits.
+    let sums: Vec<(f64, usize)> = drives
         .par_iter()
         .map(|drive| {
             let (mut sum, mut count) = (0.0, 0usize);
@@ -107,7 +108,8 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
             }
             (sum, count)
         })
-        .reduce(|| (0.0, 0), |a, b| (a.0 + b.0, a.1 + b.1));
+        .collect();
+    let (sum, count) = sums.iter().fold((0.0, 0), |all, one| (all.0 + one.0, all.1 + one.1));
     sum / count.max(1) as f64
 }
 
