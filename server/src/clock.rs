@@ -1,6 +1,6 @@
-//! The machine's clock, as the engine sees it.
+//! The machine's clocks: the one that the engine sees, and that of the calendar.
 
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use nesam_engine::Clock;
 
@@ -25,4 +25,9 @@ impl Clock for MonotonicClock {
     fn now_ns(&self) -> u64 {
         u64::try_from(self.0.elapsed().as_nanos()).unwrap_or(u64::MAX)
     }
+}
+
+/// The calendar's clock, ns since 1970; 0 on a machine that believes it is earlier.
+pub(crate) fn unix_ns() -> i64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
 }

@@ -220,10 +220,12 @@ def test_service_sessions_and_maps(client, hills):
 
 def test_service_fallback_is_declared(driven):
     fallback = nesam.KinematicFallback(driven.session("truck").vehicle)
-    with pytest.raises(nesam.DeadlineExceeded):
+    # While the one before is still being given up, the service says at once that there is no time.
+    too_late = (nesam.DeadlineExceeded, nesam.Overloaded)
+    with pytest.raises(too_late):
         driven.predict("truck", fan(2000, 32), timeout_s=0.004)
     late = driven.predict("truck", fan(2000, 32), timeout_s=0.004, fallback=fallback, channels=("x", "y"), stride=8)
-    assert late.computed_by == "kinematic_fallback" and isinstance(late.fallback_reason, nesam.DeadlineExceeded)
+    assert late.computed_by == "kinematic_fallback" and isinstance(late.fallback_reason, too_late)
     assert late.states.shape == (2000, 4, 2) and late.soil is None and late.provenance is None
     np.testing.assert_allclose(late.start, driven.session("truck").state)
     # In time, the service answers although a fallback is there.

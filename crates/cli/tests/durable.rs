@@ -1,15 +1,16 @@
 //! Goal: a server that is killed loses no measurement that it called durable, and the estimate goes on as if nothing had happened. Method: the real
 //! binary, SIGKILL in the middle of a recorded drive, a restart on the same store; a second server that is never killed is the oracle, bit for bit.
 
-use std::io::{BufRead, BufReader};
-use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+mod common;
+
+use std::path::Path;
+use std::process::{Child, Command};
 use std::time::Duration;
 
+use common::{BINARY, bundle, repository};
 use nesam_client::{Candidates, Client, MapLayers, Outbox, measurement, outcome_label, v1};
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory};
 
-const BINARY: &str = env!("CARGO_BIN_EXE_nesam");
 const STEP_NS: i64 = 100_000_000;
 /// Samples of the drive that are sent, and those after which the server is killed.
 const SENT: usize = 120;
@@ -17,26 +18,12 @@ const KILLS: [usize; 3] = [7, 52, 88];
 /// Measurements on their way when the server is killed.
 const IN_FLIGHT: usize = 12;
 
-fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
-}
-
 /// Starts a server and gives its process and gRPC address; `None` when it ends instead.
 fn serve(folder: &Path, options: &[&str]) -> Option<(Child, String)> {
-    let bundle = repository().join("deploy/bundles/hmmwv-nominal").display().to_string();
-    let mut server = Command::new(BINARY)
-        .args(["serve", "--bundle", &bundle, "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"])
-        .args(options)
-        .current_dir(folder)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let lines = BufReader::new(server.stdout.take().unwrap()).lines().map(Result::unwrap);
-    let told: Vec<String> = lines.take_while(|l| !l.starts_with("ready")).collect();
-    let address = told.iter().find_map(|l| l.strip_prefix("grpc")).map(|l| format!("http://{}", l.trim()));
+    let (mut server, lines) = common::start(folder, options);
+    let address = common::told(&lines, "grpc").map(|address| format!("http://{address}"));
     if address.is_none() {
-        assert_eq!(server.wait().unwrap().code(), Some(2), "{told:?}");
+        assert_eq!(server.wait().unwrap().code(), Some(2), "{lines:?}");
     }
     Some((server, address?))
 }
@@ -117,7 +104,7 @@ async fn send(client: &mut Client, outbox: &mut Outbox, stop: usize) -> u64 {
 
 /// Waits until everything in the outbox is durable.
 async fn settle(client: &mut Client, outbox: &mut Outbox) {
-    for _ in 0..100 {
+    for _ in 0..600 {
         outbox.durable(client.session("truck").await.unwrap().durable_place);
         if outbox.is_empty() {
             return;
@@ -186,9 +173,8 @@ async fn service_a_killed_server_goes_on_bit_for_bit() {
     let mut client = Client::connect(&address).await.unwrap();
     client.open_session(v1::OpenSessionRequest { vehicle_id: "truck".into(), ..Default::default() }).await.unwrap();
     kill(server);
-    let husky = repository().join("deploy/bundles/clearpath-husky").display().to_string();
     let refused = Command::new(BINARY)
-        .args(["serve", "--bundle", &husky, "--store", "store", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"])
+        .args(["serve", "--bundle", &bundle("clearpath-husky"), "--store", "store", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"])
         .current_dir(here.path())
         .output()
         .unwrap();

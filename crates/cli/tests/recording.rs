@@ -1,19 +1,15 @@
 //! Goal: the field engineer's way: record with the real server, stop it gently or kill it, replay what is on the disk. Method: the real binary,
 //! sockets, signals; exit codes and words are the contract.
 
-use std::io::{BufRead, BufReader};
+mod common;
+
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output, Stdio};
+use std::process::{Child, Command, Output};
 use std::time::Duration;
 
+use common::{BINARY, bundle};
 use nesam_client::{Candidates, Client, measurement, v1};
 use serde_json::Value;
-
-const BINARY: &str = env!("CARGO_BIN_EXE_nesam");
-
-fn bundle(name: &str) -> String {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles").join(name).display().to_string()
-}
 
 fn nesam(args: &[&str], folder: &Path) -> Output {
     Command::new(BINARY).args(args).current_dir(folder).output().unwrap()
@@ -25,19 +21,10 @@ fn said(output: &Output) -> String {
 
 /// A recording server and the address of its gRPC.
 fn serve(folder: &Path) -> (Child, String) {
-    let mut server = Command::new(BINARY)
-        .args(["serve", "--bundle", &bundle("hmmwv-nominal"), "--record", "run", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"])
-        .current_dir(folder)
-        .stdout(Stdio::piped())
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let lines = BufReader::new(server.stdout.take().unwrap()).lines().map(Result::unwrap);
-    let told: Vec<String> = lines.take_while(|l| !l.starts_with("ready")).collect();
-    let line =
-        |name: &str| told.iter().find_map(|l| l.strip_prefix(name)).unwrap_or_else(|| panic!("no {name} in {told:?}")).trim().to_string();
-    assert!(line("record").ends_with(".0001.mcap"), "{told:?}");
-    (server, format!("http://{}", line("grpc")))
+    let (server, lines) = common::start(folder, &["--record", "run"]);
+    assert!(common::told(&lines, "record").is_some_and(|file| file.ends_with(".0001.mcap")), "{lines:?}");
+    let address = common::told(&lines, "grpc").expect("an address");
+    (server, format!("http://{address}"))
 }
 
 /// A short drive straight on.

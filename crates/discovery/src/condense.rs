@@ -46,6 +46,17 @@ pub struct Condensed {
     pub soil_information: DMatrix<f64>,
 }
 
+impl Condensed {
+    /// Score and information of the first columns alone.
+    pub fn head(&self, columns: usize) -> Self {
+        Self {
+            score: self.score.rows(0, columns).into_owned(),
+            information: self.information.view((0, 0), (columns, columns)).into_owned(),
+            ..self.clone()
+        }
+    }
+}
+
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.
 pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[Candidate]) -> Signatures {
     let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| drive.deviations(bench, effect.as_slice(), soil);

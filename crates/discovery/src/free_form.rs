@@ -67,7 +67,8 @@ impl Leftover {
 
     /// The term that the drives teach, but for one of them where given, with the share of the distance that it explains on drives it was not fitted on; `None` where it explains nothing there.
     pub fn effect(&self, left_out: Option<usize>) -> Option<(Effect, f64)> {
-        let kept: Vec<Condensed> = (0..self.drives.len()).filter(|d| Some(*d) != left_out).map(|d| head(&self.drives[d])).collect();
+        let kept: Vec<Condensed> =
+            (0..self.drives.len()).filter(|d| Some(*d) != left_out).map(|d| self.drives[d].head(PARAMETERS)).collect();
         let keep = self.orthogonal(left_out);
         let found = ridge::fit(&kept.iter().collect::<Vec<_>>(), keep.as_ref())?;
         let mut effect = self.region;
@@ -96,15 +97,6 @@ impl Leftover {
         }
         let q = cross.qr().q();
         Some(DMatrix::identity(PARAMETERS, PARAMETERS) - &q * q.transpose())
-    }
-}
-
-/// Scores in the coefficients alone.
-fn head(drive: &Condensed) -> Condensed {
-    Condensed {
-        score: drive.score.rows(0, PARAMETERS).into_owned(),
-        information: drive.information.view((0, 0), (PARAMETERS, PARAMETERS)).into_owned(),
-        ..drive.clone()
     }
 }
 

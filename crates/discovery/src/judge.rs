@@ -65,10 +65,7 @@ impl Judge {
     pub fn yardstick(&self, channels: &[usize], drives: usize, without: &[String]) -> Result<Yardstick, DiscoveryError> {
         let nulls = Nulls::new(&self.nulls.iter().collect::<Vec<_>>())
             .ok_or_else(|| DiscoveryError::Reference { reason: "has too few drives".into() })?;
-        let catalogue = catalogue();
-        let groups = NullGroups::draw(&self.nulls, &catalogue, channels, drives);
-        let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
-        Ok(Yardstick { nulls, groups, channels: channels.to_vec(), catalogue, considered })
+        Ok(Yardstick::new(nulls, channels, without, |catalogue| NullGroups::draw(&self.nulls, catalogue, channels, drives)))
     }
 
     /// Compares observed drives with the reference.
@@ -106,9 +103,6 @@ pub(crate) fn own_yardstick(case: &Case<'_>, without: &[String]) -> Result<Yards
     let drives: Vec<Condensed> = case.condensed().cloned().collect();
     let nulls = Nulls::about_zero(&drives.iter().collect::<Vec<_>>())
         .ok_or_else(|| DiscoveryError::Drives { reason: "--reference physics needs more drives".into() })?;
-    let catalogue = catalogue();
-    let channels = case.metric.channels.clone();
-    let groups = own_reference::sign_flips(&drives, &catalogue, &channels);
-    let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
-    Ok(Yardstick { nulls, groups, channels, catalogue, considered })
+    let channels = &case.metric.channels;
+    Ok(Yardstick::new(nulls, channels, without, |catalogue| own_reference::sign_flips(&drives, catalogue, channels)))
 }

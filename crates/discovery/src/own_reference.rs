@@ -5,7 +5,6 @@
 //! sign of whole drives at random: if the model were right on average, a drive would deviate as often to one side as to the other.
 
 use nalgebra::DVector;
-use nesam_evaluation::quantile_sorted;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::SoilCorrection;
 use rand::{RngExt, SeedableRng};
@@ -19,7 +18,7 @@ use crate::error::DiscoveryError;
 use crate::evidence::Nulls;
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
-use crate::reference::{DRIVES_MIN, FALSE_ALARM, NullGroups, THRESHOLD_FLOOR, all_evidence};
+use crate::reference::{DRIVES_MIN, NullGroups, all_evidence};
 
 /// Random choices of signs.
 const FLIPS: usize = 1000;
@@ -68,5 +67,5 @@ pub fn sign_flips(drives: &[Condensed], catalogue: &[Candidate], channels: &[usi
             Some(all_evidence(&group, catalogue, channels))
         })
         .collect::<Option<_>>()?;
-    Some(NullGroups::of(groups, |largest| quantile_sorted(largest, 1.0 - FALSE_ALARM).max(THRESHOLD_FLOOR)))
+    Some(NullGroups::of(groups))
 }

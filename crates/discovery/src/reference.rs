@@ -26,10 +26,10 @@ const NULL_GROUPS: usize = 1000;
 /// Fewest drives of a reference.
 pub const DRIVES_MIN: usize = 8;
 /// Family-wise false-alarm rate of the evidence.
-pub(crate) const FALSE_ALARM: f64 = 0.05;
+const FALSE_ALARM: f64 = 0.05;
 /// Evidence below which nothing is claimed, whatever few null drives say: null groups of some thirty drives overlap, so their tail is known
 /// roughly, and an effect worth adding stands far above (chosen).
-pub(crate) const THRESHOLD_FLOOR: f64 = 4.0;
+const THRESHOLD_FLOOR: f64 = 4.0;
 
 /// A drive without an effect.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -215,17 +215,18 @@ impl NullGroups {
                 Some(all_evidence(&group, catalogue, channels))
             })
             .collect::<Option<_>>()?;
-        Some(Self::of(groups, |largest| quantile_sorted(largest, 1.0 - FALSE_ALARM).max(THRESHOLD_FLOOR)))
+        Some(Self::of(groups))
     }
 
     /// From the evidence of every hypothesis and level in each of some groups.
-    pub(crate) fn of(groups: Vec<Vec<f64>>, threshold: impl Fn(&[f64]) -> f64) -> Self {
+    pub(crate) fn of(groups: Vec<Vec<f64>>) -> Self {
         let count = groups.first().map_or(0, Vec::len);
         let spread: Vec<f64> =
             (0..count).map(|e| (groups.iter().map(|z| z[e] * z[e]).sum::<f64>() / groups.len() as f64).sqrt().max(1.0)).collect();
         let mut largest: Vec<f64> = groups.iter().map(|z| z.iter().zip(&spread).map(|(z, s)| z / s).fold(0.0, f64::max)).collect();
         largest.sort_by(f64::total_cmp);
-        Self { threshold: threshold(&largest), spread, largest }
+        let threshold = quantile_sorted(&largest, 1.0 - FALSE_ALARM).max(THRESHOLD_FLOOR);
+        Self { threshold, spread, largest }
     }
 
     /// Share of null groups whose largest evidence reaches this one, never below 1 / (groups + 1).

@@ -5,7 +5,7 @@
 
 use nesam_physics::effects::Layer;
 
-use crate::candidates::Candidate;
+use crate::candidates::{Candidate, catalogue};
 use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, level_column};
 use crate::evidence::{Group, Nulls};
@@ -37,6 +37,15 @@ pub struct Yardstick {
     pub catalogue: Vec<Candidate>,
     /// Which of them are considered.
     pub considered: Vec<bool>,
+}
+
+impl Yardstick {
+    /// The whole catalogue but for the ids `without`, on these channels.
+    pub fn new(nulls: Nulls, channels: &[usize], without: &[String], groups: impl FnOnce(&[Candidate]) -> Option<NullGroups>) -> Self {
+        let catalogue = catalogue();
+        let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
+        Self { nulls, groups: groups(&catalogue), channels: channels.to_vec(), catalogue, considered }
+    }
 }
 
 /// A hypothesis that the drives cannot tell from a chosen one.

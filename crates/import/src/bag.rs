@@ -133,7 +133,8 @@ fn messages(path: &Path) -> Result<(Messages, Notes), ImportError> {
             Ok(Some(Record::Message { channel_id, log_time_ns, data, .. })) => {
                 let held = channels.get(&channel_id).and_then(|topic| messages.get_mut(topic));
                 // What is not needed is not kept: bags hold images.
-                if let Some((_, kept)) = held.filter(|(name, _)| [ODOMETRY, COMMANDS, IMU].concat().contains(&name.as_str())) {
+                if let Some((_, kept)) = held.filter(|(name, _)| [ODOMETRY, COMMANDS, IMU].iter().any(|kind| kind.contains(&name.as_str())))
+                {
                     kept.push((i64::try_from(log_time_ns).unwrap_or(i64::MAX), data));
                 }
             }

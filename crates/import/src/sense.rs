@@ -5,7 +5,7 @@
 //! limits are wide (chosen): slip, lag and noise of a sound log stay inside, a wrong unit or sign does not.
 
 use nesam_physics::{SecondCommand, Vehicle, wrap_angle};
-use nesam_trajectories::{Trajectory, VelocitySource};
+use nesam_trajectories::{Trajectory, VelocitySource, to_body};
 
 /// Speed over ground from which on a direction of motion is known, m/s.
 const MOVING_M_S: f64 = 0.7;
@@ -181,14 +181,6 @@ fn heading(drives: &[Trajectory]) -> Option<Doubt> {
     }
     let advice = "the yaw seems to be in degrees, or of another frame";
     Some(doubt(format!("heading and direction of motion are unrelated (agreement {agreement:.2} of 1)"), advice))
-}
-
-/// Rotates a vector of World into Body with roll, pitch, yaw.
-fn to_body([roll, pitch, yaw]: [f64; 3], v: [f64; 3]) -> [f64; 3] {
-    let ((sr, cr), (sp, cp), (sy, cy)) = (roll.sin_cos(), pitch.sin_cos(), yaw.sin_cos());
-    let [x, y, z] = [cy * v[0] + sy * v[1], cy * v[1] - sy * v[0], v[2]];
-    let [x, z] = [cp * x - sp * z, sp * x + cp * z];
-    [x, cr * y + sr * z, cr * z - sr * y]
 }
 
 fn velocity(drives: &[Trajectory]) -> Vec<Doubt> {

@@ -197,7 +197,8 @@ impl Vehicle {
     }
 
     /// Torque that the drive adds at each wheel against the friction of all of them, N m: a vehicle that tracks its speed with an integral part holds it
-    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none, one driven by torque as much as its demand grows.
+    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none; one driven by torque adds
+    /// as much as its demand grows.
     pub fn drag_made_up_n_m(&self) -> f64 {
         let mean = self.effects.force.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
         let makes_up = self.second != SecondCommand::YawRateRadS && self.driveline.torque.is_none();

@@ -29,4 +29,5 @@ pub use error::TrajectoryError;
 pub use ground_truth::GroundTruth;
 pub use soil_truth::{RegionSoil, SoilTruth, read_ground_truth_soil};
 pub use trajectory::{MeasuredChannels, Split, Trajectory, VelocitySource};
+pub use velocity::to_body;
 pub use windows::windows;

@@ -11,7 +11,7 @@ const SMOOTHING_S: f64 = 0.25;
 const JUMP_FACTOR: f64 = 2.0;
 
 /// R_WB^T v: a World vector in Body, for R_WB = Rz(yaw) Ry(pitch) Rx(roll).
-pub(crate) fn to_body([roll, pitch, yaw]: [f64; 3], v: [f64; 3]) -> [f64; 3] {
+pub fn to_body([roll, pitch, yaw]: [f64; 3], v: [f64; 3]) -> [f64; 3] {
     let ((sr, cr), (sp, cp), (sy, cy)) = (roll.sin_cos(), pitch.sin_cos(), yaw.sin_cos());
     let x = cy * v[0] + sy * v[1];
     let y = -sy * v[0] + cy * v[1];

@@ -2,11 +2,11 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use nesam_model::ModelBundle;
 
 use super::error::RecordingError;
+use crate::clock::unix_ns;
 use crate::config::{FleetSoilConfig, LimitsConfig};
 
 /// Name of the metadata record that begins every part.
@@ -44,8 +44,7 @@ pub struct RecordingHeader {
 impl RecordingHeader {
     /// The header of a run that starts now.
     pub fn of_run(bundle: &ModelBundle, limits: &LimitsConfig, fleet_soil: &FleetSoilConfig, engine_now_ns: u64) -> Self {
-        let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-        let now_ns = u64::try_from(since.as_nanos()).unwrap_or(0);
+        let now_ns = unix_ns().unsigned_abs();
         Self {
             program: Self::this_program(),
             bundle: bundle.name.clone(),
@@ -56,7 +55,7 @@ impl RecordingHeader {
             soil_filter: bundle.soil_filter_json.clone().unwrap_or_default(),
             machine: Self::this_machine(),
             clock_zero_unix_ns: now_ns.saturating_sub(engine_now_ns),
-            run: format!("nesam-{}-{}", utc(since.as_secs()), std::process::id()),
+            run: format!("nesam-{}-{}", utc(now_ns / 1_000_000_000), std::process::id()),
         }
     }
 

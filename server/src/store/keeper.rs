@@ -9,8 +9,9 @@ use nesam_engine::{Command, EngineHandle, Event, Reply, Snapshot};
 use tokio::sync::watch;
 
 use super::map_bytes::map_bytes;
-use super::restore::{Restored, unix_ns};
+use super::restore::Restored;
 use super::{Change, SessionStore, StoreError, StoredSession};
+use crate::clock::unix_ns;
 use crate::convert::image_bytes;
 
 /// Pause before a commit that failed is tried again.

@@ -1,12 +1,12 @@
 //! Sessions and maps of a store back into an engine.
 
 use std::collections::BTreeMap;
-use std::time::{SystemTime, UNIX_EPOCH};
 
 use nesam_engine::{Command, EngineError, EngineHandle};
 
 use super::map_bytes::map_of;
 use super::{Contents, StoreError, StoredSession};
+use crate::clock::unix_ns;
 use crate::convert::session_image;
 
 /// What came back.
@@ -16,11 +16,6 @@ pub(crate) struct Restored {
     pub accepted: BTreeMap<String, u64>,
     /// Hash of each map.
     pub maps: BTreeMap<String, String>,
-}
-
-/// The machine's clock, ns since 1970.
-pub(super) fn unix_ns() -> i64 {
-    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| i64::try_from(since.as_nanos()).unwrap_or(i64::MAX))
 }
 
 /// Puts everything into an engine that holds nothing yet.

@@ -134,7 +134,7 @@ impl Compared<'_> {
     /// A method that is linear in the shares of all columns.
     fn linear(&self, method: &'static str, shares: fn(&[&Condensed]) -> Option<DVector<f64>>) -> Entry {
         let columns = column_count();
-        let drives: Vec<Condensed> = self.case.condensed().map(|d| named_columns(d, columns)).collect();
+        let drives: Vec<Condensed> = self.case.condensed().map(|d| d.head(columns)).collect();
         let of = |left_out: Option<usize>| {
             shares(&drives.iter().enumerate().filter(|(d, _)| Some(*d) != left_out).map(|(_, c)| c).collect::<Vec<_>>())
         };
@@ -161,14 +161,6 @@ fn ratio(with: &ModelScore, before: &ModelScore) -> f64 {
     let rows = with.summary.tree.row(false).into_iter().zip(before.summary.tree.row(false));
     let ratios: Vec<f64> = rows.filter_map(|(w, b)| Some(w? / b?.max(1e-9))).collect();
     ratios.iter().sum::<f64>() / ratios.len().max(1) as f64
-}
-
-fn named_columns(drive: &Condensed, columns: usize) -> Condensed {
-    Condensed {
-        score: drive.score.rows(0, columns).into_owned(),
-        information: drive.information.view((0, 0), (columns, columns)).into_owned(),
-        ..drive.clone()
-    }
 }
 
 fn ridge_shares(drives: &[&Condensed]) -> Option<DVector<f64>> {

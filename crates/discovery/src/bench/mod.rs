@@ -41,6 +41,8 @@ use rand_chacha::ChaCha8Rng;
 
 /// Drives of a pseudo-vehicle.
 pub const DRIVES: usize = 5;
+/// Methods that are compared.
+pub const METHODS: [&str; 7] = ["diagnosis", "oracle", "soil_only", "ridge", "stlsq", "black_box", "free_form"];
 
 /// What is hidden in a set of drives.
 #[derive(Clone, Debug)]
@@ -204,6 +206,3 @@ impl Stage<'_> {
         Ok(Outcome { comparisons, ..Outcome::of(hidden, group, &judgement, seconds) })
     }
 }
-
-/// Methods that are compared.
-pub const METHODS: [&str; 7] = ["diagnosis", "oracle", "soil_only", "ridge", "stlsq", "black_box", "free_form"];
