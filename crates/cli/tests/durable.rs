@@ -20,7 +20,7 @@ const IN_FLIGHT: usize = 12;
 
 /// Starts a server and gives its process and gRPC address; `None` when it ends instead.
 fn serve(folder: &Path, options: &[&str]) -> Option<(Child, String)> {
-    let (mut server, lines) = common::start(folder, options);
+    let (mut server, lines) = common::start(folder, &[&["--no-http"], options].concat());
     let address = common::told(&lines, "grpc").map(|address| format!("http://{address}"));
     if address.is_none() {
         assert_eq!(server.wait().unwrap().code(), Some(2), "{lines:?}");

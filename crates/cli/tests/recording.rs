@@ -21,7 +21,7 @@ fn said(output: &Output) -> String {
 
 /// A recording server and the address of its gRPC.
 fn serve(folder: &Path) -> (Child, String) {
-    let (server, lines) = common::start(folder, &["--record", "run"]);
+    let (server, lines) = common::start(folder, &["--no-http", "--record", "run"]);
     assert!(common::told(&lines, "record").is_some_and(|file| file.ends_with(".0001.mcap")), "{lines:?}");
     let address = common::told(&lines, "grpc").expect("an address");
     (server, format!("http://{address}"))

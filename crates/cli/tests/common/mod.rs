@@ -15,10 +15,10 @@ pub fn bundle(name: &str) -> String {
     repository().join("deploy/bundles").join(name).display().to_string()
 }
 
-/// Starts a server in a folder and gives its process and what it said before it was ready.
+/// Starts a server without Zenoh in a folder and gives its process and what it said before it was ready.
 pub fn start(folder: &Path, options: &[&str]) -> (Child, Vec<String>) {
     let mut server = Command::new(BINARY)
-        .args(["serve", "--bundle", &bundle("hmmwv-nominal"), "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"])
+        .args(["serve", "--bundle", &bundle("hmmwv-nominal"), "--grpc", "127.0.0.1:0", "--no-zenoh"])
         .args(options)
         .current_dir(folder)
         .stdout(Stdio::piped())

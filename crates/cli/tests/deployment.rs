@@ -1,0 +1,43 @@
+//! Goal: what is shipped for operators watches what the server tells. Method: the real binary with everything that has metrics on; every metric that
+//! the alert rules and the dashboard name is among those of `/metrics`.
+
+mod common;
+
+use std::collections::BTreeSet;
+use std::io::{Read, Write};
+use std::net::TcpStream;
+
+/// Words that begin like a metric.
+fn metrics_of(text: &str) -> BTreeSet<String> {
+    let words = text.split(|c: char| !(c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_'));
+    words.filter(|w| w.starts_with("nesam_") && w.len() > "nesam_".len()).map(str::to_string).collect()
+}
+
+fn get(address: &str, path: &str) -> String {
+    let mut stream = TcpStream::connect(address).unwrap();
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: {address}\r\nConnection: close\r\n\r\n").unwrap();
+    let mut text = String::new();
+    stream.read_to_string(&mut text).unwrap();
+    text
+}
+
+#[test]
+fn service_rules_and_dashboard_name_metrics_that_exist() {
+    let here = tempfile::tempdir().unwrap();
+    let (mut server, lines) = common::start(here.path(), &["--http", "127.0.0.1:0", "--store", "store", "--record", "run"]);
+    let page = common::told(&lines, "http").unwrap_or_else(|| panic!("{lines:?}")).trim_start_matches("http://");
+    let told = get(page.split(['/', ' ']).next().unwrap(), "/metrics");
+    server.kill().unwrap();
+    server.wait().unwrap();
+    let kinds: BTreeSet<&str> = told.lines().filter_map(|l| l.strip_prefix("# TYPE ")?.split(' ').next()).collect();
+    assert!(kinds.len() > 8, "{told}");
+    for file in ["deploy/prometheus/rules.yaml", "deploy/grafana/nesam.json"] {
+        let text = std::fs::read_to_string(common::repository().join(file)).unwrap();
+        let named = metrics_of(&text);
+        assert!(named.len() > 4, "{file}: {named:?}");
+        for metric in named {
+            let known = kinds.contains(metric.as_str()) || metric.strip_suffix("_bucket").is_some_and(|m| kinds.contains(m));
+            assert!(known, "{file} watches {metric}, which /metrics does not tell: {kinds:?}");
+        }
+    }
+}
