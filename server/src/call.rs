@@ -8,8 +8,8 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use nesam_engine::{
-    Answer, Command, EngineError, EngineHandle, FleetCell, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply, SessionImage,
-    SessionView, Submission,
+    Answer, AppliedEffects, Command, EngineError, EngineHandle, FleetCell, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply,
+    SessionImage, SessionView, Submission,
 };
 use nesam_terrain::WorldMap;
 use tokio::sync::oneshot;
@@ -156,6 +156,14 @@ impl EngineClient {
         match self.call(Command::Import { image: Box::new(image), session: session.into() }, budget).await?.0 {
             Reply::Session(view) => Ok(*view),
             _ => Err(mismatch("import")),
+        }
+    }
+
+    /// Puts effects on a session, in place of those that were applied before.
+    pub async fn set_effects(&self, session: &str, effects: AppliedEffects, budget: Duration) -> Result<SessionView, EngineError> {
+        match self.call(Command::SetEffects { session: session.into(), effects }, budget).await?.0 {
+            Reply::Session(view) => Ok(*view),
+            _ => Err(mismatch("set_effects")),
         }
     }
 

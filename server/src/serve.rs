@@ -164,12 +164,16 @@ fn start_recording(
 /// Where the engine's events go: counters, the directory of sessions, the store, watchers.
 fn event_sink(watchers: broadcast::Sender<Event>, metrics: Arc<Metrics>, keeper: Option<Arc<Keeper>>, directory: Directory) -> EventSink {
     Box::new(move |event| {
-        metrics.event(event.label());
+        metrics.event(&event);
         directory.note(&event);
         if let Some(keeper) = &keeper {
             keeper.note(&event);
         }
-        if matches!(event, Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::SessionClosed { .. }) {
+        let watched = matches!(
+            event,
+            Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } | Event::SessionClosed { .. }
+        );
+        if watched {
             let _ = watchers.send(event);
         }
     })

@@ -18,15 +18,31 @@ from ._errors import (
 )
 from ._extras import ExtraOutputs, Extras
 from ._fallback import KinematicFallback
-from ._types import Answer, MapDescription, Measurement, Prediction, Provenance, Session, Soil, Tls, Validity, VehicleCard, WorldMap
+from ._types import (
+    Alarm,
+    Answer,
+    Effect,
+    MapDescription,
+    Measurement,
+    Prediction,
+    Provenance,
+    Session,
+    Soil,
+    Tls,
+    Validity,
+    VehicleCard,
+    WorldMap,
+)
 
 __all__ = [
     "CHANNELS",
+    "Alarm",
     "AlreadyExists",
     "Answer",
     "Client",
     "DeadlineExceeded",
     "DurableStream",
+    "Effect",
     "ExtraOutputs",
     "Extras",
     "FailedPrecondition",

@@ -14,6 +14,8 @@ from ._extras import Extras, extra_outputs
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
 from .v1 import (
+    alarms_pb2,
+    effects_pb2,
     measurements_pb2,
     measurements_pb2_grpc,
     prediction_pb2,
@@ -126,6 +128,29 @@ class Client:
         """Closes a session and forgets its history. Raises NotFound."""
         self._call(self._sessions.Close, sessions_pb2.CloseSessionRequest(session_id=session_id))
         self._known_states.pop(session_id, None)
+
+    # Effects and alarms
+
+    def apply_effects(self, session_id: str, effects: Sequence[t.Effect], source: str = "") -> t.Session:
+        """Puts physical effects on a session, in place of those that were applied before; its soil begins again from the prior. Needs the rights of an operator.
+
+        Raises NotFound, InvalidArgument (none or too many, an unknown id or parameter, a value outside its range), PermissionDenied as NesamError.
+        """
+        messages = [effects_pb2.Effect(id=e.id, parameters=_parameter_messages(e)) for e in effects]
+        request = effects_pb2.ApplyEffectsRequest(session_id=session_id, source=source, effects=messages)
+        return _session(self._call(self._sessions.ApplyEffects, request))
+
+    def revert_effects(self, session_id: str) -> t.Session:
+        """Takes the applied effects away again. Raises NotFound."""
+        return _session(self._call(self._sessions.RevertEffects, effects_pb2.RevertEffectsRequest(session_id=session_id)))
+
+    def alarms(self, session_id: str) -> Iterator[t.Alarm]:
+        """The alarms of a session as they come: the active one first, then each that is raised or cleared. Ends when the session closes. Raises NotFound."""
+        try:
+            for message in self._sessions.WatchAlarms(alarms_pb2.WatchAlarmsRequest(session_id=session_id)):
+                yield _alarm(message)
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
 
     # Maps
 
@@ -379,6 +404,40 @@ def _session(message: sessions_pb2.Session) -> t.Session:
         vehicle_alive=message.vehicle_alive if message.HasField("vehicle_alive") else None,
         accepted=message.accepted,
         durable_place=message.durable_place,
+        effects=tuple(_effect(effect) for effect in message.effects),
+        effects_source=message.effects_source,
+        alarm=_alarm(message.alarm) if message.HasField("alarm") else None,
+    )
+
+
+def _parameter_messages(effect: t.Effect) -> List[effects_pb2.EffectParameter]:
+    return [effects_pb2.EffectParameter(name=name, value=value, sd=effect.sd.get(name, 0.0)) for name, value in effect.parameters.items()]
+
+
+def _effect(message: effects_pb2.Effect) -> t.Effect:
+    return t.Effect(
+        id=message.id,
+        parameters={p.name: p.value for p in message.parameters},
+        sd={p.name: p.sd for p in message.parameters if p.sd > 0.0},
+    )
+
+
+def _alarm(message: alarms_pb2.Alarm) -> t.Alarm:
+    return t.Alarm(
+        session_id=message.session_id,
+        vehicle_id=message.vehicle_id,
+        episode=message.episode,
+        active=message.active,
+        kind=alarms_pb2.AlarmKind.Name(message.kind)[len("ALARM_KIND_") :].lower(),
+        channel=message.channel,
+        size=message.size,
+        statistic=message.statistic,
+        threshold=message.threshold,
+        stamp_ns=message.stamp_ns,
+        onset_stamp_ns=message.onset_stamp_ns,
+        soil_share=message.soil_share,
+        description=message.description,
+        diagnose=message.diagnose,
     )
 
 

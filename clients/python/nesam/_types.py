@@ -2,7 +2,7 @@
 
 import enum
 from dataclasses import dataclass, field
-from typing import Optional, Sequence, Tuple
+from typing import Dict, Optional, Sequence, Tuple
 
 import numpy as np
 
@@ -63,11 +63,45 @@ class Soil:
 
 
 @dataclass(frozen=True)
+class Effect:
+    """A physical effect of the catalogue (docs/effects.md): every parameter by name in the unit of the catalogue, and the standard deviations of those that have one."""
+
+    id: str
+    parameters: Dict[str, float]
+    sd: Dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """An episode in which the measurements of a session disagree with its predictions; `active` is False when it has ended.
+
+    kind: nis_large, nis_small, correlated, motion_jump or sensor_jump. channel: what jumped, "" for a test of all. size: mean of the channel since the onset, in
+    the unit that its name ends in. soil_share: share of the misfit that another soil could explain at most. Stamps are of the vehicle's clock.
+    """
+
+    session_id: str
+    vehicle_id: str
+    episode: int
+    active: bool
+    kind: str
+    channel: str
+    size: float
+    statistic: float
+    threshold: float
+    stamp_ns: int
+    onset_stamp_ns: int
+    soil_share: float
+    description: str
+    diagnose: str
+
+
+@dataclass(frozen=True)
 class Session:
     """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
 
     boot_id: start of the vehicle's software, None when it does not tell. vehicle_alive: whether the vehicle's Zenoh token is there, None without Zenoh.
     accepted: measurements accepted so far; durable_place: how many of them survive a crash of the server, 0 where it keeps no store.
+    effects: those that were applied on top of the bundle's, effects_source: where they come from. alarm: the active one, None without.
     """
 
     session_id: str
@@ -84,6 +118,9 @@ class Session:
     vehicle_alive: Optional[bool] = None
     accepted: int = 0
     durable_place: int = 0
+    effects: Tuple[Effect, ...] = ()
+    effects_source: str = ""
+    alarm: Optional[Alarm] = None
 
 
 @dataclass(frozen=True)

@@ -100,6 +100,22 @@ impl Client {
         Ok(self.sessions().import(request).await?.into_inner())
     }
 
+    /// Puts physical effects on a session, in place of those that were applied before; `source` says where they come from.
+    pub async fn apply_effects(&mut self, session: &str, source: &str, effects: Vec<v1::Effect>) -> Result<v1::Session, ClientError> {
+        let request = v1::ApplyEffectsRequest { session_id: session.into(), source: source.into(), effects };
+        Ok(self.sessions().apply_effects(request).await?.into_inner())
+    }
+
+    /// Takes the applied effects from a session.
+    pub async fn revert_effects(&mut self, session: &str) -> Result<v1::Session, ClientError> {
+        Ok(self.sessions().revert_effects(v1::RevertEffectsRequest { session_id: session.into() }).await?.into_inner())
+    }
+
+    /// Watches the alarms of a session: the active one first, then every one that is raised or cleared.
+    pub async fn watch_alarms(&mut self, session: &str) -> Result<tonic::Streaming<v1::Alarm>, ClientError> {
+        Ok(self.sessions().watch_alarms(v1::WatchAlarmsRequest { session_id: session.into() }).await?.into_inner())
+    }
+
     /// Closes a session.
     pub async fn close_session(&mut self, session: &str) -> Result<(), ClientError> {
         self.sessions().close(v1::CloseSessionRequest { session_id: session.into() }).await?;

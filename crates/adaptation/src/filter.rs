@@ -4,6 +4,7 @@ use nalgebra::{DMatrix, DVector, SMatrix, SVector};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCorrection};
 
+use crate::agreement::{Agreement, agreement};
 use crate::calibration::UncorrectedBuffer;
 use crate::conditions::conditions;
 use crate::joint::{JointState, Linearisation, correction_of};
@@ -51,6 +52,8 @@ pub struct SoilUpdate {
     pub nis: f64,
     /// Degrees of freedom of the NIS, 6 B over the block.
     pub dof: usize,
+    /// How the buffer agrees with what the bundle expects, whatever this drive was like so far.
+    pub agreement: Agreement,
     /// The gate refused the buffer.
     pub rejected: bool,
     /// The drive told something of the soil; where it did not, the estimate stays as it was.
@@ -80,6 +83,8 @@ pub struct SoilFilter {
     buffer: Vec<BufferedTransition>,
     /// Class of the ground under the newest transition.
     here: usize,
+    /// What the next update expects its innovation to err by beyond R_B.
+    considered: Option<DMatrix<f64>>,
 }
 
 impl SoilFilter {
@@ -99,6 +104,7 @@ impl SoilFilter {
             trust: Trust::new(config.trust_memory, config.trust_log_odds),
             buffer: Vec::with_capacity(config.buffer),
             here: 0,
+            considered: None,
             config,
         })
     }
@@ -178,6 +184,35 @@ impl SoilFilter {
         outcome.map(Some)
     }
 
+    /// Makes the next update expect what parameters outside of the soil may be wrong by: C = Σ d dᵀ on top of R_B, where d is how the innovation of the
+    /// coming buffer changes when one of them is one standard deviation off. `shifted` holds the same buffer as each such model sees it.
+    ///
+    /// These are consider parameters (Schmidt) without their correlation with the soil: each update takes their error for a new one, so a filter that sees
+    /// the same error in every buffer is surer of the soil than it should be.
+    ///
+    /// # Errors
+    /// `NotFinite` when a prediction is not a number; nothing is considered then.
+    pub fn consider(
+        &mut self,
+        model: &StepModel,
+        buffer: &[BufferedTransition],
+        shifted: &[(&StepModel, Vec<BufferedTransition>)],
+    ) -> Result<(), AdaptationError> {
+        self.considered = None;
+        if shifted.is_empty() {
+            return Ok(());
+        }
+        let at = self.state.predicted(&self.config).soils();
+        let usual = innovation(&self.config, model, buffer, &at)?;
+        let mut sum = DMatrix::zeros(usual.len(), usual.len());
+        for (model, buffer) in shifted {
+            let change = innovation(&self.config, model, buffer, &at)? - &usual;
+            sum += &change * change.transpose();
+        }
+        self.considered = Some(sum);
+        Ok(())
+    }
+
     /// Forgets the transitions that wait: measurements were lost, so the next one does not follow the last.
     pub fn clear_buffer(&mut self) {
         self.buffer.clear();
@@ -194,8 +229,12 @@ impl SoilFilter {
         let unit = noise_scale.sqrt().recip();
         let raw = self.linearise(model, buffer, &before)?;
         let innovation = raw.innovation.iter().copied().collect();
+        // What is considered is as large as it is on any ground: the factor on R_B is not on it.
+        let considered = self.considered.take();
+        let rest = considered.as_ref().map_or_else(|| self.rest.clone(), |considered| &self.rest + considered / noise_scale);
+        let agreement = self.agreement(&raw, &ahead, factor, considered)?;
         let first = raw.scaled(unit);
-        let judged = ahead.step(&first, &before, &self.rest)?;
+        let judged = ahead.step(&first, &before, &rest)?;
         let (nis, dof) = (judged.nis, first.innovation.len());
         let excitation = self.excitation(&first.jacobian)?;
         self.scale.observe(nis / dof as f64);
@@ -204,7 +243,7 @@ impl SoilFilter {
         if !rejected && excited {
             self.judge(model, buffer, unit, &judged)?;
             let tail = if self.config.tail_dof > 0.0 { (self.config.tail_dof + nis) / (self.config.tail_dof + dof as f64) } else { 1.0 };
-            let noise = &self.rest * (self.config.shared_buffers * tail.max(1.0));
+            let noise = &rest * (self.config.shared_buffers * tail.max(1.0));
             let mut linear = first;
             let mut step = ahead.step(&linear, &before, &noise)?;
             let mut delta = self.held(ahead.moved_soils(&step), buffer);
@@ -229,6 +268,7 @@ impl SoilFilter {
             innovation,
             nis,
             dof,
+            agreement,
             rejected,
             excited,
             excitation,
@@ -236,6 +276,20 @@ impl SoilFilter {
             trust,
             noise_scale,
         })
+    }
+
+    /// How a buffer agrees with R_B under its conditions, `factor` on it.
+    fn agreement(
+        &self,
+        raw: &Linearisation,
+        ahead: &JointState,
+        factor: f64,
+        considered: Option<DMatrix<f64>>,
+    ) -> Result<Agreement, AdaptationError> {
+        let noise = &self.noise * factor + considered.unwrap_or_else(|| DMatrix::zeros(self.noise.nrows(), self.noise.ncols()));
+        let through = |covariance: DMatrix<f64>| &raw.jacobian * covariance * raw.jacobian.transpose();
+        let prior = JointState::prior(&self.config).soils_covariance();
+        agreement(&raw.innovation, through(ahead.soils_covariance()), through(prior), &noise)
     }
 
     /// max_i P₀_ii (Hᵀ R_B⁻¹ H)_ii: what a buffer could tell of the parameter that it tells most of, in units of what the prior tells.

@@ -93,6 +93,11 @@ impl JointState {
         self.mean.rows(0, self.soils).into_owned()
     }
 
+    /// Covariance of the Δθ of all classes.
+    pub(crate) fn soils_covariance(&self) -> DMatrix<f64> {
+        self.covariance.view((0, 0), (self.soils, self.soils)).into_owned()
+    }
+
     /// Mean and covariance as plain numbers.
     pub(crate) fn snapshot(&self) -> JointSnapshot {
         JointSnapshot { mean: self.mean.iter().copied().collect(), covariance: self.covariance.transpose().iter().copied().collect() }

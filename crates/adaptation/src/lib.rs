@@ -14,6 +14,7 @@
 //! | S, K, Δθ⁺, P⁺ | [`kalman_update`] |
 #![forbid(unsafe_code)]
 
+mod agreement;
 mod calibration;
 mod chi_square;
 mod conditions;
@@ -27,6 +28,7 @@ mod settings;
 mod trust;
 mod update;
 
+pub use agreement::Agreement;
 pub use calibration::{NoiseCalibration, UncorrectedBuffer, calibrate};
 pub use chi_square::chi_square_tail;
 pub use conditions::{CONDITIONS, NoiseConditions, conditions};

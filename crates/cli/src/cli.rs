@@ -48,6 +48,8 @@ enum Command {
     Evaluate(commands::evaluate::EvaluateArgs),
     /// Find the effects that the model lacks, and try them on other drives
     Diagnose(commands::diagnose::DiagnoseArgs),
+    /// Put effects on a session of a running server, take them away, list them and the active alarms
+    Effects(commands::effects::EffectsArgs),
     /// Learn the soil while driving: fixed against adapted predictions on measured drives
     Adapt(commands::adapt::AdaptArgs),
     /// Start on ground that another vehicle has driven: with its soil map against without
@@ -90,6 +92,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Serve(args)) => commands::serve::run(&args),
         Some(Command::Evaluate(args)) => commands::evaluate::run(&args),
         Some(Command::Diagnose(args)) => commands::diagnose::run(&args),
+        Some(Command::Effects(args)) => commands::effects::run(&args),
         Some(Command::Adapt(args)) => commands::adapt::run(&args),
         Some(Command::Fleet(args)) => commands::fleet::run(&args),
         Some(Command::Navigate(args)) => commands::navigate::run(&args),

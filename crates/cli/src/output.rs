@@ -54,12 +54,17 @@ pub fn command_line() -> String {
 
 /// What a result is made from.
 pub fn provenance(bundle: Option<&ModelBundle>, drives: &Drives) -> Provenance {
+    provenance_of(bundle, &drives.root.hash(), &maps_hash(&drives.maps))
+}
+
+/// The same of drives that do not lie in a data root.
+pub fn provenance_of(bundle: Option<&ModelBundle>, data_hash: &str, maps_hash: &str) -> Provenance {
     Provenance {
         version: env!("CARGO_PKG_VERSION").into(),
         command: command_line(),
         bundle: bundle.map_or_else(String::new, |b| b.name.clone()),
         bundle_hash: bundle.map_or_else(String::new, |b| b.hash.clone()),
-        data_hash: drives.root.hash(),
-        maps_hash: maps_hash(&drives.maps),
+        data_hash: data_hash.into(),
+        maps_hash: maps_hash.into(),
     }
 }

@@ -9,7 +9,7 @@ use nesam_terrain::WorldMap;
 use crate::fleet::FleetCell;
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
-use crate::session::{SessionImage, SoilEstimate};
+use crate::session::{Alarm, AppliedEffects, SessionImage, SoilEstimate};
 
 /// A command. The list is closed: what is not here cannot happen to a session.
 #[derive(Clone, Debug)]
@@ -54,6 +54,14 @@ pub enum Command {
     Close {
         /// Name of the session.
         session: String,
+    },
+    /// Puts physical effects on a session, in place of those that were applied before; none = takes them away. The soil begins again from its prior where
+    /// that changes the vehicle. Answer: `Reply::Session`.
+    SetEffects {
+        /// Name of the session.
+        session: String,
+        /// The effects.
+        effects: AppliedEffects,
     },
     /// Closes the sessions that were idle for longer than the limit. Answer: `Reply::Expired`.
     Expire,
@@ -106,6 +114,7 @@ impl Command {
             Self::Snapshot { .. } => "snapshot",
             Self::Import { .. } => "import",
             Self::Close { .. } => "close",
+            Self::SetEffects { .. } => "set_effects",
             Self::Expire => "expire",
             Self::Measure { .. } => "measure",
             Self::FleetSoil { .. } => "fleet_soil",
@@ -120,7 +129,9 @@ impl Command {
     /// The session that this command keeps from being idle: one that is fed or asked. Reading it is no use of it.
     pub(crate) fn uses(&self) -> Option<&str> {
         match self {
-            Self::Measure { session, .. } | Self::Fork { session, .. } | Self::Export { session } => Some(session),
+            Self::Measure { session, .. } | Self::Fork { session, .. } | Self::Export { session } | Self::SetEffects { session, .. } => {
+                Some(session)
+            }
             Self::Predict(query) => Some(&query.session),
             _ => None,
         }
@@ -218,6 +229,10 @@ pub struct SessionView {
     pub boot: Option<u64>,
     /// What was learned of the soil.
     pub soil: SoilEstimate,
+    /// Effects that were applied to the session, on top of those of the bundle.
+    pub effects: AppliedEffects,
+    /// The alarm that is active.
+    pub alarm: Option<Alarm>,
 }
 
 /// What watchers of the engine hear.
@@ -241,6 +256,22 @@ pub enum Event {
     },
     /// A session is there: opened, copied or imported.
     SessionOpened {
+        /// Name of the session.
+        session: String,
+        /// Vehicle that it belongs to.
+        vehicle: String,
+    },
+    /// An alarm of a session was raised or cleared; also told of a session that comes with an active one.
+    AlarmChanged {
+        /// Name of the session.
+        session: String,
+        /// Vehicle that it belongs to.
+        vehicle: String,
+        /// The alarm.
+        alarm: Box<Alarm>,
+    },
+    /// Other effects act in a session from now on.
+    EffectsChanged {
         /// Name of the session.
         session: String,
         /// Vehicle that it belongs to.
@@ -274,6 +305,9 @@ impl Event {
             Self::SoilChanged { .. } => "soil_changed",
             Self::FleetSoilChanged { .. } => "fleet_soil_changed",
             Self::SessionOpened { .. } => "session_opened",
+            Self::AlarmChanged { alarm, .. } if alarm.active => "alarm_raised",
+            Self::AlarmChanged { .. } => "alarm_cleared",
+            Self::EffectsChanged { .. } => "effects_changed",
             Self::MeasurementAccepted { .. } => "measurement_accepted",
             Self::MapChanged { .. } => "map_changed",
             Self::SessionClosed { expired: false, .. } => "session_closed",

@@ -1,5 +1,7 @@
 //! The engine: all sessions and maps, one command at a time.
 
+mod effects;
+
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
@@ -18,7 +20,7 @@ use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
 use crate::query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-use crate::session::{Observed, Rules, Session, SessionImage, refused};
+use crate::session::{Acting, Observed, Rules, Session, SessionImage, refused};
 
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
 pub type EventSink = Box<dyn FnMut(Event) + Send>;
@@ -137,6 +139,7 @@ impl Engine {
             Command::Snapshot { sessions, maps } => Ok(Reply::Snapshot(Box::new(self.snapshot(now_ns, sessions, maps)))),
             Command::Import { image, session } => self.import(now_ns, image, session),
             Command::Close { session } => self.close(session),
+            Command::SetEffects { session, effects } => self.set_effects(session, effects),
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
             Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
@@ -171,6 +174,9 @@ impl Engine {
         }
         self.check_room("session_id", id)?;
         let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
+        if self.watches() {
+            session.begin_watch();
+        }
         if self.drives(&open.vehicle) {
             session.bring_nothing();
         }
@@ -185,10 +191,18 @@ impl Engine {
         Ok(self.insert(session))
     }
 
+    /// Whether sessions watch their innovations: only against a noise that was measured for this bundle.
+    fn watches(&self) -> bool {
+        self.predictor.bundle().soil_filter_json.is_some()
+    }
+
     /// Holds a new session.
     fn insert(&mut self, session: Session) -> Reply {
         let view = self.view(&session);
         self.emit(Event::SessionOpened { session: view.session.clone(), vehicle: view.vehicle.clone() });
+        if let Some(alarm) = view.alarm {
+            self.emit(Event::AlarmChanged { session: view.session.clone(), vehicle: view.vehicle.clone(), alarm: Box::new(alarm) });
+        }
         self.sessions.insert(view.session.clone(), session);
         Reply::Session(Box::new(view))
     }
@@ -262,7 +276,11 @@ impl Engine {
         }
         self.check_room("session_id", id)?;
         let rules = Rules { step_ns: self.step_ns, vehicle: &bundle.vehicle, limits: &self.limits };
-        let mut session = Session::from_image(id, image, self.filter.clone(), now_ns, rules)?;
+        let acting = Acting::new(&self.predictor, &image.effects).map_err(|error| refused(error.to_string()))?;
+        let mut session = Session::from_image(id, image, self.filter.clone(), acting, now_ns, rules)?;
+        if self.watches() {
+            session.begin_watch();
+        }
         if self.drives(&image.vehicle) {
             session.bring_nothing();
         }
@@ -306,7 +324,7 @@ impl Engine {
             session.begin_from(&prior);
         }
         let outcome = session.learn(&self.predictor, map.as_ref(), self.step_ns, outcome);
-        let (vehicle, brought) = (session.vehicle().to_string(), session.take_brought());
+        let (vehicle, brought, told) = (session.vehicle().to_string(), session.take_brought(), session.take_told());
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
         let accepted = session.accepted();
         if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
@@ -320,6 +338,7 @@ impl Engine {
             let buffer_ended = soil.state.last_buffer != before.0.last_buffer;
             self.emit(Event::MeasurementAccepted { session: id.into(), buffer_ended });
         }
+        self.emit_alarms(id, &vehicle, told);
         if soil.state.epoch != before.0.epoch {
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
         }
@@ -328,6 +347,7 @@ impl Engine {
 
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
         let session = self.session(&query.session)?;
+        let predictor = session.predictor().unwrap_or(&self.predictor);
         query.check(&self.limits, &self.predictor.bundle().vehicle)?;
         let map = session.map().map(|id| self.maps.get(id)).transpose()?;
         let start = start_state(session, query, map)?;
@@ -356,19 +376,19 @@ impl Engine {
         };
         let learned = session.soil_field(map);
         let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk };
-        let (rollout, risk) = self.predictor.rollout_with(&asked, &asked_extras)?;
+        let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
         let mut extras = ExtraOutputs {
             soil_groups: soils.len().max(1),
             risk: risk.map(|risk| forward.split_risk(risk, horizon)),
             ..Default::default()
         };
         if query.extras.derived() {
-            let linearisations = self.predictor.linearise(&asked)?;
+            let linearisations = predictor.linearise(&asked)?;
             (extras.jacobians, extras.covariance) =
                 query.extras.derive(&linearisations, forward.steps(), session.soil(), self.noise.as_ref())?;
         }
         let (rolled, mut rollout) = forward.split(rollout);
-        if session.soil().state.epoch == 0 {
+        if session.soil().state.is_prior() {
             rollout.flags.iter_mut().for_each(|flags| *flags |= SOIL_NOT_LEARNED);
         }
         Ok(Prediction {
@@ -426,6 +446,8 @@ impl Engine {
             accepted: session.accepted(),
             boot: session.boot(),
             soil: *session.soil(),
+            effects: session.applied(),
+            alarm: session.alarm(),
         }
     }
 

@@ -49,4 +49,7 @@ pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FilterSnapshot, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
-pub use session::{BufferTest, Observed, Session, SessionImage, SoilEstimate, SoilState, TrackImage};
+pub use session::{
+    Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, Session, SessionImage, SoilEstimate,
+    SoilState, TrackImage, WatchImage,
+};

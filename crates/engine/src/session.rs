@@ -9,17 +9,24 @@ use nesam_model::{HistoryStep, Predictor, SoilByClass};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 
+mod alarm;
+mod effects;
 mod image;
 mod order;
 mod soil;
 mod track;
+mod watch;
 
+pub use self::alarm::{Alarm, AlarmKind};
+pub(crate) use self::effects::Acting;
+pub use self::effects::{AppliedEffect, AppliedEffects, AppliedParameter};
 pub(crate) use self::image::refused;
-pub use self::image::{SessionImage, TrackImage};
+pub use self::image::{SessionImage, TrackImage, WatchImage};
 use self::order::{Order, Verdict};
-use self::soil::SoilLearner;
 pub use self::soil::{BufferTest, SoilState};
+use self::soil::{Judged, Models, SoilLearner};
 use self::track::{Taken, Track};
+use self::watch::{Watch, WatchedBuffer};
 use crate::error::EngineError;
 use crate::fleet::Brought;
 use crate::forward::Newest;
@@ -68,6 +75,12 @@ pub struct Session {
     learner: SoilLearner,
     soil: SoilEstimate,
     fleet: FleetPart,
+    /// Effects that were applied to this session; `None` = those of the bundle alone.
+    acting: Option<Arc<Acting>>,
+    /// Whether measurements go on agreeing with predictions; `None` = not watched.
+    watch: Option<Watch>,
+    /// Alarms that were raised or cleared since they were last asked for.
+    told: Vec<Alarm>,
 }
 
 /// What a session has to do with the soil map of the fleet.
@@ -131,6 +144,9 @@ impl Session {
             soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0 },
             learner,
             fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
+            acting: None,
+            watch: None,
+            told: Vec::new(),
         }
     }
 
@@ -221,9 +237,14 @@ impl Session {
     }
 
     /// Lets the soil filter learn from what has become final with an observation; every B-th step makes an update (paper Alg. 1). The steps
-    /// stay in the history when the filter refuses its buffer: then the outcome says so.
+    /// stay in the history when the filter refuses its buffer: then the outcome says so. `predictor` is that of the bundle; applied effects act on top of it.
     pub fn learn(&mut self, predictor: &Predictor, map: Option<&Arc<WorldMap>>, step_ns: i64, outcome: Outcome) -> Outcome {
         let mut outcome = outcome;
+        let acting = self.acting.clone();
+        let models = match &acting {
+            Some(acting) => Models { usual: acting.predictor(), shifted: acting.shifted() },
+            None => Models { usual: predictor, shifted: &[] },
+        };
         while let Some(leaving) = self.leaving.pop_front() {
             let Leaving::Measured(measurement) = leaving else {
                 self.settled = Track::default();
@@ -239,7 +260,7 @@ impl Session {
                 }
             };
             for step in [Some(first), second].into_iter().flatten() {
-                if let Some(nis) = self.learn_step(step, predictor, map) {
+                if let Some(nis) = self.learn_step(step, models, map) {
                     outcome = Outcome::Gated { nis };
                 }
             }
@@ -248,11 +269,15 @@ impl Session {
     }
 
     /// Lets the filter learn from one final step; NIS of the buffer that it ended if that was refused.
-    fn learn_step(&mut self, step: HistoryStep, predictor: &Predictor, map: Option<&Arc<WorldMap>>) -> Option<f64> {
+    fn learn_step(&mut self, step: HistoryStep, models: Models<'_>, map: Option<&Arc<WorldMap>>) -> Option<f64> {
         self.settled.push(step);
         let stamp_ns = self.settled.grid.map(|grid| grid.last_ns());
         let (newest, before) = self.settled.history.make_contiguous().split_last()?;
-        let (update, brought) = self.learner.step(predictor, before, newest, map)?;
+        let Judged { update, brought, contradiction, standing } = self.learner.step(models, before, newest, map)?;
+        if let (Some(watch), Some(end_ns), Some(grid)) = (self.watch.as_mut().filter(|_| !standing), stamp_ns, self.settled.grid) {
+            let begin_ns = end_ns.saturating_sub(grid.step_ns * self.learner.buffer() as i64);
+            self.told.extend(watch.feed(WatchedBuffer::new([begin_ns, end_ns], &update.agreement, contradiction)));
+        }
         self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
         let judged = self.soil.state.last_buffer.map_or(0, |last| last.judged) + 1;
         let last_buffer = Some(BufferTest { judged, nis: update.nis, dof: update.dof, rejected: update.rejected });
@@ -263,6 +288,42 @@ impl Session {
         let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, stamp_ns) };
         self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale };
         None
+    }
+
+    /// Puts effects on the vehicle of this session, or takes them away, and begins to learn the soil from the prior of `filter`: what was learned answered for
+    /// another vehicle.
+    pub(crate) fn act(&mut self, acting: Option<Arc<Acting>>, filter: SoilFilter) {
+        self.acting = acting;
+        self.told.extend(self.watch.as_mut().and_then(Watch::begin_again));
+        self.learner = SoilLearner::new(filter);
+        let begun = self.learner.state(self.soil.state.epoch + 1, None);
+        let state = SoilState { last_buffer: self.soil.state.last_buffer, ..begun };
+        self.soil = SoilEstimate { state, covariance: self.learner.covariance(), noise_scale: 1.0 };
+    }
+
+    /// Watches from now on whether measurements go on agreeing with predictions.
+    pub(crate) fn begin_watch(&mut self) {
+        self.watch.get_or_insert_default();
+    }
+
+    /// The alarm of the present episode.
+    pub fn alarm(&self) -> Option<Alarm> {
+        self.watch.as_ref().and_then(|watch| watch.active)
+    }
+
+    /// Alarms that were raised or cleared since the last time.
+    pub(crate) fn take_told(&mut self) -> Vec<Alarm> {
+        core::mem::take(&mut self.told)
+    }
+
+    /// The predictor of this session's vehicle, where effects were applied to it.
+    pub(crate) fn predictor(&self) -> Option<&Predictor> {
+        self.acting.as_ref().map(|acting| acting.predictor())
+    }
+
+    /// The effects that were applied.
+    pub fn applied(&self) -> AppliedEffects {
+        self.acting.as_ref().map(|acting| acting.applied().clone()).unwrap_or_default()
     }
 
     /// Position at which the session begins, once it has one; then never again. World, m.

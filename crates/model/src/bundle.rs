@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::{SOIL_DIM, Vehicle};
@@ -84,7 +85,7 @@ pub struct ModelBundle {
     /// Fitted baselines as JSON, if the bundle carries them.
     pub baselines_json: Option<String>,
     /// What a diagnosis must know of the model's usual errors as JSON, if the bundle carries it.
-    pub reference_json: Option<String>,
+    pub reference_json: Option<Arc<str>>,
     /// Settings of the soil filter that were estimated for this model as JSON, if the bundle carries them.
     pub soil_filter_json: Option<String>,
     /// Covariance of the model's own errors along a rollout as JSON, if the bundle carries it ([`crate::RolloutNoise`]).
@@ -170,7 +171,7 @@ impl ModelBundle {
         let vehicle = nesam_vehicle_card::from_json(&text_of(VEHICLE)?).map_err(|e| folder.fail(VEHICLE, e.to_string()))?;
         let effects = effects_file::read(&text_of(EFFECTS)?).map_err(|reason| folder.fail(EFFECTS, reason))?;
         let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;
-        let reference_json = take(REFERENCE).map(|bytes| folder.text(REFERENCE, bytes)).transpose()?;
+        let reference_json = take(REFERENCE).map(|bytes| folder.text(REFERENCE, bytes)).transpose()?.map(Arc::from);
         let soil_filter_json = take(SOIL_FILTER).map(|bytes| folder.text(SOIL_FILTER, bytes)).transpose()?;
         let rollout_noise_json = take(ROLLOUT_NOISE).map(|bytes| folder.text(ROLLOUT_NOISE, bytes)).transpose()?;
         Ok(Self {
@@ -223,7 +224,7 @@ impl ModelBundle {
             files.push((BASELINES, json.clone().into_bytes()));
         }
         if let Some(json) = &self.reference_json {
-            files.push((REFERENCE, json.clone().into_bytes()));
+            files.push((REFERENCE, json.as_bytes().to_vec()));
         }
         if let Some(json) = &self.soil_filter_json {
             files.push((SOIL_FILTER, json.clone().into_bytes()));

@@ -58,6 +58,14 @@ pub(crate) fn write(effects: &[ScheduledEffect]) -> String {
     format!("# Effects found by `nesam diagnose`, added to the vehicle card.\n{text}")
 }
 
+/// An effect by its id and its parameters by name, acting always.
+///
+/// # Errors
+/// What is wrong: an unknown id, a missing or unknown parameter, a value outside its physical range. The text follows the name of what holds the effect.
+pub fn named_effect(id: &str, parameters: &BTreeMap<String, f64>) -> Result<ScheduledEffect, String> {
+    effect(&Entry { id: id.into(), onset_s: 0.0, parameters: parameters.clone() })
+}
+
 fn effect(entry: &Entry) -> Result<ScheduledEffect, String> {
     let id = &entry.id;
     let form = Effect::example(id).ok_or_else(|| format!("names the effect `{id}`; this program knows {}", Effect::IDS.join(", ")))?;

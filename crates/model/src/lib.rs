@@ -28,6 +28,7 @@ pub mod weights;
 
 pub use bundle::{ModelBundle, Provenance};
 pub use dims::{HISTORY, MAX_HORIZON};
+pub use effects_file::named_effect;
 pub use fused::Path;
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;

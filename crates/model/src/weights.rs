@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
+use std::sync::Arc;
 
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
@@ -17,17 +18,17 @@ pub struct Array {
     pub values: Vec<f32>,
 }
 
-/// A set of named arrays, ordered by name so that files are reproducible byte for byte.
+/// A set of named arrays, ordered by name so that files are reproducible byte for byte. Clones share them until one is changed.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Weights {
-    arrays: BTreeMap<String, Array>,
+    arrays: Arc<BTreeMap<String, Array>>,
 }
 
 impl Weights {
     /// Adds or replaces an array. The number of values must match the shape.
     pub fn insert(&mut self, name: impl Into<String>, shape: &[usize], values: Vec<f32>) {
         assert_eq!(shape.iter().product::<usize>(), values.len(), "shape and values disagree; this is a bug");
-        self.arrays.insert(name.into(), Array { shape: shape.to_vec(), values });
+        Arc::make_mut(&mut self.arrays).insert(name.into(), Array { shape: shape.to_vec(), values });
     }
 
     /// All arrays in the order of their names.
@@ -37,7 +38,7 @@ impl Weights {
 
     /// Values of an array, to be changed in place.
     pub fn values_mut(&mut self, name: &str) -> Option<&mut [f32]> {
-        self.arrays.get_mut(name).map(|array| array.values.as_mut_slice())
+        Arc::make_mut(&mut self.arrays).get_mut(name).map(|array| array.values.as_mut_slice())
     }
 
     /// Number of values whose name starts with `prefix`.

@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 mod command_path;
+mod contradiction;
 pub mod driveline;
 pub mod effects;
 pub mod linear;
@@ -18,6 +19,7 @@ pub mod vec3;
 mod vehicle;
 
 pub use command_path::CommandPath;
+pub use contradiction::{CONTRADICTIONS, contradiction};
 pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};

@@ -103,6 +103,11 @@ impl FleetFile {
         }
     }
 
+    /// Whether it may change what a session takes its vehicle to be: every planner of the vehicle would be answered for another one.
+    pub fn may_operate(&self, identity: &Identity) -> bool {
+        matches!(identity, Identity::Operator(_)) && self.knows(identity)
+    }
+
     /// Whether it may upload, patch and delete a map.
     pub fn may_change_map(&self, identity: &Identity, map: &str) -> bool {
         match identity {
@@ -143,6 +148,7 @@ maps = ["quarry"]
         assert_eq!(rights(&|i| file.may_read(i, "truck-8")), [false, true, false, false, true, true]);
         assert_eq!(rights(&|i| file.may_read(i, "truck-9")), [false, false, false, false, true, true]);
         assert_eq!(rights(&|i| file.may_change(i, "truck-7")), [true, false, false, false, false, true]);
+        assert_eq!(rights(&|i| file.may_operate(i)), [false, false, false, false, false, true]);
         assert_eq!(rights(&|i| file.may_change_map(i, "truck-7-local")), [true, false, false, false, false, true]);
         assert_eq!(rights(&|i| file.may_change_map(i, "quarry")), [false, false, false, false, true, true]);
         assert_eq!(rights(&|i| file.may_name(i, "truck-8")), [false, true, false, false, false, true]);

@@ -33,6 +33,8 @@ pub enum Wish<'a> {
         /// Name of the session; empty = the vehicle's.
         session: &'a str,
     },
+    /// Put effects on the vehicle of an open session, or take them away.
+    ApplyEffects(&'a str),
     /// Upload, patch or delete a map.
     ChangeMap(&'a str),
 }
@@ -132,10 +134,11 @@ impl Caller {
         };
         let vehicle = self.vehicle_of(wish);
         let allowed = match (wish, &vehicle) {
-            (Wish::ReadSession(session) | Wish::ChangeSession(session), None) => {
+            (Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session), None) => {
                 return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
             }
             (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
+            (Wish::ApplyEffects(_), Some(_)) => fleet.may_operate(identity),
             (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
             (Wish::OpenSession { vehicle, session }, _) => {
                 let name = if session.is_empty() { vehicle } else { session };
@@ -160,7 +163,9 @@ impl Caller {
 
     fn vehicle_of(&self, wish: Wish<'_>) -> Option<Arc<str>> {
         match wish {
-            Wish::ReadSession(session) | Wish::ChangeSession(session) => self.access.directory.vehicle(session),
+            Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session) => {
+                self.access.directory.vehicle(session)
+            }
             Wish::OpenSession { .. } | Wish::ChangeMap(_) => None,
         }
     }
@@ -170,6 +175,7 @@ impl core::fmt::Display for Wish<'_> {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
         match self {
             Self::ReadSession(session) => write!(f, "read session `{session}`"),
+            Self::ApplyEffects(session) => write!(f, "change the effects of session `{session}`"),
             Self::ChangeSession(session) => write!(f, "change session `{session}`"),
             Self::OpenSession { vehicle, session } => write!(f, "open session `{session}` of vehicle `{vehicle}`"),
             Self::ChangeMap(map) => write!(f, "change map `{map}`"),

@@ -10,10 +10,11 @@ use nesam_proto::v1 as pb;
 use prost::Message as _;
 use sha2::{Digest as _, Sha256};
 
-use super::soil_correction;
+use super::alarm::{from_watch_image, watch_image};
+use super::{applied_effects, effect_messages, soil_correction};
 
 /// Version of the format. Any change of `SessionContent` needs another one.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 
 fn refused(reason: impl Into<String>) -> EngineError {
     EngineError::invalid("image", reason)
@@ -90,6 +91,9 @@ fn content(image: &SessionImage) -> pb::SessionContent {
             dof: last.dof as u32,
             rejected: last.rejected,
         }),
+        effects: effect_messages(&image.effects),
+        effects_source: image.effects.source.clone(),
+        watch: image.watch.as_ref().map(watch_image),
     }
 }
 
@@ -153,6 +157,8 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
             ground_class: filter.ground_class as usize,
         },
         soil: from_soil(content)?,
+        effects: applied_effects(&content.effects_source, &content.effects),
+        watch: content.watch.as_ref().map(from_watch_image).transpose()?,
     })
 }
 

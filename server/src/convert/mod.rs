@@ -1,6 +1,8 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
+mod alarm;
 mod command;
+mod effects;
 mod extras;
 mod image;
 mod measurement;
@@ -12,7 +14,9 @@ mod status;
 mod terrain;
 mod terrain_message;
 
+pub use alarm::alarm_message;
 pub use command::{measurement_message, open_message, predict_message};
+pub use effects::{applied_effects, effect_messages};
 pub use image::{image_bytes, session_image};
 pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};

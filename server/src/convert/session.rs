@@ -5,7 +5,7 @@ use nesam_engine::{FleetCell, OpenSession, Provenance, SessionView, SoilEstimate
 use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
-use super::{control_message, measurement, vehicle_state_message};
+use super::{alarm_message, control_message, effect_messages, measurement, vehicle_state_message};
 
 /// A session to open.
 ///
@@ -42,6 +42,9 @@ pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
         state: view.newest.as_ref().map(|step| vehicle_state_message(&step.state)),
         command: view.newest.as_ref().map(|step| control_message(&step.control)),
         soil_correction: Some(soil_correction(&view.soil)),
+        effects: effect_messages(&view.effects),
+        effects_source: view.effects.source.clone(),
+        alarm: view.alarm.as_ref().map(|alarm| alarm_message(&view.session, &view.vehicle, alarm)),
     }
 }
 

@@ -1,5 +1,6 @@
 //! The gRPC services: one file each, handlers that convert, ask the engine and convert back.
 
+mod alarms;
 mod deadline;
 mod measurements;
 mod prediction;

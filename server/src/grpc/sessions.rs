@@ -1,12 +1,12 @@
 //! nesam.v1.Sessions.
 
-use nesam_engine::SessionView;
+use nesam_engine::{AppliedEffects, EngineError, SessionView};
 use nesam_proto::v1 as pb;
 use tonic::{Request, Response, Status};
 
-use super::Edge;
+use super::{Edge, ReplyStream, alarms};
 use crate::access::Wish;
-use crate::convert::{image_bytes, open_session, session_image, session_view, to_status};
+use crate::convert::{applied_effects, image_bytes, open_session, session_image, session_view, to_status};
 use crate::store::Key;
 use crate::telemetry::Transport;
 
@@ -20,10 +20,33 @@ impl Edge {
         let durable_place = self.durable_place(&view.session);
         pb::Session { vehicle_alive, durable_place, ..session_view(view, &self.predictor.bundle().vehicle) }
     }
+
+    /// Puts effects on a session; `None` takes them away.
+    async fn set_effects<T>(
+        &self,
+        method: &'static str,
+        request: &Request<T>,
+        session: &str,
+        effects: Option<AppliedEffects>,
+    ) -> Result<Response<pb::Session>, Status> {
+        self.engine.metrics().request(Transport::Grpc, method);
+        let budget = self.budget(request);
+        self.allow(request, Wish::ApplyEffects(session))?;
+        if effects.as_ref().is_some_and(|given| given.effects.is_empty()) {
+            return Err(to_status(EngineError::invalid("effects", "is empty; RevertEffects takes effects away")));
+        }
+        let view = self.engine.set_effects(session, effects.unwrap_or_default(), budget).await.map_err(to_status)?;
+        let ids: Vec<&str> = view.effects.effects.iter().map(|e| e.id.as_str()).collect();
+        tracing::info!(session, effects = ids.join(","), source = view.effects.source, "effects of a session changed");
+        self.settled(Key::Session(view.session.clone()), budget).await?;
+        Ok(Response::new(self.session(&view)))
+    }
 }
 
 #[tonic::async_trait]
 impl pb::sessions_server::Sessions for Service {
+    type WatchAlarmsStream = ReplyStream<pb::Alarm>;
+
     async fn open(&self, request: Request<pb::OpenSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "open");
         let budget = self.0.budget(&request);
@@ -84,6 +107,20 @@ impl pb::sessions_server::Sessions for Service {
         tracing::info!(session = view.session, vehicle = view.vehicle, "session imported");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
+    }
+
+    async fn apply_effects(&self, request: Request<pb::ApplyEffectsRequest>) -> Result<Response<pb::Session>, Status> {
+        let pb::ApplyEffectsRequest { session_id, source, effects } = request.get_ref();
+        let applied = applied_effects(source, effects);
+        self.0.set_effects("apply_effects", &request, session_id, Some(applied)).await
+    }
+
+    async fn revert_effects(&self, request: Request<pb::RevertEffectsRequest>) -> Result<Response<pb::Session>, Status> {
+        self.0.set_effects("revert_effects", &request, &request.get_ref().session_id, None).await
+    }
+
+    async fn watch_alarms(&self, request: Request<pb::WatchAlarmsRequest>) -> Result<Response<Self::WatchAlarmsStream>, Status> {
+        alarms::watch(self.0.clone(), request).await
     }
 
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {

@@ -3,15 +3,15 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_engine::{Command, EngineError, Limits, Reply};
+use nesam_engine::{AppliedEffects, Command, EngineError, Limits, Reply};
 use nesam_proto::v1 as pb;
 use nesam_terrain::WorldMap;
 use prost::Message as _;
 
 use super::topic::Topic;
 use crate::convert::{
-    MapBuilder, changed_tile, image_bytes, measurement, measurement_message, open_message, open_session, patched, predict_message,
-    predict_query, session_image, upload,
+    MapBuilder, applied_effects, changed_tile, effect_messages, image_bytes, measurement, measurement_message, open_message, open_session,
+    patched, predict_message, predict_query, session_image, upload,
 };
 
 /// A message and its topic.
@@ -22,6 +22,11 @@ pub(crate) type Entry = (Topic, Vec<u8>);
 pub(crate) struct HeldMaps(BTreeMap<String, Arc<WorldMap>>);
 
 impl HeldMaps {
+    /// A map.
+    pub fn get(&self, id: &str) -> Option<Arc<WorldMap>> {
+        self.0.get(id).cloned()
+    }
+
     /// Follows what a command has done.
     pub fn follow(&mut self, command: &Command, result: &Result<Reply, EngineError>) {
         match (command, result) {
@@ -56,6 +61,13 @@ pub(crate) fn to_entries(command: &Command, maps: &HeldMaps) -> Vec<Entry> {
         Command::Snapshot { .. } => Vec::new(),
         Command::FleetSoil { map } => one(Topic::FleetSoil, pb::FleetSoilRequest { map_id: map.clone() }.encode_to_vec()),
         Command::Close { session } => one(Topic::Close, pb::CloseSessionRequest { session_id: session.clone() }.encode_to_vec()),
+        Command::SetEffects { session, effects } if effects.effects.is_empty() => {
+            one(Topic::RevertEffects, pb::RevertEffectsRequest { session_id: session.clone() }.encode_to_vec())
+        }
+        Command::SetEffects { session, effects } => {
+            let (source, messages) = (effects.source.clone(), effect_messages(effects));
+            one(Topic::ApplyEffects, pb::ApplyEffectsRequest { session_id: session.clone(), source, effects: messages }.encode_to_vec())
+        }
         Command::Expire => one(Topic::Expire, pb::ExpireSessionsRequest {}.encode_to_vec()),
         Command::Measure { session, vehicle, measurement } => {
             let source = vehicle.iter().map(|vehicle| pb::MeasurementSource { vehicle_id: vehicle.clone() }.encode_to_vec());
@@ -106,6 +118,14 @@ pub(crate) fn of_entries(entries: &[Entry], limits: &Limits, maps: &HeldMaps) ->
         }
         [(Topic::FleetSoil, data)] => Ok(Command::FleetSoil { map: read::<pb::FleetSoilRequest>(data)?.map_id }),
         [(Topic::Close, data)] => Ok(Command::Close { session: read::<pb::CloseSessionRequest>(data)?.session_id }),
+        [(Topic::ApplyEffects, data)] => {
+            let pb::ApplyEffectsRequest { session_id, source, effects } = read(data)?;
+            Ok(Command::SetEffects { session: session_id, effects: applied_effects(&source, &effects) })
+        }
+        [(Topic::RevertEffects, data)] => {
+            let session = read::<pb::RevertEffectsRequest>(data)?.session_id;
+            Ok(Command::SetEffects { session, effects: AppliedEffects::default() })
+        }
         [(Topic::Expire, _)] => Ok(Command::Expire),
         [(Topic::Measurement, data)] => measure(data, None),
         [(Topic::MeasurementSource, source), (Topic::Measurement, data)] => {

@@ -8,6 +8,7 @@
 //! - [`Recorder`] hears the engine ([`nesam_engine::Tap`]), queues what it hears and writes it on a thread of its own. What the disk cannot follow is
 //!   dropped and counted, never waited for.
 //! - [`Recording`] reads the parts of a recording back, finished or not.
+//! - [`window`] gives back what one session measured, for a diagnosis.
 //! - [`replay`] executes the commands on a fresh engine and compares the answers bit for bit.
 //!
 //! ```text
@@ -27,6 +28,7 @@ mod recorder;
 mod replay;
 mod schema;
 mod topic;
+mod window;
 
 pub use difference::FieldDifference;
 pub use error::RecordingError;
@@ -35,3 +37,4 @@ pub use reader::{Ending, RecordedCommand, Recording};
 pub use recorder::{Recorder, RecorderCounts};
 pub use replay::{Difference, KindCount, ReplayReport, replay};
 pub use topic::Topic;
+pub use window::{RecordedWindow, window};

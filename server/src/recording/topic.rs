@@ -56,6 +56,8 @@ topics! {
     Export Request "/session/export" "ExportSessionRequest",
     Import Request "/session/import" "ImportSessionRequest",
     Close Request "/session/close" "CloseSessionRequest",
+    ApplyEffects Request "/session/effects/apply" "ApplyEffectsRequest",
+    RevertEffects Request "/session/effects/revert" "RevertEffectsRequest",
     Expire Request "/session/expire" "ExpireSessionsRequest",
     MeasurementSource Request "/measurement/source" "MeasurementSource",
     Measurement Request "/measurement" "Measurement",

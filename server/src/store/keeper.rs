@@ -85,12 +85,14 @@ impl Keeper {
     /// Hears the engine; called on its thread.
     pub fn note(&self, event: &Event) {
         let (key, wait) = match event {
-            Event::SessionOpened { session, .. } | Event::SessionClosed { session, .. } => (Key::Session(session.clone()), Duration::ZERO),
+            Event::SessionOpened { session, .. } | Event::SessionClosed { session, .. } | Event::EffectsChanged { session, .. } => {
+                (Key::Session(session.clone()), Duration::ZERO)
+            }
             Event::MeasurementAccepted { session, buffer_ended } => {
                 (Key::Session(session.clone()), if *buffer_ended { Duration::ZERO } else { self.interval })
             }
             Event::MapChanged { map } => (Key::Map(map.clone()), Duration::ZERO),
-            Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } => return,
+            Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } => return,
         };
         let mut state = self.lock();
         state.changes += 1;

@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Mutex;
 
-use nesam_engine::{Answer, EngineError, Reply};
+use nesam_engine::{Answer, EngineError, Event, Reply};
 
+use super::alarms::AlarmCounts;
 use super::histogram::Histogram;
 
 /// What brought a measurement or a request.
@@ -37,6 +38,7 @@ pub struct Metrics {
     measurements: Pairs,
     requests: Pairs,
     events: Mutex<BTreeMap<&'static str, u64>>,
+    alarms: AlarmCounts,
     queue: Histogram,
     prediction: Histogram,
 }
@@ -85,10 +87,11 @@ impl Metrics {
     }
 
     /// Counts something that happened to a session.
-    pub fn event(&self, event: &'static str) {
+    pub fn event(&self, event: &Event) {
         if let Ok(mut events) = self.events.lock() {
-            *events.entry(event).or_default() += 1;
+            *events.entry(event.label()).or_default() += 1;
         }
+        self.alarms.note(event);
     }
 
     /// Number of predictions answered.
@@ -117,6 +120,7 @@ impl Metrics {
                 let _ = writeln!(out, "nesam_events_total{{event=\"{event}\"}} {value}");
             }
         }
+        self.alarms.render(&mut out);
         self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
         self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
         for (lane, value) in [("commands", waiting_commands), ("predictions", waiting_predictions)] {
@@ -143,7 +147,7 @@ mod tests {
         }
         metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
         metrics.measurement(Transport::Zenoh, "applied");
-        metrics.event("soil_changed");
+        metrics.event(&Event::MapChanged { map: "m".into() });
         let text = metrics.render(3, 4);
         for line in [
             "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
@@ -151,7 +155,9 @@ mod tests {
             "nesam_measurements_total{transport=\"zenoh\",outcome=\"applied\"} 1",
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
-            "nesam_events_total{event=\"soil_changed\"} 1",
+            "nesam_events_total{event=\"map_changed\"} 1",
+            "nesam_alarms_total{kind=\"sensor_jump\"} 0",
+            "nesam_alarms_active 0",
             "nesam_waiting_predictions 4",
         ] {
             assert!(text.lines().any(|l| l == line), "{line} is not in\n{text}");

@@ -1,5 +1,6 @@
 //! What the server counts.
 
+mod alarms;
 mod histogram;
 mod metrics;
 

@@ -9,6 +9,7 @@ use nesam_proto::v1 as pb;
 use tokio::sync::{Notify, mpsc};
 
 use super::{Outgoing, encode, keys};
+use crate::convert::{alarm_message, effect_messages};
 use crate::grpc::Edge;
 
 /// Tokens that are remembered; a network that shows more is not one of vehicles.
@@ -81,6 +82,8 @@ pub async fn publish_status(edge: Edge, presence: Presence, key: String, name: S
             history_epoch: view.provenance.history_epoch,
             soil_epoch: view.provenance.soil_epoch,
             vehicle_alive: presence.is_alive(&view.vehicle),
+            effects: effect_messages(&view.effects),
+            alarm: view.alarm.as_ref().map(|alarm| alarm_message(&view.session, &view.vehicle, alarm)),
         });
         let bundle = edge.predictor.bundle();
         let status = pb::ServerStatus {

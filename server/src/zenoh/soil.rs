@@ -1,11 +1,12 @@
-//! Soil over Zenoh: each change of an estimate is published on `.../<vehicle>/soil`, each change of the map of the fleet on `.../soil_map`.
+//! Soil and alarms over Zenoh: each change of an estimate is published on `.../<vehicle>/soil`, each change of the map of the fleet on `.../soil_map`, each
+//! alarm on `.../<vehicle>/alarm`.
 
 use nesam_engine::Event;
 use tokio::sync::broadcast::{self, error::RecvError};
 use tokio::sync::mpsc;
 
 use super::{Outgoing, encode, keys};
-use crate::convert::{fleet_soil_map, soil_estimate};
+use crate::convert::{alarm_message, fleet_soil_map, soil_estimate};
 
 /// Hands every change over to the publisher, as long as there are events and a publisher.
 pub async fn publish_changes(mut events: broadcast::Receiver<Event>, fleet: String, sender: mpsc::Sender<Outgoing>) {
@@ -23,8 +24,14 @@ pub async fn publish_changes(mut events: broadcast::Receiver<Event>, fleet: Stri
                     return;
                 }
             }
+            Ok(Event::AlarmChanged { session, vehicle, alarm }) => {
+                let key = keys::of_vehicle(&fleet, &vehicle, "alarm");
+                if sender.send((key, encode(&alarm_message(&session, &vehicle, &alarm)))).await.is_err() {
+                    return;
+                }
+            }
             Ok(_) => {}
-            Err(RecvError::Lagged(missed)) => tracing::warn!(missed, "changes of the soil were not published"),
+            Err(RecvError::Lagged(missed)) => tracing::warn!(missed, "changes of the soil or alarms were not published"),
             Err(RecvError::Closed) => return,
         }
     }

@@ -1,7 +1,9 @@
 //! The service over real sockets: a server on loopback, the Rust client, a recorded drive, the shipped bundle.
 #![allow(clippy::unwrap_used)]
 
+mod alarms;
 mod bad_input;
+mod effects;
 mod extras;
 mod fleet_soil;
 mod from_now;

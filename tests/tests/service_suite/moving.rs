@@ -69,9 +69,9 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
         change(&mut content);
         let content = content.encode_to_vec();
         let checksum = <sha2::Sha256 as sha2::Digest>::digest(&content).to_vec();
-        v1::SessionImage { version: 2, checksum: checksum.into(), content: content.into() }.encode_to_vec()
+        v1::SessionImage { version: 3, checksum: checksum.into(), content: content.into() }.encode_to_vec()
     };
-    let newer = v1::SessionImage { version: 3, ..outer }.encode_to_vec();
+    let newer = v1::SessionImage { version: 4, ..outer }.encode_to_vec();
     type Change<'a> = &'a dyn Fn(&mut v1::SessionContent);
     let changes: [(&str, Change<'_>); 11] = [
         ("bundle", &|c| c.bundle_hash = "0".repeat(64)),

@@ -82,9 +82,16 @@ fn valid_message(path: &str, recorded: &Recorded, map: &str) -> Vec<u8> {
         // Complete but empty: exports with content are changed one by one in `moving`.
         "Import" => {
             let checksum = <sha2::Sha256 as sha2::Digest>::digest(b"").to_vec();
-            let image = v1::SessionImage { version: 2, checksum: checksum.into(), content: Bytes::new() }.encode_to_vec();
+            let image = v1::SessionImage { version: 3, checksum: checksum.into(), content: Bytes::new() }.encode_to_vec();
             v1::ImportSessionRequest { image: image.into(), session_id: "new".into() }.encode_to_vec()
         }
+        "ApplyEffects" => {
+            let parameters = vec![v1::EffectParameter { name: "second".into(), value: 0.01, sd: 0.0 }];
+            let effects = vec![v1::Effect { id: "steering_offset".into(), parameters }];
+            v1::ApplyEffectsRequest { session_id: session_id(), source: "test".into(), effects }.encode_to_vec()
+        }
+        "RevertEffects" => v1::RevertEffectsRequest { session_id: session_id() }.encode_to_vec(),
+        "WatchAlarms" => v1::WatchAlarmsRequest { session_id: session_id() }.encode_to_vec(),
         "Close" => v1::CloseSessionRequest { session_id: session_id() }.encode_to_vec(),
         "Predict" | "PredictStream" => candidates("s", &recorded.drive, 39, 2, 3)
             .starting_at(39 * STEP_NS, vec![(40 * STEP_NS, [1.0, 0.0])])

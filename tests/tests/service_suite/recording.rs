@@ -38,6 +38,10 @@ async fn record(folder: &Path, change: impl FnOnce(&mut Config)) -> Vec<PathBuf>
     let image = client.export_session("s").await.unwrap();
     client.import_session(image, "u").await.unwrap();
     client.predict(candidates("u", &recorded.drive, FED, 1, 8)).await.unwrap();
+    let parameters = vec![v1::EffectParameter { name: "second".into(), value: 0.05, sd: 0.01 }];
+    client.apply_effects("u", "a test", vec![v1::Effect { id: "steering_offset".into(), parameters }]).await.unwrap();
+    client.predict(candidates("u", &recorded.drive, FED, 1, 8)).await.unwrap();
+    client.revert_effects("u").await.unwrap();
     assert!(!client.fleet_soil("").await.unwrap().cells.is_empty());
     let tile = v1::MapTile {
         row: 7,
@@ -104,9 +108,9 @@ async fn service_a_recorded_run_comes_out_bit_for_bit() {
     assert!(report.all_equal());
     assert_eq!(report.ending, Some(Ending::Finished { reason: "stopped".into(), dropped_commands: 0 }));
     let count = |kind: &str| report.kinds.get(kind).map_or(0, |kind| kind.equal);
-    assert_eq!((count("measure"), count("predict"), count("put_map")), (FED as u64 + 1 + 21, 5, 2));
+    assert_eq!((count("measure"), count("predict"), count("put_map")), (FED as u64 + 1 + 21, 6, 2));
     assert_eq!((count("open"), count("fork"), count("close"), count("get"), count("list"), count("delete_map")), (1, 1, 1, 1, 1, 1));
-    assert_eq!((count("export"), count("import"), count("fleet_soil")), (1, 1, 1));
+    assert_eq!((count("export"), count("import"), count("fleet_soil"), count("set_effects")), (1, 1, 1, 2));
     // A viewer finds our messages with their schemas, and the soil on a topic of its own.
     let mut reader = Reader::new(std::fs::File::open(&parts[0]).unwrap());
     let (mut schemas, mut topics, mut seen) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::<String, usize>::new());

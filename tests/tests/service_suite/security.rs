@@ -97,6 +97,11 @@ fn open_request(vehicle: &str, session: &str) -> v1::OpenSessionRequest {
 }
 
 /// Asserts PERMISSION_DENIED with the name of whoever asked.
+fn offset() -> Vec<v1::Effect> {
+    let parameters = vec![v1::EffectParameter { name: "second".into(), value: 0.02, sd: 0.0 }];
+    vec![v1::Effect { id: "steering_offset".into(), parameters }]
+}
+
 fn denied<T: core::fmt::Debug>(what: &str, result: Result<T, ClientError>, who: &str) {
     let error = result.expect_err(what);
     assert_eq!(error.code(), Some(Code::PermissionDenied), "{what}: {error}");
@@ -131,6 +136,8 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
         denied("close", client.close_session("truck").await, who);
         denied("fork", client.fork_session("truck", "copy").await, who);
         denied("import", client.import_session(operator.export_session("truck").await.unwrap(), "copy").await, who);
+        denied("effects", client.apply_effects("truck", "", offset()).await, who);
+        denied("revert", client.revert_effects("truck").await, who);
         denied("map", client.upload_map(&layers(&recorded.world)).await, who);
         denied("delete", client.delete_map(recorded.world.id()).await, who);
         let answers = client.feed(samples("truck", &recorded.drive, 3)).await.unwrap();
@@ -139,6 +146,8 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
             assert_eq!((rejected.code, rejected.field.as_str()), (Code::PermissionDenied.into(), "session_id"));
         }
     }
+    denied("its own effects", truck.apply_effects("truck", "", offset()).await, "vehicle `truck`");
+    denied("alarms", other.watch_alarms("truck").await, "vehicle `other`");
     denied("get", other.session("truck").await, "vehicle `other`");
     denied("export", other.export_session("truck").await, "vehicle `other`");
     denied("predict", other.predict(query.clone()).await, "vehicle `other`");
@@ -156,6 +165,9 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
 
     // A replayed measurement changes nothing either.
     assert_eq!(outcome_label(&truck.feed(vec![sample("truck", &recorded.drive, 40)]).await.unwrap()[0]), "DUPLICATE");
+
+    // What a vehicle is taken to be is for operators.
+    assert_eq!(operator.apply_effects("truck", "", offset()).await.unwrap().effects, offset());
     stage.server.shutdown().await;
 }
 

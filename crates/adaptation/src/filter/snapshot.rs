@@ -45,7 +45,7 @@ pub struct ClassBelief {
 impl SoilFilter {
     /// What the filter has learned. Transitions that wait for the next update are not part of it.
     pub fn snapshot(&self) -> FilterSnapshot {
-        let Self { config: _, noise: _, rest: _, state, plain, scale, trust, buffer: _, here } = self;
+        let Self { config: _, noise: _, rest: _, state, plain, scale, trust, buffer: _, here, considered: _ } = self;
         let (trust_log_odds, corrections) = trust.state();
         FilterSnapshot {
             state: state.snapshot(),

@@ -1,5 +1,7 @@
-//! `nesam bench`: what answers cost on this machine, whether the soil filter knows how wrong it is, and how often a diagnosis is right.
+//! `nesam bench`: what answers cost on this machine, whether the soil filter knows how wrong it is, how often sessions alarm, and how often a
+//! diagnosis is right.
 
+mod alarms;
 mod consistency;
 mod discovery;
 mod page;
@@ -38,6 +40,8 @@ enum Bench {
     Predict(PredictBench),
     /// Simulate drives on known soils and hold what the soil filter says of its errors against them (NEES, NIS, coverage)
     Consistency(consistency::ConsistencyBench),
+    /// Count the alarms of sessions on drives without a change and, with --hide, on drives that change midway
+    Alarms(alarms::AlarmBench),
     /// Hide effects in validation drives and score what a diagnosis makes of them
     Discovery(discovery::DiscoveryBench),
     /// Ask a real server for more than it can give, at random instants, and count what comes in time
@@ -91,6 +95,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
     match &args.what {
         Bench::Predict(args) => predict(args),
         Bench::Consistency(args) => consistency::run(args),
+        Bench::Alarms(args) => alarms::run(args),
         Bench::Discovery(args) => discovery::run(args),
         Bench::Serve(args) => serve::run(args),
     }

@@ -1,23 +1,28 @@
 //! `nesam diagnose`: from a measured residual to the physical effect that the model lacks.
 
+mod recording;
+
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
+use std::sync::{Arc, Mutex};
 
 use clap::Args;
 use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
-use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM};
+use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
 use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
 use nesam_physics::Vehicle;
 use nesam_physics::effects::{Effect, ScheduledEffect};
+use nesam_terrain::WorldMap;
+use nesam_trajectories::Trajectory;
 
+use self::recording::RecordingArgs;
 use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{command_line, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Hypotheses in the printed table.
@@ -32,6 +37,8 @@ pub struct DiagnoseArgs {
     bundle: BundleArgs,
     #[command(flatten)]
     window: WindowArgs,
+    #[command(flatten)]
+    recording: RecordingArgs,
     /// Fit on these drives only and score on the others [default: leave each drive out once]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     fit_on: Option<Vec<String>>,
@@ -42,7 +49,7 @@ pub struct DiagnoseArgs {
     #[arg(long, value_enum, default_value_t = ReferenceArg::Bundle)]
     reference: ReferenceArg,
     /// Measure the reference on the drives of the train split that training left for validation, and put it into the bundle
-    #[arg(long, conflicts_with_all = ["fit_on", "without"])]
+    #[arg(long, conflicts_with_all = ["fit_on", "without", "recording"])]
     make_reference: bool,
     /// Leave out the controls: rivals refitted, a black box, a free form of what is left
     #[arg(long)]
@@ -76,6 +83,25 @@ impl From<ReferenceArg> for Against {
             ReferenceArg::Physics => Self::Physics,
         }
     }
+}
+
+/// What is diagnosed.
+struct Input {
+    set: String,
+    drives: Vec<Trajectory>,
+    maps: Vec<Option<Arc<WorldMap>>>,
+    data_hash: String,
+    predictor: Arc<Predictor>,
+    provenance: ReportProvenance,
+}
+
+/// The drives of a set in a data root.
+fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
+    let drives = read_drives(&args.data, false)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let provenance = output::provenance(Some(predictor.bundle()), &drives);
+    let data_hash = drives.root.hash();
+    Ok(Input { set: drives.set, drives: drives.drives, maps: drives.maps, data_hash, predictor, provenance })
 }
 
 /// Runs the command.
@@ -120,7 +146,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
             );
         }
     }
-    bundle.reference_json = Some(text);
+    bundle.reference_json = Some(text.into());
     bundle.save(&dir).or_failed()?;
     say!("bundle {} now carries the reference of {} drives; its hash is {}", bundle.name, observed.len(), &bundle.hash[..12]);
     Ok(())
@@ -142,9 +168,9 @@ fn stepping(bundle: &ModelBundle) -> Stepping {
 
 fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
-    let drives = read_drives(&args.data, false)?;
+    let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.data.dt)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = Arc::clone(&drives.predictor);
     let options = Options {
         fit_on: args.fit_on.clone(),
         without: args.without.clone(),
@@ -167,13 +193,12 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         Some(_) => Some(patched(&predictor, &with_free_form, &drives, &out.join("bundle-free-form"))?),
     };
     let [shown, free_form_bundle] = [bundle, free_form_bundle].map(|b| b.map(|p| p.display().to_string()));
-    let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let report = Report {
         set: &drives.set,
         diagnosis: &found,
         bundle: shown.as_deref(),
         free_form_bundle: free_form_bundle.as_deref(),
-        provenance: &provenance,
+        provenance: &drives.provenance,
         dt_s: args.data.dt,
         against: args.reference.into(),
     };
@@ -187,12 +212,12 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
 }
 
 /// Writes the bundle with effects.
-fn patched(predictor: &Predictor, effects: &[ScheduledEffect], drives: &Drives, to: &Path) -> Result<PathBuf, Failure> {
+fn patched(predictor: &Predictor, effects: &[ScheduledEffect], drives: &Input, to: &Path) -> Result<PathBuf, Failure> {
     let base = predictor.bundle();
     let mut bundle = base.with_effects(effects);
     bundle.provenance = Provenance {
         command: command_line(),
-        data_hash: drives.root.hash(),
+        data_hash: drives.data_hash.clone(),
         program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
         parent: Some(base.hash.clone()),
         ..base.provenance.clone()

@@ -6,6 +6,7 @@ pub mod check;
 mod coverage;
 pub mod demo;
 pub mod diagnose;
+pub mod effects;
 pub mod evaluate;
 pub mod fleet;
 pub mod import;

@@ -167,7 +167,7 @@ pub fn bundle() -> ModelBundle {
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
             let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 } };
             let reference = Reference::measure(&bench, &observed, "twin", &|_| {}).unwrap();
-            bundle.reference_json = Some(reference.to_json());
+            bundle.reference_json = Some(reference.to_json().into());
             bundle
         })
         .clone()

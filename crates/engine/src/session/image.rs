@@ -1,12 +1,15 @@
 //! A session as plain numbers, to move it to another server or another time.
 
+use std::sync::Arc;
+
 use nesam_adaptation::{FilterSnapshot, SoilFilter};
 use nesam_model::{HISTORY, HistoryStep};
 
 use super::order::Order;
 use super::soil::SoilLearner;
 use super::track::Track;
-use super::{FleetPart, OPEN_MAX, Rules, Session, SoilEstimate};
+use super::watch::{VALUES, Watch, WatchedBuffer};
+use super::{Acting, Alarm, AppliedEffects, FleetPart, OPEN_MAX, Rules, Session, SoilEstimate};
 use crate::error::EngineError;
 use crate::grid::StepGrid;
 use crate::limits::outside_card;
@@ -57,6 +60,50 @@ pub struct SessionImage {
     pub filter: FilterSnapshot,
     /// What the session gives out of it.
     pub soil: SoilEstimate,
+    /// Effects that were applied.
+    pub effects: AppliedEffects,
+    /// The watch of the innovations; `None` = not watched.
+    pub watch: Option<WatchImage>,
+}
+
+/// What a watch remembers.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct WatchImage {
+    /// First and last stamp of each buffer in the window, oldest first, ns.
+    pub stamps_ns: Vec<[i64; 2]>,
+    /// Numbers of each buffer.
+    pub values: Vec<[f64; WatchImage::VALUES]>,
+    /// Episodes so far.
+    pub episodes: u64,
+    /// The alarm of the present one.
+    pub active: Option<Alarm>,
+    /// Calm buffers in a row.
+    pub calm: u32,
+}
+
+impl WatchImage {
+    /// Numbers of one buffer.
+    pub const VALUES: usize = VALUES;
+
+    fn of(watch: &Watch) -> Self {
+        Self {
+            stamps_ns: watch.window.iter().map(|b| b.stamps_ns).collect(),
+            values: watch.window.iter().map(|b| b.to_values()).collect(),
+            episodes: watch.episodes,
+            active: watch.active,
+            calm: watch.calm,
+        }
+    }
+
+    fn watch(&self) -> Watch {
+        let buffers = self.stamps_ns.iter().zip(&self.values);
+        Watch {
+            window: buffers.map(|(stamps_ns, values)| WatchedBuffer::from_values(*stamps_ns, values)).collect(),
+            episodes: self.episodes,
+            active: self.active,
+            calm: self.calm,
+        }
+    }
 }
 
 /// A grid with the measurement before and the steps made so far.
@@ -98,10 +145,12 @@ impl Session {
             filter_first,
             filter: filter.snapshot(),
             soil: self.soil,
+            effects: self.applied(),
+            watch: self.watch.as_ref().map(WatchImage::of),
         }
     }
 
-    /// The session of an image under a name. The caller has compared bundle and map.
+    /// The session of an image under a name. The caller has compared bundle and map and prepared the effects.
     ///
     /// # Errors
     /// `EngineError::Invalid` naming `image` when it was made with other settings of the soil filter, or holds what no session can hold.
@@ -109,6 +158,7 @@ impl Session {
         id: &str,
         image: &SessionImage,
         filter: SoilFilter,
+        acting: Option<Arc<Acting>>,
         now_ns: u64,
         rules: Rules<'_>,
     ) -> Result<Self, EngineError> {
@@ -142,6 +192,9 @@ impl Session {
             learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first),
             soil: image.soil,
             fleet: FleetPart { asks: false, brings: true, brought: Vec::new() },
+            acting,
+            watch: image.watch.as_ref().map(WatchImage::watch),
+            told: Vec::new(),
         })
     }
 }
@@ -167,6 +220,7 @@ impl SessionImage {
             ("too many starts", self.ended_boots.len() <= super::order::ENDED_BOOTS_MAX),
             ("a soil that is not finite", self.soil.covariance.as_flattened().iter().all(|v| v.is_finite())),
             ("a noise scale that is not positive", self.soil.noise_scale > 0.0 && self.soil.noise_scale.is_finite()),
+            ("an impossible watch", self.watch.as_ref().is_none_or(|watch| watch.watch().is_possible())),
             ("a soil that is not finite", self.soil.state.correction.delta.iter().all(|v| v.is_finite())),
         ];
         if let Some((what, _)) = possible.iter().find(|(_, holds)| !holds) {

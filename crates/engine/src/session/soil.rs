@@ -5,13 +5,16 @@ use std::sync::Arc;
 use nesam_adaptation::{BufferedTransition, ClassBelief, Innovation, SoilFilter, SoilUpdate};
 use nesam_fleet_soil::{FleetPrior, Increment, SoilBelief};
 use nesam_model::{HISTORY, HistoryStep, Predictor, SoilByClass, SoilField};
-use nesam_physics::{SOIL_DIM, SoilCorrection};
+use nesam_physics::{CONTRADICTIONS, SOIL_DIM, SoilCorrection, contradiction};
 use nesam_terrain::WorldMap;
 
 use crate::fleet::Brought;
 
 /// What the fleet may say at most on whether the correction helps, log odds: a vehicle that finds it wrong unlearns it within a few buffers. Chosen.
 const VOTES_MAX: f64 = 4.0;
+
+/// Distance in a buffer, m, and commanded speed, m/s, below which a vehicle stands. Chosen.
+const STANDING: [f64; 2] = [0.5, 0.5];
 
 /// What was learned of the soil in this session.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -44,11 +47,36 @@ pub struct BufferTest {
 }
 
 impl SoilState {
+    /// Whether the prior alone speaks: nothing was learned, or it was forgotten because other effects act now.
+    pub fn is_prior(&self) -> bool {
+        self.epoch == 0 || (self.stamp_ns.is_none() && self.correction.delta == [0.0; SOIL_DIM])
+    }
+
     /// Variance of a corrected soil in physical units squared, to first order.
     pub fn variance_at(&self, soil: &[f64; SOIL_DIM]) -> Option<[f64; SOIL_DIM]> {
         let slope = self.correction.coordinates.slope(soil);
         self.variance.map(|variance| core::array::from_fn(|i| slope[i] * slope[i] * variance[i]))
     }
+}
+
+/// What a session predicts with.
+#[derive(Clone, Copy)]
+pub(super) struct Models<'a> {
+    /// The vehicle as it is taken to be.
+    pub usual: &'a Predictor,
+    /// The same with one uncertain parameter of an applied effect one standard deviation off.
+    pub shifted: &'a [Predictor],
+}
+
+/// A full buffer that the filter has judged.
+pub(super) struct Judged {
+    pub update: SoilUpdate,
+    /// What it knows more than its prior, where it was not refused.
+    pub brought: Option<Brought>,
+    /// How its sensors contradict each other, see [`contradiction`].
+    pub contradiction: [f64; CONTRADICTIONS],
+    /// The vehicle stood and was told to: nothing moves, so nothing can disagree.
+    pub standing: bool,
 }
 
 /// The soil filter of one session. What a step says of the soil is known when the next one is measured.
@@ -71,6 +99,11 @@ impl SoilLearner {
         (&self.filter, &self.steps, if self.steps.is_empty() { 0 } else { self.first })
     }
 
+    /// Transitions of a full buffer.
+    pub(super) fn buffer(&self) -> usize {
+        self.filter.config().buffer
+    }
+
     /// The inverse of [`SoilLearner::parts`].
     pub(super) fn from_parts(filter: SoilFilter, steps: Vec<HistoryStep>, first: usize) -> Self {
         Self { filter, steps, first }
@@ -88,11 +121,11 @@ impl SoilLearner {
     /// with a wheel off the map is left out.
     pub(super) fn step(
         &mut self,
-        predictor: &Predictor,
+        models: Models<'_>,
         before: &[HistoryStep],
         newest: &HistoryStep,
         map: Option<&Arc<WorldMap>>,
-    ) -> Option<(SoilUpdate, Option<Brought>)> {
+    ) -> Option<Judged> {
         let Some(map) = map else {
             self.forget_open();
             return None;
@@ -105,7 +138,7 @@ impl SoilLearner {
         if self.steps.len() <= self.first + self.filter.config().buffer {
             return None;
         }
-        let update = self.learn_from_buffer(predictor, map);
+        let update = self.learn_from_buffer(models, map);
         self.filter.clear_buffer();
         // The end of this buffer is the start of the next.
         self.steps.drain(..self.steps.len().saturating_sub(HISTORY));
@@ -113,25 +146,47 @@ impl SoilLearner {
         update
     }
 
-    /// The update of the full buffer and, where it was not refused, what it knows more than its prior.
-    fn learn_from_buffer(&mut self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<(SoilUpdate, Option<Brought>)> {
+    /// What the filter makes of the full buffer.
+    fn learn_from_buffer(&mut self, models: Models<'_>, map: &Arc<WorldMap>) -> Option<Judged> {
         let (first, last) = (self.first, self.steps.len() - 1);
-        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| SoilByClass::new(Some(map), self.filter.estimates()));
-        let along = along.as_ref().map(|soil| soil as &dyn SoilField);
-        let transitions = predictor.measured_transitions(&self.steps, first..last, along, map)?;
+        let buffer = self.transitions(models.usual, map)?;
+        let shifted = models.shifted.iter().map(|model| self.transitions(model, map).map(|buffer| (model.step_model(), buffer)));
+        let shifted: Vec<_> = shifted.collect::<Option<_>>()?;
+        self.filter.consider(models.usual.step_model(), &buffer, &shifted).ok()?;
         let (predicted, log_odds) = (self.filter.predicted_beliefs(), self.filter.snapshot().trust_log_odds);
         let mut update = None;
-        for (transition, end) in transitions.into_iter().zip(&self.steps[first + 1..]) {
-            let [x, y, _] = transition.input.state.position_m;
-            let ground_class = SoilByClass::class_at(Some(map), [x, y]);
-            let end = predictor.true_state(&end.state);
-            let buffered = BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end) };
-            update = self.filter.push(predictor.step_model(), buffered).ok()?;
+        for buffered in buffer {
+            update = self.filter.push(models.usual.step_model(), buffered).ok()?;
         }
         let update = update?;
         let [x, y, _] = self.steps[(first + last) / 2].state.position_m;
         let increment = if update.rejected { None } else { self.increment(&predicted, log_odds) };
-        Some((update, increment.map(|increment| Brought { position_m: [x, y], increment })))
+        let brought = increment.map(|increment| Brought { position_m: [x, y], increment });
+        let states: Vec<_> = self.steps[first..=last].iter().map(|step| models.usual.true_state(&step.state)).collect();
+        let contradiction = contradiction(&states, models.usual.bundle().normalization.dt_s);
+        Some(Judged { update, brought, contradiction, standing: self.stands(first, last) })
+    }
+
+    /// Whether the vehicle stood over these steps and was told to. One that is told to drive and does not is no such case.
+    fn stands(&self, first: usize, last: usize) -> bool {
+        let ([x0, y0, _], [x1, y1, _]) = (self.steps[first].state.position_m, self.steps[last].state.position_m);
+        let told = self.steps[first..last].iter().fold(0.0, |most: f64, step| most.max(step.control.speed_m_s.abs()));
+        (x1 - x0).hypot(y1 - y0) < STANDING[0] && told < STANDING[1]
+    }
+
+    /// The transitions of the full buffer as a predictor sees them.
+    fn transitions(&self, predictor: &Predictor, map: &Arc<WorldMap>) -> Option<Vec<BufferedTransition>> {
+        let (first, last) = (self.first, self.steps.len() - 1);
+        let along = (self.filter.config().innovation == Innovation::Rollout).then(|| SoilByClass::new(Some(map), self.filter.estimates()));
+        let along = along.as_ref().map(|soil| soil as &dyn SoilField);
+        let transitions = predictor.measured_transitions(&self.steps, first..last, along, map)?;
+        let buffered = transitions.into_iter().zip(&self.steps[first + 1..]).map(|(transition, end)| {
+            let [x, y, _] = transition.input.state.position_m;
+            let ground_class = SoilByClass::class_at(Some(map), [x, y]);
+            let end = predictor.true_state(&end.state);
+            BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end) }
+        });
+        Some(buffered.collect())
     }
 
     /// What the last update knows more than it was predicted, and how it voted on whether the correction helps.

@@ -1,0 +1,73 @@
+//! The drives of a diagnosis from what a server recorded of one session: what an alarm asks for.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use nesam_engine::Measurement;
+use nesam_model::bundle::sha256_hex;
+use nesam_server::recording::{Recording, window};
+use nesam_trajectories::{Report, drives_of_reports};
+
+use super::Input;
+use crate::args::BundleArgs;
+use crate::failure::{Failure, OrFail};
+use crate::output::{self, say};
+use crate::sources::{load_bundle, maps_hash};
+
+/// Options that take the drives from a recording.
+#[derive(Args, Debug)]
+pub struct RecordingArgs {
+    /// Diagnose what a server recorded of a session instead of a set: files of one recording, or its folder
+    #[arg(long, value_name = "PATH", num_args = 1.., requires = "session", conflicts_with_all = ["data", "set", "trajectories", "vehicle"])]
+    pub recording: Vec<PathBuf>,
+    /// Session to diagnose
+    #[arg(long, value_name = "ID", requires = "recording")]
+    session: Option<String>,
+    /// First stamp of the window, ns of the vehicle's clock [default: the first]
+    #[arg(long, value_name = "NS", requires = "recording", allow_negative_numbers = true, default_value_t = i64::MIN, hide_default_value = true)]
+    from_ns: i64,
+    /// Last stamp of the window, ns of the vehicle's clock [default: the last]
+    #[arg(long, value_name = "NS", requires = "recording", allow_negative_numbers = true, default_value_t = i64::MAX, hide_default_value = true)]
+    to_ns: i64,
+    /// Pieces that stand for drives. They share ground and driver, so the evidence is weaker than that of as many drives
+    #[arg(long, value_name = "N", default_value_t = 5, requires = "recording")]
+    pieces: usize,
+}
+
+impl RecordingArgs {
+    /// The pieces of the window with the map of the session.
+    pub fn input(&self, bundle: &BundleArgs, dt_s: f64) -> Result<Input, Failure> {
+        let session = self.session.as_deref().unwrap_or_default();
+        let mut recording = Recording::open(&self.recording).or_input()?;
+        let window = window(&mut recording, session, self.from_ns, self.to_ns).or_input()?;
+        let reports: Vec<Report> = window.measurements.iter().map(report).collect();
+        let drives = drives_of_reports(session, &reports, dt_s, self.pieces);
+        if drives.is_empty() {
+            return Err(Failure::input(format!("session `{session}` has no 4 s of measurements without a pause in this window")));
+        }
+        let seconds: f64 = drives.iter().map(|d| d.time_s.last().copied().unwrap_or(0.0)).sum();
+        say!(
+            "session {session}: {} measurements, {seconds:.1} s in {} pieces of one recording; pieces share ground and driver, so this is weaker evidence than \
+             that many drives",
+            reports.len(),
+            drives.len()
+        );
+        let numbers = reports.iter().flat_map(|r| r.state.to_array().into_iter().chain([r.time_s, r.command.speed_m_s, r.command.second]));
+        let data_hash = sha256_hex(&numbers.flat_map(f64::to_le_bytes).collect::<Vec<u8>>());
+        let maps = vec![window.map; drives.len()];
+        let bundle = load_bundle(bundle.bundle.as_deref())?;
+        let provenance = output::provenance_of(Some(&bundle), &data_hash, &maps_hash(&maps));
+        let predictor = std::sync::Arc::new(nesam_model::Predictor::new(std::sync::Arc::new(bundle)).or_input()?);
+        Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance })
+    }
+}
+
+fn report(m: &Measurement) -> Report {
+    Report {
+        time_s: m.stamp_ns as f64 * 1e-9,
+        state: m.state,
+        command: m.command,
+        wheel_speed_rad_s: m.wheels.speed_rad_s,
+        road_wheel_angle_rad: m.wheels.road_wheel_angle_rad,
+    }
+}

@@ -1,0 +1,31 @@
+//! Effects on sessions, and what their watches tell.
+
+use super::Engine;
+use crate::command::{Event, Reply};
+use crate::error::EngineError;
+use crate::session::{Acting, Alarm, AppliedEffects};
+
+impl Engine {
+    /// Puts effects on a session, in place of those that were applied before.
+    pub(super) fn set_effects(&mut self, id: &str, effects: &AppliedEffects) -> Result<Reply, EngineError> {
+        self.session(id)?;
+        let acting = Acting::new(&self.predictor, effects)?;
+        let filter = self.filter.clone();
+        let session = self.sessions.get_mut(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })?;
+        if acting.is_some() || session.predictor().is_some() {
+            session.act(acting, filter);
+            let (vehicle, soil, told) = (session.vehicle().to_string(), Box::new(*session.soil()), session.take_told());
+            self.emit_alarms(id, &vehicle, told);
+            self.emit(Event::EffectsChanged { session: id.into(), vehicle: vehicle.clone() });
+            self.emit(Event::SoilChanged { session: id.into(), vehicle, soil });
+        }
+        Ok(Reply::Session(Box::new(self.view(self.session(id)?))))
+    }
+
+    /// Tells what a watch has raised or cleared.
+    pub(super) fn emit_alarms(&mut self, session: &str, vehicle: &str, told: Vec<Alarm>) {
+        for alarm in told {
+            self.emit(Event::AlarmChanged { session: session.into(), vehicle: vehicle.into(), alarm: Box::new(alarm) });
+        }
+    }
+}
