@@ -48,7 +48,7 @@ enum Command {
     Evaluate(commands::evaluate::EvaluateArgs),
     /// Find the effects that the model lacks, and try them on other drives
     Diagnose(commands::diagnose::DiagnoseArgs),
-    /// Put effects on a session of a running server, take them away, list them and the active alarms
+    /// Put effects on a session of a running server, take them away, list them with the active alarms; write some into a bundle
     Effects(commands::effects::EffectsArgs),
     /// Learn the soil while driving: fixed against adapted predictions on measured drives
     Adapt(commands::adapt::AdaptArgs),

@@ -2,10 +2,22 @@
 //!
 //! Each entry is an id of the catalogue, its parameters by name and, where it does not act always, the onset in s since the start of the log. The file is listed in the manifest like every other, so an effect cannot be
 //! slipped into a bundle unseen; an unknown id, a missing or unknown parameter and a value outside its physical range are refused.
+//!
+//! An effect that the catalogue does not have is written down as formulas with units (`[[written]]`, [`nesam_physics::effects::written`]):
+//!
+//! ```toml
+//! [[written]]
+//! id = "snow_plough"
+//! force_x = "-(push + per_speed * abs(v_ahead)) * tanh(v_ahead / fade)"     # N; also force_y, force_z, moment_x, moment_y, moment_z (N m)
+//! parameters.push = { value = 300.0, unit = "N", range = [0.0, 2000.0] }
+//! parameters.per_speed = { value = 80.0, unit = "N s/m", range = [0.0, 500.0] }
+//! parameters.fade = { value = 0.2, unit = "m/s", range = [0.05, 1.0] }
+//! ```
 
 use std::collections::BTreeMap;
 
-use nesam_physics::effects::{Effect, ScheduledEffect};
+use nesam_physics::effects::written::{WRITTEN_MAX, WrittenParameter, WrittenText};
+use nesam_physics::effects::{Effect, ScheduledEffect, Written};
 use serde::{Deserialize, Serialize};
 
 /// Version of the file; absent in files without effects.
@@ -18,7 +30,10 @@ const NONE: &str = "# Effects found by `nesam diagnose`; none yet.\neffects = []
 struct EffectsFile {
     #[serde(default, skip_serializing_if = "Option::is_none")]
     format: Option<String>,
+    #[serde(default)]
     effects: Vec<Entry>,
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    written: Vec<WrittenEntry>,
 }
 
 #[derive(Debug, Serialize, Deserialize)]
@@ -30,17 +45,80 @@ struct Entry {
     parameters: BTreeMap<String, f64>,
 }
 
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct WrittenEntry {
+    id: String,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    onset_s: f64,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    force_x: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    force_y: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    force_z: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    moment_x: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    moment_y: String,
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    moment_z: String,
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    parameters: BTreeMap<String, ParameterEntry>,
+}
+
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct ParameterEntry {
+    value: f64,
+    unit: String,
+    range: [f64; 2],
+}
+
+impl WrittenEntry {
+    fn of(written: &Written, onset_s: f64) -> Self {
+        let text = written.text();
+        let [force_x, force_y, force_z, moment_x, moment_y, moment_z] = text.formulas.clone();
+        let entry = |p: &WrittenParameter| (p.name.clone(), ParameterEntry { value: p.value, unit: p.unit.clone(), range: p.range });
+        let parameters = text.parameters.iter().map(entry).collect();
+        Self { id: text.id.clone(), onset_s, force_x, force_y, force_z, moment_x, moment_y, moment_z, parameters }
+    }
+
+    fn effect(self) -> Result<ScheduledEffect, String> {
+        let onset_s = onset(&self.id, self.onset_s)?;
+        let parameter = |(name, p): (String, ParameterEntry)| WrittenParameter { name, value: p.value, unit: p.unit, range: p.range };
+        let text = WrittenText {
+            id: self.id,
+            formulas: [self.force_x, self.force_y, self.force_z, self.moment_x, self.moment_y, self.moment_z],
+            parameters: self.parameters.into_iter().map(parameter).collect(),
+        };
+        Ok(ScheduledEffect { effect: Effect::Written(Written::read(&text)?), onset_s })
+    }
+}
+
 fn is_zero(onset_s: &f64) -> bool {
     *onset_s == 0.0
 }
 
-/// Reads the effects; the error says what is wrong, to follow the name of the file.
-pub(crate) fn read(text: &str) -> Result<Vec<ScheduledEffect>, String> {
+/// Reads the text of an `effects.toml`.
+///
+/// # Errors
+/// What is wrong, to follow the name of the file.
+pub fn read(text: &str) -> Result<Vec<ScheduledEffect>, String> {
     let file: EffectsFile = toml::from_str(text).map_err(|e| format!("is not readable: {e}"))?;
     if let Some(format) = file.format.filter(|f| f != FORMAT) {
         return Err(format!("has format `{format}`, this program reads `{FORMAT}`"));
     }
-    file.effects.iter().map(effect).collect()
+    if file.written.len() > WRITTEN_MAX {
+        return Err(format!("has {} written effects; {WRITTEN_MAX} can act at once", file.written.len()));
+    }
+    let mut ids: Vec<&str> = file.written.iter().map(|w| w.id.as_str()).collect();
+    ids.sort_unstable();
+    if let Some(twice) = ids.windows(2).find(|pair| pair[0] == pair[1]) {
+        return Err(format!("has two written effects `{}`", twice[0]));
+    }
+    let named = file.effects.iter().map(effect);
+    named.chain(file.written.into_iter().map(WrittenEntry::effect)).collect()
 }
 
 /// The text of a list of effects.
@@ -53,7 +131,9 @@ pub(crate) fn write(effects: &[ScheduledEffect]) -> String {
         onset_s: e.onset_s,
         parameters: e.effect.parameters().iter().map(|p| (p.name.to_string(), p.value)).collect(),
     };
-    let file = EffectsFile { format: Some(FORMAT.into()), effects: effects.iter().map(entry).collect() };
+    let named = effects.iter().filter(|e| !matches!(e.effect, Effect::Written(_))).map(entry).collect();
+    let written = |e: &ScheduledEffect| if let Effect::Written(w) = &e.effect { Some(WrittenEntry::of(w, e.onset_s)) } else { None };
+    let file = EffectsFile { format: Some(FORMAT.into()), effects: named, written: effects.iter().filter_map(written).collect() };
     let text = toml::to_string(&file).expect("names and numbers serialise; this is a bug");
     format!("# Effects found by `nesam diagnose`, added to the vehicle card.\n{text}")
 }
@@ -81,10 +161,14 @@ fn effect(entry: &Entry) -> Result<ScheduledEffect, String> {
             return Err(format!("gives `{id}` {} = {given} {}, outside {}…{}", p.name, p.unit, p.range[0], p.range[1]));
         }
     }
-    if !entry.onset_s.is_finite() || entry.onset_s < 0.0 {
-        return Err(format!("gives `{id}` onset_s = {}; it is a time of 0 or more since the start of the log", entry.onset_s));
+    Ok(ScheduledEffect { effect, onset_s: onset(id, entry.onset_s)? })
+}
+
+fn onset(id: &str, onset_s: f64) -> Result<f64, String> {
+    if !onset_s.is_finite() || onset_s < 0.0 {
+        return Err(format!("gives `{id}` onset_s = {onset_s}; it is a time of 0 or more since the start of the log"));
     }
-    Ok(ScheduledEffect { effect, onset_s: entry.onset_s })
+    Ok(onset_s)
 }
 
 #[cfg(test)]
@@ -103,6 +187,56 @@ mod tests {
         effects[2].onset_s = 12.3;
         let text = write(&effects);
         assert_eq!(read(&text).unwrap(), effects, "{text}");
+    }
+
+    const PLOUGH: &str = r#"
+[[written]]
+id = "snow_plough"
+onset_s = 4.0
+force_x = "-(push + per_speed * abs(v_ahead)) * tanh(v_ahead / fade)"
+moment_z = "0.3 * mass * gravity * wheelbase * slope_left"
+parameters.push = { value = 300.0, unit = "N", range = [0.0, 2000.0] }
+parameters.per_speed = { value = 80.0, unit = "N s/m", range = [0.0, 500.0] }
+parameters.fade = { value = 0.2, unit = "m/s", range = [0.05, 1.0] }
+parameters.wheelbase = { value = 3.3, unit = "m", range = [1.0, 5.0] }
+"#;
+
+    #[test]
+    fn property_written_effects_round_trip_beside_named_ones() {
+        let text = format!("format = \"{FORMAT}\"\n[[effects]]\nid = \"steering_offset\"\nparameters = {{ second = 0.1 }}\n{PLOUGH}");
+        let effects = read(&text).unwrap();
+        assert_eq!(
+            effects.iter().map(|e| (e.effect.id(), e.onset_s)).collect::<Vec<_>>(),
+            [("steering_offset", 0.0), ("snow_plough", 4.0)]
+        );
+        let written = write(&effects);
+        assert_eq!(read(&written).unwrap(), effects, "{written}");
+        assert_eq!(write(&read(&written).unwrap()), written);
+    }
+
+    #[test]
+    fn property_wrong_written_effects_are_refused_with_the_reason() {
+        for (from, to, reason) in [
+            ("snow_plough", "payload", "none of the catalogue"),
+            ("snow_plough", "Snow Plough", "snake_case"),
+            ("v_ahead / fade", "v_ahead", "tanh"),
+            ("push + per_speed", "push + 3 * per_speed * abs(v_ahead) / per_speed", "a sum"),
+            ("value = 300.0", "value = 3000.0", "outside 0…2000"),
+            ("unit = \"N s/m\"", "unit = \"N furlong\"", "furlong"),
+            ("moment_z", "moment_y = \"1\"\nmoment_z", "moment_y"),
+            ("onset_s = 4.0", "onset_s = nan", "onset_s"),
+            ("parameters.fade", "parameters.v_left", "v_left"),
+            ("id = ", "formula = 3\nid = ", "not readable"),
+        ] {
+            let text = PLOUGH.replacen(from, to, 1);
+            let error = read(&text).unwrap_err();
+            assert!(error.contains(reason), "`{error}` should say `{reason}`");
+        }
+        assert!(read(&PLOUGH.repeat(2)).unwrap_err().contains("two written effects"));
+        let many: String = (0..5).map(|i| PLOUGH.replace("snow_plough", &format!("plough_{i}"))).collect();
+        assert!(read(&many).unwrap_err().contains("at once"));
+        let nothing = "[[written]]\nid = \"nothing\"\n";
+        assert!(read(nothing).unwrap_err().contains("no formula"));
     }
 
     #[test]

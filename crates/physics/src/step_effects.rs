@@ -15,6 +15,12 @@ use crate::vec3::{Tilt, Vec3, add, cross, dot, scale};
 /// Speed around which a resistance of a wheel changes its sign, m/s (chosen, as for wheel drag).
 const RESISTANCE_SPEED_M_S: f64 = 0.07;
 
+fn add_wrench<T: Real>(rhs: &mut [T; 6], wrench: &[T]) {
+    for (sum, part) in rhs.iter_mut().zip(wrench) {
+        *sum = *sum + *part;
+    }
+}
+
 /// Which parts of a step effects change.
 #[derive(Clone, Debug)]
 pub(crate) struct Altered {
@@ -51,7 +57,7 @@ impl StepModel {
         }
     }
 
-    /// Adds drag, tow, wind and a free form to the generalised force (N, N m) about the reference point, Body.
+    /// Adds drag, tow, wind, a free form and written wrenches to the generalised force (N, N m) about the reference point, Body.
     #[cold]
     #[inline(never)]
     pub(crate) fn add_body_forces<T: Real>(&self, state: &VehicleState<T>, input: &StepInput<T>, tilt: &Tilt<T>, rhs: &mut [T; 6]) {
@@ -70,12 +76,21 @@ impl StepModel {
             rhs[axis] = rhs[axis] + force[axis];
         }
         rhs[4] = rhs[4] + T::lit(terms.tow_moment_n_m);
+        let mean = |of: &dyn Fn(usize) -> T, count: usize| (1..count).fold(of(0), |sum, i| sum + of(i)) * T::lit(1.0 / count as f64);
+        let conditions = || {
+            [mean(&|i| input.wheels.angle_rad[i], 2), mean(&|i| input.ground[i].slope_ahead, 4), mean(&|i| input.ground[i].slope_left, 4)]
+        };
         if terms.free_form.acts() {
-            let mean = |of: &dyn Fn(usize) -> T, count: usize| (1..count).fold(of(0), |sum, i| sum + of(i)) * T::lit(1.0 / count as f64);
-            let [ahead, left] = [mean(&|i| input.ground[i].slope_ahead, 4), mean(&|i| input.ground[i].slope_left, 4)];
-            let wrench = terms.free_form.at(v[0], mean(&|i| input.wheels.angle_rad[i], 2), ahead, left);
-            for (sum, part) in rhs.iter_mut().zip(wrench.as_flattened()) {
-                *sum = *sum + *part;
+            let [angle, ahead, left] = conditions();
+            add_wrench(rhs, terms.free_form.at(v[0], angle, ahead, left).as_flattened());
+        }
+        if terms.written[0].is_some() {
+            let ([angle, ahead, left], rate, [roll, pitch, _]) = (conditions(), state.angular_velocity_rad_s, state.attitude_rad);
+            let (mass, gravity) = (self.body.mass_kg, self.vehicle.gravity_m_s2);
+            let of_vehicle = [mass, gravity].map(T::lit);
+            let variables = [v[0], v[1], v[2], rate[0], rate[1], rate[2], roll, pitch, angle, ahead, left, of_vehicle[0], of_vehicle[1]];
+            for written in terms.written.iter().flatten() {
+                add_wrench(rhs, &written.wrench(&variables, mass));
             }
         }
     }

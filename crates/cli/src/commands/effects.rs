@@ -1,10 +1,13 @@
-//! `nesam effects`: physical effects on a session of a running server.
+//! `nesam effects`: physical effects on a session of a running server, and into a bundle.
+
+mod write;
 
 use std::path::PathBuf;
 
 use clap::{Args, Subcommand};
 use nesam_client::{Client, ClientError, Tls, v1};
 use nesam_model::ModelBundle;
+use nesam_physics::effects::Effect;
 
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
@@ -18,6 +21,14 @@ pub struct EffectsArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
+    #[command(flatten)]
+    OnSession(OnSession),
+    /// Write a new version of a bundle that has further effects, named or written as formulas
+    Write(write::WriteArgs),
+}
+
+#[derive(Subcommand, Debug)]
+enum OnSession {
     /// Put effects on a session, in place of those that were applied before; the soil begins again from its prior
     Apply(ApplyArgs),
     /// Take the applied effects away; the soil begins again from its prior
@@ -59,19 +70,23 @@ struct ApplyArgs {
 
 /// Runs the command.
 pub fn run(args: &EffectsArgs) -> Result<(), Failure> {
+    let what = match &args.what {
+        What::Write(args) => return write::run(args),
+        What::OnSession(what) => what,
+    };
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().or_failed()?;
     runtime.block_on(async {
-        match &args.what {
-            What::Apply(args) => {
+        match what {
+            OnSession::Apply(args) => {
                 let (source, effects) = wanted(args)?;
                 let session = connect(&args.server).await?.apply_effects(named(&args.server)?, &source, effects).await;
                 show(&session.map_err(refused)?);
             }
-            What::Revert(args) => {
+            OnSession::Revert(args) => {
                 let session = connect(args).await?.revert_effects(named(args)?).await;
                 show(&session.map_err(refused)?);
             }
-            What::List(args) => {
+            OnSession::List(args) => {
                 let sessions = connect(args).await?.list_sessions().await.map_err(refused)?;
                 sessions.iter().filter(|s| args.session.is_empty() || s.session_id == args.session).for_each(show);
             }
@@ -103,6 +118,10 @@ fn wanted(args: &ApplyArgs) -> Result<(String, Vec<v1::Effect>), Failure> {
     let bundle = ModelBundle::load(dir).or_input()?;
     if bundle.effects.is_empty() {
         return Err(Failure::input(format!("bundle {} adds no effect to its card", dir.display())));
+    }
+    if let Some(written) = bundle.effects.iter().find(|e| matches!(e.effect, Effect::Written(_))) {
+        let why = "is written as formulas, which do not travel to a running session; serve that bundle instead";
+        return Err(Failure::input(format!("`{}` of bundle {} {why}", written.effect.id(), dir.display())));
     }
     let effects = bundle.effects.iter().map(|e| {
         let parameters = e.effect.parameters();

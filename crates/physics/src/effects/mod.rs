@@ -12,6 +12,7 @@
 //! | soil | [`soil`] | the soil vector and the contact coefficients of the wheels |
 //! | sensor | [`sensor`] | [`SensorTerms::to_true`] and [`SensorTerms::to_measured`] around a prediction |
 //! | map | [`map`] | [`MapTerms::raised`], where ground is looked up |
+//! | force | [`written`] | formulas that somebody wrote into a bundle; `step_effects.rs` |
 //!
 //! A new effect is one file in its layer's folder (a struct through the macro `effect!` or an [`Act`] by hand), a term for what it changes, and one
 //! line in `catalogue!` below.
@@ -23,6 +24,7 @@ pub mod map;
 mod schedule;
 pub mod sensor;
 pub mod soil;
+pub mod written;
 
 pub use act::{Act, Parameter, Quantity, Scaling};
 pub use actuator::*;
@@ -31,6 +33,7 @@ pub use map::*;
 pub use schedule::{Phases, ScheduledEffect};
 pub use sensor::*;
 pub use soil::*;
+pub use written::Written;
 
 use crate::vehicle::Vehicle;
 
@@ -84,10 +87,12 @@ impl Layer {
 
 macro_rules! catalogue {
     ($($effect:ident)*) => {
-        /// An effect of the catalogue: a closed list, so that every effect is one file and one line.
+        /// An effect: of the catalogue, a closed list, so that every effect is one file and one line; or one that somebody wrote down.
         #[derive(Clone, Copy, Debug, PartialEq)]
         pub enum Effect {
             $(#[doc = concat!("See [`", stringify!($effect), "`].")] $effect($effect),)*
+            /// See [`Written`].
+            Written(Written),
         }
 
         impl Effect {
@@ -109,27 +114,27 @@ macro_rules! catalogue {
 
             /// Id as in `effects.toml` and reports.
             pub fn id(&self) -> &'static str {
-                match self { $(Self::$effect(_) => $effect::ID),* }
+                match self { $(Self::$effect(_) => $effect::ID,)* Self::Written(e) => e.id() }
             }
 
             /// What the parameters are, in the order of [`Effect::parameters`].
             pub fn quantities(&self) -> &'static [Quantity] {
-                match self { $(Self::$effect(_) => $effect::QUANTITIES),* }
+                match self { $(Self::$effect(_) => $effect::QUANTITIES,)* Self::Written(e) => e.quantities() }
             }
 
             /// Values of the parameters, in the order of [`Effect::parameters`].
             pub fn values(&self) -> Vec<f64> {
-                match self { $(Self::$effect(e) => e.values()),* }
+                match self { $(Self::$effect(e) => e.values(),)* Self::Written(e) => e.values() }
             }
 
             /// Layer in which the effect acts.
             pub fn layer(&self) -> Layer {
-                match self { $(Self::$effect(_) => $effect::LAYER),* }
+                match self { $(Self::$effect(_) => $effect::LAYER,)* Self::Written(e) => e.layer() }
             }
 
             /// Adds the effect to a vehicle's terms.
             pub fn add_to(&self, terms: &mut EffectTerms) {
-                match self { $(Self::$effect(e) => e.add_to(terms)),* }
+                match self { $(Self::$effect(e) => e.add_to(terms),)* Self::Written(e) => e.add_to(terms) }
             }
         }
     };
@@ -159,6 +164,9 @@ impl Effect {
 
     /// The effect scaled: 0 = absent, 1 = as it is.
     pub fn scaled(&self, share: f64) -> Self {
+        if let Self::Written(written) = self {
+            return Self::Written(written.scaled(share));
+        }
         let values: Vec<f64> = self.quantities().iter().zip(self.values()).map(|(q, value)| q.scaling.apply(value, share)).collect();
         Self::from_parameters(self.id(), &values).expect("as many values as quantities; this is a bug")
     }

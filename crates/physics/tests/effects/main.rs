@@ -11,6 +11,7 @@ mod schedule;
 mod sensor;
 mod soil;
 mod sweep;
+mod written;
 
 use common::Drive;
 use nesam_physics::effects::{Effect, Payload, SteeringOffset, WheelDrag};

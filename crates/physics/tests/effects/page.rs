@@ -15,7 +15,7 @@ fn page() -> String {
         "# Catalogue of effects\n\nMade by `crates/physics/tests/effects/page.rs`. What a bundle's `effects.toml` may list, for instance\n\n```toml\nformat = \"nesam.effects/1\"\n\n\
          [[effects]]\nid = \"steering_delay\"\nonset_s = 12.5          # s since the start of the log; left out: always\nparameters = { seconds = 0.15 }\n```\n\n\
          Equations, sources and what each neglects stand in `crates/physics/src/effects/<layer>/<id>.rs`. Values outside a range are refused. A *place* says where or how,\n\
-         not how much; an effect is absent when its sizes are 0, its factors 1, its limits infinite.\n\n| id | layer | parameter | unit | range | kind |\n|---|---|---|---|---|---|\n",
+         not how much; an effect is absent when its sizes are 0, its factors 1, its limits infinite. What the catalogue lacks can be [written down](your-own-effect.md).\n\n| id | layer | parameter | unit | range | kind |\n|---|---|---|---|---|---|\n",
     );
     for effect in Effect::examples() {
         for (n, q) in effect.quantities().iter().enumerate() {

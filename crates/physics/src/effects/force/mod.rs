@@ -34,6 +34,7 @@ pub use tyre_radius_rear::TyreRadiusRear;
 pub use wheel_drag::WheelDrag;
 pub use wind::Wind;
 
+use crate::effects::written::{WRITTEN_MAX, Written};
 use crate::vehicle::WHEELS;
 
 /// What effects change of body and wheels; all zero by default.
@@ -67,6 +68,8 @@ pub struct ForceTerms {
     pub friction_cap_inverse: f64,
     /// A wrench without a cause.
     pub free_form: FreeForm,
+    /// Wrenches that somebody wrote down.
+    pub written: [Option<Written>; WRITTEN_MAX],
 }
 
 impl ForceTerms {
@@ -78,6 +81,7 @@ impl ForceTerms {
             || self.tow_moment_n_m != 0.0
             || self.wind_n != [0.0; 2]
             || self.free_form.acts()
+            || self.written[0].is_some()
     }
 
     /// Whether a wheel is another one than the card's, but for friction torques.
