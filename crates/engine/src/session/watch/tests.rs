@@ -4,10 +4,21 @@ use super::*;
 
 const SECOND_NS: i64 = 1_000_000_000;
 
-/// Pseudo-random numbers with mean 0 and variance 1, uniform, the same for the same seed.
-struct Noise(u64);
+/// Pseudo-random numbers with mean 0 and variance 1, uniform, the same for the same seed; and the errors of the sensors where the last buffer ended.
+struct Noise(u64, [f64; CONTRADICTIONS]);
 
 impl Noise {
+    fn of(seed: u64) -> Self {
+        Self(seed, [0.0; CONTRADICTIONS])
+    }
+
+    /// Sensors against each other: the errors of positions and attitudes at both ends, one of which the buffer before shares.
+    fn contradiction(&mut self) -> [f64; CONTRADICTIONS] {
+        let before = self.1;
+        self.1 = core::array::from_fn(|c| SENSOR_ENDS_SD[c] * core::f64::consts::FRAC_1_SQRT_2 * self.next());
+        core::array::from_fn(|c| self.1[c] - before[c])
+    }
+
     fn next(&mut self) -> f64 {
         self.0 = self.0.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
         ((self.0 >> 11) as f64 / (1u64 << 53) as f64 - 0.5) * 12.0_f64.sqrt()
@@ -22,7 +33,7 @@ fn usual(k: i64, noise: &mut Noise) -> WatchedBuffer {
         nis: normalised.iter().map(|v: &f64| v * v).sum::<f64>() / 6.0,
         normalised,
         mean: normalised.map(|v| 0.05 * v),
-        contradiction: core::array::from_fn(|c| SENSOR_ENDS_SD[c] * noise.next()),
+        contradiction: noise.contradiction(),
         weighed: [1.0, 0.9],
     }
 }
@@ -30,7 +41,7 @@ fn usual(k: i64, noise: &mut Noise) -> WatchedBuffer {
 #[test]
 fn property_usual_buffers_raise_nothing() {
     for seed in 0..20 {
-        let (mut watch, mut noise) = (Watch::default(), Noise(seed));
+        let (mut watch, mut noise) = (Watch::default(), Noise::of(seed));
         let told: Vec<Alarm> = (0..200).filter_map(|k| watch.feed(usual(k, &mut noise))).collect();
         assert_eq!(told, [], "seed {seed}");
     }
@@ -50,7 +61,7 @@ fn analytic_each_change_is_told_once_by_its_test_and_dated() {
         (AlarmKind::NisSmall, "", 0.0, |b| (b.nis, b.normalised) = (0.01, b.normalised.map(|v| 0.1 * v)), 12),
     ];
     for (kind, channel, size, change, delay) in changes {
-        let (mut watch, mut noise) = (Watch::default(), Noise(7));
+        let (mut watch, mut noise) = (Watch::default(), Noise::of(7));
         let mut told = Vec::new();
         for k in 0..120 {
             let mut buffer = usual(k, &mut noise);
@@ -78,7 +89,7 @@ fn analytic_the_same_error_again_and_again_is_correlated() {
     let mut watch = Watch::default();
     let told = (0..12).find_map(|k| {
         let normalised = core::array::from_fn(|c| if c % 2 == 0 { 1.3 } else { -1.3 });
-        watch.feed(WatchedBuffer { normalised, nis: 1.0, contradiction: [0.0; CONTRADICTIONS], ..usual(k, &mut Noise(1)) })
+        watch.feed(WatchedBuffer { normalised, nis: 1.0, contradiction: [0.0; CONTRADICTIONS], ..usual(k, &mut Noise::of(1)) })
     });
     assert!(told.is_some_and(|alarm| alarm.kind == AlarmKind::Correlated && alarm.statistic > 0.99), "{told:?}");
 }
@@ -86,7 +97,7 @@ fn analytic_the_same_error_again_and_again_is_correlated() {
 #[test]
 fn property_a_gap_forgives_the_noise_of_its_ends() {
     // The noise of positions telescopes over buffers that follow each other; over buffers that do not it adds up, and the bound knows.
-    let (mut together, mut apart, mut noise) = (Watch::default(), Watch::default(), Noise(3));
+    let (mut together, mut apart, mut noise) = (Watch::default(), Watch::default(), Noise::of(3));
     for k in 0..12 {
         let buffer = WatchedBuffer { contradiction: [0.013, 0.0, 0.0, 0.0, 0.0, 0.0], ..usual(k, &mut noise) };
         together.feed(buffer);
@@ -98,7 +109,7 @@ fn property_a_gap_forgives_the_noise_of_its_ends() {
 
 #[test]
 fn property_numbers_that_are_not_finite_leave_no_trace_and_values_round_trip() {
-    let (mut watch, mut noise) = (Watch::default(), Noise(5));
+    let (mut watch, mut noise) = (Watch::default(), Noise::of(5));
     for k in 0..9 {
         watch.feed(usual(k, &mut noise));
     }
