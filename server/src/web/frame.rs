@@ -58,9 +58,12 @@ impl Scenery {
         self.priors.retain(|name, _| notes.sessions.contains_key(name));
         for (name, session) in &notes.sessions {
             let Some((measurement, _)) = &session.newest else { continue };
+            let map = session.map.as_ref().map(|(id, _)| self.maps.get(id));
+            // A map that the engine has not handed over yet says nothing.
+            let (None | Some(Some(_))) = map else { continue };
             let [x_m, y_m, _] = measurement.state.position_m;
             let pose = Pose2 { x_m, y_m, yaw_rad: measurement.state.attitude_rad[2] };
-            if let Some(prior) = self.predictor.known_soil_prior(self.map_under(session), pose) {
+            if let Some(prior) = self.predictor.known_soil_prior(map.flatten(), pose) {
                 self.priors.insert(name.clone(), prior);
             }
         }

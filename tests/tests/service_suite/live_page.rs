@@ -5,10 +5,13 @@ use std::io::{BufRead as _, BufReader, Write as _};
 use std::net::{SocketAddr, TcpStream};
 use std::time::Duration;
 
+use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{outcome_label, v1};
+use nesam_server::ZenohMode;
 use serde_json::Value;
 
 use crate::stage::*;
+use crate::zenoh_network::{PATIENCE, router};
 
 /// A stream of updates.
 struct Page(BufReader<TcpStream>);
@@ -184,4 +187,41 @@ async fn service_pages_that_never_read_cost_no_answer() {
     assert_eq!(update["service"]["notes_missed"].as_u64(), Some(0));
     tokio::time::timeout(Duration::from_secs(20), server.shutdown()).await.expect("they do not hold the server up");
     drop(deaf);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn regress_the_live_page_sees_measurements_over_zenoh() {
+    let recorded = recorded();
+    let (router, endpoint) = router().await;
+    let (server, mut client) = start_with(|config| {
+        config.zenoh.enabled = true;
+        config.zenoh.mode = ZenohMode::Client;
+        config.zenoh.listen.clear();
+        config.zenoh.connect = vec![endpoint.clone()];
+        config.zenoh.fleet = "test".into();
+    })
+    .await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "truck", recorded.world.id()).await;
+    let address = server.http_addr.unwrap();
+    let (mut page, _) = tokio::task::spawn_blocking(move || {
+        let (_, mut page) = Page::open(address);
+        let first = page.next();
+        (page, first)
+    })
+    .await
+    .unwrap();
+    let vehicle = ZenohVehicle::connect(&endpoint, "test", "truck").await.unwrap();
+    vehicle.wait_for_service(PATIENCE).await.unwrap();
+    for i in 0..3 {
+        vehicle.publish(&sample("", &recorded.drive, i)).await.unwrap();
+        vehicle.answer(PATIENCE).await.unwrap().expect("an answer on the status key");
+    }
+    let seen = move || page.until(|update| update["sessions"][0]["outcomes"]["applied"].as_u64() == Some(3));
+    let update = tokio::task::spawn_blocking(seen).await.unwrap();
+    let told = update["sessions"][0]["newest"]["position_m"][0].as_f64().unwrap();
+    assert!((told - recorded.drive.states[2].position_m[0]).abs() < 1e-5, "{update}");
+    vehicle.close().await.unwrap();
+    server.shutdown().await;
+    drop(router);
 }

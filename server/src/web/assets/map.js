@@ -259,6 +259,8 @@ export class MapView {
     if (this.store.sessions.size > 1) {
       c.font = "600 12px system-ui, sans-serif";
       c.lineWidth = 3;
+      c.lineJoin = "round";
+      c.strokeStyle = css("--panel");
       c.strokeText(session.session, x + 12, y - 12);
       c.fillStyle = css("--ink");
       c.fillText(session.session, x + 12, y - 12);

@@ -48,12 +48,12 @@ export function soil(element, text, session) {
     const [symbol, meaning, factor, unit] = SOIL[name], [low, high] = s.bounds[i], scale = LOGARITHMIC.has(name) ? Math.log : (v) => v;
     const at = (v) => `${(100 * Math.min(Math.max((scale(v) - scale(low)) / (scale(high) - scale(low)), 0), 1)).toFixed(2)}%`;
     const value = s.value[i] * factor, known = s.learned[i] && s.epoch > 0, band = s.low ? [s.low[i] * factor, s.high[i] * factor] : null;
-    const told = `${fixed(value, digits(value))}${unit ? ` ${unit}` : ""}`;
+    const withUnit = (v) => `${fixed(v, digits(v))}${unit ? ` ${unit}` : ""}`, told = withUnit(value), prior = withUnit(s.prior[i] * factor);
     const between = band ? `${fixed(band[0], digits(band[0]))} to ${fixed(band[1], digits(band[1]))}` : "no band";
-    const label = `${meaning} ${told}, ${known ? `95 % ${between}` : "not learned, the prior"}`;
-    return `<tr class="${known ? "known" : "unknown"}" title="${esc(label)}; prior ${fixed(s.prior[i] * factor, digits(value))}"><th scope="row" aria-label="${esc(meaning)}">${symbol}</th>
+    const label = known ? `${meaning} ${told}, 95 % ${between}` : `${meaning} not learned, estimate ${told}`;
+    return `<tr class="${known ? "known" : "unknown"}" title="${esc(label)}; prior ${prior}"><th scope="row" aria-label="${esc(meaning)}">${symbol}</th>
       <td class="track"><svg role="img" aria-label="${esc(label)}"><line class="rail" x1="0" x2="100%" y1="9" y2="9"/>${s.low ? `<line class="spread" x1="${at(s.low[i])}" x2="${at(s.high[i])}" y1="9" y2="9.01"/>` : ""}<line class="prior" x1="${at(s.prior[i])}" x2="${at(s.prior[i])}" y1="2" y2="16"/><circle class="dot" cx="${at(s.value[i])}" cy="9" r="4"/></svg></td>
-      <td class="value">${told}<br><small>${known ? between : "not learned"}</small></td></tr>`;
+      <td class="value">${known ? `${told}<br><small>${between}</small>` : `not learned<br><small>prior ${prior}</small>`}</td></tr>`;
   });
   put(element, `<table><tbody>${rows.join("")}</tbody></table>`);
 }

@@ -60,7 +60,9 @@ export class NisPlot extends Plot {
       const [px, py] = [x(i), y(ratios[i])];
       svg += t.rejected ? `<path class="refused" d="M${px - 4} ${py - 4}l8 8m0 -8l-8 8"/>` : `<circle class="dot" cx="${px}" cy="${py}" r="2.8"/>`;
     });
-    svg += `<text x="${f.left}" y="${f.bottom + 15}">buffer ${tests[0].judged}</text><text x="${x(tests.length - 1)}" y="${f.bottom + 15}" text-anchor="${tests.length > 12 ? "end" : "start"}" ${tests.length < 4 ? "hidden" : ""}>${tests.at(-1).judged}</text>`;
+    svg += `<text x="${f.left}" y="${f.bottom + 15}">buffer ${tests[0].judged}</text>`;
+    // The second number needs room beside the first.
+    if (tests.length >= 4) svg += `<text x="${x(tests.length - 1)}" y="${f.bottom + 15}" text-anchor="${tests.length > 12 ? "end" : "start"}">${tests.at(-1).judged}</text>`;
     if (this.hover !== null) {
       const i = Math.min(tests.length - 1, Math.max(0, Math.round(((this.hover - f.left) / (f.right - f.left)) * Math.max(tests.length, 20) - 0.5)));
       const note = `buffer ${tests[i].judged}: NIS ${tests[i].nis.toFixed(1)} over ${tests[i].dof} = ${ratios[i].toFixed(2)}${tests[i].rejected ? ", refused" : ""}`;

@@ -22,7 +22,7 @@ use crate::failure::{Failure, OrFail};
 use crate::output::{self, say};
 use crate::sources::{Drives, check_model_step, load_bundle_for, read_drives};
 
-use stage::Stage;
+use stage::{Played, Stage};
 
 /// Options of `nesam demo`.
 #[derive(Args, Debug)]
@@ -92,9 +92,10 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     super::serve::log_to_stderr("warn");
     let provenance = output::provenance(Some(&bundle), &drives);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
-    let (summary, server) = runtime.block_on(stage.play(bundle.clone()))?;
+    let Played { summary, server, interrupted } = runtime.block_on(stage.play(bundle.clone()))?;
+    let is_interrupted = interrupted.is_finished();
     summary.print();
-    let diagnoses = if args.no_diagnosis {
+    let diagnoses = if args.no_diagnosis || is_interrupted {
         Vec::new()
     } else {
         diagnosis::close_the_loop(&bundle, &drives, &args.data, &|report| server.show_diagnosis(report))?
@@ -102,9 +103,10 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     if let Some(file) = &args.json {
         output::write_file(file, summary.to_json(&diagnoses, &provenance).as_bytes())?;
     }
-    if args.hold {
+    if args.hold && !is_interrupted {
         say!("\nthe live page stays until ctrl-c");
-        runtime.block_on(nesam_server::termination());
+        // It may have come during the diagnosis.
+        let _ = runtime.block_on(interrupted);
     }
     runtime.block_on(server.shutdown());
     Ok(())

@@ -13,6 +13,7 @@ use nesam_server::{Config, RunningServer, termination};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
 
 use super::ledger::Ledger;
 use super::planner::{CANDIDATES, HORIZON, Planner};
@@ -50,6 +51,16 @@ pub struct Stage {
     pub http: Option<SocketAddr>,
 }
 
+/// A drive that was played.
+pub struct Played {
+    /// What came of it.
+    pub summary: Summary,
+    /// The server, which goes on serving.
+    pub server: RunningServer,
+    /// Ends with ctrl-c or SIGTERM, also where that came during the drive.
+    pub interrupted: JoinHandle<()>,
+}
+
 /// What the live table shows.
 struct Shared {
     ledger: Ledger,
@@ -61,8 +72,8 @@ struct Shared {
 
 impl Stage {
     /// Plays the drive through a real server, which goes on serving.
-    pub async fn play(self, bundle: ModelBundle) -> Result<(Summary, RunningServer), Failure> {
-        let interrupted = tokio::spawn(termination());
+    pub async fn play(self, bundle: ModelBundle) -> Result<Played, Failure> {
+        let mut interrupted = tokio::spawn(termination());
         let endpoint = format!("tcp/127.0.0.1:{}", free_port()?);
         let vehicle_card = bundle.vehicle.clone();
         let server = raise(bundle, &endpoint, self.http).await?;
@@ -91,7 +102,7 @@ impl Stage {
         let table = tokio::spawn(live_table(Arc::clone(&self.drive), applied_seen.clone(), Arc::clone(&shared)));
         let played = tokio::select! {
             outcomes = player.play(&vehicle) => outcomes?,
-            _ = interrupted => {
+            _ = &mut interrupted => {
                 say!("interrupted; this is what there is so far");
                 Default::default()
             }
@@ -105,7 +116,7 @@ impl Stage {
         let now = applied_seen.borrow().unwrap_or(0);
         let _ = vehicle.close().await;
         let shared = shared.lock().map_err(|_| Failure::Failed("the planner ended early".into()))?;
-        Ok((self.summary(&shared, now, begin.elapsed().as_secs_f64(), played), server))
+        Ok(Played { summary: self.summary(&shared, now, begin.elapsed().as_secs_f64(), played), server, interrupted })
     }
 
     fn summary(&self, shared: &Shared, now: usize, wall_s: f64, outcomes: BTreeMap<&'static str, usize>) -> Summary {
