@@ -16,6 +16,7 @@ use tokio::sync::oneshot;
 
 use crate::access::Directory;
 use crate::telemetry::Metrics;
+use crate::web::Feed;
 
 /// Awaits the engine; one for all handlers, clones share it.
 #[derive(Clone, Debug)]
@@ -23,6 +24,7 @@ pub struct EngineClient {
     handle: EngineHandle,
     metrics: Arc<Metrics>,
     directory: Directory,
+    page: Option<Feed>,
 }
 
 /// How long a prediction waited and computed.
@@ -59,7 +61,13 @@ impl Drop for Pending {
 impl EngineClient {
     /// A client of an engine whose sessions stand in this directory: vehicles compete, not their sessions.
     pub fn new(handle: EngineHandle, metrics: Arc<Metrics>, directory: Directory) -> Self {
-        Self { handle, metrics, directory }
+        Self { handle, metrics, directory, page: None }
+    }
+
+    /// Shows what passes to the live page.
+    pub(crate) fn shown_on(mut self, page: Option<Feed>) -> Self {
+        self.page = page;
+        self
     }
 
     /// The engine's handle.
@@ -72,14 +80,24 @@ impl EngineClient {
         &self.metrics
     }
 
+    /// A command whose answer is counted and shown on the live page before `reply` gets it, on the engine's thread or on the submitter's.
+    pub(crate) fn submission(&self, command: Command, reply: impl FnOnce(Answer) + Send + 'static) -> Submission {
+        let (label, metrics) = (command.label(), self.metrics.clone());
+        let passing = self.page.as_ref().and_then(|page| page.look(&command));
+        Submission::new(command, move |answer: Answer| {
+            metrics.engine_answer(label, &answer);
+            if let Some(passing) = passing {
+                passing.answered(&answer);
+            }
+            reply(answer);
+        })
+    }
+
     /// Puts a command in the queue now; commands submitted by one task are executed in that order.
     pub fn submit(&self, command: Command, budget: Duration) -> Pending {
         let (sender, answer) = oneshot::channel();
         let abandoned = Arc::new(AtomicBool::new(false));
-        let label = command.label();
-        let metrics = self.metrics.clone();
-        let mut submission = Submission::new(command, move |answer: Answer| {
-            metrics.engine_answer(label, &answer);
+        let mut submission = self.submission(command, move |answer| {
             let _ = sender.send(answer);
         });
         submission.abandoned = Some(abandoned.clone());

@@ -69,6 +69,10 @@ pub struct HttpConfig {
     pub enabled: bool,
     /// Address to listen on; port 0 takes a free one.
     pub listen: SocketAddr,
+    /// Most live pages open at a time.
+    pub watchers_max: usize,
+    /// Folder with reports of `nesam diagnose --json` that the live page shows; empty = none.
+    pub reports: PathBuf,
 }
 
 /// Role in a Zenoh network.
@@ -205,7 +209,7 @@ impl Default for GrpcConfig {
 
 impl Default for HttpConfig {
     fn default() -> Self {
-        Self { enabled: true, listen: loopback(50080) }
+        Self { enabled: true, listen: loopback(50080), watchers_max: 8, reports: PathBuf::new() }
     }
 }
 
@@ -368,6 +372,7 @@ impl Config {
             ("grpc.tile_bytes_max", self.grpc.tile_bytes_max),
             ("grpc.measurements_in_flight_max", self.grpc.measurements_in_flight_max),
             ("grpc.streams_per_connection_max", self.grpc.streams_per_connection_max as usize),
+            ("http.watchers_max", self.http.watchers_max),
             ("limits.sessions_max", self.limits.sessions_max),
             ("limits.samples_max", self.limits.samples_max),
             ("limits.horizon_max", self.limits.horizon_max),

@@ -14,6 +14,7 @@ use crate::clock::MonotonicClock;
 use crate::grpc::Edge;
 use crate::recording::Recorder;
 use crate::store::StoreCounts;
+use crate::web::Live;
 
 /// What the HTTP side reads.
 #[derive(Clone)]
@@ -21,6 +22,7 @@ pub(crate) struct HttpState {
     pub edge: Edge,
     pub clock: MonotonicClock,
     pub recorder: Option<Arc<Recorder>>,
+    pub live: Live,
 }
 
 const STATUS_DEADLINE: Duration = Duration::from_secs(5);

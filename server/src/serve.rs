@@ -27,6 +27,7 @@ use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
 use crate::store::{Keeper, RedbStore, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
+use crate::web::{Feed, Live, Raised};
 use crate::zenoh::{Bus, Presence};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
@@ -51,6 +52,7 @@ pub struct RunningServer {
     bus: Option<Bus>,
     recorder: Option<Arc<Recorder>>,
     keeper: Option<Arc<Keeper>>,
+    live: Live,
     drain: Duration,
 }
 
@@ -79,7 +81,8 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
     let metrics = Arc::new(Metrics::default());
     let keeper = config.store.enabled.then(|| Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s))));
-    let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone());
+    let (live, passed) = Live::new(&config.http);
+    let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone(), live.feed.clone());
     let unusable =
         |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
     let mut engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?;
@@ -101,7 +104,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
-        engine: EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()),
+        engine: EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()).shown_on(http_addr.map(|_| live.feed.clone())),
         predictor,
         uploads: Arc::new(Semaphore::new(config.grpc.uploads_max)),
         config: Arc::new(config.grpc),
@@ -123,7 +126,8 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         false => None,
     };
     let http = http_listener.map(|listener| {
-        let router = http::router(HttpState { edge: edge.clone(), clock, recorder: recorder.clone() });
+        live.start(&edge, clock, recorder.clone(), passed);
+        let router = http::router(HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() });
         let stopping = stopping.clone();
         tokio::spawn(async move {
             if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
@@ -143,7 +147,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping)?;
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
-    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, drain })
+    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, live, drain })
 }
 
 /// The recording that the configuration asks for, and the tap that feeds it.
@@ -161,13 +165,22 @@ fn start_recording(
     Ok((Some(Arc::new(recorder)), Some(tap)))
 }
 
-/// Where the engine's events go: counters, the directory of sessions, the store, watchers.
-fn event_sink(watchers: broadcast::Sender<Event>, metrics: Arc<Metrics>, keeper: Option<Arc<Keeper>>, directory: Directory) -> EventSink {
+/// Where the engine's events go: counters, the directory of sessions, the store, the live page, watchers.
+fn event_sink(
+    watchers: broadcast::Sender<Event>,
+    metrics: Arc<Metrics>,
+    keeper: Option<Arc<Keeper>>,
+    directory: Directory,
+    page: Feed,
+) -> EventSink {
     Box::new(move |event| {
         metrics.event(&event);
         directory.note(&event);
         if let Some(keeper) = &keeper {
             keeper.note(&event);
+        }
+        if let Event::AlarmChanged { session, alarm, .. } = &event {
+            page.alarm(Raised::by_watch(session, alarm));
         }
         let watched = matches!(
             event,
@@ -263,6 +276,11 @@ impl RunningServer {
         self.recorder.as_deref()
     }
 
+    /// Shows a report of a diagnosis (schema `nesam.diagnose/1`) on the live page; anything else is left out.
+    pub fn show_diagnosis(&self, report: serde_json::Value) {
+        self.live.reports.add(report);
+    }
+
     /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements, the
     /// recording is written to its end. Sessions of a store are committed before the engine stops.
     pub async fn shutdown(mut self) {
@@ -271,6 +289,7 @@ impl RunningServer {
             bus.stop().await;
         }
         let _ = self.stop.send(true);
+        self.live.stop();
         for mut task in [Some(self.grpc), self.http.take()].into_iter().flatten() {
             if tokio::time::timeout(self.drain, &mut task).await.is_err() {
                 tracing::warn!("requests still ran after the drain time and were cut off");

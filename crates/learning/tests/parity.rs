@@ -11,7 +11,7 @@ use nesam_learning::Drive;
 use nesam_model::dims::HIDDEN;
 use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
 use nesam_model::{
-    GroundSource, HistoryStep, ModelBundle, Normalization, Path, Predictor, RolloutQuery, Variant, Weights, history_actuators,
+    CacheCounts, GroundSource, HistoryStep, ModelBundle, Normalization, Path, Predictor, RolloutQuery, Variant, Weights, history_actuators,
 };
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
@@ -185,6 +185,22 @@ fn property_row_of_a_batch_equals_the_row_alone() {
             }
         }
     }
+}
+
+#[test]
+fn property_looking_at_the_soil_prior_encodes_nothing() {
+    let map = hills();
+    let drive = drive(Some(&map), 40);
+    let scales = measured_scales(&drive);
+    let predictor = predictor(&scales, lively_weights(&scales));
+    let at = pose(&drive.states[33]);
+    assert_eq!(predictor.known_soil_prior(Some(&map), at), None);
+    assert_eq!(predictor.terrain_cache(&map), CacheCounts::default());
+    let prior = predictor.soil_prior(Some(&map), at);
+    let counts = predictor.terrain_cache(&map);
+    assert_eq!(predictor.known_soil_prior(Some(&map), at), Some(prior));
+    assert_eq!(predictor.terrain_cache(&map), counts);
+    assert_eq!(predictor.known_soil_prior(None, at), Some(predictor.soil_prior(None, at)));
 }
 
 #[test]

@@ -201,15 +201,30 @@ impl Predictor {
         from_raw(&raw_soil(&self.terrain_tokens(map, &[pose])[0]))
     }
 
+    /// The same where it costs a lookup: `None` where the terrain has not been encoded yet. It encodes nothing, makes no cache and counts as no lookup, so
+    /// an onlooker can ask while others predict.
+    pub fn known_soil_prior(&self, map: Option<&Arc<WorldMap>>, pose: Pose2) -> Option<[f64; SOIL_DIM]> {
+        let Some(map) = map.filter(|map| map.has_semantics()) else {
+            return Some(from_raw(&self.bundle.normalization.default_soil_raw));
+        };
+        self.held_tokens(map)?.known(&pose).map(|token| from_raw(&raw_soil(&token)))
+    }
+
     /// Context token W_c c (128) and raw soil (6) at each pose: what the network sees of the terrain there.
     pub fn terrain_tokens(&self, map: Option<&Arc<WorldMap>>, poses: &[Pose2]) -> Vec<TerrainToken> {
         let tokens = map.map(|map| self.tokens_of(map));
         self.terrain(tokens.as_deref(), poses)
     }
 
-    /// What was asked of the terrain cache of a map so far.
+    /// What was asked of the terrain cache of a map so far; nothing when there is none.
     pub fn terrain_cache(&self, map: &Arc<WorldMap>) -> CacheCounts {
-        self.tokens_of(map).counts()
+        self.held_tokens(map).map_or_else(CacheCounts::default, |tokens| tokens.counts())
+    }
+
+    /// The cache of a map, if somebody has asked for it.
+    fn held_tokens(&self, map: &WorldMap) -> Option<Arc<TerrainTokens>> {
+        let maps = self.maps.lock().expect("no holder panics; this is a bug");
+        maps.iter().find(|(hash, _)| hash == map.hash()).map(|(_, tokens)| tokens.clone())
     }
 
     /// The cache of a map, made on first use; the least recently made one goes when there are too many.

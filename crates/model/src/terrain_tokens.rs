@@ -202,11 +202,7 @@ impl TerrainTokens {
                     continue;
                 }
                 match nodes.get(node) {
-                    Some(values) => {
-                        for (sum, value) in token.iter_mut().zip(values.iter()) {
-                            *sum = weight.mul_add(*value, *sum);
-                        }
-                    }
+                    Some(values) => add_weighted(token, weight, values),
                     None => missing.push(node),
                 }
             }
@@ -214,6 +210,18 @@ impl TerrainTokens {
         if missing.is_empty() {
             self.looked_up.fetch_add(8 * poses.len() as u64, Ordering::Relaxed);
         }
+    }
+
+    /// The token at a pose if all of its nodes are there. It is not counted as a lookup.
+    pub fn known(&self, pose: &Pose2) -> Option<TerrainToken> {
+        let nodes = self.nodes.read();
+        let mut token = [0.0; VALUES];
+        for (node, weight) in corners(pose) {
+            if weight > 0.0 {
+                add_weighted(&mut token, weight, nodes.get(node)?);
+            }
+        }
+        Some(token)
     }
 
     /// Encodes nodes, in parallel; those that several poses miss once.
@@ -225,6 +233,13 @@ impl TerrainTokens {
         let poses: Vec<Pose2> = missing.iter().map(|node| pose_of(*node)).collect();
         let encoded = projection.exact(&self.map, &poses);
         self.nodes.insert(missing.into_iter().zip(encoded));
+    }
+}
+
+#[inline]
+fn add_weighted(sum: &mut TerrainToken, weight: f32, values: &TerrainToken) {
+    for (sum, value) in sum.iter_mut().zip(values) {
+        *sum = weight.mul_add(*value, *sum);
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nesam_engine::{Answer, Command, EngineError, MeasureAnswer, Submission};
+use nesam_engine::{Command, EngineError, MeasureAnswer};
 use nesam_proto::v1 as pb;
 use tokio::sync::mpsc;
 
@@ -48,11 +48,7 @@ fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &:
     match undecodable.map_or_else(|| measurement(&path.message), Err) {
         Ok(measurement) => {
             let command = Command::Measure { session, vehicle: Some(vehicle.into()), measurement };
-            let label = command.label();
-            edge.engine.handle().submit(Submission::new(command, move |answer: Answer| {
-                path.edge.engine.metrics().engine_answer(label, &answer);
-                path.answer(measured(answer));
-            }));
+            edge.engine.handle().submit(edge.engine.submission(command, move |answer| path.answer(measured(answer))));
         }
         Err(error) => path.answer(Err(error)),
     }

@@ -8,6 +8,7 @@ mod extras;
 mod fleet_soil;
 mod from_now;
 mod lifecycle;
+mod live_page;
 mod measurements;
 mod moving;
 mod overload;

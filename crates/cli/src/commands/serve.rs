@@ -26,10 +26,10 @@ pub struct ServeArgs {
     /// Address of gRPC; port 0 takes a free one
     #[arg(long, value_name = "ADDRESS:PORT")]
     grpc: Option<SocketAddr>,
-    /// Address of metrics and status pages; port 0 takes a free one
+    /// Address of the live page, metrics and status; port 0 takes a free one
     #[arg(long, value_name = "ADDRESS:PORT", conflicts_with = "no_http")]
     http: Option<SocketAddr>,
-    /// Serve no metrics and status pages
+    /// Serve no live page, metrics and status
     #[arg(long)]
     no_http: bool,
     /// Zenoh endpoints to listen on, for instance tcp/0.0.0.0:7447
@@ -44,6 +44,9 @@ pub struct ServeArgs {
     /// Fleet in the Zenoh keys nesam/v1/<fleet>/<vehicle>/...
     #[arg(long, value_name = "NAME")]
     fleet: Option<String>,
+    /// Show the JSON reports of `nesam diagnose` in this folder on the live page
+    #[arg(long, value_name = "DIR", conflicts_with = "no_http")]
+    reports: Option<PathBuf>,
     /// Write all that the engine does into MCAP files in this folder, maps and answers included: repeat it with `nesam replay`, look at it with any
     /// MCAP viewer. Writing never delays an answer; what the disk cannot follow is dropped and counted
     #[arg(long, value_name = "DIR")]
@@ -112,6 +115,9 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
     }
     if let Some(fleet) = &args.fleet {
         config.zenoh.fleet.clone_from(fleet);
+    }
+    if let Some(folder) = &args.reports {
+        config.http.reports.clone_from(folder);
     }
     if let Some(folder) = &args.record {
         config.recording.enabled = true;

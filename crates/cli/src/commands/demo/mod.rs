@@ -2,7 +2,7 @@
 //!
 //! The real server starts on loopback. A vehicle task publishes the drive's measurements over Zenoh at the pace at which they were recorded; a
 //! planner task asks the server over gRPC for 64 candidates of 3.2 s in every cycle. What was predicted for the commands that the
-//! driver then gave is compared with what the vehicle then measured. At the end, drives of a vehicle that was changed are diagnosed.
+//! driver then gave is compared with what the vehicle then measured; the live page shows it all. At the end, drives of a vehicle that was changed are diagnosed.
 
 mod diagnosis;
 mod ledger;
@@ -11,6 +11,7 @@ mod stage;
 mod summary;
 mod vehicle;
 
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
 
@@ -18,10 +19,10 @@ use clap::Args;
 
 use crate::args::{BundleArgs, DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
-use crate::output;
+use crate::output::{self, say};
 use crate::sources::{Drives, check_model_step, load_bundle_for, read_drives};
 
-use stage::Stage;
+use stage::{Played, Stage};
 
 /// Options of `nesam demo`.
 #[derive(Args, Debug)]
@@ -45,6 +46,12 @@ pub struct DemoArgs {
     /// Do not diagnose the drives of changed vehicles (sets `effect_open/*` of the data root) at the end
     #[arg(long)]
     no_diagnosis: bool,
+    /// Address of the live page [default: a free port of this machine]
+    #[arg(long, value_name = "ADDRESS:PORT")]
+    http: Option<SocketAddr>,
+    /// Keep the live page up at the end, until interrupted
+    #[arg(long)]
+    hold: bool,
     /// Also write the summary as JSON
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -85,12 +92,23 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     super::serve::log_to_stderr("warn");
     let provenance = output::provenance(Some(&bundle), &drives);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
-    let summary = runtime.block_on(stage.play(bundle.clone()))?;
+    let Played { summary, server, interrupted } = runtime.block_on(stage.play(bundle.clone()))?;
+    let is_interrupted = interrupted.is_finished();
     summary.print();
-    let diagnoses = if args.no_diagnosis { Vec::new() } else { diagnosis::close_the_loop(&bundle, &drives, &args.data)? };
+    let diagnoses = if args.no_diagnosis || is_interrupted {
+        Vec::new()
+    } else {
+        diagnosis::close_the_loop(&bundle, &drives, &args.data, &|report| server.show_diagnosis(report))?
+    };
     if let Some(file) = &args.json {
         output::write_file(file, summary.to_json(&diagnoses, &provenance).as_bytes())?;
     }
+    if args.hold && !is_interrupted {
+        say!("\nthe live page stays until ctrl-c");
+        // It may have come during the diagnosis.
+        let _ = runtime.block_on(interrupted);
+    }
+    runtime.block_on(server.shutdown());
     Ok(())
 }
 
@@ -107,5 +125,5 @@ fn stage_of(args: &DemoArgs, drives: &Drives) -> Result<Stage, Failure> {
             drive.id
         )));
     }
-    Ok(Stage { drive: Arc::new(drive), map: drives.maps[at].clone(), samples, rate: args.rate, fast: args.fast })
+    Ok(Stage { drive: Arc::new(drive), map: drives.maps[at].clone(), samples, rate: args.rate, fast: args.fast, http: args.http })
 }

@@ -1,6 +1,7 @@
 //! Sets the stage: server, map, session, vehicle, planner and live table, and takes it down again.
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -12,6 +13,7 @@ use nesam_server::{Config, RunningServer, termination};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use tokio::sync::watch;
+use tokio::task::JoinHandle;
 
 use super::ledger::Ledger;
 use super::planner::{CANDIDATES, HORIZON, Planner};
@@ -28,6 +30,8 @@ const NAME: &str = "demo";
 const ROW_EVERY: Duration = Duration::from_millis(500);
 /// Samples for which a plan is shown.
 const PLAN_SHOWN: usize = 10;
+/// Cycles between two questions for the covariance of a prediction.
+const REGION_EVERY: usize = 5;
 /// Seed of the planner's noise.
 const SEED: u64 = 1;
 
@@ -43,6 +47,18 @@ pub struct Stage {
     pub rate: f64,
     /// Without pauses.
     pub fast: bool,
+    /// Address of the live page; `None` = a free port of loopback.
+    pub http: Option<SocketAddr>,
+}
+
+/// A drive that was played.
+pub struct Played {
+    /// What came of it.
+    pub summary: Summary,
+    /// The server, which goes on serving.
+    pub server: RunningServer,
+    /// Ends with ctrl-c or SIGTERM, also where that came during the drive.
+    pub interrupted: JoinHandle<()>,
 }
 
 /// What the live table shows.
@@ -55,12 +71,12 @@ struct Shared {
 }
 
 impl Stage {
-    /// Plays the drive through a real server.
-    pub async fn play(self, bundle: ModelBundle) -> Result<Summary, Failure> {
-        let interrupted = tokio::spawn(termination());
+    /// Plays the drive through a real server, which goes on serving.
+    pub async fn play(self, bundle: ModelBundle) -> Result<Played, Failure> {
+        let mut interrupted = tokio::spawn(termination());
         let endpoint = format!("tcp/127.0.0.1:{}", free_port()?);
         let vehicle_card = bundle.vehicle.clone();
-        let server = raise(bundle, &endpoint).await?;
+        let server = raise(bundle, &endpoint, self.http).await?;
         let mut client = Client::connect(&format!("http://{}", server.grpc_addr)).await.or_failed()?;
         self.prepare(&mut client).await?;
         let vehicle = ZenohVehicle::connect(&endpoint, NAME, NAME).await.or_failed()?;
@@ -86,7 +102,7 @@ impl Stage {
         let table = tokio::spawn(live_table(Arc::clone(&self.drive), applied_seen.clone(), Arc::clone(&shared)));
         let played = tokio::select! {
             outcomes = player.play(&vehicle) => outcomes?,
-            _ = interrupted => {
+            _ = &mut interrupted => {
                 say!("interrupted; this is what there is so far");
                 Default::default()
             }
@@ -99,9 +115,8 @@ impl Stage {
         }
         let now = applied_seen.borrow().unwrap_or(0);
         let _ = vehicle.close().await;
-        server.shutdown().await;
         let shared = shared.lock().map_err(|_| Failure::Failed("the planner ended early".into()))?;
-        Ok(self.summary(&shared, now, begin.elapsed().as_secs_f64(), played))
+        Ok(Played { summary: self.summary(&shared, now, begin.elapsed().as_secs_f64(), played), server, interrupted })
     }
 
     fn summary(&self, shared: &Shared, now: usize, wall_s: f64, outcomes: BTreeMap<&'static str, usize>) -> Summary {
@@ -151,6 +166,9 @@ impl Stage {
         shared: Arc<Mutex<Shared>>,
     ) -> impl Future<Output = Result<(), Failure>> + use<> {
         let (drive, until, fast) = (Arc::clone(&self.drive), self.plan_until(), self.fast);
+        // The page draws where the driver's own commands lead and how sure that is; without pauses nobody looks.
+        let mut regions = !fast;
+        let mut cycles = 0_usize;
         async move {
             while applied.changed().await.is_ok() {
                 let Some(at) = *applied.borrow_and_update() else { continue };
@@ -158,6 +176,7 @@ impl Stage {
                     continue;
                 }
                 let candidates = planner.candidates(&drive.controls[at..at + HORIZON]);
+                let driver = candidates[..2 * HORIZON].to_vec();
                 let asked = Instant::now();
                 let prediction = client.predict(Candidates::new(NAME, CANDIDATES, HORIZON, candidates)).await.or_failed()?;
                 let latency_s = asked.elapsed().as_secs_f64();
@@ -169,16 +188,23 @@ impl Stage {
                 let Some(decision) = planner.decide(&poses, &prediction.validity, &path) else { continue };
                 // A measurement that arrived while the request travelled moves the start; then the driver's commands are of another instant.
                 let same_start = prediction.start[..2] == drive.states[at].position_m[..2];
-                let Ok(mut state) = shared.lock() else { break };
-                if same_start {
-                    let driver: Vec<[f64; 2]> = poses[..HORIZON].iter().map(|p| [p[0], p[1]]).collect();
-                    state.ledger.enter(at, &driver, latency_s);
-                    state.cost_sum += decision.best_cost;
+                {
+                    let Ok(mut state) = shared.lock() else { break };
+                    if same_start {
+                        let driver: Vec<[f64; 2]> = poses[..HORIZON].iter().map(|p| [p[0], p[1]]).collect();
+                        state.ledger.enter(at, &driver, latency_s);
+                        state.cost_sum += decision.best_cost;
+                    }
+                    state.plan = Some((at, decision.command));
+                    state.newest = Some(prediction);
                 }
-                state.plan = Some((at, decision.command));
-                state.newest = Some(prediction);
-                drop(state);
                 planned.send_replace(Some(at));
+                if regions && cycles % REGION_EVERY == 0 {
+                    let extras = Some(v1::PredictExtras { covariance: true, ..Default::default() });
+                    // A bundle that does not know its errors refuses; it need not be asked again.
+                    regions = client.predict(Candidates { extras, ..Candidates::new(NAME, 1, HORIZON, driver) }).await.is_ok();
+                }
+                cycles += 1;
             }
             Ok(())
         }
@@ -186,15 +212,16 @@ impl Stage {
 }
 
 /// Starts the server on loopback, with Zenoh at `endpoint`, and says where it is.
-async fn raise(bundle: ModelBundle, endpoint: &str) -> Result<RunningServer, Failure> {
+async fn raise(bundle: ModelBundle, endpoint: &str, http: Option<SocketAddr>) -> Result<RunningServer, Failure> {
     let mut config = Config::ephemeral();
+    config.http.listen = http.unwrap_or(config.http.listen);
     config.zenoh.enabled = true;
     config.zenoh.listen = vec![endpoint.into()];
     config.zenoh.fleet = NAME.into();
     let (server, bundle) = serve::start(config, bundle).await?;
     say!("server    grpc {}, zenoh {endpoint}, bundle {} {}", server.grpc_addr, bundle.name, &bundle.hash[..12]);
     if let Some(http) = server.http_addr {
-        say!("          status http://{http}/status, metrics http://{http}/metrics");
+        say!("          watch http://{http}/, metrics http://{http}/metrics");
     }
     Ok(server)
 }

@@ -1,0 +1,182 @@
+#!/usr/bin/env python3
+"""Drives the live page in a headless Chromium against the real server: `live_page.py NESAM [--shots DIR]`.
+
+Goal: the page comes alive with real data, says what to do when there is none, and can be used with the keyboard, on a laptop and a tablet, in light and
+dark. Method: `nesam serve` without vehicles, then `nesam demo`, which plays a recorded drive; what is asserted is what a person would see.
+Prints `skipped: no chromium` and ends well where there is none.
+"""
+
+import json
+import pathlib
+import re
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+
+from browser import Browser, find
+
+SIZES = {"laptop": (1440, 900), "tablet": (820, 1180)}
+REPORT = {
+    "schema": "nesam.diagnose/1", "set": "mine/steering", "verdict": "explained", "reason": "", "fit_on": ["a"], "held_out": ["b", "c"],
+    "effects": [{"id": "steering_offset", "weight": 1.0, "parameters": [{"name": "second", "unit": "-", "value": 0.12, "ci95": [0.11, 0.13]}],
+                 "onset_s": None, "evidence": {"z": 9.0}, "rivals": [{"id": "gyro_bias", "weight": 0.1}]}],
+    "before": {"mae_mean": {"yaw_deg": 5.0}, "position_m": {"mean": 0.8}, "ci95": {"position_m": {"mean": [0.7, 0.9]}}},
+    "soil_only": {"mae_mean": {"yaw_deg": 4.9}, "position_m": {"mean": 0.7}, "ci95": {}},
+    "after": {"mae_mean": {"yaw_deg": 1.0}, "position_m": {"mean": 0.2}, "ci95": {}},
+    "improvement_ci95": {"position_m": {"mean": [-0.6, -0.4]}},
+}
+CONTRAST = """(() => {
+  const value = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const light = (hex) => { const [r, g, b] = [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16) / 255).map((v) => v <= 0.04045 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
+    return 0.2126 * r + 0.7152 * g + 0.0722 * b; };
+  const ratio = (a, b) => { const [x, y] = [light(a), light(b)].sort((p, q) => q - p); return (x + 0.05) / (y + 0.05); };
+  return Object.fromEntries(["--ink", "--soft", "--vermilion", "--blue"].map((name) => [name, ratio(value(name), value("--panel"))]));
+})()"""
+NAMELESS = "[...document.querySelectorAll('button, canvas, svg[role=img], section')].filter((e) => !(e.ariaLabel || e.getAttribute('aria-labelledby') || e.textContent.trim())).length"
+FOREIGN = "performance.getEntriesByType('resource').filter((e) => !e.name.startsWith(location.origin) && !e.name.startsWith('data:')).map((e) => e.name)"
+PAINTED = """(() => { const c = document.querySelector('#map'), d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, seen = new Set();
+  for (let i = 0; i < d.length; i += 4 * 97) seen.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]); return seen.size; })()"""
+
+
+class Program:
+    """A running `nesam`, and the address of its page."""
+
+    def __init__(self, *args):
+        self.process = subprocess.Popen([*args], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        for line in self.process.stdout:
+            found = re.search(r"(?:http |watch )\s*(http://[0-9.:]+/)", line)
+            if found:
+                self.url = found.group(1)
+                # What it prints is read on, or it would wait for us one day.
+                threading.Thread(target=self.process.stdout.read, daemon=True).start()
+                return
+        raise AssertionError(f"{args} ended without saying where its page is")
+
+    def stop(self):
+        self.process.terminate()
+        self.process.wait(60)
+
+
+def becomes(browser, element, pressed=True):
+    """Whether a button is or is not pressed within seconds: the page draws when the browser has time."""
+    try:
+        browser.wait(f"document.getElementById('{element}').getAttribute('aria-pressed') === '{str(pressed).lower()}'", 30)
+    except AssertionError:
+        return False
+    return True
+
+
+def text(browser, selector):
+    return browser.value(f"document.querySelector({json.dumps(selector)}).innerText")
+
+
+def check(condition, what):
+    if not condition:
+        raise AssertionError(what)
+    print(f"  {what}")
+
+
+def without_vehicles(browser, nesam, shots):
+    with tempfile.TemporaryDirectory() as folder:
+        pathlib.Path(folder, "steering.json").write_text(json.dumps(REPORT))
+        server = Program(nesam, "serve", "--grpc", "127.0.0.1:0", "--http", "127.0.0.1:0", "--no-zenoh", "--reports", folder)
+        try:
+            browser.look(*SIZES["laptop"])
+            browser.open(server.url)
+            browser.wait("document.getElementById('link')?.dataset.state === 'live'")
+            check("nesam demo" in text(browser, "#empty"), "an empty service says how to see one drive")
+            browser.wait("document.querySelectorAll('#reports article').length === 1")
+            report = text(browser, "#reports")
+            check("steering_offset" in report and "0.200 m" in report and "gyro_bias" in report, "a diagnosis shows effect, rival, before and after")
+            widths = browser.value("[...document.querySelectorAll('#reports i')].map((i) => i.getBoundingClientRect().width)")
+            check(widths[0] > widths[1] > widths[2] > 0 and abs(widths[2] / widths[0] - 0.25) < 0.02, "its bars are as long as the errors")
+            browser.screenshot(shots / "empty.png")
+        finally:
+            server.stop()
+        browser.wait("document.getElementById('link').dataset.state === 'lost'")
+        check("No connection" in text(browser, "#empty"), "a service that stops is told, with what to do")
+        browser.screenshot(shots / "lost.png")
+        browser.errors = [error for error in browser.errors if "ERR_" not in error]
+
+
+def interactions(browser):
+    check(becomes(browser, "layer-elevation") and becomes(browser, "view-follow"), "it begins with the elevation and follows the vehicle")
+    before = browser.value(PAINTED)
+    browser.key("2")
+    check(becomes(browser, "layer-semantics") and before > 50 and browser.value(PAINTED) > 50, "elevation and semantics are painted; key 2 changes them")
+    browser.key("1")
+    browser.click("#view-all")
+    check(becomes(browser, "view-all"), "a button shows the whole map")
+    box = browser.value("(() => { const r = document.querySelector('#map').getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2] })()")
+    browser.drag(box, [box[0] + 60, box[1] + 30])
+    check(becomes(browser, "view-all", False) and becomes(browser, "view-follow", False), "dragging frees the map")
+    check("x " in text(browser, "#cursor") and " z " in text(browser, "#cursor"), "the place under the pointer is read")
+    browser.key("f")
+    check(becomes(browser, "view-follow"), "key F follows again")
+    browser.key(" ")
+    check(becomes(browser, "pause"), "space holds the picture still")
+    age = text(browser, "#clock")
+    time.sleep(1.5)
+    check(text(browser, "#clock") == age, "and it stays still")
+    browser.key(" ")
+    browser.wait("document.getElementById('link').dataset.state === 'live'")
+    browser.key("?")
+    check(browser.value("document.getElementById('help').open"), "key ? explains keys and colours")
+    browser.value("document.getElementById('help').close()")
+    reached = browser.value("[...document.querySelectorAll('a[href], button, canvas[tabindex], summary')].filter((e) => e.tabIndex < 0).length")
+    check(reached == 0, "everything that can be pressed is reached with the tab key")
+
+
+def with_a_drive(browser, nesam, shots):
+    # The recorded pace; a machine that does much else may be too slow for it.
+    demo = Program(nesam, "demo", "--http", "127.0.0.1:0", "--hold", "--no-diagnosis")
+    try:
+        browser.look(*SIZES["laptop"])
+        browser.open(demo.url)
+        browser.wait("document.querySelectorAll('#soil tr').length === 6", 240)
+        browser.wait("document.querySelectorAll('#nis-plot circle, #nis-plot .refused').length >= 3", 240)
+        # One is enough: a machine that does much else predicts seldom.
+        browser.wait("document.querySelectorAll('#latency-plot circle').length >= 1", 240)
+        soil = text(browser, "#soil")
+        check("kPa" in soil and ("not learned" in soil or "to" in soil), "soil parameters have units and bands or say that they are not learned")
+        check("64 candidates" in text(browser, "#legend") and "90 %" in text(browser, "#legend"), "fan and 90 % regions are drawn")
+        check(re.search(r"\d of \d+ in the 95 % band", text(browser, "#nis-text")), "consistency is told as a share")
+        check(re.search(r"median [\d.]+, 99 % [\d.]+", text(browser, "#latency-text")), "latency is told as quantiles")
+        check("%" in text(browser, "#service") and "m/s" in text(browser, "#vehicle"), "cache hits and the vehicle's motion have figures")
+        check("at x" in browser.value("document.getElementById('map').getAttribute('aria-label')"), "the map says in words where the vehicle is")
+        for name, (width, height) in SIZES.items():
+            for dark in (False, True):
+                browser.look(width, height, dark)
+                time.sleep(1.0)
+                look = f"{name}-{'dark' if dark else 'light'}"
+                browser.screenshot(shots / f"{look}.png")
+                overflow = browser.value("document.documentElement.scrollWidth - innerWidth")
+                contrast = browser.value(CONTRAST)
+                check(overflow <= 0 and min(contrast.values()) >= 4.5, f"{look}: nothing sticks out, text has contrast {min(contrast.values()):.1f}")
+        browser.look(*SIZES["laptop"])
+        interactions(browser)
+        check(browser.value(NAMELESS) == 0, "everything has a name for a screen reader")
+        check(browser.value(FOREIGN) == [], "nothing is loaded from elsewhere")
+    finally:
+        demo.stop()
+
+
+def main():
+    if not find():
+        print("skipped: no chromium")
+        return
+    nesam = sys.argv[1]
+    with tempfile.TemporaryDirectory() as temporary, Browser() as browser:
+        shots = pathlib.Path(sys.argv[3]) if sys.argv[2:3] == ["--shots"] else pathlib.Path(temporary)
+        shots.mkdir(parents=True, exist_ok=True)
+        without_vehicles(browser, nesam, shots)
+        with_a_drive(browser, nesam, shots)
+        errors = [error for error in browser.errors if "ERR_" not in error]
+        check(not errors, f"no error in the console {errors}")
+    print("live page: all as expected")
+
+
+if __name__ == "__main__":
+    main()
