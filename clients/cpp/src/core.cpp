@@ -43,7 +43,10 @@ Error error_from(const grpc::Status& status, const grpc::ClientContext& context)
   const auto& metadata = context.GetServerTrailingMetadata();
   const auto entry = metadata.find(field_metadata);
   std::string field = entry == metadata.end() ? std::string() : std::string(entry->second.data(), entry->second.size());
-  return Error(code_from(static_cast<int>(status.error_code())), std::move(field), status.error_message());
+  // How the server's transport says that the time the client gave was over, where it notices before engine and client do.
+  const bool late = status.error_code() == grpc::StatusCode::CANCELLED && status.error_message() == "Timeout expired";
+  const auto code = late ? grpc::StatusCode::DEADLINE_EXCEEDED : status.error_code();
+  return Error(code_from(static_cast<int>(code)), std::move(field), status.error_message());
 }
 
 Core::Core(const std::string& target, const ClientOptions& settings)

@@ -53,9 +53,15 @@ _CLASSES = {
 }
 
 
+# How the server's transport says that the time the client gave was over, where it notices before engine and client do.
+_TIME_IS_OVER = (grpc.StatusCode.CANCELLED, "Timeout expired")
+
+
 def from_rpc(error: grpc.RpcError) -> NesamError:
     """The error class for a failed call."""
     code = error.code()
+    if (code, error.details()) == _TIME_IS_OVER:
+        code = grpc.StatusCode.DEADLINE_EXCEEDED
     metadata = dict(error.trailing_metadata() or ())
     field = metadata.get("nesam-field", "")
     field = field.decode() if isinstance(field, bytes) else field

@@ -83,6 +83,21 @@ impl From<tonic::Status> for ClientError {
     fn from(status: tonic::Status) -> Self {
         let field = status.metadata().get("nesam-field").and_then(|v| v.to_str().ok()).unwrap_or_default().into();
         let retry_after = status.get_details_retry_info().and_then(|info| info.retry_delay);
-        Self::Refused { code: status.code(), field, message: status.message().into(), retry_after }
+        // How the server's transport says that the time the client gave was over, where it notices before engine and client do.
+        let late = status.code() == tonic::Code::Cancelled && status.message() == "Timeout expired";
+        let code = if late { tonic::Code::DeadlineExceeded } else { status.code() };
+        Self::Refused { code, field, message: status.message().into(), retry_after }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regress_a_deadline_that_the_transport_notices_is_a_deadline() {
+        let of = |message: &str| ClientError::from(tonic::Status::cancelled(message)).code();
+        assert_eq!(of("Timeout expired"), Some(tonic::Code::DeadlineExceeded));
+        assert_eq!(of("the server is gone"), Some(tonic::Code::Cancelled));
     }
 }
