@@ -127,27 +127,29 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let http = http_listener.map(|listener| {
         live.start(&edge, clock, recorder.clone(), passed);
-        let router = http::router(HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() });
-        let stopping = stopping.clone();
-        tokio::spawn(async move {
-            if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
-                tracing::error!(%error, "http ended");
-            }
-        })
+        spawn_http(listener, HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() })
     });
     tokio::spawn(expire_sessions(edge.clone()));
     let health = HealthReporter::new();
     report(&health, ServingStatus::Serving).await;
-    let secure = if edge.access.is_restricted() {
-        "mutual TLS"
-    } else if tls.is_some() {
-        "TLS, clients unknown"
-    } else {
-        "none"
+    let secure = match (edge.access.is_restricted(), &tls) {
+        (true, _) => "mutual TLS",
+        (false, Some(_)) => "TLS, clients unknown",
+        (false, None) => "none",
     };
     let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping)?;
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
     Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, live, drain })
+}
+
+fn spawn_http(listener: TcpListener, state: HttpState) -> JoinHandle<()> {
+    let stopping = state.edge.stopping.clone();
+    let router = http::router(state);
+    tokio::spawn(async move {
+        if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
+            tracing::error!(%error, "http ended");
+        }
+    })
 }
 
 /// The recording that the configuration asks for, and the tap that feeds it.
