@@ -2,6 +2,7 @@
 
 mod args;
 mod bundle_path;
+mod bundle_version;
 mod cli;
 mod commands;
 mod failure;

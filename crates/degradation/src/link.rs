@@ -174,7 +174,7 @@ fn unit(random: &mut ChaCha8Rng) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use nesam_trajectories::{MeasuredChannels, VelocitySource};
+    use nesam_trajectories::MeasuredChannels;
 
     use super::*;
 
@@ -198,16 +198,7 @@ mod tests {
             controls: (0..count).map(|i| Control { speed_m_s: i as f64, second: 0.0 }).collect(),
             wheel_speed_rad_s: None,
             road_wheel_angle_rad: None,
-            measured: MeasuredChannels {
-                position: true,
-                height: true,
-                attitude: true,
-                linear_velocity: true,
-                velocity_source: VelocitySource::Body,
-                angular_velocity: [true; 3],
-                wheel_speed: false,
-                road_wheel_angle: false,
-            },
+            measured: MeasuredChannels::POSE_AND_TWIST,
             truth: None,
         }
     }

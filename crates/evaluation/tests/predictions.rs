@@ -10,7 +10,7 @@ use nesam_evaluation::{
     slices, write_predictions,
 };
 use nesam_physics::{Control, VehicleState};
-use nesam_trajectories::{MeasuredChannels, Trajectory, VelocitySource};
+use nesam_trajectories::{MeasuredChannels, Trajectory};
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 
@@ -42,16 +42,7 @@ fn drive(id: &str, samples: usize, radius_m: f64) -> Trajectory {
         controls: vec![Control { speed_m_s: 2.0, second: 0.0 }; samples],
         wheel_speed_rad_s: None,
         road_wheel_angle_rad: None,
-        measured: MeasuredChannels {
-            position: true,
-            height: true,
-            attitude: true,
-            linear_velocity: true,
-            velocity_source: VelocitySource::Body,
-            angular_velocity: [true; 3],
-            wheel_speed: false,
-            road_wheel_angle: false,
-        },
+        measured: MeasuredChannels::POSE_AND_TWIST,
         truth: None,
     }
 }

@@ -293,16 +293,7 @@ mod tests {
             wheels.push([speed / 0.4; 4]);
             (x, y, yaw) = (x + dt_s * speed * yaw.cos(), y + dt_s * speed * yaw.sin(), yaw + dt_s * yaw_rate);
         }
-        let measured = MeasuredChannels {
-            position: true,
-            height: true,
-            attitude: true,
-            linear_velocity: true,
-            velocity_source: VelocitySource::Body,
-            angular_velocity: [true, false, true],
-            wheel_speed: true,
-            road_wheel_angle: false,
-        };
+        let measured = MeasuredChannels { angular_velocity: [true, false, true], wheel_speed: true, ..MeasuredChannels::POSE_AND_TWIST };
         Trajectory {
             id: "a".into(),
             set: "s".into(),

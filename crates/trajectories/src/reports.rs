@@ -3,7 +3,7 @@
 use nesam_physics::{Control, VehicleState, WHEELS};
 
 use crate::resample::Grid;
-use crate::trajectory::{MeasuredChannels, Trajectory, VelocitySource};
+use crate::trajectory::{MeasuredChannels, Trajectory};
 
 /// Pause between reports that ends a stretch, s.
 const PAUSE_S: f64 = 0.5;
@@ -81,14 +81,9 @@ fn drive(id: &str, reports: &[Report], dt_s: f64) -> Option<Trajectory> {
         states: states.collect(),
         controls: grid.held(&reports.iter().map(|r| r.command).collect::<Vec<_>>()),
         measured: MeasuredChannels {
-            position: true,
-            height: true,
-            attitude: true,
-            linear_velocity: true,
-            velocity_source: VelocitySource::Body,
-            angular_velocity: [true; 3],
             wheel_speed: wheels.is_some(),
             road_wheel_angle: angles.is_some(),
+            ..MeasuredChannels::POSE_AND_TWIST
         },
         wheel_speed_rad_s: wheels.map(|w| grid.linear(&w)),
         road_wheel_angle_rad: angles.map(|a| grid.angles(&a)),

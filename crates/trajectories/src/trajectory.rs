@@ -55,6 +55,20 @@ pub struct MeasuredChannels {
     pub road_wheel_angle: bool,
 }
 
+impl MeasuredChannels {
+    /// Pose and twist measured, of wheels nothing.
+    pub const POSE_AND_TWIST: Self = Self {
+        position: true,
+        height: true,
+        attitude: true,
+        linear_velocity: true,
+        velocity_source: VelocitySource::Body,
+        angular_velocity: [true; 3],
+        wheel_speed: false,
+        road_wheel_angle: false,
+    };
+}
+
 /// A recorded drive, resampled to a fixed step; all vectors have one entry per sample.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Trajectory {

@@ -1,8 +1,8 @@
 //! The gRPC services: one file each, handlers that convert, ask the engine and convert back.
 
-mod alarms;
 mod deadline;
 mod measurements;
+mod news;
 mod prediction;
 mod sessions;
 mod soil;

@@ -1,12 +1,13 @@
 //! nesam.v1.Sessions.
 
-use nesam_engine::{AppliedEffects, EngineError, SessionView};
+use nesam_engine::{AppliedEffects, EngineError, Event, SessionView};
 use nesam_proto::v1 as pb;
 use tonic::{Request, Response, Status};
 
-use super::{Edge, ReplyStream, alarms};
+use super::news::{News, tell};
+use super::{Edge, ReplyStream};
 use crate::access::Wish;
-use crate::convert::{applied_effects, image_bytes, open_session, session_image, session_view, to_status};
+use crate::convert::{alarm_message, applied_effects, image_bytes, open_session, session_image, session_view, to_status};
 use crate::store::Key;
 use crate::telemetry::Transport;
 
@@ -120,7 +121,16 @@ impl pb::sessions_server::Sessions for Service {
     }
 
     async fn watch_alarms(&self, request: Request<pb::WatchAlarmsRequest>) -> Result<Response<Self::WatchAlarmsStream>, Status> {
-        alarms::watch(self.0.clone(), request).await
+        self.0.engine.metrics().request(Transport::Grpc, "watch_alarms");
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
+        let news = News {
+            of_event: |session, event| match event {
+                Event::AlarmChanged { session: of, vehicle, alarm } if of == session => Some(alarm_message(session, &vehicle, &alarm)),
+                _ => None,
+            },
+            of_session: |session, view| view.alarm.as_ref().map(|alarm| alarm_message(session, &view.vehicle, alarm)),
+        };
+        tell(self.0.clone(), request.into_inner().session_id, news).await
     }
 
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {

@@ -3,12 +3,11 @@
 use std::time::Duration;
 
 use nesam_client::v1;
-use nesam_server::ZenohMode;
 use prost::Message as _;
 use tonic::Code;
 
 use crate::stage::*;
-use crate::zenoh_network::{PATIENCE, router};
+use crate::zenoh_network::{PATIENCE, behind, router};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_a_second_vehicle_begins_from_what_the_first_has_learned() {
@@ -16,11 +15,7 @@ async fn service_a_second_vehicle_begins_from_what_the_first_has_learned() {
     let (router, endpoint) = router().await;
     let (server, mut client) = start_with(|config| {
         config.fleet_soil.enabled = true;
-        config.zenoh.enabled = true;
-        config.zenoh.mode = ZenohMode::Client;
-        config.zenoh.listen.clear();
-        config.zenoh.connect = vec![endpoint.clone()];
-        config.zenoh.fleet = "test".into();
+        behind(config, &endpoint);
     })
     .await;
     let published = router.declare_subscriber("nesam/v1/test/soil_map").await.unwrap();

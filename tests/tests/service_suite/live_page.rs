@@ -7,11 +7,10 @@ use std::time::Duration;
 
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{outcome_label, v1};
-use nesam_server::ZenohMode;
 use serde_json::Value;
 
 use crate::stage::*;
-use crate::zenoh_network::{PATIENCE, router};
+use crate::zenoh_network::{PATIENCE, behind, router};
 
 /// A stream of updates.
 struct Page(BufReader<TcpStream>);
@@ -193,14 +192,7 @@ async fn service_pages_that_never_read_cost_no_answer() {
 async fn regress_the_live_page_sees_measurements_over_zenoh() {
     let recorded = recorded();
     let (router, endpoint) = router().await;
-    let (server, mut client) = start_with(|config| {
-        config.zenoh.enabled = true;
-        config.zenoh.mode = ZenohMode::Client;
-        config.zenoh.listen.clear();
-        config.zenoh.connect = vec![endpoint.clone()];
-        config.zenoh.fleet = "test".into();
-    })
-    .await;
+    let (server, mut client) = start_with(|config| behind(config, &endpoint)).await;
     client.upload_map(&layers(&recorded.world)).await.unwrap();
     open(&mut client, "truck", recorded.world.id()).await;
     let address = server.http_addr.unwrap();

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{outcome_label, v1};
-use nesam_server::ZenohMode;
+use nesam_server::{Config, ZenohMode};
 use prost::Message as _;
 
 use crate::stage::*;
@@ -22,18 +22,20 @@ pub async fn router() -> (zenoh::Session, String) {
     (zenoh::open(config).await.unwrap(), endpoint)
 }
 
+/// The configuration of a server of the fleet `test` behind a router.
+pub fn behind(config: &mut Config, endpoint: &str) {
+    config.zenoh.enabled = true;
+    config.zenoh.mode = ZenohMode::Client;
+    config.zenoh.listen.clear();
+    config.zenoh.connect = vec![endpoint.into()];
+    config.zenoh.fleet = "test".into();
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction() {
     let recorded = recorded();
     let (router, endpoint) = router().await;
-    let (server, mut client) = start_with(|config| {
-        config.zenoh.enabled = true;
-        config.zenoh.mode = ZenohMode::Client;
-        config.zenoh.listen.clear();
-        config.zenoh.connect = vec![endpoint.clone()];
-        config.zenoh.fleet = "test".into();
-    })
-    .await;
+    let (server, mut client) = start_with(|config| behind(config, &endpoint)).await;
     client.upload_map(&layers(&recorded.world)).await.unwrap();
     open(&mut client, "grpc", recorded.world.id()).await;
     open(&mut client, "truck", recorded.world.id()).await;

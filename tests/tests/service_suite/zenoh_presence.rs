@@ -4,12 +4,11 @@ use std::time::Duration;
 
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{Client, outcome_label, v1};
-use nesam_server::ZenohMode;
 use prost::Message as _;
 use zenoh::sample::SampleKind;
 
 use crate::stage::*;
-use crate::zenoh_network::{PATIENCE, router};
+use crate::zenoh_network::{PATIENCE, behind, router};
 
 /// Waits until the session listing says this of the vehicle.
 async fn until_alive(client: &mut Client, expected: bool) {
@@ -31,11 +30,8 @@ async fn service_liveliness_and_status_follow_vehicles_and_servers() {
     // A vehicle that was there before the server is seen too.
     let early = ZenohVehicle::connect(&endpoint, "test", "early").await.unwrap();
     let (server, mut client) = start_with(|config| {
-        config.zenoh.enabled = true;
-        config.zenoh.mode = ZenohMode::Client;
-        config.zenoh.listen.clear();
-        config.zenoh.connect = vec![endpoint.clone()];
-        (config.zenoh.fleet, config.zenoh.name, config.zenoh.status_interval_s) = ("test".into(), "alpha".into(), 0.2);
+        behind(config, &endpoint);
+        (config.zenoh.name, config.zenoh.status_interval_s) = ("alpha".into(), 0.2);
     })
     .await;
     let token = tokio::time::timeout(PATIENCE, tokens.recv_async()).await.expect("in time").unwrap();

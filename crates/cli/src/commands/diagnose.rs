@@ -10,7 +10,7 @@ use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
-use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Provenance};
+use nesam_model::{MAX_HORIZON, ModelBundle, Predictor};
 use nesam_physics::Vehicle;
 use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_terrain::WorldMap;
@@ -19,8 +19,9 @@ use nesam_trajectories::Trajectory;
 use self::recording::RecordingArgs;
 use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
+use crate::bundle_version::save_with_effects;
 use crate::failure::{Failure, OrFail};
-use crate::output::{command_line, say};
+use crate::output::say;
 use crate::progress::Progress;
 use crate::sources::{check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
@@ -184,13 +185,13 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     console.end();
     let bundle = match found.claimed.as_slice() {
         [] => None,
-        claimed => Some(patched(&predictor, claimed, &drives, &out.join("bundle"))?),
+        claimed => Some(save_with_effects(predictor.bundle(), claimed, &drives.data_hash, &out.join("bundle"))?),
     };
     let with_free_form: Vec<ScheduledEffect> = found.claimed.iter().copied().chain(found.free_form.map(Into::into)).collect();
     // What silences the network finds is no addition to a network that speaks.
     let free_form_bundle = match found.free_form.filter(|_| args.reference == ReferenceArg::Bundle) {
         None => None,
-        Some(_) => Some(patched(&predictor, &with_free_form, &drives, &out.join("bundle-free-form"))?),
+        Some(_) => Some(save_with_effects(predictor.bundle(), &with_free_form, &drives.data_hash, &out.join("bundle-free-form"))?),
     };
     let [shown, free_form_bundle] = [bundle, free_form_bundle].map(|b| b.map(|p| p.display().to_string()));
     let report = Report {
@@ -209,20 +210,6 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     output::write_file(&html, report.to_html().as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
     Ok(())
-}
-
-/// Writes the bundle with effects.
-fn patched(predictor: &Predictor, effects: &[ScheduledEffect], drives: &Input, to: &Path) -> Result<PathBuf, Failure> {
-    let base = predictor.bundle();
-    let mut bundle = base.with_effects(effects);
-    bundle.provenance = Provenance {
-        command: command_line(),
-        data_hash: drives.data_hash.clone(),
-        program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
-        parent: Some(base.hash.clone()),
-        ..base.provenance.clone()
-    };
-    bundle.save(to).or_failed()
 }
 
 fn summary(report: &Report<'_>, found: &Diagnosis) {

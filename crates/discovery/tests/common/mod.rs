@@ -11,7 +11,7 @@ use nesam_physics::effects::Effect;
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, Driveline, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
-use nesam_trajectories::{MeasuredChannels, Trajectory, VelocitySource};
+use nesam_trajectories::{MeasuredChannels, Trajectory};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{Distribution, StandardNormal};
@@ -118,16 +118,7 @@ pub fn drive_from(id: &str, seed: u64, effects: &[Effect], onset_s: f64, soil: &
         controls,
         wheel_speed_rad_s: None,
         road_wheel_angle_rad: Some(steering),
-        measured: MeasuredChannels {
-            position: true,
-            height: true,
-            attitude: true,
-            linear_velocity: true,
-            velocity_source: VelocitySource::Body,
-            angular_velocity: [true; 3],
-            wheel_speed: false,
-            road_wheel_angle: true,
-        },
+        measured: MeasuredChannels { road_wheel_angle: true, ..MeasuredChannels::POSE_AND_TWIST },
         truth: None,
     }
 }

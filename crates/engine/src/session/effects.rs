@@ -79,6 +79,11 @@ impl Acting {
             applied.effects.iter().enumerate().map(|(i, effect)| checked(i, effect)).collect::<Result<_, _>>()?;
         let effects: Vec<ScheduledEffect> = named.iter().map(|(effect, _)| *effect).collect();
         let in_order: Vec<AppliedEffect> = named.into_iter().map(|(_, effect)| effect).collect();
+        let uncertain = in_order.iter().flat_map(|effect| &effect.parameters).filter(|p| p.sd > 0.0).count();
+        if uncertain > UNCERTAIN_MAX {
+            let reason = format!("have {uncertain} parameters with a standard deviation, at most {UNCERTAIN_MAX} are allowed");
+            return Err(EngineError::invalid("effects", reason));
+        }
         let mut shifted = Vec::new();
         for (i, effect) in in_order.iter().enumerate() {
             for uncertain in effect.parameters.iter().filter(|p| p.sd > 0.0) {
@@ -86,10 +91,6 @@ impl Acting {
                 moved[i] = one_off(i, effect, uncertain)?;
                 shifted.push(base.with_effects(&moved));
             }
-        }
-        if shifted.len() > UNCERTAIN_MAX {
-            let reason = format!("have {} parameters with a standard deviation, at most {UNCERTAIN_MAX} are allowed", shifted.len());
-            return Err(EngineError::invalid("effects", reason));
         }
         let applied = AppliedEffects { source: applied.source.clone(), effects: in_order };
         Ok(Some(Arc::new(Self { applied, predictor: base.with_effects(&effects), shifted })))

@@ -3,13 +3,14 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use nesam_model::{ModelBundle, Provenance, effects_from_toml};
+use nesam_model::{ModelBundle, effects_from_toml};
 use nesam_physics::effects::Effect;
 use nesam_physics::effects::written::WRITTEN_MAX;
 
 use crate::bundle_path::bundle_dir;
+use crate::bundle_version::save_with_effects;
 use crate::failure::{Failure, OrFail};
-use crate::output::{command_line, say};
+use crate::output::say;
 
 /// Options of `nesam effects write`.
 #[derive(Args, Debug)]
@@ -36,17 +37,11 @@ pub fn run(args: &WriteArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("{} is there already; give another folder", args.to.display())));
     }
     let base = ModelBundle::load(&bundle_dir(args.bundle.as_deref())?).or_input()?;
-    let mut bundle = base.with_effects(&effects);
-    if bundle.effects.iter().filter(|e| matches!(e.effect, Effect::Written(_))).count() > WRITTEN_MAX {
+    let written = base.effects.iter().chain(&effects).filter(|e| matches!(e.effect, Effect::Written(_))).count();
+    if written > WRITTEN_MAX {
         return Err(Failure::input(format!("with those of {} there are more than {WRITTEN_MAX} written effects", base.name)));
     }
-    bundle.provenance = Provenance {
-        command: command_line(),
-        program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
-        parent: Some(base.hash.clone()),
-        ..base.provenance.clone()
-    };
-    let to = bundle.save(&args.to).or_failed()?;
+    let to = save_with_effects(&base, &effects, &base.provenance.data_hash, &args.to)?;
     let ids: Vec<&str> = effects.iter().map(|e| e.effect.id()).collect();
     say!("{}: {} with {}", to.display(), base.name, ids.join(", "));
     Ok(())

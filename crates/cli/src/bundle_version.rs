@@ -1,0 +1,22 @@
+//! The next version of a bundle: the same with further effects.
+
+use std::path::{Path, PathBuf};
+
+use nesam_model::{ModelBundle, Provenance};
+use nesam_physics::effects::ScheduledEffect;
+
+use crate::failure::{Failure, OrFail};
+use crate::output::command_line;
+
+/// Writes a bundle with further effects into a folder; its manifest names this command, the data it was made from and the bundle before as its parent.
+pub fn save_with_effects(base: &ModelBundle, effects: &[ScheduledEffect], data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
+    let mut bundle = base.with_effects(effects);
+    bundle.provenance = Provenance {
+        command: command_line(),
+        data_hash: data_hash.into(),
+        program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
+        parent: Some(base.hash.clone()),
+        ..base.provenance.clone()
+    };
+    bundle.save(to).or_failed()
+}
