@@ -95,9 +95,10 @@ pub struct ZenohConfig {
     pub enabled: bool,
     /// Role.
     pub mode: ZenohMode,
-    /// Endpoints to listen on, e.g. `tcp/0.0.0.0:7447`.
+    /// Endpoints to listen on, e.g. `tcp/127.0.0.1:7447`; `tls/0.0.0.0:7447` uses the files of `[tls]` and gives everybody the keys that the fleet file
+    /// says.
     pub listen: Vec<String>,
-    /// Endpoints to connect to, e.g. `tcp/router:7447`; a peer keeps trying.
+    /// Endpoints to connect to, e.g. `tcp/router:7447` or `tls/router:7447`; a peer keeps trying.
     pub connect: Vec<String>,
     /// Fleet in the keys `nesam/v1/<fleet>/<vehicle>/...`.
     pub fleet: String,
@@ -318,6 +319,22 @@ impl From<&LimitsConfig> for Limits {
     }
 }
 
+impl ZenohConfig {
+    /// Whether an endpoint needs certificates.
+    pub fn uses_tls(&self) -> bool {
+        self.enabled && self.listen.iter().chain(&self.connect).any(|endpoint| is_tls(endpoint))
+    }
+
+    /// Whether somebody can connect to this server with a certificate.
+    pub fn listens_with_tls(&self) -> bool {
+        self.listen.iter().any(|endpoint| is_tls(endpoint))
+    }
+}
+
+fn is_tls(endpoint: &str) -> bool {
+    endpoint.starts_with("tls/")
+}
+
 fn loopback(port: u16) -> SocketAddr {
     (Ipv4Addr::LOCALHOST, port).into()
 }
@@ -356,6 +373,7 @@ impl Config {
             ("grpc.keepalive_s", self.grpc.keepalive_s),
             ("grpc.drain_s", self.grpc.drain_s),
             ("tls.handshake_s", self.tls.handshake_s),
+            ("tls.reload_s", self.tls.reload_s),
             ("limits.pause_max_s", self.limits.pause_max_s),
             ("limits.session_idle_s", self.limits.session_idle_s),
             ("limits.clock_ahead_max_s", self.limits.clock_ahead_max_s),
@@ -391,6 +409,10 @@ impl Config {
             }
         }
         self.tls.check()?;
+        if self.zenoh.uses_tls() && !self.tls.restricts() {
+            let reason = "has an endpoint `tls/...`, which needs certificates for both sides: set `tls.client_ca`".into();
+            return Err(ServerError::Value { key: "zenoh", reason });
+        }
         self.check_side_doors()?;
         FleetSoilSettings::from(&self.fleet_soil)
             .check()
@@ -420,11 +442,11 @@ impl Config {
             address.parse::<SocketAddr>().is_ok_and(|address| address.ip().is_loopback())
         };
         if self.zenoh.enabled
-            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !inside(endpoint))
+            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !inside(endpoint) && !is_tls(endpoint))
         {
             let reason = format!(
-                "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on loopback only, and let a router with \
-                 TLS and access control face the network"
+                "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on `tls/...`, or on loopback only \
+                 behind a router (`nesam router-config` writes its configuration)"
             );
             return Err(ServerError::Value { key: "zenoh.listen", reason });
         }

@@ -18,6 +18,7 @@ pub mod recording;
 mod serve;
 pub mod store;
 mod telemetry;
+mod tls_listener;
 mod web;
 mod zenoh;
 
@@ -28,3 +29,4 @@ pub use config::{
 pub use error::ServerError;
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;
+pub use zenoh::{LinkFiles, router_config};

@@ -11,15 +11,14 @@ use nesam_proto::v1 as pb;
 use tokio::net::TcpListener;
 use tokio::sync::{Semaphore, broadcast, watch};
 use tokio::task::JoinHandle;
-use tonic::transport::ServerTlsConfig;
 use tonic::transport::server::TcpIncoming;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
-use crate::access::{self, Directory};
+use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
 use crate::clock::MonotonicClock;
-use crate::config::{Config, GrpcConfig};
+use crate::config::{Config, GrpcConfig, TlsConfig};
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
@@ -27,6 +26,7 @@ use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
 use crate::store::{Keeper, RedbStore, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
+use crate::tls_listener;
 use crate::web::{Feed, Live, Raised};
 use crate::zenoh::{Bus, Presence};
 
@@ -115,7 +115,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         access,
     };
     let bus = match config.zenoh.enabled {
-        true => match Bus::start(&config.zenoh, &edge).await {
+        true => match Bus::start(&config.zenoh, &config.tls, &edge).await {
             Ok(bus) => Some(bus),
             Err(error) => {
                 keeper.iter().for_each(|keeper| keeper.finish());
@@ -137,7 +137,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         (false, Some(_)) => "TLS, clients unknown",
         (false, None) => "none",
     };
-    let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping)?;
+    let grpc = spawn_grpc(grpc_listener, tls, &config.tls, &edge, &health, stopping);
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
     Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, live, drain })
 }
@@ -236,11 +236,12 @@ fn builder(config: &GrpcConfig) -> tonic::transport::Server {
 
 fn spawn_grpc(
     listener: TcpListener,
-    tls: Option<ServerTlsConfig>,
+    credentials: Option<Credentials>,
+    tls: &TlsConfig,
     edge: &Edge,
     health: &HealthReporter,
     stopping: watch::Receiver<bool>,
-) -> Result<JoinHandle<()>, ServerError> {
+) -> JoinHandle<()> {
     let health =
         tonic_health::pb::health_server::HealthServer::new(tonic_health::server::HealthService::from_health_reporter(health.clone()));
     let reflection = tonic_reflection::server::Builder::configure()
@@ -249,17 +250,21 @@ fn spawn_grpc(
         .build_v1()
         .expect("the committed descriptor set decodes; this is a bug");
     let routes = grpc::routes(edge).add_service(health).add_service(reflection);
-    let mut builder = builder(&edge.config);
-    if let Some(tls) = tls {
-        builder = builder.tls_config(tls).map_err(|error| ServerError::Tls { key: "tls", reason: error.to_string() })?;
-    }
-    let router = builder.add_routes(routes);
+    let router = builder(&edge.config).add_routes(routes);
     let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
-    Ok(tokio::spawn(async move {
-        if let Err(error) = router.serve_with_incoming_shutdown(incoming, stopped(stopping)).await {
-            tracing::error!(%error, "grpc ended");
-        }
-    }))
+    let Some(credentials) = credentials else {
+        return tokio::spawn(ended(router.serve_with_incoming_shutdown(incoming, stopped(stopping))));
+    };
+    let handshake = Duration::from_secs_f64(tls.handshake_s);
+    let connections = tls_listener::accept(incoming, credentials.tls(), handshake, stopping.clone());
+    tokio::spawn(credentials.follow(edge.engine.metrics().clone(), stopping.clone()));
+    tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stopped(stopping))))
+}
+
+async fn ended(serving: impl Future<Output = Result<(), tonic::transport::Error>>) {
+    if let Err(error) = serving.await {
+        tracing::error!(%error, "grpc ended");
+    }
 }
 
 impl RunningServer {

@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use base64::Engine as _;
+use base64::prelude::BASE64_STANDARD;
 use tonic::transport::{Certificate, ClientTlsConfig, Identity};
 
 use crate::error::ClientError;
@@ -34,6 +36,21 @@ impl Tls {
         let read = |path: &Path| std::fs::read(path).map_err(|source| ClientError::File { path: path.into(), source });
         let identity = identity.map(|(certificate, key)| Ok::<_, ClientError>((read(certificate)?, read(key)?))).transpose()?;
         Ok(Self { authority: read(authority)?, identity, server_name: String::new() })
+    }
+
+    /// Writes authority and identity into the configuration of a Zenoh session.
+    pub(crate) fn configure_zenoh(&self, config: &mut zenoh::Config) -> Result<(), zenoh::Error> {
+        let mut set = |key: &str, pem: &[u8]| {
+            let value = BASE64_STANDARD.encode(pem);
+            config.insert_json5(&format!("transport/link/tls/{key}_base64"), &format!("{value:?}"))
+        };
+        set("root_ca_certificate", &self.authority)?;
+        if let Some((certificate, key)) = &self.identity {
+            set("connect_certificate", certificate)?;
+            set("connect_private_key", key)?;
+            config.insert_json5("transport/link/tls/enable_mtls", "true")?;
+        }
+        Ok(())
     }
 
     pub(crate) fn config(&self) -> ClientTlsConfig {

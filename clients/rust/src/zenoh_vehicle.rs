@@ -12,6 +12,7 @@ use zenoh::sample::Sample;
 
 use crate::error::ClientError;
 use crate::prediction::{Candidates, Prediction};
+use crate::tls::Tls;
 
 /// A vehicle in a Zenoh network. Needs a multi-thread tokio runtime.
 #[derive(Debug)]
@@ -28,16 +29,36 @@ fn failed(error: impl core::fmt::Display) -> ClientError {
     ClientError::Zenoh { reason: error.to_string() }
 }
 
+/// A client of one endpoint.
+fn client_of(endpoint: &str) -> Result<zenoh::Config, ClientError> {
+    let mut config = zenoh::Config::default();
+    config.insert_json5("mode", "\"client\"").map_err(failed)?;
+    config.insert_json5("scouting/multicast/enabled", "false").map_err(failed)?;
+    config.insert_json5("connect/endpoints", &format!("[{endpoint:?}]")).map_err(failed)?;
+    Ok(config)
+}
+
 impl ZenohVehicle {
     /// Joins the network as a client of the router or server at `endpoint`, e.g. `tcp/127.0.0.1:7447`. Nothing is searched for by multicast.
     ///
     /// # Errors
     /// `ClientError::Zenoh` when nobody answers there.
     pub async fn connect(endpoint: &str, fleet: &str, vehicle: &str) -> Result<Self, ClientError> {
-        let mut config = zenoh::Config::default();
-        config.insert_json5("mode", "\"client\"").map_err(failed)?;
-        config.insert_json5("scouting/multicast/enabled", "false").map_err(failed)?;
-        config.insert_json5("connect/endpoints", &format!("[{endpoint:?}]")).map_err(failed)?;
+        Self::join(client_of(endpoint)?, fleet, vehicle).await
+    }
+
+    /// As [`ZenohVehicle::connect`], to an endpoint `tls/...`. The common name of the certificate is who this vehicle is, `nesam:vehicle:<vehicle>`; the
+    /// name of the endpoint's host has to stand in the router's certificate.
+    ///
+    /// # Errors
+    /// `ClientError::Zenoh` when nobody answers there or either side does not trust the other.
+    pub async fn connect_tls(endpoint: &str, fleet: &str, vehicle: &str, tls: &Tls) -> Result<Self, ClientError> {
+        let mut config = client_of(endpoint)?;
+        tls.configure_zenoh(&mut config).map_err(failed)?;
+        Self::join(config, fleet, vehicle).await
+    }
+
+    async fn join(config: zenoh::Config, fleet: &str, vehicle: &str) -> Result<Self, ClientError> {
         let session = zenoh::open(config).await.map_err(failed)?;
         let key = |topic: &str| format!("nesam/v1/{fleet}/{vehicle}/{topic}");
         let answers = session.declare_subscriber(key("status")).await.map_err(failed)?;

@@ -44,6 +44,8 @@ enum Command {
     Demo(commands::demo::DemoArgs),
     /// Answer planners over gRPC and vehicles over gRPC and Zenoh until interrupted
     Serve(commands::serve::ServeArgs),
+    /// Write the configuration of a Zenoh router that lets each member of a fleet use its own keys only
+    RouterConfig(commands::router_config::RouterConfigArgs),
     /// Score models against measured drives, with intervals and plots
     Evaluate(commands::evaluate::EvaluateArgs),
     /// Find the effects that the model lacks, and try them on other drives
@@ -90,6 +92,7 @@ pub fn run() -> Result<(), Failure> {
         }
         Some(Command::Demo(args)) => commands::demo::run(&args),
         Some(Command::Serve(args)) => commands::serve::run(&args),
+        Some(Command::RouterConfig(args)) => commands::router_config::run(&args),
         Some(Command::Evaluate(args)) => commands::evaluate::run(&args),
         Some(Command::Diagnose(args)) => commands::diagnose::run(&args),
         Some(Command::Effects(args)) => commands::effects::run(&args),

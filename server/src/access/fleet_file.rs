@@ -1,8 +1,7 @@
-//! The fleet file: who there is and what each may do. Whoever is not in it may do nothing, whatever certificate there is: taking a name out of it and
-//! restarting the server revokes a certificate.
+//! The fleet file: who there is and what each may do. Whoever is not in it may do nothing, whatever certificate there is: taking a name out of it
+//! revokes a certificate.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::Path;
 
 use nesam_engine::check_name;
 use serde::Deserialize;
@@ -18,6 +17,8 @@ const ALL: &str = "*";
 pub struct FleetFile {
     /// Names that may do everything.
     operators: BTreeSet<String>,
+    /// Servers of the fleet: what Zenoh routers let answer vehicles and planners. Over gRPC they may do nothing.
+    servers: BTreeSet<String>,
     /// By vehicle id.
     vehicles: BTreeMap<String, VehicleEntry>,
     /// By name.
@@ -41,19 +42,18 @@ struct PlannerEntry {
 }
 
 impl FleetFile {
-    /// Reads the file.
+    /// Reads the text of a file.
     ///
     /// # Errors
     /// Which entry is wrong.
-    pub fn load(path: &Path) -> Result<Self, String> {
-        let text = std::fs::read_to_string(path).map_err(|error| error.to_string())?;
-        let file: Self = toml::from_str(&text).map_err(|error| error.to_string())?;
+    pub fn parse(text: &str) -> Result<Self, String> {
+        let file: Self = toml::from_str(text).map_err(|error| error.to_string())?;
         file.check().map(|()| file)
     }
 
     fn check(&self) -> Result<(), String> {
         let maps = self.vehicles.values().map(|v| &v.maps).chain(self.planners.values().map(|p| &p.maps)).flatten();
-        let names = self.operators.iter().chain(self.vehicles.keys()).chain(self.planners.keys()).chain(maps);
+        let names = self.operators.iter().chain(&self.servers).chain(self.vehicles.keys()).chain(self.planners.keys()).chain(maps);
         for name in names {
             check_name("name", name).map_err(|error| format!("`{name}`: {error}"))?;
         }
@@ -71,7 +71,21 @@ impl FleetFile {
             Identity::Vehicle(name) => self.vehicles.contains_key(name),
             Identity::Planner(name) => self.planners.contains_key(name),
             Identity::Operator(name) => self.operators.contains(name),
+            Identity::Server(name) => self.servers.contains(name),
         }
+    }
+
+    /// Everybody in the file.
+    pub fn members(&self) -> impl Iterator<Item = Identity> {
+        let vehicles = self.vehicles.keys().cloned().map(Identity::Vehicle);
+        let planners = self.planners.keys().cloned().map(Identity::Planner);
+        let operators = self.operators.iter().cloned().map(Identity::Operator);
+        vehicles.chain(planners).chain(operators).chain(self.servers.iter().cloned().map(Identity::Server))
+    }
+
+    /// Vehicles that a planner may read; `*` = all.
+    pub fn vehicles_of_planner(&self, name: &str) -> impl Iterator<Item = &str> {
+        self.planners.get(name).into_iter().flat_map(|planner| planner.vehicles.iter().map(String::as_str))
     }
 
     /// Whether it may read the sessions of a vehicle and predict from them.
@@ -82,6 +96,7 @@ impl FleetFile {
                 self.planners.get(name).is_some_and(|planner| planner.vehicles.contains(vehicle) || planner.vehicles.contains(ALL))
             }
             Identity::Operator(_) => self.knows(identity),
+            Identity::Server(_) => false,
         }
     }
 
@@ -89,7 +104,7 @@ impl FleetFile {
     pub fn may_change(&self, identity: &Identity, vehicle: &str) -> bool {
         match identity {
             Identity::Vehicle(name) => name == vehicle && self.knows(identity),
-            Identity::Planner(_) => false,
+            Identity::Planner(_) | Identity::Server(_) => false,
             Identity::Operator(_) => self.knows(identity),
         }
     }
@@ -98,7 +113,7 @@ impl FleetFile {
     pub fn may_name(&self, identity: &Identity, session: &str) -> bool {
         match identity {
             Identity::Vehicle(name) => name == session || !self.vehicles.contains_key(session),
-            Identity::Planner(_) => false,
+            Identity::Planner(_) | Identity::Server(_) => false,
             Identity::Operator(_) => true,
         }
     }
@@ -114,6 +129,7 @@ impl FleetFile {
             Identity::Vehicle(name) => self.vehicles.get(name).is_some_and(|vehicle| vehicle.maps.contains(map)),
             Identity::Planner(name) => self.planners.get(name).is_some_and(|planner| planner.maps.contains(map)),
             Identity::Operator(_) => self.knows(identity),
+            Identity::Server(_) => false,
         }
     }
 }
@@ -124,6 +140,7 @@ mod tests {
 
     const FILE: &str = r#"
 operators = ["control"]
+servers = ["alpha"]
 [vehicles.truck-7]
 maps = ["truck-7-local"]
 [vehicles.truck-8]
@@ -136,22 +153,22 @@ maps = ["quarry"]
 
     #[test]
     fn analytic_rights_are_those_of_the_table() {
-        let file: FleetFile = toml::from_str(FILE).unwrap();
-        file.check().unwrap();
+        let file = FleetFile::parse(FILE).unwrap();
         let [seven, eight, nine] = ["truck-7", "truck-8", "truck-9"].map(|name| Identity::Vehicle(name.into()));
         let [mission, dispatch] = ["mission", "dispatch"].map(|name| Identity::Planner(name.into()));
         let control = Identity::Operator("control".into());
-        let who = [&seven, &eight, &nine, &mission, &dispatch, &control];
+        let alpha = Identity::Server("alpha".into());
+        let who = [&seven, &eight, &nine, &mission, &dispatch, &control, &alpha];
         let rights = |may: &dyn Fn(&Identity) -> bool| who.map(may);
-        assert_eq!(rights(&|i| file.knows(i)), [true, true, false, true, true, true]);
-        assert_eq!(rights(&|i| file.may_read(i, "truck-7")), [true, false, false, true, true, true]);
-        assert_eq!(rights(&|i| file.may_read(i, "truck-8")), [false, true, false, false, true, true]);
-        assert_eq!(rights(&|i| file.may_read(i, "truck-9")), [false, false, false, false, true, true]);
-        assert_eq!(rights(&|i| file.may_change(i, "truck-7")), [true, false, false, false, false, true]);
-        assert_eq!(rights(&|i| file.may_operate(i)), [false, false, false, false, false, true]);
-        assert_eq!(rights(&|i| file.may_change_map(i, "truck-7-local")), [true, false, false, false, false, true]);
-        assert_eq!(rights(&|i| file.may_change_map(i, "quarry")), [false, false, false, false, true, true]);
-        assert_eq!(rights(&|i| file.may_name(i, "truck-8")), [false, true, false, false, false, true]);
+        assert_eq!(rights(&|i| file.knows(i)), [true, true, false, true, true, true, true]);
+        assert_eq!(rights(&|i| file.may_read(i, "truck-7")), [true, false, false, true, true, true, false]);
+        assert_eq!(rights(&|i| file.may_read(i, "truck-8")), [false, true, false, false, true, true, false]);
+        assert_eq!(rights(&|i| file.may_read(i, "truck-9")), [false, false, false, false, true, true, false]);
+        assert_eq!(rights(&|i| file.may_change(i, "truck-7")), [true, false, false, false, false, true, false]);
+        assert_eq!(rights(&|i| file.may_operate(i)), [false, false, false, false, false, true, false]);
+        assert_eq!(rights(&|i| file.may_change_map(i, "truck-7-local")), [true, false, false, false, false, true, false]);
+        assert_eq!(rights(&|i| file.may_change_map(i, "quarry")), [false, false, false, false, true, true, false]);
+        assert_eq!(rights(&|i| file.may_name(i, "truck-8")), [false, true, false, false, false, true, false]);
         assert!(file.may_name(&seven, "truck-7") && file.may_name(&seven, "what-if"));
         assert!(!file.knows(&Identity::Operator("truck-7".into())) && !file.may_read(&Identity::Operator("x".into()), "truck-7"));
     }
@@ -164,7 +181,7 @@ maps = ["quarry"]
             ("operator = [\"x\"]", "operator"),
             ("[vehicles.a]\nmap = [\"m\"]", "map"),
         ] {
-            let result = toml::from_str::<FleetFile>(text).map_err(|error| error.to_string()).and_then(|file| file.check());
+            let result = FleetFile::parse(text);
             assert!(result.as_ref().is_err_and(|error| error.contains(part)), "{text}: {result:?}");
         }
     }

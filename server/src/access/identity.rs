@@ -16,15 +16,31 @@ pub enum Identity {
     Planner(String),
     /// Somebody who may do everything.
     Operator(String),
+    /// A server of the fleet, towards Zenoh routers.
+    Server(String),
+}
+
+impl Identity {
+    /// Role and name.
+    fn parts(&self) -> (&'static str, &str) {
+        match self {
+            Self::Vehicle(name) => ("vehicle", name),
+            Self::Planner(name) => ("planner", name),
+            Self::Operator(name) => ("operator", name),
+            Self::Server(name) => ("server", name),
+        }
+    }
+
+    /// `nesam:vehicle:truck-7` and the like: the subject alternative name over gRPC, the common name over Zenoh.
+    pub fn uri(&self) -> String {
+        let (role, name) = self.parts();
+        format!("{SCHEME}:{role}:{name}")
+    }
 }
 
 impl core::fmt::Display for Identity {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
-        let (role, name) = match self {
-            Self::Vehicle(name) => ("vehicle", name),
-            Self::Planner(name) => ("planner", name),
-            Self::Operator(name) => ("operator", name),
-        };
+        let (role, name) = self.parts();
         write!(f, "{role} `{name}`")
     }
 }
@@ -42,7 +58,8 @@ impl Identity {
             "vehicle" => Ok(Self::Vehicle((*name).into())),
             "planner" => Ok(Self::Planner((*name).into())),
             "operator" => Ok(Self::Operator((*name).into())),
-            _ => Err(format!("`{uri}`: roles are vehicle, planner and operator")),
+            "server" => Ok(Self::Server((*name).into())),
+            _ => Err(format!("`{uri}`: roles are vehicle, planner, operator and server")),
         }
     }
 
@@ -69,6 +86,7 @@ mod tests {
     fn analytic_names_are_read_strictly() {
         assert_eq!(Identity::parse("nesam:vehicle:truck-7"), Ok(Identity::Vehicle("truck-7".into())));
         assert_eq!(Identity::parse("nesam:operator:x").map(|i| i.to_string()), Ok("operator `x`".into()));
+        assert_eq!(Identity::parse("nesam:server:alpha").map(|i| i.uri()), Ok("nesam:server:alpha".into()));
         for wrong in ["nesam:vehicle", "nesam:vehicle:a:b", "nesam:king:a", "nesam:vehicle:", "nesam:vehicle:a/b", "other:vehicle:a", ""] {
             assert!(Identity::parse(wrong).is_err(), "{wrong}");
         }

@@ -1,18 +1,20 @@
 //! Who may do what.
 //!
 //! With `tls.client_ca` every client shows a certificate that the CA has signed; its subject alternative name `nesam:<role>:<name>` is who it is, and the
-//! fleet file says what that one may do. Every handler asks [`Access`] before the engine does; what is refused is logged under the
+//! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused is logged under the
 //! target `nesam::audit` with who asked for what. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
 
+mod credentials;
 mod directory;
 mod fleet_file;
 mod identity;
 
 use std::sync::Arc;
 
-use tonic::transport::{Certificate, Identity as ServerIdentity, ServerTlsConfig};
+use tokio::sync::watch;
 use tonic::{Request, Status};
 
+pub use self::credentials::Credentials;
 pub use self::directory::Directory;
 pub use self::fleet_file::FleetFile;
 pub use self::identity::Identity;
@@ -43,7 +45,7 @@ pub enum Wish<'a> {
 #[derive(Clone, Debug, Default)]
 pub struct Access {
     /// `None` = no client certificates: everybody may do everything.
-    fleet: Option<Arc<FleetFile>>,
+    fleet: Option<watch::Receiver<Arc<FleetFile>>>,
     /// Whose session is whose.
     pub directory: Directory,
 }
@@ -60,35 +62,13 @@ pub struct Caller {
 ///
 /// # Errors
 /// `ServerError::Tls` naming the key whose file cannot be used.
-pub fn load(config: &TlsConfig) -> Result<(Option<ServerTlsConfig>, Access), ServerError> {
+pub fn load(config: &TlsConfig) -> Result<(Option<Credentials>, Access), ServerError> {
     if config.certificate.as_os_str().is_empty() {
         return Ok((None, Access::default()));
     }
-    let read = |key: &'static str, path: &std::path::Path| {
-        std::fs::read(path).map_err(|source| ServerError::Tls { key, reason: format!("{}: {source}", path.display()) })
-    };
-    let certificate = read("tls.certificate", &config.certificate)?;
-    // What is in the key file never reaches a message.
-    let key = read("tls.key", &config.key)?;
-    let mut tls = ServerTlsConfig::new()
-        .identity(ServerIdentity::from_pem(certificate, key))
-        .timeout(std::time::Duration::from_secs_f64(config.handshake_s));
-    let mut access = Access::default();
-    if !config.client_ca.as_os_str().is_empty() {
-        tls = tls.client_ca_root(Certificate::from_pem(read("tls.client_ca", &config.client_ca)?));
-        let fleet = FleetFile::load(&config.fleet)
-            .map_err(|reason| ServerError::Tls { key: "tls.fleet", reason: format!("{}: {reason}", config.fleet.display()) })?;
-        access.fleet = Some(Arc::new(fleet));
-    }
-    // The files are tried now: a wrong key is told at the start and not at the first handshake.
-    tonic::transport::Server::builder().tls_config(tls.clone()).map_err(|error| ServerError::Tls { key: "tls", reason: chain(&error) })?;
-    Ok((Some(tls), access))
-}
-
-/// An error with its causes.
-fn chain(error: &dyn std::error::Error) -> String {
-    let causes = std::iter::successors(error.source(), |cause| cause.source());
-    causes.fold(error.to_string(), |text, cause| format!("{text}: {cause}"))
+    let credentials = Credentials::read(config)?;
+    let access = Access { fleet: credentials.rights(), ..Access::default() };
+    Ok((Some(credentials), access))
 }
 
 impl Access {
@@ -97,12 +77,17 @@ impl Access {
         self.fleet.is_some()
     }
 
+    /// The rights in force, where clients have identities.
+    pub fn rights(&self) -> Option<Arc<FleetFile>> {
+        self.fleet.as_ref().map(|fleet| fleet.borrow().clone())
+    }
+
     /// Who sent a request.
     ///
     /// # Errors
     /// UNAUTHENTICATED when the certificate names nobody, PERMISSION_DENIED when it is nobody of the fleet.
     pub fn caller<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
-        let Some(fleet) = &self.fleet else { return Ok(Caller { access: self.clone(), identity: None }) };
+        let Some(fleet) = self.rights() else { return Ok(Caller { access: self.clone(), identity: None }) };
         let certificates = request.peer_certs().unwrap_or_default();
         let identity = match certificates.first() {
             Some(certificate) => Identity::of_certificate(certificate),
@@ -127,7 +112,7 @@ impl Caller {
     /// # Errors
     /// PERMISSION_DENIED, or NOT_FOUND for a session that is not open: then there is nobody whose it could be.
     pub fn may(&self, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
-        let (fleet, identity) = match (&self.access.fleet, &self.identity) {
+        let (fleet, identity) = match (self.access.rights(), &self.identity) {
             (Some(fleet), Some(identity)) => (fleet, identity),
             // Without identities the engine says what is not there.
             _ => return Ok(None),
@@ -155,7 +140,7 @@ impl Caller {
 
     /// Whether the caller may read the sessions of a vehicle; nothing is logged.
     pub fn sees(&self, vehicle: &str) -> bool {
-        match (&self.access.fleet, &self.identity) {
+        match (self.access.rights(), &self.identity) {
             (Some(fleet), Some(identity)) => fleet.may_read(identity, vehicle),
             _ => true,
         }

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::error::ServerError;
 
-/// TLS of gRPC. Files are PEM; an empty path = none.
+/// TLS of gRPC and of Zenoh endpoints `tls/...`. Files are PEM; an empty path = none.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TlsConfig {
@@ -20,12 +20,14 @@ pub struct TlsConfig {
     pub fleet: PathBuf,
     /// Longest handshake, s; a connection that says nothing for longer is closed.
     pub handshake_s: f64,
+    /// Interval at which the files are read again, s. What has changed and is sound holds for new connections, rights at once.
+    pub reload_s: f64,
 }
 
 impl Default for TlsConfig {
     fn default() -> Self {
         let none = PathBuf::new;
-        Self { certificate: none(), key: none(), client_ca: none(), fleet: none(), handshake_s: 5.0 }
+        Self { certificate: none(), key: none(), client_ca: none(), fleet: none(), handshake_s: 5.0, reload_s: 10.0 }
     }
 }
 

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
 
 use nesam_engine::{Answer, EngineError, Event, Reply};
 
@@ -37,6 +38,8 @@ pub struct Metrics {
     commands: Pairs,
     measurements: Pairs,
     requests: Pairs,
+    /// Changes of certificates and rights that were not usable, and that were.
+    reloads: [AtomicU64; 2],
     events: Mutex<BTreeMap<&'static str, u64>>,
     alarms: AlarmCounts,
     queue: Histogram,
@@ -86,6 +89,11 @@ impl Metrics {
         count(&self.requests, (transport.label(), method));
     }
 
+    /// Counts that certificates or rights have changed, and whether they were usable.
+    pub fn reloaded(&self, usable: bool) {
+        self.reloads[usize::from(usable)].fetch_add(1, Ordering::Relaxed);
+    }
+
     /// Counts something that happened to a session.
     pub fn event(&self, event: &Event) {
         if let Ok(mut events) = self.events.lock() {
@@ -120,6 +128,12 @@ impl Metrics {
                 let _ = writeln!(out, "nesam_events_total{{event=\"{event}\"}} {value}");
             }
         }
+        // Both from the start, so that the first failure is an increase.
+        let name = "nesam_credentials_reloads_total";
+        let _ = writeln!(out, "# HELP {name} Changes of certificates and rights, by whether they were usable.\n# TYPE {name} counter");
+        for (result, count) in ["failed", "ok"].iter().zip(&self.reloads) {
+            let _ = writeln!(out, "{name}{{result=\"{result}\"}} {}", count.load(Ordering::Relaxed));
+        }
         self.alarms.render(&mut out);
         self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
         self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
@@ -148,6 +162,7 @@ mod tests {
         metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
         metrics.measurement(Transport::Zenoh, "applied");
         metrics.event(&Event::MapChanged { map: "m".into() });
+        metrics.reloaded(false);
         let text = metrics.render(3, 4);
         for line in [
             "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
@@ -156,6 +171,8 @@ mod tests {
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
             "nesam_events_total{event=\"map_changed\"} 1",
+            "nesam_credentials_reloads_total{result=\"failed\"} 1",
+            "nesam_credentials_reloads_total{result=\"ok\"} 0",
             "nesam_alarms_total{kind=\"sensor_jump\"} 0",
             "nesam_alarms_active 0",
             "nesam_waiting_predictions 4",

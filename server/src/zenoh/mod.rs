@@ -1,11 +1,13 @@
 //! The Zenoh side: the same messages, the same conversions, the same engine.
 
+mod access_control;
 mod keys;
 mod measurements;
 mod predict;
 mod presence;
 mod soil;
 
+pub use access_control::{LinkFiles, router_config};
 pub(crate) use presence::Presence;
 
 use std::time::Duration;
@@ -13,7 +15,8 @@ use std::time::Duration;
 use nesam_engine::EngineError;
 use tokio::sync::mpsc;
 
-use crate::config::{ZenohConfig, ZenohMode};
+use crate::access::FleetFile;
+use crate::config::{TlsConfig, ZenohConfig, ZenohMode};
 use crate::error::ServerError;
 use crate::grpc::Edge;
 
@@ -37,12 +40,12 @@ type Outgoing = (String, Vec<u8>);
 
 impl Bus {
     /// Joins the network and declares subscriber, publisher, queryable and liveliness token.
-    pub async fn start(config: &ZenohConfig, edge: &Edge) -> Result<Self, ServerError> {
+    pub async fn start(config: &ZenohConfig, tls: &TlsConfig, edge: &Edge) -> Result<Self, ServerError> {
         if tokio::runtime::Handle::current().runtime_flavor() == tokio::runtime::RuntimeFlavor::CurrentThread {
             return Err(ServerError::Runtime);
         }
         let failed = |error: ::zenoh::Error| ServerError::Zenoh { reason: error.to_string() };
-        let session = ::zenoh::open(zenoh_config(config).map_err(failed)?).await.map_err(failed)?;
+        let session = ::zenoh::open(zenoh_config(config, tls, edge.access.rights().as_deref()).map_err(failed)?).await.map_err(failed)?;
         let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
         let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sender.clone()));
         let name = if config.name.is_empty() { session.zid().to_string() } else { config.name.clone() };
@@ -69,7 +72,8 @@ impl Bus {
     }
 }
 
-fn zenoh_config(config: &ZenohConfig) -> Result<::zenoh::Config, ::zenoh::Error> {
+/// The configuration of the session. Whoever connects to this server over TLS gets the keys that the fleet file says; the files are read once.
+fn zenoh_config(config: &ZenohConfig, tls: &TlsConfig, members: Option<&FleetFile>) -> Result<::zenoh::Config, ::zenoh::Error> {
     let mode = match config.mode {
         ZenohMode::Peer => "peer",
         ZenohMode::Client => "client",
@@ -81,6 +85,13 @@ fn zenoh_config(config: &ZenohConfig) -> Result<::zenoh::Config, ::zenoh::Error>
     zenoh.insert_json5("scouting/multicast/enabled", "false")?;
     zenoh.insert_json5("listen/endpoints", &list(&config.listen))?;
     zenoh.insert_json5("connect/endpoints", &list(&config.connect))?;
+    if config.uses_tls() {
+        let files = LinkFiles { certificate: &tls.certificate, key: &tls.key, authority: &tls.client_ca };
+        zenoh.insert_json5("transport/link/tls", &access_control::link(files).to_string())?;
+    }
+    if let Some(members) = members.filter(|_| config.listens_with_tls()) {
+        zenoh.insert_json5("access_control", &access_control::access_control(members, &config.fleet).to_string())?;
+    }
     Ok(zenoh)
 }
 

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod alarms;
+mod authority;
 mod bad_input;
 mod effects;
 mod extras;
@@ -15,8 +16,10 @@ mod overload;
 mod predictions;
 mod random_bytes;
 mod recording;
+mod reload;
 mod reorder;
 mod replay;
+mod resets;
 mod security;
 mod sessions;
 mod soil;
@@ -24,3 +27,4 @@ mod stage;
 mod streams;
 mod zenoh_network;
 mod zenoh_presence;
+mod zenoh_security;

@@ -5,103 +5,25 @@ use std::path::Path;
 use std::time::Duration;
 
 use nesam_client::{Client, ClientError, Tls, outcome_label, v1};
-use nesam_server::{Config, RunningServer, serve};
+use nesam_server::{Config, serve};
 use prost::bytes::Bytes;
-use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType, date_time_ymd};
+use rcgen::SanType;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tonic::Code;
 
+use crate::authority::{Authority, dns, secured, uri};
 use crate::stage::*;
-
-const FLEET: &str = r#"
-operators = ["control"]
-[vehicles.truck]
-maps = ["local"]
-[vehicles.other]
-[planners.mission]
-vehicles = ["truck"]
-"#;
-
-/// An authority that signs certificates.
-struct Authority {
-    pem: String,
-    issuer: Issuer<'static, KeyPair>,
-}
-
-impl Authority {
-    fn new() -> Self {
-        let mut params = CertificateParams::new(vec![]).unwrap();
-        params.is_ca = IsCa::Ca(BasicConstraints::Unconstrained);
-        let key = KeyPair::generate().unwrap();
-        let pem = params.self_signed(&key).unwrap().pem();
-        Self { pem, issuer: Issuer::new(params, key) }
-    }
-
-    /// Certificate and key for these names; `expired` = valid until a year ago.
-    fn sign(&self, names: &[SanType], expired: bool) -> (Vec<u8>, Vec<u8>) {
-        let mut params = CertificateParams::new(vec![]).unwrap();
-        params.subject_alt_names = names.to_vec();
-        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ServerAuth, ExtendedKeyUsagePurpose::ClientAuth];
-        if expired {
-            (params.not_before, params.not_after) = (date_time_ymd(2019, 1, 1), date_time_ymd(2020, 1, 1));
-        }
-        let key = KeyPair::generate().unwrap();
-        let certificate = params.signed_by(&key, &self.issuer).unwrap();
-        (certificate.pem().into_bytes(), key.serialize_pem().into_bytes())
-    }
-}
-
-fn uri(text: &str) -> SanType {
-    SanType::URI(text.try_into().unwrap())
-}
-
-/// A server that knows a fleet.
-struct Stage {
-    server: RunningServer,
-    authority: Authority,
-    _files: tempfile::TempDir,
-}
-
-async fn secured() -> Stage {
-    let (files, authority) = (tempfile::tempdir().unwrap(), Authority::new());
-    let (certificate, key) = authority.sign(&[SanType::DnsName("localhost".try_into().unwrap())], false);
-    let write = |name: &str, bytes: &[u8]| {
-        let path = files.path().join(name);
-        std::fs::write(&path, bytes).unwrap();
-        path
-    };
-    let mut config = Config::ephemeral();
-    config.tls.certificate = write("server.pem", &certificate);
-    config.tls.key = write("server.key", &key);
-    config.tls.client_ca = write("ca.pem", authority.pem.as_bytes());
-    config.tls.fleet = write("fleet.toml", FLEET.as_bytes());
-    config.tls.handshake_s = 0.5;
-    let server = serve(config, predictor()).await.unwrap();
-    Stage { server, authority, _files: files }
-}
-
-impl Stage {
-    async fn connect(&self, identity: Option<(Vec<u8>, Vec<u8>)>) -> Result<Client, ClientError> {
-        let tls = Tls { authority: self.authority.pem.clone().into_bytes(), identity, server_name: "localhost".into() };
-        Client::connect_tls(&format!("https://{}", self.server.grpc_addr), &tls).await
-    }
-
-    /// A client whose certificate says this.
-    async fn client(&self, name: &str) -> Client {
-        self.connect(Some(self.authority.sign(&[uri(name)], false))).await.unwrap()
-    }
-}
 
 fn open_request(vehicle: &str, session: &str) -> v1::OpenSessionRequest {
     v1::OpenSessionRequest { vehicle_id: vehicle.into(), session_id: session.into(), ..Default::default() }
 }
 
-/// Asserts PERMISSION_DENIED with the name of whoever asked.
 fn offset() -> Vec<v1::Effect> {
     let parameters = vec![v1::EffectParameter { name: "second".into(), value: 0.02, sd: 0.0 }];
     vec![v1::Effect { id: "steering_offset".into(), parameters }]
 }
 
+/// Asserts PERMISSION_DENIED with the name of whoever asked.
 fn denied<T: core::fmt::Debug>(what: &str, result: Result<T, ClientError>, who: &str) {
     let error = result.expect_err(what);
     assert_eq!(error.code(), Some(Code::PermissionDenied), "{what}: {error}");
@@ -180,7 +102,7 @@ async fn service_strangers_do_not_get_in() {
 
     // With a certificate of the right authority that says nothing, too much or somebody who is not in the fleet file.
     let names: [(&str, Vec<SanType>, Code); 4] = [
-        ("nobody", vec![SanType::DnsName("truck".try_into().unwrap())], Code::Unauthenticated),
+        ("nobody", vec![dns("truck")], Code::Unauthenticated),
         ("two", vec![uri("nesam:vehicle:truck"), uri("nesam:operator:control")], Code::Unauthenticated),
         ("a king", vec![uri("nesam:king:control")], Code::Unauthenticated),
         ("revoked", vec![uri("nesam:vehicle:sold")], Code::PermissionDenied),
@@ -240,12 +162,12 @@ async fn service_strangers_do_not_get_in() {
 async fn service_bad_security_files_are_told_at_the_start() {
     let files = tempfile::tempdir().unwrap();
     let authority = Authority::new();
-    let (certificate, key) = authority.sign(&[SanType::DnsName("localhost".try_into().unwrap())], false);
+    let (certificate, key) = authority.sign(&[dns("localhost")], false);
     let write = |name: &str, bytes: &[u8]| std::fs::write(files.path().join(name), bytes).unwrap();
     write("server.pem", &certificate);
     write("server.key", &key);
     write("ca.pem", authority.pem.as_bytes());
-    write("fleet.toml", FLEET.as_bytes());
+    write("fleet.toml", crate::authority::FLEET.as_bytes());
     write("text", b"not PEM");
     write("ghost.toml", b"[planners.p]\nvehicles = [\"ghost\"]");
     let at = |name: &str| if name.is_empty() { Default::default() } else { files.path().join(name) };

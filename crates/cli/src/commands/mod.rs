@@ -16,5 +16,6 @@ pub mod navigate;
 pub mod plant;
 pub mod predict;
 pub mod replay;
+pub mod router_config;
 pub mod serve;
 pub mod train;

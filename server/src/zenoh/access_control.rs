@@ -1,0 +1,195 @@
+//! Who may use which key: the access control of a Zenoh router, from the fleet file.
+//!
+//! A router knows its neighbours by the common name of their certificate, which is `nesam:<role>:<name>` here. Everything is denied that a rule does not
+//! allow. Messages are named from the router's side: what comes in (`ingress`) and what goes out (`egress`).
+
+use std::path::Path;
+
+use serde_json::{Value, json};
+
+use super::keys;
+use crate::access::{FleetFile, Identity};
+
+/// Topics of a vehicle that servers publish.
+const TOLD: [&str; 3] = ["status", "soil", "alarm"];
+
+/// Rules, whom they are for, and both together, as Zenoh's `access_control` has them.
+#[derive(Default)]
+struct Policies {
+    rules: Vec<Value>,
+    subjects: Vec<Value>,
+    policies: Vec<Value>,
+}
+
+/// What one member may do.
+struct Member<'a> {
+    all: &'a mut Policies,
+    name: String,
+    rules: Vec<String>,
+}
+
+impl Member<'_> {
+    /// Allows messages that concern these keys.
+    fn allow(&mut self, flow: &[&str], messages: &[&str], keys: Vec<String>) {
+        // Zenoh knows no empty lists; whoever has no vehicles has no keys.
+        if keys.is_empty() {
+            return;
+        }
+        let id = format!("{} {}", self.name, self.rules.len());
+        self.all.rules.push(json!({ "id": id, "permission": "allow", "flows": flow, "messages": messages, "key_exprs": keys }));
+        self.rules.push(id);
+    }
+
+    /// To hear what is published on these keys.
+    fn hears(&mut self, keys: Vec<String>) {
+        self.allow(&["ingress"], &["declare_subscriber"], keys.clone());
+        self.allow(&["egress"], &["put"], keys);
+    }
+
+    /// To see the tokens of whoever is there.
+    fn watches(&mut self, keys: Vec<String>) {
+        self.allow(&["ingress"], &["declare_liveliness_subscriber", "liveliness_query"], keys.clone());
+        self.allow(&["egress"], &["liveliness_token"], keys);
+    }
+
+    /// To ask for predictions, and to see whether somebody answers them.
+    fn asks(&mut self, fleet: &str, keys: Vec<String>) {
+        self.allow(&["ingress"], &["query"], keys.clone());
+        self.allow(&["egress"], &["reply"], keys);
+        self.allow(&["egress"], &["declare_queryable"], vec![keys::all_vehicles(fleet, "predict")]);
+    }
+
+    /// Hands over what the member may do.
+    fn done(self) {
+        let Self { all, name, rules } = self;
+        all.subjects.push(json!({ "id": name, "cert_common_names": [name] }));
+        all.policies.push(json!({ "rules": rules, "subjects": [name] }));
+    }
+}
+
+/// The `access_control` of whatever the members of a fleet connect to.
+pub fn access_control(members: &FleetFile, fleet: &str) -> Value {
+    let mut all = Policies::default();
+    for identity in members.members() {
+        let mut member = Member { all: &mut all, name: identity.uri(), rules: Vec::new() };
+        match &identity {
+            Identity::Vehicle(name) => vehicle(&mut member, fleet, name),
+            Identity::Planner(name) => planner(&mut member, fleet, &members.vehicles_of_planner(name).collect::<Vec<_>>()),
+            Identity::Operator(_) => operator(&mut member, fleet),
+            Identity::Server(name) => server(&mut member, fleet, name),
+        }
+        member.done();
+    }
+    let Policies { rules, subjects, policies } = all;
+    json!({ "enabled": true, "default_permission": "deny", "rules": rules, "subjects": subjects, "policies": policies })
+}
+
+fn vehicle(member: &mut Member<'_>, fleet: &str, name: &str) {
+    let own = |topic: &str| keys::of_vehicle(fleet, name, topic);
+    member.allow(&["ingress"], &["put"], vec![own("measurement")]);
+    member.allow(&["ingress"], &["liveliness_token"], vec![own("alive")]);
+    // That a server listens to all vehicles.
+    member.allow(&["egress"], &["declare_subscriber"], vec![keys::all_vehicles(fleet, "measurement")]);
+    member.asks(fleet, vec![own("predict")]);
+    member.hears(TOLD.map(own).into_iter().chain(of_servers(fleet)).collect());
+    member.watches(vec![keys::of_server(fleet, "*", "alive")]);
+}
+
+fn planner(member: &mut Member<'_>, fleet: &str, vehicles: &[&str]) {
+    let of = |topic: &str| vehicles.iter().map(|vehicle| keys::of_vehicle(fleet, vehicle, topic)).collect::<Vec<_>>();
+    member.asks(fleet, of("predict"));
+    member.hears(TOLD.iter().flat_map(|topic| of(topic)).chain(of_servers(fleet)).collect());
+    member.watches(of("alive"));
+    member.watches(vec![keys::of_server(fleet, "*", "alive")]);
+}
+
+fn operator(member: &mut Member<'_>, fleet: &str) {
+    let every = [
+        "put",
+        "query",
+        "reply",
+        "declare_subscriber",
+        "declare_queryable",
+        "liveliness_token",
+        "declare_liveliness_subscriber",
+        "liveliness_query",
+    ];
+    member.allow(&["ingress", "egress"], &every, vec![keys::of_fleet(fleet, "**")]);
+}
+
+fn server(member: &mut Member<'_>, fleet: &str, name: &str) {
+    let of_all = |topic: &str| keys::all_vehicles(fleet, topic);
+    member.hears(vec![of_all("measurement")]);
+    member.allow(&["ingress"], &["declare_queryable", "reply"], vec![of_all("predict")]);
+    member.allow(&["egress"], &["query"], vec![of_all("predict")]);
+    let own = [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, name, "status")];
+    member.allow(&["ingress"], &["put"], TOLD.map(of_all).into_iter().chain(own).collect());
+    member.allow(&["ingress"], &["liveliness_token"], vec![keys::of_server(fleet, name, "alive")]);
+    member.watches(vec![of_all("alive")]);
+}
+
+/// What everybody may hear of servers.
+fn of_servers(fleet: &str) -> [String; 2] {
+    [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, "*", "status")]
+}
+
+/// Certificate, key and authority of one end of a connection.
+#[derive(Clone, Copy, Debug)]
+pub struct LinkFiles<'a> {
+    /// Certificate with its chain, PEM.
+    pub certificate: &'a Path,
+    /// Its key.
+    pub key: &'a Path,
+    /// Authority of the other ends' certificates.
+    pub authority: &'a Path,
+}
+
+/// Zenoh's `transport/link/tls`: certificates on both sides, links closed when one expires.
+pub(super) fn link(files: LinkFiles<'_>) -> Value {
+    json!({
+        "root_ca_certificate": files.authority,
+        "listen_certificate": files.certificate,
+        "listen_private_key": files.key,
+        "connect_certificate": files.certificate,
+        "connect_private_key": files.key,
+        "enable_mtls": true,
+        "close_link_on_expiration": true,
+    })
+}
+
+/// The configuration of a Zenoh router that lets each member of a fleet use its own keys and nobody else anything.
+pub fn router_config(members: &FleetFile, fleet: &str, listen: &[String], files: LinkFiles<'_>) -> Value {
+    json!({
+        "mode": "router",
+        "listen": { "endpoints": listen },
+        "scouting": { "multicast": { "enabled": false } },
+        "transport": { "link": { "protocols": ["tls"], "tls": link(files) } },
+        "access_control": access_control(members, fleet),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn property_nobody_but_operators_and_servers_has_keys_of_all_vehicles() {
+        let text = "operators = [\"c\"]\nservers = [\"s\"]\n[vehicles.a]\n[vehicles.b]\n[planners.p]\nvehicles = [\"a\"]\n[planners.idle]";
+        let rules = access_control(&FleetFile::parse(text).unwrap(), "f");
+        assert_eq!(rules["subjects"].as_array().unwrap().len(), 6);
+        for rule in rules["rules"].as_array().unwrap() {
+            let who = rule["id"].as_str().unwrap();
+            let only_declared =
+                rule["messages"].as_array().unwrap().iter().all(|message| message.as_str().unwrap().starts_with("declare_"));
+            for key in rule["key_exprs"].as_array().unwrap().iter().map(|key| key.as_str().unwrap()) {
+                assert!(key.starts_with("nesam/v1/f/"), "{who}: {key}");
+                let narrow = key.starts_with("nesam/v1/f/a/") || key.starts_with("nesam/v1/f/server/") || key == "nesam/v1/f/soil_map";
+                match who.split(':').nth(1).unwrap() {
+                    "vehicle" if who.contains(":b ") => assert!(!key.contains("/a/"), "{who}: {key}"),
+                    "vehicle" | "planner" => assert!(narrow || only_declared, "{who}: {key}"),
+                    _ => {}
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,62 @@
+//! Goal: a client that abuses HTTP/2 harms nobody else. Method: frames by the `h2` crate, which does what a gRPC client never would.
+
+use std::time::{Duration, Instant};
+
+use h2::client::SendRequest;
+use prost::bytes::Bytes;
+
+use crate::stage::*;
+
+/// A connection below gRPC, driven in the background.
+async fn raw(address: std::net::SocketAddr) -> SendRequest<Bytes> {
+    let socket = tokio::net::TcpStream::connect(address).await.unwrap();
+    let (client, connection) = h2::client::handshake(socket).await.unwrap();
+    tokio::spawn(async move { drop(connection.await) });
+    client
+}
+
+fn request(method: &str, encoding: &str) -> http::Request<()> {
+    let request = http::Request::post(format!("http://localhost/nesam.v1.Sessions/{method}"));
+    request.header("content-type", "application/grpc").header("te", "trailers").header("grpc-encoding", encoding).body(()).unwrap()
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_rapid_resets_harm_nobody_else() {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    open(&mut client, "truck", "").await;
+    let mut slowest = Duration::ZERO;
+    let mut answered = 0;
+    for _ in 0..10 {
+        let mut attacker = raw(server.grpc_addr).await;
+        for _ in 0..500 {
+            let Ok(ready) = attacker.ready().await else { break };
+            attacker = ready;
+            let Ok((_, mut stream)) = attacker.send_request(request("List", "identity"), false) else { break };
+            stream.send_reset(h2::Reason::CANCEL);
+        }
+        let start = Instant::now();
+        client.feed(vec![sample("truck", &recorded.drive, answered)]).await.unwrap();
+        (slowest, answered) = (slowest.max(start.elapsed()), answered + 1);
+    }
+    assert!(slowest < Duration::from_secs(5), "{slowest:?}");
+    assert_eq!(client.session("truck").await.unwrap().history_steps, answered as u32);
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_compressed_messages_are_refused_unread() {
+    let (server, mut client) = start().await;
+    let attacker = raw(server.grpc_addr).await;
+    // gRPC's prefix: compressed, and a length that the rest does not have.
+    let (response, mut stream) = attacker.ready().await.unwrap().send_request(request("Open", "gzip"), false).unwrap();
+    let mut bomb = vec![1, 0, 0, 0, 40];
+    bomb.extend([0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3]);
+    bomb.extend([0; 30]);
+    stream.send_data(bomb.into(), true).unwrap();
+    let headers = tokio::time::timeout(Duration::from_secs(10), response).await.unwrap().unwrap();
+    let status = headers.headers().get("grpc-status").expect("refused before anything is read");
+    assert_eq!(status, "12", "UNIMPLEMENTED");
+    assert!(client.list_sessions().await.unwrap().is_empty());
+    server.shutdown().await;
+}
