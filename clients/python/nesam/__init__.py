@@ -4,6 +4,7 @@
 (z up), Body is x forward, y left, z up. A state is the twelve numbers x y z roll pitch yaw vx vy vz wx wy wz, both velocities in Body.
 """
 
+from ._candidates import Drawing, PathCost, Ranking
 from ._client import CHANNELS, Client, MeasurementStream
 from ._durable import DurableStream
 from ._errors import (
@@ -41,6 +42,7 @@ __all__ = [
     "Answer",
     "Client",
     "DeadlineExceeded",
+    "Drawing",
     "DurableStream",
     "Effect",
     "ExtraOutputs",
@@ -54,8 +56,10 @@ __all__ = [
     "NesamError",
     "NotFound",
     "Overloaded",
+    "PathCost",
     "Prediction",
     "Provenance",
+    "Ranking",
     "Session",
     "Soil",
     "Tls",

@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from typing import Dict, Iterable, Iterator, List, Optional, Sequence, Tuple
+from typing import Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from . import _types as t
 from ._durable import DurableStream
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable, from_rpc
+from ._candidates import Drawing, PathCost, ranking
 from ._extras import Extras, extra_outputs
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
@@ -232,7 +233,7 @@ class Client:
     def predict(
         self,
         session_id: str,
-        controls: np.ndarray,
+        controls: Union[np.ndarray, Drawing],
         start: Optional[Sequence[float]] = None,
         use_history: bool = True,
         channels: Optional[Sequence[str]] = None,
@@ -244,22 +245,26 @@ class Client:
         sent: Sequence[Tuple[int, Sequence[float]]] = (),
         half: bool = False,
         extras: Optional[Extras] = None,
+        cost: Optional[PathCost] = None,
     ) -> t.Prediction:
         """Rolls candidate command sequences out from the session's newest state, or from `start`.
 
-        controls: (samples, horizon, 2): speed m/s, second command in the unit of the vehicle card; one step is 0.1 s. start: (12,); with
+        controls: (samples, horizon, 2): speed m/s, second command in the unit of the vehicle card; one step is 0.1 s; or a `Drawing`, by which the
+        service draws them: `Prediction.controls` then tells what they were. cost: lets the service rank the candidates along a path and send the best
+        only; `Prediction.ranking` has the costs of all. start: (12,); with
         `use_history` it is taken to hold at the instant of the newest measurement. channels: names from CHANNELS to return, default all.
         stride: returns the steps stride, 2 stride, ... timeout_s: deadline, default that of the client. fallback: answers instead when the
         service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so.
         start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session forward to it with the commands `sent`,
         pairs (stamp_ns, (speed, second)) by ascending stamp. half: lets the reply travel as 16-bit numbers; positions are rounded by at most
-        4 mm within 16 m of the start. A fallback does not roll forward. extras: Jacobians, covariance, risk and what-if soils; the answer is in
+        4 mm within 16 m of the start. A fallback does not roll forward and predicts the nominal sequence of a drawing alone. extras: Jacobians, covariance, risk and what-if soils; the answer is in
         `Prediction.extras`, a fallback has none.
 
         Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, or it lies off the map), Overloaded, DeadlineExceeded,
         Unavailable; ValueError for arrays of a wrong shape.
         """
-        controls = np.ascontiguousarray(controls, dtype="<f4")
+        drawing = controls if isinstance(controls, Drawing) else None
+        controls = np.ascontiguousarray(controls if drawing is None else np.asarray(drawing.nominal)[None], dtype="<f4")
         if controls.ndim != 3 or controls.shape[2] != 2:
             raise ValueError(f"controls have shape {controls.shape}, expected (samples, horizon, 2)")
         names = _channel_names(channels)
@@ -267,9 +272,11 @@ class Client:
             session_id=session_id,
             start=None if start is None else t.state_message(start, "start"),
             history_use=prediction_pb2.HISTORY_USE_MEASURED if use_history else prediction_pb2.HISTORY_USE_NONE,
-            samples=controls.shape[0],
+            samples=controls.shape[0] if drawing is None else drawing.samples,
             horizon=controls.shape[1],
-            controls=controls.tobytes(),
+            controls=controls.tobytes() if drawing is None else b"",
+            drawing=None if drawing is None else drawing.message(),
+            cost=None if cost is None else cost.message(),
             output=prediction_pb2.OutputSelection(
                 channels=sum(1 << CHANNELS.index(name) for name in names),
                 stride=stride,
@@ -496,7 +503,8 @@ def _steps_s(steps: int, stride: int) -> np.ndarray:
 def _prediction(reply: prediction_pb2.PredictReply, stride: int, horizon: int, extras: Optional[Extras]) -> t.Prediction:
     channels = tuple(name for i, name in enumerate(CHANNELS) if reply.channels >> i & 1)
     what_if = extras is not None and extras.what_if
-    rows = (reply.soil_groups, reply.samples) if what_if else (reply.samples,)
+    ranked = ranking(reply)
+    rows = (reply.soil_groups, reply.samples) if what_if else (reply.samples if ranked is None else len(ranked.best),)
     shape = (*rows, reply.steps, len(channels))
     start = t.state_array(reply.start)
     half = reply.precision == prediction_pb2.PRECISION_F16
@@ -526,6 +534,8 @@ def _prediction(reply: prediction_pb2.PredictReply, stride: int, horizon: int, e
         rolled_forward_steps=reply.rolled_forward_steps,
         soil_correction=t.soil(reply.soil_correction),
         extras=None if extras is None else extra_outputs(reply, horizon, what_if),
+        controls=np.frombuffer(reply.drawn_controls, dtype="<f4").reshape(-1, horizon, 2) if reply.drawn_controls else None,
+        ranking=ranked,
     )
 
 

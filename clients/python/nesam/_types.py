@@ -6,6 +6,7 @@ from typing import Dict, Optional, Sequence, Tuple
 
 import numpy as np
 
+from ._candidates import Ranking
 from ._extras import ExtraOutputs
 from .v1 import types_pb2
 
@@ -217,7 +218,8 @@ class Prediction:
     start_stamp_ns: instant of the start by the vehicle's clock, None when a start was given. rolled_forward_steps: steps of 0.1 s from the newest
     measurement to the start. soil: (6,) k_phi k_c n c phi k_shear under the start; soil_variance: (6,) or None while no filter runs;
     soil_correction: what the session knew of the soil. extras: what `Extras` asked for; with what-if soils, states, sinkage_m and validity have a first
-    dimension more, one group for each soil.
+    dimension more, one group for each soil. controls: (samples, horizon, 2) float32 of candidates that the service drew, None of those that were sent.
+    ranking: with a `PathCost`, the costs of all candidates; states, validity, sinkage_m and controls then have the rows of `ranking.best`.
     computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance and
     sinkage_m are None, validity is 0 and `fallback_reason` is the service's error.
     """
@@ -241,6 +243,8 @@ class Prediction:
     rolled_forward_steps: int = 0
     soil_correction: Optional[Soil] = None
     extras: Optional[ExtraOutputs] = None
+    controls: Optional[np.ndarray] = None
+    ranking: Optional[Ranking] = None
 
 
 def array(values: Sequence[float], shape: Tuple[int, ...], name: str) -> np.ndarray:

@@ -48,6 +48,25 @@ def test_service_selection_returns_the_slice(driven):
     np.testing.assert_allclose(part.steps_s, [0.4, 0.8])
 
 
+def test_service_the_best_of_what_the_service_draws(driven):
+    drawing = nesam.Drawing(fan(1, 12)[0], samples=16, sd=(0.5, 0.2), correlation=0.8, seed=3)
+    everything = driven.predict("truck", drawing)
+    assert everything.controls.shape == (16, 12, 2) and (everything.controls[0] == drawing.nominal).all()
+    assert (driven.predict("truck", everything.controls).states == everything.states).all()
+    path = everything.start[:2] + np.outer(np.linspace(-5, 30, 36), [np.cos(everything.start[5]), np.sin(everything.start[5])])
+    ranked = driven.predict("truck", drawing, cost=nesam.PathCost(path, 2.0, best=3, temperature=0.1), channels=("x", "y"))
+    assert ranked.states.shape == (3, 12, 2) and ranked.ranking.costs.shape == (16,) and ranked.ranking.mean_controls.shape == (12, 2)
+    assert (ranked.ranking.best == np.argsort(ranked.ranking.costs, kind="stable")[:3]).all()
+    assert (ranked.states == everything.states[ranked.ranking.best][:, :, :2]).all()
+    assert (ranked.controls == everything.controls[ranked.ranking.best]).all()
+    assert everything.ranking is None and driven.predict("truck", fan(1, 1)).controls is None
+    with pytest.raises(nesam.InvalidArgument) as refused:
+        driven.predict("truck", drawing, cost=nesam.PathCost(path, 2.0, best=17))
+    assert refused.value.field == "cost.best"
+    with pytest.raises(ValueError, match="path"):
+        driven.predict("truck", drawing, cost=nesam.PathCost(np.zeros(4), 2.0))
+
+
 def test_service_half_precision_is_rounding_only(driven):
     whole = driven.predict("truck", fan(3, 32), wheel_sinkage=True)
     half = driven.predict("truck", fan(3, 32), wheel_sinkage=True, half=True)

@@ -22,8 +22,12 @@ pub struct Candidates {
     pub samples: usize,
     /// K.
     pub horizon: usize,
-    /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card.
+    /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card; empty where they are drawn.
     pub controls: Vec<f32>,
+    /// Lets the service draw the candidates instead.
+    pub drawing: Option<v1::CandidateDrawing>,
+    /// Lets the service say what each is worth, and send the best only.
+    pub cost: Option<v1::PathCost>,
     /// What to return.
     pub output: v1::OutputSelection,
     /// What to compute beyond the states.
@@ -46,10 +50,23 @@ impl Candidates {
             samples,
             horizon,
             controls,
+            drawing: None,
+            cost: None,
             output,
             extras: None,
             tag: 0,
         }
+    }
+
+    /// Candidates that the service draws around a nominal sequence, (horizon, 2), as MPPI does.
+    pub fn drawn(session: &str, samples: usize, nominal: &[f32], drawing: v1::CandidateDrawing) -> Self {
+        let drawing = v1::CandidateDrawing { nominal: pack(nominal), ..drawing };
+        Self { drawing: Some(drawing), ..Self::new(session, samples, nominal.len() / 2, Vec::new()) }
+    }
+
+    /// The same candidates, of which only the best along a path, (points, 2), are sent.
+    pub fn ranked(self, path: &[f32], cost: v1::PathCost) -> Self {
+        Self { cost: Some(v1::PathCost { path: pack(path), ..cost }), ..self }
     }
 
     /// The same candidates from this instant of the vehicle's clock on, when the vehicle was sent these commands before.
@@ -72,6 +89,8 @@ impl Candidates {
             start_stamp_ns: self.start_stamp_ns,
             sent: self.sent.iter().map(|(stamp_ns, command)| sent_command(*stamp_ns, *command)).collect(),
             extras: self.extras.clone(),
+            drawing: self.drawing.clone(),
+            cost: self.cost.clone(),
         }
     }
 }
@@ -91,7 +110,7 @@ pub struct Prediction {
     pub steps: usize,
     /// Indices of the channels returned, in the order x y z roll pitch yaw vx vy vz wx wy wz.
     pub channels: Vec<usize>,
-    /// Row-major (samples, steps, channels): m, rad, m/s, rad/s. Positions are in World, also where the reply was packed as f16.
+    /// Row-major (rows, steps, channels), rows = samples, or those of `best` where candidates are ranked: m, rad, m/s, rad/s. Positions are in World, also where the reply was packed as f16.
     pub states: Vec<f32>,
     /// Row-major (samples, steps, 4): wheel sinkage, m; empty unless asked for.
     pub sinkage_m: Vec<f32>,
@@ -123,6 +142,14 @@ pub struct Prediction {
     pub soil_groups: usize,
     /// Jacobians, covariance and risk; empty arrays unless asked for.
     pub extras: ExtraOutputs,
+    /// Commands that were drawn, (rows, horizon, 2).
+    pub drawn_controls: Vec<f32>,
+    /// Cost of each of the samples, infinite where it is worthless; empty unless asked for.
+    pub costs: Vec<f32>,
+    /// Which samples the rows are, best first; empty unless ranked.
+    pub best: Vec<u32>,
+    /// (horizon, 2): mean of all samples by their cost.
+    pub mean_controls: Vec<f32>,
 }
 
 /// What was computed beyond the states, row-major; empty unless asked for. The fields and their shapes are those of `v1::PredictReply`.
@@ -181,7 +208,8 @@ impl Prediction {
         let channels: Vec<usize> = (0..12).filter(|i| reply.channels >> i & 1 == 1).collect();
         let (samples, steps) = (reply.samples as usize, reply.steps as usize);
         let soil_groups = (reply.soil_groups as usize).max(1);
-        let rows = soil_groups * samples;
+        let rows = if reply.costs.is_empty() { soil_groups * samples } else { reply.best.len() };
+        let plain = |name: &str, packed: &[u8]| unpack(name, packed, packed.len() / 4, v1::Precision::F32);
         let sinkage = if reply.sinkage_m.is_empty() { 0 } else { rows * steps * 4 };
         let missing = |part: &str| ClientError::protocol(format!("`{part}` is missing"));
         let start = reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?;
@@ -213,15 +241,19 @@ impl Prediction {
             compute_s: reply.compute_s,
             soil_groups,
             extras: ExtraOutputs::from_message(reply)?,
+            drawn_controls: plain("drawn_controls", &reply.drawn_controls)?,
+            costs: plain("costs", &reply.costs)?,
+            best: reply.best.clone(),
+            mean_controls: plain("mean_controls", &reply.mean_controls)?,
         })
     }
 
-    /// Returned channels of row `n` at returned step `k` (0-based); row = soil group times samples plus sample.
+    /// Returned channels of row `n` at returned step `k` (0-based); row = soil group times samples plus sample, or place among the best.
     ///
     /// # Panics
     /// When `n` or `k` is out of range.
     pub fn state(&self, n: usize, k: usize) -> &[f32] {
-        let rows = self.soil_groups * self.samples;
+        let rows = self.validity.len();
         assert!(n < rows && k < self.steps, "row {n}, step {k} of {rows} x {}", self.steps);
         let width = self.channels.len();
         let at = (n * self.steps + k) * width;

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_engine::{Command, Engine, EngineError, Limits, OpenSession, PredictExtras, PredictQuery, Prediction, Reply};
+use nesam_engine::{Candidates, Command, Engine, EngineError, Limits, OpenSession, PredictExtras, PredictQuery, Prediction, Reply};
 use nesam_evaluation::{POSE_DIM, Pose, PosePath, Truth, pose_of};
 use nesam_model::Predictor;
 use nesam_terrain::WorldMap;
@@ -153,7 +153,8 @@ impl Ride<'_> {
             samples: 1,
             horizon: controls.len() / 2,
             extras: PredictExtras::default(),
-            controls,
+            controls: Candidates::Given(controls),
+            cost: None,
         };
         match self.engine.execute(clock_ns(asked_s), &Command::Predict(query))? {
             Reply::Predicted(prediction) => Ok(prediction),

@@ -11,6 +11,7 @@ use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNois
 use nesam_physics::VehicleState;
 use nesam_terrain::WorldMap;
 
+use crate::candidates::Candidates;
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
 use crate::error::EngineError;
 use crate::extras::ExtraOutputs;
@@ -361,7 +362,8 @@ impl Engine {
         self.limits.check_shape(query.samples * soils.len().max(1), horizon)?;
         let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
         let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
-        let controls = forward.prepend(&query.controls, query.horizon);
+        let commands = query.controls.commands(query.samples, self.predictor.bundle().vehicle.command_range);
+        let controls = forward.prepend(&commands, query.horizon);
         let asked = RolloutQuery {
             history: &history,
             start,
@@ -391,6 +393,15 @@ impl Engine {
         if session.soil().state.is_prior() {
             rollout.flags.iter_mut().for_each(|flags| *flags |= SOIL_NOT_LEARNED);
         }
+        let ranking = query.cost.as_ref().map(|cost| cost.rank(&rollout, &commands));
+        if let Some(ranking) = &ranking {
+            rollout = ranking.best_of(&rollout);
+        }
+        let drawn_controls = match (&query.controls, &ranking) {
+            (Candidates::Given(_), _) => Vec::new(),
+            (Candidates::Drawn(_), None) => commands.into_owned(),
+            (Candidates::Drawn(_), Some(ranking)) => ranking.rows_of_best(&commands, 2 * query.horizon),
+        };
         Ok(Prediction {
             soil_variance: session.soil().state.variance_at(&rollout.soil),
             rollout,
@@ -402,6 +413,8 @@ impl Engine {
             measurement_age_s: session.age_s(now_ns),
             provenance: self.provenance(session),
             extras,
+            drawn_controls,
+            ranking,
         })
     }
 

@@ -16,6 +16,7 @@
 //! ```
 #![forbid(unsafe_code)]
 
+mod candidates;
 mod clock;
 mod command;
 mod engine;
@@ -31,9 +32,11 @@ mod maps;
 mod measurement;
 mod query;
 mod queue;
+mod ranking;
 mod service_time;
 mod session;
 
+pub use candidates::{Candidates, Drawing};
 pub use clock::{Clock, ManualClock};
 pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
 pub use engine::{Engine, EventSink, Logged};
@@ -49,6 +52,7 @@ pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FilterSnapshot, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
+pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{
     Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, Session, SessionImage, SoilEstimate,
     SoilState, TrackImage, WatchImage,

@@ -3,10 +3,12 @@
 use nesam_model::Rollout;
 use nesam_physics::{Control, SOIL_DIM, Vehicle, VehicleState};
 
+use crate::candidates::Candidates;
 use crate::error::EngineError;
 use crate::extras::{ExtraOutputs, PredictExtras};
 use crate::forward::StartInstant;
 use crate::limits::{Limits, outside_card};
+use crate::ranking::{PathCost, Ranking};
 use crate::session::SoilEstimate;
 
 /// Bit of `Rollout::flags` that the engine adds to those of the model: the drive has not updated the soil yet, the prior alone speaks.
@@ -27,8 +29,10 @@ pub struct PredictQuery {
     pub samples: usize,
     /// K.
     pub horizon: usize,
-    /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the card.
-    pub controls: Vec<f32>,
+    /// The candidates.
+    pub controls: Candidates,
+    /// What they are worth; then only the best are answered. Not together with extras.
+    pub cost: Option<PathCost>,
     /// What to compute beyond the states.
     pub extras: PredictExtras,
 }
@@ -51,7 +55,8 @@ pub struct Provenance {
 /// An answered prediction.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
-    /// Predicted states, sinkages, flags and the soil under the start; one row for each sample of each group of what-if soils.
+    /// Predicted states, sinkages, flags and the soil under the start; one row for each sample of each group of what-if soils, or for each of the best of the
+    /// ranking.
     pub rollout: Rollout,
     /// State that the rollout started from.
     pub start: VehicleState<f64>,
@@ -71,6 +76,18 @@ pub struct Prediction {
     pub provenance: Provenance,
     /// What was asked for beyond the states.
     pub extras: ExtraOutputs,
+    /// Commands of the rows of the rollout, (rows, horizon, 2); empty for candidates that were given.
+    pub drawn_controls: Vec<f32>,
+    /// What all candidates are worth, where it was asked.
+    pub ranking: Option<Ranking>,
+}
+
+impl Prediction {
+    /// N, as asked.
+    pub fn candidates(&self) -> usize {
+        let rows = self.rollout.samples / self.extras.soil_groups.max(1);
+        self.ranking.as_ref().map_or(rows, |ranking| ranking.costs.len())
+    }
 }
 
 impl PredictQuery {
@@ -81,13 +98,35 @@ impl PredictQuery {
     pub fn check(&self, limits: &Limits, vehicle: &Vehicle) -> Result<(), EngineError> {
         limits.check_shape(self.samples, self.horizon)?;
         self.extras.check(limits, self.samples)?;
-        let expected = self.samples * self.horizon * 2;
-        if self.controls.len() != expected {
-            let reason = format!("has {} numbers, samples x horizon x 2 = {expected} are needed", self.controls.len());
-            return Err(EngineError::invalid("controls", reason));
+        if let Some(cost) = &self.cost {
+            cost.check(self.samples)?;
+            if self.extras != PredictExtras::default() {
+                return Err(EngineError::invalid("cost", "is given together with `extras`, allowed is one of the two"));
+            }
         }
-        for (at, pair) in self.controls.chunks_exact(2).enumerate() {
-            let place = || format!("controls[{}, {}]", at / self.horizon, at % self.horizon);
+        self.check_commands(vehicle)?;
+        match (&self.start, &self.instant) {
+            (Some(_), Some(_)) => Err(EngineError::invalid("start", "is given together with `start_stamp_ns`, allowed is one of the two")),
+            (Some(start), None) => limits.check_state("start", start),
+            (None, Some(instant)) => instant.check(vehicle),
+            (None, None) => Ok(()),
+        }
+    }
+
+    /// Checks number and range of the commands, those of the nominal sequence where candidates are drawn.
+    fn check_commands(&self, vehicle: &Vehicle) -> Result<(), EngineError> {
+        let rows = match &self.controls {
+            Candidates::Given(_) => self.samples,
+            Candidates::Drawn(drawing) => drawing.check().map(|()| 1)?,
+        };
+        let (field, controls) = self.controls.asked();
+        let expected = rows * self.horizon * 2;
+        if controls.len() != expected {
+            let reason = format!("has {} numbers, {rows} x horizon x 2 = {expected} are needed", controls.len());
+            return Err(EngineError::invalid(field, reason));
+        }
+        for (at, pair) in controls.chunks_exact(2).enumerate() {
+            let place = || format!("{field}[{}, {}]", at / self.horizon, at % self.horizon);
             let control = Control { speed_m_s: f64::from(pair[0]), second: f64::from(pair[1]) };
             if !pair.iter().all(|v| v.is_finite()) {
                 return Err(EngineError::invalid(place(), "holds a number that is not finite"));
@@ -96,11 +135,6 @@ impl PredictQuery {
                 return Err(EngineError::invalid(format!("{}.{entry}", place()), reason));
             }
         }
-        match (&self.start, &self.instant) {
-            (Some(_), Some(_)) => Err(EngineError::invalid("start", "is given together with `start_stamp_ns`, allowed is one of the two")),
-            (Some(start), None) => limits.check_state("start", start),
-            (None, Some(instant)) => instant.check(vehicle),
-            (None, None) => Ok(()),
-        }
+        Ok(())
     }
 }

@@ -798,7 +798,7 @@ pub struct PredictRequest {
     /// Number of steps K, 1 to 32.
     #[prost(uint32, tag = "5")]
     pub horizon: u32,
-    /// Packed f32, shape (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card. 8 N K bytes.
+    /// Packed f32, shape (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card. 8 N K bytes. Empty with `drawing`.
     #[prost(bytes = "bytes", tag = "6")]
     pub controls: ::prost::bytes::Bytes,
     #[prost(message, optional, tag = "7")]
@@ -818,6 +818,65 @@ pub struct PredictRequest {
     /// What to compute beyond the states; absent = nothing, and nothing is spent on it.
     #[prost(message, optional, tag = "11")]
     pub extras: ::core::option::Option<PredictExtras>,
+    /// Lets the service draw the candidates instead of sending them: 8 K bytes instead of 8 N K.
+    #[prost(message, optional, tag = "12")]
+    pub drawing: ::core::option::Option<CandidateDrawing>,
+    /// Lets the service say what each candidate is worth and send the best only: 4 N bytes and 48 K for each of them instead of 48 N K. Not together with
+    /// `extras`.
+    #[prost(message, optional, tag = "13")]
+    pub cost: ::core::option::Option<PathCost>,
+}
+/// Candidates as MPPI draws them: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the vehicle card.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct CandidateDrawing {
+    /// Packed f32, shape (horizon, 2): speed in m/s, second command in the unit of the vehicle card.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub nominal: ::prost::bytes::Bytes,
+    /// Standard deviation of the noise of the speed, m/s.
+    #[prost(double, tag = "2")]
+    pub speed_sd_m_s: f64,
+    /// The same of the second command, in its unit.
+    #[prost(double, tag = "3")]
+    pub second_sd: f64,
+    /// Correlation of the noise from one step to the next, 0 (white) to below 1; its standard deviation stays the same.
+    #[prost(double, tag = "4")]
+    pub correlation: f64,
+    /// The same drawing with the same seed gives the same candidates from the same version of the service.
+    #[prost(uint64, tag = "5")]
+    pub seed: u64,
+}
+/// Cost of a candidate along a path: the mean over the steps of the weighted squares below. Infinite for a candidate that overturns, leaves the map or has a
+/// state that is not finite. Weights are at least 0.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct PathCost {
+    /// Points of the path in the order they are driven, packed f32, shape (points, 2), World, m; 2 to 1024 points. A step is held against the place of
+    /// the path that is nearest to it, not far from that of the step before, so that a path may cross itself.
+    #[prost(bytes = "bytes", tag = "1")]
+    pub path: ::prost::bytes::Bytes,
+    /// Speed to be made along the path, m/s.
+    #[prost(double, tag = "2")]
+    pub speed_m_s: f64,
+    /// Weight of the squared distance from the path, per m^2.
+    #[prost(double, tag = "3")]
+    pub path_weight: f64,
+    /// Weight of the squared difference between `speed_m_s` and the velocity along the path, per (m/s)^2.
+    #[prost(double, tag = "4")]
+    pub speed_weight: f64,
+    /// Weight of roll^2 + pitch^2, per rad^2.
+    #[prost(double, tag = "5")]
+    pub tilt_weight: f64,
+    /// Weight of the squared change of the speed command from step to step, per (m/s)^2.
+    #[prost(double, tag = "6")]
+    pub speed_change_weight: f64,
+    /// The same of the second command, per unit of it squared.
+    #[prost(double, tag = "7")]
+    pub second_change_weight: f64,
+    /// Candidates to send, best first; 0 = none, at most N.
+    #[prost(uint32, tag = "8")]
+    pub best: u32,
+    /// Temperature of `PredictReply.mean_controls`, in units of the cost; 0 = no mean.
+    #[prost(double, tag = "9")]
+    pub temperature: f64,
 }
 /// Jacobians, covariance, risk and what-if soils. `OutputSelection.stride` picks their steps too, `channels` and `precision` do not apply to them:
 /// states have all twelve entries in the order x y z roll pitch yaw vx vy vz wx wy wz (World, velocities in Body), numbers are f32.
@@ -880,7 +939,7 @@ pub struct PredictReply {
     /// N, as asked.
     #[prost(uint32, tag = "2")]
     pub samples: u32,
-    /// Number of steps returned, floor(K / stride).
+    /// Number of steps returned, floor(K / stride). With `cost` the arrays below have a row for each of `best` instead of N rows.
     #[prost(uint32, tag = "3")]
     pub steps: u32,
     /// Bits of the channels returned, in ascending order of the bit.
@@ -968,6 +1027,19 @@ pub struct PredictReply {
     /// shape (S N, steps).
     #[prost(bytes = "bytes", tag = "30")]
     pub traction_reserve: ::prost::bytes::Bytes,
+    /// Candidates that were drawn, packed f32, shape (N, horizon, 2), or (best, horizon, 2) with `cost`. Empty for candidates that were sent.
+    #[prost(bytes = "bytes", tag = "31")]
+    pub drawn_controls: ::prost::bytes::Bytes,
+    /// Cost of every candidate, packed f32, shape (N); empty without `cost`.
+    #[prost(bytes = "bytes", tag = "32")]
+    pub costs: ::prost::bytes::Bytes,
+    /// Indices of the candidates that are sent, best first.
+    #[prost(uint32, repeated, tag = "33")]
+    pub best: ::prost::alloc::vec::Vec<u32>,
+    /// Mean of all candidates weighted with exp(-(cost - least cost) / temperature), packed f32, shape (horizon, 2): the step of MPPI. Empty without
+    /// `temperature`, or when no candidate has a finite cost.
+    #[prost(bytes = "bytes", tag = "34")]
+    pub mean_controls: ::prost::bytes::Bytes,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PredictStreamReply {

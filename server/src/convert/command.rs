@@ -3,6 +3,7 @@
 use nesam_engine::{Measurement, OpenSession, PredictExtras, PredictQuery, SentCommand, WhatIfSoils, WheelMeasurement};
 use nesam_proto::v1 as pb;
 
+use super::candidates::{candidates_message, path_cost_message};
 use super::{Precision, control_message, encode, vehicle_state_message};
 
 /// The message that brings a measurement to a session.
@@ -38,7 +39,8 @@ pub fn open_message(open: &OpenSession) -> pb::OpenSessionRequest {
 
 /// The message that asks for a prediction and for everything of it.
 pub fn predict_message(query: &PredictQuery) -> pb::PredictRequest {
-    let PredictQuery { session, start, instant, use_history, samples, horizon, controls, extras } = query;
+    let PredictQuery { session, start, instant, use_history, samples, horizon, controls, cost, extras } = query;
+    let (controls, drawing) = candidates_message(controls);
     let history_use = if *use_history { pb::HistoryUse::Measured } else { pb::HistoryUse::None };
     let sent = |sent: &SentCommand| pb::SentCommand { stamp_ns: sent.stamp_ns, command: Some(control_message(&sent.command)) };
     pb::PredictRequest {
@@ -47,12 +49,14 @@ pub fn predict_message(query: &PredictQuery) -> pb::PredictRequest {
         history_use: history_use.into(),
         samples: u32::try_from(*samples).unwrap_or(u32::MAX),
         horizon: u32::try_from(*horizon).unwrap_or(u32::MAX),
-        controls: encode(controls, Precision::F32),
+        controls,
         output: Some(pb::OutputSelection { wheel_sinkage: true, ..Default::default() }),
         tag: 0,
         start_stamp_ns: instant.as_ref().map(|instant| instant.stamp_ns),
         sent: instant.as_ref().map(|instant| instant.sent.iter().map(sent).collect()).unwrap_or_default(),
         extras: (*extras != PredictExtras::default()).then(|| extras_message(extras)),
+        drawing,
+        cost: cost.as_ref().map(path_cost_message),
     }
 }
 
@@ -76,7 +80,7 @@ fn extras_message(extras: &PredictExtras) -> pb::PredictExtras {
 
 #[cfg(test)]
 mod tests {
-    use nesam_engine::{CovarianceQuery, Limits, StartInstant};
+    use nesam_engine::{Candidates, CostWeights, CovarianceQuery, Drawing, Limits, PathCost, StartInstant};
     use nesam_physics::{Control, VehicleState};
 
     use super::*;
@@ -118,10 +122,17 @@ mod tests {
             (None, Some(StartInstant { stamp_ns: 9, sent: Vec::new() }), true, sigma),
             (None, Some(StartInstant { stamp_ns: i64::MIN, sent }), true, PredictExtras::default()),
         ] {
-            let controls = vec![1.0, f32::NAN, -0.0, f32::MAX, 2.0, 3.0];
-            let query = PredictQuery { session: "s".into(), start, instant, use_history, samples: 3, horizon: 1, controls, extras };
-            let (back, _) = predict_query(&predict_message(&query), &Limits::default()).unwrap();
-            assert_eq!(format!("{back:?}"), format!("{query:?}"));
+            let controls = Candidates::Given(vec![1.0, f32::NAN, -0.0, f32::MAX, 2.0, 3.0]);
+            let mut query =
+                PredictQuery { session: "s".into(), start, instant, use_history, samples: 3, horizon: 1, controls, cost: None, extras };
+            let drawing = Drawing { nominal: vec![-0.0, f32::NAN], sd: [0.5, f64::NAN], correlation: 0.75, seed: u64::MAX };
+            let weights = CostWeights { path: 1.0, speed: 2.0, tilt: 3.0, change: [4.0, 5.0] };
+            let cost = PathCost { path: vec![1.0, f32::INFINITY], speed_m_s: 6.0, weights, best: 2, temperature: 7.0 };
+            for _ in 0..2 {
+                let (back, _) = predict_query(&predict_message(&query), &Limits::default()).unwrap();
+                assert_eq!(format!("{back:?}"), format!("{query:?}"));
+                (query.controls, query.cost) = (Candidates::Drawn(drawing.clone()), Some(cost.clone()));
+            }
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Messages to domain values and back. The only place that knows both; every refusal names the path of the field.
 
 mod alarm;
+mod candidates;
 mod command;
 mod effects;
 mod extras;

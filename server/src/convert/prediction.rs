@@ -1,11 +1,12 @@
 //! Predictions.
 
-use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, SentCommand, StartInstant};
+use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, Ranking, SentCommand, StartInstant};
 use nesam_physics::{STATE_DIM, WHEELS};
 use nesam_proto::v1 as pb;
 
+use super::candidates::{candidates, path_cost};
 use super::extras::{predict_extras, put_extras};
-use super::{Precision, code, control, decode_f32, encode, provenance, soil_correction, soil_vector, vehicle_state, vehicle_state_message};
+use super::{Precision, code, control, encode, provenance, soil_correction, soil_vector, vehicle_state, vehicle_state_message};
 use crate::call::Timing;
 
 /// What the reply carries.
@@ -30,7 +31,7 @@ const ALL_CHANNELS: u32 = (1 << STATE_DIM) - 1;
 pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(PredictQuery, OutputSelection), EngineError> {
     let (samples, horizon) = (message.samples as usize, message.horizon as usize);
     limits.check_shape(samples, horizon)?;
-    let controls = decode_f32("controls", &message.controls, samples * horizon * 2)?;
+    let controls = candidates(message)?;
     let start = message.start.as_ref().map(|state| vehicle_state("start", state)).transpose()?;
     let use_history = match pb::HistoryUse::try_from(message.history_use) {
         Ok(pb::HistoryUse::Unspecified | pb::HistoryUse::Measured) => true,
@@ -43,7 +44,11 @@ pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(P
     let output = output_selection(&message.output.unwrap_or_default(), horizon)?;
     let instant = start_instant(message)?;
     let extras = message.extras.as_ref().map(predict_extras).transpose()?.unwrap_or_default();
-    Ok((PredictQuery { session: message.session_id.clone(), start, instant, use_history, samples, horizon, controls, extras }, output))
+    let cost = message.cost.as_ref().map(path_cost).transpose()?;
+    Ok((
+        PredictQuery { session: message.session_id.clone(), start, instant, use_history, samples, horizon, controls, cost, extras },
+        output,
+    ))
 }
 
 /// The instant to start from and the commands until then, if one is given.
@@ -138,7 +143,7 @@ pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection,
     let groups = prediction.extras.soil_groups.max(1);
     let mut reply = pb::PredictReply {
         tag,
-        samples: (prediction.rollout.samples / groups) as u32,
+        samples: prediction.candidates() as u32,
         steps: output.steps(prediction.rollout.horizon) as u32,
         channels: output.channels,
         states: output.states(prediction),
@@ -157,8 +162,14 @@ pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection,
         start_stamp_ns: prediction.start_stamp_ns,
         precision: output.precision.to_message().into(),
         soil_groups: groups as u32,
+        drawn_controls: encode(&prediction.drawn_controls, Precision::F32),
         ..Default::default()
     };
+    if let Some(Ranking { costs, best, mean_controls }) = &prediction.ranking {
+        reply.costs = encode(costs, Precision::F32);
+        reply.best.clone_from(best);
+        reply.mean_controls = encode(mean_controls, Precision::F32);
+    }
     put_extras(&mut reply, &prediction.extras, prediction.rollout.horizon, output);
     reply
 }

@@ -132,12 +132,15 @@ fn note_part(shared: &Shared, path: &Path) {
 /// What a command holds in memory, bytes. Maps are shared with the engine and count as much as they are written.
 fn weight(executed: &Executed) -> u64 {
     let asked = match &executed.command {
-        Command::Predict(query) => 4 * query.controls.len() as u64,
+        Command::Predict(query) => 4 * query.controls.asked().1.len() as u64,
         Command::PutMap { map, .. } => 7 * map.geometry().cells() as u64,
         _ => 0,
     };
     let answered = match &executed.result {
-        Ok(Reply::Predicted(prediction)) => 4 * (prediction.rollout.states.len() + prediction.rollout.sinkage_m.len()) as u64,
+        Ok(Reply::Predicted(prediction)) => {
+            let drawn = prediction.drawn_controls.len() + prediction.ranking.as_ref().map_or(0, |ranking| ranking.costs.len());
+            4 * (prediction.rollout.states.len() + prediction.rollout.sinkage_m.len() + drawn) as u64
+        }
         Ok(Reply::Sessions(sessions)) => COMMAND_BYTES * sessions.len() as u64,
         _ => 0,
     };

@@ -189,8 +189,7 @@ fn fan_json(fan: &Shown, scenery: &Scenery) -> Value {
         [f64::from(rollout.states[first]), f64::from(rollout.states[first + 1])].map(|v| v.is_finite().then(|| rounded(v, 2)))
     };
     // Rows of further what-if soils are the same candidates again.
-    let samples = rollout.samples / prediction.extras.soil_groups.max(1);
-    let rows = drawn(samples);
+    let rows = drawn(rollout.samples / prediction.extras.soil_groups.max(1));
     let steps = steps(rollout.horizon);
     let paths: Vec<Vec<_>> = rows.iter().map(|n| steps.iter().flat_map(|k| at(*n, *k)).collect()).collect();
     let flags: Vec<u32> = rows.iter().map(|n| rollout.flags.get(*n).copied().unwrap_or(0)).collect();
@@ -199,7 +198,7 @@ fn fan_json(fan: &Shown, scenery: &Scenery) -> Value {
         "at_s": rounded(fan.at_s, 3),
         "start": [rounded(x, 2), rounded(y, 2)],
         "stamp_s": prediction.start_stamp_ns.map(|ns| ns as f64 * 1e-9),
-        "samples": samples,
+        "samples": prediction.candidates(),
         "soils": prediction.extras.soil_groups,
         "horizon_s": rollout.horizon as f64 * scenery.predictor.bundle().normalization.dt_s,
         "paths": paths,

@@ -143,7 +143,7 @@ impl Notes {
                 self.measured(session, &measurement, &answer, at_s);
             }
             Note::Predicted { session, prediction, queue_s, compute_s } => {
-                let timing = PredictionTiming { at_s, queue_s, compute_s, samples: prediction.rollout.samples };
+                let timing = PredictionTiming { at_s, queue_s, compute_s, samples: prediction.candidates() };
                 self.predicted(session, prediction, timing);
             }
             Note::Session(view) => self.open(&view, at_s),

@@ -15,6 +15,7 @@ mod moving;
 mod overload;
 mod predictions;
 mod random_bytes;
+mod ranked;
 mod recording;
 mod reload;
 mod reorder;

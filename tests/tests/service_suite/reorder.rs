@@ -3,7 +3,7 @@
 
 use std::cell::Cell;
 
-use nesam_engine::{Command, Engine, Limits, Measurement, OpenSession, PredictExtras, PredictQuery, Reply, WheelMeasurement};
+use nesam_engine::{Candidates, Command, Engine, Limits, Measurement, OpenSession, PredictExtras, PredictQuery, Reply, WheelMeasurement};
 use nesam_physics::VehicleState;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
@@ -54,7 +54,8 @@ fn shown(recorded: &Recorded, arrivals: &[Measurement]) -> (String, u64, Vec<&'s
         samples: 1,
         horizon: 16,
         extras: PredictExtras::default(),
-        controls: candidates("truck", &recorded.drive, 60, 1, 16).controls,
+        controls: Candidates::Given(candidates("truck", &recorded.drive, 60, 1, 16).controls),
+        cost: None,
     };
     let Reply::Predicted(prediction) = engine.execute(0, &Command::Predict(query)).unwrap() else { panic!("another reply") };
     let text = format!(

@@ -3,7 +3,8 @@
 use std::sync::Arc;
 
 use nesam_engine::{
-    Command, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PredictExtras, PredictQuery, WheelMeasurement,
+    Candidates, Command, CostWeights, Drawing, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PathCost,
+    PredictExtras, PredictQuery, WheelMeasurement,
 };
 
 use crate::stage::*;
@@ -41,8 +42,26 @@ fn property_replayed_commands_give_the_same_bytes() {
                 use_history: true,
                 samples: 3,
                 horizon: 8,
-                controls: candidates.controls,
+                controls: Candidates::Given(candidates.controls.clone()),
+                cost: None,
                 extras: PredictExtras { jacobians: i % 32 == 7, risk: true, ..Default::default() },
+            }));
+            let weights = CostWeights { path: 1.0, speed: 1.0, ..Default::default() };
+            call(Command::Predict(PredictQuery {
+                session: "truck".into(),
+                start: None,
+                instant: None,
+                use_history: true,
+                samples: 5,
+                horizon: 8,
+                controls: Candidates::Drawn(Drawing {
+                    nominal: candidates.controls[..16].to_vec(),
+                    sd: [0.5, 0.1],
+                    correlation: 0.8,
+                    seed: i as u64,
+                }),
+                cost: Some(PathCost { path: vec![0.0, 0.0, 50.0, 50.0], speed_m_s: 2.0, weights, best: 2, temperature: 1.0 }),
+                extras: PredictExtras::default(),
             }));
         }
     }

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use clap::Args;
 use nesam_engine::{
-    Command, Engine, FleetSoilSettings, Limits, Measurement, OpenSession, PredictExtras, PredictQuery, Reply, WheelMeasurement,
+    Candidates, Command, Engine, FleetSoilSettings, Limits, Measurement, OpenSession, PredictExtras, PredictQuery, Reply, WheelMeasurement,
 };
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, PosePath, Resamples, Truth, Window, WindowErrors, pose_of};
 use nesam_model::{MAX_HORIZON, Predictor};
@@ -161,7 +161,8 @@ fn predict(engine: &mut Engine, now_ns: u64, drive: &Trajectory, sample: usize, 
         samples: 1,
         horizon,
         extras: PredictExtras::default(),
-        controls,
+        controls: Candidates::Given(controls),
+        cost: None,
     };
     match engine.execute(now_ns, &Command::Predict(query)).or_failed()? {
         Reply::Predicted(prediction) => Ok((0..horizon).map(|k| pose_of(&prediction.rollout.state(0, k).map(f64::from))).collect()),
