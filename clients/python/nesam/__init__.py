@@ -1,11 +1,13 @@
 """Client of the nesam kinodynamics prediction service.
 
-`Client` opens sessions, uploads maps, sends measurements and asks for predictions; arrays are numpy arrays. Units are SI and radians, World is ENU
-(z up), Body is x forward, y left, z up. A state is the twelve numbers x y z roll pitch yaw vx vy vz wx wy wz, both velocities in Body.
+`Client` opens sessions, uploads maps, sends measurements and asks for predictions, `AsyncClient` does the same in asyncio; arrays are numpy arrays. Units are
+SI and radians, World is ENU (z up), Body is x forward, y left, z up. A state is the twelve numbers x y z roll pitch yaw vx vy vz wx wy wz, both velocities in
+Body.
 """
 
+from ._aio import AsyncClient, AsyncMeasurementStream
 from ._candidates import Drawing, PathCost, Ranking
-from ._client import CHANNELS, Client, MeasurementStream
+from ._client import Client, MeasurementStream
 from ._durable import DurableStream
 from ._errors import (
     AlreadyExists,
@@ -19,6 +21,7 @@ from ._errors import (
 )
 from ._extras import ExtraOutputs, Extras
 from ._fallback import KinematicFallback
+from ._messages import CHANNELS
 from ._types import (
     Alarm,
     Answer,
@@ -40,6 +43,8 @@ __all__ = [
     "Alarm",
     "AlreadyExists",
     "Answer",
+    "AsyncClient",
+    "AsyncMeasurementStream",
     "Client",
     "DeadlineExceeded",
     "Drawing",

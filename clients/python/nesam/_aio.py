@@ -1,0 +1,224 @@
+"""The client for asyncio."""
+
+import asyncio
+from typing import AsyncIterator, Dict, List, Optional, Sequence, Tuple, Union
+
+import grpc
+import numpy as np
+
+from . import _calls as calls
+from . import _messages as m
+from . import _types as t
+from ._candidates import Drawing, PathCost
+from ._connection import arguments
+from ._errors import Unavailable, from_rpc
+from ._extras import Extras
+from ._fallback import KinematicFallback
+from ._routing import HEADER
+from .v1 import alarms_pb2, measurements_pb2_grpc, prediction_pb2_grpc, sessions_pb2_grpc, terrain_pb2_grpc
+
+
+class AsyncClient:
+    """`Client` in asyncio: the same methods with the same arguments, errors and answers, to be awaited; tasks of one event loop may share it. Use it in an
+    `async with` block.
+
+    A call that is cancelled is cancelled in the service too: a planner that has no more use for an answer costs no one else time.
+    """
+
+    def __init__(self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = ""):
+        self.timeout_s = timeout_s
+        options, credentials = arguments(tls)
+        secure = credentials is not None
+        channel = grpc.aio.secure_channel(address, credentials, options) if secure else grpc.aio.insecure_channel(address, options)
+        self._channel = channel
+        self._metadata: Tuple[Tuple[str, str], ...] = ((HEADER, vehicle_id),) if vehicle_id else ()
+        self._stubs = {
+            "sessions": sessions_pb2_grpc.SessionsStub(channel),
+            "prediction": prediction_pb2_grpc.PredictionStub(channel),
+            "terrain": terrain_pb2_grpc.TerrainStub(channel),
+            "measurements": measurements_pb2_grpc.MeasurementsStub(channel),
+        }
+        self._known_states: Dict[str, np.ndarray] = {}
+
+    async def __aenter__(self) -> "AsyncClient":
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Closes the connection."""
+        await self._channel.close()
+
+    async def _do(self, call: calls.Call, timeout_s: Optional[float] = None):
+        method = getattr(self._stubs[call.service], call.method)
+        try:
+            timeout = self.timeout_s if timeout_s is None else timeout_s
+            return call.read(await method(call.request, timeout=timeout, metadata=self._metadata))
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
+
+    # Sessions
+
+    async def open_session(
+        self,
+        vehicle_id: str,
+        session_id: str = "",
+        map_id: str = "",
+        vehicle_card: str = "",
+        initial: Optional[t.Measurement] = None,
+    ) -> t.Session:
+        """As `Client.open_session`."""
+        return await self._do(calls.open_session(vehicle_id, session_id, map_id, vehicle_card, initial))
+
+    async def session(self, session_id: str) -> t.Session:
+        """As `Client.session`."""
+        return await self._do(calls.session(session_id))
+
+    async def sessions(self) -> List[t.Session]:
+        """As `Client.sessions`."""
+        return await self._do(calls.sessions())
+
+    async def fork_session(self, session_id: str, new_session_id: str) -> t.Session:
+        """As `Client.fork_session`."""
+        return await self._do(calls.fork_session(session_id, new_session_id))
+
+    async def export_session(self, session_id: str) -> bytes:
+        """As `Client.export_session`."""
+        return await self._do(calls.export_session(session_id))
+
+    async def import_session(self, image: bytes, session_id: str = "") -> t.Session:
+        """As `Client.import_session`."""
+        return await self._do(calls.import_session(image, session_id))
+
+    async def close_session(self, session_id: str) -> None:
+        """As `Client.close_session`."""
+        await self._do(calls.close_session(session_id))
+        self._known_states.pop(session_id, None)
+
+    # Effects and alarms
+
+    async def apply_effects(self, session_id: str, effects: Sequence[t.Effect], source: str = "") -> t.Session:
+        """As `Client.apply_effects`."""
+        return await self._do(calls.apply_effects(session_id, effects, source))
+
+    async def revert_effects(self, session_id: str) -> t.Session:
+        """As `Client.revert_effects`."""
+        return await self._do(calls.revert_effects(session_id))
+
+    async def alarms(self, session_id: str) -> AsyncIterator[t.Alarm]:
+        """As `Client.alarms`, for `async for`."""
+        request = alarms_pb2.WatchAlarmsRequest(session_id=session_id)
+        try:
+            async for message in self._stubs["sessions"].WatchAlarms(request, metadata=self._metadata):
+                yield m.alarm(message)
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
+
+    # Maps
+
+    async def upload_map(self, world: t.WorldMap, timeout_s: float = 120.0) -> t.MapDescription:
+        """As `Client.upload_map`."""
+        return await self._do(calls.upload_map(world), timeout_s)
+
+    async def patch_tile(
+        self,
+        map_id: str,
+        base_version: int,
+        row: int,
+        column: int,
+        elevation_m: np.ndarray,
+        semantic_rgb: Optional[np.ndarray] = None,
+    ) -> t.MapDescription:
+        """As `Client.patch_tile`."""
+        return await self._do(calls.patch_tile(map_id, base_version, row, column, elevation_m, semantic_rgb))
+
+    async def map(self, map_id: str) -> t.MapDescription:
+        """As `Client.map`."""
+        return await self._do(calls.map_(map_id))
+
+    async def maps(self) -> List[t.MapDescription]:
+        """As `Client.maps`."""
+        return await self._do(calls.maps())
+
+    async def delete_map(self, map_id: str) -> None:
+        """As `Client.delete_map`."""
+        await self._do(calls.delete_map(map_id))
+
+    # Measurements
+
+    def measurement_stream(self) -> "AsyncMeasurementStream":
+        """An open stream for a vehicle that reports at its own pace; use it in an `async with` block."""
+        return AsyncMeasurementStream(self)
+
+    def _remember(self, measurement: t.Measurement, answer: t.Answer) -> None:
+        if calls.is_newest(answer):
+            self._known_states[measurement.session_id] = np.asarray(measurement.state, dtype=np.float64)
+
+    # Predictions
+
+    async def predict(
+        self,
+        session_id: str,
+        controls: Union[np.ndarray, Drawing],
+        start: Optional[Sequence[float]] = None,
+        use_history: bool = True,
+        channels: Optional[Sequence[str]] = None,
+        stride: int = 1,
+        wheel_sinkage: bool = False,
+        timeout_s: Optional[float] = None,
+        fallback: Optional[KinematicFallback] = None,
+        start_stamp_ns: Optional[int] = None,
+        sent: Sequence[Tuple[int, Sequence[float]]] = (),
+        half: bool = False,
+        extras: Optional[Extras] = None,
+        cost: Optional[PathCost] = None,
+    ) -> t.Prediction:
+        """As `Client.predict`."""
+        question = calls.Question(
+            session_id, controls, start, use_history, channels, stride, wheel_sinkage, fallback, start_stamp_ns, sent, half, extras, cost
+        )
+        try:
+            prediction = await self._do(question.call(), timeout_s)
+        except calls.LATE as error:
+            return question.fall_back(error, self._known_states.get(session_id))
+        if question.newest:
+            self._known_states[session_id] = prediction.start
+        return prediction
+
+
+class AsyncMeasurementStream:
+    """One open stream. Tasks may share it: each `send` is answered in its turn."""
+
+    def __init__(self, client: AsyncClient):
+        self._client = client
+        self._stream = client._stubs["measurements"].Stream(metadata=client._metadata)
+        self._turn = asyncio.Lock()
+
+    async def __aenter__(self) -> "AsyncMeasurementStream":
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def send(self, measurement: t.Measurement) -> t.Answer:
+        """Sends one measurement and awaits its answer. Raises Unavailable when the stream has ended."""
+        message = m.measurement_message(measurement)
+        async with self._turn:
+            try:
+                await self._stream.write(message)
+                reply = await self._stream.read()
+            except asyncio.InvalidStateError:
+                raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed") from None
+            except grpc.RpcError as error:
+                raise from_rpc(error) from None
+        if reply is grpc.aio.EOF:
+            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream")
+        answer = m.answer(reply)
+        self._client._remember(measurement, answer)
+        return answer
+
+    async def close(self) -> None:
+        """Says that no more measurements come."""
+        if not self._stream.done():
+            await self._stream.done_writing()

@@ -1,0 +1,200 @@
+"""Every unary call: which method of which service, with what, and what the reply means. The clients differ only in how they wait."""
+
+from dataclasses import dataclass
+from typing import Any, Callable, List, Optional, Sequence, Tuple, Union
+
+import numpy as np
+
+from . import _messages as m
+from . import _types as t
+from ._candidates import Drawing, PathCost
+from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
+from ._extras import Extras
+from ._fallback import KinematicFallback
+from .v1 import effects_pb2, prediction_pb2, sessions_pb2, terrain_pb2, types_pb2
+
+LATE = (DeadlineExceeded, Overloaded, Unavailable)
+"""What a fallback may answer instead of."""
+
+
+@dataclass(frozen=True)
+class Call:
+    """A unary call: `service` and `method` by name, the request or an iterator of requests, and how the reply is read."""
+
+    service: str
+    method: str
+    request: Any
+    read: Callable[[Any], Any]
+
+
+def _nothing(_: Any) -> None:
+    return None
+
+
+def open_session(vehicle_id: str, session_id: str, map_id: str, vehicle_card: str, initial: Optional[t.Measurement]) -> Call:
+    """Opens a session."""
+    request = sessions_pb2.OpenSessionRequest(
+        vehicle_id=vehicle_id,
+        session_id=session_id,
+        map_id=map_id,
+        vehicle_card=vehicle_card,
+        initial=None if initial is None else m.measurement_message(initial),
+    )
+    return Call("sessions", "Open", request, m.session)
+
+
+def session(session_id: str) -> Call:
+    """Reads a session."""
+    return Call("sessions", "Get", sessions_pb2.GetSessionRequest(session_id=session_id), m.session)
+
+
+def sessions() -> Call:
+    """Lists the sessions."""
+
+    def read(reply: sessions_pb2.ListSessionsReply) -> List[t.Session]:
+        return [m.session(s) for s in reply.sessions]
+
+    return Call("sessions", "List", sessions_pb2.ListSessionsRequest(), read)
+
+
+def fork_session(session_id: str, new_session_id: str) -> Call:
+    """Copies a session."""
+    request = sessions_pb2.ForkSessionRequest(session_id=session_id, new_session_id=new_session_id)
+    return Call("sessions", "Fork", request, m.session)
+
+
+def export_session(session_id: str) -> Call:
+    """Reads everything that a session remembers."""
+    return Call("sessions", "Export", sessions_pb2.ExportSessionRequest(session_id=session_id), lambda reply: reply.image)
+
+
+def import_session(image: bytes, session_id: str) -> Call:
+    """Opens a session from an export."""
+    return Call("sessions", "Import", sessions_pb2.ImportSessionRequest(image=image, session_id=session_id), m.session)
+
+
+def close_session(session_id: str) -> Call:
+    """Closes a session."""
+    return Call("sessions", "Close", sessions_pb2.CloseSessionRequest(session_id=session_id), _nothing)
+
+
+def apply_effects(session_id: str, effects: Sequence[t.Effect], source: str) -> Call:
+    """Puts effects on a session."""
+    messages = [effects_pb2.Effect(id=e.id, parameters=m.parameter_messages(e)) for e in effects]
+    request = effects_pb2.ApplyEffectsRequest(session_id=session_id, source=source, effects=messages)
+    return Call("sessions", "ApplyEffects", request, m.session)
+
+
+def revert_effects(session_id: str) -> Call:
+    """Takes effects away."""
+    return Call("sessions", "RevertEffects", effects_pb2.RevertEffectsRequest(session_id=session_id), m.session)
+
+
+def upload_map(world: t.WorldMap) -> Call:
+    """Uploads a map in tiles."""
+    elevation = np.ascontiguousarray(world.elevation_m, dtype="<f4")
+    if elevation.ndim != 2:
+        raise ValueError(f"elevation_m has shape {elevation.shape}, expected (height, width)")
+    return Call("terrain", "UploadMap", m.upload_messages(world, elevation), m.map_description)
+
+
+def patch_tile(
+    map_id: str, base_version: int, row: int, column: int, elevation_m: np.ndarray, semantic_rgb: Optional[np.ndarray]
+) -> Call:
+    """Replaces a rectangle of a map."""
+    tile = m.tile(row, column, np.ascontiguousarray(elevation_m, dtype="<f4"), semantic_rgb)
+    request = terrain_pb2.PatchTileRequest(map_id=map_id, base_version=base_version, tile=tile)
+    return Call("terrain", "PatchTile", request, m.map_description)
+
+
+def map_(map_id: str) -> Call:
+    """Describes a map."""
+    return Call("terrain", "Get", terrain_pb2.GetMapRequest(map_id=map_id), m.map_description)
+
+
+def maps() -> Call:
+    """Lists the maps."""
+
+    def read(reply: terrain_pb2.ListMapsReply) -> List[t.MapDescription]:
+        return [m.map_description(one) for one in reply.maps]
+
+    return Call("terrain", "List", terrain_pb2.ListMapsRequest(), read)
+
+
+def delete_map(map_id: str) -> Call:
+    """Forgets a map."""
+    return Call("terrain", "Delete", terrain_pb2.DeleteMapRequest(map_id=map_id), _nothing)
+
+
+def is_newest(answer: t.Answer) -> bool:
+    """Whether the measured state is now the newest of its session."""
+    return answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered
+
+
+@dataclass(frozen=True)
+class Question:
+    """A prediction: the call, and what a fallback needs. The arguments are those of `Client.predict`."""
+
+    session_id: str
+    controls: Union[np.ndarray, Drawing]
+    start: Optional[Sequence[float]] = None
+    use_history: bool = True
+    channels: Optional[Sequence[str]] = None
+    stride: int = 1
+    wheel_sinkage: bool = False
+    fallback: Optional[KinematicFallback] = None
+    start_stamp_ns: Optional[int] = None
+    sent: Sequence[Tuple[int, Sequence[float]]] = ()
+    half: bool = False
+    extras: Optional[Extras] = None
+    cost: Optional[PathCost] = None
+
+    @property
+    def newest(self) -> bool:
+        """Whether the answer starts from the newest measured state."""
+        return self.start is None and self.start_stamp_ns is None
+
+    def commands(self) -> np.ndarray:
+        """(samples, horizon, 2) as they are sent, or (1, horizon, 2): the nominal sequence of a drawing. ValueError for another shape."""
+        given = np.asarray(self.controls.nominal)[None] if isinstance(self.controls, Drawing) else self.controls
+        controls = np.ascontiguousarray(given, dtype="<f4")
+        if controls.ndim != 3 or controls.shape[2] != 2:
+            raise ValueError(f"controls have shape {controls.shape}, expected (samples, horizon, 2)")
+        return controls
+
+    def call(self) -> Call:
+        """The call. ValueError for arrays of a wrong shape."""
+        controls = self.commands()
+        drawing = self.controls if isinstance(self.controls, Drawing) else None
+        horizon = controls.shape[1]
+        request = prediction_pb2.PredictRequest(
+            session_id=self.session_id,
+            start=None if self.start is None else t.state_message(self.start, "start"),
+            history_use=prediction_pb2.HISTORY_USE_MEASURED if self.use_history else prediction_pb2.HISTORY_USE_NONE,
+            samples=controls.shape[0] if drawing is None else drawing.samples,
+            horizon=horizon,
+            controls=controls.tobytes() if drawing is None else b"",
+            drawing=None if drawing is None else drawing.message(),
+            cost=None if self.cost is None else self.cost.message(),
+            output=prediction_pb2.OutputSelection(
+                channels=sum(1 << m.CHANNELS.index(name) for name in m.channel_names(self.channels)),
+                stride=self.stride,
+                wheel_sinkage=self.wheel_sinkage,
+                precision=prediction_pb2.PRECISION_F16 if self.half else prediction_pb2.PRECISION_F32,
+            ),
+            start_stamp_ns=self.start_stamp_ns,
+            sent=[
+                prediction_pb2.SentCommand(stamp_ns=stamp_ns, command=types_pb2.Control(speed_m_s=command[0], second=command[1]))
+                for stamp_ns, command in self.sent
+            ],
+            extras=None if self.extras is None else self.extras.message(),
+        )
+        return Call("prediction", "Predict", request, lambda reply: m.prediction(reply, self.stride, horizon, self.extras))
+
+    def fall_back(self, error: NesamError, known: Optional[np.ndarray]) -> t.Prediction:
+        """What the fallback answers from `start` or the newest known state; raises the error again without one of them."""
+        start = known if self.start is None else self.start
+        if self.fallback is None or start is None:
+            raise error
+        names = m.channel_names(self.channels)
+        return m.fallback_prediction(self.fallback, t.array(start, (12,), "start"), self.commands(), names, self.stride, error)
