@@ -26,7 +26,7 @@ def main() -> int:
     drive = read_drive(root, "nominal")
     world = read_world(root, drive.world)
     controls = candidates(drive, ROW, SAMPLES, HORIZON, seed=1)
-    with server(args.nesam, str(args.bundle)) as client:
+    with server(args.nesam, str(args.bundle)) as (client, _):
         scene = drive_until(client, drive, world, ROW)
         grid, exact = compare(client, bundle, world, scene, controls, torch.float32)
     print(f"on the same pose grid:          {grid}")

@@ -112,24 +112,35 @@ class Trunk(nn.Module):
         return cache
 
     def allocate(self, prefix, samples: int, horizon: int):
-        """Room for the keys and values of a rollout, (N, heads, T + K, 32) each, the history filled in for every sample."""
+        """The history's keys and values, one copy for all samples, (heads, T, 32) each, and room for those of the rollout, (N, heads, K, 32) each."""
         cache = []
-        for kv in prefix:
-            room = [part.new_empty(samples, HEADS, part.shape[2] + horizon, HEAD_WIDTH) for part in kv]
-            for part, full in zip(kv, room):
-                full[:, :, : part.shape[2]] = part
-            cache.append(room)
+        for keys, values in prefix:
+            room = [keys.new_empty(samples, HEADS, horizon, HEAD_WIDTH) for _ in range(2)]
+            cache.append((keys[0].transpose(1, 2).contiguous(), values[0], *room))
         return cache
 
-    def forward(self, cache, filled: int, k: int, entries: torch.Tensor, context: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
-        """Raw sinkage (N, 4) and residual (N, 12) of step `k` from scaled entries (N, 14) and W_c c (N, 128); `filled` tokens lie in the cache."""
+    def forward(self, cache, k: int, entries: torch.Tensor, context: torch.Tensor) -> Tuple[torch.Tensor, torch.Tensor]:
+        """Raw sinkage (N, 4) and residual (N, 12) of step `k` from scaled entries (N, 14) and W_c c (N, 128)."""
         x = (self.embed(entries) + context + self.position[HISTORY - 1 + k])[:, None]
-        for block, (keys, values) in zip(self.blocks, cache):
+        for block, (shared_keys, shared_values, keys, values) in zip(self.blocks, cache):
             q, key, value = block.project(x)
-            keys[:, :, filled : filled + 1], values[:, :, filled : filled + 1] = key, value
-            x = block.finish(x, F.scaled_dot_product_attention(q, keys[:, :, : filled + 1], values[:, :, : filled + 1]))
+            keys[:, :, k : k + 1], values[:, :, k : k + 1] = key, value
+            x = block.finish(x, attend(q, shared_keys, shared_values, keys[:, :, : k + 1], values[:, :, : k + 1]))
         x = self.norm(x)[:, 0]
         return self.sinkage(x), self.residual(x)
+
+
+def attend(q, shared_keys, shared_values, keys, values):
+    """Attention (N, heads, 1, 32) of one token of each sample: the history as one matrix product for all samples, then the sample's own tokens.
+
+    Several times faster than torch's own attention, which would read a copy of the history for each sample.
+    """
+    q = q * HEAD_WIDTH**-0.5
+    history = shared_keys.shape[2]
+    over_shared = (q[:, :, 0].transpose(0, 1) @ shared_keys).transpose(0, 1)[:, :, None]
+    weight = torch.cat([over_shared, q @ keys.transpose(2, 3)], -1).softmax(-1).to(values.dtype)
+    from_shared = (weight[:, :, 0, :history].transpose(0, 1) @ shared_values).transpose(0, 1)[:, :, None]
+    return from_shared + weight[..., history:] @ values
 
 
 def soil_from_raw(raw: torch.Tensor, delta: torch.Tensor) -> torch.Tensor:

@@ -10,7 +10,7 @@ from drives import World
 from network import TerrainNetwork
 from rollout import Peer, Scene
 from service import SESSION
-from terrain import ExactTokens, Ground, GridTokens
+from terrain import ExactTokens, Ground, GridTokens, in_batches
 from weights import Bundle
 
 
@@ -37,20 +37,10 @@ def deviation(ours: np.ndarray, theirs: np.ndarray) -> Deviation:
     return Deviation(*(float(x.max()) for x in (position, d[..., 2], d[..., 3:5], yaw, d[..., 6:9])))
 
 
-def encoder_of(network: TerrainNetwork, ground: Ground):
-    """Tokens (B, 134) at poses (B,) each, crop included."""
-
-    @torch.inference_mode()
-    def encode(x, y, yaw):
-        return network(ground.patches(x, y, yaw))
-
-    return encode
-
-
 def compare(client: nesam.Client, bundle: Bundle, world: World, scene: Scene, controls: np.ndarray, dtype: torch.dtype):
     """Deviation from the server's reply of the peer on the server's pose grid, and with both encoders at every pose."""
     ours = client.predict(SESSION, controls).states
     ground = Ground(world, bundle.scales, dtype)
-    encode = encoder_of(TerrainNetwork(bundle).to(dtype).eval(), ground)
+    encode = in_batches(TerrainNetwork(bundle).to(dtype).eval(), ground, 64)
     peer = Peer(bundle, ground, dtype)
     return tuple(deviation(ours, peer.predict(scene, controls, tokens)) for tokens in (GridTokens(encode, ground), ExactTokens(encode)))

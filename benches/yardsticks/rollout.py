@@ -80,7 +80,7 @@ class Peer(nn.Module):
         for name in ("token_mean", "token_scale", "residual_scale"):
             constant(name)
         self.motion: Callable = self.move
-        self.network: Callable = self.trunk
+        self.network: Callable = self.trunk.forward
 
     def entries(self, states, turned, moved, commands, floor_m):
         """Scaled token entries (N, 14) of states (12, N), change of yaw (N,), displacement (2, N), commands (2, N) and the height of the ground (N,)."""
@@ -100,11 +100,11 @@ class Peer(nn.Module):
         height, east, north = self.ground(x, y)
         ground = (height - start[2], cos * east + sin * north, cos * north - sin * east)
         sinkage, residual = said
-        log_ratio = self.log_ratio_max * torch.tanh(sinkage.T.to(self.dtype))
+        log_ratio = self.log_ratio_max * torch.tanh(sinkage.T)
         state = torch.cat([states[2:5], states[6:]])
         soil = soil_from_raw(raw_soil, soil_delta)
         increment = self.physics(state, angle, self.line.gain_per_s * integral_m, speed, log_ratio, soil, ground)
-        increment = increment + (residual.to(self.dtype) * self.residual_scale).T
+        increment = increment + (residual * self.residual_scale).T
         moved = torch.stack([cos * increment[0] - sin * increment[1], sin * increment[0] + cos * increment[1]])
         return states + torch.cat([moved, increment[2:]]), (next_steering, next_integral), increment
 
@@ -134,7 +134,6 @@ class Peer(nn.Module):
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.autocast):
             prefix, actuators = self.measured(scene, history_tokens or tokens)
             cache = self.trunk.allocate(prefix, samples, horizon)
-        filled = len(scene.history)
         start = torch.tensor(scene.start, dtype=self.dtype)
         delta = torch.tensor(scene.soil_delta, dtype=self.dtype)
         commands = torch.tensor(controls, dtype=self.dtype).permute(1, 2, 0).contiguous()
@@ -153,7 +152,7 @@ class Peer(nn.Module):
             floor_m = self.ground(x, y)[0] - start[2]
             entries = self.entries(states, turned, moved, commands[k], floor_m)
             with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.autocast):
-                said = self.network(cache, filled + k, k, entries, terrain[:, :128])
+                said = tuple(part.to(self.dtype) for part in self.network(cache, k, entries, terrain[:, :128]))
             states, actuators, increment = self.motion(states, actuators, commands[k], said, terrain[:, 128:].to(self.dtype), delta, start)
             turned, moved = increment[5], increment[:2]
             out[k] = states

@@ -1,9 +1,11 @@
 """Starts the real server and drives a session up to an instant."""
 
 import contextlib
+import os
 import subprocess
 import threading
-from typing import Iterator
+from pathlib import Path
+from typing import Iterator, Tuple
 
 import nesam
 import numpy as np
@@ -15,10 +17,10 @@ SESSION, STEP_NS = "yardstick", 100_000_000
 
 
 @contextlib.contextmanager
-def server(binary: str, bundle: str) -> Iterator[nesam.Client]:
-    """A client of a server of its own on a free loopback port."""
+def server(binary: str, bundle: str) -> Iterator[Tuple[nesam.Client, int]]:
+    """A client of a server of its own on a free loopback port, and the server's process id."""
     command = [binary, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh", "--bundle", bundle]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         address = None
         for line in process.stdout:
@@ -31,7 +33,7 @@ def server(binary: str, bundle: str) -> Iterator[nesam.Client]:
             raise RuntimeError(f"{' '.join(command)} did not start")
         threading.Thread(target=process.stdout.read, daemon=True).start()
         with nesam.Client(address, timeout_s=120.0) as client:
-            yield client
+            yield client, process.pid
     finally:
         process.terminate()
         process.wait(timeout=30)
@@ -53,6 +55,12 @@ def drive_until(client: nesam.Client, drive: Drive, world: World, index: int) ->
         raise RuntimeError("the soil correction is not in logarithmic coordinates")
     rows = slice(index - 31, index)
     return Scene(drive.states[rows], drive.commands[rows], drive.states[index], probe.soil_correction.delta)
+
+
+def processor_s(pid: int) -> float:
+    """Processor time of all threads of a process so far, s (Linux)."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def candidates(drive: Drive, index: int, samples: int, horizon: int, seed: int) -> np.ndarray:

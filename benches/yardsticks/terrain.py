@@ -79,6 +79,17 @@ class Ground(nn.Module):
 Encode = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 
 
+def in_batches(network: Callable[[torch.Tensor], torch.Tensor], ground: Ground, batch: int) -> Encode:
+    """Tokens (B, 134) at poses (B,) each: crops, then the network, so many poses at a time that what is between them stays near the processor."""
+
+    @torch.inference_mode()
+    def encode(x, y, yaw):
+        starts = range(0, len(x), batch)
+        return torch.cat([network(ground.patches(x[i : i + batch], y[i : i + batch], yaw[i : i + batch])).to(x.dtype) for i in starts])
+
+    return encode
+
+
 class ExactTokens:
     """Both encoders at every pose: what the paper's text amounts to."""
 
@@ -104,8 +115,8 @@ class GivenTokens:
 class GridTokens:
     """The terrain cache of `nesam`: exact tokens at the nodes of a pose grid (0.25 m, 5 degrees), trilinear between them, nodes encoded when first asked for."""
 
-    def __init__(self, encode: Encode, ground: Ground, batch: int = 256):
-        self.encode, self.batch = encode, batch
+    def __init__(self, encode: Encode, ground: Ground):
+        self.encode = encode
         self.low = [math.floor(o / GRID_M) - 1 for o in ground.origin_m]
         cells = [math.ceil(side * ground.resolution_m / GRID_M) + 3 for side in (ground.width, ground.height)]
         self.cells = cells
@@ -143,6 +154,5 @@ class GridTokens:
         x = (cell // self.cells[1] + self.low[0]).to(dtype) * GRID_M
         y = (cell % self.cells[1] + self.low[1]).to(dtype) * GRID_M
         yaw = heading.to(dtype) * (2.0 * math.pi / HEADINGS)
-        found = [self.encode(x[i : i + self.batch], y[i : i + self.batch], yaw[i : i + self.batch]) for i in range(0, len(nodes), self.batch)]
         self.row_of[nodes] = torch.arange(len(nodes)) + len(self.values)
-        self.values = torch.cat([self.values, *found])
+        self.values = torch.cat([self.values, self.encode(x, y, yaw)])
