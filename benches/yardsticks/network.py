@@ -115,7 +115,8 @@ class Trunk(nn.Module):
         """The history's keys and values, one copy for all samples, (heads, T, 32) each, and room for those of the rollout, (N, heads, K, 32) each."""
         cache = []
         for keys, values in prefix:
-            room = [keys.new_empty(samples, HEADS, horizon, HEAD_WIDTH) for _ in range(2)]
+            # One place more than is filled: a full cache would be contiguous, and torch.compile would compile that case anew.
+            room = [keys.new_empty(samples, HEADS, horizon + 1, HEAD_WIDTH) for _ in range(2)]
             cache.append((keys[0].transpose(1, 2).contiguous(), values[0], *room))
         return cache
 

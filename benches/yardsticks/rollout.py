@@ -133,7 +133,7 @@ class Peer(nn.Module):
         horizon = horizon if steps is None else steps
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.autocast):
             prefix, actuators = self.measured(scene, history_tokens or tokens)
-            cache = self.trunk.allocate(prefix, samples, horizon)
+            cache = self.trunk.allocate(prefix, samples, controls.shape[1])
         start = torch.tensor(scene.start, dtype=self.dtype)
         delta = torch.tensor(scene.soil_delta, dtype=self.dtype)
         commands = torch.tensor(controls, dtype=self.dtype).permute(1, 2, 0).contiguous()

@@ -57,6 +57,7 @@ class Yardsticks:
         sets = lambda samples: [candidates(self.drive, ROW, samples, HORIZON, seed) for seed in range(1, SETS + 1)]
         self.ours = Ours(client, pid, sets(SAMPLES), QUERIES)
         self.fewer = Ours(client, pid, sets(FEWER), QUERIES)
+        self.agreement, self.runtime_errors = {}, {}
 
     def parity(self) -> dict:
         """Deviations from the server over a few candidates: f32 and f64 on the same pose grid, exact tokens, and exact tokens in bf16."""
@@ -86,8 +87,7 @@ class Yardsticks:
         plain.predict(self.scene, ours.controls[0], grid, kept=kept)
         pose = (torch.tensor(self.scene.history[:, i], dtype=torch.float32) for i in (0, 1, 5))
         with torch.inference_mode():
-            history = GivenTokens(grid.at(0, *pose)[None])
-        return {"grid": grid, "given": GivenTokens(torch.stack(kept)), "history": history}
+            return {"grid": grid, "given": GivenTokens(torch.stack(kept)), "history": GivenTokens(grid.at(0, *pose)[None])}
 
     def entries(self) -> list:
         """All that is timed."""
@@ -100,12 +100,15 @@ class Yardsticks:
             controls, scale = ours.controls[0], HORIZON / args.steps
             share = f"{args.steps} of {HORIZON} steps, scaled"
             add = lambda *parts: made.append(Entry(f"{parts[0]}, N = {samples}", *parts[1:], ours))
+            check = [ways[name].predict(self.scene, ours.controls[0], cached["given"], cached["history"]) for name in ("eager f32", best)]
+            self.agreement[f"{best} against eager f32, tokens given, N = {samples}"] = vars(deviation(*check))
             if samples == SAMPLES:
                 at_once = in_batches(TerrainNetwork(self.bundle).eval(), self.ground, samples)
                 plain = peers.exact_query(ways["eager f32"], at_once, self.scene, controls, cached["history"], args.steps)
                 add("PyTorch eager, encoders at every pose", "plain", f"eager f32, all poses of a step at once; {share}", plain, scale)
                 eager = peers.exact_query(ways["eager f32"], self.eager, self.scene, controls, cached["history"], args.steps)
                 add("PyTorch eager, encoders at every pose, best batch", "eager", f"{self.eager_name}; {share}", eager, scale)
+                self.whole = peers.exact_query(ways["eager f32"], self.eager, self.scene, controls, cached["history"], HORIZON)
                 tuned_way = "compiled, bf16 Transformer" if self.compiled else "eager f32"
                 tuned = peers.exact_query(ways[tuned_way], self.tuned, self.scene, controls, cached["history"], args.steps)
                 add("PyTorch tuned bf16, encoders at every pose", "tuned", f"{self.tuned_name}; {tuned_way}; {share}", tuned, scale)
@@ -124,7 +127,6 @@ class Yardsticks:
         scale, found = SAMPLES * HORIZON / PATCHES, []
         crop = torch.inference_mode()(lambda: [self.ground.patches(*(p[i : i + 32] for p in poses)) for i in range(0, PATCHES, 32)])
         found.append(Entry("crop alone (torch)", "part", f"{PATCHES} patches, scaled", crop, scale, self.ours))
-        self.runtime_errors = {}
         for name, made_ready in runtimes.prepare(TerrainNetwork(self.bundle).eval(), patches.numpy(), torch.get_num_threads()).items():
             self.runtime_errors[name] = made_ready["relative_error"]
             setting = f"{made_ready['setting']}; {PATCHES} patches, scaled"
@@ -144,6 +146,10 @@ def main() -> int:
         figures["parity"] = yardsticks.parity()
         entries = yardsticks.entries()
         contest(entries, args.rounds, say)
+        whole = time.perf_counter()
+        yardsticks.whole()
+        figures["whole_eager_query_s"] = time.perf_counter() - whole
+    figures["parity"].update(yardsticks.agreement)
     figures["load_after"] = report.load()
     figures["runtime_relative_error"] = yardsticks.runtime_errors
     figures["drive"] = {"trajectory": yardsticks.drive.trajectory, "world": yardsticks.world.name, "row": ROW}
