@@ -160,6 +160,8 @@ pub struct LimitsConfig {
     pub jacobian_samples_max: usize,
     /// Samples of one prediction with covariance.
     pub covariance_samples_max: usize,
+    /// Samples of one prediction with the terrain encoded at every pose.
+    pub exact_samples_max: usize,
     /// What-if soils of one prediction.
     pub soils_max: usize,
     /// Uploaded maps.
@@ -272,6 +274,7 @@ impl Default for LimitsConfig {
             sample_steps_max: l.sample_steps_max,
             jacobian_samples_max: l.jacobian_samples_max,
             covariance_samples_max: l.covariance_samples_max,
+            exact_samples_max: l.exact_samples_max,
             soils_max: l.soils_max,
             maps_max: l.maps_max,
             map_cells_max: l.map_cells_max,
@@ -300,6 +303,7 @@ impl From<&LimitsConfig> for Limits {
             sample_steps_max: c.sample_steps_max,
             jacobian_samples_max: c.jacobian_samples_max,
             covariance_samples_max: c.covariance_samples_max,
+            exact_samples_max: c.exact_samples_max,
             soils_max: c.soils_max,
             maps_max: c.maps_max,
             map_cells_max: c.map_cells_max,

@@ -16,7 +16,8 @@ class Extras:
     start_covariance: (12, 12) of the start, default that of a measured state as the bundle knows it. risk: wheel loads and slips, load transfer,
     traction reserve. soil_deltas: (soils, 6) what-if corrections in the order k_phi k_c n c phi k_shear, added to the session's in its coordinates;
     `Prediction.states` then is (soils, samples, steps, channels). soil_sigma_points: thirteen such groups for the sigma points of what the session
-    knows of the soil: the estimate first, then twelve with equal weights. Jacobians and covariance do not go together with what-if soils.
+    knows of the soil: the estimate first, then twelve with equal weights. exact_terrain: encodes the terrain at every pose instead of interpolating on the
+    pose grid; at most 16 samples. What-if soils do not go together with Jacobians, covariance and exact terrain.
     """
 
     jacobians: bool = False
@@ -25,6 +26,7 @@ class Extras:
     risk: bool = False
     soil_deltas: Optional[np.ndarray] = None
     soil_sigma_points: bool = False
+    exact_terrain: bool = False
 
     @property
     def what_if(self) -> bool:
@@ -40,6 +42,7 @@ class Extras:
             risk=self.risk,
             soil_deltas=_packed(self.soil_deltas, (None, 6), "soil_deltas"),
             soil_sigma_points=self.soil_sigma_points,
+            exact_terrain=self.exact_terrain,
         )
 
 

@@ -350,6 +350,8 @@ impl Engine {
         let session = self.session(&query.session)?;
         let predictor = session.predictor().unwrap_or(&self.predictor);
         query.check(&self.limits, &self.predictor.bundle().vehicle)?;
+        let exact = query.extras.exact_terrain.then(|| predictor.exactly());
+        let predictor = exact.as_ref().unwrap_or(predictor);
         let map = session.map().map(|id| self.maps.get(id)).transpose()?;
         let start = start_state(session, query, map)?;
         let newest = session.newest_at().filter(|_| query.start.is_none());

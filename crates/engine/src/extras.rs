@@ -23,6 +23,8 @@ pub struct PredictExtras {
     pub covariance: Option<CovarianceQuery>,
     /// Wheel loads and slips, load transfer, traction reserve.
     pub risk: bool,
+    /// Encodes the terrain at every pose instead of interpolating on the pose grid.
+    pub exact_terrain: bool,
     /// Soils to predict for.
     pub soils: WhatIfSoils,
 }
@@ -106,6 +108,7 @@ impl PredictExtras {
         let derived = [
             ("jacobians", self.jacobians, limits.jacobian_samples_max),
             ("covariance", self.covariance.is_some(), limits.covariance_samples_max),
+            ("exact_terrain", self.exact_terrain, limits.exact_samples_max),
         ];
         for (field, asked, limit) in derived {
             if asked && samples > limit {

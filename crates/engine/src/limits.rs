@@ -39,6 +39,8 @@ pub struct Limits {
     pub jacobian_samples_max: usize,
     /// Samples of one prediction with covariance; each takes a third of a Jacobian's time.
     pub covariance_samples_max: usize,
+    /// Samples of one prediction with the terrain encoded at every pose.
+    pub exact_samples_max: usize,
     /// What-if soils of one prediction.
     pub soils_max: usize,
     /// Uploaded maps.
@@ -83,6 +85,7 @@ impl Default for Limits {
             sample_steps_max: 65_536,
             jacobian_samples_max: 8,
             covariance_samples_max: 64,
+            exact_samples_max: 16,
             soils_max: 16,
             maps_max: 64,
             map_cells_max: nesam_terrain::MAX_CELLS,

@@ -123,6 +123,11 @@ impl Predictor {
         }
     }
 
+    /// The same predictor with the terrain encoded at every pose: what interpolation on the pose grid is held against.
+    pub fn exactly(&self) -> Self {
+        Self { mode: TerrainMode::Exact, ..self.with_effects::<ScheduledEffect>(&[]) }
+    }
+
     /// Instructions that rollouts run on.
     pub fn path(&self) -> Path {
         self.network.path()

@@ -905,6 +905,10 @@ pub struct PredictExtras {
     /// the unscented transform.
     #[prost(bool, tag = "6")]
     pub soil_sigma_points: bool,
+    /// Encodes the terrain at every predicted pose instead of interpolating on the pose grid: what the interpolation moves is the difference to the same
+    /// request without. At most 16 samples (server configuration), not together with what-if soils.
+    #[prost(bool, tag = "7")]
+    pub exact_terrain: bool,
 }
 /// A command on its way to the vehicle.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]

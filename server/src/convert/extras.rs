@@ -38,6 +38,7 @@ pub(super) fn predict_extras(message: &pb::PredictExtras) -> Result<PredictExtra
         jacobians: message.jacobians,
         covariance: message.covariance.then_some(CovarianceQuery { start }),
         risk: message.risk,
+        exact_terrain: message.exact_terrain,
         soils,
     })
 }

@@ -20,6 +20,26 @@ fn packed(values: &[f32]) -> prost::bytes::Bytes {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn service_exact_terrain_is_that_of_the_model_and_near_the_pose_grid() {
+    let (server, mut client, recorded) = driven().await;
+    let mut asked = candidates("s", &recorded.drive, 60, 2, 16);
+    let on_grid = client.predict(asked.clone()).await.unwrap();
+    let expected = offline_by(&fresh_predictor().exactly(), &recorded, 60, &asked, 31, learned(&recorded, 60).0);
+    asked.extras = Some(v1::PredictExtras { exact_terrain: true, ..Default::default() });
+    let exactly = client.predict(asked.clone()).await.unwrap();
+    assert_same(&exactly, &expected);
+    let apart = |n: usize| {
+        let [a, b] = [&on_grid, &exactly].map(|p| p.state(n, 15));
+        f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]))
+    };
+    let apart = apart(0).max(apart(1));
+    assert!(apart > 0.0 && apart < 0.05, "interpolation moves a prediction by {apart} m after 1.6 s");
+    asked.extras = None;
+    assert_eq!(bits(&client.predict(asked).await.unwrap().states), bits(&on_grid.states), "the next is on the grid again");
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn service_jacobians_are_those_of_the_model_and_rows_stand_alone() {
     let (server, mut client, recorded) = driven().await;
     let (samples, horizon) = (3, 6);
@@ -171,6 +191,7 @@ async fn service_bad_extras_are_refused() {
         ("NaN covariance", ask(1, covariance(&entry(5, f32::NAN))), "extras.start_covariance"),
         ("negative variance", ask(1, covariance(&entry(13, -1.0))), "extras.start_covariance"),
         ("asymmetric covariance", ask(1, covariance(&entry(1, 0.5))), "extras.start_covariance"),
+        ("17 exactly", ask(17, v1::PredictExtras { exact_terrain: true, ..Default::default() }), "extras.exact_terrain"),
         ("half a soil", ask(1, soils(&[0.0; 9])), "extras.soil_deltas"),
         ("17 soils", ask(1, soils(&[0.0; 102])), "extras.soil_deltas"),
         ("infinite soil", ask(1, soils(&[f32::INFINITY; 6])), "extras.soil_deltas"),

@@ -159,10 +159,22 @@ pub fn learned(recorded: &Recorded, i: usize) -> (SoilCorrection, u64) {
 
 /// What the offline rollout gives after sample `i` with this soil, from a predictor that has answered nothing else, on the map read from the file.
 pub fn offline(recorded: &Recorded, i: usize, candidates: &Candidates, history_steps: usize, soil_correction: SoilCorrection) -> Rollout {
+    offline_by(&fresh_predictor(), recorded, i, candidates, history_steps, soil_correction)
+}
+
+/// The same from this predictor.
+pub fn offline_by(
+    predictor: &Predictor,
+    recorded: &Recorded,
+    i: usize,
+    candidates: &Candidates,
+    history_steps: usize,
+    soil_correction: SoilCorrection,
+) -> Rollout {
     let drive = &recorded.drive;
     let history: Vec<HistoryStep> =
         (i - history_steps..i).map(|j| HistoryStep { state: drive.states[j], control: drive.controls[j] }).collect();
-    fresh_predictor()
+    predictor
         .rollout(&RolloutQuery {
             history: &history,
             start: drive.states[i],

@@ -26,8 +26,8 @@ pub struct TrainArgs {
     /// Name of the new bundle [default: <vehicle's first word>-<set>]
     #[arg(long, value_name = "NAME")]
     name: Option<String>,
-    /// What to train: nesam; an ablation, nesam_no_residual or nesam_zero_sinkage; or a baseline on the same tokens, transformer,
-    /// kinematic_residual or rigid_residual
+    /// What to train: nesam; an ablation, nesam_no_residual or nesam_zero_sinkage; a baseline on the same tokens, transformer,
+    /// kinematic_residual or rigid_residual; or one that attends to the terrain, tal_elev_sem, tal_elev or tal_sem
     #[arg(long, value_name = "MODEL", default_value = "nesam")]
     model: String,
     /// Optimiser steps of the encoders' pre-training
