@@ -1,6 +1,7 @@
 """A vehicle that reports over Zenoh: copy this and replace `measured` by what the vehicle measures.
 
     python zenoh_publisher.py --connect tcp/127.0.0.1:7447 --fleet default --vehicle truck-1 --rate 50 --seconds 10
+    python zenoh_publisher.py --connect tls/router:7447 --authority fleet-ca.pem --certificate truck-1.pem --key truck-1.key --vehicle truck-1
 
 A session named like the vehicle has to be open (over gRPC). Every measurement carries its number and the id of this start of the program, so that the service
 can tell repeated, late and lost measurements, a clock that was set, and a restart apart. It answers each one on `.../status`; what it has no answer to
@@ -8,6 +9,7 @@ may be sent again at any time.
 """
 
 import argparse
+import json
 import math
 import random
 import sys
@@ -20,8 +22,13 @@ from nesam.v1 import measurements_pb2, types_pb2
 class ZenohVehicle:
     """A vehicle in a Zenoh network. While it exists, its liveliness token `nesam/v1/<fleet>/<vehicle>/alive` tells everybody that it is there."""
 
-    def __init__(self, endpoint: str, fleet: str, vehicle: str, on_answer):
+    def __init__(self, endpoint: str, fleet: str, vehicle: str, on_answer, tls=None):
+        """tls: files (authority, certificate, key) for an endpoint `tls/...`; the certificate's common name is nesam:vehicle:<vehicle>."""
         config = zenoh.Config()
+        if tls is not None:
+            for name, file in zip(("root_ca_certificate", "connect_certificate", "connect_private_key"), tls):
+                config.insert_json5(f"transport/link/tls/{name}", json.dumps(str(file)))
+            config.insert_json5("transport/link/tls/enable_mtls", "true")
         config.insert_json5("mode", '"client"')
         config.insert_json5("connect/endpoints", f'["{endpoint}"]')
         config.insert_json5("scouting/multicast/enabled", "false")
@@ -86,7 +93,13 @@ def main() -> int:
     parser.add_argument("--vehicle", default="truck-1")
     parser.add_argument("--rate", type=float, default=50.0, help="measurements per second, 10 to 200")
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--authority", help="for tls/...: authority of the router's certificate, PEM")
+    parser.add_argument("--certificate", help="this vehicle's certificate, common name nesam:vehicle:<vehicle>")
+    parser.add_argument("--key", help="its private key")
     arguments = parser.parse_args()
+    tls = (arguments.authority, arguments.certificate, arguments.key)
+    if any(tls) and not all(tls):
+        parser.error("--authority, --certificate and --key go together")
     counts = {}
 
     def on_answer(answer):
@@ -95,7 +108,7 @@ def main() -> int:
         if kind == "REJECTED":
             print(f"measurement {answer.sequence}: {answer.rejected.message}", file=sys.stderr)
 
-    vehicle = ZenohVehicle(arguments.connect, arguments.fleet, arguments.vehicle, on_answer)
+    vehicle = ZenohVehicle(arguments.connect, arguments.fleet, arguments.vehicle, on_answer, tls if all(tls) else None)
     while not vehicle.heard():
         time.sleep(0.05)
     start = time.monotonic()

@@ -2,6 +2,7 @@
 
 import enum
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Dict, Optional, Sequence, Tuple
 
 import numpy as np
@@ -133,6 +134,12 @@ class Tls:
     certificate: Optional[bytes] = None
     key: Optional[bytes] = field(default=None, repr=False)
     server_name: str = ""
+
+    @classmethod
+    def from_files(cls, authority: str, certificate: Optional[str] = None, key: Optional[str] = None, server_name: str = "") -> "Tls":
+        """Reads the files. Raises OSError naming the one that cannot be read."""
+        given = [None if path is None else Path(path).read_bytes() for path in (authority, certificate, key)]
+        return cls(given[0], given[1], given[2], server_name)
 
 
 @dataclass(frozen=True)

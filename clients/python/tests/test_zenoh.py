@@ -1,7 +1,10 @@
 """The example publisher of examples/zenoh_publisher.py against a real server that is the Zenoh router of its network."""
 
 import importlib.util
+import json
+import os
 import queue
+import re
 import socket
 import subprocess
 import sys
@@ -17,6 +20,7 @@ import nesam
 zenoh = pytest.importorskip("zenoh")
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "zenoh_publisher.py"
+FLEET_PAGE = Path(__file__).resolve().parents[3] / "docs" / "run-a-fleet.md"
 STEP_NS = 100_000_000
 
 
@@ -28,9 +32,18 @@ def network(request, tmp_path):
         endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
     config = tmp_path / "router.toml"
     config.write_text(f'[zenoh]\nmode = "router"\nlisten = ["{endpoint}"]\nfleet = "python"\nname = "router"\n')
+    process, address = serve(request, config)
+    with nesam.Client(address, timeout_s=60.0) as client:
+        yield client, endpoint
+    process.terminate()
+    assert process.wait(timeout=30) == 0, "the server did not shut down cleanly"
+
+
+def serve(request, config):
+    """A server with a configuration, in the folder of that: the process and the address of gRPC."""
     bundle = request.config.getoption("--bundle")
     command = [request.config.getoption("--server"), "serve", "--config", str(config), "--grpc", "127.0.0.1:0", "--no-http"]
-    process = subprocess.Popen(command + (["--bundle", bundle] if bundle else []), stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(command + (["--bundle", bundle] if bundle else []), stdout=subprocess.PIPE, text=True, cwd=config.parent)
     address = None
     for line in process.stdout:
         words = line.split()
@@ -40,10 +53,7 @@ def network(request, tmp_path):
             break
     assert address, f"{command} did not start"
     threading.Thread(target=process.stdout.read, daemon=True).start()
-    with nesam.Client(address, timeout_s=60.0) as client:
-        yield client, endpoint
-    process.terminate()
-    assert process.wait(timeout=30) == 0, "the server did not shut down cleanly"
+    return process, address
 
 
 def load_example():
@@ -115,3 +125,50 @@ def test_service_reordering_repetition_gap_and_restart_over_zenoh(network):
     assert (session.history_steps, session.last_sequence) == (2, 2)
     np.testing.assert_allclose(session.state, example.measured(0.9)[0])
     again.close()
+
+
+@pytest.mark.skipif(not FLEET_PAGE.is_file(), reason="the book is in the repository")
+def test_service_the_fleet_of_the_book_keeps_to_its_own_keys(request, tmp_path):
+    server = Path(request.config.getoption("--server")).resolve()
+    block = re.search(r"<!-- run -->\n```sh\n(.*?)```", FLEET_PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
+    environment = {**os.environ, "REPO": str(FLEET_PAGE.parents[1]), "PATH": f"{server.parent}:{os.environ['PATH']}"}
+    subprocess.run(["bash", "-euo", "pipefail", "-c", block], cwd=tmp_path, env=environment, check=True, stdout=subprocess.DEVNULL)
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"tls/localhost:{free.getsockname()[1]}"
+    (tmp_path / "nesam.toml").write_text((tmp_path / "nesam.toml").read_text().replace("tls/localhost:7447", endpoint))
+    # The router of the book, on a free port; its files are named as seen from this folder.
+    text = (tmp_path / "router.json5").read_text().replace("tls/0.0.0.0:7447", endpoint)
+    for name in ("router.pem", "router.key", "fleet-ca.pem"):
+        text = text.replace(f'"{name}"', json.dumps(str(tmp_path / name)))
+    router = zenoh.open(zenoh.Config.from_json5(text))
+    process, address = serve(request, tmp_path / "nesam.toml")
+
+    def tls(name):
+        return (tmp_path / "fleet-ca.pem", tmp_path / f"{name}.pem", tmp_path / f"{name}.key")
+
+    try:
+        example, answers, overheard = load_example(), queue.Queue(), queue.Queue()
+        shown = nesam.Tls.from_files(*tls("truck-7"), server_name="localhost")
+        with nesam.Client(address, timeout_s=60.0, tls=shown) as client:
+            client.open_session("truck-7")
+            own = example.ZenohVehicle(endpoint, "default", "truck-7", answers.put, tls("truck-7"))
+            planner = example.ZenohVehicle(endpoint, "default", "truck-7", overheard.put, tls("mission-1"))
+            other = example.ZenohVehicle(endpoint, "default", "truck-8", overheard.put, tls("truck-7"))
+            until(own.heard, "the service listens")
+            state, command = example.measured(0.0)
+            for liar in (planner, other):
+                liar.publish(0, state, command)
+            own.publish(STEP_NS, state, command)
+            assert answers.get(timeout=20).WhichOneof("outcome") == "applied"
+            # The planner may hear what its vehicle is told, and only that.
+            assert overheard.get(timeout=20).sequence == 1
+            time.sleep(1.0)
+            assert answers.empty() and overheard.empty()
+            assert client.session("truck-7").accepted == 1
+            for vehicle in (own, planner, other):
+                vehicle.close()
+    finally:
+        process.terminate()
+        router.close()
+    assert process.wait(timeout=30) == 0
