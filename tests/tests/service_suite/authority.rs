@@ -90,7 +90,7 @@ pub async fn secured_with(change: impl FnOnce(&mut Config)) -> Stage {
     config.tls.key = write("server.key", &key);
     config.tls.client_ca = write("ca.pem", authority.pem.as_bytes());
     config.tls.fleet = write("fleet.toml", FLEET.as_bytes());
-    config.tls.handshake_s = 0.5;
+    config.tls.handshake_s = 2.0;
     change(&mut config);
     let server = serve(config, predictor()).await.unwrap();
     Stage { server, authority, files }
