@@ -326,16 +326,17 @@ impl From<&LimitsConfig> for Limits {
 impl ZenohConfig {
     /// Whether an endpoint needs certificates.
     pub fn uses_tls(&self) -> bool {
-        self.enabled && self.listen.iter().chain(&self.connect).any(|endpoint| is_tls(endpoint))
+        self.enabled && self.listen.iter().chain(&self.connect).any(|endpoint| is_tls_endpoint(endpoint))
     }
 
     /// Whether somebody can connect to this server with a certificate.
     pub fn listens_with_tls(&self) -> bool {
-        self.listen.iter().any(|endpoint| is_tls(endpoint))
+        self.listen.iter().any(|endpoint| is_tls_endpoint(endpoint))
     }
 }
 
-fn is_tls(endpoint: &str) -> bool {
+/// Whether a Zenoh endpoint shows who connects.
+pub fn is_tls_endpoint(endpoint: &str) -> bool {
     endpoint.starts_with("tls/")
 }
 
@@ -446,7 +447,7 @@ impl Config {
             address.parse::<SocketAddr>().is_ok_and(|address| address.ip().is_loopback())
         };
         if self.zenoh.enabled
-            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !inside(endpoint) && !is_tls(endpoint))
+            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !inside(endpoint) && !is_tls_endpoint(endpoint))
         {
             let reason = format!(
                 "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on `tls/...`, or on loopback only \

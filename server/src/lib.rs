@@ -25,6 +25,7 @@ mod zenoh;
 pub use clock::MonotonicClock;
 pub use config::{
     Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, ZenohConfig, ZenohMode,
+    is_tls_endpoint,
 };
 pub use error::ServerError;
 pub use serve::{RunningServer, serve, termination};

@@ -18,7 +18,7 @@ use tonic_health::server::HealthReporter;
 use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
 use crate::clock::MonotonicClock;
-use crate::config::{Config, GrpcConfig, TlsConfig};
+use crate::config::{Config, GrpcConfig};
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
@@ -137,7 +137,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         (false, Some(_)) => "TLS, clients unknown",
         (false, None) => "none",
     };
-    let grpc = spawn_grpc(grpc_listener, tls, &config.tls, &edge, &health, stopping);
+    let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping);
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
     Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, live, drain })
 }
@@ -237,7 +237,6 @@ fn builder(config: &GrpcConfig) -> tonic::transport::Server {
 fn spawn_grpc(
     listener: TcpListener,
     credentials: Option<Credentials>,
-    tls: &TlsConfig,
     edge: &Edge,
     health: &HealthReporter,
     stopping: watch::Receiver<bool>,
@@ -255,8 +254,7 @@ fn spawn_grpc(
     let Some(credentials) = credentials else {
         return tokio::spawn(ended(router.serve_with_incoming_shutdown(incoming, stopped(stopping))));
     };
-    let handshake = Duration::from_secs_f64(tls.handshake_s);
-    let connections = tls_listener::accept(incoming, credentials.tls(), handshake, stopping.clone());
+    let connections = tls_listener::accept(incoming, credentials.tls(), credentials.handshake(), stopping.clone());
     tokio::spawn(credentials.follow(edge.engine.metrics().clone(), stopping.clone()));
     tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stopped(stopping))))
 }

@@ -1,7 +1,7 @@
 """The client for asyncio."""
 
 import asyncio
-from typing import AsyncIterator, Dict, List, Optional, Sequence, Tuple, Union
+from typing import AsyncIterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -38,7 +38,7 @@ class AsyncClient:
             "terrain": terrain_pb2_grpc.TerrainStub(channel),
             "measurements": measurements_pb2_grpc.MeasurementsStub(channel),
         }
-        self._known_states: Dict[str, np.ndarray] = {}
+        self._known_states = calls.KnownStates()
 
     async def __aenter__(self) -> "AsyncClient":
         return self
@@ -94,7 +94,7 @@ class AsyncClient:
     async def close_session(self, session_id: str) -> None:
         """As `Client.close_session`."""
         await self._do(calls.close_session(session_id))
-        self._known_states.pop(session_id, None)
+        self._known_states.forget(session_id)
 
     # Effects and alarms
 
@@ -151,10 +151,6 @@ class AsyncClient:
         """An open stream for a vehicle that reports at its own pace; use it in an `async with` block."""
         return AsyncMeasurementStream(self)
 
-    def _remember(self, measurement: t.Measurement, answer: t.Answer) -> None:
-        if calls.is_newest(answer):
-            self._known_states[measurement.session_id] = np.asarray(measurement.state, dtype=np.float64)
-
     # Predictions
 
     async def predict(
@@ -176,15 +172,24 @@ class AsyncClient:
     ) -> t.Prediction:
         """As `Client.predict`."""
         question = calls.Question(
-            session_id, controls, start, use_history, channels, stride, wheel_sinkage, fallback, start_stamp_ns, sent, half, extras, cost
+            session_id,
+            controls,
+            start=start,
+            use_history=use_history,
+            channels=channels,
+            stride=stride,
+            wheel_sinkage=wheel_sinkage,
+            fallback=fallback,
+            start_stamp_ns=start_stamp_ns,
+            sent=sent,
+            half=half,
+            extras=extras,
+            cost=cost,
         )
         try:
-            prediction = await self._do(question.call(), timeout_s)
+            return self._known_states.predicted(question, await self._do(question.call(), timeout_s))
         except calls.LATE as error:
-            return question.fall_back(error, self._known_states.get(session_id))
-        if question.newest:
-            self._known_states[session_id] = prediction.start
-        return prediction
+            return self._known_states.fall_back(question, error)
 
 
 class AsyncMeasurementStream:
@@ -215,7 +220,7 @@ class AsyncMeasurementStream:
         if reply is grpc.aio.EOF:
             raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream")
         answer = m.answer(reply)
-        self._client._remember(measurement, answer)
+        self._client._known_states.measured(measurement, answer)
         return answer
 
     async def close(self) -> None:

@@ -1,7 +1,7 @@
 """Every unary call: which method of which service, with what, and what the reply means. The clients differ only in how they wait."""
 
 from dataclasses import dataclass
-from typing import Any, Callable, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -126,11 +126,6 @@ def delete_map(map_id: str) -> Call:
     return Call("terrain", "Delete", terrain_pb2.DeleteMapRequest(map_id=map_id), _nothing)
 
 
-def is_newest(answer: t.Answer) -> bool:
-    """Whether the measured state is now the newest of its session."""
-    return answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered
-
-
 @dataclass(frozen=True)
 class Question:
     """A prediction: the call, and what a fallback needs. The arguments are those of `Client.predict`."""
@@ -148,11 +143,6 @@ class Question:
     half: bool = False
     extras: Optional[Extras] = None
     cost: Optional[PathCost] = None
-
-    @property
-    def newest(self) -> bool:
-        """Whether the answer starts from the newest measured state."""
-        return self.start is None and self.start_stamp_ns is None
 
     def commands(self) -> np.ndarray:
         """(samples, horizon, 2) as they are sent, or (1, horizon, 2): the nominal sequence of a drawing. ValueError for another shape."""
@@ -198,3 +188,29 @@ class Question:
             raise error
         names = m.channel_names(self.channels)
         return m.fallback_prediction(self.fallback, t.array(start, (12,), "start"), self.commands(), names, self.stride, error)
+
+
+class KnownStates:
+    """The newest state that a client knows of each session; a fallback without a given start begins there."""
+
+    def __init__(self) -> None:
+        self._states: Dict[str, np.ndarray] = {}
+
+    def measured(self, measurement: t.Measurement, answer: t.Answer) -> None:
+        """Notes a measured state that is now the newest of its session."""
+        if answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered:
+            self._states[measurement.session_id] = np.asarray(measurement.state, dtype=np.float64)
+
+    def predicted(self, question: Question, prediction: t.Prediction) -> t.Prediction:
+        """Notes where a prediction from the newest measured state began, and gives it back."""
+        if question.start is None and question.start_stamp_ns is None:
+            self._states[question.session_id] = prediction.start
+        return prediction
+
+    def fall_back(self, question: Question, error: NesamError) -> t.Prediction:
+        """What the fallback of a question answers; raises the error again without one or without a state."""
+        return question.fall_back(error, self._states.get(question.session_id))
+
+    def forget(self, session_id: str) -> None:
+        """Forgets a closed session."""
+        self._states.pop(session_id, None)

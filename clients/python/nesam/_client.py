@@ -2,7 +2,7 @@
 
 import queue
 import threading
-from typing import Dict, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -39,8 +39,7 @@ class Client:
             "terrain": terrain_pb2_grpc.TerrainStub(self._channel),
         }
         self._measurements = measurements_pb2_grpc.MeasurementsStub(self._channel)
-        # Newest state that this client knows of each session; a fallback without a given start begins there.
-        self._known_states: Dict[str, np.ndarray] = {}
+        self._known_states = calls.KnownStates()
 
     def __enter__(self) -> "Client":
         return self
@@ -101,7 +100,7 @@ class Client:
     def close_session(self, session_id: str) -> None:
         """Closes a session and forgets its history. Raises NotFound."""
         self._do(calls.close_session(session_id))
-        self._known_states.pop(session_id, None)
+        self._known_states.forget(session_id)
 
     # Effects and alarms
 
@@ -172,7 +171,7 @@ class Client:
         try:
             for message in self._measurements.Stream(messages()):
                 answers.append(m.answer(message))
-                self._remember(sent[len(answers) - 1], answers[-1])
+                self._known_states.measured(sent[len(answers) - 1], answers[-1])
         except grpc.RpcError as error:
             raise from_rpc(error) from None
         return answers
@@ -188,10 +187,6 @@ class Client:
         (`nesam serve --store DIR`).
         """
         return DurableStream(self, session_id, reconnect_s, pause_s)
-
-    def _remember(self, measurement: t.Measurement, answer: t.Answer) -> None:
-        if calls.is_newest(answer):
-            self._known_states[measurement.session_id] = np.asarray(measurement.state, dtype=np.float64)
 
     # Predictions
 
@@ -229,15 +224,24 @@ class Client:
         Unavailable; ValueError for arrays of a wrong shape.
         """
         question = calls.Question(
-            session_id, controls, start, use_history, channels, stride, wheel_sinkage, fallback, start_stamp_ns, sent, half, extras, cost
+            session_id,
+            controls,
+            start=start,
+            use_history=use_history,
+            channels=channels,
+            stride=stride,
+            wheel_sinkage=wheel_sinkage,
+            fallback=fallback,
+            start_stamp_ns=start_stamp_ns,
+            sent=sent,
+            half=half,
+            extras=extras,
+            cost=cost,
         )
         try:
-            prediction = self._do(question.call(), timeout_s)
+            return self._known_states.predicted(question, self._do(question.call(), timeout_s))
         except calls.LATE as error:
-            return question.fall_back(error, self._known_states.get(session_id))
-        if question.newest:
-            self._known_states[session_id] = prediction.start
-        return prediction
+            return self._known_states.fall_back(question, error)
 
 
 class MeasurementStream:
@@ -266,7 +270,7 @@ class MeasurementStream:
             raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream") from None
         except grpc.RpcError as error:
             raise from_rpc(error) from None
-        self._client._remember(measurement, answer)
+        self._client._known_states.measured(measurement, answer)
         return answer
 
     def close(self) -> None:

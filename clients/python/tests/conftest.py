@@ -1,6 +1,7 @@
 """A real server for the tests: `pytest --server path/to/nesam`, or the environment variable NESAM_SERVER."""
 
 import os
+import socket
 import subprocess
 import threading
 
@@ -18,13 +19,19 @@ def pytest_addoption(parser):
 @pytest.fixture(scope="session")
 def server_address(request):
     """Starts `nesam serve` on a free port and gives its address."""
-    binary = request.config.getoption("--server")
-    if not binary:
+    if not request.config.getoption("--server"):
         pytest.exit("give the server binary: pytest --server path/to/nesam", returncode=2)
-    command = [binary, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"]
+    process, address = start_server(request, "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh")
+    yield address
+    process.terminate()
+    assert process.wait(timeout=30) == 0, "the server did not shut down cleanly"
+
+
+def start_server(request, *arguments, folder=None):
+    """`nesam serve` with these arguments in a folder, when it is ready: the process and the address of gRPC."""
     bundle = request.config.getoption("--bundle")
-    command += ["--bundle", bundle] if bundle else []
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    command = [request.config.getoption("--server"), "serve", *arguments, *(["--bundle", bundle] if bundle else [])]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder)
     watchdog = threading.Timer(120.0, process.kill)
     watchdog.start()
     address = None
@@ -38,9 +45,14 @@ def server_address(request):
     assert address, f"{command} did not start"
     # The server may write more; nobody reads it, so the pipe is drained.
     threading.Thread(target=process.stdout.read, daemon=True).start()
-    yield address
-    process.terminate()
-    assert process.wait(timeout=30) == 0, "the server did not shut down cleanly"
+    return process, address
+
+
+def free_port():
+    """A port of loopback that nobody uses at the moment."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        return taken.getsockname()[1]
 
 
 @pytest.fixture

@@ -1,36 +1,23 @@
 """Goal: a vehicle that keeps what is not durable loses nothing when the server is killed. Method: the real binary, SIGKILL, a restart on its store."""
 
-import socket
-import subprocess
 import threading
 
 import numpy as np
 import pytest
 
 import nesam
-from conftest import straight
-
-
-def free_port():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        return taken.getsockname()[1]
+from conftest import free_port, start_server, straight
 
 
 @pytest.fixture
 def start(request, tmp_path):
     """Starts a server on one port and one store, again and again."""
-    binary, bundle = request.config.getoption("--server"), request.config.getoption("--bundle")
     port, running = free_port(), []
 
     def started():
-        command = [binary, "serve", "--grpc", f"127.0.0.1:{port}", "--no-http", "--no-zenoh", "--store", str(tmp_path / "store")]
-        process = subprocess.Popen(command + (["--bundle", bundle] if bundle else []), stdout=subprocess.PIPE, text=True)
+        process, address = start_server(request, "--grpc", f"127.0.0.1:{port}", "--no-http", "--no-zenoh", "--store", str(tmp_path / "store"))
         running.append(process)
-        for line in process.stdout:
-            if line.startswith("ready;"):
-                return process, f"127.0.0.1:{port}"
-        pytest.fail(f"{command} did not start")
+        return process, address
 
     yield started
     for process in running:

@@ -5,10 +5,8 @@ import json
 import os
 import queue
 import re
-import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import numpy as np
 import pytest
 
 import nesam
+from conftest import free_port, start_server
 
 zenoh = pytest.importorskip("zenoh")
 
@@ -27,33 +26,14 @@ STEP_NS = 100_000_000
 @pytest.fixture
 def network(request, tmp_path):
     """A server in router mode: its gRPC client and the endpoint of the router."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
     config = tmp_path / "router.toml"
     config.write_text(f'[zenoh]\nmode = "router"\nlisten = ["{endpoint}"]\nfleet = "python"\nname = "router"\n')
-    process, address = serve(request, config)
+    process, address = start_server(request, "--config", str(config), "--grpc", "127.0.0.1:0", "--no-http")
     with nesam.Client(address, timeout_s=60.0) as client:
         yield client, endpoint
     process.terminate()
     assert process.wait(timeout=30) == 0, "the server did not shut down cleanly"
-
-
-def serve(request, config):
-    """A server with a configuration, in the folder of that: the process and the address of gRPC."""
-    bundle = request.config.getoption("--bundle")
-    command = [request.config.getoption("--server"), "serve", "--config", str(config), "--grpc", "127.0.0.1:0", "--no-http"]
-    process = subprocess.Popen(command + (["--bundle", bundle] if bundle else []), stdout=subprocess.PIPE, text=True, cwd=config.parent)
-    address = None
-    for line in process.stdout:
-        words = line.split()
-        if words[:1] == ["grpc"]:
-            address = words[1]
-        if words[:1] == ["ready;"]:
-            break
-    assert address, f"{command} did not start"
-    threading.Thread(target=process.stdout.read, daemon=True).start()
-    return process, address
 
 
 def load_example():
@@ -133,16 +113,14 @@ def test_service_the_fleet_of_the_book_keeps_to_its_own_keys(request, tmp_path):
     block = re.search(r"<!-- run -->\n```sh\n(.*?)```", FLEET_PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
     environment = {**os.environ, "REPO": str(FLEET_PAGE.parents[1]), "PATH": f"{server.parent}:{os.environ['PATH']}"}
     subprocess.run(["bash", "-euo", "pipefail", "-c", block], cwd=tmp_path, env=environment, check=True, stdout=subprocess.DEVNULL)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tls/localhost:{free.getsockname()[1]}"
+    endpoint = f"tls/localhost:{free_port()}"
     (tmp_path / "nesam.toml").write_text((tmp_path / "nesam.toml").read_text().replace("tls/localhost:7447", endpoint))
     # The router of the book, on a free port; its files are named as seen from this folder.
     text = (tmp_path / "router.json5").read_text().replace("tls/0.0.0.0:7447", endpoint)
     for name in ("router.pem", "router.key", "fleet-ca.pem"):
         text = text.replace(f'"{name}"', json.dumps(str(tmp_path / name)))
     router = zenoh.open(zenoh.Config.from_json5(text))
-    process, address = serve(request, tmp_path / "nesam.toml")
+    process, address = start_server(request, "--config", "nesam.toml", "--grpc", "127.0.0.1:0", "--no-http", folder=tmp_path)
 
     def tls(name):
         return (tmp_path / "fleet-ca.pem", tmp_path / f"{name}.pem", tmp_path / f"{name}.key")

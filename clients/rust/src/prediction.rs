@@ -179,20 +179,24 @@ pub struct ExtraOutputs {
 
 impl ExtraOutputs {
     fn from_message(reply: &v1::PredictReply) -> Result<Self, ClientError> {
-        let of = |name: &str, packed: &[u8]| unpack(name, packed, packed.len() / 4, v1::Precision::F32);
         Ok(Self {
-            jacobian_start: of("jacobian_start", &reply.jacobian_start)?,
-            jacobian_controls: of("jacobian_controls", &reply.jacobian_controls)?,
-            jacobian_soil: of("jacobian_soil", &reply.jacobian_soil)?,
-            covariance: of("covariance", &reply.covariance)?,
+            jacobian_start: plain("jacobian_start", &reply.jacobian_start)?,
+            jacobian_controls: plain("jacobian_controls", &reply.jacobian_controls)?,
+            jacobian_soil: plain("jacobian_soil", &reply.jacobian_soil)?,
+            covariance: plain("covariance", &reply.covariance)?,
             region_90_planar: reply.region_90_planar,
             region_90_single: reply.region_90_single.clone(),
-            wheel_load_n: of("wheel_load_n", &reply.wheel_load_n)?,
-            wheel_slip: of("wheel_slip", &reply.wheel_slip)?,
-            load_transfer_ratio: of("load_transfer_ratio", &reply.load_transfer_ratio)?,
-            traction_reserve: of("traction_reserve", &reply.traction_reserve)?,
+            wheel_load_n: plain("wheel_load_n", &reply.wheel_load_n)?,
+            wheel_slip: plain("wheel_slip", &reply.wheel_slip)?,
+            load_transfer_ratio: plain("load_transfer_ratio", &reply.load_transfer_ratio)?,
+            traction_reserve: plain("traction_reserve", &reply.traction_reserve)?,
         })
     }
+}
+
+/// Numbers that are f32 whatever the precision of the states.
+fn plain(name: &str, packed: &[u8]) -> Result<Vec<f32>, ClientError> {
+    unpack(name, packed, packed.len() / 4, v1::Precision::F32)
 }
 
 fn soil_array(soil: &v1::SoilVector) -> [f64; 6] {
@@ -209,7 +213,6 @@ impl Prediction {
         let (samples, steps) = (reply.samples as usize, reply.steps as usize);
         let soil_groups = (reply.soil_groups as usize).max(1);
         let rows = if reply.costs.is_empty() { soil_groups * samples } else { reply.best.len() };
-        let plain = |name: &str, packed: &[u8]| unpack(name, packed, packed.len() / 4, v1::Precision::F32);
         let sinkage = if reply.sinkage_m.is_empty() { 0 } else { rows * steps * 4 };
         let missing = |part: &str| ClientError::protocol(format!("`{part}` is missing"));
         let start = reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?;

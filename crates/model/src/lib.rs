@@ -33,7 +33,7 @@ pub use effects_file::read as effects_from_toml;
 pub use fused::Path;
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
-pub use predictor::{PartTimes, Predictor, TerrainMode, Transition};
+pub use predictor::{PartTimes, Predictor, Transition};
 pub use rollout::{HistoryStep, MeasuredWheels, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 pub use rollout_noise::RolloutNoise;
 pub use soil_field::{SoilByClass, SoilField};

@@ -44,10 +44,9 @@ pub(crate) const NO_SINKAGE: f32 = -12.0;
 const OVERTURNED_RAD: f64 = 60.0 * core::f64::consts::PI / 180.0;
 
 /// How terrain tokens are obtained.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
-pub enum TerrainMode {
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum TerrainMode {
     /// Interpolated on a pose grid that is cached per map.
-    #[default]
     Grid,
     /// Encoded at every pose: slow, for checking the grid.
     Exact,
@@ -85,14 +84,6 @@ impl Predictor {
     /// # Errors
     /// `ModelError::Weights` naming an array that is missing or has another shape.
     pub fn new(bundle: Arc<ModelBundle>) -> Result<Self, ModelError> {
-        Self::with_terrain(bundle, TerrainMode::Grid)
-    }
-
-    /// Same, choosing how terrain tokens are obtained.
-    ///
-    /// # Errors
-    /// As [`Predictor::new`].
-    pub fn with_terrain(bundle: Arc<ModelBundle>, mode: TerrainMode) -> Result<Self, ModelError> {
         let (weights, scales) = (&bundle.weights, &bundle.normalization);
         let projection = TerrainProjection::new(
             TerrainEncoders::new(weights)?,
@@ -107,7 +98,7 @@ impl Predictor {
             network: Arc::new(FusedTransformer::new(weights)?),
             projection: Arc::new(projection),
             token_scale: scales.token_scale(),
-            mode,
+            mode: TerrainMode::Grid,
             maps: Arc::default(),
             bundle,
         })

@@ -9,7 +9,7 @@ use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
 use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
-use tokio_rustls::rustls::{RootCertStore, ServerConfig};
+use tokio_rustls::rustls::{Error, RootCertStore, ServerConfig};
 
 use super::fleet_file::FleetFile;
 use crate::config::TlsConfig;
@@ -53,6 +53,11 @@ impl Credentials {
     /// The configuration that new connections get.
     pub fn tls(&self) -> watch::Receiver<Arc<ServerConfig>> {
         self.tls.subscribe()
+    }
+
+    /// Longest handshake of a new connection.
+    pub fn handshake(&self) -> Duration {
+        Duration::from_secs_f64(self.config.handshake_s)
     }
 
     /// The rights of the fleet, where clients have identities.
@@ -136,7 +141,10 @@ impl Files {
 
     /// TLS 1.2 and 1.3 over HTTP/2, with client certificates where there is an authority for them.
     fn server_config(&self) -> Result<ServerConfig, ServerError> {
-        let failed = |error: tokio_rustls::rustls::Error| unusable("tls", error.to_string());
+        let failed = |error| match error {
+            Error::InconsistentKeys(_) => unusable("tls.key", "does not belong to the certificate in `tls.certificate`"),
+            other => unusable("tls", other.to_string()),
+        };
         let provider = Arc::new(ring::default_provider());
         let builder = ServerConfig::builder_with_provider(provider.clone()).with_safe_default_protocol_versions().map_err(failed)?;
         let builder = if self.client_ca.is_empty() {

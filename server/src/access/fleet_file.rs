@@ -17,7 +17,8 @@ const ALL: &str = "*";
 pub struct FleetFile {
     /// Names that may do everything.
     operators: BTreeSet<String>,
-    /// Servers of the fleet: what Zenoh routers let answer vehicles and planners. Over gRPC they may do nothing.
+    /// Servers of the fleet: what Zenoh routers let answer vehicles and planners. Over gRPC they read maps, as everybody
+    /// in the file does, and nothing else.
     servers: BTreeSet<String>,
     /// By vehicle id.
     vehicles: BTreeMap<String, VehicleEntry>,

@@ -1,8 +1,8 @@
 //! Who may do what.
 //!
 //! With `tls.client_ca` every client shows a certificate that the CA has signed; its subject alternative name `nesam:<role>:<name>` is who it is, and the
-//! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused is logged under the
-//! target `nesam::audit` with who asked for what. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
+//! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused is
+//! logged under the target `nesam::audit` with who asked for what. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
 
 mod credentials;
 mod directory;

@@ -99,8 +99,7 @@ fn planner(member: &mut Member<'_>, fleet: &str, vehicles: &[&str]) {
     let of = |topic: &str| vehicles.iter().map(|vehicle| keys::of_vehicle(fleet, vehicle, topic)).collect::<Vec<_>>();
     member.asks(fleet, of("predict"));
     member.hears(TOLD.iter().flat_map(|topic| of(topic)).chain(of_servers(fleet)).collect());
-    member.watches(of("alive"));
-    member.watches(vec![keys::of_server(fleet, "*", "alive")]);
+    member.watches(of("alive").into_iter().chain([keys::of_server(fleet, "*", "alive")]).collect());
 }
 
 fn operator(member: &mut Member<'_>, fleet: &str) {

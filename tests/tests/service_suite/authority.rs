@@ -1,6 +1,6 @@
 //! An authority that signs certificates, and a server that knows a fleet.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use nesam_client::{Client, ClientError, Tls};
 use nesam_server::{Config, RunningServer, serve};
@@ -65,6 +65,13 @@ pub fn dns(text: &str) -> SanType {
     SanType::DnsName(text.try_into().unwrap())
 }
 
+/// A file with these bytes.
+pub fn written(folder: &Path, name: &str, bytes: &[u8]) -> PathBuf {
+    let path = folder.join(name);
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
 /// A server that knows a fleet, and the folder with its files.
 pub struct Stage {
     pub server: RunningServer,
@@ -80,11 +87,7 @@ pub async fn secured() -> Stage {
 pub async fn secured_with(change: impl FnOnce(&mut Config)) -> Stage {
     let (files, authority) = (tempfile::tempdir().unwrap(), Authority::new());
     let (certificate, key) = authority.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
-    let write = |name: &str, bytes: &[u8]| -> PathBuf {
-        let path = files.path().join(name);
-        std::fs::write(&path, bytes).unwrap();
-        path
-    };
+    let write = |name: &str, bytes: &[u8]| written(files.path(), name, bytes);
     let mut config = Config::ephemeral();
     config.tls.certificate = write("server.pem", &certificate);
     config.tls.key = write("server.key", &key);

@@ -8,11 +8,7 @@ use crate::stage::*;
 
 /// A server with a session that has a map and 40 steps, and the same session read back.
 async fn prepared() -> (nesam_server::RunningServer, Client, Recorded, v1::Session) {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 39)).await.unwrap();
+    let (server, mut client, recorded) = driven("s", 39).await;
     let session = client.session("s").await.unwrap();
     (server, client, recorded, session)
 }

@@ -89,11 +89,7 @@ async fn service_effects_act_in_their_session_alone_until_reverted() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_effects_outside_the_catalogue_are_refused() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 30)).await.unwrap();
+    let (server, mut client, _) = driven("s", 30).await;
     let before = client.session("s").await.unwrap();
     let offset = |parameters: &[(&str, f64, f64)]| vec![effect("steering_offset", parameters)];
     let wrong = [

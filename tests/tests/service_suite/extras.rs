@@ -6,22 +6,13 @@ use tonic::Code;
 
 use crate::stage::*;
 
-async fn driven() -> (nesam_server::RunningServer, nesam_client::Client, Recorded) {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 60)).await.unwrap();
-    (server, client, recorded)
-}
-
 fn packed(values: &[f32]) -> prost::bytes::Bytes {
     values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into()
 }
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_exact_terrain_is_that_of_the_model_and_near_the_pose_grid() {
-    let (server, mut client, recorded) = driven().await;
+    let (server, mut client, recorded) = driven("s", 60).await;
     let mut asked = candidates("s", &recorded.drive, 60, 2, 16);
     let on_grid = client.predict(asked.clone()).await.unwrap();
     let expected = offline_by(&fresh_predictor().exactly(), &recorded, 60, &asked, 31, learned(&recorded, 60).0);
@@ -41,7 +32,7 @@ async fn service_exact_terrain_is_that_of_the_model_and_near_the_pose_grid() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_jacobians_are_those_of_the_model_and_rows_stand_alone() {
-    let (server, mut client, recorded) = driven().await;
+    let (server, mut client, recorded) = driven("s", 60).await;
     let (samples, horizon) = (3, 6);
     let mut asked = candidates("s", &recorded.drive, 60, samples, horizon);
     let plain = client.predict(asked.clone()).await.unwrap();
@@ -92,7 +83,7 @@ async fn service_jacobians_are_those_of_the_model_and_rows_stand_alone() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_what_if_soils_are_groups_and_none_is_the_plain_prediction() {
-    let (server, mut client, recorded) = driven().await;
+    let (server, mut client, recorded) = driven("s", 60).await;
     let (samples, horizon) = (5, 12);
     let plain = client.predict(candidates("s", &recorded.drive, 60, samples, horizon)).await.unwrap();
     let ask = |extras: v1::PredictExtras| {
@@ -124,7 +115,7 @@ async fn service_what_if_soils_are_groups_and_none_is_the_plain_prediction() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_risk_is_plausible_and_picked_by_stride() {
-    let (server, mut client, recorded) = driven().await;
+    let (server, mut client, recorded) = driven("s", 60).await;
     let mut asked = candidates("s", &recorded.drive, 60, 2, 9);
     asked.extras = Some(v1::PredictExtras { risk: true, ..Default::default() });
     let whole = client.predict(asked.clone()).await.unwrap().extras;
@@ -148,7 +139,7 @@ async fn service_risk_is_plausible_and_picked_by_stride() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_covariance_of_an_exact_start_is_smaller() {
-    let (server, mut client, recorded) = driven().await;
+    let (server, mut client, recorded) = driven("s", 60).await;
     let ask = |start_covariance| {
         let mut asked = candidates("s", &recorded.drive, 60, 2, 32);
         asked.extras = Some(v1::PredictExtras { covariance: true, start_covariance, ..Default::default() });
@@ -168,7 +159,7 @@ async fn service_covariance_of_an_exact_start_is_smaller() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_bad_extras_are_refused() {
-    let (server, mut client, recorded) = driven().await;
+    let (server, mut client, recorded) = driven("s", 60).await;
     let ask = |samples: usize, extras: v1::PredictExtras| v1::PredictRequest {
         extras: Some(extras),
         ..candidates("s", &recorded.drive, 60, samples, 2).to_message()

@@ -102,11 +102,7 @@ async fn service_bad_instants_and_sent_commands_are_refused() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_half_precision_is_half_the_bytes_and_rounding_only() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let (server, mut client, recorded) = driven("s", 40).await;
     let mut query = candidates("s", &recorded.drive, 40, 4, 32);
     query.output.stride = 4;
     let whole = client.predict(query.clone()).await.unwrap();

@@ -45,11 +45,7 @@ async fn service_an_imported_session_goes_on_as_the_original() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_damaged_foreign_and_old_exports_are_refused() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let (server, mut client, _) = driven("s", 40).await;
     let image = client.export_session("s").await.unwrap();
     let before = client.list_sessions().await.unwrap();
     assert_refused("unknown session", client.export_session("nobody").await, Code::NotFound, "session_id");

@@ -43,11 +43,7 @@ async fn service_overload_is_resource_exhausted_and_measurements_get_through() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_deadlines_are_honoured_and_abandoned_requests_are_skipped() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let (server, mut client, recorded) = driven("s", 40).await;
     let heavy = candidates("s", &recorded.drive, 40, 2048, 32);
     let busy = {
         let (mut client, heavy) = (client.clone(), heavy.clone());

@@ -32,11 +32,7 @@ async fn service_prediction_equals_offline_rollout_bit_for_bit() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_batch_row_equals_row_alone() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 60)).await.unwrap();
+    let (server, mut client, recorded) = driven("s", 60).await;
     let batch = candidates("s", &recorded.drive, 60, 19, 8);
     let together = client.predict(batch.clone()).await.unwrap();
     for n in [0, 7, 15, 16, 18] {
@@ -89,11 +85,7 @@ async fn service_given_start_history_use_and_selection() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_stream_of_requests_equals_single_requests_and_survives_bad_ones() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 40)).await.unwrap();
+    let (server, mut client, recorded) = driven("s", 40).await;
     let good = |tag| v1::PredictRequest { tag, ..candidates("s", &recorded.drive, 40, 2, 4).to_message() };
     let requests =
         vec![good(1), v1::PredictRequest { horizon: 33, ..good(2) }, v1::PredictRequest { session_id: "x".into(), ..good(3) }, good(4)];

@@ -113,11 +113,7 @@ fn valid_message(path: &str, recorded: &Recorded, map: &str) -> Vec<u8> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_no_bytes_on_any_method_change_or_stop_anything() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "s", recorded.world.id()).await;
-    client.feed(samples("s", &recorded.drive, 39)).await.unwrap();
+    let (server, mut client, recorded) = driven("s", 39).await;
     let query = candidates("s", &recorded.drive, 39, 2, 8);
     let before = (client.list_sessions().await.unwrap(), client.list_maps().await.unwrap(), client.predict(query.clone()).await.unwrap());
     let methods = methods();

@@ -34,11 +34,7 @@ fn cost(best: u32) -> v1::PathCost {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_the_best_of_drawn_candidates_are_the_best() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
-    open(&mut client, "truck", recorded.world.id()).await;
-    client.feed(samples("truck", &recorded.drive, NEWEST)).await.unwrap();
+    let (server, mut client, recorded) = driven("truck", NEWEST).await;
     let (samples, horizon) = (24, 16);
 
     // Everything, and the same candidates sent back.
@@ -97,10 +93,7 @@ async fn service_the_best_of_drawn_candidates_are_the_best() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_drawing_and_ranking_save_bytes() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    open(&mut client, "truck", "").await;
-    client.feed(samples("truck", &recorded.drive, NEWEST)).await.unwrap();
+    let (server, _client, recorded) = driven("truck", NEWEST).await;
     let (samples, horizon) = (1024, 32);
     let channel = tonic::transport::Endpoint::new(format!("http://{}", server.grpc_addr)).unwrap().connect().await.unwrap();
     let mut raw = v1::prediction_client::PredictionClient::new(channel);
@@ -119,10 +112,7 @@ async fn service_drawing_and_ranking_save_bytes() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_contradictory_drawings_and_costs_are_refused_with_the_field() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    open(&mut client, "truck", "").await;
-    client.feed(samples("truck", &recorded.drive, NEWEST)).await.unwrap();
+    let (server, mut client, recorded) = driven("truck", NEWEST).await;
     let sound = drawn(&recorded.drive, 4, 8);
     let line = [0.0, 0.0, 9.0, 0.0];
     let change = |f: &dyn Fn(&mut v1::CandidateDrawing)| {

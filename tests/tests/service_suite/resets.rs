@@ -47,16 +47,21 @@ async fn service_rapid_resets_harm_nobody_else() {
 #[tokio::test(flavor = "multi_thread")]
 async fn service_compressed_messages_are_refused_unread() {
     let (server, mut client) = start().await;
-    let attacker = raw(server.grpc_addr).await;
-    // gRPC's prefix: compressed, and a length that the rest does not have.
-    let (response, mut stream) = attacker.ready().await.unwrap().send_request(request("Open", "gzip"), false).unwrap();
-    let mut bomb = vec![1, 0, 0, 0, 40];
-    bomb.extend([0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3]);
-    bomb.extend([0; 30]);
-    stream.send_data(bomb.into(), true).unwrap();
-    let headers = tokio::time::timeout(Duration::from_secs(10), response).await.unwrap().unwrap();
-    let status = headers.headers().get("grpc-status").expect("refused before anything is read");
-    assert_eq!(status, "12", "UNIMPLEMENTED");
+    // With the headers, and after the refusal.
+    for wait in [Duration::ZERO, Duration::from_millis(300)] {
+        let attacker = raw(server.grpc_addr).await;
+        let (response, mut stream) = attacker.ready().await.unwrap().send_request(request("Open", "gzip"), false).unwrap();
+        tokio::time::sleep(wait).await;
+        // gRPC's prefix: compressed, and a length that the rest does not have.
+        let mut bomb = vec![1, 0, 0, 0, 40];
+        bomb.extend([0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0, 3]);
+        bomb.extend([0; 30]);
+        // A stream that the server has refused takes nothing more.
+        drop(stream.send_data(bomb.into(), true));
+        let headers = tokio::time::timeout(Duration::from_secs(10), response).await.unwrap().unwrap();
+        let status = headers.headers().get("grpc-status").expect("refused before anything is read");
+        assert_eq!(status, "12", "UNIMPLEMENTED");
+    }
     assert!(client.list_sessions().await.unwrap().is_empty());
     server.shutdown().await;
 }

@@ -11,7 +11,7 @@ use rcgen::SanType;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tonic::Code;
 
-use crate::authority::{Authority, dns, secured, uri};
+use crate::authority::{Authority, dns, secured, uri, written};
 use crate::stage::*;
 
 fn open_request(vehicle: &str, session: &str) -> v1::OpenSessionRequest {
@@ -163,9 +163,10 @@ async fn service_bad_security_files_are_told_at_the_start() {
     let files = tempfile::tempdir().unwrap();
     let authority = Authority::new();
     let (certificate, key) = authority.sign(&[dns("localhost")], false);
-    let write = |name: &str, bytes: &[u8]| std::fs::write(files.path().join(name), bytes).unwrap();
+    let write = |name: &str, bytes: &[u8]| drop(written(files.path(), name, bytes));
     write("server.pem", &certificate);
     write("server.key", &key);
+    write("other.key", &authority.sign(&[dns("localhost")], false).1);
     write("ca.pem", authority.pem.as_bytes());
     write("fleet.toml", crate::authority::FLEET.as_bytes());
     write("text", b"not PEM");
@@ -183,6 +184,7 @@ async fn service_bad_security_files_are_told_at_the_start() {
         (["server.pem", "", "", ""], "tls.key"),
         (["text", "server.key", "", ""], "tls"),
         (["server.pem", "text", "", ""], "tls"),
+        (["server.pem", "other.key", "", ""], "does not belong"),
         (["server.pem", "server.key", "ca.pem", ""], "tls.fleet"),
         (["server.pem", "server.key", "ca.pem", "ghost.toml"], "ghost"),
         (["server.pem", "server.key", "ca.pem", "absent"], "tls.fleet"),

@@ -119,6 +119,16 @@ pub async fn open(client: &mut Client, session: &str, map: &str) -> v1::Session 
     client.open_session(request).await.unwrap()
 }
 
+/// A server with a session on the recorded map that has driven to sample `last`.
+pub async fn driven(session: &str, last: usize) -> (RunningServer, Client, Recorded) {
+    let recorded = recorded();
+    let (server, mut client) = start().await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, session, recorded.world.id()).await;
+    client.feed(samples(session, &recorded.drive, last)).await.unwrap();
+    (server, client, recorded)
+}
+
 /// Sample `i` of a drive as a measurement.
 pub fn sample(session: &str, drive: &Trajectory, i: usize) -> v1::Measurement {
     let control = drive.controls[i];

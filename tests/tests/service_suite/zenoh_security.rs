@@ -8,7 +8,7 @@ use nesam_client::{Client, Tls, outcome_label, v1};
 use nesam_server::access::FleetFile;
 use nesam_server::{LinkFiles, ZenohMode, router_config};
 
-use crate::authority::{Authority, FLEET, Stage, dns, secured_with, uri};
+use crate::authority::{Authority, FLEET, Stage, dns, secured_with, uri, written};
 use crate::stage::*;
 use crate::zenoh_network::{PATIENCE, behind};
 
@@ -87,11 +87,7 @@ async fn service_a_router_with_the_written_configuration_guards_the_fleet() {
     let endpoint = free_endpoint();
     // The router has a certificate of the same authority, which is made with the server's.
     let (authority, files) = (Authority::new(), tempfile::tempdir().unwrap());
-    let write = |name: &str, bytes: &[u8]| {
-        let path = files.path().join(name);
-        std::fs::write(&path, bytes).unwrap();
-        path
-    };
+    let write = |name: &str, bytes: &[u8]| written(files.path(), name, bytes);
     let (certificate, key) = authority.sign(&[dns("localhost")], false);
     let (certificate, key) = (write("router.pem", &certificate), write("router.key", &key));
     let ca = write("ca.pem", authority.pem.as_bytes());

@@ -14,7 +14,7 @@ use std::time::Instant;
 
 use clap::{Args, Subcommand};
 use nesam_evaluation::{Pose, Truth, absolute_error, all_windows, history_steps, horizontal_distance, roll_out};
-use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, ModelBundle, Predictor, Rollout, RolloutQuery, TerrainMode, Variant};
+use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, ModelBundle, Predictor, Rollout, RolloutQuery, Variant};
 use nesam_physics::{Control, SoilCorrection};
 use nesam_terrain::WorldMap;
 use rand::{RngExt, SeedableRng};
@@ -276,9 +276,8 @@ fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) ->
     if windows.is_empty() {
         return Ok(None);
     }
-    let shared = Arc::new(bundle.clone());
-    let [grid, exact] = [TerrainMode::Grid, TerrainMode::Exact].map(|mode| Predictor::with_terrain(shared.clone(), mode));
-    let (grid, exact) = (grid.or_input()?, exact.or_input()?);
+    let grid = Predictor::new(Arc::new(bundle.clone())).or_input()?;
+    let exact = grid.exactly();
     // Horizontal position in the place of x and y, which depend on the heading.
     let apart = |a: &Pose, b: &Pose| {
         let [_, _, z, roll, pitch, yaw] = absolute_error(a, b);

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use nesam_server::access::FleetFile;
-use nesam_server::{LinkFiles, router_config};
+use nesam_server::{LinkFiles, is_tls_endpoint, router_config};
 
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
@@ -43,7 +43,7 @@ pub fn run(args: &RouterConfigArgs) -> Result<(), Failure> {
     let text = std::fs::read_to_string(&args.members).map_err(|error| named(&error))?;
     let members = FleetFile::parse(&text).map_err(|reason| named(&reason))?;
     nesam_engine::check_name("fleet", &args.fleet).or_input()?;
-    if let Some(open) = args.listen.iter().find(|endpoint| !endpoint.starts_with("tls/")) {
+    if let Some(open) = args.listen.iter().find(|endpoint| !is_tls_endpoint(endpoint)) {
         return Err(Failure::input(format!("--listen {open}: only tls/... shows who connects")));
     }
     let files = LinkFiles { certificate: &args.certificate, key: &args.key, authority: &args.authority };
