@@ -17,10 +17,10 @@ fi
 binary="$(cd "$(dirname "$1")" && pwd)/$(basename "$1")"
 shift
 
-packages=(g++ cmake make pkg-config protobuf-compiler protobuf-compiler-grpc libprotobuf-dev libgrpc++-dev)
+packages=(g++ cmake make openssl pkg-config protobuf-compiler protobuf-compiler-grpc libprotobuf-dev libgrpc++-dev)
 tools_present() {
   local tool
-  for tool in g++ cmake make pkg-config protoc grpc_cpp_plugin; do
+  for tool in g++ cmake make openssl pkg-config protoc grpc_cpp_plugin; do
     command -v "$tool" > /dev/null || return 1
   done
   pkg-config --exists grpc++ protobuf
@@ -60,32 +60,60 @@ clean_up() {
 }
 trap clean_up EXIT
 
-# The server takes a free port and says which on its standard output; the file is there before the first look at it.
-: > "$scratch/server.out"
-"$binary" serve --grpc 127.0.0.1:0 --no-http --no-zenoh "$@" > "$scratch/server.out" 2> "$scratch/server.log" &
-server=$!
-address=""
-for _ in $(seq 600); do
-  address="$(sed -n 's/^grpc  *\([^ ]*\)$/\1/p' "$scratch/server.out")"
-  [ -z "$address" ] || break
-  kill -0 "$server" 2> /dev/null || break
-  sleep 0.1
-done
-if [ -z "$address" ]; then
+# Starts a server on a free port, which it says on its standard output; the file is there before the first look at it. Sets `address`.
+start_server() {
+  : > "$scratch/server.out"
+  "$binary" serve --grpc 127.0.0.1:0 --no-http --no-zenoh "$@" > "$scratch/server.out" 2> "$scratch/server.log" &
+  server=$!
+  address=""
+  for _ in $(seq 600); do
+    address="$(sed -n 's/^grpc  *\([^ ]*\)$/\1/p' "$scratch/server.out")"
+    [ -z "$address" ] || return 0
+    kill -0 "$server" 2> /dev/null || break
+    sleep 0.1
+  done
   echo "run_tests.sh: the server did not start:" >&2
   cat "$scratch/server.out" "$scratch/server.log" >&2
   exit 1
-fi
-
-failed=no
-timeout 300 "$build/client_test" "$address" || failed=yes
-timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
-stop_server || {
-  echo "run_tests.sh: the server did not stop cleanly" >&2
-  failed=yes
 }
-if [ "$failed" = yes ]; then
+
+# Stops the server; says its log and ends when a test has failed.
+finish_server() {
+  stop_server || {
+    echo "run_tests.sh: the server did not stop cleanly" >&2
+    failed=yes
+  }
+  [ "$failed" = yes ] || return 0
   echo "run_tests.sh: log of the server:" >&2
   tail -n 40 "$scratch/server.log" >&2
   exit 1
-fi
+}
+
+failed=no
+start_server "$@"
+timeout 300 "$build/client_test" "$address" || failed=yes
+timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
+finish_server
+
+# Certificates of one authority for server and vehicle, and another authority.
+(
+  cd "$scratch"
+  ec=(-newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes)
+  member() { # member FILE SUBJECT_ALTERNATIVE_NAME
+    openssl req "${ec[@]}" -subj "/CN=$1" -keyout "$1.key" -out "$1.csr"
+    printf 'subjectAltName=%s\n' "$2" > "$1.ext"
+    openssl x509 -req -in "$1.csr" -CA ca.pem -CAkey ca.key -CAcreateserial -days 2 -extfile "$1.ext" -out "$1.pem"
+  }
+  openssl req -x509 "${ec[@]}" -days 2 -subj "/CN=authority" -keyout ca.key -out ca.pem
+  openssl req -x509 "${ec[@]}" -days 2 -subj "/CN=other authority" -keyout other-ca.key -out other-ca.pem
+  member server DNS:localhost
+  member truck-7 URI:nesam:vehicle:truck-7
+) 2> "$scratch/openssl.log" || {
+  cat "$scratch/openssl.log" >&2
+  exit 1
+}
+cp "$root/deploy/config/fleet.toml" "$scratch/fleet.toml"
+printf '[tls]\ncertificate = "%s"\nkey = "%s"\nclient_ca = "%s"\nfleet = "%s"\n' "$scratch"/{server.pem,server.key,ca.pem,fleet.toml} > "$scratch/nesam.toml"
+start_server --config "$scratch/nesam.toml" "$@"
+timeout 120 "$build/tls_test" "$address" "$scratch" || failed=yes
+finish_server

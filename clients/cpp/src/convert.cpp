@@ -43,6 +43,26 @@ void set(v1::VehicleState* message, const VehicleState& state) {
   set(message->mutable_angular_velocity_rad_s(), state.angular_velocity_rad_s);
 }
 
+void set(v1::CandidateDrawing* message, const CandidateDrawing& drawing) {
+  pack(drawing.nominal, *message->mutable_nominal());
+  message->set_speed_sd_m_s(drawing.speed_sd_m_s);
+  message->set_second_sd(drawing.second_sd);
+  message->set_correlation(drawing.correlation);
+  message->set_seed(drawing.seed);
+}
+
+void set(v1::PathCost* message, const PathCost& cost) {
+  pack(cost.path_m, *message->mutable_path());
+  message->set_speed_m_s(cost.speed_m_s);
+  message->set_path_weight(cost.path_weight);
+  message->set_speed_weight(cost.speed_weight);
+  message->set_tilt_weight(cost.tilt_weight);
+  message->set_speed_change_weight(cost.speed_change_weight);
+  message->set_second_change_weight(cost.second_change_weight);
+  message->set_best(cost.best);
+  message->set_temperature(cost.temperature);
+}
+
 std::array<double, 3> from_message(const v1::Vector3& message) { return {message.x(), message.y(), message.z()}; }
 
 VehicleState from_message(const v1::VehicleState& message) {
@@ -142,9 +162,17 @@ v1::PredictRequest to_message(const std::string& session_id, const PredictReques
   message.set_session_id(session_id);
   if (request.start) set(message.mutable_start(), *request.start);
   message.set_history_use(request.history_use == HistoryUse::none ? v1::HISTORY_USE_NONE : v1::HISTORY_USE_MEASURED);
-  message.set_samples(static_cast<std::uint32_t>(request.controls.samples()));
-  message.set_horizon(static_cast<std::uint32_t>(request.controls.steps()));
-  pack(request.controls.values(), *message.mutable_controls());
+  if (request.drawing) {
+    const CandidateDrawing& drawing = *request.drawing;
+    message.set_samples(drawing.samples);
+    message.set_horizon(static_cast<std::uint32_t>(drawing.nominal.size() / 2));
+    set(message.mutable_drawing(), drawing);
+  } else {
+    message.set_samples(static_cast<std::uint32_t>(request.controls.samples()));
+    message.set_horizon(static_cast<std::uint32_t>(request.controls.steps()));
+    pack(request.controls.values(), *message.mutable_controls());
+  }
+  if (request.cost) set(message.mutable_cost(), *request.cost);
   message.mutable_output()->set_channels(request.channels);
   message.mutable_output()->set_stride(request.stride);
   message.mutable_output()->set_wheel_sinkage(request.wheel_sinkage);
@@ -223,13 +251,20 @@ Result<Prediction> from_message(const v1::PredictReply& message, const PredictRe
   prediction.samples = message.samples();
   prediction.steps = message.steps();
   prediction.channels = message.channels();
-  const std::size_t points = prediction.samples * prediction.steps;
-  const bool fits = prediction.samples == request.controls.samples() && message.states().size() == 4 * points * prediction.channel_count() &&
-                    message.sinkage_m().size() == (request.wheel_sinkage ? 16 * points : 0) &&
-                    static_cast<std::size_t>(message.validity_size()) == prediction.samples;
+  prediction.costs = unpack(message.costs());
+  prediction.best.assign(message.best().begin(), message.best().end());
+  prediction.mean_controls = unpack(message.mean_controls());
+  const std::size_t samples = request.drawing ? request.drawing->samples : request.controls.samples();
+  const std::size_t points = prediction.rows() * prediction.steps;
+  const std::size_t drawn = request.drawing ? prediction.rows() * request.drawing->nominal.size() : 0;
+  const bool fits = prediction.samples == samples && message.costs().size() == (request.cost ? 4 * samples : 0) &&
+                    message.states().size() == 4 * points * prediction.channel_count() &&
+                    message.sinkage_m().size() == (request.wheel_sinkage ? 16 * points : 0) && message.drawn_controls().size() == 4 * drawn &&
+                    static_cast<std::size_t>(message.validity_size()) == prediction.rows();
   if (!fits) return Error(Code::internal, "states", "the reply does not have the shape that was asked for; client and server may differ in version");
   prediction.states_storage = unpack(message.states());
   prediction.sinkage_storage_m = unpack(message.sinkage_m());
+  prediction.drawn_storage = unpack(message.drawn_controls());
   prediction.validity.assign(message.validity().begin(), message.validity().end());
   prediction.start = from_message(message.start());
   prediction.history_steps = message.history_steps();

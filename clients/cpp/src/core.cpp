@@ -22,7 +22,13 @@ std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const Cli
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, keepalive_ms);
   // A stream may rest for long between two measurements; pings must go on then.
   arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
-  return grpc::CreateCustomChannel(target, grpc::InsecureChannelCredentials(), arguments);
+  if (!options.tls) return grpc::CreateCustomChannel(target, grpc::InsecureChannelCredentials(), arguments);
+  if (!options.tls->server_name.empty()) arguments.SetSslTargetNameOverride(options.tls->server_name);
+  grpc::SslCredentialsOptions files;
+  files.pem_root_certs = options.tls->authority;
+  files.pem_cert_chain = options.tls->certificate;
+  files.pem_private_key = options.tls->key;
+  return grpc::CreateCustomChannel(target, grpc::SslCredentials(files), arguments);
 }
 
 /// What is wrong with the shape of the controls, before anything is copied. The limits themselves are the server's.
@@ -74,8 +80,12 @@ Result<void> Core::close(const std::string& id, Timeout timeout) const {
 }
 
 Result<Prediction> Core::predict(const std::string& id, const PredictRequest& request, Timeout timeout) const {
-  if (std::string fault = shape_fault(request.controls); !fault.empty()) {
-    return Error(Code::invalid_argument, "controls", "`controls`: " + fault);
+  if (!request.drawing) {
+    if (std::string fault = shape_fault(request.controls); !fault.empty()) return Error(Code::invalid_argument, "controls", "`controls`: " + fault);
+  } else if (!request.controls.values().empty()) {
+    return Error(Code::invalid_argument, "controls", "`controls`: must be empty when the service draws the candidates");
+  } else if (request.drawing->nominal.size() % 2 != 0) {
+    return Error(Code::invalid_argument, "drawing.nominal", "`drawing.nominal`: two numbers for each step");
   }
   auto reply = call(*prediction, &v1::Prediction::Stub::Predict, to_message(id, request), timeout);
   if (!reply) return reply.error();

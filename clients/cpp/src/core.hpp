@@ -33,11 +33,17 @@ class Core {
   Result<Reply> call(Stub& stub, grpc::Status (Stub::*method)(grpc::ClientContext*, const Request&, Reply*), const Request& request,
                      Timeout timeout) const {
     grpc::ClientContext context;
+    introduce(context);
     context.set_deadline(deadline(timeout.value_or(options.timeout)));
     Reply reply;
     const grpc::Status status = (stub.*method)(&context, request, &reply);
     if (!status.ok()) return error_from(status, context);
     return reply;
+  }
+
+  /// Tells a proxy which vehicle a call is about.
+  void introduce(grpc::ClientContext& context) const {
+    if (!options.vehicle_id.empty()) context.AddMetadata("x-vehicle-id", options.vehicle_id);
   }
 
   static std::chrono::system_clock::time_point deadline(std::chrono::nanoseconds timeout) {

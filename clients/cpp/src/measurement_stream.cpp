@@ -9,6 +9,7 @@ namespace nesam {
 namespace detail {
 
 StreamImpl::StreamImpl(std::shared_ptr<Core> core, std::string session_id) : core_(std::move(core)), session_id_(std::move(session_id)) {
+  core_->introduce(context_);
   stream_ = core_->measurements->Stream(&context_);
   writer_ = std::thread([this] { write_all(); });
   try {

@@ -60,6 +60,7 @@ Result<MapDescription> Core::upload(const Map& map, Timeout timeout) const {
   if (!map.semantic_rgb.empty() && map.semantic_rgb.size() != 3 * pixels) return fault("semantic_rgb", map.semantic_rgb.size(), 3 * pixels);
 
   grpc::ClientContext context;
+  introduce(context);
   context.set_deadline(deadline(timeout.value_or(options.upload_timeout)));
   v1::MapDescription reply;
   const auto writer = terrain->UploadMap(&context, &reply);

@@ -19,6 +19,7 @@
 #include <utility>
 #include <vector>
 
+#include "minimal_nav2.hpp"
 #include "scenario.hpp"
 
 namespace {
@@ -303,6 +304,145 @@ void service_predictions(const nesam::Session& session, const std::string& map_i
   check(what_if.ok() && what_if->history_steps == 0 && what_if->start.position_m[0] == -5.0, "a start of its own");
 }
 
+void service_the_service_draws_and_ranks(const nesam::Session& session) {
+  constexpr std::size_t horizon = 16;
+  const auto nominal = varied_controls(1, horizon, session.vehicle());
+  nesam::PredictRequest request;
+  request.drawing = nesam::CandidateDrawing{24, nesam::Span<const float>(nominal), 0.5, 0.1, 0.8, 7};
+  const auto all = session.predict(request);
+  check(all.ok() && all->rows() == 24 && all->states().fits() && all->drawn_controls().fits() && all->costs.empty(), all.ok() ? "all" : all.error().what());
+  if (!all) return;
+  check(equal_bits(all->drawn_controls().sample(0), nominal), "the first candidate is the nominal one");
+  nesam::PredictRequest sent;
+  sent.controls = all->drawn_controls();
+  const auto again = session.predict(sent);
+  check(again.ok() && equal_bits(again->states().values(), all->states().values()), "the drawn candidates, sent, give the same bits");
+
+  const std::vector<float> path = {-5.0F, 0.0F, 15.0F, 0.0F};
+  request.cost = nesam::PathCost{};
+  request.cost->path_m = nesam::Span<const float>(path);
+  request.cost->speed_weight = 0.5;
+  request.cost->speed_m_s = 2.0;
+  request.cost->best = 3;
+  request.cost->temperature = 0.2;
+  const auto ranked = session.predict(request);
+  check(ranked.ok() && ranked->rows() == 3 && ranked->states().samples() == 3 && ranked->costs.size() == 24, ranked.ok() ? "three" : ranked.error().what());
+  if (!ranked) return;
+  check(*std::min_element(ranked->costs.begin(), ranked->costs.end()) == ranked->costs[ranked->best[0]], "the best is the cheapest");
+  for (std::size_t row = 0; row < 3; ++row) {
+    check(equal_bits(ranked->states().sample(row), all->states().sample(ranked->best[row])), "a row is that of its candidate");
+  }
+  check(ranked->mean_controls.size() == 2 * horizon && ranked->validity.size() == 3, "mean and validity");
+  request.controls = sent.controls;
+  check_error(session.predict(request), nesam::Code::invalid_argument, "controls", "candidates sent and drawn");
+  request.controls = {};
+  request.drawing->correlation = 1.0;
+  check_error(session.predict(request), nesam::Code::invalid_argument, "drawing.correlation", "a correlation of one");
+}
+
+void analytic_commands_ask_for_a_twist() {
+  nesam::VehicleCard card;
+  card.speed_min_m_s = -2.0;
+  card.speed_max_m_s = 6.0;
+  card.wheelbase_m = 2.0;
+  card.second = nesam::SecondCommand::road_wheel_angle_rad;
+  card.second_min = -0.6;
+  card.second_max = 0.6;
+  const auto near = [](double a, double b) { return std::abs(a - b) < 1e-12; };
+  check(near(nesam::command_from_twist(card, 4.0, 0.5).second, std::atan(0.25)), "a bicycle turns with tan(angle) / wheelbase per metre");
+  check(near(nesam::command_from_twist(card, -1.0, 0.2).second, -std::atan(0.4)), "backwards the wheels point the other way");
+  check(near(nesam::command_from_twist(card, 0.0, 3.0).second, 0.6) && nesam::command_from_twist(card, 9.0, 0.0).speed_m_s == 6.0, "cut to the card");
+  card.second = nesam::SecondCommand::steering_normalised;
+  card.second_min = -1.0;
+  card.second_max = 1.0;
+  card.road_wheel_angle_max_rad = 0.5;
+  check(near(nesam::command_from_twist(card, 4.0, 0.5).second, std::atan(0.25) / 0.5), "normalised");
+  card.second = nesam::SecondCommand::yaw_rate_rad_s;
+  check(near(nesam::command_from_twist(card, 4.0, 0.5).second, 0.5), "a yaw rate stays one");
+}
+
+/// Planner's arrays of one shape: what nav2 integrates out of them must be what the service predicted.
+template <bool eigen>
+void check_motion_model(const std::shared_ptr<nesam::Session>& session, double model_dt_s, bool lateral) {
+  constexpr std::size_t batch = 5;
+  const std::size_t fineness = static_cast<std::size_t>(std::lround(0.1 / model_dt_s));
+  const std::size_t time = 12 * fineness;
+  MinimalState<eigen> state(batch, time);
+  for (std::size_t i = 0; i < batch; ++i) {
+    state.vx(i, 0) = 1.0F;
+    for (std::size_t j = 0; j < time; ++j) {
+      state.cvx(i, j) = 1.0F + 0.2F * static_cast<float>(i);
+      state.cwz(i, j) = 0.1F * static_cast<float>(i) - 0.2F;
+    }
+  }
+  nesam::MotionModelOptions options;
+  options.model_dt_s = model_dt_s;
+  options.lateral = lateral;
+  options.timeout = 30s;
+  nesam::RemoteMotionModel<MinimalMotionModel<eigen>, MinimalState<eigen>> model(session, options);
+  MinimalMotionModel<eigen>& as_nav2_sees_it = model;
+  as_nav2_sees_it.predict(state);
+  check(as_nav2_sees_it.isHolonomic() == lateral && !model.rollout().failure(), "lateral or not");
+  const auto& prediction = model.rollout().prediction();
+  check(prediction && prediction->rows() == batch && prediction->states().steps() == 12, "shape of the prediction");
+  if (!prediction) return;
+  const MinimalPose start = {prediction->start.position_m[0], prediction->start.position_m[1], prediction->start.attitude_rad[2]};
+  double apart_m = 0.0, apart_rad = 0.0;
+  for (std::size_t i = 0; i < batch; ++i) {
+    check(state.vx(i, 0) == 1.0F && state.vy(i, 0) == 0.0F, "the first column is the planner's");
+    for (std::size_t k = 1; k < 12; ++k) {
+      const MinimalPose pose = integrated(state, i, (k + 1) * fineness - 1, start, model_dt_s);
+      const auto states = prediction->states();
+      apart_m = std::max(apart_m, std::hypot(pose.x_m - states(i, k, 0), pose.y_m - states(i, k, 1)));
+      apart_rad = std::max(apart_rad, std::abs(std::remainder(pose.yaw_rad - states(i, k, 2), 2.0 * 3.14159265358979)));
+    }
+  }
+  // Without lateral velocities the heading is right, and what the reference point moves sideways in a bend is lost.
+  check(apart_m < (lateral ? 1e-4 : 0.5) && apart_rad < 1e-4, "integrated " + std::to_string(apart_m) + " m and " + std::to_string(apart_rad) + " rad apart");
+}
+
+void service_motion_model_of_nav2(nesam::Client& client, const std::string& map_id) {
+  nesam::OpenOptions options;
+  options.vehicle_id = unique("nav2");
+  options.map_id = map_id;
+  const auto session = std::make_shared<nesam::Session>(std::move(client.open(options).value()));
+  for (int step = 0; step < 5; ++step) (void)session->send(cruise(step, session->vehicle())).value();
+  check_motion_model<false>(session, 0.1, true);
+  check_motion_model<true>(session, 0.1, false);
+  check_motion_model<true>(session, 0.05, true);
+
+  // Longer than the service sees: the last velocities go on.
+  MinimalState<true> state(1, 40);
+  for (std::size_t j = 0; j < 40; ++j) state.cvx(0, j) = 1.0F;
+  nesam::MotionModelOptions patient;
+  patient.timeout = 30s;
+  patient.failures_max = 2;
+  nesam::RemoteMotionModel<MinimalMotionModel<true>, MinimalState<true>> model(session, patient);
+  model.predict(state);
+  check(state.vx(0, 39) == state.vx(0, 31) && state.vx(0, 31) != 0.0F, "beyond the horizon");
+
+  // A service that does not answer: commands twice, then the planner is told.
+  check(session->close().ok(), "close");
+  int told = 0;
+  for (int i = 0; i < 3; ++i) {
+    try {
+      model.predict(state);
+      check(state.vx(0, 1) == 1.0F && model.rollout().failure() && model.rollout().failure()->code() == nesam::Code::not_found, "the commands are followed");
+    } catch (const nesam::Error& error) {
+      told += error.code() == nesam::Code::not_found ? 1 : 100;
+    }
+  }
+  check(told == 1, "the third failure in a row is thrown");
+  patient.model_dt_s = 0.03;
+  bool refused = false;
+  try {
+    nesam::VelocityRollout(session, patient);
+  } catch (const nesam::Error& error) {
+    refused = error.field() == "model_dt_s";
+  }
+  check(refused, "a step that is no whole fraction");
+}
+
 void service_bad_predictions_are_refused(const nesam::Session& session, nesam::Client& client) {
   constexpr auto invalid = nesam::Code::invalid_argument;
   const nesam::VehicleCard& card = session.vehicle();
@@ -318,7 +458,7 @@ void service_bad_predictions_are_refused(const nesam::Session& session, nesam::C
   check_error(session.predict(three_channels), invalid, "controls", "three numbers for each command");
   const auto longer = varied_controls(2, 33, card);
   check_error(session.predict(request_of(longer, 2, 33)), invalid, "horizon", "K = 33");
-  check_error(session.predict(nesam::PredictRequest{{{}, 0, 0, 2}, {}, nesam::HistoryUse::measured, 0, 1, false, 0}), invalid, "samples", "N = 0");
+  check_error(session.predict(request_of({}, 0, 0)), invalid, "samples", "N = 0");
   const auto wider = varied_controls(4097, 1, card);
   check_error(session.predict(request_of(wider, 4097, 1)), invalid, "samples", "N = 4097");
   const auto good = varied_controls(2, 8, card);
@@ -424,6 +564,8 @@ void run_all(nesam::Client& client) {
     run("service_measurements_get_typed_answers", [&] { service_measurements_get_typed_answers(session); });
     run("service_predictions", [&] { service_predictions(session, map_id); });
     run("service_bad_predictions_are_refused", [&] { service_bad_predictions_are_refused(session, client); });
+    run("service_the_service_draws_and_ranks", [&] { service_the_service_draws_and_ranks(session); });
+    run("service_motion_model_of_nav2", [&] { service_motion_model_of_nav2(client, map_id); });
     run("service_threads_share_a_session", [&] { service_threads_share_a_session(session); });
   }
   client.delete_map(map_id).value();
@@ -440,6 +582,7 @@ int main(int argc, char** argv) {
   }
   run("analytic_views_index_row_major", analytic_views_index_row_major);
   run("analytic_channels_have_columns", analytic_channels_have_columns);
+  run("analytic_commands_ask_for_a_twist", analytic_commands_ask_for_a_twist);
   run("service_nobody_listens", service_nobody_listens);
   nesam::ClientOptions options;
   // The first prediction on a new map encodes its terrain, perhaps on a busy machine.

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, HIDDEN};
-use nesam_model::reference::{Network, Row, TerrainProvider};
+use nesam_model::reference::{Network, PredictedStep, Row, TerrainProvider};
 use nesam_model::{GroundSource, Normalization, Variant, history_actuators};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
@@ -133,6 +133,19 @@ pub fn state_loss(predicted: &Tensor, target: &Tensor, scales: &Normalization) -
     let yaw = (error.narrow(1, 5, 1)? - turns.affine(core::f64::consts::TAU, 0.0)?)?;
     let error = Tensor::cat(&[error.narrow(1, 0, 5)?, yaw, error.narrow(1, 6, 6)?], 1)?.broadcast_div(&scale)?;
     ((error.sqr()? + 1.0)?.sqrt()? - 1.0)?.sum(1)?.mean_all()
+}
+
+/// Mean over rows of Σ_i r̄_i² with r̄ the mean over the horizon of the raw residual: forces that last seconds are wheels' and ground's to carry. Without
+/// it a network may hold up a part of the vehicle's weight, and the wheels then stand under too small a load. `None` in a form without residual.
+///
+/// # Errors
+/// A candle error.
+pub fn sustained_residual(steps: &[PredictedStep]) -> Result<Option<Tensor>> {
+    let residuals: Vec<&Tensor> = steps.iter().filter_map(|step| step.residual.as_ref()).collect();
+    if residuals.is_empty() {
+        return Ok(None);
+    }
+    Tensor::stack(&residuals, 0)?.mean(0)?.sqr()?.sum(1)?.mean_all().map(Some)
 }
 
 /// Pooled contexts and their projection, cut from the graph: the rollout reads the leaf, and the gradient of W_c is one product at the end.

@@ -20,4 +20,4 @@ pub mod trainer;
 
 pub use drives::{Drive, encode_drives};
 pub use pooling::Pooling;
-pub use trainer::{EpochReport, Trained, TrainingError, TrainingPlan, TrainingSet, train};
+pub use trainer::{EpochReport, Objective, Trained, TrainingError, TrainingPlan, TrainingSet, train};

@@ -42,6 +42,8 @@ pub struct Recipe {
     pub pooling: Pooling,
     /// Training plan; its folder is `out/checkpoint`.
     pub plan: TrainingPlan,
+    /// Starts from the weights, scales and vehicle of this bundle instead of from nothing.
+    pub start: Option<ModelBundle>,
     /// Output folder.
     pub out: PathBuf,
     /// Goes on where an interrupted run of the same command stopped.
@@ -84,8 +86,10 @@ pub fn run(
         (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
     };
     let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
-    let mut vehicle = root.vehicle().clone();
-    let mut scales = calibrated(&mut vehicle, &drives, &train_at, recipe.dt_s, reporter);
+    let (vehicle, mut scales) = match &recipe.start {
+        Some(bundle) => (bundle.vehicle.clone(), bundle.normalization.clone()),
+        None => calibrated(root.vehicle().clone(), &drives, &train_at, recipe.dt_s, reporter),
+    };
 
     if recipe.mirror {
         let images = mirrored(&drives, &train_at);
@@ -93,17 +97,19 @@ pub fn run(
         drives.extend(images);
     }
 
-    let mut weights = initial_weights(recipe.plan.seed, &scales);
-    prepare_projection(&mut weights, &recipe.pooling, recipe.plan.variant);
-    if recipe.plan.variant.is_end_to_end() {
+    let mut weights = recipe.start.as_ref().map_or_else(|| initial_weights(recipe.plan.seed, &scales), |bundle| bundle.weights.clone());
+    prepare_projection(&mut weights, &recipe.pooling, recipe.plan.objective.variant);
+    if recipe.start.is_none() && recipe.plan.objective.variant.is_end_to_end() {
         let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
         let [mean, sd] = measure_increments(&training);
         scales.residual_scale = sd;
         weights.insert("residual.bias", &[STATE_DIM], mean.iter().zip(sd).map(|(m, s)| m / s).collect());
     }
     if drives.iter().any(|d| d.map.is_some()) {
-        for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
-            weights.insert(name, &array.shape, array.values.clone());
+        if recipe.start.is_none() {
+            for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
+                weights.insert(name, &array.shape, array.values.clone());
+            }
         }
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
@@ -124,7 +130,7 @@ pub fn run(
         "{} drives train, {} validate, {} parameters",
         set.train.len(),
         validation_at.len(),
-        trained_parameters(&weights, recipe.plan.variant)
+        trained_parameters(&weights, recipe.plan.objective.variant)
     ));
     reporter.stage("training", recipe.plan.steps);
     let plan = TrainingPlan { folder: recipe.out.join("checkpoint"), ..recipe.plan.clone() };
@@ -142,9 +148,9 @@ pub fn run(
     let mut bundle = ModelBundle {
         name: recipe.name.clone(),
         hash: String::new(),
-        form: recipe.plan.variant,
+        form: recipe.plan.objective.variant,
         default_soil: scales.default_soil(),
-        parameters: trained_parameters(&trained.weights, recipe.plan.variant),
+        parameters: trained_parameters(&trained.weights, recipe.plan.objective.variant),
         vehicle,
         normalization: scales,
         weights: trained.weights,
@@ -160,7 +166,7 @@ pub fn run(
             steps: trained.steps as u64,
             training_s: optimisation_s(&trained.curve),
             program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
-            parent: None,
+            parent: recipe.start.as_ref().map(|bundle| bundle.hash.clone()),
         },
     };
     bundle.save(&recipe.out.join("bundle"))?;
@@ -223,17 +229,17 @@ fn mirrored(drives: &[Drive], at: &[usize]) -> Vec<Drive> {
         .collect()
 }
 
-/// Scales; the drive line of the vehicle is fitted on the training drives under each contact law, and the better pair is kept.
-fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64, reporter: &dyn Reporter) -> Normalization {
+/// The vehicle with its drive line fitted on the training drives under each contact law, the better pair kept, and the scales of the drives.
+fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
     let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
-    let scales = measure(&training, vehicle, dt_s);
+    let scales = measure(&training, &vehicle, dt_s);
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
     let mut best: Option<(f64, Vehicle)> = None;
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
     for (law, drive) in ContactLaw::ALL.iter().flat_map(|law| drives_by.iter().map(move |drive| (*law, *drive))) {
-        let Some(start) = drive.of(vehicle, &few) else { continue };
+        let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
         let name = format!("{law:?}, {drive:?}");
         reporter.stage(&format!("drive line, {name}"), 3 * knobs(&candidate).len());
@@ -247,10 +253,7 @@ fn calibrated(vehicle: &mut Vehicle, drives: &[Drive], train_at: &[usize], dt_s:
             best = Some((after, candidate));
         }
     }
-    if let Some((_, chosen)) = best {
-        *vehicle = chosen;
-    }
-    scales
+    (best.map_or(vehicle, |(_, chosen)| chosen), scales)
 }
 
 /// Pre-trained encoders, from the output folder if this run was made before.

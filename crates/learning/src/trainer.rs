@@ -13,7 +13,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::adam::Adam;
-use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, targets};
+use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, sustained_residual, targets};
 use crate::drives::Drive;
 use crate::pooling::Pooling;
 use crate::schedule::{cosine, curriculum};
@@ -39,10 +39,19 @@ pub struct TrainingPlan {
     pub dropout: f32,
     /// Decoupled decay of the weight matrices per unit of learning rate (Loshchilov & Hutter 2019).
     pub decay: f32,
-    /// Ablation trained.
-    pub variant: Variant,
+    /// What is trained, towards what.
+    pub objective: Objective,
     /// Where checkpoints go.
     pub folder: PathBuf,
+}
+
+/// What a form is trained towards.
+#[derive(Clone, Copy, Debug)]
+pub struct Objective {
+    /// Form trained.
+    pub variant: Variant,
+    /// Weight of the sustained residual in the loss (`batch::sustained_residual`).
+    pub sustained: f64,
 }
 
 /// One line of the loss curve.
@@ -118,7 +127,7 @@ impl TrainingSet<'_> {
         Sight { variant, pooling: &self.pooling, default_soil: self.scales.default_soil_raw }
     }
 
-    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1) and its gradient in every trainable array.
+    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1) with the weighted sustained residual, and its gradient in every trainable array.
     ///
     /// # Errors
     /// A candle error.
@@ -128,16 +137,23 @@ impl TrainingSet<'_> {
         windows: &[Window<'_>],
         history: usize,
         horizon: usize,
-        variant: Variant,
+        objective: Objective,
     ) -> Result<(f32, HashMap<String, Vec<f32>>)> {
+        let variant = objective.variant;
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
         let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
         let mut terrain = PathTerrain::new(network, windows, history, horizon, self.sight(variant))?;
         let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;
-        for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
+        let steps = rollout.run(&rows, horizon, &mut terrain)?;
+        for (k, step) in steps.iter().enumerate() {
             total = (total + state_loss(&step.state, &targets(windows, k)?, self.scales)?)?;
         }
-        let loss = (total / horizon as f64)?;
+        let mut loss = (total / horizon as f64)?;
+        if objective.sustained > 0.0
+            && let Some(sustained) = sustained_residual(&steps)?
+        {
+            loss = (loss + (sustained * objective.sustained)?)?;
+        }
         let store = loss.backward()?;
         let mut gradients = HashMap::new();
         for (name, var) in &network.variables {
@@ -234,7 +250,7 @@ pub fn train(
             windows.push(Window { drive, start, dropout });
         }
         let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
-        let history = steps_needed(plan.variant, draw_history(&mut rng, available));
+        let history = steps_needed(plan.objective.variant, draw_history(&mut rng, available));
         let (loss, gradients) = parallel_gradients(set, &network, &windows, history, horizon, plan, &pools)?;
         let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0, plan.decay)?;
         checkpoint.step += 1;
@@ -245,7 +261,7 @@ pub fn train(
         let stop = interrupted();
         if checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps || stop {
             let step_s = since.elapsed().as_secs_f64() / loss_count as f64;
-            let validation = set.validate(&Network::from_weights(&checkpoint.average)?, plan.horizon, plan.variant)?;
+            let validation = set.validate(&Network::from_weights(&checkpoint.average)?, plan.horizon, plan.objective.variant)?;
             let line = EpochReport { step: checkpoint.step, loss: loss_sum / loss_count as f32, validation, step_s };
             checkpoint.latest = merged(weights, &network.to_weights()?);
             if score(&validation) < checkpoint.best_score {
@@ -292,7 +308,7 @@ fn parallel_gradients(
         let running: Vec<_> = windows
             .chunks(size)
             .zip(pools)
-            .map(|(windows, pool)| scope.spawn(move || pool.install(|| set.gradients(network, windows, history, horizon, plan.variant))))
+            .map(|(windows, pool)| scope.spawn(move || pool.install(|| set.gradients(network, windows, history, horizon, plan.objective))))
             .collect();
         running.into_iter().map(|thread| thread.join().expect("a shard does not panic; this is a bug")).collect()
     });

@@ -9,7 +9,7 @@ use candle_core::Tensor;
 use common::{drive, encoded, measured_scales, single_cells, striped, truck};
 use nesam_learning::batch::Window;
 use nesam_learning::initial::initial_weights;
-use nesam_learning::{Drive, TrainingSet};
+use nesam_learning::{Drive, Objective, TrainingSet};
 use nesam_model::Variant;
 use nesam_model::reference::Network;
 use nesam_physics::step::StepModel;
@@ -31,7 +31,8 @@ fn check(mut made: Drive, entries: &[(&str, usize)], tolerance: f64) {
     let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model, pooling: single_cells() };
     let network = Network::from_weights(&weights).expect("all arrays are there");
     let windows = [12, 30].map(|start| Window { drive: &made, start, dropout: None });
-    let gradients = || set.gradients(&network, &windows, 8, 6, Variant::Full).expect("the loss is differentiable");
+    let objective = Objective { variant: Variant::Full, sustained: 0.5 };
+    let gradients = || set.gradients(&network, &windows, 8, 6, objective).expect("the loss is differentiable");
     let (_, backward) = gradients();
     for &(name, index) in entries {
         let (_, var) = network.variables.iter().find(|(n, _)| n == name).expect("a variable");

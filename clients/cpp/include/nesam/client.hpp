@@ -3,12 +3,14 @@
 #include <chrono>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include <nesam/error.hpp>
 #include <nesam/session.hpp>
 #include <nesam/terrain.hpp>
+#include <nesam/tls.hpp>
 #include <nesam/types.hpp>
 
 namespace nesam {
@@ -27,12 +29,16 @@ struct ClientOptions {
   int reply_bytes_max = 64 << 20;
   /// Whether to honour the proxy that the environment names. Off: planners talk to a machine nearby.
   bool use_proxy = false;
+  /// Encrypts the connection and shows who this client is; absent = neither, for a trusted network.
+  std::optional<Tls> tls;
+  /// Vehicle that this client works for: a proxy in front of several servers keeps its calls together (metadata `x-vehicle-id`); empty = not told.
+  std::string vehicle_id;
 };
 
 /// A connection to a nesam server. Cheap calls, safe from several threads at once.
 ///
-/// The connection is made with the first call and again after a failure; a call on a server that cannot be reached fails with UNAVAILABLE. It is neither
-/// encrypted nor authenticated: keep it on a trusted network or put a proxy before the server.
+/// The connection is made with the first call and again after a failure; a call on a server that cannot be reached, or whose certificate `ClientOptions::tls`
+/// does not accept, fails with UNAVAILABLE. UNAUTHENTICATED and PERMISSION_DENIED: the server does not know this client, or it may not do this.
 class Client {
  public:
   /// `target` is `host:port`. Nothing is sent yet.

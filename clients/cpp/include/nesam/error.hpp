@@ -15,7 +15,7 @@ enum class Code : int {
   deadline_exceeded = 4,    ///< The answer did not come in time. A prediction may be asked again; see `Session::send` for measurements.
   not_found = 5,            ///< Unknown session or map.
   already_exists = 6,       ///< The session is open, or the map is there in this or a newer version.
-  permission_denied = 7,    ///< Not used by the service itself; a proxy may answer so.
+  permission_denied = 7,    ///< The certificate that the client shows gives no right to this.
   resource_exhausted = 8,   ///< A limit is reached or the service is overloaded; try again later or ask for less.
   failed_precondition = 9,  ///< No start state and no measurement yet, the vehicle lies outside its map, or the map is in use.
   aborted = 10,             ///< The map changed meanwhile; read its version again.
@@ -24,7 +24,7 @@ enum class Code : int {
   internal = 13,            ///< A bug of the service, or a reply that contradicts the request.
   unavailable = 14,         ///< The server is not reached, or it is shutting down.
   data_loss = 15,           ///< Not used by the service itself.
-  unauthenticated = 16,     ///< Not used by the service itself; a proxy may answer so.
+  unauthenticated = 16,     ///< The certificate that the client shows says of nobody that the fleet file knows.
 };
 
 /// The name of a code in capitals, as gRPC writes it: INVALID_ARGUMENT.

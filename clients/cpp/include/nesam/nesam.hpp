@@ -6,8 +6,10 @@
 #include <nesam/error.hpp>
 #include <nesam/measurement.hpp>
 #include <nesam/measurement_stream.hpp>
+#include <nesam/motion_model.hpp>
 #include <nesam/prediction.hpp>
 #include <nesam/session.hpp>
 #include <nesam/span.hpp>
 #include <nesam/terrain.hpp>
+#include <nesam/tls.hpp>
 #include <nesam/types.hpp>

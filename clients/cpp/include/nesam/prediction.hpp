@@ -36,9 +36,43 @@ enum class HistoryUse {
   none = 2,      ///< The start stands alone, as for a what-if question at another place.
 };
 
+/// Candidates that the service draws as MPPI does: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the card.
+struct CandidateDrawing {
+  /// Number of candidates N.
+  std::uint32_t samples = 0;
+  /// Shape (K, 2): speed in m/s, second command in the unit of the vehicle card. Only read during the call.
+  Span<const float> nominal;
+  /// Standard deviation of the noise of the speed, m/s, and of the second command, in its unit.
+  double speed_sd_m_s = 0.0;
+  double second_sd = 0.0;
+  /// Correlation of the noise from one step to the next, 0 (white) to below 1.
+  double correlation = 0.0;
+  /// The same drawing with the same seed gives the same candidates.
+  std::uint64_t seed = 0;
+};
+
+/// Cost of a candidate: the mean over its steps of weighted squares. Infinite for one that overturns, leaves the map or is not finite.
+struct PathCost {
+  /// Shape (points, 2): the path in the order it is driven, World, m; 2 to 1024 points. Only read during the call.
+  Span<const float> path_m;
+  /// Speed to be made along the path, m/s.
+  double speed_m_s = 0.0;
+  /// Weights of the distance from the path (per m^2), of the speed along it (per (m/s)^2), of roll and pitch (per rad^2), and of the change of the commands
+  /// from step to step (per (m/s)^2 and per unit of the second command squared).
+  double path_weight = 1.0;
+  double speed_weight = 0.0;
+  double tilt_weight = 0.0;
+  double speed_change_weight = 0.0;
+  double second_change_weight = 0.0;
+  /// Candidates to return, best first; 0 = none.
+  std::uint32_t best = 1;
+  /// Temperature of `Prediction::mean_controls`, in units of the cost; 0 = no mean.
+  double temperature = 0.0;
+};
+
 /// A batch of candidate command sequences.
 struct PredictRequest {
-  /// Shape (N, K, 2): speed in m/s, second command in the unit of the vehicle card. N 1 to 4096, K 1 to 32. Only read during the call.
+  /// Shape (N, K, 2): speed in m/s, second command in the unit of the vehicle card. N 1 to 4096, K 1 to 32. Only read during the call. Empty with `drawing`.
   View3<const float> controls;
   /// State to start from; absent = the newest measured step.
   std::optional<VehicleState> start;
@@ -51,18 +85,29 @@ struct PredictRequest {
   bool wheel_sinkage = false;
   /// Copied to the reply; for the caller's own use.
   std::uint64_t tag = 0;
+  /// Lets the service draw the candidates: 8 K bytes on the wire instead of 8 N K.
+  std::optional<CandidateDrawing> drawing;
+  /// Lets the service say what each candidate is worth and return the best only: 4 N bytes and 48 K for each of them instead of 48 N K.
+  std::optional<PathCost> cost;
 };
 
 /// The predicted states and what they were computed from.
 class Prediction {
  public:
-  /// Shape (N, floor(K / stride), C) with C = number of channels asked for, in the order of `Channel`; yaw in (-pi, pi]. Step k (from 0) is the state
-  /// (k + 1) stride x 0.1 s after the start. Valid as long as this object is neither changed nor moved from.
-  View3<const float> states() const noexcept { return {states_storage, samples, steps, channel_count()}; }
-  /// Sinkage of the wheels, m, shape (N, floor(K / stride), 4); empty unless asked for.
+  /// Shape (rows, floor(K / stride), C) with C = number of channels asked for, in the order of `Channel`; yaw in (-pi, pi]. Step k (from 0) is the state
+  /// (k + 1) stride x 0.1 s after the start. A row for each candidate, or for each of `best` where a cost was given. Valid as long as this object is neither
+  /// changed nor moved from.
+  View3<const float> states() const noexcept { return {states_storage, rows(), steps, channel_count()}; }
+  /// Sinkage of the wheels, m, shape (rows, floor(K / stride), 4); empty unless asked for.
   View3<const float> sinkage_m() const noexcept {
-    return sinkage_storage_m.empty() ? View3<const float>{} : View3<const float>{sinkage_storage_m, samples, steps, 4};
+    return sinkage_storage_m.empty() ? View3<const float>{} : View3<const float>{sinkage_storage_m, rows(), steps, 4};
   }
+  /// Candidates that the service drew, shape (rows, K, 2); empty for candidates that were sent.
+  View3<const float> drawn_controls() const noexcept {
+    return drawn_storage.empty() ? View3<const float>{} : View3<const float>{drawn_storage, rows(), drawn_storage.size() / (2 * rows()), 2};
+  }
+  /// Number of candidates returned.
+  std::size_t rows() const noexcept { return costs.empty() ? samples : best.size(); }
   /// Column of a channel in `states()`; absent when it was not asked for.
   std::optional<std::size_t> column(Channel channel) const noexcept;
   /// Number of channels returned.
@@ -75,7 +120,15 @@ class Prediction {
   std::uint32_t channels = 0;
   std::vector<float> states_storage;
   std::vector<float> sinkage_storage_m;
-  /// One word for each sample: the sum of its `Validity` bits.
+  std::vector<float> drawn_storage;
+  /// Cost of every candidate, (N); empty without a cost.
+  std::vector<float> costs;
+  /// Indices of the candidates returned, best first; empty without a cost.
+  std::vector<std::uint32_t> best;
+  /// Mean of all candidates weighted with exp(-(cost - least cost) / temperature), shape (K, 2): the step of MPPI. Empty without a temperature, or when no
+  /// candidate has a finite cost.
+  std::vector<float> mean_controls;
+  /// One word for each row: the sum of its `Validity` bits.
   std::vector<std::uint32_t> validity;
   /// State that the rollout started from.
   VehicleState start;

@@ -1,14 +1,14 @@
 //! `nesam train`: trains a bundle on the train split of a set.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
 use nesam_learning::recipe::{Recipe, Reporter, run as train};
-use nesam_learning::{Pooling, TrainingError, TrainingPlan};
-use nesam_model::Variant;
+use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
+use nesam_model::{ModelBundle, Variant};
 
 use crate::args::{DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
@@ -60,6 +60,12 @@ pub struct TrainArgs {
     /// Decay of the weights, per unit of learning rate
     #[arg(long, value_name = "RATE", default_value_t = 0.0)]
     decay: f32,
+    /// Weight in the loss of what the residual carries on average over a window: more of it leaves lasting forces to the wheels
+    #[arg(long, value_name = "WEIGHT", default_value_t = 0.0)]
+    sustained: f64,
+    /// Start from the weights, scales and vehicle of this bundle (same model, no effects) instead of from nothing
+    #[arg(long, value_name = "BUNDLE")]
+    from: Option<PathBuf>,
     /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right
     #[arg(long)]
     no_mirror: bool,
@@ -153,6 +159,10 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if !(0.0..100.0).contains(&args.decay) {
         return Err(Failure::input(format!("--decay {} is not in 0..100", args.decay)));
     }
+    if !(0.0..100.0).contains(&args.sustained) {
+        return Err(Failure::input(format!("--sustained {} is not in 0..100", args.sustained)));
+    }
+    let start = args.from.as_deref().map(|dir| start_of(dir, variant)).transpose()?;
     own_threads()?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
     let hash = drives.root.hash();
@@ -181,9 +191,10 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             shards: args.threads,
             dropout: args.dropout,
             decay: args.decay,
-            variant,
+            objective: Objective { variant, sustained: args.sustained },
             folder: out.join("checkpoint"),
         },
+        start,
         out: out.clone(),
         resume: args.resume,
         command: command_line(),
@@ -198,6 +209,18 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     };
     eprintln!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
     Ok(())
+}
+
+/// The bundle that a run starts from.
+fn start_of(dir: &Path, variant: Variant) -> Result<ModelBundle, Failure> {
+    let bundle = ModelBundle::load(dir).or_input()?;
+    if bundle.form != variant {
+        return Err(Failure::input(format!("--from {}: it is a {}, not a {}", dir.display(), bundle.form.as_str(), variant.as_str())));
+    }
+    if !bundle.effects.is_empty() {
+        return Err(Failure::input(format!("--from {}: it carries effects; start from the bundle that they were added to", dir.display())));
+    }
+    Ok(bundle)
 }
 
 /// The command as typed, without the folders of this machine.

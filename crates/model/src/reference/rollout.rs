@@ -53,6 +53,8 @@ pub trait TerrainProvider {
 pub struct PredictedStep {
     /// (batch, 12): x, y relative (m), z relative (m), roll, pitch, yaw (absolute, not wrapped), velocities in Body.
     pub state: Tensor,
+    /// (batch, 12): what the network added to this step, in the raw units of `Normalization::residual_scale`; `None` in a form without residual.
+    pub residual: Option<Tensor>,
 }
 
 /// A rollout in progress.
@@ -120,12 +122,13 @@ impl ReferenceRollout<'_> {
                 constants.push(pack_constants(&wheels, &ground, states[b].attitude_rad[2]));
                 actuators[b] = after;
             }
-            let increment = self.increment(&state, &raw_sinkage, &raw_residual, &raw_soil, &constants)?;
+            let residual = (self.variant != Variant::NoResidual).then_some(raw_residual);
+            let increment = self.increment(&state, &raw_sinkage, residual.as_ref(), &raw_soil, &constants)?;
             state = advance(&state, &increment)?;
             previous = states.iter().copied().map(Some).collect();
             states = self.to_states(rows, &state)?;
             last_increment = Some(increment);
-            steps.push(PredictedStep { state: state.clone() });
+            steps.push(PredictedStep { state: state.clone(), residual });
         }
         Ok(steps)
     }
@@ -204,7 +207,7 @@ impl ReferenceRollout<'_> {
         &self,
         state: &Tensor,
         raw_sinkage: &Tensor,
-        raw_residual: &Tensor,
+        raw_residual: Option<&Tensor>,
         raw_soil: &Tensor,
         constants: &[[f32; CONSTANT]],
     ) -> Result<Tensor> {
@@ -216,9 +219,7 @@ impl ReferenceRollout<'_> {
             Tensor::cat(&[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, rows_tensor(constants)?], 1)?;
         // z, roll, pitch are columns 2..5; yaw (5) does not enter the step.
         let symbolic = physics_increment(&packed, self.variant, self.model)?;
-        if self.variant == Variant::NoResidual {
-            return Ok(symbolic);
-        }
+        let Some(raw_residual) = raw_residual else { return Ok(symbolic) };
         let scale = Tensor::from_slice(&self.scales.residual_scale, (1, STATE_DIM), &Device::Cpu)?;
         symbolic + raw_residual.broadcast_mul(&scale)?
     }
