@@ -177,6 +177,7 @@ v1::PredictRequest to_message(const std::string& session_id, const PredictReques
   message.mutable_output()->set_stride(request.stride);
   message.mutable_output()->set_wheel_sinkage(request.wheel_sinkage);
   message.set_tag(request.tag);
+  message.set_samples_min(request.samples_min);
   return message;
 }
 
@@ -254,10 +255,11 @@ Result<Prediction> from_message(const v1::PredictReply& message, const PredictRe
   prediction.costs = unpack(message.costs());
   prediction.best.assign(message.best().begin(), message.best().end());
   prediction.mean_controls = unpack(message.mean_controls());
-  const std::size_t samples = request.drawing ? request.drawing->samples : request.controls.samples();
+  const std::size_t asked = request.drawing ? request.drawing->samples : request.controls.samples();
+  const std::size_t samples = prediction.samples;
   const std::size_t points = prediction.rows() * prediction.steps;
   const std::size_t drawn = request.drawing ? prediction.rows() * request.drawing->nominal.size() : 0;
-  const bool fits = prediction.samples == samples && message.costs().size() == (request.cost ? 4 * samples : 0) &&
+  const bool fits = (samples == asked || (request.samples_min > 0 && samples >= request.samples_min && samples < asked)) && message.costs().size() == (request.cost ? 4 * samples : 0) &&
                     message.states().size() == 4 * points * prediction.channel_count() &&
                     message.sinkage_m().size() == (request.wheel_sinkage ? 16 * points : 0) && message.drawn_controls().size() == 4 * drawn &&
                     static_cast<std::size_t>(message.validity_size()) == prediction.rows();

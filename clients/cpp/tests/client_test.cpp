@@ -466,6 +466,12 @@ void service_bad_predictions_are_refused(const nesam::Session& session, nesam::C
   request.stride = 9;
   check_error(session.predict(request), invalid, "output.stride", "a stride beyond the horizon");
   request = request_of(good, 2, 8);
+  request.samples_min = 3;
+  check_error(session.predict(request), invalid, "samples_min", "fewer than are there");
+  request.samples_min = 1;
+  const auto enough_time = session.predict(request);
+  check(enough_time.ok() && enough_time->samples == 2, "all samples where there is time");
+  request = request_of(good, 2, 8);
   request.channels = 1U << 12;
   check_error(session.predict(request), invalid, "output.channels", "an unknown channel");
   request = request_of(good, 2, 8);

@@ -169,6 +169,7 @@ class AsyncClient:
         half: bool = False,
         extras: Optional[Extras] = None,
         cost: Optional[PathCost] = None,
+        samples_min: int = 0,
     ) -> t.Prediction:
         """As `Client.predict`."""
         question = calls.Question(
@@ -185,6 +186,7 @@ class AsyncClient:
             half=half,
             extras=extras,
             cost=cost,
+            samples_min=samples_min,
         )
         try:
             return self._known_states.predicted(question, await self._do(question.call(), timeout_s))

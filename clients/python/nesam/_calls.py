@@ -143,6 +143,7 @@ class Question:
     half: bool = False
     extras: Optional[Extras] = None
     cost: Optional[PathCost] = None
+    samples_min: int = 0
 
     def commands(self) -> np.ndarray:
         """(samples, horizon, 2) as they are sent, or (1, horizon, 2): the nominal sequence of a drawing. ValueError for another shape."""
@@ -178,6 +179,7 @@ class Question:
                 for stamp_ns, command in self.sent
             ],
             extras=None if self.extras is None else self.extras.message(),
+            samples_min=self.samples_min,
         )
         return Call("prediction", "Predict", request, lambda reply: m.prediction(reply, self.stride, horizon, self.extras))
 

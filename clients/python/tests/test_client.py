@@ -186,6 +186,7 @@ def test_service_measurement_answers_are_typed(driven):
         ({"controls": fan(2, 33)}, nesam.InvalidArgument, "horizon"),
         ({"controls": fan(4097, 1)}, nesam.InvalidArgument, "samples"),
         ({"controls": fan(0, 3)}, nesam.InvalidArgument, "samples"),
+        ({"controls": fan(4, 3), "samples_min": 5}, nesam.InvalidArgument, "samples_min"),
         ({"controls": fan(2, 3) * np.float32(np.nan)}, nesam.InvalidArgument, "controls[0, 0]"),
         ({"controls": fan(2, 3, speed=500.0)}, nesam.InvalidArgument, "controls[0, 0].speed_m_s"),
         ({"start": np.full(12, np.inf)}, nesam.InvalidArgument, "start.position_m.x"),

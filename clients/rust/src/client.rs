@@ -2,6 +2,9 @@
 
 use nesam_proto::v1;
 use tokio_stream::wrappers::ReceiverStream;
+use tonic::metadata::{Ascii, MetadataValue};
+use tonic::service::Interceptor;
+use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 
 use crate::error::ClientError;
@@ -13,10 +16,29 @@ use crate::tls::Tls;
 /// Largest reply accepted, bytes: 64 for each of 131 072 sample-steps, and some room.
 const REPLY_BYTES_MAX: usize = 16 << 20;
 
+/// Metadata by which a proxy in front of several servers keeps the calls of a vehicle together.
+const VEHICLE: &str = "x-vehicle-id";
+
+/// Adds the vehicle to every call.
+#[derive(Clone, Debug, Default)]
+struct Route(Option<MetadataValue<Ascii>>);
+
+impl Interceptor for Route {
+    fn call(&mut self, mut request: tonic::Request<()>) -> Result<tonic::Request<()>, tonic::Status> {
+        if let Some(vehicle) = &self.0 {
+            request.metadata_mut().insert(VEHICLE, vehicle.clone());
+        }
+        Ok(request)
+    }
+}
+
+type Routed = InterceptedService<Channel, Route>;
+
 /// A connection to a service. Cheap to clone; clones share the connection.
 #[derive(Clone, Debug)]
 pub struct Client {
     channel: Channel,
+    route: Route,
 }
 
 impl Client {
@@ -44,7 +66,22 @@ impl Client {
             Some(tls) => endpoint.tls_config(tls.config()).map_err(failed)?,
             None => endpoint,
         };
-        Ok(Self { channel: endpoint.connect().await.map_err(failed)? })
+        Ok(Self { channel: endpoint.connect().await.map_err(failed)?, route: Route::default() })
+    }
+
+    /// The same connection, working for one vehicle: a proxy in front of several servers keeps its calls together (metadata `x-vehicle-id`).
+    ///
+    /// # Errors
+    /// `ClientError::Refused` for a name that no header can hold.
+    pub fn for_vehicle(mut self, vehicle_id: &str) -> Result<Self, ClientError> {
+        let value = vehicle_id.parse().map_err(|_| ClientError::Refused {
+            code: tonic::Code::InvalidArgument,
+            field: "vehicle_id".into(),
+            message: format!("vehicle id `{}`: letters, digits, _ . and - are allowed", vehicle_id.escape_debug()),
+            retry_after: None,
+        })?;
+        self.route = Route(Some(value));
+        Ok(self)
     }
 
     /// The connection, for generated clients of the same server (health, reflection).
@@ -52,16 +89,20 @@ impl Client {
         self.channel.clone()
     }
 
-    fn sessions(&self) -> v1::sessions_client::SessionsClient<Channel> {
-        v1::sessions_client::SessionsClient::new(self.channel.clone())
+    fn routed(&self) -> Routed {
+        InterceptedService::new(self.channel.clone(), self.route.clone())
     }
 
-    fn terrain(&self) -> v1::terrain_client::TerrainClient<Channel> {
-        v1::terrain_client::TerrainClient::new(self.channel.clone())
+    fn sessions(&self) -> v1::sessions_client::SessionsClient<Routed> {
+        v1::sessions_client::SessionsClient::new(self.routed())
     }
 
-    fn prediction(&self) -> v1::prediction_client::PredictionClient<Channel> {
-        v1::prediction_client::PredictionClient::new(self.channel.clone()).max_decoding_message_size(REPLY_BYTES_MAX)
+    fn terrain(&self) -> v1::terrain_client::TerrainClient<Routed> {
+        v1::terrain_client::TerrainClient::new(self.routed())
+    }
+
+    fn prediction(&self) -> v1::prediction_client::PredictionClient<Routed> {
+        v1::prediction_client::PredictionClient::new(self.routed()).max_decoding_message_size(REPLY_BYTES_MAX)
     }
 
     /// Opens a session.
@@ -156,14 +197,14 @@ impl Client {
     /// Opens a stream of measurements.
     pub async fn measure(&mut self) -> Result<MeasurementStream, ClientError> {
         let (sender, receiver) = tokio::sync::mpsc::channel(WAITING_MAX);
-        let mut client = v1::measurements_client::MeasurementsClient::new(self.channel.clone());
+        let mut client = v1::measurements_client::MeasurementsClient::new(self.routed());
         let answers = client.stream(ReceiverStream::new(receiver)).await?.into_inner();
         Ok(MeasurementStream { sender, answers })
     }
 
     /// Sends measurements and collects their answers.
     pub async fn feed(&mut self, measurements: Vec<v1::Measurement>) -> Result<Vec<v1::MeasurementAnswer>, ClientError> {
-        let mut client = v1::measurements_client::MeasurementsClient::new(self.channel.clone());
+        let mut client = v1::measurements_client::MeasurementsClient::new(self.routed());
         let mut inbound = client.stream(tokio_stream::iter(measurements)).await?.into_inner();
         let mut answers = Vec::new();
         while let Some(answer) = inbound.message().await? {
@@ -207,13 +248,13 @@ impl Client {
 
     /// What the fleet has learned of the ground; an empty name means all maps.
     pub async fn fleet_soil(&mut self, map: &str) -> Result<v1::FleetSoilMap, ClientError> {
-        let mut soil = v1::soil_client::SoilClient::new(self.channel());
+        let mut soil = v1::soil_client::SoilClient::new(self.routed());
         Ok(soil.map(v1::FleetSoilRequest { map_id: map.into() }).await?.into_inner())
     }
 
     /// Watches the soil estimate of a session.
     pub async fn watch_soil(&mut self, session: &str) -> Result<tonic::Streaming<v1::SoilEstimate>, ClientError> {
-        let mut client = v1::soil_client::SoilClient::new(self.channel.clone());
+        let mut client = v1::soil_client::SoilClient::new(self.routed());
         Ok(client.watch(v1::WatchSoilRequest { session_id: session.into() }).await?.into_inner())
     }
 }

@@ -20,6 +20,8 @@ pub struct Candidates {
     pub use_history: bool,
     /// N.
     pub samples: usize,
+    /// Fewest of them that are of use when time is short, 0 = all or nothing; [`Prediction::samples`] says how many were computed.
+    pub samples_min: usize,
     /// K.
     pub horizon: usize,
     /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card; empty where they are drawn.
@@ -48,6 +50,7 @@ impl Candidates {
             sent: Vec::new(),
             use_history: true,
             samples,
+            samples_min: 0,
             horizon,
             controls,
             drawing: None,
@@ -91,6 +94,7 @@ impl Candidates {
             extras: self.extras.clone(),
             drawing: self.drawing.clone(),
             cost: self.cost.clone(),
+            samples_min: u32::try_from(self.samples_min).unwrap_or(u32::MAX),
         }
     }
 }

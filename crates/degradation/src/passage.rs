@@ -151,6 +151,7 @@ impl Ride<'_> {
             instant: None,
             use_history: true,
             samples: 1,
+            samples_min: 0,
             horizon: controls.len() / 2,
             extras: PredictExtras::default(),
             controls: Candidates::Given(controls),

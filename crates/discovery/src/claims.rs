@@ -274,7 +274,7 @@ impl Case<'_> {
                     rivals,
                     refused: None,
                 };
-                finding.refused = refusal(&finding, fit, i);
+                finding.refused = refusal(&group, &finding, fit, i);
                 finding
             })
             .collect()
@@ -357,13 +357,13 @@ fn class(yardstick: &Yardstick, selection: &Selection, i: usize) -> (f64, Vec<Me
     (1.0 / total, close.into_iter().map(|(candidate, weight)| Member { candidate, weight: weight / total }).collect())
 }
 
-/// Half width of the 95 % interval of a value: the wider of the scatter of null drives and the jackknife over drives.
-fn half_width(group: &Group, fit: &Fit, term: usize, i: usize) -> f64 {
+/// Half width of the 95 % interval of what follows from the values of a term: the wider of the scatter of null drives and the jackknife over drives.
+fn half_width(group: &Group, fit: &Fit, term: usize, derivatives: &[(usize, f64)], of: impl Fn(&[f64]) -> f64) -> f64 {
     let columns = fit.terms[term].candidate.columns();
     let dispersion = columns.iter().map(|c| group.covariance[(*c, *c)] / group.information[(*c, *c)].max(1e-12)).fold(1.0, f64::max);
-    let posterior = T_NULLS * fit.sd[term][i] * dispersion.sqrt();
+    let posterior = T_NULLS * fit.sd(term, derivatives) * dispersion.sqrt();
     let t = T_975.get(fit.jackknife.len().saturating_sub(2)).copied().unwrap_or(2.1);
-    fit.jackknife_sd(term, i).map_or(posterior, |sd| posterior.max(t * sd))
+    fit.jackknife_sd(term, of).map_or(posterior, |sd| posterior.max(t * sd))
 }
 
 fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
@@ -378,7 +378,7 @@ fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
             let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
                 // The first value is the magnitude, which answers for the scale of the response.
                 let scale = if i == 0 { 1.96 * mismatch(candidate.layer()) * fit.values[term][i] } else { 0.0 };
-                let half = half_width(group, fit, term, i).hypot(scale);
+                let half = half_width(group, fit, term, &[(i, 1.0)], |values| values[i]).hypot(scale);
                 [parameter.value - half, parameter.value + half]
             });
             Estimate { name: parameter.name, unit: parameter.unit, value: parameter.value, ci95 }
@@ -386,8 +386,18 @@ fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
         .collect()
 }
 
+/// Half width of the moments m x, m y and m z of a payload, as shares of them: a vehicle feels them besides the mass, and knows them where it cannot tell a heavy
+/// load near the axle from a light one far out.
+fn moments(group: &Group, fit: &Fit, term: usize) -> impl Iterator<Item = f64> {
+    let values = &fit.values[term];
+    (1..values.len()).map(move |i| {
+        let half = half_width(group, fit, term, &[(0, values[i]), (i, values[0])], |values| values[0] * values[i]);
+        half / (values[0] * values[i]).abs().max(1e-12)
+    })
+}
+
 /// Why a fit is not claimed even if it is the best.
-fn refusal(finding: &Finding, fit: &Fit, term: usize) -> Option<String> {
+fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<String> {
     let free = finding.candidate.free();
     if let Some(i) = fit.held[term].iter().position(|h| *h) {
         let e = &finding.estimates[free[i].parameter];
@@ -397,13 +407,13 @@ fn refusal(finding: &Finding, fit: &Fit, term: usize) -> Option<String> {
         return Some(format!("only {:.0} % of half-samples of the drives choose it", 100.0 * finding.stability));
     }
     // An effect of several magnitudes, such as a wind, is known when one of them is.
+    let payload = finding.candidate.id() == "payload";
     let relative = free
         .iter()
-        .filter(|f| {
-            f.parameter == free[0].parameter || finding.candidate.unit().is_none() && f.mean == 0.0 && finding.candidate.id() != "payload"
-        })
+        .filter(|f| f.parameter == free[0].parameter || finding.candidate.unit().is_none() && f.mean == 0.0 && !payload)
         .filter_map(|f| finding.estimates.get(f.parameter))
         .filter_map(|e| e.ci95.map(|[low, high]| 0.5 * (high - low) / e.value.abs().max(1e-12)))
+        .chain(payload.then(|| moments(group, fit, term)).into_iter().flatten())
         .fold(f64::INFINITY, f64::min);
     (relative > MAGNITUDE_HALF_MAX).then(|| format!("its size is known to ±{:.0} % only", 100.0 * relative))
 }

@@ -20,12 +20,12 @@ use crate::select::{Selection, Yardstick};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
-const LEFT_MAX: f64 = 0.35;
+const LEFT_MAX: f64 = 0.4;
 /// How far beyond the family-wise threshold the largest evidence must be before drives count as different without a known cause (chosen, as in ADR 0008):
 /// one set in twenty without an effect is beyond the threshold itself.
 const UNEXPLAINED_MARGIN: f64 = 1.5;
 /// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
-const LEFT_MAX_GEOMETRY: f64 = 0.15;
+const LEFT_MAX_GEOMETRY: f64 = 0.2;
 
 /// What drives are held against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]

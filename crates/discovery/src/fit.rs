@@ -43,8 +43,8 @@ pub struct Fit {
     pub terms: Vec<Term>,
     /// Values of the free parameters of each term.
     pub values: Vec<Vec<f64>>,
-    /// Posterior standard deviations in the metric.
-    pub sd: Vec<Vec<f64>>,
+    /// Posterior covariance of all values, term by term, in the metric.
+    pub covariance: DMatrix<f64>,
     /// Whether the physical range holds a parameter.
     pub held: Vec<Vec<bool>>,
     /// Values that one step gives when each drive in turn is left out.
@@ -67,14 +67,22 @@ impl Fit {
         timed(&self.terms, &values)
     }
 
-    /// Standard deviation of a value over drives, by the jackknife; `None` with fewer than three drives.
-    pub fn jackknife_sd(&self, term: usize, i: usize) -> Option<f64> {
+    /// Posterior standard deviation of what has these derivatives in the values of a term.
+    pub fn sd(&self, term: usize, derivatives: &[(usize, f64)]) -> f64 {
+        let first: usize = self.values[..term].iter().map(Vec::len).sum();
+        let pairs = derivatives.iter().flat_map(|a| derivatives.iter().map(move |b| (a, b)));
+        pairs.map(|(a, b)| a.1 * b.1 * self.covariance[(first + a.0, first + b.0)]).sum::<f64>().max(0.0).sqrt()
+    }
+
+    /// Standard deviation over drives of what follows from the values of a term, by the jackknife; `None` with fewer than three drives.
+    pub fn jackknife_sd(&self, term: usize, of: impl Fn(&[f64]) -> f64) -> Option<f64> {
         let n = self.jackknife.len();
         if n < 3 {
             return None;
         }
-        let mean = self.jackknife.iter().map(|v| v[term][i]).sum::<f64>() / n as f64;
-        let square = self.jackknife.iter().map(|v| (v[term][i] - mean).powi(2)).sum::<f64>();
+        let left_out: Vec<f64> = self.jackknife.iter().map(|values| of(&values[term])).collect();
+        let mean = left_out.iter().sum::<f64>() / n as f64;
+        let square = left_out.iter().map(|v| (v - mean).powi(2)).sum::<f64>();
         Some((square * (n - 1) as f64 / n as f64).sqrt())
     }
 }
@@ -113,13 +121,12 @@ pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Te
     } else {
         Vec::new()
     };
-    let sd = shaped(terms, &(0..covariance.nrows()).map(|i| covariance[(i, i)].sqrt()).collect::<Vec<_>>());
     let centred: Vec<f64> = flat(&values).iter().zip(offset).map(|(v, o)| v - o).collect();
     let mut values = shaped(terms, &centred);
     for (held, now) in held.iter_mut().flatten().zip(clamp(terms, &mut values).into_iter().flatten()) {
         *held |= now;
     }
-    Fit { terms: terms.to_vec(), values, sd, held, jackknife }
+    Fit { terms: terms.to_vec(), values, covariance, held, jackknife }
 }
 
 /// Score and information of each drive in the free parameters, soil profiled out.

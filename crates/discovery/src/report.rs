@@ -13,7 +13,7 @@ use crate::diagnose::{Against, Diagnosis, Verdict};
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
-pub const STOP_RULE: &str = "2: up to three effects, pairwise criterion 6, at most 35 % of the largest evidence left";
+pub const STOP_RULE: &str = "3: up to three effects, pairwise criterion 6, at most 40 % of the largest evidence left, 20 % for geometry";
 const STAGES: [&str; 3] = ["before", "soil only", "after"];
 
 /// What a report is made from.

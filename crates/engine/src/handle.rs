@@ -185,9 +185,13 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap
             Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
                 answer(&mut engine, submission, clock, &mut tap);
             }),
-            Turn::Prediction(submission) => {
-                let work = match &submission.command {
-                    Command::Predict(query) => work(query),
+            Turn::Prediction(mut submission) => {
+                let left_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(clock.now_ns()));
+                let work = match &mut submission.command {
+                    Command::Predict(query) => {
+                        queue.fit(query, left_ns);
+                        work(query, query.samples)
+                    }
                     _ => 1.0,
                 };
                 if let Some(busy_ns) = answer(&mut engine, *submission, clock, &mut tap) {

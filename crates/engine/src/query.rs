@@ -27,6 +27,8 @@ pub struct PredictQuery {
     pub use_history: bool,
     /// N.
     pub samples: usize,
+    /// Fewest samples that are of use when time is short; 0 = all or nothing.
+    pub samples_min: usize,
     /// K.
     pub horizon: usize,
     /// The candidates.
@@ -83,7 +85,7 @@ pub struct Prediction {
 }
 
 impl Prediction {
-    /// N, as asked.
+    /// Candidates that were computed.
     pub fn candidates(&self) -> usize {
         let rows = self.rollout.samples / self.extras.soil_groups.max(1);
         self.ranking.as_ref().map_or(rows, |ranking| ranking.costs.len())
@@ -91,12 +93,39 @@ impl Prediction {
 }
 
 impl PredictQuery {
+    /// Fewest samples that answer it.
+    pub(crate) fn least(&self) -> usize {
+        if self.samples_min == 0 { self.samples } else { self.samples_min.min(self.samples) }
+    }
+
+    /// Leaves the first samples only. A query whose counts do not fit each other stays as it is, to be refused for what is wrong with it.
+    pub(crate) fn keep_first(&mut self, samples: usize) {
+        let given = match &self.controls {
+            Candidates::Given(controls) => controls.len() == self.samples * self.horizon * 2,
+            Candidates::Drawn(_) => true,
+        };
+        if !given || self.cost.as_ref().is_some_and(|cost| cost.best > self.samples) {
+            return;
+        }
+        self.samples = samples;
+        if let Candidates::Given(controls) = &mut self.controls {
+            controls.truncate(samples * self.horizon * 2);
+        }
+        if let Some(cost) = &mut self.cost {
+            cost.best = cost.best.min(samples);
+        }
+    }
+
     /// Checks what needs no session: shape, finite numbers, range of the card, plausible start.
     ///
     /// # Errors
     /// `EngineError::Invalid` naming the field and the limit.
     pub fn check(&self, limits: &Limits, vehicle: &Vehicle) -> Result<(), EngineError> {
         limits.check_shape(self.samples, self.horizon)?;
+        if self.samples_min > self.samples {
+            let reason = format!("is {}, allowed are 0 to samples = {}", self.samples_min, self.samples);
+            return Err(EngineError::invalid("samples_min", reason));
+        }
         self.extras.check(limits, self.samples)?;
         if let Some(cost) = &self.cost {
             cost.check(self.samples)?;

@@ -8,6 +8,7 @@ use crate::error::EngineError;
 use crate::fair::FairQueue;
 use crate::handle::Submission;
 use crate::limits::Limits;
+use crate::query::PredictQuery;
 use crate::service_time::{ServiceTime, work};
 
 /// Shortest pause that a refused asker is told, ns.
@@ -60,7 +61,7 @@ impl Queue {
             return Err(Box::new((EngineError::Stopped, submission)));
         }
         let admitted = match &submission.command {
-            Command::Predict(query) => lanes.admit(&submission, work(query), limits),
+            Command::Predict(query) => lanes.admit(&submission, query, limits),
             _ => lanes.take(&submission, limits).map(|()| 0),
         };
         match admitted {
@@ -95,6 +96,20 @@ impl Queue {
         }
     }
 
+    /// Leaves of the prediction whose turn it is what is expected to be done by its deadline, where fewer samples are of use.
+    pub fn fit(&self, query: &mut PredictQuery, left_ns: u64) {
+        if query.least() == query.samples {
+            return;
+        }
+        let mut lanes = self.lock();
+        let affordable = lanes.service_time.affordable(query, left_ns);
+        query.keep_first(affordable);
+        let expected_ns = lanes.service_time.expected_ns(work(query, affordable));
+        if let Some(running) = &mut lanes.running {
+            running.expected_ns = expected_ns;
+        }
+    }
+
     /// Learns how long a prediction took.
     pub fn learn(&self, work: f64, busy_ns: u64) {
         self.lock().service_time.learn(work, busy_ns);
@@ -116,12 +131,18 @@ impl Queue {
 }
 
 impl Lanes {
-    /// The time that a prediction is expected to take, if it is let in.
-    fn admit(&self, submission: &Submission, work: f64, limits: &Limits) -> Result<u64, EngineError> {
+    /// The time that a prediction is expected to take, if it is let in: all of it, or the least of it that is of use where all would be late.
+    fn admit(&self, submission: &Submission, query: &PredictQuery, limits: &Limits) -> Result<u64, EngineError> {
         let (share, now_ns) = (submission.share(), submission.submitted_ns());
-        let expected_ns = self.service_time.expected_ns(work);
         let running_ns = self.running.map_or(0, |running| (running.since_ns + running.expected_ns).saturating_sub(now_ns));
-        let wait_ns = running_ns + self.predictions.wait_ns(&share, expected_ns);
+        let of = |samples| {
+            let expected_ns = self.service_time.expected_ns(work(query, samples));
+            let wait_ns = running_ns + self.predictions.wait_ns(&share, expected_ns);
+            (expected_ns, wait_ns, now_ns.saturating_add(wait_ns).saturating_add(expected_ns))
+        };
+        let all = of(query.samples);
+        let late = |done_ns| submission.deadline_ns.is_some_and(|deadline_ns| done_ns > deadline_ns);
+        let (expected_ns, wait_ns, done_ns) = if late(all.2) { of(query.least()) } else { all };
         let refused = |kind, waiting, retry_after_ns: u64| EngineError::Overloaded {
             kind,
             waiting,
@@ -136,7 +157,6 @@ impl Lanes {
         }
         // Whoever comes while nothing else is to be done is let in whatever is expected: so the estimate stays true.
         let idle = waiting == 0 && self.running.is_none();
-        let done_ns = now_ns.saturating_add(wait_ns).saturating_add(expected_ns);
         match submission.deadline_ns {
             Some(deadline_ns) if !idle && done_ns > deadline_ns => Err(refused("predictions", waiting, done_ns - deadline_ns)),
             _ => Ok(expected_ns),

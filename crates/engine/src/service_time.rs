@@ -24,9 +24,13 @@ pub(crate) struct ServiceTime {
     ns_per_work: Option<f64>,
 }
 
-/// Work of a prediction, in sample-steps.
-pub(crate) fn work(query: &PredictQuery) -> f64 {
-    let steps = (query.samples * query.horizon) as f64;
+/// Samples that the kernels compute at once: fewer of them are not faster.
+const LANES: usize = 16;
+/// Share of the time that is left before a deadline which is made use of.
+const USED: f64 = 0.9;
+
+/// Work of one sample of a prediction, in sample-steps.
+fn sample_work(query: &PredictQuery) -> f64 {
     let extras = &query.extras;
     let soils = match &extras.soils {
         WhatIfSoils::Estimate => 1,
@@ -36,13 +40,28 @@ pub(crate) fn work(query: &PredictQuery) -> f64 {
     let exact = if extras.exact_terrain { EXACT_WORK } else { 0.0 };
     let derived =
         exact + if extras.jacobians { JACOBIAN_WORK } else { 0.0 } + if extras.covariance.is_some() { COVARIANCE_WORK } else { 0.0 };
-    FIXED_WORK + steps * (soils as f64 + derived)
+    query.horizon as f64 * (soils as f64 + derived)
+}
+
+/// Work of the first `samples` of a prediction, in sample-steps.
+pub(crate) fn work(query: &PredictQuery, samples: usize) -> f64 {
+    FIXED_WORK + samples as f64 * sample_work(query)
 }
 
 impl ServiceTime {
     /// Expected time, ns; 0 while nothing is known.
     pub fn expected_ns(&self, work: f64) -> u64 {
         self.ns_per_work.map_or(0, |ns| (ns * work) as u64)
+    }
+
+    /// Samples of a prediction that are expected to be done within this time, between the fewest that it asks for and all.
+    pub fn affordable(&self, query: &PredictQuery, left_ns: u64) -> usize {
+        let Some(ns_per_work) = self.ns_per_work else { return query.samples };
+        let samples = (USED * left_ns as f64 / ns_per_work - FIXED_WORK) / sample_work(query);
+        if samples >= query.samples as f64 {
+            return query.samples;
+        }
+        (samples.max(0.0) as usize / LANES * LANES).clamp(query.least(), query.samples)
     }
 
     /// Learns from a prediction that took this long.
@@ -59,6 +78,38 @@ impl ServiceTime {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::candidates::Candidates;
+
+    #[test]
+    fn analytic_as_many_samples_as_there_is_time_for() {
+        let query = |samples_min| PredictQuery {
+            session: "s".into(),
+            start: None,
+            instant: None,
+            use_history: true,
+            samples: 1000,
+            samples_min,
+            horizon: 10,
+            controls: Candidates::Given(vec![0.0; 20_000]),
+            cost: None,
+            extras: Default::default(),
+        };
+        let mut time = ServiceTime::default();
+        assert_eq!(time.affordable(&query(1), 1), 1000, "nothing is known yet");
+        time.learn(1.0, 1000);
+        // 1 µs for each of 256 + 10 n, nine tenths of the time used: n = (2256 - 256) / 10 in 2.507 ms, in whole lanes 192.
+        assert_eq!(time.affordable(&query(1), 2_507_000), 192);
+        assert_eq!(time.affordable(&query(500), 2_507_000), 500, "no fewer than are of use");
+        assert_eq!(time.affordable(&query(7), 0), 7);
+        assert_eq!((time.affordable(&query(1), u64::MAX), query(0).least()), (1000, 1000));
+        let mut short = query(1);
+        short.keep_first(48);
+        assert_eq!((short.samples, short.controls.asked().1.len()), (48, 960));
+        let mut wrong = query(1);
+        wrong.controls = Candidates::Given(vec![0.0; 30_000]);
+        wrong.keep_first(48);
+        assert_eq!(wrong.samples, 1000, "what is wrong stays wrong");
+    }
 
     #[test]
     fn analytic_the_estimate_follows_the_machine_and_forgets_the_cold_start() {

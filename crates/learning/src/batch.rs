@@ -322,3 +322,27 @@ pub fn absolute_errors(predicted: &Tensor, target: &Tensor) -> Result<[f64; 5]> 
     }
     Ok(sums.map(|s| s / p.len() as f64))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Σᵢ r̄ᵢ² of rows, and its derivative 2 r̄ᵢ / (steps · rows) at each residual.
+    #[test]
+    fn analytic_what_lasts_counts_and_what_alternates_does_not() -> Result<()> {
+        let residuals = [[1.0, 3.0, 0.0], [3.0, -3.0, 0.0]].map(|row: [f32; 3]| Var::new(&[row, [0.0; 3]], &Device::Cpu));
+        let [first, second] = residuals.map(|residual| residual.expect("a tensor"));
+        let step = |residual: &Var| PredictedStep { state: residual.as_tensor().clone(), residual: Some(residual.as_tensor().clone()) };
+        let loss = sustained_residual(&[step(&first), step(&second)])?.expect("there are residuals");
+        // Means over the two steps: 2 and 0 in the first row, nothing in the second.
+        assert_eq!(loss.to_scalar::<f32>()?, 4.0 / 2.0);
+        let gradients = loss.backward()?;
+        for residual in [&first, &second] {
+            let gradient: Vec<Vec<f32>> = gradients.get(residual).expect("it is reached").to_vec2()?;
+            assert_eq!(gradient, [[1.0, 0.0, 0.0], [0.0; 3]], "2 · 2 / (2 · 2)");
+        }
+        let none = PredictedStep { state: first.as_tensor().clone(), residual: None };
+        assert!(sustained_residual(&[none])?.is_none());
+        Ok(())
+    }
+}

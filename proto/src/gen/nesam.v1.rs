@@ -825,6 +825,10 @@ pub struct PredictRequest {
     /// `extras`.
     #[prost(message, optional, tag = "13")]
     pub cost: ::core::option::Option<PathCost>,
+    /// Fewest samples that are of use, at most N; 0 = all or nothing. Where all N would not be done before the deadline of the call, the service computes as
+    /// many of the first ones as will be, at least this many, and says so by `PredictReply.samples`. A row is the same in any number of rows.
+    #[prost(uint32, tag = "14")]
+    pub samples_min: u32,
 }
 /// Candidates as MPPI draws them: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the vehicle card.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -940,7 +944,7 @@ pub struct PredictReply {
     /// Copied from the request.
     #[prost(uint64, tag = "1")]
     pub tag: u64,
-    /// N, as asked.
+    /// Candidates that were computed: N, or the first of them where fewer were allowed and time was short.
     #[prost(uint32, tag = "2")]
     pub samples: u32,
     /// Number of steps returned, floor(K / stride). With `cost` the arrays below have a row for each of `best` instead of N rows.

@@ -39,7 +39,7 @@ pub fn open_message(open: &OpenSession) -> pb::OpenSessionRequest {
 
 /// The message that asks for a prediction and for everything of it.
 pub fn predict_message(query: &PredictQuery) -> pb::PredictRequest {
-    let PredictQuery { session, start, instant, use_history, samples, horizon, controls, cost, extras } = query;
+    let PredictQuery { session, start, instant, use_history, samples, samples_min, horizon, controls, cost, extras } = query;
     let (controls, drawing) = candidates_message(controls);
     let history_use = if *use_history { pb::HistoryUse::Measured } else { pb::HistoryUse::None };
     let sent = |sent: &SentCommand| pb::SentCommand { stamp_ns: sent.stamp_ns, command: Some(control_message(&sent.command)) };
@@ -57,6 +57,7 @@ pub fn predict_message(query: &PredictQuery) -> pb::PredictRequest {
         extras: (*extras != PredictExtras::default()).then(|| extras_message(extras)),
         drawing,
         cost: cost.as_ref().map(path_cost_message),
+        samples_min: u32::try_from(*samples_min).unwrap_or(u32::MAX),
     }
 }
 
@@ -125,8 +126,18 @@ mod tests {
             (None, Some(StartInstant { stamp_ns: i64::MIN, sent }), true, PredictExtras::default()),
         ] {
             let controls = Candidates::Given(vec![1.0, f32::NAN, -0.0, f32::MAX, 2.0, 3.0]);
-            let mut query =
-                PredictQuery { session: "s".into(), start, instant, use_history, samples: 3, horizon: 1, controls, cost: None, extras };
+            let mut query = PredictQuery {
+                session: "s".into(),
+                start,
+                instant,
+                use_history,
+                samples: 3,
+                samples_min: 2,
+                horizon: 1,
+                controls,
+                cost: None,
+                extras,
+            };
             let drawing = Drawing { nominal: vec![-0.0, f32::NAN], sd: [0.5, f64::NAN], correlation: 0.75, seed: u64::MAX };
             let weights = CostWeights { path: 1.0, speed: 2.0, tilt: 3.0, change: [4.0, 5.0] };
             let cost = PathCost { path: vec![1.0, f32::INFINITY], speed_m_s: 6.0, weights, best: 2, temperature: 7.0 };

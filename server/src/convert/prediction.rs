@@ -29,7 +29,7 @@ const ALL_CHANNELS: u32 = (1 << STATE_DIM) - 1;
 /// # Errors
 /// `Invalid` naming the field and the limit.
 pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(PredictQuery, OutputSelection), EngineError> {
-    let (samples, horizon) = (message.samples as usize, message.horizon as usize);
+    let (samples, samples_min, horizon) = (message.samples as usize, message.samples_min as usize, message.horizon as usize);
     limits.check_shape(samples, horizon)?;
     let controls = candidates(message)?;
     let start = message.start.as_ref().map(|state| vehicle_state("start", state)).transpose()?;
@@ -46,7 +46,18 @@ pub fn predict_query(message: &pb::PredictRequest, limits: &Limits) -> Result<(P
     let extras = message.extras.as_ref().map(predict_extras).transpose()?.unwrap_or_default();
     let cost = message.cost.as_ref().map(path_cost).transpose()?;
     Ok((
-        PredictQuery { session: message.session_id.clone(), start, instant, use_history, samples, horizon, controls, cost, extras },
+        PredictQuery {
+            session: message.session_id.clone(),
+            start,
+            instant,
+            use_history,
+            samples,
+            samples_min,
+            horizon,
+            controls,
+            cost,
+            extras,
+        },
         output,
     ))
 }

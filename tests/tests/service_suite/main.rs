@@ -21,6 +21,7 @@ mod reload;
 mod reorder;
 mod replay;
 mod resets;
+mod routing;
 mod security;
 mod sessions;
 mod soil;

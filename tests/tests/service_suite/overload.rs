@@ -116,6 +116,41 @@ async fn service_what_would_be_late_is_refused_at_once() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn service_fewer_samples_in_time_rather_than_none() {
+    let (server, mut client, recorded) = driven("s", 40).await;
+    let heavy = candidates("s", &recorded.drive, 40, 2048, 32);
+    let mut takes = Duration::MAX;
+    let mut whole = None;
+    for _ in 0..4 {
+        let begun = Instant::now();
+        whole = Some(client.predict(heavy.clone()).await.unwrap());
+        takes = takes.min(begun.elapsed());
+    }
+    let (whole, mut fewer) = (whole.unwrap(), heavy.clone());
+    fewer.samples_min = 32;
+    // Half of the time, on a machine whose pace varies: what matters is that an answer is the beginning of the whole.
+    let (mut answered, mut attempts) = (0, 0);
+    while answered < 2 {
+        attempts += 1;
+        assert!(attempts <= 20, "{answered} of 20 in time");
+        if let Ok(some) = client.predict_within(fewer.clone(), Some(takes / 2)).await {
+            assert!((32..2048).contains(&some.samples), "{} samples in half of {takes:?}", some.samples);
+            let same = some.states.iter().zip(&whole.states).all(|(a, b)| a.to_bits() == b.to_bits());
+            assert!(same && some.states.len() == some.samples * 32 * 12 && some.validity == whole.validity[..some.samples]);
+            answered += 1;
+        }
+    }
+    // With time enough all are computed, and without leave none is left out.
+    assert_eq!(client.predict_within(fewer.clone(), Some(Duration::from_secs(20))).await.unwrap().samples, 2048);
+    if let Ok(all) = client.predict_within(heavy, Some(takes / 2)).await {
+        assert_eq!(all.samples, 2048);
+    }
+    fewer.samples_min = 2049;
+    assert_refused("more than all", client.predict(fewer).await, Code::InvalidArgument, "samples_min");
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn service_vehicles_share_the_time_evenly() {
     let recorded = recorded();
     let (server, mut client) = start_with(|config| config.limits.waiting_predictions_per_vehicle_max = 20).await;

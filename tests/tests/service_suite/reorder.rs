@@ -52,6 +52,7 @@ fn shown(recorded: &Recorded, arrivals: &[Measurement]) -> (String, u64, Vec<&'s
         instant: None,
         use_history: true,
         samples: 1,
+        samples_min: 0,
         horizon: 16,
         extras: PredictExtras::default(),
         controls: Candidates::Given(candidates("truck", &recorded.drive, 60, 1, 16).controls),

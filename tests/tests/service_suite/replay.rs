@@ -41,6 +41,7 @@ fn property_replayed_commands_give_the_same_bytes() {
                 instant: None,
                 use_history: true,
                 samples: 3,
+                samples_min: 0,
                 horizon: 8,
                 controls: Candidates::Given(candidates.controls.clone()),
                 cost: None,
@@ -53,6 +54,7 @@ fn property_replayed_commands_give_the_same_bytes() {
                 instant: None,
                 use_history: true,
                 samples: 5,
+                samples_min: 0,
                 horizon: 8,
                 controls: Candidates::Drawn(Drawing {
                     nominal: candidates.controls[..16].to_vec(),

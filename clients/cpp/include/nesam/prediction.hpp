@@ -85,6 +85,8 @@ struct PredictRequest {
   bool wheel_sinkage = false;
   /// Copied to the reply; for the caller's own use.
   std::uint64_t tag = 0;
+  /// Fewest samples that are of use when the timeout is near, 0 = all or nothing; `Prediction::samples` says how many were computed.
+  std::uint32_t samples_min = 0;
   /// Lets the service draw the candidates: 8 K bytes on the wire instead of 8 N K.
   std::optional<CandidateDrawing> drawing;
   /// Lets the service say what each candidate is worth and return the best only: 4 N bytes and 48 K for each of them instead of 48 N K.
@@ -114,6 +116,7 @@ class Prediction {
   std::size_t channel_count() const noexcept;
 
   std::uint64_t tag = 0;
+  /// Candidates that were computed.
   std::size_t samples = 0;
   std::size_t steps = 0;
   /// Channels returned, a sum of `bit(Channel)`.

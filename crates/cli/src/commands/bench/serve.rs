@@ -30,6 +30,9 @@ pub(super) struct ServeBench {
     /// Candidate command sequences per query
     #[arg(long, default_value_t = 128)]
     samples: usize,
+    /// Fewest of them that are of use: the server then answers with fewer when time is short [default: all or nothing]
+    #[arg(long, value_name = "SAMPLES", default_value_t = 0)]
+    samples_min: usize,
     /// Steps per rollout
     #[arg(long, value_name = "STEPS", default_value_t = 32)]
     horizon: usize,
@@ -60,6 +63,8 @@ const DRIVEN: i64 = 40;
 struct Tally {
     /// Latencies of answers in time, of refusals and of the rest, ms.
     good_ms: Vec<f64>,
+    /// Samples of the answers in time.
+    samples: usize,
     refused_ms: Vec<f64>,
     late: usize,
     measured_ms: Vec<f64>,
@@ -98,10 +103,11 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     );
     say!("capacity: {capacity_hz:.1} answers/s to {ASKERS} askers");
     say!(
-        "{:>6} {:>9} {:>11} {:>9} {:>7} {:>14} {:>15} {:>18}",
+        "{:>6} {:>9} {:>11} {:>12} {:>9} {:>7} {:>14} {:>15} {:>18}",
         "load",
         "asked/s",
         "in time/s",
+        "samples each",
         "refused/s",
         "late/s",
         "p99 in time ms",
@@ -120,7 +126,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.bench.serve/1",
-        "samples": args.samples, "horizon": args.horizon, "vehicles": args.vehicles, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
+        "samples": args.samples, "samples_min": args.samples_min, "horizon": args.horizon, "vehicles": args.vehicles, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
         "capacity_hz": capacity_hz, "loads": rows, "goodput_share_of_peak": last / peak.max(f64::MIN_POSITIVE),
         "command": command_line(), "bundle": bundle.name, "bundle_hash": bundle.hash,
     });
@@ -142,7 +148,7 @@ fn question(args: &ServeBench, vehicle: usize) -> Candidates {
         let second = 0.4 * n as f32 / args.samples as f32 - 0.2;
         std::iter::repeat_n([2.0, second], args.horizon).flatten()
     });
-    Candidates::new(&name(vehicle), args.samples, args.horizon, controls.collect())
+    Candidates { samples_min: args.samples_min, ..Candidates::new(&name(vehicle), args.samples, args.horizon, controls.collect()) }
 }
 
 /// Answers per second to askers who each wait for an answer before they ask again.
@@ -194,7 +200,10 @@ async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Ta
             let took_ms = sent.elapsed().as_secs_f64() * 1e3;
             let Ok(mut tally) = tally.lock() else { return };
             match outcome {
-                Ok(Ok(_)) if sent.elapsed() <= deadline => tally.good_ms.push(took_ms),
+                Ok(Ok(prediction)) if sent.elapsed() <= deadline => {
+                    tally.good_ms.push(took_ms);
+                    tally.samples += prediction.samples;
+                }
                 Ok(Err(error)) if error.retry_after().is_some() => tally.refused_ms.push(took_ms),
                 _ => tally.late += 1,
             }
@@ -230,10 +239,14 @@ fn row(load: f64, seconds: f64, tally: &mut Tally) -> Value {
     let asked = tally.good_ms.len() + tally.refused_ms.len() + tally.late;
     let (good, refused, late) = (rate(tally.good_ms.len()), rate(tally.refused_ms.len()), rate(tally.late));
     let (good_ms, refused_ms, measured_ms) = (p99(&mut tally.good_ms), p99(&mut tally.refused_ms), p99(&mut tally.measured_ms));
-    say!("{load:>6.2} {:>9.1} {good:>11.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refused_ms:>15.2} {measured_ms:>18.1}", rate(asked));
+    let samples = tally.samples as f64 / tally.good_ms.len() as f64;
+    say!(
+        "{load:>6.2} {:>9.1} {good:>11.1} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refused_ms:>15.2} {measured_ms:>18.1}",
+        rate(asked)
+    );
     let refused_p50_ms = if tally.refused_ms.is_empty() { f64::NAN } else { percentile(&mut tally.refused_ms, 0.5) };
     json!({
-        "load": load, "asked_hz": rate(asked), "in_time_hz": good, "refused_hz": refused, "late_hz": late,
+        "load": load, "asked_hz": rate(asked), "in_time_hz": good, "samples_mean": samples, "refused_hz": refused, "late_hz": late,
         "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "measurement_p99_ms": measured_ms,
         "measurements": tally.measured_ms.len(), "measurements_refused": tally.measurements_refused,
     })
