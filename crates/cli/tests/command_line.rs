@@ -214,6 +214,33 @@ fn tiny_bundle() -> &'static Path {
     bundle
 }
 
+/// Goal: a run that starts from a bundle goes on with its vehicle and scales, and says whose child it is. Method: two steps from the bundle of two steps.
+#[test]
+fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
+    let here = tempfile::tempdir().unwrap();
+    let root = sample().display().to_string();
+    copy_folder(tiny_bundle(), &here.path().join("start"));
+    let tiny = ["--epochs", "1", "--batches", "2", "--batch-size", "4", "--from", "start", "--out", "made"];
+    let run = |more: &'static [&'static str]| [&["train", "--data", root.as_str(), "--set", "nominal"], &tiny[..], more].concat();
+    let trained = nesam(&run(&["--sustained=0.2"]), here.path());
+    assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
+    let text = |bundle: &str, file: &str| std::fs::read_to_string(here.path().join(bundle).join(file)).unwrap();
+    assert_eq!(text("made/bundle", "normalization.toml"), text("start", "normalization.toml"));
+    // What was calibrated, to the last bit but one that reading decimals may cost.
+    let limit = |bundle: &str| {
+        serde_json::from_str::<Value>(&text(bundle, "vehicle.json")).unwrap()["driveline"]["overspeed_limit_m_s"].as_f64().unwrap()
+    };
+    assert!((limit("made/bundle") / limit("start") - 1.0).abs() < 1e-14);
+    let manifest = text("made/bundle", "manifest.toml");
+    let inspected = nesam(&["inspect", "start"], here.path());
+    let parent = manifest.lines().find_map(|line| line.strip_prefix("parent = \"")).unwrap();
+    assert!(stdout(&inspected).contains(&parent[..12]), "{parent} is not in {}", stdout(&inspected));
+    let weights = |bundle: &str| std::fs::read(here.path().join(bundle).join("weights.safetensors")).unwrap();
+    assert_ne!(weights("made/bundle"), weights("start"));
+    refused(&run(&["--model", "transformer"]), here.path(), &["--from start", "not a transformer"]);
+    refused(&run(&["--sustained=-1"]), here.path(), &["--sustained"]);
+}
+
 /// Goal: train → inspect → predict → evaluate hold together, and a damaged bundle is refused by name. Method: a bundle of two training
 /// steps (its errors mean nothing), then one flipped byte.
 #[test]
