@@ -128,13 +128,13 @@ async fn service_fewer_samples_in_time_rather_than_none() {
     }
     let (whole, mut fewer) = (whole.unwrap(), heavy.clone());
     fewer.samples_min = 32;
-    // Half of the time, on a machine whose pace varies: what matters is that an answer is the beginning of the whole.
+    // A third of the time, on a machine whose pace varies: what matters is that an answer is the beginning of the whole.
     let (mut answered, mut attempts) = (0, 0);
     while answered < 2 {
         attempts += 1;
         assert!(attempts <= 20, "{answered} of 20 in time");
-        if let Ok(some) = client.predict_within(fewer.clone(), Some(takes / 2)).await {
-            assert!((32..2048).contains(&some.samples), "{} samples in half of {takes:?}", some.samples);
+        if let Ok(some) = client.predict_within(fewer.clone(), Some(takes / 3)).await {
+            assert!((32..2048).contains(&some.samples), "{} samples in a third of {takes:?}", some.samples);
             let same = some.states.iter().zip(&whole.states).all(|(a, b)| a.to_bits() == b.to_bits());
             assert!(same && some.states.len() == some.samples * 32 * 12 && some.validity == whole.validity[..some.samples]);
             answered += 1;
@@ -142,7 +142,7 @@ async fn service_fewer_samples_in_time_rather_than_none() {
     }
     // With time enough all are computed, and without leave none is left out.
     assert_eq!(client.predict_within(fewer.clone(), Some(Duration::from_secs(20))).await.unwrap().samples, 2048);
-    if let Ok(all) = client.predict_within(heavy, Some(takes / 2)).await {
+    if let Ok(all) = client.predict_within(heavy, Some(takes / 3)).await {
         assert_eq!(all.samples, 2048);
     }
     fewer.samples_min = 2049;
