@@ -239,6 +239,15 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     assert_ne!(weights("made/bundle"), weights("start"));
     refused(&run(&["--model", "transformer"]), here.path(), &["--from start", "not a transformer"]);
     refused(&run(&["--sustained=-1"]), here.path(), &["--sustained"]);
+    refused(&run(&["--dt", "0.2"]), here.path(), &["--from start", "0.1 s", "0.2 s"]);
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), root.path());
+    let card = root.path().join("vehicle_hmmwv.json");
+    std::fs::write(&card, std::fs::read_to_string(&card).unwrap().replace("HMMWV (", "Another (")).unwrap();
+    let elsewhere = root.path().display().to_string();
+    let other = ["train", "--data", &elsewhere, "--set", "nominal", "--from", "start"];
+    refused(&other, here.path(), &["--from", "HMMWV", "Another"]);
+    refused(&["train", "--model", "transformer", "--sustained=0.2"], here.path(), &["--sustained", "transformer"]);
 }
 
 /// Goal: train → inspect → predict → evaluate hold together, and a damaged bundle is refused by name. Method: a bundle of two training

@@ -13,7 +13,7 @@ use nesam_model::{ModelBundle, Variant};
 use crate::args::{DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
 use crate::progress::Progress;
-use crate::sources::read_drives;
+use crate::sources::{load_bundle, read_drives};
 
 /// Options of `nesam train`.
 #[derive(Args, Debug)]
@@ -162,9 +162,18 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if !(0.0..100.0).contains(&args.sustained) {
         return Err(Failure::input(format!("--sustained {} is not in 0..100", args.sustained)));
     }
-    let start = args.from.as_deref().map(|dir| start_of(dir, variant)).transpose()?;
+    if args.sustained > 0.0 && variant.is_end_to_end() {
+        return Err(Failure::input(format!("--sustained is for models whose physics carries what lasts; {} has none", args.model)));
+    }
+    let start = args.from.as_deref().map(|dir| start_of(dir, variant, args.data.dt)).transpose()?;
     own_threads()?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
+    if let (Some(bundle), given) = (&start, drives.root.vehicle()) {
+        let own = &bundle.vehicle;
+        if own.second != given.second || own.name != given.name {
+            return Err(Failure::input(format!("--from: bundle {} is of `{}`, the data of `{}`", bundle.name, own.name, given.name)));
+        }
+    }
     let hash = drives.root.hash();
     let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, args.horizon).or_input()?;
     let name = args.name.clone().unwrap_or_else(|| {
@@ -212,10 +221,13 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
 }
 
 /// The bundle that a run starts from.
-fn start_of(dir: &Path, variant: Variant) -> Result<ModelBundle, Failure> {
-    let bundle = ModelBundle::load(dir).or_input()?;
+fn start_of(dir: &Path, variant: Variant, dt_s: f64) -> Result<ModelBundle, Failure> {
+    let bundle = load_bundle(Some(dir))?;
     if bundle.form != variant {
         return Err(Failure::input(format!("--from {}: it is a {}, not a {}", dir.display(), bundle.form.as_str(), variant.as_str())));
+    }
+    if (bundle.normalization.dt_s - dt_s).abs() > 1e-9 {
+        return Err(Failure::input(format!("--from {}: it steps by {} s, --dt is {dt_s} s", dir.display(), bundle.normalization.dt_s)));
     }
     if !bundle.effects.is_empty() {
         return Err(Failure::input(format!("--from {}: it carries effects; start from the bundle that they were added to", dir.display())));

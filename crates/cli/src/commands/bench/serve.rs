@@ -63,12 +63,12 @@ const DRIVEN: i64 = 40;
 struct Tally {
     /// Latencies of answers in time, of refusals and of the rest, ms.
     good_ms: Vec<f64>,
-    /// Samples of the answers in time.
-    samples: usize,
     refused_ms: Vec<f64>,
     late: usize,
     measured_ms: Vec<f64>,
     measurements_refused: usize,
+    /// Samples of the answers in time.
+    samples: usize,
 }
 
 /// Runs the command.
