@@ -1,5 +1,6 @@
 //! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
 
+mod cluster;
 mod store;
 mod tls;
 
@@ -11,6 +12,7 @@ use figment::providers::{Format, Serialized, Toml};
 use nesam_engine::{FleetSoilSettings, Limits, check_name};
 use serde::{Deserialize, Serialize};
 
+pub use self::cluster::ClusterConfig;
 pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
 use crate::error::ServerError;
@@ -35,6 +37,8 @@ pub struct Config {
     pub recording: RecordingConfig,
     /// Durable sessions.
     pub store: StoreConfig,
+    /// Servers that share sessions.
+    pub cluster: ClusterConfig,
 }
 
 /// gRPC.
@@ -69,6 +73,8 @@ pub struct HttpConfig {
     pub enabled: bool,
     /// Address to listen on; port 0 takes a free one.
     pub listen: SocketAddr,
+    /// Address for `/health` alone, which tells nothing of vehicles and so may be open to a proxy or an orchestrator where the rest may not; empty = none.
+    pub health: String,
     /// Most live pages open at a time.
     pub watchers_max: usize,
     /// Folder with reports of `nesam diagnose --json` that the live page shows; empty = none.
@@ -212,7 +218,7 @@ impl Default for GrpcConfig {
 
 impl Default for HttpConfig {
     fn default() -> Self {
-        Self { enabled: true, listen: loopback(50080), watchers_max: 8, reports: PathBuf::new() }
+        Self { enabled: true, listen: loopback(50080), health: String::new(), watchers_max: 8, reports: PathBuf::new() }
     }
 }
 
@@ -323,6 +329,20 @@ impl From<&LimitsConfig> for Limits {
     }
 }
 
+impl HttpConfig {
+    /// Where `/health` is served by itself; `None` = nowhere.
+    ///
+    /// # Errors
+    /// `ServerError::Value` for something that is no address.
+    pub fn health_address(&self) -> Result<Option<SocketAddr>, ServerError> {
+        let wrong = |error| ServerError::Value {
+            key: "http.health",
+            reason: format!("`{}`: {error}; expected for instance 0.0.0.0:50081", self.health),
+        };
+        Some(&self.health).filter(|text| !text.is_empty()).map(|text| text.parse().map_err(wrong)).transpose()
+    }
+}
+
 impl ZenohConfig {
     /// Whether an endpoint needs certificates.
     pub fn uses_tls(&self) -> bool {
@@ -413,7 +433,13 @@ impl Config {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
         }
+        self.http.health_address()?;
         self.tls.check()?;
+        self.cluster.check()?;
+        if self.cluster.enabled() && self.store.enabled {
+            let reason = "is on, but with `cluster.etcd` sessions are kept in etcd; choose one".into();
+            return Err(ServerError::Value { key: "store.enabled", reason });
+        }
         if self.zenoh.uses_tls() && !self.tls.restricts() {
             let reason = "has an endpoint `tls/...`, which needs certificates for both sides: set `tls.client_ca`".into();
             return Err(ServerError::Value { key: "zenoh", reason });
@@ -506,6 +532,13 @@ mod tests {
                 "[tls]\ncertificate = \"c\"\nkey = \"k\"\nclient_ca = \"a\"\nfleet = \"f\"\n[zenoh]\nlisten = [\"tcp/0.0.0.0:7447\"]\n",
                 "zenoh.listen",
             ),
+            ("[http]\nhealth = \"everywhere\"\n", "http.health"),
+            ("[cluster]\netcd = [\"etcd:2379\"]\n", "cluster.etcd"),
+            ("[cluster]\netcd = [\"https://e:2379\"]\n", "cluster.authority"),
+            ("[cluster]\netcd = [\"http://e:2379\"]\nlease_s = 0\n", "cluster.lease_s"),
+            ("[cluster]\netcd = [\"http://e:2379\"]\nkey = \"k\"\n", "cluster.key"),
+            ("[cluster]\netcd = [\"http://e:2379\"]\nprefix = \"a/\"\n", "cluster.prefix"),
+            ("[cluster]\netcd = [\"http://e:2379\"]\n[store]\nenabled = true\n", "store.enabled"),
             ("not toml", "default.toml"),
         ] {
             let path = dir.join("default.toml");

@@ -11,6 +11,7 @@ use axum::{Json, Router};
 use serde_json::json;
 
 use crate::clock::MonotonicClock;
+use crate::cluster::{Cluster, ClusterCounts};
 use crate::grpc::Edge;
 use crate::recording::Recorder;
 use crate::store::StoreCounts;
@@ -35,6 +36,11 @@ pub(crate) fn router(state: HttpState) -> Router {
         .route("/health", get(health))
         .merge(crate::web::routes())
         .with_state(state)
+}
+
+/// `/health` alone.
+pub(crate) fn health_router(edge: Edge) -> Router {
+    Router::new().route("/health", get(async move || health_of(&edge)))
 }
 
 async fn metrics(State(state): State<HttpState>) -> Response {
@@ -62,6 +68,9 @@ async fn metrics(State(state): State<HttpState>) -> Response {
     if let Some(keeper) = &state.edge.keeper {
         text += &store_metrics(&keeper.counts());
     }
+    // A server that is alone owns whatever it has.
+    let alone = ClusterCounts { leased: true, ..Default::default() };
+    text += &cluster_metrics(&state.edge.cluster.as_ref().map_or(alone, Cluster::counts));
     if let Some(presence) = &state.edge.presence {
         text += &format!(
             "# HELP nesam_vehicles_alive Vehicles whose Zenoh liveliness token is there.\n# TYPE nesam_vehicles_alive gauge\nnesam_vehicles_alive {}\n",
@@ -86,8 +95,29 @@ fn store_metrics(counts: &StoreCounts) -> String {
     .concat()
 }
 
+fn cluster_metrics(counts: &ClusterCounts) -> String {
+    let ClusterCounts { held, taken, handed_over, lost, leased } = *counts;
+    [
+        ("sessions", "gauge", "Sessions whose owner this server is.", held as u64),
+        ("taken_total", "counter", "Sessions that came from another server.", taken),
+        ("handed_over_total", "counter", "Sessions that another server asked for.", handed_over),
+        ("lost_total", "counter", "Sessions lost with the lease or to another server.", lost),
+        ("leased", "gauge", "Whether this server may answer for its sessions: 1 while etcd hears it.", u64::from(leased)),
+    ]
+    .map(|(name, kind, help, value)| {
+        format!("# HELP nesam_cluster_{name} {help}\n# TYPE nesam_cluster_{name} {kind}\nnesam_cluster_{name} {value}\n")
+    })
+    .concat()
+}
+
 async fn health(State(state): State<HttpState>) -> StatusCode {
-    if *state.edge.stopping.borrow() { StatusCode::SERVICE_UNAVAILABLE } else { StatusCode::OK }
+    health_of(&state.edge)
+}
+
+/// Whether requests should come here: not while the server stops, and not without a lease.
+fn health_of(edge: &Edge) -> StatusCode {
+    let leased = edge.cluster.as_ref().is_none_or(|cluster| cluster.counts().leased);
+    if *edge.stopping.borrow() || !leased { StatusCode::SERVICE_UNAVAILABLE } else { StatusCode::OK }
 }
 
 async fn status(State(state): State<HttpState>) -> Response {

@@ -8,6 +8,7 @@
 pub mod access;
 pub mod call;
 mod clock;
+mod cluster;
 mod config;
 pub mod convert;
 mod error;
@@ -24,8 +25,8 @@ mod zenoh;
 
 pub use clock::MonotonicClock;
 pub use config::{
-    Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, ZenohConfig, ZenohMode,
-    is_tls_endpoint,
+    ClusterConfig, Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, ZenohConfig,
+    ZenohMode, is_tls_endpoint,
 };
 pub use error::ServerError;
 pub use serve::{RunningServer, serve, termination};

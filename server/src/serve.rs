@@ -17,14 +17,15 @@ use tonic_health::server::HealthReporter;
 
 use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
-use crate::clock::MonotonicClock;
+use crate::clock::{MonotonicClock, unix_ns};
+use crate::cluster::Cluster;
 use crate::config::{Config, GrpcConfig};
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
-use crate::store::{Keeper, RedbStore, SessionStore as _, StoreError, restore};
+use crate::store::{EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
 use crate::tls_listener;
 use crate::web::{Feed, Live, Raised};
@@ -43,6 +44,8 @@ pub struct RunningServer {
     pub grpc_addr: SocketAddr,
     /// Address of HTTP, if it is enabled.
     pub http_addr: Option<SocketAddr>,
+    /// Address of `/health` alone, if there is one.
+    pub health_addr: Option<SocketAddr>,
     handle: EngineHandle,
     metrics: Arc<Metrics>,
     health: HealthReporter,
@@ -52,6 +55,7 @@ pub struct RunningServer {
     bus: Option<Bus>,
     recorder: Option<Arc<Recorder>>,
     keeper: Option<Arc<Keeper>>,
+    cluster: Option<Cluster>,
     live: Live,
     drain: Duration,
 }
@@ -75,12 +79,17 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         true => Some(listen(config.http.listen, "http.listen").await?),
         false => None,
     };
+    let health_listener = match config.http.health_address()? {
+        Some(address) => Some(listen(address, "http.health").await?),
+        None => None,
+    };
     let grpc_addr = local(&grpc_listener, config.grpc.listen);
     let http_addr = http_listener.as_ref().map(|listener| local(listener, config.http.listen));
 
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
     let metrics = Arc::new(Metrics::default());
-    let keeper = config.store.enabled.then(|| Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s))));
+    let keeper =
+        (config.store.enabled || config.cluster.enabled()).then(|| Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s))));
     let (live, passed) = Live::new(&config.http);
     let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone(), live.feed.clone());
     let unusable =
@@ -95,30 +104,39 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let clock = MonotonicClock::default();
     let (recorder, tap) = start_recording(&config, &predictor, clock)?;
     let handle = EngineHandle::spawn_tapped(engine, Arc::new(clock), tap);
-    if let Some(keeper) = &keeper
-        && let Err(source) = open_store(&config.store.directory, keeper, &handle).await
-    {
-        handle.stop();
-        return Err(ServerError::Store { source });
-    }
+    let engine =
+        EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()).shown_on(http_addr.map(|_| live.feed.clone()));
+    let cluster = match &keeper {
+        Some(keeper) => match open_store(&config, grpc_addr, keeper, &engine).await {
+            Ok(cluster) => cluster,
+            Err(error) => {
+                handle.stop();
+                return Err(error);
+            }
+        },
+        None => None,
+    };
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
-        engine: EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()).shown_on(http_addr.map(|_| live.feed.clone())),
+        engine,
         predictor,
         uploads: Arc::new(Semaphore::new(config.grpc.uploads_max)),
         config: Arc::new(config.grpc),
         events,
         stopping: stopping.clone(),
         presence: config.zenoh.enabled.then(Presence::default),
+        run: unix_ns().unsigned_abs(),
         keeper: keeper.clone(),
+        cluster: cluster.clone(),
+        runtime: tokio::runtime::Handle::current(),
         access,
     };
     let bus = match config.zenoh.enabled {
         true => match Bus::start(&config.zenoh, &config.tls, &edge).await {
             Ok(bus) => Some(bus),
             Err(error) => {
-                keeper.iter().for_each(|keeper| keeper.finish());
+                end_store(keeper, cluster).await;
                 handle.stop();
                 return Err(error);
             }
@@ -127,8 +145,13 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let http = http_listener.map(|listener| {
         live.start(&edge, clock, recorder.clone(), passed);
-        spawn_http(listener, HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() })
+        let state = HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() };
+        spawn_http(listener, http::router(state), stopping.clone())
     });
+    let health_addr = health_listener.as_ref().and_then(|listener| listener.local_addr().ok());
+    if let Some(listener) = health_listener {
+        spawn_http(listener, http::health_router(edge.clone()), stopping.clone());
+    }
     tokio::spawn(expire_sessions(edge.clone()));
     let health = HealthReporter::new();
     report(&health, ServingStatus::Serving).await;
@@ -139,12 +162,26 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping);
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
-    Ok(RunningServer { grpc_addr, http_addr, handle, metrics, health, stop, grpc, http, bus, recorder, keeper, live, drain })
+    Ok(RunningServer {
+        grpc_addr,
+        http_addr,
+        health_addr,
+        handle,
+        metrics,
+        health,
+        stop,
+        grpc,
+        http,
+        bus,
+        recorder,
+        keeper,
+        cluster,
+        live,
+        drain,
+    })
 }
 
-fn spawn_http(listener: TcpListener, state: HttpState) -> JoinHandle<()> {
-    let stopping = state.edge.stopping.clone();
-    let router = http::router(state);
+fn spawn_http(listener: TcpListener, router: axum::Router, stopping: watch::Receiver<bool>) -> JoinHandle<()> {
     tokio::spawn(async move {
         if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
             tracing::error!(%error, "http ended");
@@ -194,8 +231,35 @@ fn event_sink(
     })
 }
 
-/// Opens the store, gives the engine what it holds and starts the keeper.
-async fn open_store(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle) -> Result<(), StoreError> {
+/// Opens the store that the configuration asks for, gives the engine what it holds and starts the keeper.
+async fn open_store(
+    config: &Config,
+    grpc_addr: SocketAddr,
+    keeper: &Arc<Keeper>,
+    engine: &EngineClient,
+) -> Result<Option<Cluster>, ServerError> {
+    if !config.cluster.enabled() {
+        let opened = open_folder(&config.store.directory, keeper, engine.handle()).await;
+        return opened.map(|()| None).map_err(|source| ServerError::Store { source });
+    }
+    let cluster = Cluster::start(&config.cluster, grpc_addr.to_string(), engine.clone(), keeper.clone()).await?;
+    let store = EtcdStore::new(cluster.clone(), tokio::runtime::Handle::current());
+    let started = keeper.start(Box::new(store), engine.handle().clone(), Restored::default());
+    started.map_err(|source| ServerError::Store { source })?;
+    Ok(Some(cluster))
+}
+
+/// Commits what is left, then lets the sessions go: others may have them from now on.
+async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) {
+    if let Some(keeper) = keeper {
+        let _ = tokio::task::spawn_blocking(move || keeper.finish()).await;
+    }
+    if let Some(cluster) = cluster {
+        cluster.stop().await;
+    }
+}
+
+async fn open_folder(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle) -> Result<(), StoreError> {
     let (folder, keeper, handle) = (folder.to_path_buf(), keeper.clone(), handle.clone());
     let opened = tokio::task::spawn_blocking(move || {
         let store = RedbStore::open(&folder)?;
@@ -301,11 +365,9 @@ impl RunningServer {
                 task.abort();
             }
         }
-        let (handle, recorder, keeper) = (self.handle, self.recorder, self.keeper);
+        end_store(self.keeper, self.cluster).await;
+        let (handle, recorder) = (self.handle, self.recorder);
         let _ = tokio::task::spawn_blocking(move || {
-            if let Some(keeper) = keeper {
-                keeper.finish();
-            }
             handle.stop();
             if let Some(recorder) = recorder {
                 recorder.join();

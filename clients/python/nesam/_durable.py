@@ -27,6 +27,8 @@ class DurableStream:
         self._stream = None
         # Each measurement with its place, None before it is answered by this run of the server.
         self._kept: Deque[Tuple[t.Measurement, Optional[int]]] = deque()
+        # Who counts the places.
+        self._run = 0
 
     def __enter__(self) -> "DurableStream":
         return self
@@ -54,7 +56,8 @@ class DurableStream:
             if any(place is None for _, place in self._kept):
                 self._deliver()
             try:
-                self._durable(self._client.session(self._session_id).durable_place)
+                session = self._client.session(self._session_id)
+                self._durable(session.run, session.durable_place)
             except NesamError as error:
                 if error.code not in _BROKEN:
                     raise
@@ -96,14 +99,22 @@ class DurableStream:
             answer = self._stream.send(measurement)
             if answer.code in (grpc.StatusCode.RESOURCE_EXHAUSTED.value[0], grpc.StatusCode.UNAVAILABLE.value[0]):
                 raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", answer.message)
+            self._counted_by(answer.run)
             self._kept[i] = (measurement, answer.place)
             answers.append(answer)
         # A place of 0 is that of a refused measurement, which nobody keeps.
-        self._durable(answers[-1].durable_place if answers else 0)
+        if answers:
+            self._durable(answers[-1].run, answers[-1].durable_place)
         return answers
 
-    def _durable(self, durable_place: int) -> None:
+    def _durable(self, run: int, durable_place: int) -> None:
+        self._counted_by(run)
         self._kept = deque((m, place) for m, place in self._kept if place is None or place > durable_place)
+
+    def _counted_by(self, run: int) -> None:
+        if run != self._run:
+            self._run = run
+            self._forget_places()
 
     def _forget_places(self) -> None:
         """Another run of the server may count otherwise."""

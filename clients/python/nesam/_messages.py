@@ -64,6 +64,7 @@ def answer(message: measurements_pb2.MeasurementAnswer) -> t.Answer:
         reordered=message.reordered,
         place=message.place,
         durable_place=message.durable_place,
+        run=message.run,
         code=getattr(detail, "code", 0),
     )
 
@@ -93,6 +94,7 @@ def session(message: sessions_pb2.Session) -> t.Session:
         vehicle_alive=message.vehicle_alive if message.HasField("vehicle_alive") else None,
         accepted=message.accepted,
         durable_place=message.durable_place,
+        run=message.run,
         effects=tuple(effect(effect) for effect in message.effects),
         effects_source=message.effects_source,
         alarm=alarm(message.alarm) if message.HasField("alarm") else None,

@@ -102,7 +102,8 @@ class Session:
     """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
 
     boot_id: start of the vehicle's software, None when it does not tell. vehicle_alive: whether the vehicle's Zenoh token is there, None without Zenoh.
-    accepted: measurements accepted so far; durable_place: how many of them survive a crash of the server, 0 where it keeps no store.
+    accepted: measurements accepted so far; durable_place: how many of them survive a crash of the server, 0 where it keeps no store; run: which server in
+    which run counts them.
     effects: those that were applied on top of the bundle's, effects_source: where they come from. alarm: the active one, None without.
     """
 
@@ -123,6 +124,7 @@ class Session:
     effects: Tuple[Effect, ...] = ()
     effects_source: str = ""
     alarm: Optional[Alarm] = None
+    run: int = 0
 
 
 @dataclass(frozen=True)
@@ -169,7 +171,7 @@ class Answer:
     did not. reordered: it arrived after a later one and was put in its place.
     field and message say what was wrong with a NOT_FINITE or REJECTED one, code is its gRPC number. soil: after this measurement, None when it was
     rejected. place: of the measurement among the accepted ones, 0 when it was refused; it survives a crash of the server as soon as a durable_place
-    reaches it, which is 0 where the server keeps no store.
+    reaches it, which is 0 where the server keeps no store. run: which server in which run counts; places of different runs say nothing of each other.
     """
 
     outcome: str
@@ -185,6 +187,7 @@ class Answer:
     place: int = 0
     durable_place: int = 0
     code: int = 0
+    run: int = 0
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ pub fn measurement(session: &str, stamp_ns: i64, state: [f64; 12], command: [f64
         command: Some(v1::Control { speed_m_s: command[0], second: command[1] }),
         wheels: None,
         boot_id: 0,
+        run: 0,
     }
 }
 

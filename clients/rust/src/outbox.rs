@@ -22,6 +22,8 @@ enum Progress {
 #[derive(Clone, Debug, Default)]
 pub struct Outbox {
     kept: VecDeque<(v1::Measurement, Progress)>,
+    /// Who counts the places.
+    run: u64,
 }
 
 impl Outbox {
@@ -40,6 +42,7 @@ impl Outbox {
     /// Takes the answer to the oldest measurement that was sent and not answered. A refused measurement is not kept, but for one that the service had no room
     /// for: that is sent again.
     pub fn answered(&mut self, answer: &v1::MeasurementAnswer) {
+        self.counted_by(answer.run);
         if let Some(at) = self.kept.iter().position(|(_, progress)| *progress == Progress::Sent) {
             match &answer.outcome {
                 Some(v1::measurement_answer::Outcome::Rejected(rejected))
@@ -51,12 +54,22 @@ impl Outbox {
                 _ => self.kept[at].1 = Progress::Received(answer.place),
             }
         }
-        self.durable(answer.durable_place);
+        self.durable(answer.run, answer.durable_place);
     }
 
-    /// Takes a `durable_place` that this run of the server has told, for example by `Sessions.Get`.
-    pub fn durable(&mut self, place: u64) {
+    /// Takes a `durable_place` and the `run` that told it, for example by `Sessions.Get`. Another run than the one that answered says nothing of its places:
+    /// what it answered is sent again.
+    pub fn durable(&mut self, run: u64, place: u64) {
+        self.counted_by(run);
         self.kept.retain(|(_, progress)| !matches!(progress, Progress::Received(received) if *received <= place));
+    }
+
+    fn counted_by(&mut self, run: u64) {
+        if run != self.run {
+            self.run = run;
+            let received = self.kept.iter_mut().filter(|(_, progress)| matches!(progress, Progress::Received(_)));
+            received.for_each(|(_, progress)| *progress = Progress::Unsent);
+        }
     }
 
     /// A new stream begins, to the same run of the server or another one: everything kept is sent again.
@@ -104,11 +117,27 @@ mod tests {
         outbox.reconnected();
         assert_eq!(sequences(&mut outbox), [2, 4]);
         // A number of another run of the server says nothing before the measurement is answered again.
-        outbox.durable(7);
+        outbox.durable(0, 7);
         assert_eq!(outbox.len(), 2);
         outbox.answered(&answer(7, 7));
         outbox.answered(&answer(8, 7));
-        outbox.durable(8);
+        outbox.durable(0, 8);
+        assert!(outbox.is_empty());
+    }
+
+    #[test]
+    fn analytic_places_of_another_run_say_nothing() {
+        let mut outbox = Outbox::default();
+        (1..=2).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        assert_eq!(sequences(&mut outbox), [1, 2]);
+        outbox.answered(&v1::MeasurementAnswer { run: 5, ..answer(1, 0) });
+        outbox.answered(&v1::MeasurementAnswer { run: 5, ..answer(2, 1) });
+        assert_eq!(outbox.len(), 1);
+        // Taken up by another server, which has more of somebody else.
+        outbox.durable(6, 9);
+        assert_eq!(sequences(&mut outbox), [2]);
+        outbox.answered(&v1::MeasurementAnswer { run: 6, ..answer(10, 9) });
+        outbox.durable(6, 10);
         assert!(outbox.is_empty());
     }
 }

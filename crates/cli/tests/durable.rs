@@ -74,7 +74,7 @@ impl Drive {
         let session = client.session("truck").await.unwrap();
         let controls = (0..20).flat_map(|k| [self.drive.controls[SENT + k].speed_m_s as f32, self.drive.controls[SENT + k].second as f32]);
         let prediction = client.predict(Candidates::new("truck", 1, 20, controls.collect())).await.unwrap();
-        (v1::Session { durable_place: 0, ..session }, prediction.states.iter().map(|v| v.to_bits()).collect())
+        (v1::Session { durable_place: 0, run: 0, ..session }, prediction.states.iter().map(|v| v.to_bits()).collect())
     }
 }
 
@@ -105,7 +105,8 @@ async fn send(client: &mut Client, outbox: &mut Outbox, stop: usize) -> u64 {
 /// Waits until everything in the outbox is durable.
 async fn settle(client: &mut Client, outbox: &mut Outbox) {
     for _ in 0..600 {
-        outbox.durable(client.session("truck").await.unwrap().durable_place);
+        let session = client.session("truck").await.unwrap();
+        outbox.durable(session.run, session.durable_place);
         if outbox.is_empty() {
             return;
         }

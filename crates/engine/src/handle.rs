@@ -183,18 +183,14 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap
     loop {
         match queue.next(|| clock.now_ns()) {
             Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
-                answer(&mut engine, submission, clock, &mut tap);
+                answer(&mut engine, submission, Ok(()), clock, &mut tap);
             }),
             Turn::Prediction(mut submission) => {
                 let left_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(clock.now_ns()));
-                let work = match &mut submission.command {
-                    Command::Predict(query) => {
-                        queue.fit(query, left_ns);
-                        work(query, query.samples)
-                    }
-                    _ => 1.0,
-                };
-                if let Some(busy_ns) = answer(&mut engine, *submission, clock, &mut tap) {
+                let Command::Predict(query) = &mut submission.command else { continue };
+                let fits = queue.fit(query, left_ns);
+                let work = work(query, query.samples);
+                if let Some(busy_ns) = answer(&mut engine, *submission, fits, clock, &mut tap) {
                     queue.learn(work, busy_ns);
                 }
             }
@@ -212,8 +208,14 @@ pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> R
         .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
 }
 
-/// Executes one submission and answers it; a recording hears of it last. Gives the time that it took if it was not refused.
-fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock, tap: &mut Option<Tap>) -> Option<u64> {
+/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. Gives the time that it took if it was not refused.
+fn answer(
+    engine: &mut Engine,
+    submission: Submission,
+    fits: Result<(), EngineError>,
+    clock: &dyn Clock,
+    tap: &mut Option<Tap>,
+) -> Option<u64> {
     let Submission { command, deadline_ns, abandoned, reply, submitted_ns, share: _ } = submission;
     let now_ns = clock.now_ns();
     let is_prediction = matches!(command, Command::Predict(_));
@@ -222,7 +224,7 @@ fn answer(engine: &mut Engine, submission: Submission, clock: &dyn Clock, tap: &
     } else if is_prediction && deadline_ns.is_some_and(|deadline| now_ns > deadline) {
         Err(EngineError::Expired)
     } else {
-        execute_guarded(engine, now_ns, &command)
+        fits.and_then(|()| execute_guarded(engine, now_ns, &command))
     };
     let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
     let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. })).map(|_| result.clone());

@@ -11,6 +11,10 @@ use crate::limits::Limits;
 use crate::query::PredictQuery;
 use crate::service_time::{ServiceTime, work};
 
+/// What an answer still needs after the engine: its way back, ns.
+const WAY_BACK_NS: u64 = 2_000_000;
+/// Share by which waiting and computing may take longer than expected: measurements come in between.
+const LONGER: f64 = 0.1;
 /// Shortest pause that a refused asker is told, ns.
 const RETRY_MIN_NS: u64 = 1_000_000;
 
@@ -97,17 +101,24 @@ impl Queue {
     }
 
     /// Leaves of the prediction whose turn it is what is expected to be done by its deadline, where fewer samples are of use.
-    pub fn fit(&self, query: &mut PredictQuery, left_ns: u64) {
-        if query.least() == query.samples {
-            return;
-        }
+    ///
+    /// # Errors
+    /// `EngineError::Overloaded` where it would be late all the same and others wait, who may not be.
+    pub fn fit(&self, query: &mut PredictQuery, left_ns: u64) -> Result<(), EngineError> {
         let mut lanes = self.lock();
-        let affordable = lanes.service_time.affordable(query, left_ns);
-        query.keep_first(affordable);
-        let expected_ns = lanes.service_time.expected_ns(work(query, affordable));
+        if query.least() < query.samples {
+            let affordable = lanes.service_time.affordable(query, left_ns);
+            query.keep_first(affordable);
+        }
+        let expected_ns = lanes.service_time.expected_ns(work(query, query.samples));
         if let Some(running) = &mut lanes.running {
             running.expected_ns = expected_ns;
         }
+        let waiting = lanes.predictions.len();
+        if waiting > 0 && expected_ns > left_ns {
+            return Err(EngineError::Overloaded { kind: "predictions", waiting, retry_after_ns: expected_ns.max(RETRY_MIN_NS) });
+        }
+        Ok(())
     }
 
     /// Learns how long a prediction took.
@@ -138,7 +149,8 @@ impl Lanes {
         let of = |samples| {
             let expected_ns = self.service_time.expected_ns(work(query, samples));
             let wait_ns = running_ns + self.predictions.wait_ns(&share, expected_ns);
-            (expected_ns, wait_ns, now_ns.saturating_add(wait_ns).saturating_add(expected_ns))
+            let needed_ns = ((1.0 + LONGER) * (wait_ns + expected_ns) as f64) as u64 + WAY_BACK_NS;
+            (expected_ns, wait_ns, now_ns.saturating_add(needed_ns))
         };
         let all = of(query.samples);
         let late = |done_ns| submission.deadline_ns.is_some_and(|deadline_ns| done_ns > deadline_ns);

@@ -329,6 +329,11 @@ pub struct Measurement {
     /// 0 = not told. Another one than before begins a new history, keeps the soil, and ends the old start: its late measurements are TOO_OLD.
     #[prost(uint64, tag = "7")]
     pub boot_id: u64,
+    /// `MeasurementAnswer.run` of the answers so far; 0 = whatever it is. Where the session is at another run now, and so may lack what that one had not made
+    /// durable, the measurement is REJECTED with FAILED_PRECONDITION for `run`: send again what is not durable, in order. A stream of gRPC ends by itself then;
+    /// who sends over Zenoh learns it only so.
+    #[prost(uint64, tag = "8")]
+    pub run: u64,
 }
 /// Optional measurements of the wheels.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -372,6 +377,10 @@ pub struct MeasurementAnswer {
     /// keeps no store (`store.enabled`).
     #[prost(uint64, tag = "9")]
     pub durable_place: u64,
+    /// Which server in which run counts the places. Places and durable places of different runs say nothing of each other: when it changes, everything that
+    /// is not known to be durable is sent again.
+    #[prost(uint64, tag = "21")]
+    pub run: u64,
     #[prost(
         oneof = "measurement_answer::Outcome",
         tags = "10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20"
@@ -1933,6 +1942,9 @@ pub struct Session {
     /// The alarm that is active; absent when none is.
     #[prost(message, optional, tag = "17")]
     pub alarm: ::core::option::Option<Alarm>,
+    /// As `MeasurementAnswer.run`; where servers share sessions it is the epoch of the owner.
+    #[prost(uint64, tag = "18")]
+    pub run: u64,
 }
 /// The part of the vehicle card that a client needs to form valid commands.
 #[derive(Clone, PartialEq, ::prost::Message)]

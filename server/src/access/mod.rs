@@ -71,6 +71,16 @@ pub fn load(config: &TlsConfig) -> Result<(Option<Credentials>, Access), ServerE
     Ok((Some(credentials), access))
 }
 
+impl<'a> Wish<'a> {
+    /// The session that has to be open for it.
+    pub fn session(self) -> Option<&'a str> {
+        match self {
+            Self::ReadSession(session) | Self::ChangeSession(session) | Self::ApplyEffects(session) => Some(session),
+            Self::OpenSession { .. } | Self::ChangeMap(_) => None,
+        }
+    }
+}
+
 impl Access {
     /// Whether clients have identities.
     pub fn is_restricted(&self) -> bool {
@@ -117,7 +127,27 @@ impl Caller {
             // Without identities the engine says what is not there.
             _ => return Ok(None),
         };
-        let vehicle = self.vehicle_of(wish);
+        self.decide(fleet.as_ref(), identity, wish, self.vehicle_of(wish))
+    }
+
+    /// The same for a session of this vehicle that is not open here.
+    ///
+    /// # Errors
+    /// PERMISSION_DENIED.
+    pub fn may_with(&self, wish: Wish<'_>, vehicle: &str) -> Result<(), Status> {
+        match (self.access.rights(), &self.identity) {
+            (Some(fleet), Some(identity)) => self.decide(fleet.as_ref(), identity, wish, Some(vehicle.into())).map(drop),
+            _ => Ok(()),
+        }
+    }
+
+    fn decide(
+        &self,
+        fleet: &FleetFile,
+        identity: &Identity,
+        wish: Wish<'_>,
+        vehicle: Option<Arc<str>>,
+    ) -> Result<Option<Arc<str>>, Status> {
         let allowed = match (wish, &vehicle) {
             (Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session), None) => {
                 return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
@@ -147,12 +177,7 @@ impl Caller {
     }
 
     fn vehicle_of(&self, wish: Wish<'_>) -> Option<Arc<str>> {
-        match wish {
-            Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session) => {
-                self.access.directory.vehicle(session)
-            }
-            Wish::OpenSession { .. } | Wish::ChangeMap(_) => None,
-        }
+        wish.session().and_then(|session| self.access.directory.vehicle(session))
     }
 }
 

@@ -15,6 +15,7 @@ pub fn measurement_message(session: &str, measurement: &Measurement) -> pb::Meas
         session_id: session.into(),
         sequence: sequence.unwrap_or(0),
         boot_id: boot.unwrap_or(0),
+        run: 0,
         stamp_ns: *stamp_ns,
         state: Some(vehicle_state_message(state)),
         command: Some(control_message(command)),

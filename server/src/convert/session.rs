@@ -38,6 +38,7 @@ pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
         boot_id: view.boot,
         accepted: view.accepted,
         durable_place: 0,
+        run: 0,
         vehicle_alive: None,
         state: view.newest.as_ref().map(|step| vehicle_state_message(&step.state)),
         command: view.newest.as_ref().map(|step| control_message(&step.control)),

@@ -5,11 +5,13 @@ use nesam_proto::v1 as pb;
 use tokio::sync::mpsc;
 use tokio_stream::StreamExt as _;
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Code, Request, Response, Status, Streaming};
 
+use super::used::Used;
 use super::{Edge, ReplyStream, stopped};
 use crate::access::{Caller, Wish};
 use crate::call::{Pending, measured};
+use crate::cluster::moved;
 use crate::convert::{measurement, measurement_answer};
 use crate::telemetry::Transport;
 
@@ -22,7 +24,8 @@ type InFlight = (pb::Measurement, Result<Pending, Refused>);
 /// Why a measurement did not reach the engine.
 enum Refused {
     Invalid(EngineError),
-    NoRight(Status),
+    /// By the rights, or by where the session is.
+    Status(Status),
 }
 
 #[tonic::async_trait]
@@ -38,7 +41,7 @@ impl pb::measurements_server::Measurements for Service {
             let edge = edge.clone();
             async move {
                 match item {
-                    Ok(in_flight) => Ok(answer(&edge, in_flight).await),
+                    Ok(in_flight) => answer(&edge, in_flight).await,
                     Err(status) => Err(status),
                 }
             }
@@ -51,16 +54,22 @@ impl pb::measurements_server::Measurements for Service {
 async fn submit_all(edge: Edge, caller: Caller, mut inbound: Streaming<pb::Measurement>, sender: mpsc::Sender<Result<InFlight, Status>>) {
     let stop = stopped(edge.stopping.clone());
     tokio::pin!(stop);
+    let mut used = Used::of(&edge);
     loop {
         let item = tokio::select! {
             item = inbound.next() => item,
+            session = used.gone() => Some(Err(moved(&session))),
             () = &mut stop => Some(Err(Status::unavailable(EngineError::Stopped.to_string()))),
         };
         let Some(item) = item else { return };
-        let item = item.map(|message| {
-            let pending = submit(&edge, &caller, &message);
-            (message, pending)
-        });
+        let item = match item {
+            Ok(message) => match submit(&edge, &caller, &mut used, &message).await {
+                // It is to be sent again, to whoever has the session.
+                Err(Refused::Status(status)) if status.code() == Code::Unavailable => Err(status),
+                pending => Ok((message, pending)),
+            },
+            Err(status) => Err(status),
+        };
         let last = item.is_err();
         if sender.send(item).await.is_err() || last {
             return;
@@ -69,27 +78,31 @@ async fn submit_all(edge: Edge, caller: Caller, mut inbound: Streaming<pb::Measu
 }
 
 /// Puts one measurement into the queue. The engine looks once more whether the session belongs to the vehicle that the sender may feed.
-fn submit(edge: &Edge, caller: &Caller, message: &pb::Measurement) -> Result<Pending, Refused> {
+async fn submit(edge: &Edge, caller: &Caller, used: &mut Used, message: &pb::Measurement) -> Result<Pending, Refused> {
     let measurement = measurement(message).map_err(Refused::Invalid)?;
-    let vehicle = caller.may(Wish::ChangeSession(&message.session_id)).map_err(Refused::NoRight)?;
+    let vehicle = used.enter(edge, caller, Wish::ChangeSession(&message.session_id)).await.map_err(Refused::Status)?;
     let vehicle = vehicle.map(|vehicle| vehicle.to_string());
     let command = Command::Measure { session: message.session_id.clone(), vehicle, measurement };
+    edge.check_run(&message.session_id, message.run).map_err(Refused::Invalid)?;
     Ok(edge.engine.submit(command, edge.stream_budget()))
 }
 
-async fn answer(edge: &Edge, (message, pending): InFlight) -> pb::MeasurementAnswer {
+async fn answer(edge: &Edge, (message, pending): InFlight) -> Result<pb::MeasurementAnswer, Status> {
     let result = match pending {
         Ok(pending) => measured(pending.await),
         Err(Refused::Invalid(error)) => Err(error),
-        Err(Refused::NoRight(status)) => {
+        Err(Refused::Status(status)) => {
             edge.engine.metrics().measurement(Transport::Grpc, "rejected");
             let rejected = pb::Rejected { code: status.code().into(), field: "session_id".into(), message: status.message().into() };
             let (session_id, sequence, stamp_ns) = (message.session_id, message.sequence, message.stamp_ns);
             let outcome = Some(pb::measurement_answer::Outcome::Rejected(rejected));
-            return pb::MeasurementAnswer { session_id, sequence, stamp_ns, outcome, ..Default::default() };
+            return Ok(pb::MeasurementAnswer { session_id, sequence, stamp_ns, outcome, ..Default::default() });
         }
     };
+    if let (Some(_), Err(error @ EngineError::UnknownSession { .. })) = (&edge.cluster, &result) {
+        return Err(edge.status(error.clone()));
+    }
     edge.engine.metrics().measurement(Transport::Grpc, result.as_ref().map_or("rejected", |m| m.outcome.label()));
-    let durable_place = edge.durable_place(&message.session_id);
-    pb::MeasurementAnswer { durable_place, ..measurement_answer(&message, &message.session_id, result) }
+    let (run, durable_place) = edge.durable_place(&message.session_id);
+    Ok(pb::MeasurementAnswer { run, durable_place, ..measurement_answer(&message, &message.session_id, result) })
 }

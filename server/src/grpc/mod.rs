@@ -7,12 +7,13 @@ mod prediction;
 mod sessions;
 mod soil;
 mod terrain;
+mod used;
 
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Duration;
 
-use nesam_engine::Event;
+use nesam_engine::{EngineError, Event, SessionView, check_name};
 use nesam_model::Predictor;
 use nesam_proto::v1 as pb;
 use tokio::sync::{Semaphore, broadcast, watch};
@@ -20,9 +21,11 @@ use tokio_stream::Stream;
 use tonic::Status;
 use tonic::service::Routes;
 
-use crate::access::{Access, Wish};
+use crate::access::{Access, Caller, Wish};
 use crate::call::EngineClient;
+use crate::cluster::{Brought, Cluster, moved};
 use crate::config::GrpcConfig;
+use crate::convert::to_status;
 use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
 
@@ -45,8 +48,14 @@ pub(crate) struct Edge {
     pub uploads: Arc<Semaphore>,
     /// Vehicles in the Zenoh network; `None` without one.
     pub presence: Option<Presence>,
+    /// Tells this run of the server from others.
+    pub run: u64,
     /// The store's side; `None` without a store.
     pub keeper: Option<Arc<Keeper>>,
+    /// The servers that share sessions; `None` for a server that is alone.
+    pub cluster: Option<Cluster>,
+    /// For what a thread of the bus begins and does not wait for.
+    pub runtime: tokio::runtime::Handle,
     /// Who may do what.
     pub access: Access,
 }
@@ -57,17 +66,86 @@ impl Edge {
         deadline::budget(request.metadata(), Duration::from_secs_f64(self.config.deadline_s))
     }
 
-    /// Refuses a request whose sender has no right to it; gives the vehicle of the session that it is about.
+    /// Refuses a request whose sender has no right to it; gives the vehicle of the session that it is about. A session that another server has comes here.
     ///
     /// # Errors
-    /// UNAUTHENTICATED, PERMISSION_DENIED or NOT_FOUND.
-    pub fn allow<T>(&self, request: &tonic::Request<T>, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
-        self.access.caller(request).and_then(|caller| caller.may(wish))
+    /// UNAUTHENTICATED, PERMISSION_DENIED or NOT_FOUND; UNAVAILABLE when the session does not come.
+    pub async fn allow<T>(&self, request: &tonic::Request<T>, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
+        let caller = self.access.caller(request)?;
+        self.allow_caller(&caller, wish, self.budget(request)).await
     }
 
-    /// Accepted measurements of a session that are on stable storage; 0 without a store.
-    pub fn durable_place(&self, session: &str) -> u64 {
-        self.keeper.as_ref().map_or(0, |keeper| keeper.durable(session))
+    /// The same for one message of a stream.
+    ///
+    /// # Errors
+    /// As [`Edge::allow`].
+    pub async fn allow_caller(&self, caller: &Caller, wish: Wish<'_>, budget: Duration) -> Result<Option<Arc<str>>, Status> {
+        if let (Some(cluster), Some(session)) = (&self.cluster, wish.session())
+            && cluster.bring(session, budget, |vehicle| caller.may_with(wish, vehicle)).await? == Brought::Nowhere
+        {
+            return Err(to_status(EngineError::UnknownSession { session: session.into() }));
+        }
+        caller.may(wish)
+    }
+
+    /// A refusal of the engine as status. A session that was brought here and that the engine does not have any more has moved.
+    pub fn status(&self, error: EngineError) -> Status {
+        match (&self.cluster, error) {
+            (Some(_), EngineError::UnknownSession { session }) => moved(&session),
+            (_, error) => to_status(error),
+        }
+    }
+
+    /// Brings a map here that another server took, if there is such a map; an empty name is none.
+    ///
+    /// # Errors
+    /// What keeps it from coming; DEADLINE_EXCEEDED.
+    pub async fn bring_map(&self, map: &str, budget: Duration) -> Result<(), Status> {
+        let Some(cluster) = self.cluster.as_ref().filter(|_| !map.is_empty()) else { return Ok(()) };
+        tokio::time::timeout(budget, cluster.bring_map(map))
+            .await
+            .unwrap_or_else(|_| Err(Status::deadline_exceeded(format!("map `{map}` did not come from etcd in time"))))
+    }
+
+    /// Begins a session under a name that no server has yet.
+    ///
+    /// # Errors
+    /// What `begin` says; UNAVAILABLE when the name cannot be claimed.
+    pub async fn begin(
+        &self,
+        name: &str,
+        budget: Duration,
+        begin: impl Future<Output = Result<SessionView, EngineError>>,
+    ) -> Result<SessionView, Status> {
+        let Some(cluster) = &self.cluster else { return begin.await.map_err(to_status) };
+        check_name("session_id", name).map_err(to_status)?;
+        cluster.claim(name, budget).await?;
+        match begin.await {
+            Ok(view) => Ok(view),
+            Err(error) => {
+                cluster.unclaim(name).await;
+                Err(to_status(error))
+            }
+        }
+    }
+
+    /// Who counts the measurements of a session, and how many of them are on stable storage; 0 without a store.
+    pub fn durable_place(&self, session: &str) -> (u64, u64) {
+        let epoch = self.cluster.as_ref().map(|cluster| cluster.epoch(session).unwrap_or(0).unsigned_abs());
+        (epoch.unwrap_or(self.run), self.keeper.as_ref().map_or(0, |keeper| keeper.durable(session)))
+    }
+
+    /// Refuses a measurement that was meant for another run: what the sender has sent to that one may be missing here.
+    ///
+    /// # Errors
+    /// `EngineError::NotReady` for `run`.
+    pub fn check_run(&self, session: &str, meant: u64) -> Result<(), EngineError> {
+        let (run, _) = self.durable_place(session);
+        if meant == 0 || meant == run {
+            return Ok(());
+        }
+        let reason = format!("is {meant}, the session is at {run} now; first send again what was not durable");
+        Err(EngineError::NotReady { field: "run".into(), reason })
     }
 
     /// Resolves when the change that was just made is on stable storage, at once without a store.

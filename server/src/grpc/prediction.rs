@@ -5,11 +5,13 @@ use std::time::Duration;
 use nesam_engine::EngineError;
 use nesam_proto::v1 as pb;
 use tokio_stream::StreamExt as _;
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Code, Request, Response, Status, Streaming};
 
+use super::used::Used;
 use super::{Edge, ReplyStream, stopped};
 use crate::access::Wish;
-use crate::convert::{predict_error, predict_query, predict_reply, to_status};
+use crate::cluster::moved;
+use crate::convert::{predict_error, predict_query, predict_reply};
 use crate::telemetry::Transport;
 
 /// Answers planners.
@@ -33,9 +35,9 @@ pub(crate) async fn predict(edge: &Edge, request: &pb::PredictRequest, budget: D
 impl pb::prediction_server::Prediction for Service {
     async fn predict(&self, request: Request<pb::PredictRequest>) -> Result<Response<pb::PredictReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "predict");
-        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id)).await?;
         let budget = self.0.budget(&request);
-        predict(&self.0, request.get_ref(), budget).await.map(Response::new).map_err(to_status)
+        predict(&self.0, request.get_ref(), budget).await.map(Response::new).map_err(|error| self.0.status(error))
     }
 
     type PredictStreamStream = ReplyStream<pb::PredictStreamReply>;
@@ -48,15 +50,19 @@ impl pb::prediction_server::Prediction for Service {
         tokio::spawn(async move {
             let stop = stopped(edge.stopping.clone());
             tokio::pin!(stop);
+            let mut used = Used::of(&edge);
             loop {
                 let item = tokio::select! {
                     item = inbound.next() => item,
+                    session = used.gone() => Some(Err(moved(&session))),
                     () = &mut stop => Some(Err(Status::unavailable(EngineError::Stopped.to_string()))),
                     () = sender.closed() => None,
                 };
                 let reply = match item {
-                    Some(Ok(request)) => match caller.may(Wish::ReadSession(&request.session_id)) {
+                    Some(Ok(request)) => match used.enter(&edge, &caller, Wish::ReadSession(&request.session_id)).await {
                         Ok(_) => Ok(answer(&edge, &request).await),
+                        // The session has moved, and the planner is to come after it.
+                        Err(status) if status.code() == Code::Unavailable => Err(status),
                         Err(status) => Ok(refused(request.tag, &status)),
                     },
                     Some(Err(status)) => Err(status),
@@ -81,6 +87,7 @@ fn refused(tag: u64, status: &Status) -> pb::PredictStreamReply {
 async fn answer(edge: &Edge, request: &pb::PredictRequest) -> pb::PredictStreamReply {
     edge.engine.metrics().request(Transport::Grpc, "predict_stream");
     let outcome = match predict(edge, request, edge.stream_budget()).await {
+        Err(error @ EngineError::UnknownSession { .. }) if edge.cluster.is_some() => return refused(request.tag, &edge.status(error)),
         Ok(reply) => pb::predict_stream_reply::Outcome::Reply(reply),
         Err(error) => pb::predict_stream_reply::Outcome::Error(predict_error(request.tag, &error)),
     };

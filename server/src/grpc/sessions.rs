@@ -18,8 +18,8 @@ impl Edge {
     /// A session as message, with what the Zenoh network says of its vehicle.
     fn session(&self, view: &SessionView) -> pb::Session {
         let vehicle_alive = self.presence.as_ref().map(|presence| presence.is_alive(&view.vehicle));
-        let durable_place = self.durable_place(&view.session);
-        pb::Session { vehicle_alive, durable_place, ..session_view(view, &self.predictor.bundle().vehicle) }
+        let (run, durable_place) = self.durable_place(&view.session);
+        pb::Session { vehicle_alive, run, durable_place, ..session_view(view, &self.predictor.bundle().vehicle) }
     }
 
     /// Puts effects on a session; `None` takes them away.
@@ -32,11 +32,11 @@ impl Edge {
     ) -> Result<Response<pb::Session>, Status> {
         self.engine.metrics().request(Transport::Grpc, method);
         let budget = self.budget(request);
-        self.allow(request, Wish::ApplyEffects(session))?;
+        self.allow(request, Wish::ApplyEffects(session)).await?;
         if effects.as_ref().is_some_and(|given| given.effects.is_empty()) {
             return Err(to_status(EngineError::invalid("effects", "is empty; RevertEffects takes effects away")));
         }
-        let view = self.engine.set_effects(session, effects.unwrap_or_default(), budget).await.map_err(to_status)?;
+        let view = self.engine.set_effects(session, effects.unwrap_or_default(), budget).await.map_err(|error| self.status(error))?;
         let ids: Vec<&str> = view.effects.effects.iter().map(|e| e.id.as_str()).collect();
         tracing::info!(session, effects = ids.join(","), source = view.effects.source, "effects of a session changed");
         self.settled(Key::Session(view.session.clone()), budget).await?;
@@ -52,9 +52,11 @@ impl pb::sessions_server::Sessions for Service {
         self.0.engine.metrics().request(Transport::Grpc, "open");
         let budget = self.0.budget(&request);
         let pb::OpenSessionRequest { vehicle_id: vehicle, session_id: session, .. } = request.get_ref();
-        self.0.allow(&request, Wish::OpenSession { vehicle, session })?;
+        self.0.allow(&request, Wish::OpenSession { vehicle, session }).await?;
         let open = open_session(request.get_ref()).map_err(to_status)?;
-        let view = self.0.engine.open(open, budget).await.map_err(to_status)?;
+        let name = if session.is_empty() { vehicle } else { session };
+        self.0.bring_map(&open.map, budget).await?;
+        let view = self.0.begin(name, budget, self.0.engine.open(open, budget)).await?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session opened");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
@@ -62,8 +64,8 @@ impl pb::sessions_server::Sessions for Service {
 
     async fn get(&self, request: Request<pb::GetSessionRequest>) -> Result<Response<pb::Session>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "get");
-        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
-        let view = self.0.engine.get(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(to_status)?;
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id)).await?;
+        let view = self.0.engine.get(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(|error| self.0.status(error))?;
         Ok(Response::new(self.0.session(&view)))
     }
 
@@ -80,10 +82,10 @@ impl pb::sessions_server::Sessions for Service {
         let budget = self.0.budget(&request);
         let caller = self.0.access.caller(&request)?;
         let pb::ForkSessionRequest { session_id, new_session_id } = request.into_inner();
-        if let Some(vehicle) = caller.may(Wish::ChangeSession(&session_id))? {
+        if let Some(vehicle) = self.0.allow_caller(&caller, Wish::ChangeSession(&session_id), budget).await? {
             caller.may(Wish::OpenSession { vehicle: &vehicle, session: &new_session_id })?;
         }
-        let view = self.0.engine.fork(&session_id, &new_session_id, budget).await.map_err(to_status)?;
+        let view = self.0.begin(&new_session_id, budget, self.0.engine.fork(&session_id, &new_session_id, budget)).await?;
         tracing::info!(session = session_id, copy = view.session, "session copied");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
@@ -91,8 +93,9 @@ impl pb::sessions_server::Sessions for Service {
 
     async fn export(&self, request: Request<pb::ExportSessionRequest>) -> Result<Response<pb::ExportSessionReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "export");
-        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
-        let image = self.0.engine.export(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(to_status)?;
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id)).await?;
+        let image =
+            self.0.engine.export(&request.get_ref().session_id, self.0.budget(&request)).await.map_err(|error| self.0.status(error))?;
         Ok(Response::new(pb::ExportSessionReply { image: image_bytes(&image).into() }))
     }
 
@@ -104,7 +107,11 @@ impl pb::sessions_server::Sessions for Service {
         let image = session_image(&image).map_err(to_status)?;
         let name = if session_id.is_empty() { &image.session } else { &session_id };
         caller.may(Wish::OpenSession { vehicle: &image.vehicle, session: name })?;
-        let view = self.0.engine.import(image, &session_id, budget).await.map_err(to_status)?;
+        if let Some((map, _)) = &image.map {
+            self.0.bring_map(map, budget).await?;
+        }
+        let name = name.clone();
+        let view = self.0.begin(&name, budget, self.0.engine.import(image, &session_id, budget)).await?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session imported");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
@@ -122,7 +129,7 @@ impl pb::sessions_server::Sessions for Service {
 
     async fn watch_alarms(&self, request: Request<pb::WatchAlarmsRequest>) -> Result<Response<Self::WatchAlarmsStream>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "watch_alarms");
-        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
+        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id)).await?;
         let news = News {
             of_event: |session, event| match event {
                 Event::AlarmChanged { session: of, vehicle, alarm } if of == session => Some(alarm_message(session, &vehicle, &alarm)),
@@ -136,9 +143,9 @@ impl pb::sessions_server::Sessions for Service {
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "close");
         let budget = self.0.budget(&request);
-        self.0.allow(&request, Wish::ChangeSession(&request.get_ref().session_id))?;
+        self.0.allow(&request, Wish::ChangeSession(&request.get_ref().session_id)).await?;
         let session = request.into_inner().session_id;
-        self.0.engine.close(&session, budget).await.map_err(to_status)?;
+        self.0.engine.close(&session, budget).await.map_err(|error| self.0.status(error))?;
         tracing::info!(session, "session closed");
         self.0.settled(Key::Session(session), budget).await?;
         Ok(Response::new(pb::CloseSessionReply {}))

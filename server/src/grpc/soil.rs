@@ -20,7 +20,7 @@ impl pb::soil_server::Soil for Service {
     async fn watch(&self, request: Request<pb::WatchSoilRequest>) -> Result<Response<Self::WatchStream>, Status> {
         let edge = self.0.clone();
         edge.engine.metrics().request(Transport::Grpc, "watch_soil");
-        edge.allow(&request, Wish::ReadSession(&request.get_ref().session_id))?;
+        edge.allow(&request, Wish::ReadSession(&request.get_ref().session_id)).await?;
         let news = News {
             of_event: |session, event| match event {
                 Event::SoilChanged { session: changed, soil, .. } if changed == session => Some(soil_estimate(session, &soil)),

@@ -64,10 +64,11 @@ impl pb::terrain_server::Terrain for Service {
     async fn patch_tile(&self, request: Request<pb::PatchTileRequest>) -> Result<Response<pb::MapDescription>, Status> {
         let edge = &self.0;
         edge.engine.metrics().request(Transport::Grpc, "patch_tile");
-        edge.allow(&request, Wish::ChangeMap(&request.get_ref().map_id))?;
+        edge.allow(&request, Wish::ChangeMap(&request.get_ref().map_id)).await?;
         let budget = edge.budget(&request);
         let message = request.into_inner();
         let tile = message.tile.ok_or_else(|| to_status(EngineError::invalid("tile", "is missing")))?;
+        edge.bring_map(&message.map_id, budget).await?;
         let held = edge.engine.get_map(&message.map_id, budget).await.map_err(to_status)?;
         let base = message.base_version;
         if held.version() != base {
@@ -82,6 +83,7 @@ impl pb::terrain_server::Terrain for Service {
     async fn get(&self, request: Request<pb::GetMapRequest>) -> Result<Response<pb::MapDescription>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "get_map");
         self.0.access.caller(&request)?;
+        self.0.bring_map(&request.get_ref().map_id, self.0.budget(&request)).await?;
         let map = self.0.engine.get_map(&request.get_ref().map_id, self.0.budget(&request)).await.map_err(to_status)?;
         Ok(Response::new(description(&map)))
     }
@@ -96,8 +98,9 @@ impl pb::terrain_server::Terrain for Service {
     async fn delete(&self, request: Request<pb::DeleteMapRequest>) -> Result<Response<pb::DeleteMapReply>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "delete_map");
         let budget = self.0.budget(&request);
-        self.0.allow(&request, Wish::ChangeMap(&request.get_ref().map_id))?;
+        self.0.allow(&request, Wish::ChangeMap(&request.get_ref().map_id)).await?;
         let map = request.into_inner().map_id;
+        self.0.bring_map(&map, budget).await?;
         self.0.engine.delete_map(&map, budget).await.map_err(to_status)?;
         self.0.settled(Key::Map(map), budget).await?;
         Ok(Response::new(pb::DeleteMapReply {}))

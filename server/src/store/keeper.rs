@@ -1,6 +1,6 @@
 //! What is not on stable storage yet, and the thread that brings it there.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -56,6 +56,8 @@ struct State {
     durable: BTreeMap<String, u64>,
     /// Last opening or closing of sessions since their last commit: what was read before says nothing of the session of that name now.
     renamed: BTreeMap<String, u64>,
+    /// Sessions that are taken out of the engine without being closed: other servers have them.
+    gone: BTreeSet<String>,
     counts: StoreCounts,
     stopping: bool,
 }
@@ -95,6 +97,18 @@ impl Keeper {
             Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } => return,
         };
         let mut state = self.lock();
+        if let Key::Session(session) = &key
+            && state.gone.contains(session)
+        {
+            match event {
+                Event::SessionOpened { .. } => drop(state.gone.remove(session)),
+                Event::SessionClosed { .. } => {
+                    state.gone.remove(session);
+                    return;
+                }
+                _ => return,
+            }
+        }
         state.changes += 1;
         let (latest, due) = (state.changes, Instant::now() + wait);
         let entry = state.dirty.entry(key).or_insert(Dirty { first: latest, latest, due });
@@ -131,6 +145,31 @@ impl Keeper {
             }
         };
         tokio::time::timeout(budget, wait).await.is_ok()
+    }
+
+    /// Makes what waits for a commit due now.
+    pub fn hurry(&self, key: &Key) {
+        if let Some(dirty) = self.lock().dirty.get_mut(key) {
+            dirty.due = Instant::now();
+            self.changed.notify_one();
+        }
+    }
+
+    /// Forgets a session that goes to another server: that the engine will lose it is no closing.
+    pub fn forget(&self, session: &str) {
+        let mut state = self.lock();
+        state.changes += 1;
+        let latest = state.changes;
+        state.dirty.remove(&Key::Session(session.into()));
+        state.durable.remove(session);
+        // A commit that runs now says nothing of a session of that name that comes later.
+        state.renamed.insert(session.into(), latest);
+        state.gone.insert(session.into());
+    }
+
+    /// The engine did not have a forgotten session, or has lost it: from now on its name is like any other.
+    pub fn forgotten(&self, session: &str) {
+        self.lock().gone.remove(session);
     }
 
     /// Starts the thread. What was restored is durable already.
@@ -283,12 +322,14 @@ impl Work {
             });
         }
         let bytes = changes.iter().map(weight).sum();
-        self.store.commit(&changes).map_err(|error| error.to_string())?;
+        for foreign in self.store.commit(&changes).map_err(|error| error.to_string())? {
+            places.remove(&foreign);
+        }
         self.maps = maps;
         Ok((places, bytes))
     }
 
-    fn snapshot(&self, due: &BTreeMap<Key, u64>) -> Result<Snapshot, String> {
+    fn snapshot(&mut self, due: &BTreeMap<Key, u64>) -> Result<Snapshot, String> {
         let (mut sessions, mut maps) = (Vec::new(), Vec::new());
         for key in due.keys() {
             match key {
@@ -296,6 +337,7 @@ impl Work {
                 Key::Map(id) => maps.push(id.clone()),
             }
         }
+        self.store.begin(&sessions);
         match self.engine.call(Command::Snapshot { sessions, maps }) {
             Ok(Reply::Snapshot(snapshot)) => Ok(*snapshot),
             Ok(_) => Err("the engine answered with another reply; this is a bug".into()),

@@ -5,11 +5,14 @@
 //! ended, at the latest `store.interval_s` after its first change. What a commit held is DURABLE, what came after is RECEIVED: a client sends that again after
 //! a crash, and since a snapshot is everything that a session remembers, the estimate goes on bit for bit.
 //!
+//! Several servers share sessions through etcd, which knows whose each one is: see `cluster`.
+//!
 //! ```text
 //! engine ── Event ──► Keeper (what is dirty) ── Command::Snapshot ──► engine
 //!                        └── Change ──► SessionStore::commit (fsync) ──► durable places
 //! ```
 
+mod etcd;
 mod keeper;
 mod map_bytes;
 mod redb;
@@ -17,11 +20,13 @@ mod restore;
 
 use std::path::PathBuf;
 
+pub(crate) use self::etcd::EtcdStore;
 pub(crate) use self::keeper::{Keeper, Key, StoreCounts};
+pub(crate) use self::map_bytes::map_of;
 pub use self::redb::RedbStore;
-pub(crate) use self::restore::restore;
+pub(crate) use self::restore::{Restored, restore, resumed};
 
-/// Something that keeps sessions and maps on stable storage. One process owns a store at a time.
+/// Something that keeps sessions and maps on stable storage: [`RedbStore`] for one process, etcd for several.
 pub trait SessionStore: Send {
     /// Everything that is held.
     ///
@@ -29,11 +34,16 @@ pub trait SessionStore: Send {
     /// `StoreError` when it cannot be read.
     fn load(&self) -> Result<Contents, StoreError>;
 
-    /// Makes all changes or none. They are on stable storage when it returns: neither the end of the process nor that of the machine undoes them.
+    /// Called before the changes of these sessions are read from the engine. What is committed next was read after this, and a store of several servers
+    /// writes it only for a session that has stayed here since.
+    fn begin(&mut self, _sessions: &[String]) {}
+
+    /// Makes each change whole or not at all. They are on stable storage when it returns: neither the end of the process nor that of the machine undoes
+    /// them. Gives the sessions that belong to another server now: of those nothing was written.
     ///
     /// # Errors
-    /// `StoreError` when the changes were not made, or when it is not known whether they were.
-    fn commit(&mut self, changes: &[Change]) -> Result<(), StoreError>;
+    /// `StoreError` when changes were not made, or when it is not known whether they were; all may be made again.
+    fn commit(&mut self, changes: &[Change]) -> Result<Vec<String>, StoreError>;
 }
 
 /// What a store holds.

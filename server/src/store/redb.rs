@@ -93,7 +93,7 @@ impl SessionStore for RedbStore {
         Ok(contents)
     }
 
-    fn commit(&mut self, changes: &[Change]) -> Result<(), StoreError> {
+    fn commit(&mut self, changes: &[Change]) -> Result<Vec<String>, StoreError> {
         let mut transaction = self.database.begin_write().map_err(failed)?;
         transaction.set_durability(Durability::Immediate).map_err(failed)?;
         {
@@ -110,7 +110,8 @@ impl SessionStore for RedbStore {
                 }
             }
         }
-        transaction.commit().map_err(failed)
+        transaction.commit().map_err(failed)?;
+        Ok(Vec::new())
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nesam_engine::{Command, EngineError, EngineHandle};
+use nesam_engine::{Command, EngineError, EngineHandle, SessionImage};
 
 use super::map_bytes::map_of;
 use super::{Contents, StoreError, StoredSession};
@@ -41,13 +41,21 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle) -> Result<Rest
     Ok(restored)
 }
 
-fn import(stored: &StoredSession, maps: &BTreeMap<String, String>, engine: &EngineHandle) -> Result<u64, EngineError> {
+/// A stored session as it goes on where its vehicle is now: the time without a server counts as silence.
+///
+/// # Errors
+/// `EngineError` for bytes that are no session of this version.
+pub(crate) fn resumed(stored: &StoredSession) -> Result<SessionImage, EngineError> {
     let mut image = session_image(&stored.image)?;
-    // The session goes on where its vehicle is now: the time without a server counts as silence.
     let down_ns = unix_ns().saturating_sub(stored.saved_unix_ns).max(0);
     for age_ns in [&mut image.newest_age_ns, &mut image.step_age_ns].into_iter().flatten() {
         *age_ns = age_ns.saturating_add(down_ns);
     }
+    Ok(image)
+}
+
+fn import(stored: &StoredSession, maps: &BTreeMap<String, String>, engine: &EngineHandle) -> Result<u64, EngineError> {
+    let mut image = resumed(stored)?;
     // The map may have been patched since the session was saved; it drives on what is held.
     if let Some((id, hash)) = &mut image.map
         && let Some(held) = maps.get(id)

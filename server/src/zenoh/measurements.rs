@@ -8,17 +8,20 @@ use tokio::sync::mpsc;
 
 use super::{MEASUREMENT_BYTES_MAX, Outgoing, decode, encode, keys};
 use crate::call::measured;
+use crate::cluster::Brought;
 use crate::convert::{measurement, measurement_answer};
 use crate::grpc::Edge;
 use crate::telemetry::Transport;
 
 /// Where the answer to one measurement goes.
+#[derive(Clone)]
 struct ReturnPath {
     edge: Edge,
     sender: mpsc::Sender<Outgoing>,
     status_key: String,
     message: pb::Measurement,
     session: String,
+    vehicle: String,
 }
 
 /// Feeds every measurement of the fleet to the engine, in order of arrival.
@@ -44,8 +47,13 @@ fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &:
         status_key: keys::of_vehicle(fleet, vehicle, "status"),
         message,
         session: session.clone(),
+        vehicle: vehicle.into(),
     };
-    match undecodable.map_or_else(|| measurement(&path.message), Err) {
+    let measurement = match undecodable.map_or_else(|| measurement(&path.message), Err) {
+        Ok(_) if !path.is_ours() => return,
+        decoded => decoded.and_then(|measurement| edge.check_run(&session, path.message.run).map(|()| measurement)),
+    };
+    match measurement {
         Ok(measurement) => {
             let command = Command::Measure { session, vehicle: Some(vehicle.into()), measurement };
             edge.engine.handle().submit(edge.engine.submission(command, move |answer| path.answer(measured(answer))));
@@ -55,11 +63,31 @@ fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &:
 }
 
 impl ReturnPath {
+    /// Whether this server answers. Every server hears every measurement: the owner of the session takes it, the others pass over it, and where there is
+    /// no owner they race for the session; what was not answered meanwhile the vehicle sends again.
+    fn is_ours(&self) -> bool {
+        let Some(cluster) = &self.edge.cluster else { return true };
+        if cluster.is_here(&self.session).unwrap_or(false) {
+            return true;
+        }
+        if cluster.should_search(&self.session) {
+            let (cluster, path) = (cluster.clone(), self.clone());
+            self.edge.runtime.spawn(async move {
+                let own = |of: &str| if of == path.vehicle { Ok(()) } else { Err(tonic::Status::permission_denied("of another vehicle")) };
+                if let Ok(Brought::Nowhere) = cluster.bring_if_free(&path.session, path.edge.stream_budget(), own).await {
+                    let error = EngineError::UnknownSession { session: path.session.clone() };
+                    path.answer(Err(error));
+                }
+            });
+        }
+        false
+    }
+
     /// Counts and publishes the answer.
     fn answer(self, result: Result<MeasureAnswer, EngineError>) {
         self.edge.engine.metrics().measurement(Transport::Zenoh, result.as_ref().map_or("rejected", |m| m.outcome.label()));
-        let durable_place = self.edge.durable_place(&self.session);
-        let answer = pb::MeasurementAnswer { durable_place, ..measurement_answer(&self.message, &self.session, result) };
+        let (run, durable_place) = self.edge.durable_place(&self.session);
+        let answer = pb::MeasurementAnswer { run, durable_place, ..measurement_answer(&self.message, &self.session, result) };
         if self.sender.try_send((self.status_key, encode(&answer))).is_err() {
             self.edge.engine.metrics().measurement(Transport::Zenoh, "answer_dropped");
         }

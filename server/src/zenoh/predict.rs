@@ -4,6 +4,7 @@ use nesam_engine::EngineError;
 use nesam_proto::v1 as pb;
 
 use super::{decode, encode, keys};
+use crate::cluster::Brought;
 use crate::convert::predict_error;
 use crate::grpc::Edge;
 use crate::grpc::predict as answer;
@@ -28,6 +29,29 @@ fn foreign(edge: &Edge, session: &str, vehicle: &str) -> Option<EngineError> {
     ))
 }
 
+/// Why a session cannot be asked here.
+enum Absent {
+    Elsewhere,
+    Refused(EngineError),
+}
+
+/// Every server is asked; the one that has the session answers, and where there is none the first that gets it.
+async fn absent(edge: &Edge, session: &str, vehicle: &str) -> Option<Absent> {
+    let cluster = edge.cluster.as_ref()?;
+    if cluster.is_here(session).unwrap_or(false) {
+        return None;
+    }
+    if !cluster.should_search(session) {
+        return Some(Absent::Elsewhere);
+    }
+    let own = |of: &str| if of == vehicle { Ok(()) } else { Err(tonic::Status::permission_denied("of another vehicle")) };
+    match cluster.bring_if_free(session, edge.stream_budget(), own).await {
+        Ok(Brought::Here) => None,
+        Ok(Brought::Nowhere) => Some(Absent::Refused(EngineError::UnknownSession { session: session.into() })),
+        Err(_) => Some(Absent::Elsewhere),
+    }
+}
+
 async fn reply(edge: Edge, query: ::zenoh::query::Query) {
     let key = query.key_expr().clone();
     let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
@@ -38,9 +62,14 @@ async fn reply(edge: Edge, query: ::zenoh::query::Query) {
             if request.session_id.is_empty() {
                 request.session_id = keys::vehicle(key.as_str()).into();
             }
-            match foreign(&edge, &request.session_id, keys::vehicle(key.as_str())) {
-                Some(error) => Err((request.tag, error)),
-                None => answer(&edge, &request, edge.stream_budget()).await.map_err(|error| (request.tag, error)),
+            match absent(&edge, &request.session_id, keys::vehicle(key.as_str())).await {
+                // The server that has the session answers.
+                Some(Absent::Elsewhere) => return,
+                Some(Absent::Refused(error)) => Err((request.tag, error)),
+                None => match foreign(&edge, &request.session_id, keys::vehicle(key.as_str())) {
+                    Some(error) => Err((request.tag, error)),
+                    None => answer(&edge, &request, edge.stream_budget()).await.map_err(|error| (request.tag, error)),
+                },
             }
         }
         Err(error) => Err((0, error)),

@@ -72,6 +72,21 @@ async fn service_health_reflection_metrics_and_status() {
     server.shutdown().await;
 }
 
+/// A proxy asks for health where it must not read positions.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_health_has_an_address_of_its_own() {
+    let mut config = Config::ephemeral();
+    config.http.health = "127.0.0.1:0".into();
+    let server = serve(config, predictor()).await.unwrap();
+    let address = server.health_addr.unwrap();
+    assert_ne!(Some(address), server.http_addr);
+    assert_eq!(http_get(address, "/health").await.0, 200);
+    for closed in ["/", "/status", "/metrics", "/live"] {
+        assert_eq!(http_get(address, closed).await.0, 404, "{closed}");
+    }
+    server.shutdown().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn service_shutdown_ends_streams_and_frees_the_ports() {
     let recorded = recorded();

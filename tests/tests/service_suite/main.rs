@@ -23,6 +23,7 @@ mod replay;
 mod resets;
 mod routing;
 mod security;
+mod session_model;
 mod sessions;
 mod soil;
 mod stage;

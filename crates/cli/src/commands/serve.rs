@@ -54,8 +54,15 @@ pub struct ServeArgs {
     /// Keep sessions and maps in this folder, so that a restarted server goes on with them. Opening, copying and closing a session or a map answers when
     /// the disk has it; each measurement is acknowledged as RECEIVED at once, and as DURABLE when it was committed and synced: when a buffer of the soil
     /// filter ends, at the latest after `store.interval_s`. Without it nothing outlives the process
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", conflicts_with = "etcd")]
     store: Option<PathBuf>,
+    /// Share sessions with other servers through these members of etcd, for instance http://etcd:2379: each session has one owner at a time, moves to the
+    /// server that is asked for it, and outlives every one of them
+    #[arg(long, value_name = "URL,…", value_delimiter = ',')]
+    etcd: Option<Vec<String>>,
+    /// Name of this server among those that share sessions; else its host and port
+    #[arg(long, value_name = "NAME")]
+    server_name: Option<String>,
     /// Check configuration, certificates, fleet file and bundle, say what is wrong, and serve nothing
     #[arg(long)]
     check: bool,
@@ -69,17 +76,14 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
     if args.check {
         return checked(&config, bundle);
     }
-    let (zenoh, store) = (config.zenoh.clone(), config.store.clone());
+    let (zenoh, kept) = (config.zenoh.clone(), kept(&config));
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(async {
         // The signals are caught before the addresses are printed, so that whoever waits for them can stop the server at once.
         let signal = tokio::spawn(termination());
         let (server, bundle) = start(config, bundle).await?;
         announce(&server, &bundle, &zenoh);
-        match store.enabled {
-            true => say!("store {}; measurements are durable within {} s", store.directory.display(), store.interval_s),
-            false => say!("store none; sessions end with this process"),
-        }
+        say!("store {kept}");
         say!("ready; ctrl-c stops");
         server
             .run_until(async {
@@ -127,8 +131,24 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
         config.store.enabled = true;
         config.store.directory.clone_from(folder);
     }
+    if let Some(members) = &args.etcd {
+        config.cluster.etcd.clone_from(members);
+    }
+    if let Some(name) = &args.server_name {
+        config.cluster.name.clone_from(name);
+    }
     config.check().or_input()?;
     Ok(config)
+}
+
+/// Where sessions are kept.
+fn kept(config: &Config) -> String {
+    let within = format!("measurements are durable within {} s", config.store.interval_s);
+    match (config.cluster.enabled(), config.store.enabled) {
+        (true, _) => format!("etcd {} below {}, shared; {within}", config.cluster.etcd.join(","), config.cluster.prefix),
+        (false, true) => format!("{}; {within}", config.store.directory.display()),
+        (false, false) => "none; sessions end with this process".into(),
+    }
 }
 
 /// Says on standard output where the service listens; scripts read these lines.
@@ -137,6 +157,9 @@ fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     say!("grpc  {}", server.grpc_addr);
     if let Some(http) = server.http_addr {
         say!("http  http://{http}/");
+    }
+    if let Some(health) = server.health_addr {
+        say!("health http://{health}/health");
     }
     if zenoh.enabled {
         say!("zenoh {} keys nesam/v1/{}/<vehicle>/...", [&zenoh.listen[..], &zenoh.connect[..]].concat().join(","), zenoh.fleet);
@@ -170,10 +193,7 @@ fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
             (true, true) => "mutual TLS; clients have the rights of the fleet file",
         }
     );
-    match config.store.enabled {
-        true => say!("store  {}, every {} s at the latest", config.store.directory.display(), config.store.interval_s),
-        false => say!("store  none; sessions end with the process"),
-    }
+    say!("store  {}", kept(config));
     say!("sound");
     Ok(())
 }

@@ -203,7 +203,7 @@ fn service_damaged_foreign_and_shared_stores_are_refused() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join(FILE);
     let mut store = RedbStore::open(folder.path()).unwrap();
-    (1..=20).for_each(|n| store.commit(&changes(n)).unwrap());
+    (1..=20).for_each(|n| drop(store.commit(&changes(n)).unwrap()));
     assert!(matches!(RedbStore::open(folder.path()), Err(StoreError::InUse { .. })));
     drop(store);
     assert_eq!(RedbStore::open(folder.path()).unwrap().load().unwrap(), expected(20));

@@ -1,0 +1,257 @@
+//! Bringing a session here.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use nesam_engine::SessionImage;
+use nesam_proto::etcd::KeyValue;
+use tonic::Status;
+
+use super::record::{Server, json, of_json, session_of};
+use super::{Cluster, Held, Stage, again, created, delete, get, moved, put};
+use crate::convert::to_status;
+use crate::store::{StoredSession, resumed};
+
+/// Longest wait for an owner that is gone or slow, however long the client would wait.
+const WAIT_MAX: Duration = Duration::from_secs(10);
+/// Longest pause between two looks at etcd; the watch usually tells sooner.
+const LOOK_AGAIN: Duration = Duration::from_millis(100);
+/// Pause between two looks at the lease.
+const LEASE_PAUSE: Duration = Duration::from_millis(20);
+/// Shortest pause between two searches for one session on behalf of a bus.
+const SEARCH_PAUSE: Duration = Duration::from_millis(200);
+
+/// What came of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Brought {
+    /// The session can be used here.
+    Here,
+    /// No server has a session of this name, and none is stored.
+    Nowhere,
+}
+
+/// What may be done to have a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Zeal {
+    /// Take it when nobody has it.
+    IfFree,
+    /// Ask its owner for it.
+    Ask,
+    /// Have its name, also when there is no such session yet.
+    Create,
+}
+
+/// What etcd says of a session.
+struct Seen {
+    /// Epoch, lease and name of the owner.
+    owner: Option<(i64, i64, Server)>,
+    stored: Option<StoredSession>,
+}
+
+impl Cluster {
+    /// Brings a session here, wherever it is. `permit` hears the vehicle that it belongs to before anything is done.
+    ///
+    /// # Errors
+    /// What `permit` says; UNAVAILABLE when the owner does not let go within `budget` or etcd does not answer; FAILED_PRECONDITION when the session
+    /// cannot go on here, for example for another bundle.
+    pub async fn bring(&self, session: &str, budget: Duration, permit: impl Fn(&str) -> Result<(), Status>) -> Result<Brought, Status> {
+        self.have(session, Zeal::Ask, budget, permit).await
+    }
+
+    /// Brings a session here if no server has it.
+    ///
+    /// # Errors
+    /// As [`Cluster::bring`].
+    pub async fn bring_if_free(
+        &self,
+        session: &str,
+        budget: Duration,
+        permit: impl Fn(&str) -> Result<(), Status>,
+    ) -> Result<Brought, Status> {
+        self.have(session, Zeal::IfFree, budget, permit).await
+    }
+
+    /// Makes this server the owner of a name under which a session is to begin. A session that has the name already is brought here: the engine will say
+    /// that it is there.
+    ///
+    /// # Errors
+    /// As [`Cluster::bring`].
+    pub async fn claim(&self, session: &str, budget: Duration) -> Result<(), Status> {
+        self.have(session, Zeal::Create, budget, |_| Ok(())).await.map(drop)
+    }
+
+    /// Lets a claimed name go if no session has begun under it.
+    pub async fn unclaim(&self, session: &str) {
+        if self.0.engine.get(session, WAIT_MAX).await.is_err() {
+            self.let_go(session).await;
+        }
+    }
+
+    /// Whether a session should be looked for now on behalf of a bus that tells every server of it.
+    pub fn should_search(&self, session: &str) -> bool {
+        if self.is_elsewhere(session) {
+            return false;
+        }
+        let now = Instant::now();
+        let mut state = self.lock();
+        state.looked.retain(|_, at| now.duration_since(*at) < SEARCH_PAUSE);
+        let due = !state.looked.contains_key(session);
+        if due {
+            state.looked.insert(session.into(), now);
+        }
+        due
+    }
+
+    async fn have(
+        &self,
+        session: &str,
+        zeal: Zeal,
+        budget: Duration,
+        permit: impl Fn(&str) -> Result<(), Status>,
+    ) -> Result<Brought, Status> {
+        let until = Instant::now() + budget.min(WAIT_MAX);
+        // Without a lease nothing can be said. It may come back, and else a proxy that watches /health cuts the connection soon: a refusal at once would only
+        // bring the client back to this server.
+        while self.0.lease.id().is_none() && Instant::now() < until {
+            tokio::time::sleep(LEASE_PAUSE).await;
+        }
+        if self.is_here(session)? {
+            return Ok(Brought::Here);
+        }
+        let turn = self.lock().turns.entry(session.into()).or_default().clone();
+        let guard = turn.lock().await;
+        let result = self.have_in_turn(session, zeal, until, permit).await;
+        drop(guard);
+        drop(turn);
+        self.lock().turns.retain(|_, turn| Arc::strong_count(turn) > 1);
+        result
+    }
+
+    async fn have_in_turn(
+        &self,
+        session: &str,
+        zeal: Zeal,
+        until: Instant,
+        permit: impl Fn(&str) -> Result<(), Status>,
+    ) -> Result<Brought, Status> {
+        let mut changes = self.0.changes.subscribe();
+        // Epoch of the owner that was asked; one that took the session since then has not heard.
+        let mut asked = None;
+        loop {
+            if self.is_here(session)? {
+                return Ok(Brought::Here);
+            }
+            changes.borrow_and_update();
+            let seen = self.look(session).await?;
+            let image = seen.stored.as_ref().map(resumed).transpose().map_err(to_status)?;
+            match &image {
+                Some(image) => permit(&image.vehicle)?,
+                // Somebody may be about to begin it; it is not there yet.
+                None if zeal != Zeal::Create => return Ok(Brought::Nowhere),
+                None => {}
+            }
+            let Some((epoch, lease, owner)) = seen.owner else {
+                if self.take(session).await? {
+                    return Ok(Brought::Here);
+                }
+                continue;
+            };
+            if Some(lease) == self.0.lease.id() {
+                // Taken by this server and never begun.
+                self.release_key(session, epoch).await?;
+                continue;
+            }
+            let left = until.saturating_duration_since(Instant::now());
+            if left.is_zero() || zeal == Zeal::IfFree {
+                if asked.is_some() {
+                    let _ = self.0.etcd.all(vec![delete(&self.0.keys.want(session))]).await;
+                }
+                let reason = format!("session `{session}` is with server `{}` ({}), which has not let go of it", owner.name, owner.address);
+                return Err(again(&reason, self.0.lease.length() / 4));
+            }
+            if asked != Some(epoch) {
+                let lease = self.0.lease.id().ok_or_else(|| moved(session))?;
+                self.0.etcd.all(vec![put(&self.0.keys.want(session), json(&self.0.me), lease)]).await?;
+                asked = Some(epoch);
+            }
+            let _ = tokio::time::timeout(left.min(LOOK_AGAIN), changes.changed()).await;
+        }
+    }
+
+    async fn look(&self, session: &str) -> Result<Seen, Status> {
+        let keys = &self.0.keys;
+        let mut read =
+            self.0.etcd.all(vec![get(&keys.owner(session)), get(&keys.session(session))]).await?.read.into_iter().flat_map(first);
+        let (mut owner, mut stored) = (None, None);
+        for found in read.by_ref() {
+            if found.key == keys.owner(session).as_bytes() {
+                let server = of_json(&found.value).unwrap_or_else(|| Server { name: "?".into(), address: "?".into() });
+                owner = Some((found.create_revision, found.lease, server));
+            } else {
+                stored = Some(stored_session(session, &found)?);
+            }
+        }
+        Ok(Seen { owner, stored })
+    }
+
+    /// Takes a session that nobody has, and goes on with what is stored of it; false = somebody else was quicker.
+    async fn take(&self, session: &str) -> Result<bool, Status> {
+        let (keys, begun) = (&self.0.keys, Instant::now());
+        let Some(lease) = self.0.lease.id() else { return Err(moved(session)) };
+        let owner = keys.owner(session);
+        // Read in the same transaction: nobody writes after it without the new epoch.
+        let then = vec![put(&owner, json(&self.0.me), lease), delete(&keys.want(session)), get(&keys.session(session))];
+        let done = self.0.etcd.transaction(vec![created(&owner, 0)], then, Vec::new()).await?;
+        if !done.held {
+            return Ok(false);
+        }
+        let epoch = done.revision;
+        self.lock().held.insert(session.into(), Held { epoch, since: Instant::now(), stage: Stage::Arriving });
+        let stored = done.read.into_iter().flat_map(first).next();
+        let begun_here = match stored.map(|found| stored_session(session, &found)).transpose() {
+            Ok(None) => Ok(false),
+            Ok(Some(stored)) => self.go_on(session, &stored).await.map(|()| true),
+            Err(status) => Err(status),
+        };
+        match begun_here {
+            Ok(went_on) => {
+                let mut state = self.lock();
+                // The lease may have ended meanwhile; then everything was let go of.
+                let Some(held) = state.held.get_mut(session).filter(|held| held.epoch == epoch) else { return Err(moved(session)) };
+                held.stage = Stage::Here;
+                state.counts.taken += u64::from(went_on);
+                drop(state);
+                if went_on {
+                    tracing::info!(session, epoch, took_s = begun.elapsed().as_secs_f64(), "session taken");
+                }
+                Ok(true)
+            }
+            Err(status) => {
+                self.let_go(session).await;
+                Err(status)
+            }
+        }
+    }
+
+    /// Puts a stored session and its map into the engine.
+    async fn go_on(&self, session: &str, stored: &StoredSession) -> Result<(), Status> {
+        let mut image: SessionImage = resumed(stored).map_err(to_status)?;
+        if let Some((map, hash)) = &mut image.map {
+            *hash = self.have_map(map).await?;
+        }
+        let refused = |error: nesam_engine::EngineError| {
+            Status::failed_precondition(format!(
+                "session `{session}` cannot go on on this server: {error}; its servers must have the same bundle and limits"
+            ))
+        };
+        self.0.engine.import(image, session, WAIT_MAX).await.map(drop).map_err(refused)
+    }
+}
+
+fn first(found: Vec<KeyValue>) -> Option<KeyValue> {
+    found.into_iter().next()
+}
+
+fn stored_session(session: &str, found: &KeyValue) -> Result<StoredSession, Status> {
+    session_of(session, &found.value).ok_or_else(|| Status::data_loss(format!("what etcd holds of session `{session}` is no session")))
+}

@@ -1,0 +1,123 @@
+//! Maps that servers share: whoever takes a session brings its map, and a newer one replaces what is held.
+
+use sha2::{Digest as _, Sha256};
+use tonic::Status;
+
+use super::record::{MapHead, json, of_json};
+use super::{Cluster, delete, delete_all, get, get_all, put, written};
+use crate::convert::to_status;
+use crate::store::map_of;
+
+/// Size of a part, bytes; etcd takes requests of 1.5 MiB.
+const PART_BYTES: usize = 512 << 10;
+/// Attempts at a map that somebody else writes at the same time.
+const ATTEMPTS: usize = 5;
+/// Longest wait for the engine.
+const PUT: std::time::Duration = std::time::Duration::from_secs(10);
+
+impl Cluster {
+    /// Puts the newest content of a map into the engine, unless it is there, and gives the hash of what the engine holds.
+    pub(super) async fn have_map(&self, map: &str) -> Result<String, Status> {
+        let keys = &self.0.keys;
+        for _ in 0..ATTEMPTS {
+            let held = self.0.engine.get_map(map, PUT).await.ok().map(|held| held.hash().to_string());
+            let Some((head, _)) = self.map_head(map).await? else {
+                return held.ok_or_else(|| Status::failed_precondition(format!("map `{map}` is held by no server")));
+            };
+            if let Some(held) = held.filter(|_| self.lock().maps.get(map) == Some(&head.sha256)) {
+                return Ok(held);
+            }
+            let parts = self.0.etcd.all(vec![get_all(&keys.parts(map, Some(&head.sha256)))]).await?.read.into_iter().flatten();
+            let parts: Vec<_> = parts.map(|found| found.value).collect();
+            let bytes = parts.concat();
+            if parts.len() != head.parts || sha256(&bytes) != head.sha256 {
+                // Replaced while it was read.
+                continue;
+            }
+            let limits = self.0.engine.handle().limits().clone();
+            let read = tokio::task::spawn_blocking(move || map_of(&bytes, &limits)).await;
+            let read = read.unwrap_or_else(|_| Err("reading it panicked; this is a bug".into()));
+            let read = read.map_err(|reason| Status::data_loss(format!("map `{map}` as etcd holds it: {reason}")))?;
+            let hash = read.hash().to_string();
+            self.lock().maps.insert(map.into(), head.sha256);
+            let put = self.0.engine.put_map(read.into(), None, PUT).await;
+            return match put {
+                Ok(_) => Ok(hash),
+                // A newer one was put here a moment ago.
+                Err(nesam_engine::EngineError::MapExists { .. }) => {
+                    Ok(self.0.engine.get_map(map, PUT).await.map_err(to_status)?.hash().to_string())
+                }
+                Err(error) => Err(to_status(error)),
+            };
+        }
+        Err(Status::unavailable(format!("map `{map}` changes faster than it can be read; ask again")))
+    }
+
+    /// Brings a map here if etcd has it.
+    ///
+    /// # Errors
+    /// What etcd says, or what is wrong with the map.
+    pub async fn bring_map(&self, map: &str) -> Result<(), Status> {
+        match self.map_head(map).await? {
+            Some(_) => self.have_map(map).await.map(drop),
+            None => Ok(()),
+        }
+    }
+
+    /// Puts a newer content of a map into the engine if an older one is held.
+    pub(super) async fn renew_map(self, map: String, sha256: String) {
+        let old = self.lock().maps.get(&map).is_some_and(|held| *held != sha256);
+        if old && let Err(status) = self.have_map(&map).await {
+            tracing::warn!(map, reason = status.message(), "map not renewed");
+        }
+    }
+
+    /// Writes a map; the last writer's stands.
+    ///
+    /// # Errors
+    /// What etcd says.
+    pub(crate) async fn write_map(&self, map: &str, bytes: &[u8]) -> Result<(), Status> {
+        let (keys, sha256) = (&self.0.keys, sha256(bytes));
+        let parts = bytes.chunks(PART_BYTES);
+        let head = MapHead { sha256: sha256.clone(), parts: parts.len() };
+        for _ in 0..ATTEMPTS {
+            let before = self.map_head(map).await?;
+            self.lock().maps.insert(map.into(), sha256.clone());
+            if before.as_ref().is_some_and(|(before, _)| *before == head) {
+                return Ok(());
+            }
+            for (number, part) in parts.clone().enumerate() {
+                self.0.etcd.all(vec![put(&keys.part(map, &sha256, number), part.to_vec(), 0)]).await?;
+            }
+            let revision = before.as_ref().map_or(0, |(_, revision)| *revision);
+            let mut then = vec![put(&keys.map(map), json(&head), 0)];
+            then.extend(before.map(|(before, _)| delete_all(&keys.parts(map, Some(&before.sha256)))));
+            if self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then, Vec::new()).await?.held {
+                return Ok(());
+            }
+        }
+        Err(Status::aborted(format!("map `{map}` is written by others all the time")))
+    }
+
+    /// Removes a map.
+    ///
+    /// # Errors
+    /// What etcd says.
+    pub(crate) async fn remove_map(&self, map: &str) -> Result<(), Status> {
+        let keys = &self.0.keys;
+        self.lock().maps.remove(map);
+        self.0.etcd.all(vec![delete(&keys.map(map)), delete_all(&keys.parts(map, None))]).await.map(drop)
+    }
+
+    /// What etcd says of a map, and the revision at which it was said.
+    async fn map_head(&self, map: &str) -> Result<Option<(MapHead, i64)>, Status> {
+        let read = self.0.etcd.all(vec![get(&self.0.keys.map(map))]).await?.read;
+        let Some(found) = read.into_iter().flatten().next() else { return Ok(None) };
+        let head = of_json(&found.value).ok_or_else(|| Status::data_loss(format!("what etcd holds of map `{map}` is no map")))?;
+        Ok(Some((head, found.mod_revision)))
+    }
+}
+
+fn sha256(bytes: &[u8]) -> String {
+    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
+}

@@ -1,0 +1,233 @@
+//! Servers that share sessions: each session has one owner at a time, and moves to where it is asked for.
+//!
+//! A session lives in the memory of its owner and, up to its durable place, in etcd. The owner holds a key under its lease; the revision at which that key
+//! was made is the epoch, and every write of the session is conditional on it: an owner that was stopped, cut off or slow can write nothing once somebody
+//! else has the session. Whoever is asked for a session that it does not have takes it: from an owner that is gone as soon as its lease has ended, from
+//! one that lives by asking for it; that one writes what it has, lets go, and ends the streams that feed it, so that their clients come after it and send
+//! again what was not durable. A load balancer that sends a vehicle always to the same server makes moves rare; nothing depends on it.
+//!
+//! ```text
+//! request ── bring ──► owner's key free? take it (epoch), read image and map, import ──► answer
+//!                        └─ held by another: put `want` ── watch ──► that one: write, let go
+//! ```
+
+mod bring;
+mod etcd;
+mod keys;
+mod lease;
+mod leave;
+mod maps;
+mod record;
+mod watch;
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard};
+use std::time::{Duration, Instant};
+
+use tokio::sync::{broadcast, watch as latest};
+use tokio::task::JoinHandle;
+use tonic::Status;
+use tonic_types::{ErrorDetails, StatusExt as _};
+
+pub(crate) use self::bring::Brought;
+pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, put, written};
+pub(crate) use self::keys::Keys;
+use self::lease::Lease;
+use self::record::Server;
+pub(crate) use self::record::session_bytes;
+use crate::call::EngineClient;
+use crate::config::ClusterConfig;
+use crate::error::ServerError;
+use crate::store::Keeper;
+
+/// Streams that may lag behind the sessions that left.
+const LEFT_KEPT: usize = 1024;
+/// Longest wait for the first lease.
+const FIRST_LEASE: Duration = Duration::from_secs(10);
+
+/// How far a session has come.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stage {
+    Arriving,
+    Here,
+    Leaving,
+}
+
+/// A session whose owner this server is.
+#[derive(Clone, Copy, Debug)]
+struct Held {
+    epoch: i64,
+    since: Instant,
+    stage: Stage,
+}
+
+/// Counters of a server among others.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct ClusterCounts {
+    /// Sessions whose owner this server is.
+    pub held: usize,
+    /// Sessions that were taken, handed over on request, and lost to others.
+    pub taken: u64,
+    pub handed_over: u64,
+    pub lost: u64,
+    /// Whether the lease lasts.
+    pub leased: bool,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    held: BTreeMap<String, Held>,
+    /// Lease of the owner of each session of the fleet, as the watch tells.
+    owners: BTreeMap<String, i64>,
+    /// Sessions that are being brought here: one at a time each.
+    turns: BTreeMap<String, Arc<tokio::sync::Mutex<()>>>,
+    /// When a session was last looked for on behalf of a bus that sends to everybody.
+    looked: BTreeMap<String, Instant>,
+    /// SHA-256 of each map as it was last read or written.
+    maps: BTreeMap<String, String>,
+    counts: ClusterCounts,
+}
+
+/// This server among the others; clones share it.
+#[derive(Clone, Debug)]
+pub(crate) struct Cluster(Arc<Inner>);
+
+#[derive(Debug)]
+struct Inner {
+    etcd: Etcd,
+    keys: Keys,
+    me: Server,
+    lease: Lease,
+    state: Mutex<State>,
+    /// Counts the changes of owners, for those who wait for one.
+    changes: latest::Sender<u64>,
+    /// Sessions that left.
+    left: broadcast::Sender<Arc<str>>,
+    engine: EngineClient,
+    keeper: Arc<Keeper>,
+    tasks: Mutex<Vec<JoinHandle<()>>>,
+}
+
+impl Cluster {
+    /// Connects, and returns when the first lease is there.
+    ///
+    /// # Errors
+    /// `ServerError` for endpoints or files that cannot be used, or when etcd does not answer.
+    pub async fn start(config: &ClusterConfig, address: String, engine: EngineClient, keeper: Arc<Keeper>) -> Result<Self, ServerError> {
+        let etcd = Etcd::new(config)?;
+        let name = if config.name.is_empty() { own_name(&address) } else { config.name.clone() };
+        let (changes, _) = latest::channel(0);
+        let (left, _) = broadcast::channel(LEFT_KEPT);
+        let cluster = Self(Arc::new(Inner {
+            etcd: etcd.clone(),
+            keys: Keys::new(&config.prefix),
+            me: Server { name, address },
+            lease: Lease::new(f64::from(config.lease_s)),
+            state: Mutex::default(),
+            changes,
+            left,
+            engine,
+            keeper,
+            tasks: Mutex::default(),
+        }));
+        let lost = {
+            let cluster = cluster.clone();
+            move || cluster.clone().lose_all()
+        };
+        let keeping = tokio::spawn(cluster.0.lease.clone().keep(etcd, lost));
+        let watching = tokio::spawn(cluster.clone().watch());
+        if let Ok(mut tasks) = cluster.0.tasks.lock() {
+            tasks.extend([keeping, watching, tokio::spawn(cluster.clone().compact())]);
+        }
+        let begun = Instant::now();
+        while cluster.0.lease.id().is_none() {
+            if begun.elapsed() > FIRST_LEASE {
+                cluster.stop().await;
+                let reason = format!("{}: no answer within {} s; is etcd there?", config.etcd.join(", "), FIRST_LEASE.as_secs());
+                return Err(ServerError::Value { key: "cluster.etcd", reason });
+            }
+            tokio::time::sleep(Duration::from_millis(10)).await;
+        }
+        tracing::info!(server = cluster.0.me.name, etcd = config.etcd.join(","), lease_s = config.lease_s, "sharing sessions");
+        Ok(cluster)
+    }
+
+    /// Gives everything back. What is to be durable must be committed before.
+    pub async fn stop(&self) {
+        for task in self.0.tasks.lock().map(|mut tasks| std::mem::take(&mut *tasks)).unwrap_or_default() {
+            task.abort();
+        }
+        self.0.lease.give_back(&self.0.etcd).await;
+    }
+
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.0.state.lock().expect("no holder of the cluster's state panics; this is a bug")
+    }
+
+    /// The connection.
+    pub fn etcd(&self) -> &Etcd {
+        &self.0.etcd
+    }
+
+    /// The keys.
+    pub fn keys(&self) -> &Keys {
+        &self.0.keys
+    }
+
+    /// Whether a session can be used here now.
+    ///
+    /// # Errors
+    /// UNAVAILABLE without a lease, and for a session that is on its way to another server.
+    pub fn is_here(&self, session: &str) -> Result<bool, Status> {
+        if self.0.lease.id().is_none() {
+            let reason = "this server has lost touch with etcd and may not answer for its sessions; ask again, another one will";
+            return Err(again(reason, self.0.lease.length() / 4));
+        }
+        match self.lock().held.get(session).map(|held| held.stage) {
+            Some(Stage::Here) => Ok(true),
+            Some(Stage::Leaving) => Err(moved(session)),
+            Some(Stage::Arriving) | None => Ok(false),
+        }
+    }
+
+    /// Whether another server has the session, as far as this one knows.
+    pub fn is_elsewhere(&self, session: &str) -> bool {
+        let state = self.lock();
+        !state.held.contains_key(session) && state.owners.get(session).is_some_and(|lease| Some(*lease) != self.0.lease.id())
+    }
+
+    /// Epoch of a session whose owner this server is.
+    pub fn epoch(&self, session: &str) -> Option<i64> {
+        self.lock().held.get(session).map(|held| held.epoch)
+    }
+
+    /// Tells which sessions leave, from now on.
+    pub fn leaving(&self) -> broadcast::Receiver<Arc<str>> {
+        self.0.left.subscribe()
+    }
+
+    /// Counters.
+    pub fn counts(&self) -> ClusterCounts {
+        let state = self.lock();
+        ClusterCounts { held: state.held.len(), leased: self.0.lease.id().is_some(), ..state.counts }
+    }
+}
+
+/// What a client hears of a session that has moved or is about to.
+pub(crate) fn moved(session: &str) -> Status {
+    again(
+        &format!("session `{session}` moves to another server; ask again, and send again what was not durable"),
+        Duration::from_millis(20),
+    )
+}
+
+/// UNAVAILABLE with the time to wait.
+fn again(reason: &str, after: Duration) -> Status {
+    Status::with_error_details(tonic::Code::Unavailable, reason, ErrorDetails::with_retry_info(Some(after)))
+}
+
+fn own_name(address: &str) -> String {
+    let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
+    let port = address.rsplit(':').next().unwrap_or_default();
+    format!("{}:{port}", host.trim())
+}

@@ -1,0 +1,57 @@
+//! What stands under the keys.
+
+use serde::{Deserialize, Serialize};
+
+use crate::store::StoredSession;
+
+/// Who has a session, or who asks for it.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct Server {
+    /// Name of the server.
+    pub name: String,
+    /// Where it answers gRPC.
+    pub address: String,
+}
+
+/// The newest content of a map.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(super) struct MapHead {
+    /// SHA-256 of the bytes, hexadecimal.
+    pub sha256: String,
+    /// Into how many parts they are cut.
+    pub parts: usize,
+}
+
+/// As JSON.
+pub(super) fn json(record: &impl Serialize) -> Vec<u8> {
+    serde_json::to_vec(record).unwrap_or_default()
+}
+
+/// From JSON; `None` for something else.
+pub(super) fn of_json<T: for<'de> Deserialize<'de>>(bytes: &[u8]) -> Option<T> {
+    serde_json::from_slice(bytes).ok()
+}
+
+/// A session: when it was saved, big-endian, then its image.
+pub(crate) fn session_bytes(session: &StoredSession) -> Vec<u8> {
+    [&session.saved_unix_ns.to_be_bytes()[..], &session.image].concat()
+}
+
+/// The session in such bytes; `None` where they are too few.
+pub(super) fn session_of(name: &str, bytes: &[u8]) -> Option<StoredSession> {
+    let (saved, image) = bytes.split_first_chunk::<8>()?;
+    Some(StoredSession { name: name.into(), saved_unix_ns: i64::from_be_bytes(*saved), image: image.to_vec() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_sessions_are_read_back() {
+        let session = StoredSession { name: "a".into(), saved_unix_ns: -5, image: vec![1, 2, 3] };
+        assert_eq!(session_of("a", &session_bytes(&session)), Some(session));
+        assert_eq!(session_of("a", &[0; 7]), None);
+        assert_eq!(of_json::<Server>(b"{}"), None);
+    }
+}

@@ -1,0 +1,100 @@
+//! What the others do: who has which session, who wants ours, which maps are new.
+
+use std::time::Duration;
+
+use nesam_proto::etcd as pb;
+use tonic::Status;
+
+use super::keys::Topic;
+use super::record::{MapHead, Server, of_json};
+use super::{Cluster, get_all};
+
+/// Time for which etcd remembers old contents, at least.
+const COMPACT_EVERY: Duration = Duration::from_secs(30);
+/// Pause before a broken watch is begun again.
+const RETRY: Duration = Duration::from_millis(50);
+
+impl Cluster {
+    /// Follows everything below `live` for ever.
+    pub(super) async fn watch(self) {
+        loop {
+            if let Err(status) = self.follow().await {
+                tracing::debug!(reason = status.message(), "watch of etcd broke; begun again");
+            }
+            tokio::time::sleep(RETRY).await;
+        }
+    }
+
+    /// Lets etcd forget old contents of the keys, for ever: sessions are written every second, and etcd keeps every version until it is told otherwise. Every
+    /// server does so; what one has done the others find done.
+    pub(super) async fn compact(self) {
+        let mut before = None;
+        loop {
+            if let Ok(now) = self.0.etcd.all(Vec::new()).await {
+                if let Some(revision) = before.replace(now.revision) {
+                    let _ = self.0.etcd.compact(revision).await;
+                }
+            }
+            tokio::time::sleep(COMPACT_EVERY).await;
+        }
+    }
+
+    /// Reads all, then follows the changes until the stream breaks.
+    async fn follow(&self) -> Result<(), Status> {
+        let live = self.0.keys.live();
+        let all = self.0.etcd.all(vec![get_all(&live)]).await?;
+        self.lock().owners.clear();
+        for found in all.read.iter().flatten() {
+            self.apply(found, true).await;
+        }
+        self.tell();
+        let mut changes = self.0.etcd.watch(&live, all.revision + 1).await?;
+        while let Some(change) = changes.message().await? {
+            if change.canceled || change.compact_revision > 0 {
+                return Err(Status::aborted(change.cancel_reason));
+            }
+            for event in &change.events {
+                if let Some(found) = &event.kv {
+                    self.apply(found, event.r#type() == pb::event::EventType::Put).await;
+                }
+            }
+            self.tell();
+        }
+        Ok(())
+    }
+
+    /// Takes note of a key that is there, or not any more.
+    async fn apply(&self, found: &pb::KeyValue, there: bool) {
+        match (self.0.keys.topic(&found.key), there) {
+            (Some(Topic::Owner(session)), true) => {
+                let foreign = {
+                    let mut state = self.lock();
+                    state.owners.insert(session.into(), found.lease);
+                    state.held.get(session).is_some_and(|held| held.epoch < found.create_revision)
+                };
+                if foreign && Some(found.lease) != self.0.lease.id() {
+                    self.lose(session).await;
+                }
+            }
+            (Some(Topic::Owner(session)), false) => {
+                self.lock().owners.remove(session);
+            }
+            (Some(Topic::Want(session)), true) => {
+                let by_other = of_json::<Server>(&found.value).is_some_and(|asker| asker != self.0.me);
+                if by_other && self.epoch(session).is_some() {
+                    tokio::spawn(self.clone().hand_over(session.into()));
+                }
+            }
+            (Some(Topic::Map(map)), true) => {
+                if let Some(MapHead { sha256, .. }) = of_json(&found.value) {
+                    tokio::spawn(self.clone().renew_map(map.into(), sha256));
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn tell(&self) {
+        self.0.changes.send_modify(|changes| *changes += 1);
+    }
+}

@@ -1,0 +1,274 @@
+"""tests/fleet/run: what must hold while parts of a fleet die. See `run`."""
+
+import argparse
+import contextlib
+import shutil
+import signal
+import sys
+import tempfile
+import time
+
+import hosts as network
+import nesam
+import scaling
+import soak
+import traffic
+from services import REPLICAS, Fleet
+
+VEHICLES = 6
+ZENOH_VEHICLES = 2
+"""Of them over Zenoh; the others over gRPC."""
+FAULT_AFTER_S = 2.0
+TAKEOVER_S = 2.0
+"""Longest time that a planner may go without an answer, besides its own pause between two calls."""
+
+
+class Check:
+    """One fault under load. `needs_cut`: only where hosts can be cut off."""
+
+    def __init__(self, name, what, fault, needs_cut=False, takes_over=True):
+        self.name, self.what, self.fault, self.needs_cut, self.takes_over = name, what, fault, needs_cut, takes_over
+
+
+def victim(fleet, run):
+    """The replica with most sessions."""
+    owners = [owner for session, owner in fleet.owners().items() if session in run.sessions]
+    return max(REPLICAS, key=owners.count)
+
+
+def kill(fleet, run):
+    name = victim(fleet, run)
+    fleet.processes[name].kill()
+    yield
+    fleet.processes[name].start()
+    fleet.await_healthy(name)
+
+
+def stop_and_resume(fleet, run):
+    name = victim(fleet, run)
+    before = {session: owner for session, owner in fleet.owners().items() if owner == name and session in run.sessions}
+    with nesam.Client(f"{fleet.hosts.address[name]}:50051", timeout_s=2.0) as direct:
+        epochs = {session: direct.session(session).run for session in before}
+        fleet.processes[name].signal(signal.SIGSTOP)
+        yield
+        fleet.processes[name].signal(signal.SIGCONT)
+        # At once, past the proxy: the old owner may refuse, or ask for the session and then answer under a new epoch.
+        for session, epoch in epochs.items():
+            try:
+                if direct.session(session).run == epoch:
+                    run.violations.append(f"{name} answers for {session} under the epoch that it lost")
+            except nesam.NesamError:
+                pass
+    fleet.await_healthy(name)
+
+
+def cut_from_etcd(fleet, run):
+    name = victim(fleet, run)
+    fleet.hosts.cut(name, "etcd")
+    yield
+    fleet.hosts.heal(name, "etcd")
+    fleet.await_healthy(name)
+
+
+def cut_from_all(fleet, run):
+    name = victim(fleet, run)
+    fleet.hosts.cut(name)
+    yield
+    fleet.hosts.heal(name)
+    fleet.await_healthy(name)
+
+
+def slow_store(fleet, run):
+    for _ in range(6):
+        fleet.processes["etcd"].signal(signal.SIGSTOP)
+        time.sleep(0.3)
+        fleet.processes["etcd"].signal(signal.SIGCONT)
+        time.sleep(0.2)
+    yield
+
+
+def store_restarts(fleet, run):
+    fleet.processes["etcd"].kill()
+    fleet.processes["etcd"].start()
+    yield
+
+
+def router_restarts(fleet, run):
+    fleet.processes["router"].kill()
+    time.sleep(0.5)
+    fleet.processes["router"].start()
+    yield
+
+
+def upgrade(fleet, run):
+    for name in REPLICAS:
+        status = fleet.processes[name].terminate()
+        if status != 0:
+            run.violations.append(f"{name} ended with {status} after SIGTERM")
+        fleet.processes[name].start()
+        fleet.await_healthy(name)
+    yield
+
+
+CHECKS = [
+    Check("kill", "SIGKILL of the replica with most sessions", kill),
+    Check("stop", "SIGSTOP of an owner, SIGCONT when others have its sessions", stop_and_resume),
+    Check("partition-store", "an owner cut off from etcd, not from its clients", cut_from_etcd, needs_cut=True),
+    Check("partition", "an owner cut off from everybody", cut_from_all, needs_cut=True),
+    Check("slow-store", "etcd stopped for 0.3 s, six times in 3 s", slow_store, takes_over=False),
+    Check("store-restart", "SIGKILL of etcd and restart", store_restarts, takes_over=False),
+    Check("router-restart", "SIGKILL of the Zenoh router and restart", router_restarts, takes_over=False),
+    Check("upgrade", "SIGTERM and restart of all replicas, one after the other", upgrade),
+]
+
+
+class Run:
+    """Vehicles and planners of one check, and what was found."""
+
+    def __init__(self, fleet, name):
+        self.fleet = fleet
+        self.sessions = [f"{name}-{i}" for i in range(VEHICLES)]
+        self.vehicles = [traffic.Vehicle(fleet.proxy_address, session) for session in self.sessions[ZENOH_VEHICLES:]]
+        router = f"tcp/{fleet.hosts.address['router']}:7447"
+        self.vehicles += [traffic.ZenohVehicle(fleet.proxy_address, session, router, "fleet") for session in self.sessions[:ZENOH_VEHICLES]]
+        self.planners = [traffic.Planner(fleet.proxy_address, session) for session in self.sessions]
+        self.violations = []
+
+    def drive(self, fault):
+        """Everything drives, something dies, everything arrives."""
+        since = self.fleet.revision()
+        for vehicle in self.vehicles:
+            vehicle.open()
+        for thread in (*self.vehicles, *self.planners):
+            thread.start()
+        time.sleep(FAULT_AFTER_S)
+        mending = fault(self.fleet, self)
+        next(mending)
+        for vehicle in self.vehicles:
+            vehicle.join(60.0)
+            if vehicle.is_alive():
+                self.violations.append(f"{vehicle.name} does not arrive")
+        for planner in self.planners:
+            planner.stop()
+        for _ in mending:
+            pass
+        for thread in (*self.vehicles, *self.planners):
+            self.violations += thread.violations
+        return since
+
+    def compare(self, oracle):
+        """Whether each session knows in the end what it would without failures."""
+        for vehicle in self.vehicles:
+            try:
+                differences = traffic.Outcome(vehicle.client, vehicle.name).differences(oracle)
+            except nesam.NesamError as error:
+                differences = [str(error)]
+            if differences:
+                self.violations.append(f"{vehicle.name} differs from a run without failures: {', '.join(differences)}")
+
+    def audit(self, since):
+        """Whether each session had one owner at a time, and was written under one only. Gives the number of owners."""
+        owned, count = set(), 0
+        for revision, kind, session, put, new in self.fleet.history(since):
+            if kind == "owner":
+                if put and not new:
+                    self.violations.append(f"{session}: a second owner in one epoch at revision {revision}")
+                count += put
+                (owned.add if put else owned.discard)(session)
+            elif put and session not in owned:
+                self.violations.append(f"{session}: written without an owner at revision {revision}")
+        return count
+
+    def close(self):
+        for thread in (*self.vehicles, *self.planners):
+            with contextlib.suppress(nesam.NesamError):
+                if thread in self.vehicles:
+                    thread.client.close_session(thread.name)
+            thread.client.close()
+
+
+def perform(check, fleet, oracle):
+    run = Run(fleet, check.name)
+    try:
+        since = run.drive(check.fault)
+        run.compare(oracle)
+        owners = run.audit(since)
+    finally:
+        run.close()
+    silence_s = max(planner.silence_s for planner in run.planners)
+    if check.takes_over and silence_s > TAKEOVER_S + traffic.PLAN_S:
+        run.violations.append(f"a planner waited {silence_s:.2f} s for an answer")
+    figures = {
+        "answers": sum(planner.answered for planner in run.planners),
+        "retried": sum(planner.retried for planner in run.planners),
+        "silence s": f"{silence_s:.2f}",
+        "measured s": f"{max(vehicle.worst_s for vehicle in run.vehicles):.2f}",
+        "owners": owners,
+    }
+    return figures, run.violations
+
+
+def row(name, result, figures, what):
+    print(f"{name:<16} {result:<9} " + " ".join(f"{figures.get(key, ''):>10}" for key in COLUMNS) + f"  {what}", flush=True)
+
+
+COLUMNS = ("answers", "retried", "silence s", "measured s", "owners")
+
+
+def main():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("server")
+    parser.add_argument("--only", default="", help="checks, by name")
+    parser.add_argument("--loopback", action="store_true", help="without namespaces")
+    parser.add_argument("--scaling", action="store_true", help="measure what sessions and queries cost, and check nothing")
+    parser.add_argument("--memory", action="store_true", help="measure the memory of a session, and check nothing")
+    parser.add_argument("--soak", type=float, metavar="SECONDS", help="load for so long: do memory, files and threads stay?")
+    parser.add_argument("--keep", default="", help="folder for logs and data; else they are thrown away when all holds")
+    arguments = parser.parse_args()
+    only = [name for name in arguments.only.split(",") if name]
+    unknown = set(only) - {check.name for check in CHECKS}
+    if unknown:
+        parser.error(f"no check is called {', '.join(sorted(unknown))}")
+    folder = arguments.keep or tempfile.mkdtemp(prefix="nesam-fleet-")
+    hosts, reason = network.make(arguments.loopback)
+    print(f"hosts: {'network namespaces' if hosts.can_cut else 'loopback addresses (' + reason + ')'}; logs: {folder}", flush=True)
+    failed, skipped = [], []
+    fleet = Fleet(hosts, arguments.server, folder)
+    try:
+        fleet.start()
+        with nesam.Client(fleet.proxy_address, timeout_s=60.0, vehicle_id="maps") as client:
+            client.upload_map(traffic.world())
+        if arguments.scaling or arguments.memory:
+            (scaling.measure if arguments.scaling else scaling.memory)(fleet)
+            return 0
+        if arguments.soak:
+            violations = soak.soak(fleet, arguments.soak)
+            print("\n".join(violations) or "holds")
+            return 1 if violations else 0
+        oracle = traffic.without_failures(arguments.server, lambda command: hosts.command("client", command))
+        row("check", "result", dict(zip(COLUMNS, COLUMNS)), "what happens, two seconds after the start of the drives")
+        for check in CHECKS:
+            if only and check.name not in only:
+                continue
+            if check.needs_cut and not hosts.can_cut:
+                skipped.append(check.name)
+                row(check.name, "not run", {}, "needs network namespaces")
+                continue
+            figures, violations = perform(check, fleet, oracle)
+            row(check.name, "VIOLATED" if violations else "holds", figures, check.what)
+            for violation in violations[:8]:
+                print(f"    {violation}", flush=True)
+            failed += violations
+    finally:
+        fleet.stop()
+        hosts.close()
+    if failed:
+        print(f"{len(failed)} violations; logs are in {folder}")
+        return 1
+    if not arguments.keep:
+        shutil.rmtree(folder, ignore_errors=True)
+    return 2 if skipped else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

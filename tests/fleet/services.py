@@ -1,0 +1,172 @@
+"""The processes of the fleet: etcd, HAProxy with the shipped configuration, a Zenoh router, and the replicas."""
+
+import base64
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+REPLICAS = ("nesam-1", "nesam-2", "nesam-3")
+LEASE_S = 1
+ROUTER = """
+import sys, time, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"router"')
+config.insert_json5("listen/endpoints", sys.argv[1])
+config.insert_json5("scouting/multicast/enabled", "false")
+with zenoh.open(config):
+    while True:
+        time.sleep(60)
+"""
+
+
+class Process:
+    """A process that can be started, stopped and killed again and again."""
+
+    def __init__(self, name, command, log):
+        self.name, self._command, self._log = name, command, log
+        self._child = None
+
+    def start(self):
+        self._child = subprocess.Popen(self._command, stdout=open(self._log, "ab"), stderr=subprocess.STDOUT, start_new_session=True)
+
+    def signal(self, number):
+        os.kill(self._child.pid, number)
+
+    def kill(self):
+        if self._child is not None and self._child.poll() is None:
+            os.killpg(self._child.pid, signal.SIGKILL)
+            self._child.wait()
+
+    def terminate(self, timeout_s=30.0):
+        """SIGTERM; the exit status."""
+        self._child.terminate()
+        return self._child.wait(timeout_s)
+
+    @property
+    def running(self):
+        return self._child is not None and self._child.poll() is None
+
+    @property
+    def pid(self):
+        return self._child.pid
+
+
+class Fleet:
+    """All of them."""
+
+    def __init__(self, hosts, server, folder):
+        self.hosts, self.folder = hosts, Path(folder)
+        at = hosts.address
+        self.proxy_address = f"{at['proxy']}:50051"
+        etcd = f"http://{at['etcd']}:2379"
+        peer = f"http://{at['etcd']}:2380"
+        self._etcd_url = etcd
+        commands = {
+            "etcd": ["etcd", "--name", "e", "--data-dir", str(self.folder / "etcd"), "--listen-client-urls", etcd, "--advertise-client-urls", etcd]
+            + ["--listen-peer-urls", peer, "--initial-advertise-peer-urls", peer, "--initial-cluster", f"e={peer}"]
+            + ["--heartbeat-interval", "50", "--election-timeout", "500", "--log-level", "error"],
+            "proxy": ["haproxy", "-db", "-f", str(self._proxy_configuration())],
+            "router": [sys.executable, "-c", ROUTER, json.dumps([f"tcp/{at['router']}:7447"])],
+        }
+        for name in REPLICAS:
+            commands[name] = [server, "serve", "--config", str(self._configuration(name, etcd))]
+        self.processes = {
+            name: Process(name, hosts.command(name, command), self.folder / f"{name}.log") for name, command in commands.items()
+        }
+
+    def _proxy_configuration(self):
+        text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
+        text = text.replace("bind :50051", f"bind {self.hosts.address['proxy']}:50051")
+        for name in REPLICAS:
+            text = text.replace(f"{name}:50051", f"{self.hosts.address[name]}:50051")
+        path = self.folder / "haproxy.cfg"
+        path.write_text(text)
+        return path
+
+    def _configuration(self, name, etcd):
+        address = self.hosts.address[name]
+        path = self.folder / f"{name}.toml"
+        path.write_text(
+            f'[grpc]\nlisten = "{address}:50051"\n[http]\nlisten = "{address}:50080"\n'
+            f'[zenoh]\nlisten = []\nconnect = ["tcp/{self.hosts.address["router"]}:7447"]\nfleet = "fleet"\nname = "{name}"\n'
+            f'[cluster]\netcd = ["{etcd}"]\nname = "{name}"\nlease_s = {LEASE_S}\n'
+        )
+        return path
+
+    def start(self):
+        for name in ("etcd", "router", *REPLICAS):
+            self.processes[name].start()
+        for name in REPLICAS:
+            self.await_healthy(name)
+        self.processes["proxy"].start()
+        time.sleep(1.0)
+
+    def healthy(self, name):
+        try:
+            with urllib.request.urlopen(f"http://{self.hosts.address[name]}:50080/health", timeout=0.5) as reply:
+                return reply.status == 200
+        except OSError:
+            return False
+
+    def await_healthy(self, name, timeout_s=60.0):
+        end = time.monotonic() + timeout_s
+        while not self.healthy(name):
+            if time.monotonic() > end or not self.processes[name].running:
+                raise RuntimeError(f"{name} does not come up; see {self.folder / (name + '.log')}")
+            time.sleep(0.05)
+
+    def metric(self, name, metric):
+        with urllib.request.urlopen(f"http://{self.hosts.address[name]}:50080/metrics", timeout=5) as reply:
+            return float(re.search(rf"^{metric} (\S+)$", reply.read().decode(), re.M).group(1))
+
+    def stop(self):
+        for process in self.processes.values():
+            process.kill()
+
+    def _etcd(self, path, body, timeout_s=5.0):
+        request = urllib.request.Request(self._etcd_url + path, data=json.dumps(body).encode())
+        return urllib.request.urlopen(request, timeout=timeout_s)
+
+    @staticmethod
+    def _prefix(prefix):
+        end = prefix[:-1] + chr(ord(prefix[-1]) + 1)
+        return {"key": base64.b64encode(prefix.encode()).decode(), "range_end": base64.b64encode(end.encode()).decode()}
+
+    def revision(self):
+        with self._etcd("/v3/kv/range", {"key": base64.b64encode(b"x").decode()}) as reply:
+            return int(json.load(reply)["header"]["revision"])
+
+    def owners(self):
+        """Name of the server that has each session."""
+        with self._etcd("/v3/kv/range", self._prefix("nesam/live/owner/")) as reply:
+            found = json.load(reply).get("kvs", [])
+        return {_text(kv["key"]).rsplit("/", 1)[1]: json.loads(_text(kv["value"]))["name"] for kv in found}
+
+    def history(self, since):
+        """What etcd remembers of owners and sessions after a revision: (revision, kind, session, is it a put, was it made new)."""
+        until, events = self.revision(), []
+        with self._etcd("/v3/watch", {"create_request": {**self._prefix("nesam/"), "start_revision": since + 1}}, timeout_s=10.0) as stream:
+            while until > since:
+                told = json.loads(stream.readline())["result"]
+                for event in told.get("events", []):
+                    kv, put = event["kv"], event.get("type", "PUT") == "PUT"
+                    words = _text(kv["key"]).split("/")
+                    kind = {"live": words[2], "session": "session"}.get(words[1])
+                    revision = int(kv["mod_revision"])
+                    if kind in ("owner", "session"):
+                        events.append((revision, kind, words[-1], put, put and kv["create_revision"] == kv["mod_revision"]))
+                    since = max(since, revision)
+                # The last revisions may be of keys that do not interest.
+                since = max(since, int(told["header"]["revision"]) if told.get("events") else since)
+        return events
+
+
+def _text(encoded):
+    return base64.b64decode(encoded).decode()
