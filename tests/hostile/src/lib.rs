@@ -1,17 +1,22 @@
-//! Every reader of files and texts that come from outside, each as a function of bytes: what it gets may be refused, and must not panic, hang or take memory
+//! Every reader of files, texts and messages that come from outside, each as a function of bytes: what it gets may be refused, and must not panic, hang or take memory
 //! without bound.
 //!
 //! `tests/corpus.rs` feeds the corpora and seeded mutations of them on every run of the tests; `fuzz/` has the same readers as libFuzzer targets, for campaigns
-//! (`tests/hostile/fuzz.sh`). What a campaign finds goes into the corpus of its reader. What comes over the network is not here: `random_bytes.rs`
-//! of the service suite sends that to a real server.
+//! (`tests/hostile/fuzz.sh`). What a campaign finds goes into the corpus of its reader. The corpora of messages are made by
+//! `tests/tools/hostile_messages.py`; `random_bytes.rs` of the service suite sends random bytes to a real server.
 #![forbid(unsafe_code)]
 
 use std::cell::RefCell;
 use std::path::Path;
 
 use nesam_degradation::Degradation;
+use nesam_engine::Limits;
 use nesam_import::{Mapping, Options, Topics, drives, read_bag, read_csv};
 use nesam_model::{ModelBundle, Weights, effects_from_toml};
+use nesam_proto::{Message, v1 as pb};
+use nesam_server::access::FleetFile;
+use nesam_server::recording::Recording;
+use nesam_server::{Config, convert};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, read_vehicle_card};
 use tempfile::TempDir;
@@ -20,7 +25,7 @@ use tempfile::TempDir;
 pub type Reader = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const READERS: [Reader; 13] = [
+pub const READERS: [Reader; 21] = [
     ("bag", bag),
     ("csv_log", csv_log),
     ("mapping", mapping),
@@ -34,6 +39,14 @@ pub const READERS: [Reader; 13] = [
     ("index_json", index_json),
     ("index_parquet", index_parquet),
     ("samples_parquet", samples_parquet),
+    ("measurement", measurement),
+    ("open_session", open_session),
+    ("predict", predict),
+    ("session_image", session_image),
+    ("map_messages", map_messages),
+    ("recording", recording),
+    ("fleet_file", fleet_file),
+    ("configuration", configuration),
 ];
 
 thread_local! {
@@ -41,28 +54,35 @@ thread_local! {
     static FOLDER: RefCell<Option<TempDir>> = const { RefCell::new(None) };
 }
 
-/// Calls `read` with the thread's folder, which has the valid files of `around` in it.
+/// Valid files, from below this folder, and where a reader looks for them.
+const AROUND: [(&str, &str); 11] = [
+    ("corpus/vehicle_card/hmmwv.json", "vehicle.json"),
+    ("corpus/index_json/valid.json", "run/index.json"),
+    ("corpus/samples_parquet/valid.parquet", "run/samples.parquet"),
+    ("corpus/index_parquet/valid.parquet", "indexed/index.parquet"),
+    ("corpus/samples_parquet/valid.parquet", "indexed/samples.parquet"),
+    ("corpus/world_json/valid.json", "worlds/w01/world.json"),
+    ("corpus/elevation_png/valid.png", "worlds/w01/elevation.png"),
+    ("semantic.png", "worlds/w01/semantic.png"),
+    ("../../deploy/bundles/hmmwv-nominal/vehicle.json", "bundle/vehicle.json"),
+    ("../../deploy/bundles/hmmwv-nominal/normalization.toml", "bundle/normalization.toml"),
+    ("../../deploy/bundles/hmmwv-nominal/effects.toml", "bundle/effects.toml"),
+];
+
+/// Calls `read` with the thread's folder, in which the files of [`AROUND`] lie.
 fn in_folder(read: impl FnOnce(&Path)) {
     FOLDER.with_borrow_mut(|folder| {
         let folder = folder.get_or_insert_with(|| {
             let made = tempfile::tempdir().expect("a temporary folder");
-            copy(&Path::new(env!("CARGO_MANIFEST_DIR")).join("around"), made.path());
+            for (from, to) in AROUND {
+                let to = made.path().join(to);
+                std::fs::create_dir_all(to.parent().unwrap_or(made.path())).expect("a folder can be made");
+                std::fs::copy(Path::new(env!("CARGO_MANIFEST_DIR")).join(from), to).expect("the file is part of the repository");
+            }
             made
         });
         read(folder.path());
     });
-}
-
-fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).expect("a folder can be made");
-    for entry in std::fs::read_dir(from).expect("the folder is part of the repository").flatten() {
-        let target = to.join(entry.file_name());
-        if entry.path().is_dir() {
-            copy(&entry.path(), &target);
-        } else {
-            std::fs::copy(entry.path(), target).expect("a file can be copied");
-        }
-    }
 }
 
 /// Writes the bytes to a file of the folder, reads, and puts back what was there.
@@ -150,4 +170,60 @@ fn index_parquet(bytes: &[u8]) {
 
 fn samples_parquet(bytes: &[u8]) {
     instead("run/samples.parquet", bytes, |folder| load(folder, "run"));
+}
+
+/// A message, if the bytes are one.
+fn message<M: Message + Default>(bytes: &[u8]) -> Option<M> {
+    M::decode(bytes).ok()
+}
+
+fn measurement(bytes: &[u8]) {
+    drop(message::<pb::Measurement>(bytes).map(|message| convert::measurement(&message)));
+}
+
+fn open_session(bytes: &[u8]) {
+    drop(message::<pb::OpenSessionRequest>(bytes).map(|message| convert::open_session(&message)));
+}
+
+fn predict(bytes: &[u8]) {
+    drop(message::<pb::PredictRequest>(bytes).map(|message| convert::predict_query(&message, &Limits::default()).map(drop)));
+}
+
+fn session_image(bytes: &[u8]) {
+    drop(convert::session_image(bytes));
+}
+
+/// The messages of an upload one after the other, each behind its length of two bytes.
+fn map_messages(mut bytes: &[u8]) {
+    use pb::upload_map_request::Part;
+    let limits = Limits { map_cells_max: 1 << 20, ..Limits::default() };
+    let mut builder = None;
+    while let Some((length, rest)) = bytes.split_first_chunk::<2>() {
+        let (one, rest) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
+        bytes = rest;
+        match message::<pb::UploadMapRequest>(one).and_then(|message| message.part) {
+            Some(Part::Header(header)) => builder = convert::MapBuilder::new(&header, &limits).ok(),
+            Some(Part::Tile(tile)) => drop(builder.as_mut().map(|builder| builder.add(&tile))),
+            None => {}
+        }
+    }
+    drop(builder.map(convert::MapBuilder::finish));
+}
+
+fn recording(bytes: &[u8]) {
+    instead("run.mcap", bytes, |folder| {
+        if let Ok(mut recording) = Recording::open(&[folder.join("run.mcap")]) {
+            while let Ok(Some(command)) = recording.next_command() {
+                drop(command);
+            }
+        }
+    });
+}
+
+fn fleet_file(bytes: &[u8]) {
+    drop(text(bytes).map(FleetFile::parse));
+}
+
+fn configuration(bytes: &[u8]) {
+    instead("nesam.toml", bytes, |folder| drop(Config::load(&folder.join("nesam.toml"))));
 }

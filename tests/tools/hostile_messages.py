@@ -1,0 +1,79 @@
+"""Makes the corpora of messages in tests/hostile/corpus from a real server: target/python-client/bin/python tests/tools/hostile_messages.py target/release/nesam
+
+Run it again when the messages change; what it writes is committed."""
+
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+import nesam
+from nesam import _calls as calls
+from nesam import _messages as messages
+
+CORPUS = Path(__file__).resolve().parents[1] / "hostile/corpus"
+
+
+def keep(reader, name, content):
+    folder = CORPUS / reader
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(content)
+
+
+def requests():
+    """Messages that clients send."""
+    state = np.zeros(12)
+    state[:9] = -8.0, 1.0, 0.6, 0.01, -0.02, 0.3, 2.0, 0.05, 0.0
+    measurement = nesam.Measurement("truck", 12_300_000_000, state, (2.0, -0.1), sequence=7)
+    keep("measurement", "valid.bin", messages.measurement_message(measurement).SerializeToString())
+    keep("open_session", "valid.bin", calls.open_session("truck", "truck", "hills", "", measurement).request.SerializeToString())
+    controls = np.tile(np.float32([2.0, 0.1]), (3, 5, 1))
+    extras = nesam.Extras(jacobians=True, covariance=True)
+    cost = nesam.PathCost(np.float32([[0, 0], [5, 0]]), 2.0, best=2)
+    for name, question in {
+        "valid": calls.Question("truck", controls),
+        "extras": calls.Question("truck", controls, start=state, channels=("x", "yaw"), stride=2, extras=extras),
+        "ranked": calls.Question("truck", controls, cost=cost, half=True, samples_min=1),
+        "drawn": calls.Question("truck", nesam.Drawing(controls[0], 4, (0.5, 0.1), seed=3)),
+        "from_now": calls.Question("truck", controls, start_stamp_ns=12_400_000_000, sent=[(12_300_000_000, (2.0, 0.0))]),
+    }.items():
+        keep("predict", f"{name}.bin", question.call().request.SerializeToString())
+    world = nesam.WorldMap("hills", np.zeros((9, 11), np.float32), 0.5, origin_m=(-2.0, -2.0), semantic_rgb=np.full((9, 11, 3), 90, np.uint8))
+    parts = [part.SerializeToString() for part in calls.upload_map(world).request]
+    keep("map_messages", "valid.bin", b"".join(len(part).to_bytes(2, "little") + part for part in parts))
+    return state, world
+
+
+def of_a_server(binary, state, world):
+    """An exported session and a recording."""
+    folder = Path(tempfile.mkdtemp())
+    command = [binary, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh", "--record", str(folder)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    for line in process.stdout:
+        if match := re.match(r"grpc\s+(\S+)", line):
+            address = match.group(1)
+        if line.startswith("ready"):
+            break
+    with nesam.Client(address, timeout_s=60.0) as client:
+        client.upload_map(world)
+        client.open_session("truck", map_id="hills")
+        steps = []
+        for i in range(3):
+            moved = state.copy()
+            moved[:2] = 0.2 * i - 1.0, 0.0
+            steps.append(nesam.Measurement("truck", i * 100_000_000, moved, (2.0, 0.0), sequence=i + 1))
+        client.measure(steps)
+        keep("session_image", "valid.bin", client.export_session("truck"))
+        client.predict("truck", np.tile(np.float32([2.0, 0.1]), (2, 2, 1)))
+    process.terminate()
+    process.wait(30)
+    keep("recording", "valid.mcap", next(folder.glob("*.mcap")).read_bytes())
+    shutil.rmtree(folder)
+
+
+if __name__ == "__main__":
+    of_a_server(sys.argv[1], *requests())
