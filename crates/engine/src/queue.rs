@@ -13,8 +13,9 @@ use crate::service_time::{ServiceTime, work};
 
 /// What an answer still needs after the engine: its way back, ns.
 const WAY_BACK_NS: u64 = 2_000_000;
-/// Share by which waiting and computing may take longer than expected: measurements come in between.
-const LONGER: f64 = 0.1;
+/// Share by which waiting and computing may take longer than expected: measurements come in between, and times scatter. With less more predictions are let in that
+/// are refused only when their turn comes.
+const LONGER: f64 = 0.3;
 /// Shortest pause that a refused asker is told, ns.
 const RETRY_MIN_NS: u64 = 1_000_000;
 
