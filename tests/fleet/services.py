@@ -71,7 +71,7 @@ class Fleet:
         commands = {
             "etcd": ["etcd", "--name", "e", "--data-dir", str(self.folder / "etcd"), "--listen-client-urls", etcd, "--advertise-client-urls", etcd]
             + ["--listen-peer-urls", peer, "--initial-advertise-peer-urls", peer, "--initial-cluster", f"e={peer}"]
-            + ["--heartbeat-interval", "50", "--election-timeout", "500", "--log-level", "error"],
+            + ["--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--log-level", "error"],
             "proxy": ["haproxy", "-db", "-f", str(self._proxy_configuration())],
             "router": [sys.executable, "-c", ROUTER, json.dumps([f"tcp/{at['router']}:7447"])],
         }
