@@ -46,10 +46,7 @@ pub(crate) fn health_router(edge: Edge) -> Router {
 async fn metrics(State(state): State<HttpState>) -> Response {
     let (commands, predictions) = state.edge.engine.handle().waiting();
     let mut text = state.edge.engine.metrics().render(commands, predictions);
-    text += &format!(
-        "# HELP nesam_uptime_seconds Time since the start.\n# TYPE nesam_uptime_seconds gauge\nnesam_uptime_seconds {}\n",
-        state.clock.elapsed().as_secs_f64()
-    );
+    text += &metric("nesam_uptime_seconds", "gauge", "Time since the start.", state.clock.elapsed().as_secs_f64());
     if let Some(recorder) = &state.recorder {
         let counts = recorder.counts();
         for (name, help, value) in [
@@ -61,8 +58,7 @@ async fn metrics(State(state): State<HttpState>) -> Response {
             ),
             ("bytes", "Bytes written to the recording.", counts.bytes),
         ] {
-            let name = format!("nesam_recording_{name}_total");
-            text += &format!("# HELP {name} {help}\n# TYPE {name} counter\n{name} {value}\n");
+            text += &metric(&format!("nesam_recording_{name}_total"), "counter", help, value);
         }
     }
     if let Some(keeper) = &state.edge.keeper {
@@ -72,10 +68,7 @@ async fn metrics(State(state): State<HttpState>) -> Response {
     let alone = ClusterCounts { leased: true, ..Default::default() };
     text += &cluster_metrics(&state.edge.cluster.as_ref().map_or(alone, Cluster::counts));
     if let Some(presence) = &state.edge.presence {
-        text += &format!(
-            "# HELP nesam_vehicles_alive Vehicles whose Zenoh liveliness token is there.\n# TYPE nesam_vehicles_alive gauge\nnesam_vehicles_alive {}\n",
-            presence.count()
-        );
+        text += &metric("nesam_vehicles_alive", "gauge", "Vehicles whose Zenoh liveliness token is there.", presence.count());
     }
     ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
 }
@@ -89,10 +82,13 @@ fn store_metrics(counts: &StoreCounts) -> String {
         ("commit_seconds_total", "counter", "Time of all commits together.", commit_s),
         ("waiting", "gauge", "Sessions and maps that are not durable yet.", waiting as f64),
     ]
-    .map(|(name, kind, help, value)| {
-        format!("# HELP nesam_store_{name} {help}\n# TYPE nesam_store_{name} {kind}\nnesam_store_{name} {value}\n")
-    })
+    .map(|(name, kind, help, value)| metric(&format!("nesam_store_{name}"), kind, help, value))
     .concat()
+}
+
+/// One metric without labels, as Prometheus reads it.
+fn metric(name: &str, kind: &str, help: &str, value: impl core::fmt::Display) -> String {
+    format!("# HELP {name} {help}\n# TYPE {name} {kind}\n{name} {value}\n")
 }
 
 fn cluster_metrics(counts: &ClusterCounts) -> String {
@@ -104,9 +100,7 @@ fn cluster_metrics(counts: &ClusterCounts) -> String {
         ("lost_total", "counter", "Sessions lost with the lease or to another server.", lost),
         ("leased", "gauge", "Whether this server may answer for its sessions: 1 while etcd hears it.", u64::from(leased)),
     ]
-    .map(|(name, kind, help, value)| {
-        format!("# HELP nesam_cluster_{name} {help}\n# TYPE nesam_cluster_{name} {kind}\nnesam_cluster_{name} {value}\n")
-    })
+    .map(|(name, kind, help, value)| metric(&format!("nesam_cluster_{name}"), kind, help, value))
     .concat()
 }
 

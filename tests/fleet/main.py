@@ -1,7 +1,6 @@
 """tests/fleet/run: what must hold while parts of a fleet die. See `run`."""
 
 import argparse
-import contextlib
 import shutil
 import signal
 import sys
@@ -137,10 +136,7 @@ class Run:
     def drive(self, fault):
         """Everything drives, something dies, everything arrives."""
         since = self.fleet.revision()
-        for vehicle in self.vehicles:
-            vehicle.open()
-        for thread in (*self.vehicles, *self.planners):
-            thread.start()
+        traffic.start(self.vehicles, self.planners)
         time.sleep(FAULT_AFTER_S)
         mending = fault(self.fleet, self)
         next(mending)
@@ -179,13 +175,6 @@ class Run:
                 self.violations.append(f"{session}: written without an owner at revision {revision}")
         return count
 
-    def close(self):
-        for thread in (*self.vehicles, *self.planners):
-            with contextlib.suppress(nesam.NesamError):
-                if thread in self.vehicles:
-                    thread.client.close_session(thread.name)
-            thread.client.close()
-
 
 def perform(check, fleet, oracle, attempt):
     run = Run(fleet, f"{check.name}-{attempt}")
@@ -194,7 +183,7 @@ def perform(check, fleet, oracle, attempt):
         run.compare(oracle)
         owners = run.audit(since)
     finally:
-        run.close()
+        traffic.close(run.vehicles, run.planners)
     silence_s = max(planner.silence_s for planner in run.planners)
     late = check.takes_over and silence_s > TAKEOVER_S + traffic.PLAN_S
     figures = {

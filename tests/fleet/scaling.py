@@ -68,21 +68,15 @@ def phase(fleet, replicas, name, plan, vehicles=VEHICLES):
     sessions = [f"{name}-{i}" for i in range(vehicles * len(replicas))]
     drivers = [traffic.Vehicle(fleet.proxy_address, session, steps=int(SECONDS * RATE_HZ), rate_hz=RATE_HZ) for session in sessions]
     planners = [Timed(fleet.proxy_address, session, every_s=1.0) for session in sessions] if plan else []
-    for vehicle in drivers:
-        vehicle.open()
     before = Reading(fleet, replicas)
-    for thread in (*drivers, *planners):
-        thread.start()
+    traffic.start(drivers, planners)
     for vehicle in drivers:
         vehicle.join()
     for planner in planners:
         planner.stop()
     after = Reading(fleet, replicas)
-    for thread in (*drivers, *planners):
-        if thread in drivers:
-            thread.client.close_session(thread.name)
-        thread.client.close()
-    measurements = sum(len(vehicle._steps) for vehicle in drivers)
+    traffic.close(drivers, planners)
+    measurements = sum(len(vehicle.steps) for vehicle in drivers)
     took = sorted(time_s for planner in planners for time_s in planner.took_s)
     return {
         "server_s": after.server_s - before.server_s,

@@ -34,20 +34,15 @@ def one_round(fleet, number, violations):
     vehicles = [traffic.ZenohVehicle(fleet.proxy_address, name, router, "fleet") for name in names[:ZENOH_VEHICLES]]
     vehicles += [traffic.Vehicle(fleet.proxy_address, name) for name in names[ZENOH_VEHICLES:]]
     planners = [traffic.Planner(fleet.proxy_address, name, every_s=0.5) for name in names]
-    for vehicle in vehicles:
-        vehicle.open()
-    for thread in (*vehicles, *planners):
-        thread.start()
+    traffic.start(vehicles, planners)
     for vehicle in vehicles:
         vehicle.join()
     for planner in planners:
         planner.stop()
     for thread in (*vehicles, *planners):
         violations += thread.violations
-        if thread in vehicles:
-            thread.client.close_session(thread.name)
-        thread.client.close()
-    return sum(planner.answered for planner in planners) + sum(len(traffic.drive(name)) for name in names)
+    traffic.close(vehicles, planners)
+    return sum(planner.answered for planner in planners) + sum(len(vehicle.steps) for vehicle in vehicles)
 
 
 def soak(fleet, seconds):

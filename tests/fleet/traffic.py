@@ -1,9 +1,9 @@
 """What the fleet is there for: vehicles that stream a recorded drive, planners that ask, and what both must find in the end."""
 
+import contextlib
+import functools
 import json
 import queue
-import re
-import subprocess
 import threading
 import time
 from pathlib import Path
@@ -16,6 +16,7 @@ from PIL import Image
 import nesam
 from nesam import _messages
 from nesam.v1 import measurements_pb2
+from serving import served
 
 DATA = Path(__file__).resolve().parents[1] / "data/chrono_sample"
 DRIVE, WORLD, MAP = "n0005", "w05", "w05"
@@ -37,11 +38,17 @@ def world():
     return nesam.WorldMap(MAP, np.ascontiguousarray(elevation, np.float32), about["resolution_m"], origin_m=tuple(about["origin_m"]), semantic_rgb=rgb)
 
 
-def drive(session):
-    """The measurements of a session."""
+@functools.lru_cache
+def recorded():
+    """Columns of the recorded drives, and the rows of ours."""
     table = parquet.read_table(DATA / "nominal/samples.parquet", columns=["trajectory", "t", *STATE, "cmd_speed", "cmd_steer"])
     columns = {name: table[name].to_pylist() for name in table.column_names}
-    rows = [i for i, name in enumerate(columns["trajectory"]) if name == DRIVE][:STEPS]
+    return columns, [i for i, name in enumerate(columns["trajectory"]) if name == DRIVE][:STEPS]
+
+
+def drive(session):
+    """The measurements of a session."""
+    columns, rows = recorded()
     return [
         nesam.Measurement(
             session,
@@ -73,22 +80,29 @@ class Outcome:
 
 def without_failures(server, command):
     """The outcome of the drive on one server that nothing happens to."""
-    process = subprocess.Popen(
-        command([server, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"]), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    )
-    try:
-        for line in process.stdout:
-            if match := re.match(r"grpc\s+(\S+)", line):
-                address = match.group(1)
-            if line.startswith("ready"):
-                break
+    with served(command([server, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh"])) as address:
         with nesam.Client(address, timeout_s=60.0) as client:
             client.upload_map(world())
             client.open_session("oracle", map_id=MAP)
             client.measure(drive("oracle"))
             return Outcome(client, "oracle")
-    finally:
-        process.kill()
+
+
+def start(vehicles, planners):
+    """Opens the sessions and lets everybody drive and ask."""
+    for vehicle in vehicles:
+        vehicle.open()
+    for thread in (*vehicles, *planners):
+        thread.start()
+
+
+def close(vehicles, planners):
+    """Closes the sessions and the connections."""
+    for vehicle in vehicles:
+        with contextlib.suppress(nesam.NesamError):
+            vehicle.client.close_session(vehicle.name)
+    for thread in (*vehicles, *planners):
+        thread.client.close()
 
 
 class Vehicle(threading.Thread):
@@ -97,7 +111,7 @@ class Vehicle(threading.Thread):
     def __init__(self, address, name, steps=None, rate_hz=RATE_HZ):
         super().__init__(name=name, daemon=True)
         self.client = nesam.Client(address, timeout_s=10.0, vehicle_id=name)
-        self._steps, self._rate_hz = drive(name)[:steps], rate_hz
+        self.steps, self._rate_hz = drive(name)[:steps], rate_hz
         self.violations, self.worst_s = [], 0.0
 
     def open(self):
@@ -107,7 +121,7 @@ class Vehicle(threading.Thread):
         try:
             with self.client.durable_stream(self.name, reconnect_s=20.0, pause_s=0.02) as stream:
                 begun = time.monotonic()
-                for i, measurement in enumerate(self._steps):
+                for i, measurement in enumerate(self.steps):
                     time.sleep(max(0.0, begun + i / self._rate_hz - time.monotonic()))
                     asked = time.monotonic()
                     answer = stream.send(measurement)
@@ -128,7 +142,7 @@ class ZenohVehicle(threading.Thread):
     def __init__(self, address, name, router, fleet):
         super().__init__(name=name, daemon=True)
         self.client = nesam.Client(address, timeout_s=10.0, vehicle_id=name)
-        self._steps, self._router, self._key = drive(name), router, f"nesam/v1/{fleet}/{name}/"
+        self.steps, self._router, self._key = drive(name), router, f"nesam/v1/{fleet}/{name}/"
         self._answers = queue.Queue()
         self.violations, self.worst_s = [], 0.0
 
@@ -150,7 +164,7 @@ class ZenohVehicle(threading.Thread):
                 self.violations.append(f"{self.name}: {error}")
 
     def _drive(self, publisher):
-        begun, unsent, kept, run = time.monotonic(), list(self._steps), [], 0
+        begun, unsent, kept, run = time.monotonic(), list(self.steps), [], 0
         while unsent or kept:
             if not unsent:
                 # All were received; are they durable?

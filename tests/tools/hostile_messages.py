@@ -2,9 +2,7 @@
 
 Run it again when the messages change; what it writes is committed."""
 
-import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -14,6 +12,7 @@ import numpy as np
 import nesam
 from nesam import _calls as calls
 from nesam import _messages as messages
+from serving import served
 
 CORPUS = Path(__file__).resolve().parents[1] / "hostile/corpus"
 
@@ -52,13 +51,7 @@ def of_a_server(binary, state, world):
     """An exported session and a recording."""
     folder = Path(tempfile.mkdtemp())
     command = [binary, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh", "--record", str(folder)]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-    for line in process.stdout:
-        if match := re.match(r"grpc\s+(\S+)", line):
-            address = match.group(1)
-        if line.startswith("ready"):
-            break
-    with nesam.Client(address, timeout_s=60.0) as client:
+    with served(command) as address, nesam.Client(address, timeout_s=60.0) as client:
         client.upload_map(world)
         client.open_session("truck", map_id="hills")
         steps = []
@@ -69,8 +62,6 @@ def of_a_server(binary, state, world):
         client.measure(steps)
         keep("session_image", "valid.bin", client.export_session("truck"))
         client.predict("truck", np.tile(np.float32([2.0, 0.1]), (2, 2, 1)))
-    process.terminate()
-    process.wait(30)
     keep("recording", "valid.mcap", next(folder.glob("*.mcap")).read_bytes())
     shutil.rmtree(folder)
 

@@ -191,8 +191,6 @@ pub struct TxnRequest {
     pub compare: ::prost::alloc::vec::Vec<Compare>,
     #[prost(message, repeated, tag = "2")]
     pub success: ::prost::alloc::vec::Vec<RequestOp>,
-    #[prost(message, repeated, tag = "3")]
-    pub failure: ::prost::alloc::vec::Vec<RequestOp>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct TxnResponse {

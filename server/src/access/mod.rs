@@ -122,12 +122,9 @@ impl Caller {
     /// # Errors
     /// PERMISSION_DENIED, or NOT_FOUND for a session that is not open: then there is nobody whose it could be.
     pub fn may(&self, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
-        let (fleet, identity) = match (self.access.rights(), &self.identity) {
-            (Some(fleet), Some(identity)) => (fleet, identity),
-            // Without identities the engine says what is not there.
-            _ => return Ok(None),
-        };
-        self.decide(fleet.as_ref(), identity, wish, self.vehicle_of(wish))
+        // Without identities the engine says what is not there.
+        let Some((fleet, identity)) = self.known() else { return Ok(None) };
+        decide(&fleet, identity, wish, self.vehicle_of(wish))
     }
 
     /// The same for a session of this vehicle that is not open here.
@@ -135,50 +132,45 @@ impl Caller {
     /// # Errors
     /// PERMISSION_DENIED.
     pub fn may_with(&self, wish: Wish<'_>, vehicle: &str) -> Result<(), Status> {
-        match (self.access.rights(), &self.identity) {
-            (Some(fleet), Some(identity)) => self.decide(fleet.as_ref(), identity, wish, Some(vehicle.into())).map(drop),
-            _ => Ok(()),
-        }
+        let Some((fleet, identity)) = self.known() else { return Ok(()) };
+        decide(&fleet, identity, wish, Some(vehicle.into())).map(drop)
     }
 
-    fn decide(
-        &self,
-        fleet: &FleetFile,
-        identity: &Identity,
-        wish: Wish<'_>,
-        vehicle: Option<Arc<str>>,
-    ) -> Result<Option<Arc<str>>, Status> {
-        let allowed = match (wish, &vehicle) {
-            (Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session), None) => {
-                return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
-            }
-            (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
-            (Wish::ApplyEffects(_), Some(_)) => fleet.may_operate(identity),
-            (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
-            (Wish::OpenSession { vehicle, session }, _) => {
-                let name = if session.is_empty() { vehicle } else { session };
-                fleet.may_change(identity, vehicle) && fleet.may_name(identity, name)
-            }
-            (Wish::ChangeMap(map), _) => fleet.may_change_map(identity, map),
-        };
-        if allowed {
-            return Ok(vehicle);
-        }
-        tracing::warn!(target: "nesam::audit", %identity, ?wish, "refused: no right");
-        Err(Status::permission_denied(format!("{identity} has no right to {wish}; the fleet file of the server gives rights")))
+    /// The rights in force and who the caller is, where clients have identities.
+    fn known(&self) -> Option<(Arc<FleetFile>, &Identity)> {
+        self.access.rights().zip(self.identity.as_ref())
     }
 
     /// Whether the caller may read the sessions of a vehicle; nothing is logged.
     pub fn sees(&self, vehicle: &str) -> bool {
-        match (self.access.rights(), &self.identity) {
-            (Some(fleet), Some(identity)) => fleet.may_read(identity, vehicle),
-            _ => true,
-        }
+        self.known().is_none_or(|(fleet, identity)| fleet.may_read(identity, vehicle))
     }
 
     fn vehicle_of(&self, wish: Wish<'_>) -> Option<Arc<str>> {
         wish.session().and_then(|session| self.access.directory.vehicle(session))
     }
+}
+
+/// Whether somebody may, with a session of this vehicle; what is refused is logged.
+fn decide(fleet: &FleetFile, identity: &Identity, wish: Wish<'_>, vehicle: Option<Arc<str>>) -> Result<Option<Arc<str>>, Status> {
+    let allowed = match (wish, &vehicle) {
+        (Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session), None) => {
+            return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
+        }
+        (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
+        (Wish::ApplyEffects(_), Some(_)) => fleet.may_operate(identity),
+        (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
+        (Wish::OpenSession { vehicle, session }, _) => {
+            let name = if session.is_empty() { vehicle } else { session };
+            fleet.may_change(identity, vehicle) && fleet.may_name(identity, name)
+        }
+        (Wish::ChangeMap(map), _) => fleet.may_change_map(identity, map),
+    };
+    if allowed {
+        return Ok(vehicle);
+    }
+    tracing::warn!(target: "nesam::audit", %identity, ?wish, "refused: no right");
+    Err(Status::permission_denied(format!("{identity} has no right to {wish}; the fleet file of the server gives rights")))
 }
 
 impl core::fmt::Display for Wish<'_> {

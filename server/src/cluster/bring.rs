@@ -30,6 +30,16 @@ pub(crate) enum Brought {
     Nowhere,
 }
 
+/// Where a session is, as far as this server knows without asking.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Standing {
+    Here,
+    /// With another server, or searched for a moment ago.
+    Elsewhere,
+    /// No server is known to have it: it is to be searched for now.
+    Lost,
+}
+
 /// What may be done to have a session.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Zeal {
@@ -58,19 +68,6 @@ impl Cluster {
         self.have(session, Zeal::Ask, budget, permit).await
     }
 
-    /// Brings a session here if no server has it.
-    ///
-    /// # Errors
-    /// As [`Cluster::bring`].
-    pub async fn bring_if_free(
-        &self,
-        session: &str,
-        budget: Duration,
-        permit: impl Fn(&str) -> Result<(), Status>,
-    ) -> Result<Brought, Status> {
-        self.have(session, Zeal::IfFree, budget, permit).await
-    }
-
     /// Makes this server the owner of a name under which a session is to begin. A session that has the name already is brought here: the engine will say
     /// that it is there.
     ///
@@ -87,19 +84,28 @@ impl Cluster {
         }
     }
 
-    /// Whether a session should be looked for now on behalf of a bus that tells every server of it.
-    pub fn should_search(&self, session: &str) -> bool {
+    /// Where a session is, for a bus that tells every server of it.
+    pub fn standing(&self, session: &str) -> Standing {
+        if self.is_here(session).unwrap_or(false) {
+            return Standing::Here;
+        }
         if self.is_elsewhere(session) {
-            return false;
+            return Standing::Elsewhere;
         }
         let now = Instant::now();
         let mut state = self.lock();
         state.looked.retain(|_, at| now.duration_since(*at) < SEARCH_PAUSE);
-        let due = !state.looked.contains_key(session);
-        if due {
-            state.looked.insert(session.into(), now);
+        if state.looked.contains_key(session) {
+            return Standing::Elsewhere;
         }
-        due
+        state.looked.insert(session.into(), now);
+        Standing::Lost
+    }
+
+    /// Brings a session of this vehicle here if no server has it; `None` = another one was quicker, it is another vehicle's, or etcd does not answer.
+    pub async fn search(&self, session: &str, vehicle: &str, budget: Duration) -> Option<Brought> {
+        let own = |of: &str| if of == vehicle { Ok(()) } else { Err(Status::permission_denied("of another vehicle")) };
+        self.have(session, Zeal::IfFree, budget, own).await.ok()
     }
 
     async fn have(
@@ -180,17 +186,13 @@ impl Cluster {
 
     async fn look(&self, session: &str) -> Result<Seen, Status> {
         let keys = &self.0.keys;
-        let mut read =
-            self.0.etcd.all(vec![get(&keys.owner(session)), get(&keys.session(session))]).await?.read.into_iter().flat_map(first);
-        let (mut owner, mut stored) = (None, None);
-        for found in read.by_ref() {
-            if found.key == keys.owner(session).as_bytes() {
-                let server = of_json(&found.value).unwrap_or_else(|| Server { name: "?".into(), address: "?".into() });
-                owner = Some((found.create_revision, found.lease, server));
-            } else {
-                stored = Some(stored_session(session, &found)?);
-            }
-        }
+        let read = self.0.etcd.all(vec![get(&keys.owner(session)), get(&keys.session(session))]).await?.read;
+        let mut found = read.into_iter().map(first);
+        let owner = found.next().flatten().map(|owner| {
+            let server = of_json(&owner.value).unwrap_or_else(|| Server { name: "?".into(), address: "?".into() });
+            (owner.create_revision, owner.lease, server)
+        });
+        let stored = found.next().flatten().map(|found| stored_session(session, &found)).transpose()?;
         Ok(Seen { owner, stored })
     }
 
@@ -201,7 +203,7 @@ impl Cluster {
         let owner = keys.owner(session);
         // Read in the same transaction: nobody writes after it without the new epoch.
         let then = vec![put(&owner, json(&self.0.me), lease), delete(&keys.want(session)), get(&keys.session(session))];
-        let done = self.0.etcd.transaction(vec![created(&owner, 0)], then, Vec::new()).await?;
+        let done = self.0.etcd.transaction(vec![created(&owner, 0)], then).await?;
         if !done.held {
             return Ok(false);
         }

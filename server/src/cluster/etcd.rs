@@ -51,13 +51,13 @@ impl Etcd {
         Ok(Self { kv, lease, watch })
     }
 
-    /// Does all of `then` when every condition holds, all of `otherwise` when not; at one instant.
+    /// Does all of `then` at one instant when every condition holds, and nothing when not.
     ///
     /// # Errors
     /// What etcd or the way to it says; whether the transaction was done is not known then.
-    pub async fn transaction(&self, conditions: Vec<pb::Compare>, then: Vec<Request>, otherwise: Vec<Request>) -> Result<Done, Status> {
-        let operations = |list: Vec<Request>| list.into_iter().map(|request| pb::RequestOp { request: Some(request) }).collect();
-        let request = pb::TxnRequest { compare: conditions, success: operations(then), failure: operations(otherwise) };
+    pub async fn transaction(&self, conditions: Vec<pb::Compare>, then: Vec<Request>) -> Result<Done, Status> {
+        let success = then.into_iter().map(|request| pb::RequestOp { request: Some(request) }).collect();
+        let request = pb::TxnRequest { compare: conditions, success };
         let reply = within(TRANSACTION, self.kv.clone().txn(request)).await?.into_inner();
         let read = reply.responses.into_iter().filter_map(|response| match response.response {
             Some(pb::response_op::Response::ResponseRange(range)) => Some(range.kvs),
@@ -71,7 +71,7 @@ impl Etcd {
     /// # Errors
     /// As [`Etcd::transaction`].
     pub async fn all(&self, then: Vec<Request>) -> Result<Done, Status> {
-        self.transaction(Vec::new(), then, Vec::new()).await
+        self.transaction(Vec::new(), then).await
     }
 
     /// Forgets what keys were before a revision.

@@ -80,6 +80,6 @@ impl Cluster {
 
     pub(super) async fn release_key(&self, session: &str, epoch: i64) -> Result<(), Status> {
         let owner = self.0.keys.owner(session);
-        self.0.etcd.transaction(vec![created(&owner, epoch)], vec![delete(&owner)], Vec::new()).await.map(drop)
+        self.0.etcd.transaction(vec![created(&owner, epoch)], vec![delete(&owner)]).await.map(drop)
     }
 }

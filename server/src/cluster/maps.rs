@@ -92,7 +92,7 @@ impl Cluster {
             let revision = before.as_ref().map_or(0, |(_, revision)| *revision);
             let mut then = vec![put(&keys.map(map), json(&head), 0)];
             then.extend(before.map(|(before, _)| delete_all(&keys.parts(map, Some(&before.sha256)))));
-            if self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then, Vec::new()).await?.held {
+            if self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then).await?.held {
                 return Ok(());
             }
         }

@@ -29,7 +29,7 @@ use tokio::task::JoinHandle;
 use tonic::Status;
 use tonic_types::{ErrorDetails, StatusExt as _};
 
-pub(crate) use self::bring::Brought;
+pub(crate) use self::bring::{Brought, Standing};
 pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, put, written};
 pub(crate) use self::keys::Keys;
 use self::lease::Lease;
@@ -191,7 +191,7 @@ impl Cluster {
     }
 
     /// Whether another server has the session, as far as this one knows.
-    pub fn is_elsewhere(&self, session: &str) -> bool {
+    fn is_elsewhere(&self, session: &str) -> bool {
         let state = self.lock();
         !state.held.contains_key(session) && state.owners.get(session).is_some_and(|lease| Some(*lease) != self.0.lease.id())
     }

@@ -90,7 +90,7 @@ impl EtcdStore {
             Some(session) => vec![put(&keys.session(write.name), session_bytes(session), 0)],
             None => vec![delete(&keys.session(write.name)), delete(&keys.owner(write.name))],
         });
-        let held = self.cluster.etcd().transaction(conditions, then.collect(), Vec::new()).await?.held;
+        let held = self.cluster.etcd().transaction(conditions, then.collect()).await?.held;
         if held {
             group.iter().filter(|write| write.session.is_none()).for_each(|write| self.cluster.closed(write.name, write.epoch));
         }

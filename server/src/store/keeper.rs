@@ -100,14 +100,10 @@ impl Keeper {
         if let Key::Session(session) = &key
             && state.gone.contains(session)
         {
-            match event {
-                Event::SessionOpened { .. } => drop(state.gone.remove(session)),
-                Event::SessionClosed { .. } => {
-                    state.gone.remove(session);
-                    return;
-                }
-                _ => return,
+            if !matches!(event, Event::SessionOpened { .. }) {
+                return;
             }
+            state.gone.remove(session);
         }
         state.changes += 1;
         let (latest, due) = (state.changes, Instant::now() + wait);

@@ -8,7 +8,7 @@ use tokio::sync::mpsc;
 
 use super::{MEASUREMENT_BYTES_MAX, Outgoing, decode, encode, keys};
 use crate::call::measured;
-use crate::cluster::Brought;
+use crate::cluster::{Brought, Standing};
 use crate::convert::{measurement, measurement_answer};
 use crate::grpc::Edge;
 use crate::telemetry::Transport;
@@ -67,20 +67,17 @@ impl ReturnPath {
     /// no owner they race for the session; what was not answered meanwhile the vehicle sends again.
     fn is_ours(&self) -> bool {
         let Some(cluster) = &self.edge.cluster else { return true };
-        if cluster.is_here(&self.session).unwrap_or(false) {
-            return true;
-        }
-        if cluster.should_search(&self.session) {
+        let standing = cluster.standing(&self.session);
+        if standing == Standing::Lost {
             let (cluster, path) = (cluster.clone(), self.clone());
             self.edge.runtime.spawn(async move {
-                let own = |of: &str| if of == path.vehicle { Ok(()) } else { Err(tonic::Status::permission_denied("of another vehicle")) };
-                if let Ok(Brought::Nowhere) = cluster.bring_if_free(&path.session, path.edge.stream_budget(), own).await {
+                if let Some(Brought::Nowhere) = cluster.search(&path.session, &path.vehicle, path.edge.stream_budget()).await {
                     let error = EngineError::UnknownSession { session: path.session.clone() };
                     path.answer(Err(error));
                 }
             });
         }
-        false
+        standing == Standing::Here
     }
 
     /// Counts and publishes the answer.

@@ -4,7 +4,7 @@ use nesam_engine::EngineError;
 use nesam_proto::v1 as pb;
 
 use super::{decode, encode, keys};
-use crate::cluster::Brought;
+use crate::cluster::{Brought, Standing};
 use crate::convert::predict_error;
 use crate::grpc::Edge;
 use crate::grpc::predict as answer;
@@ -38,17 +38,15 @@ enum Absent {
 /// Every server is asked; the one that has the session answers, and where there is none the first that gets it.
 async fn absent(edge: &Edge, session: &str, vehicle: &str) -> Option<Absent> {
     let cluster = edge.cluster.as_ref()?;
-    if cluster.is_here(session).unwrap_or(false) {
-        return None;
-    }
-    if !cluster.should_search(session) {
-        return Some(Absent::Elsewhere);
-    }
-    let own = |of: &str| if of == vehicle { Ok(()) } else { Err(tonic::Status::permission_denied("of another vehicle")) };
-    match cluster.bring_if_free(session, edge.stream_budget(), own).await {
-        Ok(Brought::Here) => None,
-        Ok(Brought::Nowhere) => Some(Absent::Refused(EngineError::UnknownSession { session: session.into() })),
-        Err(_) => Some(Absent::Elsewhere),
+    let brought = match cluster.standing(session) {
+        Standing::Here => Some(Brought::Here),
+        Standing::Elsewhere => None,
+        Standing::Lost => cluster.search(session, vehicle, edge.stream_budget()).await,
+    };
+    match brought {
+        Some(Brought::Here) => None,
+        Some(Brought::Nowhere) => Some(Absent::Refused(EngineError::UnknownSession { session: session.into() })),
+        None => Some(Absent::Elsewhere),
     }
 }
 
