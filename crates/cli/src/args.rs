@@ -3,6 +3,10 @@
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use nesam_model::MAX_HORIZON;
+use nesam_trajectories::Trajectory;
+
+use crate::failure::Failure;
 
 /// Which drives to read.
 #[derive(Args, Clone, Debug)]
@@ -60,12 +64,47 @@ pub struct BundleArgs {
 /// Length of a window.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct WindowArgs {
-    /// Steps to predict
-    #[arg(long, value_name = "STEPS", default_value_t = 32, value_parser = positive)]
-    pub horizon: usize,
+    /// Steps to predict [default: 32, fewer where every drive is shorter]
+    #[arg(long, value_name = "STEPS", value_parser = positive)]
+    horizon: Option<usize>,
     /// Steps of measured history that the model may see, the start included
     #[arg(long, value_name = "STEPS", default_value_t = 32, value_parser = positive)]
     pub history: usize,
+}
+
+impl WindowArgs {
+    /// Steps to predict where no drive limits them.
+    pub fn horizon(&self) -> usize {
+        self.horizon.unwrap_or(MAX_HORIZON)
+    }
+
+    /// Steps to predict on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows.
+    pub fn horizon_on(&self, drives: &[Trajectory]) -> usize {
+        if let Some(asked) = self.horizon {
+            return asked;
+        }
+        let longest = drives.iter().map(|d| d.states.len()).max().unwrap_or(0);
+        let horizon = MAX_HORIZON.min(longest.saturating_sub(1)).max(1);
+        if horizon < MAX_HORIZON {
+            eprintln!(
+                "note: predicting {horizon} steps, as many as the longest drive allows ({MAX_HORIZON} where drives are longer); --horizon sets another number"
+            );
+        }
+        horizon
+    }
+
+    /// Refuses more steps than the model knows.
+    ///
+    /// # Errors
+    /// Wrong usage.
+    pub fn check_horizon(&self) -> Result<(), Failure> {
+        match self.horizon {
+            Some(horizon) if horizon > MAX_HORIZON => {
+                Err(Failure::input(format!("--horizon {horizon} exceeds the model's {MAX_HORIZON} steps")))
+            }
+            _ => Ok(()),
+        }
+    }
 }
 
 fn positive(text: &str) -> Result<usize, String> {

@@ -10,7 +10,7 @@ use nesam_physics::{STATE_DIM, SoilCorrection};
 use rayon::prelude::*;
 
 use crate::claims::Case;
-use crate::condense::{Condensed, difference, profiled};
+use crate::condense::{Condensed, Parts, difference, profiled};
 use crate::ridge;
 
 /// Principal directions of the hidden layer that the head may change along (chosen: most of what a few drives vary).
@@ -27,7 +27,7 @@ pub struct BlackBox {
     mean: DVector<f64>,
     /// Directions over their standard deviation, one a column. (128, directions)
     directions: DMatrix<f64>,
-    drives: Vec<Condensed>,
+    parts: Parts,
 }
 
 impl BlackBox {
@@ -60,15 +60,15 @@ impl BlackBox {
                 profiled(&case.metric, rows, &columns, &prepared.signatures.soil)
             })
             .collect();
-        Some(Self { mean, directions, drives })
+        Some(Self { mean, directions, parts: Parts::of(drives) })
     }
 
-    /// A predictor with the head that the drives teach, but for one of them where given; unchanged where they teach nothing.
+    /// A predictor with the head that the drives teach, but for the part of one of them where given; unchanged where they teach nothing.
     ///
     /// # Errors
     /// Those of [`Predictor::with_residual_head`].
     pub fn predictor(&self, predictor: &Predictor, left_out: Option<usize>) -> Result<Predictor, ModelError> {
-        let kept: Vec<&Condensed> = (0..self.drives.len()).filter(|d| Some(*d) != left_out).map(|d| &self.drives[d]).collect();
+        let kept: Vec<&Condensed> = self.parts.without(left_out).collect();
         let hidden = self.mean.len();
         let (mut weight, mut bias) = (vec![0.0f32; STATE_DIM * hidden], vec![0.0f32; STATE_DIM]);
         if let Some(found) = ridge::fit(&kept, None) {

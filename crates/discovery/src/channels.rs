@@ -51,16 +51,19 @@ pub fn layer(channel: usize) -> &'static str {
     }
 }
 
-/// Which channels a drive measures; an estimated channel is not compared.
-pub fn available(measured: &MeasuredChannels) -> [bool; CHANNELS] {
+/// Which channels of a drive are compared: what is measured and predicted. Rims that are servoed turn as they are told, others follow the ground under them,
+/// which is known where velocity is measured. Without a map, height, roll and pitch tell of the ground and not of the vehicle.
+pub fn available(measured: &MeasuredChannels, rims_servoed: bool, mapped: bool) -> [bool; CHANNELS] {
     let w = measured.angular_velocity;
     let (position, height, attitude, velocity) = (measured.position, measured.height, measured.attitude, measured.linear_velocity);
-    let state = [position, position, height, attitude, attitude, attitude, velocity, velocity, velocity, w[0], w[1], w[2]];
+    let (level, tilt) = (height && mapped, attitude && mapped);
+    let (heave, sway) = (velocity && mapped, [w[0] && mapped, w[1] && mapped]);
+    let state = [position, position, level, tilt, tilt, attitude, velocity, velocity, heave, sway[0], sway[1], w[2]];
     core::array::from_fn(|c| match c {
         c if c < STEERING_AT => state[c % STATE_CHANNELS],
         c if c < RIM_AT => measured.road_wheel_angle,
-        c if c < PATH_AT => measured.wheel_speed && velocity,
+        c if c < PATH_AT => measured.wheel_speed && (velocity || rims_servoed),
         c if c < TURN_AT => position && velocity && attitude && (height || c < PATH_AT + 2),
-        _ => attitude && w.iter().all(|w| *w),
+        _ => attitude && w[c - TURN_AT],
     })
 }

@@ -296,8 +296,8 @@ impl Case<'_> {
         let hits = subsets
             .par_iter()
             .filter(|subset| {
-                let inside = |i: usize| i < n && **subset & (1 << i) != 0;
-                let part = || yardstick.group((0..n).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
+                let inside = |i: usize| **subset & (1 << (i * n / self.prepared.len())) != 0;
+                let part = || yardstick.group((0..self.prepared.len()).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
                 let chosen = yardstick.select(&part()).chosen;
                 if chosen.iter().any(|h| in_class(*h)) {
                     return true;

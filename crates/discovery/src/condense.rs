@@ -55,6 +55,49 @@ impl Condensed {
             ..self.clone()
         }
     }
+
+    fn add(&mut self, other: &Self) {
+        self.score += &other.score;
+        self.information += &other.information;
+        self.square += other.square;
+        self.soil_score += &other.soil_score;
+        self.soil_information += &other.soil_information;
+    }
+}
+
+/// Most parts of which a control leaves each out in turn.
+const PARTS_MAX: usize = 24;
+
+/// The drives of a set in at most 24 parts of neighbours, for what would take too long if each drive were left out by itself.
+#[derive(Clone, Debug)]
+pub struct Parts {
+    parts: Vec<Condensed>,
+    drives: usize,
+}
+
+impl Parts {
+    /// Sums of neighbouring drives; every drive is a part where there are few.
+    pub fn of(drives: Vec<Condensed>) -> Self {
+        let count = drives.len();
+        let mut parts: Vec<Condensed> = Vec::new();
+        for (d, drive) in drives.into_iter().enumerate() {
+            match parts.get_mut(Self::part(d, count)) {
+                Some(part) => part.add(&drive),
+                None => parts.push(drive),
+            }
+        }
+        Self { parts, drives: count }
+    }
+
+    /// The parts, but for that of a drive where given.
+    pub fn without(&self, drive: Option<usize>) -> impl Iterator<Item = &Condensed> {
+        let left_out = drive.map(|d| Self::part(d, self.drives));
+        self.parts.iter().enumerate().filter(move |(p, _)| Some(*p) != left_out).map(|(_, part)| part)
+    }
+
+    fn part(drive: usize, drives: usize) -> usize {
+        drive * drives.min(PARTS_MAX) / drives
+    }
 }
 
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.

@@ -9,7 +9,7 @@ use nesam_physics::effects::{Effect, FREE_FORM_AXES, FREE_FORM_FEATURES, FreeFor
 use rayon::prelude::*;
 
 use crate::claims::Case;
-use crate::condense::{Condensed, difference, profiled};
+use crate::condense::{Condensed, Parts, difference, profiled};
 use crate::fit::{Fit, parameter_columns};
 use crate::ridge;
 
@@ -29,7 +29,7 @@ pub struct Leftover {
     /// Unit of each coefficient. (parameters)
     units: Vec<f64>,
     /// Scores in the coefficients and, after them, in the parameters of the named effects.
-    drives: Vec<Condensed>,
+    parts: Parts,
 }
 
 impl Leftover {
@@ -62,13 +62,12 @@ impl Leftover {
                 profiled(&case.metric, &rows, &columns, &prepared.signatures.soil)
             })
             .collect();
-        Self { region, units, drives }
+        Self { region, units, parts: Parts::of(drives) }
     }
 
-    /// The term that the drives teach, but for one of them where given, with the share of the distance that it explains on drives it was not fitted on; `None` where it explains nothing there.
+    /// The term that the drives teach, but for the part of one of them where given, with the share of the distance that it explains on drives it was not fitted on; `None` where it explains nothing there.
     pub fn effect(&self, left_out: Option<usize>) -> Option<(Effect, f64)> {
-        let kept: Vec<Condensed> =
-            (0..self.drives.len()).filter(|d| Some(*d) != left_out).map(|d| self.drives[d].head(PARAMETERS)).collect();
+        let kept: Vec<Condensed> = self.parts.without(left_out).map(|d| d.head(PARAMETERS)).collect();
         let keep = self.orthogonal(left_out);
         let found = ridge::fit(&kept.iter().collect::<Vec<_>>(), keep.as_ref())?;
         let mut effect = self.region;
@@ -82,13 +81,13 @@ impl Leftover {
 
     /// Projection of coefficients onto those whose response is orthogonal to the named effects' parameters; `None` without such.
     fn orthogonal(&self, left_out: Option<usize>) -> Option<DMatrix<f64>> {
-        let size = self.drives.first()?.score.len();
+        let size = self.parts.without(None).next()?.score.len();
         let named = size - PARAMETERS;
         if named == 0 {
             return None;
         }
         let mut cross = DMatrix::zeros(PARAMETERS, named);
-        for (_, drive) in self.drives.iter().enumerate().filter(|(d, _)| Some(*d) != left_out) {
+        for drive in self.parts.without(left_out) {
             cross += drive.information.view((0, PARAMETERS), (PARAMETERS, named));
         }
         let norms = DVector::from_iterator(named, cross.column_iter().map(|c| c.norm().max(1e-12)));

@@ -104,5 +104,6 @@ pub(crate) fn own_yardstick(case: &Case<'_>, without: &[String]) -> Result<Yards
     let nulls = Nulls::about_zero(&drives.iter().collect::<Vec<_>>())
         .ok_or_else(|| DiscoveryError::Drives { reason: "--reference physics needs more drives".into() })?;
     let channels = &case.metric.channels;
-    Ok(Yardstick::new(nulls, channels, without, |catalogue| own_reference::sign_flips(&drives, catalogue, channels)))
+    let yardstick = Yardstick::new(nulls, channels, without, |catalogue| own_reference::sign_flips(&drives, catalogue, channels));
+    Ok(Yardstick { model_on_trial: true, ..yardstick })
 }

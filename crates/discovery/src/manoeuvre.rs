@@ -19,7 +19,15 @@ pub fn separating(finding: &Finding) -> Option<&'static str> {
         "coast straight ahead from full speed to rest on level ground, up and down the same slope"
     } else if either(&["tyre_radius_front", "tyre_radius_rear", "speed_gain", "velocity_scale", "clock_drift"]) {
         "drive a measured straight distance at two constant speeds on hard ground"
-    } else if either(&["steering_lag", "steering_delay", "steering_backlash", "position_latency", "speed_lag", "speed_delay"]) {
+    } else if either(&[
+        "steering_lag",
+        "steering_delay",
+        "steering_backlash",
+        "position_latency",
+        "pose_latency",
+        "speed_lag",
+        "speed_delay",
+    ]) {
         "step steers and step changes of speed, with pauses between them"
     } else if either(&["steering_offset", "steering_ratio", "steering_compliance", "cg_lateral", "side_bulldozing", "locked_differential"])
     {

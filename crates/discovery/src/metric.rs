@@ -10,8 +10,9 @@ use crate::channels::{CHANNELS, Row};
 
 /// Share of the correlations within drives that is not believed: hundreds of segments stand behind them.
 const SHRINKAGE_WITHIN: f64 = 0.05;
-/// Share of the correlations between drives that is not believed: some thirty drives stand behind them.
+/// Share of the correlations between drives that is not believed where up to [`DRIVES_BEHIND`] drives stand behind them; it falls as one over their number.
 const SHRINKAGE_BETWEEN: f64 = 0.5;
+const DRIVES_BEHIND: f64 = 30.0;
 /// Robust standard deviations beyond which a deviation has no further say in a covariance (Huber 1964).
 const CUT_OFF: f64 = 4.0;
 /// Standard deviation of a normal variable per median distance from its median.
@@ -62,7 +63,7 @@ impl Metric {
             between[(i, i)] = between[(i, i)].max(floor);
         }
         shrink(&mut within, SHRINKAGE_WITHIN);
-        shrink(&mut between, SHRINKAGE_BETWEEN);
+        shrink(&mut between, SHRINKAGE_BETWEEN * (DRIVES_BEHIND / levels.len() as f64).min(1.0));
         Self::new(channels, centre, within, between)
     }
 

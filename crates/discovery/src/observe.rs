@@ -8,10 +8,10 @@ use std::sync::Arc;
 
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, Predictor, Transition};
-use nesam_physics::driveline::{DrivelineState, command_wheels};
+use nesam_physics::driveline::{DrivelineState, command_wheels, rim_twist};
 use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel, StepOutput};
-use nesam_physics::{SOIL_DIM, STATE_DIM, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
@@ -22,6 +22,8 @@ use crate::error::DiscoveryError;
 
 /// First sample of the first segment, so that the actuators are known from the commands before it.
 const FIRST_START: usize = 16;
+/// The same where the measured rims tell where the actuators begin.
+const FIRST_START_SERVOED: usize = 1;
 /// Smallest change of tractive force per rim over-speed that is believed, N per m/s (a wheel in the air has none).
 const TRACTION_SLOPE_FLOOR: f64 = 2000.0;
 
@@ -110,7 +112,10 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
         .map(|k| predictor.transition(&steps[..k], &steps[k].state, &steps[k].control, map))
         .collect();
     let last = drive.states.len().saturating_sub(SEGMENT_STEPS + 1);
-    let first = FIRST_START.min(last);
+    let model = predictor.step_model();
+    let servoed = model.vehicle().second == SecondCommand::YawRateRadS;
+    let known = servoed && drive.measured.wheel_speed;
+    let first = if known { FIRST_START_SERVOED } else { FIRST_START }.min(last);
     let finite = |k: usize| drive.states[k].to_array().iter().all(|v| v.is_finite());
     let usable = |&k: &usize| {
         k + SEGMENT_STEPS < drive.states.len()
@@ -121,11 +126,10 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
     if starts.is_empty() {
         return Err(DiscoveryError::NoSegments { trajectory: drive.id.clone(), steps: SEGMENT_STEPS });
     }
-    let model = predictor.step_model();
     let traction_slope = transitions.par_iter().map(|t| traction_slopes(model, t)).collect();
     Ok(ObservedDrive {
         id: drive.id.clone(),
-        available: available(&drive.measured),
+        available: available(&drive.measured, servoed, map.is_some()),
         starts,
         map: map.cloned(),
         states: drive.states.clone(),
@@ -214,7 +218,7 @@ impl ObservedDrive {
         let vehicle = bench.vehicle.with_effects(effects);
         let states: Vec<VehicleState<f64>> = self.states.iter().map(|s| vehicle.effects.sensor.to_true(s)).collect();
         let model = bench.stepping.model(&vehicle);
-        let mut now = DrivelineState::starting(&vehicle, &states[0], &self.transitions[0].control);
+        let mut now = self.first_actuators(&vehicle, &states[0]);
         let actuators = self
             .transitions
             .iter()
@@ -227,6 +231,16 @@ impl ObservedDrive {
             })
             .collect();
         Reading { model, actuators, states }
+    }
+
+    /// Actuators at the first sample: measured rims where they are servoed and measured, else what motion and command tell.
+    fn first_actuators(&self, vehicle: &Vehicle, state: &VehicleState<f64>) -> DrivelineState {
+        let control = &self.transitions[0].control;
+        let rims = self.wheel_speed_rad_s.as_ref().map(|w| rim_twist(vehicle, &w[0]));
+        match rims.filter(|twist| vehicle.second == SecondCommand::YawRateRadS && twist.iter().all(|v| v.is_finite())) {
+            Some(twist) => DrivelineState::turning(twist, control),
+            None => DrivelineState::starting(vehicle, state, control),
+        }
     }
 
     /// The drive as a vehicle with effects would have driven it under the recorded commands, in place of what `drive` records.
@@ -356,7 +370,9 @@ impl ObservedDrive {
         }
         let Some(wheel_speed) = self.wheel_speed_rad_s.as_ref().map(|m| m[sample]) else { return };
         let share = 1.0 / SEGMENT_STEPS as f64;
-        let wheels = command_wheels::<f64>(vehicle, before, after, &transition.control);
+        // Servoed rims are measured at the instant of the sample; a step takes their mean over it.
+        let servoed = vehicle.second == SecondCommand::YawRateRadS;
+        let wheels = command_wheels::<f64>(vehicle, before, if servoed { before } else { after }, &transition.control);
         let state = &reading.states[sample];
         let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
         for i in 0..WHEELS {

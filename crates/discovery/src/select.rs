@@ -37,6 +37,8 @@ pub struct Yardstick {
     pub catalogue: Vec<Candidate>,
     /// Which of them are considered.
     pub considered: Vec<bool>,
+    /// Whether the model itself is on trial, by the scatter of the judged drives.
+    pub model_on_trial: bool,
 }
 
 impl Yardstick {
@@ -44,7 +46,7 @@ impl Yardstick {
     pub fn new(nulls: Nulls, channels: &[usize], without: &[String], groups: impl FnOnce(&[Candidate]) -> Option<NullGroups>) -> Self {
         let catalogue = catalogue();
         let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
-        Self { nulls, groups: groups(&catalogue), channels: channels.to_vec(), catalogue, considered }
+        Self { nulls, groups: groups(&catalogue), channels: channels.to_vec(), catalogue, considered, model_on_trial: false }
     }
 }
 

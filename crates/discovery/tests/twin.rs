@@ -4,11 +4,11 @@
 
 mod common;
 
-use common::{bundle, diagnose_from, diagnose_twin, drive, options, world};
+use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, options, rover, world};
 use nesam_discovery::controls::Kind;
 use nesam_discovery::{Against, Bench, Diagnosis, Stepping, Verdict, observe};
 use nesam_model::ModelBundle;
-use nesam_physics::effects::{Effect, Payload, ScheduledEffect, SteeringOffset, WheelDrag};
+use nesam_physics::effects::{Effect, Payload, PoseLatency, ScheduledEffect, SteeringOffset, SteeringRatio, WheelDrag};
 
 fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
     let e = found.estimates.iter().find(|e| e.name == name).unwrap();
@@ -125,6 +125,24 @@ fn property_the_model_itself_on_trial_lacks_what_all_drives_have() {
     assert!(explained_by(&found, "steering_offset"));
     let (second, ci95) = value(&found, "second");
     assert!((second - 0.08).abs() < 0.008, "{second} {ci95:?}");
+}
+
+#[test]
+fn property_a_new_skid_steer_base_is_judged_by_short_logs_without_a_map() {
+    let found = diagnose_rover(&[]);
+    assert!(found.claimed.is_empty(), "{}; z {:?}", found.reason, found.selection.z);
+    // Rims that turn less than they are told: what they are told, or how far apart they are.
+    let found = diagnose_rover(&[Effect::SteeringRatio(SteeringRatio { relative: -0.3 })]);
+    explained_by(&found, "steering_ratio");
+    let rover = rover();
+    let terms = rover.with_effects(&found.claimed.iter().map(|e| e.effect).collect::<Vec<_>>()).effects.actuator;
+    let turning = (1.0 + terms.steering_ratio) * (1.0 + terms.track_m / rover.track_m);
+    // Starts whose velocity nobody measured speak against the last few hundredths.
+    assert!((turning - 0.7).abs() < 0.08, "rims turn {turning:.3} of what they are told: {}", found.reason);
+    // Velocities that nobody measured are no evidence; a heading behind the gyro is.
+    let found = diagnose_rover(&[Effect::PoseLatency(PoseLatency { seconds: 0.2 })]);
+    let first = found.findings.first().map(|f| f.candidate.id());
+    assert_eq!(first, Some("pose_latency"), "{}; z {:?}", found.reason, found.selection.z);
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! Calibration of a skid-steer base's rim servo on measured wheel speeds: what it makes of a commanded twist, apart from what the ground makes of
 //! the rims.
 
-use nesam_physics::driveline::DrivelineState;
+use nesam_physics::driveline::{DrivelineState, rim_twist};
 use nesam_physics::{RimServo, Vehicle};
 
 use crate::drives::Drive;
@@ -20,17 +20,14 @@ const KNOBS: [Knob; 6] = [
 
 /// Mean rim speed (m/s) and turning of the rims (rad/s) over a drive.
 fn rim_twists(vehicle: &Vehicle, drive: &Drive) -> Option<Vec<[f64; 2]>> {
-    let side = |w: &[f64; 4], i: usize| 0.5 * (w[i] + w[i + 2]) * vehicle.wheel_radius_m;
-    let twist = |w: &[f64; 4]| [0.5 * (side(w, 0) + side(w, 1)), (side(w, 1) - side(w, 0)) / vehicle.track_m];
-    Some(drive.wheel_speed_rad_s.as_ref()?.iter().map(twist).collect())
+    Some(drive.wheel_speed_rad_s.as_ref()?.iter().map(|w| rim_twist(vehicle, w)).collect())
 }
 
 /// Mean square error of the rims, (m/s)², when the servo runs freely from each drive's first sample.
 fn servo_error(vehicle: &Vehicle, measured: &[(&Drive, Vec<[f64; 2]>)], dt_s: f64) -> f64 {
     let (mut sum, mut count) = (0.0, 0usize);
     for (drive, twists) in measured {
-        let [speed, turning] = twists[0];
-        let mut state = DrivelineState { steering: turning, rim_speed_m_s: speed, rim_demand: twists[0], ..DrivelineState::default() };
+        let mut state = DrivelineState::turning(twists[0], &drive.controls[0]);
         for (control, twist) in drive.controls.iter().zip(&twists[1..]) {
             state = state.advance(vehicle, control, 0.0, dt_s);
             let speed = state.rim_speed_m_s - twist[0];

@@ -64,9 +64,12 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         let servo = &vehicle.driveline.rims;
         let measured = state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency);
         let turning = clamp(measured, -servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
-        let speed = state.velocity_m_s[0];
-        let path = CommandPath::settled(control);
-        Self { steering: turning, speed_error_integral_m: T::lit(0.0), rim_speed_m_s: speed, rim_demand: [speed, turning], path }
+        Self::turning([state.velocity_m_s[0], turning], control)
+    }
+
+    /// Actuators whose rims have settled on a twist: mean rim speed (m/s) and turning (rad/s), see [`rim_twist`].
+    pub fn turning(twist: [T; 2], control: &Control<T>) -> Self {
+        Self { steering: twist[1], rim_speed_m_s: twist[0], rim_demand: twist, ..Self::settled(control) }
     }
 
     /// The rims of a skid-steer vehicle after `dt_s` under a command.
@@ -140,6 +143,15 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         let position = if vehicle.effects.actuator.steering_play != 0.0 { self.path.play } else { self.steering };
         road_wheel_angles(vehicle, behind_actuator(vehicle, position))
     }
+}
+
+/// Mean speed (m/s) and turning (rad/s, positive left) that the servo of a skid-steer base holds where its wheels turn so (FL, FR, RL, RR, rad/s): the way
+/// back from wheels to actuators, through what effects change between them.
+pub fn rim_twist(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHEELS]) -> [f64; 2] {
+    let side = |i: usize| 0.5 * (wheel_speed_rad_s[i] + wheel_speed_rad_s[i + 2]) * vehicle.wheel_radius_m;
+    let terms = &vehicle.effects.actuator;
+    let turning = (side(1) - side(0)) / (vehicle.track_m + terms.track_m);
+    [0.5 * (side(0) + side(1)), (turning - terms.steering_offset) / (1.0 + terms.steering_ratio)]
 }
 
 /// Position of a car's steering actuator after `dt_s` under a command.

@@ -3,6 +3,7 @@
 use nesam_physics::{Control, VehicleState, WHEELS};
 
 use crate::ground_truth::GroundTruth;
+use crate::velocity::replace_in_hindsight;
 
 /// Part of a set that a drive belongs to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -96,4 +97,14 @@ pub struct Trajectory {
     pub measured: MeasuredChannels,
     /// Ground truth, only where it was asked for.
     pub truth: Option<GroundTruth>,
+}
+
+impl Trajectory {
+    /// The drive with velocities that are not measured estimated in hindsight, from what came before and after each sample. For identification only: nothing
+    /// that predicts may see it. What is measured stays.
+    pub fn in_hindsight(&self) -> Self {
+        let mut seen = self.clone();
+        replace_in_hindsight(&mut seen.states, &self.measured, self.dt_s);
+        seen
+    }
 }

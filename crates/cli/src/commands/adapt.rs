@@ -12,7 +12,7 @@ use nesam_evaluation::{
     Adaptation, DEFAULT_RESAMPLES, Disguise, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, ModelName, Resamples, Truth,
     WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score,
 };
-use nesam_model::{MAX_HORIZON, ModelBundle, Predictor, Variant};
+use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -105,9 +105,7 @@ enum DisguiseArg {
 /// Runs the command.
 pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
-    if args.window.horizon > MAX_HORIZON {
-        return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
-    }
+    args.window.check_horizon()?;
     if args.calibrate {
         return calibrate(args);
     }
@@ -118,7 +116,8 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         disguise(&mut drives, look)?;
     }
     let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
-    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
+    let horizon = args.window.horizon_on(&drives.drives);
+    let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let filter = filter_in_force(&settings_file(args.filter.as_deref())?, args.literal, predictor.bundle())?;
     warn_about_velocities(&drives);
@@ -139,12 +138,12 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth, resamples: &resamples };
     let others = args.also.iter().map(|also| scene.row(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
     let apart = apart(&drives.drives, &args.apart)?;
-    let reference = args.reference.as_deref().map(|set| Ok((set, reference(args, set, &predictor)?))).transpose()?;
+    let reference = args.reference.as_deref().map(|set| Ok((set, reference(args, set, horizon, &predictor)?))).transpose()?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let adaptation = Adaptation {
         set: &drives.set,
         split: args.data.split.as_str(),
-        horizon_steps: args.window.horizon,
+        horizon_steps: horizon,
         dt_s: args.data.dt,
         path_m_median: path_median_m(&windows, truth),
         truth,
@@ -180,11 +179,11 @@ fn apart(drives: &[Trajectory], ids: &[String]) -> Result<Vec<usize>, Failure> {
 }
 
 /// What the model scores with its soil prior on another set.
-fn reference(args: &AdaptArgs, set: &str, predictor: &Arc<Predictor>) -> Result<ErrorSummary, Failure> {
+fn reference(args: &AdaptArgs, set: &str, horizon: usize, predictor: &Arc<Predictor>) -> Result<ErrorSummary, Failure> {
     let data = DataArgs { set: Some(set.into()), trajectories: None, split: SplitArg::All, ..args.data.clone() };
     let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
     let drives = read_drives(&data, truth == Truth::Gt)?;
-    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
+    let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     let none = Arc::new(vec![DriveAdaptation::default(); drives.drives.len()]);
     let model = [(ModelName::Nesam, WindowPredictor::Adapted { predictor: Arc::clone(predictor), filtered: none })];
     let paths = predict_all(&model, &windows, &drives.maps, &|_| {}).or_failed()?;

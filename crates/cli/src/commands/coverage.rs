@@ -97,7 +97,7 @@ fn windows_of(
     start: &StateCovariance,
     learned: bool,
 ) -> Result<Vec<LinearisedWindow>, Failure> {
-    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, Truth::Measured).or_input()?;
+    let windows = all_windows(&drives.drives, args.window.horizon_on(&drives.drives), args.window.history, Truth::Measured).or_input()?;
     let filter = match &predictor.bundle().soil_filter_json {
         Some(json) => CalibratedFilter::from_json(json).or_input()?.config(),
         None => FilterConfig::default(),

@@ -10,11 +10,11 @@ use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
-use nesam_model::{MAX_HORIZON, ModelBundle, Predictor};
+use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::Vehicle;
 use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_terrain::WorldMap;
-use nesam_trajectories::Trajectory;
+use nesam_trajectories::{Split, Trajectory};
 
 use self::recording::RecordingArgs;
 use crate::args::{BundleArgs, DataArgs, WindowArgs};
@@ -40,7 +40,7 @@ pub struct DiagnoseArgs {
     window: WindowArgs,
     #[command(flatten)]
     recording: RecordingArgs,
-    /// Fit on these drives only and score on the others [default: leave each drive out once]
+    /// Fit on these drives only and score on the others; `train` stands for those of the train split [default: leave each drive out once]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     fit_on: Option<Vec<String>>,
     /// Effects that are not considered
@@ -111,9 +111,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("--without {unknown}: no such effect; the catalogue has {}", Effect::IDS.join(", "))));
     }
     check_model_step(args.data.dt)?;
-    if args.window.horizon > MAX_HORIZON {
-        return Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)));
-    }
+    args.window.check_horizon()?;
     if args.make_reference { make_reference(args) } else { diagnose_set(args) }
 }
 
@@ -167,16 +165,33 @@ fn stepping(bundle: &ModelBundle) -> Stepping {
     Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps }
 }
 
+/// Ids of the drives to fit on; `train` stands for those of the train split.
+fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure> {
+    if ids != ["train"] || drives.iter().any(|d| d.id == "train") {
+        return Ok(ids.to_vec());
+    }
+    let train: Vec<String> = drives.iter().filter(|d| d.split == Some(Split::Train)).map(|d| d.id.clone()).collect();
+    if train.is_empty() || train.len() == drives.len() {
+        return Err(Failure::input("--fit-on train: needs drives of the train split and others; use --split all"));
+    }
+    Ok(train)
+}
+
 fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.data.dt)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
     let predictor = Arc::clone(&drives.predictor);
     let options = Options {
-        fit_on: args.fit_on.clone(),
+        fit_on: args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?,
         without: args.without.clone(),
         against: args.reference.into(),
-        scoring: Scoring { horizon: args.window.horizon, history: args.window.history, resamples: DEFAULT_RESAMPLES, seed: args.seed },
+        scoring: Scoring {
+            horizon: args.window.horizon_on(&drives.drives),
+            history: args.window.history,
+            resamples: DEFAULT_RESAMPLES,
+            seed: args.seed,
+        },
         controls: !args.no_controls,
     };
     let console = Console::default();

@@ -8,7 +8,7 @@ use nesam_evaluation::{
     Baselines, DEFAULT_RESAMPLES, Evaluation, Inputs, Kinematic, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window,
     WindowPredictor, all_windows, path_median_m, predict_all, report, score, slices, write_predictions,
 };
-use nesam_model::{MAX_HORIZON, Predictor};
+use nesam_model::Predictor;
 use nesam_trajectories::Trajectory;
 
 use super::coverage;
@@ -121,7 +121,7 @@ fn at_least_1000(text: &str) -> Result<usize, String> {
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     if args.coverage || args.calibrate_coverage {
         check_model_step(args.data.dt)?;
-        check_horizon(args)?;
+        args.window.check_horizon()?;
         return if args.coverage { coverage::run(args) } else { coverage::calibrate(args) };
     }
     let names = model_names(args)?;
@@ -133,7 +133,8 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         start_noise_free(&mut drives)?;
     }
     let out = output::out_dir(args.out.as_deref(), "evaluate", &drives.set)?;
-    let windows = all_windows(&drives.drives, args.window.horizon, args.window.history, truth).or_input()?;
+    let horizon = args.window.horizon_on(&drives.drives);
+    let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     warn_about_training_drives(args, &drives);
 
     let training = training_drives(&drives, &args.data);
@@ -149,7 +150,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     let evaluation = Evaluation {
         set: &drives.set,
         split: args.data.split.as_str(),
-        horizon_steps: args.window.horizon,
+        horizon_steps: horizon,
         history_steps: args.window.history,
         dt_s: args.data.dt,
         windows: windows.len(),
@@ -165,13 +166,6 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     };
     print_table(&evaluation);
     write_results(args, &out, &evaluation, &paths, &windows)
-}
-
-fn check_horizon(args: &EvaluateArgs) -> Result<(), Failure> {
-    if args.window.horizon <= MAX_HORIZON {
-        return Ok(());
-    }
-    Err(Failure::input(format!("--horizon {} exceeds the model's {MAX_HORIZON} steps", args.window.horizon)))
 }
 
 /// Puts the noise-free states in the place of the measured ones.
@@ -237,7 +231,7 @@ impl Models {
     fn prepare(args: &EvaluateArgs, names: &[ModelName], drives: &Drives, training: Option<&[Trajectory]>) -> Result<Self, Failure> {
         let predictor = if names.iter().any(|n| n.is_nesam()) {
             check_model_step(args.data.dt)?;
-            check_horizon(args)?;
+            args.window.check_horizon()?;
             Some(predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?)
         } else {
             None
@@ -320,7 +314,7 @@ fn kinematic(
     }
     let Some(training) = training else { return Ok(None) };
     eprintln!("fitting the kinematic baseline on {} training drives", training.len());
-    Ok(Some(Baselines::fit(drives.root.vehicle(), training, args.window.horizon).or_failed()?.kinematic))
+    Ok(Some(Baselines::fit(drives.root.vehicle(), training, args.window.horizon_on(training)).or_failed()?.kinematic))
 }
 
 fn print_table(e: &Evaluation<'_>) {

@@ -74,7 +74,7 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
     let drives = read_drives(&data, false)?;
     let window = window(args, &drives)?;
     let controls = match &args.controls {
-        Some(file) => read_controls(file, args.window.horizon)?,
+        Some(file) => read_controls(file, args.window.horizon())?,
         None => recorded(&window)?,
     };
     if controls.len() > MAX_HORIZON {
@@ -120,7 +120,7 @@ fn window<'a>(args: &PredictArgs, drives: &'a Drives) -> Result<Window<'a>, Fail
         }
     };
     let first_history = (start + 1).saturating_sub(args.window.history);
-    Ok(Window { trajectory: drive, drive: 0, start, first_history, horizon: args.window.horizon })
+    Ok(Window { trajectory: drive, drive: 0, start, first_history, horizon: args.window.horizon() })
 }
 
 fn recorded(window: &Window<'_>) -> Result<Vec<Control<f64>>, Failure> {

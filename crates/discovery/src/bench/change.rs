@@ -10,6 +10,7 @@
 use std::sync::Arc;
 
 use nesam_physics::vec3::Tilt;
+use nesam_physics::wrap_angle;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 
@@ -36,6 +37,8 @@ pub enum Change {
     VelocityScale(f64),
     /// Position (t - size), s.
     PositionLatency(f64),
+    /// Position and heading (t - size), s.
+    PoseLatency(f64),
     /// Position and velocity of a point `size` ahead of the reference point, m.
     LeverArm(f64),
     /// Roll + size, rad, velocity and gyro turned likewise.
@@ -85,6 +88,11 @@ pub fn apply(change: Change, onset_s: f64, drive: &mut Trajectory, map: Option<A
             Change::VelocityScale(size) => s.velocity_m_s = s.velocity_m_s.map(|v| v * (1.0 + size)),
             Change::PositionLatency(size) => {
                 s.position_m = core::array::from_fn(|i| at(time - steps(size), &|j| states[j].position_m[i]));
+            }
+            Change::PoseLatency(size) => {
+                s.position_m = core::array::from_fn(|i| at(time - steps(size), &|j| states[j].position_m[i]));
+                let now = s.attitude_rad[2];
+                s.attitude_rad[2] = wrap_angle(now + at(time - steps(size), &|j| wrap_angle(states[j].attitude_rad[2] - now)));
             }
             Change::LeverArm(size) => {
                 let [roll, pitch, yaw] = s.attitude_rad;

@@ -94,6 +94,7 @@ pub fn plan() -> Vec<Hidden> {
         recorded("sensor", "gyro_scale", 0.03, C::GyroScale(0.03)),
         recorded("sensor", "velocity_scale", 0.02, C::VelocityScale(0.02)),
         recorded("sensor", "position_latency", 0.1, C::PositionLatency(0.1)),
+        recorded("sensor", "pose_latency", 0.1, C::PoseLatency(0.1)),
         recorded("sensor", "lever_arm", 0.4, C::LeverArm(0.4)),
         recorded("sensor", "mount_angle", 0.02, C::MountRoll(0.02)),
         recorded("map", "map_offset", 0.04, C::MapOffset(0.04)),

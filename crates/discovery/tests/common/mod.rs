@@ -9,7 +9,7 @@ use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::effects::Effect;
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{Control, Driveline, Soil, SoilCorrection, Vehicle, VehicleState};
+use nesam_physics::{Control, Driveline, RimServo, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
 use nesam_trajectories::{MeasuredChannels, Trajectory};
 use rand::SeedableRng;
@@ -186,4 +186,83 @@ pub fn diagnose_from(effects: &[Effect], onset_s: f64, seed: u64, options: &Opti
     let drives: Vec<Trajectory> = (0..8).map(|i| drive_from(&format!("d{i}"), seed + i, effects, onset_s, &bundle.default_soil)).collect();
     let predictor = Predictor::new(Arc::new(bundle)).unwrap();
     diagnose(&predictor, &drives, &vec![Some(world()); drives.len()], options, &|_, _, _| {}).unwrap()
+}
+
+/// A skid-steer base of the same size, its rims servoed.
+pub fn rover() -> Vehicle {
+    let car = truck();
+    let rims = RimServo { speed_lag_s: 0.1, yaw_lag_s: 0.1, ..RimServo::default() };
+    Vehicle {
+        name: "rover".into(),
+        second: SecondCommand::YawRateRadS,
+        steering: None,
+        command_range: [[-3.0, 3.0], [-1.5, 1.5]],
+        driveline: Driveline { rims, ..car.driveline },
+        ..car
+    }
+}
+
+/// Logs of a rover with effects, as short ones of real robots are: two seconds after a step of the commands, on ground without a map, poses, wheel speeds and
+/// the yaw rate measured, velocities not (what stands for them is noise about the truth).
+pub fn rover_logs(count: u64, seed: u64, effects: &[Effect]) -> Vec<Trajectory> {
+    (0..count).map(|i| rover_log(&format!("r{i:02}"), seed + i, effects)).collect()
+}
+
+fn rover_log(id: &str, seed: u64, effects: &[Effect]) -> Trajectory {
+    const STEPS: usize = 21;
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
+    let vehicle = rover().with_effects(effects);
+    let model = StepModel::new(&vehicle, 0.1, 2);
+    let soil = Soil::from_array(bundle().default_soil);
+    let mut command = || Control { speed_m_s: (1.2 * normal()).clamp(-2.0, 2.0), second: (0.5 * normal()).clamp(-1.0, 1.0) };
+    let told = [command(), command()];
+    let mut state = VehicleState::from_array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0, told[0].speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    let mut actuators = DrivelineState::settled(&told[0]);
+    let (mut states, mut controls, mut wheels) = (Vec::new(), Vec::new(), Vec::new());
+    for k in 0..20 + STEPS {
+        let control = told[usize::from(k >= 20)];
+        if k >= 20 {
+            let seen = vehicle.effects.sensor.to_measured(&state).to_array();
+            let sd = |i: usize| [0.004, 0.004, 0.004, 0.002, 0.002, 0.004, 0.05, 0.05, 0.05, 0.02, 0.02, 0.005][i];
+            states.push(VehicleState::from_array(core::array::from_fn(|i| seen[i] + sd(i) * normal())));
+            controls.push(control);
+            let now = command_wheels::<f64>(&vehicle, &actuators, &actuators, &control);
+            wheels.push(core::array::from_fn(|i| now.servo_m_s(i) / vehicle.wheel_radius_m + 0.02 * normal()));
+        }
+        let after = actuators.advance(&vehicle, &control, state.velocity_m_s[0], 0.1);
+        let ground = GroundSource::new(None, &model, &state).under_wheels(&model, &state, 0.0).0;
+        let told = command_wheels(&vehicle, &actuators, &after, &control);
+        let step = model.step(&StepInput { state, wheels: told, sinkage_log_ratio: [0.0; 4], soil, ground });
+        (state, actuators) = (VehicleState::from_array(state.advanced(&step.increment.to_array())), after);
+    }
+    let measured = MeasuredChannels {
+        linear_velocity: false,
+        angular_velocity: [false, false, true],
+        wheel_speed: true,
+        ..MeasuredChannels::POSE_AND_TWIST
+    };
+    Trajectory {
+        id: id.into(),
+        set: "rover".into(),
+        world: None,
+        split: None,
+        dt_s: 0.1,
+        time_s: (0..STEPS).map(|k| 0.1 * k as f64).collect(),
+        states,
+        controls,
+        wheel_speed_rad_s: Some(wheels),
+        road_wheel_angle_rad: None,
+        measured,
+        truth: None,
+    }
+}
+
+/// The model of a rover on trial by logs of one with effects.
+pub fn diagnose_rover(effects: &[Effect]) -> Diagnosis {
+    let bundle = ModelBundle { vehicle: rover(), reference_json: None, ..bundle() };
+    let logs = rover_logs(60, 300, effects);
+    let options = Options { against: Against::Physics, scoring: Scoring { horizon: 19, history: 1, ..options().scoring }, ..options() };
+    let predictor = Predictor::new(Arc::new(bundle)).unwrap();
+    diagnose(&predictor, &logs, &vec![None; logs.len()], &options, &|_, _, _| {}).unwrap()
 }

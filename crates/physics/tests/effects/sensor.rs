@@ -58,11 +58,16 @@ fn analytic_latency_is_the_place_on_the_circle_before() {
             angular_velocity_rad_s: [0.0, 0.0, rate],
         }
     };
-    let seen = terms(&[Effect::PositionLatency(PositionLatency { seconds: latency })]).to_measured(&at(4.0));
-    for (got, want) in seen.position_m.iter().zip(at(4.0 - latency).position_m) {
-        assert!((got - want).abs() < 1e-3, "{:?}", seen.position_m);
+    let place = terms(&[Effect::PositionLatency(PositionLatency { seconds: latency })]).to_measured(&at(4.0));
+    let pose = terms(&[Effect::PoseLatency(PoseLatency { seconds: latency })]).to_measured(&at(4.0));
+    for seen in [place, pose] {
+        for (got, want) in seen.position_m.iter().zip(at(4.0 - latency).position_m) {
+            assert!((got - want).abs() < 1e-3, "{:?}", seen.position_m);
+        }
+        assert_eq!(seen.angular_velocity_rad_s, at(4.0).angular_velocity_rad_s);
     }
-    assert_eq!(seen.attitude_rad, at(4.0).attitude_rad);
+    assert_eq!(place.attitude_rad, at(4.0).attitude_rad);
+    assert!((pose.attitude_rad[2] - at(4.0 - latency).attitude_rad[2]).abs() < 1e-12, "{:?}", pose.attitude_rad);
 }
 
 #[test]

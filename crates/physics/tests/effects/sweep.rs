@@ -55,7 +55,7 @@ fn mirrored(effect: &Effect) -> Effect {
 
 #[test]
 fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
-    assert_eq!(Effect::IDS.len(), 46);
+    assert_eq!(Effect::IDS.len(), 47);
     for (i, effect) in Effect::examples().iter().enumerate() {
         assert_eq!(Effect::IDS[i], effect.id());
         assert_eq!(Effect::IDS.iter().filter(|id| **id == effect.id()).count(), 1);

@@ -8,6 +8,7 @@ mod gyro_scale;
 mod lever_arm;
 mod mount_angle;
 mod observation;
+mod pose_latency;
 mod position_latency;
 mod velocity_scale;
 
@@ -16,6 +17,7 @@ pub use gyro_bias::GyroBias;
 pub use gyro_scale::GyroScale;
 pub use lever_arm::LeverArm;
 pub use mount_angle::MountAngle;
+pub use pose_latency::PoseLatency;
 pub use position_latency::PositionLatency;
 pub use velocity_scale::VelocityScale;
 
@@ -30,6 +32,8 @@ pub struct SensorTerms {
     pub velocity_scale: f64,
     /// Age of a measured position, s.
     pub position_latency_s: f64,
+    /// Age of a measured position and heading, s; adds to that of the position.
+    pub pose_latency_s: f64,
     /// Place whose position and velocity are measured, from the reference point, Body, m.
     pub lever_arm_m: [f64; 3],
     /// Roll, pitch, yaw of the sensors against Body, rad.

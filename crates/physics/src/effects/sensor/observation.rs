@@ -12,9 +12,10 @@ impl SensorTerms {
         Self { clock_drift: 0.0, ..*self } != Self::default()
     }
 
-    /// The state as the sensors measure it: p' = p(t - d) + R ℓ, v' = (1 + k) Eᵀ (v + ω × ℓ), ω' = (1 + s) Eᵀ ω + b e_z, R' = R E.
+    /// The state as the sensors measure it: p' = p(t - d) + R ℓ, v' = (1 + k) Eᵀ (v + ω × ℓ), ω' = (1 + s) Eᵀ ω + b e_z, R' = R E with the
+    /// heading of t - d.
     ///
-    /// p(t - d) is taken along the arc of the present velocities, which errs by the change of velocity within d.
+    /// Place and heading of t - d are taken along the arc of the present velocities, which errs by the change of velocity within d.
     #[inline(always)]
     pub fn to_measured<T: Real>(&self, state: &VehicleState<T>) -> VehicleState<T> {
         if self.alters_states() { self.measured(state) } else { *state }
@@ -40,9 +41,11 @@ impl SensorTerms {
         let at_sensor = self.turned_back(add(v, cross(w, lever)));
         let mut rate = scale(self.turned_back(w), T::lit(1.0 + self.gyro_scale));
         rate[2] = rate[2] + T::lit(self.gyro_bias_rad_s);
+        let mut attitude = state.attitude_rad;
+        attitude[2] = attitude[2] - self.turned_since(state);
         VehicleState {
             position_m: position,
-            attitude_rad: self.attitude(&state.attitude_rad, false),
+            attitude_rad: self.attitude(&attitude, false),
             velocity_m_s: scale(at_sensor, T::lit(1.0 + self.velocity_scale)),
             angular_velocity_rad_s: rate,
         }
@@ -63,6 +66,7 @@ impl SensorTerms {
             velocity_m_s: v,
             angular_velocity_rad_s: w,
         };
+        truth.attitude_rad[2] = truth.attitude_rad[2] + self.turned_since(&truth);
         let arm = in_world(&truth.attitude_rad, lever);
         let moved = self.travelled(&truth);
         for axis in 0..3 {
@@ -73,10 +77,17 @@ impl SensorTerms {
 
     /// Way in World within the latency, m: chord of the arc that ends at the true state.
     fn travelled<T: Real>(&self, truth: &VehicleState<T>) -> Vec3<T> {
-        let latency = T::lit(self.position_latency_s);
+        let latency = T::lit(self.position_latency_s + self.pose_latency_s);
         let [roll, pitch, yaw] = truth.attitude_rad;
         let middle = yaw - truth.angular_velocity_rad_s[2] * latency * T::lit(0.5);
         scale(in_world(&[roll, pitch, middle], truth.velocity_m_s), latency)
+    }
+
+    /// Turn of the heading within the latency of the pose, rad: d ψ' with ψ' = (ω_y sin φ + ω_z cos φ) / cos θ.
+    fn turned_since<T: Real>(&self, truth: &VehicleState<T>) -> T {
+        let ([roll, pitch, _], w) = (truth.attitude_rad, truth.angular_velocity_rad_s);
+        let ((sin, cos), (_, level)) = (roll.sin_cos(), pitch.sin_cos());
+        T::lit(self.pose_latency_s) * (w[1] * sin + w[2] * cos) / level
     }
 
     /// Eᵀ a: a vector of Body in the axes of the sensors.
