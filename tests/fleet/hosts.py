@@ -4,7 +4,7 @@ import ctypes
 import os
 import subprocess
 
-NAMES = ("etcd", "proxy", "router", "nesam-1", "nesam-2", "nesam-3", "client")
+NAMES = ("etcd", "etcd-2", "etcd-3", "proxy", "router", "nesam-1", "nesam-2", "nesam-3", "client")
 _CLONE_NEWNET = 0x40000000
 
 

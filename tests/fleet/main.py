@@ -23,10 +23,10 @@ TAKEOVER_S = 2.0
 
 
 class Check:
-    """One fault under load. `needs_cut`: only where hosts can be cut off."""
+    """One fault under load. `needs_cut`: only where hosts can be cut off; `members`: only with so many members of etcd."""
 
-    def __init__(self, name, what, fault, needs_cut=False, takes_over=True):
-        self.name, self.what, self.fault, self.needs_cut, self.takes_over = name, what, fault, needs_cut, takes_over
+    def __init__(self, name, what, fault, needs_cut=False, takes_over=True, members=1):
+        self.name, self.what, self.fault, self.needs_cut, self.takes_over, self.members = name, what, fault, needs_cut, takes_over, members
 
 
 def victim(fleet, run):
@@ -63,9 +63,11 @@ def stop_and_resume(fleet, run):
 
 def cut_from_etcd(fleet, run):
     name = victim(fleet, run)
-    fleet.hosts.cut(name, "etcd")
+    for member in fleet.members:
+        fleet.hosts.cut(name, member)
     yield
-    fleet.hosts.heal(name, "etcd")
+    for member in fleet.members:
+        fleet.hosts.heal(name, member)
     fleet.await_healthy(name)
 
 
@@ -78,18 +80,27 @@ def cut_from_all(fleet, run):
 
 
 def slow_store(fleet, run):
+    leader = fleet.processes[fleet.leader()]
     for _ in range(6):
-        fleet.processes["etcd"].signal(signal.SIGSTOP)
+        leader.signal(signal.SIGSTOP)
         time.sleep(0.3)
-        fleet.processes["etcd"].signal(signal.SIGCONT)
+        leader.signal(signal.SIGCONT)
         time.sleep(0.2)
     yield
 
 
 def store_restarts(fleet, run):
-    fleet.processes["etcd"].kill()
-    fleet.processes["etcd"].start()
+    leader = fleet.processes[fleet.leader()]
+    leader.kill()
+    leader.start()
     yield
+
+
+def store_leader_dies(fleet, run):
+    leader = fleet.processes[fleet.leader()]
+    leader.kill()
+    yield
+    leader.start()
 
 
 def router_restarts(fleet, run):
@@ -114,8 +125,9 @@ CHECKS = [
     Check("stop", "SIGSTOP of an owner, SIGCONT when others have its sessions", stop_and_resume),
     Check("partition-store", "an owner cut off from etcd, not from its clients", cut_from_etcd, needs_cut=True),
     Check("partition", "an owner cut off from everybody", cut_from_all, needs_cut=True),
-    Check("slow-store", "etcd stopped for 0.3 s, six times in 3 s", slow_store, takes_over=False),
-    Check("store-restart", "SIGKILL of etcd and restart", store_restarts, takes_over=False),
+    Check("slow-store", "etcd, of several members the leader, stopped for 0.3 s, six times in 3 s", slow_store, takes_over=False),
+    Check("store-restart", "SIGKILL of etcd, of several members of the leader, and restart", store_restarts, takes_over=False),
+    Check("store-leader", "SIGKILL of the leading member of etcd, restart after the drives", store_leader_dies, members=3),
     Check("router-restart", "SIGKILL of the Zenoh router and restart", router_restarts, takes_over=False),
     Check("upgrade", "SIGTERM and restart of all replicas, one after the other", upgrade),
 ]
@@ -208,6 +220,7 @@ def main():
     parser.add_argument("server")
     parser.add_argument("--only", default="", help="checks, by name")
     parser.add_argument("--loopback", action="store_true", help="without namespaces")
+    parser.add_argument("--members", type=int, choices=(1, 3), default=1, help="members of etcd [default: 1]")
     parser.add_argument("--scaling", action="store_true", help="measure what sessions and queries cost, and check nothing")
     parser.add_argument("--memory", action="store_true", help="measure the memory of a session, and check nothing")
     parser.add_argument("--soak", type=float, metavar="SECONDS", help="load for so long: do memory, files and threads stay?")
@@ -221,7 +234,7 @@ def main():
     hosts, reason = network.make(arguments.loopback)
     print(f"hosts: {'network namespaces' if hosts.can_cut else 'loopback addresses (' + reason + ')'}; logs: {folder}", flush=True)
     failed, skipped = [], []
-    fleet = Fleet(hosts, arguments.server, folder)
+    fleet = Fleet(hosts, arguments.server, folder, arguments.members)
     try:
         fleet.start()
         with nesam.Client(fleet.proxy_address, timeout_s=60.0, vehicle_id="maps") as client:
@@ -236,7 +249,7 @@ def main():
         oracle = traffic.without_failures(arguments.server, lambda command: hosts.command("client", command))
         row("check", "result", dict(zip(COLUMNS, COLUMNS)), "what happens, two seconds after the start of the drives")
         for check in CHECKS:
-            if only and check.name not in only:
+            if (only and check.name not in only) or check.members > arguments.members:
                 continue
             if check.needs_cut and not hosts.can_cut:
                 skipped.append(check.name)

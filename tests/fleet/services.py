@@ -13,6 +13,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 REPLICAS = ("nesam-1", "nesam-2", "nesam-3")
+MEMBERS = ("etcd", "etcd-2", "etcd-3")
 LEASE_S = 1
 ROUTER = """
 import sys, time, zenoh
@@ -61,25 +62,30 @@ class Process:
 class Fleet:
     """All of them."""
 
-    def __init__(self, hosts, server, folder):
+    def __init__(self, hosts, server, folder, members=1):
         self.hosts, self.folder = hosts, Path(folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
         at = hosts.address
         self.proxy_address = f"{at['proxy']}:50051"
-        etcd = f"http://{at['etcd']}:2379"
-        peer = f"http://{at['etcd']}:2380"
-        self._etcd_url = etcd
+        self.members = MEMBERS[:members]
+        self._etcd_urls = {name: f"http://{at[name]}:2379" for name in self.members}
         commands = {
-            "etcd": ["etcd", "--name", "e", "--data-dir", str(self.folder / "etcd"), "--listen-client-urls", etcd, "--advertise-client-urls", etcd]
-            + ["--listen-peer-urls", peer, "--initial-advertise-peer-urls", peer, "--initial-cluster", f"e={peer}"]
-            + ["--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--log-level", "error"],
+            **{name: self._member(name) for name in self.members},
             "proxy": ["haproxy", "-db", "-f", str(self._proxy_configuration())],
             "router": [sys.executable, "-c", ROUTER, json.dumps([f"tcp/{at['router']}:7447"])],
         }
         for name in REPLICAS:
-            commands[name] = [server, "serve", "--config", str(self._configuration(name, etcd))]
+            commands[name] = [server, "serve", "--config", str(self._configuration(name))]
         self.processes = {
             name: Process(name, hosts.command(name, command), self.folder / f"{name}.log") for name, command in commands.items()
         }
+
+    def _member(self, name):
+        client, peers = self._etcd_urls[name], {member: f"http://{self.hosts.address[member]}:2380" for member in self.members}
+        command = ["etcd", "--name", name, "--data-dir", str(self.folder / name), "--listen-client-urls", client, "--advertise-client-urls", client]
+        command += ["--listen-peer-urls", peers[name], "--initial-advertise-peer-urls", peers[name]]
+        command += ["--initial-cluster", ",".join(f"{member}={peer}" for member, peer in peers.items())]
+        return [*command, "--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--log-level", "error"]
 
     def _proxy_configuration(self):
         text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
@@ -90,18 +96,19 @@ class Fleet:
         path.write_text(text)
         return path
 
-    def _configuration(self, name, etcd):
+    def _configuration(self, name):
         address = self.hosts.address[name]
         path = self.folder / f"{name}.toml"
         path.write_text(
             f'[grpc]\nlisten = "{address}:50051"\n[http]\nlisten = "{address}:50080"\n'
             f'[zenoh]\nlisten = []\nconnect = ["tcp/{self.hosts.address["router"]}:7447"]\nfleet = "fleet"\nname = "{name}"\n'
-            f'[cluster]\netcd = ["{etcd}"]\nname = "{name}"\nlease_s = {LEASE_S}\n'
+            f"[cluster]\netcd = {json.dumps(list(self._etcd_urls.values()))}\n"
+            f'name = "{name}"\nlease_s = {LEASE_S}\n'
         )
         return path
 
     def start(self):
-        for name in ("etcd", "router", *REPLICAS):
+        for name in (*self.members, "router", *REPLICAS):
             self.processes[name].start()
         for name in REPLICAS:
             self.await_healthy(name)
@@ -130,9 +137,25 @@ class Fleet:
         for process in self.processes.values():
             process.kill()
 
-    def _etcd(self, path, body, timeout_s=5.0):
-        request = urllib.request.Request(self._etcd_url + path, data=json.dumps(body).encode())
-        return urllib.request.urlopen(request, timeout=timeout_s)
+    def _etcd(self, path, body, timeout_s=5.0, member=None):
+        """What a member answers: the one asked for, else the first that does."""
+        members = [member] if member else self.members
+        for name in members:
+            request = urllib.request.Request(self._etcd_urls[name] + path, data=json.dumps(body).encode())
+            try:
+                return urllib.request.urlopen(request, timeout=timeout_s)
+            except OSError:
+                if name == members[-1]:
+                    raise
+
+    def leader(self):
+        """The member of etcd that leads."""
+        for name in self.members:
+            with self._etcd("/v3/maintenance/status", {}, member=name) as reply:
+                told = json.load(reply)
+            if told["leader"] == told["header"]["member_id"]:
+                return name
+        raise RuntimeError("etcd has no leader")
 
     @staticmethod
     def _prefix(prefix):
