@@ -19,6 +19,8 @@ ZENOH_VEHICLES = 2
 """Of them over Zenoh; the others over gRPC."""
 FAULT_AFTER_S = 2.0
 TAKEOVER_S = 2.0
+IDLE_S = 20.0
+"""Time after which a session that nobody uses is closed, or removed where no server has it."""
 """Longest time that a planner may go without an answer, besides its own pause between two calls."""
 
 
@@ -133,6 +135,29 @@ CHECKS = [
 ]
 
 
+def abandoned(fleet):
+    """All replicas die and come back, and nobody asks for the sessions: do they leave etcd?"""
+    opened = [f"left-{i}" for i in range(VEHICLES)]
+    for session in opened:
+        with nesam.Client(fleet.proxy_address, timeout_s=10.0, vehicle_id=session) as client:
+            client.open_session(session, map_id=traffic.MAP)
+    until = time.monotonic() + 5.0
+    while not set(opened) <= set(fleet.sessions()) and time.monotonic() < until:
+        time.sleep(0.1)
+    before = fleet.sessions()
+    for name in REPLICAS:
+        fleet.processes[name].kill()
+    for name in REPLICAS:
+        fleet.processes[name].start()
+        fleet.await_healthy(name)
+    begun = time.monotonic()
+    while fleet.sessions() and time.monotonic() - begun < 2.0 * IDLE_S:
+        time.sleep(0.2)
+    took_s, left = time.monotonic() - begun, fleet.sessions()
+    row("abandoned", "VIOLATED" if left else "holds", {}, f"SIGKILL of all replicas; {len(before)} sessions without an owner left etcd after {took_s:.0f} s")
+    return [f"{name} is still in etcd" for name in left] + [f"{name} was never in etcd" for name in opened if name not in before]
+
+
 class Run:
     """Vehicles and planners of one check, and what was found."""
 
@@ -227,14 +252,15 @@ def main():
     parser.add_argument("--keep", default="", help="folder for logs and data; else they are thrown away when all holds")
     arguments = parser.parse_args()
     only = [name for name in arguments.only.split(",") if name]
-    unknown = set(only) - {check.name for check in CHECKS}
+    unknown = set(only) - {check.name for check in CHECKS} - {"abandoned"}
     if unknown:
         parser.error(f"no check is called {', '.join(sorted(unknown))}")
     folder = arguments.keep or tempfile.mkdtemp(prefix="nesam-fleet-")
+    measures = arguments.scaling or arguments.memory or arguments.soak
     hosts, reason = network.make(arguments.loopback)
     print(f"hosts: {'network namespaces' if hosts.can_cut else 'loopback addresses (' + reason + ')'}; logs: {folder}", flush=True)
     failed, skipped = [], []
-    fleet = Fleet(hosts, arguments.server, folder, arguments.members)
+    fleet = Fleet(hosts, arguments.server, folder, arguments.members, 86400.0 if measures else IDLE_S)
     try:
         fleet.start()
         with nesam.Client(fleet.proxy_address, timeout_s=60.0, vehicle_id="maps") as client:
@@ -266,6 +292,8 @@ def main():
             for violation in violations[:8]:
                 print(f"    {violation}", flush=True)
             failed += violations
+        if not only or "abandoned" in only:
+            failed += abandoned(fleet)
     finally:
         fleet.stop()
         hosts.close()

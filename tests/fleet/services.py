@@ -62,12 +62,12 @@ class Process:
 class Fleet:
     """All of them."""
 
-    def __init__(self, hosts, server, folder, members=1):
+    def __init__(self, hosts, server, folder, members=1, idle_s=86400.0):
         self.hosts, self.folder = hosts, Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         at = hosts.address
         self.proxy_address = f"{at['proxy']}:50051"
-        self.members = MEMBERS[:members]
+        self.members, self.idle_s = MEMBERS[:members], idle_s
         self._etcd_urls = {name: f"http://{at[name]}:2379" for name in self.members}
         commands = {
             **{name: self._member(name) for name in self.members},
@@ -103,7 +103,7 @@ class Fleet:
             f'[grpc]\nlisten = "{address}:50051"\n[http]\nlisten = "{address}:50080"\n'
             f'[zenoh]\nlisten = []\nconnect = ["tcp/{self.hosts.address["router"]}:7447"]\nfleet = "fleet"\nname = "{name}"\n'
             f"[cluster]\netcd = {json.dumps(list(self._etcd_urls.values()))}\n"
-            f'name = "{name}"\nlease_s = {LEASE_S}\n'
+            f'name = "{name}"\nlease_s = {LEASE_S}\n[limits]\nsession_idle_s = {self.idle_s}\n'
         )
         return path
 
@@ -171,6 +171,11 @@ class Fleet:
         with self._etcd("/v3/kv/range", self._prefix("nesam/live/owner/")) as reply:
             found = json.load(reply).get("kvs", [])
         return {_text(kv["key"]).rsplit("/", 1)[1]: json.loads(_text(kv["value"]))["name"] for kv in found}
+
+    def sessions(self):
+        """Names of the sessions in etcd."""
+        with self._etcd("/v3/kv/range", {**self._prefix("nesam/session/"), "keys_only": True}) as reply:
+            return [_text(kv["key"]).rsplit("/", 1)[1] for kv in json.load(reply).get("kvs", [])]
 
     def history(self, since):
         """What etcd remembers of owners and sessions after a revision: (revision, kind, session, is it a put, was it made new)."""

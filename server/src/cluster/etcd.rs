@@ -191,6 +191,11 @@ pub(crate) fn get_all(prefix: &str) -> Request {
     Request::RequestRange(pb::RangeRequest { key: bytes(prefix), range_end: behind(prefix).into(), keys_only: false })
 }
 
+/// Reads all keys with a prefix, in order, without their values.
+pub(crate) fn get_keys(prefix: &str) -> Request {
+    Request::RequestRange(pb::RangeRequest { key: bytes(prefix), range_end: behind(prefix).into(), keys_only: true })
+}
+
 /// Writes a key; it goes with the lease, 0 = it stays.
 pub(crate) fn put(key: &str, value: Vec<u8>, lease: i64) -> Request {
     Request::RequestPut(pb::PutRequest { key: bytes(key), value: value.into(), lease })

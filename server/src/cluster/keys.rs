@@ -45,8 +45,13 @@ impl Keys {
         format!("{}/live/map/{map}", self.prefix)
     }
 
+    /// Before the images of all sessions.
+    pub fn sessions(&self) -> String {
+        format!("{}/session/", self.prefix)
+    }
+
     pub fn session(&self, session: &str) -> String {
-        format!("{}/session/{session}", self.prefix)
+        format!("{}{session}", self.sessions())
     }
 
     /// Before all parts of one content of a map; without a hash, of all its contents.

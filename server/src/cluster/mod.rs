@@ -17,6 +17,7 @@ mod keys;
 mod lease;
 mod leave;
 mod maps;
+mod reap;
 mod record;
 mod watch;
 
@@ -30,7 +31,7 @@ use tonic::Status;
 use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use self::bring::{Brought, Standing};
-pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, put, written};
+pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, get_keys, put, written};
 pub(crate) use self::keys::Keys;
 use self::lease::Lease;
 use self::record::Server;
@@ -138,6 +139,10 @@ impl Cluster {
         let watching = tokio::spawn(cluster.clone().watch());
         if let Ok(mut tasks) = cluster.0.tasks.lock() {
             tasks.extend([keeping, watching, tokio::spawn(cluster.clone().compact())]);
+            // A time that no clock can hold is never.
+            if let Ok(idle) = Duration::try_from_secs_f64(cluster.0.engine.handle().limits().session_idle_s) {
+                tasks.push(tokio::spawn(cluster.clone().reap(idle)));
+            }
         }
         let begun = Instant::now();
         while cluster.0.lease.id().is_none() {
