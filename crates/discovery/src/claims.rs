@@ -21,7 +21,7 @@ use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick, mismatch}
 const MAGNITUDE_HALF_MAX: f64 = 0.7;
 /// Share of half-samples of the drives that must choose a claimed effect or one of its rivals.
 const STABILITY_MIN: f64 = 0.6;
-/// Drives of which all half-samples are looked at.
+/// Parts of neighbouring drives of which all half-samples are looked at; every drive is a part where there are fewer.
 const STABILITY_DRIVES: usize = 10;
 /// Contenders for which an onset is looked for.
 const ONSET_CONTENDERS: usize = 3;
