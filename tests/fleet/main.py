@@ -19,9 +19,9 @@ ZENOH_VEHICLES = 2
 """Of them over Zenoh; the others over gRPC."""
 FAULT_AFTER_S = 2.0
 TAKEOVER_S = 2.0
+"""Longest time that a planner may go without an answer, besides its own pause between two calls."""
 IDLE_S = 20.0
 """Time after which a session that nobody uses is closed, or removed where no server has it."""
-"""Longest time that a planner may go without an answer, besides its own pause between two calls."""
 
 
 class Check:
@@ -154,8 +154,10 @@ def abandoned(fleet):
     while fleet.sessions() and time.monotonic() - begun < 2.0 * IDLE_S:
         time.sleep(0.2)
     took_s, left = time.monotonic() - begun, fleet.sessions()
-    row("abandoned", "VIOLATED" if left else "holds", {}, f"SIGKILL of all replicas; {len(before)} sessions without an owner left etcd after {took_s:.0f} s")
-    return [f"{name} is still in etcd" for name in left] + [f"{name} was never in etcd" for name in opened if name not in before]
+    violations = [f"{name} is still in etcd" for name in left] + [f"{name} was never in etcd" for name in opened if name not in before]
+    what = f"SIGKILL of all replicas; {len(before)} sessions without an owner left etcd after {took_s:.0f} s"
+    row("abandoned", "VIOLATED" if violations else "holds", {}, what)
+    return violations
 
 
 class Run:

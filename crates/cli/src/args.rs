@@ -83,8 +83,7 @@ impl WindowArgs {
         if let Some(asked) = self.horizon {
             return asked;
         }
-        let longest = drives.iter().map(|d| d.states.len()).max().unwrap_or(0);
-        let horizon = MAX_HORIZON.min(longest.saturating_sub(1)).max(1);
+        let horizon = longest_horizon(drives);
         if horizon < MAX_HORIZON {
             eprintln!(
                 "note: predicting {horizon} steps, as many as the longest drive allows ({MAX_HORIZON} where drives are longer); --horizon sets another number"
@@ -105,6 +104,12 @@ impl WindowArgs {
             _ => Ok(()),
         }
     }
+}
+
+/// As many steps as the model knows and the longest drive allows, at least one.
+pub fn longest_horizon(drives: &[Trajectory]) -> usize {
+    let longest = drives.iter().map(|d| d.states.len()).max().unwrap_or(0);
+    MAX_HORIZON.min(longest.saturating_sub(1)).max(1)
 }
 
 fn positive(text: &str) -> Result<usize, String> {

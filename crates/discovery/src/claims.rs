@@ -8,7 +8,7 @@ use rayon::prelude::*;
 
 use crate::candidates::Candidate;
 use crate::channels::{self, Row};
-use crate::condense::{Condensed, condense};
+use crate::condense::{Condensed, condense, part_of};
 use crate::evidence::Group;
 use crate::fit::{Fit, Prepared, Term, fit};
 use crate::metric::Metric;
@@ -22,7 +22,7 @@ const MAGNITUDE_HALF_MAX: f64 = 0.7;
 /// Share of half-samples of the drives that must choose a claimed effect or one of its rivals.
 const STABILITY_MIN: f64 = 0.6;
 /// Parts of neighbouring drives of which all half-samples are looked at; every drive is a part where there are fewer.
-const STABILITY_DRIVES: usize = 10;
+const STABILITY_PARTS: usize = 10;
 /// Contenders for which an onset is looked for.
 const ONSET_CONTENDERS: usize = 3;
 /// Criterion within which a rival is sized through the physics before it is judged.
@@ -286,7 +286,8 @@ impl Case<'_> {
     /// compared in the same way on the half: its choice counts for the class if the hypothesis or a rival of it is best there, or within the
     /// criterion of the best.
     fn stability(&self, yardstick: &Yardstick, own: Candidate, rivals: &[Member], settled: Option<&Settled>) -> f64 {
-        let n = self.prepared.len().min(STABILITY_DRIVES);
+        let drives = self.prepared.len();
+        let n = drives.min(STABILITY_PARTS);
         let half = n.div_ceil(2);
         let subsets: Vec<u32> = (0u32..1 << n).filter(|s| s.count_ones() as usize == half).collect();
         let in_class = |h: usize| {
@@ -296,8 +297,8 @@ impl Case<'_> {
         let hits = subsets
             .par_iter()
             .filter(|subset| {
-                let inside = |i: usize| **subset & (1 << (i * n / self.prepared.len())) != 0;
-                let part = || yardstick.group((0..self.prepared.len()).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
+                let inside = |i: usize| **subset & (1 << part_of(i, drives, STABILITY_PARTS)) != 0;
+                let part = || yardstick.group((0..drives).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
                 let chosen = yardstick.select(&part()).chosen;
                 if chosen.iter().any(|h| in_class(*h)) {
                     return true;

@@ -68,6 +68,11 @@ impl Condensed {
 /// Most parts of which a control leaves each out in turn.
 const PARTS_MAX: usize = 24;
 
+/// Part of a drive where `drives` drives are cut into at most `parts_max` parts of neighbours; every drive is a part where there are fewer.
+pub fn part_of(drive: usize, drives: usize, parts_max: usize) -> usize {
+    drive * drives.min(parts_max) / drives
+}
+
 /// The drives of a set in at most 24 parts of neighbours, for what would take too long if each drive were left out by itself.
 #[derive(Clone, Debug)]
 pub struct Parts {
@@ -81,7 +86,7 @@ impl Parts {
         let count = drives.len();
         let mut parts: Vec<Condensed> = Vec::new();
         for (d, drive) in drives.into_iter().enumerate() {
-            match parts.get_mut(Self::part(d, count)) {
+            match parts.get_mut(part_of(d, count, PARTS_MAX)) {
                 Some(part) => part.add(&drive),
                 None => parts.push(drive),
             }
@@ -91,12 +96,8 @@ impl Parts {
 
     /// The parts, but for that of a drive where given.
     pub fn without(&self, drive: Option<usize>) -> impl Iterator<Item = &Condensed> {
-        let left_out = drive.map(|d| Self::part(d, self.drives));
+        let left_out = drive.map(|d| part_of(d, self.drives, PARTS_MAX));
         self.parts.iter().enumerate().filter(move |(p, _)| Some(*p) != left_out).map(|(_, part)| part)
-    }
-
-    fn part(drive: usize, drives: usize) -> usize {
-        drive * drives.min(PARTS_MAX) / drives
     }
 }
 

@@ -293,7 +293,7 @@ pub fn diagnose(
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
     let mut scores = if held.is_empty() { None } else { Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?) };
-    let (verdict, reason) = proven(&judgement, scores.as_ref(), options.against);
+    let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial);
     let any = matches!(verdict, Verdict::Explained | Verdict::Ambiguous);
     let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
     let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: any, predictor, held_out: &places };
@@ -425,22 +425,23 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
 }
 
 /// Verdict after the proof on held-out drives.
-fn proven(judgement: &Judgement, scores: Option<&HeldOut>, against: Against) -> (Verdict, String) {
-    let Some(scores) = scores.filter(|_| !judgement.claimed().is_empty()) else {
-        return (judgement.verdict, judgement.reason.clone());
-    };
+fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool) -> (Verdict, String) {
     let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
-    // A wrong sensor shows in the sensors; whether predictions from it get better is another question.
-    let on_trial = against == Against::Physics;
-    let must_help = on_trial || claimed.iter().any(|f| matches!(f.candidate.layer(), Layer::Force | Layer::Actuator | Layer::Soil));
-    match not_proven(scores, must_help.then_some(if on_trial { GAIN_ON_TRIAL } else { 0.0 })) {
-        Some(reason) => (Verdict::Unexplained, format!("{} fits, but {reason}", claimed[0].candidate.label())),
-        None if on_trial => {
-            (judgement.verdict, format!("{}; it helps on drives that were not fitted, and {}", judgement.reason, left(judgement)))
-        }
-        None if must_help => (judgement.verdict, format!("{}; it helps on drives that were not fitted", judgement.reason)),
-        None => (judgement.verdict, judgement.reason.clone()),
+    let (verdict, reason) = (judgement.verdict, judgement.reason.clone());
+    let Some(first) = claimed.first() else { return (verdict, reason) };
+    let refused = |why: String| (Verdict::Unexplained, format!("{} fits, but {why}", first.candidate.label()));
+    let Some(scores) = scores else {
+        return if model_on_trial { refused("no drive is left to prove it on".into()) } else { (verdict, reason) };
+    };
+    // A wrong sensor shows in the sensors; whether predictions from it get better is another question, unless the model itself is on trial.
+    let acts = |f: &&Finding| matches!(f.candidate.layer(), Layer::Force | Layer::Actuator | Layer::Soil);
+    let must_help = model_on_trial || claimed.iter().any(acts);
+    if let Some(why) = not_proven(scores, must_help.then_some(if model_on_trial { GAIN_ON_TRIAL } else { 0.0 })) {
+        return refused(why);
     }
+    let helps = if must_help { "; it helps on drives that were not fitted" } else { "" };
+    let more = if model_on_trial { format!(", and {}", left(judgement)) } else { String::new() };
+    (verdict, format!("{reason}{helps}{more}"))
 }
 
 fn left(judgement: &Judgement) -> String {

@@ -113,7 +113,7 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
         .collect();
     let last = drive.states.len().saturating_sub(SEGMENT_STEPS + 1);
     let model = predictor.step_model();
-    let servoed = model.vehicle().second == SecondCommand::YawRateRadS;
+    let servoed = rims_servoed(model.vehicle());
     let known = servoed && drive.measured.wheel_speed;
     let first = if known { FIRST_START_SERVOED } else { FIRST_START }.min(last);
     let finite = |k: usize| drive.states[k].to_array().iter().all(|v| v.is_finite());
@@ -138,6 +138,11 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
         road_wheel_angle_rad: drive.road_wheel_angle_rad.clone(),
         traction_slope,
     })
+}
+
+/// Whether the rims turn as they are told, whatever the ground does.
+fn rims_servoed(vehicle: &Vehicle) -> bool {
+    vehicle.second == SecondCommand::YawRateRadS
 }
 
 /// How much more each wheel pulls per rim over-speed, by central differences of the contact forces.
@@ -237,7 +242,7 @@ impl ObservedDrive {
     fn first_actuators(&self, vehicle: &Vehicle, state: &VehicleState<f64>) -> DrivelineState {
         let control = &self.transitions[0].control;
         let rims = self.wheel_speed_rad_s.as_ref().map(|w| rim_twist(vehicle, &w[0]));
-        match rims.filter(|twist| vehicle.second == SecondCommand::YawRateRadS && twist.iter().all(|v| v.is_finite())) {
+        match rims.filter(|twist| rims_servoed(vehicle) && twist.iter().all(|v| v.is_finite())) {
             Some(twist) => DrivelineState::turning(twist, control),
             None => DrivelineState::starting(vehicle, state, control),
         }
@@ -371,8 +376,8 @@ impl ObservedDrive {
         let Some(wheel_speed) = self.wheel_speed_rad_s.as_ref().map(|m| m[sample]) else { return };
         let share = 1.0 / SEGMENT_STEPS as f64;
         // Servoed rims are measured at the instant of the sample; a step takes their mean over it.
-        let servoed = vehicle.second == SecondCommand::YawRateRadS;
-        let wheels = command_wheels::<f64>(vehicle, before, if servoed { before } else { after }, &transition.control);
+        let until = if rims_servoed(vehicle) { before } else { after };
+        let wheels = command_wheels::<f64>(vehicle, before, until, &transition.control);
         let state = &reading.states[sample];
         let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
         for i in 0..WHEELS {

@@ -138,7 +138,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     warn_about_training_drives(args, &drives);
 
     let training = training_drives(&drives, &args.data);
-    let models = Models::prepare(args, &names, &drives, training.as_deref())?;
+    let models = Models::prepare(args, &names, &drives, training.as_deref(), horizon)?;
     let progress = Progress::start("windows predicted", windows.len());
     let paths = predict_all(&models.ready, &windows, &drives.maps, &|done| progress.set(done)).or_failed()?;
     progress.finish();
@@ -228,7 +228,14 @@ struct Models {
 }
 
 impl Models {
-    fn prepare(args: &EvaluateArgs, names: &[ModelName], drives: &Drives, training: Option<&[Trajectory]>) -> Result<Self, Failure> {
+    /// A baseline that is fitted here is fitted over `horizon` steps.
+    fn prepare(
+        args: &EvaluateArgs,
+        names: &[ModelName],
+        drives: &Drives,
+        training: Option<&[Trajectory]>,
+        horizon: usize,
+    ) -> Result<Self, Failure> {
         let predictor = if names.iter().any(|n| n.is_nesam()) {
             check_model_step(args.data.dt)?;
             args.window.check_horizon()?;
@@ -236,7 +243,10 @@ impl Models {
         } else {
             None
         };
-        let kinematic = if names.contains(&ModelName::Kinematic) { kinematic(args, predictor.as_deref(), drives, training)? } else { None };
+        let kinematic = match names.contains(&ModelName::Kinematic) {
+            true => kinematic(args, predictor.as_deref(), drives, training, horizon)?,
+            false => None,
+        };
         let vehicle = Arc::new(drives.root.vehicle().clone());
         let trained = trained_baselines(args, names, drives)?;
         let mut ready = Vec::new();
@@ -298,6 +308,7 @@ fn kinematic(
     predictor: Option<&Predictor>,
     drives: &Drives,
     training: Option<&[Trajectory]>,
+    horizon: usize,
 ) -> Result<Option<Kinematic>, Failure> {
     let bundled = match predictor {
         Some(p) => p.bundle().baselines_json.clone(),
@@ -314,7 +325,7 @@ fn kinematic(
     }
     let Some(training) = training else { return Ok(None) };
     eprintln!("fitting the kinematic baseline on {} training drives", training.len());
-    Ok(Some(Baselines::fit(drives.root.vehicle(), training, args.window.horizon_on(training)).or_failed()?.kinematic))
+    Ok(Some(Baselines::fit(drives.root.vehicle(), training, horizon).or_failed()?.kinematic))
 }
 
 fn print_table(e: &Evaluation<'_>) {

@@ -86,13 +86,12 @@ pub fn apply(change: Change, onset_s: f64, drive: &mut Trajectory, map: Option<A
             Change::GyroBias(size) => s.angular_velocity_rad_s[2] += size,
             Change::GyroScale(size) => s.angular_velocity_rad_s = s.angular_velocity_rad_s.map(|w| w * (1.0 + size)),
             Change::VelocityScale(size) => s.velocity_m_s = s.velocity_m_s.map(|v| v * (1.0 + size)),
-            Change::PositionLatency(size) => {
+            Change::PositionLatency(size) | Change::PoseLatency(size) => {
                 s.position_m = core::array::from_fn(|i| at(time - steps(size), &|j| states[j].position_m[i]));
-            }
-            Change::PoseLatency(size) => {
-                s.position_m = core::array::from_fn(|i| at(time - steps(size), &|j| states[j].position_m[i]));
-                let now = s.attitude_rad[2];
-                s.attitude_rad[2] = wrap_angle(now + at(time - steps(size), &|j| wrap_angle(states[j].attitude_rad[2] - now)));
+                if let Change::PoseLatency(_) = change {
+                    let now = s.attitude_rad[2];
+                    s.attitude_rad[2] = wrap_angle(now + at(time - steps(size), &|j| wrap_angle(states[j].attitude_rad[2] - now)));
+                }
             }
             Change::LeverArm(size) => {
                 let [roll, pitch, yaw] = s.attitude_rad;

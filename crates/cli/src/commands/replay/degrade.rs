@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use serde_json::json;
 
 use super::ReplayArgs;
+use crate::args::longest_horizon;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::{self, say};
@@ -26,7 +27,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
     every_nth(&mut drives, args.every);
     let longest = drives.drives.iter().map(|drive| drive.states.len()).max().unwrap_or(0);
-    let horizon = args.horizon.unwrap_or_else(|| MAX_HORIZON.min(longest.saturating_sub(1)));
+    let horizon = args.horizon.unwrap_or_else(|| longest_horizon(&drives.drives));
     let asked: Vec<Vec<usize>> = drives.drives.iter().map(|drive| windows(drive.states.len(), horizon, MAX_HORIZON)).collect();
     if horizon > MAX_HORIZON || asked.iter().all(Vec::is_empty) {
         let reason =
