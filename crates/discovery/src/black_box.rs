@@ -57,7 +57,7 @@ impl BlackBox {
                         difference(rows, &changed.deviations(&case.bench, &[], &SoilCorrection::NONE), 1.0)
                     })
                     .collect();
-                profiled(&case.metric, rows, &columns, &prepared.signatures.soil)
+                profiled(&case.metric_without, rows, &columns, &prepared.signatures.soil)
             })
             .collect();
         Some(Self { mean, directions, parts: Parts::of(drives) })

@@ -222,6 +222,12 @@ impl Candidate {
         self.line.free.iter().enumerate().map(of).collect()
     }
 
+    /// Share in the first column of a value of the first free parameter; the reverse of [`Candidate::start`].
+    pub fn share(&self, value: f64) -> f64 {
+        let unit = self.line.columns[0][self.line.free[0].parameter];
+        self.line.scalings[0].share(unit, value)
+    }
+
     /// Physical range of a free parameter.
     pub fn range(&self, i: usize) -> [f64; 2] {
         let range = self.of(&self.line.columns[0]).parameters()[self.line.free[i].parameter].range;

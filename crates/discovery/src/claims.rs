@@ -10,7 +10,7 @@ use crate::candidates::Candidate;
 use crate::channels::{self, Row};
 use crate::condense::{Condensed, condense, part_of};
 use crate::evidence::Group;
-use crate::fit::{Fit, Prepared, Term, fit};
+use crate::fit::{Fit, Prepared, Start, Term, fit};
 use crate::metric::Metric;
 use crate::observe::Bench;
 use crate::onset::{self, Onset};
@@ -23,6 +23,8 @@ const MAGNITUDE_HALF_MAX: f64 = 0.7;
 const STABILITY_MIN: f64 = 0.6;
 /// Parts of neighbouring drives of which all half-samples are looked at; every drive is a part where there are fewer.
 const STABILITY_PARTS: usize = 10;
+/// Weight of the priors of a fit where the model itself is on trial: they only keep in place what cannot be seen (chosen).
+const PRIOR_ON_TRIAL: f64 = 0.01;
 /// Contenders for which an onset is looked for.
 const ONSET_CONTENDERS: usize = 3;
 /// Criterion within which a rival is sized through the physics before it is judged.
@@ -130,8 +132,10 @@ impl Settled {
 pub struct Case<'a> {
     /// Reference.
     pub bench: Bench<'a>,
-    /// Metric.
+    /// Metric of what is judged.
     pub metric: Metric,
+    /// Metric of the drives without any effect.
+    pub metric_without: Metric,
     /// Drives.
     pub prepared: Vec<Prepared>,
     /// Deviations of each drive without any effect.
@@ -198,7 +202,7 @@ impl Case<'_> {
         let columns: Vec<usize> = chosen.iter().flat_map(|h| yardstick.catalogue[*h].columns()).collect();
         let mut shares = group.joint_shares(&columns);
         let mut offset = Vec::new();
-        let start = terms
+        let values = terms
             .iter()
             .map(|term| {
                 let own = term.candidate.columns();
@@ -213,11 +217,13 @@ impl Case<'_> {
             })
             .collect();
         let drives: Vec<&Prepared> = self.prepared.iter().collect();
-        fit(&self.bench, &self.metric, &drives, &terms, start, &offset)
+        // What a data sheet lacks is no small change of what a vehicle was.
+        let prior = if yardstick.model_on_trial { PRIOR_ON_TRIAL } else { 1.0 };
+        fit(&self.bench, &self.metric, &drives, &terms, Start { values, offset, prior })
     }
 
     /// Scores of what fitted effects leave of each drive.
-    fn left(&self, fit: &Fit) -> Vec<Condensed> {
+    pub(crate) fn left(&self, fit: &Fit) -> Vec<Condensed> {
         let effects = fit.effects();
         self.prepared
             .par_iter()
@@ -226,9 +232,9 @@ impl Case<'_> {
     }
 
     /// Compares the first chosen effect with its closest rivals once more, each sized through the physics, because a large delay or drag is no multiple of a small one.
-    /// The best comes first, the others remain its rivals; what is left is that of the fit. `None` when nothing was chosen.
+    /// The best comes first, the others remain its rivals; what is left is that of the fit. `None` when nothing was chosen, or what an earlier look settled.
     pub fn settle(&self, yardstick: &Yardstick, selection: &mut Selection, onsets: &[Option<Onset>]) -> Option<Settled> {
-        let &first = selection.chosen.first()?;
+        let &first = selection.chosen.first().filter(|h| yardstick.known(**h).is_none())?;
         let before = yardstick.group(self.condensed());
         let close = selection.rivals[0].iter().filter(|r| r.difference < SETTLED).take(2 * RIVALS_MAX).map(|r| r.hypothesis);
         let members: Vec<usize> = std::iter::once(first).chain(close).collect();

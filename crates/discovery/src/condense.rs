@@ -56,6 +56,13 @@ impl Condensed {
         }
     }
 
+    /// As if a column had been there with a share and were not fitted.
+    pub fn plus(mut self, column: usize, share: f64) -> Self {
+        self.square += share * (2.0 * self.score[column] + share * self.information[(column, column)]);
+        self.score.axpy(share, &self.information.column(column), 1.0);
+        self
+    }
+
     fn add(&mut self, other: &Self) {
         self.score += &other.score;
         self.information += &other.information;
@@ -101,19 +108,44 @@ impl Parts {
     }
 }
 
+/// An effect beside which others are looked for.
+#[derive(Clone, Copy, Debug)]
+pub struct Beside {
+    /// The hypothesis, of one column.
+    pub candidate: Candidate,
+    /// The effect as fitted.
+    pub effect: ScheduledEffect,
+    /// Its share in the column of the hypothesis.
+    pub share: f64,
+}
+
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.
 pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[Candidate]) -> Signatures {
-    let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| drive.deviations(bench, effect.as_slice(), soil);
+    signatures_beside(bench, drive, catalogue, &[])
+}
+
+/// The same beside effects that were fitted; their own columns are the secants, from without to with each, one after the other, so that the deviations without
+/// them are those with them plus the columns times their shares.
+pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[Candidate], fitted: &[Beside]) -> Signatures {
+    let beside: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
+    let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| {
+        let effects: Vec<ScheduledEffect> = beside.iter().copied().chain(effect).collect();
+        drive.deviations(bench, &effects, soil)
+    };
     let base = at(None, &SoilCorrection::NONE);
     let forms: Vec<(nesam_physics::effects::Effect, bool)> =
         catalogue.iter().flat_map(|c| c.linear_form().into_iter().map(|e| (e, c.forward())).collect::<Vec<_>>()).collect();
-    let columns = forms
+    let mut columns: Vec<Vec<Row>> = forms
         .par_iter()
         .map(|(effect, forward)| {
             let side = |share: f64| at(Some(ScheduledEffect { effect: effect.scaled(share), onset_s: 0.0 }), &SoilCorrection::NONE);
             if *forward { difference(&base, &side(1.0), 1.0) } else { difference(&side(-1.0), &side(1.0), 0.5) }
         })
         .collect();
+    for (i, own) in fitted.iter().enumerate() {
+        let with = |count: usize| drive.deviations(bench, &beside[..count], &SoilCorrection::NONE);
+        columns[own.candidate.columns()[0]] = difference(&with(i), &with(i + 1), 1.0 / own.share);
+    }
     let soil = (0..SOIL_DIM)
         .into_par_iter()
         .map(|i| {

@@ -1,6 +1,6 @@
 //! The whole diagnosis of a set: detect, select, refit, prove on drives that were not fitted.
 
-use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, paired_difference};
+use nesam_evaluation::DriveMaps;
 use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::{Effect, Layer};
@@ -8,7 +8,7 @@ use nesam_trajectories::Trajectory;
 
 use crate::candidates::Candidate;
 use crate::claims::{Case, Estimate, Finding, Trace};
-use crate::condense::best_soil;
+use crate::condense::{Condensed, best_soil};
 use crate::controls::{Kind, NullDrives, Setting};
 use crate::error::DiscoveryError;
 use crate::fit::Fit;
@@ -16,6 +16,8 @@ use crate::held_out::{HeldOut, Learned, Scoring, score_held_out, score_models};
 use crate::judge::{Judge, case_of, own_yardstick};
 use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
 use crate::own_reference;
+use crate::proof::{Trial, not_proven};
+use crate::pursuit::{Pursued, pursue};
 use crate::select::{Selection, Yardstick};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
@@ -235,9 +237,16 @@ fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool
     let named: Vec<String> = findings.iter().map(|f| f.candidate.label()).collect();
     let rivals: Vec<String> = findings.iter().flat_map(|f| &f.rivals).map(|m| m.candidate.label()).collect();
     if rivals.is_empty() {
-        (Verdict::Explained, format!("{} explains it", named.join(" with ")))
+        (Verdict::Explained, format!("{} explains it", together(&named)))
     } else {
-        (Verdict::Ambiguous, format!("{} explains it, but {} would do about as well", named.join(" with "), rivals.join(" or ")))
+        (Verdict::Ambiguous, format!("{} explains it, but {} would do about as well", together(&named), rivals.join(" or ")))
+    }
+}
+
+fn together(named: &[String]) -> String {
+    match named {
+        [first, others @ ..] if !others.is_empty() => format!("{first} with {}", others.join(" and ")),
+        _ => named.concat(),
     }
 }
 
@@ -274,9 +283,12 @@ pub fn diagnose(
     let observed = observe_all(predictor, &fit_drives, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
     let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
     let bench = Bench { vehicle: &bundle.vehicle, stepping };
-    let (mut case, yardstick) = held_against(judge_by.as_ref(), bench, observed, options, progress)?;
+    let as_measured: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
+    let trial = Trial { predictor, drives: &as_measured, maps: &fit_maps, scoring: &options.scoring };
+    let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
     progress("hypotheses", 0, 1);
-    let judgement = judge(&mut case, &yardstick);
+    let mut judgement = judge(&mut case, &yardstick);
+    judgement.findings.extend(refused);
     let fewer = match &judge_by {
         Some(judge_by) if options.fit_on.is_none() && total > 1 => {
             Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?)
@@ -338,17 +350,20 @@ fn held_against<'a>(
     bench: Bench<'a>,
     observed: Vec<ObservedDrive>,
     options: &Options,
+    trial: &Trial<'_>,
     progress: OnProgress<'_>,
-) -> Result<(Case<'a>, Yardstick), DiscoveryError> {
+) -> Result<(Case<'a>, Pursued), DiscoveryError> {
     let total = observed.len();
     let Some(judge_by) = judge_by else {
-        let case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
-        let yardstick = own_yardstick(&case, &options.without)?;
-        return Ok((case, yardstick));
+        let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
+        let drives: Vec<Condensed> = case.condensed().cloned().collect();
+        let first = own_yardstick(&case, &drives, &options.without)?;
+        let pursued = pursue(&mut case, first, &options.without, trial, progress)?;
+        return Ok((case, pursued));
     };
     let case = judge_by.case(bench, observed, progress)?;
     let yardstick = judge_by.yardstick(&case.metric.channels, total, &options.without)?;
-    Ok((case, yardstick))
+    Ok((case, Pursued { yardstick, refused: Vec::new() }))
 }
 
 /// Kind and number of parameters of each control, and the free form of what all drives leave.
@@ -447,28 +462,6 @@ fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool)
 fn left(judgement: &Judgement) -> String {
     let (z, what) = &judgement.selection.remaining;
     format!("the model lacks more than that: what is left shows most in {what} (z = {z:.1})")
-}
-
-/// Why the proof on held-out drives fails: no error falls surely by the share that one must, or something worsens surely by more than 2 %.
-fn not_proven(scores: &HeldOut, least_gain: Option<f64>) -> Option<String> {
-    let [before, soil, after] = &scores.scores;
-    for (gain, against) in least_gain.into_iter().flat_map(|gain| [(gain, soil), (gain, before)]) {
-        let (_, interval) = paired_difference(&against.errors, &after.errors, &scores.resamples);
-        let falls = |(i, b): (Option<[f64; 2]>, Option<f64>)| matches!((i, b), (Some([low, _]), Some(b)) if low > 0.0 && low >= gain * b);
-        if !interval.row(false).into_iter().zip(against.summary.tree.row(false)).any(falls) {
-            let share = if gain > 0.0 { format!(" by {:.0} %", 100.0 * gain) } else { String::new() };
-            return Some(format!("no error falls surely{share} on drives that were not fitted"));
-        }
-    }
-    let (difference, interval) = paired_difference(&after.errors, &before.errors, &scores.resamples);
-    let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
-    let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(before.summary.tree.row(false));
-    rows.zip(names).find_map(|(((d, i), b), name)| match (d, i, b) {
-        (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > 0.02 * b => {
-            Some(format!("the error of {name} rises surely on drives that were not fitted, from {b:.4} by {d:.4}"))
-        }
-        _ => None,
-    })
 }
 
 /// Mean deviation of each compared channel from its usual level over all segments.

@@ -91,15 +91,27 @@ fn timed(terms: &[Term], values: &[Vec<f64>]) -> Vec<ScheduledEffect> {
     terms.iter().zip(values).map(|(t, v)| ScheduledEffect { effect: t.candidate.effect(v), onset_s: t.onset_s }).collect()
 }
 
-/// Fits terms from starting values. `offset` is the share of each parameter that drives without an effect show, in the unit of the parameter.
-pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], start: Vec<Vec<f64>>, offset: &[f64]) -> Fit {
+/// What a fit begins from and is drawn to.
+#[derive(Clone, Debug)]
+pub struct Start {
+    /// Values of the free parameters of each term.
+    pub values: Vec<Vec<f64>>,
+    /// Share of each parameter that drives without an effect show, in the unit of the parameter.
+    pub offset: Vec<f64>,
+    /// Weight of the priors, which are those of a change of a known vehicle at 1.
+    pub prior: f64,
+}
+
+/// Fits terms.
+pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], start: Start) -> Fit {
+    let Start { values: start, offset, prior } = start;
     let mut values = start;
     let mut held = clamp(terms, &mut values);
     let mut at = linearised(bench, metric, drives, terms, &values);
     let all: Vec<usize> = (0..drives.len()).collect();
     let mut covariance = DMatrix::zeros(0, 0);
     for _ in 0..ITERATIONS {
-        let (moved, spread) = step(terms, &at, &all, &values, &vec![0.0; offset.len()]);
+        let (moved, spread) = step(terms, &at, &all, (&values, prior), &vec![0.0; offset.len()]);
         covariance = spread;
         let before = flat(&values);
         values = shaped(terms, &moved);
@@ -117,11 +129,11 @@ pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Te
     }
     let others = |d: usize| -> Vec<usize> { all.iter().copied().filter(|i| *i != d).collect() };
     let jackknife = if all.len() > 1 {
-        all.iter().map(|d| shaped(terms, &step(terms, &at, &others(*d), &values, offset).0)).collect()
+        all.iter().map(|d| shaped(terms, &step(terms, &at, &others(*d), (&values, prior), &offset).0)).collect()
     } else {
         Vec::new()
     };
-    let centred: Vec<f64> = flat(&values).iter().zip(offset).map(|(v, o)| v - o).collect();
+    let centred: Vec<f64> = flat(&values).iter().zip(&offset).map(|(v, o)| v - o).collect();
     let mut values = shaped(terms, &centred);
     for (held, now) in held.iter_mut().flatten().zip(clamp(terms, &mut values).into_iter().flatten()) {
         *held |= now;
@@ -161,8 +173,8 @@ pub fn parameter_columns(bench: &Bench<'_>, prepared: &Prepared, terms: &[Term],
     columns
 }
 
-/// A step from `values` on the drives in `kept`: where it leads, less `offset`, and its covariance in the metric.
-fn step(terms: &[Term], at: &[Condensed], kept: &[usize], values: &[Vec<f64>], offset: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
+/// A step from values, with priors of a weight, on the drives in `kept`: where it leads, less `offset`, and its covariance in the metric.
+fn step(terms: &[Term], at: &[Condensed], kept: &[usize], (values, prior): (&[Vec<f64>], f64), offset: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
     let values = flat(values);
     let size = values.len();
     let (mut information, mut score) = (DMatrix::zeros(size, size), DVector::zeros(size));
@@ -171,8 +183,8 @@ fn step(terms: &[Term], at: &[Condensed], kept: &[usize], values: &[Vec<f64>], o
         score += &at[*d].score;
     }
     for (i, f) in terms.iter().flat_map(|t| t.candidate.free()).enumerate() {
-        information[(i, i)] += f.sd.powi(-2);
-        score[i] += (f.mean - values[i]) * f.sd.powi(-2);
+        information[(i, i)] += prior * f.sd.powi(-2);
+        score[i] += (f.mean - values[i]) * prior * f.sd.powi(-2);
     }
     let covariance = information.cholesky().map_or_else(|| DMatrix::zeros(size, size), |c| c.inverse());
     let moved = &covariance * score;

@@ -95,15 +95,17 @@ pub(crate) fn case_of<'a>(metric: Metric, bench: Bench<'a>, observed: Vec<Observ
             Prepared { drive, signatures, condensed }
         })
         .collect();
-    Case { bench, metric, prepared, rows }
+    Case { bench, metric_without: metric.clone(), metric, prepared, rows }
 }
 
-/// What drives are compared with that stand for themselves: `--reference physics`.
-pub(crate) fn own_yardstick(case: &Case<'_>, without: &[String]) -> Result<Yardstick, DiscoveryError> {
-    let drives: Vec<Condensed> = case.condensed().cloned().collect();
+/// What drives are compared with that stand for themselves (`--reference physics`), whose scatter is that of `drives`.
+///
+/// # Errors
+/// `DiscoveryError::Drives` with fewer than four.
+pub(crate) fn own_yardstick(case: &Case<'_>, drives: &[Condensed], without: &[String]) -> Result<Yardstick, DiscoveryError> {
     let nulls = Nulls::about_zero(&drives.iter().collect::<Vec<_>>())
         .ok_or_else(|| DiscoveryError::Drives { reason: "--reference physics needs more drives".into() })?;
     let channels = &case.metric.channels;
-    let yardstick = Yardstick::new(nulls, channels, without, |catalogue| own_reference::sign_flips(&drives, catalogue, channels));
+    let yardstick = Yardstick::new(nulls, channels, without, |catalogue| own_reference::sign_flips(drives, catalogue, channels));
     Ok(Yardstick { model_on_trial: true, ..yardstick })
 }

@@ -14,7 +14,8 @@
 //! 8. [`controls`] predicts the same drives with what else might explain them: rivals, a black box, a free form of what is left;
 //! 9. [`diagnose`] does all of it, [`report`] writes JSON and HTML; [`bench`] measures how often it is right.
 //!
-//! With [`Against::Physics`] the drives stand for themselves and the symbolic model itself is on trial.
+//! With [`Against::Physics`] the drives stand for themselves and the symbolic model itself is on trial; [`pursuit`] then
+//! looks for further effects beside those already found.
 //!
 //! Ground truth is never read.
 #![forbid(unsafe_code)]
@@ -39,6 +40,8 @@ mod metric;
 mod observe;
 pub mod onset;
 mod own_reference;
+pub mod proof;
+pub mod pursuit;
 mod reference;
 pub mod report;
 mod ridge;

@@ -243,7 +243,7 @@ impl ObservedDrive {
         let control = &self.transitions[0].control;
         let rims = self.wheel_speed_rad_s.as_ref().map(|w| rim_twist(vehicle, &w[0]));
         match rims.filter(|twist| rims_servoed(vehicle) && twist.iter().all(|v| v.is_finite())) {
-            Some(twist) => DrivelineState::turning(twist, control),
+            Some(twist) => DrivelineState::turning(vehicle, twist),
             None => DrivelineState::starting(vehicle, state, control),
         }
     }

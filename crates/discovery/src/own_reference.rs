@@ -48,8 +48,15 @@ pub fn metric(bench: &Bench<'_>, drives: &[ObservedDrive]) -> Result<Metric, Dis
         return Err(DiscoveryError::Drives { reason });
     }
     let rows: Vec<Vec<Row>> = drives.iter().map(|d| d.deviations(bench, &[], &SoilCorrection::NONE)).collect();
-    let available: [bool; CHANNELS] = core::array::from_fn(|c| drives.iter().all(|d| d.available[c]));
-    Metric::measure(&rows, &available)
+    metric_of(&rows, &core::array::from_fn(|c| drives.iter().all(|d| d.available[c])))
+}
+
+/// The same from the deviations of each drive, on the channels that all of them have.
+///
+/// # Errors
+/// `DiscoveryError::Drives` where the deviations have no scatter.
+pub fn metric_of(rows: &[Vec<Row>], available: &[bool; CHANNELS]) -> Result<Metric, DiscoveryError> {
+    Metric::measure(rows, available)
         .and_then(|m| Metric::new(m.channels, DVector::zeros(m.centre.len()), m.within, m.between))
         .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })
 }

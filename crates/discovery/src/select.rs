@@ -22,7 +22,7 @@ const THRESHOLD_ALONE: f64 = 6.2;
 /// Share of the strongest gain below which a hypothesis does not compete.
 const COMPETING: f64 = 0.3;
 /// Evidence that a second or third effect needs, as a multiple of the threshold (chosen): the model's answer to the first is not exact.
-const FURTHER: f64 = 1.25;
+pub(crate) const FURTHER: f64 = 1.25;
 
 /// What a group of drives is compared with.
 #[derive(Clone, Debug)]
@@ -39,6 +39,19 @@ pub struct Yardstick {
     pub considered: Vec<bool>,
     /// Whether the model itself is on trial, by the scatter of the judged drives.
     pub model_on_trial: bool,
+    /// What earlier looks found, first found first; chosen before anything else.
+    pub known: Vec<Known>,
+    /// What stood out and was refused by an earlier look; not chosen.
+    pub refused: Vec<usize>,
+}
+
+/// A hypothesis that an earlier look found, with the rivals that it had then.
+#[derive(Clone, Debug)]
+pub struct Known {
+    /// Index in the catalogue.
+    pub hypothesis: usize,
+    /// Its rivals, each sized in its place where they were close.
+    pub rivals: Vec<Rival>,
 }
 
 impl Yardstick {
@@ -46,7 +59,16 @@ impl Yardstick {
     pub fn new(nulls: Nulls, channels: &[usize], without: &[String], groups: impl FnOnce(&[Candidate]) -> Option<NullGroups>) -> Self {
         let catalogue = catalogue();
         let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
-        Self { nulls, groups: groups(&catalogue), channels: channels.to_vec(), catalogue, considered, model_on_trial: false }
+        Self {
+            nulls,
+            groups: groups(&catalogue),
+            channels: channels.to_vec(),
+            catalogue,
+            considered,
+            model_on_trial: false,
+            known: Vec::new(),
+            refused: Vec::new(),
+        }
     }
 }
 
@@ -92,6 +114,12 @@ impl Selection {
         yardstick.describe(group, self);
     }
 
+    /// Chooses these hypotheses, in this order.
+    pub fn choose(&mut self, yardstick: &Yardstick, group: &Group, chosen: Vec<usize>) {
+        self.chosen = chosen;
+        yardstick.describe(group, self);
+    }
+
     /// Whether the drives differ from the reference, known cause or not.
     pub fn differs(&self) -> bool {
         self.largest() >= self.threshold
@@ -105,6 +133,11 @@ pub fn mismatch(layer: Layer) -> f64 {
 }
 
 impl Yardstick {
+    /// What an earlier look said of a hypothesis that it found.
+    pub fn known(&self, hypothesis: usize) -> Option<&Known> {
+        self.known.iter().find(|k| k.hypothesis == hypothesis)
+    }
+
     /// Family-wise threshold.
     pub fn threshold(&self) -> f64 {
         self.groups.as_ref().map_or(THRESHOLD_ALONE, |n| n.threshold)
@@ -137,6 +170,11 @@ impl Yardstick {
             return (0.0, 0.0);
         }
         (found.z / self.spread(hypothesis), found.gain)
+    }
+
+    /// Evidence of a hypothesis in what `fitted` left when they were sized through the physics without it, in units of its null spread.
+    pub fn refitted(&self, left: &Group, fitted: &[usize], hypothesis: usize) -> f64 {
+        left.remainder(&self.columns(fitted), &self.catalogue[hypothesis].columns(), 0.0).z / self.spread(hypothesis)
     }
 
     /// Criterion of hypothesis j against k when `others` are fitted too; positive = j is better.
@@ -196,6 +234,9 @@ impl Yardstick {
             })
             .collect();
         contenders.sort_by(|a, b| b.1.total_cmp(&a.1));
+        if let Some(known) = self.known.iter().find(|known| contenders.iter().any(|c| c.0 == known.hypothesis)) {
+            return Some(known.hypothesis);
+        }
         let (mut best, top) = *contenders.first()?;
         for (k, _) in contenders.iter().skip(1).filter(|(_, gain)| *gain >= COMPETING * top) {
             if self.difference(group, chosen, best, *k) < 0.0 {
@@ -221,10 +262,13 @@ impl Yardstick {
     }
 
     fn open<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
-        (0..self.catalogue.len()).filter(|k| self.considered[*k] && !chosen.contains(k))
+        (0..self.catalogue.len()).filter(|k| self.considered[*k] && !chosen.contains(k) && !self.refused.contains(k))
     }
 
     fn rivals(&self, group: &Group, others: &[usize], j: usize, chosen: &[usize]) -> Vec<Rival> {
+        if let Some(known) = self.known(j) {
+            return known.rivals.iter().filter(|r| !chosen.contains(&r.hypothesis)).cloned().collect();
+        }
         let mut rivals: Vec<Rival> = self
             .open(chosen)
             .filter(|k| self.after(group, others, *k).0 >= self.threshold())

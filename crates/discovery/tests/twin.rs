@@ -8,7 +8,7 @@ use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, option
 use nesam_discovery::controls::Kind;
 use nesam_discovery::{Against, Bench, Diagnosis, Stepping, Verdict, observe};
 use nesam_model::ModelBundle;
-use nesam_physics::effects::{Effect, Payload, PoseLatency, ScheduledEffect, SteeringOffset, SteeringRatio, WheelDrag};
+use nesam_physics::effects::*;
 
 fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
     let e = found.estimates.iter().find(|e| e.name == name).unwrap();
@@ -139,10 +139,35 @@ fn property_a_new_skid_steer_base_is_judged_by_short_logs_without_a_map() {
     let turning = (1.0 + terms.steering_ratio) * (1.0 + terms.track_m / rover.track_m);
     // Starts whose velocity nobody measured speak against the last few hundredths.
     assert!((turning - 0.7).abs() < 0.08, "rims turn {turning:.3} of what they are told: {}", found.reason);
+    // Rims that turn no faster than 0.4 rad/s, whatever they are told.
+    let found = diagnose_rover(&[Effect::TurnLimit(TurnLimit { rad_s: 0.4 })]);
+    assert!(explained_by(&found, "turn_limit"), "{}; z {:?}", found.reason, found.selection.z);
+    let (rad_s, ci95) = value(&found, "rad_s");
+    assert!((rad_s - 0.4).abs() < 0.06, "{rad_s} {ci95:?}");
     // Velocities that nobody measured are no evidence; a heading behind the gyro is.
     let found = diagnose_rover(&[Effect::PoseLatency(PoseLatency { seconds: 0.2 })]);
     let first = found.findings.first().map(|f| f.candidate.id());
     assert_eq!(first, Some("pose_latency"), "{}; z {:?}", found.reason, found.selection.z);
+}
+
+#[test]
+fn property_a_large_effect_hides_no_other() {
+    // What a data sheet says nothing of: each is seen only beside the others. Sizes within a tenth, a lag of the steering within a fifth.
+    let (gain, lag, limit) = (SpeedGain { relative: 0.6 }, SpeedLag { seconds: 0.4 }, TurnLimit { rad_s: 0.4 });
+    let found = diagnose_rover(&[Effect::SpeedGain(gain), Effect::SpeedLag(lag), Effect::TurnLimit(limit)]);
+    for id in ["speed_gain", "speed_lag", "turn_limit"] {
+        assert!(explained_by(&found, id), "{id} is a rival only: {}", found.reason);
+    }
+    for (name, want) in [("relative", 0.6), ("seconds", 0.4), ("rad_s", 0.4)] {
+        let (got, ci95) = value(&found, name);
+        assert!((got / want - 1.0).abs() < 0.1, "{name} {got} {ci95:?}, {want} is true");
+    }
+    let found = diagnose_rover(&[Effect::SteeringLag(SteeringLag { seconds: 0.5 }), Effect::TurnLimit(limit)]);
+    for id in ["steering_lag", "turn_limit"] {
+        assert!(explained_by(&found, id), "{id} is a rival only: {}", found.reason);
+    }
+    let [(seconds, _), (rad_s, _)] = ["seconds", "rad_s"].map(|name| value(&found, name));
+    assert!((seconds / 0.5 - 1.0).abs() < 0.2 && (rad_s / 0.4 - 1.0).abs() < 0.1, "{seconds} {rad_s}");
 }
 
 #[test]

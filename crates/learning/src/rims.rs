@@ -27,7 +27,7 @@ fn rim_twists(vehicle: &Vehicle, drive: &Drive) -> Option<Vec<[f64; 2]>> {
 fn servo_error(vehicle: &Vehicle, measured: &[(&Drive, Vec<[f64; 2]>)], dt_s: f64) -> f64 {
     let (mut sum, mut count) = (0.0, 0usize);
     for (drive, twists) in measured {
-        let mut state = DrivelineState::turning(twists[0], &drive.controls[0]);
+        let mut state = DrivelineState::turning(vehicle, twists[0]);
         for (control, twist) in drive.controls.iter().zip(&twists[1..]) {
             state = state.advance(vehicle, control, 0.0, dt_s);
             let speed = state.rim_speed_m_s - twist[0];

@@ -61,15 +61,20 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         if vehicle.second != SecondCommand::YawRateRadS {
             return Self::settled(control);
         }
-        let servo = &vehicle.driveline.rims;
+        let servo = &vehicle.limited_rims();
         let measured = state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency);
         let turning = clamp(measured, -servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
-        Self::turning([state.velocity_m_s[0], turning], control)
+        Self::turning(vehicle, [state.velocity_m_s[0], turning])
     }
 
-    /// Actuators whose rims have settled on a twist: mean rim speed (m/s) and turning (rad/s), see [`rim_twist`].
-    pub fn turning(twist: [T; 2], control: &Control<T>) -> Self {
-        Self { steering: twist[1], rim_speed_m_s: twist[0], rim_demand: twist, ..Self::settled(control) }
+    /// Actuators of a skid-steer vehicle whose rims have settled on a twist, mean rim speed (m/s) and turning (rad/s), see [`rim_twist`]; before, it was told
+    /// what its servo makes this twist of. A command that is late or lagged so begins at what the rims do, not at what they are now told.
+    pub fn turning(vehicle: &Vehicle, twist: [T; 2]) -> Self {
+        let servo = &vehicle.driveline.rims;
+        let gains = [servo.speed_gain * (1.0 + vehicle.effects.actuator.speed_gain), servo.yaw_gain];
+        let [speed_m_s, second] = core::array::from_fn(|i| twist[i] * T::lit(1.0 / gains[i]));
+        let path = CommandPath::settled(&Control { speed_m_s, second });
+        Self { steering: twist[1], speed_error_integral_m: T::lit(0.0), rim_speed_m_s: twist[0], rim_demand: twist, path }
     }
 
     /// The rims of a skid-steer vehicle after `dt_s` under a command.

@@ -218,13 +218,16 @@ impl Vehicle {
         T::lit(own) - passed * T::lit(0.5 * (own - partner))
     }
 
-    /// Servo of the rims with what the drive still has of its limit.
+    /// Servo of the rims with what the drive still has of its limits.
     pub fn limited_rims(&self) -> RimServo {
-        let rims = self.driveline.rims;
-        match self.effects.actuator.torque_lost {
-            0.0 => rims,
-            lost => RimServo { rim_limit_m_s: rims.rim_limit_m_s * (1.0 - lost), ..rims },
+        let (mut rims, lost) = (self.driveline.rims, &self.effects.actuator);
+        if lost.torque_lost != 0.0 {
+            rims.rim_limit_m_s *= 1.0 - lost.torque_lost;
         }
+        if lost.turn_limit_inverse_s_rad > 0.0 {
+            rims.yaw_limit_rad_s = rims.yaw_limit_rad_s.min(1.0 / lost.turn_limit_inverse_s_rad);
+        }
+        rims
     }
 
     /// Whether the command lies in the range of the card (both ends included).

@@ -25,6 +25,16 @@ impl Scaling {
             Self::Held => value,
         }
     }
+
+    /// The share under which `unit` becomes `value`: the reverse of [`Scaling::apply`]; 1 for what is held.
+    pub fn share(self, unit: f64, value: f64) -> f64 {
+        match self {
+            Self::Size => value / unit,
+            Self::Factor => value.ln() / unit.ln(),
+            Self::Limit => unit / value,
+            Self::Held => 1.0,
+        }
+    }
 }
 
 /// What a parameter is.

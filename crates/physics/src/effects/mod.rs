@@ -147,7 +147,7 @@ catalogue! {
     SlipSinkage MultiPass ElasticRecovery ThetaMShift Grousers FrontBulldozing SideBulldozing
     RollStiffness PitchStiffness MapTilt MapOffset SoilDrift
     GyroBias GyroScale VelocityScale PositionLatency LeverArm MountAngle ClockDrift FrictionCap SoilCrust
-    PoseLatency
+    PoseLatency TurnLimit
     FreeForm
 }
 

@@ -139,6 +139,30 @@ fn analytic_track_of_a_differential_drive() {
 }
 
 #[test]
+fn analytic_a_lag_begins_at_what_the_rims_do() {
+    let tau = 0.3;
+    let vehicle = robot().with_effects(&[Effect::SpeedLag(SpeedLag { seconds: tau }), Effect::SpeedGain(SpeedGain { relative: 0.5 })]);
+    let decay = |t: f64| (-t / tau).exp();
+    let mut state = DrivelineState::turning(&vehicle, [1.0, 0.0]);
+    for k in 0..8 {
+        state = state.advance(&vehicle, &Control { speed_m_s: 0.0, second: 0.0 }, 0.0, DT_S);
+        let t = k as f64 * DT_S;
+        let mean = tau / DT_S * (decay(t) - decay(t + DT_S));
+        assert!((state.rim_speed_m_s - mean).abs() < 1e-12, "step {k}: {} {mean}", state.rim_speed_m_s);
+    }
+}
+
+#[test]
+fn analytic_a_turn_limit_holds_the_rims_and_leaves_slower_turns() {
+    let limited = robot().with_effects(&[Effect::TurnLimit(TurnLimit { rad_s: 1.5 })]);
+    let turning = |vehicle: &Vehicle, told: f64| follow(vehicle, &[[0.5, told]; 40])[39].0.steering;
+    for told in [2.5, -2.5] {
+        assert!((turning(&limited, told) - 1.5 * told.signum()).abs() < 1e-9);
+    }
+    assert_eq!(turning(&limited, 1.2).to_bits(), turning(&robot(), 1.2).to_bits());
+}
+
+#[test]
 fn analytic_compliance_is_a_smaller_angle() {
     let compliance = 8e-6;
     let turn = |effects: &[Effect], command: &dyn Fn(&Drive) -> f64| {

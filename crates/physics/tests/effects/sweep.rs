@@ -55,7 +55,7 @@ fn mirrored(effect: &Effect) -> Effect {
 
 #[test]
 fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
-    assert_eq!(Effect::IDS.len(), 47);
+    assert_eq!(Effect::IDS.len(), 48);
     for (i, effect) in Effect::examples().iter().enumerate() {
         assert_eq!(Effect::IDS[i], effect.id());
         assert_eq!(Effect::IDS.iter().filter(|id| **id == effect.id()).count(), 1);
@@ -64,6 +64,13 @@ fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
         for p in effect.parameters() {
             assert!(p.range[0] <= p.value && p.value < p.range[1], "{} {} = {}", effect.id(), p.name, p.value);
         }
+    }
+}
+
+#[test]
+fn analytic_a_share_is_what_scaling_made_of_a_unit() {
+    for scaling in [Scaling::Size, Scaling::Factor, Scaling::Limit] {
+        assert!((scaling.share(0.4, scaling.apply(0.4, 2.5)) - 2.5).abs() < 1e-12, "{scaling:?}");
     }
 }
 
@@ -170,9 +177,11 @@ fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
             wrong.push(format!("{id}: channel {channel} moved by {moved:+.2e}"));
         }
     }
-    let track = |effects: &[Effect]| drive(&robot(), effects, 0.6, 30).attitude_rad[2];
-    if track(&[Effect::example("skid_steer_track").unwrap()]) <= track(&[]) {
-        wrong.push("skid_steer_track".into());
+    for (id, sign) in [("skid_steer_track", 1.0), ("turn_limit", -1.0)] {
+        let heading = |effects: &[Effect]| drive(&robot(), effects, 2.0, 30).attitude_rad[2];
+        if (heading(&[Effect::example(id).unwrap()]) - heading(&[])) * sign < 1e-5 {
+            wrong.push(id.into());
+        }
     }
     assert!(wrong.is_empty(), "{wrong:#?}");
 }

@@ -12,6 +12,7 @@ mod steering_lag;
 mod steering_offset;
 mod steering_ratio;
 mod torque_limit;
+mod turn_limit;
 
 pub use locked_differential::LockedDifferential;
 pub use skid_steer_track::SkidSteerTrack;
@@ -25,6 +26,7 @@ pub use steering_lag::SteeringLag;
 pub use steering_offset::SteeringOffset;
 pub use steering_ratio::SteeringRatio;
 pub use torque_limit::TorqueLimit;
+pub use turn_limit::TurnLimit;
 
 /// What effects change between command and wheel; all zero by default. Pairs are (speed, second command).
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -47,6 +49,8 @@ pub struct ActuatorTerms {
     pub torque_lost: f64,
     /// Share of the difference of the rims of an axle that a lock takes away, -.
     pub lock: f64,
+    /// Inverse of the largest turning of the rims of a skid-steer base, s/rad.
+    pub turn_limit_inverse_s_rad: f64,
     /// Added to the track of a differential drive, m.
     pub track_m: f64,
 }

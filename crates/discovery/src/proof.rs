@@ -1,0 +1,92 @@
+//! When predictions count as better: by errors of full rollouts, paired by drive, with intervals.
+
+use nesam_evaluation::{
+    DIMENSION_KEYS, DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window, all_windows,
+    paired_difference, roll_out, score,
+};
+use nesam_model::{Predictor, Variant};
+use nesam_physics::SoilCorrection;
+use nesam_physics::effects::ScheduledEffect;
+use nesam_trajectories::Trajectory;
+use rayon::prelude::*;
+
+use crate::held_out::{HeldOut, Scoring};
+
+/// Most windows of a trial.
+const WINDOWS_MAX: usize = 1000;
+/// Share of an error by which it may rise without being counted (chosen).
+const RISE_MIN: f64 = 0.02;
+
+/// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the model
+/// before and against the best soil alone.
+pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>) -> Option<String> {
+    const WHERE: &str = "on drives that were not fitted";
+    let [before, soil, after] = &scores.scores;
+    for (gain, against) in least_gain.into_iter().flat_map(|gain| [(gain, soil), (gain, before)]) {
+        if !falls_surely(against, after, gain, &scores.resamples) {
+            let share = if gain > 0.0 { format!(" by {:.0} %", 100.0 * gain) } else { String::new() };
+            return Some(format!("no error falls surely{share} {WHERE}"));
+        }
+    }
+    rises_surely(before, after, &scores.resamples)
+        .map(|[name, from, by]| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
+}
+
+/// Whether an error surely falls by at least a share of itself.
+fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, resamples: &Resamples) -> bool {
+    let (_, interval) = paired_difference(&before.errors, &after.errors, resamples);
+    let falls = |(i, b): (Option<[f64; 2]>, Option<f64>)| matches!((i, b), (Some([low, _]), Some(b)) if low > 0.0 && low >= gain * b);
+    interval.row(false).into_iter().zip(before.summary.tree.row(false)).any(falls)
+}
+
+/// The first error that surely rises, and by more than is negligible: its name, where from, by how much.
+fn rises_surely(before: &ModelScore, after: &ModelScore, resamples: &Resamples) -> Option<[String; 3]> {
+    let (difference, interval) = paired_difference(&after.errors, &before.errors, resamples);
+    let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
+    let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(before.summary.tree.row(false));
+    rows.zip(names).find_map(|(((d, i), b), name)| match (d, i, b) {
+        (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > RISE_MIN * b => Some([(*name).into(), format!("{b:.4}"), format!("{d:.4}")]),
+        _ => None,
+    })
+}
+
+/// Drives on which an effect that stands out is tried before others are sought beside it: those that are fitted.
+#[derive(Clone, Copy, Debug)]
+pub struct Trial<'a> {
+    /// The model without effects.
+    pub predictor: &'a Predictor,
+    /// Drives as measured.
+    pub drives: &'a [Trajectory],
+    /// Their maps.
+    pub maps: &'a DriveMaps,
+    /// Rollouts.
+    pub scoring: &'a Scoring,
+}
+
+impl Trial<'_> {
+    /// Why predictions of these drives are not better with the second effects than with the first; `None` where they are.
+    ///
+    /// # Errors
+    /// `EvaluationError::NoWindows` when no window fits; the first error of the model.
+    pub fn no_better(&self, without: &[ScheduledEffect], with: &[ScheduledEffect]) -> Result<Option<String>, EvaluationError> {
+        let windows = all_windows(self.drives, self.scoring.horizon, self.scoring.history, Truth::Measured)?;
+        let every = windows.len().div_ceil(WINDOWS_MAX);
+        let windows: Vec<Window<'_>> = windows.into_iter().step_by(every).collect();
+        let resamples = Resamples::draw(self.drives.len(), self.scoring.resamples, self.scoring.seed);
+        let scored = |effects: &[ScheduledEffect]| {
+            let predictor = self.predictor.with_effects(effects);
+            let roll = |w: &Window<'_>| roll_out(&predictor, Variant::Full, SoilCorrection::NONE, w, None, self.maps[w.drive].as_ref());
+            let paths = windows.par_iter().map(roll).collect::<Result<_, EvaluationError>>()?;
+            let model = ModelPaths { name: ModelName::Nesam, parameters: 0, paths };
+            Ok::<_, EvaluationError>(score(&model, &windows, Truth::Measured, &resamples))
+        };
+        let (before, after) = (scored(without)?, scored(with)?);
+        if !falls_surely(&before, &after, 0.0, &resamples) {
+            return Ok(Some("no error of predictions of the fitted drives falls surely with it".into()));
+        }
+        let told = |[name, from, by]: [String; 3]| {
+            format!("the error of {name} of predictions of the fitted drives rises surely with it, from {from} by {by}")
+        };
+        Ok(rises_surely(&before, &after, &resamples).map(told))
+    }
+}
