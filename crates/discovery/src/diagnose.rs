@@ -179,6 +179,7 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
             }
             _ => {
                 let (verdict, reason) = provisional(&selection, &findings, yardstick.model_on_trial);
+                left_out.retain(|dropped| findings.iter().all(|f| f.hypothesis != dropped.hypothesis));
                 findings.extend(left_out);
                 return Judgement { selection, findings, fit: Some(fit), verdict, reason };
             }
@@ -404,7 +405,10 @@ fn fitted(drives: &[Trajectory], options: &Options) -> Result<Vec<usize>, Discov
     let Some(ids) = &options.fit_on else { return Ok((0..drives.len()).collect()) };
     ids.iter()
         .map(|id| {
-            let present = || drives.iter().map(|d| d.id.as_str()).collect::<Vec<_>>().join(", ");
+            let present = || match drives {
+                [first, .., last] => format!("{} drives from {} to {}", drives.len(), first.id, last.id),
+                _ => drives.iter().map(|d| d.id.as_str()).collect(),
+            };
             drives
                 .iter()
                 .position(|d| d.id == *id)
