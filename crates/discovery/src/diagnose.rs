@@ -18,7 +18,7 @@ use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
 use crate::own_reference;
 use crate::proof::{Trial, not_proven};
 use crate::pursuit::{Pursued, pursue};
-use crate::select::{Selection, Yardstick};
+use crate::select::{Selection, Yardstick, without};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
@@ -174,7 +174,8 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
         match dropped {
             Some(i) if findings.len() > 1 => {
                 left_out.push(findings.remove(i));
-                selection.drop_chosen(yardstick, &group, i);
+                let others = without(&selection.chosen, i);
+                selection.choose(yardstick, &group, others);
                 settled = case.settle(yardstick, &mut selection, &onsets);
             }
             _ => {
@@ -277,15 +278,16 @@ pub fn diagnose(
     };
     let fit_at = fitted(drives, options)?;
     // The model itself is judged from the best that is known of each state; a bundle's network knows what the past tells, and is judged from that.
-    let seen = |d: &Trajectory| if options.against == Against::Physics { d.in_hindsight() } else { d.clone() };
-    let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| seen(&drives[d])).collect();
+    let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
+    let in_hindsight: Option<Vec<Trajectory>> =
+        (options.against == Against::Physics).then(|| fit_drives.iter().map(Trajectory::in_hindsight).collect());
+    let seen = in_hindsight.as_ref().unwrap_or(&fit_drives);
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let total = fit_at.len();
-    let observed = observe_all(predictor, &fit_drives, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
+    let observed = observe_all(predictor, seen, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
     let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
     let bench = Bench { vehicle: &bundle.vehicle, stepping };
-    let as_measured: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
-    let trial = Trial { predictor, drives: &as_measured, maps: &fit_maps, scoring: &options.scoring };
+    let trial = Trial { predictor, drives: &fit_drives, maps: &fit_maps, scoring: &options.scoring };
     let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
     progress("hypotheses", 0, 1);
     let mut judgement = judge(&mut case, &yardstick);
@@ -379,9 +381,10 @@ fn score_controls(
     options: &Options,
 ) -> Result<Tried, DiscoveryError> {
     let (made, free_form) = setting.controls()?;
+    let windows = options.scoring.windows(held)?;
     for control in &made {
         let models: Vec<_> = control.predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
-        let score = score_models(held, maps, &models, control.parameters, &options.scoring, &scores.resamples)?;
+        let score = score_models(&windows, maps, &models, control.parameters, &scores.resamples)?;
         scores.controls.push(score);
     }
     Ok((made.iter().map(|c| (c.kind, c.parameters)).collect(), free_form))

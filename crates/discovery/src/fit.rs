@@ -104,14 +104,13 @@ pub struct Start {
 
 /// Fits terms.
 pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], start: Start) -> Fit {
-    let Start { values: start, offset, prior } = start;
-    let mut values = start;
+    let Start { mut values, offset, prior } = start;
     let mut held = clamp(terms, &mut values);
     let mut at = linearised(bench, metric, drives, terms, &values);
     let all: Vec<usize> = (0..drives.len()).collect();
     let mut covariance = DMatrix::zeros(0, 0);
     for _ in 0..ITERATIONS {
-        let (moved, spread) = step(terms, &at, &all, (&values, prior), &vec![0.0; offset.len()]);
+        let (moved, spread) = step(terms, &at, &all, &values, prior, &vec![0.0; offset.len()]);
         covariance = spread;
         let before = flat(&values);
         values = shaped(terms, &moved);
@@ -129,7 +128,7 @@ pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Te
     }
     let others = |d: usize| -> Vec<usize> { all.iter().copied().filter(|i| *i != d).collect() };
     let jackknife = if all.len() > 1 {
-        all.iter().map(|d| shaped(terms, &step(terms, &at, &others(*d), (&values, prior), &offset).0)).collect()
+        all.iter().map(|d| shaped(terms, &step(terms, &at, &others(*d), &values, prior, &offset).0)).collect()
     } else {
         Vec::new()
     };
@@ -173,8 +172,8 @@ pub fn parameter_columns(bench: &Bench<'_>, prepared: &Prepared, terms: &[Term],
     columns
 }
 
-/// A step from values, with priors of a weight, on the drives in `kept`: where it leads, less `offset`, and its covariance in the metric.
-fn step(terms: &[Term], at: &[Condensed], kept: &[usize], (values, prior): (&[Vec<f64>], f64), offset: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
+/// A step from `values`, with priors of weight `prior`, on the drives in `kept`: where it leads, less `offset`, and its covariance in the metric.
+fn step(terms: &[Term], at: &[Condensed], kept: &[usize], values: &[Vec<f64>], prior: f64, offset: &[f64]) -> (Vec<f64>, DMatrix<f64>) {
     let values = flat(values);
     let size = values.len();
     let (mut information, mut score) = (DMatrix::zeros(size, size), DVector::zeros(size));

@@ -45,6 +45,16 @@ pub struct Scoring {
     pub seed: u64,
 }
 
+impl Scoring {
+    /// All windows of some drives.
+    ///
+    /// # Errors
+    /// `EvaluationError::NoWindows` when none fits.
+    pub fn windows<'a>(&self, drives: &'a [Trajectory]) -> Result<Vec<Window<'a>>, EvaluationError> {
+        all_windows(drives, self.horizon, self.history, Truth::Measured)
+    }
+}
+
 /// Rolls every window of the held-out drives out before, with the best soil, and after. `learned[i]` belongs to `drives[i]`.
 ///
 /// # Errors
@@ -56,7 +66,7 @@ pub fn score_held_out(
     learned: &[Learned],
     scoring: &Scoring,
 ) -> Result<HeldOut, EvaluationError> {
-    let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
+    let windows = scoring.windows(drives)?;
     let after: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
     let paths: Vec<[PosePath; 3]> = windows
         .par_iter()
@@ -86,25 +96,23 @@ pub fn score_held_out(
     })
 }
 
-/// The same windows with another model and soil for each drive.
+/// Any windows with a model and soil for each drive.
 ///
 /// # Errors
-/// As [`score_held_out`].
+/// The first error of the model.
 pub fn score_models(
-    drives: &[Trajectory],
+    windows: &[Window<'_>],
     maps: &DriveMaps,
     models: &[(&Predictor, SoilCorrection)],
     parameters: usize,
-    scoring: &Scoring,
     resamples: &Resamples,
 ) -> Result<ModelScore, EvaluationError> {
-    let windows = all_windows(drives, scoring.horizon, scoring.history, Truth::Measured)?;
     let roll = |w: &Window<'_>| {
         let (predictor, soil) = models[w.drive];
         roll_out(predictor, Variant::Full, soil, w, None, maps[w.drive].as_ref())
     };
     let paths = windows.par_iter().map(roll).collect::<Result<_, _>>()?;
-    Ok(score(&ModelPaths { name: ModelName::Nesam, parameters, paths }, &windows, Truth::Measured, resamples))
+    Ok(score(&ModelPaths { name: ModelName::Nesam, parameters, paths }, windows, Truth::Measured, resamples))
 }
 
 /// Whether a window ends before any of the learned effects begins.

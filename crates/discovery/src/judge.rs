@@ -12,7 +12,7 @@ use crate::error::DiscoveryError;
 use crate::evidence::Nulls;
 use crate::fit::Prepared;
 use crate::metric::Metric;
-use crate::observe::{Bench, ObservedDrive};
+use crate::observe::{Bench, ObservedDrive, available_in_all};
 use crate::own_reference;
 use crate::reference::{NullGroups, Reference};
 use crate::select::Yardstick;
@@ -73,7 +73,7 @@ impl Judge {
     /// # Errors
     /// As [`Reference::metric`].
     pub fn case<'a>(&self, bench: Bench<'a>, observed: Vec<ObservedDrive>, progress: OnProgress<'_>) -> Result<Case<'a>, DiscoveryError> {
-        let available = core::array::from_fn(|c| observed.iter().all(|d| d.available[c]));
+        let available = available_in_all(&observed);
         let metric = self.reference.metric(&available)?;
         Ok(case_of(metric, bench, observed, progress))
     }

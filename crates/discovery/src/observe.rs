@@ -140,6 +140,11 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
     })
 }
 
+/// Channels that all of these drives have.
+pub(crate) fn available_in_all<'a>(drives: impl IntoIterator<Item = &'a ObservedDrive>) -> [bool; CHANNELS] {
+    drives.into_iter().fold([true; CHANNELS], |all, d| core::array::from_fn(|c| all[c] && d.available[c]))
+}
+
 /// Whether the rims turn as they are told, whatever the ground does.
 fn rims_servoed(vehicle: &Vehicle) -> bool {
     vehicle.second == SecondCommand::YawRateRadS

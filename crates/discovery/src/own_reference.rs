@@ -17,7 +17,7 @@ use crate::condense::Condensed;
 use crate::error::DiscoveryError;
 use crate::evidence::Nulls;
 use crate::metric::Metric;
-use crate::observe::{Bench, ObservedDrive};
+use crate::observe::{Bench, ObservedDrive, available_in_all};
 use crate::reference::{DRIVES_MIN, NullGroups, all_evidence};
 
 /// Random choices of signs.
@@ -48,7 +48,7 @@ pub fn metric(bench: &Bench<'_>, drives: &[ObservedDrive]) -> Result<Metric, Dis
         return Err(DiscoveryError::Drives { reason });
     }
     let rows: Vec<Vec<Row>> = drives.iter().map(|d| d.deviations(bench, &[], &SoilCorrection::NONE)).collect();
-    metric_of(&rows, &core::array::from_fn(|c| drives.iter().all(|d| d.available[c])))
+    metric_of(&rows, &available_in_all(drives))
 }
 
 /// The same from the deviations of each drive, on the channels that all of them have.

@@ -1,16 +1,12 @@
 //! When predictions count as better: by errors of full rollouts, paired by drive, with intervals.
 
-use nesam_evaluation::{
-    DIMENSION_KEYS, DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window, all_windows,
-    paired_difference, roll_out, score,
-};
-use nesam_model::{Predictor, Variant};
+use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, EvaluationError, ModelScore, Resamples, Window, paired_difference};
+use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_trajectories::Trajectory;
-use rayon::prelude::*;
 
-use crate::held_out::{HeldOut, Scoring};
+use crate::held_out::{HeldOut, Scoring, score_models};
 
 /// Most windows of a trial.
 const WINDOWS_MAX: usize = 1000;
@@ -69,16 +65,14 @@ impl Trial<'_> {
     /// # Errors
     /// `EvaluationError::NoWindows` when no window fits; the first error of the model.
     pub fn no_better(&self, without: &[ScheduledEffect], with: &[ScheduledEffect]) -> Result<Option<String>, EvaluationError> {
-        let windows = all_windows(self.drives, self.scoring.horizon, self.scoring.history, Truth::Measured)?;
+        let windows = self.scoring.windows(self.drives)?;
         let every = windows.len().div_ceil(WINDOWS_MAX);
         let windows: Vec<Window<'_>> = windows.into_iter().step_by(every).collect();
         let resamples = Resamples::draw(self.drives.len(), self.scoring.resamples, self.scoring.seed);
         let scored = |effects: &[ScheduledEffect]| {
             let predictor = self.predictor.with_effects(effects);
-            let roll = |w: &Window<'_>| roll_out(&predictor, Variant::Full, SoilCorrection::NONE, w, None, self.maps[w.drive].as_ref());
-            let paths = windows.par_iter().map(roll).collect::<Result<_, EvaluationError>>()?;
-            let model = ModelPaths { name: ModelName::Nesam, parameters: 0, paths };
-            Ok::<_, EvaluationError>(score(&model, &windows, Truth::Measured, &resamples))
+            let models = vec![(&predictor, SoilCorrection::NONE); self.drives.len()];
+            score_models(&windows, self.maps, &models, 0, &resamples)
         };
         let (before, after) = (scored(without)?, scored(with)?);
         if !falls_surely(&before, &after, 0.0, &resamples) {

@@ -17,8 +17,10 @@ use crate::claims::{Case, Finding};
 use crate::condense::{Beside, Condensed, condense, signatures_beside};
 use crate::diagnose::OnProgress;
 use crate::error::DiscoveryError;
+use crate::evidence::Group;
 use crate::fit::{Fit, Term};
 use crate::judge::own_yardstick;
+use crate::observe::available_in_all;
 use crate::onset::Onset;
 use crate::own_reference;
 use crate::proof::Trial;
@@ -59,8 +61,8 @@ pub(crate) fn pursue(
         let group = yardstick.group(case.condensed());
         selection.choose(&yardstick, &group, chosen);
         case.settle(&yardstick, &mut selection, &onsets);
-        selection.chosen = needed(case, &yardstick, &selection.chosen, &onsets);
-        let Some((fit, fitted)) = sized(case, &yardstick, &selection.chosen, &onsets) else { break };
+        selection.chosen = needed(case, &yardstick, &group, &selection.chosen, &onsets);
+        let Some((fit, fitted)) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
         let others = case.size(&yardstick, &group, &selection.chosen[1..], &onsets);
         if let Some(why) = trial.no_better(&others.effects(), &fit.effects())? {
             let found = case.findings(&yardstick, &selection, &onsets, &fit, None).into_iter().next();
@@ -81,12 +83,11 @@ pub(crate) fn pursue(
 
 /// Those of the chosen hypotheses that drives ask for when the others are sized again without them: what was found early may have stood for what was found
 /// after it. The newest comes first and stays.
-fn needed(case: &Case<'_>, yardstick: &Yardstick, chosen: &[usize], onsets: &[Option<Onset>]) -> Vec<usize> {
-    let before = yardstick.group(case.condensed());
+fn needed(case: &Case<'_>, yardstick: &Yardstick, group: &Group, chosen: &[usize], onsets: &[Option<Onset>]) -> Vec<usize> {
     let mut kept = chosen.to_vec();
     for hypothesis in chosen.iter().skip(1).rev() {
         let others: Vec<usize> = kept.iter().copied().filter(|h| h != hypothesis).collect();
-        let left = case.left(&case.size(yardstick, &before, &others, onsets));
+        let left = case.left(&case.size(yardstick, group, &others, onsets));
         if yardstick.refitted(&yardstick.group(left.iter()), &others, *hypothesis) < FURTHER * yardstick.threshold() {
             kept = others;
         }
@@ -95,12 +96,12 @@ fn needed(case: &Case<'_>, yardstick: &Yardstick, chosen: &[usize], onsets: &[Op
 }
 
 /// Hypotheses sized together; `None` where one cannot stand as a single column that is always there, or ends at its range.
-fn sized(case: &Case<'_>, yardstick: &Yardstick, chosen: &[usize], onsets: &[Option<Onset>]) -> Option<(Fit, Vec<Beside>)> {
+fn sized(case: &Case<'_>, yardstick: &Yardstick, group: &Group, chosen: &[usize], onsets: &[Option<Onset>]) -> Option<(Fit, Vec<Beside>)> {
     let plain = |h: &usize| onsets[*h].is_none() && yardstick.catalogue[*h].columns().len() == 1;
     if !chosen.iter().all(plain) {
         return None;
     }
-    let fit = case.size(yardstick, &yardstick.group(case.condensed()), chosen, onsets);
+    let fit = case.size(yardstick, group, chosen, onsets);
     if fit.held.iter().flatten().any(|held| *held) {
         return None;
     }
@@ -117,7 +118,7 @@ fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>)
     let effects: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
     let (bench, catalogue) = (case.bench, catalogue());
     let rows: Vec<Vec<Row>> = case.prepared.par_iter().map(|p| p.drive.deviations(&bench, &effects, &SoilCorrection::NONE)).collect();
-    case.metric = own_reference::metric_of(&rows, &core::array::from_fn(|c| case.prepared.iter().all(|p| p.drive.available[c])))?;
+    case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
     let total = case.prepared.len();
     let mut left = Vec::with_capacity(total);
     for (done, (prepared, rows)) in case.prepared.iter_mut().zip(&rows).enumerate() {

@@ -18,7 +18,7 @@ use crate::condense::{Condensed, column_names, condense, level_column, signature
 use crate::error::DiscoveryError;
 use crate::evidence::{Group, Nulls};
 use crate::metric::Metric;
-use crate::observe::{Bench, ObservedDrive};
+use crate::observe::{Bench, ObservedDrive, available_in_all};
 
 const SCHEMA: &str = "nesam.reference/3";
 /// Random groups of null drives.
@@ -93,7 +93,7 @@ impl Reference {
             });
         }
         let rows: Vec<Vec<Row>> = drives.iter().map(|d| d.deviations(bench, &[], &SoilCorrection::NONE)).collect();
-        let available: [bool; CHANNELS] = core::array::from_fn(|c| drives.iter().all(|d| d.available[c]));
+        let available = available_in_all(drives);
         let metric = Metric::measure(&rows, &available)
             .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })?;
         let catalogue = catalogue();

@@ -108,12 +108,6 @@ impl Selection {
         self.z.iter().flatten().chain(&self.levels).copied().fold(0.0, f64::max)
     }
 
-    /// Takes the `i`-th chosen hypothesis away again.
-    pub fn drop_chosen(&mut self, yardstick: &Yardstick, group: &Group, i: usize) {
-        self.chosen.remove(i);
-        yardstick.describe(group, self);
-    }
-
     /// Chooses these hypotheses, in this order.
     pub fn choose(&mut self, yardstick: &Yardstick, group: &Group, chosen: Vec<usize>) {
         self.chosen = chosen;
@@ -301,6 +295,7 @@ impl Yardstick {
     }
 }
 
-fn without(chosen: &[usize], i: usize) -> Vec<usize> {
+/// The chosen hypotheses but for the `i`-th.
+pub fn without(chosen: &[usize], i: usize) -> Vec<usize> {
     chosen.iter().enumerate().filter(|(at, _)| *at != i).map(|(_, h)| *h).collect()
 }

@@ -22,7 +22,7 @@ fn explained_by(found: &Diagnosis, id: &str) -> bool {
     assert!(class.contains(&id), "{id} is not in {class:?}: {}; {told:?}; z {:?}", found.reason, found.selection.z);
     let scores = &found.scores.as_ref().unwrap().scores;
     let position = |i: usize| scores[i].summary.tree.position_m.mean.unwrap();
-    eprintln!("{id}: position {:.3} -> soil only {:.3} -> after {:.3} m", position(0), position(1), position(2));
+    eprintln!("{id}: {told:?}; position {:.3} -> soil only {:.3} -> after {:.3} m", position(0), position(1), position(2));
     found.claims().any(|f| f.candidate.id() == id)
 }
 

@@ -71,9 +71,10 @@ impl Compared<'_> {
     pub fn all(&self, scoring: &Scoring) -> Result<Vec<Comparison>, EvaluationError> {
         let count = self.drives.len();
         let resamples = Resamples::draw(count, DEFAULT_RESAMPLES.min(10), 1);
+        let windows = scoring.windows(self.drives)?;
         let score = |entry: &Entry| {
             let models: Vec<(&Predictor, SoilCorrection)> = entry.predictors.iter().zip(entry.soils.iter().copied()).collect();
-            score_models(self.drives, self.maps, &models, 0, scoring, &resamples)
+            score_models(&windows, self.maps, &models, 0, &resamples)
         };
         let plain = self.entry("before", |_| Vec::new(), Vec::new());
         let before = score(&plain)?;
