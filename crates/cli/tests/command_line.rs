@@ -222,7 +222,7 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     copy_folder(tiny_bundle(), &here.path().join("start"));
     let tiny = ["--epochs", "1", "--batches", "2", "--batch-size", "4", "--from", "start", "--out", "made"];
     let run = |more: &'static [&'static str]| [&["train", "--data", root.as_str(), "--set", "nominal"], &tiny[..], more].concat();
-    let trained = nesam(&run(&["--sustained=0.2"]), here.path());
+    let trained = nesam(&run(&["--sustained=0.2", "--soil-prior=0.05"]), here.path());
     assert_eq!(trained.status.code(), Some(0), "{}", stderr(&trained));
     let text = |bundle: &str, file: &str| std::fs::read_to_string(here.path().join(bundle).join(file)).unwrap();
     assert_eq!(text("made/bundle", "normalization.toml"), text("start", "normalization.toml"));
@@ -239,6 +239,7 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     assert_ne!(weights("made/bundle"), weights("start"));
     refused(&run(&["--model", "transformer"]), here.path(), &["--from start", "not a transformer"]);
     refused(&run(&["--sustained=-1"]), here.path(), &["--sustained"]);
+    refused(&run(&["--soil-prior=nan"]), here.path(), &["--soil-prior"]);
     refused(&run(&["--dt", "0.2"]), here.path(), &["--from start", "0.1 s", "0.2 s"]);
     let root = tempfile::tempdir().unwrap();
     copy_folder(&sample(), root.path());
@@ -248,6 +249,7 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     let other = ["train", "--data", &elsewhere, "--set", "nominal", "--from", "start"];
     refused(&other, here.path(), &["--from", "HMMWV", "Another"]);
     refused(&["train", "--model", "transformer", "--sustained=0.2"], here.path(), &["--sustained", "transformer"]);
+    refused(&["train", "--model", "transformer", "--soil-prior=0.2"], here.path(), &["--soil-prior", "transformer"]);
 }
 
 /// Goal: train → inspect → predict → evaluate hold together, and a damaged bundle is refused by name. Method: a bundle of two training

@@ -232,11 +232,11 @@ impl ObservedDrive {
         let actuators = self
             .transitions
             .iter()
-            .zip(&states)
-            .map(|(transition, state)| {
-                let after = now.advance(&vehicle, &transition.control, state.velocity_m_s[0], model.dt_s());
+            .zip(states.windows(2))
+            .map(|(transition, states)| {
+                let after = now.advance(&vehicle, &transition.control, states[0].velocity_m_s[0], model.dt_s());
                 let pair = [now, after];
-                now = after;
+                now = model.observed_actuators(&after, &transition.control, &states[0], &states[1], model.dt_s());
                 pair
             })
             .collect();
@@ -279,6 +279,10 @@ impl ObservedDrive {
             let total = core::array::from_fn(|i| between(&self.states[k], &self.states[k + 1])[i] + driven[i] - recorded[i]);
             state = VehicleState::from_array(state.advanced(&total));
             actuators = after;
+            // What the recorded motion told of the controller's integral beyond its law belongs to the drive.
+            if let Some(next) = plain.actuators.get(k + 1) {
+                actuators.speed_error_integral_m += next[0].speed_error_integral_m - plain.actuators[k][1].speed_error_integral_m;
+            }
             drive.states[k + 1] = state;
         }
     }

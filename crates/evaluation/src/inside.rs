@@ -97,8 +97,32 @@ fn ranks(values: &[f64]) -> Vec<f64> {
 /// Pairs by name: `sinkage_m/dry_sand`, `load_n/all`, `soil_log_k_phi/all`, ….
 pub type Comparison = BTreeMap<String, Pairs>;
 
-/// What the learned residual adds, as a share of all that moves a state: Σ|Δx_res| / (Σ|Δx_res| + Σ|Δx_NE|), by state entry.
-pub type ResidualShare = [f64; STATE_DIM];
+/// What the learned residual adds to a step, by state entry.
+#[derive(Clone, Copy, Debug, Serialize)]
+pub struct ResidualPart {
+    /// Share of all that moves the state: Σ|Δx_res| / (Σ|Δx_res| + Σ|Δx_NE|).
+    pub share: f64,
+    /// Mean over the steps, in units of the state per second: what lasts, and should be the wheels' work.
+    pub mean_per_s: f64,
+}
+
+/// Sums over steps of one state entry.
+#[derive(Clone, Copy, Default)]
+struct Sums {
+    residual: f64,
+    residual_size: f64,
+    symbolic_size: f64,
+    steps: f64,
+}
+
+impl Sums {
+    fn add(&mut self, other: &Self) {
+        self.residual += other.residual;
+        self.residual_size += other.residual_size;
+        self.symbolic_size += other.symbolic_size;
+        self.steps += other.steps;
+    }
+}
 
 /// Compares wheels, soils and shares along the drives; `soils` are the true soils of each drive's world, where they are known.
 ///
@@ -109,20 +133,23 @@ pub fn look_inside(
     drives: &[Trajectory],
     maps: &[Option<Arc<WorldMap>>],
     soils: &[Option<SoilTruth>],
-) -> (Comparison, ResidualShare) {
-    let parts: Vec<(Comparison, [[f64; 2]; STATE_DIM])> =
+) -> (Comparison, [ResidualPart; STATE_DIM]) {
+    let parts: Vec<(Comparison, [Sums; STATE_DIM])> =
         (0..drives.len()).into_par_iter().map(|d| drive_inside(predictor, &drives[d], maps[d].as_ref(), soils[d].as_ref())).collect();
     let mut all = Comparison::new();
-    let mut sums = [[0.0; 2]; STATE_DIM];
-    for (part, share) in parts {
+    let mut sums = [Sums::default(); STATE_DIM];
+    for (part, own) in parts {
         for (name, pairs) in part {
             all.entry(name).or_default().append(pairs);
         }
-        for (sum, part) in sums.iter_mut().zip(share) {
-            *sum = [sum[0] + part[0], sum[1] + part[1]];
-        }
+        sums.iter_mut().zip(&own).for_each(|(sum, own)| sum.add(own));
     }
-    (all, sums.map(|[residual, symbolic]| residual / (residual + symbolic).max(f64::MIN_POSITIVE)))
+    let dt_s = predictor.bundle().normalization.dt_s;
+    let part = |sum: Sums| ResidualPart {
+        share: sum.residual_size / (sum.residual_size + sum.symbolic_size).max(f64::MIN_POSITIVE),
+        mean_per_s: sum.residual / (sum.steps * dt_s).max(f64::MIN_POSITIVE),
+    };
+    (all, sums.map(part))
 }
 
 fn drive_inside(
@@ -130,16 +157,16 @@ fn drive_inside(
     drive: &Trajectory,
     map: Option<&Arc<WorldMap>>,
     soils: Option<&SoilTruth>,
-) -> (Comparison, [[f64; 2]; STATE_DIM]) {
+) -> (Comparison, [Sums; STATE_DIM]) {
     let mut out = Comparison::new();
-    let mut sums = [[0.0; 2]; STATE_DIM];
+    let mut sums = [Sums::default(); STATE_DIM];
     let Some(truth) = &drive.truth else { return (out, sums) };
     let steps = history_steps(drive);
     for i in (HISTORY..steps.len().saturating_sub(1)).step_by(EVERY) {
         let transition = predictor.transition(&steps[i + 1 - HISTORY..i], &steps[i].state, &steps[i].control, map);
         let output = predictor.step_model().step(&transition.input);
         for ((sum, residual), symbolic) in sums.iter_mut().zip(transition.residual).zip(output.increment.to_array()) {
-            *sum = [sum[0] + residual.abs(), sum[1] + symbolic.abs()];
+            sum.add(&Sums { residual, residual_size: residual.abs(), symbolic_size: symbolic.abs(), steps: 1.0 });
         }
         let yaw = truth.states[i + 1].attitude_rad[2];
         for w in 0..WHEELS {

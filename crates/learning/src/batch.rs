@@ -12,6 +12,7 @@ use nesam_physics::{SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
+use crate::class_soil::ClassSoil;
 use crate::drives::{Drive, Place};
 use crate::pooling::Pooling;
 
@@ -154,6 +155,33 @@ struct Projected {
     tokens: Var,
 }
 
+/// Raw soil of the samples ahead, what the map says of it, and the leaf that the rollout reads.
+struct SoilAhead {
+    /// (rows, 6), with its graph.
+    graph: Tensor,
+    leaf: Var,
+    /// Mean of the class under each row, (rows, 6); zero where there is none.
+    class_mean: Tensor,
+    /// One over its standard deviation, (rows, 6); zero where there is none.
+    class_per_sd: Tensor,
+}
+
+impl SoilAhead {
+    fn new(graph: Tensor, classes: &[Option<ClassSoil>]) -> Result<Self> {
+        let table = |of: fn(&ClassSoil) -> [f32; SOIL_DIM]| {
+            let values: Vec<f32> = classes.iter().flat_map(|class| class.as_ref().map_or([0.0; SOIL_DIM], of)).collect();
+            Tensor::from_vec(values, (classes.len(), SOIL_DIM), &Device::Cpu)
+        };
+        let leaf = Var::from_tensor(&graph.detach())?;
+        Ok(Self { graph, leaf, class_mean: table(|class| class.mean)?, class_per_sd: table(|class| class.sd.map(|sd| 1.0 / sd))? })
+    }
+
+    /// Mean over rows of Σ_p ((u_p - mean_p) / sd_p)², u the raw soil: twice the negative logarithm of its prior density.
+    fn off_class(&self) -> Result<Tensor> {
+        ((&self.graph - &self.class_mean)? * &self.class_per_sd)?.sqr()?.sum(1)?.mean_all()
+    }
+}
+
 /// Terrain tokens of a batch, computed once for all samples that its rollouts can reach.
 pub struct PathTerrain<'a, 'w> {
     windows: &'w [Window<'a>],
@@ -161,8 +189,8 @@ pub struct PathTerrain<'a, 'w> {
     /// Contexts and their tokens of the history, and of the samples ahead: (rows, width) and (rows, 128).
     past: Option<Projected>,
     ahead: Projected,
-    /// Raw soil of the samples ahead with its graph, and the leaf that the rollout reads; `None` where the form or the drives have none.
-    soil: Option<(Tensor, Var)>,
+    /// `None` where the form or the drives have no soil.
+    soil: Option<SoilAhead>,
     /// First row of each window in the table ahead.
     first_row: Vec<u32>,
     has_map: bool,
@@ -178,7 +206,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         let (variant, width) = (sight.variant, sight.pooling.width());
         let has_map = windows.iter().all(|w| w.drive.has_features());
         let rows: usize = windows.iter().map(|w| w.last(horizon) - w.start + 1).sum();
-        let (mut context, mut past, mut semantic) = (Vec::new(), Vec::new(), Vec::new());
+        let (mut context, mut past, mut semantic, mut classes) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
         let mut first_row = Vec::with_capacity(windows.len());
         if has_map {
             context.reserve(rows * width);
@@ -189,6 +217,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
                     w.drive.push_context(i, &mut context);
                     if variant.has_soil() {
                         w.drive.push_semantic(i, &mut semantic);
+                        classes.push(w.drive.class_soil(i));
                     }
                 }
                 for i in w.start - history..w.start {
@@ -214,8 +243,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         let past_rows = windows.len() * history;
         let soil = if has_map && variant.has_soil() {
             let graph = network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?;
-            let leaf = Var::from_tensor(&graph.detach())?;
-            Some((graph, leaf))
+            Some(SoilAhead::new(graph, &classes)?)
         } else {
             None
         };
@@ -231,11 +259,26 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         })
     }
 
-    /// Completes the gradients of a loss for what lies before the leaves: W_c and the soil prior.
+    /// How far the soil lies from what the map says of its class ([`ClassSoil`]), mean over the samples ahead; `None` without soil.
     ///
     /// # Errors
     /// A candle error.
-    pub fn add_gradients(&self, network: &Network, store: &GradStore, gradients: &mut HashMap<String, Vec<f32>>) -> Result<()> {
+    pub fn off_class(&self) -> Result<Option<f32>> {
+        self.soil.as_ref().map(|soil| soil.off_class()?.to_scalar()).transpose()
+    }
+
+    /// Completes the gradients of a loss for what lies before the leaves: W_c and the soil prior, to which `soil_prior` times
+    /// [`PathTerrain::off_class`] is added.
+    ///
+    /// # Errors
+    /// A candle error.
+    pub fn add_gradients(
+        &self,
+        network: &Network,
+        store: &GradStore,
+        soil_prior: f64,
+        gradients: &mut HashMap<String, Vec<f32>>,
+    ) -> Result<()> {
         if !self.has_map {
             return Ok(());
         }
@@ -254,10 +297,14 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             let pooled: Vec<Vec<f32>> = projection.to_vec2()?;
             gradients.insert("token.context.weight".into(), pooled.iter().flat_map(|row| self.sight.pooling.spread(row)).collect());
         }
-        if let Some((graph, leaf)) = &self.soil
-            && let Some(upstream) = store.get(leaf)
+        if let Some(soil) = &self.soil
+            && let Some(upstream) = store.get(&soil.leaf)
         {
-            let pulled = (graph * upstream.detach())?.sum_all()?.backward()?;
+            let mut pulled = (&soil.graph * upstream.detach())?.sum_all()?;
+            if soil_prior > 0.0 {
+                pulled = (pulled + (soil.off_class()? * soil_prior)?)?;
+            }
+            let pulled = pulled.backward()?;
             for (name, var) in network.variables.iter().filter(|(name, _)| name.starts_with("soil.")) {
                 if let Some(gradient) = pulled.get(var) {
                     gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
@@ -301,7 +348,7 @@ impl TerrainProvider for PathTerrain<'_, '_> {
         let places: Vec<Place> =
             self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();
         let soil = match &self.soil {
-            Some((_, leaf)) => self.interpolate(leaf, &places)?,
+            Some(soil) => self.interpolate(&soil.leaf, &places)?,
             None => default_soil()?,
         };
         Ok((self.interpolate(&self.ahead.tokens, &places)?, soil))

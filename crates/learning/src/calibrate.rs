@@ -1,11 +1,13 @@
 //! Calibration of the drive line on measured drives, with the symbolic model alone.
 
+use nesam_model::soil_coordinates::from_raw;
 use nesam_model::{GroundSource, Normalization, history_actuators};
 use nesam_physics::driveline::command_wheels;
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{SecondCommand, Soil, TORQUE_KNOTS, TorqueDrive, Vehicle, VehicleState, WHEELS};
 use rayon::prelude::*;
 
+use crate::class_soil::ClassSoil;
 use crate::drives::Drive;
 use crate::rims::fit_rims;
 
@@ -26,11 +28,12 @@ const OVERSPEED: [Knob; 4] = [
 ];
 
 /// Numbers of a drive by torque; the gain stands for the torque per demand, which is fixed by the vehicle, and the curve is relative to its middle.
-const TORQUE: [Knob; 12] = [
+const TORQUE: [Knob; 13] = [
     ("speed_gain", |v| &mut v.driveline.speed_gain, [0.05, 5.0]),
     ("speed_integral_gain_per_s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 2.0]),
     ("holding_demand_m_s", |v| &mut torque(v).holding_demand_m_s, [0.0, 2.0]),
-    ("speed_integral_leak_s", |v| &mut v.driveline.speed_integral_leak_s, [0.5, 20.0]),
+    ("speed_integral_leak_s", |v| &mut v.driveline.speed_integral_leak_s, [0.5, 100.0]),
+    ("integral_observer_per_s", |v| &mut torque(v).integral_observer_per_s, [0.0, 2.0]),
     ("curve 0", |v| &mut torque(v).curve[0], [0.2, 3.0]),
     ("curve 1", |v| &mut torque(v).curve[1], [0.2, 3.0]),
     ("curve 3", |v| &mut torque(v).curve[3], [0.2, 3.0]),
@@ -83,6 +86,7 @@ impl DriveLaw {
         line.torque = Some(TorqueDrive {
             per_demand_n_m_s_m: TORQUE_PER_WEIGHT_S_M * vehicle.mass_kg * vehicle.gravity_m_s2 * vehicle.wheel_radius_m,
             holding_demand_m_s: 0.4,
+            integral_observer_per_s: 0.5,
             closed_n_m: 0.0,
             brake_ratio: 1.0,
             curve_speed_m_s,
@@ -95,7 +99,7 @@ impl DriveLaw {
 /// Mean position error (m) over short rollouts of the symbolic model from every `stride`-th sample.
 pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, stride: usize) -> f64 {
     let model = StepModel::new(vehicle, scales.dt_s, scales.substeps);
-    let soil = Soil::from_array(scales.default_soil());
+    let default_soil = Soil::from_array(scales.default_soil());
     // Summed in the order of the drives, so that calibrating again gives the same bits.
     let sums: Vec<(f64, usize)> = drives
         .par_iter()
@@ -103,7 +107,7 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
             let (mut sum, mut count) = (0.0, 0usize);
             let last = drive.states.len().saturating_sub(HORIZON + 1);
             for i in (8.min(last.saturating_sub(1))..last).step_by(stride) {
-                sum += rollout_error(&model, drive, i, &soil, scales);
+                sum += rollout_error(&model, drive, i, &default_soil, scales);
                 count += 1;
             }
             (sum, count)
@@ -113,7 +117,8 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
     sum / count.max(1) as f64
 }
 
-fn rollout_error(model: &StepModel, drive: &Drive, i: usize, soil: &Soil<f64>, scales: &Normalization) -> f64 {
+/// The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
+fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> f64 {
     let mut state = drive.states[i];
     let ground = GroundSource::new(drive.map.as_deref(), model, &state);
     let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &state, &drive.controls[i], scales.dt_s);
@@ -121,11 +126,13 @@ fn rollout_error(model: &StepModel, drive: &Drive, i: usize, soil: &Soil<f64>, s
     for k in 0..HORIZON {
         let control = &drive.controls[i + k];
         let after = actuators.advance(model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);
+        let [x_m, y_m, _] = state.position_m;
+        let class_soil = drive.map.as_deref().and_then(|map| ClassSoil::at(map, x_m, y_m));
         let input = StepInput {
             state,
             wheels: command_wheels(model.vehicle(), &actuators, &after, control),
             sinkage_log_ratio: [0.0; WHEELS],
-            soil: *soil,
+            soil: class_soil.map_or(*default_soil, |class| Soil::from_array(from_raw(&class.mean))),
             ground: ground.under_wheels(model, &state, 0.0).0,
         };
         let increment = model.step(&input).increment;

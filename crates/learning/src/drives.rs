@@ -15,6 +15,7 @@ use nesam_physics::{Control, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
 use rayon::prelude::*;
 
+use crate::class_soil::ClassSoil;
 use crate::pooling::Pooling;
 
 /// Metres that one radian of heading counts when places are compared.
@@ -74,6 +75,12 @@ impl Drive {
     pub fn pose(&self, i: usize) -> Pose2 {
         let s = &self.states[i];
         Pose2 { x_m: s.position_m[0], y_m: s.position_m[1], yaw_rad: s.attitude_rad[2] }
+    }
+
+    /// What the map says of the soil under sample `i`; `None` without a map or a class.
+    pub fn class_soil(&self, i: usize) -> Option<ClassSoil> {
+        let [x_m, y_m, _] = self.states[i].position_m;
+        ClassSoil::at(self.map.as_deref()?, x_m, y_m)
     }
 
     /// Steps `from .. to` as history.

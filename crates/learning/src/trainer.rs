@@ -52,6 +52,8 @@ pub struct Objective {
     pub variant: Variant,
     /// Weight of the sustained residual in the loss (`batch::sustained_residual`).
     pub sustained: f64,
+    /// Weight in the loss of soils that are not what the map says of their class (`PathTerrain::off_class`).
+    pub soil_prior: f64,
 }
 
 /// One line of the loss curve.
@@ -127,7 +129,7 @@ impl TrainingSet<'_> {
         Sight { variant, pooling: &self.pooling, default_soil: self.scales.default_soil_raw }
     }
 
-    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1) with the weighted sustained residual, and its gradient in every trainable array.
+    /// Mean loss over steps and windows (paper Eq. 3 with λ_k = 1) with the other terms of the objective, and its gradient in every trainable array.
     ///
     /// # Errors
     /// A candle error.
@@ -161,8 +163,9 @@ impl TrainingSet<'_> {
                 gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
             }
         }
-        terrain.add_gradients(network, &store, &mut gradients)?;
-        Ok((loss.to_scalar::<f32>()?, gradients))
+        terrain.add_gradients(network, &store, objective.soil_prior, &mut gradients)?;
+        let off_class = terrain.off_class()?.unwrap_or(0.0);
+        Ok((loss.to_scalar::<f32>()? + objective.soil_prior as f32 * off_class, gradients))
     }
 
     /// Mean absolute errors over fixed windows of the validation drives.

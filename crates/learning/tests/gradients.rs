@@ -13,9 +13,10 @@ use nesam_learning::{Drive, Objective, TrainingSet};
 use nesam_model::Variant;
 use nesam_model::reference::Network;
 use nesam_physics::step::StepModel;
+use nesam_terrain::SoilClassRange;
 
 /// Compares single entries of the gradient with central differences of half-width `h`.
-fn check(mut made: Drive, entries: &[(&str, usize)], tolerance: f64) {
+fn check(mut made: Drive, entries: &[(&str, usize)], soil_prior: f64, tolerance: f64) {
     // Errors to learn from: the same drive, measured on a slower vehicle.
     for (k, state) in made.states.iter_mut().enumerate() {
         state.velocity_m_s[0] *= 0.9;
@@ -31,7 +32,7 @@ fn check(mut made: Drive, entries: &[(&str, usize)], tolerance: f64) {
     let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model, pooling: single_cells() };
     let network = Network::from_weights(&weights).expect("all arrays are there");
     let windows = [12, 30].map(|start| Window { drive: &made, start, dropout: None });
-    let objective = Objective { variant: Variant::Full, sustained: 0.0 };
+    let objective = Objective { variant: Variant::Full, sustained: 0.0, soil_prior };
     let gradients = || set.gradients(&network, &windows, 8, 6, objective).expect("the loss is differentiable");
     let (_, backward) = gradients();
     for &(name, index) in entries {
@@ -66,12 +67,28 @@ fn analytic_gradient_of_the_heads_equals_central_differences() {
         ("block1.down.bias", 11),
         ("token.bias", 40),
     ];
-    check(drive(None, 60), &entries, 0.02);
+    check(drive(None, 60), &entries, 0.0, 0.02);
 }
 
 #[test]
 fn analytic_gradient_of_the_soil_prior_equals_central_differences() {
     // Level but coloured: the only detached look-up is that of the token, which the soil moves little within six steps.
     let entries = ["soil.out.bias"; 4].into_iter().zip([0, 2, 4, 5]).collect::<Vec<_>>();
-    check(drive(Some(&striped(0.0)), 60), &entries, 0.05);
+    check(drive(Some(&striped(0.0)), 60), &entries, 0.0, 0.05);
+}
+
+#[test]
+fn analytic_gradient_towards_the_soil_of_the_map_equals_central_differences() {
+    // A weight that makes the term larger than the error of the states.
+    let class = |name: &str, colour, k_phi: f64, phi: f64| SoilClassRange {
+        name: name.into(),
+        colour: Some(colour),
+        low: [0.5 * k_phi, 5e3, 0.8, 1e3, phi - 0.05, 0.01],
+        high: [2.0 * k_phi, 5e4, 1.0, 4e3, phi + 0.05, 0.03],
+    };
+    let map = Arc::into_inner(striped(0.0))
+        .expect("nobody else has it")
+        .with_soil_classes(vec![class("grass", [90, 122, 52], 3e6, 0.55), class("sand", [214, 190, 140], 1e6, 0.5)]);
+    let entries = ["soil.out.bias"; 6].into_iter().zip(0..6).collect::<Vec<_>>();
+    check(drive(Some(&Arc::new(map)), 60), &entries, 0.5, 0.02);
 }

@@ -75,7 +75,7 @@ pub(crate) fn wheel_points<T: Real>(model: &StepModel, state: &VehicleState<T>) 
     })
 }
 
-/// Actuators at the start of a rollout, rebuilt from the commands and measured speeds of the history.
+/// Actuators at the start of a rollout, rebuilt from the commands and the measured motion of the history.
 /// `start` and `first` are the state and the command at the start itself; they begin a history that is empty.
 pub fn history_actuators(
     model: &StepModel,
@@ -98,7 +98,12 @@ pub(crate) fn actuators_along<'a>(
     let (state, control) = history.first().map_or((start, first), |step| (&step.state, &step.control));
     let initial = DrivelineState::starting(model_before(history.len()).vehicle(), state, control);
     history.iter().enumerate().fold(initial, |actuators, (j, step)| {
-        let vehicle = model_before(history.len() - j).vehicle();
-        actuators.advance(vehicle, &step.control, step.state.velocity_m_s[0], dt_s)
+        let model = model_before(history.len() - j);
+        let advanced = actuators.advance(model.vehicle(), &step.control, step.state.velocity_m_s[0], dt_s);
+        // The start itself observes nothing: what is predicted from it is smooth in it.
+        match history.get(j + 1) {
+            Some(next) => model.observed_actuators(&advanced, &step.control, &step.state, &next.state, dt_s),
+            None => advanced,
+        }
     })
 }

@@ -5,6 +5,7 @@ mod command_path;
 mod contradiction;
 pub mod driveline;
 pub mod effects;
+mod integral_observer;
 pub mod linear;
 pub mod risk;
 pub mod scalar;

@@ -61,6 +61,21 @@ impl StepModel {
     #[cold]
     #[inline(never)]
     pub(crate) fn add_body_forces<T: Real>(&self, state: &VehicleState<T>, input: &StepInput<T>, tilt: &Tilt<T>, rhs: &mut [T; 6]) {
+        let mean = |of: &dyn Fn(usize) -> T, count: usize| (1..count).fold(of(0), |sum, i| sum + of(i)) * T::lit(1.0 / count as f64);
+        let angle = mean(&|i| input.wheels.angle_rad[i], 2);
+        let slopes = [mean(&|i| input.ground[i].slope_ahead, 4), mean(&|i| input.ground[i].slope_left, 4)];
+        self.add_body_forces_at(state, input.state.attitude_rad[2] + state.attitude_rad[2], [angle, slopes[0], slopes[1]], tilt, rhs);
+    }
+
+    /// The same at a heading in World (rad), a mean angle of the front wheels (rad) and mean slopes of the ground ahead and to the left.
+    pub(crate) fn add_body_forces_at<T: Real>(
+        &self,
+        state: &VehicleState<T>,
+        yaw_rad: T,
+        [angle, ahead, left]: [T; 3],
+        tilt: &Tilt<T>,
+        rhs: &mut [T; 6],
+    ) {
         let terms = &self.vehicle.effects.force;
         let v = state.velocity_m_s;
         let speed = (dot(v, v) + T::lit(1e-12)).sqrt();
@@ -69,23 +84,18 @@ impl StepModel {
         force[0] = force[0] - T::lit(terms.tow_n);
         if terms.wind_n != [0.0; 2] {
             let [east, north] = terms.wind_n.map(T::lit);
-            let (sin, cos) = (input.state.attitude_rad[2] + state.attitude_rad[2]).sin_cos();
+            let (sin, cos) = yaw_rad.sin_cos();
             force = add(force, tilt.to_body([cos * east + sin * north, cos * north - sin * east, T::lit(0.0)]));
         }
         for axis in 0..3 {
             rhs[axis] = rhs[axis] + force[axis];
         }
         rhs[4] = rhs[4] + T::lit(terms.tow_moment_n_m);
-        let mean = |of: &dyn Fn(usize) -> T, count: usize| (1..count).fold(of(0), |sum, i| sum + of(i)) * T::lit(1.0 / count as f64);
-        let conditions = || {
-            [mean(&|i| input.wheels.angle_rad[i], 2), mean(&|i| input.ground[i].slope_ahead, 4), mean(&|i| input.ground[i].slope_left, 4)]
-        };
         if terms.free_form.acts() {
-            let [angle, ahead, left] = conditions();
             add_wrench(rhs, terms.free_form.at(v[0], angle, ahead, left).as_flattened());
         }
         if terms.written[0].is_some() {
-            let ([angle, ahead, left], rate, [roll, pitch, _]) = (conditions(), state.angular_velocity_rad_s, state.attitude_rad);
+            let (rate, [roll, pitch, _]) = (state.angular_velocity_rad_s, state.attitude_rad);
             let (mass, gravity) = (self.body.mass_kg, self.vehicle.gravity_m_s2);
             let of_vehicle = [mass, gravity].map(T::lit);
             let variables = [v[0], v[1], v[2], rate[0], rate[1], rate[2], roll, pitch, angle, ahead, left, of_vehicle[0], of_vehicle[1]];

@@ -66,6 +66,8 @@ pub struct TorqueDrive {
     pub per_demand_n_m_s_m: f64,
     /// Demand that holds the usual resistance at no speed error, m/s.
     pub holding_demand_m_s: f64,
+    /// Rate at which the integral of the speed error, rebuilt from a history, follows what the measured motion says of it, 1/s; 0 = not at all.
+    pub integral_observer_per_s: f64,
     /// Torque by which engine and gears brake at no demand, all wheels together, N m.
     pub closed_n_m: f64,
     /// Torque of the brakes per negative demand over that of the engine, -.
@@ -80,16 +82,30 @@ impl TorqueDrive {
     /// Torque at all wheels together for a demand (m/s) at a speed (m/s), of an engine that gives `share` of what it should, N m.
     #[inline(always)]
     pub fn torque_n_m<T: Real>(&self, demand_m_s: T, speed_m_s: T, share: f64) -> T {
+        let factor = self.factor(speed_m_s);
+        let (driving, braking) = (demand_m_s.max(T::lit(0.0)), demand_m_s.min(T::lit(0.0)));
+        let direction = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S);
+        (driving * factor * T::lit(share) + braking * T::lit(self.brake_ratio)) * T::lit(self.per_demand_n_m_s_m)
+            - direction * T::lit(self.closed_n_m)
+    }
+
+    /// The demand (m/s) that brings a torque at all wheels together (N m) at a speed above rest (m/s); `None` where no demand brings it.
+    pub fn demand_m_s(&self, torque_n_m: f64, speed_m_s: f64, share: f64) -> Option<f64> {
+        let opened = torque_n_m + speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S) * self.closed_n_m;
+        let factor = if opened > 0.0 { self.factor(speed_m_s) * share } else { self.brake_ratio };
+        (factor > 0.0).then(|| opened / (factor * self.per_demand_n_m_s_m))
+    }
+
+    /// What engine and gears make of a demand at a speed over what they make of it at the middle knot, -.
+    #[inline(always)]
+    fn factor<T: Real>(&self, speed_m_s: T) -> T {
         let mut factor = T::lit(self.curve[0]);
         for k in 1..TORQUE_KNOTS {
             let reach = self.curve_speed_m_s[k] - self.curve_speed_m_s[k - 1];
             let inside = (speed_m_s - T::lit(self.curve_speed_m_s[k - 1])).max(T::lit(0.0)).min(T::lit(reach));
             factor = factor + inside * T::lit((self.curve[k] - self.curve[k - 1]) / reach);
         }
-        let (driving, braking) = (demand_m_s.max(T::lit(0.0)), demand_m_s.min(T::lit(0.0)));
-        let direction = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S);
-        (driving * factor * T::lit(share) + braking * T::lit(self.brake_ratio)) * T::lit(self.per_demand_n_m_s_m)
-            - direction * T::lit(self.closed_n_m)
+        factor
     }
 }
 

@@ -44,6 +44,7 @@ pub fn torque_truck() -> Vehicle {
     let torque = TorqueDrive {
         per_demand_n_m_s_m: 4570.0,
         holding_demand_m_s: 0.5,
+        integral_observer_per_s: 0.0,
         closed_n_m: 85.0,
         brake_ratio: 0.64,
         curve_speed_m_s: [1.1, 1.9, 2.5, 3.2, 3.8],

@@ -82,6 +82,8 @@ struct Line {
 struct Torque {
     per_demand_n_m_s_m: f64,
     holding_demand_m_s: f64,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    integral_observer_per_s: f64,
     closed_n_m: f64,
     brake_ratio: f64,
     curve_speed_m_s: [f64; TORQUE_KNOTS],
@@ -90,21 +92,29 @@ struct Torque {
 
 impl From<TorqueDrive> for Torque {
     fn from(t: TorqueDrive) -> Self {
-        let TorqueDrive { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve } = t;
-        Self { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve }
+        let TorqueDrive {
+            per_demand_n_m_s_m,
+            holding_demand_m_s,
+            integral_observer_per_s,
+            closed_n_m,
+            brake_ratio,
+            curve_speed_m_s,
+            curve,
+        } = t;
+        Self { per_demand_n_m_s_m, holding_demand_m_s, integral_observer_per_s, closed_n_m, brake_ratio, curve_speed_m_s, curve }
     }
 }
 
 impl From<Torque> for TorqueDrive {
     fn from(t: Torque) -> Self {
-        let Torque { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve } = t;
-        Self { per_demand_n_m_s_m, holding_demand_m_s, closed_n_m, brake_ratio, curve_speed_m_s, curve }
+        let Torque { per_demand_n_m_s_m, holding_demand_m_s, integral_observer_per_s, closed_n_m, brake_ratio, curve_speed_m_s, curve } = t;
+        Self { per_demand_n_m_s_m, holding_demand_m_s, integral_observer_per_s, closed_n_m, brake_ratio, curve_speed_m_s, curve }
     }
 }
 
 /// What is wrong with engine and brakes, if anything.
 fn torque_at_fault(t: &Torque) -> Option<String> {
-    let numbers = [t.per_demand_n_m_s_m, t.holding_demand_m_s, t.closed_n_m, t.brake_ratio];
+    let numbers = [t.per_demand_n_m_s_m, t.holding_demand_m_s, t.integral_observer_per_s, t.closed_n_m, t.brake_ratio];
     if numbers.iter().chain(&t.curve).any(|v| !(v.is_finite() && *v >= 0.0)) {
         return Some("`driveline.torque` has a number that is negative or not finite".into());
     }

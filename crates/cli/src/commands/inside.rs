@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use nesam_evaluation::look_inside;
+use nesam_evaluation::{ResidualPart, look_inside};
 use nesam_trajectories::{SoilTruth, read_ground_truth_soil};
 use serde_json::{Map, Value, json};
 
@@ -34,7 +34,7 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("set `{}` has no gt_ columns: there is nothing to compare the physics with", drives.set)));
     }
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
-    let (comparison, share) = look_inside(&predictor, &drives.drives, &drives.maps, &true_soils(&drives));
+    let (comparison, residual) = look_inside(&predictor, &drives.drives, &drives.maps, &true_soils(&drives));
     say!("{:<28}{:>9}{:>12}{:>12}{:>12}{:>8}{:>8}", "quantity/class", "values", "true mean", "bias", "mean |err|", "corr.", "rank");
     let mut quantities = Map::new();
     for (name, pairs) in &comparison {
@@ -52,9 +52,14 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
         );
         quantities.insert(name.clone(), serde_json::to_value(a).expect("numbers serialise; this is a bug"));
     }
-    let shares: Map<String, Value> = STATE_NAMES.iter().zip(share).map(|(name, s)| ((*name).into(), json!(s))).collect();
+    let by_state = || STATE_NAMES.iter().zip(&residual);
+    let listed = |text: fn(&ResidualPart) -> String| by_state().map(|(name, part)| format!("{name} {}", text(part))).collect::<Vec<_>>();
+    let shares: Map<String, Value> = by_state().map(|(name, part)| ((*name).into(), json!(part.share))).collect();
+    let means: Map<String, Value> = by_state().map(|(name, part)| ((*name).into(), json!(part.mean_per_s))).collect();
     say!("\nshare of one step's change that the learned residual carries:");
-    say!("{}", STATE_NAMES.iter().zip(share).map(|(name, s)| format!("{name} {:.0} %", 100.0 * s)).collect::<Vec<_>>().join(", "));
+    say!("{}", listed(|part| format!("{:.0} %", 100.0 * part.share)).join(", "));
+    say!("and what it adds on average, per second (m, rad, m/s, rad/s):");
+    say!("{}", listed(|part| format!("{:.3}", part.mean_per_s)).join(", "));
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.inside/1",
@@ -62,6 +67,7 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
         "split": args.data.split.as_str(),
         "quantities": quantities,
         "residual_share": shares,
+        "residual_mean_per_s": means,
         "provenance": provenance(Some(predictor.bundle()), &drives),
     });
     write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())

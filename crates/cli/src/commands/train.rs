@@ -63,6 +63,9 @@ pub struct TrainArgs {
     /// Weight in the loss of what the residual carries on average over a window: more of it leaves lasting forces to the wheels
     #[arg(long, value_name = "WEIGHT", default_value_t = 0.0)]
     sustained: f64,
+    /// Weight in the loss of soils that lie off the ranges that the map states for their class: more of it keeps the soil what the map says
+    #[arg(long, value_name = "WEIGHT", default_value_t = 0.0)]
+    soil_prior: f64,
     /// Start from the weights, scales and vehicle of this bundle (same model, no effects) instead of from nothing
     #[arg(long, value_name = "BUNDLE")]
     from: Option<PathBuf>,
@@ -159,11 +162,16 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if !(0.0..100.0).contains(&args.decay) {
         return Err(Failure::input(format!("--decay {} is not in 0..100", args.decay)));
     }
-    if !(0.0..100.0).contains(&args.sustained) {
-        return Err(Failure::input(format!("--sustained {} is not in 0..100", args.sustained)));
+    for (option, weight) in [("--sustained", args.sustained), ("--soil-prior", args.soil_prior)] {
+        if !(0.0..100.0).contains(&weight) {
+            return Err(Failure::input(format!("{option} {weight} is not in 0..100")));
+        }
     }
     if args.sustained > 0.0 && variant.is_end_to_end() {
         return Err(Failure::input(format!("--sustained is for models whose physics carries what lasts; {} has none", args.model)));
+    }
+    if args.soil_prior > 0.0 && !variant.has_soil() {
+        return Err(Failure::input(format!("--soil-prior is for models that read a soil off the map; {} does not", args.model)));
     }
     let start = args.from.as_deref().map(|dir| start_of(dir, variant, args.data.dt)).transpose()?;
     own_threads()?;
@@ -200,7 +208,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             shards: args.threads,
             dropout: args.dropout,
             decay: args.decay,
-            objective: Objective { variant, sustained: args.sustained },
+            objective: Objective { variant, sustained: args.sustained, soil_prior: args.soil_prior },
             folder: out.join("checkpoint"),
         },
         start,

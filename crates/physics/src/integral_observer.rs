@@ -1,0 +1,70 @@
+//! What a measured motion says of the integral of the speed control.
+//!
+//! A controller with an integral part has long made up for a slope, a soft soil or a dragging brake when a prediction begins; a history of a few seconds
+//! does not tell how far, if the integral is rebuilt from speed errors alone. The motion tells: whatever force moved the vehicle, its drive was asked for.
+
+use crate::driveline::DrivelineState;
+use crate::scalar::Real;
+use crate::state::{Control, VehicleState};
+use crate::step::StepModel;
+use crate::vec3::Tilt;
+
+/// Slowest motion that says something of the drive, m/s (chosen: below it a climb per way is noise).
+const SLOWEST_M_S: f64 = 0.3;
+/// Share of the largest demand up to which a torque says what was demanded (chosen: beyond it the limit hides it).
+const UNSATURATED: f64 = 0.9;
+/// Integral gain below which the integral says nothing, 1/s.
+const SMALLEST_GAIN_PER_S: f64 = 0.02;
+
+impl StepModel {
+    /// Actuators after a measured step from `before` to `after`, of which `advanced` is what commands and speeds made: the integral of the speed error is
+    /// drawn towards the one that explains the motion, at the card's rate. Unchanged for a vehicle whose hubs no torque drives, and at rest.
+    ///
+    /// The force along the way, m (Δv/Δt + g Δz / (v Δt)) with what effects hold against it, asks for a torque beyond the usual resistance (that of the
+    /// held demand); the inverse of the torque's law gives the demand, less the part of the present error: the integral's.
+    pub fn observed_actuators(
+        &self,
+        advanced: &DrivelineState,
+        control: &Control<f64>,
+        before: &VehicleState<f64>,
+        after: &VehicleState<f64>,
+        dt_s: f64,
+    ) -> DrivelineState {
+        let (line, actuator) = (&self.vehicle().driveline, &self.vehicle().effects.actuator);
+        let Some(torque) = line.torque.as_ref().filter(|t| t.integral_observer_per_s > 0.0) else { return *advanced };
+        let [speed_before, speed_after] = [before, after].map(|s| s.velocity_m_s[0]);
+        let speed = 0.5 * (speed_before + speed_after);
+        if speed < SLOWEST_M_S || line.speed_integral_gain_per_s < SMALLEST_GAIN_PER_S {
+            return *advanced;
+        }
+        let climb = (after.position_m[2] - before.position_m[2]) / (speed * dt_s);
+        let acceleration = (speed_after - speed_before) / dt_s + self.vehicle().gravity_m_s2 * climb;
+        let force_n = self.body.mass_kg * acceleration + self.lasting_resistance_n(before, speed);
+        let share = 1.0 - actuator.torque_lost;
+        let held = torque.holding_demand_m_s;
+        let limit = line.overspeed_limit_m_s;
+        let usual_n_m = torque.torque_n_m(held / (1.0 + (held / limit).powi(2)).sqrt(), speed, share);
+        let Some(limited) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
+        let limited = limited.clamp(-UNSATURATED * limit, UNSATURATED * limit);
+        let demand = limited / (1.0 - (limited / limit).powi(2)).sqrt();
+        let told_m_s = if actuator.alters_commands() { advanced.path.speed_over_step_m_s } else { control.speed_m_s };
+        let integral = (demand - held - line.speed_gain * (told_m_s - speed)) / line.speed_integral_gain_per_s;
+        let integral = integral.clamp(-line.speed_integral_limit_m, line.speed_integral_limit_m);
+        let rate = (torque.integral_observer_per_s * dt_s).min(1.0);
+        let kept = advanced.speed_error_integral_m;
+        DrivelineState { speed_error_integral_m: kept + rate * (integral - kept), ..*advanced }
+    }
+
+    /// What effects hold against a vehicle that goes straight ahead on level ground at a speed (m/s) above rest, N.
+    fn lasting_resistance_n(&self, state: &VehicleState<f64>, speed_m_s: f64) -> f64 {
+        let terms = &self.vehicle().effects.force;
+        let of_wheels = terms.rolling_resistance * self.body.mass_kg * self.vehicle().gravity_m_s2
+            + terms.wheel_drag_n_m.iter().sum::<f64>() / self.vehicle().wheel_radius_m;
+        let mut on_body = [0.0; 6];
+        if self.altered.on_body {
+            let straight = VehicleState { velocity_m_s: [speed_m_s, 0.0, 0.0], ..VehicleState::zero() };
+            self.add_body_forces_at(&straight, state.attitude_rad[2], [f64::lit(0.0); 3], &Tilt::new(0.0, 0.0), &mut on_body);
+        }
+        of_wheels - on_body[0]
+    }
+}

@@ -1,0 +1,108 @@
+//! Goal: a motion says what a speed control's integral must have been, on the flat, on a slope, while gaining speed, and against what effects hold back.
+//! Method: the demand that Newton's law needs, worked out by hand from the card's numbers; and a drive whose integral is known and forgotten.
+
+mod common;
+
+use common::Drive;
+use nesam_physics::driveline::DrivelineState;
+use nesam_physics::effects::{Effect, LinearDrag, Payload, WheelDrag};
+use nesam_physics::step::StepModel;
+use nesam_physics::{Control, DT_S, TorqueDrive, Vehicle, VehicleState};
+use nesam_test_vehicles::torque_truck;
+
+const SPEED_M_S: f64 = 2.5;
+const RATE_PER_S: f64 = 1.0;
+
+/// The car whose integral is observed and hardly forgets, with a limit of its demand far away.
+fn observed(rate_per_s: f64) -> Vehicle {
+    let car = torque_truck();
+    let torque = car.driveline.torque.map(|t| TorqueDrive { integral_observer_per_s: rate_per_s, ..t });
+    let driveline = nesam_physics::Driveline { torque, speed_integral_leak_s: 1e3, overspeed_limit_m_s: 1e3, ..car.driveline.clone() };
+    Vehicle { driveline, ..car }
+}
+
+/// The integral at which an observer settles that sees this change of speed (m/s²) and climb (m/m) again and again, under a command of `SPEED_M_S` at that
+/// speed.
+fn settled(vehicle: &Vehicle, acceleration_m_s2: f64, climb: f64) -> f64 {
+    let model = StepModel::new(vehicle, DT_S, 2);
+    let control = Control { speed_m_s: SPEED_M_S, second: 0.0 };
+    let half = 0.5 * acceleration_m_s2 * DT_S;
+    let at = |height_m: f64, speed: f64| VehicleState {
+        position_m: [0.0, 0.0, height_m],
+        velocity_m_s: [speed, 0.0, 0.0],
+        ..VehicleState::zero()
+    };
+    let (before, after) = (at(0.0, SPEED_M_S - half), at(climb * SPEED_M_S * DT_S, SPEED_M_S + half));
+    (0..400)
+        .fold(DrivelineState::settled(&control), |actuators, _| model.observed_actuators(&actuators, &control, &before, &after, DT_S))
+        .speed_error_integral_m
+}
+
+/// The integral (m) that brings a force (N) beyond the usual one: the curve is 1 at `SPEED_M_S`.
+fn needed(vehicle: &Vehicle, force_n: f64) -> f64 {
+    let torque = vehicle.driveline.torque.expect("this car's hubs are under torque");
+    force_n * vehicle.wheel_radius_m / torque.per_demand_n_m_s_m / vehicle.driveline.speed_integral_gain_per_s
+}
+
+#[test]
+fn analytic_the_integral_brings_the_force_that_was_seen() {
+    let car = observed(RATE_PER_S);
+    let (mass, weight) = (car.mass_kg, car.mass_kg * car.gravity_m_s2);
+    let payload = Effect::Payload(Payload { mass_kg: 500.0, at_m: [0.0; 3] });
+    let drag = Effect::LinearDrag(LinearDrag { n_s_m: 200.0 });
+    let brake = Effect::WheelDrag(WheelDrag { wheel: 3, torque_n_m: 900.0 });
+    let cases = [
+        ("level", vec![], 0.0, 0.0, 0.0),
+        ("uphill", vec![], 0.0, 0.08, 0.08 * weight),
+        ("downhill, still driving", vec![], 0.0, -0.01, -0.01 * weight),
+        ("gaining speed", vec![], 0.5, 0.0, 0.5 * mass),
+        ("uphill with a payload", vec![payload], 0.0, 0.05, 0.05 * (weight + 500.0 * car.gravity_m_s2)),
+        ("against a drag", vec![drag], 0.0, 0.0, 200.0 * SPEED_M_S),
+        ("with a dragging brake", vec![brake], 0.0, 0.0, 900.0 / car.wheel_radius_m),
+    ];
+    for (name, effects, acceleration, climb, force_n) in cases {
+        let (got, want) = (settled(&car.with_effects(&effects), acceleration, climb), needed(&car, force_n));
+        assert!((got - want).abs() < 1e-3, "{name}: {got} m, {want} m");
+    }
+}
+
+#[test]
+fn analytic_nothing_is_observed_at_rest_or_where_no_torque_drives() {
+    let [watching, blind] = [RATE_PER_S, 0.0].map(observed);
+    assert_eq!(settled(&blind, 0.5, 0.1), 0.0);
+    let held = Vehicle { driveline: nesam_physics::Driveline { torque: None, ..watching.driveline.clone() }, ..watching.clone() };
+    assert_eq!(settled(&held, 0.5, 0.1), 0.0);
+    let (control, still) = (Control { speed_m_s: 0.0, second: 0.0 }, VehicleState::zero());
+    let model = StepModel::new(&watching, DT_S, 2);
+    let start = DrivelineState { speed_error_integral_m: 0.3, ..DrivelineState::settled(&control) };
+    assert_eq!(model.observed_actuators(&start, &control, &still, &still, DT_S), start);
+}
+
+#[test]
+fn property_three_seconds_of_motion_tell_an_integral_that_was_forgotten() {
+    // Up a slope for 20 s: the controller has made up for it. Who comes to it with the last 3 s only must find what it made up, beyond what the same ground
+    // asks for on the level.
+    let control = Control { speed_m_s: SPEED_M_S, second: 0.0 };
+    let integrals = |slope: f64| {
+        let mut drive = Drive::new(observed(0.0), SPEED_M_S);
+        drive.slope = [slope, 0.0];
+        let mut states = vec![drive.state];
+        for _ in 0..200 {
+            drive.step(control.speed_m_s, control.second);
+            states.push(drive.state);
+        }
+        let rebuilt = |rate_per_s: f64| {
+            let model = StepModel::new(&observed(rate_per_s), DT_S, 2);
+            let late = &states[states.len() - 32..];
+            let last = late.windows(2).fold(DrivelineState::settled(&control), |actuators, pair| {
+                let advanced = actuators.advance(model.vehicle(), &control, pair[0].velocity_m_s[0], DT_S);
+                model.observed_actuators(&advanced, &control, &pair[0], &pair[1], DT_S)
+            });
+            last.speed_error_integral_m
+        };
+        [drive.actuators.speed_error_integral_m, rebuilt(0.0), rebuilt(2.0)]
+    };
+    let (level, uphill) = (integrals(0.0), integrals(0.08));
+    let [known, blind, watching]: [f64; 3] = core::array::from_fn(|i| uphill[i] - level[i]);
+    assert!((watching / known - 1.0).abs() < 0.1 && blind / known < 0.1, "of {known} m: {blind} without, {watching} with");
+}
