@@ -17,7 +17,7 @@ class Extras:
     traction reserve. soil_deltas: (soils, 6) what-if corrections in the order k_phi k_c n c phi k_shear, added to the session's in its coordinates;
     `Prediction.states` then is (soils, samples, steps, channels). soil_sigma_points: thirteen such groups for the sigma points of what the session
     knows of the soil: the estimate first, then twelve with equal weights. exact_terrain: encodes the terrain at every pose instead of interpolating on the
-    pose grid; at most 16 samples. What-if soils do not go together with Jacobians, covariance and exact terrain.
+    pose grid; at most 16 samples. interpolation_deviation: how far that moves the first candidate; not together with exact_terrain. What-if soils do not go together with Jacobians, covariance and exact terrain.
     """
 
     jacobians: bool = False
@@ -27,6 +27,7 @@ class Extras:
     soil_deltas: Optional[np.ndarray] = None
     soil_sigma_points: bool = False
     exact_terrain: bool = False
+    interpolation_deviation: bool = False
 
     @property
     def what_if(self) -> bool:
@@ -43,6 +44,7 @@ class Extras:
             soil_deltas=_packed(self.soil_deltas, (None, 6), "soil_deltas"),
             soil_sigma_points=self.soil_sigma_points,
             exact_terrain=self.exact_terrain,
+            interpolation_deviation=self.interpolation_deviation,
         )
 
 
@@ -56,7 +58,8 @@ class ExtraOutputs:
     this, P the 2 x 2 block; region_90_single: (6,), the same for x y z roll pitch yaw alone. wheel_load_n, N, and wheel_slip, -1 to 1: (..., steps, 4)
     with the wheels front left, front right, rear left, rear right. load_transfer_ratio: (..., steps), 0 even to 1 one side carries nothing.
     traction_reserve: (..., steps), drawbar pull that is left over the weight; below 0 the vehicle gets stuck. `...` is (samples,), or (soils, samples) with
-    what-if soils.
+    what-if soils. interpolation_deviation_m: mean over the horizon of the horizontal distance between the first candidate and the same one with the terrain
+    encoded at every pose.
     """
 
     jacobian_start: Optional[np.ndarray] = None
@@ -69,6 +72,7 @@ class ExtraOutputs:
     wheel_slip: Optional[np.ndarray] = None
     load_transfer_ratio: Optional[np.ndarray] = None
     traction_reserve: Optional[np.ndarray] = None
+    interpolation_deviation_m: Optional[float] = None
 
 
 def _packed(values: Optional[np.ndarray], shape: Tuple[Optional[int], ...], name: str) -> bytes:
@@ -101,4 +105,5 @@ def extra_outputs(reply: prediction_pb2.PredictReply, horizon: int, what_if: boo
         wheel_slip=unpack(reply.wheel_slip, (*rows, 4)),
         load_transfer_ratio=unpack(reply.load_transfer_ratio, rows),
         traction_reserve=unpack(reply.traction_reserve, rows),
+        interpolation_deviation_m=reply.interpolation_deviation_m if reply.HasField("interpolation_deviation_m") else None,
     )

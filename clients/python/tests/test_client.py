@@ -109,6 +109,9 @@ def test_service_extras_have_shapes_and_agree_with_each_other(driven):
     # A 2.5-tonne car that was set down on gentle hills, some of its wheels below the ground.
     np.testing.assert_allclose(extras.wheel_load_n.sum(axis=-1), 24_460, rtol=0.5)
     assert ((extras.load_transfer_ratio >= 0) & (extras.load_transfer_ratio <= 1)).all() and extras.traction_reserve.shape == (2, 3)
+    assert extras.interpolation_deviation_m is None
+    moved = driven.predict("truck", fan(2, 6), extras=nesam.Extras(interpolation_deviation=True)).extras.interpolation_deviation_m
+    assert 0 < moved < 0.05
 
 
 def test_service_what_if_soils_are_groups(driven):

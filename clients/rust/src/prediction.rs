@@ -179,6 +179,8 @@ pub struct ExtraOutputs {
     pub load_transfer_ratio: Vec<f32>,
     /// (rows, steps).
     pub traction_reserve: Vec<f32>,
+    /// How far interpolation of the terrain moved the first candidate, mean over the horizon, m.
+    pub interpolation_deviation_m: Option<f64>,
 }
 
 impl ExtraOutputs {
@@ -194,6 +196,7 @@ impl ExtraOutputs {
             wheel_slip: plain("wheel_slip", &reply.wheel_slip)?,
             load_transfer_ratio: plain("load_transfer_ratio", &reply.load_transfer_ratio)?,
             traction_reserve: plain("traction_reserve", &reply.traction_reserve)?,
+            interpolation_deviation_m: reply.interpolation_deviation_m,
         })
     }
 }

@@ -381,8 +381,11 @@ impl Engine {
         let learned = session.soil_field(map);
         let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk };
         let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
+        let looked_at = query.extras.interpolation_deviation && map.is_some();
+        let deviation_m = looked_at.then(|| predictor.interpolation_deviation_m(&asked, &asked_extras, &rollout)).transpose()?;
         let mut extras = ExtraOutputs {
             soil_groups: soils.len().max(1),
+            interpolation_deviation_m: deviation_m.filter(|deviation_m| deviation_m.is_finite()),
             risk: risk.map(|risk| forward.split_risk(risk, horizon)),
             ..Default::default()
         };

@@ -25,6 +25,8 @@ pub struct PredictExtras {
     pub risk: bool,
     /// Encodes the terrain at every pose instead of interpolating on the pose grid.
     pub exact_terrain: bool,
+    /// How far that moves the first candidate.
+    pub interpolation_deviation: bool,
     /// Soils to predict for.
     pub soils: WhatIfSoils,
 }
@@ -60,6 +62,8 @@ pub struct ExtraOutputs {
     pub covariance: Option<Covariances>,
     /// Risk of each row and step.
     pub risk: Option<RiskOutputs>,
+    /// Horizontal distance between the first candidate and the same one with the terrain encoded at every pose, mean over the horizon, m.
+    pub interpolation_deviation_m: Option<f64>,
 }
 
 /// Derivatives of the states of every sample, row-major; rows of a state are World x y z roll pitch yaw vx vy vz wx wy wz. NaN after a state that is not
@@ -110,6 +114,9 @@ impl PredictExtras {
             ("covariance", self.covariance.is_some(), limits.covariance_samples_max),
             ("exact_terrain", self.exact_terrain, limits.exact_samples_max),
         ];
+        if self.exact_terrain && self.interpolation_deviation {
+            return fail("interpolation_deviation", "is asked for together with `exact_terrain`, which interpolates nothing".into());
+        }
         for (field, asked, limit) in derived {
             if asked && samples > limit {
                 return fail(field, format!("is asked for {samples} samples, allowed are up to {limit}"));

@@ -45,7 +45,12 @@ fn sample_work(query: &PredictQuery) -> f64 {
 
 /// Work of the first `samples` of a prediction, in sample-steps.
 pub(crate) fn work(query: &PredictQuery, samples: usize) -> f64 {
-    FIXED_WORK + samples as f64 * sample_work(query)
+    fixed_work(query) + samples as f64 * sample_work(query)
+}
+
+/// Work that does not grow with the samples, in sample-steps.
+fn fixed_work(query: &PredictQuery) -> f64 {
+    FIXED_WORK + if query.extras.interpolation_deviation { EXACT_WORK * query.horizon as f64 } else { 0.0 }
 }
 
 impl ServiceTime {
@@ -57,7 +62,7 @@ impl ServiceTime {
     /// Samples of a prediction that are expected to be done within this time, between the fewest that it asks for and all.
     pub fn affordable(&self, query: &PredictQuery, left_ns: u64) -> usize {
         let Some(ns_per_work) = self.ns_per_work else { return query.samples };
-        let samples = (USED * left_ns as f64 / ns_per_work - FIXED_WORK) / sample_work(query);
+        let samples = (USED * left_ns as f64 / ns_per_work - fixed_work(query)) / sample_work(query);
         if samples >= query.samples as f64 {
             return query.samples;
         }

@@ -55,8 +55,8 @@ enum TerrainMode {
 /// Hash of a map and its encoded terrain.
 type TokensOfMap = (String, Arc<TerrainTokens>);
 
-/// A loaded bundle that answers rollout queries. `Send + Sync`; shared behind an `Arc`.
-#[derive(Debug)]
+/// A loaded bundle that answers rollout queries. `Send + Sync`; a clone shares all that is large.
+#[derive(Clone, Debug)]
 pub struct Predictor {
     bundle: Arc<ModelBundle>,
     physics: Phases<StepModel>,
@@ -116,7 +116,7 @@ impl Predictor {
 
     /// The same predictor with the terrain encoded at every pose: what interpolation on the pose grid is held against.
     pub fn exactly(&self) -> Self {
-        Self { mode: TerrainMode::Exact, ..self.with_effects::<ScheduledEffect>(&[]) }
+        Self { mode: TerrainMode::Exact, ..self.clone() }
     }
 
     /// Instructions that rollouts run on.
@@ -180,6 +180,27 @@ impl Predictor {
     /// As [`Predictor::rollout`].
     pub fn rollout_on(&self, query: &RolloutQuery<'_>, soil: &dyn SoilField) -> Result<Rollout, ModelError> {
         self.rollout_with(query, &RolloutExtras { field: Some(soil), ..Default::default() }).map(|(rollout, _)| rollout)
+    }
+
+    /// How far the first candidate of an answer lies from the same candidate with the terrain encoded at every pose: horizontal distance, mean over the
+    /// horizon, m. `answered` is what this predictor made of the query, whose first candidate is its first row.
+    ///
+    /// # Errors
+    /// As [`Predictor::rollout`].
+    pub fn interpolation_deviation_m(
+        &self,
+        query: &RolloutQuery<'_>,
+        extras: &RolloutExtras<'_>,
+        answered: &Rollout,
+    ) -> Result<f64, ModelError> {
+        let first = RolloutQuery { samples: 1, controls: &query.controls[..2 * query.horizon], ..query.clone() };
+        let extras = RolloutExtras { soils: &extras.soils[..extras.soils.len().min(1)], risk: false, ..*extras };
+        let (exact, _) = self.exactly().rollout_with(&first, &extras)?;
+        let planar = |states: &[f32]| -> Vec<[f32; 2]> {
+            states.chunks_exact(STATE_DIM).take(query.horizon).map(|state| [state[0], state[1]]).collect()
+        };
+        let pairs = planar(&answered.states).into_iter().zip(planar(&exact.states));
+        Ok(pairs.map(|(a, b)| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]))).sum::<f64>() / query.horizon as f64)
     }
 
     /// Form that a query asks for.

@@ -922,6 +922,10 @@ pub struct PredictExtras {
     /// request without. At most 16 samples (server configuration), not together with what-if soils.
     #[prost(bool, tag = "7")]
     pub exact_terrain: bool,
+    /// Say how far that moves the first candidate, which is then rolled out both ways: about 0.5 ms for each step of its history and horizon on one core,
+    /// whatever the number of samples. Not together with `exact_terrain`.
+    #[prost(bool, tag = "8")]
+    pub interpolation_deviation: bool,
 }
 /// A command on its way to the vehicle.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
@@ -1057,6 +1061,10 @@ pub struct PredictReply {
     /// `temperature`, or when no candidate has a finite cost.
     #[prost(bytes = "bytes", tag = "34")]
     pub mean_controls: ::prost::bytes::Bytes,
+    /// Horizontal distance between the first candidate and the same one with the terrain encoded at every pose, mean over the horizon, m. Absent unless asked
+    /// for, and without a map, where nothing is interpolated.
+    #[prost(double, optional, tag = "35")]
+    pub interpolation_deviation_m: ::core::option::Option<f64>,
 }
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PredictStreamReply {

@@ -64,7 +64,7 @@ pub fn predict_message(query: &PredictQuery) -> pb::PredictRequest {
 
 /// The message that asks for what a prediction computes beyond states. Its numbers came as f32.
 fn extras_message(extras: &PredictExtras) -> pb::PredictExtras {
-    let PredictExtras { jacobians, covariance, risk, exact_terrain, soils } = extras;
+    let PredictExtras { jacobians, covariance, risk, exact_terrain, interpolation_deviation, soils } = extras;
     let packed = |values: &mut dyn Iterator<Item = &f64>| encode(&values.map(|v| *v as f32).collect::<Vec<f32>>(), Precision::F32);
     let start = covariance.as_ref().and_then(|query| query.start.as_ref());
     pb::PredictExtras {
@@ -73,6 +73,7 @@ fn extras_message(extras: &PredictExtras) -> pb::PredictExtras {
         start_covariance: start.map(|start| packed(&mut start.as_flattened().iter())).unwrap_or_default(),
         risk: *risk,
         exact_terrain: *exact_terrain,
+        interpolation_deviation: *interpolation_deviation,
         soil_deltas: match soils {
             WhatIfSoils::Added(soils) => packed(&mut soils.as_flattened().iter()),
             WhatIfSoils::Estimate | WhatIfSoils::SigmaPoints => Default::default(),
@@ -116,6 +117,7 @@ mod tests {
             covariance: Some(CovarianceQuery { start: Some(Box::new([[0.25; 12]; 12])) }),
             risk: true,
             exact_terrain: true,
+            interpolation_deviation: true,
             soils: WhatIfSoils::Added(vec![[0.5; 6], [-0.125; 6]]),
         };
         let sigma = PredictExtras { soils: WhatIfSoils::SigmaPoints, ..Default::default() };

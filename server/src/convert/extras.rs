@@ -39,6 +39,7 @@ pub(super) fn predict_extras(message: &pb::PredictExtras) -> Result<PredictExtra
         covariance: message.covariance.then_some(CovarianceQuery { start }),
         risk: message.risk,
         exact_terrain: message.exact_terrain,
+        interpolation_deviation: message.interpolation_deviation,
         soils,
     })
 }
@@ -46,6 +47,7 @@ pub(super) fn predict_extras(message: &pb::PredictExtras) -> Result<PredictExtra
 /// Writes what came of it into a reply.
 pub(super) fn put_extras(reply: &mut pb::PredictReply, extras: &ExtraOutputs, horizon: usize, output: OutputSelection) {
     let packed = |values: &[f32], width: usize| output.steps_of(values, horizon, width);
+    reply.interpolation_deviation_m = extras.interpolation_deviation_m;
     if let Some(jacobians) = &extras.jacobians {
         reply.jacobian_start = packed(&jacobians.start, STATE_DIM * STATE_DIM);
         reply.jacobian_controls = packed(&jacobians.controls, STATE_DIM * horizon * 2);

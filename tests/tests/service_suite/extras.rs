@@ -19,12 +19,22 @@ async fn service_exact_terrain_is_that_of_the_model_and_near_the_pose_grid() {
     asked.extras = Some(v1::PredictExtras { exact_terrain: true, ..Default::default() });
     let exactly = client.predict(asked.clone()).await.unwrap();
     assert_same(&exactly, &expected);
-    let apart = |n: usize| {
-        let [a, b] = [&on_grid, &exactly].map(|p| p.state(n, 15));
+    let apart = |n: usize, k: usize| {
+        let [a, b] = [&on_grid, &exactly].map(|p| p.state(n, k));
         f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]))
     };
-    let apart = apart(0).max(apart(1));
-    assert!(apart > 0.0 && apart < 0.05, "interpolation moves a prediction by {apart} m after 1.6 s");
+    let last = apart(0, 15).max(apart(1, 15));
+    assert!(last > 0.0 && last < 0.05, "interpolation moves a prediction by {last} m after 1.6 s");
+    // The reply says it of the first candidate, and is else what it was.
+    asked.extras = Some(v1::PredictExtras { interpolation_deviation: true, ..Default::default() });
+    let told = client.predict(asked.clone()).await.unwrap();
+    let mean = (0..16).map(|k| apart(0, k)).sum::<f64>() / 16.0;
+    assert!((told.extras.interpolation_deviation_m.unwrap() - mean).abs() < 1e-9, "{:?}, {mean}", told.extras.interpolation_deviation_m);
+    assert_eq!(bits(&told.states), bits(&on_grid.states));
+    assert_eq!((on_grid.extras.interpolation_deviation_m, exactly.extras.interpolation_deviation_m), (None, None));
+    asked.extras = Some(v1::PredictExtras { interpolation_deviation: true, exact_terrain: true, ..Default::default() });
+    let refused = client.predict(asked.clone()).await.unwrap_err();
+    assert!(refused.to_string().contains("interpolation_deviation"), "{refused}");
     asked.extras = None;
     assert_eq!(bits(&client.predict(asked).await.unwrap().states), bits(&on_grid.states), "the next is on the grid again");
     server.shutdown().await;
