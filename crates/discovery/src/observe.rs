@@ -24,6 +24,8 @@ use crate::error::DiscoveryError;
 const FIRST_START: usize = 16;
 /// The same where the measured rims tell where the actuators begin.
 const FIRST_START_SERVOED: usize = 1;
+/// Over-speed beyond which a wheel spins more than it grips, m/s (chosen: a slip of a fifth at the usual speed).
+const GRIPPING_M_S: f64 = 0.5;
 /// Smallest change of tractive force per rim over-speed that is believed, N per m/s (a wheel in the air has none).
 const TRACTION_SLOPE_FLOOR: f64 = 2000.0;
 
@@ -148,6 +150,12 @@ pub(crate) fn available_in_all<'a>(drives: impl IntoIterator<Item = &'a Observed
 /// Whether the rims turn as they are told, whatever the ground does.
 fn rims_servoed(vehicle: &Vehicle) -> bool {
     vehicle.second == SecondCommand::YawRateRadS
+}
+
+/// An over-speed as far as it says something of the torque: of a wheel that spins only that it does, m/s. Near the strength of the soil a rim's answer to a
+/// torque has no bound, and a few such moments would outweigh a drive.
+fn gripping(overspeed_m_s: f64) -> f64 {
+    GRIPPING_M_S * (overspeed_m_s / GRIPPING_M_S).tanh()
 }
 
 /// How much more each wheel pulls per rim over-speed, by central differences of the contact forces.
@@ -319,7 +327,7 @@ impl ObservedDrive {
         let of = |(model, state, actuators, step): WayToDrive<'_>| {
             let mut row = [0.0; CHANNELS];
             let reading = Reading { model: model.clone(), actuators: vec![*actuators; k + 1], states: vec![*state; k + 1] };
-            self.actuators(&reading, &self.transitions[k], k, 0, step.contacts.map(|c| c.overspeed_m_s), &mut row);
+            self.actuators(&reading, &self.transitions[k], k, 0, step.contacts.map(|c| c.overspeed_m_s), |overspeed| overspeed, &mut row);
             row
         };
         let (before, after) = (of(from), of(to));
@@ -350,7 +358,7 @@ impl ObservedDrive {
                 ..transition.input
             };
             let StepOutput { increment, contacts } = model.step(&input);
-            self.actuators(reading, transition, start + j, j, contacts.map(|c| c.overspeed_m_s), &mut row);
+            self.actuators(reading, transition, start + j, j, contacts.map(|c| c.overspeed_m_s), gripping, &mut row);
             let increment = increment.to_array();
             let total: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + transition.residual[i]);
             state = VehicleState::from_array(state.advanced(&total));
@@ -372,7 +380,16 @@ impl ObservedDrive {
     /// A drag torque τ lowers the rim speed until the tread makes up for what the coupling of the axle does not:
     /// Δ(over-speed) = -(τ at the tread / r) / (∂F/∂over-speed), see `StepModel`.
     /// Of a vehicle driven by torque the step knows the over-speeds (`overspeed_m_s`), drags and locks included.
-    fn actuators(&self, reading: &Reading, transition: &Transition, sample: usize, j: usize, overspeed_m_s: [f64; WHEELS], row: &mut Row) {
+    fn actuators(
+        &self,
+        reading: &Reading,
+        transition: &Transition,
+        sample: usize,
+        j: usize,
+        overspeed_m_s: [f64; WHEELS],
+        rim: impl Fn(f64) -> f64,
+        row: &mut Row,
+    ) {
         let vehicle = reading.model.vehicle();
         let [before, after] = &reading.actuators[sample];
         let mut angles = before.road_wheel_angles(vehicle);
@@ -396,7 +413,8 @@ impl ObservedDrive {
             let own = cos * centre[0] + sin * centre[1];
             let radius = 1.0 + vehicle.effects.force.radius_relative[i / 2];
             if vehicle.driveline.torque.is_some() {
-                row[RIM_AT + i] += share * (wheel_speed[i] * vehicle.wheel_radius_m - (own + overspeed_m_s[i]) / radius);
+                let [seen, told] = [wheel_speed[i] * vehicle.wheel_radius_m * radius - own, overspeed_m_s[i]].map(&rim);
+                row[RIM_AT + i] += share * (seen - told) / radius;
                 continue;
             }
             // A locked axle turns both rims at the mean of what their own ground asks for; Ω is read as a speed of the card's radius.
