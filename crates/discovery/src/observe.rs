@@ -327,7 +327,7 @@ impl ObservedDrive {
         let of = |(model, state, actuators, step): WayToDrive<'_>| {
             let mut row = [0.0; CHANNELS];
             let reading = Reading { model: model.clone(), actuators: vec![*actuators; k + 1], states: vec![*state; k + 1] };
-            self.actuators(&reading, &self.transitions[k], k, 0, step.contacts.map(|c| c.overspeed_m_s), |overspeed| overspeed, &mut row);
+            self.actuators(&reading, k, 0, step.contacts.map(|c| c.overspeed_m_s), |overspeed| overspeed, &mut row);
             row
         };
         let (before, after) = (of(from), of(to));
@@ -358,7 +358,7 @@ impl ObservedDrive {
                 ..transition.input
             };
             let StepOutput { increment, contacts } = model.step(&input);
-            self.actuators(reading, transition, start + j, j, contacts.map(|c| c.overspeed_m_s), gripping, &mut row);
+            self.actuators(reading, start + j, j, contacts.map(|c| c.overspeed_m_s), gripping, &mut row);
             let increment = increment.to_array();
             let total: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + transition.residual[i]);
             state = VehicleState::from_array(state.advanced(&total));
@@ -379,15 +379,14 @@ impl ObservedDrive {
     ///
     /// A drag torque τ lowers the rim speed until the tread makes up for what the coupling of the axle does not:
     /// Δ(over-speed) = -(τ at the tread / r) / (∂F/∂over-speed), see `StepModel`.
-    /// Of a vehicle driven by torque the step knows the over-speeds (`overspeed_m_s`), drags and locks included.
+    /// Of a vehicle driven by torque the step knows the over-speeds (`overspeed_m_s`), drags and locks included; `heard` says what of an over-speed is compared.
     fn actuators(
         &self,
         reading: &Reading,
-        transition: &Transition,
         sample: usize,
         j: usize,
         overspeed_m_s: [f64; WHEELS],
-        rim: impl Fn(f64) -> f64,
+        heard: impl Fn(f64) -> f64,
         row: &mut Row,
     ) {
         let vehicle = reading.model.vehicle();
@@ -403,7 +402,7 @@ impl ObservedDrive {
         let share = 1.0 / SEGMENT_STEPS as f64;
         // Servoed rims are measured at the instant of the sample; a step takes their mean over it.
         let until = if rims_servoed(vehicle) { before } else { after };
-        let wheels = command_wheels::<f64>(vehicle, before, until, &transition.control);
+        let wheels = command_wheels::<f64>(vehicle, before, until, &self.transitions[sample].control);
         let state = &reading.states[sample];
         let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
         for i in 0..WHEELS {
@@ -413,7 +412,7 @@ impl ObservedDrive {
             let own = cos * centre[0] + sin * centre[1];
             let radius = 1.0 + vehicle.effects.force.radius_relative[i / 2];
             if vehicle.driveline.torque.is_some() {
-                let [seen, told] = [wheel_speed[i] * vehicle.wheel_radius_m * radius - own, overspeed_m_s[i]].map(&rim);
+                let [seen, told] = [wheel_speed[i] * vehicle.wheel_radius_m * radius - own, overspeed_m_s[i]].map(&heard);
                 row[RIM_AT + i] += share * (seen - told) / radius;
                 continue;
             }
@@ -452,4 +451,15 @@ fn deviation(measured: &VehicleState<f64>, predicted: &VehicleState<f64>) -> [f6
         3..=5 => wrap_angle(m[c] - p[c]),
         _ => m[c] - p[c],
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_a_gripping_wheel_is_heard_and_a_spinning_one_only_spins() {
+        assert!((gripping(0.05) / 0.05 - 1.0).abs() < 0.01 && (gripping(-0.05) + gripping(0.05)).abs() < 1e-15);
+        assert!(gripping(2.5) - gripping(1.5) < 0.005 && gripping(2.5) <= GRIPPING_M_S);
+    }
 }
