@@ -3,8 +3,8 @@
 //! A car-like vehicle tracks the commanded speed of its reference point: its drive line holds every rim a little faster or slower than the
 //! ground under it, in proportion to the speed error and to its integral, within a limit. A skid-steer vehicle servoes the rims themselves
 //! ([`RimServo`](crate::vehicle::RimServo)). The steering
-//! actuator lags the command and is limited in rate. The actuator state depends on commands and measured speed only, so a server
-//! rebuilds it from the history of a session.
+//! actuator lags the command and is limited in rate. The actuator state depends on commands and measured motion only (see also `integral_observer.rs`), so a
+//! server rebuilds it from the history of a session.
 
 use crate::command_path::CommandPath;
 use crate::scalar::Real;
