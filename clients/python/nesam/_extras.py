@@ -17,7 +17,8 @@ class Extras:
     traction reserve. soil_deltas: (soils, 6) what-if corrections in the order k_phi k_c n c phi k_shear, added to the session's in its coordinates;
     `Prediction.states` then is (soils, samples, steps, channels). soil_sigma_points: thirteen such groups for the sigma points of what the session
     knows of the soil: the estimate first, then twelve with equal weights. exact_terrain: encodes the terrain at every pose instead of interpolating on the
-    pose grid; at most 16 samples. interpolation_deviation: how far that moves the first candidate; not together with exact_terrain. What-if soils do not go together with Jacobians, covariance and exact terrain.
+    pose grid; at most 16 samples. interpolation_deviation: how far that moves the first candidate; not together with exact_terrain. What-if soils do not go
+    together with Jacobians, covariance and exact terrain.
     """
 
     jacobians: bool = False

@@ -98,7 +98,7 @@ fn ranks(values: &[f64]) -> Vec<f64> {
 pub type Comparison = BTreeMap<String, Pairs>;
 
 /// What the learned residual adds to a step, by state entry.
-#[derive(Clone, Copy, Debug, Serialize)]
+#[derive(Clone, Copy, Debug)]
 pub struct ResidualPart {
     /// Share of all that moves the state: Σ|Δx_res| / (Σ|Δx_res| + Σ|Δx_NE|).
     pub share: f64,

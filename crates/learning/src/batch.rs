@@ -155,33 +155,6 @@ struct Projected {
     tokens: Var,
 }
 
-/// Raw soil of the samples ahead, what the map says of it, and the leaf that the rollout reads.
-struct SoilAhead {
-    /// (rows, 6), with its graph.
-    graph: Tensor,
-    leaf: Var,
-    /// Mean of the class under each row, (rows, 6); zero where there is none.
-    class_mean: Tensor,
-    /// One over its standard deviation, (rows, 6); zero where there is none.
-    class_per_sd: Tensor,
-}
-
-impl SoilAhead {
-    fn new(graph: Tensor, classes: &[Option<ClassSoil>]) -> Result<Self> {
-        let table = |of: fn(&ClassSoil) -> [f32; SOIL_DIM]| {
-            let values: Vec<f32> = classes.iter().flat_map(|class| class.as_ref().map_or([0.0; SOIL_DIM], of)).collect();
-            Tensor::from_vec(values, (classes.len(), SOIL_DIM), &Device::Cpu)
-        };
-        let leaf = Var::from_tensor(&graph.detach())?;
-        Ok(Self { graph, leaf, class_mean: table(|class| class.mean)?, class_per_sd: table(|class| class.sd.map(|sd| 1.0 / sd))? })
-    }
-
-    /// Mean over rows of Σ_p ((u_p - mean_p) / sd_p)², u the raw soil: twice the negative logarithm of its prior density.
-    fn off_class(&self) -> Result<Tensor> {
-        ((&self.graph - &self.class_mean)? * &self.class_per_sd)?.sqr()?.sum(1)?.mean_all()
-    }
-}
-
 /// Terrain tokens of a batch, computed once for all samples that its rollouts can reach.
 pub struct PathTerrain<'a, 'w> {
     windows: &'w [Window<'a>],
@@ -189,8 +162,8 @@ pub struct PathTerrain<'a, 'w> {
     /// Contexts and their tokens of the history, and of the samples ahead: (rows, width) and (rows, 128).
     past: Option<Projected>,
     ahead: Projected,
-    /// `None` where the form or the drives have no soil.
-    soil: Option<SoilAhead>,
+    /// Raw soil of the samples ahead with its graph, and the leaf that the rollout reads; `None` where the form or the drives have none.
+    soil: Option<(Tensor, Var)>,
     /// First row of each window in the table ahead.
     first_row: Vec<u32>,
     has_map: bool,
@@ -206,7 +179,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         let (variant, width) = (sight.variant, sight.pooling.width());
         let has_map = windows.iter().all(|w| w.drive.has_features());
         let rows: usize = windows.iter().map(|w| w.last(horizon) - w.start + 1).sum();
-        let (mut context, mut past, mut semantic, mut classes) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+        let (mut context, mut past, mut semantic) = (Vec::new(), Vec::new(), Vec::new());
         let mut first_row = Vec::with_capacity(windows.len());
         if has_map {
             context.reserve(rows * width);
@@ -217,7 +190,6 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
                     w.drive.push_context(i, &mut context);
                     if variant.has_soil() {
                         w.drive.push_semantic(i, &mut semantic);
-                        classes.push(w.drive.class_soil(i));
                     }
                 }
                 for i in w.start - history..w.start {
@@ -243,7 +215,8 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         let past_rows = windows.len() * history;
         let soil = if has_map && variant.has_soil() {
             let graph = network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?;
-            Some(SoilAhead::new(graph, &classes)?)
+            let leaf = Var::from_tensor(&graph.detach())?;
+            Some((graph, leaf))
         } else {
             None
         };
@@ -259,16 +232,24 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         })
     }
 
-    /// How far the soil lies from what the map says of its class ([`ClassSoil`]), mean over the samples ahead; `None` without soil.
+    /// How far the soil ahead lies from what the map says of its class: mean over samples of Σ_p ((u_p - mean_p) / sd_p)² with u the raw soil, twice the
+    /// negative logarithm of its density by [`ClassSoil`]. A sample without a class counts as none. `None` where there is no soil.
     ///
     /// # Errors
     /// A candle error.
-    pub fn off_class(&self) -> Result<Option<f32>> {
-        self.soil.as_ref().map(|soil| soil.off_class()?.to_scalar()).transpose()
+    pub fn off_class(&self) -> Result<Option<Tensor>> {
+        let Some((graph, _)) = &self.soil else { return Ok(None) };
+        let samples = self.windows.iter().flat_map(|w| (w.start..=w.last(self.horizon)).map(|i| w.drive.class_soil(i)));
+        let classes: Vec<Option<ClassSoil>> = samples.collect();
+        let table = |of: fn(&ClassSoil) -> [f32; SOIL_DIM]| {
+            let values: Vec<f32> = classes.iter().flat_map(|class| class.as_ref().map_or([0.0; SOIL_DIM], of)).collect();
+            Tensor::from_vec(values, (classes.len(), SOIL_DIM), &Device::Cpu)
+        };
+        let (mean, per_sd) = (table(|class| class.mean)?, table(|class| class.sd.map(|sd| 1.0 / sd))?);
+        ((graph - mean)? * per_sd)?.sqr()?.sum(1)?.mean_all().map(Some)
     }
 
-    /// Completes the gradients of a loss for what lies before the leaves: W_c and the soil prior, to which `soil_prior` times
-    /// [`PathTerrain::off_class`] is added.
+    /// Completes the gradients of a loss for what lies before the leaves: W_c and the soil prior, with those of a further loss that reads the soil alone.
     ///
     /// # Errors
     /// A candle error.
@@ -276,7 +257,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         &self,
         network: &Network,
         store: &GradStore,
-        soil_prior: f64,
+        of_soil: Option<&Tensor>,
         gradients: &mut HashMap<String, Vec<f32>>,
     ) -> Result<()> {
         if !self.has_map {
@@ -297,14 +278,14 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             let pooled: Vec<Vec<f32>> = projection.to_vec2()?;
             gradients.insert("token.context.weight".into(), pooled.iter().flat_map(|row| self.sight.pooling.spread(row)).collect());
         }
-        if let Some(soil) = &self.soil
-            && let Some(upstream) = store.get(&soil.leaf)
+        if let Some((graph, leaf)) = &self.soil
+            && let Some(upstream) = store.get(leaf)
         {
-            let mut pulled = (&soil.graph * upstream.detach())?.sum_all()?;
-            if soil_prior > 0.0 {
-                pulled = (pulled + (soil.off_class()? * soil_prior)?)?;
+            let mut loss = (graph * upstream.detach())?.sum_all()?;
+            if let Some(further) = of_soil {
+                loss = (loss + further)?;
             }
-            let pulled = pulled.backward()?;
+            let pulled = loss.backward()?;
             for (name, var) in network.variables.iter().filter(|(name, _)| name.starts_with("soil.")) {
                 if let Some(gradient) = pulled.get(var) {
                     gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
@@ -348,7 +329,7 @@ impl TerrainProvider for PathTerrain<'_, '_> {
         let places: Vec<Place> =
             self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();
         let soil = match &self.soil {
-            Some(soil) => self.interpolate(&soil.leaf, &places)?,
+            Some((_, leaf)) => self.interpolate(leaf, &places)?,
             None => default_soil()?,
         };
         Ok((self.interpolate(&self.ahead.tokens, &places)?, soil))

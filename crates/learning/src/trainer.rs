@@ -163,9 +163,13 @@ impl TrainingSet<'_> {
                 gradients.insert(name.clone(), gradient.flatten_all()?.to_vec1()?);
             }
         }
-        terrain.add_gradients(network, &store, objective.soil_prior, &mut gradients)?;
-        let off_class = terrain.off_class()?.unwrap_or(0.0);
-        Ok((loss.to_scalar::<f32>()? + objective.soil_prior as f32 * off_class, gradients))
+        let off_class = if objective.soil_prior > 0.0 { terrain.off_class()? } else { None };
+        let of_soil = off_class.map(|off_class| off_class * objective.soil_prior).transpose()?;
+        terrain.add_gradients(network, &store, of_soil.as_ref(), &mut gradients)?;
+        if let Some(of_soil) = of_soil {
+            loss = (loss + of_soil)?;
+        }
+        Ok((loss.to_scalar::<f32>()?, gradients))
     }
 
     /// Mean absolute errors over fixed windows of the validation drives.

@@ -110,7 +110,7 @@ impl Predictor {
             network: Arc::new(self.network.on(path)),
             projection: Arc::new(self.projection.on(path)),
             maps: Arc::default(),
-            ..self.with_effects::<ScheduledEffect>(&[])
+            ..self.clone()
         }
     }
 
@@ -158,7 +158,7 @@ impl Predictor {
             own.iter_mut().zip(change).for_each(|(own, change)| *own += change);
         }
         let network = Arc::new(FusedTransformer::new(&bundle.weights)?.on(self.network.path()));
-        Ok(Self { network, bundle: Arc::new(bundle), ..self.with_effects::<ScheduledEffect>(&[]) })
+        Ok(Self { network, bundle: Arc::new(bundle), ..self.clone() })
     }
 
     /// The bundle behind the predictions.

@@ -143,6 +143,11 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         clamp(integral, -limit, limit)
     }
 
+    /// Speed that the drive is told over the step that led to these actuators, m/s: what arrives of the command where effects alter it.
+    pub(crate) fn told_speed_m_s(&self, vehicle: &Vehicle, control: &Control<T>) -> T {
+        if vehicle.effects.actuator.alters_commands() { self.path.speed_over_step_m_s } else { control.speed_m_s }
+    }
+
     /// Road-wheel angles FL, FR, RL, RR at an instant, rad.
     pub fn road_wheel_angles(&self, vehicle: &Vehicle) -> [T; WHEELS] {
         let position = if vehicle.effects.actuator.steering_play != 0.0 { self.path.play } else { self.steering };
@@ -173,6 +178,18 @@ fn behind_actuator<T: Real>(vehicle: &Vehicle, position: T) -> T {
     let terms = &vehicle.effects.actuator;
     let position = if terms.steering_ratio != 0.0 { position * T::lit(1.0 + terms.steering_ratio) } else { position };
     position + T::lit(terms.steering_offset)
+}
+
+/// Smooth saturation d / sqrt(1 + (d / limit)²) of a demand: slope one at zero, the limit far out.
+#[inline(always)]
+pub(crate) fn limited<T: Real>(demand_m_s: T, limit_m_s: T) -> T {
+    let share = demand_m_s / limit_m_s;
+    demand_m_s / (T::lit(1.0) + share * share).sqrt()
+}
+
+/// The demand that [`limited`] makes this of, which lies inside the limit.
+pub(crate) fn unlimited(limited_m_s: f64, limit_m_s: f64) -> f64 {
+    limited_m_s / (1.0 - (limited_m_s / limit_m_s).powi(2)).sqrt()
 }
 
 /// Speed command around which the held demand turns its direction, m/s (chosen: a command of zero holds nothing).
@@ -276,7 +293,7 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
         rim_follow: T::lit(if skid { 0.0 } else { 1.0 }),
         rim_gain: T::lit(if skid { 0.0 } else { line.speed_gain }),
         overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s * if line.torque.is_some() { 1.0 } else { 1.0 - actuator.torque_lost }),
-        speed_m_s: if actuator.alters_commands() { after.path.speed_over_step_m_s } else { control.speed_m_s },
+        speed_m_s: after.told_speed_m_s(vehicle, control),
     }
 }
 
@@ -304,9 +321,7 @@ impl<T: Real> WheelCommand<T> {
     #[inline(always)]
     pub fn demand_m_s(&self, i: usize, vehicle_forward_m_s: T) -> T {
         let demand = self.rim_base_m_s[i] * self.rim_follow + self.rim_gain * (self.speed_m_s - vehicle_forward_m_s);
-        // Smooth saturation d / sqrt(1 + (d / limit)²): slope one at zero, the limit far out.
-        let share = demand / self.overspeed_limit_m_s;
-        demand / (T::lit(1.0) + share * share).sqrt()
+        limited(demand, self.overspeed_limit_m_s)
     }
 
     /// Rim speed of wheel `i` where it is servoed or measured, m/s, else 0.

@@ -3,8 +3,7 @@
 //! A controller with an integral part has long made up for a slope, a soft soil or a dragging brake when a prediction begins; a history of a few seconds
 //! does not tell how far, if the integral is rebuilt from speed errors alone. The motion tells: whatever force moved the vehicle, its drive was asked for.
 
-use crate::driveline::DrivelineState;
-use crate::scalar::Real;
+use crate::driveline::{DrivelineState, limited, unlimited};
 use crate::state::{Control, VehicleState};
 use crate::step::StepModel;
 use crate::vec3::Tilt;
@@ -30,7 +29,7 @@ impl StepModel {
         after: &VehicleState<f64>,
         dt_s: f64,
     ) -> DrivelineState {
-        let (line, actuator) = (&self.vehicle().driveline, &self.vehicle().effects.actuator);
+        let line = &self.vehicle().driveline;
         let Some(torque) = line.torque.as_ref().filter(|t| t.integral_observer_per_s > 0.0) else { return *advanced };
         let [speed_before, speed_after] = [before, after].map(|s| s.velocity_m_s[0]);
         let speed = 0.5 * (speed_before + speed_after);
@@ -40,15 +39,14 @@ impl StepModel {
         let climb = (after.position_m[2] - before.position_m[2]) / (speed * dt_s);
         let acceleration = (speed_after - speed_before) / dt_s + self.vehicle().gravity_m_s2 * climb;
         let force_n = self.body.mass_kg * acceleration + self.lasting_resistance_n(before, speed);
-        let share = 1.0 - actuator.torque_lost;
+        let share = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let held = torque.holding_demand_m_s;
         let limit = line.overspeed_limit_m_s;
-        let usual_n_m = torque.torque_n_m(held / (1.0 + (held / limit).powi(2)).sqrt(), speed, share);
-        let Some(limited) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
-        let limited = limited.clamp(-UNSATURATED * limit, UNSATURATED * limit);
-        let demand = limited / (1.0 - (limited / limit).powi(2)).sqrt();
-        let told_m_s = if actuator.alters_commands() { advanced.path.speed_over_step_m_s } else { control.speed_m_s };
-        let integral = (demand - held - line.speed_gain * (told_m_s - speed)) / line.speed_integral_gain_per_s;
+        let usual_n_m = torque.torque_n_m(limited(held, limit), speed, share);
+        let Some(brought) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
+        let demand = unlimited(brought.clamp(-UNSATURATED * limit, UNSATURATED * limit), limit);
+        let error = advanced.told_speed_m_s(self.vehicle(), control) - speed;
+        let integral = (demand - held - line.speed_gain * error) / line.speed_integral_gain_per_s;
         let integral = integral.clamp(-line.speed_integral_limit_m, line.speed_integral_limit_m);
         let rate = (torque.integral_observer_per_s * dt_s).min(1.0);
         let kept = advanced.speed_error_integral_m;
@@ -63,7 +61,7 @@ impl StepModel {
         let mut on_body = [0.0; 6];
         if self.altered.on_body {
             let straight = VehicleState { velocity_m_s: [speed_m_s, 0.0, 0.0], ..VehicleState::zero() };
-            self.add_body_forces_at(&straight, state.attitude_rad[2], [f64::lit(0.0); 3], &Tilt::new(0.0, 0.0), &mut on_body);
+            self.add_body_forces_at(&straight, state.attitude_rad[2], [0.0; 3], &Tilt::new(0.0, 0.0), &mut on_body);
         }
         of_wheels - on_body[0]
     }
