@@ -44,6 +44,8 @@ pub struct Recipe {
     pub plan: TrainingPlan,
     /// Starts from the weights, scales and vehicle of this bundle instead of from nothing.
     pub start: Option<ModelBundle>,
+    /// With `start`: takes the data's vehicle and fits its drive line anew, instead of the bundle's vehicle.
+    pub recalibrate: bool,
     /// Output folder.
     pub out: PathBuf,
     /// Goes on where an interrupted run of the same command stopped.
@@ -86,9 +88,11 @@ pub fn run(
         (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
     };
     let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
+    let fitted = || calibrated(root.vehicle().clone(), &drives, &train_at, recipe.dt_s, reporter);
     let (vehicle, mut scales) = match &recipe.start {
+        Some(bundle) if recipe.recalibrate => (fitted().0, bundle.normalization.clone()),
         Some(bundle) => (bundle.vehicle.clone(), bundle.normalization.clone()),
-        None => calibrated(root.vehicle().clone(), &drives, &train_at, recipe.dt_s, reporter),
+        None => fitted(),
     };
 
     if recipe.mirror {

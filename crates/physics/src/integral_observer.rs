@@ -14,13 +14,17 @@ const SLOWEST_M_S: f64 = 0.3;
 const UNSATURATED: f64 = 0.9;
 /// Integral gain below which the integral says nothing, 1/s.
 const SMALLEST_GAIN_PER_S: f64 = 0.02;
+/// Power of the weight with which compaction resists: (2 n + 2) / (2 n + 1) of a rigid wheel (Bekker 1969; Wong, *Theory of Ground Vehicles*, ch. 2), for the
+/// n = 0.7 of a sandy loam (Wong's table); 1.35 to 1.5 over all but the stiffest of its soils.
+const COMPACTION_POWER: f64 = 1.42;
 
 impl StepModel {
     /// Actuators after a measured step from `before` to `after`, of which `advanced` is what commands and speeds made: the integral of the speed error is
     /// drawn towards the one that explains the motion, at the card's rate. Unchanged for a vehicle whose hubs no torque drives, and at rest.
     ///
     /// The force along the way, m (Δv/Δt + g Δz / (v Δt)) with what effects hold against it, asks for a torque beyond the usual resistance (that of the
-    /// held demand); the inverse of the torque's law gives the demand, less the part of the present error: the integral's.
+    /// held demand, for a heavier vehicle as compaction grows with the weight); the inverse of the torque's law gives the demand, less the part of the
+    /// present error: the integral's.
     pub fn observed_actuators(
         &self,
         advanced: &DrivelineState,
@@ -42,7 +46,8 @@ impl StepModel {
         let share = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let held = torque.holding_demand_m_s;
         let limit = line.overspeed_limit_m_s;
-        let usual_n_m = torque.torque_n_m(limited(held, limit), speed, share);
+        let heavier = (self.body.mass_kg / self.vehicle().mass_kg).powf(COMPACTION_POWER);
+        let usual_n_m = torque.torque_n_m(limited(held, limit), speed, share) * heavier;
         let Some(brought) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
         let demand = unlimited(brought.clamp(-UNSATURATED * limit, UNSATURATED * limit), limit);
         let error = advanced.told_speed_m_s(self.vehicle(), control) - speed;

@@ -11,7 +11,7 @@ use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
 use crate::terramechanics::{Support, WheelGeometry, WheelMotion, WheelWrench, balance_sinkage, wheel_wrench};
-use crate::torque_drive::Grip;
+use crate::torque_drive::{Driven, Grip};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -111,6 +111,16 @@ impl RigidBody {
     }
 }
 
+/// How a wheel stands on its ground: axes (ahead, left, normal) and the lever arm of the contact in Body, velocities, and what presses it down.
+#[derive(Clone, Copy, Debug)]
+struct Stance<T> {
+    axes: [Vec3<T>; 3],
+    lever: Vec3<T>,
+    forward_m_s: T,
+    left_m_s: T,
+    preload_n: T,
+}
+
 /// Contact of one wheel as the assembly needs it: axes, lever arm, forces and their rates.
 struct Contribution<T> {
     axes: [Vec3<T>; 3],
@@ -202,7 +212,10 @@ impl StepModel {
             }
         }
 
-        let contributions: [Contribution<T>; WHEELS] = core::array::from_fn(|i| self.wheel_contribution(i, state, &tilt, input));
+        let stances: [Stance<T>; WHEELS] = core::array::from_fn(|i| self.stance(i, state, &tilt, input));
+        let driven = self.driven(&stances.each_ref().map(|s| s.preload_n), &stances.each_ref().map(|s| s.forward_m_s), state, input);
+        let contributions: [Contribution<T>; WHEELS] =
+            core::array::from_fn(|i| self.wheel_contribution(i, &stances[i], driven.as_ref().map(|driven| &driven[i]), state, input));
         for wheel in &contributions {
             assemble(wheel, v, w, h, &mut lhs, &mut rhs);
         }
@@ -222,33 +235,52 @@ impl StepModel {
         contributions.map(|c| c.contact)
     }
 
-    /// Forces of one wheel and how they change with its velocity.
+    /// How a wheel stands on its ground, before it is known how it turns.
     #[inline(always)]
-    fn wheel_contribution<T: Real>(&self, i: usize, state: &VehicleState<T>, tilt: &Tilt<T>, input: &StepInput<T>) -> Contribution<T> {
+    fn stance<T: Real>(&self, i: usize, state: &VehicleState<T>, tilt: &Tilt<T>, input: &StepInput<T>) -> Stance<T> {
         let one = T::lit(1.0);
         let centre = self.vehicle.wheel_centre_m[i].map(T::lit);
         let velocity = add(state.velocity_m_s, cross(state.angular_velocity_rad_s, centre));
         let normal = tilt.to_body(normalise([-input.ground[i].slope_ahead, -input.ground[i].slope_left, one]));
-        let wheel = self.wheel_at(i);
         let (sin, cos) = if self.altered.on_wheels { self.yielding_angle(i, state, input) } else { input.wheels.angle_rad[i] }.sin_cos();
         let heading = [cos, sin, T::lit(0.0)];
         let forward = normalise(add(heading, scale(normal, -dot(heading, normal))));
         let left = cross(normal, forward);
 
         let distance = self.distance(i, state, tilt, input);
-        let (forward_m_s, left_m_s) = (dot(velocity, forward), dot(velocity, left));
+        let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
+        let closing = -dot(velocity, normal);
+        let mut preload_n = T::lit(self.static_load_n[i]) + rate * (T::lit(self.wheel_at(i).radius_m) - distance) + damper * closing;
+        if self.altered.on_wheels {
+            preload_n = preload_n + self.stabiliser_n(i, state, tilt, input);
+        }
+        Stance {
+            axes: [forward, left, normal],
+            lever: add(centre, scale(normal, -distance)),
+            forward_m_s: dot(velocity, forward),
+            left_m_s: dot(velocity, left),
+            preload_n,
+        }
+    }
+
+    /// Forces of one wheel and how they change with its velocity.
+    #[inline(always)]
+    fn wheel_contribution<T: Real>(
+        &self,
+        i: usize,
+        stance: &Stance<T>,
+        driven: Option<&Driven<T>>,
+        state: &VehicleState<T>,
+        input: &StepInput<T>,
+    ) -> Contribution<T> {
+        let wheel = self.wheel_at(i);
+        let Stance { axes, lever, forward_m_s, left_m_s, preload_n: preload } = *stance;
         let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
         let mut ratio = input.sinkage_log_ratio[i].exp();
-        let closing = -dot(velocity, normal);
-        let mut preload = T::lit(self.static_load_n[i]) + rate * (T::lit(wheel.radius_m) - distance) + damper * closing;
-        if self.altered.on_wheels {
-            preload = preload + self.stabiliser_n(i, state, tilt, input);
-        }
-        let driven = self.driven(i, preload, forward_m_s, state, input);
-        let rim_speed_m_s = match (&driven, self.altered.on_wheels) {
+        let rim_speed_m_s = match (driven, self.altered.on_wheels) {
             (Some(driven), _) => input.wheels.servo_m_s(i) + input.wheels.rim_follow * (forward_m_s + driven.overspeed_m_s),
             (None, false) => input.wheels.rim_speed_m_s(i, forward_m_s, state.velocity_m_s[0]),
-            (None, true) => self.altered_rim_speed(i, state, forward, input),
+            (None, true) => self.altered_rim_speed(i, state, axes[0], input),
         };
         let wheel_motion = WheelMotion { rim_speed_m_s, forward_m_s, left_m_s };
         let (direction, motion) = wheel_motion.contact();
@@ -266,7 +298,7 @@ impl StepModel {
         let soil_rate = (soil.n + T::lit(0.5)) * load / balanced;
         let in_series = soil_rate / (soil_rate + rate);
         let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
-        if let Some(driven) = &driven {
+        if let Some(driven) = driven {
             let grip = Grip::new(wheel, sinkage, load, &soil);
             let taken = wrench.torque_n_m * share * direction * T::lit(1.0 / wheel.radius_m);
             let more = grip.carried_on_n(driven.at_rim_n, taken, wrench.thrust_n * share * direction);
@@ -277,8 +309,8 @@ impl StepModel {
             self.alter_traction(i, &wheel_motion, &motion, &soil, share, &mut drag, &mut contact);
         }
         Contribution {
-            axes: [forward, left, normal],
-            lever: add(centre, scale(normal, -distance)),
+            axes,
+            lever,
             force: [contact.forward_n, contact.left_n, load],
             damping: [drag[0], drag[1], damper * in_series],
             stiffness_n_m: rate * in_series,

@@ -13,6 +13,8 @@ use crate::vehicle::WHEELS;
 
 /// Largest share of the shear strength that the guess mobilises (chosen: beyond it the wheel spins and traction control works).
 const MOBILISED_MAX: f64 = 0.95;
+/// The same where couplings are asked, first and again: what they hand over keeps most wheels from spinning (chosen).
+const MOBILISED: [f64; 2] = [0.7, MOBILISED_MAX];
 /// Largest over-speed, m/s (chosen: middle of the range in which traction control closes the throttle of the simulated vehicle).
 const OVERSPEED_MAX_M_S: f64 = 2.5;
 /// Range of slips of the guess: s = (rim - ground) / rim.
@@ -20,7 +22,7 @@ const SLIP_RANGE: [f64; 2] = [-3.0, 0.6];
 /// Ground speed around which directions turn, m/s (as for slip).
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// Coupling of a locked differential, N m s/rad (chosen: ten times a viscous one).
-const LOCKED_N_M_S: f64 = 2500.0;
+const LOCKED_N_M_S: f64 = 5000.0;
 /// Smallest contact length, m.
 const LENGTH_FLOOR_M: f64 = 5e-3;
 
@@ -58,21 +60,29 @@ impl<T: Real> Grip<T> {
         }
     }
 
-    /// Slip s = (rim - ground) / rim at which the contact takes a torque given as force at the rim (N), and the slope of that force over the slip, N.
+    /// How the rim turns whose contact takes a torque, given as force at the rim (N), on ground that passes under it at `ground_m_s`.
     ///
     /// Inverts the mean of Janosi's law over a contact of linearly growing displacement, u = 1 - (1 - e^-a) / a with a = s L / K, by a = u (2 - u) / (1 - u)
-    /// (within 6 %).
+    /// (within 6 %). Of the strength, `mobilised_max` is used at most.
     #[inline(always)]
-    fn slip(&self, driven_n: T, direction: T, soil: &Soil<T>) -> (T, T) {
+    fn rim(&self, driven_n: T, ground_m_s: T, mobilised_max: f64, soil: &Soil<T>) -> Rim<T> {
         let one = T::lit(1.0);
-        let shear_n = driven_n * direction - self.compaction_n * direction.sqr();
-        let share = (shear_n / self.limit_n).min(T::lit(MOBILISED_MAX)).max(T::lit(-MOBILISED_MAX));
+        let size = ground_m_s.abs_smooth(SPEED_FLOOR_M_S);
+        let direction = ground_m_s / size;
+        let compaction = self.compaction_n * direction.sqr();
+        let share = ((driven_n * direction - compaction) / self.limit_n).min(T::lit(mobilised_max)).max(T::lit(-mobilised_max));
         let used = share.abs_smooth(1e-6);
         let free = one - used;
         let per_stretch = soil.k_shear / self.length_m;
         let slip = share * (T::lit(2.0) - used) / free * per_stretch + self.neutral_slip;
+        let slip = slip.min(T::lit(SLIP_RANGE[1])).max(T::lit(SLIP_RANGE[0]));
         let slope = self.limit_n * free.sqr() / ((one + free.sqr()) * per_stretch);
-        (slip.min(T::lit(SLIP_RANGE[1])).max(T::lit(SLIP_RANGE[0])), slope)
+        let over = direction * slip * size / (one - slip);
+        Rim {
+            overspeed_m_s: over.min(T::lit(OVERSPEED_MAX_M_S)).max(T::lit(-OVERSPEED_MAX_M_S)),
+            taken_n: (share * self.limit_n + compaction) * direction,
+            slope_n_s_m: slope * (one - slip).sqr() / size,
+        }
     }
 
     /// What is to be added to the shear force found at the guess so that the contact takes the torque, N, within the strength of the soil.
@@ -82,6 +92,30 @@ impl<T: Real> Grip<T> {
         let top = self.limit_n;
         wanted.min(top).max(-top) - thrust_n
     }
+}
+
+/// A point of the curve of the force that a contact takes at the rim over the speed of the rim over the ground.
+#[derive(Clone, Copy, Debug)]
+struct Rim<T> {
+    overspeed_m_s: T,
+    /// Force at the rim that the contact takes there: the one that was asked for as far as it is below the strength, N.
+    taken_n: T,
+    slope_n_s_m: T,
+}
+
+/// Forces at the rims that couplings hand from faster wheels to slower ones, N: C times what a rim's speed is above the mean of all, C = `coupling_n_s_m`.
+///
+/// Each rim follows its ground and, by the slope of its traction, the force that it is handed: p_i = -C (u_i - ū) with u_i = v_i + o_i + p_i / k_i, of which
+/// one point each is known. Linear in p; the sum of all is 0.
+#[inline(always)]
+fn handed_over<T: Real>(coupling_n_s_m: f64, driven_n: &[T; WHEELS], ground_m_s: &[T; WHEELS], rims: &[Rim<T>; WHEELS]) -> [T; WHEELS] {
+    let sum = |of: &dyn Fn(usize) -> T| (1..WHEELS).fold(of(0), |sum, i| sum + of(i));
+    let coupling = T::lit(coupling_n_s_m);
+    let alone: [T; WHEELS] =
+        core::array::from_fn(|i| ground_m_s[i] + rims[i].overspeed_m_s + (driven_n[i] - rims[i].taken_n) / rims[i].slope_n_s_m);
+    let weight: [T; WHEELS] = core::array::from_fn(|i| rims[i].slope_n_s_m / (rims[i].slope_n_s_m + coupling));
+    let mean = sum(&|i| weight[i] * alone[i]) / sum(&|i| weight[i]);
+    core::array::from_fn(|i| coupling * weight[i] * (mean - alone[i]))
 }
 
 /// A wheel under torque, as the step needs it.
@@ -96,48 +130,94 @@ pub(crate) struct Driven<T> {
 }
 
 impl StepModel {
-    /// What drives wheel `i`, which passes over the ground at `forward_m_s` under a support of `preload_n`, if torque drives this vehicle: a quarter of what
-    /// the speed control asks for through open differentials, and what their couplings hand from faster wheels to slower ones; friction of the wheel
-    /// itself takes its part. Neglects couplings between over-speeds (they are small against the slope of traction) but for that friction.
+    /// What drives the wheels, which pass over the ground at `forward_m_s` under supports of `preload_n`, if torque drives this vehicle: a quarter each of
+    /// what the speed control asks for through open differentials, less the friction of the wheel itself, and what couplings hand from faster wheels to
+    /// slower ones, sides and axles alike.
     #[inline(always)]
     pub(crate) fn driven<T: Real>(
         &self,
-        i: usize,
-        preload_n: T,
-        forward_m_s: T,
+        preload_n: &[T; WHEELS],
+        forward_m_s: &[T; WHEELS],
         state: &VehicleState<T>,
         input: &StepInput<T>,
-    ) -> Option<Driven<T>> {
+    ) -> Option<[Driven<T>; WHEELS]> {
         let line = &self.vehicle.driveline;
         let drive = line.torque.as_ref()?;
-        let wheel = self.wheel_at(i);
-        let radius = wheel.radius_m;
-        let each = T::lit(1.0 / (WHEELS as f64 * radius));
-        // A lock is a coupling that leaves no difference: stiff against every soil.
-        let coupling = (line.side_coupling_n_m_s + self.vehicle.effects.actuator.lock * LOCKED_N_M_S) / (radius * radius);
+        let actuator = &self.vehicle.effects.actuator;
         let speed = state.velocity_m_s[0];
-        let demand = input.wheels.demand_m_s(i, speed);
-        let mut at_rim_n = drive.torque_n_m(demand, speed, 1.0 - self.vehicle.effects.actuator.torque_lost) * each
-            - T::lit(coupling) * (forward_m_s - speed);
+        let each: [T; WHEELS] = core::array::from_fn(|i| T::lit(1.0 / (WHEELS as f64 * self.wheel_at(i).radius_m)));
+        let grips: [Grip<T>; WHEELS] = core::array::from_fn(|i| self.grip(i, preload_n[i], &input.soil));
+        let alone_n: [T; WHEELS] = core::array::from_fn(|i| {
+            let driven_n = drive.torque_n_m(input.wheels.demand_m_s(i, speed), speed, 1.0 - actuator.torque_lost) * each[i];
+            let braked_n = self.vehicle.effects.force.wheel_drag_n_m[i] / self.wheel_at(i).radius_m;
+            driven_n - forward_m_s[i] / forward_m_s[i].abs_smooth(SPEED_FLOOR_M_S) * T::lit(braked_n)
+        });
+        // A lock is a coupling that leaves no difference: stiff against every soil.
+        let coupling_n_m_s = 2.0 * line.side_coupling_n_m_s + actuator.lock * LOCKED_N_M_S;
+        let coupling_n_s_m = coupling_n_m_s / (self.wheel.radius_m * self.wheel.radius_m);
+        let mut at_rim_n = alone_n;
+        for mobilised in MOBILISED.into_iter().filter(|_| coupling_n_s_m != 0.0) {
+            let rims = core::array::from_fn(|i| grips[i].rim(at_rim_n[i], forward_m_s[i], mobilised, &input.soil));
+            let handed = handed_over(coupling_n_s_m, &alone_n, forward_m_s, &rims);
+            at_rim_n = core::array::from_fn(|i| alone_n[i] + handed[i]);
+        }
+        Some(core::array::from_fn(|i| Driven {
+            at_rim_n: at_rim_n[i],
+            damping_n_s_m: input.wheels.rim_gain * each[i] * T::lit(drive.per_demand_n_m_s_m),
+            overspeed_m_s: grips[i].rim(at_rim_n[i], forward_m_s[i], MOBILISED_MAX, &input.soil).overspeed_m_s,
+        }))
+    }
 
+    /// What the contact of a wheel under a support can hold, by the sinkage that carries the load at rest.
+    #[inline(always)]
+    fn grip<T: Real>(&self, i: usize, preload_n: T, soil: &Soil<T>) -> Grip<T> {
+        let wheel = self.wheel_at(i);
         let pressed = preload_n.relu_smooth(1.0);
-        let alone = bekker_sinkage(pressed, radius, wheel.width_m, &input.soil);
+        let alone = bekker_sinkage(pressed, wheel.radius_m, wheel.width_m, soil);
         let rate = T::lit(self.vehicle.suspension_n_m[i]);
         let sinkage = alone * pressed / (pressed + rate * alone);
-        let load = (preload_n - rate * sinkage).relu_smooth(1.0);
-        let grip = Grip::new(wheel, sinkage, load, &input.soil);
-        let size = forward_m_s.abs_smooth(SPEED_FLOOR_M_S);
-        let direction = forward_m_s / size;
-        if self.vehicle.effects.force.wheel_drag_n_m.iter().any(|drag| *drag != 0.0) {
-            let slope = grip.slip(at_rim_n, direction, &input.soil).1 / size;
-            at_rim_n = at_rim_n - direction * self.vehicle.drag_at_tread_n_m(i, slope) * T::lit(1.0 / radius);
+        Grip::new(wheel, sinkage, (preload_n - rate * sinkage).relu_smooth(1.0), soil)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn grip(load_n: f64, soil: &Soil<f64>) -> Grip<f64> {
+        let wheel = WheelGeometry::new(0.467, 0.254).with_law(ContactLaw::SoilContactModel);
+        Grip::new(&wheel, bekker_sinkage(load_n, 0.467, 0.254, soil), load_n, soil)
+    }
+
+    #[test]
+    fn analytic_what_is_handed_over_is_what_the_rims_it_leads_to_ask_for() {
+        let loam = Soil { k_phi: 1515.04e3, k_c: 5.27e3, n: 0.7, c: 1.72e3, phi: 0.506, k_shear: 0.025 };
+        let firm = Soil { k_phi: 1.2e7, k_c: 1e5, n: 1.0, c: 2e4, phi: 0.6, k_shear: 0.005 };
+        // Forces before the couplings and speeds of the ground: a turn, a dragging wheel, and an axle that gets more.
+        let cases = [
+            ([2400.0; WHEELS], [2.05, 2.4, 1.8, 2.2]),
+            ([2400.0, 2400.0, 2400.0, 500.0], [2.0; WHEELS]),
+            ([4000.0, 1000.0, 2400.0, 2000.0], [2.0; WHEELS]),
+        ];
+        for (soil, coupling_n_s_m, (alone_n, ground_m_s)) in
+            [(&loam, 1000.0), (&firm, 2000.0)].into_iter().flat_map(|(soil, c)| cases.map(|case| (soil, c, case)))
+        {
+            let grips = [6400.0, 6400.0, 4000.0, 8000.0].map(|load_n| grip(load_n, soil));
+            let mut handed = [0.0; WHEELS];
+            let rims = |handed: &[f64; WHEELS], mobilised: f64| -> [Rim<f64>; WHEELS] {
+                core::array::from_fn(|i| grips[i].rim(alone_n[i] + handed[i], ground_m_s[i], mobilised, soil))
+            };
+            for mobilised in MOBILISED {
+                handed = handed_over(coupling_n_s_m, &alone_n, &ground_m_s, &rims(&handed, mobilised));
+            }
+            assert!(handed.iter().sum::<f64>().abs() < 1e-6, "{handed:?}");
+            let turning = rims(&handed, MOBILISED_MAX);
+            let rim_m_s: [f64; WHEELS] = core::array::from_fn(|i| ground_m_s[i] + turning[i].overspeed_m_s);
+            let mean = rim_m_s.iter().sum::<f64>() / WHEELS as f64;
+            for (i, got) in handed.iter().enumerate() {
+                let want = coupling_n_s_m * (mean - rim_m_s[i]);
+                assert!((got - want).abs() < 30.0, "wheel {i}: {got} N, its rim asks for {want} N, {soil:?}, {alone_n:?}");
+            }
         }
-        let slip = grip.slip(at_rim_n, direction, &input.soil).0;
-        let over = direction * slip * size / (T::lit(1.0) - slip);
-        Some(Driven {
-            at_rim_n,
-            damping_n_s_m: input.wheels.rim_gain * each * T::lit(drive.per_demand_n_m_s_m) + T::lit(coupling),
-            overspeed_m_s: over.min(T::lit(OVERSPEED_MAX_M_S)).max(T::lit(-OVERSPEED_MAX_M_S)),
-        })
     }
 }

@@ -49,7 +49,8 @@ pub struct Driveline {
     pub overspeed_limit_m_s: f64,
     /// Servo of the rims; of a skid-steer vehicle only.
     pub rims: RimServo,
-    /// Torque that the coupling between the wheels of an axle passes per difference of their speeds, N m s/rad; 0 = open differential.
+    /// Torque that the coupling between the wheels of an axle passes per difference of their speeds, N m s/rad; 0 = open differential. Under torque the
+    /// axles are coupled alike.
     pub side_coupling_n_m_s: f64,
     /// Engine and brakes of a car whose hubs are driven by a torque; `None` = the rims are held at the demanded over-speed.
     pub torque: Option<TorqueDrive>,

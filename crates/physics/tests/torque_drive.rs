@@ -97,7 +97,7 @@ fn analytic_friction_at_a_wheel_slows_by_its_torque_and_turns() {
 
 #[test]
 fn analytic_couplings_resist_a_turn_by_their_moment() {
-    // Wheels of a turn at yaw rate r differ by r y in speed; the coupling takes c / R² of it at each, a moment of c / R² r Σ y² about the vertical.
+    // Rims of a turn differ; what the coupling passes, k per difference of speeds, is 2 k / R² times the difference of the rims between the forces of both.
     let open = constant_torque(0.6);
     let mut coupled = open.clone();
     coupled.driveline.side_coupling_n_m_s = 220.0;
@@ -106,14 +106,36 @@ fn analytic_couplings_resist_a_turn_by_their_moment() {
         drive.model = nesam_physics::step::StepModel::new(vehicle, 0.001, 1);
         let rate = drive.state.angular_velocity_rad_s[2];
         let step = drive.step(2.5, 0.4);
-        (step.contacts.map(|c| c.forward_n), rate)
+        let rims: [f64; 4] = core::array::from_fn(|i| step.contacts[i].overspeed_m_s - rate * open.wheel_centre_m[i][1]);
+        [2, 3].map(|rear| (step.contacts[rear].forward_n, rims[rear]))
     };
-    let ((without, rate), (with, _)) = (forces(&open), forces(&coupled));
-    for wheel in [2, 3] {
-        let y = open.wheel_centre_m[wheel][1];
-        let want = 220.0 / (open.wheel_radius_m * open.wheel_radius_m) * rate * y;
-        let got = with[wheel] - without[wheel];
-        assert!((got - want).abs() < 0.1 * want.abs(), "rear wheel {wheel}: {got} N, coupling gives {want} N at {rate} rad/s");
+    let (without, with) = (forces(&open), forces(&coupled));
+    let resisted_n = (with[0].0 - without[0].0) - (with[1].0 - without[1].0);
+    let want = 2.0 * 220.0 / (open.wheel_radius_m * open.wheel_radius_m) * (with[1].1 - with[0].1);
+    assert!(want > 300.0 && (resisted_n / want - 1.0).abs() < 0.05, "{resisted_n} N, coupling gives {want} N: {with:?}");
+}
+
+#[test]
+fn analytic_couplings_hand_torque_from_rims_that_turn_faster() {
+    // Straight ahead with a dragging wheel and soft ground: over-speeds differ, and each hub takes T / 4 - drag - 2 k (ω - ω̄) to its contact.
+    for (coupling, soil) in [(250.0, firm()), (250.0, common::loam()), (2500.0, common::loam())] {
+        let mut car = constant_torque(1.0);
+        car.driveline.side_coupling_n_m_s = coupling;
+        let drag = Effect::WheelDrag(WheelDrag { wheel: 3, torque_n_m: 600.0 });
+        let car = car.with_effects(&[drag]);
+        let (drive, step, _) = driven(car.clone(), soil, 2.0, 1, 0.0);
+        let radius = car.wheel_radius_m;
+        let side = |i: usize| drive.state.angular_velocity_rad_s[2] * car.wheel_centre_m[i][1];
+        let rim: [f64; 4] = core::array::from_fn(|i| drive.state.velocity_m_s[0] - side(i) + step.contacts[i].overspeed_m_s);
+        let mean = rim.iter().sum::<f64>() / 4.0;
+        for (i, contact) in step.contacts.iter().enumerate() {
+            let at_rim_n = contact.forward_n + compaction_n(&car, &soil, contact.sinkage_m);
+            let own_n = 4570.0 / 4.0 / radius - if i == 3 { 600.0 / radius } else { 0.0 };
+            let handed_n = -2.0 * coupling / (radius * radius) * (rim[i] - mean);
+            assert!((at_rim_n - own_n - handed_n).abs() < 120.0, "{coupling}, wheel {i}: {at_rim_n} N of {own_n} and {handed_n}");
+        }
+        let handed = 600.0 / radius - (step.contacts[2].forward_n - step.contacts[3].forward_n);
+        assert!(handed > 100.0, "the dragged wheel is helped by its partner: {handed} N");
     }
 }
 

@@ -69,6 +69,9 @@ pub struct TrainArgs {
     /// Start from the weights, scales and vehicle of this bundle (same model, no effects) instead of from nothing
     #[arg(long, value_name = "BUNDLE")]
     from: Option<PathBuf>,
+    /// Fit the drive line anew on these drives instead of taking the bundle's vehicle: after the physics or the card has changed
+    #[arg(long, requires = "from")]
+    recalibrate: bool,
     /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right
     #[arg(long)]
     no_mirror: bool,
@@ -212,6 +215,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             folder: out.join("checkpoint"),
         },
         start,
+        recalibrate: args.recalibrate,
         out: out.clone(),
         resume: args.resume,
         command: command_line(),
