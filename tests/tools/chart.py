@@ -5,7 +5,7 @@ Goal: what Kubernetes, HAProxy, Envoy and the server are given is valid, and fit
 every manifest is held to the schemas of the oldest Kubernetes that the chart allows and of the newest one known, strictly; names, ports, labels and rights are
 followed from one manifest to the next, and the network policies are asked who reaches whom; nesam.toml may have the keys of deploy/config/default.toml only;
 `envoy --mode validate` and, where it is installed, `haproxy -c` read their files. Values that make no sense have to be refused. Nothing is started.
-What it needs is installed into target/chart, for which a Python of at least 3.10 is looked for. --print shows what is rendered.
+What it needs is installed into target/chart, for which a Python of at least 3.10 is looked for; 2 = it cannot be had here. --print shows what is rendered.
 """
 
 import os
@@ -65,16 +65,23 @@ def enough(python):
     return subprocess.run([python, "-c", "import sys; sys.exit(sys.version_info < (3, 10))"], check=False).returncode == 0
 
 
+def lacking(what):
+    print(f"chart.py: nothing was checked, this cannot be had here: {what}", file=sys.stderr)
+    sys.exit(2)
+
+
 def inside(folder):
     """Goes on in a virtual environment that has what is needed."""
     python, done = folder / "bin/python", folder / "installed"
     if not python.exists():
         base = next((p for p in [sys.executable, *map(shutil.which, ("python3.13", "python3.12", "python3.11", "python3.10"))] if p and enough(p)), None)
         if not base:
-            sys.exit("chart.py: Helm's library needs a Python of at least 3.10, and there is none")
-        subprocess.run([base, "-m", "venv", str(folder)], check=True)
+            lacking("a Python of at least 3.10, which Helm's library needs")
+        if subprocess.run([base, "-m", "venv", str(folder)], check=False).returncode:
+            lacking(f"a virtual environment of {base}")
     if not done.exists() or done.read_text() != "\n".join(NEEDS):
-        subprocess.run([str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *NEEDS], check=True)
+        if subprocess.run([str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", *NEEDS], check=False).returncode:
+            lacking(" ".join(NEEDS))
         done.write_text("\n".join(NEEDS))
     os.execv(str(python), [str(python), __file__, *sys.argv[1:]])
 
