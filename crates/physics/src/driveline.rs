@@ -192,9 +192,6 @@ pub(crate) fn unlimited(limited_m_s: f64, limit_m_s: f64) -> f64 {
     limited_m_s / (1.0 - (limited_m_s / limit_m_s).powi(2)).sqrt()
 }
 
-/// Speed command around which the held demand turns its direction, m/s (chosen: a command of zero holds nothing).
-const HOLDING_SPEED_M_S: f64 = 0.1;
-
 /// What the wheels are told during one step; constants of the step (no derivative flows through the actuators).
 #[derive(Clone, Copy, Debug)]
 pub struct WheelCommand<T> {
@@ -278,7 +275,7 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let mut base = [T::lit(line.speed_integral_gain_per_s) * before.speed_error_integral_m; WHEELS];
     if let Some(torque) = &line.torque {
-        let held = T::lit(torque.holding_demand_m_s) * control.speed_m_s / control.speed_m_s.abs_smooth(HOLDING_SPEED_M_S);
+        let held = torque.held_m_s(control.speed_m_s);
         base = base.map(|b| b + held);
     }
     if skid {

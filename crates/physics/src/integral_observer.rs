@@ -44,14 +44,13 @@ impl StepModel {
         let acceleration = (speed_after - speed_before) / dt_s + self.vehicle().gravity_m_s2 * climb;
         let force_n = self.body.mass_kg * acceleration + self.lasting_resistance_n(before, speed);
         let share = 1.0 - self.vehicle().effects.actuator.torque_lost;
-        let held = torque.holding_demand_m_s;
         let limit = line.overspeed_limit_m_s;
         let heavier = (self.body.mass_kg / self.vehicle().mass_kg).powf(COMPACTION_POWER);
-        let usual_n_m = torque.torque_n_m(limited(held, limit), speed, share) * heavier;
+        let usual_n_m = torque.torque_n_m(limited(torque.holding_demand_m_s, limit), speed, share) * heavier;
         let Some(brought) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
         let demand = unlimited(brought.clamp(-UNSATURATED * limit, UNSATURATED * limit), limit);
-        let error = advanced.told_speed_m_s(self.vehicle(), control) - speed;
-        let integral = (demand - held - line.speed_gain * error) / line.speed_integral_gain_per_s;
+        let told = advanced.told_speed_m_s(self.vehicle(), control);
+        let integral = (demand - torque.held_m_s(control.speed_m_s) - line.speed_gain * (told - speed)) / line.speed_integral_gain_per_s;
         let integral = integral.clamp(-line.speed_integral_limit_m, line.speed_integral_limit_m);
         let rate = (torque.integral_observer_per_s * dt_s).min(1.0);
         let kept = advanced.speed_error_integral_m;

@@ -23,6 +23,8 @@ const SLIP_RANGE: [f64; 2] = [-3.0, 0.6];
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// Coupling of a locked differential, N m s/rad (chosen: ten times a viscous one).
 const LOCKED_N_M_S: f64 = 5000.0;
+/// What presses a wheel in the air, N: its share in a load of nothing would be 0 / 0 in f32.
+const LEAST_PRELOAD_N: f64 = 0.01;
 /// Smallest contact length, m.
 const LENGTH_FLOOR_M: f64 = 5e-3;
 
@@ -105,17 +107,18 @@ struct Rim<T> {
 
 /// Forces at the rims that couplings hand from faster wheels to slower ones, N: C times what a rim's speed is above the mean of all, C = `coupling_n_s_m`.
 ///
-/// Each rim follows its ground and, by the slope of its traction, the force that it is handed: p_i = -C (u_i - ū) with u_i = v_i + o_i + p_i / k_i, of which
-/// one point each is known. Linear in p; the sum of all is 0.
+/// Each rim follows its ground and, by the slope of its traction, the force that it is handed: p_i = -C (u_i - ū) with u_i = v_i + o_i + (f_i + p_i - t_i) / k_i
+/// from the point (o_i, t_i) of its curve and the force f_i alone. Linear in p; the sum of all is 0. Nothing is divided by a slope, which is next to nothing
+/// for a wheel in the air.
 #[inline(always)]
 fn handed_over<T: Real>(coupling_n_s_m: f64, driven_n: &[T; WHEELS], ground_m_s: &[T; WHEELS], rims: &[Rim<T>; WHEELS]) -> [T; WHEELS] {
     let sum = |of: &dyn Fn(usize) -> T| (1..WHEELS).fold(of(0), |sum, i| sum + of(i));
     let coupling = T::lit(coupling_n_s_m);
-    let alone: [T; WHEELS] =
-        core::array::from_fn(|i| ground_m_s[i] + rims[i].overspeed_m_s + (driven_n[i] - rims[i].taken_n) / rims[i].slope_n_s_m);
-    let weight: [T; WHEELS] = core::array::from_fn(|i| rims[i].slope_n_s_m / (rims[i].slope_n_s_m + coupling));
-    let mean = sum(&|i| weight[i] * alone[i]) / sum(&|i| weight[i]);
-    core::array::from_fn(|i| coupling * weight[i] * (mean - alone[i]))
+    let share: [T; WHEELS] = core::array::from_fn(|i| T::lit(1.0) / (rims[i].slope_n_s_m + coupling));
+    let turning: [T; WHEELS] = core::array::from_fn(|i| ground_m_s[i] + rims[i].overspeed_m_s);
+    let untaken: [T; WHEELS] = core::array::from_fn(|i| driven_n[i] - rims[i].taken_n);
+    let mean = sum(&|i| share[i] * (rims[i].slope_n_s_m * turning[i] + untaken[i])) / sum(&|i| share[i] * rims[i].slope_n_s_m);
+    core::array::from_fn(|i| coupling * share[i] * (rims[i].slope_n_s_m * (mean - turning[i]) - untaken[i]))
 }
 
 /// A wheel under torque, as the step needs it.
@@ -172,7 +175,7 @@ impl StepModel {
     #[inline(always)]
     fn grip<T: Real>(&self, i: usize, preload_n: T, soil: &Soil<T>) -> Grip<T> {
         let wheel = self.wheel_at(i);
-        let pressed = preload_n.relu_smooth(1.0);
+        let pressed = preload_n.relu_smooth(1.0) + T::lit(LEAST_PRELOAD_N);
         let alone = bekker_sinkage(pressed, wheel.radius_m, wheel.width_m, soil);
         let rate = T::lit(self.vehicle.suspension_n_m[i]);
         let sinkage = alone * pressed / (pressed + rate * alone);

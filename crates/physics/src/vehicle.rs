@@ -90,6 +90,12 @@ impl TorqueDrive {
             - direction * T::lit(self.closed_n_m)
     }
 
+    /// Demand that holds the usual resistance under a speed command (m/s), m/s.
+    #[inline(always)]
+    pub fn held_m_s<T: Real>(&self, command_m_s: T) -> T {
+        T::lit(self.holding_demand_m_s) * command_m_s / command_m_s.abs_smooth(HOLDING_SPEED_M_S)
+    }
+
     /// The demand (m/s) that brings a torque at all wheels together (N m) at a speed above rest (m/s); `None` where no demand brings it.
     pub fn demand_m_s(&self, torque_n_m: f64, speed_m_s: f64, share: f64) -> Option<f64> {
         let opened = torque_n_m + speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S) * self.closed_n_m;
@@ -112,6 +118,8 @@ impl TorqueDrive {
 
 /// Speed around which the drag of the engine turns its direction, m/s (chosen).
 const CLOSED_SPEED_M_S: f64 = 0.1;
+/// Speed command around which the held demand turns its direction, m/s (chosen: a command of zero holds nothing).
+const HOLDING_SPEED_M_S: f64 = 0.1;
 
 /// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then two equal lags in series, for the mean rim speed and for
 /// the turning of the rims (their difference over the track) apart.

@@ -24,8 +24,13 @@ fn observed(rate_per_s: f64) -> Vehicle {
 /// The integral at which an observer settles that sees this change of speed (m/s²) and climb (m/m) again and again, under a command of `SPEED_M_S` at that
 /// speed.
 fn settled(vehicle: &Vehicle, acceleration_m_s2: f64, climb: f64) -> f64 {
+    settled_under(vehicle, SPEED_M_S, acceleration_m_s2, climb)
+}
+
+/// The same under any command.
+fn settled_under(vehicle: &Vehicle, command_m_s: f64, acceleration_m_s2: f64, climb: f64) -> f64 {
     let model = StepModel::new(vehicle, DT_S, 2);
-    let control = Control { speed_m_s: SPEED_M_S, second: 0.0 };
+    let control = Control { speed_m_s: command_m_s, second: 0.0 };
     let half = 0.5 * acceleration_m_s2 * DT_S;
     let at = |height_m: f64, speed: f64| VehicleState {
         position_m: [0.0, 0.0, height_m],
@@ -68,6 +73,17 @@ fn analytic_the_integral_brings_the_force_that_was_seen() {
         let (got, want) = (settled(&car.with_effects(&effects), acceleration, climb), needed(&car, force_n));
         assert!((got - want).abs() < 2e-3, "{name}: {got} m, {want} m");
     }
+}
+
+#[test]
+fn analytic_who_is_told_to_stand_holds_nothing() {
+    // A car that rolls on at its speed although it is told to stand: its integral brings what is held otherwise, and takes what the error asks for.
+    let car = observed(RATE_PER_S);
+    let torque = car.driveline.torque.expect("this car's hubs are under torque");
+    let want = (torque.holding_demand_m_s + car.driveline.speed_gain * SPEED_M_S) / car.driveline.speed_integral_gain_per_s;
+    let wide = Vehicle { driveline: nesam_physics::Driveline { speed_integral_limit_m: 100.0, ..car.driveline.clone() }, ..car };
+    let got = settled_under(&wide, 0.0, 0.0, 0.0);
+    assert!((got - want).abs() < 2e-3, "{got} m, {want} m");
 }
 
 #[test]
