@@ -20,7 +20,7 @@ def main() -> int:
     """Runs the check."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nesam", required=True, help="the nesam binary")
-    parser.add_argument("--bundle", type=Path, default=REPOSITORY / "deploy/bundles/hmmwv-nominal")
+    parser.add_argument("--bundle", type=Path, default=REPOSITORY / "deploy/candidates/hmmwv-nominal-overspeed")
     parser.add_argument("--set", default="nominal", help="set of the repository's sample")
     parser.add_argument("--trajectory", help="drive [default: the first of the test split]")
     parser.add_argument("--row", type=int, default=120, help="row of the drive to start from, at least 31")

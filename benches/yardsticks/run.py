@@ -35,7 +35,7 @@ def arguments() -> argparse.Namespace:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--nesam", required=True, help="the nesam binary")
-    parser.add_argument("--bundle", type=Path, default=REPOSITORY / "deploy/bundles/hmmwv-nominal")
+    parser.add_argument("--bundle", type=Path, default=REPOSITORY / "deploy/candidates/hmmwv-nominal-overspeed")
     parser.add_argument("--data", type=Path, default=REPOSITORY / "tests/data/chrono_sample", help="data root with the drive and its map")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--steps", type=int, default=4, help="steps of 32 that the peers with both encoders at every pose are timed for, then scaled")
