@@ -91,7 +91,9 @@ finish_server() {
 
 failed=no
 start_server "$@"
-timeout 300 "$build/client_test" "$address" || failed=yes
+for test in client_test extras_test streams_test; do
+  timeout 300 "$build/$test" "$address" || failed=yes
+done
 timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
 finish_server
 

@@ -36,58 +36,14 @@ void set(v1::Vector3* message, const std::array<double, 3>& vector) {
   message->set_z(vector[2]);
 }
 
-void set(v1::VehicleState* message, const VehicleState& state) {
-  set(message->mutable_position_m(), state.position_m);
-  set(message->mutable_attitude_rad(), state.attitude_rad);
-  set(message->mutable_velocity_m_s(), state.velocity_m_s);
-  set(message->mutable_angular_velocity_rad_s(), state.angular_velocity_rad_s);
-}
-
-void set(v1::CandidateDrawing* message, const CandidateDrawing& drawing) {
-  pack(drawing.nominal, *message->mutable_nominal());
-  message->set_speed_sd_m_s(drawing.speed_sd_m_s);
-  message->set_second_sd(drawing.second_sd);
-  message->set_correlation(drawing.correlation);
-  message->set_seed(drawing.seed);
-}
-
-void set(v1::PathCost* message, const PathCost& cost) {
-  pack(cost.path_m, *message->mutable_path());
-  message->set_speed_m_s(cost.speed_m_s);
-  message->set_path_weight(cost.path_weight);
-  message->set_speed_weight(cost.speed_weight);
-  message->set_tilt_weight(cost.tilt_weight);
-  message->set_speed_change_weight(cost.speed_change_weight);
-  message->set_second_change_weight(cost.second_change_weight);
-  message->set_best(cost.best);
-  message->set_temperature(cost.temperature);
-}
-
 std::array<double, 3> from_message(const v1::Vector3& message) { return {message.x(), message.y(), message.z()}; }
 
-VehicleState from_message(const v1::VehicleState& message) {
-  return {from_message(message.position_m()), from_message(message.attitude_rad()), from_message(message.velocity_m_s()),
-          from_message(message.angular_velocity_rad_s())};
-}
-
-SoilVector from_message(const v1::SoilVector& message) {
-  return {message.k_phi(), message.k_c(), message.n(), message.c_pa(), message.phi_rad(), message.k_shear_m()};
-}
-
-SoilCorrection from_message(const v1::SoilCorrection& message) {
-  SoilCorrection correction;
-  const int coordinates = static_cast<int>(message.coordinates());
-  correction.coordinates = coordinates == 1 || coordinates == 2 ? static_cast<SoilCoordinates>(coordinates) : SoilCoordinates::unspecified;
-  correction.delta = from_message(message.delta());
-  if (message.has_variance()) correction.variance = from_message(message.variance());
-  const int known = std::min(static_cast<int>(correction.learned.size()), message.learned_size());
-  for (int i = 0; i < known; ++i) correction.learned[static_cast<std::size_t>(i)] = message.learned(i);
-  return correction;
-}
-
-Provenance from_message(const v1::Provenance& message) {
-  return {message.history_epoch(), message.soil_epoch(), message.map_id(), message.map_version(), message.map_hash(), message.bundle_name(),
-          message.bundle_hash()};
+/// The covariance of a correction; absent where the message has none.
+std::optional<std::array<std::array<double, 6>, 6>> covariance_from(const v1::SoilCorrection& message) {
+  if (message.covariance_size() != 36) return std::nullopt;
+  std::array<std::array<double, 6>, 6> covariance{};
+  for (int i = 0; i < 36; ++i) covariance[static_cast<std::size_t>(i / 6)][static_cast<std::size_t>(i % 6)] = message.covariance(i);
+  return covariance;
 }
 
 VehicleCard from_message(const v1::VehicleCard& message) {
@@ -129,6 +85,39 @@ std::vector<float> unpack(const std::string& bytes) {
   return values;
 }
 
+void set(v1::VehicleState* message, const VehicleState& state) {
+  set(message->mutable_position_m(), state.position_m);
+  set(message->mutable_attitude_rad(), state.attitude_rad);
+  set(message->mutable_velocity_m_s(), state.velocity_m_s);
+  set(message->mutable_angular_velocity_rad_s(), state.angular_velocity_rad_s);
+}
+
+VehicleState from_message(const v1::VehicleState& message) {
+  return {from_message(message.position_m()), from_message(message.attitude_rad()), from_message(message.velocity_m_s()),
+          from_message(message.angular_velocity_rad_s())};
+}
+
+SoilVector from_message(const v1::SoilVector& message) {
+  return {message.k_phi(), message.k_c(), message.n(), message.c_pa(), message.phi_rad(), message.k_shear_m()};
+}
+
+SoilCorrection from_message(const v1::SoilCorrection& message) {
+  SoilCorrection correction;
+  const int coordinates = static_cast<int>(message.coordinates());
+  correction.coordinates = coordinates == 1 || coordinates == 2 ? static_cast<SoilCoordinates>(coordinates) : SoilCoordinates::unspecified;
+  correction.delta = from_message(message.delta());
+  if (message.has_variance()) correction.variance = from_message(message.variance());
+  const int known = std::min(static_cast<int>(correction.learned.size()), message.learned_size());
+  for (int i = 0; i < known; ++i) correction.learned[static_cast<std::size_t>(i)] = message.learned(i);
+  correction.covariance = covariance_from(message);
+  return correction;
+}
+
+Provenance from_message(const v1::Provenance& message) {
+  return {message.history_epoch(), message.soil_epoch(), message.map_id(), message.map_version(), message.map_hash(), message.bundle_name(),
+          message.bundle_hash()};
+}
+
 v1::Measurement to_message(const std::string& session_id, const Measurement& measurement) {
   v1::Measurement message;
   message.set_session_id(session_id);
@@ -154,30 +143,6 @@ v1::OpenSessionRequest to_message(const OpenOptions& options) {
   message.set_vehicle_card(options.vehicle_card);
   message.set_map_id(options.map_id);
   if (options.initial) *message.mutable_initial() = to_message(std::string(), *options.initial);
-  return message;
-}
-
-v1::PredictRequest to_message(const std::string& session_id, const PredictRequest& request) {
-  v1::PredictRequest message;
-  message.set_session_id(session_id);
-  if (request.start) set(message.mutable_start(), *request.start);
-  message.set_history_use(request.history_use == HistoryUse::none ? v1::HISTORY_USE_NONE : v1::HISTORY_USE_MEASURED);
-  if (request.drawing) {
-    const CandidateDrawing& drawing = *request.drawing;
-    message.set_samples(drawing.samples);
-    message.set_horizon(static_cast<std::uint32_t>(drawing.nominal.size() / 2));
-    set(message.mutable_drawing(), drawing);
-  } else {
-    message.set_samples(static_cast<std::uint32_t>(request.controls.samples()));
-    message.set_horizon(static_cast<std::uint32_t>(request.controls.steps()));
-    pack(request.controls.values(), *message.mutable_controls());
-  }
-  if (request.cost) set(message.mutable_cost(), *request.cost);
-  message.mutable_output()->set_channels(request.channels);
-  message.mutable_output()->set_stride(request.stride);
-  message.mutable_output()->set_wheel_sinkage(request.wheel_sinkage);
-  message.set_tag(request.tag);
-  message.set_samples_min(request.samples_min);
   return message;
 }
 
@@ -236,6 +201,15 @@ MeasurementAnswer from_message(const v1::MeasurementAnswer& message) {
   return answer;
 }
 
+SoilEstimate from_message(const v1::SoilEstimate& message) {
+  SoilEstimate estimate;
+  estimate.session_id = message.session_id();
+  estimate.soil_epoch = message.soil_epoch();
+  if (message.has_stamp_ns()) estimate.stamp_ns = message.stamp_ns();
+  estimate.correction = from_message(message.correction());
+  return estimate;
+}
+
 MapDescription from_message(const v1::MapDescription& message) {
   MapDescription description;
   description.id = message.map_id();
@@ -244,39 +218,6 @@ MapDescription from_message(const v1::MapDescription& message) {
   description.geometry = {{message.origin_x_m(), message.origin_y_m()}, message.resolution_m(), message.width(), message.height()};
   description.semantic = message.semantic();
   return description;
-}
-
-Result<Prediction> from_message(const v1::PredictReply& message, const PredictRequest& request) {
-  Prediction prediction;
-  prediction.tag = message.tag();
-  prediction.samples = message.samples();
-  prediction.steps = message.steps();
-  prediction.channels = message.channels();
-  prediction.costs = unpack(message.costs());
-  prediction.best.assign(message.best().begin(), message.best().end());
-  prediction.mean_controls = unpack(message.mean_controls());
-  const std::size_t asked = request.drawing ? request.drawing->samples : request.controls.samples();
-  const std::size_t samples = prediction.samples;
-  const std::size_t points = prediction.rows() * prediction.steps;
-  const std::size_t drawn = request.drawing ? prediction.rows() * request.drawing->nominal.size() : 0;
-  const bool fits = (samples == asked || (request.samples_min > 0 && samples >= request.samples_min && samples < asked)) && message.costs().size() == (request.cost ? 4 * samples : 0) &&
-                    message.states().size() == 4 * points * prediction.channel_count() &&
-                    message.sinkage_m().size() == (request.wheel_sinkage ? 16 * points : 0) && message.drawn_controls().size() == 4 * drawn &&
-                    static_cast<std::size_t>(message.validity_size()) == prediction.rows();
-  if (!fits) return Error(Code::internal, "states", "the reply does not have the shape that was asked for; client and server may differ in version");
-  prediction.states_storage = unpack(message.states());
-  prediction.sinkage_storage_m = unpack(message.sinkage_m());
-  prediction.drawn_storage = unpack(message.drawn_controls());
-  prediction.validity.assign(message.validity().begin(), message.validity().end());
-  prediction.start = from_message(message.start());
-  prediction.history_steps = message.history_steps();
-  prediction.soil = from_message(message.soil());
-  if (message.has_soil_variance()) prediction.soil_variance = from_message(message.soil_variance());
-  if (message.has_measurement_age_s()) prediction.measurement_age_s = message.measurement_age_s();
-  prediction.provenance = from_message(message.provenance());
-  prediction.queue_s = message.queue_s();
-  prediction.compute_s = message.compute_s();
-  return prediction;
 }
 
 }  // namespace nesam::detail

@@ -1,10 +1,10 @@
 #include "core.hpp"
 
 #include <climits>
-#include <limits>
 #include <utility>
 
 #include "convert.hpp"
+#include "convert_prediction.hpp"
 
 namespace nesam::detail {
 
@@ -31,18 +31,6 @@ std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const Cli
   return grpc::CreateCustomChannel(target, grpc::SslCredentials(files), arguments);
 }
 
-/// What is wrong with the shape of the controls, before anything is copied. The limits themselves are the server's.
-std::string shape_fault(const View3<const float>& controls) {
-  if (controls.channels() != 2) return "has " + std::to_string(controls.channels()) + " channels, 2 are needed";
-  if (!controls.fits()) {
-    return "has " + std::to_string(controls.values().size()) + " numbers, which is not samples x steps x 2 = " + std::to_string(controls.samples()) + " x " +
-           std::to_string(controls.steps()) + " x 2";
-  }
-  constexpr std::size_t largest = std::numeric_limits<std::uint32_t>::max();
-  if (controls.samples() > largest || controls.steps() > largest) return "has more than 2^32 - 1 samples or steps";
-  return {};
-}
-
 }  // namespace
 
 Error error_from(const grpc::Status& status, const grpc::ClientContext& context) {
@@ -61,6 +49,7 @@ Core::Core(const std::string& target, const ClientOptions& settings)
       sessions(v1::Sessions::NewStub(channel)),
       prediction(v1::Prediction::NewStub(channel)),
       measurements(v1::Measurements::NewStub(channel)),
+      soil(v1::Soil::NewStub(channel)),
       terrain(v1::Terrain::NewStub(channel)) {}
 
 Result<SessionStatus> Core::session(const std::string& id, Timeout timeout) const {
@@ -80,16 +69,11 @@ Result<void> Core::close(const std::string& id, Timeout timeout) const {
 }
 
 Result<Prediction> Core::predict(const std::string& id, const PredictRequest& request, Timeout timeout) const {
-  if (!request.drawing) {
-    if (std::string fault = shape_fault(request.controls); !fault.empty()) return Error(Code::invalid_argument, "controls", "`controls`: " + fault);
-  } else if (!request.controls.values().empty()) {
-    return Error(Code::invalid_argument, "controls", "`controls`: must be empty when the service draws the candidates");
-  } else if (request.drawing->nominal.size() % 2 != 0) {
-    return Error(Code::invalid_argument, "drawing.nominal", "`drawing.nominal`: two numbers for each step");
-  }
-  auto reply = call(*prediction, &v1::Prediction::Stub::Predict, to_message(id, request), timeout);
+  auto message = to_message(id, request);
+  if (!message) return message.error();
+  auto reply = call(*prediction, &v1::Prediction::Stub::Predict, *message, timeout);
   if (!reply) return reply.error();
-  return from_message(*reply, request);
+  return from_message(*reply, Asked(request));
 }
 
 }  // namespace nesam::detail

@@ -11,6 +11,7 @@
 #include "nesam/v1/measurements.grpc.pb.h"
 #include "nesam/v1/prediction.grpc.pb.h"
 #include "nesam/v1/sessions.grpc.pb.h"
+#include "nesam/v1/soil.grpc.pb.h"
 #include "nesam/v1/terrain.grpc.pb.h"
 
 namespace nesam::detail {
@@ -60,6 +61,7 @@ class Core {
   const std::unique_ptr<v1::Sessions::Stub> sessions;
   const std::unique_ptr<v1::Prediction::Stub> prediction;
   const std::unique_ptr<v1::Measurements::Stub> measurements;
+  const std::unique_ptr<v1::Soil::Stub> soil;
   const std::unique_ptr<v1::Terrain::Stub> terrain;
 };
 

@@ -5,7 +5,6 @@
 #include <utility>
 
 #include "session_impl.hpp"
-#include "stream_impl.hpp"
 
 namespace nesam {
 
@@ -32,6 +31,16 @@ Result<std::vector<MeasurementAnswer>> exchange(MeasurementStream& stream, Span<
     answers.push_back(std::move(*answer));
   }
   return answers;
+}
+
+/// A stream, or RESOURCE_EXHAUSTED where the machine has no threads for it.
+template <class Open>
+auto opened(Open open) -> Result<decltype(open())> {
+  try {
+    return open();
+  } catch (const std::system_error& error) {
+    return Error(Code::resource_exhausted, "", std::string("no thread for the stream: ") + error.what());
+  }
 }
 
 }  // namespace
@@ -64,12 +73,14 @@ Result<SessionStatus> Session::status(Timeout timeout) const { return impl_->cor
 
 Result<Prediction> Session::predict(const PredictRequest& request, Timeout timeout) const { return impl_->core->predict(impl_->id, request, timeout); }
 
+Result<PredictionStream> Session::predictions() const {
+  return opened([this] { return PredictionStream(impl_->core, impl_->id); });
+}
+
+SoilWatch Session::watch_soil() const { return SoilWatch(impl_->core, impl_->id); }
+
 Result<MeasurementStream> Session::measurements() const {
-  try {
-    return MeasurementStream(std::make_unique<detail::StreamImpl>(impl_->core, impl_->id));
-  } catch (const std::system_error& error) {
-    return Error(Code::resource_exhausted, "", std::string("no thread for the stream: ") + error.what());
-  }
+  return opened([this] { return MeasurementStream(impl_->core, impl_->id); });
 }
 
 Result<MeasurementAnswer> Session::send(const Measurement& measurement, Timeout timeout) {

@@ -2,54 +2,26 @@
 // Method: one session on an uploaded flat map, one without a map. Expected values are exact where the protocol promises them (echoes, shapes, codes, fields,
 // equal bits of a row in any batch) and loose where only physics does.
 //
-// Usage: client_test HOST:PORT        Exit code 0 when everything passed, 1 when something failed, 2 for wrong usage.
+// Usage and exit codes: check.hpp.
 
 #include <nesam/nesam.hpp>
 
 #include <algorithm>
 #include <chrono>
 #include <cmath>
-#include <cstdio>
-#include <cstring>
-#include <functional>
-#include <iostream>
 #include <limits>
 #include <string>
 #include <thread>
 #include <utility>
 #include <vector>
 
+#include "check.hpp"
 #include "minimal_nav2.hpp"
 #include "scenario.hpp"
 
 namespace {
 
 using namespace std::chrono_literals;
-
-int passed = 0;
-int failed = 0;
-const char* current = "";
-
-void check(bool holds, const std::string& what) {
-  if (holds) {
-    ++passed;
-    return;
-  }
-  ++failed;
-  std::cerr << "FAILED " << current << ": " << what << "\n";
-}
-
-template <class T>
-void check_error(const nesam::Result<T>& result, nesam::Code code, const std::string& field, const std::string& what) {
-  if (result.ok()) return check(false, what + ": succeeded, " + nesam::name(code) + " was expected");
-  const nesam::Error& error = result.error();
-  const bool right = error.code() == code && error.field() == field;
-  check(right, what + ": expected " + nesam::name(code) + " of `" + field + "`, got `" + error.field() + "`, " + error.what());
-}
-
-bool equal_bits(nesam::Span<const float> a, nesam::Span<const float> b) {
-  return a.size() == b.size() && !a.empty() && std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0;
-}
 
 void analytic_views_index_row_major() {
   std::vector<float> values(2 * 3 * 4);
@@ -193,62 +165,6 @@ void service_measurements_get_typed_answers(nesam::Session& session) {
   const auto status = session.status();
   check(status.ok() && status->history_steps == 6 && status->last_sequence == 9 && status->last_stamp_ns == batch[5].stamp_ns, "status");
   check(status.ok() && status->state && status->state->position_m[0] == batch[5].state.position_m[0], "state of the newest step");
-}
-
-void service_streams_of_measurements(nesam::Client& client) {
-  nesam::OpenOptions options;
-  options.vehicle_id = unique("streamer");
-  auto session = client.open(options);
-  check(session.ok(), session.ok() ? "" : session.error().what());
-  if (!session) return;
-  auto stream = session->measurements();
-  check(stream.ok(), "stream");
-  if (!stream) return;
-  check_error(stream->receive(20ms), nesam::Code::deadline_exceeded, "", "nothing sent yet");
-  // One thread sends, this one collects.
-  constexpr int count = 300;
-  const nesam::VehicleCard card = session->vehicle();
-  bool all_sent = true;
-  std::thread sender([&] {
-    for (int step = 0; step < count; ++step) all_sent = stream->send(cruise(step, card)).ok() && all_sent;
-  });
-  int in_order = 0;
-  for (int step = 0; step < count; ++step) {
-    const auto answer = stream->receive(10s);
-    in_order += answer.ok() && answer->accepted() && answer->sequence == static_cast<std::uint64_t>(step) + 1 ? 1 : 0;
-  }
-  sender.join();
-  check(all_sent && in_order == count && stream->unanswered().empty(), std::to_string(in_order) + " of 300 answers in order");
-
-  nesam::Measurement late = cruise(count + 20, card);
-  check(stream->send(late).ok(), "after a pause");
-  const auto gap = stream->receive(10s);
-  check(gap.ok() && gap->is<nesam::Gap>() && std::abs(gap->is<nesam::Gap>()->gap_s - 2.1) < 1e-6, "GAP");
-  // Nobody collects: the limit holds, and the answers are still there afterwards.
-  std::size_t queued = 0;
-  while (queued <= nesam::MeasurementStream::pending_max && stream->send(late).ok()) ++queued;
-  check(queued == nesam::MeasurementStream::pending_max, "limit of uncollected answers");
-  check_error(stream->send(late), nesam::Code::resource_exhausted, "", "beyond the limit");
-  check(stream->finish(10s).ok(), "finish");
-  std::size_t duplicates = 0;
-  while (true) {
-    const auto answer = stream->receive(1s);
-    if (!answer) {
-      check_error(answer, nesam::Code::failed_precondition, "", "all answers were collected");
-      break;
-    }
-    duplicates += answer->is<nesam::Duplicate>() ? 1 : 0;
-  }
-  check(duplicates == queued, "every measurement was answered before the end");
-  check_error(stream->send(late), nesam::Code::failed_precondition, "", "sending after the end");
-
-  // A stream outlives its session on the server: measurements are refused one by one.
-  auto orphan = session->measurements();
-  check(orphan.ok() && session->close().ok(), "close under a stream");
-  check(orphan->send(late).ok(), "queued");
-  const auto refused = orphan->receive(10s);
-  const auto* rejected = refused.ok() ? refused->is<nesam::Rejected>() : nullptr;
-  check(rejected && rejected->code == nesam::Code::not_found && rejected->field == "session_id", "REJECTED with NOT_FOUND");
 }
 
 void service_predictions(const nesam::Session& session, const std::string& map_id) {
@@ -543,20 +459,11 @@ void service_nobody_listens() {
   check(thrown, "value() throws the error in this thread");
 }
 
-void run(const char* name, const std::function<void()>& test) {
-  current = name;
-  const int failed_before = failed;
-  const auto begin = std::chrono::steady_clock::now();
-  try {
-    test();
-  } catch (const std::exception& error) {
-    check(false, std::string("threw ") + error.what());
-  }
-  const auto took = std::chrono::duration_cast<std::chrono::milliseconds>(std::chrono::steady_clock::now() - begin);
-  std::cout << (failed == failed_before ? "ok      " : "FAILED  ") << name << " (" << took.count() << " ms)" << std::endl;
-}
-
 void run_all(nesam::Client& client) {
+  run("analytic_views_index_row_major", analytic_views_index_row_major);
+  run("analytic_channels_have_columns", analytic_channels_have_columns);
+  run("analytic_commands_ask_for_a_twist", analytic_commands_ask_for_a_twist);
+  run("service_nobody_listens", service_nobody_listens);
   run("service_maps", [&] { service_maps(client); });
   run("service_sessions_are_raii", [&] { service_sessions_are_raii(client); });
   const FlatMap flat;
@@ -575,35 +482,9 @@ void run_all(nesam::Client& client) {
     run("service_threads_share_a_session", [&] { service_threads_share_a_session(session); });
   }
   client.delete_map(map_id).value();
-  run("service_streams_of_measurements", [&] { service_streams_of_measurements(client); });
   run("service_sessions_without_a_map", [&] { service_sessions_without_a_map(client); });
 }
 
 }  // namespace
 
-int main(int argc, char** argv) {
-  if (argc != 2) {
-    std::fprintf(stderr, "usage: client_test HOST:PORT\n");
-    return 2;
-  }
-  run("analytic_views_index_row_major", analytic_views_index_row_major);
-  run("analytic_channels_have_columns", analytic_channels_have_columns);
-  run("analytic_commands_ask_for_a_twist", analytic_commands_ask_for_a_twist);
-  run("service_nobody_listens", service_nobody_listens);
-  nesam::ClientOptions options;
-  // The first prediction on a new map encodes its terrain, perhaps on a busy machine.
-  options.timeout = 60s;
-  nesam::Client client(argv[1], options);
-  current = "connect";
-  const auto connected = client.connect(30s);
-  check(connected.ok(), connected.ok() ? "" : connected.error().what());
-  if (connected) {
-    try {
-      run_all(client);
-    } catch (const std::exception& error) {
-      check(false, std::string("threw ") + error.what());
-    }
-  }
-  std::printf("%d passed, %d failed\n", passed, failed);
-  return failed == 0 ? 0 : 1;
-}
+int main(int argc, char** argv) { return run_against_server(argc, argv, run_all); }

@@ -5,11 +5,14 @@
 #include <nesam/nesam.hpp>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <cmath>
 #include <cstdint>
 #include <limits>
 #include <string>
+#include <thread>
+#include <utility>
 #include <vector>
 
 inline constexpr float nan_f = std::numeric_limits<float>::quiet_NaN();
@@ -36,6 +39,17 @@ struct FlatMap {
     map.elevation_m = elevation_m;
     map.semantic_rgb = rgb;
     return map;
+  }
+};
+
+/// The same with hills of 0.3 m, some metres wide.
+struct HillyMap : FlatMap {
+  HillyMap() {
+    for (std::size_t row = 0; row < side; ++row) {
+      for (std::size_t column = 0; column < side; ++column) {
+        elevation_m[row * side + column] = 0.3F * std::sin(0.5F * static_cast<float>(column)) * std::cos(0.3F * static_cast<float>(row));
+      }
+    }
   }
 };
 
@@ -67,4 +81,29 @@ inline nesam::PredictRequest request_of(const std::vector<float>& controls, std:
   nesam::PredictRequest request;
   request.controls = {nesam::Span<const float>(controls), samples, horizon, 2};
   return request;
+}
+
+/// A state from its twelve channels.
+inline nesam::VehicleState state_of(nesam::Span<const float> values) {
+  const auto three = [&](std::size_t i) { return std::array<double, 3>{values[i], values[i + 1], values[i + 2]}; };
+  return {three(0), three(3), three(6), three(9)};
+}
+
+/// Asks for a prediction, and again while the service is overloaded: beside other work the machine may be slow for a while.
+inline nesam::Result<nesam::Prediction> predicted(const nesam::Session& session, const nesam::PredictRequest& request) {
+  for (int attempt = 1;; ++attempt) {
+    auto prediction = session.predict(request);
+    if (prediction || prediction.error().code() != nesam::Code::resource_exhausted || attempt == 20) return prediction;
+    std::this_thread::sleep_for(std::chrono::milliseconds(200));
+  }
+}
+
+/// A session of its own on a map, driven for five steps.
+inline nesam::Session driven(nesam::Client& client, const std::string& name, const std::string& map_id) {
+  nesam::OpenOptions options;
+  options.vehicle_id = unique(name);
+  options.map_id = map_id;
+  nesam::Session session = std::move(client.open(options).value());
+  for (int step = 0; step < 5; ++step) (void)session.send(cruise(step, session.vehicle())).value();
+  return session;
 }

@@ -3,6 +3,7 @@
 #include <chrono>
 #include <cstddef>
 #include <memory>
+#include <string>
 #include <vector>
 
 #include <nesam/error.hpp>
@@ -12,7 +13,7 @@ namespace nesam {
 
 namespace detail {
 class Core;
-class StreamImpl;
+class MeasurementStreamImpl;
 }  // namespace detail
 
 /// The bidirectional stream that feeds one session. Each measurement gets exactly one answer, in order; a bad measurement is answered and does not end the
@@ -50,8 +51,8 @@ class MeasurementStream {
 
  private:
   friend class Session;
-  explicit MeasurementStream(std::unique_ptr<detail::StreamImpl> impl);
-  std::unique_ptr<detail::StreamImpl> impl_;
+  MeasurementStream(std::shared_ptr<detail::Core> core, const std::string& session_id);
+  std::unique_ptr<detail::MeasurementStreamImpl> impl_;
 };
 
 }  // namespace nesam

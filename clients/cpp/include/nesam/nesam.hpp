@@ -2,13 +2,17 @@
 
 // Everything of the client.
 
+#include <nesam/array.hpp>
 #include <nesam/client.hpp>
 #include <nesam/error.hpp>
+#include <nesam/extras.hpp>
 #include <nesam/measurement.hpp>
 #include <nesam/measurement_stream.hpp>
 #include <nesam/motion_model.hpp>
 #include <nesam/prediction.hpp>
+#include <nesam/prediction_stream.hpp>
 #include <nesam/session.hpp>
+#include <nesam/soil_watch.hpp>
 #include <nesam/span.hpp>
 #include <nesam/terrain.hpp>
 #include <nesam/tls.hpp>

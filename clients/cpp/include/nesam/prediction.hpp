@@ -4,6 +4,7 @@
 #include <optional>
 #include <vector>
 
+#include <nesam/extras.hpp>
 #include <nesam/span.hpp>
 #include <nesam/types.hpp>
 
@@ -91,25 +92,31 @@ struct PredictRequest {
   std::optional<CandidateDrawing> drawing;
   /// Lets the service say what each candidate is worth and return the best only: 4 N bytes and 48 K for each of them instead of 48 N K.
   std::optional<PathCost> cost;
+  /// What to compute beyond the states.
+  Extras extras;
 };
 
 /// The predicted states and what they were computed from.
 class Prediction {
  public:
   /// Shape (rows, floor(K / stride), C) with C = number of channels asked for, in the order of `Channel`; yaw in (-pi, pi]. Step k (from 0) is the state
-  /// (k + 1) stride x 0.1 s after the start. A row for each candidate, or for each of `best` where a cost was given. Valid as long as this object is neither
-  /// changed nor moved from.
+  /// (k + 1) stride x 0.1 s after the start. A row for each candidate, for each of `best` where a cost was given, or for each soil and candidate (`row`).
+  /// Valid as long as this object is neither changed nor moved from.
   View3<const float> states() const noexcept { return {states_storage, rows(), steps, channel_count()}; }
   /// Sinkage of the wheels, m, shape (rows, floor(K / stride), 4); empty unless asked for.
   View3<const float> sinkage_m() const noexcept {
     return sinkage_storage_m.empty() ? View3<const float>{} : View3<const float>{sinkage_storage_m, rows(), steps, 4};
   }
-  /// Candidates that the service drew, shape (rows, K, 2); empty for candidates that were sent.
+  /// Candidates that the service drew, shape (candidates, K, 2); empty for candidates that were sent.
   View3<const float> drawn_controls() const noexcept {
-    return drawn_storage.empty() ? View3<const float>{} : View3<const float>{drawn_storage, rows(), drawn_storage.size() / (2 * rows()), 2};
+    return drawn_storage.empty() ? View3<const float>{} : View3<const float>{drawn_storage, candidates(), drawn_storage.size() / (2 * candidates()), 2};
   }
-  /// Number of candidates returned.
-  std::size_t rows() const noexcept { return costs.empty() ? samples : best.size(); }
+  /// Number of candidates returned: all, or those of `best` where a cost was given.
+  std::size_t candidates() const noexcept { return costs.empty() ? samples : best.size(); }
+  /// Number of trajectories returned: one for each candidate, with what-if soils one for each soil and candidate.
+  std::size_t rows() const noexcept { return soil_groups * candidates(); }
+  /// Row of a candidate in the group of a what-if soil: of `Extras::soil_deltas`, or of the thirteen sigma points.
+  std::size_t row(std::size_t group, std::size_t candidate) const noexcept { return group * candidates() + candidate; }
   /// Column of a channel in `states()`; absent when it was not asked for.
   std::optional<std::size_t> column(Channel channel) const noexcept;
   /// Number of channels returned.
@@ -119,6 +126,8 @@ class Prediction {
   /// Candidates that were computed.
   std::size_t samples = 0;
   std::size_t steps = 0;
+  /// Groups of trajectories, one for each what-if soil; 1 without.
+  std::size_t soil_groups = 1;
   /// Channels returned, a sum of `bit(Channel)`.
   std::uint32_t channels = 0;
   std::vector<float> states_storage;
@@ -141,12 +150,16 @@ class Prediction {
   SoilVector soil;
   /// Variance of that soil to first order, units of `SoilVector` squared; absent while no filter runs.
   std::optional<SoilVector> soil_variance;
+  /// What the session knew of the soil: `Extras::soil_deltas` and `ExtraOutputs::jacobian_soil` are in its coordinates.
+  SoilCorrection soil_correction;
   /// Time between the arrival of the session's newest measurement and the start of this computation, s; absent before the first.
   std::optional<double> measurement_age_s;
   Provenance provenance;
   /// Time that the request waited for the engine and time that the engine computed, s.
   double queue_s = 0.0;
   double compute_s = 0.0;
+  /// What was computed beyond the states.
+  ExtraOutputs extras;
 };
 
 }  // namespace nesam

@@ -9,6 +9,8 @@
 #include <nesam/measurement.hpp>
 #include <nesam/measurement_stream.hpp>
 #include <nesam/prediction.hpp>
+#include <nesam/prediction_stream.hpp>
+#include <nesam/soil_watch.hpp>
 #include <nesam/span.hpp>
 #include <nesam/types.hpp>
 
@@ -57,6 +59,12 @@ class Session {
   /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: the session was closed. FAILED_PRECONDITION: no start state and no measurement yet, or the
   /// measured position lies outside the map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not in time.
   Result<Prediction> predict(const PredictRequest& request, Timeout timeout = {}) const;
+
+  /// Opens a stream of predictions from this session, for planners with a fixed rate. UNAVAILABLE comes out of its first `receive`.
+  Result<PredictionStream> predictions() const;
+
+  /// Watches what this session learns of the soil. UNAVAILABLE and NOT_FOUND come out of its first `receive`.
+  SoilWatch watch_soil() const;
 
   /// Opens a stream of measurements into this session, for senders that do not wait for each answer. UNAVAILABLE comes out of its first `receive`.
   Result<MeasurementStream> measurements() const;

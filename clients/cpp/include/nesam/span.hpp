@@ -43,46 +43,80 @@ class Span {
   std::size_t size_ = 0;
 };
 
-/// A row-major view of shape (samples, steps, channels), without padding: value (n, k, c) lies at `(n * steps + k) * channels + c`.
+/// A row-major view of any shape, without padding: the last index moves fastest.
 ///
-/// Controls have the shape (N, K, 2), predicted states (N, steps, C). Indexing is not checked; `fits()` says whether storage and shape agree.
-template <class T>
-class View3 {
+/// Indexing is not checked; `fits()` says whether storage and shape agree.
+template <class T, std::size_t Rank>
+class View {
  public:
-  constexpr View3() noexcept = default;
-  constexpr View3(Span<T> values, std::size_t samples, std::size_t steps, std::size_t channels) noexcept
-      : values_(values), samples_(samples), steps_(steps), channels_(channels) {}
+  constexpr View() noexcept = default;
+  constexpr View(Span<T> values, const std::array<std::size_t, Rank>& shape) noexcept : values_(values), shape_(shape) {}
   /// A view for reading of a view for writing.
   template <class U = T, class = std::enable_if_t<std::is_const_v<U>>>
-  constexpr View3(View3<std::remove_cv_t<T>> other) noexcept
-      : values_(other.values()), samples_(other.samples()), steps_(other.steps()), channels_(other.channels()) {}
+  constexpr View(View<std::remove_cv_t<T>, Rank> other) noexcept : values_(other.values()), shape_(other.shape()) {}
 
-  constexpr std::size_t samples() const noexcept { return samples_; }
-  constexpr std::size_t steps() const noexcept { return steps_; }
-  constexpr std::size_t channels() const noexcept { return channels_; }
+  constexpr const std::array<std::size_t, Rank>& shape() const noexcept { return shape_; }
   constexpr Span<T> values() const noexcept { return values_; }
-  /// Whether the storage holds exactly samples x steps x channels values.
+  constexpr bool empty() const noexcept { return values_.empty(); }
+  /// Whether the storage holds exactly as many values as the shape has places.
   constexpr bool fits() const noexcept {
     // Division instead of a product that could overflow.
     std::size_t rest = values_.size();
-    for (const std::size_t side : {samples_, steps_, channels_}) {
+    for (const std::size_t side : shape_) {
       if (side == 0) return values_.empty();
       if (rest % side != 0) return false;
       rest /= side;
     }
     return rest == 1;
   }
-  constexpr T& operator()(std::size_t n, std::size_t k, std::size_t c) const noexcept { return values_[(n * steps_ + k) * channels_ + c]; }
-  /// The steps of one sample, shape (steps, channels).
-  constexpr Span<T> sample(std::size_t n) const noexcept { return values_.subspan(n * steps_ * channels_, steps_ * channels_); }
-  /// The channels of one step of one sample.
-  constexpr Span<T> step(std::size_t n, std::size_t k) const noexcept { return values_.subspan((n * steps_ + k) * channels_, channels_); }
+  /// One value.
+  template <class... Indices>
+  constexpr T& operator()(Indices... indices) const noexcept {
+    static_assert(sizeof...(Indices) == Rank, "one index for each dimension");
+    return values_[block(indices...)];
+  }
+  /// The values under the first indices, for example the 12 x 12 matrix of one step of a (samples, steps, 12, 12) view.
+  template <class... Indices>
+  constexpr Span<T> part(Indices... indices) const noexcept {
+    static_assert(sizeof...(Indices) <= Rank, "not more indices than dimensions");
+    std::size_t size = 1;
+    for (std::size_t axis = sizeof...(Indices); axis < Rank; ++axis) size *= shape_[axis];
+    return values_.subspan(block(indices...) * size, size);
+  }
 
  private:
+  /// Place of the block under the first indices among all blocks of its size.
+  template <class... Indices>
+  constexpr std::size_t block(Indices... indices) const noexcept {
+    std::size_t place = 0, axis = 0;
+    ((place = place * shape_[axis++] + static_cast<std::size_t>(indices)), ...);
+    return place;
+  }
+
   Span<T> values_;
-  std::size_t samples_ = 0;
-  std::size_t steps_ = 0;
-  std::size_t channels_ = 0;
+  std::array<std::size_t, Rank> shape_{};
+};
+
+/// A row-major view of shape (samples, steps, channels): value (n, k, c) lies at `(n * steps + k) * channels + c`.
+///
+/// Controls have the shape (N, K, 2), predicted states (N, steps, C).
+template <class T>
+class View3 : public View<T, 3> {
+ public:
+  constexpr View3() noexcept = default;
+  constexpr View3(Span<T> values, std::size_t samples, std::size_t steps, std::size_t channels) noexcept
+      : View<T, 3>(values, {samples, steps, channels}) {}
+  /// A view for reading of a view for writing.
+  template <class U = T, class = std::enable_if_t<std::is_const_v<U>>>
+  constexpr View3(View3<std::remove_cv_t<T>> other) noexcept : View<T, 3>(other) {}
+
+  constexpr std::size_t samples() const noexcept { return this->shape()[0]; }
+  constexpr std::size_t steps() const noexcept { return this->shape()[1]; }
+  constexpr std::size_t channels() const noexcept { return this->shape()[2]; }
+  /// The steps of one sample, shape (steps, channels).
+  constexpr Span<T> sample(std::size_t n) const noexcept { return this->part(n); }
+  /// The channels of one step of one sample.
+  constexpr Span<T> step(std::size_t n, std::size_t k) const noexcept { return this->part(n, k); }
 };
 
 }  // namespace nesam

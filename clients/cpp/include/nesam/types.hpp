@@ -89,6 +89,8 @@ struct SoilCorrection {
   std::optional<SoilVector> variance;
   /// Whether the drive has told something of each parameter, in the order of `SoilVector`; a parameter that is not learned has no number to show.
   std::array<bool, 6> learned{};
+  /// Covariance of `delta`, in these coordinates and in the order of `SoilVector`; absent while no filter runs.
+  std::optional<std::array<std::array<double, 6>, 6>> covariance;
 };
 
 /// What a reply was computed from. A planner may refuse a reply whose provenance it does not accept.
