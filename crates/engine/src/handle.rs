@@ -183,16 +183,14 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap
     loop {
         match queue.next(|| clock.now_ns()) {
             Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
-                answer(&mut engine, submission, Ok(()), clock, &mut tap);
+                answer(&mut engine, submission, Ok(()), clock, &mut tap, |_| ());
             }),
             Turn::Prediction(mut submission) => {
                 let left_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(clock.now_ns()));
                 let Command::Predict(query) = &mut submission.command else { continue };
                 let fits = queue.fit(query, left_ns);
                 let work = work(query, query.samples);
-                if let Some(busy_ns) = answer(&mut engine, *submission, fits, clock, &mut tap) {
-                    queue.learn(work, busy_ns);
-                }
+                answer(&mut engine, *submission, fits, clock, &mut tap, |took_ns| queue.done(work, took_ns));
             }
             Turn::End => return engine,
         }
@@ -208,14 +206,16 @@ pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> R
         .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
 }
 
-/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. Gives the time that it took if it was not refused.
+/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. `done` is told the time that it took, ns, if it was
+/// not refused, before the answer leaves.
 fn answer(
     engine: &mut Engine,
     submission: Submission,
     fits: Result<(), EngineError>,
     clock: &dyn Clock,
     tap: &mut Option<Tap>,
-) -> Option<u64> {
+    done: impl FnOnce(Option<u64>),
+) {
     let Submission { command, deadline_ns, abandoned, reply, submitted_ns, share: _ } = submission;
     let now_ns = clock.now_ns();
     let is_prediction = matches!(command, Command::Predict(_));
@@ -228,10 +228,9 @@ fn answer(
     };
     let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
     let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. })).map(|_| result.clone());
-    let took = result.is_ok().then_some(busy_ns);
+    done(result.is_ok().then_some(busy_ns));
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {
         tap(Executed { now_ns, command, result, queued_ns, busy_ns });
     }
-    took
 }

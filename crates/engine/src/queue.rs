@@ -85,7 +85,6 @@ impl Queue {
     pub fn next(&self, now_ns: impl Fn() -> u64) -> Turn {
         let mut lanes = self.lock();
         loop {
-            lanes.running = None;
             if !lanes.commands.is_empty() {
                 lanes.commands_of.clear();
                 return Turn::Commands(std::mem::take(&mut lanes.commands));
@@ -122,9 +121,14 @@ impl Queue {
         Ok(())
     }
 
-    /// Learns how long a prediction took.
-    pub fn learn(&self, work: f64, busy_ns: u64) {
-        self.lock().service_time.learn(work, busy_ns);
+    /// The prediction whose turn it was is done: learns how long it took if it was computed. Said before its answer leaves, so that whoever asks again at once
+    /// finds the engine idle.
+    pub fn done(&self, work: f64, took_ns: Option<u64>) {
+        let mut lanes = self.lock();
+        lanes.running = None;
+        if let Some(took_ns) = took_ns {
+            lanes.service_time.learn(work, took_ns);
+        }
     }
 
     /// Refuses new commands and gives back the predictions that wait.

@@ -1,8 +1,13 @@
 //! Goal: too much is refused at once and typed, measurements still get through, and the server lives on.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use nesam_client::{outcome_label, v1};
+use nesam_engine::{
+    Candidates, Clock, Command, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PredictExtras, PredictQuery,
+    Submission, WheelMeasurement,
+};
 use tonic::Code;
 
 use crate::stage::*;
@@ -39,6 +44,47 @@ async fn service_overload_is_resource_exhausted_and_measurements_get_through() {
     let after = client.predict(candidates("s", &recorded.drive, 59, 2, 4)).await.unwrap();
     assert_eq!(after.provenance.history_epoch, 60);
     server.shutdown().await;
+}
+
+/// Whoever asks again as soon as its answer is there finds nobody before it, however long the engine's thread takes to look for its next turn.
+#[test]
+fn service_one_after_the_other_is_never_too_many() {
+    let recorded = recorded();
+    let clock = Arc::new(ManualClock::default());
+    let handle = EngineHandle::spawn(Engine::new(predictor(), Limits::default()).unwrap(), clock.clone());
+    handle.call(Command::Open(OpenSession { vehicle: "s".into(), ..Default::default() })).unwrap();
+    for i in 0..3 {
+        let (state, command) = (recorded.drive.states[i], recorded.drive.controls[i]);
+        let measurement =
+            Measurement { sequence: None, boot: None, stamp_ns: i as i64 * STEP_NS, state, command, wheels: WheelMeasurement::default() };
+        handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+    }
+    let ask = || {
+        let candidates = candidates("s", &recorded.drive, 2, 1, 2);
+        Command::Predict(PredictQuery {
+            session: candidates.session,
+            start: None,
+            instant: None,
+            use_history: true,
+            samples: 1,
+            samples_min: 0,
+            horizon: 2,
+            controls: Candidates::Given(candidates.controls),
+            cost: None,
+            extras: PredictExtras::default(),
+        })
+    };
+    let (sender, receiver) = std::sync::mpsc::channel();
+    // Sooner than an answer finds its way back: let in only by an idle engine.
+    let mut again = Submission::new(ask(), move |answer| sender.send(answer.result).unwrap());
+    again.deadline_ns = Some(clock.now_ns() + 1);
+    let asked = handle.clone();
+    handle.submit(Submission::new(ask(), move |answer| {
+        answer.result.unwrap();
+        asked.submit(again);
+    }));
+    receiver.recv().unwrap().unwrap();
+    handle.stop();
 }
 
 #[tokio::test(flavor = "multi_thread")]
