@@ -17,7 +17,7 @@
 
 namespace nesam::detail {
 
-/// A bidirectional stream with its two threads, in which each request gets exactly one answer, in order. The reader outlives the writer: it joins it, then
+/// A bidirectional stream of a session with its two threads, in which each request gets exactly one answer, in order. The reader outlives the writer: it joins it, then
 /// reads the final status, so that nothing is called on the stream after that.
 ///
 /// `Kind` says what travels: the messages `Request` and `Reply`, what is kept of a request until its answer comes (`Sent`), the `Answer`, the most of them that
@@ -31,7 +31,7 @@ class DuplexStream {
   using Answer = typename Kind::Answer;
 
   /// Throws `std::system_error` where the machine has no thread for it.
-  explicit DuplexStream(std::shared_ptr<Core> core);
+  DuplexStream(std::shared_ptr<Core> core, const std::string& id);
   ~DuplexStream();
 
   Result<void> send(Request message, Sent sent);
@@ -39,6 +39,8 @@ class DuplexStream {
   Result<void> finish(std::chrono::nanoseconds timeout);
   /// What was sent and not answered yet, oldest first.
   std::vector<Sent> unanswered() const;
+
+  const std::string session_id;
 
  private:
   void write_all() noexcept;
@@ -69,7 +71,7 @@ class DuplexStream {
 };
 
 template <class Kind>
-DuplexStream<Kind>::DuplexStream(std::shared_ptr<Core> core) : core_(std::move(core)) {
+DuplexStream<Kind>::DuplexStream(std::shared_ptr<Core> core, const std::string& id) : session_id(id), core_(std::move(core)) {
   core_->introduce(context_);
   stream_ = Kind::open(*core_, context_);
   writer_ = std::thread([this] { write_all(); });

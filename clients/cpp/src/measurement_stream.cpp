@@ -19,12 +19,9 @@ struct MeasurementExchange {
   static Answer answer(const Reply& reply, const Sent&) { return from_message(reply); }
 };
 
-class MeasurementStreamImpl {
+class MeasurementStreamImpl : public DuplexStream<MeasurementExchange> {
  public:
-  MeasurementStreamImpl(std::shared_ptr<Core> core, const std::string& id) : session_id(id), stream(std::move(core)) {}
-
-  const std::string session_id;
-  DuplexStream<MeasurementExchange> stream;
+  using DuplexStream::DuplexStream;
 };
 
 }  // namespace detail
@@ -36,10 +33,10 @@ MeasurementStream& MeasurementStream::operator=(MeasurementStream&&) noexcept = 
 MeasurementStream::~MeasurementStream() = default;
 
 Result<void> MeasurementStream::send(const Measurement& measurement) {
-  return impl_->stream.send(detail::to_message(impl_->session_id, measurement), measurement);
+  return impl_->send(detail::to_message(impl_->session_id, measurement), measurement);
 }
-Result<MeasurementAnswer> MeasurementStream::receive(std::chrono::nanoseconds timeout) { return impl_->stream.receive(timeout); }
-Result<void> MeasurementStream::finish(std::chrono::nanoseconds timeout) { return impl_->stream.finish(timeout); }
-std::vector<Measurement> MeasurementStream::unanswered() const { return impl_->stream.unanswered(); }
+Result<MeasurementAnswer> MeasurementStream::receive(std::chrono::nanoseconds timeout) { return impl_->receive(timeout); }
+Result<void> MeasurementStream::finish(std::chrono::nanoseconds timeout) { return impl_->finish(timeout); }
+std::vector<Measurement> MeasurementStream::unanswered() const { return impl_->unanswered(); }
 
 }  // namespace nesam

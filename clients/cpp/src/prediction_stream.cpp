@@ -19,12 +19,9 @@ struct PredictionExchange {
   static Answer answer(const Reply& reply, const Sent& asked) { return from_message(reply, asked); }
 };
 
-class PredictionStreamImpl {
+class PredictionStreamImpl : public DuplexStream<PredictionExchange> {
  public:
-  PredictionStreamImpl(std::shared_ptr<Core> core, const std::string& id) : session_id(id), stream(std::move(core)) {}
-
-  const std::string session_id;
-  DuplexStream<PredictionExchange> stream;
+  using DuplexStream::DuplexStream;
 };
 
 }  // namespace detail
@@ -38,9 +35,9 @@ PredictionStream::~PredictionStream() = default;
 Result<void> PredictionStream::send(const PredictRequest& request) {
   auto message = detail::to_message(impl_->session_id, request);
   if (!message) return message.error();
-  return impl_->stream.send(std::move(*message), detail::Asked(request));
+  return impl_->send(std::move(*message), detail::Asked(request));
 }
-Result<PredictionAnswer> PredictionStream::receive(std::chrono::nanoseconds timeout) { return impl_->stream.receive(timeout); }
-Result<void> PredictionStream::finish(std::chrono::nanoseconds timeout) { return impl_->stream.finish(timeout); }
+Result<PredictionAnswer> PredictionStream::receive(std::chrono::nanoseconds timeout) { return impl_->receive(timeout); }
+Result<void> PredictionStream::finish(std::chrono::nanoseconds timeout) { return impl_->finish(timeout); }
 
 }  // namespace nesam
