@@ -4,10 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use nesam_client::{outcome_label, v1};
-use nesam_engine::{
-    Candidates, Clock, Command, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PredictExtras, PredictQuery,
-    Submission, WheelMeasurement,
-};
+use nesam_engine::{Clock, Command, Engine, EngineHandle, Limits, ManualClock, OpenSession, Submission};
 use tonic::Code;
 
 use crate::stage::*;
@@ -54,26 +51,10 @@ fn service_one_after_the_other_is_never_too_many() {
     let handle = EngineHandle::spawn(Engine::new(predictor(), Limits::default()).unwrap(), clock.clone());
     handle.call(Command::Open(OpenSession { vehicle: "s".into(), ..Default::default() })).unwrap();
     for i in 0..3 {
-        let (state, command) = (recorded.drive.states[i], recorded.drive.controls[i]);
-        let measurement =
-            Measurement { sequence: None, boot: None, stamp_ns: i as i64 * STEP_NS, state, command, wheels: WheelMeasurement::default() };
+        let measurement = engine_sample(&recorded.drive, i);
         handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
     }
-    let ask = || {
-        let candidates = candidates("s", &recorded.drive, 2, 1, 2);
-        Command::Predict(PredictQuery {
-            session: candidates.session,
-            start: None,
-            instant: None,
-            use_history: true,
-            samples: 1,
-            samples_min: 0,
-            horizon: 2,
-            controls: Candidates::Given(candidates.controls),
-            cost: None,
-            extras: PredictExtras::default(),
-        })
-    };
+    let ask = || Command::Predict(engine_query("s", &recorded.drive, 2, 1, 2));
     let (sender, receiver) = std::sync::mpsc::channel();
     // Sooner than an answer finds its way back: let in only by an idle engine.
     let mut again = Submission::new(ask(), move |answer| sender.send(answer.result).unwrap());

@@ -3,7 +3,7 @@
 
 use std::cell::Cell;
 
-use nesam_engine::{Candidates, Command, Engine, Limits, Measurement, OpenSession, PredictExtras, PredictQuery, Reply, WheelMeasurement};
+use nesam_engine::{Command, Engine, Limits, Measurement, OpenSession, Reply, WheelMeasurement};
 use nesam_physics::VehicleState;
 use proptest::prelude::*;
 use proptest::test_runner::{Config, RngAlgorithm, TestRng, TestRunner};
@@ -46,18 +46,7 @@ fn shown(recorded: &Recorded, arrivals: &[Measurement]) -> (String, u64, Vec<&'s
         outcomes.push(answer.outcome.label());
     }
     let Reply::Session(view) = engine.execute(0, &Command::Get { session: "truck".into() }).unwrap() else { panic!("another reply") };
-    let query = PredictQuery {
-        session: "truck".into(),
-        start: None,
-        instant: None,
-        use_history: true,
-        samples: 1,
-        samples_min: 0,
-        horizon: 16,
-        extras: PredictExtras::default(),
-        controls: Candidates::Given(candidates("truck", &recorded.drive, 60, 1, 16).controls),
-        cost: None,
-    };
+    let query = engine_query("truck", &recorded.drive, 60, 1, 16);
     let Reply::Predicted(prediction) = engine.execute(0, &Command::Predict(query)).unwrap() else { panic!("another reply") };
     let text = format!(
         "{:?} {:?} {:?} {:?}",

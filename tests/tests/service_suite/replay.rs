@@ -3,8 +3,8 @@
 use std::sync::Arc;
 
 use nesam_engine::{
-    Candidates, Command, CostWeights, Drawing, Engine, EngineHandle, Limits, ManualClock, Measurement, OpenSession, PathCost,
-    PredictExtras, PredictQuery, WheelMeasurement,
+    Candidates, Command, CostWeights, Drawing, Engine, EngineHandle, Limits, ManualClock, OpenSession, PathCost, PredictExtras,
+    PredictQuery,
 };
 
 use crate::stage::*;
@@ -24,46 +24,19 @@ fn property_replayed_commands_give_the_same_bytes() {
     call(Command::PutMap { map: recorded.world.clone(), base: None });
     call(Command::Open(OpenSession { vehicle: "truck".into(), map: recorded.world.id().into(), ..Default::default() }));
     for i in (0..40).chain([38, 20, 60]) {
-        let measurement = Measurement {
-            sequence: None,
-            boot: None,
-            stamp_ns: i as i64 * STEP_NS,
-            state: recorded.drive.states[i],
-            command: recorded.drive.controls[i],
-            wheels: WheelMeasurement::default(),
-        };
+        let measurement = engine_sample(&recorded.drive, i);
         call(Command::Measure { session: "truck".into(), vehicle: None, measurement });
         if i % 16 == 7 {
-            let candidates = candidates("truck", &recorded.drive, i, 3, 8);
-            call(Command::Predict(PredictQuery {
-                session: candidates.session,
-                start: None,
-                instant: None,
-                use_history: true,
-                samples: 3,
-                samples_min: 0,
-                horizon: 8,
-                controls: Candidates::Given(candidates.controls.clone()),
-                cost: None,
-                extras: PredictExtras { jacobians: i % 32 == 7, risk: true, ..Default::default() },
-            }));
+            let query = engine_query("truck", &recorded.drive, i, 3, 8);
+            let extras = PredictExtras { jacobians: i % 32 == 7, risk: true, ..Default::default() };
+            call(Command::Predict(PredictQuery { extras, ..query.clone() }));
+            let nominal = candidates("truck", &recorded.drive, i, 3, 8).controls[..16].to_vec();
             let weights = CostWeights { path: 1.0, speed: 1.0, ..Default::default() };
             call(Command::Predict(PredictQuery {
-                session: "truck".into(),
-                start: None,
-                instant: None,
-                use_history: true,
                 samples: 5,
-                samples_min: 0,
-                horizon: 8,
-                controls: Candidates::Drawn(Drawing {
-                    nominal: candidates.controls[..16].to_vec(),
-                    sd: [0.5, 0.1],
-                    correlation: 0.8,
-                    seed: i as u64,
-                }),
+                controls: Candidates::Drawn(Drawing { nominal, sd: [0.5, 0.1], correlation: 0.8, seed: i as u64 }),
                 cost: Some(PathCost { path: vec![0.0, 0.0, 50.0, 50.0], speed_m_s: 2.0, weights, best: 2, temperature: 1.0 }),
-                extras: PredictExtras::default(),
+                ..query
             }));
         }
     }

@@ -3,9 +3,7 @@
 
 use std::collections::BTreeMap;
 
-use nesam_engine::{
-    Command, Engine, EngineError, Limits, MeasureAnswer, Measurement, OpenSession, Outcome, Reply, SessionImage, WheelMeasurement,
-};
+use nesam_engine::{Command, Engine, EngineError, Limits, MeasureAnswer, Measurement, OpenSession, Outcome, Reply, SessionImage};
 use nesam_server::convert::{image_bytes, session_image};
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
@@ -55,15 +53,7 @@ impl Pair {
         change: impl FnOnce(&mut Measurement),
         vehicle: Option<&str>,
     ) -> Result<MeasureAnswer, EngineError> {
-        let recorded = recorded();
-        let mut measurement = Measurement {
-            sequence: None,
-            boot: None,
-            stamp_ns: i as i64 * STEP_NS,
-            state: recorded.drive.states[i],
-            command: recorded.drive.controls[i],
-            wheels: WheelMeasurement::default(),
-        };
+        let mut measurement = engine_sample(&recorded().drive, i);
         change(&mut measurement);
         match self.ask(Command::Measure { session: name.into(), vehicle: vehicle.map(Into::into), measurement })? {
             Reply::Measured(answer) => Ok(*answer),

@@ -4,6 +4,7 @@ use std::sync::{Arc, OnceLock};
 
 use nesam_adaptation::CalibratedFilter;
 use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
+use nesam_engine::{PredictExtras, PredictQuery, WheelMeasurement};
 use nesam_evaluation::adapt_drive;
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{HistoryStep, ModelBundle, Predictor, Provenance, Rollout, RolloutQuery, Variant};
@@ -135,6 +136,34 @@ pub fn sample(session: &str, drive: &Trajectory, i: usize) -> v1::Measurement {
     let mut message = measurement(session, i as i64 * STEP_NS, drive.states[i].to_array(), [control.speed_m_s, control.second]);
     message.sequence = i as u64 + 1;
     message
+}
+
+/// Sample `i` of a drive as the engine takes it.
+pub fn engine_sample(drive: &Trajectory, i: usize) -> nesam_engine::Measurement {
+    nesam_engine::Measurement {
+        sequence: None,
+        boot: None,
+        stamp_ns: i as i64 * STEP_NS,
+        state: drive.states[i],
+        command: drive.controls[i],
+        wheels: WheelMeasurement::default(),
+    }
+}
+
+/// The candidates of [`candidates`] as the engine takes them, without extras.
+pub fn engine_query(session: &str, drive: &Trajectory, i: usize, samples: usize, horizon: usize) -> PredictQuery {
+    PredictQuery {
+        session: session.into(),
+        start: None,
+        instant: None,
+        use_history: true,
+        samples,
+        samples_min: 0,
+        horizon,
+        controls: nesam_engine::Candidates::Given(candidates(session, drive, i, samples, horizon).controls),
+        cost: None,
+        extras: PredictExtras::default(),
+    }
 }
 
 /// Samples `0..=last` of a drive.
