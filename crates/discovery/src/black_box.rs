@@ -39,6 +39,7 @@ impl BlackBox {
         }
         let scale = bundle.normalization.residual_scale.map(f64::from);
         let (mean, directions) = principal(case)?;
+        let metric = case.metric_without.believing_all();
         let drives = case
             .prepared
             .par_iter()
@@ -57,7 +58,7 @@ impl BlackBox {
                         difference(rows, &changed.deviations(&case.bench, &[], &SoilCorrection::NONE), 1.0)
                     })
                     .collect();
-                profiled(&case.metric_without, rows, &columns, &prepared.signatures.soil)
+                profiled(&metric, rows, &columns, &prepared.signatures.soil)
             })
             .collect();
         Some(Self { mean, directions, parts: Parts::of(drives) })

@@ -193,6 +193,11 @@ impl Candidate {
         self.line.layer
     }
 
+    /// Whether the answer to the effect goes through the contact of the wheels, which is known roughly: forces, soils, and what changes the drive.
+    pub fn through_contact(&self) -> bool {
+        self.layer().is_force() || ["torque_limit", "speed_lag", "speed_delay", "speed_gain", "locked_differential"].contains(&self.id())
+    }
+
     /// The effect with given values of the free parameters.
     pub fn effect(&self, values: &[f64]) -> Effect {
         let mut all = self.line.columns[0].clone();
@@ -236,13 +241,15 @@ impl Candidate {
 
     /// Moves values into the physical range; true where the range holds one of them.
     pub fn clamp(&self, values: &mut [f64]) -> Vec<bool> {
-        let ranges: Vec<[f64; 2]> = (0..values.len()).map(|i| self.range(i)).collect();
+        let quantities = self.of(&self.line.columns[0]).quantities();
+        let ends: Vec<([f64; 2], bool)> =
+            (0..values.len()).map(|i| (self.range(i), quantities[self.line.free[i].parameter].complete)).collect();
         values
             .iter_mut()
-            .zip(ranges)
-            .map(|(value, [low, high])| {
+            .zip(ends)
+            .map(|(value, ([low, high], complete))| {
                 let margin = 0.01 * (high - low);
-                let held = *value <= low + if low < 0.0 { margin } else { 0.0 } || *value >= high - margin;
+                let held = *value <= low + if low < 0.0 { margin } else { 0.0 } || !complete && *value >= high - margin;
                 *value = value.clamp(low, high);
                 held
             })

@@ -376,8 +376,9 @@ fn half_width(group: &Group, fit: &Fit, term: usize, derivatives: &[(usize, f64)
 fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
     let candidate = fit.terms[term].candidate;
     let free = candidate.free();
-    candidate
-        .effect(&fit.values[term])
+    let effect = candidate.effect(&fit.values[term]);
+    let quantities = effect.quantities();
+    effect
         .parameters()
         .iter()
         .enumerate()
@@ -386,7 +387,8 @@ fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
                 // The first value is the magnitude, which answers for the scale of the response.
                 let scale = if i == 0 { 1.96 * mismatch(candidate.layer()) * fit.values[term][i] } else { 0.0 };
                 let half = half_width(group, fit, term, &[(i, 1.0)], |values| values[i]).hypot(scale);
-                [parameter.value - half, parameter.value + half]
+                let end = if quantities[p].complete { parameter.range[1] } else { f64::INFINITY };
+                [parameter.value - half, (parameter.value + half).min(end)]
             });
             Estimate { name: parameter.name, unit: parameter.unit, value: parameter.value, ci95 }
         })

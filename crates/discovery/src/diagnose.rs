@@ -225,7 +225,7 @@ fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool
     }
     let (left, what) = &selection.remaining;
     let share = left / selection.largest().max(1e-9);
-    let force = findings.iter().any(|f| f.candidate.layer().is_force());
+    let force = findings.iter().any(|f| f.candidate.through_contact());
     if !model_on_trial && *left >= selection.threshold && share > if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY } {
         return (
             Verdict::Unexplained,

@@ -40,6 +40,7 @@ impl Leftover {
         let force = UNIT_SHARE * vehicle.mass_kg * vehicle.gravity_m_s2;
         let units: Vec<f64> = (0..PARAMETERS).map(|p| force / FEATURE_UNITS[p % FREE_FORM_FEATURES]).collect();
         let named = fit.map_or_else(Vec::new, Fit::effects);
+        let metric = case.metric.believing_all();
         let drives = case
             .prepared
             .par_iter()
@@ -59,7 +60,7 @@ impl Leftover {
                 if let Some(fit) = fit {
                     columns.extend(parameter_columns(&case.bench, prepared, &fit.terms, &fit.values));
                 }
-                profiled(&case.metric, &rows, &columns, &prepared.signatures.soil)
+                profiled(&metric, &rows, &columns, &prepared.signatures.soil)
             })
             .collect();
         Self { region, units, parts: Parts::of(drives) }

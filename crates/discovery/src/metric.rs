@@ -29,6 +29,8 @@ pub struct Metric {
     pub within: DMatrix<f64>,
     /// Covariance of a drive's level.
     pub between: DMatrix<f64>,
+    /// Share of what segments say within a drive that is believed against its level ([`believed_within`](crate::condense::believed_within)); 1 = all of it.
+    pub within_believed: f64,
     whiten: DMatrix<f64>,
     level: DMatrix<f64>,
 }
@@ -72,7 +74,17 @@ impl Metric {
         let lower = within.clone().cholesky()?.l();
         let whiten = lower.solve_lower_triangular(&DMatrix::identity(channels.len(), channels.len()))?;
         let level = &whiten * &between * whiten.transpose();
-        Some(Self { channels, centre, within, between, whiten, level })
+        Some(Self { channels, centre, within, between, within_believed: 1.0, whiten, level })
+    }
+
+    /// The same that believes a share of what segments say within a drive.
+    pub fn believing(self, within_believed: f64) -> Self {
+        Self { within_believed, ..self }
+    }
+
+    /// The same that believes all: for what is fitted to predict and claims nothing.
+    pub fn believing_all(&self) -> Self {
+        self.clone().believing(1.0)
     }
 
     /// A deviation from the usual level, whitened. (C)

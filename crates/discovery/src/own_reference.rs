@@ -2,7 +2,8 @@
 //!
 //! The hypothesis is then not "these drives differ from those" but "the model is wrong on average". Deviations are measured against zero, not against what is
 //! usual; the scatter is that of the same drives about their mean, the drive being the unit of replication. The null distribution comes from changing the
-//! sign of whole drives at random: if the model were right on average, a drive would deviate as often to one side as to the other.
+//! sign of whole drives at random: if the model were right on average, a drive would deviate as often to one side as to the other. What segments say within a
+//! drive is believed whole: these drives have the effect that is sought, and its answer would count as disagreement between them.
 
 use nalgebra::DVector;
 use nesam_model::{ModelBundle, Predictor};

@@ -14,13 +14,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::candidates::{Candidate, catalogue};
 use crate::channels::{self, CHANNELS, Row};
-use crate::condense::{Condensed, column_names, condense, level_column, signatures};
+use crate::condense::{Condensed, Signatures, believed_within, column_names, condense, level_column, signatures};
 use crate::error::DiscoveryError;
 use crate::evidence::{Group, Nulls};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
 
-const SCHEMA: &str = "nesam.reference/3";
+const SCHEMA: &str = "nesam.reference/4";
 /// Random groups of null drives.
 const NULL_GROUPS: usize = 1000;
 /// Fewest drives of a reference.
@@ -47,7 +47,7 @@ pub struct NullDrive {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reference {
-    /// Always `nesam.reference/3`.
+    /// Always `nesam.reference/4`.
     pub schema: String,
     /// Hash of the data behind it.
     pub data_hash: String,
@@ -59,6 +59,8 @@ pub struct Reference {
     pub centre: Vec<f64>,
     /// Covariance of a segment within its drive, lower half by rows.
     pub within: Vec<f64>,
+    /// Share of what segments say within a drive that is believed against its level.
+    pub within_believed: f64,
     /// Covariance of a drive's level, lower half by rows.
     pub between: Vec<f64>,
     /// Null drives.
@@ -97,13 +99,22 @@ impl Reference {
         let metric = Metric::measure(&rows, &available)
             .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })?;
         let catalogue = catalogue();
+        let signatures: Vec<Signatures> = drives
+            .iter()
+            .enumerate()
+            .map(|(count, drive)| {
+                let signatures = signatures(bench, drive, &catalogue);
+                done(count + 1);
+                signatures
+            })
+            .collect();
+        let within_believed = believed_within(&metric, rows.iter().map(Vec::as_slice).zip(&signatures));
+        let metric = metric.believing(within_believed);
         let nulls = drives
             .iter()
-            .zip(&rows)
-            .enumerate()
-            .map(|(count, (drive, rows))| {
-                let condensed = condense(&metric, rows, &signatures(bench, drive, &catalogue));
-                done(count + 1);
+            .zip(rows.iter().zip(&signatures))
+            .map(|(drive, (rows, signatures))| {
+                let condensed = condense(&metric, rows, signatures);
                 NullDrive {
                     trajectory: drive.id.clone(),
                     score: condensed.score.iter().map(|v| *v as f32).collect(),
@@ -118,6 +129,7 @@ impl Reference {
             columns: column_names(&catalogue),
             centre: metric.centre.iter().copied().collect(),
             within: lower(&metric.within),
+            within_believed,
             between: lower(&metric.between),
             drives: nulls,
         })
@@ -143,7 +155,8 @@ impl Reference {
             && read.within.len() == half(channels)
             && read.between.len() == half(channels)
             && read.drives.iter().all(|d| d.score.len() == columns && d.information.len() == half(columns));
-        if !sized || read.drives.len() < DRIVES_MIN {
+        let believed = read.within_believed > 0.0 && read.within_believed <= 1.0;
+        if !sized || !believed || read.drives.len() < DRIVES_MIN {
             return Err(fail("has arrays of another size; run `nesam diagnose --make-reference`".into()));
         }
         Ok(read)
@@ -170,6 +183,7 @@ impl Reference {
         }
         let size = channels.len();
         Metric::new(channels, DVector::from_column_slice(&self.centre), symmetric(&self.within, size), symmetric(&self.between, size))
+            .map(|metric| metric.believing(self.within_believed))
             .ok_or_else(|| fail("has a covariance that is not definite"))
     }
 

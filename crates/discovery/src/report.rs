@@ -13,7 +13,7 @@ use crate::diagnose::{Against, Diagnosis, Verdict};
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
-pub const STOP_RULE: &str = "3: up to three effects, pairwise criterion 6, at most 40 % of the largest evidence left, 20 % for geometry";
+pub const STOP_RULE: &str = "4: up to three effects, pairwise criterion 6, at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree";
 const STAGES: [&str; 3] = ["before", "soil only", "after"];
 
 /// What a report is made from.

@@ -279,8 +279,8 @@ impl Yardstick {
 
     /// The same where `left` are the scores after the fit went through the physics.
     ///
-    /// The rims of this drive line follow the ground plus an over-speed and carry no torque (ADR 0003): what a force or a soil does to them is not
-    /// predicted, so their levels do not speak against one.
+    /// What a force or a soil does to the rims follows from the slope of traction, which is known worst (and without torque not at all, ADR 0003), so their
+    /// levels do not speak against one.
     pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
         let columns = self.columns(chosen);
         let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);

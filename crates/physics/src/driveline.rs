@@ -209,22 +209,15 @@ pub struct WheelCommand<T> {
     pub speed_m_s: T,
 }
 
-/// Linear interpolation in an ascending table, held at its ends.
+/// Linear interpolation in an ascending table, carried on beyond its ends with the slope there: a linkage does not end where a data sheet does.
 fn interpolate<T: Real<Value = f64>>(x: T, grid: &[f64], values: &[f64]) -> T {
-    let last = grid.len() - 1;
-    let at = x.value();
-    if at <= grid[0] {
-        return T::lit(values[0]);
-    }
-    if at >= grid[last] {
-        return T::lit(values[last]);
-    }
-    let i = grid.partition_point(|&g| g <= at) - 1;
+    let Some(last) = grid.len().checked_sub(1).filter(|last| *last > 0) else { return T::lit(values[0]) };
+    let i = grid.partition_point(|&g| g <= x.value()).clamp(1, last) - 1;
     let share = (x - T::lit(grid[i])) / T::lit(grid[i + 1] - grid[i]);
     T::lit(values[i]) + share * T::lit(values[i + 1] - values[i])
 }
 
-/// Road-wheel angles FL, FR, RL, RR of an actuator position, rad.
+/// Road-wheel angles FL, FR, RL, RR of an actuator position, rad. Positions beyond the table, where an offset or a ratio takes them, go on with its slope.
 pub fn road_wheel_angles<T: Real<Value = f64>>(vehicle: &Vehicle, steering: T) -> [T; WHEELS] {
     let zero = T::lit(0.0);
     match (&vehicle.steering, vehicle.second) {

@@ -23,6 +23,8 @@ const SLIP_RANGE: [f64; 2] = [-3.0, 0.6];
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// Coupling of a locked differential, N m s/rad (chosen: ten times a viscous one).
 const LOCKED_N_M_S: f64 = 5000.0;
+/// What half a lock leaves of that coupling is one part in this many and one (chosen: as much as a viscous coupling, which grips about half of a difference).
+const LOOSENESS: f64 = 16.0;
 /// What presses a wheel in the air, N: its share in a load of nothing would be 0 / 0 in f32.
 const LEAST_PRELOAD_N: f64 = 0.01;
 /// Smallest contact length, m.
@@ -121,6 +123,12 @@ fn handed_over<T: Real>(coupling_n_s_m: f64, driven_n: &[T; WHEELS], ground_m_s:
     core::array::from_fn(|i| coupling * share[i] * (rims[i].slope_n_s_m * (mean - turning[i]) - untaken[i]))
 }
 
+/// Coupling of a lock that takes away a share of the difference of rims, N m s/rad: k s / (1 - s) against a slope of traction k, up to the stiffest one.
+fn lock_n_m_s(share: f64) -> f64 {
+    let share = share.clamp(0.0, 1.0);
+    LOCKED_N_M_S * share / (share + LOOSENESS * (1.0 - share))
+}
+
 /// A wheel under torque, as the step needs it.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Driven<T> {
@@ -155,8 +163,7 @@ impl StepModel {
             let braked_n = self.vehicle.effects.force.wheel_drag_n_m[i] / self.wheel_at(i).radius_m;
             driven_n - forward_m_s[i] / forward_m_s[i].abs_smooth(SPEED_FLOOR_M_S) * T::lit(braked_n)
         });
-        // A lock is a coupling that leaves no difference: stiff against every soil.
-        let coupling_n_m_s = 2.0 * line.side_coupling_n_m_s + actuator.lock * LOCKED_N_M_S;
+        let coupling_n_m_s = 2.0 * line.side_coupling_n_m_s + lock_n_m_s(actuator.lock);
         let coupling_n_s_m = coupling_n_m_s / (self.wheel.radius_m * self.wheel.radius_m);
         let mut at_rim_n = alone_n;
         for mobilised in MOBILISED.into_iter().filter(|_| coupling_n_s_m != 0.0) {
@@ -190,6 +197,16 @@ mod tests {
     fn grip(load_n: f64, soil: &Soil<f64>) -> Grip<f64> {
         let wheel = WheelGeometry::new(0.467, 0.254).with_law(ContactLaw::SoilContactModel);
         Grip::new(&wheel, bekker_sinkage(load_n, 0.467, 0.254, soil), load_n, soil)
+    }
+
+    #[test]
+    fn analytic_a_lock_grows_from_nothing_to_one_that_is_stiff() {
+        assert!(lock_n_m_s(0.0) == 0.0 && lock_n_m_s(1.0) == LOCKED_N_M_S && lock_n_m_s(1.3) == LOCKED_N_M_S);
+        // k s / (1 - s) for a slope of traction of k, far from the end.
+        for share in [0.2, 0.5, 0.7] {
+            let want = LOCKED_N_M_S / LOOSENESS * share / (1.0 - share);
+            assert!((lock_n_m_s(share) / want - 1.0).abs() < 0.15, "{share}: {} {want}", lock_n_m_s(share));
+        }
     }
 
     #[test]

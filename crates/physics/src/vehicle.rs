@@ -222,12 +222,11 @@ impl Vehicle {
     }
 
     /// Torque that the drive adds at each wheel against the friction of all of them, N m: a vehicle that tracks its speed with an integral part holds it
-    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none; one driven by torque adds
-    /// as much as its demand grows.
+    /// in spite of the friction, through open differentials equally at all wheels. A vehicle that servoes its rims adds none. Not asked of one driven by
+    /// torque, whose demand grows by itself.
     pub fn drag_made_up_n_m(&self) -> f64 {
         let mean = self.effects.force.wheel_drag_n_m.iter().sum::<f64>() / WHEELS as f64;
-        let makes_up = self.second != SecondCommand::YawRateRadS && self.driveline.torque.is_none();
-        if makes_up { mean } else { 0.0 }
+        if self.second == SecondCommand::YawRateRadS { 0.0 } else { mean }
     }
 
     /// Friction torque that is left to the tread of a wheel, N m, for a slope of traction over rim speed of `slope_n_s_m`, the same at both wheels of the

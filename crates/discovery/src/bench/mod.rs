@@ -6,7 +6,9 @@
 //! |---|---|
 //! | `actuator`, `sensor`, `map` | one effect of the catalogue in the recording, exact ([`Change`]) |
 //! | `force_twin` | one force or soil effect, driven again by our own physics ([`crate::observe::ObservedDrive::driven_again`]) |
-//! | `onset` | an effect that begins in the middle of the drives |
+//! | `force_twin_large` | the same at two to three times the size |
+//! | `other_twin` | suspension, drive line, steering and soil, driven again |
+//! | `onset`, `onset_twin` | an effect that begins in the middle of the drives, recorded or driven again |
 //! | `two` | two effects at once |
 //! | `outside` | something that the catalogue does not have |
 //! | `left_out` | an effect of the catalogue, with its id withheld from the diagnosis |
@@ -65,10 +67,10 @@ fn recorded(set: &'static str, id: &'static str, size: f64, change: Change) -> H
     Hidden { set, changes: vec![change], driven: Vec::new(), truth: vec![(id, size)], onset_s: 0.0, without: Vec::new() }
 }
 
-fn driven(id: &'static str, values: &[f64], scored: usize) -> Option<Hidden> {
+fn driven(set: &'static str, id: &'static str, values: &[f64], scored: usize) -> Option<Hidden> {
     let effect = Effect::from_parameters(id, values)?;
     let truth = vec![(id, values[scored])];
-    Some(Hidden { set: "force_twin", changes: Vec::new(), driven: vec![effect], truth, onset_s: 0.0, without: Vec::new() })
+    Some(Hidden { set, changes: Vec::new(), driven: vec![effect], truth, onset_s: 0.0, without: Vec::new() })
 }
 
 fn outside(change: Change) -> Hidden {
@@ -103,7 +105,8 @@ pub fn plan() -> Vec<Hidden> {
         outside(C::SteeringWarp(0.08)),
         outside(C::VelocityRipple(0.15)),
     ];
-    let forces: [(&'static str, &[f64], usize); 10] = [
+    type Twin = (&'static str, &'static [f64], usize);
+    const FORCES: [Twin; 10] = [
         ("payload", &[500.0, -1.0, 0.0, 0.7], 0),
         ("wheel_drag", &[1.0, 900.0], 1),
         ("linear_drag", &[200.0], 0),
@@ -115,7 +118,37 @@ pub fn plan() -> Vec<Hidden> {
         ("tyre_radius_rear", &[0.03], 0),
         ("slip_sinkage", &[1.0], 0),
     ];
-    plan.extend(forces.into_iter().filter_map(|(id, values, scored)| driven(id, values, scored)));
+    const LARGE: [Twin; 6] = [
+        ("linear_drag", &[500.0], 0),
+        ("quadratic_drag", &[150.0], 0),
+        ("rolling_resistance", &[0.08], 0),
+        ("tow", &[2000.0, 0.0], 0),
+        ("wind", &[800.0, 0.0], 0),
+        ("tyre_radius_front", &[-0.05], 0),
+    ];
+    const OTHERS: [Twin; 10] = [
+        ("cg_height", &[0.3], 0),
+        ("roll_stiffness", &[-0.4], 0),
+        ("pitch_stiffness", &[-0.4], 0),
+        ("side_bulldozing", &[0.5, 15_000.0], 0),
+        ("multi_pass", &[0.5], 0),
+        ("locked_differential", &[1.0], 0),
+        ("torque_limit", &[0.6], 0),
+        ("speed_lag", &[0.4], 0),
+        ("steering_backlash", &[0.1], 0),
+        ("steering_compliance", &[1e-5], 0),
+    ];
+    const BEGUN: [Twin; 4] =
+        [("payload", &[500.0, -1.0, 0.0, 0.7], 0), ("wheel_drag", &[1.0, 900.0], 1), ("tow", &[2000.0, 0.0], 0), ("cg_lateral", &[0.1], 0)];
+    let twins = |set, onset_s, twins: &[Twin]| -> Vec<Hidden> {
+        let hidden = |(id, values, scored): &Twin| Some(Hidden { onset_s, ..driven(set, id, values, *scored)? });
+        twins.iter().filter_map(hidden).collect()
+    };
+    for (set, onset_s, hidden) in
+        [("force_twin", 0.0, &FORCES[..]), ("force_twin_large", 0.0, &LARGE), ("other_twin", 0.0, &OTHERS), ("onset_twin", 11.0, &BEGUN)]
+    {
+        plan.extend(twins(set, onset_s, hidden));
+    }
     for (id, size, change) in [
         ("steering_offset", 0.08, C::SteeringOffset(0.08)),
         ("gyro_bias", 0.02, C::GyroBias(0.02)),

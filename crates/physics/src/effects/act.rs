@@ -44,7 +44,7 @@ pub struct Quantity {
     pub name: &'static str,
     /// Unit as in reports.
     pub unit: &'static str,
-    /// Physical range; an estimate at its end is not accepted.
+    /// Physical range; an estimate at its end is not accepted, unless it is `complete` there.
     pub range: [f64; 2],
     /// A size that a good drive shows.
     pub typical: f64,
@@ -52,17 +52,24 @@ pub struct Quantity {
     pub scaling: Scaling,
     /// Whether a mirror image of the vehicle has it with the other sign.
     pub odd: bool,
+    /// Whether the upper end of the range is something that vehicles have, such as a lock that is closed, and no bound of what is believed.
+    pub complete: bool,
 }
 
 impl Quantity {
     /// A quantity that a mirror image shares.
     pub const fn new(name: &'static str, unit: &'static str, range: [f64; 2], typical: f64, scaling: Scaling) -> Self {
-        Self { name, unit, range, typical, scaling, odd: false }
+        Self { name, unit, range, typical, scaling, odd: false, complete: false }
     }
 
     /// The same with left and right exchanged by its sign.
     pub const fn odd(self) -> Self {
         Self { odd: true, ..self }
+    }
+
+    /// The same with an upper end that vehicles have.
+    pub const fn complete(self) -> Self {
+        Self { complete: true, ..self }
     }
 }
 

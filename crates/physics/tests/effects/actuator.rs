@@ -97,6 +97,20 @@ fn analytic_ratio_and_offset_of_the_road_wheels() {
 }
 
 #[test]
+fn analytic_an_offset_at_full_lock_turns_the_wheels_beyond_the_table() {
+    let mut vehicle = truck();
+    (vehicle.driveline.steering_lag_s, vehicle.driveline.steering_rate_limit_per_s) = (0.0, 1e3);
+    let table = vehicle.steering.clone().expect("the truck has a steering table");
+    let (last, end) = (table.command.len() - 1, 1.0);
+    assert_eq!(table.command[last], end);
+    let angle = |effects: &[Effect], told: f64| follow(&vehicle.with_effects(effects), &[[1.0, told]; 4])[3].1.angle_rad[0];
+    assert!((angle(&[], end) - table.front_left_rad[last]).abs() < 1e-12);
+    let slope = (table.front_left_rad[last] - table.front_left_rad[last - 1]) / (table.command[last] - table.command[last - 1]);
+    let beyond = angle(&[Effect::SteeringOffset(SteeringOffset { second: 0.12 })], end) - table.front_left_rad[last];
+    assert!((beyond / (0.12 * slope) - 1.0).abs() < 1e-9, "{beyond}");
+}
+
+#[test]
 fn analytic_backlash_is_crossed_at_every_reversal() {
     let play = 0.1;
     let vehicle = direct().with_effects(&[Effect::SteeringBacklash(SteeringBacklash { second: play })]);

@@ -62,7 +62,7 @@ fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
         assert_eq!(Effect::from_parameters(effect.id(), &effect.values()), Some(*effect));
         assert_eq!(Effect::from_parameters(effect.id(), &[0.0; 9]), None);
         for p in effect.parameters() {
-            assert!(p.range[0] <= p.value && p.value < p.range[1], "{} {} = {}", effect.id(), p.name, p.value);
+            assert!(p.range[0] <= p.value && p.value <= p.range[1], "{} {} = {}", effect.id(), p.name, p.value);
         }
     }
 }

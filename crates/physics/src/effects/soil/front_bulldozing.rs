@@ -8,7 +8,7 @@ effect! {
     /// motion. The rear wheels roll in ruts.
     struct FrontBulldozing = "front_bulldozing" in Soil {
         /// a, -.
-        share: ("-", [-0.2, 2.0], 0.5, Size),
+        share: ("-", [0.0, 2.0], 0.5, Size),
         /// Unit weight of the soil, N/m³.
         unit_weight_n_m3: ("N/m³", [5e3, 25e3], 16e3, Held),
     }
