@@ -155,9 +155,11 @@ impl Reference {
             && read.within.len() == half(channels)
             && read.between.len() == half(channels)
             && read.drives.iter().all(|d| d.score.len() == columns && d.information.len() == half(columns));
-        let believed = read.within_believed > 0.0 && read.within_believed <= 1.0;
-        if !sized || !believed || read.drives.len() < DRIVES_MIN {
+        if !sized || read.drives.len() < DRIVES_MIN {
             return Err(fail("has arrays of another size; run `nesam diagnose --make-reference`".into()));
+        }
+        if !(read.within_believed > 0.0 && read.within_believed <= 1.0) {
+            return Err(fail(format!("believes {} of what varies within a drive, not a share above 0 and up to 1", read.within_believed)));
         }
         Ok(read)
     }

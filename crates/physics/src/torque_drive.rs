@@ -23,7 +23,7 @@ const SLIP_RANGE: [f64; 2] = [-3.0, 0.6];
 const SPEED_FLOOR_M_S: f64 = 0.05;
 /// Coupling of a locked differential, N m s/rad (chosen: ten times a viscous one).
 const LOCKED_N_M_S: f64 = 5000.0;
-/// What half a lock leaves of that coupling is one part in this many and one (chosen: as much as a viscous coupling, which grips about half of a difference).
+/// The coupling of half a lock is one part in this many and one of the whole (chosen: about that of a viscous coupling).
 const LOOSENESS: f64 = 16.0;
 /// What presses a wheel in the air, N: its share in a load of nothing would be 0 / 0 in f32.
 const LEAST_PRELOAD_N: f64 = 0.01;

@@ -77,6 +77,47 @@ fn outside(change: Change) -> Hidden {
     Hidden { set: "outside", changes: vec![change], driven: Vec::new(), truth: Vec::new(), onset_s: 0.0, without: Vec::new() }
 }
 
+/// An effect under which drives are driven again: id, values of its parameters, and which of them is scored.
+type Twin = (&'static str, &'static [f64], usize);
+/// Forces and a soil at the sizes of the catalogue or about twice that.
+const FORCES: [Twin; 10] = [
+    ("payload", &[500.0, -1.0, 0.0, 0.7], 0),
+    ("wheel_drag", &[1.0, 900.0], 1),
+    ("linear_drag", &[200.0], 0),
+    ("quadratic_drag", &[60.0], 0),
+    ("rolling_resistance", &[0.03], 0),
+    ("tow", &[800.0, 0.0], 0),
+    ("cg_forward", &[0.15], 0),
+    ("cg_lateral", &[0.1], 0),
+    ("tyre_radius_rear", &[0.03], 0),
+    ("slip_sinkage", &[1.0], 0),
+];
+/// Forces that a speed control makes up for, larger.
+const LARGE: [Twin; 6] = [
+    ("linear_drag", &[500.0], 0),
+    ("quadratic_drag", &[150.0], 0),
+    ("rolling_resistance", &[0.08], 0),
+    ("tow", &[2000.0, 0.0], 0),
+    ("wind", &[800.0, 0.0], 0),
+    ("tyre_radius_front", &[-0.05], 0),
+];
+/// Suspension, soil, drive line and steering.
+const OTHERS: [Twin; 10] = [
+    ("cg_height", &[0.3], 0),
+    ("roll_stiffness", &[-0.4], 0),
+    ("pitch_stiffness", &[-0.4], 0),
+    ("side_bulldozing", &[0.5, 15_000.0], 0),
+    ("multi_pass", &[0.5], 0),
+    ("locked_differential", &[1.0], 0),
+    ("torque_limit", &[0.6], 0),
+    ("speed_lag", &[0.4], 0),
+    ("steering_backlash", &[0.1], 0),
+    ("steering_compliance", &[1e-5], 0),
+];
+/// Forces that begin in the middle of a drive.
+const BEGUN: [Twin; 4] =
+    [("payload", &[500.0, -1.0, 0.0, 0.7], 0), ("wheel_drag", &[1.0, 900.0], 1), ("tow", &[2000.0, 0.0], 0), ("cg_lateral", &[0.1], 0)];
+
 /// Everything that is hidden, each at the size that the catalogue calls believable on four terrains or about twice that.
 pub fn plan() -> Vec<Hidden> {
     use Change as C;
@@ -105,41 +146,6 @@ pub fn plan() -> Vec<Hidden> {
         outside(C::SteeringWarp(0.08)),
         outside(C::VelocityRipple(0.15)),
     ];
-    type Twin = (&'static str, &'static [f64], usize);
-    const FORCES: [Twin; 10] = [
-        ("payload", &[500.0, -1.0, 0.0, 0.7], 0),
-        ("wheel_drag", &[1.0, 900.0], 1),
-        ("linear_drag", &[200.0], 0),
-        ("quadratic_drag", &[60.0], 0),
-        ("rolling_resistance", &[0.03], 0),
-        ("tow", &[800.0, 0.0], 0),
-        ("cg_forward", &[0.15], 0),
-        ("cg_lateral", &[0.1], 0),
-        ("tyre_radius_rear", &[0.03], 0),
-        ("slip_sinkage", &[1.0], 0),
-    ];
-    const LARGE: [Twin; 6] = [
-        ("linear_drag", &[500.0], 0),
-        ("quadratic_drag", &[150.0], 0),
-        ("rolling_resistance", &[0.08], 0),
-        ("tow", &[2000.0, 0.0], 0),
-        ("wind", &[800.0, 0.0], 0),
-        ("tyre_radius_front", &[-0.05], 0),
-    ];
-    const OTHERS: [Twin; 10] = [
-        ("cg_height", &[0.3], 0),
-        ("roll_stiffness", &[-0.4], 0),
-        ("pitch_stiffness", &[-0.4], 0),
-        ("side_bulldozing", &[0.5, 15_000.0], 0),
-        ("multi_pass", &[0.5], 0),
-        ("locked_differential", &[1.0], 0),
-        ("torque_limit", &[0.6], 0),
-        ("speed_lag", &[0.4], 0),
-        ("steering_backlash", &[0.1], 0),
-        ("steering_compliance", &[1e-5], 0),
-    ];
-    const BEGUN: [Twin; 4] =
-        [("payload", &[500.0, -1.0, 0.0, 0.7], 0), ("wheel_drag", &[1.0, 900.0], 1), ("tow", &[2000.0, 0.0], 0), ("cg_lateral", &[0.1], 0)];
     let twins = |set, onset_s, twins: &[Twin]| -> Vec<Hidden> {
         let hidden = |(id, values, scored): &Twin| Some(Hidden { onset_s, ..driven(set, id, values, *scored)? });
         twins.iter().filter_map(hidden).collect()
