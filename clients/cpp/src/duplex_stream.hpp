@@ -17,8 +17,8 @@
 
 namespace nesam::detail {
 
-/// A bidirectional stream of a session with its two threads, in which each request gets exactly one answer, in order. The reader outlives the writer: it joins it, then
-/// reads the final status, so that nothing is called on the stream after that.
+/// A bidirectional stream of a session with its two threads, in which each request gets exactly one answer, in order. The reader outlives the writer: it joins
+/// it, then reads the final status, so that nothing is called on the stream after that.
 ///
 /// `Kind` says what travels: the messages `Request` and `Reply`, what is kept of a request until its answer comes (`Sent`), the `Answer`, the most of them that
 /// may be outstanding or uncollected (`pending_max`), how the stream is opened (`open`) and how a reply is read (`answer`).

@@ -180,20 +180,25 @@ pub fn level_column(channel: usize) -> usize {
 
 /// Condenses a drive: the catalogue's columns and, after them, the level of every channel as a column of its own, which names no cause.
 pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Condensed {
-    let mut columns: Vec<Vec<DVector<f64>>> = signatures.columns.iter().map(|g| g.iter().map(|row| metric.shift(row)).collect()).collect();
+    let mut columns = whitened(metric, &signatures.columns);
     for c in 0..CHANNELS {
         let unit =
             metric.channels.iter().position(|own| *own == c).map_or_else(|| DVector::zeros(metric.channels.len()), |at| metric.unit(at));
         columns.push(vec![unit; rows.len()]);
     }
     let named = columns.len();
-    columns.extend(signatures.soil.iter().map(|g| g.iter().map(|row| metric.shift(row)).collect::<Vec<_>>()));
+    columns.extend(whitened(metric, &signatures.soil));
     profile_soil(&products(metric, rows, &columns).sum(metric), named)
+}
+
+/// Columns as shifts in the metric, segment by segment.
+fn whitened(metric: &Metric, columns: &[Vec<Row>]) -> Vec<Vec<DVector<f64>>> {
+    columns.iter().map(|column| column.iter().map(|row| metric.shift(row)).collect()).collect()
 }
 
 /// Condenses a drive over any columns, without levels.
 pub fn profiled(metric: &Metric, rows: &[Row], columns: &[Vec<Row>], soil: &[Vec<Row>]) -> Condensed {
-    let shifts: Vec<Vec<DVector<f64>>> = columns.iter().chain(soil).map(|g| g.iter().map(|row| metric.shift(row)).collect()).collect();
+    let shifts: Vec<Vec<DVector<f64>>> = [columns, soil].into_iter().flat_map(|c| whitened(metric, c)).collect();
     profile_soil(&products(metric, rows, &shifts).sum(metric), columns.len())
 }
 
@@ -239,9 +244,7 @@ fn products(metric: &Metric, rows: &[Row], columns: &[Vec<DVector<f64>>]) -> Pro
 pub fn believed_within<'a>(metric: &Metric, drives: impl Iterator<Item = (&'a [Row], &'a Signatures)>) -> f64 {
     let scores: Vec<Vec<(f64, f64)>> = drives
         .map(|(rows, signatures)| {
-            let shifts: Vec<Vec<DVector<f64>>> =
-                signatures.columns.iter().map(|g| g.iter().map(|row| metric.shift(row)).collect()).collect();
-            let within = products(metric, rows, &shifts).within;
+            let within = products(metric, rows, &whitened(metric, &signatures.columns)).within;
             (1..within.ncols()).map(|j| (within[(0, j)], within[(j, j)])).collect()
         })
         .collect();
@@ -306,15 +309,15 @@ pub fn best_soil<'a>(drives: impl Iterator<Item = &'a Condensed>) -> SoilCorrect
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rand::{RngExt, SeedableRng};
+    use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
 
     /// Drives of 40 segments with noise of one in nine channels, so that few segments are far out, and an answer in the first that each drive has a share of, of
     /// this standard deviation.
     fn drives(sd: f64) -> (Metric, Vec<Vec<Row>>, Signatures) {
         let mut rng = ChaCha8Rng::seed_from_u64(3);
-        // Sum of twelve uniform deviates, Irwin and Hall: variance one.
-        let mut normal = || (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0;
+        let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
         let answer = |k: usize| if k % 10 < 5 { 0.5 } else { -0.5 };
         let row = |value: f64| -> Row { core::array::from_fn(|c| if c == 0 { value } else { 0.0 }) };
         let mut noisy = |value: f64| -> Row { core::array::from_fn(|c| if c == 0 { value + normal() } else { normal() }) };

@@ -182,8 +182,9 @@ impl Group {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use rand::{RngExt, SeedableRng};
+    use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
+    use rand_distr::{Distribution, StandardNormal};
 
     /// Information of two columns at a cosine of 0.8 and one apart from them.
     fn information() -> DMatrix<f64> {
@@ -195,8 +196,7 @@ mod tests {
         let lower = information().cholesky().unwrap().l();
         let mut noise = DVector::zeros(3);
         for i in 0..3 {
-            // Sum of twelve uniform deviates, Irwin and Hall: variance one.
-            noise[i] = (0..12).map(|_| rng.random::<f64>()).sum::<f64>() - 6.0;
+            noise[i] = StandardNormal.sample(rng);
         }
         Condensed {
             score: 2.0 * lower * noise + information().column(0) * share,

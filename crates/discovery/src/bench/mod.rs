@@ -63,18 +63,22 @@ pub struct Hidden {
     pub without: Vec<String>,
 }
 
-fn recorded(set: &'static str, id: &'static str, size: f64, change: Change) -> Hidden {
-    Hidden { set, changes: vec![change], driven: Vec::new(), truth: vec![(id, size)], onset_s: 0.0, without: Vec::new() }
+/// Drives as they were recorded.
+fn nothing(set: &'static str) -> Hidden {
+    Hidden { set, changes: Vec::new(), driven: Vec::new(), truth: Vec::new(), onset_s: 0.0, without: Vec::new() }
 }
 
-fn driven(set: &'static str, id: &'static str, values: &[f64], scored: usize) -> Option<Hidden> {
-    let effect = Effect::from_parameters(id, values)?;
-    let truth = vec![(id, values[scored])];
-    Some(Hidden { set, changes: Vec::new(), driven: vec![effect], truth, onset_s: 0.0, without: Vec::new() })
+fn recorded(set: &'static str, id: &'static str, size: f64, change: Change) -> Hidden {
+    Hidden { changes: vec![change], truth: vec![(id, size)], ..nothing(set) }
+}
+
+fn driven(set: &'static str, (id, values, scored): Twin) -> Hidden {
+    let effect = Effect::from_parameters(id, values).expect("twins have the ids and parameters of the catalogue; this is a bug");
+    Hidden { driven: vec![effect], truth: vec![(id, values[scored])], ..nothing(set) }
 }
 
 fn outside(change: Change) -> Hidden {
-    Hidden { set: "outside", changes: vec![change], driven: Vec::new(), truth: Vec::new(), onset_s: 0.0, without: Vec::new() }
+    Hidden { changes: vec![change], ..nothing("outside") }
 }
 
 /// An effect under which drives are driven again: id, values of its parameters, and which of them is scored.
@@ -114,6 +118,8 @@ const OTHERS: [Twin; 10] = [
     ("steering_backlash", &[0.1], 0),
     ("steering_compliance", &[1e-5], 0),
 ];
+/// When an effect begins that is not there from the start, s.
+const ONSET_S: f64 = 11.0;
 /// Forces that begin in the middle of a drive.
 const BEGUN: [Twin; 4] =
     [("payload", &[500.0, -1.0, 0.0, 0.7], 0), ("wheel_drag", &[1.0, 900.0], 1), ("tow", &[2000.0, 0.0], 0), ("cg_lateral", &[0.1], 0)];
@@ -146,21 +152,16 @@ pub fn plan() -> Vec<Hidden> {
         outside(C::SteeringWarp(0.08)),
         outside(C::VelocityRipple(0.15)),
     ];
-    let twins = |set, onset_s, twins: &[Twin]| -> Vec<Hidden> {
-        let hidden = |(id, values, scored): &Twin| Some(Hidden { onset_s, ..driven(set, id, values, *scored)? });
-        twins.iter().filter_map(hidden).collect()
-    };
-    for (set, onset_s, hidden) in
-        [("force_twin", 0.0, &FORCES[..]), ("force_twin_large", 0.0, &LARGE), ("other_twin", 0.0, &OTHERS), ("onset_twin", 11.0, &BEGUN)]
-    {
-        plan.extend(twins(set, onset_s, hidden));
+    for (set, twins) in [("force_twin", &FORCES[..]), ("force_twin_large", &LARGE), ("other_twin", &OTHERS)] {
+        plan.extend(twins.iter().map(|twin| driven(set, *twin)));
     }
+    plan.extend(BEGUN.map(|twin| Hidden { onset_s: ONSET_S, ..driven("onset_twin", twin) }));
     for (id, size, change) in [
         ("steering_offset", 0.08, C::SteeringOffset(0.08)),
         ("gyro_bias", 0.02, C::GyroBias(0.02)),
         ("steering_ratio", 0.15, C::SteeringRatio(0.15)),
     ] {
-        plan.push(Hidden { onset_s: 11.0, ..recorded("onset", id, size, change) });
+        plan.push(Hidden { onset_s: ONSET_S, ..recorded("onset", id, size, change) });
         plan.push(Hidden { without: vec![id.into()], ..recorded("left_out", id, size, change) });
     }
     for (first, second) in [
@@ -171,8 +172,7 @@ pub fn plan() -> Vec<Hidden> {
         let truth = vec![(first.0, first.1), (second.0, second.1)];
         plan.push(Hidden { changes: vec![first.2, second.2], truth, ..recorded("two", first.0, first.1, first.2) });
     }
-    let null = |set, changes| Hidden { set, changes, driven: Vec::new(), truth: Vec::new(), onset_s: 0.0, without: Vec::new() };
-    plan.extend([null("null", Vec::new()), null("null_noise", vec![C::Noise(1.0)])]);
+    plan.extend([nothing("null"), Hidden { changes: vec![C::Noise(1.0)], ..nothing("null_noise") }]);
     plan
 }
 
