@@ -1,10 +1,11 @@
 //! The machine's clocks: the one that the engine sees, and that of the calendar.
 
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use nesam_engine::Clock;
+use tokio::time::Instant;
 
-/// Nanoseconds since the clock was made.
+/// Nanoseconds since the clock was made; of simulated time inside a simulation.
 #[derive(Clone, Copy, Debug)]
 pub struct MonotonicClock(Instant);
 

@@ -15,9 +15,11 @@ mod error;
 mod expiry;
 mod grpc;
 mod http;
+mod one_thread;
 pub mod recording;
 mod serve;
 pub mod store;
+mod sync;
 mod telemetry;
 mod tls_listener;
 mod web;
@@ -29,6 +31,7 @@ pub use config::{
     ZenohMode, is_tls_endpoint,
 };
 pub use error::ServerError;
+pub use one_thread::serve_on_one_thread;
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;
 pub use zenoh::{LinkFiles, router_config};

@@ -9,15 +9,15 @@ use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Limits, T
 use nesam_model::Predictor;
 use nesam_proto::v1 as pb;
 use tokio::net::TcpListener;
-use tokio::sync::{Semaphore, broadcast, watch};
+use tokio::sync::{broadcast, watch};
 use tokio::task::JoinHandle;
-use tonic::transport::server::TcpIncoming;
+use tonic::transport::server::{Router, TcpIncoming};
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
 use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
-use crate::clock::{MonotonicClock, unix_ns};
+use crate::clock::MonotonicClock;
 use crate::cluster::Cluster;
 use crate::config::{Config, GrpcConfig};
 use crate::error::ServerError;
@@ -29,10 +29,10 @@ use crate::store::{EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, St
 use crate::telemetry::Metrics;
 use crate::tls_listener;
 use crate::web::{Feed, Live, Raised};
-use crate::zenoh::{Bus, Presence};
+use crate::zenoh::{Presence, RenewedBus};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
-const EVENTS_KEPT: usize = 1024;
+pub(crate) const EVENTS_KEPT: usize = 1024;
 
 /// Names under which health is reported; the empty one stands for the whole server.
 const HEALTH_NAMES: [&str; 6] =
@@ -52,7 +52,7 @@ pub struct RunningServer {
     stop: watch::Sender<bool>,
     grpc: JoinHandle<()>,
     http: Option<JoinHandle<()>>,
-    bus: Option<Bus>,
+    bus: Option<RenewedBus>,
     recorder: Option<Arc<Recorder>>,
     keeper: Option<Arc<Keeper>>,
     cluster: Option<Cluster>,
@@ -92,15 +92,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         (config.store.enabled || config.cluster.enabled()).then(|| Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s))));
     let (live, passed) = Live::new(&config.http);
     let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone(), live.feed.clone());
-    let unusable =
-        |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
-    let mut engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|e| unusable(&e))?;
-    if config.fleet_soil.enabled {
-        engine = engine
-            .with_fleet_soil((&config.fleet_soil).into())
-            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
-    }
-    let engine = engine.with_events(sink);
+    let engine = engine_of(&config, &predictor, sink)?;
     let clock = MonotonicClock::default();
     let (recorder, tap) = start_recording(&config, &predictor, clock)?;
     let handle = EngineHandle::spawn_tapped(engine, Arc::new(clock), tap);
@@ -119,21 +111,13 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
-        engine,
-        predictor,
-        uploads: Arc::new(Semaphore::new(config.grpc.uploads_max)),
-        config: Arc::new(config.grpc),
-        events,
-        stopping: stopping.clone(),
         presence: config.zenoh.enabled.then(Presence::default),
-        run: unix_ns().unsigned_abs(),
         keeper: keeper.clone(),
         cluster: cluster.clone(),
-        runtime: tokio::runtime::Handle::current(),
-        access,
+        ..Edge::alone(engine, predictor, config.grpc, access, events, stopping.clone())
     };
     let bus = match config.zenoh.enabled {
-        true => match Bus::start(&config.zenoh, &config.tls, &edge).await {
+        true => match RenewedBus::start(config.zenoh, config.tls, edge.clone(), tls.as_ref().map(Credentials::tls)).await {
             Ok(bus) => Some(bus),
             Err(error) => {
                 end_store(keeper, cluster).await;
@@ -181,6 +165,18 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     })
 }
 
+/// The engine that the configuration asks for, whose events go to `sink`.
+pub(crate) fn engine_of(config: &Config, predictor: &Arc<Predictor>, sink: EventSink) -> Result<Engine, ServerError> {
+    let unusable =
+        |error: &dyn std::fmt::Display| ServerError::SoilFilter { bundle: predictor.bundle().name.clone(), reason: error.to_string() };
+    let engine = Engine::new(predictor.clone(), Limits::from(&config.limits)).map_err(|error| unusable(&error))?;
+    let engine = match config.fleet_soil.enabled {
+        true => engine.with_fleet_soil((&config.fleet_soil).into()),
+        false => Ok(engine),
+    };
+    Ok(engine.map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?.with_events(sink))
+}
+
 fn spawn_http(listener: TcpListener, router: axum::Router, stopping: watch::Receiver<bool>) -> JoinHandle<()> {
     tokio::spawn(async move {
         if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
@@ -205,7 +201,7 @@ fn start_recording(
 }
 
 /// Where the engine's events go: counters, the directory of sessions, the store, the live page, watchers.
-fn event_sink(
+pub(crate) fn event_sink(
     watchers: broadcast::Sender<Event>,
     metrics: Arc<Metrics>,
     keeper: Option<Arc<Keeper>>,
@@ -298,13 +294,8 @@ fn builder(config: &GrpcConfig) -> tonic::transport::Server {
         .http2_max_pending_accept_reset_streams(Some(64))
 }
 
-fn spawn_grpc(
-    listener: TcpListener,
-    credentials: Option<Credentials>,
-    edge: &Edge,
-    health: &HealthReporter,
-    stopping: watch::Receiver<bool>,
-) -> JoinHandle<()> {
+/// All services, health and reflection.
+pub(crate) fn router(edge: &Edge, health: &HealthReporter) -> Router {
     let health =
         tonic_health::pb::health_server::HealthServer::new(tonic_health::server::HealthService::from_health_reporter(health.clone()));
     let reflection = tonic_reflection::server::Builder::configure()
@@ -312,8 +303,17 @@ fn spawn_grpc(
         .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
         .build_v1()
         .expect("the committed descriptor set decodes; this is a bug");
-    let routes = grpc::routes(edge).add_service(health).add_service(reflection);
-    let router = builder(&edge.config).add_routes(routes);
+    builder(&edge.config).add_routes(grpc::routes(edge).add_service(health).add_service(reflection))
+}
+
+fn spawn_grpc(
+    listener: TcpListener,
+    credentials: Option<Credentials>,
+    edge: &Edge,
+    health: &HealthReporter,
+    stopping: watch::Receiver<bool>,
+) -> JoinHandle<()> {
+    let router = router(edge, health);
     let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
     let Some(credentials) = credentials else {
         return tokio::spawn(ended(router.serve_with_incoming_shutdown(incoming, stopped(stopping))));
@@ -323,7 +323,7 @@ fn spawn_grpc(
     tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stopped(stopping))))
 }
 
-async fn ended(serving: impl Future<Output = Result<(), tonic::transport::Error>>) {
+pub(crate) async fn ended(serving: impl Future<Output = Result<(), tonic::transport::Error>>) {
     if let Err(error) = serving.await {
         tracing::error!(%error, "grpc ended");
     }

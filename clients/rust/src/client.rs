@@ -58,6 +58,11 @@ impl Client {
         Self::connect_over(address, Some(tls)).await
     }
 
+    /// A client over a connection that somebody else made.
+    pub fn over(channel: Channel) -> Self {
+        Self { channel, route: Route::default() }
+    }
+
     async fn connect_over(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {
         let failed = |source| ClientError::Connect { address: address.into(), source };
         let endpoint = Endpoint::from_shared(address.to_string()).map_err(failed)?;
@@ -66,7 +71,7 @@ impl Client {
             Some(tls) => endpoint.tls_config(tls.config()).map_err(failed)?,
             None => endpoint,
         };
-        Ok(Self { channel: endpoint.connect().await.map_err(failed)?, route: Route::default() })
+        Ok(Self::over(endpoint.connect().await.map_err(failed)?))
     }
 
     /// The same connection, working for one vehicle: a proxy in front of several servers keeps its calls together (metadata `x-vehicle-id`).

@@ -1,9 +1,8 @@
 //! The engine behind a thread.
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex};
-use std::thread::JoinHandle;
 
 use crate::clock::Clock;
 use crate::command::{Command, Reply};
@@ -12,6 +11,8 @@ use crate::error::EngineError;
 use crate::limits::Limits;
 use crate::queue::{Queue, Turn};
 use crate::service_time::work;
+use crate::sync::thread::{self, JoinHandle};
+use crate::sync::{Mutex, mpsc};
 
 /// A command on its way to the engine.
 pub struct Submission {
@@ -89,13 +90,21 @@ pub struct Executed {
 /// Hears of every command but snapshots after its answer was sent, in the order of execution; called on the engine's thread, so it must not wait.
 pub type Tap = Box<dyn FnMut(Executed) + Send>;
 
-/// The way to an engine that runs on a thread of its own. Clones share the engine.
+/// The way to an engine. Clones share the engine.
 #[derive(Clone)]
 pub struct EngineHandle {
     queue: Arc<Queue>,
     clock: Arc<dyn Clock>,
     limits: Arc<Limits>,
-    thread: Arc<Mutex<Option<JoinHandle<Engine>>>>,
+    worker: Arc<Worker>,
+}
+
+/// Who executes. `None` once the engine was given back.
+enum Worker {
+    /// A thread of its own.
+    Thread(Mutex<Option<JoinHandle<Engine>>>),
+    /// Whoever submits.
+    Submitter(Mutex<Option<(Engine, Option<Tap>)>>),
 }
 
 impl core::fmt::Debug for EngineHandle {
@@ -121,14 +130,21 @@ impl EngineHandle {
     pub fn spawn_tapped(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
         let queue = Arc::new(Queue::default());
         let limits = Arc::new(engine.limits().clone());
-        let thread = std::thread::Builder::new()
+        let thread = thread::Builder::new()
             .name("nesam-engine".into())
             .spawn({
                 let (queue, clock) = (queue.clone(), clock.clone());
                 move || run(engine, &queue, clock.as_ref(), tap)
             })
             .expect("the system starts a thread");
-        Self { queue, clock, limits, thread: Arc::new(Mutex::new(Some(thread))) }
+        Self { queue, clock, limits, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
+    }
+
+    /// An engine without a thread: whoever submits executes all that waits before it goes on, unless somebody else is at it. So a simulation runs on one
+    /// thread.
+    pub fn unthreaded(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
+        let limits = Arc::new(engine.limits().clone());
+        Self { queue: Arc::default(), clock, limits, worker: Arc::new(Worker::Submitter(Mutex::new(Some((engine, tap))))) }
     }
 
     /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once.
@@ -138,6 +154,19 @@ impl EngineHandle {
             let (error, submission) = *refused;
             submission.refuse(error);
         }
+        self.work_off();
+    }
+
+    /// Executes what waits where nobody else does. What comes while another executes is found by that one: it looks again after it has let the engine go.
+    fn work_off(&self) {
+        let Worker::Submitter(held) = self.worker.as_ref() else { return };
+        while self.queue.has_turn() {
+            let Ok(mut held) = held.try_lock() else { return };
+            let Some((engine, tap)) = held.as_mut() else { return };
+            while self.queue.has_turn() {
+                take_turn(self.queue.next(|| self.clock.now_ns()), engine, &self.queue, self.clock.as_ref(), tap);
+            }
+        }
     }
 
     /// The same, waiting for the answer on this thread.
@@ -145,7 +174,7 @@ impl EngineHandle {
     /// # Errors
     /// Any [`EngineError`].
     pub fn call(&self, command: Command) -> Result<Reply, EngineError> {
-        let (sender, receiver) = std::sync::mpsc::channel();
+        let (sender, receiver) = mpsc::channel();
         self.submit(Submission::new(command, move |answer| {
             let _ = sender.send(answer.result);
         }));
@@ -173,28 +202,36 @@ impl EngineHandle {
         for submission in self.queue.stop() {
             submission.refuse(EngineError::Stopped);
         }
-        let thread = self.thread.lock().ok()?.take()?;
-        thread.join().ok()
+        match self.worker.as_ref() {
+            Worker::Thread(thread) => thread.lock().ok()?.take()?.join().ok(),
+            Worker::Submitter(held) => held.lock().ok()?.take().map(|(engine, _)| engine),
+        }
     }
 }
 
 /// The thread's loop.
 fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap>) -> Engine {
-    loop {
-        match queue.next(|| clock.now_ns()) {
-            Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
-                answer(&mut engine, submission, Ok(()), clock, &mut tap, |_| ());
-            }),
-            Turn::Prediction(mut submission) => {
-                let left_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(clock.now_ns()));
-                let Command::Predict(query) = &mut submission.command else { continue };
+    while take_turn(queue.next(|| clock.now_ns()), &mut engine, queue, clock, &mut tap) {}
+    engine
+}
+
+/// Does what a turn asks for; false at the end.
+fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, tap: &mut Option<Tap>) -> bool {
+    match turn {
+        Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
+            answer(engine, submission, Ok(()), clock, tap, |_| ());
+        }),
+        Turn::Prediction(mut submission) => {
+            let left_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(clock.now_ns()));
+            if let Command::Predict(query) = &mut submission.command {
                 let fits = queue.fit(query, left_ns);
                 let work = work(query, query.samples);
-                answer(&mut engine, *submission, fits, clock, &mut tap, |took_ns| queue.done(work, took_ns));
+                answer(engine, *submission, fits, clock, tap, |took_ns| queue.done(work, took_ns));
             }
-            Turn::End => return engine,
         }
+        Turn::End => return false,
     }
+    true
 }
 
 /// Executes a command. A panic inside is a bug of ours; it costs that command, not the service.

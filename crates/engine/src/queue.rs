@@ -1,7 +1,7 @@
 //! The two lanes in front of the engine, and what is let in.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::sync::Arc;
 
 use crate::command::Command;
 use crate::error::EngineError;
@@ -10,6 +10,7 @@ use crate::handle::Submission;
 use crate::limits::Limits;
 use crate::query::PredictQuery;
 use crate::service_time::{ServiceTime, work};
+use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// What an answer still needs after the engine: its way back, ns.
 const WAY_BACK_NS: u64 = 2_000_000;
@@ -137,6 +138,12 @@ impl Queue {
         lanes.stopped = true;
         self.filled.notify_all();
         lanes.predictions.drain()
+    }
+
+    /// Whether [`Queue::next`] would give a command or a prediction at once.
+    pub fn has_turn(&self) -> bool {
+        let lanes = self.lock();
+        !lanes.commands.is_empty() || (!lanes.stopped && lanes.predictions.len() > 0)
     }
 
     /// Waiting commands and predictions.

@@ -23,6 +23,7 @@ use tonic::service::Routes;
 
 use crate::access::{Access, Caller, Wish};
 use crate::call::EngineClient;
+use crate::clock::unix_ns;
 use crate::cluster::{Brought, Cluster, moved};
 use crate::config::GrpcConfig;
 use crate::convert::to_status;
@@ -61,6 +62,31 @@ pub(crate) struct Edge {
 }
 
 impl Edge {
+    /// Of a server without store, cluster and bus.
+    pub fn alone(
+        engine: EngineClient,
+        predictor: Arc<Predictor>,
+        config: GrpcConfig,
+        access: Access,
+        events: broadcast::Sender<Event>,
+        stopping: watch::Receiver<bool>,
+    ) -> Self {
+        Self {
+            engine,
+            predictor,
+            uploads: Arc::new(Semaphore::new(config.uploads_max)),
+            config: Arc::new(config),
+            events,
+            stopping,
+            presence: None,
+            run: unix_ns().unsigned_abs(),
+            keeper: None,
+            cluster: None,
+            runtime: tokio::runtime::Handle::current(),
+            access,
+        }
+    }
+
     /// Time that a request may take: what the client allows, at most the configured deadline.
     pub fn budget<T>(&self, request: &tonic::Request<T>) -> Duration {
         deadline::budget(request.metadata(), Duration::from_secs_f64(self.config.deadline_s))

@@ -1,21 +1,25 @@
 //! What is not on stable storage yet, and the thread that brings it there.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard};
-use std::thread::JoinHandle;
-use std::time::{Duration, Instant};
+use std::sync::Arc;
+use std::time::Duration;
 
 use nesam_engine::{Command, EngineHandle, Event, Reply, Snapshot};
 use tokio::sync::watch;
+use tokio::time::Instant;
 
 use super::map_bytes::map_bytes;
 use super::restore::Restored;
 use super::{Change, SessionStore, StoreError, StoredSession};
 use crate::clock::unix_ns;
 use crate::convert::image_bytes;
+use crate::sync::thread::{self, JoinHandle};
+use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// Pause before a commit that failed is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
+/// Pause between two looks of a keeper without a thread.
+const LOOK_EVERY: Duration = Duration::from_millis(10);
 
 /// Accepted measurements of each session in a commit; `None` = the session is gone.
 type Places = BTreeMap<String, Option<u64>>;
@@ -64,7 +68,7 @@ struct State {
 
 /// Knows what is durable and sees to it that everything becomes so.
 #[derive(Debug)]
-pub(crate) struct Keeper {
+pub struct Keeper {
     state: Mutex<State>,
     changed: Condvar,
     /// Counts the commits, for those who wait for one.
@@ -124,13 +128,13 @@ impl Keeper {
     }
 
     /// Counters.
-    pub fn counts(&self) -> StoreCounts {
+    pub(crate) fn counts(&self) -> StoreCounts {
         let state = self.lock();
         StoreCounts { waiting: state.dirty.len(), ..state.counts }
     }
 
     /// Resolves when every change that is noted now of a session or map is on stable storage; says whether that was within `budget`.
-    pub async fn settled(&self, key: &Key, budget: Duration) -> bool {
+    pub(crate) async fn settled(&self, key: &Key, budget: Duration) -> bool {
         let mut committed = self.committed.subscribe();
         let Some(latest) = self.lock().dirty.get(key).map(|dirty| dirty.latest) else { return true };
         let wait = async {
@@ -144,7 +148,7 @@ impl Keeper {
     }
 
     /// Makes what waits for a commit due now.
-    pub fn hurry(&self, key: &Key) {
+    pub(crate) fn hurry(&self, key: &Key) {
         if let Some(dirty) = self.lock().dirty.get_mut(key) {
             dirty.due = Instant::now();
             self.changed.notify_one();
@@ -168,18 +172,35 @@ impl Keeper {
         self.lock().gone.remove(session);
     }
 
-    /// Starts the thread. What was restored is durable already.
-    ///
-    /// # Errors
-    /// `StoreError::File` when the system refuses to start a thread.
-    pub fn start(self: &Arc<Self>, store: Box<dyn SessionStore>, engine: EngineHandle, restored: Restored) -> Result<(), StoreError> {
+    /// What was restored is durable already.
+    fn begin(self: &Arc<Self>, store: Box<dyn SessionStore>, engine: EngineHandle, restored: Restored) -> Work {
         let mut state = self.lock();
         state.dirty.clear();
         state.renamed.clear();
         state.durable = restored.accepted;
         drop(state);
-        let work = Work { keeper: Arc::clone(self), store, engine, maps: restored.maps };
-        let thread = std::thread::Builder::new().name("nesam-store".into()).spawn(move || work.run());
+        Work { keeper: Arc::clone(self), store, engine, maps: restored.maps }
+    }
+
+    /// Does in the calling task what the thread does, without an end, for a server on one thread.
+    pub async fn keep(self: Arc<Self>, store: Box<dyn SessionStore>, engine: EngineHandle, restored: Restored) {
+        let mut work = self.begin(store, engine, restored);
+        loop {
+            tokio::time::sleep(LOOK_EVERY).await;
+            let due = self.due(&mut self.lock());
+            if !due.is_empty() {
+                work.commit(&due);
+            }
+        }
+    }
+
+    /// Starts the thread.
+    ///
+    /// # Errors
+    /// `StoreError::File` when the system refuses to start a thread.
+    pub fn start(self: &Arc<Self>, store: Box<dyn SessionStore>, engine: EngineHandle, restored: Restored) -> Result<(), StoreError> {
+        let work = self.begin(store, engine, restored);
+        let thread = thread::Builder::new().name("nesam-store".into()).spawn(move || work.run());
         let thread = thread.map_err(|source| StoreError::File { path: "thread nesam-store".into(), source })?;
         if let Ok(mut held) = self.thread.lock() {
             *held = Some(thread);
@@ -197,26 +218,29 @@ impl Keeper {
         }
     }
 
-    /// Waits until something is due, or everything once the server stops; nothing when there is nothing left to do.
+    /// What is due now, everything once the server stops: each with its latest change.
+    fn due(&self, state: &mut State) -> BTreeMap<Key, u64> {
+        let (now, stopping) = (Instant::now(), state.stopping);
+        let due = state.dirty.iter_mut().filter(|(_, dirty)| stopping || dirty.due <= now);
+        due.map(|(key, dirty)| {
+            // What changes while this is committed is due by itself.
+            dirty.due = now + self.interval;
+            (key.clone(), dirty.latest)
+        })
+        .collect()
+    }
+
+    /// Waits until something is due; nothing when the server stops and there is nothing left to do.
     fn next_due(&self) -> BTreeMap<Key, u64> {
         let mut state = self.lock();
         loop {
-            let now = Instant::now();
-            let stopping = state.stopping;
-            let due = state.dirty.iter_mut().filter(|(_, dirty)| stopping || dirty.due <= now);
-            let due: BTreeMap<Key, u64> = due
-                .map(|(key, dirty)| {
-                    // What changes while this is committed is due by itself.
-                    dirty.due = now + self.interval;
-                    (key.clone(), dirty.latest)
-                })
-                .collect();
-            if !due.is_empty() || stopping {
+            let due = self.due(&mut state);
+            if !due.is_empty() || state.stopping {
                 return due;
             }
             let next = state.dirty.values().map(|dirty| dirty.due).min();
             // Woken by a change that is due at once; what is due later is looked at after an interval at the latest.
-            let pause = next.map_or(self.interval, |next| next.saturating_duration_since(now));
+            let pause = next.map_or(self.interval, |next| next.saturating_duration_since(Instant::now()));
             (state, _) = self.changed.wait_timeout(state, pause).expect("no holder of the keeper's state panics; this is a bug");
         }
     }
@@ -262,7 +286,7 @@ impl Keeper {
     }
 }
 
-/// What the thread owns.
+/// What commits.
 struct Work {
     keeper: Arc<Keeper>,
     store: Box<dyn SessionStore>,
@@ -276,18 +300,23 @@ impl Work {
     fn run(mut self) {
         loop {
             let due = self.keeper.next_due();
-            if due.is_empty() {
+            if due.is_empty() || !self.commit(&due) {
                 return;
             }
-            let begun = Instant::now();
-            match self.write(&due) {
-                Ok((places, bytes)) => self.keeper.committed(&due, &places, bytes, begun.elapsed()),
-                Err(reason) => {
-                    tracing::error!(reason, changes = due.len(), "sessions are not durable: the store did not take them; tried again");
-                    if self.keeper.failed(&due) {
-                        return;
-                    }
-                }
+        }
+    }
+
+    /// Commits these, or sees to it that they are tried again; false when the server stops and will not wait for that.
+    fn commit(&mut self, due: &BTreeMap<Key, u64>) -> bool {
+        let begun = Instant::now();
+        match self.write(due) {
+            Ok((places, bytes)) => {
+                self.keeper.committed(due, &places, bytes, begun.elapsed());
+                true
+            }
+            Err(reason) => {
+                tracing::error!(reason, changes = due.len(), "sessions are not durable: the store did not take them; tried again");
+                !self.keeper.failed(due)
             }
         }
     }

@@ -21,10 +21,12 @@ mod restore;
 use std::path::PathBuf;
 
 pub(crate) use self::etcd::EtcdStore;
-pub(crate) use self::keeper::{Keeper, Key, StoreCounts};
+pub use self::keeper::Keeper;
+pub(crate) use self::keeper::{Key, StoreCounts};
 pub(crate) use self::map_bytes::map_of;
 pub use self::redb::RedbStore;
-pub(crate) use self::restore::{Restored, restore, resumed};
+pub use self::restore::Restored;
+pub(crate) use self::restore::{restore, resumed};
 
 /// Something that keeps sessions and maps on stable storage: [`RedbStore`] for one process, etcd for several.
 pub trait SessionStore: Send {

@@ -11,7 +11,7 @@ use crate::convert::session_image;
 
 /// What came back.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub(crate) struct Restored {
+pub struct Restored {
     /// Measurements that each session had accepted.
     pub accepted: BTreeMap<String, u64>,
     /// Hash of each map.

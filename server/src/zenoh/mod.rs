@@ -5,10 +5,12 @@ mod keys;
 mod measurements;
 mod predict;
 mod presence;
+mod renewal;
 mod soil;
 
 pub use access_control::{LinkFiles, router_config};
 pub(crate) use presence::Presence;
+pub(crate) use renewal::RenewedBus;
 
 use std::time::Duration;
 
@@ -26,7 +28,7 @@ const MEASUREMENT_BYTES_MAX: usize = 64 << 10;
 const ANSWERS_WAITING_MAX: usize = 4096;
 
 /// A running Zenoh side.
-pub(crate) struct Bus {
+struct Bus {
     session: ::zenoh::Session,
     publisher: tokio::task::JoinHandle<()>,
     soil: tokio::task::JoinHandle<()>,
@@ -72,7 +74,7 @@ impl Bus {
     }
 }
 
-/// The configuration of the session. Whoever connects to this server over TLS gets the keys that the fleet file says; the files are read once.
+/// The configuration of the session. Whoever connects to this server over TLS gets the keys that the fleet file says.
 fn zenoh_config(config: &ZenohConfig, tls: &TlsConfig, members: Option<&FleetFile>) -> Result<::zenoh::Config, ::zenoh::Error> {
     let mode = match config.mode {
         ZenohMode::Peer => "peer",

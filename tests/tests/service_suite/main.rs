@@ -25,6 +25,7 @@ mod routing;
 mod security;
 mod session_model;
 mod sessions;
+mod simulation;
 mod soil;
 mod stage;
 mod streams;

@@ -125,3 +125,59 @@ async fn service_a_server_that_listens_with_tls_guards_its_fleet_itself() {
     guarded(&stage, &endpoint, operator).await;
     stage.server.shutdown().await;
 }
+
+/// A vehicle that connects like this and reports until it is answered; says how.
+async fn reports(endpoint: &str, tls: &Tls, measurement: &v1::Measurement) -> Option<String> {
+    let vehicle = tokio::time::timeout(SILENCE, ZenohVehicle::connect_tls(endpoint, "test", "truck", tls)).await.ok()?.ok()?;
+    vehicle.publish(measurement).await.ok()?;
+    let answer = vehicle.answer(SILENCE).await.ok()??;
+    Some(outcome_label(&answer).into())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_server_that_listens_with_tls_takes_new_certificates_and_rights() {
+    let (endpoint, recorded) = (free_endpoint(), recorded());
+    let stage = secured_with(|config| {
+        config.tls.reload_s = 0.1;
+        config.zenoh.enabled = true;
+        config.zenoh.mode = ZenohMode::Router;
+        config.zenoh.listen = vec![endpoint.clone()];
+        (config.zenoh.fleet, config.zenoh.name) = ("test".into(), "alpha".into());
+    })
+    .await;
+    let mut operator = stage.client("nesam:operator:control").await;
+    operator.open_session(v1::OpenSessionRequest { vehicle_id: "truck".into(), ..Default::default() }).await.unwrap();
+    let old = stage.authority.tls("nesam:vehicle:truck");
+    assert_eq!(reports(&endpoint, &old, &sample("", &recorded.drive, 0)).await.as_deref(), Some("APPLIED"));
+    let replace = |name: &str, bytes: &[u8]| {
+        let new = written(stage.files.path(), "new", bytes);
+        std::fs::rename(new, stage.files.path().join(name)).unwrap();
+    };
+    let eventually = async |tls: &Tls, heard: bool, i: usize| {
+        let begun = std::time::Instant::now();
+        while reports(&endpoint, tls, &sample("", &recorded.drive, i)).await.is_some() != heard {
+            assert!(begun.elapsed() < 2 * PATIENCE, "sample {i} is not {}heard", if heard { "" } else { "un" });
+        }
+    };
+
+    // Taken out of the fleet file, and in again.
+    replace(
+        "fleet.toml",
+        FLEET.replace("[vehicles.truck]\nmaps = [\"local\"]\n", "").replace("vehicles = [\"truck\"]", "vehicles = []").as_bytes(),
+    );
+    eventually(&old, false, 1).await;
+    replace("fleet.toml", FLEET.as_bytes());
+    eventually(&old, true, 2).await;
+
+    // An authority that has nothing to do with the one before.
+    let successor = Authority::new();
+    let (certificate, key) = successor.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
+    replace("server.pem", &certificate);
+    replace("server.key", &key);
+    replace("ca.pem", successor.pem.as_bytes());
+    eventually(&successor.tls("nesam:vehicle:truck"), true, 3).await;
+    let stranger = Tls { authority: successor.pem.clone().into_bytes(), ..old };
+    assert!(reports(&endpoint, &stranger, &sample("", &recorded.drive, 4)).await.is_none(), "signed by the authority before");
+    drop(operator);
+    stage.server.shutdown().await;
+}
