@@ -226,6 +226,7 @@ def check_haproxy(text, scratch):
         curve = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "1", "-subj", "/CN=localhost"]
         subprocess.run(["openssl", "req", "-x509", *curve, "-keyout", str(key), "-out", str(certificate)], check=True, stderr=subprocess.DEVNULL)
         shutil.copy(certificate, scratch / "ca.crt")
+        (scratch / "both.pem").write_text(certificate.read_text() + key.read_text())
     file = scratch / "haproxy.cfg"
     file.write_text(re.sub(r"/etc/nesam/[-a-z]+/", f"{scratch}/", text))
     done = subprocess.run(["haproxy", "-c", "-f", str(file)], capture_output=True, text=True, check=False)
@@ -239,6 +240,21 @@ def settings(text):
     return [line for line in lines if line and not line.startswith(("#", "server "))]
 
 
+def check_haproxy_tls(haproxy, scratch):
+    """The configuration with certificates is the one without but for what they need, and valid."""
+    text = (ROOT / "deploy/haproxy/haproxy-tls.cfg").read_text()
+
+    def lines(text):
+        told = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
+        return [re.sub(r"port 5008\d", "port 5008x", line) for line in told]
+
+    added = [line for line in lines(text) if line not in lines(haproxy)]
+    assert len(added) == 3 and all("ssl" in line for line in added), added
+    assert [line for line in lines(haproxy) if line not in lines(text)] == ["bind :50051 proto h2"]
+    if check_haproxy(re.sub(r"/etc/nesam/tls/[-a-z]+\.pem", str(scratch / "both.pem"), text), scratch):
+        print("HAProxy with certificates differs by them alone")
+
+
 def check_others(scratch):
     """compose, HAProxy and Envoy outside of the chart: valid, and the same replicas in all of them."""
     compose = yaml.load((ROOT / "deploy/docker/compose.yaml").read_text(), Loader=Strict)
@@ -248,6 +264,7 @@ def check_others(scratch):
     haproxy = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
     assert dict(re.findall(r"^ +server (\S+) (\S+)$", haproxy, re.M)) == {name: f"{name}:50051" for name in replicas}
     read = check_haproxy(haproxy, scratch)
+    check_haproxy_tls(haproxy, scratch)
     file = ROOT / "deploy/envoy/envoy.yaml"
     cluster = yaml.load(file.read_text(), Loader=Strict)["static_resources"]["clusters"][0]
     endpoints = [e["endpoint"]["address"]["socket_address"] for e in cluster["load_assignment"]["endpoints"][0]["lb_endpoints"]]

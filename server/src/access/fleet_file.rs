@@ -20,6 +20,8 @@ pub struct FleetFile {
     /// Servers of the fleet: what Zenoh routers let answer vehicles and planners. Over gRPC they read maps, as everybody
     /// in the file does, and nothing else.
     servers: BTreeSet<String>,
+    /// Proxies that are believed for whom they call; they may do nothing themselves.
+    proxies: BTreeSet<String>,
     /// By vehicle id.
     vehicles: BTreeMap<String, VehicleEntry>,
     /// By name.
@@ -54,7 +56,14 @@ impl FleetFile {
 
     fn check(&self) -> Result<(), String> {
         let maps = self.vehicles.values().map(|v| &v.maps).chain(self.planners.values().map(|p| &p.maps)).flatten();
-        let names = self.operators.iter().chain(&self.servers).chain(self.vehicles.keys()).chain(self.planners.keys()).chain(maps);
+        let names = self
+            .operators
+            .iter()
+            .chain(&self.servers)
+            .chain(&self.proxies)
+            .chain(self.vehicles.keys())
+            .chain(self.planners.keys())
+            .chain(maps);
         for name in names {
             check_name("name", name).map_err(|error| format!("`{name}`: {error}"))?;
         }
@@ -73,10 +82,11 @@ impl FleetFile {
             Identity::Planner(name) => self.planners.contains_key(name),
             Identity::Operator(name) => self.operators.contains(name),
             Identity::Server(name) => self.servers.contains(name),
+            Identity::Proxy(name) => self.proxies.contains(name),
         }
     }
 
-    /// Everybody in the file.
+    /// Everybody in the file but the proxies, which Zenoh does not know.
     pub fn members(&self) -> impl Iterator<Item = Identity> {
         let vehicles = self.vehicles.keys().cloned().map(Identity::Vehicle);
         let planners = self.planners.keys().cloned().map(Identity::Planner);
@@ -97,7 +107,7 @@ impl FleetFile {
                 self.planners.get(name).is_some_and(|planner| planner.vehicles.contains(vehicle) || planner.vehicles.contains(ALL))
             }
             Identity::Operator(_) => self.knows(identity),
-            Identity::Server(_) => false,
+            Identity::Server(_) | Identity::Proxy(_) => false,
         }
     }
 
@@ -105,7 +115,7 @@ impl FleetFile {
     pub fn may_change(&self, identity: &Identity, vehicle: &str) -> bool {
         match identity {
             Identity::Vehicle(name) => name == vehicle && self.knows(identity),
-            Identity::Planner(_) | Identity::Server(_) => false,
+            Identity::Planner(_) | Identity::Server(_) | Identity::Proxy(_) => false,
             Identity::Operator(_) => self.knows(identity),
         }
     }
@@ -114,7 +124,7 @@ impl FleetFile {
     pub fn may_name(&self, identity: &Identity, session: &str) -> bool {
         match identity {
             Identity::Vehicle(name) => name == session || !self.vehicles.contains_key(session),
-            Identity::Planner(_) | Identity::Server(_) => false,
+            Identity::Planner(_) | Identity::Server(_) | Identity::Proxy(_) => false,
             Identity::Operator(_) => true,
         }
     }
@@ -130,7 +140,7 @@ impl FleetFile {
             Identity::Vehicle(name) => self.vehicles.get(name).is_some_and(|vehicle| vehicle.maps.contains(map)),
             Identity::Planner(name) => self.planners.get(name).is_some_and(|planner| planner.maps.contains(map)),
             Identity::Operator(_) => self.knows(identity),
-            Identity::Server(_) => false,
+            Identity::Server(_) | Identity::Proxy(_) => false,
         }
     }
 }

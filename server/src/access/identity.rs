@@ -18,6 +18,8 @@ pub enum Identity {
     Operator(String),
     /// A server of the fleet, towards Zenoh routers.
     Server(String),
+    /// A proxy that ends TLS and says with each call for whom it is.
+    Proxy(String),
 }
 
 impl Identity {
@@ -28,6 +30,7 @@ impl Identity {
             Self::Planner(name) => ("planner", name),
             Self::Operator(name) => ("operator", name),
             Self::Server(name) => ("server", name),
+            Self::Proxy(name) => ("proxy", name),
         }
     }
 
@@ -59,7 +62,8 @@ impl Identity {
             "planner" => Ok(Self::Planner((*name).into())),
             "operator" => Ok(Self::Operator((*name).into())),
             "server" => Ok(Self::Server((*name).into())),
-            _ => Err(format!("`{uri}`: roles are vehicle, planner, operator and server")),
+            "proxy" => Ok(Self::Proxy((*name).into())),
+            _ => Err(format!("`{uri}`: roles are vehicle, planner, operator, server and proxy")),
         }
     }
 

@@ -12,6 +12,7 @@ mod identity;
 use std::sync::Arc;
 
 use tokio::sync::watch;
+use tonic::metadata::MetadataMap;
 use tonic::{Request, Status};
 
 pub use self::credentials::Credentials;
@@ -20,6 +21,9 @@ pub use self::fleet_file::FleetFile;
 pub use self::identity::Identity;
 use crate::config::TlsConfig;
 use crate::error::ServerError;
+
+/// Metadata in which a proxy that ends TLS says for whom a call is: `nesam:<role>:<name>`. Of anybody else it means nothing.
+const ON_BEHALF_OF: &str = "x-nesam-identity";
 
 /// What a caller wants to do with a session, a vehicle or a map.
 #[derive(Clone, Copy, Debug)]
@@ -92,27 +96,48 @@ impl Access {
         self.fleet.as_ref().map(|fleet| fleet.borrow().clone())
     }
 
-    /// Who sent a request.
+    /// Who sent a request; behind a proxy, whom it names.
     ///
     /// # Errors
-    /// UNAUTHENTICATED when the certificate names nobody, PERMISSION_DENIED when it is nobody of the fleet.
+    /// UNAUTHENTICATED when the certificate or the proxy names nobody, PERMISSION_DENIED when it is nobody of the fleet.
     pub fn caller<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
         let Some(fleet) = self.rights() else { return Ok(Caller { access: self.clone(), identity: None }) };
         let certificates = request.peer_certs().unwrap_or_default();
-        let identity = match certificates.first() {
+        let shown = match certificates.first() {
             Some(certificate) => Identity::of_certificate(certificate),
             None => Err("the client shows no certificate".into()),
         };
-        let identity = identity.map_err(|reason| {
-            let peer = request.remote_addr().map(|address| address.to_string()).unwrap_or_default();
-            tracing::warn!(target: "nesam::audit", peer, reason, "refused: no identity");
-            Status::unauthenticated(reason)
-        })?;
-        if !fleet.knows(&identity) {
-            tracing::warn!(target: "nesam::audit", %identity, "refused: not in the fleet file");
-            return Err(Status::permission_denied(format!("{identity} is not in the fleet file of this server")));
+        let peer = || request.remote_addr().map(|address| address.to_string()).unwrap_or_default();
+        let mut identity = member(&fleet, shown, peer)?;
+        if let Identity::Proxy(_) = identity {
+            identity = member(&fleet, behind(&identity, request.metadata()), peer)?;
         }
         Ok(Caller { access: self.clone(), identity: Some(identity) })
+    }
+}
+
+/// Somebody who is in the fleet file.
+fn member(fleet: &FleetFile, identity: Result<Identity, String>, peer: impl Fn() -> String) -> Result<Identity, Status> {
+    let identity = identity.map_err(|reason| {
+        tracing::warn!(target: "nesam::audit", peer = peer(), reason, "refused: no identity");
+        Status::unauthenticated(reason)
+    })?;
+    if !fleet.knows(&identity) {
+        tracing::warn!(target: "nesam::audit", %identity, "refused: not in the fleet file");
+        return Err(Status::permission_denied(format!("{identity} is not in the fleet file of this server")));
+    }
+    Ok(identity)
+}
+
+/// For whom a proxy calls.
+fn behind(proxy: &Identity, metadata: &MetadataMap) -> Result<Identity, String> {
+    let mut values = metadata.get_all(ON_BEHALF_OF).iter();
+    let (Some(value), None) = (values.next(), values.next()) else {
+        return Err(format!("{proxy} has to say in `{ON_BEHALF_OF}` for whom it calls, once"));
+    };
+    match Identity::parse(value.to_str().map_err(|_| format!("`{ON_BEHALF_OF}` is no text"))?)? {
+        Identity::Proxy(_) => Err(format!("{proxy} calls for another proxy")),
+        identity => Ok(identity),
     }
 }
 

@@ -11,6 +11,7 @@ use crate::stage::predictor;
 pub const FLEET: &str = r#"
 operators = ["control"]
 servers = ["alpha"]
+proxies = ["front"]
 [vehicles.truck]
 maps = ["local"]
 [vehicles.other]

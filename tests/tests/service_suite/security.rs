@@ -93,6 +93,41 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
     stage.server.shutdown().await;
 }
 
+/// Lists the sessions over a client's connection as a proxy would, with these words in place of the client's certificate.
+async fn list_for(client: &Client, words: &[&str]) -> Result<Vec<String>, tonic::Status> {
+    let mut request = tonic::Request::new(v1::ListSessionsRequest {});
+    for word in words {
+        request.metadata_mut().append("x-nesam-identity", word.parse().unwrap());
+    }
+    let listed = v1::sessions_client::SessionsClient::new(client.channel()).list(request).await?;
+    Ok(listed.into_inner().sessions.into_iter().map(|session| session.session_id).collect())
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_proxy_is_believed_for_whom_it_calls_and_nobody_else_is() {
+    let stage = secured().await;
+    let (mut truck, mut other) = (stage.client("nesam:vehicle:truck").await, stage.client("nesam:vehicle:other").await);
+    truck.open_session(open_request("truck", "")).await.unwrap();
+    other.open_session(open_request("other", "")).await.unwrap();
+    let proxy = stage.client("nesam:proxy:front").await;
+    assert_eq!(list_for(&proxy, &["nesam:vehicle:truck"]).await.unwrap(), ["truck"]);
+    assert_eq!(list_for(&proxy, &["nesam:operator:control"]).await.unwrap(), ["other", "truck"]);
+    for (words, code) in [
+        (&[][..], Code::Unauthenticated),
+        (&["nesam:vehicle:truck", "nesam:operator:control"], Code::Unauthenticated),
+        (&["truck"], Code::Unauthenticated),
+        (&["nesam:proxy:front"], Code::Unauthenticated),
+        (&["nesam:vehicle:sold"], Code::PermissionDenied),
+    ] {
+        assert_eq!(list_for(&proxy, words).await.unwrap_err().code(), code, "{words:?}");
+    }
+    // Of anybody else the words mean nothing, and a proxy that is not in the fleet file is nobody.
+    assert_eq!(list_for(&other, &["nesam:operator:control"]).await.unwrap(), ["other"]);
+    let unknown = stage.client("nesam:proxy:back").await;
+    assert_eq!(list_for(&unknown, &["nesam:operator:control"]).await.unwrap_err().code(), Code::PermissionDenied);
+    stage.server.shutdown().await;
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn service_strangers_do_not_get_in() {
     let recorded = recorded();
