@@ -404,3 +404,21 @@ fn service_a_configuration_is_checked_without_serving() {
     refused(&["serve", "--check", "--config", "absent.toml"], here.path(), &["tls.certificate", "server.pem"]);
     refused(&["serve", "--check", "--config", "nowhere.toml"], here.path(), &["nowhere.toml"]);
 }
+
+/// The bundle itself in the place of one with effects: the same laps, so what differs in other laps is the effects.
+#[test]
+fn service_laps_with_a_diagnosed_bundle_differ_by_its_effects_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let (root, bundle) = (sample().display().to_string(), sample().join("../../../deploy/bundles/hmmwv-nominal").display().to_string());
+    let quick = ["--worlds", "w01", "--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
+    let asked = |more: &[&'static str]| [&["navigate", "--data", &root, "--bundle", &bundle][..], &quick, more].concat();
+    refused(&asked(&["--configurations", "diagnosed"]), folder.path(), &["--diagnosed"]);
+    let with: Vec<&str> = [asked(&["--configurations", "adapted,diagnosed", "--json", "laps.json"]), vec!["--diagnosed", &bundle]].concat();
+    let output = nesam(&with, folder.path());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let laps: Value = serde_json::from_slice(&std::fs::read(folder.path().join("laps.json")).unwrap()).unwrap();
+    let of = |i: usize| (laps["each"][i]["configuration"].as_str().unwrap().to_string(), laps["each"][i]["lap"].clone());
+    let ((first, adapted), (second, diagnosed)) = (of(0), of(1));
+    assert_eq!((first.as_str(), second.as_str()), ("adapted", "diagnosed"));
+    assert!(adapted["measurements"]["APPLIED"].as_u64() > Some(50) && adapted == diagnosed, "{adapted} {diagnosed}");
+}

@@ -273,3 +273,33 @@ fn symmetric(lower: &[f64], size: usize) -> DMatrix<f64> {
         lower[i * (i + 1) / 2 + j]
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_a_reference_that_makes_no_sense_is_refused_with_the_reason() {
+        let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/bundles/hmmwv-nominal/reference.json");
+        let shipped = std::fs::read_to_string(path).unwrap();
+        let believed = Reference::from_json(&shipped).unwrap().within_believed;
+        assert!(believed > 0.0 && believed < 1.0, "{believed}");
+        let with = |key: &str, value: serde_json::Value| {
+            let mut document: serde_json::Value = serde_json::from_str(&shipped).unwrap();
+            document[key] = value;
+            Reference::from_json(&document.to_string()).map(drop)
+        };
+        for (key, value, reason) in [
+            ("within_believed", 0.0.into(), "believes 0 of what varies"),
+            ("within_believed", 1.5.into(), "believes 1.5 of what varies"),
+            ("within_believed", serde_json::Value::Null, "expected f64"),
+            ("schema", "nesam.reference/3".into(), "is nesam.reference/3"),
+            ("columns", serde_json::json!(["payload"]), "another catalogue"),
+            ("centre", serde_json::json!([0.0]), "another size"),
+            ("drives", serde_json::json!([]), "another size"),
+        ] {
+            let error = with(key, value).unwrap_err().to_string();
+            assert!(error.contains(reason), "{key}: {error}");
+        }
+    }
+}

@@ -19,7 +19,7 @@ use crate::output::{self, say};
 use crate::progress::Progress;
 use crate::sources::{load_bundle_for, open_root};
 
-use stage::Stage;
+use stage::{Bundles, Stage};
 
 /// Correlation of the planner's noise from step to step, its standard deviation (m/s; share of full steering) and the temperature of its weights.
 const NOISE_CORRELATION: f64 = 0.8;
@@ -46,9 +46,12 @@ pub struct NavigateArgs {
     /// Worlds to drive in [default: w35 to w39 where there are any, else every world with true soil]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     worlds: Option<Vec<String>>,
-    /// Where predictions come from
-    #[arg(long, value_enum, value_name = "NAME,…", value_delimiter = ',', default_values_t = Configuration::ALL)]
-    configurations: Vec<Configuration>,
+    /// Where predictions come from [default: fixed, adapted, oracle, kinematic, and diagnosed where --diagnosed is given]
+    #[arg(long, value_enum, value_name = "NAME,…", value_delimiter = ',')]
+    configurations: Option<Vec<Configuration>>,
+    /// Bundle with the effects that a diagnosis found (`nesam diagnose` writes it), for the configuration `diagnosed`
+    #[arg(long, value_name = "DIR")]
+    diagnosed: Option<PathBuf>,
     /// Laps per configuration: worlds and both starts in turn, then the next seed
     #[arg(long, default_value_t = 30)]
     runs: usize,
@@ -95,10 +98,12 @@ pub enum Configuration {
     Oracle,
     /// A fitted bicycle on the map, no service.
     Kinematic,
+    /// The service, learning the soil while driving, with the bundle of --diagnosed.
+    Diagnosed,
 }
 
 impl Configuration {
-    const ALL: [Self; 4] = [Self::Fixed, Self::Adapted, Self::Oracle, Self::Kinematic];
+    const USUAL: [Self; 4] = [Self::Fixed, Self::Adapted, Self::Oracle, Self::Kinematic];
 
     /// As in the JSON.
     pub fn as_str(self) -> &'static str {
@@ -107,6 +112,7 @@ impl Configuration {
             Self::Adapted => "adapted",
             Self::Oracle => "oracle",
             Self::Kinematic => "kinematic",
+            Self::Diagnosed => "diagnosed",
         }
     }
 }
@@ -135,9 +141,10 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
         DataArgs { data: args.data.clone(), set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
     let (root, path) = open_root(&asked)?;
     let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &root)?;
+    let diagnosed = args.diagnosed.as_deref().map(|dir| load_bundle_for(Some(dir), &root)).transpose()?;
     let worlds = worlds_of(args, &root)?;
     let tasks = tasks_of(args, &worlds);
-    let settings = settings_of(args, &bundle.hash);
+    let settings = settings_of(args, &bundle.hash, diagnosed.as_ref().map(|bundle| bundle.hash.as_str()));
     let out = output::out_dir(args.out.as_deref(), "navigate", "laps")?;
     super::serve::log_to_stderr("error");
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
@@ -147,7 +154,7 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
         ("bundle".to_string(), format!("{} {}", bundle.name, bundle.hash)),
         ("plant".to_string(), args.plant.map_or("built in".into(), |address| address.to_string())),
     ];
-    let mut stage = Stage::new(args, root, path, bundle, effects)?;
+    let mut stage = Stage::new(args, root, path, Bundles { shipped: bundle, diagnosed }, effects)?;
     let progress = Progress::start("laps", tasks.len());
     let mut runs = Vec::new();
     for (done, task) in tasks.iter().enumerate() {
@@ -179,10 +186,19 @@ fn check(args: &NavigateArgs) -> Result<(), Failure> {
     if args.horizon == 0 || args.horizon > HORIZON_MAX || args.plan_every > args.horizon {
         return Err(Failure::input(format!("--horizon {} is not 1 to {HORIZON_MAX}, or shorter than --plan-every", args.horizon)));
     }
+    if configurations(args).contains(&Configuration::Diagnosed) && args.diagnosed.is_none() {
+        return Err(Failure::input("the configuration `diagnosed` needs --diagnosed, a bundle that a diagnosis has written"));
+    }
     if !(SPEED_LIMITS_M_S[0]..=SPEED_LIMITS_M_S[1]).contains(&args.speed) {
         return Err(Failure::input(format!("--speed {} is not {} to {} m/s", args.speed, SPEED_LIMITS_M_S[0], SPEED_LIMITS_M_S[1])));
     }
     Ok(())
+}
+
+/// Where predictions come from, unless it is told.
+fn configurations(args: &NavigateArgs) -> Vec<Configuration> {
+    let usual = || Configuration::USUAL.into_iter().chain(args.diagnosed.is_some().then_some(Configuration::Diagnosed)).collect();
+    args.configurations.clone().unwrap_or_else(usual)
 }
 
 /// The worlds to drive in, with the kind of their soil.
@@ -223,19 +239,20 @@ fn soil_kind(world_dir: &Path, map: &WorldMap) -> Result<SoilKind, Failure> {
 
 /// Laps in the order in which they are driven: an interrupted command has about as many of each configuration.
 fn tasks_of(args: &NavigateArgs, worlds: &[(String, SoilKind)]) -> Vec<Task> {
-    let places = 2 * worlds.len();
+    let (places, configurations) = (2 * worlds.len(), configurations(args));
     (0..args.runs)
         .flat_map(|i| {
             let (world, soil) = &worlds[i % worlds.len()];
             let (start, seed) = ((i % places) / worlds.len(), args.seed + (i / places) as u64);
-            args.configurations.iter().map(move |c| Task { configuration: *c, world: world.clone(), soil: *soil, start, seed })
+            configurations.clone().into_iter().map(move |c| Task { configuration: c, world: world.clone(), soil: *soil, start, seed })
         })
         .collect()
 }
 
-fn settings_of(args: &NavigateArgs, bundle_hash: &str) -> Value {
+fn settings_of(args: &NavigateArgs, bundle_hash: &str, diagnosed_hash: Option<&str>) -> Value {
     json!({
         "bundle_hash": bundle_hash,
+        "diagnosed_hash": diagnosed_hash,
         "candidates": args.candidates,
         "horizon": args.horizon,
         "plan_every": args.plan_every,

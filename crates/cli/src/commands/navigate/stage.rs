@@ -1,6 +1,7 @@
 //! Servers, plant and models of the laps.
 
-use std::collections::BTreeSet;
+use std::collections::btree_map::Entry;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -37,16 +38,34 @@ struct Service {
     maps: BTreeSet<String>,
 }
 
+/// The models of the laps.
+pub struct Bundles {
+    /// Of all configurations but one.
+    pub shipped: ModelBundle,
+    /// With the effects that a diagnosis found.
+    pub diagnosed: Option<ModelBundle>,
+}
+
+/// Which server a lap is predicted by.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+enum Kind {
+    /// Its soil stays the prior.
+    Fixed,
+    /// It learns the soil.
+    Learning,
+    /// So does this one, with the effects of the diagnosis.
+    Diagnosed,
+}
+
 /// Everything that laps share.
 pub struct Stage<'a> {
     args: &'a NavigateArgs,
     root: DataRoot,
     data: PathBuf,
-    bundle: ModelBundle,
+    bundles: Bundles,
     plant: Box<dyn PlantLink>,
     path: ReferencePath,
-    learning: Option<Service>,
-    fixed: Option<Service>,
+    services: BTreeMap<Kind, Service>,
     /// What the oracle is told, by world.
     told: Vec<(String, SoilAhead)>,
     driven: usize,
@@ -54,20 +73,14 @@ pub struct Stage<'a> {
 
 impl<'a> Stage<'a> {
     /// Prepares the plant; servers start when they are needed.
-    pub fn new(
-        args: &'a NavigateArgs,
-        root: DataRoot,
-        data: PathBuf,
-        bundle: ModelBundle,
-        effects: HiddenEffects,
-    ) -> Result<Self, Failure> {
+    pub fn new(args: &'a NavigateArgs, root: DataRoot, data: PathBuf, bundles: Bundles, effects: HiddenEffects) -> Result<Self, Failure> {
         let plant: Box<dyn PlantLink> = match &args.plant {
             // The number of the first request differs from process to process, so that a plant never takes it for one that it has answered.
             Some(address) => Box::new(RemotePlant::connect(&address.to_string(), u64::from(std::process::id()) << 20).or_input()?),
             None => Box::new(BuiltInPlant::new(&data, effects).or_input()?),
         };
         let path = ReferencePath::of_ood_soil();
-        Ok(Self { args, root, data, bundle, plant, path, learning: None, fixed: None, told: Vec::new(), driven: 0 })
+        Ok(Self { args, root, data, bundles, plant, path, services: BTreeMap::new(), told: Vec::new(), driven: 0 })
     }
 
     /// Drives one lap.
@@ -79,10 +92,10 @@ impl<'a> Stage<'a> {
             seed: task.seed,
             path: self.path.clone(),
             cost: cost_of(self.args),
-            mppi: mppi_of(self.args, &self.bundle.vehicle),
+            mppi: mppi_of(self.args, &self.bundles.shipped.vehicle),
             horizon: self.args.horizon,
             plan_every: self.args.plan_every,
-            steering_guess: steering_guess(&self.bundle.vehicle, &self.path),
+            steering_guess: steering_guess(&self.bundles.shipped.vehicle, &self.path),
         };
         let lap = run_lap(&plan, self.plant.as_mut(), &mut model).await.or_failed()?;
         if let Forecaster::Served(served) = model {
@@ -94,40 +107,44 @@ impl<'a> Stage<'a> {
 
     /// Stops the servers.
     pub async fn stop(self) {
-        for service in [self.learning, self.fixed].into_iter().flatten() {
+        for service in self.services.into_values() {
             service.server.shutdown().await;
         }
     }
 
     async fn model(&mut self, task: &Task) -> Result<Forecaster, Failure> {
-        if task.configuration == Configuration::Kinematic {
-            return self.kinematic(&task.world);
-        }
-        let learning = task.configuration == Configuration::Adapted;
-        self.raise(learning, &task.world).await?;
-        let told = if task.configuration == Configuration::Oracle { Some(self.told(&task.world).await?) } else { None };
-        let service = if learning { &self.learning } else { &self.fixed };
-        let client = service.as_ref().map(|s| s.client.clone()).ok_or_else(|| Failure::Failed("the server is gone".into()))?;
+        let kind = match task.configuration {
+            Configuration::Kinematic => return self.kinematic(&task.world),
+            Configuration::Fixed | Configuration::Oracle => Kind::Fixed,
+            Configuration::Adapted => Kind::Learning,
+            Configuration::Diagnosed => Kind::Diagnosed,
+        };
+        let client = self.raise(kind, &task.world).await?.client.clone();
+        let told = if task.configuration == Configuration::Oracle { Some(self.told(client.clone(), &task.world).await?) } else { None };
         self.driven += 1;
         let served = ServedForecaster::open(client, &format!("lap-{}", self.driven), &task.world, told).await.or_failed()?;
         Ok(Forecaster::Served(Box::new(served)))
     }
 
     fn kinematic(&self, world: &str) -> Result<Forecaster, Failure> {
-        let json = self.bundle.baselines_json.as_deref();
-        let json = json.ok_or_else(|| Failure::input(format!("bundle {} carries no fitted kinematic model", self.bundle.name)))?;
+        let bundle = &self.bundles.shipped;
+        let json = bundle.baselines_json.as_deref();
+        let json = json.ok_or_else(|| Failure::input(format!("bundle {} carries no fitted kinematic model", bundle.name)))?;
         let model = Baselines::from_json(json).or_input()?.kinematic;
         let map = self.root.world(world).or_input()?;
-        Ok(Forecaster::Kinematic(KinematicForecaster { model, vehicle: Arc::new(self.bundle.vehicle.clone()), map }))
+        Ok(Forecaster::Kinematic(KinematicForecaster { model, vehicle: Arc::new(bundle.vehicle.clone()), map }))
     }
 
-    /// Starts the server that learns, or the one that does not, unless it runs, and gives it the map of a world.
-    async fn raise(&mut self, learning: bool, world: &str) -> Result<(), Failure> {
-        let slot = if learning { &mut self.learning } else { &mut self.fixed };
-        let service = match slot {
-            Some(service) => service,
-            None => {
-                let bundle = if learning { self.bundle.clone() } else { without_learning(&self.bundle)? };
+    /// The server of a kind, which is started unless it runs and given the map of a world.
+    async fn raise(&mut self, kind: Kind, world: &str) -> Result<&Service, Failure> {
+        let service = match self.services.entry(kind) {
+            Entry::Occupied(running) => running.into_mut(),
+            Entry::Vacant(slot) => {
+                let bundle = match (kind, &self.bundles.diagnosed) {
+                    (Kind::Fixed, _) => without_learning(&self.bundles.shipped)?,
+                    (Kind::Diagnosed, Some(diagnosed)) => diagnosed.clone(),
+                    (Kind::Learning | Kind::Diagnosed, _) => self.bundles.shipped.clone(),
+                };
                 let mut config = Config::ephemeral();
                 config.http.enabled = false;
                 config.limits.clock_ahead_max_s = CLOCK_AHEAD_S;
@@ -141,18 +158,17 @@ impl<'a> Stage<'a> {
             let map = self.root.world(world).or_input()?;
             service.client.upload_map(&map_layers(&map)).await.or_failed()?;
         }
-        Ok(())
+        Ok(service)
     }
 
     /// What the oracle is told of a world: reads its true soil.
-    async fn told(&mut self, world: &str) -> Result<SoilAhead, Failure> {
+    async fn told(&mut self, mut client: Client, world: &str) -> Result<SoilAhead, Failure> {
         if let Some((_, told)) = self.told.iter().find(|(known, _)| known == world) {
             return Ok(told.clone());
         }
         let ground = Ground::read(&world_dir(&self.data, world)).or_input()?;
-        let service = self.fixed.as_mut().ok_or_else(|| Failure::Failed("the server is gone".into()))?;
         let stretch_m = self.args.speed * DT_S * self.args.horizon as f64;
-        let told = SoilAhead::along(&mut service.client, world, &ground, &self.path, stretch_m).await.or_failed()?;
+        let told = SoilAhead::along(&mut client, world, &ground, &self.path, stretch_m).await.or_failed()?;
         self.told.push((world.into(), told.clone()));
         Ok(told)
     }
