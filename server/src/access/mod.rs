@@ -161,6 +161,21 @@ impl Caller {
         decide(&fleet, identity, wish, Some(vehicle.into())).map(drop)
     }
 
+    /// Resolves when the caller, who had it, has lost a right; never where there are no identities.
+    pub async fn loses(&self, wish: Wish<'_>) -> Status {
+        let Some(mut fleet) = self.access.fleet.clone() else { return std::future::pending().await };
+        loop {
+            // A session that is gone is nobody's: that is told otherwise.
+            match self.may(wish) {
+                Err(status) if status.code() == tonic::Code::PermissionDenied => return status,
+                _ => {}
+            }
+            if fleet.changed().await.is_err() {
+                return std::future::pending().await;
+            }
+        }
+    }
+
     /// The rights in force and who the caller is, where clients have identities.
     fn known(&self) -> Option<(Arc<FleetFile>, &Identity)> {
         self.access.rights().zip(self.identity.as_ref())

@@ -129,7 +129,6 @@ impl pb::sessions_server::Sessions for Service {
 
     async fn watch_alarms(&self, request: Request<pb::WatchAlarmsRequest>) -> Result<Response<Self::WatchAlarmsStream>, Status> {
         self.0.engine.metrics().request(Transport::Grpc, "watch_alarms");
-        self.0.allow(&request, Wish::ReadSession(&request.get_ref().session_id)).await?;
         let news = News {
             of_event: |session, event| match event {
                 Event::AlarmChanged { session: of, vehicle, alarm } if of == session => Some(alarm_message(session, &vehicle, &alarm)),
@@ -137,7 +136,7 @@ impl pb::sessions_server::Sessions for Service {
             },
             of_session: |session, view| view.alarm.as_ref().map(|alarm| alarm_message(session, &view.vehicle, alarm)),
         };
-        tell(self.0.clone(), request.into_inner().session_id, news).await
+        tell(self.0.clone(), &request, request.get_ref().session_id.clone(), news).await
     }
 
     async fn close(&self, request: Request<pb::CloseSessionRequest>) -> Result<Response<pb::CloseSessionReply>, Status> {

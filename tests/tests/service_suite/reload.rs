@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use nesam_client::{Client, Tls};
+use nesam_client::{Client, Tls, v1};
 use tonic::Code;
 
 use crate::authority::{Authority, FLEET, dns, secured_with, uri};
@@ -26,7 +26,16 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     let stage = secured_with(|config| config.tls.reload_s = 0.1).await;
     let address = format!("https://{}", stage.server.grpc_addr);
     let (truck, other) = (stage.client("nesam:vehicle:truck").await, stage.client("nesam:vehicle:other").await);
-    other.clone().list_sessions().await.unwrap();
+    open(&mut truck.clone(), "truck", "").await;
+    let request = v1::OpenSessionRequest { vehicle_id: "other".into(), ..Default::default() };
+    other.clone().open_session(request).await.unwrap();
+    // Watches that only listen: each has told what holds now.
+    let mut watches = Vec::new();
+    for (client, session) in [(&truck, "truck"), (&other, "other")] {
+        let mut soil = client.clone().watch_soil(session).await.unwrap();
+        soil.message().await.unwrap().expect("the present soil");
+        watches.push((soil, client.clone().watch_alarms(session).await.unwrap()));
+    }
     let replace = |name: &str, bytes: &[u8]| {
         let new = stage.files.path().join("new");
         std::fs::write(&new, bytes).unwrap();
@@ -40,6 +49,11 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     })
     .await;
     truck.clone().list_sessions().await.unwrap();
+    let (mut soil, mut alarms) = watches.remove(1);
+    assert_eq!(soil.message().await.unwrap_err().code(), Code::PermissionDenied);
+    assert_eq!(alarms.message().await.unwrap_err().code(), Code::PermissionDenied);
+    let (mut soil, _) = watches.remove(0);
+    assert!(tokio::time::timeout(Duration::from_millis(300), soil.message()).await.is_err(), "the truck goes on watching");
 
     // Files that cannot be used are counted and change nothing, for new connections either.
     replace("server.key", b"half a ke");
