@@ -422,3 +422,18 @@ fn service_laps_with_a_diagnosed_bundle_differ_by_its_effects_alone() {
     assert_eq!((first.as_str(), second.as_str()), ("adapted", "diagnosed"));
     assert!(adapted["measurements"]["APPLIED"].as_u64() > Some(50) && adapted == diagnosed, "{adapted} {diagnosed}");
 }
+
+/// A bias of the gyro in three drives of the plant: found, sized, and written down with what was hidden.
+#[test]
+fn service_bench_plant_scores_what_a_diagnosis_makes_of_a_hidden_effect() {
+    let folder = tempfile::tempdir().unwrap();
+    refused(&["bench", "plant", "--worlds", "w01", "--effects", "ghosts"], folder.path(), &["ghosts", "gyro_bias"]);
+    let hidden = ["--effects", "gyro_bias", "--doses", "1", "--drives", "3", "--nulls", "0", "--json", "plant.json"];
+    let output = nesam(&[&["bench", "plant", "--worlds", "w01,w05,w16"][..], &hidden].concat(), folder.path());
+    assert!(output.status.success(), "{}", stderr(&output));
+    let read: Value = serde_json::from_slice(&std::fs::read(folder.path().join("plant.json")).unwrap()).unwrap();
+    let run = &read["runs"][0];
+    let (size, estimate) = (run["size"].as_f64().unwrap(), run["estimate"].as_f64().unwrap());
+    assert_eq!(run["named"][0][0], "gyro_bias", "{run}");
+    assert!((estimate / size - 1.0).abs() < 0.15, "{estimate} of {size}");
+}

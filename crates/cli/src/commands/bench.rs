@@ -5,6 +5,7 @@ mod alarms;
 mod consistency;
 mod discovery;
 mod page;
+mod plant;
 mod serve;
 mod sweep;
 
@@ -44,6 +45,8 @@ enum Bench {
     Alarms(alarms::AlarmBench),
     /// Hide effects in validation drives and score what a diagnosis makes of them
     Discovery(discovery::DiscoveryBench),
+    /// Hide effects of several sizes in drives of the simulated vehicle and hold what a diagnosis finds against them
+    Plant(plant::PlantBench),
     /// Ask a real server for more than it can give, at random instants, and count what comes in time
     Serve(serve::ServeBench),
 }
@@ -97,6 +100,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
         Bench::Consistency(args) => consistency::run(args),
         Bench::Alarms(args) => alarms::run(args),
         Bench::Discovery(args) => discovery::run(args),
+        Bench::Plant(args) => plant::run(args),
         Bench::Serve(args) => serve::run(args),
     }
 }

@@ -1,7 +1,7 @@
 //! `nesam plant`: the simulated vehicle that closed-loop runs drive.
 
 mod check;
-mod write;
+pub mod write;
 
 use std::net::{SocketAddr, UdpSocket};
 use std::path::PathBuf;
@@ -64,7 +64,7 @@ pub fn run(args: &PlantArgs) -> Result<(), Failure> {
 }
 
 /// The data root of a subcommand.
-fn root_of(data: Option<&PathBuf>) -> Result<PathBuf, Failure> {
+pub fn root_of(data: Option<&PathBuf>) -> Result<PathBuf, Failure> {
     let asked =
         DataArgs { data: data.cloned(), set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
     open_root(&asked).map(|(_, path)| path)

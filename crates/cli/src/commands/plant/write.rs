@@ -65,21 +65,37 @@ pub fn run(args: &WriteArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("--out {} lies in a bundle, which no command may change", args.out.display())));
     }
     let effects = effects_of(&args.effect)?;
-    let vehicle = Arc::new(PlantVehicle::of_root(&root).or_input()?);
     copy_vehicle_and_worlds(&root, &args.out, &args.worlds)?;
     let progress = Progress::start("drives", args.drives);
-    let mut drives = Vec::new();
-    for i in 0..args.drives {
-        let world = &args.worlds[i % args.worlds.len()];
-        let ground = Arc::new(Ground::read(&root.join("worlds").join(world)).or_input()?);
-        let seed = args.seed + i as u64;
-        drives.push(drive(&vehicle, &ground, &effects, world, seed, args.seconds));
-        progress.set(i + 1);
-    }
+    let asked = Asked { worlds: &args.worlds, drives: args.drives, seconds: args.seconds, seed: args.seed };
+    write_drives(&root, &args.out.join(&args.set), &effects, &asked, &|done| progress.set(done))?;
     progress.finish();
-    write_set(&args.out.join(&args.set), &drives).or_failed()?;
-    say!("{} drives in {}", drives.len(), args.out.join(&args.set).display());
+    say!("{} drives in {}", args.drives, args.out.join(&args.set).display());
     Ok(())
+}
+
+/// Drives to write.
+pub struct Asked<'a> {
+    /// Worlds, one drive after the other.
+    pub worlds: &'a [String],
+    pub drives: usize,
+    /// Length of each.
+    pub seconds: f64,
+    /// Of the first; commands, starts and sensor noise follow from it.
+    pub seed: u64,
+}
+
+/// Drives of the vehicle and worlds of a data root, as a set in this folder.
+pub fn write_drives(root: &Path, set: &Path, effects: &HiddenEffects, asked: &Asked, done: &dyn Fn(usize)) -> Result<(), Failure> {
+    let vehicle = Arc::new(PlantVehicle::of_root(root).or_input()?);
+    let mut drives = Vec::new();
+    for i in 0..asked.drives {
+        let world = &asked.worlds[i % asked.worlds.len()];
+        let ground = Arc::new(Ground::read(&root.join("worlds").join(world)).or_input()?);
+        drives.push(drive(&vehicle, &ground, effects, world, asked.seed + i as u64, asked.seconds));
+        done(i + 1);
+    }
+    write_set(set, &drives).or_failed()
 }
 
 /// A drive after the recipe of the recorded ones: sinusoids in steering and speed, in rad/s.
@@ -113,7 +129,8 @@ fn drive(vehicle: &Arc<PlantVehicle>, ground: &Arc<Ground>, effects: &HiddenEffe
     recorder.finish(&format!("p{seed:04}"), world, "test")
 }
 
-fn copy_vehicle_and_worlds(from: &Path, to: &Path, worlds: &[String]) -> Result<(), Failure> {
+/// Vehicle cards and worlds of a data root in another one.
+pub fn copy_vehicle_and_worlds(from: &Path, to: &Path, worlds: &[String]) -> Result<(), Failure> {
     let fail = |e: std::io::Error| Failure::Failed(format!("cannot copy to {}: {e}", to.display()));
     std::fs::create_dir_all(to).map_err(fail)?;
     copy_files(from, to, &|name| name.starts_with("vehicle_") && name.ends_with(".json")).map_err(fail)?;
