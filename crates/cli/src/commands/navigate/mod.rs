@@ -301,7 +301,7 @@ fn earlier(file: &Path, settings: &Value) -> Option<Run> {
 }
 
 fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> {
-    let widths = [8, 10, 5, 16, 13, 27, 12, 12, 12, 20];
+    let widths = [8, 10, 5, 16, 13, 27, 13, 14, 13, 20];
     let line = |cells: Vec<&str>| {
         let padded = cells.iter().zip(widths).enumerate().map(|(i, (c, w))| if i < 2 { format!("{c:<w$}") } else { format!("{c:>w$}") });
         say!("{}", padded.collect::<String>());
