@@ -104,7 +104,7 @@ enum Worker {
     /// A thread of its own.
     Thread(Mutex<Option<JoinHandle<Engine>>>),
     /// Whoever submits.
-    Submitter(Mutex<Option<(Engine, Option<Tap>)>>),
+    Submitter(Box<Mutex<Option<(Engine, Option<Tap>)>>>),
 }
 
 impl core::fmt::Debug for EngineHandle {
@@ -144,7 +144,7 @@ impl EngineHandle {
     /// thread.
     pub fn unthreaded(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
         let limits = Arc::new(engine.limits().clone());
-        Self { queue: Arc::default(), clock, limits, worker: Arc::new(Worker::Submitter(Mutex::new(Some((engine, tap))))) }
+        Self { queue: Arc::default(), clock, limits, worker: Arc::new(Worker::Submitter(Box::new(Mutex::new(Some((engine, tap)))))) }
     }
 
     /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once.
