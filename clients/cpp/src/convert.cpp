@@ -92,6 +92,11 @@ void set(v1::VehicleState* message, const VehicleState& state) {
   set(message->mutable_angular_velocity_rad_s(), state.angular_velocity_rad_s);
 }
 
+void set(v1::Control* message, const Control& command) {
+  message->set_speed_m_s(command.speed_m_s);
+  message->set_second(command.second);
+}
+
 VehicleState from_message(const v1::VehicleState& message) {
   return {from_message(message.position_m()), from_message(message.attitude_rad()), from_message(message.velocity_m_s()),
           from_message(message.angular_velocity_rad_s())};
@@ -125,8 +130,7 @@ v1::Measurement to_message(const std::string& session_id, const Measurement& mea
   message.set_stamp_ns(measurement.stamp_ns);
   message.set_boot_id(measurement.boot_id);
   set(message.mutable_state(), measurement.state);
-  message.mutable_command()->set_speed_m_s(measurement.command.speed_m_s);
-  message.mutable_command()->set_second(measurement.command.second);
+  set(message.mutable_command(), measurement.command);
   if (measurement.wheel_speed_rad_s) {
     for (const double speed : *measurement.wheel_speed_rad_s) message.mutable_wheels()->add_speed_rad_s(speed);
   }

@@ -26,6 +26,7 @@ void pack(Span<const float> values, std::string& bytes);
 std::vector<float> unpack(const std::string& bytes);
 
 void set(v1::VehicleState* message, const VehicleState& state);
+void set(v1::Control* message, const Control& command);
 VehicleState from_message(const v1::VehicleState& message);
 SoilVector from_message(const v1::SoilVector& message);
 SoilCorrection from_message(const v1::SoilCorrection& message);

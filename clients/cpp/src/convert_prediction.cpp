@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "convert.hpp"
+#include "half.hpp"
 
 namespace nesam::detail {
 
@@ -83,14 +84,32 @@ Error misfit(const char* field) {
   return Error(Code::internal, field, "the reply does not have the shape that was asked for; client and server may differ in version");
 }
 
+bool is_half(const v1::PredictReply& message) { return message.precision() == v1::PRECISION_F16; }
+
+/// The states of a reply that has the shape asked for. Positions of 16-bit ones are offsets from the start.
+std::vector<float> states_from(const v1::PredictReply& message, const Prediction& prediction) {
+  if (!is_half(message)) return unpack(message.states());
+  std::vector<float> states = unpack_half(message.states());
+  std::array<double, state_size> offsets{};
+  std::size_t channels = 0;
+  for (std::size_t channel = 0; channel < state_size; ++channel) {
+    if ((prediction.channels >> channel & 1) == 0) continue;
+    offsets[channels++] = channel < prediction.start.position_m.size() ? prediction.start.position_m[channel] : 0.0;
+  }
+  for (std::size_t i = 0; i < states.size(); ++i) states[i] = static_cast<float>(states[i] + offsets[i % channels]);
+  return states;
+}
+
 /// Whether number of candidates and sizes of the arrays are as asked for.
 bool fits(const v1::PredictReply& message, const Prediction& prediction, const Asked& asked) {
   const std::size_t samples = prediction.samples;
   const std::size_t points = prediction.rows() * prediction.steps;
+  const std::size_t width = is_half(message) ? 2 : 4;
   const std::size_t drawn = asked.drawn ? prediction.candidates() * asked.horizon : 0;
   const bool fewer = asked.samples_min > 0 && samples >= asked.samples_min && samples < asked.samples;
   return (samples == asked.samples || fewer) && prediction.soil_groups == asked.soil_groups && message.costs().size() == (asked.ranked ? 4 * samples : 0) &&
-         message.states().size() == 4 * points * prediction.channel_count() && message.sinkage_m().size() == (asked.wheel_sinkage ? 16 * points : 0) &&
+         message.states().size() == width * points * prediction.channel_count() &&
+         message.sinkage_m().size() == (asked.wheel_sinkage ? 4 * width * points : 0) && (asked.half || width == 4) &&
          message.drawn_controls().size() == 8 * drawn && static_cast<std::size_t>(message.validity_size()) == prediction.rows();
 }
 
@@ -136,6 +155,7 @@ Asked::Asked(const PredictRequest& request)
       drawn(request.drawing.has_value()),
       ranked(request.cost.has_value()),
       wheel_sinkage(request.wheel_sinkage),
+      half(request.half),
       jacobians(request.extras.jacobians),
       covariance(request.extras.covariance),
       risk(request.extras.risk) {}
@@ -146,6 +166,12 @@ Result<v1::PredictRequest> to_message(const std::string& session_id, const Predi
   v1::PredictRequest message;
   message.set_session_id(session_id);
   if (request.start) set(message.mutable_start(), *request.start);
+  if (request.start_stamp_ns) message.set_start_stamp_ns(*request.start_stamp_ns);
+  for (const SentCommand& sent : request.sent) {
+    v1::SentCommand& command = *message.add_sent();
+    command.set_stamp_ns(sent.stamp_ns);
+    set(command.mutable_command(), sent.command);
+  }
   message.set_history_use(request.history_use == HistoryUse::none ? v1::HISTORY_USE_NONE : v1::HISTORY_USE_MEASURED);
   message.set_samples(static_cast<std::uint32_t>(asked.samples));
   message.set_horizon(static_cast<std::uint32_t>(asked.horizon));
@@ -156,6 +182,7 @@ Result<v1::PredictRequest> to_message(const std::string& session_id, const Predi
   message.mutable_output()->set_channels(request.channels);
   message.mutable_output()->set_stride(request.stride);
   message.mutable_output()->set_wheel_sinkage(request.wheel_sinkage);
+  message.mutable_output()->set_precision(request.half ? v1::PRECISION_F16 : v1::PRECISION_F32);
   message.set_tag(request.tag);
   message.set_samples_min(request.samples_min);
   return message;
@@ -172,11 +199,13 @@ Result<Prediction> from_message(const v1::PredictReply& message, const Asked& as
   prediction.best.assign(message.best().begin(), message.best().end());
   prediction.mean_controls = unpack(message.mean_controls());
   if (!fits(message, prediction, asked)) return misfit("states");
-  prediction.states_storage = unpack(message.states());
-  prediction.sinkage_storage_m = unpack(message.sinkage_m());
+  prediction.start = from_message(message.start());
+  prediction.states_storage = states_from(message, prediction);
+  prediction.sinkage_storage_m = is_half(message) ? unpack_half(message.sinkage_m()) : unpack(message.sinkage_m());
   prediction.drawn_storage = unpack(message.drawn_controls());
   prediction.validity.assign(message.validity().begin(), message.validity().end());
-  prediction.start = from_message(message.start());
+  if (message.has_start_stamp_ns()) prediction.start_stamp_ns = message.start_stamp_ns();
+  prediction.rolled_forward_steps = message.rolled_forward_steps();
   prediction.history_steps = message.history_steps();
   prediction.soil = from_message(message.soil());
   if (message.has_soil_variance()) prediction.soil_variance = from_message(message.soil_variance());

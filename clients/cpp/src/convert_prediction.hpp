@@ -24,6 +24,7 @@ struct Asked {
   bool drawn;
   bool ranked;
   bool wheel_sinkage;
+  bool half;
   bool jacobians;
   bool covariance;
   bool risk;

@@ -71,6 +71,13 @@ struct PathCost {
   double temperature = 0.0;
 };
 
+/// A command on its way to the vehicle.
+struct SentCommand {
+  /// Instant from which the vehicle applies it, ns of the vehicle's clock.
+  std::int64_t stamp_ns = 0;
+  Control command;
+};
+
 /// A batch of candidate command sequences.
 struct PredictRequest {
   /// Shape (N, K, 2): speed in m/s, second command in the unit of the vehicle card. N 1 to 4096, K 1 to 32. Only read during the call. Empty with `drawing`.
@@ -78,12 +85,22 @@ struct PredictRequest {
   /// State to start from; absent = the newest measured step.
   std::optional<VehicleState> start;
   HistoryUse history_use = HistoryUse::measured;
+  /// Instant from which the controls apply, ns of the vehicle's clock; absent = that of the newest measured step. The session is rolled forward to it, rounded to
+  /// the nearest step of 0.1 s: at most half a step before the newest one, and so near after it that the steps rolled forward and K together do not exceed 32.
+  /// Not together with `start`.
+  std::optional<std::int64_t> start_stamp_ns;
+  /// Commands that the vehicle was sent, by ascending stamp, at most 256; only with `start_stamp_ns`. Each step that is rolled forward uses the one in effect at
+  /// its middle; before the first of them that is later than the newest step, the command measured with this step. Only read during the call.
+  Span<const SentCommand> sent;
   /// Channels to return, a sum of `bit(Channel)`; 0 = all twelve.
   std::uint32_t channels = 0;
   /// Returns the steps stride, 2 stride, ... up to K.
   std::uint32_t stride = 1;
   /// Also return the sinkage of the four wheels.
   bool wheel_sinkage = false;
+  /// Lets states and sinkage travel as 16-bit numbers of eleven significant bits, half of the bytes; positions travel as offsets from the start and are rounded by
+  /// at most 4 mm within 16 m of it. Extras keep their 32 bits.
+  bool half = false;
   /// Copied to the reply; for the caller's own use.
   std::uint64_t tag = 0;
   /// Fewest samples that are of use when the timeout is near, 0 = all or nothing; `Prediction::samples` says how many were computed.
@@ -142,11 +159,15 @@ class Prediction {
   std::vector<float> mean_controls;
   /// One word for each row: the sum of its `Validity` bits.
   std::vector<std::uint32_t> validity;
-  /// State that the rollout started from.
+  /// State that the controls started from: given, measured, or rolled forward.
   VehicleState start;
+  /// Instant of the start, ns of the vehicle's clock; absent when a start was given.
+  std::optional<std::int64_t> start_stamp_ns;
+  /// Steps of 0.1 s from the newest measured step to the start: the age of the measurement in the vehicle's own time.
+  std::uint32_t rolled_forward_steps = 0;
   /// Measured steps that preceded the start, 0 to 31.
   std::uint32_t history_steps = 0;
-  /// Soil used under the start: prior plus correction, clipped to the admissible range.
+  /// Soil used under the given or measured start: prior plus correction, clipped to the admissible range.
   SoilVector soil;
   /// Variance of that soil to first order, units of `SoilVector` squared; absent while no filter runs.
   std::optional<SoilVector> soil_variance;
