@@ -91,10 +91,16 @@ finish_server() {
 
 failed=no
 start_server "$@"
-for test in client_test extras_test predictions_test streams_test; do
+for test in client_test extras_test predictions_test sessions_test streams_test; do
   timeout 300 "$build/$test" "$address" || failed=yes
 done
 timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
+finish_server
+
+# The soil of a fleet is shared only where that is switched on.
+printf '[fleet_soil]\nenabled = true\n' > "$scratch/fleet-soil.toml"
+start_server --config "$scratch/fleet-soil.toml" "$@"
+timeout 120 "$build/fleet_soil_test" "$address" || failed=yes
 finish_server
 
 # Certificates of one authority for server and vehicle, and another authority.

@@ -42,7 +42,38 @@ Result<std::vector<SessionStatus>> Client::sessions(Timeout timeout) const {
 
 Result<void> Client::close(const std::string& session_id, Timeout timeout) { return core_->close(session_id, timeout); }
 
+Result<std::string> Client::export_session(const std::string& session_id, Timeout timeout) const { return core_->export_session(session_id, timeout); }
+
+Result<Session> Client::import_session(const std::string& image, const std::string& session_id, Timeout timeout) {
+  v1::ImportSessionRequest request;
+  request.set_image(image);
+  request.set_session_id(session_id);
+  auto reply = core_->call(*core_->sessions, &v1::Sessions::Stub::Import, request, timeout);
+  if (!reply) return reply.error();
+  return Session(std::make_unique<detail::SessionImpl>(core_, detail::from_message(*reply)));
+}
+
+Result<FleetSoilMap> Client::fleet_soil(const std::string& map_id, Timeout timeout) const {
+  v1::FleetSoilRequest request;
+  request.set_map_id(map_id);
+  auto reply = core_->call(*core_->soil, &v1::Soil::Stub::Map, request, timeout);
+  if (!reply) return reply.error();
+  return detail::from_message(*reply);
+}
+
 Result<MapDescription> Client::upload_map(const Map& map, Timeout timeout) { return core_->upload(map, timeout); }
+
+Result<MapDescription> Client::patch_tile(const std::string& map_id, std::uint64_t base_version, const MapTile& tile, Timeout timeout) {
+  return core_->patch(map_id, base_version, tile, timeout);
+}
+
+Result<MapDescription> Client::map(const std::string& map_id, Timeout timeout) const {
+  v1::GetMapRequest request;
+  request.set_map_id(map_id);
+  auto reply = core_->call(*core_->terrain, &v1::Terrain::Stub::Get, request, timeout);
+  if (!reply) return reply.error();
+  return detail::from_message(*reply);
+}
 
 Result<std::vector<MapDescription>> Client::maps(Timeout timeout) const {
   auto reply = core_->call(*core_->terrain, &v1::Terrain::Stub::List, v1::ListMapsRequest(), timeout);

@@ -38,12 +38,13 @@ void set(v1::Vector3* message, const std::array<double, 3>& vector) {
 
 std::array<double, 3> from_message(const v1::Vector3& message) { return {message.x(), message.y(), message.z()}; }
 
-/// The covariance of a correction; absent where the message has none.
-std::optional<std::array<std::array<double, 6>, 6>> covariance_from(const v1::SoilCorrection& message) {
-  if (message.covariance_size() != 36) return std::nullopt;
-  std::array<std::array<double, 6>, 6> covariance{};
-  for (int i = 0; i < 36; ++i) covariance[static_cast<std::size_t>(i / 6)][static_cast<std::size_t>(i % 6)] = message.covariance(i);
-  return covariance;
+/// A matrix of the six soil parameters from its rows; absent where there are not 36 numbers.
+template <class Numbers>
+std::optional<std::array<std::array<double, 6>, 6>> matrix_from(const Numbers& numbers) {
+  if (numbers.size() != 36) return std::nullopt;
+  std::array<std::array<double, 6>, 6> matrix{};
+  for (int i = 0; i < 36; ++i) matrix[static_cast<std::size_t>(i / 6)][static_cast<std::size_t>(i % 6)] = numbers.Get(i);
+  return matrix;
 }
 
 VehicleCard from_message(const v1::VehicleCard& message) {
@@ -114,7 +115,7 @@ SoilCorrection from_message(const v1::SoilCorrection& message) {
   if (message.has_variance()) correction.variance = from_message(message.variance());
   const int known = std::min(static_cast<int>(correction.learned.size()), message.learned_size());
   for (int i = 0; i < known; ++i) correction.learned[static_cast<std::size_t>(i)] = message.learned(i);
-  correction.covariance = covariance_from(message);
+  correction.covariance = matrix_from(message.covariance());
   return correction;
 }
 
@@ -129,6 +130,7 @@ v1::Measurement to_message(const std::string& session_id, const Measurement& mea
   message.set_sequence(measurement.sequence);
   message.set_stamp_ns(measurement.stamp_ns);
   message.set_boot_id(measurement.boot_id);
+  message.set_run(measurement.run);
   set(message.mutable_state(), measurement.state);
   set(message.mutable_command(), measurement.command);
   if (measurement.wheel_speed_rad_s) {
@@ -163,6 +165,29 @@ v1::MapHeader to_header(const Map& map) {
   return header;
 }
 
+v1::MapTile to_message(const MapTile& tile) {
+  v1::MapTile message;
+  message.set_row(tile.row);
+  message.set_column(tile.column);
+  message.set_rows(tile.rows);
+  message.set_columns(tile.columns);
+  pack(tile.elevation_m, *message.mutable_elevation_m());
+  if (!tile.semantic_rgb.empty()) message.set_semantic_rgb(tile.semantic_rgb.data(), tile.semantic_rgb.size());
+  return message;
+}
+
+v1::Effect to_message(const Effect& effect) {
+  v1::Effect message;
+  message.set_id(effect.id);
+  for (const EffectParameter& parameter : effect.parameters) {
+    v1::EffectParameter& added = *message.add_parameters();
+    added.set_name(parameter.name);
+    added.set_value(parameter.value);
+    added.set_sd(parameter.sd);
+  }
+  return message;
+}
+
 SessionStatus from_message(const v1::Session& message) {
   SessionStatus status;
   status.session_id = message.session_id();
@@ -175,6 +200,14 @@ SessionStatus from_message(const v1::Session& message) {
   if (message.has_state()) status.state = from_message(message.state());
   if (message.has_command()) status.command = Control{message.command().speed_m_s(), message.command().second()};
   status.soil_correction = from_message(message.soil_correction());
+  if (message.has_boot_id()) status.boot_id = message.boot_id();
+  if (message.has_vehicle_alive()) status.vehicle_alive = message.vehicle_alive();
+  status.accepted = message.accepted();
+  status.durable_place = message.durable_place();
+  status.run = message.run();
+  for (const v1::Effect& effect : message.effects()) status.effects.push_back(from_message(effect));
+  status.effects_source = message.effects_source();
+  if (message.has_alarm()) status.alarm = from_message(message.alarm());
   return status;
 }
 
@@ -186,6 +219,10 @@ MeasurementAnswer from_message(const v1::MeasurementAnswer& message) {
   answer.stamp_ns = message.stamp_ns();
   answer.history_epoch = message.history_epoch();
   answer.soil_epoch = message.soil_epoch();
+  if (message.has_soil_correction()) answer.soil_correction = from_message(message.soil_correction());
+  answer.place = message.place();
+  answer.durable_place = message.durable_place();
+  answer.run = message.run();
   switch (message.outcome_case()) {
     case v1::MeasurementAnswer::kApplied: answer.outcome = Applied{message.applied().history_steps()}; break;
     case v1::MeasurementAnswer::kBuffered: answer.outcome = Buffered{message.buffered().next_step_in_s()}; break;
@@ -212,6 +249,44 @@ SoilEstimate from_message(const v1::SoilEstimate& message) {
   if (message.has_stamp_ns()) estimate.stamp_ns = message.stamp_ns();
   estimate.correction = from_message(message.correction());
   return estimate;
+}
+
+Effect from_message(const v1::Effect& message) {
+  Effect effect;
+  effect.id = message.id();
+  for (const v1::EffectParameter& parameter : message.parameters()) effect.parameters.push_back({parameter.name(), parameter.value(), parameter.sd()});
+  return effect;
+}
+
+Alarm from_message(const v1::Alarm& message) {
+  Alarm alarm;
+  alarm.session_id = message.session_id();
+  alarm.vehicle_id = message.vehicle_id();
+  alarm.episode = message.episode();
+  alarm.active = message.active();
+  const int kind = static_cast<int>(message.kind());
+  alarm.kind = kind >= 1 && kind <= 5 ? static_cast<AlarmKind>(kind) : AlarmKind::unspecified;
+  alarm.channel = message.channel();
+  alarm.size = message.size();
+  alarm.statistic = message.statistic();
+  alarm.threshold = message.threshold();
+  alarm.stamp_ns = message.stamp_ns();
+  alarm.onset_stamp_ns = message.onset_stamp_ns();
+  alarm.soil_share = message.soil_share();
+  alarm.description = message.description();
+  alarm.diagnose = message.diagnose();
+  return alarm;
+}
+
+Result<FleetSoilMap> from_message(const v1::FleetSoilMap& message) {
+  FleetSoilMap map;
+  map.cell_m = message.cell_m();
+  for (const v1::FleetSoilCell& cell : message.cells()) {
+    const auto information = matrix_from(cell.information());
+    if (!information) return Error(Code::internal, "information", "a cell of the soil map does not have 6 x 6 numbers; client and server may differ in version");
+    map.cells.push_back({cell.map_id(), cell.colour_rgb(), cell.column(), cell.row(), *information, from_message(cell.vector()), cell.buffers(), cell.age_s()});
+  }
+  return map;
 }
 
 MapDescription from_message(const v1::MapDescription& message) {

@@ -3,12 +3,18 @@
 #include <string>
 #include <vector>
 
+#include <nesam/alarm.hpp>
+#include <nesam/effect.hpp>
 #include <nesam/error.hpp>
+#include <nesam/fleet_soil.hpp>
 #include <nesam/measurement.hpp>
 #include <nesam/session.hpp>
+#include <nesam/session_status.hpp>
 #include <nesam/soil_watch.hpp>
 #include <nesam/terrain.hpp>
 #include <nesam/types.hpp>
+#include "nesam/v1/alarms.pb.h"
+#include "nesam/v1/effects.pb.h"
 #include "nesam/v1/measurements.pb.h"
 #include "nesam/v1/sessions.pb.h"
 #include "nesam/v1/soil.pb.h"
@@ -35,10 +41,16 @@ Provenance from_message(const v1::Provenance& message);
 v1::Measurement to_message(const std::string& session_id, const Measurement& measurement);
 v1::OpenSessionRequest to_message(const OpenOptions& options);
 v1::MapHeader to_header(const Map& map);
+v1::MapTile to_message(const MapTile& tile);
+v1::Effect to_message(const Effect& effect);
 
 SessionStatus from_message(const v1::Session& message);
 MeasurementAnswer from_message(const v1::MeasurementAnswer& message);
 SoilEstimate from_message(const v1::SoilEstimate& message);
+Effect from_message(const v1::Effect& message);
+Alarm from_message(const v1::Alarm& message);
+/// INTERNAL when a cell does not have six by six numbers.
+Result<FleetSoilMap> from_message(const v1::FleetSoilMap& message);
 MapDescription from_message(const v1::MapDescription& message);
 
 }  // namespace nesam::detail

@@ -68,6 +68,14 @@ Result<void> Core::close(const std::string& id, Timeout timeout) const {
   return {};
 }
 
+Result<std::string> Core::export_session(const std::string& id, Timeout timeout) const {
+  v1::ExportSessionRequest request;
+  request.set_session_id(id);
+  auto reply = call(*sessions, &v1::Sessions::Stub::Export, request, timeout);
+  if (!reply) return reply.error();
+  return std::move(*reply->mutable_image());
+}
+
 Result<Prediction> Core::predict(const std::string& id, const PredictRequest& request, Timeout timeout) const {
   auto message = to_message(id, request);
   if (!message) return message.error();

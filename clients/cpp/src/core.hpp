@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <cstdint>
 #include <memory>
 #include <string>
 
@@ -54,7 +55,9 @@ class Core {
   Result<SessionStatus> session(const std::string& id, Timeout timeout) const;
   Result<void> close(const std::string& id, Timeout timeout) const;
   Result<Prediction> predict(const std::string& id, const PredictRequest& request, Timeout timeout) const;
+  Result<std::string> export_session(const std::string& id, Timeout timeout) const;
   Result<MapDescription> upload(const Map& map, Timeout timeout) const;
+  Result<MapDescription> patch(const std::string& map_id, std::uint64_t base_version, const MapTile& tile, Timeout timeout) const;
 
   const ClientOptions options;
   const std::shared_ptr<grpc::Channel> channel;

@@ -4,6 +4,7 @@
 #include <system_error>
 #include <utility>
 
+#include "convert.hpp"
 #include "session_impl.hpp"
 
 namespace nesam {
@@ -78,6 +79,36 @@ Result<PredictionStream> Session::predictions() const {
 }
 
 SoilWatch Session::watch_soil() const { return SoilWatch(impl_->core, impl_->id); }
+AlarmWatch Session::watch_alarms() const { return AlarmWatch(impl_->core, impl_->id); }
+
+Result<SessionStatus> Session::apply_effects(const std::vector<Effect>& effects, const std::string& source, Timeout timeout) {
+  v1::ApplyEffectsRequest request;
+  request.set_session_id(impl_->id);
+  request.set_source(source);
+  for (const Effect& effect : effects) *request.add_effects() = detail::to_message(effect);
+  auto reply = impl_->core->call(*impl_->core->sessions, &v1::Sessions::Stub::ApplyEffects, request, timeout);
+  if (!reply) return reply.error();
+  return detail::from_message(*reply);
+}
+
+Result<SessionStatus> Session::revert_effects(Timeout timeout) {
+  v1::RevertEffectsRequest request;
+  request.set_session_id(impl_->id);
+  auto reply = impl_->core->call(*impl_->core->sessions, &v1::Sessions::Stub::RevertEffects, request, timeout);
+  if (!reply) return reply.error();
+  return detail::from_message(*reply);
+}
+
+Result<Session> Session::fork(const std::string& new_id, Timeout timeout) const {
+  v1::ForkSessionRequest request;
+  request.set_session_id(impl_->id);
+  request.set_new_session_id(new_id);
+  auto reply = impl_->core->call(*impl_->core->sessions, &v1::Sessions::Stub::Fork, request, timeout);
+  if (!reply) return reply.error();
+  return Session(std::make_unique<detail::SessionImpl>(impl_->core, detail::from_message(*reply)));
+}
+
+Result<std::string> Session::export_image(Timeout timeout) const { return impl_->core->export_session(impl_->id, timeout); }
 
 Result<MeasurementStream> Session::measurements() const {
   return opened([this] { return MeasurementStream(impl_->core, impl_->id); });

@@ -28,6 +28,17 @@ v1::UploadMapRequest tile_message(const Map& map, std::size_t row, std::size_t c
   return message;
 }
 
+/// INVALID_ARGUMENT when layers do not have the shape that they say; `shape` names it.
+Result<void> check_layers(Span<const float> elevation_m, Span<const std::uint8_t> semantic_rgb, std::size_t pixels, const char* shape) {
+  const auto fault = [shape](const char* field, std::size_t size, std::size_t needed) {
+    const std::string reason = " values, " + std::string(shape) + " needs " + std::to_string(needed);
+    return Error(Code::invalid_argument, field, "`" + std::string(field) + "`: has " + std::to_string(size) + reason);
+  };
+  if (elevation_m.size() != pixels) return fault("elevation_m", elevation_m.size(), pixels);
+  if (!semantic_rgb.empty() && semantic_rgb.size() != 3 * pixels) return fault("semantic_rgb", semantic_rgb.size(), 3 * pixels);
+  return {};
+}
+
 /// Sends header and tiles. False: the server has ended the call; its status says why.
 bool write_all(grpc::ClientWriter<v1::UploadMapRequest>& writer, const Map& map) {
   v1::UploadMapRequest first;
@@ -52,13 +63,7 @@ bool write_all(grpc::ClientWriter<v1::UploadMapRequest>& writer, const Map& map)
 
 Result<MapDescription> Core::upload(const Map& map, Timeout timeout) const {
   const std::size_t pixels = std::size_t{map.geometry.width} * map.geometry.height;
-  const auto fault = [](const char* field, std::size_t size, std::size_t needed) {
-    const std::string reason = " values, height x width needs " + std::to_string(needed);
-    return Error(Code::invalid_argument, field, "`" + std::string(field) + "`: has " + std::to_string(size) + reason);
-  };
-  if (map.elevation_m.size() != pixels) return fault("elevation_m", map.elevation_m.size(), pixels);
-  if (!map.semantic_rgb.empty() && map.semantic_rgb.size() != 3 * pixels) return fault("semantic_rgb", map.semantic_rgb.size(), 3 * pixels);
-
+  if (auto layers = check_layers(map.elevation_m, map.semantic_rgb, pixels, "height x width"); !layers) return layers.error();
   grpc::ClientContext context;
   introduce(context);
   context.set_deadline(deadline(timeout.value_or(options.upload_timeout)));
@@ -68,6 +73,18 @@ Result<MapDescription> Core::upload(const Map& map, Timeout timeout) const {
   const grpc::Status status = writer->Finish();
   if (!status.ok()) return error_from(status, context);
   return from_message(reply);
+}
+
+Result<MapDescription> Core::patch(const std::string& map_id, std::uint64_t base_version, const MapTile& tile, Timeout timeout) const {
+  const std::size_t pixels = std::size_t{tile.rows} * tile.columns;
+  if (auto layers = check_layers(tile.elevation_m, tile.semantic_rgb, pixels, "rows x columns"); !layers) return layers.error();
+  v1::PatchTileRequest request;
+  request.set_map_id(map_id);
+  request.set_base_version(base_version);
+  *request.mutable_tile() = to_message(tile);
+  auto reply = call(*terrain, &v1::Terrain::Stub::PatchTile, request, timeout);
+  if (!reply) return reply.error();
+  return from_message(*reply);
 }
 
 }  // namespace nesam::detail

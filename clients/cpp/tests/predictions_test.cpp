@@ -1,6 +1,6 @@
 // Goal: predictions that start at an instant start there, and 16-bit replies are the 32-bit ones rounded.
-// Method: the state rolled forward against the same commands sent as candidates, bit for bit; half against whole with the tolerance that eleven significant bits
-// leave; the same over single calls and streams.
+// Method: the state rolled forward against the same commands sent as candidates, bit for bit; half against whole with the tolerance that eleven significant
+// bits leave; the same over single calls and streams.
 //
 // Usage and exit codes: check.hpp.
 
@@ -69,7 +69,9 @@ void service_half_precision_is_rounding_only(const nesam::Session& session) {
   check(half->validity == whole->validity && half->start.position_m == whole->start.position_m, "validity and start are the same");
   const auto sinkage_m = half->sinkage_m(), exact_m = whole->sinkage_m();
   bool near = sinkage_m.fits() && sinkage_m.shape() == exact_m.shape();
-  for (std::size_t i = 0; near && i < exact_m.values().size(); ++i) near = std::abs(sinkage_m.values()[i] - exact_m.values()[i]) <= 1e-3F * exact_m.values()[i] + 1e-7F;
+  for (std::size_t i = 0; near && i < exact_m.values().size(); ++i) {
+    near = std::abs(sinkage_m.values()[i] - exact_m.values()[i]) <= 1e-3F * exact_m.values()[i] + 1e-7F;
+  }
   check(near, "sinkage");
 
   // Offsets belong to the channels that are there, far from the origin too, and extras stay as they are.

@@ -107,3 +107,20 @@ inline nesam::Session driven(nesam::Client& client, const std::string& name, con
   for (int step = 0; step < 5; ++step) (void)session.send(cruise(step, session.vehicle())).value();
   return session;
 }
+
+/// Measurements that follow the model's own prediction after those of `driven`, so that the filter of the soil takes them.
+inline std::vector<nesam::Measurement> predicted_drive(const nesam::Session& session) {
+  constexpr std::size_t horizon = nesam::horizon_max;
+  const auto controls = varied_controls(1, horizon, session.vehicle());
+  nesam::PredictRequest request = request_of(controls, 1, horizon);
+  const nesam::Prediction prediction = predicted(session, request).value();
+  std::vector<nesam::Measurement> drive;
+  for (std::size_t k = 0; k < horizon; ++k) {
+    nesam::Measurement measurement = cruise(5 + static_cast<int>(k), session.vehicle());
+    measurement.state = state_of(prediction.states().step(0, k));
+    const std::size_t next = std::min(k + 1, horizon - 1);
+    measurement.command = {controls[2 * next], controls[2 * next + 1]};
+    drive.push_back(measurement);
+  }
+  return drive;
+}

@@ -176,23 +176,6 @@ void service_a_prediction_stream_has_limits_and_ends(nesam::Session& session) {
   check(orphan->send(one).ok(), "left unanswered");
 }
 
-/// Measurements that follow the model's own prediction, so that the filter of the soil takes them.
-std::vector<nesam::Measurement> predicted_drive(const nesam::Session& session) {
-  constexpr std::size_t horizon = nesam::horizon_max;
-  const auto controls = varied_controls(1, horizon, session.vehicle());
-  nesam::PredictRequest request = request_of(controls, 1, horizon);
-  const nesam::Prediction prediction = predicted(session, request).value();
-  std::vector<nesam::Measurement> drive;
-  for (std::size_t k = 0; k < horizon; ++k) {
-    nesam::Measurement measurement = cruise(5 + static_cast<int>(k), session.vehicle());
-    measurement.state = state_of(prediction.states().step(0, k));
-    const std::size_t next = std::min(k + 1, horizon - 1);
-    measurement.command = {controls[2 * next], controls[2 * next + 1]};
-    drive.push_back(measurement);
-  }
-  return drive;
-}
-
 void service_the_soil_is_watched(nesam::Session& session) {
   nesam::SoilWatch watch = session.watch_soil();
   const auto first = watch.receive(30s);

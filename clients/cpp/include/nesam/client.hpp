@@ -8,7 +8,9 @@
 #include <vector>
 
 #include <nesam/error.hpp>
+#include <nesam/fleet_soil.hpp>
 #include <nesam/session.hpp>
+#include <nesam/session_status.hpp>
 #include <nesam/terrain.hpp>
 #include <nesam/tls.hpp>
 #include <nesam/types.hpp>
@@ -68,11 +70,33 @@ class Client {
   /// Closes a session by name. NOT_FOUND: unknown session.
   Result<void> close(const std::string& session_id, Timeout timeout = {});
 
+  /// Everything that a session remembers, as opaque bytes for `import_session` here or on another server with the same bundle; about 20 kB. The session stays
+  /// open. NOT_FOUND: unknown session.
+  Result<std::string> export_session(const std::string& session_id, Timeout timeout = {}) const;
+
+  /// Opens a session from an export; from then on it answers as the original would, bit for bit. `session_id`: its name; empty = that of the exported one.
+  ///
+  /// INVALID_ARGUMENT of `image`: damaged or cut bytes, another version of the format, another bundle, other settings of the soil filter. NOT_FOUND: the map is
+  /// not uploaded. FAILED_PRECONDITION: the map has other layers. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as `open`.
+  Result<Session> import_session(const std::string& image, const std::string& session_id = {}, Timeout timeout = {});
+
+  /// What the fleet has learned of the ground of a map; empty = of all maps. FAILED_PRECONDITION: the service keeps no such map (`fleet_soil.enabled`).
+  Result<FleetSoilMap> fleet_soil(const std::string& map_id = {}, Timeout timeout = {}) const;
+
   /// Uploads a map in tiles.
   ///
   /// INVALID_ARGUMENT: a layer does not have the shape of the geometry, or the server refuses a field. ALREADY_EXISTS: the map is there in this or a newer
   /// version. RESOURCE_EXHAUSTED: too many maps, pixels or simultaneous uploads.
   Result<MapDescription> upload_map(const Map& map, Timeout timeout = {});
+
+  /// Replaces a rectangle of a map that is at `base_version`; the result is the next version, which sessions use from then on.
+  ///
+  /// INVALID_ARGUMENT: a layer does not have the shape of the tile, or the tile lies outside the map. NOT_FOUND: unknown map. ABORTED: the map is not at
+  /// `base_version` any more.
+  Result<MapDescription> patch_tile(const std::string& map_id, std::uint64_t base_version, const MapTile& tile, Timeout timeout = {});
+
+  /// Describes a map. NOT_FOUND: unknown map.
+  Result<MapDescription> map(const std::string& map_id, Timeout timeout = {}) const;
 
   /// The maps that the server holds, by id.
   Result<std::vector<MapDescription>> maps(Timeout timeout = {}) const;

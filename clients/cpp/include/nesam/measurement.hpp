@@ -19,6 +19,9 @@ struct Measurement {
   std::uint64_t sequence = 0;
   /// Start of the vehicle's software that stamps and numbers belong to: differs from start to start; 0 = not told. Another one begins a new history and keeps the soil.
   std::uint64_t boot_id = 0;
+  /// `MeasurementAnswer::run` of the answers so far; 0 = whatever it is. Where the session is at another run now, which may lack what that one had not made
+  /// durable, the measurement is `Rejected` with FAILED_PRECONDITION for `run`: send again what is not durable, in order.
+  std::uint64_t run = 0;
   /// Pose in World, twist in Body.
   VehicleState state;
   /// Command that the vehicle applies from this instant on.
@@ -81,7 +84,16 @@ struct MeasurementAnswer {
   std::int64_t stamp_ns = 0;        ///< Copied from the measurement.
   std::uint64_t history_epoch = 0;  ///< After this measurement.
   std::uint64_t soil_epoch = 0;     ///< After this measurement.
+  /// What the session knows of the soil after this measurement; absent when it was rejected.
+  std::optional<SoilCorrection> soil_correction;
   bool reordered = false;           ///< It arrived after a later one and was put in its place.
+  /// Place among the measurements that the session has accepted, counted from 1 in the order of arrival; that of the newest accepted one for a duplicate; 0 when
+  /// it was refused. It is durable as soon as an answer of the same run, or `SessionStatus`, tells a `durable_place` that reaches it.
+  std::uint64_t place = 0;
+  /// What was accepted up to this place survives a crash of the server and of its machine; 0 where the server keeps no store.
+  std::uint64_t durable_place = 0;
+  /// Which server in which run counts the places. When it changes, everything that is not known to be durable has to be sent again.
+  std::uint64_t run = 0;
   std::variant<Applied, Buffered, Duplicate, TooOld, NotFinite, Gated, Gap, Future, ClockJump, Restarted, Rejected, Unrecognised> outcome = Unrecognised{};
 
   /// The outcome if it is of this type, else null.

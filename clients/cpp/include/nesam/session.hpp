@@ -5,11 +5,14 @@
 #include <string>
 #include <vector>
 
+#include <nesam/alarm_watch.hpp>
+#include <nesam/effect.hpp>
 #include <nesam/error.hpp>
 #include <nesam/measurement.hpp>
 #include <nesam/measurement_stream.hpp>
 #include <nesam/prediction.hpp>
 #include <nesam/prediction_stream.hpp>
+#include <nesam/session_status.hpp>
 #include <nesam/soil_watch.hpp>
 #include <nesam/span.hpp>
 #include <nesam/types.hpp>
@@ -65,6 +68,28 @@ class Session {
 
   /// Watches what this session learns of the soil. UNAVAILABLE and NOT_FOUND come out of its first `receive`.
   SoilWatch watch_soil() const;
+
+  /// Watches the alarms of this session. UNAVAILABLE and NOT_FOUND come out of its first `receive`.
+  AlarmWatch watch_alarms() const;
+
+  /// Puts physical effects on this session, in place of those that were applied before: its predictions and its soil filter use them from now on, and its soil
+  /// begins again from the prior. Needs the rights of an operator.
+  ///
+  /// `effects`: 1 to 16. `source`: where they come from, for people, at most 256 bytes. INVALID_ARGUMENT names the effect: none or too many, an unknown id, an
+  /// unknown, missing or repeated parameter, a value outside its range. NOT_FOUND: the session was closed.
+  Result<SessionStatus> apply_effects(const std::vector<Effect>& effects, const std::string& source = {}, Timeout timeout = {});
+
+  /// Takes the applied effects away again; a session without any stays as it is. Needs the rights of an operator. NOT_FOUND: the session was closed.
+  Result<SessionStatus> revert_effects(Timeout timeout = {});
+
+  /// Copies this session with its history and its soil under a new name, for questions of "what if" that leave this one alone; the copy closes when the returned
+  /// object goes.
+  ///
+  /// INVALID_ARGUMENT: a bad name. ALREADY_EXISTS: a session of the new name is open. NOT_FOUND: this one was closed. RESOURCE_EXHAUSTED: too many sessions.
+  Result<Session> fork(const std::string& new_id, Timeout timeout = {}) const;
+
+  /// Everything that this session remembers, for `Client::import_session`. NOT_FOUND: it was closed.
+  Result<std::string> export_image(Timeout timeout = {}) const;
 
   /// Opens a stream of measurements into this session, for senders that do not wait for each answer. UNAVAILABLE comes out of its first `receive`.
   Result<MeasurementStream> measurements() const;

@@ -32,6 +32,20 @@ struct Map {
   Span<const std::uint8_t> semantic_rgb;
 };
 
+/// A rectangle of pixels to put into a map. The layers are only read during the call.
+struct MapTile {
+  /// South-west pixel.
+  std::uint32_t row = 0;
+  std::uint32_t column = 0;
+  /// Size in pixels.
+  std::uint32_t rows = 0;
+  std::uint32_t columns = 0;
+  /// Shape (rows, columns), row-major: elevation in World, m; NaN = hole.
+  Span<const float> elevation_m;
+  /// Shape (rows, columns, 3), row-major: red, green, blue of the semantic map. Empty = the colours stay.
+  Span<const std::uint8_t> semantic_rgb;
+};
+
 /// A map without its layers.
 struct MapDescription {
   std::string id;

@@ -104,23 +104,4 @@ struct Provenance {
   std::string bundle_hash;          ///< SHA-256 (hex) of the manifest of the model bundle.
 };
 
-/// A session as the service holds it.
-struct SessionStatus {
-  std::string session_id;
-  std::string vehicle_id;
-  Provenance provenance;
-  VehicleCard vehicle;
-  /// Measured steps in the history, the newest included: 0 to 32.
-  std::uint32_t history_steps = 0;
-  /// Stamp of the newest accepted measurement, ns of the vehicle's clock; absent before the first.
-  std::optional<std::int64_t> last_stamp_ns;
-  /// Highest accepted sequence number; absent when the vehicle numbers nothing.
-  std::optional<std::uint64_t> last_sequence;
-  /// State and command of the newest step of the history; absent before the first.
-  std::optional<VehicleState> state;
-  std::optional<Control> command;
-  /// What was learned of the soil.
-  SoilCorrection soil_correction;
-};
-
 }  // namespace nesam
