@@ -103,6 +103,14 @@ start_server --config "$scratch/fleet-soil.toml" "$@"
 timeout 120 "$build/fleet_soil_test" "$address" || failed=yes
 finish_server
 
+# This test kills and restarts servers of its own.
+mkdir "$scratch/durable"
+timeout 300 "$build/durable_test" "$binary" "$scratch/durable" "$@" || {
+  echo "run_tests.sh: log of the servers:" >&2
+  tail -n 40 "$scratch/durable/durable.log" >&2
+  exit 1
+}
+
 # Certificates of one authority for server and vehicle, and another authority.
 (
   cd "$scratch"

@@ -13,6 +13,10 @@ namespace {
 /// Trailing metadata in which the service names the field at fault.
 constexpr const char* field_metadata = "nesam-field";
 
+/// First and longest time between two attempts to connect, ms. Chosen: a vehicle notices a restart in seconds, and a server that is away is not overrun.
+constexpr int reconnect_ms_min = 200;
+constexpr int reconnect_ms_max = 2000;
+
 std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const ClientOptions& options) {
   grpc::ChannelArguments arguments;
   arguments.SetMaxReceiveMessageSize(options.reply_bytes_max);
@@ -20,6 +24,9 @@ std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const Cli
   const auto keepalive_ms = static_cast<int>(std::clamp<std::chrono::milliseconds::rep>(options.keepalive.count(), 1, INT_MAX));
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, keepalive_ms);
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, keepalive_ms);
+  // A server that comes back is found within this, however long it was away.
+  arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, reconnect_ms_min);
+  arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, reconnect_ms_max);
   // A stream may rest for long between two measurements; pings must go on then.
   arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
   if (!options.tls) return grpc::CreateCustomChannel(target, grpc::InsecureChannelCredentials(), arguments);

@@ -5,6 +5,7 @@
 #include <cstdint>
 #include <memory>
 #include <string>
+#include <system_error>
 
 #include <grpcpp/grpcpp.h>
 
@@ -23,6 +24,16 @@ Error error_from(const grpc::Status& status, const grpc::ClientContext& context)
 /// A timeout that can be added to any clock without overflow.
 inline std::chrono::nanoseconds bounded(std::chrono::nanoseconds timeout) {
   return std::clamp<std::chrono::nanoseconds>(timeout, std::chrono::nanoseconds(0), std::chrono::hours(24 * 365));
+}
+
+/// A stream, or RESOURCE_EXHAUSTED where the machine has no threads for it.
+template <class Open>
+auto open_stream(Open open) -> Result<decltype(open())> {
+  try {
+    return open();
+  } catch (const std::system_error& error) {
+    return Error(Code::resource_exhausted, "", std::string("no thread for the stream: ") + error.what());
+  }
 }
 
 /// Connection and stubs, shared by a client, its sessions and their streams.

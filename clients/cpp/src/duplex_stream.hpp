@@ -211,7 +211,9 @@ template <class Kind>
 void DuplexStream<Kind>::end(std::optional<Error> error) noexcept {
   {
     const std::lock_guard lock(mutex_);
-    if (!error && !unanswered_.empty()) error = Error(Code::unavailable, "", "the server ended the stream before it answered everything");
+    // An end without a failure that nobody asked for is one all the same: another stream can be opened, as after any break.
+    const bool early = !finishing_ || !unanswered_.empty();
+    if (!error && early) error = Error(Code::unavailable, "", "the server ended the stream before it was finished and everything answered");
     failure_ = std::move(error);
     ended_ = true;
   }

@@ -1,7 +1,6 @@
 #include <nesam/session.hpp>
 
 #include <string>
-#include <system_error>
 #include <utility>
 
 #include "convert.hpp"
@@ -32,16 +31,6 @@ Result<std::vector<MeasurementAnswer>> exchange(MeasurementStream& stream, Span<
     answers.push_back(std::move(*answer));
   }
   return answers;
-}
-
-/// A stream, or RESOURCE_EXHAUSTED where the machine has no threads for it.
-template <class Open>
-auto opened(Open open) -> Result<decltype(open())> {
-  try {
-    return open();
-  } catch (const std::system_error& error) {
-    return Error(Code::resource_exhausted, "", std::string("no thread for the stream: ") + error.what());
-  }
 }
 
 }  // namespace
@@ -75,7 +64,7 @@ Result<SessionStatus> Session::status(Timeout timeout) const { return impl_->cor
 Result<Prediction> Session::predict(const PredictRequest& request, Timeout timeout) const { return impl_->core->predict(impl_->id, request, timeout); }
 
 Result<PredictionStream> Session::predictions() const {
-  return opened([this] { return PredictionStream(impl_->core, impl_->id); });
+  return detail::open_stream([this] { return PredictionStream(impl_->core, impl_->id); });
 }
 
 SoilWatch Session::watch_soil() const { return SoilWatch(impl_->core, impl_->id); }
@@ -111,8 +100,10 @@ Result<Session> Session::fork(const std::string& new_id, Timeout timeout) const 
 Result<std::string> Session::export_image(Timeout timeout) const { return impl_->core->export_session(impl_->id, timeout); }
 
 Result<MeasurementStream> Session::measurements() const {
-  return opened([this] { return MeasurementStream(impl_->core, impl_->id); });
+  return detail::open_stream([this] { return MeasurementStream(impl_->core, impl_->id); });
 }
+
+DurableStream Session::durable_measurements(const DurableOptions& options) const { return DurableStream(impl_->core, impl_->id, options); }
 
 Result<MeasurementAnswer> Session::send(const Measurement& measurement, Timeout timeout) {
   auto answers = send(Span<const Measurement>(&measurement, 1), timeout);

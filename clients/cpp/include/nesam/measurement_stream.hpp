@@ -13,6 +13,7 @@ namespace nesam {
 
 namespace detail {
 class Core;
+class DurableStreamImpl;
 class MeasurementStreamImpl;
 }  // namespace detail
 
@@ -51,6 +52,7 @@ class MeasurementStream {
 
  private:
   friend class Session;
+  friend class detail::DurableStreamImpl;
   MeasurementStream(std::shared_ptr<detail::Core> core, const std::string& session_id);
   std::unique_ptr<detail::MeasurementStreamImpl> impl_;
 };

@@ -6,6 +6,7 @@
 #include <nesam/alarm_watch.hpp>
 #include <nesam/array.hpp>
 #include <nesam/client.hpp>
+#include <nesam/durable_stream.hpp>
 #include <nesam/effect.hpp>
 #include <nesam/error.hpp>
 #include <nesam/extras.hpp>

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include <nesam/alarm_watch.hpp>
+#include <nesam/durable_stream.hpp>
 #include <nesam/effect.hpp>
 #include <nesam/error.hpp>
 #include <nesam/measurement.hpp>
@@ -93,6 +94,10 @@ class Session {
 
   /// Opens a stream of measurements into this session, for senders that do not wait for each answer. UNAVAILABLE comes out of its first `receive`.
   Result<MeasurementStream> measurements() const;
+
+  /// A stream that keeps measurements until the service has them on stable storage, and sends them again after a crash of the server, which needs a store
+  /// (`nesam serve --store DIR`). Nothing is sent yet.
+  DurableStream durable_measurements(const DurableOptions& options = {}) const;
 
   /// Sends one measurement and waits for its answer, on a stream that stays open between calls.
   ///

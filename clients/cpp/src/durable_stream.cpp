@@ -1,0 +1,186 @@
+#include <nesam/durable_stream.hpp>
+
+#include <algorithm>
+#include <cstdint>
+#include <deque>
+#include <optional>
+#include <thread>
+#include <utility>
+
+#include "core.hpp"
+
+namespace nesam {
+namespace detail {
+
+namespace {
+
+using SteadyTime = std::chrono::steady_clock::time_point;
+
+/// How a connection that broke looks, by itself or through a proxy. Everything else is a refusal.
+bool broken(const Error& error) {
+  const Code code = error.code();
+  return code == Code::unavailable || code == Code::cancelled || code == Code::unknown || code == Code::internal;
+}
+
+/// Whether the service had no room for a measurement: it has to be sent again.
+bool no_room(const MeasurementAnswer& answer) {
+  const auto* rejected = answer.is<Rejected>();
+  return rejected && (rejected->code == Code::resource_exhausted || rejected->code == Code::unavailable);
+}
+
+}  // namespace
+
+class DurableStreamImpl {
+ public:
+  DurableStreamImpl(std::shared_ptr<Core> core, const std::string& session_id, const DurableOptions& options)
+      : core_(std::move(core)), session_id_(session_id), options_(options) {}
+
+  Result<MeasurementAnswer> send(const Measurement& measurement) {
+    if (kept_.size() >= options_.pending_max) {
+      return Error(Code::resource_exhausted, "pending_max", std::to_string(kept_.size()) + " measurements are not known to be durable; flush them first");
+    }
+    kept_.push_back({measurement, std::nullopt});
+    // Which run counts is the matter of this object.
+    kept_.back().measurement.run = 0;
+    return deliver(SteadyTime::max());
+  }
+
+  Result<void> flush(std::chrono::nanoseconds timeout) {
+    const SteadyTime end = std::chrono::steady_clock::now() + bounded(timeout);
+    while (!kept_.empty()) {
+      if (unanswered()) {
+        auto answer = deliver(end);
+        if (!answer && (answer.error().code() != Code::unavailable || !over(end))) return answer.error();
+      }
+      auto status = core_->session(session_id_, std::min(left(end), core_->options.timeout));
+      if (status) {
+        durable(status->run, status->durable_place);
+      } else if (broken(status.error())) {
+        forget_places();
+      } else if (status.error().code() != Code::deadline_exceeded) {
+        return status.error();
+      }
+      if (kept_.empty()) break;
+      if (over(end)) {
+        return Error(Code::deadline_exceeded, "", std::to_string(kept_.size()) + " measurements are not durable in time; does the server keep a store?");
+      }
+      std::this_thread::sleep_for(std::min({bounded(options_.pause), left(end), std::chrono::nanoseconds(std::chrono::milliseconds(50))}));
+    }
+    return {};
+  }
+
+  std::vector<Measurement> pending() const {
+    std::vector<Measurement> measurements;
+    measurements.reserve(kept_.size());
+    for (const Kept& kept : kept_) measurements.push_back(kept.measurement);
+    return measurements;
+  }
+
+  /// What is sent over the next connection is sent from the beginning: another run of the server may count otherwise.
+  void close() {
+    stream_.reset();
+    forget_places();
+  }
+
+ private:
+  struct Kept {
+    Measurement measurement;
+    /// Absent before it is answered by this run of the server.
+    std::optional<std::uint64_t> place;
+  };
+
+  static std::chrono::nanoseconds left(SteadyTime end) { return bounded(end - std::chrono::steady_clock::now()); }
+  static bool over(SteadyTime end) { return std::chrono::steady_clock::now() >= end; }
+
+  /// Sends what has no answer yet, oldest first, over as many connections as it takes until `end`; the answer to the newest.
+  Result<MeasurementAnswer> deliver(SteadyTime end) {
+    const SteadyTime until = std::min(end, std::chrono::steady_clock::now() + bounded(options_.reconnect));
+    while (true) {
+      auto answer = attempt(end);
+      if (answer) return answer;
+      close();
+      if (!broken(answer.error())) return answer;
+      if (over(until)) {
+        if (answer.error().code() == Code::unavailable) return answer;
+        return Error(Code::unavailable, answer.error().field(), answer.error().what());
+      }
+      std::this_thread::sleep_for(std::min(bounded(options_.pause), left(until)));
+    }
+  }
+
+  /// The same over one connection, each measurement after the answer to the one before: where the service has no room for one, later ones must not overtake it.
+  Result<MeasurementAnswer> attempt(SteadyTime end) {
+    if (!stream_) {
+      auto opened = open_stream([this] { return MeasurementStream(core_, session_id_); });
+      if (!opened) return opened.error();
+      stream_.emplace(std::move(*opened));
+    }
+    std::optional<MeasurementAnswer> newest;
+    for (Kept& kept : kept_) {
+      if (kept.place) continue;
+      auto answer = exchange(kept.measurement, std::min(left(end), bounded(options_.reconnect)));
+      if (!answer) return answer.error();
+      if (no_room(*answer)) return Error(Code::unavailable, "", answer->is<Rejected>()->message);
+      if (counted_by_another(answer->run)) return Error(Code::unavailable, "", "another run of the server counts now");
+      run_ = answer->run;
+      kept.place = answer->place;
+      newest = std::move(*answer);
+    }
+    if (!newest) return Error(Code::internal, "", "nothing to send; this is a bug");
+    // A place of 0 is that of a refused measurement, which nobody keeps.
+    durable(newest->run, newest->durable_place);
+    return *std::move(newest);
+  }
+
+  Result<MeasurementAnswer> exchange(const Measurement& measurement, std::chrono::nanoseconds timeout) {
+    if (auto queued = stream_->send(measurement); !queued) return queued.error();
+    auto answer = stream_->receive(timeout);
+    // Who does not answer is not there; the answer must not be taken for that of the next measurement.
+    if (!answer && answer.error().code() == Code::deadline_exceeded) return Error(Code::unavailable, "", "the service did not answer in time");
+    return answer;
+  }
+
+  /// Whether answers so far came from another run: then everything kept is sent again, from the oldest on.
+  bool counted_by_another(std::uint64_t run) const {
+    return run != run_ && std::any_of(kept_.begin(), kept_.end(), [](const Kept& kept) { return kept.place.has_value(); });
+  }
+
+  void durable(std::uint64_t run, std::uint64_t durable_place) {
+    if (counted_by_another(run)) return close();
+    run_ = run;
+    const auto held = [durable_place](const Kept& kept) { return kept.place && *kept.place <= durable_place; };
+    kept_.erase(std::remove_if(kept_.begin(), kept_.end(), held), kept_.end());
+  }
+
+  bool unanswered() const {
+    return std::any_of(kept_.begin(), kept_.end(), [](const Kept& kept) { return !kept.place; });
+  }
+
+  void forget_places() {
+    for (Kept& kept : kept_) kept.place.reset();
+  }
+
+  const std::shared_ptr<Core> core_;
+  const std::string session_id_;
+  const DurableOptions options_;
+  std::optional<MeasurementStream> stream_;
+  /// Oldest first.
+  std::deque<Kept> kept_;
+  /// Who counts the places.
+  std::uint64_t run_ = 0;
+};
+
+}  // namespace detail
+
+DurableStream::DurableStream(std::shared_ptr<detail::Core> core, const std::string& session_id, const DurableOptions& options)
+    : impl_(std::make_unique<detail::DurableStreamImpl>(std::move(core), session_id, options)) {}
+DurableStream::DurableStream(DurableStream&&) noexcept = default;
+DurableStream& DurableStream::operator=(DurableStream&&) noexcept = default;
+DurableStream::~DurableStream() = default;
+
+Result<MeasurementAnswer> DurableStream::send(const Measurement& measurement) { return impl_->send(measurement); }
+Result<void> DurableStream::flush(std::chrono::nanoseconds timeout) { return impl_->flush(timeout); }
+std::vector<Measurement> DurableStream::pending() const { return impl_->pending(); }
+void DurableStream::close() { impl_->close(); }
+
+}  // namespace nesam

@@ -1,0 +1,167 @@
+// Goal: a vehicle that keeps what is not durable loses nothing when the server is killed.
+// Method: the real binary with a store, SIGKILL in the middle of a drive, a restart on the same store; the same drive without a crash must teach the same soil,
+// bit for bit.
+//
+// Usage: durable_test BINARY FOLDER [arguments of nesam serve]     FOLDER: empty, for stores and logs. Exit codes: check.hpp.
+
+#include <nesam/nesam.hpp>
+
+#include <chrono>
+#include <csignal>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#include "check.hpp"
+#include "scenario.hpp"
+#include "server.hpp"
+
+namespace {
+
+using namespace std::chrono_literals;
+
+/// Where the tests run.
+struct Place {
+  std::string binary;
+  std::string folder;
+  std::vector<std::string> arguments;
+
+  /// Arguments of a server that keeps a store of this name.
+  std::vector<std::string> with_store(const std::string& name) const {
+    std::vector<std::string> all = arguments;
+    all.insert(all.end(), {"--store", folder + "/" + name});
+    return all;
+  }
+};
+
+nesam::Client connected(const Server& server) {
+  nesam::ClientOptions options;
+  options.timeout = 60s;
+  nesam::Client client(server.address(), options);
+  client.connect(30s).value();
+  return client;
+}
+
+nesam::Session opened(nesam::Client& client, const std::string& name, const std::string& map_id = {}) {
+  nesam::OpenOptions options;
+  options.vehicle_id = name;
+  options.map_id = map_id;
+  return std::move(client.open(options).value());
+}
+
+/// A drive of 37 steps that the filter of the soil takes, driven by a session of its own; what it has learned.
+nesam::SessionStatus reference_drive(nesam::Client& client, std::vector<nesam::Measurement>& drive) {
+  nesam::Session session = driven(client, "reference", "hills");
+  for (int step = 0; step < 5; ++step) drive.push_back(cruise(step, session.vehicle()));
+  for (const nesam::Measurement& measurement : predicted_drive(session)) {
+    drive.push_back(measurement);
+    (void)session.send(measurement).value();
+  }
+  return session.status().value();
+}
+
+void service_a_killed_server_costs_nothing(const Place& place) {
+  Server server(place.binary, place.folder, place.with_store("killed"));
+  nesam::Client client = connected(server);
+  client.upload_map(HillyMap().view("hills", 1)).value();
+  std::vector<nesam::Measurement> drive;
+  const nesam::SessionStatus reference = reference_drive(client, drive);
+  check(reference.provenance.soil_epoch > 0, "the drive teaches something");
+
+  nesam::Session session = opened(client, "truck", "hills");
+  nesam::DurableStream stream = session.durable_measurements();
+  constexpr std::size_t crash = 22;
+  for (std::size_t i = 0; i < crash; ++i) {
+    const auto answer = stream.send(drive[i]);
+    if (!check_ok(answer, "before the crash")) return;
+    check(answer->accepted() && answer->place == i + 1 && answer->durable_place <= i + 1, "accepted at its place");
+    // A store commits at least every second.
+    if (i == crash / 2) std::this_thread::sleep_for(1500ms);
+  }
+  server.stop(SIGKILL);
+  const std::size_t pending = stream.pending().size();
+  check(pending > 0 && pending < crash, "some are durable and some are not: " + std::to_string(pending));
+  check(pending > 0 && stream.pending().back().stamp_ns == drive[crash - 1].stamp_ns, "the newest is kept");
+  std::thread restarter([&] {
+    std::this_thread::sleep_for(500ms);
+    server.start();
+  });
+  for (std::size_t i = crash; i < drive.size(); ++i) check_ok(stream.send(drive[i]), "after the crash");
+  restarter.join();
+  check_ok(stream.flush(30s), "flush");
+  check(stream.pending().empty(), "everything is durable");
+
+  const auto status = session.status();
+  if (!check_ok(status, "status")) return;
+  check(status->accepted == drive.size() && status->durable_place == drive.size() && status->last_sequence == drive.size(), "nothing lost, nothing twice");
+  check(status->state && status->state->position_m == drive.back().state.position_m, "the newest state");
+  const auto& learned = status->soil_correction;
+  check(learned.covariance && learned.covariance == reference.soil_correction.covariance, "the covariance of a drive without a crash, bit for bit");
+  check(learned.delta.k_phi == reference.soil_correction.delta.k_phi && learned.delta.k_shear_m == reference.soil_correction.delta.k_shear_m, "so is the soil");
+  check(status->provenance.soil_epoch == reference.provenance.soil_epoch, "after as many updates");
+}
+
+void service_streams_outlive_a_restart(const Place& place) {
+  Server server(place.binary, place.folder, place.with_store("restarted"));
+  nesam::Client client = connected(server);
+  nesam::Session session = opened(client, "truck");
+  const nesam::VehicleCard card = session.vehicle();
+  nesam::DurableOptions impatient;
+  impatient.reconnect = 300ms;
+  impatient.pause = 50ms;
+  nesam::DurableStream stream = session.durable_measurements(impatient);
+  check_ok(session.send(cruise(0, card)), "over the stream of the session");
+  check_ok(stream.send(cruise(1, card)), "over the durable one");
+  check_ok(stream.flush(), "flush");
+  // A server that stops ends the streams that rest on it: both go on over another connection.
+  check(server.stop(SIGTERM) == 0, "the server stops cleanly");
+  const auto begin = std::chrono::steady_clock::now();
+  check_error(stream.send(cruise(2, card)), nesam::Code::unavailable, "", "nobody is there");
+  check(std::chrono::steady_clock::now() - begin < 20s, "it gives up in time");
+  check(stream.pending().size() == 1, "and keeps the measurement");
+  server.start();
+  check_ok(client.connect(30s), "the server is there again");
+  check_ok(stream.flush(30s), "flush sends it");
+  const auto answer = session.send(cruise(3, card));
+  check(answer.ok() && answer->accepted() && answer->place == 4, answer.ok() ? "place 4" : answer.error().what());
+
+  // Refused measurements are answered and not kept; a closed stream begins again; a session that is closed is not waited for.
+  nesam::Measurement bad = cruise(4, card);
+  bad.state.velocity_m_s[0] = nan_d;
+  const auto refused = stream.send(bad);
+  check(refused.ok() && refused->is<nesam::NotFinite>() && stream.pending().empty(), "not finite: not kept");
+  stream.close();
+  const auto again = stream.send(cruise(4, card));
+  check(again.ok() && again->accepted() && again->place == 5 && stream.pending().size() == 1, "after close");
+  check_ok(session.close(), "close");
+  check_error(stream.flush(), nesam::Code::not_found, "session_id", "a closed session");
+}
+
+void service_without_a_store_nothing_is_durable(const Place& place) {
+  const Server server(place.binary, place.folder, place.arguments);
+  nesam::Client client = connected(server);
+  nesam::Session session = opened(client, "truck");
+  nesam::DurableOptions options;
+  options.pending_max = 3;
+  nesam::DurableStream stream = session.durable_measurements(options);
+  for (int step = 0; step < 3; ++step) check_ok(stream.send(cruise(step, session.vehicle())), "three are kept");
+  check_error(stream.send(cruise(3, session.vehicle())), nesam::Code::resource_exhausted, "pending_max", "the fourth");
+  check_error(stream.flush(200ms), nesam::Code::deadline_exceeded, "", "nothing becomes durable");
+  check(stream.pending().size() == 3 && session.status().value().accepted == 3, "three are accepted and kept");
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  if (argc < 3) {
+    std::fprintf(stderr, "usage: durable_test BINARY FOLDER [arguments of nesam serve]\n");
+    return 2;
+  }
+  const Place place{argv[1], argv[2], {argv + 3, argv + argc}};
+  run("service_a_killed_server_costs_nothing", [&] { service_a_killed_server_costs_nothing(place); });
+  run("service_streams_outlive_a_restart", [&] { service_streams_outlive_a_restart(place); });
+  run("service_without_a_store_nothing_is_durable", [&] { service_without_a_store_nothing_is_durable(place); });
+  std::printf("%d passed, %d failed\n", passed, failed);
+  return failed == 0 ? 0 : 1;
+}
