@@ -157,18 +157,6 @@ impl EngineHandle {
         self.work_off();
     }
 
-    /// Executes what waits where nobody else does. What comes while another executes is found by that one: it looks again after it has let the engine go.
-    fn work_off(&self) {
-        let Worker::Submitter(held) = self.worker.as_ref() else { return };
-        while self.queue.has_turn() {
-            let Ok(mut held) = held.try_lock() else { return };
-            let Some((engine, tap)) = held.as_mut() else { return };
-            while self.queue.has_turn() {
-                take_turn(self.queue.next(|| self.clock.now_ns()), engine, &self.queue, self.clock.as_ref(), tap);
-            }
-        }
-    }
-
     /// The same, waiting for the answer on this thread.
     ///
     /// # Errors
@@ -179,6 +167,18 @@ impl EngineHandle {
             let _ = sender.send(answer.result);
         }));
         receiver.recv().unwrap_or(Err(EngineError::Stopped))
+    }
+
+    /// Executes what waits where nobody else does. What comes while another executes is found by that one: it looks again after it has let the engine go.
+    fn work_off(&self) {
+        let Worker::Submitter(held) = self.worker.as_ref() else { return };
+        while self.queue.has_turn() {
+            let Ok(mut held) = held.try_lock() else { return };
+            let Some((engine, tap)) = held.as_mut() else { return };
+            while self.queue.has_turn() {
+                take_turn(self.queue.next(|| self.clock.now_ns()), engine, &self.queue, self.clock.as_ref(), tap);
+            }
+        }
     }
 
     /// Limits in force.

@@ -38,6 +38,11 @@ impl Presence {
         self.alive.lock().map_or(0, |alive| alive.len())
     }
 
+    /// Nobody is seen from outside of the network.
+    pub fn forget(&self) {
+        self.vehicles().iter().for_each(|vehicle| self.note(vehicle, false));
+    }
+
     fn note(&self, vehicle: &str, alive: bool) {
         let Ok(mut vehicles) = self.alive.lock() else { return };
         let changed = if alive { vehicles.len() < VEHICLES_MAX && vehicles.insert(vehicle.into()) } else { vehicles.remove(vehicle) };

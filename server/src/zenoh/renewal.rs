@@ -7,7 +7,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_rustls::rustls::ServerConfig;
 
-use super::Bus;
+use super::{Bus, Presence};
 use crate::config::{TlsConfig, ZenohConfig};
 use crate::error::ServerError;
 use crate::grpc::Edge;
@@ -67,6 +67,7 @@ impl Joining {
             // A port belongs to one session at a time.
             if let Some(bus) = joined.take() {
                 bus.stop().await;
+                self.edge.presence.iter().for_each(Presence::forget);
             }
             match Bus::start(&self.config, &self.tls, &self.edge).await {
                 Ok(bus) => {

@@ -169,7 +169,16 @@ async fn service_a_server_that_listens_with_tls_takes_new_certificates_and_right
     replace("fleet.toml", FLEET.as_bytes());
     eventually(&old, true, 2).await;
 
-    // An authority that has nothing to do with the one before.
+    // An authority that has nothing to do with the one before. A vehicle that was there cannot come back, and is not taken to be there.
+    let held = ZenohVehicle::connect_tls(&endpoint, "test", "truck", &old).await.unwrap();
+    let alive = async |operator: &Client, expected: bool| {
+        let begun = std::time::Instant::now();
+        while operator.clone().session("truck").await.unwrap().vehicle_alive != Some(expected) {
+            assert!(begun.elapsed() < PATIENCE, "alive is not {expected}");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    };
+    alive(&operator, true).await;
     let successor = Authority::new();
     let (certificate, key) = successor.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
     replace("server.pem", &certificate);
@@ -178,6 +187,7 @@ async fn service_a_server_that_listens_with_tls_takes_new_certificates_and_right
     eventually(&successor.tls("nesam:vehicle:truck"), true, 3).await;
     let stranger = Tls { authority: successor.pem.clone().into_bytes(), ..old };
     assert!(reports(&endpoint, &stranger, &sample("", &recorded.drive, 4)).await.is_none(), "signed by the authority before");
-    drop(operator);
+    alive(&operator, false).await;
+    drop((operator, held));
     stage.server.shutdown().await;
 }
