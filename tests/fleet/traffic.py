@@ -209,7 +209,10 @@ class ZenohVehicle(threading.Thread):
 
 
 class Planner(threading.Thread):
-    """Asks again and again; a call that fails is repeated once."""
+    """Asks again and again; a call that fails is repeated once, after a pause."""
+
+    # As retry policies of gRPC pause: at once, a call may go over another connection that the proxy has kept to the same dead server.
+    PAUSE_S = 0.05
 
     def __init__(self, address, session, every_s=PLAN_S):
         super().__init__(name=f"planner of {session}", daemon=True)
@@ -233,6 +236,7 @@ class Planner(threading.Thread):
                         self.violations.append(f"{self.name}: two calls in a row failed: {type(error).__name__}: {error}")
                     else:
                         self.retried += 1
+                        time.sleep(self.PAUSE_S)
             now = time.monotonic()
             self.answered += 1
             self.silence_s = max(self.silence_s, now - last)
