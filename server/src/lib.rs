@@ -19,7 +19,6 @@ mod one_thread;
 pub mod recording;
 mod serve;
 pub mod store;
-mod sync;
 mod telemetry;
 mod tls_listener;
 mod web;

@@ -103,6 +103,7 @@ fn submit(engine: &EngineHandle, answers: &Answers, who: &'static str, number: u
 fn vehicles_and_a_planner(engine: EngineHandle) {
     const MEASUREMENTS: usize = 3;
     const PREDICTIONS: usize = 3;
+    const LATE: usize = 2;
     let answers = Answers::default();
     let vehicles = ["a", "b"].map(|session| {
         let (engine, answers) = (engine.clone(), answers.clone());
@@ -117,6 +118,11 @@ fn vehicles_and_a_planner(engine: EngineHandle) {
         let (engine, answers) = (engine.clone(), answers.clone());
         thread::spawn(move || (0..PREDICTIONS).for_each(|i| submit(&engine, &answers, "planner", i, predict("a"))))
     };
+    // Commands that may come while somebody stops the engine.
+    let late = {
+        let (engine, answers) = (engine.clone(), answers.clone());
+        thread::spawn(move || (0..LATE).for_each(|i| submit(&engine, &answers, "late", i, Command::List)))
+    };
     vehicles.into_iter().for_each(|vehicle| vehicle.join().unwrap());
     let stopped = {
         let engine = engine.clone();
@@ -125,12 +131,13 @@ fn vehicles_and_a_planner(engine: EngineHandle) {
     let again = engine.stop().is_some();
     assert!(stopped.join().unwrap() ^ again, "one of two gets the engine back");
     planner.join().unwrap();
+    late.join().unwrap();
     let answers = answers.lock().unwrap();
-    for (who, asked) in [("a", MEASUREMENTS), ("b", MEASUREMENTS), ("planner", PREDICTIONS)] {
+    for (who, asked) in [("a", MEASUREMENTS), ("b", MEASUREMENTS), ("planner", PREDICTIONS), ("late", LATE)] {
         let mut got = answers[who].clone();
         assert!(got.iter().all(|(_, fine)| *fine), "{who}: {got:?}");
         // Refusals overtake answers; measurements are all answered.
-        if who == "planner" {
+        if who == "planner" || who == "late" {
             got.sort_unstable();
         }
         assert_eq!(got.iter().map(|(number, _)| *number).collect::<Vec<_>>(), (0..asked).collect::<Vec<_>>(), "{who}");

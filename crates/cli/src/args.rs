@@ -31,6 +31,13 @@ pub struct DataArgs {
     pub dt: f64,
 }
 
+impl DataArgs {
+    /// All drives of a root, at the step of the model.
+    pub fn of(data: Option<PathBuf>) -> Self {
+        Self { data, set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S }
+    }
+}
+
 /// Split of a set.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum SplitArg {

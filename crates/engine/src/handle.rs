@@ -204,12 +204,15 @@ impl EngineHandle {
         }
         match self.worker.as_ref() {
             Worker::Thread(thread) => thread.lock().ok()?.take()?.join().ok(),
-            Worker::Submitter(held) => held.lock().ok()?.take().map(|(engine, _)| engine),
+            Worker::Submitter(held) => {
+                let (engine, tap) = held.lock().ok()?.take()?;
+                Some(run(engine, &self.queue, self.clock.as_ref(), tap))
+            }
         }
     }
 }
 
-/// The thread's loop.
+/// Does all that is asked for until the end.
 fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap>) -> Engine {
     while take_turn(queue.next(|| clock.now_ns()), &mut engine, queue, clock, &mut tap) {}
     engine

@@ -35,7 +35,7 @@ mod queue;
 mod ranking;
 mod service_time;
 mod session;
-mod sync;
+pub mod sync;
 
 pub use candidates::{Candidates, Drawing};
 pub use clock::{Clock, ManualClock};

@@ -1,13 +1,14 @@
-//! Locks, channels and threads: of the standard library, or of shuttle where the schedules of threads are tried.
+//! Locks, channels and threads: of the standard library, or of shuttle where the schedules of threads are tried. Who works beside
+//! the engine takes them from here too.
 
 #[cfg(not(feature = "shuttle"))]
-pub(crate) use std::{
+pub use std::{
     sync::{Condvar, Mutex, MutexGuard, mpsc},
     thread,
 };
 
 #[cfg(feature = "shuttle")]
-pub(crate) use shuttle::{
+pub use shuttle::{
     sync::{Condvar, Mutex, MutexGuard, mpsc},
     thread,
 };

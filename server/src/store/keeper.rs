@@ -4,6 +4,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::Duration;
 
+use nesam_engine::sync::thread::{self, JoinHandle};
+use nesam_engine::sync::{Condvar, Mutex, MutexGuard};
 use nesam_engine::{Command, EngineHandle, Event, Reply, Snapshot};
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -13,8 +15,6 @@ use super::restore::Restored;
 use super::{Change, SessionStore, StoreError, StoredSession};
 use crate::clock::unix_ns;
 use crate::convert::image_bytes;
-use crate::sync::thread::{self, JoinHandle};
-use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// Pause before a commit that failed is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(1);

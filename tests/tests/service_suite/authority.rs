@@ -101,6 +101,12 @@ pub async fn secured_with(change: impl FnOnce(&mut Config)) -> Stage {
 }
 
 impl Stage {
+    /// Puts a file in the place of one of the server's, whole.
+    pub fn replace(&self, name: &str, bytes: &[u8]) {
+        let new = written(self.files.path(), "new", bytes);
+        std::fs::rename(new, self.files.path().join(name)).unwrap();
+    }
+
     /// A client that shows this.
     pub async fn connect(&self, identity: Option<(Vec<u8>, Vec<u8>)>) -> Result<Client, ClientError> {
         let tls = Tls { authority: self.authority.pem.clone().into_bytes(), identity, server_name: "localhost".into() };

@@ -1,7 +1,7 @@
 //! Goal: certificates are renewed and rights withdrawn while the service runs; what cannot be used changes nothing. Method: the files of a running server are
 //! replaced.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use nesam_client::{Client, Tls, v1};
 use tonic::Code;
@@ -11,15 +11,6 @@ use crate::stage::*;
 
 /// Time until a changed file must have been noticed.
 const NOTICED: Duration = Duration::from_secs(20);
-
-/// Asks again until the answer is as expected.
-async fn eventually<F: Future<Output = bool>>(what: &str, mut holds: impl FnMut() -> F) {
-    let start = Instant::now();
-    while !holds().await {
-        assert!(start.elapsed() < NOTICED, "{what}");
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-}
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_rights_and_certificates_change_without_a_restart() {
@@ -36,15 +27,10 @@ async fn service_rights_and_certificates_change_without_a_restart() {
         soil.message().await.unwrap().expect("the present soil");
         watches.push((soil, client.clone().watch_alarms(session).await.unwrap()));
     }
-    let replace = |name: &str, bytes: &[u8]| {
-        let new = stage.files.path().join("new");
-        std::fs::write(&new, bytes).unwrap();
-        std::fs::rename(new, stage.files.path().join(name)).unwrap();
-    };
 
     // Taken out of the fleet file: the next request on an open connection is refused; nobody else notices.
-    replace("fleet.toml", FLEET.replace("[vehicles.other]\n", "").as_bytes());
-    eventually("revoked", || async {
+    stage.replace("fleet.toml", FLEET.replace("[vehicles.other]\n", "").as_bytes());
+    eventually(NOTICED, "revoked", || async {
         other.clone().list_sessions().await.is_err_and(|error| error.code() == Some(Code::PermissionDenied))
     })
     .await;
@@ -56,8 +42,8 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     assert!(tokio::time::timeout(Duration::from_millis(300), soil.message()).await.is_err(), "the truck goes on watching");
 
     // Files that cannot be used are counted and change nothing, for new connections either.
-    replace("server.key", b"half a ke");
-    eventually("counted", || async {
+    stage.replace("server.key", b"half a ke");
+    eventually(NOTICED, "counted", || async {
         stage.server.metrics().render(0, 0).contains("nesam_credentials_reloads_total{result=\"failed\"} 1")
     })
     .await;
@@ -66,14 +52,14 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     // A certificate and an authority that have nothing to do with those before.
     let successor = Authority::new();
     let (certificate, key) = successor.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
-    replace("server.pem", &certificate);
-    replace("server.key", &key);
-    replace("ca.pem", successor.pem.as_bytes());
+    stage.replace("server.pem", &certificate);
+    stage.replace("server.key", &key);
+    stage.replace("ca.pem", successor.pem.as_bytes());
     let connect = |tls: Tls| {
         let address = address.clone();
         async move { Client::connect_tls(&address, &tls).await?.list_sessions().await }
     };
-    eventually("renewed", || async { connect(successor.tls("nesam:vehicle:truck")).await.is_ok() }).await;
+    eventually(NOTICED, "renewed", || async { connect(successor.tls("nesam:vehicle:truck")).await.is_ok() }).await;
     assert!(connect(stage.authority.tls("nesam:vehicle:truck")).await.is_err(), "certificates of the authority before are strangers now");
     truck.clone().list_sessions().await.expect("open connections go on");
     drop((truck, other));

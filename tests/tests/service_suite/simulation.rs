@@ -177,9 +177,9 @@ async fn connect() -> Result<Client, Failure> {
 }
 
 /// A vehicle that drives once, whatever happens.
-struct Vehicle<'a> {
+struct Vehicle {
     session: &'static str,
-    recorded: &'a Recorded,
+    recorded: Rc<Recorded>,
     outbox: Outbox,
     begun: Instant,
     pushed: usize,
@@ -193,7 +193,7 @@ struct Seen {
     prediction: Prediction,
 }
 
-impl Vehicle<'_> {
+impl Vehicle {
     async fn drive(mut self) -> Result<Seen, Failure> {
         loop {
             match self.connected().await {
@@ -305,7 +305,7 @@ struct Run {
 }
 
 /// One simulation, on a folder that holds the world.
-fn simulate(seed: u64, folder: &Path) -> Result<Run, Failure> {
+fn simulate(seed: u64, folder: &Path, recorded: &Rc<Recorded>) -> Result<Run, Failure> {
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let faults = faults(&mut rng);
     let latency_ms = rng.random_range(1..60);
@@ -326,9 +326,8 @@ fn simulate(seed: u64, folder: &Path) -> Result<Run, Failure> {
     });
     let (arrived, got, seen) = (Rc::new(Cell::new(0)), Rc::new(Cell::new(0)), Rc::new(RefCell::new(Vec::new())));
     for session in VEHICLES {
-        let (arrived, seen) = (arrived.clone(), seen.clone());
+        let (arrived, seen, recorded) = (arrived.clone(), seen.clone(), recorded.clone());
         sim.client(session, async move {
-            let recorded = &recorded();
             let vehicle = Vehicle { session, recorded, outbox: Outbox::default(), begun: Instant::now(), pushed: 0, opened: false };
             let arrives = vehicle.drive().await?;
             seen.borrow_mut().push(arrives);
@@ -337,9 +336,9 @@ fn simulate(seed: u64, folder: &Path) -> Result<Run, Failure> {
         });
     }
     sim.client("planner", {
-        let (arrived, got) = (arrived.clone(), got.clone());
+        let (arrived, got, recorded) = (arrived.clone(), got.clone(), recorded.clone());
         async move {
-            plan(&recorded(), &arrived, &got).await;
+            plan(&recorded, &arrived, &got).await;
             Ok(())
         }
     });
@@ -379,7 +378,7 @@ fn seeds() -> std::ops::Range<u64> {
 
 #[test]
 fn simulation_of_crashes_and_networks_loses_nothing() {
-    let recorded = recorded();
+    let recorded = Rc::new(recorded());
     let prepared_folder = tempfile::tempdir().unwrap();
     tokio::runtime::Runtime::new().unwrap().block_on(prepared(prepared_folder.path(), &recorded));
     let query = candidates(VEHICLES[0], &recorded.drive, LAST, 3, 16);
@@ -391,7 +390,7 @@ fn simulation_of_crashes_and_networks_loses_nothing() {
             let file = entry.unwrap().path();
             std::fs::copy(&file, folder.path().join(file.file_name().unwrap())).unwrap();
         }
-        let run = simulate(seed, folder.path()).unwrap_or_else(|failure| panic!("seed {seed}: {failure}"));
+        let run = simulate(seed, folder.path(), &recorded).unwrap_or_else(|failure| panic!("seed {seed}: {failure}"));
         let Run { seen, starts, predictions, simulated } = run;
         println!("seed {seed}: {starts} starts, {predictions} predictions on the way, {:.1} s", simulated.as_secs_f64());
         assert_eq!(seen.len(), VEHICLES.len(), "seed {seed}");

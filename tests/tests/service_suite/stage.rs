@@ -1,6 +1,7 @@
 //! What every test needs: a predictor, a recorded drive, a running server, a client.
 
 use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
 
 use nesam_adaptation::CalibratedFilter;
 use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
@@ -251,6 +252,15 @@ pub fn assert_same(prediction: &Prediction, rollout: &Rollout) {
     assert!(prediction.validity.iter().zip(&rollout.flags).all(|(got, flags)| *got == flags | learned));
     assert_eq!(prediction.validity.len(), rollout.flags.len());
     assert_eq!(prediction.soil.map(f64::to_bits), rollout.soil.map(f64::to_bits));
+}
+
+/// Asks again until the answer is as expected, at most this long.
+pub async fn eventually<F: Future<Output = bool>>(within: Duration, what: &str, mut holds: impl FnMut() -> F) {
+    let start = Instant::now();
+    while !holds().await {
+        assert!(start.elapsed() < within, "{what}");
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    }
 }
 
 /// Asserts that a call was refused with this code and names this field.

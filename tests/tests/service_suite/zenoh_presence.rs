@@ -1,7 +1,5 @@
 //! Goal: vehicles and servers know of each other. Method: liveliness tokens and the published status, through a Zenoh router.
 
-use std::time::Duration;
-
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{Client, outcome_label, v1};
 use prost::Message as _;
@@ -11,14 +9,9 @@ use crate::stage::*;
 use crate::zenoh_network::{PATIENCE, behind, router};
 
 /// Waits until the session listing says this of the vehicle.
-async fn until_alive(client: &mut Client, expected: bool) {
-    for _ in 0..400 {
-        if client.list_sessions().await.unwrap()[0].vehicle_alive == Some(expected) {
-            return;
-        }
-        tokio::time::sleep(Duration::from_millis(50)).await;
-    }
-    panic!("the session never said that the vehicle is {expected}");
+pub async fn until_alive(client: &Client, expected: bool) {
+    let says = async || client.clone().list_sessions().await.unwrap()[0].vehicle_alive == Some(expected);
+    eventually(PATIENCE, &format!("the session never said that the vehicle is {expected}"), says).await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -38,9 +31,9 @@ async fn service_liveliness_and_status_follow_vehicles_and_servers() {
     assert_eq!((token.kind(), token.key_expr().as_str()), (SampleKind::Put, "nesam/v1/test/server/alpha/alive"));
 
     open(&mut client, "truck", "").await;
-    until_alive(&mut client, false).await;
+    until_alive(&client, false).await;
     let vehicle = ZenohVehicle::connect(&endpoint, "test", "truck").await.unwrap();
-    until_alive(&mut client, true).await;
+    until_alive(&client, true).await;
     vehicle.wait_for_service(PATIENCE).await.unwrap();
     for i in 0..3 {
         vehicle.publish(&sample("", &recorded.drive, i)).await.unwrap();
@@ -58,7 +51,7 @@ async fn service_liveliness_and_status_follow_vehicles_and_servers() {
     assert_eq!(published.bundle_hash, predictor().bundle().hash);
 
     vehicle.close().await.unwrap();
-    until_alive(&mut client, false).await;
+    until_alive(&client, false).await;
     early.close().await.unwrap();
     server.shutdown().await;
     let token = tokio::time::timeout(PATIENCE, tokens.recv_async()).await.expect("in time").unwrap();

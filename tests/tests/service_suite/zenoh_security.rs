@@ -11,6 +11,7 @@ use nesam_server::{LinkFiles, ZenohMode, router_config};
 use crate::authority::{Authority, FLEET, Stage, dns, secured_with, uri, written};
 use crate::stage::*;
 use crate::zenoh_network::{PATIENCE, behind};
+use crate::zenoh_presence::until_alive;
 
 /// Time in which something that is allowed would long have happened.
 const SILENCE: Duration = Duration::from_millis(1500);
@@ -149,45 +150,33 @@ async fn service_a_server_that_listens_with_tls_takes_new_certificates_and_right
     operator.open_session(v1::OpenSessionRequest { vehicle_id: "truck".into(), ..Default::default() }).await.unwrap();
     let old = stage.authority.tls("nesam:vehicle:truck");
     assert_eq!(reports(&endpoint, &old, &sample("", &recorded.drive, 0)).await.as_deref(), Some("APPLIED"));
-    let replace = |name: &str, bytes: &[u8]| {
-        let new = written(stage.files.path(), "new", bytes);
-        std::fs::rename(new, stage.files.path().join(name)).unwrap();
-    };
-    let eventually = async |tls: &Tls, heard: bool, i: usize| {
-        let begun = std::time::Instant::now();
-        while reports(&endpoint, tls, &sample("", &recorded.drive, i)).await.is_some() != heard {
-            assert!(begun.elapsed() < 2 * PATIENCE, "sample {i} is not {}heard", if heard { "" } else { "un" });
-        }
+    let heard = async |tls: &Tls, expected: bool, i: usize| {
+        let what = format!("sample {i}: heard is not {expected}");
+        let as_expected = async || reports(&endpoint, tls, &sample("", &recorded.drive, i)).await.is_some() == expected;
+        eventually(2 * PATIENCE, &what, as_expected).await;
     };
 
     // Taken out of the fleet file, and in again.
-    replace(
+    stage.replace(
         "fleet.toml",
         FLEET.replace("[vehicles.truck]\nmaps = [\"local\"]\n", "").replace("vehicles = [\"truck\"]", "vehicles = []").as_bytes(),
     );
-    eventually(&old, false, 1).await;
-    replace("fleet.toml", FLEET.as_bytes());
-    eventually(&old, true, 2).await;
+    heard(&old, false, 1).await;
+    stage.replace("fleet.toml", FLEET.as_bytes());
+    heard(&old, true, 2).await;
 
     // An authority that has nothing to do with the one before. A vehicle that was there cannot come back, and is not taken to be there.
     let held = ZenohVehicle::connect_tls(&endpoint, "test", "truck", &old).await.unwrap();
-    let alive = async |operator: &Client, expected: bool| {
-        let begun = std::time::Instant::now();
-        while operator.clone().session("truck").await.unwrap().vehicle_alive != Some(expected) {
-            assert!(begun.elapsed() < PATIENCE, "alive is not {expected}");
-            tokio::time::sleep(Duration::from_millis(50)).await;
-        }
-    };
-    alive(&operator, true).await;
+    until_alive(&operator, true).await;
     let successor = Authority::new();
     let (certificate, key) = successor.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
-    replace("server.pem", &certificate);
-    replace("server.key", &key);
-    replace("ca.pem", successor.pem.as_bytes());
-    eventually(&successor.tls("nesam:vehicle:truck"), true, 3).await;
+    stage.replace("server.pem", &certificate);
+    stage.replace("server.key", &key);
+    stage.replace("ca.pem", successor.pem.as_bytes());
+    heard(&successor.tls("nesam:vehicle:truck"), true, 3).await;
     let stranger = Tls { authority: successor.pem.clone().into_bytes(), ..old };
     assert!(reports(&endpoint, &stranger, &sample("", &recorded.drive, 4)).await.is_none(), "signed by the authority before");
-    alive(&operator, false).await;
+    until_alive(&operator, false).await;
     drop((operator, held));
     stage.server.shutdown().await;
 }

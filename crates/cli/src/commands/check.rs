@@ -140,7 +140,7 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
 }
 
 fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
-    let args = DataArgs { data: None, set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
+    let args = DataArgs::of(None);
     let drives = match root.load_set(&query(&args, set, SplitArg::All, false)) {
         Ok(drives) => drives,
         Err(e) => return findings.error(format!("set {set}: {}", chain(&e))),

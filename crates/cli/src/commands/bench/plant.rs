@@ -2,7 +2,6 @@
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 
 use clap::Args;
 use nesam_discovery::{Against, Diagnosis, Options, Scoring, diagnose};
@@ -14,13 +13,12 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use serde_json::json;
 
-use crate::args::{BundleArgs, DataArgs, SplitArg};
-use crate::commands::plant::root_of;
+use crate::args::{BundleArgs, DataArgs};
 use crate::commands::plant::write::{Asked, copy_vehicle_and_worlds, write_drives};
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, say, write_file};
 use crate::progress::Progress;
-use crate::sources::{load_bundle_for, predictor_for, read_drives};
+use crate::sources::{load_bundle_for, open_root, predictor_for, read_drives};
 
 /// Id of an effect, the parameter that its size is, and its usual size.
 type Dose = (&'static str, &'static str, f64);
@@ -41,6 +39,8 @@ const DOSES: [Dose; 15] = [
     ("map_offset", "z_m", 0.05),
     ("position_latency", "seconds", 0.12),
 ];
+/// The effect whose sign is drawn too.
+const EITHER_SIDE: &str = "steering_offset";
 /// Sizes are drawn within this share of what was asked for.
 const JITTER: f64 = 0.1;
 /// Length of a drive, s.
@@ -74,7 +74,7 @@ pub(super) struct PlantBench {
     #[arg(long, default_value_t = 8)]
     drives: usize,
     /// Seed of sizes, order, commands and sensor noise
-    #[arg(long, default_value_t = 1)]
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(..1 << 32))]
     seed: u64,
     /// Folder for the drives [default: nesam-out/bench-plant]
     #[arg(long, value_name = "DIR")]
@@ -84,8 +84,8 @@ pub(super) struct PlantBench {
     json: Option<PathBuf>,
 }
 
-/// What is hidden in a set of drives; `None` = nothing.
-type Label = Option<(Dose, f64)>;
+/// What is hidden in a set of drives, `None` = nothing, and the vehicle that has it.
+type Label = (Option<(Dose, f64)>, HiddenEffects);
 
 /// What a diagnosis said of a set, and what was in it.
 #[derive(Debug, Serialize)]
@@ -94,9 +94,9 @@ struct Run {
     hidden: &'static str,
     size: f64,
     verdict: &'static str,
-    /// Claimed effects with their rivals; the first is that of the estimate.
+    /// Claimed effects, each with its rivals after it.
     named: Vec<Vec<String>>,
-    /// Size of the hidden effect, where it was named first, and its 95 % interval.
+    /// Size of the hidden effect, where it was claimed, and its 95 % interval.
     estimate: Option<f64>,
     ci95: Option<[f64; 2]>,
     reason: String,
@@ -105,11 +105,13 @@ struct Run {
 /// Runs the command.
 pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
     let doses = chosen(args)?;
-    let root = root_of(args.data.as_ref())?;
+    let labels = drawn(args, &doses)?;
+    let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &root)?, &root)?;
     let out = output::out_dir(args.out.as_deref(), "bench", "plant")?;
-    copy_vehicle_and_worlds(&root, &out, &args.worlds)?;
-    let labels = write_sets(args, &doses, &root, &out)?;
-    let runs = judge(args, &out, labels)?;
+    copy_vehicle_and_worlds(&path, &out, &args.worlds)?;
+    write_sets(args, &labels, &path, &out)?;
+    let runs = judge(&predictor, &out, labels)?;
     for run in &runs {
         let estimate = run.estimate.zip(run.ci95).map_or(String::new(), |(e, [low, high])| format!("  {e:.4} [{low:.4}, {high:.4}]"));
         let named: Vec<String> = run.named.iter().map(|set| set.join(" or ")).collect();
@@ -130,6 +132,7 @@ pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
 }
 
 fn chosen(args: &PlantBench) -> Result<Vec<Dose>, Failure> {
+    asked(args, 0).check()?;
     if args.drives < 2 || args.doses.iter().any(|factor| !(factor.is_finite() && *factor > 0.0)) {
         return Err(Failure::input("--drives must be at least 2 and --doses above 0"));
     }
@@ -140,29 +143,40 @@ fn chosen(args: &PlantBench) -> Result<Vec<Dose>, Failure> {
     Ok(DOSES.into_iter().filter(|dose| args.effects.is_empty() || args.effects.iter().any(|id| id == dose.0)).collect())
 }
 
-/// Writes sets in an order drawn by the seed under names that say nothing; gives what is in each, for the score.
-fn write_sets(args: &PlantBench, doses: &[Dose], root: &Path, out: &Path) -> Result<Vec<Label>, Failure> {
+/// What is hidden in each set, in an order drawn by the seed.
+fn drawn(args: &PlantBench, doses: &[Dose]) -> Result<Vec<Label>, Failure> {
     let mut random = ChaCha8Rng::seed_from_u64(args.seed);
-    let mut labels: Vec<Label> = Vec::new();
+    let mut hidden: Vec<Option<(Dose, f64)>> = Vec::new();
     for dose in doses {
         for factor in &args.doses {
             let share = random.random_range(1.0 - JITTER..1.0 + JITTER);
-            let sign = if dose.0.starts_with("steering_off") && random.random::<bool>() { -1.0 } else { 1.0 };
-            labels.push(Some((*dose, sign * share * factor * dose.2)));
+            let sign = if dose.0 == EITHER_SIDE && random.random::<bool>() { -1.0 } else { 1.0 };
+            hidden.push(Some((*dose, sign * share * factor * dose.2)));
         }
     }
-    labels.extend((0..args.nulls).map(|_| None));
-    labels.shuffle(&mut random);
+    hidden.extend((0..args.nulls).map(|_| None));
+    hidden.shuffle(&mut random);
+    let label = |hidden: Option<(Dose, f64)>| {
+        let told = hidden.map(|((id, ..), size)| format!("{id}={size}"));
+        HiddenEffects::parse(told.as_deref()).or_input().map(|effects| (hidden, effects))
+    };
+    hidden.into_iter().map(label).collect()
+}
+
+/// What is asked of the plant for set number `i`.
+fn asked(args: &PlantBench, i: usize) -> Asked<'_> {
+    let seed = 1 + (args.seed << 16) + (i * args.drives) as u64;
+    Asked { worlds: &args.worlds, drives: args.drives, seconds: SECONDS, seed }
+}
+
+/// Writes the sets under names that say nothing.
+fn write_sets(args: &PlantBench, labels: &[Label], root: &Path, out: &Path) -> Result<(), Failure> {
     let progress = Progress::start("drives written", labels.len() * args.drives);
-    for (i, label) in labels.iter().enumerate() {
-        let hidden = label.map(|((id, ..), size)| format!("{id}={size}"));
-        let effects = HiddenEffects::parse(hidden.as_deref()).or_input()?;
-        let first = 1 + (args.seed << 16) + (i * args.drives) as u64;
-        let asked = Asked { worlds: &args.worlds, drives: args.drives, seconds: SECONDS, seed: first };
-        write_drives(root, &out.join(name(i)), &effects, &asked, &|done| progress.set(i * args.drives + done))?;
+    for (i, (_, effects)) in labels.iter().enumerate() {
+        write_drives(root, &out.join(name(i)), effects, &asked(args, i), &|done| progress.set(i * args.drives + done))?;
     }
     progress.finish();
-    Ok(labels)
+    Ok(())
 }
 
 fn name(i: usize) -> String {
@@ -170,40 +184,27 @@ fn name(i: usize) -> String {
 }
 
 /// Diagnoses every set and only then looks what was in it.
-fn judge(args: &PlantBench, out: &Path, labels: Vec<Label>) -> Result<Vec<Run>, Failure> {
+fn judge(predictor: &Predictor, out: &Path, labels: Vec<Label>) -> Result<Vec<Run>, Failure> {
     let progress = Progress::start("diagnoses", labels.len());
     let mut found = Vec::new();
-    let mut predictor = None;
     for i in 0..labels.len() {
-        found.push(diagnosis(args, out, i, &mut predictor)?);
+        found.push(diagnosis(predictor, out, i)?);
         progress.set(i + 1);
     }
     progress.finish();
-    let mut runs: Vec<Run> = found.iter().zip(labels).enumerate().map(|(i, (found, label))| scored(i, found, label)).collect();
+    let mut runs: Vec<Run> = found.iter().zip(labels).enumerate().map(|(i, (found, (hidden, _)))| scored(i, found, hidden)).collect();
     runs.sort_by(|a, b| a.hidden.cmp(b.hidden).then(a.size.abs().total_cmp(&b.size.abs())));
     Ok(runs)
 }
 
-fn diagnosis(args: &PlantBench, out: &Path, i: usize, predictor: &mut Option<Arc<Predictor>>) -> Result<Diagnosis, Failure> {
-    let data = DataArgs {
-        data: Some(out.into()),
-        set: Some(name(i)),
-        split: SplitArg::All,
-        trajectories: None,
-        vehicle: None,
-        dt: nesam_physics::DT_S,
-    };
-    let drives = read_drives(&data, false)?;
-    let predictor = match predictor {
-        Some(predictor) => predictor,
-        None => predictor.insert(predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?),
-    };
+fn diagnosis(predictor: &Predictor, out: &Path, i: usize) -> Result<Diagnosis, Failure> {
+    let drives = read_drives(&DataArgs { set: Some(name(i)), ..DataArgs::of(Some(out.into())) }, false)?;
     let options = Options { fit_on: None, without: Vec::new(), against: Against::Bundle, scoring: SCORING, controls: false };
     diagnose(predictor, &drives.drives, &drives.maps, &options, &|_, _, _| ()).or_input()
 }
 
-fn scored(i: usize, found: &Diagnosis, label: Label) -> Run {
-    let (hidden, parameter, size) = label.map_or(("", "", 0.0), |((id, parameter, _), size)| (id, parameter, size));
+fn scored(i: usize, found: &Diagnosis, hidden: Option<(Dose, f64)>) -> Run {
+    let (hidden, parameter, size) = hidden.map_or(("", "", 0.0), |((id, parameter, _), size)| (id, parameter, size));
     let named = found.claims().map(|finding| {
         let rivals = finding.rivals.iter().map(|rival| rival.candidate.id().to_string());
         std::iter::once(finding.candidate.id().to_string()).chain(rivals).collect()
@@ -226,12 +227,13 @@ fn scored(i: usize, found: &Diagnosis, label: Label) -> Run {
 #[derive(Debug, Serialize)]
 struct Line {
     sets: usize,
-    /// Sets in which it was named first, or at least among what cannot be told apart.
+    /// Sets in which it was claimed.
     first: usize,
+    /// Sets in which it was claimed, or at least a rival of what was.
     in_class: usize,
     /// Sets in which something else was named, and not this.
     other: usize,
-    /// Slope of the line through zero, with its 95 % interval, where it was named first at least twice.
+    /// Slope of the line through zero, with its 95 % interval, where it was claimed at least twice.
     slope: Option<[f64; 3]>,
 }
 

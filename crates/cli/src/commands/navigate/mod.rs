@@ -13,7 +13,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, read_ground_truth_soil};
 use serde_json::{Value, json};
 
-use crate::args::{BundleArgs, DataArgs, SplitArg};
+use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, say};
 use crate::progress::Progress;
@@ -137,9 +137,7 @@ impl Task {
 pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     check(args)?;
     let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
-    let asked =
-        DataArgs { data: args.data.clone(), set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
-    let (root, path) = open_root(&asked)?;
+    let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
     let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &root)?;
     let diagnosed = args.diagnosed.as_deref().map(|dir| load_bundle_for(Some(dir), &root)).transpose()?;
     let worlds = worlds_of(args, &root)?;

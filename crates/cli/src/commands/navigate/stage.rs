@@ -140,10 +140,10 @@ impl<'a> Stage<'a> {
         let service = match self.services.entry(kind) {
             Entry::Occupied(running) => running.into_mut(),
             Entry::Vacant(slot) => {
-                let bundle = match (kind, &self.bundles.diagnosed) {
-                    (Kind::Fixed, _) => without_learning(&self.bundles.shipped)?,
-                    (Kind::Diagnosed, Some(diagnosed)) => diagnosed.clone(),
-                    (Kind::Learning | Kind::Diagnosed, _) => self.bundles.shipped.clone(),
+                let bundle = match kind {
+                    Kind::Fixed => without_learning(&self.bundles.shipped)?,
+                    Kind::Learning => self.bundles.shipped.clone(),
+                    Kind::Diagnosed => self.bundles.diagnosed.clone().expect("options without --diagnosed are refused; this is a bug"),
                 };
                 let mut config = Config::ephemeral();
                 config.http.enabled = false;

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use clap::{Args, Subcommand};
 use nesam_plant::{EFFECTS, Ground, HiddenEffects, Plant, PlantServer, PlantVehicle, Sensors};
 
-use crate::args::{DataArgs, SplitArg};
+use crate::args::DataArgs;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::sources::open_root;
@@ -64,10 +64,8 @@ pub fn run(args: &PlantArgs) -> Result<(), Failure> {
 }
 
 /// The data root of a subcommand.
-pub fn root_of(data: Option<&PathBuf>) -> Result<PathBuf, Failure> {
-    let asked =
-        DataArgs { data: data.cloned(), set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S };
-    open_root(&asked).map(|(_, path)| path)
+fn root_of(data: Option<&PathBuf>) -> Result<PathBuf, Failure> {
+    open_root(&DataArgs::of(data.cloned())).map(|(_, path)| path)
 }
 
 fn effects_of(given: &[String]) -> Result<HiddenEffects, Failure> {

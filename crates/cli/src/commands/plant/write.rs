@@ -53,12 +53,10 @@ pub struct WriteArgs {
 
 /// Runs the command.
 pub fn run(args: &WriteArgs) -> Result<(), Failure> {
-    if !(1.0..=600.0).contains(&args.seconds) || args.drives == 0 || args.drives > 10_000 {
-        return Err(Failure::input("--seconds must be 1 to 600 and --drives 1 to 10000"));
-    }
-    let plain = |part: &str| !part.is_empty() && part != ".." && part.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c));
-    if !args.set.split('/').all(plain) || !args.worlds.iter().all(|w| plain(w)) {
-        return Err(Failure::input("--set and --worlds must be plain names"));
+    let asked = Asked { worlds: &args.worlds, drives: args.drives, seconds: args.seconds, seed: args.seed };
+    asked.check()?;
+    if !args.set.split('/').all(is_plain) {
+        return Err(Failure::input("--set must be a plain name"));
     }
     let root = root_of(args.data.as_ref())?;
     if inside_bundle(&args.out) {
@@ -67,7 +65,6 @@ pub fn run(args: &WriteArgs) -> Result<(), Failure> {
     let effects = effects_of(&args.effect)?;
     copy_vehicle_and_worlds(&root, &args.out, &args.worlds)?;
     let progress = Progress::start("drives", args.drives);
-    let asked = Asked { worlds: &args.worlds, drives: args.drives, seconds: args.seconds, seed: args.seed };
     write_drives(&root, &args.out.join(&args.set), &effects, &asked, &|done| progress.set(done))?;
     progress.finish();
     say!("{} drives in {}", args.drives, args.out.join(&args.set).display());
@@ -83,6 +80,27 @@ pub struct Asked<'a> {
     pub seconds: f64,
     /// Of the first; commands, starts and sensor noise follow from it.
     pub seed: u64,
+}
+
+impl Asked<'_> {
+    /// Whether it can be written.
+    ///
+    /// # Errors
+    /// `Failure` naming the option.
+    pub fn check(&self) -> Result<(), Failure> {
+        if !(1.0..=600.0).contains(&self.seconds) || self.drives == 0 || self.drives > 10_000 {
+            return Err(Failure::input("--seconds must be 1 to 600 and --drives 1 to 10000"));
+        }
+        match self.worlds.iter().find(|world| !is_plain(world)) {
+            Some(world) => Err(Failure::input(format!("--worlds {world}: must be a plain name"))),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Whether a part of a path stays where it is put.
+fn is_plain(part: &str) -> bool {
+    !part.is_empty() && part != ".." && part.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c))
 }
 
 /// Drives of the vehicle and worlds of a data root, as a set in this folder.
@@ -132,6 +150,9 @@ fn drive(vehicle: &Arc<PlantVehicle>, ground: &Arc<Ground>, effects: &HiddenEffe
 /// Vehicle cards and worlds of a data root in another one.
 pub fn copy_vehicle_and_worlds(from: &Path, to: &Path, worlds: &[String]) -> Result<(), Failure> {
     let fail = |e: std::io::Error| Failure::Failed(format!("cannot copy to {}: {e}", to.display()));
+    if let Some(missing) = worlds.iter().find(|world| !from.join("worlds").join(world).is_dir()) {
+        return Err(Failure::input(format!("--worlds {missing}: {} has no such world", from.display())));
+    }
     std::fs::create_dir_all(to).map_err(fail)?;
     copy_files(from, to, &|name| name.starts_with("vehicle_") && name.ends_with(".json")).map_err(fail)?;
     for world in worlds {
