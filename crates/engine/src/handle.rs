@@ -56,6 +56,11 @@ impl Submission {
         self.submitted_ns
     }
 
+    /// The same, submitted then.
+    pub(crate) fn at(self, submitted_ns: u64) -> Self {
+        Self { submitted_ns, ..self }
+    }
+
     fn refuse(self, error: EngineError) {
         (self.reply)(Answer { result: Err(error), queued_ns: 0, busy_ns: 0 });
     }
@@ -148,9 +153,8 @@ impl EngineHandle {
     }
 
     /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once.
-    pub fn submit(&self, mut submission: Submission) {
-        submission.submitted_ns = self.clock.now_ns();
-        if let Err(refused) = self.queue.push(submission, &self.limits) {
+    pub fn submit(&self, submission: Submission) {
+        if let Err(refused) = self.queue.push(submission.at(self.clock.now_ns()), &self.limits) {
             let (error, submission) = *refused;
             submission.refuse(error);
         }
@@ -225,11 +229,10 @@ fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, 
             answer(engine, submission, Ok(()), clock, tap, |_| ());
         }),
         Turn::Prediction(mut submission) => {
-            let left_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(clock.now_ns()));
             if let Command::Predict(query) = &mut submission.command {
-                let fits = queue.fit(query, left_ns);
+                let fits = queue.fit(query, submission.deadline_ns, clock.now_ns());
                 let work = work(query, query.samples);
-                answer(engine, *submission, fits, clock, tap, |took_ns| queue.done(work, took_ns));
+                answer(engine, *submission, fits, clock, tap, |took_ns| queue.done(work, took_ns, clock.now_ns()));
             }
         }
         Turn::End => return false,

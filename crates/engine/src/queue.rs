@@ -4,19 +4,19 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 use crate::command::Command;
+use crate::demand::Demand;
 use crate::error::EngineError;
-use crate::fair::FairQueue;
 use crate::handle::Submission;
 use crate::limits::Limits;
+use crate::plan::{Place, Plan, surely_done_ns};
 use crate::query::PredictQuery;
 use crate::service_time::{ServiceTime, work};
 use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// What an answer still needs after the engine: its way back, ns.
 const WAY_BACK_NS: u64 = 2_000_000;
-/// Share by which waiting and computing may take longer than expected: measurements come in between, and times scatter. With less more predictions are let in that
-/// are refused only when their turn comes.
-const LONGER: f64 = 0.3;
+/// Share of the time before its deadline that a prediction of fewer samples makes use of.
+const USED: f64 = 0.9;
 /// Shortest pause that a refused asker is told, ns.
 const RETRY_MIN_NS: u64 = 1_000_000;
 
@@ -32,17 +32,27 @@ struct Lanes {
     commands: VecDeque<Submission>,
     /// Of the waiting commands, those of each share.
     commands_of: BTreeMap<Arc<str>, usize>,
-    predictions: FairQueue<Submission>,
+    predictions: Plan<Submission>,
+    demand: Demand,
     running: Option<Running>,
     service_time: ServiceTime,
     stopped: bool,
 }
 
 /// The prediction that the engine computes now.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Running {
+    share: Arc<str>,
     since_ns: u64,
     expected_ns: u64,
+}
+
+/// How a prediction is let in.
+struct Admitted {
+    place: Place,
+    /// Time that it is expected to take: all of it, or the least of it that is of use where all would be late.
+    expected_ns: u64,
+    due_ns: u64,
 }
 
 /// What the engine does next.
@@ -66,17 +76,17 @@ impl Queue {
         if lanes.stopped {
             return Err(Box::new((EngineError::Stopped, submission)));
         }
-        let admitted = match &submission.command {
-            Command::Predict(query) => lanes.admit(&submission, query, limits),
-            _ => lanes.take(&submission, limits).map(|()| 0),
-        };
-        match admitted {
-            Err(error) => return Err(Box::new((error, submission))),
-            Ok(expected_ns) if matches!(submission.command, Command::Predict(_)) => {
-                let share = submission.share();
-                lanes.predictions.push(&share, submission, expected_ns);
+        if let Command::Predict(query) = &submission.command {
+            let share = submission.share();
+            match lanes.admit(&share, &submission, query, limits) {
+                Err(error) => return Err(Box::new((error, submission))),
+                Ok(Admitted { place, expected_ns, due_ns }) => lanes.predictions.insert(place, share, submission, expected_ns, due_ns),
             }
-            Ok(_) => lanes.commands.push_back(submission),
+        } else {
+            match lanes.take(&submission, limits) {
+                Err(error) => return Err(Box::new((error, submission))),
+                Ok(()) => lanes.commands.push_back(submission),
+            }
         }
         self.filled.notify_one();
         Ok(())
@@ -93,30 +103,29 @@ impl Queue {
             if lanes.stopped {
                 return Turn::End;
             }
-            if let Some((prediction, expected_ns)) = lanes.predictions.pop() {
-                lanes.running = Some(Running { since_ns: now_ns(), expected_ns });
-                return Turn::Prediction(Box::new(prediction));
+            if let Some(next) = lanes.predictions.pop() {
+                lanes.running = Some(Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns });
+                return Turn::Prediction(Box::new(next.item));
             }
             lanes = self.filled.wait(lanes).expect("no holder of the queue panics; this is a bug");
         }
     }
 
-    /// Leaves of the prediction whose turn it is what is expected to be done by its deadline, where fewer samples are of use.
+    /// Leaves of the prediction whose turn it is what is expected to be done by its deadline without making one that waits late, where fewer samples are of use.
     ///
     /// # Errors
-    /// `EngineError::Overloaded` where it would be late all the same and others wait, who may not be.
-    pub fn fit(&self, query: &mut PredictQuery, left_ns: u64) -> Result<(), EngineError> {
+    /// `EngineError::Overloaded` where it would be late all the same and others wait, who may not be: others took longer than was expected of them.
+    pub fn fit(&self, query: &mut PredictQuery, deadline_ns: Option<u64>, now_ns: u64) -> Result<(), EngineError> {
         let mut lanes = self.lock();
         if query.least() < query.samples {
-            let affordable = lanes.service_time.affordable(query, left_ns);
+            let own_ns = deadline_ns.map_or(u64::MAX, |deadline_ns| (USED * deadline_ns.saturating_sub(now_ns) as f64) as u64);
+            let affordable = lanes.service_time.affordable(query, own_ns.min(lanes.predictions.spare_ns(now_ns)));
             query.keep_first(affordable);
         }
         let expected_ns = lanes.service_time.expected_ns(work(query, query.samples));
-        if let Some(running) = &mut lanes.running {
-            running.expected_ns = expected_ns;
-        }
+        lanes.correct(expected_ns, now_ns);
         let waiting = lanes.predictions.len();
-        if waiting > 0 && expected_ns > left_ns {
+        if waiting > 0 && deadline_ns.is_some_and(|deadline_ns| now_ns + expected_ns > deadline_ns) {
             return Err(EngineError::Overloaded { kind: "predictions", waiting, retry_after_ns: expected_ns.max(RETRY_MIN_NS) });
         }
         Ok(())
@@ -124,12 +133,13 @@ impl Queue {
 
     /// The prediction whose turn it was is done: learns how long it took if it was computed. Said before its answer leaves, so that whoever asks again at once
     /// finds the engine idle.
-    pub fn done(&self, work: f64, took_ns: Option<u64>) {
+    pub fn done(&self, work: f64, took_ns: Option<u64>, now_ns: u64) {
         let mut lanes = self.lock();
-        lanes.running = None;
-        if let Some(took_ns) = took_ns {
-            lanes.service_time.learn(work, took_ns);
+        match took_ns {
+            Some(took_ns) => lanes.service_time.learn(work, took_ns),
+            None => lanes.correct(0, now_ns),
         }
+        lanes.running = None;
     }
 
     /// Refuses new commands and gives back the predictions that wait.
@@ -154,36 +164,45 @@ impl Queue {
 }
 
 impl Lanes {
-    /// The time that a prediction is expected to take, if it is let in: all of it, or the least of it that is of use where all would be late.
-    fn admit(&self, submission: &Submission, query: &PredictQuery, limits: &Limits) -> Result<u64, EngineError> {
-        let (share, now_ns) = (submission.share(), submission.submitted_ns());
-        let running_ns = self.running.map_or(0, |running| (running.since_ns + running.expected_ns).saturating_sub(now_ns));
+    /// How a prediction is let in: where everybody who waits is still in time, and it is too.
+    fn admit(&mut self, share: &Arc<str>, submission: &Submission, query: &PredictQuery, limits: &Limits) -> Result<Admitted, EngineError> {
+        let now_ns = submission.submitted_ns();
+        self.demand.ask(share, self.service_time.expected_ns(work(query, query.samples)), now_ns);
+        let running_ns = self.running.as_ref().map_or(0, |running| (running.since_ns + running.expected_ns).saturating_sub(now_ns));
+        let due_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS));
+        let room_ns = (self.demand.room(share) * due_ns.saturating_sub(now_ns) as f64) as u64;
         let of = |samples| {
             let expected_ns = self.service_time.expected_ns(work(query, samples));
-            let wait_ns = running_ns + self.predictions.wait_ns(&share, expected_ns);
-            let needed_ns = ((1.0 + LONGER) * (wait_ns + expected_ns) as f64) as u64 + WAY_BACK_NS;
-            (expected_ns, wait_ns, now_ns.saturating_add(needed_ns))
+            let place = self.predictions.place(share, expected_ns, now_ns, running_ns);
+            let late_ns = surely_done_ns(now_ns, place.wait_ns + expected_ns).saturating_sub(now_ns.saturating_add(room_ns));
+            (Admitted { place, expected_ns, due_ns }, late_ns)
         };
-        let all = of(query.samples);
-        let late = |done_ns| submission.deadline_ns.is_some_and(|deadline_ns| done_ns > deadline_ns);
-        let (expected_ns, wait_ns, done_ns) = if late(all.2) { of(query.least()) } else { all };
+        let (admitted, late_ns) = Some(of(query.samples)).filter(|(_, late_ns)| *late_ns == 0).unwrap_or_else(|| of(query.least()));
         let refused = |kind, waiting, retry_after_ns: u64| EngineError::Overloaded {
             kind,
             waiting,
             retry_after_ns: retry_after_ns.max(RETRY_MIN_NS),
         };
-        let (waiting, own) = (self.predictions.len(), self.predictions.len_of(&share));
-        if waiting >= limits.waiting_predictions_max {
-            return Err(refused("predictions", waiting, wait_ns));
-        }
-        if own >= limits.waiting_predictions_per_vehicle_max {
-            return Err(refused("predictions of this vehicle", own, wait_ns));
-        }
+        let (waiting, own) = (self.predictions.len(), self.predictions.len_of(share));
         // Whoever comes while nothing else is to be done is let in whatever is expected: so the estimate stays true.
         let idle = waiting == 0 && self.running.is_none();
-        match submission.deadline_ns {
-            Some(deadline_ns) if !idle && done_ns > deadline_ns => Err(refused("predictions", waiting, done_ns - deadline_ns)),
-            _ => Ok(expected_ns),
+        if waiting >= limits.waiting_predictions_max {
+            Err(refused("predictions", waiting, admitted.place.wait_ns))
+        } else if own >= limits.waiting_predictions_per_vehicle_max {
+            Err(refused("predictions of this vehicle", own, admitted.place.wait_ns))
+        } else if late_ns > 0 && !idle {
+            Err(refused("predictions", waiting, late_ns.max(self.demand.recovers_ns(share))))
+        } else {
+            self.demand.give(share, admitted.expected_ns as f64, now_ns);
+            Ok(admitted)
+        }
+    }
+
+    /// The prediction that runs is expected to take this long.
+    fn correct(&mut self, expected_ns: u64, now_ns: u64) {
+        if let Some(running) = &mut self.running {
+            self.demand.give(&running.share, expected_ns as f64 - running.expected_ns as f64, now_ns);
+            running.expected_ns = expected_ns;
         }
     }
 
@@ -201,5 +220,142 @@ impl Lanes {
             *own += 1;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::candidates::Candidates;
+
+    const MS: u64 = 1_000_000;
+    /// With this many samples of a step each a question takes 16 ms where a unit of work takes 10 µs.
+    const SAMPLES: usize = 1344;
+    const TAKES_NS: f64 = 16e6;
+    const NS_PER_WORK: f64 = 1e4;
+    const DEADLINE_NS: u64 = 200 * MS;
+    /// Time that is simulated, and of that the time after which answers count.
+    const ENDS_NS: u64 = 12_000 * MS;
+    const COUNTS_NS: u64 = 4_000 * MS;
+
+    /// What became of the questions of one vehicle.
+    #[derive(Clone, Copy, Debug, Default, PartialEq)]
+    struct Tally {
+        asked: usize,
+        in_time: usize,
+        late: usize,
+        refused_at_turn: usize,
+        samples: usize,
+    }
+
+    fn question(vehicle: usize, samples_min: usize, now_ns: u64) -> Submission {
+        let query = PredictQuery {
+            session: vehicle.to_string(),
+            start: None,
+            instant: None,
+            use_history: true,
+            samples: SAMPLES,
+            samples_min,
+            horizon: 1,
+            controls: Candidates::Given(vec![0.0; 2 * SAMPLES]),
+            cost: None,
+            extras: Default::default(),
+        };
+        let mut submission = Submission::new(Command::Predict(query), |_| ()).at(now_ns);
+        submission.deadline_ns = Some(now_ns + DEADLINE_NS);
+        submission
+    }
+
+    /// Numbers from 0 to 1, the same ones each time.
+    fn random(seed: u64) -> impl FnMut() -> f64 {
+        let mut state = seed;
+        move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            ((state >> 33) as f64 + 0.5) / (1_u64 << 31) as f64
+        }
+    }
+
+    /// Vehicles that ask at random instants, at these rates in multiples of what the engine can do, an engine that takes 0.85 to 1.15 of what is expected.
+    fn simulate(rates: &[f64], samples_min: usize) -> Vec<Tally> {
+        let (queue, limits, mut random) = (Queue::default(), Limits::default(), random(11));
+        queue.done(1.0, Some(NS_PER_WORK as u64), 0);
+        let mut tallies = vec![Tally::default(); rates.len()];
+        let mut asks_ns: Vec<f64> = rates.iter().map(|rate| -random().ln() * TAKES_NS / rate).collect();
+        // Whose prediction runs, its work, its begin and end.
+        let mut running: Option<(usize, f64, u64, u64)> = None;
+        loop {
+            let (vehicle, ask_ns) = asks_ns.iter().copied().enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+            let mut now_ns = ask_ns as u64;
+            if let Some((_, work, begin_ns, end_ns)) = running.filter(|(.., end_ns)| *end_ns <= now_ns) {
+                queue.done(work, Some(end_ns - begin_ns), end_ns);
+                (running, now_ns) = (None, end_ns);
+            } else if now_ns > ENDS_NS {
+                return tallies;
+            } else {
+                tallies[vehicle].asked += usize::from(now_ns > COUNTS_NS);
+                let _ = queue.push(question(vehicle, samples_min, now_ns), &limits);
+                asks_ns[vehicle] -= random().ln() * TAKES_NS / rates[vehicle];
+            }
+            while running.is_none() && queue.has_turn() {
+                let Turn::Prediction(mut submission) = queue.next(|| now_ns) else { panic!("only predictions were asked for") };
+                let deadline_ns = submission.deadline_ns;
+                let Command::Predict(query) = &mut submission.command else { panic!("only predictions were asked for") };
+                let fits = queue.fit(query, deadline_ns, now_ns).is_ok();
+                let work = work(query, query.samples);
+                let end_ns = now_ns + (NS_PER_WORK * work * (0.85 + 0.3 * random())) as u64;
+                let vehicle = query.session.parse::<usize>().unwrap();
+                if now_ns > COUNTS_NS {
+                    let (in_time, tally) = (Some(end_ns) <= deadline_ns, &mut tallies[vehicle]);
+                    tally.in_time += usize::from(fits && in_time);
+                    tally.late += usize::from(fits && !in_time);
+                    tally.refused_at_turn += usize::from(!fits);
+                    tally.samples += if fits { query.samples } else { 0 };
+                }
+                if fits {
+                    running = Some((vehicle, work, now_ns, end_ns));
+                } else {
+                    queue.done(work, None, now_ns);
+                }
+            }
+        }
+    }
+
+    /// Answers that the engine can give while they count.
+    const ANSWERS: f64 = (ENDS_NS - COUNTS_NS) as f64 / TAKES_NS;
+
+    fn sum(tallies: &[Tally], of: impl Fn(&Tally) -> usize) -> f64 {
+        tallies.iter().map(of).sum::<usize>() as f64
+    }
+
+    #[test]
+    fn property_who_is_let_in_is_answered_in_time_and_no_time_is_lost() {
+        for load in [0.5, 1.0, 3.0, 10.0] {
+            let tallies = simulate(&[load / 4.0; 4], 0);
+            assert_eq!(sum(&tallies, |one| one.late + one.refused_at_turn), 0.0, "load {load}: {tallies:?}");
+            let answered = sum(&tallies, |one| one.in_time) / ANSWERS.min(sum(&tallies, |one| one.asked));
+            assert!(answered > if load == 1.0 { 0.9 } else { 0.97 }, "load {load}: {answered} of what can be, {tallies:?}");
+        }
+    }
+
+    #[test]
+    fn property_who_asks_most_gets_what_the_others_leave() {
+        // Three ask for a fifth of the time each, one for all of it twice.
+        let tallies = simulate(&[2.0, 0.2, 0.2, 0.2], 0);
+        let got = |tally: &Tally| tally.in_time as f64 / tally.asked as f64;
+        assert!(tallies[1..].iter().all(|one| got(one) > 0.9), "{tallies:?}");
+        assert!(sum(&tallies, |one| one.in_time) > 0.97 * ANSWERS, "{tallies:?}");
+        // Twenty ask for more than a twentieth each, one of them ten times as often.
+        let tallies = simulate(&[vec![1.0], vec![0.1; 19]].concat(), 0);
+        let (first, others) = (tallies[0].in_time as f64, sum(&tallies[1..], |one| one.in_time) / 19.0);
+        assert!(first < 1.5 * others && 20.0 * others > 0.9 * ANSWERS, "{first} and {others}: {tallies:?}");
+    }
+
+    #[test]
+    fn property_fewer_samples_mean_more_answers() {
+        let [all, fewer] = [0, 16].map(|samples_min| simulate(&[0.75; 4], samples_min));
+        assert_eq!(sum(&fewer, |one| one.late + one.refused_at_turn), 0.0, "{fewer:?}");
+        let [answers, samples] = [|one: &Tally| one.in_time, |one: &Tally| one.samples].map(|of| sum(&fewer, of) / sum(&all, of));
+        assert!(answers > 1.8, "{answers} times as many answers, {fewer:?}");
+        assert!(samples > 0.5, "with {samples} times the samples in all, {fewer:?}");
     }
 }

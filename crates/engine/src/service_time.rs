@@ -26,8 +26,6 @@ pub(crate) struct ServiceTime {
 
 /// Samples that the kernels compute at once: fewer of them are not faster.
 const LANES: usize = 16;
-/// Share of the time that is left before a deadline which is made use of.
-const USED: f64 = 0.9;
 
 /// Work of one sample of a prediction, in sample-steps.
 fn sample_work(query: &PredictQuery) -> f64 {
@@ -60,9 +58,9 @@ impl ServiceTime {
     }
 
     /// Samples of a prediction that are expected to be done within this time, between the fewest that it asks for and all.
-    pub fn affordable(&self, query: &PredictQuery, left_ns: u64) -> usize {
+    pub fn affordable(&self, query: &PredictQuery, time_ns: u64) -> usize {
         let Some(ns_per_work) = self.ns_per_work else { return query.samples };
-        let samples = (USED * left_ns as f64 / ns_per_work - fixed_work(query)) / sample_work(query);
+        let samples = (time_ns as f64 / ns_per_work - fixed_work(query)) / sample_work(query);
         if samples >= query.samples as f64 {
             return query.samples;
         }
@@ -102,9 +100,9 @@ mod tests {
         let mut time = ServiceTime::default();
         assert_eq!(time.affordable(&query(1), 1), 1000, "nothing is known yet");
         time.learn(1.0, 1000);
-        // 1 µs for each of 256 + 10 n, nine tenths of the time used: n = (2256 - 256) / 10 in 2.507 ms, in whole lanes 192.
-        assert_eq!(time.affordable(&query(1), 2_507_000), 192);
-        assert_eq!(time.affordable(&query(500), 2_507_000), 500, "no fewer than are of use");
+        // 1 µs for each of 256 + 10 n: n = (2256 - 256) / 10 in 2.256 ms, in whole lanes 192.
+        assert_eq!(time.affordable(&query(1), 2_256_000), 192);
+        assert_eq!(time.affordable(&query(500), 2_256_000), 500, "no fewer than are of use");
         assert_eq!(time.affordable(&query(7), 0), 7);
         assert_eq!((time.affordable(&query(1), u64::MAX), query(0).least()), (1000, 1000));
         let mut short = query(1);

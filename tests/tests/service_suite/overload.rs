@@ -134,10 +134,10 @@ async fn service_what_would_be_late_is_refused_at_once() {
             (Err(error), _) => assert!(matches!(error.code(), Some(Code::DeadlineExceeded | Code::Cancelled)), "{error}"),
         }
     }
-    // Most learn at once that they ask in vain; how quickly is a figure of `nesam bench serve`. None of those was computed.
+    // They learn at once that they ask in vain; how quickly is a figure of `nesam bench serve`. None of those was computed.
     refused_after.sort_unstable();
     assert!(refused_after.len() >= 15 && in_time >= 1, "{in_time} in time, {} refused of 30", refused_after.len());
-    assert!(refused_after[refused_after.len() / 2] < takes.max(Duration::from_millis(50)), "{refused_after:?}, one takes {takes:?}");
+    assert!(refused_after[9 * refused_after.len() / 10] < takes.max(Duration::from_millis(50)), "{refused_after:?}, one takes {takes:?}");
     assert!(server.metrics().predictions() - before <= 15);
     server.shutdown().await;
 }

@@ -30,6 +30,9 @@ pub(super) struct ServeBench {
     /// Candidate command sequences per query
     #[arg(long, default_value_t = 128)]
     samples: usize,
+    /// The first vehicle asks this many times as often as each other one
+    #[arg(long, value_name = "FACTOR", default_value_t = 1)]
+    greedy: usize,
     /// Fewest of them that are of use: the server then answers with fewer when time is short [default: all or nothing]
     #[arg(long, value_name = "SAMPLES", default_value_t = 0)]
     samples_min: usize,
@@ -69,12 +72,14 @@ struct Tally {
     measurements_refused: usize,
     /// Samples of the answers in time.
     samples: usize,
+    /// Answers in time by vehicle.
+    good_of: Vec<usize>,
 }
 
 /// Runs the command.
 pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
     let positive = [args.deadline_ms, args.seconds].iter().chain(&args.loads).all(|v| *v > 0.0 && v.is_finite());
-    if args.vehicles == 0 || args.samples == 0 || args.horizon == 0 || !positive {
+    if args.vehicles == 0 || args.greedy == 0 || args.samples == 0 || args.horizon == 0 || !positive {
         return Err(Failure::input("all options must be positive".to_string()));
     }
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
@@ -103,15 +108,16 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     );
     say!("capacity: {capacity_hz:.1} answers/s to {ASKERS} askers");
     say!(
-        "{:>6} {:>9} {:>11} {:>12} {:>9} {:>7} {:>14} {:>15} {:>18}",
+        "{:>6} {:>9} {:>11} {:>19} {:>12} {:>9} {:>7} {:>14} {:>20} {:>18}",
         "load",
         "asked/s",
         "in time/s",
+        "of 1st, each other",
         "samples each",
         "refused/s",
         "late/s",
         "p99 in time ms",
-        "p99 refused ms",
+        "p50, p99 refused ms",
         "p99 measurement ms"
     );
     let mut rows = Vec::new();
@@ -126,7 +132,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.bench.serve/1",
-        "samples": args.samples, "samples_min": args.samples_min, "horizon": args.horizon, "vehicles": args.vehicles, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
+        "samples": args.samples, "samples_min": args.samples_min, "horizon": args.horizon, "vehicles": args.vehicles, "greedy": args.greedy, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
         "capacity_hz": capacity_hz, "loads": rows, "goodput_share_of_peak": last / peak.max(f64::MIN_POSITIVE),
         "command": command_line(), "bundle": bundle.name, "bundle_hash": bundle.hash,
     });
@@ -179,7 +185,7 @@ async fn capacity(args: &ServeBench, clients: &[Client]) -> Result<f64, Failure>
 
 /// Asks at random instants with this mean rate, whatever comes back, while the vehicles report.
 async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Tally, Failure> {
-    let tally = Arc::new(Mutex::new(Tally::default()));
+    let tally = Arc::new(Mutex::new(Tally { good_of: vec![0; args.vehicles], ..Tally::default() }));
     let begin = tokio::time::Instant::now();
     let deadline = Duration::from_secs_f64(args.deadline_ms * 1e-3);
     let vehicles: Vec<_> = clients
@@ -190,8 +196,9 @@ async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Ta
     let mut random = ChaCha8Rng::seed_from_u64(args.seed);
     let (mut at_s, mut asked) = (0.0, Vec::new());
     while at_s < args.seconds {
-        let (mut client, question, tally) =
-            (clients[asked.len() % clients.len()].clone(), question(args, asked.len() % clients.len()), Arc::clone(&tally));
+        // Of each round the first `greedy` questions are the first vehicle's.
+        let vehicle = (asked.len() % (args.greedy + args.vehicles - 1)).saturating_sub(args.greedy - 1);
+        let (mut client, question, tally) = (clients[vehicle].clone(), question(args, vehicle), Arc::clone(&tally));
         sleep_until(begin + Duration::from_secs_f64(at_s)).await;
         asked.push(tokio::spawn(async move {
             let sent = Instant::now();
@@ -203,6 +210,7 @@ async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Ta
                 Ok(Ok(prediction)) if sent.elapsed() <= deadline => {
                     tally.good_ms.push(took_ms);
                     tally.samples += prediction.samples;
+                    tally.good_of[vehicle] += 1;
                 }
                 Ok(Err(error)) if error.retry_after().is_some() => tally.refused_ms.push(took_ms),
                 _ => tally.late += 1,
@@ -235,19 +243,22 @@ async fn report(mut client: Client, session: String, seconds: f64, tally: Arc<Mu
 
 fn row(load: f64, seconds: f64, tally: &mut Tally) -> Value {
     let rate = |count: usize| count as f64 / seconds;
-    let p99 = |times: &mut Vec<f64>| if times.is_empty() { f64::NAN } else { percentile(times, 0.99) };
+    let quantile = |times: &mut Vec<f64>, q| if times.is_empty() { f64::NAN } else { percentile(times, q) };
     let asked = tally.good_ms.len() + tally.refused_ms.len() + tally.late;
     let (good, refused, late) = (rate(tally.good_ms.len()), rate(tally.refused_ms.len()), rate(tally.late));
-    let (good_ms, refused_ms, measured_ms) = (p99(&mut tally.good_ms), p99(&mut tally.refused_ms), p99(&mut tally.measured_ms));
+    let (good_ms, measured_ms) = (quantile(&mut tally.good_ms, 0.99), quantile(&mut tally.measured_ms, 0.99));
+    let [refused_p50_ms, refused_ms] = [0.5, 0.99].map(|q| quantile(&mut tally.refused_ms, q));
     let samples = tally.samples as f64 / tally.good_ms.len() as f64;
+    let good_of: Vec<f64> = tally.good_of.iter().map(|count| rate(*count)).collect();
+    let others = good_of[1..].iter().sum::<f64>() / (good_of.len() - 1) as f64;
+    let (each, refusals) = (format!("{:.1}, {others:.1}", good_of[0]), format!("{refused_p50_ms:.2}, {refused_ms:.2}"));
     say!(
-        "{load:>6.2} {:>9.1} {good:>11.1} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refused_ms:>15.2} {measured_ms:>18.1}",
+        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>20} {measured_ms:>18.1}",
         rate(asked)
     );
-    let refused_p50_ms = if tally.refused_ms.is_empty() { f64::NAN } else { percentile(&mut tally.refused_ms, 0.5) };
     json!({
-        "load": load, "asked_hz": rate(asked), "in_time_hz": good, "samples_mean": samples, "refused_hz": refused, "late_hz": late,
-        "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "measurement_p99_ms": measured_ms,
+        "load": load, "asked_hz": rate(asked), "in_time_hz": good, "in_time_hz_by_vehicle": good_of, "samples_mean": samples, "refused_hz": refused,
+        "late_hz": late, "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "measurement_p99_ms": measured_ms,
         "measurements": tally.measured_ms.len(), "measurements_refused": tally.measurements_refused,
     })
 }
