@@ -310,7 +310,9 @@ impl SoilFilter {
         }
         let none = DVector::zeros(SOIL_DIM * self.config.classes);
         if self.config.shared_error.is_some() {
-            let at_prior = self.linearise(model, buffer, &none)?.scaled(unit);
+            // Of a soil that is known nothing is asked how it acts.
+            let innovation = innovation(&self.config, model, buffer, &none)?;
+            let at_prior = Linearisation { jacobian: DMatrix::zeros(innovation.len(), none.len()), innovation }.scaled(unit);
             let ahead = self.plain.predicted_without_soil(&self.config);
             let step = ahead.step(&at_prior, &none, &self.rest)?;
             self.trust.vote(0.5 * (step.nis + step.log_det - judged.nis - judged.log_det));
@@ -423,9 +425,10 @@ fn innovation(
         return Err(AdaptationError::NotFinite { what: "prediction", index });
     }
     let mut innovation = DVector::zeros(buffer.len() / config.block * VELOCITY_DIM);
+    let share = 1.0 / config.block as f64;
     for (index, (transition, velocity)) in buffer.iter().zip(predicted).enumerate() {
         for c in 0..VELOCITY_DIM {
-            innovation[index / config.block * VELOCITY_DIM + c] += (transition.measured_next[c] - velocity[c]) / config.block as f64;
+            innovation[index / config.block * VELOCITY_DIM + c] += share * (transition.measured_next[c] - velocity[c]);
         }
     }
     Ok(innovation)

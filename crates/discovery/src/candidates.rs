@@ -1,8 +1,9 @@
-//! The catalogue as hypotheses: parameters with priors, a linear form for the first look and the effect itself for the refit.
+//! The catalogue, and what an engineer wrote down beside it, as hypotheses: parameters with priors, a linear form for the first look and the effect itself for
+//! the refit.
 
-use std::sync::LazyLock;
+use std::sync::{LazyLock, Mutex, PoisonError};
 
-use nesam_physics::effects::{Effect, Layer, Scaling};
+use nesam_physics::effects::{Effect, Layer, Scaling, Written};
 
 /// A parameter that a refit estimates.
 #[derive(Clone, Copy, Debug)]
@@ -20,10 +21,10 @@ pub struct Free {
 /// One line of the catalogue: what a hypothesis is and which sizes it is tried at first.
 #[derive(Clone, Debug)]
 struct Line {
-    id: &'static str,
+    /// The effect; its values are replaced.
+    effect: Effect,
     /// Distinguishes hypotheses of one id, such as the wheel that drags.
     variant: &'static str,
-    layer: Layer,
     /// Parameters of the effects whose shares span the hypothesis near zero.
     columns: Vec<Vec<f64>>,
     free: Vec<Free>,
@@ -40,15 +41,29 @@ static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| {
     Effect::examples().iter().filter(|e| !matches!(e, Effect::FreeForm(_))).flat_map(lines_of).collect()
 });
 
+/// Lines of written effects, each once: hypotheses are plain copies, so they stay, as what is written does.
+static WRITTEN: Mutex<Vec<&'static Line>> = Mutex::new(Vec::new());
+
+/// The line of a written effect, at the size in which it is written.
+fn written_line(written: &Written) -> &'static Line {
+    let effect = Effect::Written(written.at(1.0));
+    let mut lines = WRITTEN.lock().unwrap_or_else(PoisonError::into_inner);
+    if let Some(line) = lines.iter().find(|line| line.effect == effect) {
+        return line;
+    }
+    let line: &'static Line = Box::leak(Box::new(line_of(&effect)));
+    lines.push(line);
+    line
+}
+
 /// Hypotheses of one id: each size of an effect is a column of its own; a wheel drag is one hypothesis for each wheel.
 fn lines_of(example: &Effect) -> Vec<Line> {
     match example.id() {
-        "payload" => vec![payload()],
+        "payload" => vec![payload(*example)],
         "wheel_drag" => {
             let line = |(i, variant)| Line {
-                id: "wheel_drag",
+                effect: *example,
                 variant,
-                layer: Layer::Force,
                 columns: vec![vec![i as f64, 500.0]],
                 free: vec![Free { parameter: 1, mean: 0.0, sd: 2000.0, step: 100.0 }],
                 scalings: vec![Scaling::Size],
@@ -82,9 +97,8 @@ fn line_of(example: &Effect) -> Line {
     let first = &quantities[sized[0]];
     let size = first.scaling == Scaling::Size;
     Line {
-        id: example.id(),
+        effect: *example,
         variant: "",
-        layer: example.layer(),
         columns: sized.iter().map(|i| column(*i)).collect(),
         free,
         scalings: sized.iter().map(|i| quantities[*i].scaling).collect(),
@@ -95,13 +109,12 @@ fn line_of(example: &Effect) -> Line {
 
 /// A load lies on the floor, the bed or the roof and within the wheelbase or a little behind it (chosen). A payload enters to first order through m, m x,
 /// m y and m z.
-fn payload() -> Line {
+fn payload(effect: Effect) -> Line {
     let at = |x: f64, y: f64, z: f64| vec![250.0, x, y, z];
     let free = |parameter, mean, sd, step| Free { parameter, mean, sd, step };
     Line {
-        id: "payload",
+        effect,
         variant: "",
-        layer: Layer::Force,
         columns: vec![at(0.0, 0.0, 0.0), at(1.5, 0.0, 0.0), at(0.0, 0.8, 0.0), at(0.0, 0.0, 1.0)],
         free: vec![free(0, 0.0, 1500.0, 100.0), free(1, 0.0, 1.5, 0.3), free(2, 0.0, 0.5, 0.2), free(3, 0.6, 0.4, 0.3)],
         scalings: vec![Scaling::Size; 4],
@@ -127,11 +140,12 @@ impl PartialEq for Candidate {
     }
 }
 
-/// All hypotheses, in the order of their columns.
-pub fn catalogue() -> Vec<Candidate> {
+/// All hypotheses, in the order of their columns: the catalogue, then what is written.
+pub fn catalogue(written: &[Written]) -> Vec<Candidate> {
     let mut first_column = 0;
     LINES
         .iter()
+        .chain(written.iter().map(written_line))
         .map(|line| {
             let candidate = Candidate { line, first_column };
             first_column += line.columns.len();
@@ -140,9 +154,9 @@ pub fn catalogue() -> Vec<Candidate> {
         .collect()
 }
 
-/// Number of columns of the linear form of the whole catalogue.
-pub fn column_count() -> usize {
-    LINES.iter().map(|line| line.columns.len()).sum()
+/// Number of columns of the linear form of all hypotheses.
+pub fn column_count(catalogue: &[Candidate]) -> usize {
+    catalogue.iter().map(|c| c.line.columns.len()).sum()
 }
 
 /// Standard deviation of the shares of a linear form.
@@ -151,7 +165,7 @@ pub const SHARE_SD: f64 = 3.0;
 impl Candidate {
     /// Id of the effect.
     pub fn id(&self) -> &'static str {
-        self.line.id
+        self.line.effect.id()
     }
 
     /// Id and variant, for tables.
@@ -170,7 +184,7 @@ impl Candidate {
     }
 
     fn of(&self, values: &[f64]) -> Effect {
-        Effect::from_parameters(self.id(), values).expect("the catalogue has the parameters of its effects; this is a bug")
+        self.line.effect.with_values(values).expect("the catalogue has the parameters of its effects; this is a bug")
     }
 
     /// Parameters to estimate.
@@ -188,9 +202,14 @@ impl Candidate {
         self.line.positive
     }
 
+    /// What somebody wrote down; `None` for one of the catalogue.
+    pub fn written(&self) -> Option<Written> {
+        self.line.effect.written()
+    }
+
     /// Layer of the effect.
     pub fn layer(&self) -> Layer {
-        self.line.layer
+        self.line.effect.layer()
     }
 
     /// Whether the answer to the effect goes through the contact of the wheels, which is known roughly: forces, soils, and what changes the drive.

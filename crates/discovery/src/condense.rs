@@ -122,13 +122,13 @@ pub struct Beside {
 }
 
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.
-pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[Candidate]) -> Signatures {
-    signatures_beside(bench, drive, catalogue, &[])
+pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive) -> Signatures {
+    signatures_beside(bench, drive, &[])
 }
 
 /// The same beside effects that were fitted; their own columns are the secants, from without to with each, one after the other, so that the deviations without
 /// them are those with them plus the columns times their shares.
-pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[Candidate], fitted: &[Beside]) -> Signatures {
+pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Beside]) -> Signatures {
     let beside: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
     let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| {
         let effects: Vec<ScheduledEffect> = beside.iter().copied().chain(effect).collect();
@@ -136,7 +136,7 @@ pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, catalogue: &[
     };
     let base = at(None, &SoilCorrection::NONE);
     let forms: Vec<(nesam_physics::effects::Effect, bool)> =
-        catalogue.iter().flat_map(|c| c.linear_form().into_iter().map(|e| (e, c.forward())).collect::<Vec<_>>()).collect();
+        bench.catalogue.iter().flat_map(|c| c.linear_form().into_iter().map(|e| (e, c.forward())).collect::<Vec<_>>()).collect();
     let mut columns: Vec<Vec<Row>> = forms
         .par_iter()
         .map(|(effect, forward)| {
@@ -173,9 +173,9 @@ pub fn column_names(catalogue: &[Candidate]) -> Vec<String> {
     effects.chain((0..CHANNELS).map(|c| format!("level of {}", crate::channels::name(c)))).collect()
 }
 
-/// Column of the level of a channel.
-pub fn level_column(channel: usize) -> usize {
-    column_count() + channel
+/// Column of the level of a channel, after those of all hypotheses.
+pub fn level_column(catalogue: &[Candidate], channel: usize) -> usize {
+    column_count(catalogue) + channel
 }
 
 /// Condenses a drive: the catalogue's columns and, after them, the level of every channel as a column of its own, which names no cause.

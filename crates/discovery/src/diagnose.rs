@@ -1,12 +1,13 @@
 //! The whole diagnosis of a set: detect, select, refit, prove on drives that were not fitted.
 
 use nesam_evaluation::DriveMaps;
-use nesam_model::Predictor;
+use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::{Effect, Layer};
+use nesam_physics::effects::written::WRITTEN_MAX;
+use nesam_physics::effects::{Effect, Layer, Written};
 use nesam_trajectories::Trajectory;
 
-use crate::candidates::Candidate;
+use crate::candidates::{Candidate, catalogue};
 use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::{Condensed, best_soil};
 use crate::controls::{Kind, NullDrives, Setting};
@@ -18,7 +19,7 @@ use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
 use crate::own_reference;
 use crate::proof::{Trial, not_proven};
 use crate::pursuit::{Pursued, pursue};
-use crate::select::{Selection, Yardstick, without};
+use crate::select::{EFFECTS_MAX, Selection, Yardstick, without};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
@@ -50,12 +51,22 @@ pub struct Options {
     pub fit_on: Option<Vec<String>>,
     /// Ids of effects that are not considered.
     pub without: Vec<String>,
+    /// Effects that somebody wrote down, considered beside the catalogue. A reference must have been measured for them; those that it was measured for are
+    /// considered anyway.
+    pub hypotheses: Vec<Written>,
     /// What drives are held against.
     pub against: Against,
     /// Rollouts of the proof.
     pub scoring: Scoring,
     /// Whether the controls are made too: rivals refitted, a black box, a free form of what is left.
     pub controls: bool,
+}
+
+impl Options {
+    /// Each drive left out once, everything considered against the bundle, no controls.
+    pub fn of(scoring: Scoring) -> Self {
+        Self { fit_on: None, without: Vec::new(), hypotheses: Vec::new(), against: Against::Bundle, scoring, controls: false }
+    }
 }
 
 /// Outcome for a person in a hurry.
@@ -276,6 +287,7 @@ pub fn diagnose(
         Against::Bundle => Some(Judge::of(bundle)?),
         Against::Physics => None,
     };
+    let catalogue = hypotheses(bundle, judge_by.as_ref(), options)?;
     let fit_at = fitted(drives, options)?;
     // The model itself is judged from the best that is known of each state; a bundle's network knows what the past tells, and is judged from that.
     let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
@@ -286,7 +298,7 @@ pub fn diagnose(
     let total = fit_at.len();
     let observed = observe_all(predictor, seen, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
     let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
-    let bench = Bench { vehicle: &bundle.vehicle, stepping };
+    let bench = Bench { vehicle: &bundle.vehicle, stepping, catalogue: &catalogue };
     let trial = Trial { predictor, drives: &fit_drives, maps: &fit_maps, scoring: &options.scoring };
     let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
     progress("hypotheses", 0, 1);
@@ -345,6 +357,35 @@ pub fn diagnose(
         learned,
         scores,
     })
+}
+
+/// All hypotheses of a diagnosis.
+fn hypotheses(bundle: &ModelBundle, judge_by: Option<&Judge>, options: &Options) -> Result<Vec<Candidate>, DiscoveryError> {
+    let all = judge_by.map_or_else(|| catalogue(&options.hypotheses), |judge| judge.catalogue.clone());
+    let written: Vec<Written> = all.iter().filter_map(Candidate::written).collect();
+    if let Some(unknown) = options.hypotheses.iter().find(|h| !written.contains(&h.at(1.0))) {
+        let reason = format!(
+            "was not measured for `{}` as it is written; run `nesam diagnose --make-reference` with the same --hypotheses first",
+            unknown.id()
+        );
+        return Err(DiscoveryError::Reference { reason });
+    }
+    let in_bundle = bundle.effects.iter().filter(|e| e.effect.written().is_some()).count();
+    if in_bundle + written.len().min(EFFECTS_MAX) > WRITTEN_MAX {
+        let reason = format!(
+            "bundle {} has {in_bundle} written effects; with these hypotheses more than {WRITTEN_MAX} could act at once",
+            bundle.name
+        );
+        return Err(DiscoveryError::Hypotheses { reason });
+    }
+    if let Some(unknown) = options.without.iter().find(|id| !Effect::IDS.contains(&id.as_str()) && !all.iter().any(|c| c.id() == *id)) {
+        let mut known: Vec<&str> = all.iter().map(Candidate::id).collect();
+        known.dedup();
+        return Err(DiscoveryError::Hypotheses {
+            reason: format!("--without {unknown}: no such effect; considered are {}", known.join(", ")),
+        });
+    }
+    Ok(all)
 }
 
 /// Drives of a case with what they are compared with: a reference, or themselves.

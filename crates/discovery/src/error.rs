@@ -23,6 +23,12 @@ pub enum DiscoveryError {
         /// What was wrong and what to do.
         reason: String,
     },
+    /// Hypotheses that do not exist or cannot act together.
+    #[error("{reason}")]
+    Hypotheses {
+        /// What was wrong and what to do.
+        reason: String,
+    },
     /// The model refused a window.
     #[error(transparent)]
     Evaluation(#[from] nesam_evaluation::EvaluationError),

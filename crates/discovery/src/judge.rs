@@ -3,7 +3,7 @@
 use nesam_model::ModelBundle;
 use nesam_physics::SoilCorrection;
 
-use crate::candidates::catalogue;
+use crate::candidates::Candidate;
 use crate::channels::Row;
 use crate::claims::Case;
 use crate::condense::{Condensed, condense, signatures};
@@ -21,6 +21,8 @@ use crate::select::Yardstick;
 #[derive(Clone, Debug)]
 pub struct Judge {
     reference: Reference,
+    /// All hypotheses that it can judge.
+    pub catalogue: Vec<Candidate>,
     /// Scores of the drives behind the reference.
     pub(crate) nulls: Vec<Condensed>,
 }
@@ -37,20 +39,22 @@ impl Judge {
                 bundle.name
             ),
         })?;
-        Ok(Self::new(Reference::from_json(text)?))
+        Self::new(Reference::from_json(text)?)
     }
 
     /// From a reference.
-    pub fn new(reference: Reference) -> Self {
-        let nulls = reference.condensed();
-        Self { reference, nulls }
+    ///
+    /// # Errors
+    /// As [`Reference::catalogue`].
+    pub fn new(reference: Reference) -> Result<Self, DiscoveryError> {
+        Ok(Self { catalogue: reference.catalogue()?, nulls: reference.condensed(), reference })
     }
 
     /// The same without some drives of the reference: what a pseudo-vehicle made of them is judged by.
     pub fn without(&self, ids: &[&str]) -> Self {
         let mut reference = self.reference.clone();
         reference.drives.retain(|d| !ids.contains(&d.trajectory.as_str()));
-        Self::new(reference)
+        Self { nulls: reference.condensed(), catalogue: self.catalogue.clone(), reference }
     }
 
     /// Ids of the drives behind the reference.
@@ -65,7 +69,8 @@ impl Judge {
     pub fn yardstick(&self, channels: &[usize], drives: usize, without: &[String]) -> Result<Yardstick, DiscoveryError> {
         let nulls = Nulls::new(&self.nulls.iter().collect::<Vec<_>>())
             .ok_or_else(|| DiscoveryError::Reference { reason: "has too few drives".into() })?;
-        Ok(Yardstick::new(nulls, channels, without, |catalogue| NullGroups::draw(&self.nulls, catalogue, channels, drives)))
+        let groups = NullGroups::draw(&self.nulls, &self.catalogue, channels, drives);
+        Ok(Yardstick::new(nulls, groups, &self.catalogue, channels, without))
     }
 
     /// Compares observed drives with the reference.
@@ -81,7 +86,6 @@ impl Judge {
 
 /// Condenses observed drives in a metric.
 pub(crate) fn case_of<'a>(metric: Metric, bench: Bench<'a>, observed: Vec<ObservedDrive>, progress: OnProgress<'_>) -> Case<'a> {
-    let catalogue = catalogue();
     let total = observed.len();
     let rows: Vec<Vec<Row>> = observed.iter().map(|d| d.deviations(&bench, &[], &SoilCorrection::NONE)).collect();
     let prepared = observed
@@ -90,7 +94,7 @@ pub(crate) fn case_of<'a>(metric: Metric, bench: Bench<'a>, observed: Vec<Observ
         .enumerate()
         .map(|(done, (drive, rows))| {
             progress("drives held against every effect", done, total);
-            let signatures = signatures(&bench, &drive, &catalogue);
+            let signatures = signatures(&bench, &drive);
             let condensed = condense(&metric, rows, &signatures);
             Prepared { drive, signatures, condensed }
         })
@@ -105,7 +109,8 @@ pub(crate) fn case_of<'a>(metric: Metric, bench: Bench<'a>, observed: Vec<Observ
 pub(crate) fn own_yardstick(case: &Case<'_>, drives: &[Condensed], without: &[String]) -> Result<Yardstick, DiscoveryError> {
     let nulls = Nulls::about_zero(&drives.iter().collect::<Vec<_>>())
         .ok_or_else(|| DiscoveryError::Drives { reason: "--reference physics needs more drives".into() })?;
-    let channels = &case.metric.channels;
-    let yardstick = Yardstick::new(nulls, channels, without, |catalogue| own_reference::sign_flips(drives, catalogue, channels));
+    let (channels, catalogue) = (&case.metric.channels, case.bench.catalogue);
+    let groups = own_reference::sign_flips(drives, catalogue, channels);
+    let yardstick = Yardstick::new(nulls, groups, catalogue, channels, without);
     Ok(Yardstick { model_on_trial: true, ..yardstick })
 }

@@ -16,6 +16,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
+use crate::candidates::Candidate;
 use crate::channels::{BINS, CHANNELS, RIM_AT, Row, SEGMENT_STEPS, STATE_CHANNELS, STEERING_AT, available};
 use crate::consistency::add_consistency;
 use crate::error::DiscoveryError;
@@ -45,13 +46,15 @@ impl Stepping {
     }
 }
 
-/// The reference that drives are compared with.
+/// The reference that drives are compared with, and what may explain the difference.
 #[derive(Clone, Copy, Debug)]
 pub struct Bench<'a> {
     /// Vehicle of the reference.
     pub vehicle: &'a Vehicle,
     /// Physics.
     pub stepping: Stepping,
+    /// All hypotheses.
+    pub catalogue: &'a [Candidate],
 }
 
 /// A measured drive, prepared: nothing of it depends on an effect or a soil correction.

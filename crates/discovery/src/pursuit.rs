@@ -11,7 +11,6 @@ use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use rayon::prelude::*;
 
-use crate::candidates::catalogue;
 use crate::channels::Row;
 use crate::claims::{Case, Finding};
 use crate::condense::{Beside, Condensed, condense, signatures_beside};
@@ -116,14 +115,14 @@ fn sized(case: &Case<'_>, yardstick: &Yardstick, group: &Group, chosen: &[usize]
 /// Measures scatter and signatures of every drive beside fitted effects; returns what these leave of each drive.
 fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>) -> Result<Vec<Condensed>, DiscoveryError> {
     let effects: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
-    let (bench, catalogue) = (case.bench, catalogue());
+    let bench = case.bench;
     let rows: Vec<Vec<Row>> = case.prepared.par_iter().map(|p| p.drive.deviations(&bench, &effects, &SoilCorrection::NONE)).collect();
     case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
     let total = case.prepared.len();
     let mut left = Vec::with_capacity(total);
     for (done, (prepared, rows)) in case.prepared.iter_mut().zip(&rows).enumerate() {
         progress("drives held against every effect beside those found", done, total);
-        prepared.signatures = signatures_beside(&bench, &prepared.drive, &catalogue, fitted);
+        prepared.signatures = signatures_beside(&bench, &prepared.drive, fitted);
         let after = condense(&case.metric, rows, &prepared.signatures);
         let before = fitted.iter().fold(after.clone(), |with, f| with.plus(f.candidate.columns()[0], f.share));
         // What soil alone would explain stays that of the first look.

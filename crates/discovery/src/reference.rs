@@ -5,7 +5,9 @@
 
 use nalgebra::{DMatrix, DVector};
 use nesam_evaluation::quantile_sorted;
+use nesam_model::{effects_from_toml, effects_to_toml};
 use nesam_physics::SoilCorrection;
+use nesam_physics::effects::{Effect, ScheduledEffect, Written};
 use rand::SeedableRng;
 use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;
@@ -53,7 +55,10 @@ pub struct Reference {
     pub data_hash: String,
     /// Names of the channels that are compared.
     pub channels: Vec<String>,
-    /// Names of the columns: those of the catalogue, then the level of each channel.
+    /// Hypotheses beside the catalogue: written effects, as the text of an `effects.toml`; empty without any.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
+    pub hypotheses: String,
+    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel.
     pub columns: Vec<String>,
     /// Usual level of each compared channel.
     pub centre: Vec<f64>,
@@ -79,7 +84,7 @@ pub struct NullGroups {
 }
 
 impl Reference {
-    /// Measures the reference on observed drives that training never saw; `done` is called after each drive.
+    /// Measures the reference on observed drives that training never saw, for the hypotheses of the bench; `done` is called after each drive.
     ///
     /// # Errors
     /// `DiscoveryError::Drives` with fewer than 8 drives, or drives whose deviations have no scatter.
@@ -98,12 +103,11 @@ impl Reference {
         let available = available_in_all(drives);
         let metric = Metric::measure(&rows, &available)
             .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })?;
-        let catalogue = catalogue();
         let signatures: Vec<Signatures> = drives
             .iter()
             .enumerate()
             .map(|(count, drive)| {
-                let signatures = signatures(bench, drive, &catalogue);
+                let signatures = signatures(bench, drive);
                 done(count + 1);
                 signatures
             })
@@ -126,7 +130,8 @@ impl Reference {
             schema: SCHEMA.into(),
             data_hash: data_hash.into(),
             channels: metric.channels.iter().map(|c| channels::name(*c)).collect(),
-            columns: column_names(&catalogue),
+            hypotheses: text_of(bench.catalogue),
+            columns: column_names(bench.catalogue),
             centre: metric.centre.iter().copied().collect(),
             within: lower(&metric.within),
             within_believed,
@@ -146,7 +151,7 @@ impl Reference {
             return Err(fail(format!("is {}, this program needs {SCHEMA}; run `nesam diagnose --make-reference`", head.schema)));
         }
         let read: Self = serde_json::from_str(text).map_err(|e| fail(e.to_string()))?;
-        if read.columns != column_names(&catalogue()) {
+        if read.columns != column_names(&read.catalogue()?) {
             return Err(fail("was measured with another catalogue of effects; run `nesam diagnose --make-reference`".into()));
         }
         let (columns, channels) = (read.columns.len(), read.channels.len());
@@ -162,6 +167,15 @@ impl Reference {
             return Err(fail(format!("believes {} of what varies within a drive, not a share above 0 and up to 1", read.within_believed)));
         }
         Ok(read)
+    }
+
+    /// All hypotheses that it was measured for.
+    ///
+    /// # Errors
+    /// `DiscoveryError::Reference` when what is written beside the catalogue cannot be read.
+    pub fn catalogue(&self) -> Result<Vec<Candidate>, DiscoveryError> {
+        let effects = effects_from_toml(&self.hypotheses).map_err(|reason| DiscoveryError::Reference { reason })?;
+        Ok(catalogue(&effects.iter().filter_map(|e| e.effect.written()).collect::<Vec<Written>>()))
     }
 
     /// The text of `reference.json`.
@@ -211,7 +225,7 @@ pub fn all_evidence(group: &Group, catalogue: &[Candidate], channels: &[usize]) 
         let found = group.remainder(&[], &c.columns(), 0.0);
         if c.positive() && found.shares[0] <= 0.0 { 0.0 } else { found.z }
     });
-    hypotheses.chain(channels.iter().map(|c| group.remainder(&[], &[level_column(*c)], 0.0).z)).collect()
+    hypotheses.chain(channels.iter().map(|c| group.remainder(&[], &[level_column(catalogue, *c)], 0.0).z)).collect()
 }
 
 impl NullGroups {
@@ -255,6 +269,12 @@ impl NullGroups {
     pub fn attainable(&self) -> f64 {
         1.0 / (self.largest.len() + 1) as f64
     }
+}
+
+/// What is written beside the catalogue.
+fn text_of(catalogue: &[Candidate]) -> String {
+    let written: Vec<ScheduledEffect> = catalogue.iter().filter_map(Candidate::written).map(|w| Effect::Written(w).into()).collect();
+    if written.is_empty() { String::new() } else { effects_to_toml(&written) }
 }
 
 /// Enough of the file to say that it is an old one.

@@ -5,7 +5,7 @@
 
 use nesam_physics::effects::Layer;
 
-use crate::candidates::{Candidate, catalogue};
+use crate::candidates::Candidate;
 use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, level_column};
 use crate::evidence::{Group, Nulls};
@@ -55,15 +55,14 @@ pub struct Known {
 }
 
 impl Yardstick {
-    /// The whole catalogue but for the ids `without`, on these channels.
-    pub fn new(nulls: Nulls, channels: &[usize], without: &[String], groups: impl FnOnce(&[Candidate]) -> Option<NullGroups>) -> Self {
-        let catalogue = catalogue();
+    /// All hypotheses but for the ids `without`, on these channels.
+    pub fn new(nulls: Nulls, groups: Option<NullGroups>, catalogue: &[Candidate], channels: &[usize], without: &[String]) -> Self {
         let considered = catalogue.iter().map(|c| !without.iter().any(|id| id == c.id())).collect();
         Self {
             nulls,
-            groups: groups(&catalogue),
+            groups,
             channels: channels.to_vec(),
-            catalogue,
+            catalogue: catalogue.to_vec(),
             considered,
             model_on_trial: false,
             known: Vec::new(),
@@ -288,7 +287,8 @@ impl Yardstick {
         let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
         let told = |c: &usize| !(force && (RIM_AT..PATH_AT).contains(c));
         let levels = self.channels.iter().enumerate().filter(|(_, c)| told(c)).map(|(i, c)| {
-            let z = left.remainder_since(before, &columns, &[level_column(*c)], worst).z / self.spread(self.catalogue.len() + i);
+            let z = left.remainder_since(before, &columns, &[level_column(&self.catalogue, *c)], worst).z
+                / self.spread(self.catalogue.len() + i);
             (z, format!("the level of {}", crate::channels::name(*c)))
         });
         hypotheses.chain(levels).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))

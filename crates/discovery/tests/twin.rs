@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, options, rover, world};
+use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, options, plough, rover, world};
 use nesam_discovery::controls::Kind;
 use nesam_discovery::{Against, Bench, Diagnosis, Stepping, Verdict, observe};
 use nesam_model::ModelBundle;
@@ -67,6 +67,37 @@ fn property_nothing_is_claimed_without_an_effect() {
     }
 }
 
+/// What is said of drives with the plough at one and a half of its size.
+fn ploughed(options: &nesam_discovery::Options) -> Diagnosis {
+    diagnose_twin(&[Effect::Written(plough().at(1.5))], 1100, options)
+}
+
+#[test]
+fn property_what_somebody_wrote_down_is_found_and_sized_like_the_catalogue() {
+    let found = ploughed(&options());
+    assert!(explained_by(&found, "snow_plough"), "{}", found.reason);
+    let (share, ci95) = value(&found, "share");
+    assert!((share - 1.5).abs() < 0.15 && ci95[0] < 1.5 && 1.5 < ci95[1], "{share} {ci95:?}");
+    // The set that was found is a bundle like any other.
+    let folder = tempfile::tempdir().unwrap();
+    bundle().with_effects(&found.claimed).save(folder.path()).unwrap();
+    assert_eq!(ModelBundle::load(folder.path()).unwrap().effects, found.claimed);
+    // The model itself on trial needs no reference.
+    let against = nesam_discovery::Options { against: Against::Physics, hypotheses: vec![plough()], ..options() };
+    assert!(explained_by(&ploughed(&against), "snow_plough"));
+}
+
+#[test]
+fn property_a_hypothesis_that_the_reference_does_not_know_is_refused() {
+    let text = written::WrittenText { id: "another".into(), ..plough().text().clone() };
+    let options = nesam_discovery::Options { hypotheses: vec![Written::read(&text).unwrap()], ..options() };
+    let bundle = bundle();
+    let drives = [drive("d", 1, &[], &bundle.default_soil)];
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
+    let error = nesam_discovery::diagnose(&predictor, &drives, &vec![Some(world())], &options, &|_, _, _| {}).unwrap_err().to_string();
+    assert!(error.contains("another") && error.contains("--make-reference"), "{error}");
+}
+
 #[test]
 fn property_an_effect_that_begins_midway_is_dated() {
     let found = diagnose_from(&[Effect::SteeringOffset(SteeringOffset { second: 0.1 })], 10.0, 510, &options());
@@ -79,7 +110,7 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
     let bundle = bundle();
     let recorded = drive("again", 42, &[], &bundle.default_soil);
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 } };
+    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 }, catalogue: &[] };
     let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
     let mut again = recorded.clone();
     observed.driven_again(&bench, &[], &mut again);

@@ -9,6 +9,7 @@
 //! [[written]]
 //! id = "snow_plough"
 //! force_x = "-(push + per_speed * abs(v_ahead)) * tanh(v_ahead / fade)"     # N; also force_y, force_z, moment_x, moment_y, moment_z (N m)
+//! share = 1.0                                                                # of what is written; left out: 1
 //! parameters.push = { value = 300.0, unit = "N", range = [0.0, 2000.0] }
 //! parameters.per_speed = { value = 80.0, unit = "N s/m", range = [0.0, 500.0] }
 //! parameters.fade = { value = 0.2, unit = "m/s", range = [0.05, 1.0] }
@@ -45,12 +46,14 @@ struct Entry {
     parameters: BTreeMap<String, f64>,
 }
 
-#[derive(Debug, Default, Serialize, Deserialize)]
+#[derive(Debug, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 struct WrittenEntry {
     id: String,
     #[serde(default, skip_serializing_if = "is_zero")]
     onset_s: f64,
+    #[serde(default = "whole", skip_serializing_if = "is_whole")]
+    share: f64,
     #[serde(default, skip_serializing_if = "String::is_empty")]
     force_x: String,
     #[serde(default, skip_serializing_if = "String::is_empty")]
@@ -81,23 +84,34 @@ impl WrittenEntry {
         let [force_x, force_y, force_z, moment_x, moment_y, moment_z] = text.formulas.clone();
         let entry = |p: &WrittenParameter| (p.name.clone(), ParameterEntry { value: p.value, unit: p.unit.clone(), range: p.range });
         let parameters = text.parameters.iter().map(entry).collect();
-        Self { id: text.id.clone(), onset_s, force_x, force_y, force_z, moment_x, moment_y, moment_z, parameters }
+        Self { id: text.id.clone(), onset_s, share: written.share(), force_x, force_y, force_z, moment_x, moment_y, moment_z, parameters }
     }
 
     fn effect(self) -> Result<ScheduledEffect, String> {
         let onset_s = onset(&self.id, self.onset_s)?;
+        let share = self.share;
         let parameter = |(name, p): (String, ParameterEntry)| WrittenParameter { name, value: p.value, unit: p.unit, range: p.range };
         let text = WrittenText {
             id: self.id,
             formulas: [self.force_x, self.force_y, self.force_z, self.moment_x, self.moment_y, self.moment_z],
             parameters: self.parameters.into_iter().map(parameter).collect(),
         };
-        Ok(ScheduledEffect { effect: Effect::Written(Written::read(&text)?), onset_s })
+        let effect = Effect::Written(Written::read(&text)?.at(share));
+        in_range(&effect)?;
+        Ok(ScheduledEffect { effect, onset_s })
     }
 }
 
 fn is_zero(onset_s: &f64) -> bool {
     *onset_s == 0.0
+}
+
+fn whole() -> f64 {
+    1.0
+}
+
+fn is_whole(share: &f64) -> bool {
+    *share == 1.0
 }
 
 /// Reads the text of an `effects.toml`.
@@ -112,17 +126,18 @@ pub fn read(text: &str) -> Result<Vec<ScheduledEffect>, String> {
     if file.written.len() > WRITTEN_MAX {
         return Err(format!("has {} written effects; {WRITTEN_MAX} can act at once", file.written.len()));
     }
-    let mut ids: Vec<&str> = file.written.iter().map(|w| w.id.as_str()).collect();
-    ids.sort_unstable();
-    if let Some(twice) = ids.windows(2).find(|pair| pair[0] == pair[1]) {
-        return Err(format!("has two written effects `{}`", twice[0]));
+    let written: Vec<ScheduledEffect> = file.written.into_iter().map(WrittenEntry::effect).collect::<Result<_, _>>()?;
+    // What is added to a bundle that has it acts beside it.
+    let same = |a: &Written, b: &Written| a.id() == b.id() && a.text() != b.text();
+    let texts: Vec<Written> = written.iter().filter_map(|e| e.effect.written()).collect();
+    if let Some(twice) = texts.iter().find(|a| texts.iter().any(|b| same(a, b))) {
+        return Err(format!("has two written effects `{}` that differ", twice.id()));
     }
-    let named = file.effects.iter().map(effect);
-    named.chain(file.written.into_iter().map(WrittenEntry::effect)).collect()
+    file.effects.iter().map(effect).chain(written.into_iter().map(Ok)).collect()
 }
 
-/// The text of a list of effects.
-pub(crate) fn write(effects: &[ScheduledEffect]) -> String {
+/// The text of a list of effects, as [`read`] reads it.
+pub fn write(effects: &[ScheduledEffect]) -> String {
     if effects.is_empty() {
         return NONE.into();
     }
@@ -156,12 +171,15 @@ fn effect(entry: &Entry) -> Result<ScheduledEffect, String> {
     let value = |name: &&str| entry.parameters.get(*name).copied().ok_or_else(|| format!("gives `{id}` no `{name}`"));
     let values = names.iter().map(value).collect::<Result<Vec<f64>, String>>()?;
     let effect = Effect::from_parameters(id, &values).expect("the number of parameters was checked; this is a bug");
-    for (p, given) in effect.parameters().iter().zip(&values) {
-        if !given.is_finite() || *given < p.range[0] || *given > p.range[1] {
-            return Err(format!("gives `{id}` {} = {given} {}, outside {}…{}", p.name, p.unit, p.range[0], p.range[1]));
-        }
-    }
+    in_range(&effect)?;
     Ok(ScheduledEffect { effect, onset_s: onset(id, entry.onset_s)? })
+}
+
+fn in_range(effect: &Effect) -> Result<(), String> {
+    match effect.parameters().iter().find(|p| !(p.range[0]..=p.range[1]).contains(&p.value)) {
+        None => Ok(()),
+        Some(p) => Err(format!("gives `{}` {} = {} {}, outside {}…{}", effect.id(), p.name, p.value, p.unit, p.range[0], p.range[1])),
+    }
 }
 
 fn onset(id: &str, onset_s: f64) -> Result<f64, String> {
@@ -193,6 +211,7 @@ mod tests {
 [[written]]
 id = "snow_plough"
 onset_s = 4.0
+share = 0.75
 force_x = "-(push + per_speed * abs(v_ahead)) * tanh(v_ahead / fade)"
 moment_z = "0.3 * mass * gravity * wheelbase * slope_left"
 parameters.push = { value = 300.0, unit = "N", range = [0.0, 2000.0] }
@@ -225,6 +244,9 @@ parameters.wheelbase = { value = 3.3, unit = "m", range = [1.0, 5.0] }
             ("unit = \"N s/m\"", "unit = \"N furlong\"", "furlong"),
             ("moment_z", "moment_y = \"1\"\nmoment_z", "moment_y"),
             ("onset_s = 4.0", "onset_s = nan", "onset_s"),
+            ("share = 0.75", "share = -0.5", "share = -0.5 1, outside 0…10"),
+            ("share = 0.75", "share = nan", "share"),
+            ("parameters.fade", "parameters.share", "the share"),
             ("parameters.fade", "parameters.v_left", "v_left"),
             ("id = ", "formula = 3\nid = ", "not readable"),
         ] {
@@ -232,7 +254,9 @@ parameters.wheelbase = { value = 3.3, unit = "m", range = [1.0, 5.0] }
             let error = read(&text).unwrap_err();
             assert!(error.contains(reason), "`{error}` should say `{reason}`");
         }
-        assert!(read(&PLOUGH.repeat(2)).unwrap_err().contains("two written effects"));
+        let other = PLOUGH.replace("value = 80.0", "value = 81.0");
+        assert!(read(&format!("{PLOUGH}{other}")).unwrap_err().contains("two written effects"));
+        assert_eq!(read(&PLOUGH.repeat(2)).unwrap().len(), 2, "the same again is more of it");
         let many: String = (0..5).map(|i| PLOUGH.replace("snow_plough", &format!("plough_{i}"))).collect();
         assert!(read(&many).unwrap_err().contains("at once"));
         let nothing = "[[written]]\nid = \"nothing\"\n";

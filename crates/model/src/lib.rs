@@ -29,7 +29,7 @@ pub mod weights;
 pub use bundle::{ModelBundle, Provenance};
 pub use dims::{HISTORY, MAX_HORIZON};
 pub use effects_file::named_effect;
-pub use effects_file::read as effects_from_toml;
+pub use effects_file::{read as effects_from_toml, write as effects_to_toml};
 pub use fused::Path;
 pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;

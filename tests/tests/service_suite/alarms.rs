@@ -123,10 +123,7 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     let options = Options {
         // All pieces are fitted; the proof is what follows in the drive.
         fit_on: Some(pieces.iter().map(|p| p.id.clone()).collect()),
-        without: Vec::new(),
-        against: Default::default(),
-        scoring: Scoring { horizon: HORIZON, history: 32, resamples: 100, seed: 1 },
-        controls: false,
+        ..Options::of(Scoring { horizon: HORIZON, history: 32, resamples: 100, seed: 1 })
     };
     let started = std::time::Instant::now();
     let found = diagnose(&fresh_predictor(), &pieces, &maps, &options, &|_, _, _| {}).unwrap();

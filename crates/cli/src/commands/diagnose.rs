@@ -1,5 +1,6 @@
 //! `nesam diagnose`: from a measured residual to the physical effect that the model lacks.
 
+mod hypotheses;
 mod recording;
 
 use std::path::PathBuf;
@@ -8,11 +9,11 @@ use std::sync::{Arc, Mutex};
 use clap::Args;
 use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
-use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, catalogue, diagnose, observe_all};
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::Vehicle;
-use nesam_physics::effects::{Effect, ScheduledEffect};
+use nesam_physics::effects::ScheduledEffect;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{Split, Trajectory};
 
@@ -46,6 +47,10 @@ pub struct DiagnoseArgs {
     /// Effects that are not considered
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     without: Vec<String>,
+    /// Effects written as formulas that are considered beside the catalogue, each at a share of its size (docs/your-own-effect.md); a bundle's reference must
+    /// have been measured for them, with --make-reference, and then knows them without this
+    #[arg(long, value_name = "FILE")]
+    hypotheses: Option<PathBuf>,
     /// What the change is measured against
     #[arg(long, value_enum, default_value_t = ReferenceArg::Bundle)]
     reference: ReferenceArg,
@@ -107,9 +112,6 @@ fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
 
 /// Runs the command.
 pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
-    if let Some(unknown) = args.without.iter().find(|id| !Effect::IDS.contains(&id.as_str())) {
-        return Err(Failure::input(format!("--without {unknown}: no such effect; the catalogue has {}", Effect::IDS.join(", "))));
-    }
     check_model_step(args.data.dt)?;
     args.window.check_horizon()?;
     if args.make_reference { make_reference(args) } else { diagnose_set(args) }
@@ -117,6 +119,7 @@ pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
 
 fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("the bundle is unchanged");
+    let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
     let drives = validation_drives(&args.data, "--make-reference", "the reference is measured")?;
     let mut bundle = load_bundle(Some(&dir))?;
@@ -125,12 +128,13 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let progress = Progress::start("validation drives, as the model sees them", drives.drives.len());
     let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
-    let bench = Bench { vehicle: &predictor.bundle().vehicle, stepping: stepping(&bundle) };
+    let catalogue = catalogue(&hypotheses);
+    let bench = Bench { vehicle: &predictor.bundle().vehicle, stepping: stepping(&bundle), catalogue: &catalogue };
     let progress = Progress::start("validation drives against every effect", observed.len());
     let reference = Reference::measure(&bench, &observed, &drives.root.hash(), &|done| progress.set(done)).or_input()?;
     progress.finish();
     let text = reference.to_json();
-    let judge = Judge::new(reference);
+    let judge = Judge::new(reference).or_input()?;
     let channels: Vec<usize> = (0..CHANNELS).filter(|c| observed.iter().all(|d| d.available[*c])).collect();
     let yardstick = judge.yardstick(&channels, 5, &[]).or_input()?;
     if let Some(groups) = &yardstick.groups {
@@ -179,12 +183,14 @@ fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure>
 
 fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
+    let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
     let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.data.dt)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
     let predictor = Arc::clone(&drives.predictor);
     let options = Options {
         fit_on: args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?,
         without: args.without.clone(),
+        hypotheses,
         against: args.reference.into(),
         scoring: Scoring {
             horizon: args.window.horizon_on(&drives.drives),

@@ -134,7 +134,7 @@ impl Compared<'_> {
 
     /// A method that is linear in the shares of all columns.
     fn linear(&self, method: &'static str, shares: fn(&[&Condensed]) -> Option<DVector<f64>>) -> Entry {
-        let columns = column_count();
+        let columns = column_count(&self.yardstick.catalogue);
         let drives: Vec<Condensed> = self.case.condensed().map(|d| d.head(columns)).collect();
         let of = |left_out: Option<usize>| {
             shares(&drives.iter().enumerate().filter(|(d, _)| Some(*d) != left_out).map(|(_, c)| c).collect::<Vec<_>>())

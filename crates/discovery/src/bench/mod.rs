@@ -214,7 +214,7 @@ impl Stage<'_> {
         let start = Instant::now();
         let bundle = self.predictor.bundle();
         let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
-        let bench = Bench { vehicle: &bundle.vehicle, stepping };
+        let bench = Bench { vehicle: &bundle.vehicle, stepping, catalogue: &self.judge.catalogue };
         let (mut drives, mut maps) = (Vec::new(), Vec::new());
         for m in self.members(group) {
             let (mut drive, mut map) = (self.drives[m].clone(), self.maps[m].clone());

@@ -3,11 +3,11 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, Stepping, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, Stepping, catalogue, diagnose, observe_all};
 use nesam_learning::{Drive, initial::initial_weights, scales};
-use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant};
+use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant, effects_from_toml};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
-use nesam_physics::effects::Effect;
+use nesam_physics::effects::{Effect, Written};
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, Driveline, RimServo, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
@@ -123,7 +123,22 @@ pub fn drive_from(id: &str, seed: u64, effects: &[Effect], onset_s: f64, soil: &
     }
 }
 
-/// A bundle of the physics alone, whose default soil is that of the twin, with the reference of 24 null drives.
+/// A plough in front that leans to the left: it pushes more the faster the vehicle goes, and turns it.
+pub fn plough() -> Written {
+    let text = r#"
+[[written]]
+id = "snow_plough"
+force_x = "-(push + per_speed * abs(v_ahead)) * tanh(v_ahead / fade)"
+moment_z = "arm * (push + per_speed * abs(v_ahead)) * tanh(v_ahead / fade)"
+parameters.push = { value = 300.0, unit = "N", range = [0.0, 2000.0] }
+parameters.per_speed = { value = 80.0, unit = "N s/m", range = [0.0, 500.0] }
+parameters.fade = { value = 0.2, unit = "m/s", range = [0.05, 1.0] }
+parameters.arm = { value = 2.0, unit = "m", range = [-3.0, 3.0] }
+"#;
+    effects_from_toml(text).unwrap()[0].effect.written().unwrap()
+}
+
+/// A bundle of the physics alone, whose default soil is that of the twin, with the reference of 24 null drives; it knows the plough as a hypothesis.
 pub fn bundle() -> ModelBundle {
     static BUNDLE: OnceLock<ModelBundle> = OnceLock::new();
     BUNDLE
@@ -156,7 +171,8 @@ pub fn bundle() -> ModelBundle {
             let maps = vec![Some(world()); drives.len()];
             let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
-            let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 } };
+            let catalogue = catalogue(&[plough()]);
+            let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 }, catalogue: &catalogue };
             let reference = Reference::measure(&bench, &observed, "twin", &|_| {}).unwrap();
             bundle.reference_json = Some(reference.to_json().into());
             bundle
@@ -166,13 +182,7 @@ pub fn bundle() -> ModelBundle {
 
 /// Options of a quick diagnosis.
 pub fn options() -> Options {
-    Options {
-        fit_on: None,
-        without: Vec::new(),
-        against: Against::Bundle,
-        scoring: Scoring { horizon: 16, history: 16, resamples: 1000, seed: 1 },
-        controls: false,
-    }
+    Options::of(Scoring { horizon: 16, history: 16, resamples: 1000, seed: 1 })
 }
 
 /// Diagnoses eight twin drives with effects.

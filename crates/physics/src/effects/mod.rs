@@ -127,6 +127,15 @@ macro_rules! catalogue {
                 match self { $(Self::$effect(e) => e.values(),)* Self::Written(e) => e.values() }
             }
 
+            /// The same effect with other values of its parameters, in the order of [`Effect::parameters`]; `None` for a wrong number of them, and for
+            /// values that a written effect holds.
+            pub fn with_values(&self, values: &[f64]) -> Option<Self> {
+                match self {
+                    $(Self::$effect(_) => $effect::from_values(values).map(Self::$effect),)*
+                    Self::Written(e) => e.with_values(values).map(Self::Written),
+                }
+            }
+
             /// Layer in which the effect acts.
             pub fn layer(&self) -> Layer {
                 match self { $(Self::$effect(_) => $effect::LAYER,)* Self::Written(e) => e.layer() }
@@ -157,6 +166,11 @@ impl Effect {
         Self::examples().into_iter().find(|effect| effect.id() == id)
     }
 
+    /// What somebody wrote down; `None` for an effect of the catalogue.
+    pub fn written(&self) -> Option<Written> {
+        if let Self::Written(written) = self { Some(*written) } else { None }
+    }
+
     /// Parameters with units and ranges.
     pub fn parameters(&self) -> Vec<Parameter> {
         let of = |(q, value): (&Quantity, f64)| Parameter { name: q.name, unit: q.unit, value, range: q.range };
@@ -165,11 +179,8 @@ impl Effect {
 
     /// The effect scaled: 0 = absent, 1 = as it is.
     pub fn scaled(&self, share: f64) -> Self {
-        if let Self::Written(written) = self {
-            return Self::Written(written.scaled(share));
-        }
         let values: Vec<f64> = self.quantities().iter().zip(self.values()).map(|(q, value)| q.scaling.apply(value, share)).collect();
-        Self::from_parameters(self.id(), &values).expect("as many values as quantities; this is a bug")
+        self.with_values(&values).expect("as many values as quantities; this is a bug")
     }
 }
 

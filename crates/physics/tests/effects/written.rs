@@ -53,7 +53,7 @@ fn property_a_written_wrench_is_bounded_and_at_most_four_act() {
 }
 
 #[test]
-fn property_a_written_effect_is_read_once_and_is_no_hypothesis() {
+fn property_a_written_effect_is_read_once_and_none_of_the_catalogue() {
     let [one, two] = [0, 1].map(|_| written("twice", &[("force_z", "f")], &[("f", 1.0, "N")]));
     assert_eq!(one, two);
     assert!(!Effect::IDS.contains(&one.id()) && !Effect::examples().iter().any(|e| e.id() == "twice"));

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
-use nesam_discovery::{Against, Diagnosis, Options, Scoring, diagnose};
+use nesam_discovery::{Diagnosis, Options, Scoring, diagnose};
 use nesam_model::Predictor;
 use nesam_plant::HiddenEffects;
 use rand::seq::SliceRandom;
@@ -199,7 +199,7 @@ fn judge(predictor: &Predictor, out: &Path, labels: Vec<Label>) -> Result<Vec<Ru
 
 fn diagnosis(predictor: &Predictor, out: &Path, i: usize) -> Result<Diagnosis, Failure> {
     let drives = read_drives(&DataArgs { set: Some(name(i)), ..DataArgs::of(Some(out.into())) }, false)?;
-    let options = Options { fit_on: None, without: Vec::new(), against: Against::Bundle, scoring: SCORING, controls: false };
+    let options = Options::of(SCORING);
     diagnose(predictor, &drives.drives, &drives.maps, &options, &|_, _, _| ()).or_input()
 }
 

@@ -32,7 +32,7 @@ pub fn close_the_loop(bundle: &ModelBundle, played: &Drives, data: &DataArgs, sh
 fn of_set(predictor: &Predictor, data: DataArgs, show: &dyn Fn(Value)) -> Result<Value, Failure> {
     let drives = read_drives(&data, false)?;
     let scoring = Scoring { horizon: HORIZON, history: HISTORY, resamples: DEFAULT_RESAMPLES, seed: 1 };
-    let options = Options { fit_on: None, without: Vec::new(), against: Default::default(), scoring, controls: false };
+    let options = Options::of(scoring);
     // Too few drives, for instance: the demo has shown the rest and says why.
     let found = match diagnose(predictor, &drives.drives, &drives.maps, &options, &|_, _, _| {}) {
         Ok(found) => found,

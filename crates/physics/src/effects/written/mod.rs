@@ -1,8 +1,8 @@
 //! Effects that an engineer writes down: a wrench on the body as formulas with units, read from a bundle and not compiled in.
 //!
 //! A formula may use its own parameters and the variables of [`VARIABLES`]. Formulas are checked for dimensions when they are read and bounded when they
-//! act, so none can throw a rollout out of its range. A written effect has an id of its own, which is none of the catalogue, and no diagnosis takes it
-//! for a hypothesis: it acts, and `nesam evaluate` or `nesam diagnose` say what it is worth.
+//! act, so none can throw a rollout out of its range. A written effect has an id of its own, which is none of the catalogue. It acts at a share of what is
+//! written, and that share is what a diagnosis estimates when it is given the effect as a hypothesis.
 
 mod program;
 mod unit;
@@ -19,6 +19,8 @@ pub use unit::Dimension;
 pub const WRITTEN_MAX: usize = 4;
 /// Largest force over the mass of the vehicle, m/s², and largest moment as the same at an arm of 1 m (chosen: far beyond what a vehicle survives).
 const BOUND_M_S2: f64 = 100.0;
+/// The share of what is written: absent at 0, as written at 1; the sign is part of the formulas.
+const SHARE: Quantity = Quantity::new("share", "1", [0.0, 10.0], 1.0, Scaling::Size);
 
 /// Forces (N) and moments (N m) about the reference point, Body, as `effects.toml` names them.
 pub const AXES: [&str; 6] = ["force_x", "force_y", "force_z", "moment_x", "moment_y", "moment_z"];
@@ -104,9 +106,14 @@ impl Written {
         &self.definition.text
     }
 
-    /// The same at another share of its size; 0 = nothing.
-    pub fn scaled(&self, share: f64) -> Self {
-        Self { share: self.share * share, ..*self }
+    /// The same at this share of what is written.
+    pub fn at(&self, share: f64) -> Self {
+        Self { share, ..*self }
+    }
+
+    /// Share of what is written.
+    pub fn share(&self) -> f64 {
+        self.share
     }
 
     /// Its id.
@@ -114,14 +121,24 @@ impl Written {
         &self.definition.text.id
     }
 
-    /// What its parameters are.
+    /// What its parameters are; the share comes last.
     pub fn quantities(&self) -> &'static [Quantity] {
         &self.definition.quantities
     }
 
     /// Values of its parameters.
     pub fn values(&self) -> Vec<f64> {
-        self.definition.text.parameters.iter().map(|p| p.value).collect()
+        self.own_values().chain([self.share]).collect()
+    }
+
+    /// The same with these values, of which the share alone can differ from what is written; `None` for others.
+    pub fn with_values(&self, values: &[f64]) -> Option<Self> {
+        let (share, own) = values.split_last()?;
+        own.iter().copied().eq(self.own_values()).then(|| self.at(*share))
+    }
+
+    fn own_values(&self) -> impl Iterator<Item = f64> {
+        self.definition.text.parameters.iter().map(|p| p.value)
     }
 
     /// Where it acts.
@@ -162,8 +179,8 @@ impl Definition {
             VARIABLES.iter().map(|(name, dimension)| Name { name: (*name).into(), dimension: *dimension, value: None }).collect();
         for p in &text.parameters {
             let [low, high] = p.range;
-            if !plain(&p.name) || names.iter().any(|n| n.name == p.name) {
-                return Err(format!("the parameter `{}` is not snake_case, is a variable or stands twice", p.name));
+            if !plain(&p.name) || p.name == SHARE.name || names.iter().any(|n| n.name == p.name) {
+                return Err(format!("the parameter `{}` is not snake_case, is a variable or the share, or stands twice", p.name));
             }
             if !(low <= high && (low..=high).contains(&p.value) && low.is_finite() && high.is_finite()) {
                 return Err(format!("{} = {} {} is outside {low}…{high}", p.name, p.value, p.unit));
@@ -180,8 +197,8 @@ impl Definition {
             return Err(format!("it has no formula; give one of {}", AXES.join(", ")));
         }
         let kept = |text: &str| -> &'static str { Box::leak(text.to_string().into_boxed_str()) };
-        let quantities =
-            text.parameters.iter().map(|p| Quantity::new(kept(&p.name), kept(&p.unit), p.range, p.value, Scaling::Held)).collect();
+        let own = text.parameters.iter().map(|p| Quantity::new(kept(&p.name), kept(&p.unit), p.range, p.value, Scaling::Held));
+        let quantities = own.chain([SHARE]).collect();
         Ok(Self { text: text.clone(), programs, quantities })
     }
 }
