@@ -27,3 +27,32 @@ pub fn read(file: Option<&Path>) -> Result<Vec<Written>, Failure> {
         Some((_, twice)) => Err(refused(format!("has `{}` twice; a hypothesis is sized once", twice.id()))),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PUSH: &str = "[[written]]\nid = \"push\"\nforce_x = \"f\"\nparameters.f = { value = 1.0, unit = \"N\", range = [0.0, 2.0] }\n";
+
+    fn read_text(text: &str) -> Result<Vec<Written>, Failure> {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        std::fs::write(file.path(), text).unwrap();
+        read(Some(file.path()))
+    }
+
+    #[test]
+    fn property_only_written_effects_without_an_onset_are_hypotheses() {
+        assert_eq!(read(None).unwrap(), []);
+        assert_eq!(read_text(PUSH).unwrap().iter().map(Written::id).collect::<Vec<_>>(), ["push"]);
+        for (text, reason) in [
+            ("effects = []".to_string(), "has no effect"),
+            ("[[effects]]\nid = \"steering_offset\"\nparameters = { second = 0.1 }\n".into(), "which the catalogue has"),
+            (PUSH.replace("force_x", "onset_s = 3.0\nforce_x"), "a diagnosis finds it"),
+            (PUSH.repeat(2), "twice"),
+            (PUSH.replace("\"N\"", "\"kg\""), "force_x"),
+        ] {
+            let error = read_text(&text).unwrap_err().to_string();
+            assert!(error.contains(reason), "`{error}` should say `{reason}`");
+        }
+    }
+}
