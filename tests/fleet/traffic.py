@@ -25,6 +25,8 @@ STEPS = 130
 RATE_HZ = 20.0
 """Twice as fast as it was driven."""
 PLAN_S = 0.2
+PAUSE_S = 0.05
+"""Between a call and its repetition, as retry policies of gRPC pause: at once, it may go over another connection that the proxy has kept to the same dead server."""
 CONTROLS = np.stack(np.broadcast_arrays(np.linspace(1.0, 3.0, 4)[:, None], np.linspace(-0.3, 0.3, 16)), axis=-1).astype(np.float32)
 
 
@@ -61,12 +63,24 @@ def drive(session):
     ]
 
 
+def repeated(call, within_s=2.0, pause_s=PAUSE_S):
+    """What a call gives that is repeated while its session moves from one server to another: what UNAVAILABLE asks of every client."""
+    end = time.monotonic() + within_s
+    while True:
+        try:
+            return call()
+        except nesam.Unavailable:
+            if time.monotonic() > end:
+                raise
+            time.sleep(pause_s)
+
+
 class Outcome:
     """What a session knows in the end, as bytes."""
 
     def __init__(self, client, session):
-        held = client.session(session)
-        predicted = client.predict(session, CONTROLS)
+        held = repeated(lambda: client.session(session))
+        predicted = repeated(lambda: client.predict(session, CONTROLS))
         self.parts = {
             "measurements": held.accepted,
             "newest": (held.last_stamp_ns, held.last_sequence, held.state.tobytes()),
@@ -168,7 +182,7 @@ class ZenohVehicle(threading.Thread):
         while unsent or kept:
             if not unsent:
                 # All were received; are they durable?
-                session = self.client.session(self.name)
+                session = repeated(lambda: self.client.session(self.name))
                 told, durable = session.run, session.durable_place
                 time.sleep(0.05)
             else:
@@ -211,9 +225,6 @@ class ZenohVehicle(threading.Thread):
 class Planner(threading.Thread):
     """Asks again and again; a call that fails is repeated once, after a pause."""
 
-    # As retry policies of gRPC pause: at once, a call may go over another connection that the proxy has kept to the same dead server.
-    PAUSE_S = 0.05
-
     def __init__(self, address, session, every_s=PLAN_S):
         super().__init__(name=f"planner of {session}", daemon=True)
         self.client = nesam.Client(address, timeout_s=8.0, vehicle_id=session)
@@ -236,7 +247,7 @@ class Planner(threading.Thread):
                         self.violations.append(f"{self.name}: two calls in a row failed: {type(error).__name__}: {error}")
                     else:
                         self.retried += 1
-                        time.sleep(self.PAUSE_S)
+                        time.sleep(PAUSE_S)
             now = time.monotonic()
             self.answered += 1
             self.silence_s = max(self.silence_s, now - last)
