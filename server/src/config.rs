@@ -17,6 +17,9 @@ pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
 use crate::error::ServerError;
 
+/// Most worker threads: more than processors of any one machine, and few enough to start.
+const THREADS_MAX: usize = 1024;
+
 /// Everything that can be configured. Unknown keys are refused.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -29,6 +32,8 @@ pub struct Config {
     pub http: HttpConfig,
     /// Zenoh.
     pub zenoh: ZenohConfig,
+    /// Threads that compute predictions.
+    pub workers: WorkersConfig,
     /// What is accepted and held at most.
     pub limits: LimitsConfig,
     /// Soil map of the fleet.
@@ -112,6 +117,18 @@ pub struct ZenohConfig {
     pub name: String,
     /// Interval at which the status of this server is published, s.
     pub status_interval_s: f64,
+    /// Whether large messages to and from processes of the same host go through shared memory where the other side can; never together with `tls/...`.
+    pub shared_memory: bool,
+}
+
+/// Threads that compute predictions. They belong to the process: `nesam serve` starts them, see [`crate::start_workers`].
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct WorkersConfig {
+    /// Number of threads; 0 = one for each processor that this process may use.
+    pub threads: usize,
+    /// Whether each stays on a processor of its own.
+    pub pinned: bool,
 }
 
 /// Soil map of the fleet; see `nesam_engine::FleetSoilSettings`.
@@ -232,6 +249,7 @@ impl Default for ZenohConfig {
             fleet: "default".into(),
             name: String::new(),
             status_interval_s: 1.0,
+            shared_memory: true,
         }
     }
 }
@@ -410,6 +428,10 @@ impl Config {
                 return Err(ServerError::Value { key, reason: format!("is {value}, allowed is above 0 and up to 1e6 s") });
             }
         }
+        if self.workers.threads > THREADS_MAX {
+            let reason = format!("is {}, at most {THREADS_MAX} are allowed", self.workers.threads);
+            return Err(ServerError::Value { key: "workers.threads", reason });
+        }
         let counts = [
             ("grpc.uploads_max", self.grpc.uploads_max),
             ("grpc.tile_bytes_max", self.grpc.tile_bytes_max),
@@ -522,6 +544,7 @@ mod tests {
             ("[limits]\nreorder_window_s = 1.5\n", "limits.reorder_window_s"),
             ("[fleet_soil]\nreach_m = -1.0\n", "reach_m"),
             ("[zenoh]\nmode = \"king\"\n", "king"),
+            ("[workers]\nthreads = 5000\n", "workers.threads"),
             ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),
             ("[store]\ninterval_s = 0.0\n", "store.interval_s"),
             ("[tls]\ncertificate = \"c\"\n", "tls.key"),

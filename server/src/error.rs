@@ -69,4 +69,10 @@ pub enum ServerError {
     /// Zenoh needs more than the runtime offers.
     #[error("zenoh needs a multi-thread tokio runtime; start the server in one or set `zenoh.enabled = false`")]
     Runtime,
+    /// The threads that compute predictions.
+    #[error("worker threads: {reason}")]
+    Workers {
+        /// Why they were not started.
+        reason: String,
+    },
 }

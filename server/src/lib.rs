@@ -22,15 +22,17 @@ pub mod store;
 mod telemetry;
 mod tls_listener;
 mod web;
+mod workers;
 mod zenoh;
 
 pub use clock::MonotonicClock;
 pub use config::{
-    ClusterConfig, Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, ZenohConfig,
-    ZenohMode, is_tls_endpoint,
+    ClusterConfig, Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, WorkersConfig,
+    ZenohConfig, ZenohMode, is_tls_endpoint,
 };
 pub use error::ServerError;
 pub use one_thread::serve_on_one_thread;
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;
+pub use workers::start_workers;
 pub use zenoh::{LinkFiles, router_config};

@@ -38,13 +38,29 @@ fn client_of(endpoint: &str) -> Result<zenoh::Config, ClientError> {
     Ok(config)
 }
 
+/// Nothing goes past the socket of this session.
+fn no_shared_memory(config: &mut zenoh::Config) -> Result<(), ClientError> {
+    config.insert_json5("transport/shared_memory/enabled", "false").map_err(failed)
+}
+
 impl ZenohVehicle {
-    /// Joins the network as a client of the router or server at `endpoint`, e.g. `tcp/127.0.0.1:7447`. Nothing is searched for by multicast.
+    /// Joins the network as a client of the router or server at `endpoint`, e.g. `tcp/127.0.0.1:7447`. Nothing is searched for by multicast. Large messages
+    /// go through shared memory where the other side is on this host and can.
     ///
     /// # Errors
     /// `ClientError::Zenoh` when nobody answers there.
     pub async fn connect(endpoint: &str, fleet: &str, vehicle: &str) -> Result<Self, ClientError> {
         Self::join(client_of(endpoint)?, fleet, vehicle).await
+    }
+
+    /// As [`ZenohVehicle::connect`], but everything goes through the socket, also where both sides are on one host and could share memory.
+    ///
+    /// # Errors
+    /// As [`ZenohVehicle::connect`].
+    pub async fn connect_through_socket(endpoint: &str, fleet: &str, vehicle: &str) -> Result<Self, ClientError> {
+        let mut config = client_of(endpoint)?;
+        no_shared_memory(&mut config)?;
+        Self::join(config, fleet, vehicle).await
     }
 
     /// As [`ZenohVehicle::connect`], to an endpoint `tls/...`. The common name of the certificate is who this vehicle is, `nesam:vehicle:<vehicle>`; the
@@ -54,6 +70,7 @@ impl ZenohVehicle {
     /// `ClientError::Zenoh` when nobody answers there or either side does not trust the other.
     pub async fn connect_tls(endpoint: &str, fleet: &str, vehicle: &str, tls: &Tls) -> Result<Self, ClientError> {
         let mut config = client_of(endpoint)?;
+        no_shared_memory(&mut config)?;
         tls.configure_zenoh(&mut config).map_err(failed)?;
         Self::join(config, fleet, vehicle).await
     }

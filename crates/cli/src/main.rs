@@ -5,6 +5,7 @@ mod bundle_path;
 mod bundle_version;
 mod cli;
 mod commands;
+mod environment;
 mod failure;
 mod interrupt;
 mod output;

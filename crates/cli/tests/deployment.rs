@@ -1,4 +1,4 @@
-//! Goal: what is shipped for operators watches what the server tells. Method: the real binary with everything that has metrics on; every metric that
+//! Goal: what is shipped for operators does what it says. Method: the real binary; with everything that has metrics on, every metric that
 //! the alert rules and the dashboard name is among those of `/metrics`.
 
 mod common;
@@ -40,4 +40,30 @@ fn service_rules_and_dashboard_name_metrics_that_exist() {
             assert!(known, "{file} watches {metric}, which /metrics does not tell: {kinds:?}");
         }
     }
+}
+
+/// Three workers over the processors that this process may use: each stays on one, and none has more than its share.
+#[test]
+#[cfg(target_os = "linux")]
+fn service_pinned_workers_stay_on_one_processor_each() {
+    let here = tempfile::tempdir().unwrap();
+    std::fs::write(here.path().join("pinned.toml"), "[workers]\nthreads = 3\npinned = true\n").unwrap();
+    let (mut server, _) = common::start(here.path(), &["--no-http", "--config", "pinned.toml"]);
+    let tasks = std::fs::read_dir(format!("/proc/{}/task", server.id())).unwrap();
+    let mut processors = Vec::new();
+    for task in tasks.flatten() {
+        let read = |name: &str| std::fs::read_to_string(task.path().join(name)).unwrap_or_default();
+        if read("comm").starts_with("nesam-worker") {
+            let allowed =
+                read("status").lines().find_map(|line| line.strip_prefix("Cpus_allowed_list:").map(|list| list.trim().to_string()));
+            processors.push(allowed.unwrap());
+        }
+    }
+    server.kill().unwrap();
+    server.wait().unwrap();
+    assert_eq!(processors.len(), 3, "{processors:?}");
+    assert!(processors.iter().all(|list| list.parse::<usize>().is_ok()), "one processor each: {processors:?}");
+    let distinct: BTreeSet<_> = processors.iter().collect();
+    let available = std::thread::available_parallelism().unwrap().get();
+    assert_eq!(distinct.len(), available.min(3));
 }

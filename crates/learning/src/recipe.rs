@@ -22,6 +22,7 @@ use crate::initial::initial_weights;
 use crate::pooling::Pooling;
 use crate::scales::{measure, measure_increments};
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
+use crate::variation::sensor_noise;
 
 /// What a run is told; the defaults of the command line are in `nesam train --help`.
 #[derive(Clone, Debug)]
@@ -38,6 +39,8 @@ pub struct Recipe {
     pub encoder_rate: f64,
     /// Trains on the mirror image of each drive too; for vehicles whose two sides are alike.
     pub mirror: bool,
+    /// Views of the terrain from each pose of a training drive: its own, and from poses near it.
+    pub views: usize,
     /// Cells that share a weight of the terrain projection.
     pub pooling: Pooling,
     /// Training plan; its folder is `out/checkpoint`.
@@ -46,6 +49,8 @@ pub struct Recipe {
     pub start: Option<ModelBundle>,
     /// With `start`: takes the data's vehicle and fits its drive line anew, instead of the bundle's vehicle.
     pub recalibrate: bool,
+    /// Whether the encoders see borders between colours smoothed; `None` = smoothed, or with `start` as its bundle has it.
+    pub smooth_borders: Option<bool>,
     /// Output folder.
     pub out: PathBuf,
     /// Goes on where an interrupted run of the same command stopped.
@@ -95,6 +100,8 @@ pub fn run(
         None => fitted(),
     };
 
+    scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);
+
     if recipe.mirror {
         let images = mirrored(&drives, &train_at);
         train_at.extend(drives.len()..drives.len() + images.len());
@@ -118,13 +125,16 @@ pub fn run(
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
-        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), &recipe.pooling, |n| {
+        let views = |drive: usize| if validation_at.contains(&drive) { 1 } else { recipe.views };
+        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), &recipe.pooling, views, |n| {
             reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
         });
     }
 
+    let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
     let set = TrainingSet {
-        train: train_at.iter().map(|&i| &drives[i]).collect(),
+        noise_sd: sensor_noise(&training),
+        train: training,
         validation: if validation_at.is_empty() { &train_at } else { &validation_at }.iter().map(|&i| &drives[i]).collect(),
         scales: &scales,
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
@@ -190,7 +200,11 @@ fn prepare_projection(weights: &mut Weights, pooling: &Pooling, variant: Variant
 
 /// Seconds that the optimiser's steps took, over all the runs that a resumed training was made of.
 fn optimisation_s(curve: &[EpochReport]) -> f64 {
-    curve.iter().scan(0, |before, line| Some((line.step - std::mem::replace(before, line.step)) as f64 * line.step_s)).sum()
+    // From 0, as the sum of nothing is -0.
+    curve
+        .iter()
+        .scan(0, |before, line| Some((line.step - std::mem::replace(before, line.step)) as f64 * line.step_s))
+        .fold(0.0, |sum, s| sum + s)
 }
 
 /// One line of the loss curve for people.

@@ -69,6 +69,7 @@ pub fn measure(drives: &[&Drive], vehicle: &Vehicle, dt_s: f64) -> Normalization
         elevation_half_range_m: patch.elevation_half_range_m,
         semantic_mean: patch.semantic_mean,
         semantic_half_range: patch.semantic_half_range,
+        smooth_semantics: true,
         token_mean: mean.map(|v| v as f32),
         token_scale: scale.map(|v| v as f32),
         residual_scale: RESIDUAL_SCALE,

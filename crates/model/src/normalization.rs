@@ -22,6 +22,9 @@ pub struct Normalization {
     pub semantic_mean: [f32; 3],
     /// Colour difference that becomes 1, per channel.
     pub semantic_half_range: [f32; 3],
+    /// Whether the encoders see borders between colours smoothed (`PatchScale::smooth_semantics`); bundles before 0.1.0 do not say and see them hard.
+    #[serde(default)]
+    pub smooth_semantics: bool,
     /// Mean of the state and control entries of a token, see `token::ENTRY_NAMES`.
     pub token_mean: [f32; STATE_CONTROL],
     /// Scale of the same.
@@ -49,6 +52,7 @@ impl Normalization {
             elevation_half_range_m: self.elevation_half_range_m,
             semantic_mean: self.semantic_mean,
             semantic_half_range: self.semantic_half_range,
+            smooth_semantics: self.smooth_semantics,
         }
     }
 

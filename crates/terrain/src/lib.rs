@@ -6,6 +6,7 @@
 //! and missing semantics are valid in both.
 #![forbid(unsafe_code)]
 
+mod colours;
 mod error;
 mod geometry;
 mod image;

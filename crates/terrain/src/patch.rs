@@ -49,12 +49,14 @@ pub struct PatchScale {
     pub semantic_mean: [f32; 3],
     /// Colour difference that becomes 1, per channel, on the same scale.
     pub semantic_half_range: [f32; 3],
+    /// Sees borders between colours smoothed over about 0.4 m, so that tokens can be interpolated between poses; `false` = as the map has them.
+    pub smooth_semantics: bool,
 }
 
 impl Default for PatchScale {
     /// 3 m of relief (18 degrees over the 9 m to a corner of the patch), and the whole colour range.
     fn default() -> Self {
-        Self { elevation_half_range_m: 3.0, semantic_mean: [127.5; 3], semantic_half_range: [127.5; 3] }
+        Self { elevation_half_range_m: 3.0, semantic_mean: [127.5; 3], semantic_half_range: [127.5; 3], smooth_semantics: false }
     }
 }
 
@@ -194,6 +196,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
     let walk = Walk::new(map, pose);
     let centre_m = map.nearest_height_m(pose.x_m, pose.y_m) as f32;
     let per_elevation = 1.0 / scale.elevation_half_range_m;
+    let colour = map.patch_colours(scale.smooth_semantics);
     let per_colour = scale.semantic_half_range.map(|half| 1.0 / half);
 
     let mut cells = RowCells { index: [0; PATCH_PX], east: [0.0; PATCH_PX], north: [0.0; PATCH_PX] };
@@ -208,7 +211,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
         heights.gather(&map.surface.height_m, width, &cells);
         let out = &mut patch.elevation[row * PATCH_PX..(row + 1) * PATCH_PX];
         mix_heights(&heights, &cells, centre_m, per_elevation, out);
-        let Some(colour) = &map.colour else { continue };
+        let Some(colour) = colour else { continue };
         colours.gather(colour, width, &cells);
         for (channel, per_unit) in per_colour.into_iter().enumerate() {
             let at = channel * PIXELS + row * PATCH_PX;
@@ -216,7 +219,7 @@ pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut
             mix_colours(&colours, &cells, 8 * channel as u32, scale.semantic_mean[channel], per_unit, out);
         }
     }
-    if map.colour.is_none() {
+    if colour.is_none() {
         patch.semantic.fill(0.0);
     }
     patch.known_share = if finite { 1.0 - unknown as f32 / PIXELS as f32 } else { 0.0 };

@@ -1,7 +1,11 @@
 //! The immutable, versioned map of a world.
 
+use std::sync::OnceLock;
+
 use nesam_physics::SOIL_DIM;
 use sha2::{Digest, Sha256};
+
+use crate::colours::{pack, smoothed, unpack};
 
 use crate::error::TerrainError;
 use crate::geometry::{Bilinear, GridGeometry};
@@ -45,6 +49,8 @@ pub struct WorldMap {
     pub(crate) surface: Surface,
     /// Colours packed as r | g << 8 | b << 16.
     pub(crate) colour: Option<Vec<u32>>,
+    /// The same without hard borders, made when it is first asked for.
+    smooth_colour: OnceLock<Vec<u32>>,
     soil_classes: Vec<SoilClassRange>,
 }
 
@@ -84,7 +90,7 @@ impl WorldMap {
             fill_holes(&geometry, elevation_m).ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
         let slope = footprint_slopes(&geometry, &height_m);
         let surface = Surface { height_m, slope, known };
-        Ok(Self { id: id.into(), version, hash, geometry, surface, colour, soil_classes: Vec::new() })
+        Ok(Self { id: id.into(), version, hash, geometry, surface, colour, smooth_colour: OnceLock::new(), soil_classes: Vec::new() })
     }
 
     /// The same map with the prior soil ranges of its semantic classes.
@@ -196,7 +202,7 @@ impl WorldMap {
     pub fn soil_class_index(&self, x_m: f64, y_m: f64) -> Option<usize> {
         let colour = self.colour.as_ref().filter(|_| self.geometry.contains(x_m, y_m))?;
         let [column, row] = self.geometry.to_grid(x_m, y_m).map(|v| v.round().max(0.0) as usize);
-        let [r, g, b, _] = colour[row * self.geometry.width + column].to_le_bytes();
+        let [r, g, b] = unpack(colour[row * self.geometry.width + column]);
         let distance = |p: [u8; 3]| (0..3).map(|i| (i32::from(p[i]) - i32::from([r, g, b][i])).pow(2)).sum::<i32>();
         let coloured = self.soil_classes.iter().enumerate().filter_map(|(index, class)| Some((index, distance(class.colour?))));
         coloured.min_by_key(|(_, away)| *away).map(|(index, _)| index)
@@ -210,12 +216,18 @@ impl WorldMap {
 
     /// Semantic layer as given, row-major, row 0 in the south.
     pub fn semantic_rgb(&self) -> Option<Vec<[u8; 3]>> {
-        self.colour.as_ref().map(|c| c.iter().map(|p| [*p as u8, (p >> 8) as u8, (p >> 16) as u8]).collect())
+        self.colour.as_ref().map(|c| c.iter().map(|p| unpack(*p)).collect())
     }
 
     /// Whether the point lies on the map (holes included).
     pub fn contains(&self, x_m: f64, y_m: f64) -> bool {
         self.geometry.contains(x_m, y_m)
+    }
+
+    /// Packed colours as patches see them: as they are, or with borders smoothed over about 0.4 m (see [`crate::PatchScale::smooth_semantics`]).
+    pub(crate) fn patch_colours(&self, smooth: bool) -> Option<&[u32]> {
+        let colour = self.colour.as_ref()?;
+        Some(if smooth { self.smooth_colour.get_or_init(|| smoothed(&self.geometry, colour)) } else { colour })
     }
 
     /// Bilinear height, m; `None` off the map or where one of the four cells around is a hole.
@@ -250,11 +262,6 @@ impl WorldMap {
 /// Rows in reverse order.
 fn flipped<T: Copy>(cells: &[T], width: usize) -> Vec<T> {
     cells.chunks(width).rev().flatten().copied().collect()
-}
-
-/// Packs a colour as r | g << 8 | b << 16.
-fn pack([r, g, b]: [u8; 3]) -> u32 {
-    u32::from(r) | u32::from(g) << 8 | u32::from(b) << 16
 }
 
 /// SHA-256 over geometry, elevation (every NaN as one bit pattern) and colours.

@@ -87,6 +87,8 @@ fn zenoh_config(config: &ZenohConfig, tls: &TlsConfig, members: Option<&FleetFil
     zenoh.insert_json5("scouting/multicast/enabled", "false")?;
     zenoh.insert_json5("listen/endpoints", &list(&config.listen))?;
     zenoh.insert_json5("connect/endpoints", &list(&config.connect))?;
+    let shared = config.shared_memory && !config.uses_tls();
+    zenoh.insert_json5("transport/shared_memory/enabled", &shared.to_string())?;
     if config.uses_tls() {
         let files = LinkFiles { certificate: &tls.certificate, key: &tls.key, authority: &tls.client_ca };
         zenoh.insert_json5("transport/link/tls", &access_control::link(files).to_string())?;

@@ -69,6 +69,9 @@ async fn position_error_m(client: &mut Client, session: &str, drive: &Trajectory
     (0..HORIZON).map(distance).sum::<f64>() / HORIZON as f64
 }
 
+/// Standard deviation of measured positions (`DATA.md` of the drives).
+const POSITION_NOISE_M: f64 = 0.015;
+
 #[tokio::test(flavor = "multi_thread")]
 async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_driving() {
     let (drives, world) = drives(Some(Change::VelocityScale(SCALE)));
@@ -162,7 +165,8 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     let mean = |errors: &[f64]| errors.iter().sum::<f64>() / errors.len() as f64;
     println!("position error over {HORIZON} steps: {:.3} m with, {:.3} m without the effect", mean(&with), mean(&without));
     assert!(mean(&with) < 0.5 * mean(&without), "{with:?} {without:?}");
-    assert!(with.iter().zip(&without).all(|(with, without)| with < without), "{with:?} {without:?}");
+    // One window alone tells no better than the positions are measured.
+    assert!(with.iter().zip(&without).all(|(with, without)| *with < without + POSITION_NOISE_M), "{with:?} {without:?}");
     assert_eq!(client.session("s").await.unwrap().alarm, None, "and nothing disagrees any more");
     server.shutdown().await;
 }

@@ -89,6 +89,37 @@ async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction(
     router.close().await.unwrap();
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn service_large_replies_are_the_same_through_memory_and_through_the_socket() {
+    let recorded = recorded();
+    let (router, endpoint) = router().await;
+    let (server, mut client) = start_with(|config| behind(config, &endpoint)).await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "truck", recorded.world.id()).await;
+    client.feed(samples("truck", &recorded.drive, 50)).await.unwrap();
+    let question = candidates("truck", &recorded.drive, 50, 256, 32);
+    let by_grpc = client.predict(question.clone()).await.unwrap();
+    for socket_only in [true, false] {
+        let connected = if socket_only {
+            ZenohVehicle::connect_through_socket(&endpoint, "test", "truck").await
+        } else {
+            ZenohVehicle::connect(&endpoint, "test", "truck").await
+        };
+        let vehicle = connected.unwrap();
+        vehicle.wait_for_service(PATIENCE).await.unwrap();
+        for _ in 0..3 {
+            let answer = vehicle.predict(&question).await.unwrap();
+            assert!(bits(&answer.states) == bits(&by_grpc.states), "socket only: {socket_only}");
+        }
+        vehicle.close().await.unwrap();
+    }
+    // All sides are in this process, so what they share is mapped here.
+    let mapped = std::fs::read_to_string("/proc/self/maps").unwrap_or_default();
+    assert!(cfg!(not(target_os = "linux")) || mapped.contains(".zenoh"), "no segment of Zenoh is mapped");
+    server.shutdown().await;
+    router.close().await.unwrap();
+}
+
 /// Random and truncated payloads on every key that the service listens to are answered as such and change nothing.
 async fn refuses_random_bytes(network: &zenoh::Session, vehicle: &ZenohVehicle, recorded: &Recorded, client: &mut nesam_client::Client) {
     let before = client.list_sessions().await.unwrap();

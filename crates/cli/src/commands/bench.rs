@@ -8,6 +8,7 @@ mod page;
 mod plant;
 mod serve;
 mod sweep;
+mod wire;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -49,6 +50,8 @@ enum Bench {
     Plant(plant::PlantBench),
     /// Ask a real server for more than it can give, at random instants, and count what comes in time
     Serve(serve::ServeBench),
+    /// Time what lies between the engine and a planner: gRPC, Zenoh through a socket, Zenoh through shared memory
+    Wire(wire::WireBench),
 }
 
 #[derive(Args, Debug)]
@@ -102,6 +105,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
         Bench::Discovery(args) => discovery::run(args),
         Bench::Plant(args) => plant::run(args),
         Bench::Serve(args) => serve::run(args),
+        Bench::Wire(args) => wire::run(args),
     }
 }
 

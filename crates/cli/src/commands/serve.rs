@@ -7,10 +7,11 @@ use std::sync::Arc;
 
 use clap::Args;
 use nesam_model::{ModelBundle, Predictor};
-use nesam_server::{Config, RunningServer, ZenohConfig, access, serve, termination};
+use nesam_server::{Config, RunningServer, ZenohConfig, access, serve, start_workers, termination};
 use tracing_subscriber::EnvFilter;
 
 use crate::args::BundleArgs;
+use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::sources::load_bundle;
@@ -70,12 +71,15 @@ pub struct ServeArgs {
 
 /// Runs the command.
 pub fn run(args: &ServeArgs) -> Result<(), Failure> {
+    // Longer than the pause between the questions of a planner.
+    restart_with(&[(PURGE_DELAY, "1000")])?;
     let config = configuration(args)?;
     log_to_stderr("info");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     if args.check {
         return checked(&config, bundle);
     }
+    start_workers(&config.workers).or_failed()?;
     let (zenoh, kept) = (config.zenoh.clone(), kept(&config));
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(async {

@@ -11,6 +11,7 @@ use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
 use nesam_model::{ModelBundle, Variant};
 
 use crate::args::{DataArgs, SplitArg};
+use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::progress::Progress;
 use crate::sources::{load_bundle, read_drives};
@@ -36,7 +37,7 @@ pub struct TrainArgs {
     /// Peak learning rate of the encoders' pre-training
     #[arg(long, value_name = "RATE", default_value_t = 2e-3)]
     encoder_lr: f64,
-    /// Epochs: after each, the model is validated and a checkpoint written
+    /// Epochs: after each, the model is validated and a checkpoint written; 0 with --from: only what else is asked for is changed
     #[arg(long, default_value_t = 40)]
     epochs: usize,
     /// Batches per epoch
@@ -54,9 +55,20 @@ pub struct TrainArgs {
     /// Share of the terrain features that each window is trained without
     #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
     dropout: f32,
+    /// Views of the terrain from each driven pose: its own, and from drawn poses up to some decimetres beside it; each holds 2.6 GB of memory for 600
+    /// drives of 25 s
+    #[arg(long, default_value_t = 1)]
+    views: usize,
+    /// Noise added to start and history of each window, as a share of what the sensors have (read off the drives)
+    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
+    noise: f64,
     /// Cells of the 16 × 16 terrain features, per side, that share one weight: 1, 2, 4, 8 or 16; more of them learn fewer places by heart
     #[arg(long, value_name = "CELLS", default_value_t = 1)]
     pool: usize,
+    /// Let the encoders see borders between colours as the map has them, or smoothed over about 0.4 m, so that terrain can be interpolated between poses
+    /// [default: smooth, with --from as the bundle has it]
+    #[arg(long, value_name = "hard|smooth", value_parser = ["hard", "smooth"])]
+    borders: Option<String>,
     /// Decay of the weights, per unit of learning rate
     #[arg(long, value_name = "RATE", default_value_t = 0.0)]
     decay: f32,
@@ -131,35 +143,21 @@ fn stop_on_ctrl_c() {
     });
 }
 
-/// Restarts this program once with the thread counts that candle reads from its environment.
-///
-/// Each thread of `--threads` works on its own share of a batch, so candle's own element-wise threads would only get in their way (0.67 s
-/// against 0.42 s per step, measured), and without a set number candle reads the processor list at every matrix product.
-fn own_threads() -> Result<(), Failure> {
-    use std::os::unix::process::CommandExt;
-    const ELEMENTWISE: &str = "CANDLE_NUM_THREADS";
-    if std::env::var_os(ELEMENTWISE).is_some() {
-        return Ok(());
-    }
-    let program = std::env::current_exe().or_failed()?;
-    let threads = std::thread::available_parallelism().map_or(1, |n| n.get()).to_string();
-    let error = std::process::Command::new(program)
-        .args(std::env::args_os().skip(1))
-        .env(ELEMENTWISE, "1")
-        .env("RAYON_NUM_THREADS", threads)
-        .exec();
-    Err(Failure::Failed(format!("the program could not restart itself: {error}")))
-}
-
 /// Runs the command.
 pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let variant = Variant::from_name(&args.model)
         .ok_or_else(|| Failure::input(format!("no model `{}`; one of {}", args.model, Variant::ALL.map(Variant::as_str).join(", "))))?;
-    if args.epochs * args.batches * args.batch_size * args.threads == 0 {
-        return Err(Failure::input("--epochs, --batches, --batch-size and --threads must be at least 1"));
+    if args.batches * args.batch_size * args.threads == 0 || (args.epochs == 0 && args.from.is_none()) {
+        return Err(Failure::input("--batches, --batch-size and --threads must be at least 1, and so must --epochs without --from"));
     }
     if !(0.0..0.9).contains(&args.dropout) {
         return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
+    }
+    if !(1..=8).contains(&args.views) {
+        return Err(Failure::input(format!("--views {} is not in 1..=8", args.views)));
+    }
+    if !(0.0..=4.0).contains(&args.noise) {
+        return Err(Failure::input(format!("--noise {} is not in 0..=4", args.noise)));
     }
     let pooling = Pooling::new(args.pool).ok_or_else(|| Failure::input(format!("--pool {} is none of 1, 2, 4, 8, 16", args.pool)))?;
     if !(0.0..100.0).contains(&args.decay) {
@@ -177,7 +175,10 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("--soil-prior is for models that read a soil off the map; {} does not", args.model)));
     }
     let start = args.from.as_deref().map(|dir| start_of(dir, variant, args.data.dt)).transpose()?;
-    own_threads()?;
+    // Each thread of `--threads` works on its own share of a batch, so candle's own element-wise threads would only get in their way (0.67 s against 0.42 s per
+    // step, measured), and without a set number candle reads the processor list at every matrix product. What a step gives back the next one takes again.
+    let threads = std::thread::available_parallelism().map_or(1, |n| n.get()).to_string();
+    restart_with(&[("CANDLE_NUM_THREADS", "1"), ("RAYON_NUM_THREADS", &threads), (PURGE_DELAY, "-1")])?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
     if let (Some(bundle), given) = (&start, drives.root.vehicle()) {
         let own = &bundle.vehicle;
@@ -200,6 +201,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         encoder_batch: 64,
         encoder_rate: args.encoder_lr,
         mirror: !args.no_mirror,
+        views: args.views,
         pooling,
         plan: TrainingPlan {
             steps: args.epochs * args.batches,
@@ -210,12 +212,14 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             epoch: args.batches,
             shards: args.threads,
             dropout: args.dropout,
+            noise: args.noise,
             decay: args.decay,
             objective: Objective { variant, sustained: args.sustained, soil_prior: args.soil_prior },
             folder: out.join("checkpoint"),
         },
         start,
         recalibrate: args.recalibrate,
+        smooth_borders: args.borders.as_ref().map(|borders| borders == "smooth"),
         out: out.clone(),
         resume: args.resume,
         command: command_line(),
