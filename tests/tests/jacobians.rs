@@ -153,8 +153,8 @@ fn property_the_linearised_states_are_those_of_the_fast_path_to_rounding() {
 #[test]
 fn analytic_holding_the_terrain_leaves_out_a_small_part_of_the_response() {
     let recorded = recorded();
-    // The speed control takes most of a change of speed back, so the ground's part of what remains is large; smooth borders between colours, which change
-    // a token wherever the vehicle moves and not at the borders alone, make it larger (0.82 beside 0.63 with hard ones).
+    // The speed control takes most of a change of speed back, so the ground's part of what remains is large: 0.82 with smooth borders between colours, 0.63
+    // with hard ones.
     for (c, name, step, largest) in [(0, "x", 0.05, 0.5), (1, "y", 0.05, 0.5), (5, "yaw", 0.0087, 0.5), (6, "v_x", 0.1, 0.9)] {
         let (mut missed, mut size) = (0.0, 0.0);
         for i in [40, 60, 80, 101, 120] {

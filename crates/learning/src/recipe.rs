@@ -122,6 +122,8 @@ pub fn run(
                 weights.insert(name, &array.shape, array.values.clone());
             }
         }
+    }
+    if recipe.plan.steps > 0 && drives.iter().any(|d| d.map.is_some()) {
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
@@ -200,11 +202,8 @@ fn prepare_projection(weights: &mut Weights, pooling: &Pooling, variant: Variant
 
 /// Seconds that the optimiser's steps took, over all the runs that a resumed training was made of.
 fn optimisation_s(curve: &[EpochReport]) -> f64 {
-    // From 0, as the sum of nothing is -0.
-    curve
-        .iter()
-        .scan(0, |before, line| Some((line.step - std::mem::replace(before, line.step)) as f64 * line.step_s))
-        .fold(0.0, |sum, s| sum + s)
+    // The sum of nothing is -0.
+    0.0 + curve.iter().scan(0, |before, line| Some((line.step - std::mem::replace(before, line.step)) as f64 * line.step_s)).sum::<f64>()
 }
 
 /// One line of the loss curve for people.

@@ -15,6 +15,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use clap::{Args, Subcommand};
+use nesam_client::{measurement, v1};
 use nesam_evaluation::{Pose, Truth, absolute_error, all_windows, history_steps, horizontal_distance, roll_out};
 use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, ModelBundle, Predictor, Rollout, RolloutQuery, Variant};
 use nesam_physics::{Control, SoilCorrection};
@@ -93,6 +94,8 @@ struct PredictBench {
 const NOISE_MEMORY: f32 = 0.8;
 /// Standard deviation of the noise: speed, m/s, and share of the second command's range.
 const NOISE_SD: [f32; 2] = [0.5, 0.3];
+/// Measurements of a bench's vehicle before its first query.
+const DRIVEN: i64 = 40;
 /// Windows on which the cached terrain is held against the exact one.
 const CHECKED_WINDOWS: usize = 24;
 
@@ -313,6 +316,12 @@ fn processor_time_ms() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/stat").ok()?;
     // Fields after the name in parentheses; user time is the fourteenth of all.
     text.rsplit_once(')')?.1.split_whitespace().nth(11)?.parse::<f64>().ok().map(|ticks| ticks * TICK_MS)
+}
+
+/// A measurement of a vehicle that drives straight on.
+fn straight_on(session: &str, i: i64) -> v1::Measurement {
+    let state = [0.2 * i as f64, 0.0, 0.6, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0];
+    v1::Measurement { sequence: i as u64 + 1, ..measurement(session, i * 100_000_000, state, [2.0, 0.0]) }
 }
 
 /// Value below which a share of the values lies, by rank.

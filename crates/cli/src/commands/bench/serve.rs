@@ -5,14 +5,14 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use clap::Args;
-use nesam_client::{Candidates, Client, ClientError, measurement, outcome_label, v1};
+use nesam_client::{Candidates, Client, ClientError, outcome_label, v1};
 use nesam_server::Config;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::{Value, json};
 use tokio::time::{sleep_until, timeout};
 
-use super::percentile;
+use super::{DRIVEN, percentile, straight_on};
 use crate::args::BundleArgs;
 use crate::commands::serve::start;
 use crate::failure::{Failure, OrFail};
@@ -58,8 +58,6 @@ pub(super) struct ServeBench {
 
 /// Askers that measure the capacity.
 const ASKERS: usize = 4;
-/// Measurements before the first query.
-const DRIVEN: i64 = 40;
 
 /// What became of the queries of one load.
 #[derive(Debug, Default)]
@@ -95,7 +93,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
         let mut client = Client::connect(&address).await.or_failed()?;
         let name = name(vehicle);
         client.open_session(v1::OpenSessionRequest { vehicle_id: name.clone(), ..Default::default() }).await.or_failed()?;
-        client.feed((0..DRIVEN).map(|i| step(&name, i)).collect()).await.or_failed()?;
+        client.feed((0..DRIVEN).map(|i| straight_on(&name, i)).collect()).await.or_failed()?;
         clients.push(client);
     }
     let capacity_hz = capacity(args, &clients).await?;
@@ -141,12 +139,6 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
 
 fn name(vehicle: usize) -> String {
     format!("vehicle-{vehicle}")
-}
-
-/// A measurement of a vehicle that drives straight on.
-fn step(session: &str, i: i64) -> v1::Measurement {
-    let state = [0.2 * i as f64, 0.0, 0.6, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-    v1::Measurement { sequence: i as u64 + 1, ..measurement(session, i * 100_000_000, state, [2.0, 0.0]) }
 }
 
 fn question(args: &ServeBench, vehicle: usize) -> Candidates {
@@ -234,7 +226,7 @@ async fn report(mut client: Client, session: String, seconds: f64, tally: Arc<Mu
     for i in 0..(10.0 * seconds) as i64 {
         sleep_until(begin + Duration::from_millis(100 * i as u64)).await;
         let sent = Instant::now();
-        let Ok(answer) = stream.exchange(step(&copy, DRIVEN + i)).await else { return };
+        let Ok(answer) = stream.exchange(straight_on(&copy, DRIVEN + i)).await else { return };
         let Ok(mut tally) = tally.lock() else { return };
         tally.measured_ms.push(sent.elapsed().as_secs_f64() * 1e3);
         tally.measurements_refused += usize::from(outcome_label(&answer) == "REJECTED");

@@ -5,11 +5,11 @@ use std::time::Instant;
 
 use clap::Args;
 use nesam_client::zenoh_vehicle::ZenohVehicle;
-use nesam_client::{Candidates, Client, ClientError, Prediction, measurement, v1};
+use nesam_client::{Candidates, Client, ClientError, Prediction, v1};
 use nesam_server::Config;
 use serde_json::{Value, json};
 
-use super::percentile;
+use super::{DRIVEN, percentile, straight_on};
 use crate::args::BundleArgs;
 use crate::commands::serve::start;
 use crate::environment::{PURGE_DELAY, restart_with};
@@ -37,8 +37,6 @@ pub(super) struct WireBench {
     json: Option<PathBuf>,
 }
 
-/// Measurements before the first query.
-const DRIVEN: i64 = 40;
 const FLEET: &str = "wire";
 const VEHICLE: &str = "planner";
 
@@ -78,7 +76,7 @@ async fn measure(args: &WireBench, bundle: nesam_model::ModelBundle) -> Result<(
     let (server, bundle) = start(config, bundle).await?;
     let mut client = Client::connect(&format!("http://{}", server.grpc_addr)).await.or_failed()?;
     client.open_session(v1::OpenSessionRequest { vehicle_id: VEHICLE.into(), ..Default::default() }).await.or_failed()?;
-    client.feed((0..DRIVEN).map(step).collect()).await.or_failed()?;
+    client.feed((0..DRIVEN).map(|i| straight_on(VEHICLE, i)).collect()).await.or_failed()?;
     let mut ways = [
         ("gRPC", Way::Grpc(client)),
         ("Zenoh, socket", Way::Zenoh(ZenohVehicle::connect_through_socket(&endpoint, FLEET, VEHICLE).await.or_failed()?)),
@@ -121,12 +119,6 @@ async fn measure(args: &WireBench, bundle: nesam_model::ModelBundle) -> Result<(
         "reply_bytes": reply_bytes, "ways": rows, "command": command_line(), "bundle": bundle.name, "bundle_hash": bundle.hash,
     });
     write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
-}
-
-/// A measurement of a vehicle that drives straight on.
-fn step(i: i64) -> v1::Measurement {
-    let state = [0.2 * i as f64, 0.0, 0.6, 0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-    v1::Measurement { sequence: i as u64 + 1, ..measurement(VEHICLE, i * 100_000_000, state, [2.0, 0.0]) }
 }
 
 fn question(args: &WireBench) -> Candidates {
