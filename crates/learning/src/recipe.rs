@@ -116,14 +116,13 @@ pub fn run(
         scales.residual_scale = sd;
         weights.insert("residual.bias", &[STATE_DIM], mean.iter().zip(sd).map(|(m, s)| m / s).collect());
     }
-    if drives.iter().any(|d| d.map.is_some()) {
-        if recipe.start.is_none() {
-            for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
-                weights.insert(name, &array.shape, array.values.clone());
-            }
+    let mapped = drives.iter().any(|d| d.map.is_some());
+    if mapped && recipe.start.is_none() {
+        for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
+            weights.insert(name, &array.shape, array.values.clone());
         }
     }
-    if recipe.plan.steps > 0 && drives.iter().any(|d| d.map.is_some()) {
+    if mapped && recipe.plan.steps > 0 {
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
