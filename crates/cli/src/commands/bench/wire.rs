@@ -57,8 +57,16 @@ impl Way {
 
 /// Runs the command.
 pub(super) fn run(args: &WireBench) -> Result<(), Failure> {
-    if args.samples == 0 || args.horizon == 0 || args.queries == 0 {
-        return Err(Failure::input("all options must be positive"));
+    let limits = Config::ephemeral().limits;
+    let (samples, horizon) = (1..=limits.samples_max, 1..=limits.horizon_max);
+    if !samples.contains(&args.samples) || !horizon.contains(&args.horizon) || args.samples * args.horizon > limits.sample_steps_max {
+        let most = limits.sample_steps_max;
+        return Err(Failure::input(format!(
+            "--samples is in {samples:?}, --horizon in {horizon:?}, and both together give at most {most} steps"
+        )));
+    }
+    if args.queries == 0 {
+        return Err(Failure::input("--queries must be at least 1"));
     }
     restart_with(&[(PURGE_DELAY, "1000")])?; // as `nesam serve`
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
