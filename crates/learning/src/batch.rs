@@ -6,57 +6,45 @@ use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
 use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, HIDDEN};
 use nesam_model::reference::{Network, PredictedStep, Row, TerrainProvider};
-use nesam_model::{GroundSource, HISTORY, HistoryStep, Normalization, Variant, history_actuators};
+use nesam_model::{GroundSource, Normalization, Variant, history_actuators};
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use crate::class_soil::ClassSoil;
 use crate::drives::{Drive, Place};
 use crate::pooling::Pooling;
-use crate::variation::Variation;
 
 /// Samples past the window in which a fast prediction may find its place.
 const AHEAD: usize = 8;
 
-/// A window: drive and start sample, and how they are seen.
-#[derive(Clone, Debug)]
+/// A window: drive, start sample, horizon and history.
+#[derive(Clone, Copy, Debug)]
 pub struct Window<'a> {
     /// Drive.
     pub drive: &'a Drive,
-    /// Start sample i; prediction starts from the state that is seen there.
+    /// Start sample i; prediction starts from its measured state.
     pub start: usize,
-    /// States of the samples up to the start, at most as many as the model remembers; the last is the start.
-    seen: Vec<VehicleState<f64>>,
-    variation: Option<Variation>,
+    /// Terrain features left out of the whole window, so that no drive is recognised by a few of them; `None` = all stay.
+    pub dropout: Option<Dropout>,
 }
 
-impl<'a> Window<'a> {
-    /// A window as it was measured.
-    pub fn new(drive: &'a Drive, start: usize) -> Self {
-        let seen = drive.states[start.saturating_sub(HISTORY - 1)..=start].to_vec();
-        Self { drive, start, seen, variation: None }
-    }
+/// Features that a window is trained without (Srivastava et al. 2014).
+#[derive(Clone, Copy, Debug)]
+pub struct Dropout {
+    /// Share left out, 0..1.
+    pub share: f32,
+    /// Seed of the choice.
+    pub seed: u64,
+}
 
-    /// The same seen otherwise, by sensors whose noise is `noise_sd`.
-    pub fn varied(self, variation: Variation, noise_sd: &[f64; STATE_DIM]) -> Self {
-        Self { seen: variation.measured_again(&self.seen, noise_sd), variation: Some(variation), ..self }
-    }
-
-    /// The last `steps` steps before the start.
-    fn history(&self, steps: usize) -> Vec<HistoryStep> {
-        let (states, controls) = (&self.seen[self.seen.len() - 1 - steps..], &self.drive.controls[self.start - steps..]);
-        states[..steps].iter().zip(controls).map(|(state, control)| HistoryStep { state: *state, control: *control }).collect()
-    }
-
-    /// State at the start.
-    fn start_state(&self) -> VehicleState<f64> {
-        *self.seen.last().expect("a window sees its start; this is a bug")
-    }
-
-    /// View of each sample from `first` to `last`.
-    fn views(&self, first: usize, last: usize) -> Vec<usize> {
-        let samples = last + 1 - first;
-        self.variation.map_or_else(|| vec![0; samples], |variation| variation.views(samples, self.drive.views()))
+impl Dropout {
+    /// Factor of each of `n` features: 0, or what keeps the mean.
+    fn factors(&self, n: usize) -> Vec<f32> {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        let kept = 1.0 / (1.0 - self.share);
+        (0..n).map(|_| if rng.random::<f32>() < self.share { 0.0 } else { kept }).collect()
     }
 }
 
@@ -73,13 +61,13 @@ pub struct Sight<'a> {
 
 impl Sight<'_> {
     /// Factor of each pooled feature in a window; `None` = one for all.
-    fn factors(&self, variation: Option<Variation>) -> Option<Vec<f32>> {
-        let (unseen, width) = (self.variant.unseen(), self.pooling.width());
-        let left_out = variation.and_then(|variation| variation.factors(width));
-        if left_out.is_none() && unseen.is_empty() {
+    fn factors(&self, dropout: Option<Dropout>) -> Option<Vec<f32>> {
+        let unseen = self.variant.unseen();
+        if dropout.is_none() && unseen.is_empty() {
             return None;
         }
-        let mut factors = left_out.unwrap_or_else(|| vec![1.0; width]);
+        let width = self.pooling.width();
+        let mut factors = dropout.map_or_else(|| vec![1.0; width], |dropout| dropout.factors(width));
         factors[unseen.start * width / CONTEXT..unseen.end * width / CONTEXT].fill(0.0);
         Some(factors)
     }
@@ -107,12 +95,14 @@ pub fn rows<'a>(windows: &[Window<'a>], history: usize, horizon: usize, model: &
     windows
         .iter()
         .map(|w| {
-            let (drive, i, start) = (w.drive, w.start, w.start_state());
+            let (drive, i) = (w.drive, w.start);
+            let steps = drive.history(i - history, i);
+            let start = drive.states[i];
             // Actuators remember longer than the tokens: use all the commands there are, up to the model's full history.
-            let actuator_steps = w.history(w.seen.len() - 1);
+            let actuator_steps = drive.history(i.saturating_sub(nesam_model::HISTORY - 1), i);
             Row {
                 actuators: history_actuators(model, &actuator_steps, &start, &drive.controls[i], dt_s),
-                history: w.history(history),
+                history: steps,
                 start,
                 controls: drive.controls[i..i + horizon].to_vec(),
                 ground: GroundSource::new(drive.map.as_deref(), model, &start),
@@ -125,7 +115,7 @@ pub fn rows<'a>(windows: &[Window<'a>], history: usize, horizon: usize, model: &
 pub fn targets(windows: &[Window<'_>], k: usize) -> Result<Tensor> {
     let mut values = Vec::with_capacity(windows.len() * STATE_DIM);
     for w in windows {
-        let start = w.start_state().to_array();
+        let start = w.drive.states[w.start].to_array();
         let mut x = w.drive.states[w.start + k + 1].to_array();
         for i in 0..3 {
             x[i] -= start[i];
@@ -196,19 +186,17 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
             for w in windows {
                 first_row.push((context.len() / width) as u32);
                 let new_at = [context.len(), past.len()];
-                let first = w.start - history;
-                for (i, view) in (first..).zip(w.views(first, w.last(horizon))) {
-                    if i < w.start {
-                        w.drive.push_context(i, view, &mut past);
-                        continue;
-                    }
-                    w.drive.push_context(i, view, &mut context);
+                for i in w.start..=w.last(horizon) {
+                    w.drive.push_context(i, &mut context);
                     if variant.has_soil() {
-                        w.drive.push_semantic(i, view, &mut semantic);
+                        w.drive.push_semantic(i, &mut semantic);
                     }
                 }
+                for i in w.start - history..w.start {
+                    w.drive.push_context(i, &mut past);
+                }
                 let rows = context[new_at[0]..].chunks_exact_mut(width).chain(past[new_at[1]..].chunks_exact_mut(width));
-                if let Some(factors) = sight.factors(w.variation) {
+                if let Some(factors) = sight.factors(w.dropout) {
                     rows.for_each(|row| row.iter_mut().zip(&factors).for_each(|(value, factor)| *value *= factor));
                 }
             }

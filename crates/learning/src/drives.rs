@@ -13,9 +13,6 @@ use nesam_model::dims::{CONTEXT, FEATURES};
 use nesam_model::encoder::{EncoderScratch, TerrainEncoders};
 use nesam_physics::{Control, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::{Patch, PatchScale, Pose2, WorldMap, sample_patch};
-use rand::{RngExt, SeedableRng};
-use rand_chacha::ChaCha8Rng;
-use rand_distr::StandardNormal;
 use rayon::prelude::*;
 
 use crate::class_soil::ClassSoil;
@@ -37,42 +34,11 @@ pub struct Drive {
     pub controls: Vec<Control<f64>>,
     /// Measured wheel speeds FL, FR, RL, RR, rad/s, where they are known: for calibration only, no input of the model.
     pub wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,
-    /// Features seen from each pose, and from poses near it; empty until encoded.
-    views: Vec<View>,
-}
-
-/// Features of all samples of a drive, seen from its poses or from near them.
-#[derive(Clone, Debug)]
-struct View {
-    /// Pooled contexts (samples, width of the pooling).
+    /// Pooled contexts (samples, width of the pooling), empty until encoded.
     contexts: Vec<f16>,
     /// Semantic features (samples, 16, 16, 18), for the soil prior; empty where contexts are not pooled, whose second half they are.
     semantics: Vec<f16>,
 }
-
-impl View {
-    /// Contexts, and semantic features where they are needed beside them, of `samples` samples.
-    fn new(samples: usize, pooling: &Pooling) -> Self {
-        let apart = if pooling.width() == CONTEXT { 0 } else { FEATURES };
-        Self { contexts: vec![f16::ZERO; samples * pooling.width()], semantics: vec![f16::ZERO; samples * apart] }
-    }
-
-    /// Stores the context of sample `i`.
-    fn set(&mut self, i: usize, context: &[f32], pooling: &Pooling) {
-        let width = pooling.width();
-        let pooled = &mut self.contexts[i * width..(i + 1) * width];
-        if self.semantics.is_empty() {
-            pooled.convert_from_f32_slice(context);
-        } else {
-            pooled.convert_from_f32_slice(&pooling.mean(context));
-            self.semantics[i * FEATURES..(i + 1) * FEATURES].convert_from_f32_slice(&context[FEATURES..]);
-        }
-    }
-}
-
-/// How far beside a driven pose the further views of it stand: standard deviation along, across (m) and of heading (rad). Chosen: about as far as a
-/// prediction is off after some seconds.
-const BESIDE: [f64; 3] = [0.2, 0.2, 0.04];
 
 /// A place on the driven path: share `1 - share` of sample `at`, `share` of the next one.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -86,7 +52,7 @@ pub struct Place {
 impl Drive {
     /// A drive without features yet.
     pub fn new(id: String, map: Option<Arc<WorldMap>>, states: Vec<VehicleState<f64>>, controls: Vec<Control<f64>>) -> Self {
-        Self { id, map, states, controls, wheel_speed_rad_s: None, views: Vec::new() }
+        Self { id, map, states, controls, wheel_speed_rad_s: None, contexts: Vec::new(), semantics: Vec::new() }
     }
 
     /// The drive seen in a mirror (y becomes -y) over the mirrored `map`: for a vehicle whose two sides are alike, another true drive.
@@ -124,29 +90,27 @@ impl Drive {
 
     /// Whether contexts exist (a map, and `encode_drives` was called).
     pub fn has_features(&self) -> bool {
-        !self.views.is_empty()
+        !self.contexts.is_empty()
     }
 
-    /// Views of each sample; the first is that from the driven pose itself.
-    pub fn views(&self) -> usize {
-        self.views.len()
+    /// Appends the pooled context of sample `i` to `out`.
+    pub fn push_context(&self, i: usize, out: &mut Vec<f32>) {
+        push(self.context(i), out);
     }
 
-    /// Appends the pooled context of sample `i` in `view` to `out`.
-    pub fn push_context(&self, i: usize, view: usize, out: &mut Vec<f32>) {
-        let contexts = &self.views[view].contexts;
-        let width = contexts.len() / self.states.len();
-        push(&contexts[i * width..(i + 1) * width], out);
-    }
-
-    /// Appends the semantic features of sample `i` in `view`, (16, 16, 18), to `out`.
-    pub fn push_semantic(&self, i: usize, view: usize, out: &mut Vec<f32>) {
-        let View { contexts, semantics } = &self.views[view];
-        if semantics.is_empty() {
-            push(&contexts[i * CONTEXT + FEATURES..(i + 1) * CONTEXT], out);
+    /// Appends the semantic features of sample `i`, (16, 16, 18), to `out`.
+    pub fn push_semantic(&self, i: usize, out: &mut Vec<f32>) {
+        if self.semantics.is_empty() {
+            push(&self.context(i)[FEATURES..], out);
         } else {
-            push(&semantics[i * FEATURES..(i + 1) * FEATURES], out);
+            push(&self.semantics[i * FEATURES..(i + 1) * FEATURES], out);
         }
+    }
+
+    /// Pooled context of sample `i`.
+    fn context(&self, i: usize) -> &[f16] {
+        let width = self.contexts.len() / self.states.len();
+        &self.contexts[i * width..(i + 1) * width]
     }
 
     /// Where on the path, among samples `first ..= last`, a predicted state is nearest.
@@ -180,41 +144,29 @@ fn push(values: &[f16], out: &mut Vec<f32>) {
     values.convert_to_f32_slice(&mut out[at..]);
 }
 
-/// A pose near `pose`, drawn by [`BESIDE`].
-fn beside(pose: Pose2, rng: &mut ChaCha8Rng) -> Pose2 {
-    let [along, across, turn] = BESIDE.map(|deviation| deviation * rng.sample::<f64, _>(StandardNormal));
-    let (sin, cos) = pose.yaw_rad.sin_cos();
-    Pose2 { x_m: pose.x_m + along * cos - across * sin, y_m: pose.y_m + along * sin + across * cos, yaw_rad: pose.yaw_rad + turn }
-}
-
-/// Computes the contexts of all drives with a map, in parallel: of drive `i` in `views(i)` views. `progress(done)` counts samples.
+/// Computes the contexts of all drives with a map, in parallel; `progress(done)` counts samples.
 pub fn encode_drives(
     drives: &mut [Drive],
     encoders: &TerrainEncoders,
     scale: &PatchScale,
     pooling: &Pooling,
-    views: impl Fn(usize) -> usize + Sync,
     progress: impl Fn(usize) + Sync,
 ) {
-    drives.par_iter_mut().enumerate().for_each_init(
+    drives.par_iter_mut().for_each_init(
         || (Patch::new(), EncoderScratch::default(), vec![0f32; CONTEXT]),
-        |(patch, scratch, context), (at, drive)| {
+        |(patch, scratch, context), drive| {
             let Some(map) = drive.map.clone() else { return };
             let samples = drive.states.len();
-            let mut rng = ChaCha8Rng::seed_from_u64(at as u64);
-            drive.views = (0..views(at))
-                .map(|index| {
-                    let mut view = View::new(samples, pooling);
-                    for i in 0..samples {
-                        let driven = drive.pose(i);
-                        let pose = if index == 0 { driven } else { beside(driven, &mut rng) };
-                        sample_patch(&map, pose, scale, patch);
-                        encoders.encode(patch, scratch, context);
-                        view.set(i, context, pooling);
-                    }
-                    view
-                })
-                .collect();
+            // Contexts that are not pooled hold the semantic features already.
+            let apart = if pooling.width() == CONTEXT { 0 } else { FEATURES };
+            let (mut contexts, mut semantics) = (vec![f16::ZERO; samples * pooling.width()], vec![f16::ZERO; samples * apart]);
+            for (i, pooled) in contexts.chunks_exact_mut(pooling.width()).enumerate() {
+                sample_patch(&map, drive.pose(i), scale, patch);
+                encoders.encode(patch, scratch, context);
+                pooled.convert_from_f32_slice(&pooling.mean(context));
+                semantics[i * apart..(i + 1) * apart].convert_from_f32_slice(&context[CONTEXT - apart..]);
+            }
+            (drive.contexts, drive.semantics) = (contexts, semantics);
             progress(samples);
         },
     );

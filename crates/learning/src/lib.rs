@@ -18,7 +18,6 @@ pub mod rims;
 pub mod scales;
 pub mod schedule;
 pub mod trainer;
-pub mod variation;
 
 pub use drives::{Drive, encode_drives};
 pub use pooling::Pooling;

@@ -22,7 +22,6 @@ use crate::initial::initial_weights;
 use crate::pooling::Pooling;
 use crate::scales::{measure, measure_increments};
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
-use crate::variation::sensor_noise;
 
 /// What a run is told; the defaults of the command line are in `nesam train --help`.
 #[derive(Clone, Debug)]
@@ -39,8 +38,6 @@ pub struct Recipe {
     pub encoder_rate: f64,
     /// Trains on the mirror image of each drive too; for vehicles whose two sides are alike.
     pub mirror: bool,
-    /// Views of the terrain from each pose of a training drive: its own, and from poses near it.
-    pub views: usize,
     /// Cells that share a weight of the terrain projection.
     pub pooling: Pooling,
     /// Training plan; its folder is `out/checkpoint`.
@@ -99,7 +96,6 @@ pub fn run(
         Some(bundle) => (bundle.vehicle.clone(), bundle.normalization.clone()),
         None => fitted(),
     };
-
     scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);
 
     if recipe.mirror {
@@ -126,16 +122,13 @@ pub fn run(
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
-        let views = |drive: usize| if validation_at.contains(&drive) { 1 } else { recipe.views };
-        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), &recipe.pooling, views, |n| {
+        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), &recipe.pooling, |n| {
             reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
         });
     }
 
-    let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
     let set = TrainingSet {
-        noise_sd: sensor_noise(&training),
-        train: training,
+        train: train_at.iter().map(|&i| &drives[i]).collect(),
         validation: if validation_at.is_empty() { &train_at } else { &validation_at }.iter().map(|&i| &drives[i]).collect(),
         scales: &scales,
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),

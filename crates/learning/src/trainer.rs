@@ -8,17 +8,15 @@ use std::time::Instant;
 use candle_core::{DType, Device, Result, Tensor};
 use nesam_model::reference::{Network, ReferenceRollout};
 use nesam_model::{HISTORY, ModelError, Normalization, Variant, Weights};
-use nesam_physics::STATE_DIM;
 use nesam_physics::step::StepModel;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use crate::adam::Adam;
-use crate::batch::{PathTerrain, Sight, Window, absolute_errors, rows, state_loss, sustained_residual, targets};
+use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, sustained_residual, targets};
 use crate::drives::Drive;
 use crate::pooling::Pooling;
 use crate::schedule::{cosine, curriculum};
-use crate::variation::Variation;
 
 /// What a training run was told.
 #[derive(Clone, Debug)]
@@ -39,8 +37,6 @@ pub struct TrainingPlan {
     pub shards: usize,
     /// Share of the terrain features that each window is trained without.
     pub dropout: f32,
-    /// Noise added to start and history of each window, as a share of what the sensors have.
-    pub noise: f64,
     /// Decoupled decay of the weight matrices per unit of learning rate (Loshchilov & Hutter 2019).
     pub decay: f32,
     /// What is trained, towards what.
@@ -126,8 +122,6 @@ pub struct TrainingSet<'a> {
     pub model: Arc<StepModel>,
     /// Sharing of W_c; its weights are equal within blocks from the start.
     pub pooling: Pooling,
-    /// Noise of the sensors (`variation::sensor_noise`).
-    pub noise_sd: [f64; STATE_DIM],
 }
 
 impl TrainingSet<'_> {
@@ -185,7 +179,7 @@ impl TrainingSet<'_> {
             .iter()
             .flat_map(|drive| {
                 let first = (HISTORY - 1).min(drive.states.len().saturating_sub(horizon + 1));
-                (first..drive.states.len().saturating_sub(horizon)).step_by(40).map(move |start| Window::new(drive, start))
+                (first..drive.states.len().saturating_sub(horizon)).step_by(40).map(move |start| Window { drive, start, dropout: None })
             })
             .collect();
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
@@ -259,8 +253,8 @@ pub fn train(
         let mut windows: Vec<Window<'_>> = Vec::with_capacity(plan.batch);
         for _ in 0..plan.batch {
             let (drive, start) = starts[rng.random_range(0..starts.len())];
-            let variation = Variation { left_out: plan.dropout, noise: plan.noise, seed: rng.random() };
-            windows.push(Window::new(drive, start).varied(variation, &set.noise_sd));
+            let dropout = (plan.dropout > 0.0).then(|| Dropout { share: plan.dropout, seed: rng.random() });
+            windows.push(Window { drive, start, dropout });
         }
         let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
         let history = steps_needed(plan.objective.variant, draw_history(&mut rng, available));

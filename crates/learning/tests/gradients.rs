@@ -12,7 +12,6 @@ use nesam_learning::initial::initial_weights;
 use nesam_learning::{Drive, Objective, TrainingSet};
 use nesam_model::Variant;
 use nesam_model::reference::Network;
-use nesam_physics::STATE_DIM;
 use nesam_physics::step::StepModel;
 use nesam_terrain::SoilClassRange;
 
@@ -30,10 +29,9 @@ fn check(mut made: Drive, entries: &[(&str, usize)], soil_prior: f64, tolerance:
     let mut vehicle = truck();
     vehicle.driveline.speed_integral_gain_per_s = 0.0;
     let model = Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps));
-    let set =
-        TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model, pooling: single_cells(), noise_sd: [0.0; STATE_DIM] };
+    let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model, pooling: single_cells() };
     let network = Network::from_weights(&weights).expect("all arrays are there");
-    let windows = [12, 30].map(|start| Window::new(&made, start));
+    let windows = [12, 30].map(|start| Window { drive: &made, start, dropout: None });
     let objective = Objective { variant: Variant::Full, sustained: 0.0, soil_prior };
     let gradients = || set.gradients(&network, &windows, 8, 6, objective).expect("the loss is differentiable");
     let (_, backward) = gradients();

@@ -55,13 +55,6 @@ pub struct TrainArgs {
     /// Share of the terrain features that each window is trained without
     #[arg(long, value_name = "SHARE", default_value_t = 0.1)]
     dropout: f32,
-    /// Views of the terrain from each driven pose: its own, and from drawn poses up to some decimetres beside it; each holds 2.6 GB of memory for 600
-    /// drives of 25 s
-    #[arg(long, default_value_t = 1)]
-    views: usize,
-    /// Noise added to start and history of each window, as a share of what the sensors have (read off the drives)
-    #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
-    noise: f64,
     /// Cells of the 16 × 16 terrain features, per side, that share one weight: 1, 2, 4, 8 or 16; more of them learn fewer places by heart
     #[arg(long, value_name = "CELLS", default_value_t = 1)]
     pool: usize,
@@ -153,12 +146,6 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if !(0.0..0.9).contains(&args.dropout) {
         return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
     }
-    if !(1..=8).contains(&args.views) {
-        return Err(Failure::input(format!("--views {} is not in 1..=8", args.views)));
-    }
-    if !(0.0..=4.0).contains(&args.noise) {
-        return Err(Failure::input(format!("--noise {} is not in 0..=4", args.noise)));
-    }
     let pooling = Pooling::new(args.pool).ok_or_else(|| Failure::input(format!("--pool {} is none of 1, 2, 4, 8, 16", args.pool)))?;
     if !(0.0..100.0).contains(&args.decay) {
         return Err(Failure::input(format!("--decay {} is not in 0..100", args.decay)));
@@ -201,7 +188,6 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         encoder_batch: 64,
         encoder_rate: args.encoder_lr,
         mirror: !args.no_mirror,
-        views: args.views,
         pooling,
         plan: TrainingPlan {
             steps: args.epochs * args.batches,
@@ -212,7 +198,6 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             epoch: args.batches,
             shards: args.threads,
             dropout: args.dropout,
-            noise: args.noise,
             decay: args.decay,
             objective: Objective { variant, sustained: args.sustained, soil_prior: args.soil_prior },
             folder: out.join("checkpoint"),
