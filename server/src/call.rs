@@ -8,8 +8,8 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use nesam_engine::{
-    Answer, AppliedEffects, Command, EngineError, EngineHandle, FleetCell, MeasureAnswer, OpenSession, PredictQuery, Prediction, Reply,
-    SessionImage, SessionView, Submission,
+    Answer, AppliedEffects, Command, EngineError, EngineHandle, FleetCell, FleetShare, MeasureAnswer, OpenSession, PredictQuery,
+    Prediction, Reply, SessionImage, SessionView, Submission,
 };
 use nesam_terrain::WorldMap;
 use tokio::sync::oneshot;
@@ -158,6 +158,14 @@ impl EngineClient {
         match self.call(Command::FleetSoil { map: map.into() }, budget).await?.0 {
             Reply::FleetSoil(cell_m, cells) => Ok((cell_m, cells)),
             _ => Err(mismatch("fleet_soil")),
+        }
+    }
+
+    /// What was brought to the soil map of the fleet here and elsewhere: edge of a cell in m, and the shares of the servers.
+    pub async fn fleet_shares(&self, budget: Duration) -> Result<(f64, Vec<FleetShare>), EngineError> {
+        match self.call(Command::TellFleetSoil, budget).await?.0 {
+            Reply::FleetShares(cell_m, shares) => Ok((cell_m, shares)),
+            _ => Err(mismatch("tell_fleet_soil")),
         }
     }
 

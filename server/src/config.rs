@@ -149,6 +149,8 @@ pub struct FleetSoilConfig {
     pub process_share: f64,
     /// Cells held at most.
     pub cells_max: usize,
+    /// Pause after which a server asks the others of the Zenoh network for all that was brought to them, s; 0 = servers do not share their maps.
+    pub exchange_s: f64,
 }
 
 /// Recording of everything that the engine does, for `nesam replay`.
@@ -265,6 +267,7 @@ impl Default for FleetSoilConfig {
             colour_reach: s.colour_reach,
             process_share: s.process_share,
             cells_max: s.cells_max,
+            exchange_s: 30.0,
         }
     }
 }
@@ -467,6 +470,10 @@ impl Config {
             return Err(ServerError::Value { key: "zenoh", reason });
         }
         self.check_side_doors()?;
+        if !(self.fleet_soil.exchange_s >= 0.0 && self.fleet_soil.exchange_s <= 1e6) {
+            let reason = format!("is {}, allowed is 0 (off) up to 1e6 s", self.fleet_soil.exchange_s);
+            return Err(ServerError::Value { key: "fleet_soil.exchange_s", reason });
+        }
         FleetSoilSettings::from(&self.fleet_soil)
             .check()
             .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
@@ -543,6 +550,7 @@ mod tests {
             ("[zenoh]\nname = \"a/b\"\n", "zenoh.name"),
             ("[limits]\nreorder_window_s = 1.5\n", "limits.reorder_window_s"),
             ("[fleet_soil]\nreach_m = -1.0\n", "reach_m"),
+            ("[fleet_soil]\nexchange_s = -1.0\n", "fleet_soil.exchange_s"),
             ("[zenoh]\nmode = \"king\"\n", "king"),
             ("[workers]\nthreads = 5000\n", "workers.threads"),
             ("[grpc]\ndeadline_s = -1.0\n", "grpc.deadline_s"),

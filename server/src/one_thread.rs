@@ -47,7 +47,7 @@ where
     let sink = event_sink(events.clone(), metrics.clone(), Some(keeper.clone()), access.directory.clone(), live.feed);
     let handle = EngineHandle::unthreaded(engine_of(&config, &predictor, sink)?, Arc::new(MonotonicClock::default()), None);
     let failed = |source| ServerError::Store { source };
-    let restored = restore(&store.load().map_err(failed)?, &handle).map_err(failed)?;
+    let restored = restore(&store.load().map_err(failed)?, &handle, keeper.soil_of()).map_err(failed)?;
     tokio::spawn(keeper.clone().keep(store, handle.clone(), restored));
     // Nobody says that it stops: it ends with its connections.
     let (_stop, stopping) = watch::channel(false);

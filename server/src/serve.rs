@@ -17,15 +17,16 @@ use tonic_health::server::HealthReporter;
 
 use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
-use crate::clock::MonotonicClock;
+use crate::clock::{MonotonicClock, unix_ns};
 use crate::cluster::Cluster;
 use crate::config::{Config, GrpcConfig};
+use crate::convert::service_name;
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
-use crate::store::{EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
+use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, SoilOf, StoreError, restore};
 use crate::telemetry::Metrics;
 use crate::tls_listener;
 use crate::web::{Feed, Live, Raised};
@@ -88,8 +89,9 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
 
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
     let metrics = Arc::new(Metrics::default());
-    let keeper =
-        (config.store.enabled || config.cluster.enabled()).then(|| Arc::new(Keeper::new(Duration::from_secs_f64(config.store.interval_s))));
+    // This life of the server, which those who hear from it tell from others.
+    let run = unix_ns().unsigned_abs();
+    let keeper = (config.store.enabled || config.cluster.enabled()).then(|| Arc::new(keeper_of(&config, &predictor, run)));
     let (live, passed) = Live::new(&config.http);
     let sink = event_sink(events.clone(), metrics.clone(), keeper.clone(), access.directory.clone(), live.feed.clone());
     let engine = engine_of(&config, &predictor, sink)?;
@@ -112,19 +114,22 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let edge = Edge {
         presence: config.zenoh.enabled.then(Presence::default),
+        run,
         keeper: keeper.clone(),
         cluster: cluster.clone(),
         ..Edge::alone(engine, predictor, config.grpc, access, events, stopping.clone())
     };
     let bus = match config.zenoh.enabled {
-        true => match RenewedBus::start(config.zenoh, config.tls, edge.clone(), tls.as_ref().map(Credentials::tls)).await {
-            Ok(bus) => Some(bus),
-            Err(error) => {
-                end_store(keeper, cluster).await;
-                handle.stop();
-                return Err(error);
+        true => {
+            match RenewedBus::start(config.zenoh, config.fleet_soil, config.tls, edge.clone(), tls.as_ref().map(Credentials::tls)).await {
+                Ok(bus) => Some(bus),
+                Err(error) => {
+                    end_store(keeper, cluster).await;
+                    handle.stop();
+                    return Err(error);
+                }
             }
-        },
+        }
         false => None,
     };
     let http = http_listener.map(|listener| {
@@ -163,6 +168,13 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         live,
         drain,
     })
+}
+
+/// The keeper that the configuration asks for; it keeps the soil map of the fleet where no other server does.
+fn keeper_of(config: &Config, predictor: &Predictor, run: u64) -> Keeper {
+    let keeper = Keeper::new(Duration::from_secs_f64(config.store.interval_s));
+    let of = SoilOf { service: service_name(run), bundle_hash: predictor.bundle().hash.clone() };
+    if config.fleet_soil.enabled && config.store.enabled { keeper.with_soil(of) } else { keeper }
 }
 
 /// The engine that the configuration asks for, whose events go to `sink`.
@@ -258,8 +270,11 @@ async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) {
 async fn open_folder(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle) -> Result<(), StoreError> {
     let (folder, keeper, handle) = (folder.to_path_buf(), keeper.clone(), handle.clone());
     let opened = tokio::task::spawn_blocking(move || {
-        let store = RedbStore::open(&folder)?;
-        let restored = restore(&store.load()?, &handle)?;
+        let mut store = RedbStore::open(&folder)?;
+        let restored = restore(&store.load()?, &handle, keeper.soil_of())?;
+        if !restored.faded.is_empty() {
+            store.commit(&restored.faded.iter().cloned().map(Change::RemoveSoil).collect::<Vec<_>>())?;
+        }
         tracing::info!(folder = %folder.display(), sessions = restored.accepted.len(), maps = restored.maps.len(), "store opened");
         keeper.start(Box::new(store), handle, restored)
     });

@@ -179,7 +179,7 @@ impl SessionStore for MemoryStore {
                     self.0.lock().unwrap().insert(stored.name.clone(), accepted);
                 }
                 Change::RemoveSession(name) => drop(self.0.lock().unwrap().remove(name)),
-                Change::PutMap(..) | Change::RemoveMap(_) => {}
+                Change::PutMap(..) | Change::RemoveMap(_) | Change::PutSoil(_) | Change::RemoveSoil(_) => {}
             }
         }
         Ok(Vec::new())

@@ -12,6 +12,7 @@ import numpy as np
 import nesam
 from nesam import _calls as calls
 from nesam import _messages as messages
+from nesam.v1 import sharing_pb2, soil_pb2, types_pb2
 from serving import served
 
 CORPUS = Path(__file__).resolve().parents[1] / "hostile/corpus"
@@ -47,6 +48,16 @@ def requests():
     return state, world
 
 
+def of_servers():
+    """What a server tells the others of the soil."""
+    cell = soil_pb2.FleetSoilCell(map_id="hills", colour_rgb=0x586878, column=-1, row=2, buffers=1.5, age_s=3.0)
+    cell.information.extend(np.diag([4.0, 1.0, 9.0, 1.0, 2.0, 1.0]).ravel())
+    cell.vector.CopyFrom(types_pb2.SoilVector(k_phi=0.5, k_c=0.1, n=-0.2, c_pa=0.0, phi_rad=0.1, k_shear_m=0.0))
+    share = sharing_pb2.FleetSoilShare(service="18c4f0a1b2c3d4e5", cells=[sharing_pb2.SharedSoilCell(cell=cell, votes=0.5, revision=3)])
+    told = sharing_pb2.FleetSoilShares(bundle_hash="0" * 64, cell_m=10.0, shares=[share, share])
+    keep("fleet_soil_shares", "valid.bin", told.SerializeToString())
+
+
 def of_a_server(binary, state, world):
     """An exported session and a recording."""
     folder = Path(tempfile.mkdtemp())
@@ -67,4 +78,5 @@ def of_a_server(binary, state, world):
 
 
 if __name__ == "__main__":
+    of_servers()
     of_a_server(sys.argv[1], *requests())

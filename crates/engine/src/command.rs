@@ -6,7 +6,7 @@ use std::sync::Arc;
 use nesam_model::HistoryStep;
 use nesam_terrain::WorldMap;
 
-use crate::fleet::FleetCell;
+use crate::fleet::{FleetCell, FleetShare};
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
 use crate::session::{Alarm, AppliedEffects, SessionImage, SoilEstimate};
@@ -79,6 +79,15 @@ pub enum Command {
         /// World map; empty = all.
         map: String,
     },
+    /// Reads what was brought to the soil map of the fleet here and elsewhere, to be told to other services. Answer: `Reply::FleetShares`.
+    TellFleetSoil,
+    /// Takes what another service tells. Answer: `Reply::FleetSoilHeard`.
+    HearFleetSoil {
+        /// Edge of a cell there, m: cells of another size are not taken.
+        cell_m: f64,
+        /// What was brought to it, and to others that it has heard of.
+        shares: Vec<FleetShare>,
+    },
     /// Rolls candidates out. Answer: `Reply::Predicted`.
     Predict(PredictQuery),
     /// Takes a new map or a new version. Answer: `Reply::Map`.
@@ -118,6 +127,8 @@ impl Command {
             Self::Expire => "expire",
             Self::Measure { .. } => "measure",
             Self::FleetSoil { .. } => "fleet_soil",
+            Self::TellFleetSoil => "tell_fleet_soil",
+            Self::HearFleetSoil { .. } => "hear_fleet_soil",
             Self::Predict(_) => "predict",
             Self::PutMap { .. } => "put_map",
             Self::GetMap { .. } => "get_map",
@@ -170,6 +181,10 @@ pub enum Reply {
     Measured(Box<MeasureAnswer>),
     /// Edge of a cell in m, and the cells with evidence, by map, colour and place.
     FleetSoil(f64, Vec<FleetCell>),
+    /// Edge of a cell in m, and what was brought to each service.
+    FleetShares(f64, Vec<FleetShare>),
+    /// Number of cells that were news.
+    FleetSoilHeard(usize),
     /// A prediction; shared, because a recording keeps it too.
     Predicted(Arc<Prediction>),
     /// A map.
@@ -251,8 +266,10 @@ pub enum Event {
     FleetSoilChanged {
         /// Edge of a cell, m.
         cell_m: f64,
-        /// The cell that changed.
+        /// All that is known of the cell that changed.
         cell: Box<FleetCell>,
+        /// What was brought here of it.
+        own: Box<FleetCell>,
     },
     /// A session is there: opened, copied or imported.
     SessionOpened {

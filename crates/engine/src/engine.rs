@@ -15,7 +15,7 @@ use crate::candidates::Candidates;
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
 use crate::error::EngineError;
 use crate::extras::ExtraOutputs;
-use crate::fleet::{Fleet, FleetCell};
+use crate::fleet::{Fleet, FleetCell, FleetShare};
 use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
@@ -144,6 +144,8 @@ impl Engine {
             Command::Expire => Ok(Reply::Expired(self.expire(now_ns))),
             Command::Measure { session, vehicle, measurement } => self.measure(now_ns, session, vehicle.as_deref(), measurement),
             Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
+            Command::TellFleetSoil => self.fleet().map(|fleet| Reply::FleetShares(fleet.cell_m(), fleet.shares(now_ns))),
+            Command::HearFleetSoil { cell_m, shares } => self.hear_fleet_soil(now_ns, *cell_m, shares),
             Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
@@ -330,9 +332,9 @@ impl Engine {
         let accepted = session.accepted();
         if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
             let cell_m = fleet.cell_m();
-            let changed: Vec<FleetCell> = brought.iter().filter_map(|brought| fleet.add(map, brought, now_ns)).collect();
-            for cell in changed {
-                self.emit(Event::FleetSoilChanged { cell_m, cell: Box::new(cell) });
+            let changed: Vec<[FleetCell; 2]> = brought.iter().filter_map(|brought| fleet.add(map, brought, now_ns)).collect();
+            for [cell, own] in changed {
+                self.emit(Event::FleetSoilChanged { cell_m, cell: Box::new(cell), own: Box::new(own) });
             }
         }
         if accepted != before.1 {
@@ -423,12 +425,24 @@ impl Engine {
         })
     }
 
+    fn fleet(&self) -> Result<&Fleet, EngineError> {
+        self.fleet.as_ref().ok_or_else(|| EngineError::NotReady {
+            field: "map_id".into(),
+            reason: "the service keeps no soil map of the fleet; set `fleet_soil.enabled` in its configuration".into(),
+        })
+    }
+
     fn fleet_soil(&self, now_ns: u64, map: &str) -> Result<Reply, EngineError> {
-        let Some(fleet) = &self.fleet else {
-            let reason = "the service keeps no soil map of the fleet; set `fleet_soil.enabled` in its configuration";
-            return Err(EngineError::NotReady { field: "map_id".into(), reason: reason.into() });
-        };
-        Ok(Reply::FleetSoil(fleet.cell_m(), fleet.cells(map, now_ns)))
+        self.fleet().map(|fleet| Reply::FleetSoil(fleet.cell_m(), fleet.cells(map, now_ns)))
+    }
+
+    fn hear_fleet_soil(&mut self, now_ns: u64, cell_m: f64, shares: &[FleetShare]) -> Result<Reply, EngineError> {
+        let own_m = self.fleet()?.cell_m();
+        if cell_m != own_m {
+            return Err(EngineError::invalid("cell_m", format!("cells are {cell_m} m wide, those of this service {own_m} m")));
+        }
+        let heard = self.fleet.as_mut().map_or(0, |fleet| fleet.hear(shares, now_ns));
+        Ok(Reply::FleetSoilHeard(heard))
     }
 
     fn delete_map(&mut self, id: &str) -> Result<Reply, EngineError> {

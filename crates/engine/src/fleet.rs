@@ -3,7 +3,9 @@
 use std::collections::BTreeMap;
 
 use nesam_adaptation::FilterConfig;
-use nesam_fleet_soil::{CellEvidence, CellKey, Colour, FleetPrior, FleetSoilError, FleetSoilMap, FleetSoilSettings, Increment};
+use nesam_fleet_soil::{
+    CellEvidence, CellKey, Colour, EvidenceParts, FleetPrior, FleetSoilError, FleetSoilMap, FleetSoilSettings, Increment,
+};
 use nesam_terrain::WorldMap;
 
 /// Half an edge of the square that colours are averaged over at most, cells of the world map.
@@ -28,6 +30,15 @@ pub struct FleetCell {
     pub age_s: f64,
 }
 
+/// What was brought to one service's soil map of the fleet.
+#[derive(Clone, Debug, PartialEq)]
+pub struct FleetShare {
+    /// Name of the service in its present life; empty = this one.
+    pub service: String,
+    /// The cells.
+    pub cells: Vec<FleetCell>,
+}
+
 /// The map, and what the ground looks like on the world maps in use.
 #[derive(Clone, Debug)]
 pub(crate) struct Fleet {
@@ -44,22 +55,43 @@ impl Fleet {
     /// What a vehicle that begins here starts from; `None` without evidence.
     pub fn prior(&mut self, world: &WorldMap, position_m: [f64; 2], config: &FilterConfig, now_ns: u64) -> Option<FleetPrior> {
         let key = self.key(world, position_m);
-        self.map.prior(&key, position_m, &config.prior_sd, now_ns as f64 * 1e-9)
+        self.map.prior(&key, position_m, &config.prior_sd, seconds(now_ns))
     }
 
-    /// Adds what a session brought and gives the cell that it changed.
-    pub fn add(&mut self, world: &WorldMap, brought: &Brought, now_ns: u64) -> Option<FleetCell> {
+    /// Adds what a session brought; gives all that is known of the cell that it changed, and what was brought here of it.
+    pub fn add(&mut self, world: &WorldMap, brought: &Brought, now_ns: u64) -> Option<[FleetCell; 2]> {
         let key = self.key(world, brought.position_m);
-        self.map.add(key.clone(), &brought.increment, now_ns as f64 * 1e-9);
-        self.map.cell(&key).map(|evidence| FleetCell { evidence: *evidence, key, age_s: 0.0 })
+        self.map.add(key.clone(), &brought.increment, seconds(now_ns));
+        let (all, own) = (self.map.cell(&key)?, *self.map.own_cell(&key)?);
+        Some([all, own].map(|evidence| aged(&key, &evidence, now_ns)))
     }
 
     /// The cells of a map, in the order of colour and place; of all maps when no name is given.
     pub fn cells(&self, map: &str, now_ns: u64) -> Vec<FleetCell> {
-        let of_map = self.map.cells().filter(|(key, _)| map.is_empty() || key.map == map);
-        of_map
-            .map(|(key, evidence)| FleetCell { key: key.clone(), evidence: *evidence, age_s: now_ns as f64 * 1e-9 - evidence.stamp_s() })
-            .collect()
+        let of_map = self.map.cells().into_iter().filter(|(key, _)| map.is_empty() || key.map == map);
+        of_map.map(|(key, evidence)| aged(key, &evidence, now_ns)).collect()
+    }
+
+    /// What was brought here, and to each service that was heard of.
+    pub fn shares(&self, now_ns: u64) -> Vec<FleetShare> {
+        let share = |(service, cells): (Option<&str>, &BTreeMap<CellKey, CellEvidence>)| FleetShare {
+            service: service.unwrap_or_default().into(),
+            cells: cells.iter().map(|(key, evidence)| aged(key, evidence, now_ns)).collect(),
+        };
+        self.map.by_map().map(share).collect()
+    }
+
+    /// Takes what another service tells and gives the number of cells that were news. What is said to be brought here is not: nobody else knows it better.
+    pub fn hear(&mut self, shares: &[FleetShare], now_ns: u64) -> usize {
+        let told = shares.iter().filter(|share| !share.service.is_empty());
+        let cells = told.flat_map(|share| share.cells.iter().map(move |cell| (share.service.as_str(), cell)));
+        cells
+            .filter(|(service, cell)| {
+                let stamp_s = seconds(now_ns) - cell.age_s.max(0.0);
+                let evidence = CellEvidence::from_parts(&EvidenceParts { stamp_s, ..cell.evidence.parts() });
+                evidence.is_ok_and(|evidence| self.map.hear(service, cell.key.clone(), &evidence, seconds(now_ns)))
+            })
+            .count()
     }
 
     /// Edge of a cell, m.
@@ -86,4 +118,13 @@ impl Fleet {
             square.fold(([0_u64; 3], 0_u64), |(sum, count), c| (core::array::from_fn(|i| sum[i] + u64::from(c[i])), count + 1));
         sum.map(|level| (level / count.max(1)) as u8)
     }
+}
+
+/// A cell as the outside sees it.
+fn aged(key: &CellKey, evidence: &CellEvidence, now_ns: u64) -> FleetCell {
+    FleetCell { key: key.clone(), evidence: *evidence, age_s: seconds(now_ns) - evidence.stamp_s() }
+}
+
+fn seconds(now_ns: u64) -> f64 {
+    now_ns as f64 * 1e-9
 }

@@ -270,7 +270,7 @@ fn answer(
         fits.and_then(|()| execute_guarded(engine, now_ns, &command))
     };
     let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
-    let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. })).map(|_| result.clone());
+    let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil)).map(|_| result.clone());
     done(result.is_ok().then_some(busy_ns));
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {

@@ -44,7 +44,7 @@ pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView
 pub use engine::{Engine, EventSink, Logged};
 pub use error::EngineError;
 pub use extras::{CovarianceQuery, Covariances, ExtraOutputs, Jacobians, PredictExtras, SIGMA_POINTS, WhatIfSoils};
-pub use fleet::FleetCell;
+pub use fleet::{FleetCell, FleetShare};
 pub use forward::{SENT_COMMANDS_MAX, SentCommand, StartInstant};
 pub use grid::StepGrid;
 pub use handle::{Answer, EngineHandle, Executed, Submission, Tap, execute_guarded};
@@ -52,7 +52,7 @@ pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FilterSnapshot, JointSnapshot};
-pub use nesam_fleet_soil::{CellEvidence, CellKey, FleetSoilError, FleetSoilSettings};
+pub use nesam_fleet_soil::{CellEvidence, CellKey, EvidenceParts, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
 pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{

@@ -17,4 +17,10 @@ pub enum FleetSoilError {
         /// `prior` or `posterior`.
         what: &'static str,
     },
+    /// Evidence that another map told is none.
+    #[error("evidence of the soil was refused: {reason}")]
+    Evidence {
+        /// What is wrong.
+        reason: String,
+    },
 }

@@ -1,4 +1,4 @@
-//! The map: evidence by cell and colour, fused when somebody begins there.
+//! The map: evidence by cell and colour, this server's and what others told of theirs, fused when somebody begins there.
 
 use std::collections::BTreeMap;
 
@@ -14,13 +14,38 @@ use crate::settings::FleetSoilSettings;
 pub struct CellEvidence {
     information: Matrix,
     vector: Vector,
-    /// Buffers that went in, aged like the information.
     buffers: f64,
-    /// Votes on whether the correction helps, log odds, aged.
     votes: f64,
-    /// Instant of the last increment, s.
     stamp_s: f64,
+    revision: u64,
 }
+
+/// [`CellEvidence`] in plain numbers, to be told and heard.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct EvidenceParts {
+    /// Λ, in the coordinates of the correction.
+    pub information: [[f64; SOIL_DIM]; SOIL_DIM],
+    /// η = Λ m.
+    pub vector: [f64; SOIL_DIM],
+    /// Buffers that went in, aged to the last one.
+    pub buffers: f64,
+    /// Votes on whether the correction helps, log odds, aged to the last one.
+    pub votes: f64,
+    /// Instant of the last increment, s.
+    pub stamp_s: f64,
+    /// Grows with each increment of the map that it was brought to.
+    pub revision: u64,
+}
+
+/// Other maps that are remembered at most; beyond, the one with the oldest evidence is forgotten.
+const HEARD_MAX: usize = 64;
+/// Share of its weight below which evidence of another map is not taken any more.
+const FADED: f64 = 1e-3;
+/// Largest difference of two entries of Λ that should be equal, as a share of its largest.
+const ASYMMETRY_MAX: f64 = 1e-6;
+
+/// Evidence by cell.
+type Cells = BTreeMap<CellKey, CellEvidence>;
 
 /// What a vehicle starts from.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -33,27 +58,50 @@ pub struct FleetPrior {
     pub votes: f64,
 }
 
-/// Evidence of the fleet.
+/// Evidence of the fleet: brought to this map, and heard of other maps. Each part belongs to the map that it was brought to and is replaced, never added, when
+/// that one tells a later revision: hearing something twice, late, or by way of a third map changes nothing.
 #[derive(Clone, Debug)]
 pub struct FleetSoilMap {
     settings: FleetSoilSettings,
-    cells: BTreeMap<CellKey, CellEvidence>,
+    own: Cells,
+    /// Increments so far.
+    revision: u64,
+    /// What was brought to other maps, by their names.
+    heard: BTreeMap<String, Cells>,
 }
 
 impl CellEvidence {
-    /// Share of its weight that is left at an instant.
-    fn aged(&self, now_s: f64, half_life_s: f64) -> f64 {
-        (-(now_s - self.stamp_s).max(0.0) / half_life_s).exp2()
+    /// Evidence that somebody told.
+    ///
+    /// # Errors
+    /// `FleetSoilError::Evidence` when a number is not finite, or Λ has a negative diagonal or no symmetry.
+    pub fn from_parts(parts: &EvidenceParts) -> Result<Self, FleetSoilError> {
+        let EvidenceParts { information, vector, buffers, votes, stamp_s, revision } = *parts;
+        let matrix = Matrix::from_fn(|r, c| information[r][c]);
+        let numbers = matrix.iter().copied().chain(vector).chain([buffers, votes, stamp_s]);
+        let refused = |reason: &str| Err(FleetSoilError::Evidence { reason: reason.into() });
+        if numbers.into_iter().any(|v| !v.is_finite()) {
+            return refused("a number is not finite");
+        }
+        if buffers < 0.0 || (0..SOIL_DIM).any(|i| matrix[(i, i)] < 0.0) {
+            return refused("its buffers or the diagonal of its information are negative");
+        }
+        if (matrix - matrix.transpose()).amax() > ASYMMETRY_MAX * matrix.amax() {
+            return refused("its information is not symmetric");
+        }
+        Ok(Self { information: matrix, vector: Vector::from(vector), buffers, votes, stamp_s, revision })
     }
 
-    /// Λ, row-major, in the coordinates of the correction.
-    pub fn information(&self) -> [[f64; SOIL_DIM]; SOIL_DIM] {
-        core::array::from_fn(|r| core::array::from_fn(|c| self.information[(r, c)]))
-    }
-
-    /// η = Λ m.
-    pub fn vector(&self) -> [f64; SOIL_DIM] {
-        core::array::from_fn(|i| self.vector[i])
+    /// The same in plain numbers.
+    pub fn parts(&self) -> EvidenceParts {
+        EvidenceParts {
+            information: core::array::from_fn(|r| core::array::from_fn(|c| self.information[(r, c)])),
+            vector: core::array::from_fn(|i| self.vector[i]),
+            buffers: self.buffers,
+            votes: self.votes,
+            stamp_s: self.stamp_s,
+            revision: self.revision,
+        }
     }
 
     /// Buffers that went in, aged to the last one.
@@ -65,6 +113,25 @@ impl CellEvidence {
     pub fn stamp_s(&self) -> f64 {
         self.stamp_s
     }
+
+    /// Share of its weight that is left at an instant.
+    fn aged(&self, now_s: f64, half_life_s: f64) -> f64 {
+        (-(now_s - self.stamp_s).max(0.0) / half_life_s).exp2()
+    }
+
+    /// This and other evidence of the same ground, as of the later of the two.
+    fn with(&self, other: &Self, half_life_s: f64) -> Self {
+        let stamp_s = self.stamp_s.max(other.stamp_s);
+        let (a, b) = (self.aged(stamp_s, half_life_s), other.aged(stamp_s, half_life_s));
+        Self {
+            information: self.information * a + other.information * b,
+            vector: self.vector * a + other.vector * b,
+            buffers: self.buffers * a + other.buffers * b,
+            votes: self.votes * a + other.votes * b,
+            stamp_s,
+            revision: self.revision.max(other.revision),
+        }
+    }
 }
 
 impl FleetSoilMap {
@@ -74,7 +141,7 @@ impl FleetSoilMap {
     /// As [`FleetSoilSettings::check`].
     pub fn new(settings: FleetSoilSettings) -> Result<Self, FleetSoilError> {
         settings.check()?;
-        Ok(Self { settings, cells: BTreeMap::new() })
+        Ok(Self { settings, own: Cells::new(), revision: 0, heard: BTreeMap::new() })
     }
 
     /// Settings.
@@ -82,33 +149,64 @@ impl FleetSoilMap {
         &self.settings
     }
 
-    /// All cells, in the order of their keys.
-    pub fn cells(&self) -> impl Iterator<Item = (&CellKey, &CellEvidence)> {
-        self.cells.iter()
+    /// All that is known of each cell, whoever it was brought to, in the order of the keys.
+    pub fn cells(&self) -> BTreeMap<&CellKey, CellEvidence> {
+        let mut all: BTreeMap<&CellKey, CellEvidence> = self.own.iter().map(|(key, evidence)| (key, *evidence)).collect();
+        for (key, evidence) in self.heard.values().flatten() {
+            all.entry(key).and_modify(|sum| *sum = sum.with(evidence, self.settings.half_life_s)).or_insert(*evidence);
+        }
+        all
     }
 
-    /// The evidence of one cell.
-    pub fn cell(&self, key: &CellKey) -> Option<&CellEvidence> {
-        self.cells.get(key)
+    /// All that is known of one cell.
+    pub fn cell(&self, key: &CellKey) -> Option<CellEvidence> {
+        let own = self.own.get(key).copied();
+        let heard = self.heard.values().filter_map(|cells| cells.get(key));
+        heard.fold(own, |sum, evidence| Some(sum.map_or(*evidence, |sum| sum.with(evidence, self.settings.half_life_s))))
+    }
+
+    /// What was brought to this map itself, of one cell.
+    pub fn own_cell(&self, key: &CellKey) -> Option<&CellEvidence> {
+        self.own.get(key)
+    }
+
+    /// What was brought to this map (`None`) and to each of the others that it has heard of.
+    pub fn by_map(&self) -> impl Iterator<Item = (Option<&str>, &BTreeMap<CellKey, CellEvidence>)> {
+        core::iter::once((None, &self.own)).chain(self.heard.iter().map(|(name, cells)| (Some(name.as_str()), cells)))
     }
 
     /// Adds what a buffer has brought at an instant, s of any clock that only goes forward.
     pub fn add(&mut self, key: CellKey, increment: &Increment, now_s: f64) {
-        let half_life_s = self.settings.half_life_s;
-        let none = CellEvidence { information: Matrix::zeros(), vector: Vector::zeros(), buffers: 0.0, votes: 0.0, stamp_s: now_s };
-        let cell = self.cells.entry(key).or_insert(none);
-        let aged = cell.aged(now_s, half_life_s);
-        *cell = CellEvidence {
-            information: cell.information * aged + increment.matrix,
-            vector: cell.vector * aged + increment.vector,
-            buffers: cell.buffers * aged + 1.0,
-            votes: cell.votes * aged + increment.vote,
-            stamp_s: cell.stamp_s.max(now_s),
+        self.revision += 1;
+        let brought = CellEvidence {
+            information: increment.matrix,
+            vector: increment.vector,
+            buffers: 1.0,
+            votes: increment.vote,
+            stamp_s: now_s,
+            revision: self.revision,
         };
-        if self.cells.len() > self.settings.cells_max {
-            let oldest = self.cells.iter().min_by(|a, b| a.1.stamp_s.total_cmp(&b.1.stamp_s)).map(|(key, _)| key.clone());
-            oldest.and_then(|key| self.cells.remove(&key));
+        let half_life_s = self.settings.half_life_s;
+        self.own.entry(key).and_modify(|cell| *cell = cell.with(&brought, half_life_s)).or_insert(brought);
+        limit(&mut self.own, self.settings.cells_max);
+    }
+
+    /// Takes what another map tells of a cell, brought to the map `of`. Returns whether it was news: what has faded, or is no later than what was heard before, is not.
+    pub fn hear(&mut self, of: &str, key: CellKey, evidence: &CellEvidence, now_s: f64) -> bool {
+        let faded = evidence.aged(now_s, self.settings.half_life_s) < FADED;
+        let known = self.heard.get(of).and_then(|cells| cells.get(&key));
+        if faded || known.is_some_and(|known| known.revision >= evidence.revision) {
+            return false;
         }
+        let cells = self.heard.entry(of.into()).or_default();
+        cells.insert(key, *evidence);
+        limit(cells, self.settings.cells_max);
+        if self.heard.len() > HEARD_MAX {
+            let newest = |cells: &Cells| cells.values().map(CellEvidence::stamp_s).fold(f64::NEG_INFINITY, f64::max);
+            let oldest = self.heard.iter().min_by(|a, b| newest(a.1).total_cmp(&newest(b.1))).map(|(name, _)| name.clone());
+            oldest.and_then(|name| self.heard.remove(&name));
+        }
+        true
     }
 
     /// What a vehicle that begins at a position knows: P₀ around Δθ = 0, and the evidence of this map, each cell weighted by 2^(-age / half-life) e^(-distance / reach) of
@@ -119,7 +217,8 @@ impl FleetSoilMap {
         let (mut vector, mut buffers, mut votes) = (Vector::zeros(), 0.0, 0.0);
         let of_map =
             CellKey { colour: [0; 3], cell: [i32::MIN; 2], ..at.clone() }..=CellKey { colour: [255; 3], cell: [i32::MAX; 2], ..at.clone() };
-        for (key, evidence) in self.cells.range(of_map) {
+        let of_map = self.by_map().flat_map(|(_, cells)| cells.range(of_map.clone()));
+        for (key, evidence) in of_map {
             let [x, y] = key.centre_m(cell_m);
             // Inside its own cell a vehicle is as near as can be told.
             let distance_m = ((x - position_m[0]).hypot(y - position_m[1]) - 0.5 * cell_m).max(0.0);
@@ -148,6 +247,14 @@ impl FleetSoilMap {
             buffers,
             votes,
         })
+    }
+}
+
+/// Forgets the oldest evidence beyond a number of cells.
+fn limit(cells: &mut Cells, cells_max: usize) {
+    if cells.len() > cells_max {
+        let oldest = cells.iter().min_by(|a, b| a.1.stamp_s.total_cmp(&b.1.stamp_s)).map(|(key, _)| key.clone());
+        oldest.and_then(|key| cells.remove(&key));
     }
 }
 
@@ -236,8 +343,86 @@ mod tests {
         assert!((fused(&mut (0..20)) - fused(&mut (0..20).rev())).abs() < 1e-12);
         let mut small = FleetSoilMap::new(FleetSoilSettings { cells_max: 3, ..FleetSoilSettings::default() }).unwrap();
         (0..9).for_each(|i| small.add(key(i), &increments[0], f64::from(i)));
-        assert_eq!(small.cells().map(|(key, _)| key.cell[0]).collect::<Vec<_>>(), [6, 7, 8]);
+        assert_eq!(small.cells().keys().map(|key| key.cell[0]).collect::<Vec<_>>(), [6, 7, 8]);
         assert!(Increment::between(&belief(0.0, -1.0), &belief(0.0, 1.0), 0.0).is_err());
         assert!(FleetSoilMap::new(FleetSoilSettings { cell_m: 0.0, ..FleetSoilSettings::default() }).is_err());
+    }
+
+    /// What one map tells another: everything it knows.
+    fn tell(from: &FleetSoilMap, name: &str, to: &mut FleetSoilMap, to_name: &str, now_s: f64) -> usize {
+        let told: Vec<(String, CellKey, CellEvidence)> = from
+            .by_map()
+            .flat_map(|(of, cells)| cells.iter().map(move |(key, evidence)| (of.unwrap_or(name).to_owned(), key.clone(), *evidence)))
+            .collect();
+        told.iter().filter(|(of, key, evidence)| of != to_name && to.hear(of, key.clone(), evidence, now_s)).count()
+    }
+
+    #[test]
+    fn property_maps_that_tell_each_other_know_what_one_map_would() {
+        let increments: Vec<Increment> = (0..12).map(|i| update((0.1 * f64::from(i), 1.0), (f64::from(i) * 1.7).sin(), 0.5).1).collect();
+        let settings = FleetSoilSettings { half_life_s: 50.0, ..FleetSoilSettings::default() };
+        let mut one = FleetSoilMap::new(settings).unwrap();
+        let mut maps = [0; 3].map(|_| FleetSoilMap::new(settings).unwrap());
+        let names = ["a", "b", "c"];
+        for (i, increment) in increments.iter().enumerate() {
+            let (cell, now_s) = (key(i as i32 % 2), i as f64);
+            one.add(cell.clone(), increment, now_s);
+            maps[i % 3].add(cell, increment, now_s);
+            // Each tells its neighbour only: what is brought to `a` reaches `c` by way of `b`, and comes back to `a` from there.
+            let (from, to) = (i % 3, (i + 1) % 3);
+            let (teller, mut hearer) = (maps[from].clone(), maps[to].clone());
+            tell(&teller, names[from], &mut hearer, names[to], now_s);
+            maps[to] = hearer;
+        }
+        for round in 0..2 {
+            for (from, to) in [(0, 1), (1, 2), (2, 0), (0, 1)] {
+                let (teller, mut hearer) = (maps[from].clone(), maps[to].clone());
+                let news = tell(&teller, names[from], &mut hearer, names[to], 12.0);
+                assert!(round == 0 || news == 0, "nothing is news a second time");
+                maps[to] = hearer;
+            }
+        }
+        let expected = one.prior(&key(0), [5.0, 5.0], &SD, 20.0).unwrap();
+        for map in &maps {
+            let prior = map.prior(&key(0), [5.0, 5.0], &SD, 20.0).unwrap();
+            assert!((prior.belief.delta[2] - expected.belief.delta[2]).abs() < 1e-12);
+            assert!((prior.belief.covariance[2][2] - expected.belief.covariance[2][2]).abs() < 1e-12);
+            assert!((prior.buffers - expected.buffers).abs() < 1e-12 && (prior.votes - expected.votes).abs() < 1e-12);
+            for (key, evidence) in map.cells() {
+                let whole = one.cell(key).unwrap();
+                assert!((evidence.buffers() - whole.buffers()).abs() < 1e-9 && evidence.stamp_s() == whole.stamp_s());
+                assert_eq!(map.cell(key), Some(evidence));
+            }
+        }
+    }
+
+    #[test]
+    fn property_old_news_garbage_and_strangers_without_end_change_nothing() {
+        let mut teller = exact();
+        teller.add(key(0), &update((0.0, 1.0), 2.0, 0.5).1, 0.0);
+        let early = *teller.own_cell(&key(0)).unwrap();
+        teller.add(key(0), &update((0.0, 1.0), 1.0, 0.5).1, 1.0);
+        let late = *teller.own_cell(&key(0)).unwrap();
+        let mut map = FleetSoilMap::new(FleetSoilSettings { half_life_s: 100.0, ..FleetSoilSettings::default() }).unwrap();
+        assert!(map.hear("a", key(0), &late, 1.0));
+        assert!(!map.hear("a", key(0), &early, 1.0), "an older revision that comes late");
+        assert_eq!(map.cell(&key(0)), Some(late));
+        assert!(!map.hear("b", key(1), &early, 1e5), "evidence that has faded");
+        assert_eq!(CellEvidence::from_parts(&late.parts()), Ok(late));
+        let with = |change: fn(&mut EvidenceParts)| {
+            let mut parts = late.parts();
+            change(&mut parts);
+            CellEvidence::from_parts(&parts)
+        };
+        assert!(with(|parts| parts.vector[3] = f64::NAN).is_err());
+        assert!(with(|parts| parts.information[1][4] = 7.0).is_err());
+        assert!(with(|parts| parts.information[2][2] = -1.0).is_err());
+        assert!(with(|parts| parts.buffers = -1.0).is_err());
+        for i in 0..200 {
+            let parts = EvidenceParts { stamp_s: f64::from(i), ..late.parts() };
+            map.hear(&format!("stranger {i}"), key(0), &CellEvidence::from_parts(&parts).unwrap(), f64::from(i));
+        }
+        assert_eq!(map.by_map().count(), 1 + HEARD_MAX);
+        assert!(map.by_map().all(|(name, _)| name != Some("stranger 0")), "the oldest is forgotten");
     }
 }

@@ -3369,6 +3369,46 @@ pub mod soil_server {
         const NAME: &'static str = SERVICE_NAME;
     }
 }
+/// Evidence of the soil, by the server that it was brought to: each part replaces what was heard of it before, so that it does not matter how often, how late
+/// or from whom it is heard.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FleetSoilShares {
+    /// Bundle that the corrections belong to; a server with another one does not take them.
+    #[prost(string, tag = "1")]
+    pub bundle_hash: ::prost::alloc::string::String,
+    /// Edge of a cell, m.
+    #[prost(double, tag = "2")]
+    pub cell_m: f64,
+    #[prost(message, repeated, tag = "3")]
+    pub shares: ::prost::alloc::vec::Vec<FleetSoilShare>,
+}
+/// What was brought to one server.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct FleetSoilShare {
+    /// The server in its present life: another one after each start.
+    #[prost(string, tag = "1")]
+    pub service: ::prost::alloc::string::String,
+    #[prost(message, repeated, tag = "2")]
+    pub cells: ::prost::alloc::vec::Vec<SharedSoilCell>,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct SharedSoilCell {
+    #[prost(message, optional, tag = "1")]
+    pub cell: ::core::option::Option<FleetSoilCell>,
+    /// Votes of the buffers on whether the correction helps, log odds, aged like them.
+    #[prost(double, tag = "2")]
+    pub votes: f64,
+    /// Grows with each buffer that is brought to that server.
+    #[prost(uint64, tag = "3")]
+    pub revision: u64,
+}
+/// Answer of a recording: what became of shares that were heard.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct FleetSoilHeard {
+    /// Cells that were news.
+    #[prost(uint64, tag = "1")]
+    pub cells: u64,
+}
 /// What a server publishes about itself over Zenoh on nesam/v1/<fleet>/server/<name>/status, at an interval and when a vehicle comes or goes. While it is
 /// there it also holds the liveliness token nesam/v1/<fleet>/server/<name>/alive; vehicles hold nesam/v1/<fleet>/<vehicle>/alive.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -1,7 +1,7 @@
 //! Sessions, provenance and soil.
 
 use nesam_engine::EngineError;
-use nesam_engine::{FleetCell, OpenSession, Provenance, SessionView, SoilEstimate};
+use nesam_engine::{OpenSession, Provenance, SessionView, SoilEstimate};
 use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
@@ -96,6 +96,12 @@ pub fn soil_vector(values: &[f64; SOIL_DIM]) -> pb::SoilVector {
     pb::SoilVector { k_phi, k_c, n, c_pa, phi_rad, k_shear_m }
 }
 
+/// The same read.
+pub fn soil_of(message: &pb::SoilVector) -> [f64; SOIL_DIM] {
+    let pb::SoilVector { k_phi, k_c, n, c_pa, phi_rad, k_shear_m } = *message;
+    [k_phi, k_c, n, c_pa, phi_rad, k_shear_m]
+}
+
 /// What is known of the soil as message.
 pub fn soil_correction(soil: &SoilEstimate) -> pb::SoilCorrection {
     let SoilEstimate { state: soil, covariance, .. } = soil;
@@ -110,24 +116,6 @@ pub fn soil_correction(soil: &SoilEstimate) -> pb::SoilCorrection {
         learned: soil.learned.to_vec(),
         covariance: covariance.as_flattened().to_vec(),
     }
-}
-
-/// The soil map of the fleet, or a part of it, as message.
-pub fn fleet_soil_map(cell_m: f64, cells: &[FleetCell]) -> pb::FleetSoilMap {
-    let cell = |cell: &FleetCell| {
-        let [red, green, blue] = cell.key.colour.map(u32::from);
-        pb::FleetSoilCell {
-            map_id: cell.key.map.clone(),
-            colour_rgb: red << 16 | green << 8 | blue,
-            column: cell.key.cell[0],
-            row: cell.key.cell[1],
-            information: cell.evidence.information().as_flattened().to_vec(),
-            vector: Some(soil_vector(&cell.evidence.vector())),
-            buffers: cell.evidence.buffers(),
-            age_s: cell.age_s,
-        }
-    };
-    pb::FleetSoilMap { cell_m, cells: cells.iter().map(cell).collect() }
 }
 
 /// A soil estimate as message.

@@ -50,13 +50,14 @@ fn reply_entry(command: &Command, reply: &Reply, vehicle: &Vehicle, timing: Timi
         }
         Reply::Image(image) => (Topic::Exported, pb::ExportSessionReply { image: image_bytes(image).into() }.encode_to_vec()),
         Reply::FleetSoil(cell_m, cells) => (Topic::FleetSoilMap, fleet_soil_map(*cell_m, cells).encode_to_vec()),
+        Reply::FleetSoilHeard(cells) => (Topic::FleetSoilHeard, pb::FleetSoilHeard { cells: *cells as u64 }.encode_to_vec()),
         Reply::Predicted(prediction) => {
             (Topic::Prediction, predict_reply(0, prediction, OutputSelection::EVERYTHING, timing).encode_to_vec())
         }
         Reply::Map(map) => (Topic::Map, description(map).encode_to_vec()),
         Reply::Maps(maps) => (Topic::Maps, pb::ListMapsReply { maps: maps.iter().map(|map| description(map)).collect() }.encode_to_vec()),
         Reply::Done if matches!(command, Command::DeleteMap { .. }) => (Topic::MapDeleted, pb::DeleteMapReply {}.encode_to_vec()),
-        Reply::Done | Reply::Snapshot(_) => (Topic::Closed, pb::CloseSessionReply {}.encode_to_vec()),
+        Reply::Done | Reply::Snapshot(_) | Reply::FleetShares(..) => (Topic::Closed, pb::CloseSessionReply {}.encode_to_vec()),
     }
 }
 

@@ -10,8 +10,8 @@ use prost::Message as _;
 
 use super::topic::Topic;
 use crate::convert::{
-    MapBuilder, applied_effects, changed_tile, effect_messages, image_bytes, measurement, measurement_message, open_message, open_session,
-    patched, predict_message, predict_query, session_image, upload,
+    MapBuilder, applied_effects, changed_tile, effect_messages, fleet_soil_shares, heard_fleet_soil, image_bytes, measurement,
+    measurement_message, open_message, open_session, patched, predict_message, predict_query, session_image, upload,
 };
 
 /// A message and its topic.
@@ -57,8 +57,11 @@ pub(crate) fn to_entries(command: &Command, maps: &HeldMaps) -> Vec<Entry> {
             let message = pb::ImportSessionRequest { image: image_bytes(image).into(), session_id: session.clone() };
             one(Topic::Import, message.encode_to_vec())
         }
-        // The engine does not tell of snapshots: they change nothing.
-        Command::Snapshot { .. } => Vec::new(),
+        // The engine does not tell of what only it and the server need: they change nothing.
+        Command::Snapshot { .. } | Command::TellFleetSoil => Vec::new(),
+        Command::HearFleetSoil { cell_m, shares } => {
+            one(Topic::FleetSoilShares, fleet_soil_shares("", "", *cell_m, shares).encode_to_vec())
+        }
         Command::FleetSoil { map } => one(Topic::FleetSoil, pb::FleetSoilRequest { map_id: map.clone() }.encode_to_vec()),
         Command::Close { session } => one(Topic::Close, pb::CloseSessionRequest { session_id: session.clone() }.encode_to_vec()),
         Command::SetEffects { session, effects } if effects.effects.is_empty() => {
@@ -117,6 +120,11 @@ pub(crate) fn of_entries(entries: &[Entry], limits: &Limits, maps: &HeldMaps) ->
             Ok(Command::Import { image: session_image(&image).map_err(|e| e.to_string())?.into(), session: session_id })
         }
         [(Topic::FleetSoil, data)] => Ok(Command::FleetSoil { map: read::<pb::FleetSoilRequest>(data)?.map_id }),
+        [(Topic::FleetSoilShares, data)] => {
+            let message: pb::FleetSoilShares = read(data)?;
+            let shares = heard_fleet_soil(&message, "").map_err(|e| e.to_string())?;
+            Ok(Command::HearFleetSoil { cell_m: message.cell_m, shares })
+        }
         [(Topic::Close, data)] => Ok(Command::Close { session: read::<pb::CloseSessionRequest>(data)?.session_id }),
         [(Topic::ApplyEffects, data)] => {
             let pb::ApplyEffectsRequest { session_id, source, effects } = read(data)?;

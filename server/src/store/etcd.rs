@@ -51,6 +51,8 @@ impl EtcdStore {
                     self.cluster.remove_map(map).await?;
                     continue;
                 }
+                // The other servers of the fleet hold it.
+                Change::PutSoil(_) | Change::RemoveSoil(_) => continue,
                 Change::PutSession(session) => (&session.name, Some(session)),
                 Change::RemoveSession(name) => (name, None),
             };

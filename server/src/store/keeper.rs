@@ -6,15 +6,16 @@ use std::time::Duration;
 
 use nesam_engine::sync::thread::{self, JoinHandle};
 use nesam_engine::sync::{Condvar, Mutex, MutexGuard};
-use nesam_engine::{Command, EngineHandle, Event, Reply, Snapshot};
+use nesam_engine::{CellKey, Command, EngineHandle, Event, FleetCell, FleetShare, Reply, Snapshot};
+use prost::Message as _;
 use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::map_bytes::map_bytes;
 use super::restore::Restored;
-use super::{Change, SessionStore, StoreError, StoredSession};
+use super::{Change, SessionStore, StoreError, StoredSession, StoredSoil};
 use crate::clock::unix_ns;
-use crate::convert::image_bytes;
+use crate::convert::{fleet_soil_shares, image_bytes};
 
 /// Pause before a commit that failed is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
@@ -29,6 +30,8 @@ type Places = BTreeMap<String, Option<u64>>;
 pub(crate) enum Key {
     Session(String),
     Map(String),
+    /// What was brought to a cell of the soil map of the fleet.
+    Soil(CellKey),
 }
 
 /// A change that is not on stable storage yet. Changes are numbered in the order in which the engine made them.
@@ -60,10 +63,21 @@ struct State {
     durable: BTreeMap<String, u64>,
     /// Last opening or closing of sessions since their last commit: what was read before says nothing of the session of that name now.
     renamed: BTreeMap<String, u64>,
+    /// What was brought to the cells that wait for a commit: edge of a cell in m, evidence, and when that was, ns since 1970.
+    soil: BTreeMap<CellKey, (f64, FleetCell, i64)>,
     /// Sessions that are taken out of the engine without being closed: other servers have them.
     gone: BTreeSet<String>,
     counts: StoreCounts,
     stopping: bool,
+}
+
+/// Whose evidence of the soil is kept.
+#[derive(Clone, Debug)]
+pub(crate) struct SoilOf {
+    /// This server in its present life.
+    pub service: String,
+    /// Hash of its bundle.
+    pub bundle_hash: String,
 }
 
 /// Knows what is durable and sees to it that everything becomes so.
@@ -74,6 +88,8 @@ pub struct Keeper {
     /// Counts the commits, for those who wait for one.
     committed: watch::Sender<u64>,
     interval: Duration,
+    /// Whose soil map is kept; `None` = nobody's.
+    soil_of: Option<SoilOf>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -81,7 +97,17 @@ impl Keeper {
     /// A keeper that only notes until [`Keeper::start`].
     pub fn new(interval: Duration) -> Self {
         let (committed, _) = watch::channel(0);
-        Self { state: Mutex::default(), changed: Condvar::new(), committed, interval, thread: Mutex::new(None) }
+        Self { state: Mutex::default(), changed: Condvar::new(), committed, interval, soil_of: None, thread: Mutex::new(None) }
+    }
+
+    /// Whose evidence of the soil is kept.
+    pub(crate) fn soil_of(&self) -> Option<&SoilOf> {
+        self.soil_of.as_ref()
+    }
+
+    /// Keeps what is brought to the soil map of the fleet too.
+    pub(crate) fn with_soil(self, of: SoilOf) -> Self {
+        Self { soil_of: Some(of), ..self }
     }
 
     fn lock(&self) -> MutexGuard<'_, State> {
@@ -98,9 +124,13 @@ impl Keeper {
                 (Key::Session(session.clone()), if *buffer_ended { Duration::ZERO } else { self.interval })
             }
             Event::MapChanged { map } => (Key::Map(map.clone()), Duration::ZERO),
+            Event::FleetSoilChanged { own, .. } if self.soil_of.is_some() => (Key::Soil(own.key.clone()), self.interval),
             Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } => return,
         };
         let mut state = self.lock();
+        if let Event::FleetSoilChanged { cell_m, own, .. } = event {
+            state.soil.insert(own.key.clone(), (*cell_m, (**own).clone(), unix_ns()));
+        }
         if let Key::Session(session) = &key
             && state.gone.contains(session)
         {
@@ -177,6 +207,7 @@ impl Keeper {
         let mut state = self.lock();
         state.dirty.clear();
         state.renamed.clear();
+        state.soil.clear();
         state.durable = restored.accepted;
         drop(state);
         Work { keeper: Arc::clone(self), store, engine, maps: restored.maps }
@@ -230,6 +261,23 @@ impl Keeper {
         .collect()
     }
 
+    /// Changes that make these cells durable.
+    fn soil(&self, due: &BTreeMap<Key, u64>) -> Vec<Change> {
+        let Some(of) = &self.soil_of else { return Vec::new() };
+        let state = self.lock();
+        let cells = due.keys().filter_map(|key| if let Key::Soil(cell) = key { state.soil.get(cell) } else { None });
+        let change = |(cell_m, cell, saved_unix_ns): &(f64, FleetCell, i64)| {
+            let CellKey { map, colour: [red, green, blue], cell: [column, row] } = &cell.key;
+            let share = FleetShare { service: String::new(), cells: vec![cell.clone()] };
+            Change::PutSoil(StoredSoil {
+                key: format!("{}/{map}/{red:02x}{green:02x}{blue:02x}/{column}/{row}", of.service),
+                saved_unix_ns: *saved_unix_ns,
+                share: fleet_soil_shares(&of.bundle_hash, &of.service, *cell_m, &[share]).encode_to_vec(),
+            })
+        };
+        cells.map(change).collect()
+    }
+
     /// Waits until something is due; nothing when the server stops and there is nothing left to do.
     fn next_due(&self) -> BTreeMap<Key, u64> {
         let mut state = self.lock();
@@ -255,7 +303,14 @@ impl Keeper {
                     state.dirty.remove(key);
                 }
             }
-            let Key::Session(session) = key else { continue };
+            let session = match key {
+                Key::Session(session) => session,
+                Key::Soil(cell) if !state.dirty.contains_key(key) => {
+                    state.soil.remove(cell);
+                    continue;
+                }
+                Key::Soil(_) | Key::Map(_) => continue,
+            };
             if state.renamed.get(session).is_some_and(|renamed| renamed > written) {
                 continue;
             }
@@ -346,6 +401,7 @@ impl Work {
                 None => Change::RemoveSession(name),
             });
         }
+        changes.extend(self.keeper.soil(due));
         let bytes = changes.iter().map(weight).sum();
         for foreign in self.store.commit(&changes).map_err(|error| error.to_string())? {
             places.remove(&foreign);
@@ -360,6 +416,7 @@ impl Work {
             match key {
                 Key::Session(name) => sessions.push(name.clone()),
                 Key::Map(id) => maps.push(id.clone()),
+                Key::Soil(_) => {}
             }
         }
         self.store.begin(&sessions);
@@ -375,6 +432,7 @@ fn weight(change: &Change) -> u64 {
     match change {
         Change::PutSession(session) => session.image.len() as u64,
         Change::PutMap(_, bytes) => bytes.len() as u64,
-        Change::RemoveSession(_) | Change::RemoveMap(_) => 0,
+        Change::PutSoil(soil) => soil.share.len() as u64,
+        Change::RemoveSession(_) | Change::RemoveMap(_) | Change::RemoveSoil(_) => 0,
     }
 }

@@ -22,7 +22,7 @@ use std::path::PathBuf;
 
 pub(crate) use self::etcd::EtcdStore;
 pub use self::keeper::Keeper;
-pub(crate) use self::keeper::{Key, StoreCounts};
+pub(crate) use self::keeper::{Key, SoilOf, StoreCounts};
 pub(crate) use self::map_bytes::map_of;
 pub use self::redb::RedbStore;
 pub use self::restore::Restored;
@@ -55,6 +55,19 @@ pub struct Contents {
     pub sessions: Vec<StoredSession>,
     /// Ids and bytes, by id.
     pub maps: Vec<(String, Vec<u8>)>,
+    /// By key.
+    pub soil: Vec<StoredSoil>,
+}
+
+/// What was brought to one cell of the soil map of a fleet, in a store.
+#[derive(Clone, Debug, PartialEq)]
+pub struct StoredSoil {
+    /// Server in the life in which it was brought, and cell: one row for each.
+    pub key: String,
+    /// When it was brought, ns since 1970 by the machine's clock.
+    pub saved_unix_ns: i64,
+    /// A `nesam.v1.FleetSoilShares` with that cell alone.
+    pub share: Vec<u8>,
 }
 
 /// A session in a store.
@@ -79,6 +92,10 @@ pub enum Change {
     PutMap(String, Vec<u8>),
     /// No map of this id.
     RemoveMap(String),
+    /// Evidence of the soil, new or later than what is held.
+    PutSoil(StoredSoil),
+    /// No evidence under this key.
+    RemoveSoil(String),
 }
 
 /// Why a store cannot be used.

@@ -4,12 +4,14 @@ use std::path::Path;
 
 use ::redb::{Database, DatabaseError, Durability, ReadableDatabase as _, ReadableTable as _, StorageBackend, TableDefinition};
 
-use super::{Change, Contents, SessionStore, StoreError, StoredSession};
+use super::{Change, Contents, SessionStore, StoreError, StoredSession, StoredSoil};
 
 /// Name → when it was saved, image.
 const SESSIONS: TableDefinition<'_, &str, (i64, &[u8])> = TableDefinition::new("sessions");
 /// Id → bytes.
 const MAPS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("maps");
+/// Key → when it was brought, evidence of the soil.
+const SOIL: TableDefinition<'_, &str, (i64, &[u8])> = TableDefinition::new("soil");
 /// Facts on the store itself.
 const FACTS: TableDefinition<'_, &str, &str> = TableDefinition::new("facts");
 const FORMAT: (&str, &str) = ("format", "nesam.store/1");
@@ -71,6 +73,7 @@ impl RedbStore {
             }
             transaction.open_table(SESSIONS).map_err(failed)?;
             transaction.open_table(MAPS).map_err(failed)?;
+            transaction.open_table(SOIL).map_err(failed)?;
         }
         transaction.commit().map_err(failed)?;
         Ok(Self { database })
@@ -90,6 +93,11 @@ impl SessionStore for RedbStore {
             let (id, bytes) = entry.map_err(failed)?;
             contents.maps.push((id.value().into(), bytes.value().to_vec()));
         }
+        for entry in transaction.open_table(SOIL).map_err(failed)?.iter().map_err(failed)? {
+            let (key, value) = entry.map_err(failed)?;
+            let (saved_unix_ns, share) = value.value();
+            contents.soil.push(StoredSoil { key: key.value().into(), saved_unix_ns, share: share.to_vec() });
+        }
         Ok(contents)
     }
 
@@ -99,6 +107,7 @@ impl SessionStore for RedbStore {
         {
             let mut sessions = transaction.open_table(SESSIONS).map_err(failed)?;
             let mut maps = transaction.open_table(MAPS).map_err(failed)?;
+            let mut soil = transaction.open_table(SOIL).map_err(failed)?;
             for change in changes {
                 match change {
                     Change::PutSession(s) => {
@@ -107,6 +116,8 @@ impl SessionStore for RedbStore {
                     Change::RemoveSession(name) => drop(sessions.remove(name.as_str()).map_err(failed)?),
                     Change::PutMap(id, bytes) => drop(maps.insert(id.as_str(), bytes.as_slice()).map_err(failed)?),
                     Change::RemoveMap(id) => drop(maps.remove(id.as_str()).map_err(failed)?),
+                    Change::PutSoil(s) => drop(soil.insert(s.key.as_str(), (s.saved_unix_ns, s.share.as_slice())).map_err(failed)?),
+                    Change::RemoveSoil(key) => drop(soil.remove(key.as_str()).map_err(failed)?),
                 }
             }
         }

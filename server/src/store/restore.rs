@@ -2,12 +2,15 @@
 
 use std::collections::BTreeMap;
 
-use nesam_engine::{Command, EngineError, EngineHandle, SessionImage};
+use nesam_engine::{Command, EngineError, EngineHandle, Reply, SessionImage};
+use nesam_proto::v1 as pb;
+use prost::Message as _;
 
+use super::keeper::SoilOf;
 use super::map_bytes::map_of;
-use super::{Contents, StoreError, StoredSession};
+use super::{Contents, StoreError, StoredSession, StoredSoil};
 use crate::clock::unix_ns;
-use crate::convert::session_image;
+use crate::convert::{heard_fleet_soil, session_image};
 
 /// What came back.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -16,13 +19,15 @@ pub struct Restored {
     pub accepted: BTreeMap<String, u64>,
     /// Hash of each map.
     pub maps: BTreeMap<String, String>,
+    /// Keys of evidence of the soil that has faded.
+    pub faded: Vec<String>,
 }
 
-/// Puts everything into an engine that holds nothing yet.
+/// Puts everything into an engine that holds nothing yet; evidence of the soil where that is kept for this server (`soil_of`).
 ///
 /// # Errors
 /// `StoreError::Content` naming the session or map that the engine refuses: of another bundle, damaged, or beyond its limits.
-pub(crate) fn restore(contents: &Contents, engine: &EngineHandle) -> Result<Restored, StoreError> {
+pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Option<&SoilOf>) -> Result<Restored, StoreError> {
     let mut restored = Restored::default();
     for (id, bytes) in &contents.maps {
         let refused = |reason: String| StoreError::Content { what: format!("map `{id}`"), reason };
@@ -38,6 +43,11 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle) -> Result<Rest
         })?;
         restored.accepted.insert(session.name.clone(), accepted);
     }
+    for (row, of) in contents.soil.iter().zip(soil_of.into_iter().cycle()) {
+        if recall(row, of, engine) == Some(0) {
+            restored.faded.push(row.key.clone());
+        }
+    }
     Ok(restored)
 }
 
@@ -52,6 +62,22 @@ pub(crate) fn resumed(stored: &StoredSession) -> Result<SessionImage, EngineErro
         *age_ns = age_ns.saturating_add(down_ns);
     }
     Ok(image)
+}
+
+/// Evidence of the soil as old as it is now; how many cells the engine has taken. `None`: it is not for this engine, which has another bundle, cells of another
+/// size, or no soil map.
+fn recall(stored: &StoredSoil, of: &SoilOf, engine: &EngineHandle) -> Option<usize> {
+    let message = pb::FleetSoilShares::decode(stored.share.as_slice()).ok()?;
+    let mut shares = heard_fleet_soil(&message, "").ok()?;
+    let since_s = unix_ns().saturating_sub(stored.saved_unix_ns).max(0) as f64 * 1e-9;
+    shares.iter_mut().flat_map(|share| &mut share.cells).for_each(|cell| cell.age_s += since_s);
+    if message.bundle_hash != of.bundle_hash {
+        return None;
+    }
+    match engine.call(Command::HearFleetSoil { cell_m: message.cell_m, shares }) {
+        Ok(Reply::FleetSoilHeard(cells)) => Some(cells),
+        _ => None,
+    }
 }
 
 fn import(stored: &StoredSession, maps: &BTreeMap<String, String>, engine: &EngineHandle) -> Result<u64, EngineError> {

@@ -127,6 +127,17 @@ fn server(member: &mut Member<'_>, fleet: &str, name: &str) {
     member.allow(&["ingress"], &["put"], TOLD.map(of_all).into_iter().chain(own).collect());
     member.allow(&["ingress"], &["liveliness_token"], vec![keys::of_server(fleet, name, "alive")]);
     member.watches(vec![of_all("alive")]);
+    shares_soil(member, fleet, name);
+}
+
+/// To tell the other servers what was brought to this one, and to hear and ask them.
+fn shares_soil(member: &mut Member<'_>, fleet: &str, name: &str) {
+    let (own, all) = (vec![keys::of_server(fleet, name, "soil_map")], vec![keys::of_server(fleet, "*", "soil_map")]);
+    member.allow(&["ingress"], &["put", "declare_queryable", "reply"], own);
+    member.allow(&["ingress"], &["declare_subscriber"], all.clone());
+    member.allow(&["egress"], &["put", "declare_subscriber", "declare_queryable", "reply"], all.clone());
+    // One query asks all servers.
+    member.allow(&["ingress", "egress"], &["query"], all);
 }
 
 /// What everybody may hear of servers.

@@ -6,6 +6,7 @@ mod measurements;
 mod predict;
 mod presence;
 mod renewal;
+mod sharing;
 mod soil;
 
 pub use access_control::{LinkFiles, router_config};
@@ -18,9 +19,11 @@ use nesam_engine::EngineError;
 use tokio::sync::mpsc;
 
 use crate::access::FleetFile;
-use crate::config::{TlsConfig, ZenohConfig, ZenohMode};
+use crate::config::{FleetSoilConfig, TlsConfig, ZenohConfig, ZenohMode};
 use crate::error::ServerError;
 use crate::grpc::Edge;
+
+use self::sharing::Sharing;
 
 /// Largest payload of a measurement, bytes.
 const MEASUREMENT_BYTES_MAX: usize = 64 << 10;
@@ -32,6 +35,7 @@ struct Bus {
     session: ::zenoh::Session,
     publisher: tokio::task::JoinHandle<()>,
     soil: tokio::task::JoinHandle<()>,
+    sharing: Option<tokio::task::JoinHandle<()>>,
     status: tokio::task::JoinHandle<()>,
     /// Tells the network that this server is there; goes with it.
     _token: ::zenoh::liveliness::LivelinessToken,
@@ -42,15 +46,24 @@ type Outgoing = (String, Vec<u8>);
 
 impl Bus {
     /// Joins the network and declares subscriber, publisher, queryable and liveliness token.
-    pub async fn start(config: &ZenohConfig, tls: &TlsConfig, edge: &Edge) -> Result<Self, ServerError> {
+    pub async fn start(config: &ZenohConfig, fleet_soil: &FleetSoilConfig, tls: &TlsConfig, edge: &Edge) -> Result<Self, ServerError> {
         if tokio::runtime::Handle::current().runtime_flavor() == tokio::runtime::RuntimeFlavor::CurrentThread {
             return Err(ServerError::Runtime);
         }
         let failed = |error: ::zenoh::Error| ServerError::Zenoh { reason: error.to_string() };
         let session = ::zenoh::open(zenoh_config(config, tls, edge.access.rights().as_deref()).map_err(failed)?).await.map_err(failed)?;
         let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
-        let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sender.clone()));
         let name = if config.name.is_empty() { session.zid().to_string() } else { config.name.clone() };
+        let shares = fleet_soil.enabled && fleet_soil.exchange_s > 0.0;
+        let sharing = shares.then(|| Sharing::new(edge, &config.fleet, &name));
+        let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sharing.clone(), sender.clone()));
+        let sharing = match sharing {
+            Some(sharing) => {
+                let every = Duration::from_secs_f64(fleet_soil.exchange_s);
+                Some(tokio::spawn(sharing.declare(&session, &config.fleet, every).await.map_err(failed)?))
+            }
+            None => None,
+        };
         measurements::declare(&session, &config.fleet, edge.clone(), sender.clone()).await.map_err(failed)?;
         predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
         let presence = edge.presence.clone().unwrap_or_default();
@@ -60,7 +73,7 @@ impl Bus {
         let status = tokio::spawn(presence::publish_status(edge.clone(), presence, key, name, interval, sender));
         let publisher = tokio::spawn(publish(session.clone(), receiver));
         tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
-        Ok(Self { session, publisher, soil, status, _token: token })
+        Ok(Self { session, publisher, soil, sharing, status, _token: token })
     }
 
     /// Leaves the network.
@@ -70,6 +83,7 @@ impl Bus {
         }
         self.publisher.abort();
         self.soil.abort();
+        self.sharing.iter().for_each(tokio::task::JoinHandle::abort);
         self.status.abort();
     }
 }

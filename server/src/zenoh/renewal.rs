@@ -8,7 +8,7 @@ use tokio::task::JoinHandle;
 use tokio_rustls::rustls::ServerConfig;
 
 use super::{Bus, Presence};
-use crate::config::{TlsConfig, ZenohConfig};
+use crate::config::{FleetSoilConfig, TlsConfig, ZenohConfig};
 use crate::error::ServerError;
 use crate::grpc::Edge;
 
@@ -24,6 +24,7 @@ pub(crate) struct RenewedBus {
 /// What it takes to join.
 struct Joining {
     config: ZenohConfig,
+    fleet_soil: FleetSoilConfig,
     tls: TlsConfig,
     edge: Edge,
 }
@@ -35,14 +36,15 @@ impl RenewedBus {
     /// `ServerError` when it cannot be joined the first time.
     pub async fn start(
         config: ZenohConfig,
+        fleet_soil: FleetSoilConfig,
         tls: TlsConfig,
         edge: Edge,
         changes: Option<watch::Receiver<Arc<ServerConfig>>>,
     ) -> Result<Self, ServerError> {
-        let bus = Bus::start(&config, &tls, &edge).await?;
+        let bus = Bus::start(&config, &fleet_soil, &tls, &edge).await?;
         let changes = changes.filter(|_| config.uses_tls());
         let (stop, stopped) = oneshot::channel();
-        let task = tokio::spawn(Joining { config, tls, edge }.renew(bus, changes, stopped));
+        let task = tokio::spawn(Joining { config, fleet_soil, tls, edge }.renew(bus, changes, stopped));
         Ok(Self { stop, task })
     }
 
@@ -69,7 +71,7 @@ impl Joining {
                 bus.stop().await;
                 self.edge.presence.iter().for_each(Presence::forget);
             }
-            match Bus::start(&self.config, &self.tls, &self.edge).await {
+            match Bus::start(&self.config, &self.fleet_soil, &self.tls, &self.edge).await {
                 Ok(bus) => {
                     tracing::info!(target: "nesam::audit", "zenoh joined anew with changed certificates or rights");
                     joined = Some(bus);

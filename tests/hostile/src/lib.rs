@@ -25,7 +25,7 @@ use tempfile::TempDir;
 pub type Reader = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const READERS: [Reader; 21] = [
+pub const READERS: [Reader; 22] = [
     ("bag", bag),
     ("csv_log", csv_log),
     ("mapping", mapping),
@@ -43,6 +43,7 @@ pub const READERS: [Reader; 21] = [
     ("open_session", open_session),
     ("predict", predict),
     ("session_image", session_image),
+    ("fleet_soil_shares", fleet_soil_shares),
     ("map_messages", map_messages),
     ("recording", recording),
     ("fleet_file", fleet_file),
@@ -191,6 +192,10 @@ fn predict(bytes: &[u8]) {
 
 fn session_image(bytes: &[u8]) {
     drop(convert::session_image(bytes));
+}
+
+fn fleet_soil_shares(bytes: &[u8]) {
+    drop(message::<pb::FleetSoilShares>(bytes).map(|message| convert::heard_fleet_soil(&message, "own")));
 }
 
 /// The messages of an upload one after the other, each behind its length of two bytes.

@@ -10,7 +10,7 @@ use crate::stage::predictor;
 
 pub const FLEET: &str = r#"
 operators = ["control"]
-servers = ["alpha"]
+servers = ["alpha", "beta"]
 proxies = ["front"]
 [vehicles.truck]
 maps = ["local"]

@@ -7,6 +7,7 @@ mod bad_input;
 mod effects;
 mod extras;
 mod fleet_soil;
+mod fleet_soil_sharing;
 mod from_now;
 mod lifecycle;
 mod live_page;

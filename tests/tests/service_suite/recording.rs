@@ -69,7 +69,8 @@ async fn record(folder: &Path, change: impl FnOnce(&mut Config)) -> Vec<PathBuf>
     parts
 }
 
-fn replayed(paths: &[PathBuf]) -> ReplayReport {
+/// What comes out when recordings are replayed.
+pub fn replayed(paths: &[PathBuf]) -> ReplayReport {
     let mut recording = Recording::open(paths).unwrap();
     replay(&mut recording, Arc::new(fresh_predictor()), false, &mut |_| {}).unwrap()
 }

@@ -1,12 +1,14 @@
 //! Goal: on Zenoh nobody is heard in another one's name, and nobody hears what is not for him. Method: once a router with the configuration of
 //! `nesam router-config` in front of the server, once the server as its own router; members and strangers of a fleet come with real certificates.
 
+use std::path::Path;
 use std::time::Duration;
 
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{Client, Tls, outcome_label, v1};
 use nesam_server::access::FleetFile;
-use nesam_server::{LinkFiles, ZenohMode, router_config};
+use nesam_server::{LinkFiles, RunningServer, ZenohMode, router_config};
+use prost::Message as _;
 
 use crate::authority::{Authority, FLEET, Stage, dns, secured_with, uri, written};
 use crate::stage::*;
@@ -97,19 +99,79 @@ async fn service_a_router_with_the_written_configuration_guards_the_fleet() {
     let config = router_config(&members, "test", &listen, LinkFiles { certificate: &certificate, key: &key, authority: &ca });
     let router = zenoh::open(zenoh::Config::from_json5(&config.to_string()).unwrap()).await.unwrap();
 
-    let (server_certificate, server_key) = authority.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
-    let (server_certificate, server_key) = (write("alpha.pem", &server_certificate), write("alpha.key", &server_key));
-    let mut stage = secured_with(|config| {
-        (config.tls.certificate, config.tls.key, config.tls.client_ca) = (server_certificate, server_key, ca.clone());
-        behind(config, &endpoint);
-        config.zenoh.name = "alpha".into();
-    })
-    .await;
+    let server = async |authority: &Authority, name: &str| {
+        let (certificate, key) = authority.sign(&[dns("localhost"), uri(&format!("nesam:server:{name}"))], false);
+        let (certificate, key) = (write(&format!("{name}.pem"), &certificate), write(&format!("{name}.key"), &key));
+        secured_with(|config| {
+            (config.tls.certificate, config.tls.key, config.tls.client_ca) = (certificate, key, ca.clone());
+            behind(config, &endpoint);
+            config.zenoh.name = name.into();
+            config.fleet_soil.enabled = true;
+        })
+        .await
+    };
+    let mut stage = server(&authority, "alpha").await;
     stage.authority = authority;
-    let operator = stage.client("nesam:operator:control").await;
-    guarded(&stage, &endpoint, operator).await;
+    let mut operator = stage.client("nesam:operator:control").await;
+    guarded(&stage, &endpoint, operator.clone()).await;
+
+    let beta = server(&stage.authority, "beta").await.server;
+    // Servers tell each other what they learn of the soil, and nobody else is heard on that key.
+    let soil = async |server: &RunningServer| {
+        let tls = stage.authority.tls("nesam:operator:control");
+        let mut client = Client::connect_tls(&format!("https://{}", server.grpc_addr), &tls).await.unwrap();
+        client.fleet_soil("").await.unwrap().cells.iter().map(|cell| cell.buffers).sum::<f64>()
+    };
+    operator.feed((22..=70).map(|i| sample("truck", &recorded().drive, i)).collect()).await.unwrap();
+    let known = soil(&stage.server).await;
+    assert!(known > 3.0, "{known} buffers");
+    let told = async |server: &RunningServer| (soil(server).await - known).abs() < 0.01;
+    eventually(PATIENCE, "what alpha published", async || told(&beta).await).await;
+    let forged = v1::FleetSoilShares {
+        bundle_hash: predictor().bundle().hash.clone(),
+        cell_m: 10.0,
+        shares: vec![v1::FleetSoilShare { service: "stranger".into(), cells: vec![some_evidence()] }],
+    };
+    let (certificate, key) = stage.authority.sign(&[uri("nesam:vehicle:truck")], false);
+    let (certificate, key) = (write("truck.pem", &certificate), write("truck.key", &key));
+    let of_truck = zenoh::open(zenoh::Config::from_json5(&joining(&endpoint, &certificate, &key, &ca)).unwrap()).await.unwrap();
+    of_truck.put("nesam/v1/test/server/beta/soil_map", forged.encode_to_vec()).await.unwrap();
+    tokio::time::sleep(SILENCE).await;
+    assert!(told(&stage.server).await && told(&beta).await, "a vehicle is no server");
+    // A server that comes late asks.
+    beta.shutdown().await;
+    let beta = server(&stage.authority, "beta").await.server;
+    eventually(PATIENCE, "what beta asked for", async || told(&beta).await).await;
+    // The same message from a server is taken: it was the key that was not the vehicle's.
+    let (certificate, key) = stage.authority.sign(&[uri("nesam:server:beta")], false);
+    let (certificate, key) = (write("second.pem", &certificate), write("second.key", &key));
+    let of_server = zenoh::open(zenoh::Config::from_json5(&joining(&endpoint, &certificate, &key, &ca)).unwrap()).await.unwrap();
+    of_server.put("nesam/v1/test/server/beta/soil_map", forged.encode_to_vec()).await.unwrap();
+    eventually(PATIENCE, "a server's message", async || soil(&stage.server).await > known + 0.9).await;
+    beta.shutdown().await;
     stage.server.shutdown().await;
     router.close().await.unwrap();
+}
+
+/// One buffer of evidence on a cell.
+fn some_evidence() -> v1::SharedSoilCell {
+    let information = (0..36).map(|i| if i % 7 == 0 { 1.0 } else { 0.0 }).collect();
+    let vector = Some(v1::SoilVector { n: 1.0, ..Default::default() });
+    let cell = v1::FleetSoilCell { map_id: "m".into(), information, vector, buffers: 1.0, ..Default::default() };
+    v1::SharedSoilCell { cell: Some(cell), votes: 0.0, revision: 1 }
+}
+
+/// Configuration of a Zenoh client with a certificate.
+fn joining(endpoint: &str, certificate: &Path, key: &Path, authority: &Path) -> String {
+    serde_json::json!({
+        "mode": "client",
+        "connect": { "endpoints": [endpoint] },
+        "scouting": { "multicast": { "enabled": false } },
+        "transport": { "shared_memory": { "enabled": false }, "link": { "tls": {
+            "root_ca_certificate": authority, "enable_mtls": true, "connect_certificate": certificate, "connect_private_key": key,
+        } } },
+    })
+    .to_string()
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -137,22 +137,26 @@ fn changes(n: u64) -> Vec<Change> {
     if n.is_multiple_of(5) {
         changes.push(Change::RemoveSession(format!("s{}", n % 7)));
         changes.push(Change::PutMap("map".into(), n.to_le_bytes().repeat(4000)));
+        changes.push(Change::RemoveSoil(format!("c{}", n % 3)));
     }
+    changes.push(Change::PutSoil(StoredSoil { key: format!("c{}", n % 4), saved_unix_ns: n as i64, share: n.to_le_bytes().repeat(50) }));
     changes
 }
 
 /// What a store holds after commit `n`.
 fn expected(n: u64) -> Contents {
-    let (mut sessions, mut maps) = (BTreeMap::new(), BTreeMap::new());
+    let (mut sessions, mut maps, mut soil) = (BTreeMap::new(), BTreeMap::new(), BTreeMap::new());
     for change in (1..=n).flat_map(changes) {
         match change {
             Change::PutSession(s) => drop(sessions.insert(s.name.clone(), s)),
             Change::RemoveSession(name) => drop(sessions.remove(&name)),
             Change::PutMap(id, bytes) => drop(maps.insert(id, bytes)),
             Change::RemoveMap(id) => drop(maps.remove(&id)),
+            Change::PutSoil(s) => drop(soil.insert(s.key.clone(), s)),
+            Change::RemoveSoil(key) => drop(soil.remove(&key)),
         }
     }
-    Contents { sessions: sessions.into_values().collect(), maps: maps.into_iter().collect() }
+    Contents { sessions: sessions.into_values().collect(), maps: maps.into_iter().collect(), soil: soil.into_values().collect() }
 }
 
 /// Commits until the power goes; the last commit that returned.
