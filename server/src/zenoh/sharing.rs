@@ -6,6 +6,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use ::zenoh::query::QueryTarget;
 use nesam_engine::{Command, EngineError, FleetCell, FleetShare};
 use nesam_proto::v1 as pb;
 
@@ -83,7 +84,7 @@ impl Sharing {
     }
 
     async fn ask(&self, session: &::zenoh::Session, all: &str) {
-        let replies = match session.get(all).timeout(ANSWER_WITHIN).await {
+        let replies = match session.get(all).target(QueryTarget::All).timeout(ANSWER_WITHIN).await {
             Ok(replies) => replies,
             Err(error) => return tracing::warn!(%error, "the other servers were not asked for their soil maps"),
         };
