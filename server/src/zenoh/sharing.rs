@@ -17,6 +17,8 @@ use crate::telemetry::Transport;
 
 /// Largest message of another server, bytes: a hundred thousand cells.
 const SHARES_BYTES_MAX: usize = 64 << 20;
+/// Cells that the engine takes in one command: a few tenths of a millisecond.
+const CELLS_AT_ONCE: usize = 512;
 /// Wait for the answers of the other servers.
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
 
@@ -98,27 +100,34 @@ impl Sharing {
     /// Hands over to the engine what another server tells. Runs on threads of Zenoh too.
     fn hear(&self, payload: &[u8]) {
         match self.heard(payload) {
-            Ok(None) => {}
-            Ok(Some(command)) => {
-                let submission = self.edge.engine.submission(command, |answer| {
-                    if let Err(error) = answer.result {
-                        tracing::warn!(%error, "what another server tells of the soil was not taken");
-                    }
-                });
-                self.edge.engine.handle().submit(submission);
+            Ok(commands) => {
+                for command in commands {
+                    let submission = self.edge.engine.submission(command, |answer| {
+                        if let Err(error) = answer.result {
+                            tracing::warn!(%error, "what another server tells of the soil was not taken");
+                        }
+                    });
+                    self.edge.engine.handle().submit(submission);
+                }
             }
             Err(error) => tracing::warn!(%error, "what another server tells of the soil was not taken"),
         }
     }
 
-    /// The command that takes it; `None` if there is nothing in it for this server.
-    fn heard(&self, payload: &[u8]) -> Result<Option<Command>, EngineError> {
+    /// The commands that take it, short ones, so that none holds up a measurement; none if there is nothing in it for this server.
+    fn heard(&self, payload: &[u8]) -> Result<Vec<Command>, EngineError> {
         let message: pb::FleetSoilShares = decode("nesam.v1.FleetSoilShares", payload, SHARES_BYTES_MAX)?;
         // Corrections are relative to what a bundle reads off the map.
         if message.bundle_hash != self.edge.predictor.bundle().hash {
-            return Ok(None);
+            return Ok(Vec::new());
         }
+        let cell_m = message.cell_m;
+        let command = |service: &str, cells: &[FleetCell]| Command::HearFleetSoil {
+            cell_m,
+            shares: vec![FleetShare { service: service.into(), cells: cells.to_vec() }],
+        };
         let shares = heard_fleet_soil(&message, &self.service)?;
-        Ok((!shares.is_empty()).then_some(Command::HearFleetSoil { cell_m: message.cell_m, shares }))
+        let parts = shares.iter().flat_map(|share| share.cells.chunks(CELLS_AT_ONCE).map(|cells| (share.service.as_str(), cells)));
+        Ok(parts.map(|(service, cells)| command(service, cells)).collect())
     }
 }
