@@ -15,7 +15,15 @@ from ._errors import Unavailable, from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
-from .v1 import alarms_pb2, measurements_pb2_grpc, prediction_pb2_grpc, sessions_pb2_grpc, terrain_pb2_grpc
+from .v1 import (
+    alarms_pb2,
+    measurements_pb2_grpc,
+    prediction_pb2_grpc,
+    sessions_pb2_grpc,
+    soil_pb2,
+    soil_pb2_grpc,
+    terrain_pb2_grpc,
+)
 
 
 class AsyncClient:
@@ -36,6 +44,7 @@ class AsyncClient:
             "sessions": sessions_pb2_grpc.SessionsStub(channel),
             "prediction": prediction_pb2_grpc.PredictionStub(channel),
             "terrain": terrain_pb2_grpc.TerrainStub(channel),
+            "soil": soil_pb2_grpc.SoilStub(channel),
             "measurements": measurements_pb2_grpc.MeasurementsStub(channel),
         }
         self._known_states = calls.KnownStates()
@@ -114,6 +123,20 @@ class AsyncClient:
                 yield m.alarm(message)
         except grpc.RpcError as error:
             raise from_rpc(error) from None
+
+    # Soil
+
+    async def watch_soil(self, session_id: str) -> AsyncIterator[t.SoilEstimate]:
+        """As `Client.watch_soil`, for `async for`."""
+        try:
+            async for message in self._stubs["soil"].Watch(soil_pb2.WatchSoilRequest(session_id=session_id), metadata=self._metadata):
+                yield t.soil_estimate(message)
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
+
+    async def fleet_soil(self, map_id: str = "") -> t.FleetSoil:
+        """As `Client.fleet_soil`."""
+        return await self._do(calls.fleet_soil(map_id))
 
     # Maps
 

@@ -11,7 +11,7 @@ from ._candidates import Drawing, PathCost
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
 from ._extras import Extras
 from ._fallback import KinematicFallback
-from .v1 import effects_pb2, prediction_pb2, sessions_pb2, terrain_pb2, types_pb2
+from .v1 import effects_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2, types_pb2
 
 LATE = (DeadlineExceeded, Overloaded, Unavailable)
 """What a fallback may answer instead of."""
@@ -119,6 +119,11 @@ def maps() -> Call:
         return [m.map_description(one) for one in reply.maps]
 
     return Call("terrain", "List", terrain_pb2.ListMapsRequest(), read)
+
+
+def fleet_soil(map_id: str) -> Call:
+    """Reads the soil map of the fleet."""
+    return Call("soil", "Map", soil_pb2.FleetSoilRequest(map_id=map_id), t.fleet_soil)
 
 
 def delete_map(map_id: str) -> Call:

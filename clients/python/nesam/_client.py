@@ -17,7 +17,16 @@ from ._errors import Unavailable, from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
-from .v1 import alarms_pb2, measurements_pb2, measurements_pb2_grpc, prediction_pb2_grpc, sessions_pb2_grpc, terrain_pb2_grpc
+from .v1 import (
+    alarms_pb2,
+    measurements_pb2,
+    measurements_pb2_grpc,
+    prediction_pb2_grpc,
+    sessions_pb2_grpc,
+    soil_pb2,
+    soil_pb2_grpc,
+    terrain_pb2_grpc,
+)
 
 class Client:
     """A connection to a service, e.g. `Client("127.0.0.1:50051")`. Threads may share it. Close it, or use it in a `with` block.
@@ -37,6 +46,7 @@ class Client:
             "sessions": sessions_pb2_grpc.SessionsStub(self._channel),
             "prediction": prediction_pb2_grpc.PredictionStub(self._channel),
             "terrain": terrain_pb2_grpc.TerrainStub(self._channel),
+            "soil": soil_pb2_grpc.SoilStub(self._channel),
         }
         self._measurements = measurements_pb2_grpc.MeasurementsStub(self._channel)
         self._known_states = calls.KnownStates()
@@ -122,6 +132,20 @@ class Client:
                 yield m.alarm(message)
         except grpc.RpcError as error:
             raise from_rpc(error) from None
+
+    # Soil
+
+    def watch_soil(self, session_id: str) -> Iterator[t.SoilEstimate]:
+        """What a session knows of the soil: the present estimate at once, then each change. Ends when the session closes. Raises NotFound."""
+        try:
+            for message in self._stubs["soil"].Watch(soil_pb2.WatchSoilRequest(session_id=session_id)):
+                yield t.soil_estimate(message)
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
+
+    def fleet_soil(self, map_id: str = "") -> t.FleetSoil:
+        """What the fleet has learned of the ground of a map, "" = of all. Raises FailedPrecondition (the service keeps no such map: `fleet_soil.enabled`)."""
+        return self._do(calls.fleet_soil(map_id))
 
     # Maps
 

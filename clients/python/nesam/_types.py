@@ -3,13 +3,13 @@
 import enum
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Dict, Optional, Sequence, Tuple
+from typing import Dict, List, Optional, Sequence, Tuple
 
 import numpy as np
 
 from ._candidates import Ranking
 from ._extras import ExtraOutputs
-from .v1 import types_pb2
+from .v1 import soil_pb2, types_pb2
 
 
 class Validity(enum.IntFlag):
@@ -62,6 +62,43 @@ class Soil:
     delta: np.ndarray
     covariance: Optional[np.ndarray]
     learned: np.ndarray
+
+
+@dataclass(frozen=True)
+class SoilEstimate:
+    """What a session knows of the soil after an update. soil_epoch counts the updates, 0 = none yet; stamp_ns: last measurement that went in, of the vehicle's clock, None before
+    the first update.
+    """
+
+    session_id: str
+    soil_epoch: int
+    stamp_ns: Optional[int]
+    soil: Soil
+
+
+@dataclass(frozen=True)
+class SoilCell:
+    """Evidence of the fleet on one cell of ground that looks alike, without any prior, in the coordinates of `Soil`.
+
+    colour_rgb: (3,) uint8, of the semantic map in steps of 16 levels. cell: (column, row) = floor(position / cell_m) in World. information: (6, 6). vector: (6,),
+    information times mean. buffers: buffers of a filter that went in, aged to the last one, age_s ago.
+    """
+
+    map_id: str
+    colour_rgb: np.ndarray
+    cell: Tuple[int, int]
+    information: np.ndarray
+    vector: np.ndarray
+    buffers: float
+    age_s: float
+
+
+@dataclass(frozen=True)
+class FleetSoil:
+    """What the fleet has learned of the ground: edge of a cell in m, and the cells by map, colour and place."""
+
+    cell_m: float
+    cells: List[SoilCell]
 
 
 @dataclass(frozen=True)
@@ -293,6 +330,29 @@ def soil(message: types_pb2.SoilCorrection) -> Soil:
         covariance=np.array(message.covariance).reshape(6, 6) if message.covariance else None,
         learned=np.array(message.learned, dtype=bool),
     )
+
+
+def soil_estimate(message: soil_pb2.SoilEstimate) -> SoilEstimate:
+    """An estimate from its message."""
+    stamp_ns = message.stamp_ns if message.HasField("stamp_ns") else None
+    return SoilEstimate(message.session_id, message.soil_epoch, stamp_ns, soil(message.correction))
+
+
+def fleet_soil(message: soil_pb2.FleetSoilMap) -> FleetSoil:
+    """The soil map of the fleet from its message."""
+
+    def cell(one: soil_pb2.FleetSoilCell) -> SoilCell:
+        return SoilCell(
+            map_id=one.map_id,
+            colour_rgb=np.array([one.colour_rgb >> shift & 0xFF for shift in (16, 8, 0)], np.uint8),
+            cell=(one.column, one.row),
+            information=np.array(one.information).reshape(6, 6),
+            vector=soil_array(one.vector),
+            buffers=one.buffers,
+            age_s=one.age_s,
+        )
+
+    return FleetSoil(message.cell_m, [cell(one) for one in message.cells])
 
 
 def provenance(message: types_pb2.Provenance) -> Provenance:

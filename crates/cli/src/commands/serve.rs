@@ -80,7 +80,7 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
         return checked(&config, bundle);
     }
     start_workers(&config.workers).or_failed()?;
-    let (zenoh, kept) = (config.zenoh.clone(), kept(&config));
+    let (zenoh, kept, soil) = (config.zenoh.clone(), kept(&config), fleet_soil(&config));
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(async {
         // The signals are caught before the addresses are printed, so that whoever waits for them can stop the server at once.
@@ -88,6 +88,7 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
         let (server, bundle) = start(config, bundle).await?;
         announce(&server, &bundle, &zenoh);
         say!("store {kept}");
+        soil.iter().for_each(|soil| say!("soil  {soil}"));
         say!("ready; ctrl-c stops");
         server
             .run_until(async {
@@ -155,6 +156,17 @@ fn kept(config: &Config) -> String {
     }
 }
 
+/// Who has the soil map of the fleet, and for how long; `None` without one.
+fn fleet_soil(config: &Config) -> Option<String> {
+    let told = match (config.zenoh.enabled, config.fleet_soil.exchange_s > 0.0) {
+        (true, true) => format!("told to the other servers of fleet `{}`", config.zenoh.fleet),
+        (true, false) => "of this server alone, as `fleet_soil.exchange_s` is 0".into(),
+        (false, _) => "of this server alone, as `zenoh` is off".into(),
+    };
+    let kept = if config.store.enabled { "kept in the store" } else { "not kept by this process" };
+    config.fleet_soil.enabled.then(|| format!("map of the fleet, {told}; {kept}"))
+}
+
 /// Says on standard output where the service listens; scripts read these lines.
 fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     say!("nesam {} with bundle {} {}", env!("CARGO_PKG_VERSION"), bundle.name, bundle.hash);
@@ -198,6 +210,7 @@ fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
         }
     );
     say!("store  {}", kept(config));
+    fleet_soil(config).iter().for_each(|soil| say!("soil   {soil}"));
     say!("sound");
     Ok(())
 }
