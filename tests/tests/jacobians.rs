@@ -1,5 +1,6 @@
 //! Goal: Jacobians along a rollout are the derivatives of the prediction. Method: the shipped bundle on windows of a recorded drive; forward-mode tangents
 //! against central differences in f64 of the same function (terrain held), the function against the fast path, and what holding the terrain neglects.
+#![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,6 +1,7 @@
 //! Goal: the soil filter that ships knows how wrong it is.
 //! Method: seeded twin drives by the same physics on soils drawn from the filter's own prior, with the noise that the bundle states; the long run with 300
 //! drives is `nesam bench consistency`. A filter that is too sure leaves these bands: the last test shows one that does.
+#![allow(clippy::unwrap_used)]
 
 use std::sync::Arc;
 

@@ -1,5 +1,6 @@
 //! Goal: what the filter has beyond Algorithm 1 does what its settings say.
 //! Method: twin drives by the same physics, each with one thing changed.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 

@@ -1,5 +1,6 @@
 //! Goal: the filter is Algorithm 1, finds the soil that it should find, is honest about how well, and is undisturbed by bad input.
 //! Method: twin drives by the same physics on another soil with seeded sensor noise; closed forms; finite differences.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 

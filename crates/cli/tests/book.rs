@@ -1,4 +1,5 @@
 //! Goal: the book leads somewhere. Method: every shell block after `<!-- run -->` is run with the real binary, every link within the book is followed.
+#![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

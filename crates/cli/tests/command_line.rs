@@ -1,5 +1,6 @@
 //! Goal: what a person meets at the command line. Method: the real binary on the committed sample, or on a copy of it that is damaged on
 //! purpose; exit codes and the words of the messages are the contract.
+#![allow(clippy::unwrap_used)]
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};

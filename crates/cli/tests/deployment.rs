@@ -1,5 +1,6 @@
 //! Goal: what is shipped for operators does what it says. Method: the real binary; with everything that has metrics on, every metric that
 //! the alert rules and the dashboard name is among those of `/metrics`.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 

@@ -1,5 +1,6 @@
 //! Goal: a server that is killed loses no measurement that it called durable, and the estimate goes on as if nothing had happened. Method: the real
 //! binary, SIGKILL in the middle of a recorded drive, a restart on the same store; a second server that is never killed is the oracle, bit for bit.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 

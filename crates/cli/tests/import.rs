@@ -1,4 +1,5 @@
 //! Goal: a log of one's own becomes a set that every command reads, and what is odd in it is told. Method: the real binary on the example of the book.
+#![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -1,5 +1,6 @@
 //! Goal: the field engineer's way: record with the real server, stop it gently or kill it, replay what is on the disk. Method: the real binary,
 //! sockets, signals; exit codes and words are the contract.
+#![allow(clippy::unwrap_used)]
 
 mod common;
 

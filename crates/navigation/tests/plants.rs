@@ -1,5 +1,6 @@
 //! Goal: a plant is the same whichever way it is reached, and the loop around it is repeatable.
 //! Method: the plant of `tests/plant` in this process and over UDP; a foreign plant in Python; laps with the kinematic model, which needs no server.
+#![allow(clippy::unwrap_used)]
 
 use std::net::UdpSocket;
 use std::path::{Path, PathBuf};

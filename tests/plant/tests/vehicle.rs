@@ -1,6 +1,7 @@
 //! Goal: the plant obeys the laws that need no simulator to be known, and comes close to the one that made the recorded drives.
 //! Method: level ground of one soil with closed-form answers; a recorded drive of the sample with the record's own figures as limits is the
 //! command `nesam plant check`.
+#![allow(clippy::unwrap_used)]
 
 use std::path::Path;
 use std::sync::Arc;

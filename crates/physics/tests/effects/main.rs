@@ -1,5 +1,6 @@
 //! Goal: each effect moves the vehicle as mechanics says, and is nothing when scaled to zero.
 //! Method: closed forms of statics and steady turns on level ground.
+#![allow(clippy::unwrap_used)]
 
 mod actuator;
 #[path = "../common/mod.rs"]
