@@ -22,7 +22,7 @@ async fn server(endpoint: &str, name: &str, change: impl FnOnce(&mut Config)) ->
 /// A server of the fleet.
 async fn server_without_map(endpoint: &str, name: &str, change: impl FnOnce(&mut Config)) -> (RunningServer, Client) {
     start_with(|config| {
-        config.fleet_soil.enabled = true;
+        (config.fleet_soil.enabled, config.fleet_soil.exchange_s) = (true, 1.0);
         behind(config, endpoint);
         config.zenoh.name = name.into();
         change(config);

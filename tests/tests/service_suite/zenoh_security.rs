@@ -106,7 +106,7 @@ async fn service_a_router_with_the_written_configuration_guards_the_fleet() {
             (config.tls.certificate, config.tls.key, config.tls.client_ca) = (certificate, key, ca.clone());
             behind(config, &endpoint);
             config.zenoh.name = name.into();
-            config.fleet_soil.enabled = true;
+            (config.fleet_soil.enabled, config.fleet_soil.exchange_s) = (true, 1.0);
         })
         .await
     };
