@@ -20,13 +20,13 @@ use crate::call::EngineClient;
 use crate::clock::{MonotonicClock, unix_ns};
 use crate::cluster::Cluster;
 use crate::config::{Config, GrpcConfig};
-use crate::convert::service_name;
+use crate::convert::SoilTeller;
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
 use crate::http::{self, HttpState};
 use crate::recording::{Recorder, RecordingHeader};
-use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, SoilOf, StoreError, restore};
+use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
 use crate::tls_listener;
 use crate::web::{Feed, Live, Raised};
@@ -173,7 +173,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
 /// The keeper that the configuration asks for; it keeps the soil map of the fleet where no other server does.
 fn keeper_of(config: &Config, predictor: &Predictor, run: u64) -> Keeper {
     let keeper = Keeper::new(Duration::from_secs_f64(config.store.interval_s));
-    let of = SoilOf { service: service_name(run), bundle_hash: predictor.bundle().hash.clone() };
+    let of = SoilTeller::new(run, &predictor.bundle().hash);
     if config.fleet_soil.enabled && config.store.enabled { keeper.with_soil(of) } else { keeper }
 }
 

@@ -67,6 +67,13 @@ class AsyncClient:
         except grpc.RpcError as error:
             raise from_rpc(error) from None
 
+    async def _watch(self, service: str, method: str, request, read):
+        try:
+            async for message in getattr(self._stubs[service], method)(request, metadata=self._metadata):
+                yield read(message)
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
+
     # Sessions
 
     async def open_session(
@@ -115,24 +122,15 @@ class AsyncClient:
         """As `Client.revert_effects`."""
         return await self._do(calls.revert_effects(session_id))
 
-    async def alarms(self, session_id: str) -> AsyncIterator[t.Alarm]:
+    def alarms(self, session_id: str) -> AsyncIterator[t.Alarm]:
         """As `Client.alarms`, for `async for`."""
-        request = alarms_pb2.WatchAlarmsRequest(session_id=session_id)
-        try:
-            async for message in self._stubs["sessions"].WatchAlarms(request, metadata=self._metadata):
-                yield m.alarm(message)
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+        return self._watch("sessions", "WatchAlarms", alarms_pb2.WatchAlarmsRequest(session_id=session_id), m.alarm)
 
     # Soil
 
-    async def watch_soil(self, session_id: str) -> AsyncIterator[t.SoilEstimate]:
+    def watch_soil(self, session_id: str) -> AsyncIterator[t.SoilEstimate]:
         """As `Client.watch_soil`, for `async for`."""
-        try:
-            async for message in self._stubs["soil"].Watch(soil_pb2.WatchSoilRequest(session_id=session_id), metadata=self._metadata):
-                yield t.soil_estimate(message)
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+        return self._watch("soil", "Watch", soil_pb2.WatchSoilRequest(session_id=session_id), t.soil_estimate)
 
     async def fleet_soil(self, map_id: str = "") -> t.FleetSoil:
         """As `Client.fleet_soil`."""

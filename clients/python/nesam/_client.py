@@ -68,6 +68,13 @@ class Client:
         except grpc.RpcError as error:
             raise from_rpc(error) from None
 
+    def _watch(self, service: str, method: str, request, read):
+        try:
+            for message in getattr(self._stubs[service], method)(request):
+                yield read(message)
+        except grpc.RpcError as error:
+            raise from_rpc(error) from None
+
     # Sessions
 
     def open_session(
@@ -127,21 +134,13 @@ class Client:
 
     def alarms(self, session_id: str) -> Iterator[t.Alarm]:
         """The alarms of a session as they come: the active one first, then each that is raised or cleared. Ends when the session closes. Raises NotFound."""
-        try:
-            for message in self._stubs["sessions"].WatchAlarms(alarms_pb2.WatchAlarmsRequest(session_id=session_id)):
-                yield m.alarm(message)
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+        return self._watch("sessions", "WatchAlarms", alarms_pb2.WatchAlarmsRequest(session_id=session_id), m.alarm)
 
     # Soil
 
     def watch_soil(self, session_id: str) -> Iterator[t.SoilEstimate]:
         """What a session knows of the soil: the present estimate at once, then each change. Ends when the session closes. Raises NotFound."""
-        try:
-            for message in self._stubs["soil"].Watch(soil_pb2.WatchSoilRequest(session_id=session_id)):
-                yield t.soil_estimate(message)
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+        return self._watch("soil", "Watch", soil_pb2.WatchSoilRequest(session_id=session_id), t.soil_estimate)
 
     def fleet_soil(self, map_id: str = "") -> t.FleetSoil:
         """What the fleet has learned of the ground of a map, "" = of all. Raises FailedPrecondition (the service keeps no such map: `fleet_soil.enabled`)."""

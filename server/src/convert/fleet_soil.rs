@@ -26,9 +26,42 @@ fn cell_message(cell: &FleetCell) -> pb::FleetSoilCell {
     }
 }
 
-/// Name of a server in one of its lives, for [`fleet_soil_shares`].
-pub fn service_name(run: u64) -> String {
-    format!("{run:016x}")
+/// A server in its present life, and the bundle that its evidence of the soil belongs to: what it tells of that and takes of what others tell.
+#[derive(Clone, Debug)]
+pub struct SoilTeller {
+    service: String,
+    bundle_hash: String,
+}
+
+impl SoilTeller {
+    /// Of a run of a server with a bundle.
+    pub fn new(run: u64, bundle_hash: &str) -> Self {
+        Self { service: format!("{run:016x}"), bundle_hash: bundle_hash.into() }
+    }
+
+    /// Name of the server in this life.
+    pub fn service(&self) -> &str {
+        &self.service
+    }
+
+    /// What is known here, as message.
+    pub fn tell(&self, cell_m: f64, shares: &[FleetShare]) -> pb::FleetSoilShares {
+        fleet_soil_shares(&self.bundle_hash, &self.service, cell_m, shares)
+    }
+
+    /// One cell of what was brought here, as message.
+    pub fn tell_cell(&self, cell_m: f64, own: &FleetCell) -> pb::FleetSoilShares {
+        self.tell(cell_m, &[FleetShare { service: String::new(), cells: vec![own.clone()] }])
+    }
+
+    /// What of a message is for this server: nothing of another bundle, as corrections are relative to what a bundle reads off the map, and nothing that was brought
+    /// here.
+    ///
+    /// # Errors
+    /// As [`heard_fleet_soil`].
+    pub fn hear(&self, message: &pb::FleetSoilShares) -> Result<Vec<FleetShare>, EngineError> {
+        if message.bundle_hash == self.bundle_hash { heard_fleet_soil(message, &self.service) } else { Ok(Vec::new()) }
+    }
 }
 
 /// What was brought to servers as message; `own` is the name of this one.

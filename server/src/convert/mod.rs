@@ -19,7 +19,7 @@ mod terrain_message;
 pub use alarm::alarm_message;
 pub use command::{measurement_message, open_message, predict_message};
 pub use effects::{applied_effects, effect_messages};
-pub use fleet_soil::{fleet_soil_map, fleet_soil_shares, heard_fleet_soil, service_name};
+pub use fleet_soil::{SoilTeller, fleet_soil_map, fleet_soil_shares, heard_fleet_soil};
 pub use image::{image_bytes, session_image};
 pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};

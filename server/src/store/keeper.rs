@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use nesam_engine::sync::thread::{self, JoinHandle};
 use nesam_engine::sync::{Condvar, Mutex, MutexGuard};
-use nesam_engine::{CellKey, Command, EngineHandle, Event, FleetCell, FleetShare, Reply, Snapshot};
+use nesam_engine::{CellKey, Command, EngineHandle, Event, FleetCell, Reply, Snapshot};
 use prost::Message as _;
 use tokio::sync::watch;
 use tokio::time::Instant;
@@ -15,7 +15,7 @@ use super::map_bytes::map_bytes;
 use super::restore::Restored;
 use super::{Change, SessionStore, StoreError, StoredSession, StoredSoil};
 use crate::clock::unix_ns;
-use crate::convert::{fleet_soil_shares, image_bytes};
+use crate::convert::{SoilTeller, image_bytes};
 
 /// Pause before a commit that failed is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
@@ -71,15 +71,6 @@ struct State {
     stopping: bool,
 }
 
-/// Whose evidence of the soil is kept.
-#[derive(Clone, Debug)]
-pub(crate) struct SoilOf {
-    /// This server in its present life.
-    pub service: String,
-    /// Hash of its bundle.
-    pub bundle_hash: String,
-}
-
 /// Knows what is durable and sees to it that everything becomes so.
 #[derive(Debug)]
 pub struct Keeper {
@@ -89,7 +80,7 @@ pub struct Keeper {
     committed: watch::Sender<u64>,
     interval: Duration,
     /// Whose soil map is kept; `None` = nobody's.
-    soil_of: Option<SoilOf>,
+    soil_of: Option<SoilTeller>,
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -101,12 +92,12 @@ impl Keeper {
     }
 
     /// Whose evidence of the soil is kept.
-    pub(crate) fn soil_of(&self) -> Option<&SoilOf> {
+    pub(crate) fn soil_of(&self) -> Option<&SoilTeller> {
         self.soil_of.as_ref()
     }
 
     /// Keeps what is brought to the soil map of the fleet too.
-    pub(crate) fn with_soil(self, of: SoilOf) -> Self {
+    pub(crate) fn with_soil(self, of: SoilTeller) -> Self {
         Self { soil_of: Some(of), ..self }
     }
 
@@ -268,11 +259,10 @@ impl Keeper {
         let cells = due.keys().filter_map(|key| if let Key::Soil(cell) = key { state.soil.get(cell) } else { None });
         let change = |(cell_m, cell, saved_unix_ns): &(f64, FleetCell, i64)| {
             let CellKey { map, colour: [red, green, blue], cell: [column, row] } = &cell.key;
-            let share = FleetShare { service: String::new(), cells: vec![cell.clone()] };
             Change::PutSoil(StoredSoil {
-                key: format!("{}/{map}/{red:02x}{green:02x}{blue:02x}/{column}/{row}", of.service),
+                key: format!("{}/{map}/{red:02x}{green:02x}{blue:02x}/{column}/{row}", of.service()),
                 saved_unix_ns: *saved_unix_ns,
-                share: fleet_soil_shares(&of.bundle_hash, &of.service, *cell_m, &[share]).encode_to_vec(),
+                share: of.tell_cell(*cell_m, cell).encode_to_vec(),
             })
         };
         cells.map(change).collect()

@@ -22,7 +22,7 @@ use std::path::PathBuf;
 
 pub(crate) use self::etcd::EtcdStore;
 pub use self::keeper::Keeper;
-pub(crate) use self::keeper::{Key, SoilOf, StoreCounts};
+pub(crate) use self::keeper::{Key, StoreCounts};
 pub(crate) use self::map_bytes::map_of;
 pub use self::redb::RedbStore;
 pub use self::restore::Restored;

@@ -6,11 +6,10 @@ use nesam_engine::{Command, EngineError, EngineHandle, Reply, SessionImage};
 use nesam_proto::v1 as pb;
 use prost::Message as _;
 
-use super::keeper::SoilOf;
 use super::map_bytes::map_of;
 use super::{Contents, StoreError, StoredSession, StoredSoil};
 use crate::clock::unix_ns;
-use crate::convert::{heard_fleet_soil, session_image};
+use crate::convert::{SoilTeller, session_image};
 
 /// What came back.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -27,7 +26,7 @@ pub struct Restored {
 ///
 /// # Errors
 /// `StoreError::Content` naming the session or map that the engine refuses: of another bundle, damaged, or beyond its limits.
-pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Option<&SoilOf>) -> Result<Restored, StoreError> {
+pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Option<&SoilTeller>) -> Result<Restored, StoreError> {
     let mut restored = Restored::default();
     for (id, bytes) in &contents.maps {
         let refused = |reason: String| StoreError::Content { what: format!("map `{id}`"), reason };
@@ -66,14 +65,11 @@ pub(crate) fn resumed(stored: &StoredSession) -> Result<SessionImage, EngineErro
 
 /// Evidence of the soil as old as it is now; how many cells the engine has taken. `None`: it is not for this engine, which has another bundle, cells of another
 /// size, or no soil map.
-fn recall(stored: &StoredSoil, of: &SoilOf, engine: &EngineHandle) -> Option<usize> {
+fn recall(stored: &StoredSoil, of: &SoilTeller, engine: &EngineHandle) -> Option<usize> {
     let message = pb::FleetSoilShares::decode(stored.share.as_slice()).ok()?;
-    let mut shares = heard_fleet_soil(&message, "").ok()?;
+    let mut shares = of.hear(&message).ok().filter(|shares| !shares.is_empty())?;
     let since_s = unix_ns().saturating_sub(stored.saved_unix_ns).max(0) as f64 * 1e-9;
     shares.iter_mut().flat_map(|share| &mut share.cells).for_each(|cell| cell.age_s += since_s);
-    if message.bundle_hash != of.bundle_hash {
-        return None;
-    }
     match engine.call(Command::HearFleetSoil { cell_m: message.cell_m, shares }) {
         Ok(Reply::FleetSoilHeard(cells)) => Some(cells),
         _ => None,

@@ -11,7 +11,7 @@ use nesam_engine::{Command, EngineError, FleetCell, FleetShare};
 use nesam_proto::v1 as pb;
 
 use super::{decode, encode, keys};
-use crate::convert::{fleet_soil_shares, heard_fleet_soil, service_name};
+use crate::convert::SoilTeller;
 use crate::grpc::Edge;
 use crate::telemetry::Transport;
 
@@ -28,15 +28,14 @@ pub struct Sharing {
     edge: Edge,
     /// Key of this server.
     key: Arc<str>,
-    /// Name of this server in its present life.
-    service: Arc<str>,
+    soil: Arc<SoilTeller>,
 }
 
 impl Sharing {
     /// Of the server that holds a name in a fleet.
     pub fn new(edge: &Edge, fleet: &str, name: &str) -> Self {
         let key = keys::of_server(fleet, name, "soil_map").into();
-        Self { edge: edge.clone(), key, service: service_name(edge.run).into() }
+        Self { edge: edge.clone(), key, soil: SoilTeller::new(edge.run, &edge.predictor.bundle().hash).into() }
     }
 
     /// Listens to the other servers and answers them; returns what asks them, to be run for as long as this server is in the network.
@@ -67,21 +66,15 @@ impl Sharing {
 
     /// The message that tells of a cell that changed here.
     pub fn changed(&self, cell_m: f64, own: &FleetCell) -> (String, Vec<u8>) {
-        let share = FleetShare { service: String::new(), cells: vec![own.clone()] };
-        (self.key.to_string(), encode(&self.message(cell_m, &[share])))
-    }
-
-    fn message(&self, cell_m: f64, shares: &[FleetShare]) -> pb::FleetSoilShares {
-        fleet_soil_shares(&self.edge.predictor.bundle().hash, &self.service, cell_m, shares)
+        (self.key.to_string(), encode(&self.soil.tell_cell(cell_m, own)))
     }
 
     async fn answer(self, query: ::zenoh::query::Query) {
-        let key = query.key_expr().clone();
         let Ok((cell_m, shares)) = self.edge.engine.fleet_shares(self.edge.stream_budget()).await else { return };
         // The asker's key may name all servers; the answer comes from this one.
-        let answered = query.reply(&*self.key, encode(&self.message(cell_m, &shares))).await;
+        let answered = query.reply(&*self.key, encode(&self.soil.tell(cell_m, &shares))).await;
         if let Err(error) = answered {
-            tracing::warn!(%error, %key, "the soil map was not told");
+            tracing::warn!(%error, "the soil map was not told");
         }
     }
 
@@ -117,16 +110,12 @@ impl Sharing {
     /// The commands that take it, short ones, so that none holds up a measurement; none if there is nothing in it for this server.
     fn heard(&self, payload: &[u8]) -> Result<Vec<Command>, EngineError> {
         let message: pb::FleetSoilShares = decode("nesam.v1.FleetSoilShares", payload, SHARES_BYTES_MAX)?;
-        // Corrections are relative to what a bundle reads off the map.
-        if message.bundle_hash != self.edge.predictor.bundle().hash {
-            return Ok(Vec::new());
-        }
         let cell_m = message.cell_m;
         let command = |service: &str, cells: &[FleetCell]| Command::HearFleetSoil {
             cell_m,
             shares: vec![FleetShare { service: service.into(), cells: cells.to_vec() }],
         };
-        let shares = heard_fleet_soil(&message, &self.service)?;
+        let shares = self.soil.hear(&message)?;
         let parts = shares.iter().flat_map(|share| share.cells.chunks(CELLS_AT_ONCE).map(|cells| (share.service.as_str(), cells)));
         Ok(parts.map(|(service, cells)| command(service, cells)).collect())
     }
