@@ -17,7 +17,7 @@ use crate::telemetry::Transport;
 
 /// Largest message of another server, bytes: a hundred thousand cells.
 const SHARES_BYTES_MAX: usize = 64 << 20;
-/// Cells that the engine takes in one command: a few tenths of a millisecond.
+/// Cells that the engine takes in one command, few enough that a measurement does not wait for long.
 const CELLS_AT_ONCE: usize = 512;
 /// Wait for the answers of the other servers.
 const ANSWER_WITHIN: Duration = Duration::from_secs(5);
