@@ -6,6 +6,7 @@ fn soil_update(c: &mut Criterion) {
     let mut group = c.benchmark_group("soil filter");
     let works = [
         ("network along one buffer", nesam_benches::network_along_buffer()),
+        ("one prediction held against what came", nesam_benches::forecast_held()),
         ("one update", nesam_benches::soil_update(false)),
         ("one update, literal Algorithm 1", nesam_benches::soil_update(true)),
     ];

@@ -6,7 +6,7 @@ use std::hint::black_box;
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use nesam_adaptation::{BufferedTransition, CalibratedFilter, FilterConfig, SoilFilter};
+use nesam_adaptation::{BufferedTransition, CalibratedFilter, FORECAST_STEPS, FilterConfig, SoilFilter};
 use nesam_model::dims::CONTEXT;
 use nesam_model::encoder::{EncoderScratch, TerrainEncoders};
 use nesam_model::{HistoryStep, ModelBundle, Predictor, RolloutQuery, SoilByClass, Variant};
@@ -147,6 +147,15 @@ pub fn network_along_buffer() -> Work {
     let buffer = Buffer::new();
     Box::new(move || {
         black_box(buffer.transitions());
+    })
+}
+
+/// One prediction held against what came of it.
+pub fn forecast_held() -> Work {
+    let buffer = Buffer::new();
+    Box::new(move || {
+        let soil = SoilByClass::new(Some(&buffer.map), Vec::new());
+        black_box(buffer.predictor.forecast_errors(&buffer.steps, BUFFER_START, FORECAST_STEPS, &soil, &buffer.map)).expect("on its map");
     })
 }
 

@@ -208,6 +208,11 @@ SessionStatus from_message(const v1::Session& message) {
   for (const v1::Effect& effect : message.effects()) status.effects.push_back(from_message(effect));
   status.effects_source = message.effects_source();
   if (message.has_alarm()) status.alarm = from_message(message.alarm());
+  if (message.has_forecasts()) {
+    const v1::ForecastCheck& check = message.forecasts();
+    status.forecasts = ForecastCheck{check.checked(), {check.error_rms_m().begin(), check.error_rms_m().end()},
+                                     {check.expected_rms_m().begin(), check.expected_rms_m().end()}, check.scale()};
+  }
   return status;
 }
 

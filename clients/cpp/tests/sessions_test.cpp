@@ -148,6 +148,21 @@ void service_effects_act_until_reverted(nesam::Client& client, const std::string
   check_error(session.revert_effects(), nesam::Code::not_found, "session_id", "a closed session");
 }
 
+void service_predictions_are_held_against_what_came(nesam::Client& client, const std::string& map_id) {
+  nesam::Session session = driven(client, "held", map_id);
+  const auto before = session.status();
+  check(before.ok() && !before->forecasts, "nothing came true yet");
+  // The first one that is compared begins at the 32nd step and comes true 32 steps later.
+  for (int step = 5; step < 75; ++step) check_ok(session.send(cruise(step, session.vehicle())), "measurement");
+  const auto status = session.status();
+  check(status.ok() && status->forecasts, "one came true");
+  if (!status.ok() || !status->forecasts) return;
+  const nesam::ForecastCheck& told = *status->forecasts;
+  check(told.checked == 1 && told.error_rms_m.size() == 3 && told.expected_rms_m.size() == 3, "at three steps");
+  check(told.error_rms_m.back() > 0.0 && told.expected_rms_m.back() > 0.0 && told.scale >= 0.5, "errors and what was expected");
+  check_ok(session.close(), "close");
+}
+
 void service_alarms_are_watched(nesam::Client& client, const std::string& map_id) {
   nesam::Session session = driven(client, "alarmed", map_id);
   nesam::AlarmWatch watch = session.watch_alarms();
@@ -230,6 +245,7 @@ void run_all(nesam::Client& client) {
     run("service_the_status_tells_all", [&] { service_the_status_tells_all(session); });
   }
   run("service_effects_act_until_reverted", [&] { service_effects_act_until_reverted(client, map_id); });
+  run("service_predictions_are_held_against_what_came", [&] { service_predictions_are_held_against_what_came(client, map_id); });
   run("service_alarms_are_watched", [&] { service_alarms_are_watched(client, map_id); });
   run("service_tiles_are_patched", [&] { service_tiles_are_patched(client); });
   run("service_there_is_no_soil_map_by_default",

@@ -98,6 +98,17 @@ def session(message: sessions_pb2.Session) -> t.Session:
         effects=tuple(effect(effect) for effect in message.effects),
         effects_source=message.effects_source,
         alarm=alarm(message.alarm) if message.HasField("alarm") else None,
+        forecasts=forecast_check(message.forecasts) if message.HasField("forecasts") else None,
+    )
+
+
+def forecast_check(message: sessions_pb2.ForecastCheck) -> t.ForecastCheck:
+    """How predictions came true."""
+    return t.ForecastCheck(
+        checked=message.checked,
+        error_rms_m=np.array(message.error_rms_m),
+        expected_rms_m=np.array(message.expected_rms_m),
+        scale=message.scale,
     )
 
 

@@ -135,6 +135,20 @@ class Alarm:
 
 
 @dataclass(frozen=True)
+class ForecastCheck:
+    """Predictions of a session held against what was measured in the end, one every 3.2 s.
+
+    checked: comparisons so far. error_rms_m, expected_rms_m: (3,), root mean square of the distance in (x, y) after 0.8, 1.6 and 3.2 s over about the last
+    minute, as measured and as bundle and soil filter expected it. scale: how many times the model's part of predicted covariances counts for it.
+    """
+
+    checked: int
+    error_rms_m: np.ndarray
+    expected_rms_m: np.ndarray
+    scale: float
+
+
+@dataclass(frozen=True)
 class Session:
     """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
 
@@ -142,6 +156,7 @@ class Session:
     accepted: measurements accepted so far; durable_place: how many of them survive a crash of the server, 0 where it keeps no store; run: which server in
     which run counts them.
     effects: those that were applied on top of the bundle's, effects_source: where they come from. alarm: the active one, None without.
+    forecasts: how predictions came true, None before the first comparison.
     """
 
     session_id: str
@@ -162,6 +177,7 @@ class Session:
     effects_source: str = ""
     alarm: Optional[Alarm] = None
     run: int = 0
+    forecasts: Optional[ForecastCheck] = None
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ impl Engine {
             if let crate::Outcome::NotFinite { field } = observed.outcome {
                 return Err(EngineError::invalid(format!("initial.{field}"), "is not finite"));
             }
-            session.learn(&self.predictor, map.and_then(|id| self.maps.get(id).ok()), self.step_ns, observed.outcome);
+            session.learn(&self.predictor, self.noise.as_ref(), map.and_then(|id| self.maps.get(id).ok()), self.step_ns, observed.outcome);
         }
         Ok(self.insert(session))
     }
@@ -326,7 +326,7 @@ impl Engine {
         {
             session.begin_from(&prior);
         }
-        let outcome = session.learn(&self.predictor, map.as_ref(), self.step_ns, outcome);
+        let outcome = session.learn(&self.predictor, self.noise.as_ref(), map.as_ref(), self.step_ns, outcome);
         let (vehicle, brought, told) = (session.vehicle().to_string(), session.take_brought(), session.take_told());
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
         let accepted = session.accepted();

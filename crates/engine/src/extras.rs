@@ -179,7 +179,7 @@ impl PredictExtras {
             let jacobians = linearisation.by_start_and_soil();
             let covariance = noise.map(|(query, noise)| {
                 let start = query.start.as_deref().copied().unwrap_or_else(|| noise.start_covariance());
-                covariances(linearisation, &jacobians, rolled, &start, &soil.covariance, soil.noise_scale, noise)
+                covariances(linearisation, &jacobians, rolled, &start, &soil.covariance, soil.model_noise_scale(), noise)
             });
             let derivatives = self.jacobians.then(|| {
                 let flat = |v: &[f64]| v.iter().map(|v| *v as f32).collect::<Vec<f32>>();
@@ -294,7 +294,12 @@ mod tests {
 
     #[test]
     fn analytic_sigma_points_have_the_mean_and_the_covariance_of_the_posterior() {
-        let mut soil = SoilEstimate { state: Default::default(), covariance: [[0.0; SOIL_DIM]; SOIL_DIM], noise_scale: 1.0 };
+        let mut soil = SoilEstimate {
+            state: Default::default(),
+            covariance: [[0.0; SOIL_DIM]; SOIL_DIM],
+            noise_scale: 1.0,
+            forecasts: Default::default(),
+        };
         for i in 0..SOIL_DIM {
             soil.state.correction.delta[i] = 0.1 * i as f64;
             soil.covariance[i][i] = 0.5 + i as f64;

@@ -51,11 +51,11 @@ pub use handle::{Answer, EngineHandle, Executed, Submission, Tap, execute_guarde
 pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
-pub use nesam_adaptation::{FilterSnapshot, JointSnapshot};
+pub use nesam_adaptation::{FORECAST_STEPS, FORECAST_VALUES, FilterSnapshot, ForecastCheck, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, EvidenceParts, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
 pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{
-    Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, Session, SessionImage, SoilEstimate,
-    SoilState, TrackImage, WatchImage,
+    Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, OpenForecast, Session, SessionImage,
+    SoilEstimate, SoilState, TrackImage, WatchImage,
 };

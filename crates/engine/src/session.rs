@@ -3,14 +3,15 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use nesam_adaptation::SoilFilter;
+use nesam_adaptation::{ForecastCheck, SoilFilter};
 use nesam_fleet_soil::FleetPrior;
-use nesam_model::{HistoryStep, Predictor, SoilByClass};
+use nesam_model::{HistoryStep, Predictor, RolloutNoise, SoilByClass};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
 
 mod alarm;
 mod effects;
+mod forecast;
 mod image;
 mod order;
 mod soil;
@@ -20,6 +21,8 @@ mod watch;
 pub use self::alarm::{Alarm, AlarmKind};
 pub(crate) use self::effects::Acting;
 pub use self::effects::{AppliedEffect, AppliedEffects, AppliedParameter};
+use self::forecast::AHEAD;
+pub use self::forecast::OpenForecast;
 pub(crate) use self::image::refused;
 pub use self::image::{SessionImage, TrackImage, WatchImage};
 use self::order::{Order, Verdict};
@@ -43,8 +46,10 @@ pub struct SoilEstimate {
     pub state: SoilState,
     /// P⁺, in the coordinates of the correction.
     pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
-    /// How many times the model's noise counts on this ground as far as the drive has told; 1 before the first update.
+    /// How many times the model's noise counts on this ground as far as the soil filter has told; 1 before the first update.
     pub noise_scale: f64,
+    /// How predictions of the session came true: its scale counts on top.
+    pub forecasts: ForecastCheck,
 }
 
 /// A session: identity, recent measured motion, soil.
@@ -77,6 +82,8 @@ pub struct Session {
     fleet: FleetPart,
     /// Effects that were applied to this session; `None` = those of the bundle alone.
     acting: Option<Arc<Acting>>,
+    /// The prediction that is compared next.
+    forecast: Option<OpenForecast>,
     /// Whether measurements go on agreeing with predictions; `None` = not watched.
     watch: Option<Watch>,
     /// Alarms that were raised or cleared since they were last asked for.
@@ -123,6 +130,13 @@ pub struct Rules<'a> {
     pub limits: &'a Limits,
 }
 
+impl SoilEstimate {
+    /// How many times the covariance of the model's errors counts in a prediction.
+    pub fn model_noise_scale(&self) -> f64 {
+        self.noise_scale * self.forecasts.scale()
+    }
+}
+
 impl Session {
     /// A session without history, whose soil filter knows the prior only.
     pub fn new(id: &str, vehicle: &str, map: Option<&str>, filter: SoilFilter, now_ns: u64) -> Self {
@@ -141,8 +155,9 @@ impl Session {
             used_ns: now_ns,
             history_epoch: 0,
             accepted: 0,
-            soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0 },
+            soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0, forecasts: ForecastCheck::default() },
             learner,
+            forecast: None,
             fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
             acting: None,
             watch: None,
@@ -238,7 +253,15 @@ impl Session {
 
     /// Lets the soil filter learn from what has become final with an observation; every B-th step makes an update (paper Alg. 1). The steps
     /// stay in the history when the filter refuses its buffer: then the outcome says so. `predictor` is that of the bundle; applied effects act on top of it.
-    pub fn learn(&mut self, predictor: &Predictor, map: Option<&Arc<WorldMap>>, step_ns: i64, outcome: Outcome) -> Outcome {
+    /// `noise` is what its bundle knows of its errors, against which predictions that came true are held.
+    pub fn learn(
+        &mut self,
+        predictor: &Predictor,
+        noise: Option<&RolloutNoise>,
+        map: Option<&Arc<WorldMap>>,
+        step_ns: i64,
+        outcome: Outcome,
+    ) -> Outcome {
         let mut outcome = outcome;
         let acting = self.acting.clone();
         let models = match &acting {
@@ -248,14 +271,14 @@ impl Session {
         while let Some(leaving) = self.leaving.pop_front() {
             let Leaving::Measured(measurement) = leaving else {
                 self.settled = Track::default();
-                self.learner.forget_open();
+                self.forget_open();
                 continue;
             };
             let (first, second) = match self.settled.take(&measurement, step_ns) {
                 Taken::Waiting(_) => continue,
                 Taken::Steps(first, second) => (first, second),
                 Taken::AfterGap(first, _) => {
-                    self.learner.forget_open();
+                    self.forget_open();
                     (first, None)
                 }
             };
@@ -263,9 +286,34 @@ impl Session {
                 if let Some(nis) = self.learn_step(step, models, map) {
                     outcome = Outcome::Gated { nis };
                 }
+                self.check_forecast(models.usual, noise, map);
             }
         }
         outcome
+    }
+
+    /// The next step does not follow the last one.
+    fn forget_open(&mut self) {
+        self.learner.forget_open();
+        self.forecast = None;
+    }
+
+    /// Compares a prediction with the newest final step, where one has come true with it, and begins the next. Without a map, or with a bundle that does not know
+    /// its errors so far ahead, nothing is compared.
+    fn check_forecast(&mut self, predictor: &Predictor, noise: Option<&RolloutNoise>, map: Option<&Arc<WorldMap>>) {
+        let Self { settled, learner, forecast, soil, .. } = self;
+        let history = settled.history.make_contiguous();
+        let (Some(noise), Some(map), Some(newest)) = (noise.filter(|noise| noise.steps() >= AHEAD), map, history.last()) else {
+            *forecast = None;
+            return;
+        };
+        if let Some(open) = forecast {
+            if !open.follow(newest) {
+                return;
+            }
+            open.compare(predictor, noise, map, &mut soil.forecasts);
+        }
+        *forecast = OpenForecast::begin(history, || learner.corrections(), soil.noise_scale);
     }
 
     /// Lets the filter learn from one final step; NIS of the buffer that it ended if that was refused.
@@ -286,7 +334,7 @@ impl Session {
             return Some(update.nis);
         }
         let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, stamp_ns) };
-        self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale };
+        self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale, ..self.soil };
         None
     }
 
@@ -296,9 +344,10 @@ impl Session {
         self.acting = acting;
         self.told.extend(self.watch.as_mut().and_then(Watch::begin_again));
         self.learner = SoilLearner::new(filter);
+        self.forecast = None;
         let begun = self.learner.state(self.soil.state.epoch + 1, None);
         let state = SoilState { last_buffer: self.soil.state.last_buffer, ..begun };
-        self.soil = SoilEstimate { state, covariance: self.learner.covariance(), noise_scale: 1.0 };
+        self.soil = SoilEstimate { state, covariance: self.learner.covariance(), noise_scale: 1.0, forecasts: ForecastCheck::default() };
     }
 
     /// Watches from now on whether measurements go on agreeing with predictions.

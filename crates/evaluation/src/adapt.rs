@@ -4,10 +4,10 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nesam_adaptation::{
-    AdaptationError, BufferedTransition, FilterConfig, Innovation, NoiseCalibration, SoilFilter, SoilPosterior, SoilUpdate,
-    UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
+    AdaptationError, BufferedTransition, FORECAST_STEPS, FilterConfig, ForecastCheck, Innovation, NoiseCalibration, SoilFilter,
+    SoilPosterior, SoilUpdate, UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
 };
-use nesam_model::{HistoryStep, Predictor, SoilByClass, SoilField, Transition};
+use nesam_model::{HISTORY, HistoryStep, Predictor, RolloutNoise, SoilByClass, SoilField, Transition};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -46,6 +46,8 @@ pub struct DriveAdaptation {
     pub updates: Vec<TimedUpdate>,
     /// Buffers that were given up because a number was not finite or S was singular.
     pub failed: usize,
+    /// Last samples of predictions that came true, ascending, and the scale of forecasts from then on ([`check_forecasts`]).
+    pub forecasts: Vec<(usize, f64)>,
 }
 
 impl DriveAdaptation {
@@ -55,10 +57,18 @@ impl DriveAdaptation {
         known.checked_sub(1).map(|last| &self.updates[last].update.posterior)
     }
 
-    /// How many times the model's noise counts as far as measurements up to `sample` tell; 1 before the first update.
+    /// How many times the model's noise counts as far as measurements up to `sample` tell: by accepted updates of the filter, times what predictions that came true
+    /// have told; 1 before the first of either.
     pub fn noise_scale_at(&self, sample: usize) -> f64 {
+        let told = self.forecasts.partition_point(|(last, _)| *last <= sample);
+        self.filter_scale_at(sample) * told.checked_sub(1).map_or(1.0, |last| self.forecasts[last].1)
+    }
+
+    /// The filter's part of it.
+    fn filter_scale_at(&self, sample: usize) -> f64 {
         let known = self.updates.partition_point(|u| u.sample <= sample);
-        known.checked_sub(1).map_or(1.0, |last| self.updates[last].update.noise_scale)
+        let accepted = self.updates[..known].iter().rfind(|u| !u.update.rejected);
+        accepted.map_or(1.0, |last| last.update.noise_scale)
     }
 
     /// The correction that a prediction from `sample` applies where the vehicle was then.
@@ -131,6 +141,32 @@ pub fn adapt_all(
             adapted
         })
         .collect()
+}
+
+/// Holds predictions of each drive against what was measured in the end, as a session does: one every 32 samples, with what the filter knew at its start.
+pub fn check_forecasts(
+    predictor: &Predictor,
+    drives: &[Trajectory],
+    maps: &DriveMaps,
+    noise: &RolloutNoise,
+    adapted: &mut [DriveAdaptation],
+) {
+    adapted.par_iter_mut().zip(drives).zip(maps).for_each(|((adapted, drive), map)| {
+        let Some(map) = map else { return };
+        let (steps, ahead) = (history_steps(drive), FORECAST_STEPS[FORECAST_STEPS.len() - 1]);
+        let mut check = ForecastCheck::default();
+        adapted.forecasts = (HISTORY - 1..steps.len().saturating_sub(ahead))
+            .step_by(ahead)
+            .map(|start| {
+                let soil = adapted.soil_at(start, Some(map));
+                let errors = predictor.forecast_errors(&steps, start, FORECAST_STEPS, &soil, map);
+                if let (Some(errors), Some(expected)) = (errors, noise.planar(FORECAST_STEPS, adapted.filter_scale_at(start))) {
+                    check.observe(&errors, &expected);
+                }
+                (start + ahead, check.scale())
+            })
+            .collect();
+    });
 }
 
 /// Runs the filter over one drive from its first sample, as a session that receives the samples one by one.

@@ -17,6 +17,8 @@ use crate::windows::Window;
 pub struct LinearisedWindow {
     /// Drive of the window.
     pub drive: usize,
+    /// Sample at which it starts.
+    pub start: usize,
     /// Measured state minus predicted state after steps 1…K; x and y in the heading frame of the predicted state, angles wrapped.
     pub errors: Vec<[f64; STATE_DIM]>,
     /// J_x P_x J_xᵀ of these steps in the same frame.
@@ -100,7 +102,7 @@ fn linearise(
         of_start.push(turned(&sandwich(&jacobian.start, start), -yaw));
         of_soil.push(turned(&sandwich::<SOIL_DIM>(&jacobian.soil, &soil_covariance), -yaw));
     }
-    Ok(LinearisedWindow { drive: window.drive, errors, of_start, of_soil, noise_scale })
+    Ok(LinearisedWindow { drive: window.drive, start: window.start, errors, of_start, of_soil, noise_scale })
 }
 
 /// Measured minus predicted, x and y in the heading frame of the prediction.

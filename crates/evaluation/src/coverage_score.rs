@@ -26,14 +26,21 @@ pub fn calibrate_rollout_noise(windows: &[LinearisedWindow], start_sd: [f64; STA
     let steps = windows.iter().map(|w| w.errors.len()).max().filter(|steps| *steps > 0)?;
     let residual: Vec<StateCovariance> = (0..steps).map(|k| residual_covariance(windows, k)).collect();
     let mut noise = RolloutNoise::new(start_sd, &residual);
-    let steps: Vec<usize> = COVERAGE_STEPS.iter().copied().filter(|k| *k <= steps).collect();
-    let distances: Vec<Distances> = steps.iter().flat_map(|k| windows.iter().filter_map(|w| Distances::of(w, *k, &noise))).collect();
-    noise.region_90_planar = upper_quantile(distances.iter().map(|d| d.planar).collect())?;
+    noise.windows = windows.len();
+    calibrate_regions(windows, &mut noise)?;
+    Some(noise)
+}
+
+/// The radii of the 90 % regions alone, for other noise scales of the windows than those that Q_k was made with. `None` without windows.
+pub fn calibrate_regions(windows: &[LinearisedWindow], noise: &mut RolloutNoise) -> Option<()> {
+    let steps = COVERAGE_STEPS.iter().filter(|k| **k <= noise.steps());
+    let distances: Vec<Distances> = steps.flat_map(|k| windows.iter().filter_map(|w| Distances::of(w, *k, noise))).collect();
+    let planar = upper_quantile(distances.iter().map(|d| d.planar).collect())?;
     for i in 0..POSE_DIM {
         noise.region_90_single[i] = upper_quantile(distances.iter().map(|d| d.single[i]).collect())?;
     }
-    noise.windows = windows.len();
-    Some(noise)
+    noise.region_90_planar = planar;
+    Some(())
 }
 
 /// Order statistic of rank ⌈0.9 (n + 1)⌉; the largest where there are fewer.
@@ -146,6 +153,7 @@ mod tests {
         (0..count)
             .map(|w| LinearisedWindow {
                 drive: w / 10,
+                start: w % 10,
                 errors: (0..32).map(&mut error).collect(),
                 of_start: vec![NOTHING; 32],
                 of_soil: vec![NOTHING; 32],

@@ -45,13 +45,13 @@ mod true_soil;
 mod twin;
 mod windows;
 
-pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, calibrate_noise};
+pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, calibrate_noise, check_forecasts};
 pub use adapt_output::{Adaptation, Part, Row};
 pub use baselines::Baselines;
 pub use bootstrap::{DEFAULT_RESAMPLES, Resamples, median, quantile_sorted};
 pub use constant_velocity::constant_velocity;
 pub use coverage::{LinearisedWindow, SoilKnowledge, linearise_windows};
-pub use coverage_score::{COVERAGE_STEPS, Share, StepCoverage, calibrate_rollout_noise, coverage};
+pub use coverage_score::{COVERAGE_STEPS, Share, StepCoverage, calibrate_regions, calibrate_rollout_noise, coverage};
 pub use dimension::{DIMENSION_KEYS, POSE_DIM, Pose, absolute_error, horizontal_distance, pose_of};
 pub use disguise::Disguise;
 pub use error::EvaluationError;

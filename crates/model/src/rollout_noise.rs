@@ -108,6 +108,17 @@ impl RolloutNoise {
         })
     }
 
+    /// s Q_k of (x, y) at each of these steps, in the heading frame; `None` where one is beyond [`RolloutNoise::steps`].
+    pub fn planar<const N: usize>(&self, ahead: [usize; N], scale: f64) -> Option<[[[f64; 2]; 2]; N]> {
+        let known = ahead.iter().all(|k| (1..=self.steps()).contains(k));
+        known.then(|| {
+            ahead.map(|k| {
+                let q = self.residual(k);
+                [[scale * q[0][0], scale * q[0][1]], [scale * q[1][0], scale * q[1][1]]]
+            })
+        })
+    }
+
     /// P_k in World of step `k` (1 …) whose predicted yaw and derivatives are given, for covariances of start and soil; Q_k counts `scale` times.
     pub fn covariance(
         &self,

@@ -1717,6 +1717,27 @@ pub struct SessionContent {
     pub effects_source: ::prost::alloc::string::String,
     #[prost(message, optional, tag = "30")]
     pub watch: ::core::option::Option<WatchImage>,
+    /// How predictions came true: comparisons so far, and the 8 numbers behind their means; empty where an older service wrote it.
+    #[prost(uint64, tag = "31")]
+    pub forecasts_checked: u64,
+    #[prost(double, repeated, tag = "32")]
+    pub forecasts: ::prost::alloc::vec::Vec<f64>,
+    /// The prediction that is compared next; absent when none waits.
+    #[prost(message, optional, tag = "33")]
+    pub forecast: ::core::option::Option<ForecastImage>,
+}
+/// A prediction that waits for what comes true.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ForecastImage {
+    /// Measured steps, oldest first: 32 up to the start, then those since.
+    #[prost(message, repeated, tag = "1")]
+    pub steps: ::prost::alloc::vec::Vec<StepImage>,
+    /// Corrections of all classes of ground at the start, shape (classes, 6), in the coordinates of `soil`.
+    #[prost(double, repeated, tag = "2")]
+    pub corrections: ::prost::alloc::vec::Vec<f64>,
+    /// Scale of the filter's noise then.
+    #[prost(double, tag = "3")]
+    pub noise_scale: f64,
 }
 /// What the watch of the innovations remembers.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1880,7 +1901,7 @@ pub struct ExportSessionRequest {
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ExportSessionReply {
-    /// Opaque: only Import reads it. Version and checksum are inside; about 20 kB.
+    /// Opaque: only Import reads it. Version and checksum are inside; about 25 kB.
     #[prost(bytes = "bytes", tag = "1")]
     pub image: ::prost::bytes::Bytes,
 }
@@ -1953,6 +1974,26 @@ pub struct Session {
     /// As `MeasurementAnswer.run`; where servers share sessions it is the epoch of the owner.
     #[prost(uint64, tag = "18")]
     pub run: u64,
+    /// How predictions of this session came true; absent before the first comparison.
+    #[prost(message, optional, tag = "19")]
+    pub forecasts: ::core::option::Option<ForecastCheck>,
+}
+/// Predictions held against what was measured in the end: every 3.2 s one from the newest measured state, with what was known of the soil then, under the commands
+/// that followed. Only on a map, and with a bundle that knows its errors.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct ForecastCheck {
+    /// Comparisons so far.
+    #[prost(uint64, tag = "1")]
+    pub checked: u64,
+    /// Root mean square of the distance in (x, y) after 0.8, 1.6 and 3.2 s, m; about the last minute counts.
+    #[prost(double, repeated, tag = "2")]
+    pub error_rms_m: ::prost::alloc::vec::Vec<f64>,
+    /// The same as the bundle and the soil filter expected it, m.
+    #[prost(double, repeated, tag = "3")]
+    pub expected_rms_m: ::prost::alloc::vec::Vec<f64>,
+    /// How many times the model's part of predicted covariances counts for it, 1 = as expected.
+    #[prost(double, tag = "4")]
+    pub scale: f64,
 }
 /// The part of the vehicle card that a client needs to form valid commands.
 #[derive(Clone, PartialEq, ::prost::Message)]

@@ -1,8 +1,8 @@
 //! Exported sessions: bytes with a version and a checksum.
 
 use nesam_engine::{
-    BufferTest, EngineError, FilterSnapshot, JointSnapshot, Measurement, SessionImage, SoilEstimate, SoilState, StepGrid, TrackImage,
-    WheelMeasurement,
+    BufferTest, EngineError, FilterSnapshot, ForecastCheck, JointSnapshot, Measurement, OpenForecast, SessionImage, SoilEstimate,
+    SoilState, StepGrid, TrackImage, WheelMeasurement,
 };
 use nesam_model::HistoryStep;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCoordinates, SoilCorrection, VehicleState};
@@ -13,7 +13,8 @@ use sha2::{Digest as _, Sha256};
 use super::alarm::{from_watch_image, watch_image};
 use super::{applied_effects, effect_messages, soil_correction};
 
-/// Version of the format. Any change of `SessionContent` needs another one.
+/// Version of the format. What is added to `SessionContent` keeps it as long as an older service may go on without it and a newer one begins anew where it is
+/// absent, so that sessions move both ways while a fleet is upgraded; anything else needs another one.
 const VERSION: u32 = 3;
 
 fn refused(reason: impl Into<String>) -> EngineError {
@@ -49,6 +50,7 @@ pub fn session_image(bytes: &[u8]) -> Result<SessionImage, EngineError> {
 
 fn content(image: &SessionImage) -> pb::SessionContent {
     let (map_id, map_hash) = image.map.clone().unwrap_or_default();
+    let (forecasts_checked, forecasts) = image.soil.forecasts.parts();
     pb::SessionContent {
         session_id: image.session.clone(),
         vehicle_id: image.vehicle.clone(),
@@ -94,6 +96,13 @@ fn content(image: &SessionImage) -> pb::SessionContent {
         effects: effect_messages(&image.effects),
         effects_source: image.effects.source.clone(),
         watch: image.watch.as_ref().map(watch_image),
+        forecasts_checked,
+        forecasts: forecasts.to_vec(),
+        forecast: image.forecast.as_ref().map(|forecast| pb::ForecastImage {
+            steps: forecast.steps.iter().map(step).collect(),
+            corrections: forecast.corrections.iter().flat_map(|c| c.delta).collect(),
+            noise_scale: forecast.noise_scale,
+        }),
     }
 }
 
@@ -126,6 +135,7 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
     if content.recent_stamp_ns.len() != content.recent_sequence.len() {
         return Err(refused("has stamps without numbers"));
     }
+    let soil = from_soil(content)?;
     let numbers = content.recent_sequence.iter().map(|number| numbered(*number));
     let age = |age: u64| i64::try_from(age).unwrap_or(i64::MAX);
     Ok(SessionImage {
@@ -156,7 +166,8 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
             trust_corrections: filter.trust_corrections.clone(),
             ground_class: filter.ground_class as usize,
         },
-        soil: from_soil(content)?,
+        forecast: content.forecast.as_ref().map(|forecast| from_forecast(forecast, soil.state.correction.coordinates)).transpose()?,
+        soil,
         effects: applied_effects(&content.effects_source, &content.effects),
         watch: content.watch.as_ref().map(from_watch_image).transpose()?,
     })
@@ -184,7 +195,24 @@ fn from_soil(content: &pb::SessionContent) -> Result<SoilEstimate, EngineError> 
             rejected: last.rejected,
         }),
     };
-    Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)?, noise_scale: content.soil_noise_scale })
+    let forecasts = match content.forecasts.as_slice() {
+        [] => ForecastCheck::default(),
+        values => ForecastCheck::restored(content.forecasts_checked, &array(values)?)
+            .ok_or_else(|| refused("has numbers that no check of forecasts can have"))?,
+    };
+    Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)?, noise_scale: content.soil_noise_scale, forecasts })
+}
+
+fn from_forecast(forecast: &pb::ForecastImage, coordinates: SoilCoordinates) -> Result<OpenForecast, EngineError> {
+    let (corrections, rest) = forecast.corrections.as_chunks::<SOIL_DIM>();
+    if !rest.is_empty() {
+        return Err(refused(format!("has corrections of {} numbers, not sixes", forecast.corrections.len())));
+    }
+    Ok(OpenForecast {
+        steps: forecast.steps.iter().map(from_step).collect::<Result<_, _>>()?,
+        corrections: corrections.iter().map(|delta| SoilCorrection { coordinates, delta: *delta }).collect(),
+        noise_scale: forecast.noise_scale,
+    })
 }
 
 fn from_track(track: Option<&pb::TrackImage>) -> Result<TrackImage, EngineError> {

@@ -1,7 +1,7 @@
 //! Sessions, provenance and soil.
 
 use nesam_engine::EngineError;
-use nesam_engine::{OpenSession, Provenance, SessionView, SoilEstimate};
+use nesam_engine::{ForecastCheck, OpenSession, Provenance, SessionView, SoilEstimate};
 use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
@@ -46,7 +46,19 @@ pub fn session_view(view: &SessionView, vehicle: &Vehicle) -> pb::Session {
         effects: effect_messages(&view.effects),
         effects_source: view.effects.source.clone(),
         alarm: view.alarm.as_ref().map(|alarm| alarm_message(&view.session, &view.vehicle, alarm)),
+        forecasts: forecast_check(&view.soil.forecasts),
     }
+}
+
+/// How predictions came true; `None` before the first comparison.
+fn forecast_check(check: &ForecastCheck) -> Option<pb::ForecastCheck> {
+    let (error_rms_m, expected_rms_m) = check.error_rms_m().zip(check.expected_rms_m())?;
+    Some(pb::ForecastCheck {
+        checked: check.checked(),
+        error_rms_m: error_rms_m.to_vec(),
+        expected_rms_m: expected_rms_m.to_vec(),
+        scale: check.scale(),
+    })
 }
 
 fn vehicle_card(vehicle: &Vehicle) -> pb::VehicleCard {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
+use nesam_engine::{FORECAST_STEPS, ForecastCheck};
 use nesam_model::{Predictor, flag};
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, STATE_DIM};
 use nesam_terrain::{Pose2, WorldMap};
@@ -137,6 +138,7 @@ fn session_json(name: &str, session: &SessionNotes, seen: &mut SeenSession, scen
         "trail": trail,
         "tests": tests,
         "soil": soil_json(name, session, scenery),
+        "forecasts": session.soil.as_ref().and_then(|soil| forecasts_json(&soil.forecasts)),
         "fan": fan,
         "region": region,
     })
@@ -167,6 +169,18 @@ fn soil_json(name: &str, session: &SessionNotes, scenery: &Scenery) -> Value {
         "noise_scale": soil.noise_scale,
         "class": scenery.map_under(session).and_then(|map| map.soil_class(x_m, y_m)).map(|class| class.name.clone()),
     })
+}
+
+/// How predictions came true; absent before the first comparison.
+fn forecasts_json(check: &ForecastCheck) -> Option<Value> {
+    let (error_rms_m, expected_rms_m) = check.error_rms_m().zip(check.expected_rms_m())?;
+    let last = FORECAST_STEPS.len() - 1;
+    Some(json!({
+        "checked": check.checked(),
+        "steps": FORECAST_STEPS[last],
+        "error_rms_m": rounded(error_rms_m[last], 3),
+        "expected_rms_m": rounded(expected_rms_m[last], 3),
+    }))
 }
 
 /// Candidates that are drawn: all, or so many evenly chosen with the first among them.

@@ -8,6 +8,7 @@ mod effects;
 mod extras;
 mod fleet_soil;
 mod fleet_soil_sharing;
+mod forecasts;
 mod from_now;
 mod lifecycle;
 mod live_page;

@@ -73,7 +73,7 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
     };
     let newer = v1::SessionImage { version: 4, ..outer }.encode_to_vec();
     type Change<'a> = &'a dyn Fn(&mut v1::SessionContent);
-    let changes: [(&str, Change<'_>); 11] = [
+    let changes: [(&str, Change<'_>); 15] = [
         ("bundle", &|c| c.bundle_hash = "0".repeat(64)),
         ("filter", &|c| c.filter_settings.push('x')),
         ("NaN state", &|c| c.live.as_mut().unwrap().history[3].state[1] = f64::NAN),
@@ -85,6 +85,10 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
         ("grid", &|c| c.settled.as_mut().unwrap().grid_ns[0] = 0),
         ("buffer", &|c| c.filter_first = 1 << 30),
         ("no soil", &|c| c.soil = None),
+        ("forecast", &|c| c.forecast.as_mut().unwrap().steps.truncate(31)),
+        ("half a correction", &|c| c.forecast.as_mut().unwrap().corrections.truncate(5)),
+        ("NaN in a forecast", &|c| c.forecast.as_mut().unwrap().corrections[2] = f64::NAN),
+        ("impossible check", &|c| c.forecasts[0] = -1.0),
     ];
     assert_refused("newer", client.import_session(newer, "t").await, Code::InvalidArgument, "image");
     for (what, change) in changes {
@@ -96,5 +100,8 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
     assert_refused("unknown map", client.import_session(no_map, "t").await, Code::NotFound, "map_id");
     assert_eq!(client.list_sessions().await.unwrap(), before);
     client.import_session(sealed(&|_| ()), "t").await.unwrap();
+    // As a service wrote it that held no prediction against what came.
+    let older = sealed(&|c| (c.forecast, c.forecasts) = (None, Vec::new()));
+    client.import_session(older, "older").await.unwrap();
     server.shutdown().await;
 }

@@ -11,6 +11,17 @@
 
 namespace nesam {
 
+/// Predictions of a session held against what was measured in the end, one every 3.2 s.
+struct ForecastCheck {
+  /// Comparisons so far.
+  std::uint64_t checked = 0;
+  /// Root mean square of the distance in (x, y) after 0.8, 1.6 and 3.2 s over about the last minute, m: as measured, and as bundle and soil filter expected it.
+  std::vector<double> error_rms_m;
+  std::vector<double> expected_rms_m;
+  /// How many times the model's part of predicted covariances counts for it, 1 = as expected.
+  double scale = 1.0;
+};
+
 /// A session as the service holds it.
 struct SessionStatus {
   std::string session_id;
@@ -43,6 +54,8 @@ struct SessionStatus {
   std::string effects_source;
   /// The alarm that is active; absent when none is.
   std::optional<Alarm> alarm;
+  /// How predictions came true; absent before the first comparison.
+  std::optional<ForecastCheck> forecasts;
 };
 
 }  // namespace nesam

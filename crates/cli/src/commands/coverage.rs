@@ -2,8 +2,8 @@
 
 use nesam_adaptation::{CalibratedFilter, FilterConfig};
 use nesam_evaluation::{
-    LinearisedWindow, Resamples, SoilKnowledge, StepCoverage, Truth, adapt_all, all_windows, calibrate_rollout_noise, coverage,
-    linearise_windows,
+    DriveAdaptation, LinearisedWindow, Resamples, SoilKnowledge, StepCoverage, Truth, adapt_all, all_windows, calibrate_regions,
+    calibrate_rollout_noise, check_forecasts, coverage, linearise_windows,
 };
 use nesam_model::rollout_noise::{SoilCovariance, StateCovariance};
 use nesam_model::{ModelBundle, Predictor, RolloutNoise};
@@ -24,8 +24,15 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let noise = noise_of(predictor.bundle())?;
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
-    let [prior, learned] = [false, true].map(|learned| windows_of(args, &drives, &predictor, &noise.start_covariance(), learned));
-    let [prior, learned] = [coverage(&prior?, &noise, &resamples), coverage(&learned?, &noise, &resamples)];
+    let filter = filter_of(predictor.bundle())?;
+    let mut filtered = adapt_all(&predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?;
+    check_forecasts(&predictor, &drives.drives, &drives.maps, &noise, &mut filtered);
+    let covered = |filtered: Option<&[DriveAdaptation]>| {
+        let windows = windows_of(args, &drives, &predictor, &noise.start_covariance(), &filter, filtered)?;
+        Ok(coverage(&windows, &noise, &resamples))
+    };
+    let [prior, learned]: [Result<_, Failure>; 2] = [covered(None), covered(Some(&filtered))];
+    let [prior, learned] = [prior?, learned?];
     say!("{} ({}): share of windows inside the 90 % region, {} drives", drives.set, args.data.split.as_str(), drives.drives.len());
     print_table("soil prior", &prior);
     print_table("soil as learned", &learned);
@@ -61,9 +68,15 @@ pub fn calibrate(args: &EvaluateArgs) -> Result<(), Failure> {
     let mut bundle = load_bundle(Some(&dir))?;
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let start = RolloutNoise::new(start_sd, &[]).start_covariance();
-    let windows = windows_of(args, &drives, &predictor, &start, true)?;
+    let filter = filter_of(&bundle)?;
+    let mut filtered = adapt_all(&predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?;
+    let mut windows = windows_of(args, &drives, &predictor, &start, &filter, Some(&filtered))?;
     let none = || Failure::input("no window of the validation drives could be rolled out".to_string());
     let mut noise = calibrate_rollout_noise(&windows, start_sd).ok_or_else(none)?;
+    // Regions are those of a session, which knows how its predictions came true.
+    check_forecasts(&predictor, &drives.drives, &drives.maps, &noise, &mut filtered);
+    windows.iter_mut().for_each(|w| w.noise_scale = filtered[w.drive].noise_scale_at(w.start));
+    calibrate_regions(&windows, &mut noise).ok_or_else(none)?;
     (noise.drives, noise.data_hash) = (drives.drives.len(), drives.root.hash());
     bundle.rollout_noise_json = Some(noise.to_json());
     bundle.save(&dir).or_failed()?;
@@ -89,25 +102,26 @@ fn noise_of(bundle: &ModelBundle) -> Result<RolloutNoise, Failure> {
     RolloutNoise::from_json(json).or_input()
 }
 
+/// The soil filter that the bundle carries.
+fn filter_of(bundle: &ModelBundle) -> Result<FilterConfig, Failure> {
+    match &bundle.soil_filter_json {
+        Some(json) => Ok(CalibratedFilter::from_json(json).or_input()?.config()),
+        None => Ok(FilterConfig::default()),
+    }
+}
+
 /// Every window, linearised with the soil prior or with what the soil filter had learned by its start.
 fn windows_of(
     args: &EvaluateArgs,
     drives: &Drives,
     predictor: &Predictor,
     start: &StateCovariance,
-    learned: bool,
+    filter: &FilterConfig,
+    filtered: Option<&[DriveAdaptation]>,
 ) -> Result<Vec<LinearisedWindow>, Failure> {
     let windows = all_windows(&drives.drives, args.window.horizon_on(&drives.drives), args.window.history, Truth::Measured).or_input()?;
-    let filter = match &predictor.bundle().soil_filter_json {
-        Some(json) => CalibratedFilter::from_json(json).or_input()?.config(),
-        None => FilterConfig::default(),
-    };
     let prior: SoilCovariance = core::array::from_fn(|r| core::array::from_fn(|c| if r == c { filter.prior_sd[r].powi(2) } else { 0.0 }));
-    let filtered = match learned {
-        false => Vec::new(),
-        true => adapt_all(predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?,
-    };
-    let soil = if learned { SoilKnowledge::Learned(&filtered, &prior) } else { SoilKnowledge::Prior(&prior) };
+    let soil = filtered.map_or(SoilKnowledge::Prior(&prior), |filtered| SoilKnowledge::Learned(filtered, &prior));
     let progress = Progress::start("windows linearised", windows.len());
     let linearised = linearise_windows(predictor, &windows, &drives.maps, start, soil, &|done| progress.set(done)).or_failed()?;
     progress.finish();

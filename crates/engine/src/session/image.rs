@@ -5,6 +5,7 @@ use std::sync::Arc;
 use nesam_adaptation::{FilterSnapshot, SoilFilter};
 use nesam_model::{HISTORY, HistoryStep};
 
+use super::forecast::OpenForecast;
 use super::order::Order;
 use super::soil::SoilLearner;
 use super::track::Track;
@@ -60,6 +61,8 @@ pub struct SessionImage {
     pub filter: FilterSnapshot,
     /// What the session gives out of it.
     pub soil: SoilEstimate,
+    /// The prediction that is compared next.
+    pub forecast: Option<OpenForecast>,
     /// Effects that were applied.
     pub effects: AppliedEffects,
     /// The watch of the innovations; `None` = not watched.
@@ -145,6 +148,7 @@ impl Session {
             filter_first,
             filter: filter.snapshot(),
             soil: self.soil,
+            forecast: self.forecast.clone(),
             effects: self.applied(),
             watch: self.watch.as_ref().map(WatchImage::of),
         }
@@ -191,6 +195,7 @@ impl Session {
             accepted: image.accepted,
             learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first),
             soil: image.soil,
+            forecast: image.forecast.clone(),
             fleet: FleetPart { asks: false, brings: true, brought: Vec::new() },
             acting,
             watch: image.watch.as_ref().map(WatchImage::watch),
@@ -220,13 +225,15 @@ impl SessionImage {
             ("too many starts", self.ended_boots.len() <= super::order::ENDED_BOOTS_MAX),
             ("a soil that is not finite", self.soil.covariance.as_flattened().iter().all(|v| v.is_finite())),
             ("a noise scale that is not positive", self.soil.noise_scale > 0.0 && self.soil.noise_scale.is_finite()),
+            ("an impossible forecast", self.forecast.as_ref().is_none_or(OpenForecast::is_possible)),
             ("an impossible watch", self.watch.as_ref().is_none_or(|watch| watch.watch().is_possible())),
             ("a soil that is not finite", self.soil.state.correction.delta.iter().all(|v| v.is_finite())),
         ];
         if let Some((what, _)) = possible.iter().find(|(_, holds)| !holds) {
             return Err(refused(format!("holds {what}")));
         }
-        let steps = tracks.iter().flat_map(|track| &track.history).chain(&self.filter_steps);
+        let waiting = self.forecast.iter().flat_map(|open| &open.steps);
+        let steps = tracks.iter().flat_map(|track| &track.history).chain(&self.filter_steps).chain(waiting);
         let measured = self.open.iter().chain(tracks.iter().filter_map(|track| track.before.as_ref()));
         for (state, command) in steps.map(|s| (&s.state, &s.control)).chain(measured.map(|m| (&m.state, &m.command))) {
             rules.limits.check_state("state", state).map_err(|error| refused(error.to_string()))?;

@@ -213,7 +213,12 @@ impl SoilLearner {
 
     /// The soil that predictions meet: the posterior of every class of ground that the map tells apart.
     pub(super) fn field(&self, map: Option<&Arc<WorldMap>>) -> SoilByClass {
-        SoilByClass::new(map, self.filter.posteriors().iter().map(|p| p.correction).collect())
+        SoilByClass::new(map, self.corrections())
+    }
+
+    /// The corrections of all classes of ground as predictions use them.
+    pub(super) fn corrections(&self) -> Vec<SoilCorrection> {
+        self.filter.posteriors().iter().map(|p| p.correction).collect()
     }
 
     /// What the filter says now of the ground under the vehicle.

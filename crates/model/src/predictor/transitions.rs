@@ -114,6 +114,31 @@ impl Predictor {
         transitions.iter().all(|t| t.ground_known).then_some(transitions)
     }
 
+    /// How far a prediction from `steps[start]` on a given soil, under the commands measured since, lies from what was measured then: measured minus predicted (x, y)
+    /// in the heading frame of the predicted state, m, after each of `ahead` steps (ascending). History and start are those before and at `start`. `None` where the
+    /// steps do not reach so far, or a wheel of the prediction stands off the map.
+    pub fn forecast_errors<const N: usize>(
+        &self,
+        steps: &[HistoryStep],
+        start: usize,
+        ahead: [usize; N],
+        soil: &dyn SoilField,
+        map: &Arc<WorldMap>,
+    ) -> Option<[[f64; 2]; N]> {
+        let last = start + ahead.last()?;
+        if last >= steps.len() {
+            return None;
+        }
+        let predicted = self.measured_transitions(steps, start..last + 1, Some(soil), map)?;
+        Some(ahead.map(|k| {
+            let at = &predicted[k].input.state;
+            let measured = self.true_state(&steps[start + k].state);
+            let [dx, dy] = [0, 1].map(|i| measured.position_m[i] - at.position_m[i]);
+            let (sin, cos) = at.attitude_rad[2].sin_cos();
+            [cos * dx + sin * dy, cos * dy - sin * dx]
+        }))
+    }
+
     /// A transition from what the network said of it.
     fn transition_from(
         &self,

@@ -143,6 +143,13 @@ function describeMap() {
   if (by("map").getAttribute("aria-label") !== text) by("map").setAttribute("aria-label", text);
 }
 
+// How predictions came true, in a sentence.
+function forecasts(check) {
+  if (!check) return "";
+  const after = (check.steps / 10).toFixed(1), { checked, error_rms_m, expected_rms_m } = check;
+  return `${checked} ${checked === 1 ? "prediction" : "predictions"} held against what came: ${error_rms_m.toFixed(2)} m off after ${after} s, expected ${expected_rms_m.toFixed(2)} m`;
+}
+
 function draw() {
   drawLink();
   tabs();
@@ -158,6 +165,7 @@ function draw() {
   describeMap();
   empty();
   by("nis-text").textContent = nis.draw(session);
+  by("forecast-text").textContent = forecasts(session?.forecasts);
   by("latency-text").textContent = latency.draw(store);
   panels.vehicle({ list: by("vehicle"), name: by("vehicle-name"), outcomes: by("outcomes") }, session, service?.vehicles_alive?.includes(session?.vehicle));
   panels.alarms(by("alarms"), by("alarm-count"), store);
