@@ -139,7 +139,8 @@ fn chrono_wrong_input_is_refused_with_exit_code_2() {
     with(&["--set", &set, "--horizon", "0"], &["--horizon", "at least 1"]);
     with(&["--set", &set, "--horizon", "5000"], &["5000 steps", "longest drive"]);
     with(&["--set", &set, "--dt", "0"], &["--dt"]);
-    with(&["--set", &set, "--models", "tal_elev"], &["tal_elev", "nesam train --model"]);
+    let nowhere = here.path().to_str().unwrap();
+    with(&["--set", &set, "--models", "tal_elev", "--baselines", nowhere], &["tal_elev", "nesam train --model"]);
     with(&["--set", &set, "--resamples", "10"], &["--resamples", "1000"]);
     refused(&["evaluate", "--data", "no/such/root"], here.path(), &["no/such/root", "not a folder"]);
     let id = rows[0]["trajectory"].as_str().unwrap();

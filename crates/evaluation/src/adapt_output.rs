@@ -56,7 +56,7 @@ pub struct Adaptation<'a> {
     pub provenance: &'a Provenance,
 }
 
-/// A predictor by its key in the JSON: `oracle_soil`, `literal`, `best_constant`, `best_by_class`.
+/// A predictor by its key in the JSON: `oracle_soil`, `literal`, `best_constant`, `best_by_class`, `constant_elsewhere`.
 #[derive(Debug)]
 pub struct Row {
     /// Key.

@@ -91,6 +91,9 @@ pub(super) enum AlsoArg {
     BestConstant,
     /// The same with a correction for each class of ground; takes minutes.
     BestByClass,
+    /// One correction for each fifth of a drive, fitted to those windows of the rest of the drive that do not overlap it, before and after: what a correction that does
+    /// not change could carry over; takes minutes.
+    ConstantElsewhere,
 }
 
 /// How the ground is made to look.
@@ -316,14 +319,14 @@ type ErrorRow = (String, ErrorTree<f64>, Option<ErrorTree<[f64; 2]>>);
 
 fn print_errors(title: &str, rows: &[ErrorRow], last: bool) {
     let head: String = ["x m", "y m", "z m", "roll °", "pitch °", "yaw °", "pos. m"].map(|name| format!("{name:>15}")).concat();
-    say!("{title:<26}{head}");
+    say!("{title:<32}{head}");
     for (name, value, interval) in rows {
         let values = value.row(last).map(|v| v.map_or(format!("{:>15}", "–"), |v| format!("{v:>15.3}"))).concat();
-        say!("{name:<26}{values}");
+        say!("{name:<32}{values}");
         let Some(interval) = interval else { continue };
         let between = |[low, high]: [f64; 2]| format!("{:>15}", format!("{low:.3}…{high:.3}"));
         let intervals = interval.row(last).map(|ci| ci.map_or(format!("{:>15}", ""), between)).concat();
-        say!("{:<26}{intervals}", "  95 %");
+        say!("{:<32}{intervals}", "  95 %");
     }
 }
 

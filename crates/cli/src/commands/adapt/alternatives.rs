@@ -4,14 +4,19 @@ use std::sync::Arc;
 
 use nesam_adaptation::FilterConfig;
 use nesam_evaluation::{
-    ModelName, Resamples, Row, TrueSoil, Truth, Window, WindowPredictor, adapt_all, best_correction, predict_all, score,
+    ModelName, ModelPaths, PosePath, Resamples, Row, TrueSoil, Truth, Window, WindowPredictor, adapt_all, best_correction, predict_all,
+    score,
 };
 use nesam_model::{Predictor, SoilField};
+use nesam_physics::SoilCorrection;
 
 use super::AlsoArg;
 use crate::failure::{Failure, OrFail};
 use crate::progress::Progress;
 use crate::sources::Drives;
+
+/// Stretches of a drive that are predicted with what the others teach.
+const STRETCHES: usize = 5;
 
 /// Windows and model that every row shares.
 pub(super) struct Scene<'a> {
@@ -28,6 +33,10 @@ impl Scene<'_> {
         let predictor = || Arc::clone(self.predictor);
         let on = |soils| WindowPredictor::OnSoil { predictor: predictor(), soils: Arc::new(soils) };
         let (key, model) = match also {
+            AlsoArg::ConstantElsewhere => {
+                let paths = self.constant_elsewhere(filter)?;
+                return Ok(Row { key: "constant_elsewhere", score: score(&paths, self.windows, self.truth, self.resamples) });
+            }
             AlsoArg::Literal => ("literal", WindowPredictor::Adapted { predictor: predictor(), filtered: Arc::new(self.literal()?) }),
             AlsoArg::OracleSoil => {
                 let soils = (0..self.drives.drives.len()).map(|d| Ok(self.true_soil(d)? as Arc<dyn SoilField>));
@@ -38,6 +47,44 @@ impl Scene<'_> {
         };
         let paths = predict_all(&[(ModelName::Nesam, model)], self.windows, &self.drives.maps, &|_| {}).or_failed()?;
         Ok(Row { key, score: score(&paths[0], self.windows, self.truth, self.resamples) })
+    }
+
+    /// Each window predicted with the correction that other stretches of its drive ask for.
+    fn constant_elsewhere(&self, filter: &FilterConfig) -> Result<ModelPaths, Failure> {
+        let drives = self.drives.drives.len();
+        let of_drive: Vec<Vec<&Window<'_>>> = (0..drives).map(|d| self.windows.iter().filter(|w| w.drive == d).collect()).collect();
+        let stretch_of = |w: &Window<'_>| {
+            let own = &of_drive[w.drive];
+            own.iter().position(|other| other.start == w.start).map_or(0, |place| place * STRETCHES / own.len())
+        };
+        let progress = Progress::start("corrections fitted", STRETCHES * drives);
+        let mut placed: Vec<(usize, PosePath)> = Vec::with_capacity(self.windows.len());
+        let mut parameters = 0;
+        for stretch in 0..STRETCHES {
+            let mut soils: Vec<Arc<dyn SoilField>> = Vec::with_capacity(drives);
+            for (drive, own) in of_drive.iter().enumerate() {
+                let held_back: Vec<usize> = own.iter().filter(|w| stretch_of(w) == stretch).map(|w| w.start).collect();
+                let apart = |w: &Window<'_>| held_back.iter().all(|start| start.abs_diff(w.start) >= w.horizon);
+                let others: Vec<Window<'_>> = own.iter().filter(|w| apart(w)).map(|w| **w).collect();
+                let map = self.drives.maps[drive].as_ref();
+                soils.push(match others.is_empty() {
+                    true => Arc::new(SoilCorrection::NONE),
+                    false => Arc::new(best_correction(self.predictor, &others, map, self.truth, &filter.prior_sd, None).or_failed()?),
+                });
+                progress.set(stretch * drives + drive + 1);
+            }
+            let (places, windows): (Vec<usize>, Vec<Window<'_>>) =
+                self.windows.iter().copied().enumerate().filter(|(_, w)| stretch_of(w) == stretch).unzip();
+            let model = WindowPredictor::OnSoil { predictor: Arc::clone(self.predictor), soils: Arc::new(soils) };
+            let predicted = predict_all(&[(ModelName::Nesam, model)], &windows, &self.drives.maps, &|_| {}).or_failed()?;
+            for predicted in predicted {
+                parameters = predicted.parameters;
+                placed.extend(places.iter().copied().zip(predicted.paths));
+            }
+        }
+        progress.finish();
+        placed.sort_by_key(|(place, _)| *place);
+        Ok(ModelPaths { name: ModelName::Nesam, parameters, paths: placed.into_iter().map(|(_, path)| path).collect() })
     }
 
     fn literal(&self) -> Result<Vec<nesam_evaluation::DriveAdaptation>, Failure> {
