@@ -143,7 +143,7 @@ def with_a_drive(browser, nesam, shots):
         check("kPa" in soil and ("not learned" in soil or "to" in soil), "soil parameters have units and bands or say that they are not learned")
         check("64 candidates" in text(browser, "#legend") and "90 %" in text(browser, "#legend"), "fan and 90 % regions are drawn")
         check(re.search(r"\d of \d+ in the 95 % band", text(browser, "#nis-text")), "consistency is told as a share")
-        browser.wait("document.getElementById('forecast-text').textContent.includes('held against')", 240)
+        browser.wait("document.getElementById('forecast-text').textContent.includes('came true')", 240)
         check(re.search(r"[\d.]+ m off after 3.2 s, expected [\d.]+ m", text(browser, "#forecast-text")), "what predictions came to is told beside what was expected")
         check(re.search(r"median [\d.]+, 99 % [\d.]+", text(browser, "#latency-text")), "latency is told as quantiles")
         check("%" in text(browser, "#service") and "m/s" in text(browser, "#vehicle"), "cache hits and the vehicle's motion have figures")

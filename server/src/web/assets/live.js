@@ -147,7 +147,7 @@ function describeMap() {
 function forecasts(check) {
   if (!check) return "";
   const after = (check.steps / 10).toFixed(1), { checked, error_rms_m, expected_rms_m } = check;
-  return `${checked} ${checked === 1 ? "prediction" : "predictions"} held against what came: ${error_rms_m.toFixed(2)} m off after ${after} s, expected ${expected_rms_m.toFixed(2)} m`;
+  return `came true ${error_rms_m.toFixed(2)} m off after ${after} s, expected ${expected_rms_m.toFixed(2)} m (${checked} so far)`;
 }
 
 function draw() {
