@@ -106,11 +106,7 @@ struct Buffer {
 impl Buffer {
     fn new() -> Self {
         let bundle = bundle();
-        let carried = bundle
-            .soil_filter_json
-            .as_deref()
-            .map(|json| CalibratedFilter::from_json(json).expect("settings of a shipped bundle").config());
-        let config = carried.unwrap_or_default();
+        let config = CalibratedFilter::config_of(bundle.soil_filter_json.as_deref()).expect("settings of a shipped bundle");
         let predictor = Predictor::new(Arc::new(bundle)).expect("a complete bundle");
         let root = DataRoot::open(&sample_root(), None).expect("the sample");
         let query = SetQuery {

@@ -5,6 +5,10 @@
 
 /// Steps ahead at which a prediction is compared.
 pub const FORECAST_STEPS: [usize; 3] = [8, 16, 32];
+/// Steps from the start of a prediction to its last comparison.
+pub const FORECAST_AHEAD: usize = FORECAST_STEPS[FORECAST_STEPS.len() - 1];
+/// One of something at each of [`FORECAST_STEPS`].
+type AtSteps<T> = [T; FORECAST_STEPS.len()];
 /// Comparisons that count: an older one weighs e⁻¹ as much.
 const MEMORY: f64 = 20.0;
 /// Comparisons that the bundle's own word counts for.
@@ -25,15 +29,15 @@ pub struct ForecastCheck {
     weight: f64,
     sum: f64,
     /// Sums of squared errors and of what was expected of them at each of [`FORECAST_STEPS`], m².
-    squared_m2: [f64; FORECAST_STEPS.len()],
-    expected_m2: [f64; FORECAST_STEPS.len()],
+    squared_m2: AtSteps<f64>,
+    expected_m2: AtSteps<f64>,
 }
 
 impl ForecastCheck {
     /// Takes a prediction that has come true: measured minus predicted (x, y), m, at each of [`FORECAST_STEPS`], and the covariance that was expected of it, m².
     /// Says whether it counts: one that is not finite, or was expected without doubt, does not.
-    pub fn observe(&mut self, errors_m: &[[f64; 2]; FORECAST_STEPS.len()], expected_m2: &[[[f64; 2]; 2]; FORECAST_STEPS.len()]) -> bool {
-        let ratios: [f64; FORECAST_STEPS.len()] = core::array::from_fn(|i| mahalanobis(&errors_m[i], &expected_m2[i]) / 2.0);
+    pub fn observe(&mut self, errors_m: &AtSteps<[f64; 2]>, expected_m2: &AtSteps<[[f64; 2]; 2]>) -> bool {
+        let ratios: AtSteps<f64> = core::array::from_fn(|i| planar_mahalanobis(&errors_m[i], &expected_m2[i]) / 2.0);
         if !ratios.iter().all(|ratio| ratio.is_finite() && *ratio >= 0.0) {
             return false;
         }
@@ -62,16 +66,16 @@ impl ForecastCheck {
     }
 
     /// Root mean square of the distance in (x, y) at each of [`FORECAST_STEPS`] over the comparisons that count, m; `None` before the first.
-    pub fn error_rms_m(&self) -> Option<[f64; FORECAST_STEPS.len()]> {
+    pub fn error_rms_m(&self) -> Option<AtSteps<f64>> {
         self.rms(&self.squared_m2)
     }
 
     /// The same as it was expected before what was compared is taken into account, m.
-    pub fn expected_rms_m(&self) -> Option<[f64; FORECAST_STEPS.len()]> {
+    pub fn expected_rms_m(&self) -> Option<AtSteps<f64>> {
         self.rms(&self.expected_m2)
     }
 
-    fn rms(&self, sums: &[f64; FORECAST_STEPS.len()]) -> Option<[f64; FORECAST_STEPS.len()]> {
+    fn rms(&self, sums: &AtSteps<f64>) -> Option<AtSteps<f64>> {
         (self.checked > 0).then(|| sums.map(|sum| (sum / self.weight).sqrt()))
     }
 
@@ -95,10 +99,9 @@ impl ForecastCheck {
     }
 }
 
-/// eᵀ P⁻¹ e.
-fn mahalanobis(e: &[f64; 2], p: &[[f64; 2]; 2]) -> f64 {
-    let determinant = p[0][0] * p[1][1] - p[0][1] * p[1][0];
-    (p[1][1] * e[0] * e[0] - (p[0][1] + p[1][0]) * e[0] * e[1] + p[0][0] * e[1] * e[1]) / determinant
+/// eᵀ P⁻¹ e of an error in (x, y) and its covariance, which is symmetric.
+pub fn planar_mahalanobis(e: &[f64; 2], [[xx, xy], [_, yy]]: &[[f64; 2]; 2]) -> f64 {
+    (yy * e[0] * e[0] - 2.0 * xy * e[0] * e[1] + xx * e[1] * e[1]) / (xx * yy - xy * xy)
 }
 
 #[cfg(test)]

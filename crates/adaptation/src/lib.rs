@@ -36,7 +36,7 @@ pub use conditions::{CONDITIONS, NoiseConditions, conditions};
 pub use config::{FilterConfig, Innovation};
 pub use error::AdaptationError;
 pub use filter::{ClassBelief, FilterSnapshot, JointSnapshot, SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
-pub use forecast::{FORECAST_STEPS, FORECAST_VALUES, ForecastCheck};
+pub use forecast::{FORECAST_AHEAD, FORECAST_STEPS, FORECAST_VALUES, ForecastCheck, planar_mahalanobis};
 pub use noise::{BufferNoise, ChannelNoise, SharedError, VelocityNoise};
 pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocities, predict_velocity};
 pub use settings::{CalibratedFilter, Coordinates, FilterSettings};

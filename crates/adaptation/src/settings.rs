@@ -256,6 +256,14 @@ impl CalibratedFilter {
         Ok(read)
     }
 
+    /// The settings of a filter for a bundle that may carry such a file: the default ones where it carries none.
+    ///
+    /// # Errors
+    /// As [`CalibratedFilter::from_json`].
+    pub fn config_of(carried: Option<&str>) -> Result<FilterConfig, AdaptationError> {
+        Ok(carried.map(Self::from_json).transpose()?.map_or_else(FilterConfig::default, |filter| filter.config()))
+    }
+
     /// As JSON with a trailing newline.
     pub fn to_json(&self) -> String {
         serde_json::to_string_pretty(self).expect("finite numbers and text always serialise; this is a bug") + "\n"

@@ -59,11 +59,7 @@ impl Engine {
     /// `AdaptationError` when the settings or the noise that the bundle carries are not readable or not usable.
     pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Result<Self, AdaptationError> {
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
-        let config = match &predictor.bundle().soil_filter_json {
-            Some(json) => CalibratedFilter::from_json(json)?.config(),
-            None => FilterConfig::default(),
-        };
-        let filter = SoilFilter::new(config)?;
+        let filter = SoilFilter::new(CalibratedFilter::config_of(predictor.bundle().soil_filter_json.as_deref())?)?;
         let unreadable = |error: ModelError| AdaptationError::Settings { reason: error.to_string() };
         let noise = predictor.bundle().rollout_noise_json.as_deref().map(RolloutNoise::from_json).transpose().map_err(unreadable)?;
         Ok(Self {

@@ -294,12 +294,7 @@ mod tests {
 
     #[test]
     fn analytic_sigma_points_have_the_mean_and_the_covariance_of_the_posterior() {
-        let mut soil = SoilEstimate {
-            state: Default::default(),
-            covariance: [[0.0; SOIL_DIM]; SOIL_DIM],
-            noise_scale: 1.0,
-            forecasts: Default::default(),
-        };
+        let mut soil = SoilEstimate::begun(Default::default(), [[0.0; SOIL_DIM]; SOIL_DIM]);
         for i in 0..SOIL_DIM {
             soil.state.correction.delta[i] = 0.1 * i as f64;
             soil.covariance[i][i] = 0.5 + i as f64;

@@ -51,7 +51,7 @@ pub use handle::{Answer, EngineHandle, Executed, Submission, Tap, execute_guarde
 pub use limits::{Limits, NAME_LENGTH_MAX, check_name};
 pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
-pub use nesam_adaptation::{FORECAST_STEPS, FORECAST_VALUES, FilterSnapshot, ForecastCheck, JointSnapshot};
+pub use nesam_adaptation::{FORECAST_AHEAD, FilterSnapshot, ForecastCheck, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, EvidenceParts, FleetSoilError, FleetSoilSettings};
 pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
 pub use ranking::{CostWeights, PathCost, Ranking};

@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use nesam_adaptation::{ForecastCheck, SoilFilter};
+use nesam_adaptation::{FORECAST_AHEAD, ForecastCheck, SoilFilter};
 use nesam_fleet_soil::FleetPrior;
 use nesam_model::{HistoryStep, Predictor, RolloutNoise, SoilByClass};
 use nesam_physics::{SOIL_DIM, Vehicle};
@@ -21,7 +21,6 @@ mod watch;
 pub use self::alarm::{Alarm, AlarmKind};
 pub(crate) use self::effects::Acting;
 pub use self::effects::{AppliedEffect, AppliedEffects, AppliedParameter};
-use self::forecast::AHEAD;
 pub use self::forecast::OpenForecast;
 pub(crate) use self::image::refused;
 pub use self::image::{SessionImage, TrackImage, WatchImage};
@@ -131,6 +130,11 @@ pub struct Rules<'a> {
 }
 
 impl SoilEstimate {
+    /// One of which neither filter nor forecasts have told how the model errs.
+    pub(crate) fn begun(state: SoilState, covariance: [[f64; SOIL_DIM]; SOIL_DIM]) -> Self {
+        Self { state, covariance, noise_scale: 1.0, forecasts: ForecastCheck::default() }
+    }
+
     /// How many times the covariance of the model's errors counts in a prediction.
     pub fn model_noise_scale(&self) -> f64 {
         self.noise_scale * self.forecasts.scale()
@@ -155,7 +159,7 @@ impl Session {
             used_ns: now_ns,
             history_epoch: 0,
             accepted: 0,
-            soil: SoilEstimate { state: learner.state(0, None), covariance, noise_scale: 1.0, forecasts: ForecastCheck::default() },
+            soil: SoilEstimate::begun(learner.state(0, None), covariance),
             learner,
             forecast: None,
             fleet: FleetPart { asks: true, brings: true, brought: Vec::new() },
@@ -303,7 +307,7 @@ impl Session {
     fn check_forecast(&mut self, predictor: &Predictor, noise: Option<&RolloutNoise>, map: Option<&Arc<WorldMap>>) {
         let Self { settled, learner, forecast, soil, .. } = self;
         let history = settled.history.make_contiguous();
-        let (Some(noise), Some(map), Some(newest)) = (noise.filter(|noise| noise.steps() >= AHEAD), map, history.last()) else {
+        let (Some(noise), Some(map), Some(newest)) = (noise.filter(|noise| noise.steps() >= FORECAST_AHEAD), map, history.last()) else {
             *forecast = None;
             return;
         };
@@ -347,7 +351,7 @@ impl Session {
         self.forecast = None;
         let begun = self.learner.state(self.soil.state.epoch + 1, None);
         let state = SoilState { last_buffer: self.soil.state.last_buffer, ..begun };
-        self.soil = SoilEstimate { state, covariance: self.learner.covariance(), noise_scale: 1.0, forecasts: ForecastCheck::default() };
+        self.soil = SoilEstimate::begun(state, self.learner.covariance());
     }
 
     /// Watches from now on whether measurements go on agreeing with predictions.

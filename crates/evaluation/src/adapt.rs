@@ -4,8 +4,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nesam_adaptation::{
-    AdaptationError, BufferedTransition, FORECAST_STEPS, FilterConfig, ForecastCheck, Innovation, NoiseCalibration, SoilFilter,
-    SoilPosterior, SoilUpdate, UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
+    AdaptationError, BufferedTransition, FORECAST_AHEAD, FORECAST_STEPS, FilterConfig, ForecastCheck, Innovation, NoiseCalibration,
+    SoilFilter, SoilPosterior, SoilUpdate, UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
 };
 use nesam_model::{HISTORY, HistoryStep, Predictor, RolloutNoise, SoilByClass, SoilField, Transition};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
@@ -153,17 +153,17 @@ pub fn check_forecasts(
 ) {
     adapted.par_iter_mut().zip(drives).zip(maps).for_each(|((adapted, drive), map)| {
         let Some(map) = map else { return };
-        let (steps, ahead) = (history_steps(drive), FORECAST_STEPS[FORECAST_STEPS.len() - 1]);
+        let steps = history_steps(drive);
         let mut check = ForecastCheck::default();
-        adapted.forecasts = (HISTORY - 1..steps.len().saturating_sub(ahead))
-            .step_by(ahead)
+        adapted.forecasts = (HISTORY - 1..steps.len().saturating_sub(FORECAST_AHEAD))
+            .step_by(FORECAST_AHEAD)
             .map(|start| {
                 let soil = adapted.soil_at(start, Some(map));
                 let errors = predictor.forecast_errors(&steps, start, FORECAST_STEPS, &soil, map);
                 if let (Some(errors), Some(expected)) = (errors, noise.planar(FORECAST_STEPS, adapted.filter_scale_at(start))) {
                     check.observe(&errors, &expected);
                 }
-                (start + ahead, check.scale())
+                (start + FORECAST_AHEAD, check.scale())
             })
             .collect();
     });

@@ -1,6 +1,7 @@
 //! From linearised windows to the noise of a bundle, and to the share of windows that its 90 % regions hold.
 
 use nalgebra::{SMatrix, SymmetricEigen};
+use nesam_adaptation::{FORECAST_STEPS, planar_mahalanobis};
 use nesam_model::RolloutNoise;
 use nesam_model::rollout_noise::StateCovariance;
 use nesam_physics::STATE_DIM;
@@ -11,7 +12,7 @@ use crate::coverage::LinearisedWindow;
 use crate::dimension::{DIMENSION_KEYS, POSE_DIM};
 
 /// Steps at which coverage is reported and the regions are calibrated.
-pub const COVERAGE_STEPS: [usize; 3] = [8, 16, 32];
+pub const COVERAGE_STEPS: [usize; 3] = FORECAST_STEPS;
 /// Share of measured states that a region shall hold.
 pub const COVERAGE: f64 = 0.9;
 
@@ -85,9 +86,8 @@ impl Distances {
         let q = noise.residual(k);
         let p = |r: usize, c: usize| window.of_start[k - 1][r][c] + window.of_soil[k - 1][r][c] + window.noise_scale * q[r][c];
         let (xx, xy, yy) = (p(0, 0), p(0, 1), p(1, 1));
-        let determinant = xx * yy - xy * xy;
-        let planar = (yy * e[0] * e[0] - 2.0 * xy * e[0] * e[1] + xx * e[1] * e[1]) / determinant;
-        Some(Self { planar, single: core::array::from_fn(|i| e[i] * e[i] / p(i, i)), radius_m: determinant.sqrt().sqrt() })
+        let planar = planar_mahalanobis(&[e[0], e[1]], &[[xx, xy], [xy, yy]]);
+        Some(Self { planar, single: core::array::from_fn(|i| e[i] * e[i] / p(i, i)), radius_m: (xx * yy - xy * xy).sqrt().sqrt() })
     }
 }
 

@@ -1901,7 +1901,7 @@ pub struct ExportSessionRequest {
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct ExportSessionReply {
-    /// Opaque: only Import reads it. Version and checksum are inside; about 25 kB.
+    /// Opaque: only Import reads it. Version and checksum are inside; some tens of kB.
     #[prost(bytes = "bytes", tag = "1")]
     pub image: ::prost::bytes::Bytes,
 }

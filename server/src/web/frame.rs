@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_engine::{FORECAST_STEPS, ForecastCheck};
+use nesam_engine::{FORECAST_AHEAD, ForecastCheck};
 use nesam_model::{Predictor, flag};
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, STATE_DIM};
 use nesam_terrain::{Pose2, WorldMap};
@@ -174,12 +174,13 @@ fn soil_json(name: &str, session: &SessionNotes, scenery: &Scenery) -> Value {
 /// How predictions came true; absent before the first comparison.
 fn forecasts_json(check: &ForecastCheck) -> Option<Value> {
     let (error_rms_m, expected_rms_m) = check.error_rms_m().zip(check.expected_rms_m())?;
-    let last = FORECAST_STEPS.len() - 1;
+    let [.., error_m] = error_rms_m;
+    let [.., expected_m] = expected_rms_m;
     Some(json!({
         "checked": check.checked(),
-        "steps": FORECAST_STEPS[last],
-        "error_rms_m": rounded(error_rms_m[last], 3),
-        "expected_rms_m": rounded(expected_rms_m[last], 3),
+        "steps": FORECAST_AHEAD,
+        "error_rms_m": rounded(error_m, 3),
+        "expected_rms_m": rounded(expected_m, 3),
     }))
 }
 

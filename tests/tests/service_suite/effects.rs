@@ -44,9 +44,7 @@ async fn states(client: &mut Client, candidates: &Candidates, session: &str) -> 
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_effects_act_in_their_session_alone_until_reverted() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     for session in ["s", "other"] {
         open(&mut client, session, recorded.world.id()).await;
         client.feed(samples(session, &recorded.drive, 60)).await.unwrap();

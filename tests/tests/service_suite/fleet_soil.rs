@@ -60,9 +60,7 @@ async fn service_a_second_vehicle_begins_from_what_the_first_has_learned() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_without_the_map_every_session_begins_alone() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     for session in ["first", "second"] {
         open(&mut client, session, recorded.world.id()).await;
     }

@@ -1,12 +1,9 @@
 //! Goal: predictions of a session are held against what came of them, and what they got wrong widens the regions of those to come.
 
-use std::sync::Arc;
-
 use nesam_adaptation::FORECAST_STEPS;
 use nesam_client::v1;
 use nesam_evaluation::{adapt_all, check_forecasts};
 use nesam_model::RolloutNoise;
-use nesam_terrain::WorldMap;
 
 use crate::stage::*;
 
@@ -26,9 +23,7 @@ fn sliding(session: &str, recorded: &Recorded, last: usize, slide_m_s: f64) -> V
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_predictions_are_held_against_what_came() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     let opened = open(&mut client, "s", recorded.world.id()).await;
     assert_eq!(opened.forecasts, None);
     let mut stream = client.measure().await.unwrap();
@@ -56,11 +51,8 @@ async fn service_predictions_are_held_against_what_came() {
     // Offline, over the whole drive.
     let predictor = fresh_predictor();
     let noise = RolloutNoise::from_json(predictor.bundle().rollout_noise_json.as_deref().unwrap()).unwrap();
-    let filter = nesam_adaptation::CalibratedFilter::from_json(predictor.bundle().soil_filter_json.as_deref().unwrap()).unwrap().config();
-    let world = &recorded.world;
-    let map = WorldMap::from_layers(world.id(), 1, *world.geometry(), world.elevation_m(), world.semantic_rgb()).unwrap();
-    let (drives, maps) = (vec![recorded.drive.clone()], vec![Some(Arc::new(map))]);
-    let mut adapted = adapt_all(&predictor, &drives, &maps, &filter, &|_| {}).unwrap();
+    let (drives, maps) = (vec![recorded.drive.clone()], vec![Some(uploaded(&recorded))]);
+    let mut adapted = adapt_all(&predictor, &drives, &maps, &filter_config(), &|_| {}).unwrap();
     check_forecasts(&predictor, &drives, &maps, &noise, &mut adapted);
     let told = client.session("s").await.unwrap().forecasts.unwrap();
     let (at, scale) = adapted[0].forecasts[told.checked as usize - 1];
@@ -70,9 +62,7 @@ async fn service_predictions_are_held_against_what_came() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_what_predictions_got_wrong_widens_their_regions() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     let last = FIRST + 3 * APART + OPEN_STEPS;
     let mut told = Vec::new();
     for (session, slide_m_s) in [("straight", 0.0), ("sliding", 0.4)] {
@@ -95,9 +85,7 @@ async fn service_what_predictions_got_wrong_widens_their_regions() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_a_prediction_across_a_gap_is_not_compared_and_a_copy_goes_on_with_its_own() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     open(&mut client, "s", recorded.world.id()).await;
     let all = samples("s", &recorded.drive, 200);
     let checked = |session: v1::Session| session.forecasts.map_or(0, |forecasts| forecasts.checked);

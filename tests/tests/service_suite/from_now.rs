@@ -12,9 +12,7 @@ fn sent(recorded: &Recorded, i: usize, steps: usize) -> Vec<(i64, [f64; 2])> {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_prediction_from_now_equals_the_offline_rollout_behind_the_sent_commands() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     open(&mut client, "s", recorded.world.id()).await;
     let newest = 45;
     client.feed(samples("s", &recorded.drive, newest)).await.unwrap();

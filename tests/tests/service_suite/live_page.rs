@@ -55,9 +55,7 @@ impl Page {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_the_live_page_sees_what_passes() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     open(&mut client, "s", recorded.world.id()).await;
     let mut stream = client.measure().await.unwrap();
     for i in 0..5 {

@@ -26,9 +26,7 @@ async fn service_whole_recorded_drives_are_applied() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_resending_after_a_lost_connection_changes_nothing() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     for session in ["once", "twice"] {
         open(&mut client, session, recorded.world.id()).await;
     }
@@ -56,9 +54,7 @@ async fn service_resending_after_a_lost_connection_changes_nothing() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_sessions_do_not_touch_each_other() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     for session in ["alone", "a", "b"] {
         open(&mut client, session, recorded.world.id()).await;
     }

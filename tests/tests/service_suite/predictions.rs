@@ -48,9 +48,7 @@ async fn service_batch_row_equals_row_alone() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_given_start_history_use_and_selection() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     open(&mut client, "s", recorded.world.id()).await;
     let i = 50;
     let mut query = candidates("s", &recorded.drive, i, 3, 9);

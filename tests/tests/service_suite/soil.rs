@@ -7,9 +7,7 @@ use crate::stage::*;
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_every_reply_carries_soil_and_covariance() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     let opened = open(&mut client, "s", recorded.world.id()).await;
     let prior = opened.soil_correction.unwrap();
     assert_eq!((prior.delta, prior.covariance.len()), (Some(v1::SoilVector::default()), 36));

@@ -3,7 +3,7 @@
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use nesam_adaptation::CalibratedFilter;
+use nesam_adaptation::{CalibratedFilter, FilterConfig};
 use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
 use nesam_engine::{PredictExtras, PredictQuery, WheelMeasurement};
 use nesam_evaluation::adapt_drive;
@@ -121,11 +121,17 @@ pub async fn open(client: &mut Client, session: &str, map: &str) -> v1::Session 
     client.open_session(request).await.unwrap()
 }
 
-/// A server with a session on the recorded map that has driven to sample `last`.
-pub async fn driven(session: &str, last: usize) -> (RunningServer, Client, Recorded) {
+/// A server that has the recorded map.
+pub async fn start_on_map() -> (RunningServer, Client, Recorded) {
     let recorded = recorded();
     let (server, mut client) = start().await;
     client.upload_map(&layers(&recorded.world)).await.unwrap();
+    (server, client, recorded)
+}
+
+/// A server with a session on the recorded map that has driven to sample `last`.
+pub async fn driven(session: &str, last: usize) -> (RunningServer, Client, Recorded) {
+    let (server, mut client, recorded) = start_on_map().await;
     open(&mut client, session, recorded.world.id()).await;
     client.feed(samples(session, &recorded.drive, last)).await.unwrap();
     (server, client, recorded)
@@ -185,13 +191,20 @@ pub fn candidates(session: &str, drive: &Trajectory, i: usize, samples: usize, h
     Candidates::new(session, samples, horizon, controls)
 }
 
+/// Settings of the soil filter that the servers run.
+pub fn filter_config() -> FilterConfig {
+    CalibratedFilter::config_of(bundle().soil_filter_json.as_deref()).unwrap()
+}
+
+/// The recorded world as the servers have it: a map that was uploaded tells no classes of ground.
+pub fn uploaded(recorded: &Recorded) -> Arc<WorldMap> {
+    let world = &recorded.world;
+    Arc::new(WorldMap::from_layers(world.id(), 1, *world.geometry(), world.elevation_m(), world.semantic_rgb()).unwrap())
+}
+
 /// The soil correction that the filter of `nesam adapt` has learned from what is final when sample `i` is the newest, and the number of updates.
 pub fn learned(recorded: &Recorded, i: usize) -> (SoilCorrection, u64) {
-    let carried = bundle().soil_filter_json.as_deref().map(|json| CalibratedFilter::from_json(json).unwrap().config());
-    // A map that was uploaded tells no classes of ground.
-    let world = &recorded.world;
-    let uploaded = WorldMap::from_layers(world.id(), 1, *world.geometry(), world.elevation_m(), world.semantic_rgb()).unwrap();
-    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&Arc::new(uploaded)), &carried.unwrap_or_default()).unwrap();
+    let filtered = adapt_drive(&fresh_predictor(), &recorded.drive, Some(&uploaded(recorded)), &filter_config()).unwrap();
     let i = i.saturating_sub(OPEN_STEPS);
     let updates = filtered.updates.iter().filter(|u| u.sample <= i && !u.update.rejected).count();
     (filtered.correction_at(i), updates as u64)

@@ -12,9 +12,7 @@ async fn outcomes(client: &mut Client, session: &str, measurements: Vec<v1::Meas
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_reordered_measurements_give_the_posterior_and_prediction_of_the_ordered_ones() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     for session in ["ordered", "swapped"] {
         open(&mut client, session, recorded.world.id()).await;
     }
@@ -42,9 +40,7 @@ async fn service_reordered_measurements_give_the_posterior_and_prediction_of_the
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_restarts_of_the_vehicle_begin_a_history_and_keep_the_soil() {
-    let recorded = recorded();
-    let (server, mut client) = start().await;
-    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    let (server, mut client, recorded) = start_on_map().await;
     open(&mut client, "s", recorded.world.id()).await;
     let boot = |boot_id: u64, i: usize, at: usize| {
         let mut m = sample("s", &recorded.drive, i);

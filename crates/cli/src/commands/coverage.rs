@@ -24,7 +24,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let noise = noise_of(predictor.bundle())?;
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
-    let filter = filter_of(predictor.bundle())?;
+    let filter = CalibratedFilter::config_of(predictor.bundle().soil_filter_json.as_deref()).or_input()?;
     let mut filtered = adapt_all(&predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?;
     check_forecasts(&predictor, &drives.drives, &drives.maps, &noise, &mut filtered);
     let covered = |filtered: Option<&[DriveAdaptation]>| {
@@ -68,7 +68,7 @@ pub fn calibrate(args: &EvaluateArgs) -> Result<(), Failure> {
     let mut bundle = load_bundle(Some(&dir))?;
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let start = RolloutNoise::new(start_sd, &[]).start_covariance();
-    let filter = filter_of(&bundle)?;
+    let filter = CalibratedFilter::config_of(bundle.soil_filter_json.as_deref()).or_input()?;
     let mut filtered = adapt_all(&predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?;
     let mut windows = windows_of(args, &drives, &predictor, &start, &filter, Some(&filtered))?;
     let none = || Failure::input("no window of the validation drives could be rolled out".to_string());
@@ -100,14 +100,6 @@ fn noise_of(bundle: &ModelBundle) -> Result<RolloutNoise, Failure> {
         .as_deref()
         .ok_or_else(|| Failure::input(format!("bundle {} does not know the covariance of its errors; {hint}", bundle.name)))?;
     RolloutNoise::from_json(json).or_input()
-}
-
-/// The soil filter that the bundle carries.
-fn filter_of(bundle: &ModelBundle) -> Result<FilterConfig, Failure> {
-    match &bundle.soil_filter_json {
-        Some(json) => Ok(CalibratedFilter::from_json(json).or_input()?.config()),
-        None => Ok(FilterConfig::default()),
-    }
 }
 
 /// Every window, linearised with the soil prior or with what the soil filter had learned by its start.

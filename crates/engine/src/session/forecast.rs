@@ -2,18 +2,16 @@
 
 use std::sync::Arc;
 
-use nesam_adaptation::{FORECAST_STEPS, ForecastCheck};
+use nesam_adaptation::{FORECAST_AHEAD, FORECAST_STEPS, ForecastCheck};
 use nesam_model::{HISTORY, HistoryStep, Predictor, RolloutNoise, SoilByClass};
 use nesam_physics::SoilCorrection;
 use nesam_terrain::WorldMap;
 
-/// Steps from the start of a prediction to its last comparison.
-pub(super) const AHEAD: usize = FORECAST_STEPS[FORECAST_STEPS.len() - 1];
 /// Steps that an open prediction holds at most: history, start, and what was measured since.
-const FORECAST_HELD: usize = HISTORY + AHEAD;
+const FORECAST_HELD: usize = HISTORY + FORECAST_AHEAD;
 
 /// What a prediction would have been made from, and what was measured since.
-#[derive(Clone, Debug, Default, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct OpenForecast {
     /// Measured steps, oldest first: a whole history, whose newest is the start, and those after it.
     pub steps: Vec<HistoryStep>,

@@ -52,32 +52,26 @@ impl Scene<'_> {
     /// Each window predicted with the correction that other stretches of its drive ask for.
     fn constant_elsewhere(&self, filter: &FilterConfig) -> Result<ModelPaths, Failure> {
         let drives = self.drives.drives.len();
-        let of_drive: Vec<Vec<&Window<'_>>> = (0..drives).map(|d| self.windows.iter().filter(|w| w.drive == d).collect()).collect();
-        let stretch_of = |w: &Window<'_>| {
-            let own = &of_drive[w.drive];
-            own.iter().position(|other| other.start == w.start).map_or(0, |place| place * STRETCHES / own.len())
-        };
+        let stretches = self.stretches();
+        let within = |stretch: usize| self.windows.iter().zip(&stretches).enumerate().filter(move |(_, (_, s))| **s == stretch);
         let progress = Progress::start("corrections fitted", STRETCHES * drives);
         let mut placed: Vec<(usize, PosePath)> = Vec::with_capacity(self.windows.len());
         let mut parameters = 0;
         for stretch in 0..STRETCHES {
-            let mut soils: Vec<Arc<dyn SoilField>> = Vec::with_capacity(drives);
-            for (drive, own) in of_drive.iter().enumerate() {
-                let held_back: Vec<usize> = own.iter().filter(|w| stretch_of(w) == stretch).map(|w| w.start).collect();
-                let apart = |w: &Window<'_>| held_back.iter().all(|start| start.abs_diff(w.start) >= w.horizon);
-                let others: Vec<Window<'_>> = own.iter().filter(|w| apart(w)).map(|w| **w).collect();
-                let map = self.drives.maps[drive].as_ref();
-                soils.push(match others.is_empty() {
-                    true => Arc::new(SoilCorrection::NONE),
-                    false => Arc::new(best_correction(self.predictor, &others, map, self.truth, &filter.prior_sd, None).or_failed()?),
-                });
+            let (places, held_back): (Vec<usize>, Vec<Window<'_>>) = within(stretch).map(|(place, (window, _))| (place, *window)).unzip();
+            let elsewhere = |drive: usize| -> Result<Arc<dyn SoilField>, Failure> {
+                let apart = |w: &&Window<'_>| held_back.iter().all(|h| h.drive != drive || h.start.abs_diff(w.start) >= w.horizon);
+                let others: Vec<Window<'_>> = self.windows.iter().filter(|w| w.drive == drive).filter(apart).copied().collect();
                 progress.set(stretch * drives + drive + 1);
-            }
-            let (places, windows): (Vec<usize>, Vec<Window<'_>>) =
-                self.windows.iter().copied().enumerate().filter(|(_, w)| stretch_of(w) == stretch).unzip();
-            let model = WindowPredictor::OnSoil { predictor: Arc::clone(self.predictor), soils: Arc::new(soils) };
-            let predicted = predict_all(&[(ModelName::Nesam, model)], &windows, &self.drives.maps, &|_| {}).or_failed()?;
-            for predicted in predicted {
+                if others.is_empty() {
+                    return Ok(Arc::new(SoilCorrection::NONE));
+                }
+                let map = self.drives.maps[drive].as_ref();
+                Ok(Arc::new(best_correction(self.predictor, &others, map, self.truth, &filter.prior_sd, None).or_failed()?))
+            };
+            let soils = Arc::new((0..drives).map(elsewhere).collect::<Result<_, _>>()?);
+            let model = WindowPredictor::OnSoil { predictor: Arc::clone(self.predictor), soils };
+            for predicted in predict_all(&[(ModelName::Nesam, model)], &held_back, &self.drives.maps, &|_| {}).or_failed()? {
                 parameters = predicted.parameters;
                 placed.extend(places.iter().copied().zip(predicted.paths));
             }
@@ -85,6 +79,17 @@ impl Scene<'_> {
         progress.finish();
         placed.sort_by_key(|(place, _)| *place);
         Ok(ModelPaths { name: ModelName::Nesam, parameters, paths: placed.into_iter().map(|(_, path)| path).collect() })
+    }
+
+    /// Stretch of its drive that each window belongs to, by its rank there.
+    fn stretches(&self) -> Vec<usize> {
+        let mut counts = vec![0; self.drives.drives.len()];
+        let mut count = |w: &Window<'_>| {
+            counts[w.drive] += 1;
+            counts[w.drive] - 1
+        };
+        let ranks: Vec<usize> = self.windows.iter().map(&mut count).collect();
+        self.windows.iter().zip(ranks).map(|(w, rank)| rank * STRETCHES / counts[w.drive]).collect()
     }
 
     fn literal(&self) -> Result<Vec<nesam_evaluation::DriveAdaptation>, Failure> {
