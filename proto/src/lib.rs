@@ -4,7 +4,16 @@
 //! building needs no protobuf compiler. `cargo test --release -p nesam-proto` fails when it is stale;
 //! `cargo test --release -p nesam-proto -- --ignored regenerate` makes it again.
 
+pub mod packed;
+
 pub use prost::Message;
+
+/// Largest HTTP/2 frame that both sides take, bytes: a reply of two megabytes is then eight frames and not 128, each with a call of the system on either side.
+pub const FRAME_BYTES_MAX: u32 = 256 << 10;
+/// What may be on its way on one stream before the other side has taken it, bytes.
+pub const STREAM_WINDOW_BYTES: u32 = 4 << 20;
+/// The same of a connection.
+pub const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
 
 /// Version 1 of the interface.
 #[allow(missing_docs, clippy::all, unused_qualifications)]

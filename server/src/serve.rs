@@ -302,8 +302,9 @@ fn builder(config: &GrpcConfig) -> tonic::transport::Server {
     let keepalive = Duration::from_secs_f64(config.keepalive_s);
     tonic::transport::Server::builder()
         .max_concurrent_streams(config.streams_per_connection_max)
-        .initial_stream_window_size(4 << 20)
-        .initial_connection_window_size(8 << 20)
+        .initial_stream_window_size(nesam_proto::STREAM_WINDOW_BYTES)
+        .initial_connection_window_size(nesam_proto::CONNECTION_WINDOW_BYTES)
+        .max_frame_size(nesam_proto::FRAME_BYTES_MAX)
         .http2_keepalive_interval(Some(keepalive))
         .http2_keepalive_timeout(Some(keepalive))
         .http2_max_pending_accept_reset_streams(Some(64))

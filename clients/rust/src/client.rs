@@ -66,7 +66,11 @@ impl Client {
     async fn connect_over(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {
         let failed = |source| ClientError::Connect { address: address.into(), source };
         let endpoint = Endpoint::from_shared(address.to_string()).map_err(failed)?;
-        let endpoint = endpoint.tcp_nodelay(true).initial_stream_window_size(4 << 20).initial_connection_window_size(8 << 20);
+        let endpoint = endpoint
+            .tcp_nodelay(true)
+            .initial_stream_window_size(nesam_proto::STREAM_WINDOW_BYTES)
+            .initial_connection_window_size(nesam_proto::CONNECTION_WINDOW_BYTES)
+            .max_frame_size(nesam_proto::FRAME_BYTES_MAX);
         let endpoint = match tls {
             Some(tls) => endpoint.tls_config(tls.config()).map_err(failed)?,
             None => endpoint,

@@ -1,8 +1,7 @@
 //! Maps to upload.
 
+use nesam_proto::packed::pack;
 use nesam_proto::v1;
-
-use crate::message::pack;
 
 /// Rows of one tile are chosen so that a tile has about this many cells: 7 bytes each stay well below the message limit.
 const TILE_CELLS: usize = 256 << 10;

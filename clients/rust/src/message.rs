@@ -1,6 +1,5 @@
 //! Small messages from plain arrays.
 
-use bytes::Bytes;
 use half::f16;
 use nesam_proto::v1;
 
@@ -51,11 +50,6 @@ pub fn outcome_label(answer: &v1::MeasurementAnswer) -> &'static str {
     }
 }
 
-/// Packs numbers as little-endian f32.
-pub(crate) fn pack(values: &[f32]) -> Bytes {
-    values.iter().flat_map(|v| v.to_le_bytes()).collect::<Vec<u8>>().into()
-}
-
 /// Unpacks `count` little-endian numbers.
 pub(crate) fn unpack(field: &str, packed: &[u8], count: usize, precision: v1::Precision) -> Result<Vec<f32>, ClientError> {
     let width = if precision == v1::Precision::F16 { 2 } else { 4 };
@@ -64,6 +58,6 @@ pub(crate) fn unpack(field: &str, packed: &[u8], count: usize, precision: v1::Pr
     }
     Ok(match precision {
         v1::Precision::F16 => packed.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect(),
-        _ => packed.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect(),
+        _ => nesam_proto::packed::unpack(packed),
     })
 }

@@ -1,9 +1,10 @@
 //! Candidates and predictions.
 
+use nesam_proto::packed::pack;
 use nesam_proto::v1;
 
 use crate::error::ClientError;
-use crate::message::{pack, state_array, state_message, unpack};
+use crate::message::{state_array, state_message, unpack};
 
 /// Candidate command sequences to roll out.
 #[derive(Clone, Debug, PartialEq)]

@@ -1,9 +1,12 @@
 //! The vehicle's side over Zenoh: publishes measurements, hears their answers, says that it is there, may ask for predictions.
 
+use std::borrow::Cow;
 use std::time::Duration;
 
+use bytes::Bytes;
 use nesam_proto::v1;
 use prost::Message as _;
+use zenoh::bytes::ZBytes;
 use zenoh::handlers::FifoChannelHandler;
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
@@ -41,6 +44,20 @@ fn client_of(endpoint: &str) -> Result<zenoh::Config, ClientError> {
 /// Nothing goes past the socket of this session.
 fn no_shared_memory(config: &mut zenoh::Config) -> Result<(), ClientError> {
     config.insert_json5("transport/shared_memory/enabled", "false").map_err(failed)
+}
+
+/// The bytes of a payload where they lie, in shared memory or as received; copied only where they are in pieces.
+fn in_place(payload: &ZBytes) -> Bytes {
+    struct Piece(ZBytes);
+    impl AsRef<[u8]> for Piece {
+        fn as_ref(&self) -> &[u8] {
+            self.0.slices().next().unwrap_or_default()
+        }
+    }
+    match payload.to_bytes() {
+        Cow::Borrowed(_) => Bytes::from_owner(Piece(payload.clone())),
+        Cow::Owned(joined) => joined.into(),
+    }
 }
 
 impl ZenohVehicle {
@@ -137,7 +154,7 @@ impl ZenohVehicle {
         let reply = replies.recv_async().await.map_err(|_| failed("nobody answers predictions"))?;
         match reply.result() {
             Ok(sample) => {
-                let reply = v1::PredictReply::decode(sample.payload().to_bytes().as_ref());
+                let reply = v1::PredictReply::decode(in_place(sample.payload()));
                 Prediction::from_message(&reply.map_err(|error| ClientError::protocol(error.to_string()))?)
             }
             Err(error) => {

@@ -3,6 +3,7 @@
 use bytes::Bytes;
 use half::f16;
 use nesam_engine::EngineError;
+use nesam_proto::packed::{pack, unpack};
 use nesam_proto::v1 as pb;
 
 /// Width of the numbers of a reply.
@@ -46,19 +47,13 @@ pub fn decode_f32(field: &str, packed: &[u8], count: usize) -> Result<Vec<f32>, 
         let reason = format!("has {} bytes, {count} packed f32 take {}", packed.len(), 4 * count);
         return Err(EngineError::invalid(field, reason));
     }
-    Ok(packed.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect())
+    Ok(unpack(packed))
 }
 
 /// Packs an array in little-endian order.
 pub fn encode(values: &[f32], precision: Precision) -> Bytes {
     match precision {
-        Precision::F32 => {
-            let mut packed = vec![0; 4 * values.len()];
-            for (bytes, value) in packed.chunks_exact_mut(4).zip(values) {
-                bytes.copy_from_slice(&value.to_le_bytes());
-            }
-            packed.into()
-        }
+        Precision::F32 => pack(values),
         Precision::F16 => {
             let mut packed = vec![0; 2 * values.len()];
             for (bytes, value) in packed.chunks_exact_mut(2).zip(values) {

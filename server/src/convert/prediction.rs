@@ -1,7 +1,10 @@
 //! Predictions.
 
+use std::sync::Arc;
+
 use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, Ranking, SentCommand, StartInstant};
 use nesam_physics::{STATE_DIM, WHEELS};
+use nesam_proto::packed::lend;
 use nesam_proto::v1 as pb;
 
 use super::candidates::{candidates, path_cost};
@@ -124,11 +127,16 @@ impl OutputSelection {
         picked
     }
 
-    fn states(&self, prediction: &Prediction) -> bytes::Bytes {
-        let rollout = &prediction.rollout;
-        if self.channels == ALL_CHANNELS && self.stride == 1 && self.precision == Precision::F32 {
-            return encode(&rollout.states, Precision::F32);
+    /// Whether every number of every step is returned as the engine computed it.
+    fn whole_steps(&self) -> bool {
+        self.stride == 1 && self.precision == Precision::F32
+    }
+
+    fn states(&self, prediction: &Arc<Prediction>) -> bytes::Bytes {
+        if self.channels == ALL_CHANNELS && self.whole_steps() {
+            return lend(prediction.clone(), |p| &p.rollout.states);
         }
+        let rollout = &prediction.rollout;
         let columns: Vec<usize> = (0..STATE_DIM).filter(|c| self.channels >> c & 1 == 1).collect();
         let mut picked = self.pick(&rollout.states, rollout.horizon, STATE_DIM, &columns);
         if self.precision == Precision::F16 {
@@ -140,9 +148,12 @@ impl OutputSelection {
         encode(&picked, self.precision)
     }
 
-    fn sinkage(&self, prediction: &Prediction) -> bytes::Bytes {
+    fn sinkage(&self, prediction: &Arc<Prediction>) -> bytes::Bytes {
         if !self.wheel_sinkage {
             return bytes::Bytes::new();
+        }
+        if self.whole_steps() {
+            return lend(prediction.clone(), |p| &p.rollout.sinkage_m);
         }
         let columns: [usize; WHEELS] = core::array::from_fn(|i| i);
         encode(&self.pick(&prediction.rollout.sinkage_m, prediction.rollout.horizon, WHEELS, &columns), self.precision)
@@ -150,7 +161,7 @@ impl OutputSelection {
 }
 
 /// The reply to a query.
-pub fn predict_reply(tag: u64, prediction: &Prediction, output: OutputSelection, timing: Timing) -> pb::PredictReply {
+pub fn predict_reply(tag: u64, prediction: &Arc<Prediction>, output: OutputSelection, timing: Timing) -> pb::PredictReply {
     let groups = prediction.extras.soil_groups.max(1);
     let mut reply = pb::PredictReply {
         tag,

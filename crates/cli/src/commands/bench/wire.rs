@@ -132,5 +132,7 @@ async fn measure(args: &WireBench, bundle: nesam_model::ModelBundle) -> Result<(
 fn question(args: &WireBench) -> Candidates {
     let turn = |n: usize| 0.4 * n as f32 / args.samples as f32 - 0.2;
     let controls = (0..args.samples).flat_map(|n| std::iter::repeat_n([2.0, turn(n)], args.horizon).flatten()).collect();
-    Candidates::new(VEHICLE, args.samples, args.horizon, controls)
+    // States alone, so that the reply has as many bytes as are printed.
+    let output = v1::OutputSelection::default();
+    Candidates { output, ..Candidates::new(VEHICLE, args.samples, args.horizon, controls) }
 }
