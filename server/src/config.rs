@@ -129,6 +129,8 @@ pub struct WorkersConfig {
     pub threads: usize,
     /// Whether each stays on a processor of its own.
     pub pinned: bool,
+    /// Whether the network's products in rollouts are rounded to bf16: faster on processors that have instructions for it, refused on others.
+    pub bf16: bool,
 }
 
 /// Soil map of the fleet; see `nesam_engine::FleetSoilSettings`.

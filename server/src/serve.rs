@@ -206,7 +206,7 @@ fn start_recording(
     if !config.recording.enabled {
         return Ok((None, None));
     }
-    let header = RecordingHeader::of_run(predictor.bundle(), &config.limits, &config.fleet_soil, clock.now_ns());
+    let header = RecordingHeader::of_run(predictor, &config.limits, &config.fleet_soil, clock.now_ns());
     let started = Recorder::start(&config.recording, header, predictor.bundle().vehicle.clone());
     let (recorder, tap) = started.map_err(|source| ServerError::Recording { source })?;
     Ok((Some(Arc::new(recorder)), Some(tap)))

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use nesam_client::MapLayers;
 use nesam_learning::recipe::is_validation;
-use nesam_model::{ModelBundle, Predictor};
+use nesam_model::{ModelBundle, Precision, Predictor};
 use nesam_physics::DT_S;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, Trajectory};
@@ -155,6 +155,16 @@ pub fn predictor_for(mut bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Pre
         bundle.move_to(given);
     }
     Ok(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?))
+}
+
+/// The predictor as it is, or with the network's products in rollouts rounded to bf16. `key` is the option that asks for it.
+pub fn rounded(predictor: Arc<Predictor>, bf16: bool, key: &str) -> Result<Arc<Predictor>, Failure> {
+    if !bf16 {
+        return Ok(predictor);
+    }
+    let none = "this processor has no instructions for products of bf16 (AMX or AVX-512 BF16), where f32 is faster; leave it out";
+    let precision = Precision::bf16_here().ok_or_else(|| Failure::input(format!("{key}: {none}")))?;
+    Ok(Arc::new(predictor.in_precision(precision)))
 }
 
 fn check_step(dt_s: f64) -> Result<(), Failure> {

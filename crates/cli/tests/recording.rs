@@ -21,8 +21,8 @@ fn said(output: &Output) -> String {
 }
 
 /// A recording server and the address of its gRPC.
-fn serve(folder: &Path) -> (Child, String) {
-    let (server, lines) = common::start(folder, &["--no-http", "--record", "run"]);
+fn serve(folder: &Path, more: &[&str]) -> (Child, String) {
+    let (server, lines) = common::start(folder, &[&["--no-http", "--record", "run"], more].concat());
     assert!(common::told(&lines, "record").is_some_and(|file| file.ends_with(".0001.mcap")), "{lines:?}");
     let address = common::told(&lines, "grpc").expect("an address");
     (server, format!("http://{address}"))
@@ -45,7 +45,7 @@ fn recording(folder: &Path) -> PathBuf {
 #[tokio::test(flavor = "multi_thread")]
 async fn service_a_stopped_server_leaves_a_recording_that_replays() {
     let here = tempfile::tempdir().unwrap();
-    let (mut server, address) = serve(here.path());
+    let (mut server, address) = serve(here.path(), &[]);
     drive(&address).await;
     assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
     assert_eq!(server.wait().unwrap().code(), Some(0));
@@ -89,7 +89,7 @@ async fn service_a_stopped_server_leaves_a_recording_that_replays() {
 #[tokio::test(flavor = "multi_thread")]
 async fn service_a_killed_server_leaves_what_it_had_written() {
     let here = tempfile::tempdir().unwrap();
-    let (mut server, address) = serve(here.path());
+    let (mut server, address) = serve(here.path(), &[]);
     drive(&address).await;
     // What a crash may lose is half a second; wait for three.
     tokio::time::sleep(Duration::from_millis(1500)).await;
@@ -101,4 +101,25 @@ async fn service_a_killed_server_leaves_what_it_had_written() {
     let json: Value = serde_json::from_str(&std::fs::read_to_string(here.path().join("out.json")).unwrap()).unwrap();
     assert_eq!((json["kinds"]["measure"]["equal"].as_u64(), json["ending"]["kind"].as_str()), (Some(20), Some("cut_off")));
     assert_eq!(json["kinds"]["predict"]["equal"].as_u64(), Some(1));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_run_in_bf16_replays_in_bf16() {
+    let here = tempfile::tempdir().unwrap();
+    let checked = nesam(&["serve", "--check", "--bf16"], here.path());
+    if checked.status.code() == Some(2) {
+        // A processor without the instructions says so before anything is served.
+        assert!(said(&checked).contains("workers.bf16") && said(&checked).contains("AVX-512 BF16"), "{}", said(&checked));
+        return;
+    }
+    assert!(said(&checked).contains("path   a"), "{}", said(&checked));
+    let (mut server, address) = serve(here.path(), &["--bf16"]);
+    drive(&address).await;
+    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+    let output = nesam(&["replay", "run", "--json", "out.json"], here.path());
+    assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+    assert!(said(&output).contains("bf16-"), "{}", said(&output));
+    let json: Value = serde_json::from_str(&std::fs::read_to_string(here.path().join("out.json")).unwrap()).unwrap();
+    assert_eq!((json["kinds"]["predict"]["equal"].as_u64(), json["total"]["different"].as_u64()), (Some(1), Some(0)));
 }

@@ -11,7 +11,8 @@ use nesam_learning::Drive;
 use nesam_model::dims::HIDDEN;
 use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
 use nesam_model::{
-    CacheCounts, GroundSource, HistoryStep, ModelBundle, Normalization, Path, Predictor, RolloutQuery, Variant, Weights, history_actuators,
+    CacheCounts, GroundSource, HistoryStep, ModelBundle, Normalization, Order, Path, Precision, Predictor, RolloutQuery, Variant, Weights,
+    history_actuators,
 };
 use nesam_physics::step::StepModel;
 use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
@@ -161,6 +162,69 @@ fn property_every_path_gives_the_same_bytes() {
     }
     // A repeated query meets a warm cache, and other threads.
     assert_eq!(fastest.rollout(&query).expect("a valid query"), expected);
+}
+
+/// Both orders of summation in bf16.
+const IN_BF16: [Precision; 2] = [Precision::Bf16(Order::Tiles), Precision::Bf16(Order::Pairs)];
+
+#[test]
+fn property_bf16_gives_the_same_bytes_on_every_path_and_touches_rollouts_alone() {
+    let map = hills();
+    let drive = drive(Some(&map), 80);
+    let scales = measured_scales(&drive);
+    let in_f32 = predictor(&scales, lively_weights(&scales));
+    let past = drive.history(2, 33);
+    let (samples, horizon) = (19, 12);
+    let controls = wavy_controls(samples, horizon);
+    let query = from_sample_33(&drive, &past, &controls, samples, &map);
+    let exact = in_f32.rollout(&query).expect("a valid query");
+    for precision in IN_BF16 {
+        let rounded = in_f32.in_precision(precision);
+        let expected = rounded.rollout(&query).expect("a valid query");
+        assert_ne!(expected.states, exact.states, "{}", precision.as_str());
+        // Products of two bf16 are exact in f32, so that even a path without fused multiply-add gives the same sums; what is not rounded may differ there.
+        for path in Path::available().into_iter().filter(|_| cfg!(target_feature = "fma")) {
+            let on_path = rounded.on_path(path);
+            assert_eq!(on_path.precision(), precision);
+            assert_eq!(on_path.rollout(&query).expect("a valid query"), expected, "{} on {}", precision.as_str(), path.as_str());
+        }
+        let own = &controls[7 * horizon * 2..8 * horizon * 2];
+        let alone = rounded.rollout(&RolloutQuery { controls: own, samples: 1, ..query.clone() }).expect("a valid query");
+        for k in 0..horizon {
+            assert_eq!(expected.state(7, k), alone.state(0, k), "row 7, step {k}, {}", precision.as_str());
+        }
+        let back = rounded.in_precision(Precision::F32);
+        assert_eq!(back.rollout(&query).expect("a valid query"), exact);
+        let seen_by_the_filter = |predictor: &Predictor| {
+            let commands = &drive.controls[33..40];
+            format!("{:?}", predictor.transitions_along(&past, &drive.states[33], commands, Some(&map), &SoilCorrection::NONE))
+        };
+        assert_eq!(seen_by_the_filter(&rounded), seen_by_the_filter(&in_f32));
+    }
+}
+
+#[test]
+fn property_bf16_stays_near_f32_on_shipped_weights() {
+    let shipped = concat!(env!("CARGO_MANIFEST_DIR"), "/../../deploy/bundles/hmmwv-nominal");
+    let bundle = Arc::new(ModelBundle::load(shipped.as_ref()).expect("a shipped bundle"));
+    let in_f32 = Predictor::new(bundle).expect("a usable bundle");
+    let map = hills();
+    let drive = drive(Some(&map), 80);
+    let past = drive.history(2, 33);
+    let (samples, horizon) = (64, 32);
+    let controls = wavy_controls(samples, horizon);
+    let query = from_sample_33(&drive, &past, &controls, samples, &map);
+    let exact = in_f32.rollout(&query).expect("a valid query");
+    for precision in IN_BF16 {
+        let rounded = in_f32.in_precision(precision).rollout(&query).expect("a valid query");
+        let apart_m = |n: usize, k: usize| {
+            let [a, b] = [&exact, &rounded].map(|rollout| rollout.state(n, k).position_m);
+            (a[0] - b[0]).hypot(a[1] - b[1])
+        };
+        let mean_m = (0..samples).map(|n| (0..horizon).map(|k| apart_m(n, k)).sum::<f32>()).sum::<f32>() / (samples * horizon) as f32;
+        // The model errs by 0.12 m in the mean over such a horizon; rounding may add a hundredth of that.
+        assert!(mean_m > 0.0 && mean_m < 1.2e-3, "{}: {mean_m} m", precision.as_str());
+    }
 }
 
 #[test]

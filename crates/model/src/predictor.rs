@@ -14,6 +14,7 @@ use crate::dims::{CONTEXT, HIDDEN, STATE_CONTROL};
 use crate::encoder::TerrainEncoders;
 use crate::fused::{FusedTransformer, Path, Prefix};
 use crate::ground::GroundSource;
+use crate::precision::Precision;
 use crate::rollout::{HistoryStep, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
@@ -63,6 +64,8 @@ pub struct Predictor {
     /// Some effect makes measured states differ from true ones.
     sensors_err: bool,
     network: Arc<FusedTransformer>,
+    /// The same as rollouts use it: its steps may be in bf16. The history and what the soil filter asks are not.
+    rolled: Arc<FusedTransformer>,
     projection: Arc<TerrainProjection>,
     token_scale: TokenScale,
     mode: TerrainMode,
@@ -92,10 +95,12 @@ impl Predictor {
             scales.patch_scale(),
         );
         let physics = phases(&bundle);
+        let network = Arc::new(FusedTransformer::new(weights)?);
         Ok(Self {
             sensors_err: physics.any(sensors_err),
             physics,
-            network: Arc::new(FusedTransformer::new(weights)?),
+            rolled: network.clone(),
+            network,
             projection: Arc::new(projection),
             token_scale: scales.token_scale(),
             mode: TerrainMode::Grid,
@@ -108,6 +113,7 @@ impl Predictor {
     pub fn on_path(&self, path: Path) -> Self {
         Self {
             network: Arc::new(self.network.on(path)),
+            rolled: Arc::new(self.rolled.on(path)),
             projection: Arc::new(self.projection.on(path)),
             maps: Arc::default(),
             ..self.clone()
@@ -119,9 +125,19 @@ impl Predictor {
         Self { mode: TerrainMode::Exact, ..self.clone() }
     }
 
+    /// The same predictor with the network in this precision in rollouts, on the fastest instructions of this processor for it.
+    pub fn in_precision(&self, precision: Precision) -> Self {
+        Self { rolled: Arc::new(self.network.in_precision(precision)), ..self.clone() }
+    }
+
+    /// What the network's products are rounded to in rollouts.
+    pub fn precision(&self) -> Precision {
+        self.rolled.precision()
+    }
+
     /// Instructions that rollouts run on.
     pub fn path(&self) -> Path {
-        self.network.path()
+        self.rolled.path()
     }
 
     /// The same predictor for the vehicle with further effects. Network and terrain tokens do not depend on them and are shared, so this costs
@@ -134,6 +150,7 @@ impl Predictor {
             sensors_err: physics.any(sensors_err),
             physics,
             network: self.network.clone(),
+            rolled: self.rolled.clone(),
             projection: self.projection.clone(),
             token_scale: scales.token_scale(),
             mode: self.mode,
@@ -158,7 +175,8 @@ impl Predictor {
             own.iter_mut().zip(change).for_each(|(own, change)| *own += change);
         }
         let network = Arc::new(FusedTransformer::new(&bundle.weights)?.on(self.network.path()));
-        Ok(Self { network, bundle: Arc::new(bundle), ..self.clone() })
+        let rolled = Arc::new(network.in_precision(self.precision()).on(self.path()));
+        Ok(Self { network, rolled, bundle: Arc::new(bundle), ..self.clone() })
     }
 
     /// The bundle behind the predictions.

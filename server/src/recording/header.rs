@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use nesam_model::ModelBundle;
+use nesam_model::{Precision, Predictor};
 
 use super::error::RecordingError;
 use crate::clock::unix_ns;
@@ -33,6 +33,8 @@ pub struct RecordingHeader {
     pub fleet_soil: FleetSoilConfig,
     /// Settings of the soil filter that the bundle carries, JSON; empty = the defaults of the program.
     pub soil_filter: String,
+    /// What the network's products were rounded to.
+    pub precision: Precision,
     /// Processor and the vector units that decide which kernels compute.
     pub machine: String,
     /// Unix time at which the engine's clock stood at 0, ns.
@@ -43,7 +45,8 @@ pub struct RecordingHeader {
 
 impl RecordingHeader {
     /// The header of a run that starts now.
-    pub fn of_run(bundle: &ModelBundle, limits: &LimitsConfig, fleet_soil: &FleetSoilConfig, engine_now_ns: u64) -> Self {
+    pub fn of_run(predictor: &Predictor, limits: &LimitsConfig, fleet_soil: &FleetSoilConfig, engine_now_ns: u64) -> Self {
+        let bundle = predictor.bundle();
         let now_ns = unix_ns().unsigned_abs();
         Self {
             program: Self::this_program(),
@@ -53,6 +56,7 @@ impl RecordingHeader {
             limits: limits.clone(),
             fleet_soil: fleet_soil.clone(),
             soil_filter: bundle.soil_filter_json.clone().unwrap_or_default(),
+            precision: predictor.precision(),
             machine: Self::this_machine(),
             clock_zero_unix_ns: now_ns.saturating_sub(engine_now_ns),
             run: format!("nesam-{}-{}", utc(now_ns / 1_000_000_000), std::process::id()),
@@ -92,6 +96,7 @@ impl RecordingHeader {
             ("limits", limits),
             ("fleet_soil", fleet_soil),
             ("soil_filter", self.soil_filter.clone()),
+            ("precision", self.precision.as_str().to_string()),
             ("machine", self.machine.clone()),
             ("clock_zero_unix_ns", self.clock_zero_unix_ns.to_string()),
             ("run", self.run.clone()),
@@ -127,6 +132,11 @@ impl RecordingHeader {
             limits,
             fleet_soil,
             soil_filter: text("soil_filter")?,
+            // Recordings from before there was a choice are in f32.
+            precision: match metadata.get("precision") {
+                Some(name) => Precision::named(name).ok_or_else(|| wrong("precision"))?,
+                None => Precision::F32,
+            },
             machine: text("machine")?,
             clock_zero_unix_ns: text("clock_zero_unix_ns")?.parse().map_err(|_| wrong("clock_zero_unix_ns"))?,
             run: text("run")?,
@@ -181,6 +191,7 @@ mod tests {
             limits: LimitsConfig::default(),
             fleet_soil: FleetSoilConfig::default(),
             soil_filter: String::new(),
+            precision: Precision::bf16_here().unwrap_or_default(),
             machine: RecordingHeader::this_machine(),
             clock_zero_unix_ns: 7,
             run: "r".into(),
@@ -188,11 +199,16 @@ mod tests {
         let path = Path::new("x.mcap");
         let metadata = header.to_metadata(3);
         assert_eq!(RecordingHeader::of_metadata(path, &metadata).unwrap(), (header, 3));
-        for key in metadata.keys() {
+        for key in metadata.keys().filter(|key| *key != "precision") {
             let mut without = metadata.clone();
             without.remove(key);
             assert!(RecordingHeader::of_metadata(path, &without).is_err(), "{key}");
         }
+        let mut older = metadata.clone();
+        older.remove("precision");
+        assert_eq!(RecordingHeader::of_metadata(path, &older).unwrap().0.precision, Precision::F32);
+        older.insert("precision".into(), "f16".into());
+        assert!(RecordingHeader::of_metadata(path, &older).unwrap_err().to_string().contains("precision"));
         let mut newer = metadata.clone();
         newer.insert("schema".into(), "nesam.recording/9".into());
         let message = RecordingHeader::of_metadata(path, &newer).unwrap_err().to_string();

@@ -52,9 +52,12 @@ async fn absent(edge: &Edge, session: &str, vehicle: &str) -> Option<Absent> {
 
 async fn reply(edge: Edge, query: ::zenoh::query::Query) {
     let key = query.key_expr().clone();
-    let payload = query.payload().map(|p| p.to_bytes().into_owned()).unwrap_or_default();
     let limits = edge.engine.handle().limits();
-    let decoded = decode::<pb::PredictRequest>("nesam.v1.PredictRequest", &payload, 8 * limits.sample_steps_max + (64 << 10));
+    let decoded = {
+        // Read where it lies: in shared memory that is the planner's own buffer.
+        let payload = query.payload().map(|p| p.to_bytes()).unwrap_or_default();
+        decode::<pb::PredictRequest>("nesam.v1.PredictRequest", &payload, 8 * limits.sample_steps_max + (64 << 10))
+    };
     let result = match decoded {
         Ok(mut request) => {
             if request.session_id.is_empty() {

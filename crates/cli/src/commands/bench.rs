@@ -17,7 +17,7 @@ use std::time::Instant;
 use clap::{Args, Subcommand};
 use nesam_client::{measurement, v1};
 use nesam_evaluation::{Pose, Truth, absolute_error, all_windows, history_steps, horizontal_distance, roll_out};
-use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, ModelBundle, Predictor, Rollout, RolloutQuery, Variant};
+use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, Precision, Predictor, Rollout, RolloutQuery, Variant};
 use nesam_physics::{Control, SoilCorrection};
 use nesam_terrain::WorldMap;
 use rand::{RngExt, SeedableRng};
@@ -73,7 +73,8 @@ struct PredictBench {
     /// Seed of poses and commands
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Instructions to run on: avx512, or avx2 (portable where the build has no AVX2) [default: the fastest of this processor]
+    /// Instructions to run on: avx512, or avx2 (portable where the build has no AVX2), or for products of bf16 amx or avx512-bf16 [default: the fastest of
+    /// this processor in f32]
     #[arg(long, value_name = "NAME")]
     path: Option<String>,
     /// Also time 64 to 2048 candidates on every path of this processor, terrain warm
@@ -149,7 +150,11 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
     let mut later: Vec<f64> = steady[1..].to_vec();
     let p50 = percentile(&mut warm, 0.5);
     let steady_p50 = if later.is_empty() { steady[0] } else { percentile(&mut later, 0.5) };
-    let max_error = interpolation_error(&drives, &bundle, args.horizon)?;
+    let max_error = share_of_error(&drives, [fresh, &fresh.exactly()], args.horizon)?;
+    let rounding = match fresh.precision() {
+        Precision::F32 => None,
+        Precision::Bf16(_) => share_of_error(&drives, [fresh, &fresh.in_precision(Precision::F32)], args.horizon)?,
+    };
     let figures = json!({
         "schema": "nesam.bench/1",
         "samples": args.samples,
@@ -166,6 +171,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         "tokens_per_s": (args.samples * args.horizon) as f64 / (p50 * 1e-3),
         "steady_p50_ms": steady_p50,
         "terrain_cache": {"hit_rate": hit_rate, "max_error": max_error},
+        "rounding_max_error": rounding,
         "parts_ms": args.parts.then(|| sweep::parts(&drive, fresh)).transpose()?,
         "sweep": args.sweep.then(|| sweep::sweep(&drive, fresh)).transpose()?,
         "provenance": provenance(Some(&bundle), &drives),
@@ -194,6 +200,9 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
             100.0 * hit,
             100.0 * error
         );
+    }
+    if let Some(rounding) = rounding {
+        say!("  rounding to bf16 moves predictions by at most {:.2} % of the model's own error", 100.0 * rounding);
     }
     if let Some(file) = &args.html {
         write_file(file, page::predict_page(&figures).as_bytes())?;
@@ -279,16 +288,14 @@ impl<'a> Planner<'a> {
     }
 }
 
-/// Largest ratio over the six dimensions of what interpolated terrain tokens move a prediction to what the model is off by, both as means over
+/// Largest ratio over the six dimensions of how far the predictions of two predictors lie apart to what the second is off by, both as means over
 /// windows and steps; `None` without a map or when no drive is long enough.
-fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) -> Result<Option<f64>, Failure> {
+fn share_of_error(drives: &Drives, predictors: [&Predictor; 2], horizon: usize) -> Result<Option<f64>, Failure> {
     let mut windows = all_windows(&drives.drives, horizon, HISTORY, Truth::Measured).unwrap_or_default();
     windows.retain(|window| drives.maps[window.drive].is_some());
     if windows.is_empty() {
         return Ok(None);
     }
-    let grid = Predictor::new(Arc::new(bundle.clone())).or_input()?;
-    let exact = grid.exactly();
     // Horizontal position in the place of x and y, which depend on the heading.
     let apart = |a: &Pose, b: &Pose| {
         let [_, _, z, roll, pitch, yaw] = absolute_error(a, b);
@@ -297,11 +304,11 @@ fn interpolation_error(drives: &Drives, bundle: &ModelBundle, horizon: usize) ->
     let (mut moved, mut off) = ([0.0; 5], [0.0; 5]);
     for window in windows.iter().step_by(windows.len().div_ceil(CHECKED_WINDOWS)) {
         let map = drives.maps[window.drive].as_ref();
-        let [on_grid, exactly] = [&grid, &exact].map(|p| roll_out(p, Variant::Full, SoilCorrection::NONE, window, None, map));
-        for ((a, b), truth) in on_grid.or_failed()?.poses.iter().zip(&exactly.or_failed()?.poses).zip(&window.truth(Truth::Measured)) {
-            let (by_grid, by_model) = (apart(a, b), apart(b, truth));
+        let [first, second] = predictors.map(|p| roll_out(p, Variant::Full, SoilCorrection::NONE, window, None, map));
+        for ((a, b), truth) in first.or_failed()?.poses.iter().zip(&second.or_failed()?.poses).zip(&window.truth(Truth::Measured)) {
+            let (between, by_model) = (apart(a, b), apart(b, truth));
             for d in 0..moved.len() {
-                moved[d] += by_grid[d];
+                moved[d] += between[d];
                 off[d] += by_model[d];
             }
         }

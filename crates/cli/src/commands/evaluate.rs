@@ -17,7 +17,9 @@ use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, training_drives, worlds_of};
+use crate::sources::{
+    Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, rounded, training_drives, worlds_of,
+};
 use crate::{interrupt, output};
 
 /// Options of `nesam evaluate`.
@@ -55,6 +57,9 @@ pub struct EvaluateArgs {
     /// What start and history are taken from; `gt` is for an error budget (how much the noise of the start costs) and implies `--truth gt`
     #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
     start: TruthArg,
+    /// Round the network's products to bf16, as `nesam serve --bf16` does: of nesam and of trained baselines
+    #[arg(long, conflicts_with_all = ["coverage", "calibrate_coverage"])]
+    bf16: bool,
     /// Models to compare [default: all that bundle and data allow]
     #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
     models: Option<Vec<String>>,
@@ -239,7 +244,8 @@ impl Models {
         let predictor = if names.iter().any(|n| n.is_nesam()) {
             check_model_step(args.data.dt)?;
             args.window.check_horizon()?;
-            Some(predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?)
+            let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+            Some(rounded(predictor, args.bf16, "--bf16")?)
         } else {
             None
         };
@@ -296,7 +302,7 @@ fn trained_baselines(args: &EvaluateArgs, names: &[ModelName], drives: &Drives) 
     for folder in folders {
         let bundle = load_bundle(Some(&folder))?;
         if bundle.vehicle.name == drives.root.vehicle().name {
-            predictors.push(predictor_for(bundle, &drives.root)?);
+            predictors.push(rounded(predictor_for(bundle, &drives.root)?, args.bf16, "--bf16")?);
         }
     }
     Ok(predictors)

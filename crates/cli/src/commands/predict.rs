@@ -15,7 +15,7 @@ use crate::args::{BundleArgs, DataArgs, WindowArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output;
 use crate::output::say;
-use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives, rounded};
 
 /// Options of `nesam predict`.
 #[derive(Args, Debug)]
@@ -38,6 +38,9 @@ pub struct PredictArgs {
     /// Which form of the model
     #[arg(long, value_enum, default_value_t = ModelArg::Nesam)]
     model: ModelArg,
+    /// Round the network's products to bf16, as `nesam serve --bf16` does
+    #[arg(long)]
+    bf16: bool,
     /// Form of the answer
     #[arg(long, value_enum, default_value_t = Format::Json)]
     format: Format,
@@ -89,6 +92,7 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
     }
     let window = Window { horizon: controls.len(), ..window };
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = rounded(predictor, args.bf16, "--bf16")?;
     let map = drives.maps[0].as_ref();
     let rollout = rollout(args, &predictor, &window, &controls, map)?;
     let text = match args.format {

@@ -14,7 +14,7 @@ use crate::args::BundleArgs;
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
-use crate::sources::load_bundle;
+use crate::sources::{load_bundle, rounded};
 
 /// Options of `nesam serve`. They override the configuration file, which overrides the defaults.
 #[derive(Args, Debug)]
@@ -64,6 +64,9 @@ pub struct ServeArgs {
     /// Name of this server among those that share sessions; else its host and port
     #[arg(long, value_name = "NAME")]
     server_name: Option<String>,
+    /// Round the network's products in rollouts to bf16, for processors with AMX or AVX-512 BF16; sums, physics and the soil filter stay in f32
+    #[arg(long)]
+    bf16: bool,
     /// Check configuration, certificates, fleet file and bundle, say what is wrong, and serve nothing
     #[arg(long)]
     check: bool,
@@ -103,7 +106,7 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
 /// Starts a server on a bundle.
 pub async fn start(config: Config, bundle: ModelBundle) -> Result<(RunningServer, Arc<ModelBundle>), Failure> {
     let bundle = Arc::new(bundle);
-    let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?);
+    let predictor = rounded(Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?), config.workers.bf16, "workers.bf16")?;
     // A port that is taken or a value out of range is for the caller to change.
     Ok((serve(config, predictor).await.or_input()?, bundle))
 }
@@ -136,6 +139,7 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
         config.store.enabled = true;
         config.store.directory.clone_from(folder);
     }
+    config.workers.bf16 |= args.bf16;
     if let Some(members) = &args.etcd {
         config.cluster.etcd.clone_from(members);
     }
@@ -199,7 +203,8 @@ pub fn log_to_stderr(default: &str) {
 fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
     let (tls, access) = access::load(&config.tls).or_input()?;
     say!("bundle {} {}", bundle.name, bundle.hash);
-    Predictor::new(Arc::new(bundle)).or_input()?;
+    let predictor = rounded(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?), config.workers.bf16, "workers.bf16")?;
+    say!("path   {}", predictor.path().as_str());
     say!(
         "grpc   {}, {}",
         config.grpc.listen,

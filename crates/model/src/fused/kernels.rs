@@ -61,6 +61,20 @@ pub enum After {
     Add,
 }
 
+impl After {
+    /// Stores what becomes of W x + b.
+    #[inline(always)]
+    pub fn store<V: Vector>(self, sum: V, y: &mut Lane) {
+        let value = match self {
+            Self::Store => sum,
+            Self::Gelu => gelu(sum),
+            Self::Silu => silu(sum),
+            Self::Add => V::load(&y.0).add(sum),
+        };
+        value.store(&mut y.0);
+    }
+}
+
 /// y = W x + b, or what `after` makes of it: `x` (inputs) rows, `y` (padded outputs) rows. Sums run over the inputs in order.
 #[inline(always)]
 pub fn linear<V: Vector, const H: usize>(matrix: &Packed, after: After, x: &[Row<H>], y: &mut [Row<H>]) {
@@ -116,14 +130,7 @@ fn tile<'a, V: Vector, const R: usize, const W: usize, const H: usize>(
     }
     for r in 0..R {
         for w in 0..W {
-            let out = &mut y[first + r][from + w].0;
-            let value = match after {
-                After::Store => sums[r][w],
-                After::Gelu => gelu(sums[r][w]),
-                After::Silu => silu(sums[r][w]),
-                After::Add => V::load(out).add(sums[r][w]),
-            };
-            value.store(out);
+            after.store(sums[r][w], &mut y[first + r][from + w]);
         }
     }
 }

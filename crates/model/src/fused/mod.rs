@@ -1,7 +1,9 @@
 //! The fast inference path: blocks of samples in lanes, f32, no tensors. Same interface and same numbers, to rounding, as `reference`.
 //!
-//! `vector` holds the instructions, `elementary`, `kernels` and `convolution` the arithmetic, `transformer` and `prefix` the network, `real` the physics in lanes.
+//! `vector` holds the instructions, `elementary`, `kernels`, `bf16` and `convolution` the arithmetic, `transformer` and `prefix` the network, `real` the physics in
+//! lanes.
 
+mod bf16;
 mod convolution;
 mod elementary;
 mod kernels;
@@ -18,4 +20,4 @@ pub(crate) use real::Numbers;
 pub(crate) use transformer::{Block, Dense};
 pub use transformer::{BlockCache, FusedTransformer, Said};
 pub(crate) use vector::{Kernel, Vector};
-pub use vector::{LANES, Lane, Path};
+pub use vector::{LANES, Lane, Order, Path};

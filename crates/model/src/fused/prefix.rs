@@ -1,5 +1,6 @@
 //! The measured history: encoded once per query, attended by all samples.
 
+use super::bf16::Bf16Buffers;
 use super::kernels::{Packed, Row};
 use super::transformer::{Block, FusedTransformer, SCORE_SCALE, embed, finish, project};
 use super::vector::{Kernel, LANES, Lane, Vector};
@@ -103,7 +104,7 @@ impl Kernel for Project<'_> {
     #[inline(always)]
     fn run<V: Vector>(self) {
         let mut normal = [[Lane::ZERO; 2]; HIDDEN];
-        project::<V, 2>(self.block, self.x, &mut normal, self.qkv);
+        project::<V, 2>(self.block, self.x, &mut normal, self.qkv, &mut Bf16Buffers::default());
     }
 }
 
@@ -118,6 +119,6 @@ impl Kernel for Finish<'_> {
     #[inline(always)]
     fn run<V: Vector>(self) {
         let (mut normal, mut hidden) = ([[Lane::ZERO; 2]; HIDDEN], [[Lane::ZERO; 2]; FEED_FORWARD]);
-        finish::<V, 2>(self.block, self.x, self.attended, &mut normal, &mut hidden);
+        finish::<V, 2>(self.block, self.x, self.attended, &mut normal, &mut hidden, &mut Bf16Buffers::default());
     }
 }

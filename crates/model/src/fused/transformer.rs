@@ -1,11 +1,13 @@
 //! The causal Transformer over blocks of samples, with the history shared by all of them.
 
+use super::bf16::{self, Bf16Buffers, PackedBf16};
 use super::elementary::tanh;
 use super::kernels::{After, Packed, Row, add_rows, layer_norm, linear, own_scores, own_values, softmax};
 use super::prefix::Prefix;
 use super::vector::{Kernel, Lane, Path, Vector};
 use crate::ModelError;
 use crate::dims::*;
+use crate::precision::Precision;
 use crate::weights::Weights;
 use nesam_physics::{STATE_DIM, WHEELS};
 
@@ -18,12 +20,23 @@ pub(super) const SCORE_SCALE: f32 = 0.176_776_7;
 pub(crate) struct Dense {
     pub(crate) weight: Vec<f32>,
     pub(crate) bias: Vec<f32>,
-    pub(super) packed: Packed,
+    packed: Packed,
+    /// The weights in bf16, where they are to be used.
+    rounded: Option<PackedBf16>,
 }
 
 impl Dense {
     fn new(weight: &[f32], bias: &[f32]) -> Self {
-        Self { weight: weight.to_vec(), bias: bias.to_vec(), packed: Packed::from_rows(weight, bias) }
+        Self { weight: weight.to_vec(), bias: bias.to_vec(), packed: Packed::from_rows(weight, bias), rounded: None }
+    }
+
+    /// y = W x + b, or what `after` makes of it.
+    #[inline(always)]
+    fn apply<V: Vector, const H: usize>(&self, after: After, x: &[Row<H>], y: &mut [Row<H>], buffers: &mut Bf16Buffers) {
+        match &self.rounded {
+            Some(rounded) => bf16::linear::<V, H>(rounded, after, x, y, buffers),
+            None => linear::<V, H>(&self.packed, after, x, y),
+        }
     }
 }
 
@@ -48,6 +61,7 @@ pub struct FusedTransformer {
     pub(crate) residual: Dense,
     heads: Packed,
     path: Path,
+    precision: Precision,
 }
 
 /// What the network says of a block of samples.
@@ -78,6 +92,7 @@ struct Buffers<const H: usize> {
     attended: Vec<Row<H>>,
     hidden: Vec<Row<H>>,
     scores: Vec<Row<H>>,
+    rounded: Bf16Buffers,
 }
 
 impl<const H: usize> BlockCache<H> {
@@ -98,6 +113,7 @@ impl<const H: usize> BlockCache<H> {
                 attended: rows(HIDDEN),
                 hidden: rows(FEED_FORWARD),
                 scores: rows(POSITIONS),
+                rounded: Bf16Buffers::default(),
             },
         }
     }
@@ -147,12 +163,30 @@ impl FusedTransformer {
             residual,
             heads,
             path: Path::fastest(),
+            precision: Precision::F32,
         })
     }
 
     /// The same on another path.
     pub fn on(&self, path: Path) -> Self {
         Self { path, ..self.clone() }
+    }
+
+    /// The same in this precision, on the fastest path for it. In bf16 the matrices of the blocks and what they are multiplied with are rounded in every step;
+    /// tokens, attention, normalisation and heads are not.
+    pub fn in_precision(&self, precision: Precision) -> Self {
+        let mut other = Self { precision, path: precision.fastest_path(), ..self.clone() };
+        for block in &mut other.blocks {
+            for dense in [&mut block.qkv, &mut block.out, &mut block.up, &mut block.down] {
+                dense.rounded = precision.order().map(|order| PackedBf16::from_rows(order, &dense.weight, &dense.bias));
+            }
+        }
+        other
+    }
+
+    /// What its products are rounded to.
+    pub fn precision(&self) -> Precision {
+        self.precision
     }
 
     /// Instructions that it runs on.
@@ -178,7 +212,7 @@ impl FusedTransformer {
             cache.clear();
         }
         assert!(cache.steps < cache.room, "a rollout has no more steps than its cache has room for; this is a bug");
-        self.path.run(Step { network: self, prefix, cache, entries, context })
+        self.path.run_with_bf16(Step { network: self, prefix, cache, entries, context })
     }
 }
 
@@ -198,10 +232,10 @@ impl<const H: usize> Kernel for Step<'_, H> {
         let Self { network, prefix, cache, entries, context } = self;
         let step = cache.steps;
         let BlockCache { keys, values, buffers, .. } = cache;
-        let Buffers { x, normal, qkv, attended, hidden, scores } = buffers;
+        let Buffers { x, normal, qkv, attended, hidden, scores, rounded } = buffers;
         embed::<V, H>(network, Some(HISTORY - 1 + step), entries, context, x);
         for (index, block) in network.blocks.iter().enumerate() {
-            project::<V, H>(block, x, normal, qkv);
+            project::<V, H>(block, x, normal, qkv, rounded);
             let own = step * HIDDEN..(step + 1) * HIDDEN;
             keys[index][own.clone()].copy_from_slice(&qkv[HIDDEN..2 * HIDDEN]);
             values[index][own].copy_from_slice(&qkv[2 * HIDDEN..]);
@@ -209,7 +243,7 @@ impl<const H: usize> Kernel for Step<'_, H> {
             for head in 0..HEADS {
                 attend::<V, H>(head, &qkv[..HIDDEN], prefix, index, keys, values, scores, attended);
             }
-            finish::<V, H>(block, x, attended, normal, hidden);
+            finish::<V, H>(block, x, attended, normal, hidden, rounded);
         }
         cache.steps += 1;
         layer_norm::<V, H>(x, &network.norm.weight, &network.norm.bias, NORM_EPS, normal);
@@ -248,9 +282,15 @@ pub(super) fn embed<V: Vector, const H: usize>(
 
 /// Queries, keys and values (384) of pre-normalised hidden states.
 #[inline(always)]
-pub(super) fn project<V: Vector, const H: usize>(block: &Block, x: &[Row<H>], normal: &mut [Row<H>], qkv: &mut [Row<H>]) {
+pub(super) fn project<V: Vector, const H: usize>(
+    block: &Block,
+    x: &[Row<H>],
+    normal: &mut [Row<H>],
+    qkv: &mut [Row<H>],
+    rounded: &mut Bf16Buffers,
+) {
     layer_norm::<V, H>(x, &block.norm1.weight, &block.norm1.bias, NORM_EPS, normal);
-    linear::<V, H>(&block.qkv.packed, After::Store, normal, qkv);
+    block.qkv.apply::<V, H>(After::Store, normal, qkv, rounded);
 }
 
 /// Output projection and feed-forward network, both added to x.
@@ -261,11 +301,12 @@ pub(super) fn finish<V: Vector, const H: usize>(
     attended: &[Row<H>],
     normal: &mut [Row<H>],
     hidden: &mut [Row<H>],
+    rounded: &mut Bf16Buffers,
 ) {
-    linear::<V, H>(&block.out.packed, After::Add, attended, x);
+    block.out.apply::<V, H>(After::Add, attended, x, rounded);
     layer_norm::<V, H>(x, &block.norm2.weight, &block.norm2.bias, NORM_EPS, normal);
-    linear::<V, H>(&block.up.packed, After::Gelu, normal, hidden);
-    linear::<V, H>(&block.down.packed, After::Add, hidden, x);
+    block.up.apply::<V, H>(After::Gelu, normal, hidden, rounded);
+    block.down.apply::<V, H>(After::Add, hidden, x, rounded);
 }
 
 /// Attention of one head of a block of samples over the shared history and their own steps.

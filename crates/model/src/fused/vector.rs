@@ -1,4 +1,4 @@
-//! Sixteen f32 as one value, in the instructions that the processor has: the only module of this workspace with `unsafe` code.
+//! Sixteen f32 as one value, in the instructions that the processor has: the only module of this workspace with `unsafe` code (`x86` is a part of it).
 //!
 //! A [`Kernel`] is written once over [`Vector`]; [`Path::run`] compiles it for AVX-512 and for the target of the build (AVX2 with FMA on x86-64, see
 //! `.cargo/config.toml`; whatever `wide` makes of it elsewhere), and calls the one that was found to run here. Both do the same IEEE operations in the same order, lane
@@ -8,15 +8,20 @@
 //! Two things need `unsafe`: calling a function that is compiled for instructions which the processor may lack, and the intrinsics themselves. A [`Path`]
 //! of AVX-512 exists only after the processor was asked ([`Path::available`]); the vector types are private and reach a kernel only through
 //! [`Path::run`], so an intrinsic is never executed without its instructions. Loads and stores take references to whole arrays, so no pointer can leave
-//! its memory.
+//! its memory. Tiles are registers of their own, which the compiler does not use; they are set up before a kernel of that path and given back after it.
 //!
-//! AMX would be a further path here, with tiles of bf16 in place of `Vector` in `kernels::linear`; it is not written, since no processor was at hand to run it.
+//! # Products of bf16
+//! [`Vector::products`] multiplies tiles of bf16 in one of two orders of summation, those of the two instructions that do it: AMX's `tdpbf16ps` and AVX-512's
+//! `vdpbf16ps`. Every path can do both, with the same bits: a product of two bf16 is exact in f32, so only the order of the sums counts.
 #![allow(unsafe_code)]
 
 use core::fmt::Debug;
 use core::ops::{Deref, DerefMut};
 
 use wide::{f32x8, u32x8};
+
+#[cfg(target_arch = "x86_64")]
+mod x86;
 
 /// Samples of one lane.
 pub const LANES: usize = 16;
@@ -50,6 +55,29 @@ impl DerefMut for Lane {
     fn deref_mut(&mut self) -> &mut Self::Target {
         &mut self.0
     }
+}
+
+/// Sixteen rows of sixteen pairs of bf16, the even one of a pair in the low half.
+#[repr(C, align(64))]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tile(pub [[u32; LANES]; LANES]);
+
+impl Tile {
+    /// All zero.
+    pub const ZERO: Self = Self([[0; LANES]; LANES]);
+}
+
+/// Panels of sixteen outputs whose products are taken together.
+pub const TILE_PANELS: usize = 4;
+
+/// Order in which products of bf16 are summed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Order {
+    /// That of AMX (`tdpbf16ps`): over each 32 inputs the even ones and the odd ones apart, then both, then to what came before.
+    /// Rows of a tile of weights are outputs.
+    Tiles,
+    /// That of AVX-512 (`vdpbf16ps`): one after the other, of each pair the odd one first. Rows of a tile of weights are pairs of inputs.
+    Pairs,
 }
 
 /// Sixteen f32 in registers. Every operation acts on each lane alone.
@@ -92,6 +120,54 @@ pub trait Vector: Copy + Debug {
     fn mantissa(self) -> Self;
     /// `a` where self >= 0, else `b`; `b` where self is not a number.
     fn select_ge0(self, a: Self, b: Self) -> Self;
+    /// Pairs of bf16, rounded to nearest, ties to even: self and `odd`.
+    fn store_pairs(self, odd: Self, to: &mut [u32; LANES]);
+    /// Pairs of bf16 as numbers: the even ones and the odd ones.
+    fn load_pairs(from: &[u32; LANES]) -> [Self; 2];
+
+    /// Sums over the inputs of weight · input: `weights` four tiles for each of `inputs`, whose rows are pairs of inputs and whose columns are samples.
+    /// (The instructions take numbers below 1.2e-38 for zero, [`products_in_f32`] does not.)
+    #[inline(always)]
+    fn products(order: Order, weights: &[[Tile; TILE_PANELS]], inputs: &[Tile], sums: &mut [[Lane; LANES]; TILE_PANELS]) {
+        products_in_f32::<Self>(order, weights, inputs, sums);
+    }
+}
+
+/// [`Vector::products`] where there are no instructions for it.
+#[inline(always)]
+fn products_in_f32<V: Vector>(order: Order, weights: &[[Tile; TILE_PANELS]], inputs: &[Tile], sums: &mut [[Lane; LANES]; TILE_PANELS]) {
+    /// Outputs at a time.
+    const M: usize = 4;
+    for panel in 0..TILE_PANELS {
+        for first in (0..LANES).step_by(M) {
+            let mut totals = [V::splat(0.0); M];
+            for (weights, inputs) in weights.iter().zip(inputs) {
+                let mut apart = [[V::splat(0.0); 2]; M];
+                for (k, inputs) in inputs.0.iter().enumerate() {
+                    let [even, odd] = V::load_pairs(inputs);
+                    for m in 0..M {
+                        let pair = match order {
+                            Order::Tiles => weights[panel].0[first + m][k],
+                            Order::Pairs => weights[panel].0[k][first + m],
+                        };
+                        let [low, high] = [pair << 16, pair & 0xffff_0000].map(|bits| V::splat(f32::from_bits(bits)));
+                        match order {
+                            Order::Tiles => apart[m] = [low.mul_add(even, apart[m][0]), high.mul_add(odd, apart[m][1])],
+                            Order::Pairs => totals[m] = low.mul_add(even, high.mul_add(odd, totals[m])),
+                        }
+                    }
+                }
+                if order == Order::Tiles {
+                    for m in 0..M {
+                        totals[m] = totals[m].add(apart[m][0].add(apart[m][1]));
+                    }
+                }
+            }
+            for m in 0..M {
+                totals[m].store(&mut sums[panel][first + m].0);
+            }
+        }
+    }
 }
 
 /// A computation in vectors. `run` must be `#[inline(always)]`, as everything that it calls with vectors, or the instructions do not reach the code.
@@ -106,6 +182,12 @@ pub trait Kernel {
 enum Instructions {
     #[cfg(target_arch = "x86_64")]
     Avx512,
+    /// AVX-512 with products of bf16.
+    #[cfg(target_arch = "x86_64")]
+    Avx512Bf16,
+    /// AVX-512 with tiles of bf16.
+    #[cfg(target_arch = "x86_64")]
+    Amx,
     Target,
 }
 
@@ -118,10 +200,25 @@ impl Path {
     pub fn available() -> Vec<Self> {
         let mut paths = Vec::new();
         #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx512f") && is_x86_feature_detected!("avx512dq") && is_x86_feature_detected!("avx512vl") {
+        if x86::has_avx512() {
             paths.push(Self(Instructions::Avx512));
         }
         paths.push(Self(Instructions::Target));
+        paths
+    }
+
+    /// The instructions of this processor for products of bf16 and the order in which they sum, the faster first. None on processors without.
+    pub fn for_bf16() -> Vec<(Order, Self)> {
+        let mut paths = Vec::new();
+        #[cfg(target_arch = "x86_64")]
+        if x86::has_avx512() {
+            if x86::has_amx() {
+                paths.push((Order::Tiles, Self(Instructions::Amx)));
+            }
+            if is_x86_feature_detected!("avx512bf16") {
+                paths.push((Order::Pairs, Self(Instructions::Avx512Bf16)));
+            }
+        }
         paths
     }
 
@@ -142,19 +239,37 @@ impl Path {
         match self.0 {
             #[cfg(target_arch = "x86_64")]
             Instructions::Avx512 => "avx512",
+            #[cfg(target_arch = "x86_64")]
+            Instructions::Avx512Bf16 => "avx512-bf16",
+            #[cfg(target_arch = "x86_64")]
+            Instructions::Amx => "amx",
             Instructions::Target if cfg!(target_feature = "avx2") => "avx2",
             Instructions::Target => "portable",
         }
     }
 
-    /// Runs a kernel on this path.
+    /// Runs a kernel on this path. What products of bf16 it takes are done in f32.
     #[inline]
     pub fn run<K: Kernel>(self, kernel: K) -> K::Output {
         match self.0 {
-            // SAFETY: `available` has found these instructions on this processor.
+            // SAFETY: `available` or `for_bf16` has found these instructions on this processor.
             #[cfg(target_arch = "x86_64")]
-            Instructions::Avx512 => unsafe { x86::on_avx512(kernel) },
+            Instructions::Avx512 | Instructions::Avx512Bf16 | Instructions::Amx => unsafe { x86::on_avx512(kernel) },
             Instructions::Target => kernel.run::<Target>(),
+        }
+    }
+
+    /// The same with the path's own products of bf16. Of its own, because every path on which a kernel may run costs time to compile.
+    #[inline]
+    pub fn run_with_bf16<K: Kernel>(self, kernel: K) -> K::Output {
+        match self.0 {
+            // SAFETY: `for_bf16` has found these instructions on this processor.
+            #[cfg(target_arch = "x86_64")]
+            Instructions::Avx512Bf16 => unsafe { x86::on_avx512_bf16(kernel) },
+            // SAFETY: the same, and the system has given the tiles to this process.
+            #[cfg(target_arch = "x86_64")]
+            Instructions::Amx => unsafe { x86::on_amx(kernel) },
+            _ => self.run(kernel),
         }
     }
 }
@@ -258,102 +373,21 @@ impl Vector for Target {
         let half = |i: usize| self.0[i].simd_ge(f32x8::ZERO).select(a.0[i], b.0[i]);
         Self([half(0), half(1)])
     }
-}
-
-#[cfg(target_arch = "x86_64")]
-mod x86 {
-    use core::arch::x86_64::*;
-
-    use super::{Kernel, LANES, Vector};
-
-    /// Sixteen floats in one register.
-    #[derive(Clone, Copy, Debug)]
-    pub(super) struct Avx512(__m512);
-
-    /// # Safety
-    /// The processor has AVX-512 F, DQ and VL.
-    #[target_feature(enable = "avx512f,avx512dq,avx512vl")]
-    pub(super) unsafe fn on_avx512<K: Kernel>(kernel: K) -> K::Output {
-        kernel.run::<Avx512>()
+    #[inline(always)]
+    fn store_pairs(self, odd: Self, to: &mut [u32; LANES]) {
+        let rounded = |x: f32x8| -> u32x8 {
+            let bits: u32x8 = bytemuck::cast(x);
+            bits + u32x8::splat(0x7fff) + ((bits >> 16u32) & u32x8::splat(1))
+        };
+        for (i, to) in to.as_chunks_mut::<8>().0.iter_mut().enumerate() {
+            *to = ((rounded(self.0[i]) >> 16u32) | (rounded(odd.0[i]) & u32x8::splat(0xffff_0000))).to_array();
+        }
     }
-
-    // SAFETY of every block in this module: values of these types exist only inside `on_avx512`, whose caller has found the instructions.
-    impl Vector for Avx512 {
-        const WIDE: bool = true;
-        #[inline(always)]
-        fn splat(x: f32) -> Self {
-            Self(unsafe { _mm512_set1_ps(x) })
-        }
-        #[inline(always)]
-        fn load(from: &[f32; LANES]) -> Self {
-            Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
-        }
-        #[inline(always)]
-        fn store(self, to: &mut [f32; LANES]) {
-            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
-        }
-        #[inline(always)]
-        fn add(self, other: Self) -> Self {
-            Self(unsafe { _mm512_add_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn sub(self, other: Self) -> Self {
-            Self(unsafe { _mm512_sub_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn mul(self, other: Self) -> Self {
-            Self(unsafe { _mm512_mul_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn div(self, other: Self) -> Self {
-            Self(unsafe { _mm512_div_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn mul_add(self, by: Self, plus: Self) -> Self {
-            Self(unsafe { _mm512_fmadd_ps(self.0, by.0, plus.0) })
-        }
-        #[inline(always)]
-        fn max(self, other: Self) -> Self {
-            Self(unsafe { _mm512_max_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn min(self, other: Self) -> Self {
-            Self(unsafe { _mm512_min_ps(self.0, other.0) })
-        }
-        #[inline(always)]
-        fn sqrt(self) -> Self {
-            Self(unsafe { _mm512_sqrt_ps(self.0) })
-        }
-        #[inline(always)]
-        fn round(self) -> Self {
-            Self(unsafe { _mm512_roundscale_ps::<{ _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC }>(self.0) })
-        }
-        #[inline(always)]
-        fn neg(self) -> Self {
-            Self(unsafe { _mm512_xor_ps(self.0, _mm512_set1_ps(-0.0)) })
-        }
-        #[inline(always)]
-        fn abs(self) -> Self {
-            Self(unsafe { _mm512_andnot_ps(_mm512_set1_ps(-0.0), self.0) })
-        }
-        #[inline(always)]
-        fn shift_to_exponent(self) -> Self {
-            Self(unsafe { _mm512_castsi512_ps(_mm512_slli_epi32::<23>(_mm512_castps_si512(self.0))) })
-        }
-        #[inline(always)]
-        fn exponent_over_2_23(self) -> Self {
-            let shifted = unsafe { _mm512_castsi512_ps(_mm512_srli_epi32::<23>(_mm512_castps_si512(self.0))) };
-            Self(unsafe { _mm512_or_ps(shifted, _mm512_set1_ps(8_388_608.0)) })
-        }
-        #[inline(always)]
-        fn mantissa(self) -> Self {
-            let bits = unsafe { _mm512_and_ps(self.0, _mm512_set1_ps(f32::from_bits(0x007f_ffff))) };
-            Self(unsafe { _mm512_or_ps(bits, _mm512_set1_ps(0.5)) })
-        }
-        #[inline(always)]
-        fn select_ge0(self, a: Self, b: Self) -> Self {
-            Self(unsafe { _mm512_mask_blend_ps(_mm512_cmp_ps_mask::<_CMP_GE_OQ>(self.0, _mm512_setzero_ps()), b.0, a.0) })
-        }
+    #[inline(always)]
+    fn load_pairs(from: &[u32; LANES]) -> [Self; 2] {
+        let [low, high] = from.as_chunks::<8>().0 else { unreachable!("sixteen is twice eight") };
+        let pairs = [u32x8::from(*low), u32x8::from(*high)];
+        [Self(pairs.map(|bits| bytemuck::cast(bits << 16u32))), Self(pairs.map(|bits| bytemuck::cast(bits & u32x8::splat(0xffff_0000))))]
     }
 }
 

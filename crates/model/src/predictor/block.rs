@@ -94,7 +94,7 @@ impl Predictor {
         entries.iter_mut().for_each(|row| repeat_last(&mut row[0], count));
         let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane::from_fn(|l| terrain[l][i])]);
         watch.add_to(Part::Rest);
-        let said = self.network.step(&scene.prefix, cache, &entries, &context);
+        let said = self.rolled.step(&scene.prefix, cache, &entries, &context);
         watch.add_to(Part::Network);
 
         let (mut varying, mut constant) = ([Lane::ZERO; DIFFERENTIABLE], [Lane::ZERO; CONSTANT]);

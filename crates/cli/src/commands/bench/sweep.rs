@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Instant;
 
-use nesam_model::{Path, Predictor};
+use nesam_model::{Path, Precision, Predictor};
 use serde_json::{Value, json};
 
 use super::{Planner, percentile};
@@ -15,21 +15,26 @@ const CANDIDATES: [usize; 6] = [64, 128, 256, 512, 1024, 2048];
 /// Timed queries of each; their terrain is warm.
 const QUERIES: usize = 7;
 
+/// The predictor on every path of this processor, f32 first.
+fn on_all_paths(predictor: &Predictor) -> Vec<Predictor> {
+    let in_f32 = Path::available().into_iter().map(|path| predictor.in_precision(Precision::F32).on_path(path));
+    let in_bf16 = Path::for_bf16().into_iter().map(|(order, _)| predictor.in_precision(Precision::Bf16(order)));
+    in_f32.chain(in_bf16).collect()
+}
+
 /// The predictor on the path of this name, or as it is.
 pub fn on_path(predictor: Arc<Predictor>, name: Option<&str>) -> Result<Arc<Predictor>, Failure> {
     let Some(name) = name else { return Ok(predictor) };
-    let paths = Path::available();
-    let found = paths.iter().find(|path| path.as_str() == name);
-    let known: Vec<&str> = paths.iter().map(|path| path.as_str()).collect();
-    found
-        .map(|path| Arc::new(predictor.on_path(*path)))
-        .ok_or_else(|| Failure::input(format!("--path {name}: this processor has {}", known.join(", "))))
+    let all = on_all_paths(&predictor);
+    let known: Vec<&str> = all.iter().map(|predictor| predictor.path().as_str()).collect();
+    let unknown = Failure::input(format!("--path {name}: this processor has {}", known.join(", ")));
+    all.into_iter().find(|predictor| predictor.path().as_str() == name).map(Arc::new).ok_or(unknown)
 }
 
 /// Times all numbers of candidates on all paths and prints a table. The paths take turns, so that what else the machine does meets all of them.
 pub fn sweep(drive: &Planner<'_>, predictor: &Predictor) -> Result<Value, Failure> {
-    let predictors: Vec<Predictor> = Path::available().into_iter().map(|path| predictor.on_path(path)).collect();
-    let header: Vec<String> = predictors.iter().map(|p| format!("{:>9} p50      min", p.path().as_str())).collect();
+    let predictors = on_all_paths(predictor);
+    let header: Vec<String> = predictors.iter().map(|p| format!("{:>11} p50      min", p.path().as_str())).collect();
     say!("  warm, by candidates and path, ms\n       N {}", header.join(" "));
     let mut rows = Vec::new();
     for samples in CANDIDATES {
@@ -50,7 +55,7 @@ pub fn sweep(drive: &Planner<'_>, predictor: &Predictor) -> Result<Value, Failur
         let mut line = format!("    {samples:4} ");
         for (predictor, times) in predictors.iter().zip(&mut times) {
             let (p50, min) = (percentile(times, 0.5), percentile(times, 0.0));
-            line += &format!("{p50:13.1} {min:8.1} ");
+            line += &format!("{p50:15.1} {min:8.1} ");
             rows.push(json!({"path": predictor.path().as_str(), "samples": samples, "p50_ms": p50, "min_ms": min}));
         }
         say!("{}", line.trim_end());

@@ -24,7 +24,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     let mut recording = Recording::open(&args.recording).or_input()?;
     let header = recording.header().clone();
     let bundle = Arc::new(load(args.bundle.bundle.as_deref(), &header)?);
-    let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?);
+    let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?.in_precision(header.precision));
     let started = Instant::now();
     let mut said = started;
     let mut progress = |commands: u64| {
@@ -65,7 +65,8 @@ fn load(given: Option<&Path>, header: &RecordingHeader) -> Result<ModelBundle, F
 }
 
 fn print(header: &RecordingHeader, report: &ReplayReport) {
-    say!("{}: {} with bundle {} on {}, {:.1} s", header.run, header.program, header.bundle, header.machine, report.span_s);
+    let precision = header.precision.as_str();
+    say!("{}: {} with bundle {} in {precision} on {}, {:.1} s", header.run, header.program, header.bundle, header.machine, report.span_s);
     say!("{:<14}{:>12}{:>12}{:>12}{:>14}", "command", "recorded", "equal", "different", "not executed");
     let row = |name: &str, count: &KindCount| {
         say!("{name:<14}{:>12}{:>12}{:>12}{:>14}", count.commands, count.equal, count.different, count.not_executed);
@@ -114,7 +115,10 @@ fn to_json(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport
         "first_difference": report.first_difference,
         "ending": report.ending,
         "span_s": report.span_s,
-        "recorded": {"program": header.program, "machine": header.machine, "bundle": header.bundle, "bundle_hash": header.bundle_hash},
+        "recorded": {
+            "program": header.program, "machine": header.machine, "precision": header.precision.as_str(),
+            "bundle": header.bundle, "bundle_hash": header.bundle_hash,
+        },
         "replayed": {
             "program": RecordingHeader::this_program(), "machine": RecordingHeader::this_machine(),
             "bundle": bundle.name, "bundle_hash": bundle.hash,
