@@ -7,8 +7,9 @@ fn soil_update(c: &mut Criterion) {
     let works = [
         ("network along one buffer", nesam_benches::network_along_buffer()),
         ("one prediction held against what came", nesam_benches::forecast_held()),
-        ("one update", nesam_benches::soil_update(false)),
-        ("one update, literal Algorithm 1", nesam_benches::soil_update(true)),
+        ("one update, mean of a drive", nesam_benches::next_soil_update()),
+        ("the first update", nesam_benches::soil_update(false)),
+        ("the first update, literal Algorithm 1", nesam_benches::soil_update(true)),
     ];
     for (name, mut work) in works {
         group.bench_function(name, |b| b.iter(&mut work));

@@ -122,12 +122,17 @@ impl Buffer {
         Self { predictor, map, steps, config }
     }
 
-    /// The network along the buffer.
+    /// The network along the buffer, nothing learned yet.
     fn transitions(&self) -> Vec<BufferedTransition> {
-        let along = SoilByClass::new(Some(&self.map), Vec::new());
-        let range = BUFFER_START..BUFFER_START + self.config.buffer;
+        self.transitions_from(BUFFER_START, Vec::new())
+    }
+
+    /// The network along the buffer that begins at a step, on soils that were learned.
+    fn transitions_from(&self, start: usize, learned: Vec<SoilCorrection>) -> Vec<BufferedTransition> {
+        let along = SoilByClass::new(Some(&self.map), learned);
+        let range = start..start + self.config.buffer;
         let transitions = self.predictor.measured_transitions(&self.steps, range, Some(&along), &self.map).expect("a drive on its map");
-        let ended = transitions.into_iter().zip(&self.steps[BUFFER_START + 1..]);
+        let ended = transitions.into_iter().zip(&self.steps[start + 1..]);
         let at = |[x, y, _]: [f64; 3]| SoilByClass::class_at(Some(&self.map), [x, y]);
         ended
             .map(|(t, end)| {
@@ -152,6 +157,31 @@ pub fn forecast_held() -> Work {
     Box::new(move || {
         let soil = SoilByClass::new(Some(&buffer.map), Vec::new());
         black_box(buffer.predictor.forecast_errors(&buffer.steps, BUFFER_START, FORECAST_STEPS, &soil, &buffer.map)).expect("on its map");
+    })
+}
+
+/// The next update of a soil filter that goes through a recorded drive again and again; each time it begins afresh. The mean over many is what an update costs.
+pub fn next_soil_update() -> Work {
+    let buffer = Buffer::new();
+    let fresh = SoilFilter::new(buffer.config.clone()).expect("usable settings");
+    let mut filter = fresh.clone();
+    let mut buffers = Vec::new();
+    for start in (0..buffer.steps.len() - buffer.config.buffer).step_by(buffer.config.buffer) {
+        let transitions = buffer.transitions_from(start, filter.estimates());
+        for transition in &transitions {
+            filter.push(buffer.predictor.step_model(), *transition).expect("finite numbers");
+        }
+        buffers.push(transitions);
+    }
+    let (predictor, mut next) = (buffer.predictor, 0);
+    Box::new(move || {
+        if next == 0 {
+            filter.clone_from(&fresh);
+        }
+        for transition in &buffers[next] {
+            black_box(filter.push(predictor.step_model(), *transition).expect("finite numbers"));
+        }
+        next = (next + 1) % buffers.len();
     })
 }
 

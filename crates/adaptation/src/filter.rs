@@ -18,8 +18,9 @@ pub use snapshot::{ClassBelief, FilterSnapshot, JointSnapshot};
 
 /// Share of the prior variance below which a parameter counts as learned.
 const LEARNED_SHARE: f64 = 0.5;
-/// Share of the prior standard deviation below which another linearisation would change nothing.
-const CONVERGED_SHARE: f64 = 1e-3;
+/// Share of the prior standard deviation below which another linearisation would change nothing: each move is about a tenth of the one before, so what is left
+/// is a thousandth.
+const CONVERGED_SHARE: f64 = 1e-2;
 
 /// What is known of the soil correction.
 #[derive(Clone, Copy, Debug, PartialEq)]
