@@ -112,7 +112,8 @@ impl Products for OfPairs {
                     for m in 0..LANES {
                         let weight = unsafe { _mm512_set1_epi32(weights[m].cast_signed()) };
                         // The type of sixteen pairs is that of sixteen integers to the register.
-                        totals[m] = unsafe { _mm512_dpbf16_ps(totals[m], core::mem::transmute(inputs), core::mem::transmute(weight)) };
+                        let pairs = |integers| unsafe { core::mem::transmute::<__m512i, __m512bh>(integers) };
+                        totals[m] = unsafe { _mm512_dpbf16_ps(totals[m], pairs(inputs), pairs(weight)) };
                     }
                 }
             }
