@@ -43,22 +43,30 @@ fn tiles_are_given() -> bool {
     false
 }
 
+/// Products by the path's own instructions, and the same in f32.
+struct BothWays<'a> {
+    order: Order,
+    weights: &'a [[Tile; TILE_PANELS]],
+    inputs: &'a [Tile],
+}
+
+impl Kernel for BothWays<'_> {
+    type Output = [[[Lane; LANES]; TILE_PANELS]; 2];
+    #[inline(always)]
+    fn run<V: Vector>(self) -> Self::Output {
+        // What is not written stays no number, which equals nothing.
+        let mut sums = [[[Lane([f32::NAN; LANES]); LANES]; TILE_PANELS]; 2];
+        V::products(self.order, self.weights, self.inputs, &mut sums[0]);
+        products_in_f32::<V>(self.order, self.weights, self.inputs, &mut sums[1]);
+        sums
+    }
+}
+
 /// Whether tiles multiply as [`super::products_in_f32`] does, bit for bit, on numbers that show a wrong order, a wrong half of a pair and a wrong layout.
 ///
 /// # Safety
 /// As [`on_amx`].
 unsafe fn tiles_are_right() -> bool {
-    struct Both([[Tile; TILE_PANELS]; 2], [Tile; 2]);
-    impl Kernel for Both {
-        type Output = [[[Lane; LANES]; TILE_PANELS]; 2];
-        #[inline(always)]
-        fn run<V: Vector>(self) -> Self::Output {
-            let mut sums = [[[Lane::ZERO; LANES]; TILE_PANELS]; 2];
-            V::products(Order::Tiles, &self.0, &self.1, &mut sums[0]);
-            products_in_f32::<V>(Order::Tiles, &self.0, &self.1, &mut sums[1]);
-            sums
-        }
-    }
     let mut state = 1u32;
     let mut tile = || {
         Tile(core::array::from_fn(|_| {
@@ -71,9 +79,10 @@ unsafe fn tiles_are_right() -> bool {
             })
         }))
     };
-    let kernel = Both(core::array::from_fn(|_| core::array::from_fn(|_| tile())), core::array::from_fn(|_| tile()));
+    let weights: [[Tile; TILE_PANELS]; 2] = core::array::from_fn(|_| core::array::from_fn(|_| tile()));
+    let inputs: [Tile; 2] = core::array::from_fn(|_| tile());
     // SAFETY: by the caller.
-    let [found, expected] = unsafe { on_amx(kernel) };
+    let [found, expected] = unsafe { on_amx(BothWays { order: Order::Tiles, weights: &weights, inputs: &inputs }) };
     found == expected
 }
 
