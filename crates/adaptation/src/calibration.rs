@@ -4,6 +4,7 @@ use nalgebra::{Cholesky, DMatrix, DVector, Dyn, SMatrix, SVector};
 use nesam_physics::SOIL_DIM;
 
 use crate::conditions::{CONDITIONS, NoiseConditions};
+use crate::config::FilterConfig;
 use crate::error::AdaptationError;
 use crate::noise::{BufferNoise, SharedError};
 
@@ -51,7 +52,7 @@ pub struct NoiseCalibration {
 ///
 /// Buffers of one drive err alike. Two descriptions of that, of which a filter uses one:
 /// - `shared_error`: E[e_k e_{k+l}ᵀ] = a^l B, the part of R_B that a filter can follow as a state of its own;
-/// - `shared_buffers`: what a buffer says of the soil, g = Hᵀ R_B⁻¹ e, has about the variance that the filter believes, but the sum G of a drive's g
+/// - `shared_buffers`: what a buffer says of the soil, g = Hᵀ R_B⁻¹ e (R_B under the caution of the settings), has about the variance that the filter believes, but the sum G of a drive's g
 ///   varies more than a sum of independent ones; Σ|G|² / Σ|g|² (lengths in units of the prior) is how many times too often the
 ///   filter would count the same evidence: the design effect of a cluster sample.
 ///
@@ -60,7 +61,7 @@ pub struct NoiseCalibration {
 /// the second moment has no Cholesky factor.
 pub fn calibrate(
     drives: &[Vec<UncorrectedBuffer>],
-    prior_sd: &[f64; SOIL_DIM],
+    config: &FilterConfig,
     by_conditions: bool,
 ) -> Result<NoiseCalibration, AdaptationError> {
     let all: Vec<&UncorrectedBuffer> = drives.iter().flatten().collect();
@@ -78,10 +79,11 @@ pub fn calibrate(
         return Err(AdaptationError::NotFinite { what: "difference", index });
     }
     let (moment, conditions) = second_moment(&all, by_conditions)?;
-    let factor = moment.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
+    let factored = |noise: DMatrix<f64>| noise.cholesky().ok_or(AdaptationError::SingularInnovation { rows });
+    let (factor, cautious) = (factored(moment.clone())?, factored(config.with_caution(&moment))?);
     let root = |b: &UncorrectedBuffer| conditions.map_or(1.0, |c| c.factor(&b.conditions)).sqrt();
     Ok(NoiseCalibration {
-        shared_buffers: design_effect(drives, prior_sd, &factor, &root),
+        shared_buffers: design_effect(drives, &config.prior_sd, &cautious, &root),
         shared_error: shared_error(drives, &factor, &root),
         noise: BufferNoise::Sampled(moment),
         conditions,

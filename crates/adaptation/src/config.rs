@@ -1,5 +1,6 @@
 //! Settings of the filter and what each of them does.
 
+use nalgebra::DMatrix;
 use nesam_physics::{SOIL_DIM, SoilCoordinates};
 use serde::{Deserialize, Serialize};
 
@@ -36,7 +37,7 @@ pub struct FilterConfig {
     pub block: usize,
     /// Coordinates of the estimate and of the two standard deviations below.
     pub coordinates: SoilCoordinates,
-    /// What a buffer is compared with. A rollout is closer to what predictions are for, see [`crate::predict_velocities`].
+    /// What a buffer is compared with. A rollout is closer to what predictions are for, see `predict_along` in `prediction.rs`.
     pub innovation: Innovation,
     /// Standard deviations of P₀: how wrong the soil prior may be. Larger: faster first reaction, and more of the error of the model
     /// taken for soil.
@@ -67,6 +68,10 @@ pub struct FilterConfig {
     /// Beyond Algorithm 1: consecutive buffers that say together no more than one, at least 1. The model errs alike as long as the vehicle stays on one
     /// patch of ground, which R_B of single buffers cannot say ([`crate::calibrate`] estimates how many); the update counts R_B this many times (a tempered likelihood). The NIS does not.
     pub shared_buffers: f64,
+    /// Beyond Algorithm 1: factor, at least 1, by which the update takes the errors of each channel [v, ω] to be larger than R_B says: how far they are from saying
+    /// something of the *soil*. Heave, roll and pitch within a second tell more of the ride than of the ground; left to count in full, they move the soil to where
+    /// speed and turning come out worse. The NIS does not know of it.
+    pub caution: [f64; VELOCITY_DIM],
     /// Beyond Algorithm 1: buffers over which the scale of R_B on the present drive is matched to the NIS, at least 1; 0 = R_B as it is. The model errs more on
     /// ground that it was not trained for; a short memory follows faster and lets single buffers swing the gain.
     pub scale_memory: f64,
@@ -106,9 +111,10 @@ impl Default for FilterConfig {
             classes: 1,
             class_share: 0.25,
             shared_buffers: 4.0,
+            caution: [1.0; VELOCITY_DIM],
             scale_memory: 5.0,
             trust_memory: 10.0,
-            trust_log_odds: -2.0,
+            trust_log_odds: -3.0,
             gate_tail_probability: 1e-9,
             linearisations: 4,
             bounded: true,
@@ -165,6 +171,9 @@ impl FilterConfig {
         if !(self.shared_buffers.is_finite() && self.shared_buffers >= 1.0) {
             return fail("shared_buffers", format!("is {}, it must be at least 1", self.shared_buffers));
         }
+        if !self.caution.iter().all(|factor| factor.is_finite() && *factor >= 1.0) {
+            return fail("caution", format!("is {:?}; all six must be at least 1", self.caution));
+        }
         for (setting, memory) in [("scale_memory", self.scale_memory), ("trust_memory", self.trust_memory)] {
             if !(memory == 0.0 || memory.is_finite() && memory >= 1.0) {
                 return fail(setting, format!("is {memory}, it must be 0 (off) or at least 1 buffer"));
@@ -191,6 +200,12 @@ impl FilterConfig {
         }
         self.noise.check(self.rows())?;
         self.shared_error.as_ref().map_or(Ok(()), |shared| shared.check(&self.noise.covariance(self.buffer, self.block)))
+    }
+
+    /// The noise as what is learned of the soil reckons with it.
+    pub(crate) fn with_caution(&self, noise: &DMatrix<f64>) -> DMatrix<f64> {
+        let of = |row: usize| self.caution[row % VELOCITY_DIM];
+        DMatrix::from_fn(noise.nrows(), noise.ncols(), |r, c| of(r) * noise[(r, c)] * of(c))
     }
 
     /// Rows of an innovation, a multiple of the six channels.

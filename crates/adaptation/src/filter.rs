@@ -244,7 +244,7 @@ impl SoilFilter {
         if !rejected && excited {
             self.judge(model, buffer, unit, &judged)?;
             let tail = if self.config.tail_dof > 0.0 { (self.config.tail_dof + nis) / (self.config.tail_dof + dof as f64) } else { 1.0 };
-            let noise = &rest * (self.config.shared_buffers * tail.max(1.0));
+            let noise = self.config.with_caution(&rest) * (self.config.shared_buffers * tail.max(1.0));
             let mut linear = first;
             let mut step = ahead.step(&linear, &before, &noise)?;
             let mut delta = self.held(ahead.moved_soils(&step), buffer);
@@ -322,7 +322,7 @@ impl SoilFilter {
         }
         let Some(candidate) = self.trust.candidate() else { return Ok(()) };
         let rows = self.noise.nrows();
-        let factor = self.noise.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
+        let factor = self.config.with_caution(&self.noise).cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
         let squared = |correction: &DVector<f64>| -> Result<f64, AdaptationError> {
             let innovation = innovation(&self.config, model, buffer, correction)? * unit;
             Ok(innovation.dot(&factor.solve(&innovation)))

@@ -38,6 +38,6 @@ pub use error::AdaptationError;
 pub use filter::{ClassBelief, FilterSnapshot, JointSnapshot, SoilFilter, SoilPosterior, SoilUpdate, uncorrected};
 pub use forecast::{FORECAST_AHEAD, FORECAST_STEPS, FORECAST_VALUES, ForecastCheck, planar_mahalanobis};
 pub use noise::{BufferNoise, ChannelNoise, SharedError, VelocityNoise};
-pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocities, predict_velocity};
+pub use prediction::{BufferedTransition, VELOCITY_DIM, VelocityPrediction, predict_velocity};
 pub use settings::{CalibratedFilter, Coordinates, FilterSettings};
 pub use update::{KalmanStep, kalman_update};

@@ -3,7 +3,7 @@
 use nesam_physics::driveline::WheelCommand;
 use nesam_physics::scalar::Dual;
 use nesam_physics::step::{Ground, StepInput, StepModel};
-use nesam_physics::{Real, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, VehicleState};
+use nesam_physics::{Real, SOIL_DIM, STATE_DIM, Soil, SoilCoordinates, SoilCorrection, VehicleState};
 
 /// Channels of y = [v, ω].
 pub const VELOCITY_DIM: usize = 6;
@@ -47,20 +47,15 @@ pub struct VelocityPrediction {
 /// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
 pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
     let start = transition.input.state.to_array().map(SoilDual::constant);
-    prediction_of(&next_state(model, transition, &start, correction, &variables(correction)))
+    prediction_of(&next_state(model, transition, &start, corrected(transition, correction, &variables(correction))))
 }
 
 /// The same after every transition of a buffer, each starting where the prediction before it ended; only the first starts from a
-/// measurement. Ground, actuators and what the network says stay those of the measured path.
+/// measurement. Ground, actuators and what the network says stay those of the measured path. The correction may differ from class to class of the ground;
+/// derivatives are those with respect to the corrections of the transitions for which `varies` is true, that of k_c by [`with_first_slope`].
 ///
 /// A wrong soil shows as what it does to a rollout, a speed or a turn that is too fast or too slow, and the noise of the measured states
 /// enters once instead of at every step, where it looks like slip.
-pub fn predict_velocities(model: &StepModel, buffer: &[BufferedTransition], correction: &SoilCorrection) -> Vec<VelocityPrediction> {
-    predict_along(model, buffer, &|_| *correction, &|_| true)
-}
-
-/// The same where the correction differs from class to class of the ground. Derivatives are those with respect to the corrections of the transitions for which
-/// `varies` is true.
 pub(crate) fn predict_along(
     model: &StepModel,
     buffer: &[BufferedTransition],
@@ -74,7 +69,9 @@ pub(crate) fn predict_along(
         .map(|transition| {
             let correction = correction(transition);
             let delta = if varies(transition) { variables(&correction) } else { correction.delta.map(SoilDual::constant) };
-            state = next_state(model, transition, &state, &correction, &delta);
+            let mut soil = corrected(transition, &correction, &delta);
+            with_first_slope(&mut soil, &transition.input.soil, correction.coordinates);
+            state = next_state(model, transition, &state, soil);
             prediction_of(&state)
         })
         .collect()
@@ -90,7 +87,7 @@ pub(crate) fn velocities_along(
     let mut state = first.input.state.to_array();
     let velocities = buffer.iter().map(|transition| {
         let correction = correction(transition);
-        state = next_state(model, transition, &state, &correction, &correction.delta);
+        state = next_state(model, transition, &state, corrected(transition, &correction, &correction.delta));
         core::array::from_fn(|c| state[VELOCITY_AT + c])
     });
     velocities.collect()
@@ -100,16 +97,23 @@ fn variables(correction: &SoilCorrection) -> [SoilDual; SOIL_DIM] {
     core::array::from_fn(|i| SoilDual::variable(correction.delta[i], i))
 }
 
-/// x̂_{k+1} from x_k where Δθ is `delta`, in the coordinates of the correction; x, y and yaw are carried along without meaning, as the physics reads none of
-/// them.
-fn next_state<T: Real>(
-    model: &StepModel,
-    transition: &BufferedTransition,
-    state: &[T; STATE_DIM],
-    correction: &SoilCorrection,
-    delta: &[T; SOIL_DIM],
-) -> [T; STATE_DIM] {
-    let soil = correction.coordinates.correct(&transition.input.soil.to_array(), delta);
+/// θ of a transition where Δθ is `delta`, in the coordinates of the correction.
+fn corrected<T: Real>(transition: &BufferedTransition, correction: &SoilCorrection, delta: &[T; SOIL_DIM]) -> [T; SOIL_DIM] {
+    correction.coordinates.correct(&transition.input.soil.to_array(), delta)
+}
+
+/// Gives k_c the slope of a first estimate ([`SoilCoordinates::first_slope_of_k_c`]), unless its bound holds it.
+fn with_first_slope(soil: &mut [SoilDual; SOIL_DIM], prior: &Soil<f64>, coordinates: SoilCoordinates) {
+    let [k_phi, k_c, ..] = soil;
+    if let Some(slope) = coordinates.first_slope_of_k_c(prior, k_phi.re)
+        && k_c.eps[1] != 0.0
+    {
+        k_c.eps[1] = slope;
+    }
+}
+
+/// x̂_{k+1} from x_k on a soil; x, y and yaw are carried along without meaning, as the physics reads none of them.
+fn next_state<T: Real>(model: &StepModel, transition: &BufferedTransition, state: &[T; STATE_DIM], soil: [T; SOIL_DIM]) -> [T; STATE_DIM] {
     let input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
     let increment = model.step(&input).increment.to_array();
     core::array::from_fn(|i| state[i] + increment[i] + T::lit(transition.residual[i]))

@@ -60,6 +60,9 @@ pub struct FilterSettings {
     /// Buffers that say no more than one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub shared_buffers: Option<f64>,
+    /// Factors by which the update takes errors of channels to be larger: vx, vy, vz, ωx, ωy, ωz.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub caution: Option<[f64; VELOCITY_DIM]>,
     /// Buffers over which R_B is scaled to the drive, 0 = off.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scale_memory: Option<f64>,
@@ -128,6 +131,7 @@ impl FilterSettings {
             classes: Some(config.classes),
             class_share: Some(config.class_share),
             shared_buffers: Some(config.shared_buffers),
+            caution: Some(config.caution),
             scale_memory: Some(config.scale_memory),
             trust_memory: Some(config.trust_memory),
             trust_log_odds: Some(config.trust_log_odds),
@@ -177,6 +181,7 @@ impl FilterSettings {
             process_sd: self.process_sd.unwrap_or(base.process_sd),
             noise,
             shared_buffers: self.shared_buffers.unwrap_or(base.shared_buffers),
+            caution: self.caution.unwrap_or(base.caution),
             scale_memory: self.scale_memory.unwrap_or(base.scale_memory),
             trust_memory: self.trust_memory.unwrap_or(base.trust_memory),
             trust_log_odds: self.trust_log_odds.unwrap_or(base.trust_log_odds),
@@ -224,7 +229,7 @@ impl CalibratedFilter {
             noise: found.noise.clone(),
             noise_conditions: found.conditions,
             shared_error: (!counted_less).then(|| found.shared_error.clone()),
-            shared_buffers: if counted_less { found.shared_buffers } else { 1.0 },
+            shared_buffers: given.shared_buffers.unwrap_or(if counted_less { found.shared_buffers } else { 1.0 }),
             ..given.over_defaults(false)
         };
         let all = FilterSettings::of(&config);

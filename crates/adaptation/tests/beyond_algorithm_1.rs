@@ -115,6 +115,23 @@ fn property_a_wild_buffer_teaches_less_with_heavy_tails() {
 }
 
 #[test]
+fn property_caution_with_a_channel_is_for_what_is_learned_and_not_for_the_nis() {
+    let model = model();
+    let moved = |caution: [f64; 6], channel: usize| {
+        let mut transitions = twin(&model, LOAM, LOAM, 10, 5);
+        transitions.iter_mut().for_each(|t| t.measured_next[channel] += 0.1);
+        let (filter, updates) = run(FilterConfig { caution, linearisations: 1, ..plain() }, &model, &transitions);
+        let delta = filter.posterior().correction.delta;
+        ((0..SOIL_DIM).map(|i| (delta[i] / plain().prior_sd[i]).powi(2)).sum::<f64>(), updates[0].nis)
+    };
+    let of_heave = [1.0, 1.0, 10.0, 1.0, 1.0, 1.0];
+    let ((heave, nis), (cautious, same_nis)) = (moved([1.0; 6], 2), moved(of_heave, 2));
+    assert!(cautious < 0.1 * heave && nis == same_nis, "{heave} {cautious}, {nis} {same_nis}");
+    let (speed, still) = (moved([1.0; 6], 0).0, moved(of_heave, 0).0);
+    assert!(still > 0.5 * speed, "what speed tells is still learned: {speed} {still}");
+}
+
+#[test]
 fn analytic_the_factor_on_the_noise_is_log_linear_and_limited() {
     let transitions = twin(&model(), LOAM, LOAM, 10, 6);
     let here = conditions(&transitions);

@@ -120,12 +120,17 @@ fn property_twin_errors_are_as_large_as_the_filter_says() {
 
 #[test]
 fn property_one_sum_of_moduli_is_not_two_learned_parameters() {
-    // k_c acts as k_c / b + k_phi: with b = 0.254 m and a modulus of 1.5e6 it is 1.3 % of the sum and cannot be seen.
+    // k_c acts as k_c / b + k_phi: with b = 0.254 m and a modulus of 1.5e6 it is 1.3 % of the sum and cannot be told from it, however many drives are seen and
+    // wherever the estimate has moved meanwhile.
     let model = model();
-    let (filter, _) = run(config(SoilCoordinates::Logarithmic), &model, &twin(&model, SOFT, LOAM, 300, 1));
-    let learned = filter.posterior().learned;
-    assert!(!learned[1], "k_c cannot be learned: {learned:?}");
-    assert!(learned.iter().any(|l| *l), "something can: {learned:?}");
+    let config = config(SoilCoordinates::Logarithmic);
+    for seed in 0..6 {
+        let (filter, _) = run(config.clone(), &model, &twin(&model, SOFT, LOAM, 300, seed));
+        let posterior = filter.posterior();
+        let left = posterior.covariance[1][1] / config.prior_sd[1].powi(2);
+        assert!(left > 0.99 && !posterior.learned[1], "k_c cannot be learned, drive {seed}: {left} of its variance is left");
+        assert!(posterior.learned.iter().any(|l| *l), "something can: {:?}", posterior.learned);
+    }
 }
 
 #[test]
@@ -241,6 +246,7 @@ fn property_unusable_settings_are_refused_by_name() {
     assert_eq!(refused(FilterConfig { gate_tail_probability: 1.0, ..base() }), "gate_tail_probability");
     assert_eq!(refused(FilterConfig { block: 3, ..base() }), "block");
     assert_eq!(refused(FilterConfig { shared_buffers: 0.5, ..base() }), "shared_buffers");
+    assert_eq!(refused(FilterConfig { caution: [1.0, 1.0, 0.5, 1.0, 1.0, 1.0], ..base() }), "caution");
     assert_eq!(refused(FilterConfig { scale_memory: 0.5, ..base() }), "scale_memory");
     assert_eq!(refused(FilterConfig { trust_memory: -1.0, ..base() }), "trust_memory");
     assert_eq!(refused(FilterConfig { trust_log_odds: f64::NAN, ..base() }), "trust_log_odds");
@@ -356,7 +362,8 @@ fn property_noise_and_shared_evidence_are_found_again() {
             .collect()
     };
     let (apart, shared) = (drives(false), drives(true));
-    for (found, wanted) in [(calibrate(&apart, &[1.0; 6], false).unwrap(), 1.0), (calibrate(&shared, &[1.0; 6], false).unwrap(), 20.0)] {
+    let unit = FilterConfig { prior_sd: [1.0; SOIL_DIM], ..FilterConfig::default() };
+    for (found, wanted) in [(calibrate(&apart, &unit, false).unwrap(), 1.0), (calibrate(&shared, &unit, false).unwrap(), 20.0)] {
         let BufferNoise::Sampled(moment) = &found.noise else { panic!("{found:?}") };
         assert!((moment[(0, 0)] - 0.05).abs() < 8e-3 && (moment[(3, 8)] - 0.04).abs() < 8e-3, "{moment}");
         assert!((found.shared_buffers / wanted - 1.0).abs() < 0.2, "{} {wanted}", found.shared_buffers);
@@ -368,10 +375,10 @@ fn property_noise_and_shared_evidence_are_found_again() {
         );
         assert_eq!(found.buffers, 6000);
     }
-    let noise = calibrate(&apart, &[1.0; 6], false).unwrap().noise;
+    let noise = calibrate(&apart, &unit, false).unwrap().noise;
     assert!(SoilFilter::new(FilterConfig { noise: noise.clone(), buffer: 10, block: 5, ..FilterConfig::default() }).is_ok());
     let misfit = SoilFilter::new(FilterConfig { noise, buffer: 20, block: 5, ..FilterConfig::default() });
     assert!(matches!(misfit, Err(AdaptationError::Config { setting: "noise", .. })), "{misfit:?}");
-    let few = calibrate(&apart[..5], &[1.0; 6], false);
+    let few = calibrate(&apart[..5], &unit, false);
     assert_eq!(few, Err(AdaptationError::TooFewBuffers { found: 100, needed: 120 }));
 }

@@ -251,5 +251,5 @@ pub fn calibrate_noise(
         buffers.filter_map(|buffer| uncorrected(config, predictor.step_model(), &buffer).ok()).collect()
     };
     let buffers: Vec<Vec<UncorrectedBuffer>> = drives.par_iter().zip(maps).map(of_drive).collect();
-    Ok(calibrate(&buffers, &config.prior_sd, by_conditions)?)
+    Ok(calibrate(&buffers, config, by_conditions)?)
 }

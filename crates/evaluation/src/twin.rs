@@ -149,7 +149,8 @@ struct Twin<'a> {
 struct Noise {
     single: DMatrix<f64>,
     carried: DMatrix<f64>,
-    correlation: f64,
+    /// Of each row, from one buffer to the next.
+    correlation: DVector<f64>,
     shared: DVector<f64>,
     tail_dof: f64,
 }
@@ -161,10 +162,13 @@ impl Noise {
         let lower = |m: DMatrix<f64>| m.cholesky().map_or_else(|| DMatrix::zeros(rows, rows), |c| c.l());
         let slight = DMatrix::from_diagonal(&noise.diagonal()) * 1e-9;
         let (single, carried, correlation) = match &config.shared_error {
-            Some(shared) => (lower(&noise - &shared.covariance), lower(&shared.covariance + slight), shared.correlation),
+            Some(shared) => {
+                (lower(&noise - &shared.covariance), lower(&shared.covariance + slight), DVector::repeat(rows, shared.correlation))
+            }
             // The design effect of a first-order autoregressive series is (1 + a)/(1 - a).
             None => {
-                let correlation = (config.shared_buffers - 1.0) / (config.shared_buffers + 1.0);
+                let alike = |row: usize| config.shared_buffers * config.caution[row % config.caution.len()].powi(2);
+                let correlation = DVector::from_fn(rows, |row, _| (alike(row) - 1.0) / (alike(row) + 1.0));
                 (DMatrix::zeros(rows, rows), lower(noise), correlation)
             }
         };
@@ -175,8 +179,8 @@ impl Noise {
 
     fn draw(&mut self, factor: f64, rng: &mut ChaCha8Rng) -> DVector<f64> {
         let rows = self.shared.len();
-        let renewed = (1.0 - self.correlation.powi(2)).sqrt();
-        self.shared = &self.shared * self.correlation + &self.carried * normals(rows, rng) * renewed;
+        let renewed = self.correlation.map(|a| (1.0 - a * a).sqrt());
+        self.shared = self.shared.component_mul(&self.correlation) + (&self.carried * normals(rows, rng)).component_mul(&renewed);
         let tail = match ChiSquared::new(self.tail_dof) {
             Ok(chi) if self.tail_dof > 0.0 => self.tail_dof / chi.sample(rng),
             _ => 1.0,

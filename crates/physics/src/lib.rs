@@ -2,6 +2,7 @@
 #![forbid(unsafe_code)]
 
 mod command_path;
+mod contacts;
 mod contradiction;
 pub mod driveline;
 pub mod effects;

@@ -1,7 +1,7 @@
 //! Corrections of a soil prior: what the soil filter estimates and every prediction applies.
 
 use crate::scalar::Real;
-use crate::soil::{SOIL_BOUNDS, SOIL_DIM};
+use crate::soil::{SOIL_BOUNDS, SOIL_DIM, Soil};
 
 /// Parameters that vary over decades and are compared by their ratio: k_phi, k_c, c, k_shear; n and phi are compared by their difference.
 pub const SOIL_LOGARITHMIC: [bool; SOIL_DIM] = [true, true, false, true, false, true];
@@ -31,6 +31,16 @@ impl SoilCoordinates {
             let moved = if self.by_factor(i) { prior * delta[i].exp() } else { prior + delta[i] };
             moved.max(T::lit(SOIL_BOUNDS[i].0)).min(T::lit(SOIL_BOUNDS[i].1))
         })
+    }
+
+    /// Slope of k_c with its own Δ by which the sum k_c / b + k_φ answers to both Δ in the ratio that it has at the *prior*, where k_φ has become `k_phi`. `None` where
+    /// that is the true slope: in physical units the ratio is 1 / b everywhere.
+    ///
+    /// Of logarithms, the slopes of the sum stand in the ratio of its two parts, which moves as an estimate does, and a filter that linearises each buffer where
+    /// it then stands would learn the parts one by one from nothing but its own moves. Slopes of a first estimate keep what cannot be seen unseen (first-estimates
+    /// Jacobians: Huang, Mourikis & Roumeliotis 2010). Priors whose ratios differ from place to place still tell.
+    pub fn first_slope_of_k_c(self, prior: &Soil<f64>, k_phi: f64) -> Option<f64> {
+        (self == Self::Logarithmic).then(|| k_phi * prior.k_c / prior.k_phi)
     }
 
     /// The correction that leads from a prior to a soil.

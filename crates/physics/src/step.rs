@@ -4,13 +4,14 @@
 //! the current state, and their damping and stiffness enter the mass matrix, (M + h C + h² K) Δν = h (f - h K ν). The matrix is
 //! symmetric positive definite, so the step is stable for a parked 50-kg robot and a rolling 2.5-tonne truck alike.
 
+use crate::contacts::{Rolling, Sunk};
 use crate::driveline::WheelCommand;
 use crate::linear::solve_spd;
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
-use crate::terramechanics::{Support, WheelGeometry, WheelMotion, WheelWrench, balance_sinkage, wheel_wrench};
+use crate::terramechanics::{Support, WheelGeometry, WheelMotion, WheelWrench};
 use crate::torque_drive::{Driven, Grip};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
@@ -121,6 +122,14 @@ struct Stance<T> {
     preload_n: T,
 }
 
+/// How a wheel rolls over its ground, and the direction of it in (-1, 1).
+#[derive(Clone, Copy, Debug)]
+struct Roll<T> {
+    motion: WheelMotion<T>,
+    direction: T,
+    contact: Rolling<T>,
+}
+
 /// Contact of one wheel as the assembly needs it: axes, lever arm, forces and their rates.
 struct Contribution<T> {
     axes: [Vec3<T>; 3],
@@ -214,8 +223,11 @@ impl StepModel {
 
         let stances: [Stance<T>; WHEELS] = core::array::from_fn(|i| self.stance(i, state, &tilt, input));
         let driven = self.driven(&stances.each_ref().map(|s| s.preload_n), &stances.each_ref().map(|s| s.forward_m_s), state, input);
+        let driven = |i: usize| driven.as_ref().map(|driven| &driven[i]);
+        let rolls: [Roll<T>; WHEELS] = core::array::from_fn(|i| self.roll(i, &stances[i], driven(i), state, input));
+        let sunk = self.sink(rolls.each_ref().map(|roll| &roll.contact));
         let contributions: [Contribution<T>; WHEELS] =
-            core::array::from_fn(|i| self.wheel_contribution(i, &stances[i], driven.as_ref().map(|driven| &driven[i]), state, input));
+            core::array::from_fn(|i| self.wheel_contribution(i, &stances[i], driven(i), &rolls[i], &sunk[i], input));
         for wheel in &contributions {
             assemble(wheel, v, w, h, &mut lhs, &mut rhs);
         }
@@ -232,7 +244,7 @@ impl StepModel {
         state.attitude_rad = add(state.attitude_rad, scale(rates, h));
         state.velocity_m_s = add(v, dv);
         state.angular_velocity_rad_s = add(w, dw);
-        contributions.map(|c| c.contact)
+        core::array::from_fn(|i| contributions[i].contact)
     }
 
     /// How a wheel stands on its ground, before it is known how it turns.
@@ -263,19 +275,18 @@ impl StepModel {
         }
     }
 
-    /// Forces of one wheel and how they change with its velocity.
+    /// How a wheel rolls once it is known how it turns.
     #[inline(always)]
-    fn wheel_contribution<T: Real>(
+    fn roll<T: Real>(
         &self,
         i: usize,
         stance: &Stance<T>,
         driven: Option<&Driven<T>>,
         state: &VehicleState<T>,
         input: &StepInput<T>,
-    ) -> Contribution<T> {
-        let wheel = self.wheel_at(i);
-        let Stance { axes, lever, forward_m_s, left_m_s, preload_n: preload } = *stance;
-        let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
+    ) -> Roll<T> {
+        let Stance { axes, forward_m_s, left_m_s, preload_n, .. } = *stance;
+        let rate = T::lit(self.vehicle.suspension_n_m[i]);
         let mut ratio = input.sinkage_log_ratio[i].exp();
         let rim_speed_m_s = match (driven, self.altered.on_wheels) {
             (Some(driven), _) => input.wheels.servo_m_s(i) + input.wheels.rim_follow * (forward_m_s + driven.overspeed_m_s),
@@ -287,16 +298,38 @@ impl StepModel {
         let mut soil = input.soil;
         if self.altered.on_wheels {
             ratio = ratio * self.digging(motion.slip);
-            soil = self.soil_under(i, &Support { preload_n: preload, rate_n_m: rate * ratio }, ratio, &motion, &soil);
+            soil = self.soil_under(i, &Support { preload_n, rate_n_m: rate * ratio }, ratio, &motion, &soil);
         }
-        let support = Support { preload_n: preload, rate_n_m: rate * ratio };
-        let balanced = balance_sinkage(wheel, &support, &motion, &soil);
+        let support = Support { preload_n, rate_n_m: rate * ratio };
+        Roll { motion: wheel_motion, direction, contact: Rolling { support, motion, soil, ratio } }
+    }
+
+    /// The contacts of all wheels.
+    #[inline(always)]
+    fn sink<T: Real>(&self, wheels: [&Rolling<T>; WHEELS]) -> [Sunk<T>; WHEELS] {
+        let abreast = if self.of_one_geometry() { Rolling::sink_abreast(wheels, &self.wheel) } else { None };
+        abreast.unwrap_or_else(|| core::array::from_fn(|i| wheels[i].sink(self.wheel_at(i))))
+    }
+
+    /// Forces of one wheel and how they change with its velocity.
+    #[inline(always)]
+    fn wheel_contribution<T: Real>(
+        &self,
+        i: usize,
+        stance: &Stance<T>,
+        driven: Option<&Driven<T>>,
+        roll: &Roll<T>,
+        sunk: &Sunk<T>,
+        input: &StepInput<T>,
+    ) -> Contribution<T> {
+        let wheel = self.wheel_at(i);
+        let Stance { axes, lever, preload_n, .. } = *stance;
+        let Roll { motion: wheel_motion, direction, contact: Rolling { motion, soil, ratio, .. } } = *roll;
+        let Sunk { balanced_m: balanced, wrench } = *sunk;
+        let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
         let sinkage = balanced * ratio;
-        let load = (preload - rate * sinkage).relu_smooth(1.0);
-        let wrench = wheel_wrench(wheel, sinkage, &motion, &soil);
+        let load = (preload_n - rate * sinkage).relu_smooth(1.0);
         let share = load / wrench.normal_n.relu_smooth(1.0);
-        let soil_rate = (soil.n + T::lit(0.5)) * load / balanced;
-        let in_series = soil_rate / (soil_rate + rate);
         let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
         if let Some(driven) = driven {
             let grip = Grip::new(wheel, sinkage, load, &soil);
@@ -308,6 +341,8 @@ impl StepModel {
         if self.altered.on_wheels {
             self.alter_traction(i, &wheel_motion, &motion, &soil, share, &mut drag, &mut contact);
         }
+        let soil_rate = (soil.n + T::lit(0.5)) * load / balanced;
+        let in_series = soil_rate / (soil_rate + rate);
         Contribution {
             axes,
             lever,
@@ -354,7 +389,7 @@ impl StepModel {
         let thrust = (wrench.thrust_n * share).abs_smooth(1.0);
         let side = left_n.abs_smooth(1.0) / wheel_motion.left_m_s.abs_smooth(floor);
         let friction = drag_n / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
-        let drag = [thrust / over * input.wheels.slip_feedback() + friction.max(T::lit(0.0)), side];
+        let drag = [input.wheels.slip_feedback() * (thrust / over) + friction.max(T::lit(0.0)), side];
         (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip, overspeed_m_s })
     }
 }

@@ -48,6 +48,12 @@ impl Altered {
 }
 
 impl StepModel {
+    /// Whether all wheels are those of the card.
+    #[inline(always)]
+    pub(crate) fn of_one_geometry(&self) -> bool {
+        self.altered.axles.is_none()
+    }
+
     /// Geometry of a wheel.
     #[inline(always)]
     pub(crate) fn wheel_at(&self, i: usize) -> &WheelGeometry {

@@ -79,6 +79,8 @@ pub struct AdaptArgs {
 
 /// Degrees of freedom of Student's t that a calibrated filter has (chosen on validation drives and o01-o06 of `ood_soil`).
 const TAIL_DOF: f64 = 4.0;
+/// What it makes of heave, roll and pitch, order vx, vy, vz, ωx, ωy, ωz (chosen on the same, ADR 0048).
+const CAUTION: [f64; 6] = [1.0, 1.0, 3.0, 3.0, 3.0, 1.0];
 
 /// What else is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -236,6 +238,7 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);
+    given.caution.get_or_insert(CAUTION);
     if !args.follow_errors {
         given.shared_error_covariance = Some(Vec::new());
     }

@@ -49,6 +49,15 @@ impl<V: Vector> Neg for Numbers<V> {
 
 impl<V: Vector> Real for Numbers<V> {
     type Value = Self;
+    type Four = Self;
+    #[inline(always)]
+    fn abreast(_: [&Self; 4]) -> Option<Self> {
+        None
+    }
+    #[inline(always)]
+    fn apart(four: &Self) -> [Self; 4] {
+        [*four; 4]
+    }
     #[inline(always)]
     fn value(self) -> Self {
         self

@@ -30,7 +30,12 @@ impl<T: Real, const N: usize> Dual<T, N> {
     /// f(self) given f and f'.
     #[inline(always)]
     fn chain(self, value: T, slope: T) -> Self {
-        Self { re: value, eps: self.eps.map(|e| e * slope) }
+        // Loops over the derivatives, here and below: `map` of an array is not inlined.
+        let mut eps = self.eps;
+        for e in &mut eps {
+            *e = *e * slope;
+        }
+        Self { re: value, eps }
     }
 
     #[inline(always)]
@@ -78,12 +83,36 @@ impl<T: Real, const N: usize> Neg for Dual<T, N> {
     type Output = Self;
     #[inline(always)]
     fn neg(self) -> Self {
-        Self { re: -self.re, eps: self.eps.map(|e| -e) }
+        let mut eps = self.eps;
+        for e in &mut eps {
+            *e = -*e;
+        }
+        Self { re: -self.re, eps }
     }
 }
 
 impl<T: Real, const N: usize> Real for Dual<T, N> {
     type Value = T;
+    type Four = Dual<T::Four, N>;
+    #[inline(always)]
+    fn abreast([a, b, c, d]: [&Self; 4]) -> Option<Self::Four> {
+        let re = T::abreast([&a.re, &b.re, &c.re, &d.re])?;
+        let mut eps = [re; N];
+        for i in 0..N {
+            eps[i] = T::abreast([&a.eps[i], &b.eps[i], &c.eps[i], &d.eps[i]])?;
+        }
+        Some(Dual { re, eps })
+    }
+    #[inline(always)]
+    fn apart(four: &Self::Four) -> [Self; 4] {
+        let mut apart = T::apart(&four.re).map(Self::constant);
+        for i in 0..N {
+            for (one, eps) in apart.iter_mut().zip(T::apart(&four.eps[i])) {
+                one.eps[i] = eps;
+            }
+        }
+        apart
+    }
     #[inline(always)]
     fn value(self) -> T {
         self.re

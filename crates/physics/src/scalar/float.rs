@@ -1,11 +1,20 @@
 //! Plain floats.
 
-use super::Real;
+use super::{Real, f64x4};
 
 macro_rules! impl_real_for_float {
-    ($float:ty) => {
+    ($float:ty, $four:ty, $abreast:expr, $apart:expr) => {
         impl Real for $float {
             type Value = Self;
+            type Four = $four;
+            #[inline(always)]
+            fn abreast(four: [&Self; 4]) -> Option<$four> {
+                ($abreast)(four)
+            }
+            #[inline(always)]
+            fn apart(four: &$four) -> [Self; 4] {
+                ($apart)(four)
+            }
             #[inline(always)]
             fn value(self) -> Self {
                 self
@@ -45,5 +54,5 @@ macro_rules! impl_real_for_float {
         }
     };
 }
-impl_real_for_float!(f32);
-impl_real_for_float!(f64);
+impl_real_for_float!(f32, f32, |_| None, |four: &f32| [*four; 4]);
+impl_real_for_float!(f64, f64x4, |four: [&f64; 4]| Some(f64x4::new(four.map(|v| *v))), |four: &f64x4| four.to_array());

@@ -9,7 +9,7 @@ mod float;
 mod lanes;
 
 pub use dual::Dual;
-pub use wide::f32x8;
+pub use wide::{f32x8, f64x4};
 
 use core::ops::{Add, Div, Mul, Neg, Sub};
 
@@ -21,7 +21,13 @@ pub trait Real:
     ///
     /// Iterations run on values; one last Newton step on `Self` then carries the exact derivative of the implicit function.
     type Value: Real;
+    /// Four numbers side by side, one for each wheel; lanes, which have no room for wheels, name themselves.
+    type Four: Real;
 
+    /// Four numbers as one, where there is such a type: each formula is then worked out once for all wheels.
+    fn abreast(four: [&Self; 4]) -> Option<Self::Four>;
+    /// The four numbers of [`Real::abreast`].
+    fn apart(four: &Self::Four) -> [Self; 4];
     /// The value without derivatives.
     fn value(self) -> Self::Value;
     /// A constant from a value.
