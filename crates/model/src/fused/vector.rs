@@ -448,4 +448,42 @@ mod tests {
             }
         }
     }
+
+    /// What reads and writes memory, and next to nothing else: miri knows these of the AVX-512 instructions (`tests/hostile/miri.sh`).
+    struct Memory<'a>(&'a [Lane; 2], &'a mut [Lane; 3], &'a mut Tile);
+
+    impl Kernel for Memory<'_> {
+        type Output = [[Lane; LANES]; TILE_PANELS];
+        #[inline(always)]
+        fn run<V: Vector>(self) -> Self::Output {
+            let [a, b] = self.0.each_ref().map(|lane| V::load(lane));
+            a.add(b).store(&mut self.1[0]);
+            for row in &mut self.2.0 {
+                a.store_pairs(b, row);
+            }
+            let [even, odd] = V::load_pairs(&self.2.0[LANES - 1]);
+            even.store(&mut self.1[1]);
+            odd.store(&mut self.1[2]);
+            let mut sums = [[Lane::ZERO; LANES]; TILE_PANELS];
+            V::products(Order::Tiles, &[[*self.2; TILE_PANELS]], core::slice::from_ref(self.2), &mut sums);
+            sums
+        }
+    }
+
+    #[test]
+    fn property_memory_is_read_and_written_where_it_is_lent() {
+        // Halves of small integers are numbers of bf16, so nothing is rounded.
+        let lanes = [Lane::from_fn(|l| l as f32 * 0.5), Lane::from_fn(|l| 3.0 - l as f32)];
+        for path in Path::available() {
+            let (mut out, mut tile) = (Box::new([Lane::ZERO; 3]), Box::new(Tile::ZERO));
+            let sums = path.run(Memory(&lanes, &mut out, &mut tile));
+            assert_eq!(*out, [Lane::from_fn(|l| lanes[0][l] + lanes[1][l]), lanes[0], lanes[1]], "{}", path.as_str());
+            // All rows of weights and inputs are alike: output m of sample l is the sum over the pairs of a row of weights times that sample's pair.
+            let [even, odd]: [f32; 2] = core::array::from_fn(|i| lanes[i].iter().sum());
+            for (m, sums) in sums.iter().enumerate() {
+                let expected = [Lane::from_fn(|l| even * lanes[0][l] + odd * lanes[1][l]); LANES];
+                assert_eq!(*sums, expected, "{}, panel {m}", path.as_str());
+            }
+        }
+    }
 }
