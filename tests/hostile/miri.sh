@@ -13,4 +13,4 @@ export MIRIFLAGS="-Zmiri-disable-isolation"
 echo "== all of it, on the instructions of the build"
 under_miri build fused::vector
 echo "== what touches memory, in AVX-512"
-RUSTFLAGS="-C target-cpu=x86-64-v3 -C target-feature=+avx512f,+avx512dq,+avx512vl" under_miri avx512 property_memory
+RUSTFLAGS="-C target-cpu=x86-64-v3 -C target-feature=+avx512f,+avx512dq,+avx512vl,+avx512bw,+avx512bf16" under_miri avx512 property_memory

@@ -98,8 +98,8 @@ impl<T: Real, const N: usize> Real for Dual<T, N> {
     fn abreast([a, b, c, d]: [&Self; 4]) -> Option<Self::Four> {
         let re = T::abreast([&a.re, &b.re, &c.re, &d.re])?;
         let mut eps = [re; N];
-        for i in 0..N {
-            eps[i] = T::abreast([&a.eps[i], &b.eps[i], &c.eps[i], &d.eps[i]])?;
+        for (i, lanes) in eps.iter_mut().enumerate() {
+            *lanes = T::abreast([&a.eps[i], &b.eps[i], &c.eps[i], &d.eps[i]])?;
         }
         Some(Dual { re, eps })
     }
