@@ -52,9 +52,9 @@ pub struct NoiseCalibration {
 ///
 /// Buffers of one drive err alike. Two descriptions of that, of which a filter uses one:
 /// - `shared_error`: E[e_k e_{k+l}ᵀ] = a^l B, the part of R_B that a filter can follow as a state of its own;
-/// - `shared_buffers`: what a buffer says of the soil, g = Hᵀ R_B⁻¹ e (R_B under the caution of the settings), has about the variance that the filter believes, but the sum G of a drive's g
-///   varies more than a sum of independent ones; Σ|G|² / Σ|g|² (lengths in units of the prior) is how many times too often the
-///   filter would count the same evidence: the design effect of a cluster sample.
+/// - `shared_buffers`: what a buffer says of the soil, g = Hᵀ R_B⁻¹ e (R_B under the caution of the settings), has about the variance that the
+///   filter believes, but the sum G of a drive's g varies more than a sum of independent ones; Σ|G|² / Σ|g|² (lengths in units of the prior) is
+///   how many times too often the filter would count the same evidence: the design effect of a cluster sample.
 ///
 /// # Errors
 /// `TooFewBuffers` with fewer than ten buffers per row, `NotFinite` when a number is not finite or rows differ in number, `SingularInnovation` when

@@ -51,14 +51,6 @@ impl<V: Vector> Real for Numbers<V> {
     type Value = Self;
     type Four = Self;
     #[inline(always)]
-    fn abreast(_: [&Self; 4]) -> Option<Self> {
-        None
-    }
-    #[inline(always)]
-    fn apart(four: &Self) -> [Self; 4] {
-        [*four; 4]
-    }
-    #[inline(always)]
     fn value(self) -> Self {
         self
     }

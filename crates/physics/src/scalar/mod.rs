@@ -5,8 +5,7 @@
 //! `min` instead of `if`, so that lanes and duals agree with floats.
 
 mod dual;
-mod float;
-mod lanes;
+mod plain;
 
 pub use dual::Dual;
 pub use wide::{f32x8, f64x4};
@@ -25,9 +24,15 @@ pub trait Real:
     type Four: Real;
 
     /// Four numbers as one, where there is such a type: each formula is then worked out once for all wheels.
-    fn abreast(four: [&Self; 4]) -> Option<Self::Four>;
+    #[inline(always)]
+    fn abreast(_: [&Self; 4]) -> Option<Self::Four> {
+        None
+    }
     /// The four numbers of [`Real::abreast`].
-    fn apart(four: &Self::Four) -> [Self; 4];
+    #[inline(always)]
+    fn apart(_: &Self::Four) -> [Self; 4] {
+        unreachable!("numbers that were never put abreast are taken apart; this is a bug")
+    }
     /// The value without derivatives.
     fn value(self) -> Self::Value;
     /// A constant from a value.

@@ -46,12 +46,6 @@ impl<const N: usize> Neg for Nd<N> {
 impl<const N: usize> Real for Nd<N> {
     type Value = f64;
     type Four = Self;
-    fn abreast(_: [&Self; 4]) -> Option<Self> {
-        None
-    }
-    fn apart(four: &Self) -> [Self; 4] {
-        [*four; 4]
-    }
     fn value(self) -> f64 {
         self.0.re
     }
