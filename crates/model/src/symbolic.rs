@@ -1,7 +1,8 @@
 //! The half of a form that is not learned: what moves the vehicle before the learned residual is added.
 
 use nesam_physics::step::{StepInput, StepModel, StepOutput, WheelContact};
-use nesam_physics::{Real, Soil, VehicleState, WHEELS};
+use nesam_physics::terramechanics::WheelGeometry;
+use nesam_physics::{Real, Rolling, Soil, Sunk, VehicleState, WHEELS};
 
 use crate::rollout::Variant;
 
@@ -13,6 +14,17 @@ const SPEED_LAG_S: f64 = 0.5;
 /// Increment Δx of the symbolic half and the contacts of the wheels; all zero where a form has no soil.
 #[inline(always)]
 pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepInput<T>) -> StepOutput<T> {
+    symbolic_step_by(variant, model, input, Rolling::sink)
+}
+
+/// The same with somebody else who works the contacts out ([`StepModel::step_by`]).
+#[inline(always)]
+pub fn symbolic_step_by<T: Real>(
+    variant: Variant,
+    model: &StepModel,
+    input: &StepInput<T>,
+    sink: impl Fn(&Rolling<T>, &WheelGeometry) -> Sunk<T>,
+) -> StepOutput<T> {
     let zero = T::lit(0.0);
     let none = WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero, overspeed_m_s: zero };
     let without_soil = |increment| StepOutput { increment, contacts: [none; WHEELS] };
@@ -28,7 +40,7 @@ pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepI
         }
     };
     // One call for all forms: the step is inlined here, and it is long.
-    let output = model.step(&input);
+    let output = model.step_by(&input, sink);
     if variant == Variant::RigidResidual { without_soil(output.increment) } else { output }
 }
 

@@ -7,78 +7,90 @@ use crate::soil::Soil;
 use crate::terramechanics::{ContactMotion, Support, WheelGeometry, WheelWrench, balance_sinkage, wheel_wrench};
 use crate::vehicle::WHEELS;
 
+/// Numbers in a [`Rolling`] and in a [`Sunk`].
+pub const ROLLING: usize = 13;
+/// See [`ROLLING`].
+pub const SUNK: usize = 6;
+
 /// What the contact of a wheel depends on.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Rolling<T> {
+pub struct Rolling<T> {
     /// What presses the wheel down per sinkage of the balance.
-    pub(crate) support: Support<T>,
+    pub support: Support<T>,
     /// How it rolls and slides.
-    pub(crate) motion: ContactMotion<T>,
+    pub motion: ContactMotion<T>,
     /// What it rolls on.
-    pub(crate) soil: Soil<T>,
+    pub soil: Soil<T>,
     /// Sinkage over that of the balance.
-    pub(crate) ratio: T,
+    pub ratio: T,
 }
 
 /// A wheel that has sunk in.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Sunk<T> {
+pub struct Sunk<T> {
     /// Sinkage at which the soil carries what the suspension presses into it, m.
-    pub(crate) balanced_m: T,
+    pub balanced_m: T,
     /// The wrench of the soil at the sinkage of the wheel, `balanced_m` times the ratio.
-    pub(crate) wrench: WheelWrench<T>,
+    pub wrench: WheelWrench<T>,
 }
 
 impl<T: Real> Rolling<T> {
     /// The contact of a wheel.
     #[inline(always)]
-    pub(crate) fn sink(&self, wheel: &WheelGeometry) -> Sunk<T> {
+    pub fn sink(&self, wheel: &WheelGeometry) -> Sunk<T> {
         let balanced_m = balance_sinkage(wheel, &self.support, &self.motion, &self.soil);
         Sunk { balanced_m, wrench: wheel_wrench(wheel, balanced_m * self.ratio, &self.motion, &self.soil) }
+    }
+
+    /// Its numbers: support, motion, soil, ratio, each in the order of its fields.
+    #[inline(always)]
+    pub fn to_array(&self) -> [T; ROLLING] {
+        let Self { support, motion, soil, ratio } = *self;
+        let [k_phi, k_c, n, c, phi, k_shear] = soil.to_array();
+        let Support { preload_n, rate_n_m } = support;
+        let ContactMotion { travel_ratio, rim_ratio, lateral_ratio, slip } = motion;
+        [preload_n, rate_n_m, travel_ratio, rim_ratio, lateral_ratio, slip, k_phi, k_c, n, c, phi, k_shear, ratio]
+    }
+
+    /// From [`Rolling::to_array`].
+    #[inline(always)]
+    pub fn from_array(numbers: [T; ROLLING]) -> Self {
+        let [preload_n, rate_n_m, travel_ratio, rim_ratio, lateral_ratio, slip, k_phi, k_c, n, c, phi, k_shear, ratio] = numbers;
+        Self {
+            support: Support { preload_n, rate_n_m },
+            motion: ContactMotion { travel_ratio, rim_ratio, lateral_ratio, slip },
+            soil: Soil { k_phi, k_c, n, c, phi, k_shear },
+            ratio,
+        }
     }
 
     /// The contacts of four wheels of one geometry, where the scalar has room for them side by side.
     #[inline(always)]
     pub(crate) fn sink_abreast(wheels: [&Self; WHEELS], wheel: &WheelGeometry) -> Option<[Sunk<T>; WHEELS]> {
-        let abreast = Rolling {
-            support: Support { preload_n: abreast(wheels, |w| &w.support.preload_n)?, rate_n_m: abreast(wheels, |w| &w.support.rate_n_m)? },
-            motion: ContactMotion {
-                travel_ratio: abreast(wheels, |w| &w.motion.travel_ratio)?,
-                rim_ratio: abreast(wheels, |w| &w.motion.rim_ratio)?,
-                lateral_ratio: abreast(wheels, |w| &w.motion.lateral_ratio)?,
-                slip: abreast(wheels, |w| &w.motion.slip)?,
-            },
-            soil: Soil {
-                k_phi: abreast(wheels, |w| &w.soil.k_phi)?,
-                k_c: abreast(wheels, |w| &w.soil.k_c)?,
-                n: abreast(wheels, |w| &w.soil.n)?,
-                c: abreast(wheels, |w| &w.soil.c)?,
-                phi: abreast(wheels, |w| &w.soil.phi)?,
-                k_shear: abreast(wheels, |w| &w.soil.k_shear)?,
-            },
-            ratio: abreast(wheels, |w| &w.ratio)?,
-        };
-        let Sunk { balanced_m, wrench } = abreast.sink(wheel);
-        let balanced_m = T::apart(&balanced_m);
-        let (thrust_n, resistance_n, side_n) = (T::apart(&wrench.thrust_n), T::apart(&wrench.resistance_n), T::apart(&wrench.side_n));
-        let (normal_n, torque_n_m) = (T::apart(&wrench.normal_n), T::apart(&wrench.torque_n_m));
-        Some(core::array::from_fn(|i| Sunk {
-            balanced_m: balanced_m[i],
-            wrench: WheelWrench {
-                thrust_n: thrust_n[i],
-                resistance_n: resistance_n[i],
-                side_n: side_n[i],
-                normal_n: normal_n[i],
-                torque_n_m: torque_n_m[i],
-            },
-        }))
+        let [a, b, c, d] = [wheels[0].to_array(), wheels[1].to_array(), wheels[2].to_array(), wheels[3].to_array()];
+        let mut abreast = [T::abreast([&a[0], &b[0], &c[0], &d[0]])?; ROLLING];
+        for (i, four) in abreast.iter_mut().enumerate().skip(1) {
+            *four = T::abreast([&a[i], &b[i], &c[i], &d[i]])?;
+        }
+        let sunk = Rolling::from_array(abreast).sink(wheel).to_array();
+        let apart: [[T; WHEELS]; SUNK] = core::array::from_fn(|k| T::apart(&sunk[k]));
+        Some(core::array::from_fn(|i| Sunk::from_array(core::array::from_fn(|k| apart[k][i]))))
     }
 }
 
-/// One number of each wheel, side by side.
-#[inline(always)]
-fn abreast<T: Real>(wheels: [&Rolling<T>; WHEELS], of: impl Fn(&Rolling<T>) -> &T) -> Option<T::Four> {
-    T::abreast([of(wheels[0]), of(wheels[1]), of(wheels[2]), of(wheels[3])])
+impl<T: Real> Sunk<T> {
+    /// Its numbers, in the order of its fields.
+    #[inline(always)]
+    pub fn to_array(&self) -> [T; SUNK] {
+        let WheelWrench { thrust_n, resistance_n, side_n, normal_n, torque_n_m } = self.wrench;
+        [self.balanced_m, thrust_n, resistance_n, side_n, normal_n, torque_n_m]
+    }
+
+    /// From [`Sunk::to_array`].
+    #[inline(always)]
+    pub fn from_array([balanced_m, thrust_n, resistance_n, side_n, normal_n, torque_n_m]: [T; SUNK]) -> Self {
+        Self { balanced_m, wrench: WheelWrench { thrust_n, resistance_n, side_n, normal_n, torque_n_m } }
+    }
 }
 
 #[cfg(test)]
@@ -111,11 +123,6 @@ mod tests {
         })
     }
 
-    fn numbers<T: Copy>(sunk: &Sunk<T>) -> [T; 6] {
-        let w = sunk.wrench;
-        [sunk.balanced_m, w.thrust_n, w.resistance_n, w.side_n, w.normal_n, w.torque_n_m]
-    }
-
     #[test]
     fn property_wheels_abreast_are_the_wheels_one_by_one() {
         for law in ContactLaw::ALL {
@@ -126,10 +133,10 @@ mod tests {
             let with_slopes = Rolling::sink_abreast(duals.each_ref(), &wheel).unwrap();
             for i in 0..WHEELS {
                 let close = |a: f64, b: f64, size: f64| assert!((a - b).abs() <= 1e-11 * size, "{law:?}, wheel {i}: {a} and {b}");
-                for (got, want) in numbers(&abreast[i]).into_iter().zip(numbers(&plain[i].sink(&wheel))) {
+                for (got, want) in abreast[i].to_array().into_iter().zip(plain[i].sink(&wheel).to_array()) {
                     close(got, want, want.abs() + 1.0);
                 }
-                for (got, want) in numbers(&with_slopes[i]).into_iter().zip(numbers(&duals[i].sink(&wheel))) {
+                for (got, want) in with_slopes[i].to_array().into_iter().zip(duals[i].sink(&wheel).to_array()) {
                     let size = want.re.abs() + 1.0 + want.eps.iter().map(|e| e.abs()).fold(0.0, f64::max);
                     close(got.re, want.re, size);
                     got.eps.into_iter().zip(want.eps).for_each(|(got, want)| close(got, want, size));

@@ -21,6 +21,7 @@ pub mod vec3;
 mod vehicle;
 
 pub use command_path::CommandPath;
+pub use contacts::{ROLLING, Rolling, SUNK, Sunk};
 pub use contradiction::{CONTRADICTIONS, contradiction};
 pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};

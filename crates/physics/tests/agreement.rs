@@ -47,7 +47,7 @@ trait Case<const X: usize, const N: usize, const Y: usize> {
     fn difference_step(&self, i: usize) -> f64;
     /// Whether differences of the computed function can be those of the exact one.
     ///
-    /// The load balance makes three Newton steps and gives the derivative of the equation that it solves. Where a wheel of the step is
+    /// The load balance makes three steps and gives the derivative of the equation that it solves. Where a wheel of the step is
     /// within a few newtons of lifting off, three steps do not settle, and the two differ (forty steps bring them to 1e-7).
     fn settled(&self, x: &[f64; X]) -> bool;
 }
@@ -262,8 +262,8 @@ const WHEEL_TOLERANCE: Tolerance = Tolerance { f32_values: (3e-7, 1e-5), f32_der
 
 /// A step: the contact is stiff (a micrometre of height is a tenth of a newton) and lifts off within a tenth of a millimetre, which
 /// amplifies the rounding of f32: the maxima are those of wheels at lift-off, where the derivative jumps from nothing to the full
-/// stiffness. Differences see what three Newton steps leave of the load balance.
-const STEP_TOLERANCE: Tolerance = Tolerance { f32_values: (1e-6, 1e-3), f32_derivatives: (3e-6, 0.1), differences: (1e-7, 2e-3) };
+/// stiffness. Differences see what the steps of the load balance leave.
+const STEP_TOLERANCE: Tolerance = Tolerance { f32_values: (1e-6, 1e-3), f32_derivatives: (3e-6, 0.1), differences: (3e-7, 2e-3) };
 
 #[test]
 fn property_scalars_agree_on_a_wheel() {

@@ -49,6 +49,7 @@ impl<V: Vector> Neg for Numbers<V> {
 
 impl<V: Vector> Real for Numbers<V> {
     type Value = Self;
+    const PLAIN: bool = true;
     type Four = Self;
     #[inline(always)]
     fn value(self) -> Self {

@@ -122,7 +122,8 @@ impl Predictor {
         }
 
         varying.iter_mut().chain(&mut constant).for_each(|lane| repeat_last(lane, count));
-        let physics = PhysicsStep { variant: scene.variant, model, varying: &varying, constant: &constant, risk: scene.risk };
+        let physics =
+            PhysicsStep { variant: scene.variant, model, varying: &varying, constant: &constant, risk: scene.risk, path: self.path() };
         watch.add_to(Part::Rest);
         let output = Path::run_on_target(physics);
         watch.add_to(Part::Physics);

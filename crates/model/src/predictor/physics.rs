@@ -1,13 +1,17 @@
 //! The physics of a block of samples: sixteen vehicles step together.
+//!
+//! A step is long and calls functions of effects, so it is compiled for the target's vectors alone; the contacts, most of its work, are a kernel of their own on
+//! the widest vectors.
 
 use nesam_physics::step::StepModel;
-use nesam_physics::{STATE_DIM, WHEELS};
+use nesam_physics::terramechanics::WheelGeometry;
+use nesam_physics::{ROLLING, Rolling, STATE_DIM, SUNK, Sunk, WHEELS};
 
 use super::risk::{RiskRow, of_lanes};
-use crate::fused::{Kernel, LANES, Lane, Numbers, Vector};
+use crate::fused::{Kernel, LANES, Lane, Numbers, Path, Vector};
 use crate::rollout::Variant;
 use crate::step_row::{CONSTANT, DIFFERENTIABLE, step_input};
-use crate::symbolic::symbolic_step;
+use crate::symbolic::symbolic_step_by;
 
 /// One step of the symbolic half for a block of samples.
 pub(super) struct PhysicsStep<'a> {
@@ -19,6 +23,8 @@ pub(super) struct PhysicsStep<'a> {
     pub(super) constant: &'a [Lane; CONSTANT],
     /// Whether risk is asked for.
     pub(super) risk: bool,
+    /// Instructions for the contacts.
+    pub(super) path: Path,
 }
 
 /// What the step gives.
@@ -44,7 +50,7 @@ impl Kernel for PhysicsStep<'_> {
             *number = Numbers(V::load(&lane.0));
         }
         let input = step_input(varying, constant);
-        let output = symbolic_step(self.variant, self.model, &input);
+        let output = symbolic_step_by(self.variant, self.model, &input, |rolling, wheel| sink(self.path, rolling, wheel));
         let mut increment = [Lane::ZERO; STATE_DIM];
         for (lane, number) in increment.iter_mut().zip(output.increment.to_array()) {
             number.0.store(&mut lane.0);
@@ -56,4 +62,42 @@ impl Kernel for PhysicsStep<'_> {
         let risk = if self.risk { Some(of_lanes(self.model, &input, &output.contacts)) } else { None };
         PhysicsOutput { increment, sinkage_m, risk }
     }
+}
+
+/// [`Rolling::sink`] of a wheel of sixteen vehicles.
+struct Sink<'a> {
+    wheel: &'a WheelGeometry,
+    rolling: [Lane; ROLLING],
+}
+
+impl Kernel for Sink<'_> {
+    type Output = [Lane; SUNK];
+    #[inline(always)]
+    fn run<V: Vector>(self) -> Self::Output {
+        let mut numbers = [Numbers(V::splat(0.0)); ROLLING];
+        for (number, lane) in numbers.iter_mut().zip(&self.rolling) {
+            *number = Numbers(V::load(&lane.0));
+        }
+        to_lanes(Rolling::from_array(numbers).sink(self.wheel).to_array())
+    }
+}
+
+/// The contact of a wheel, worked out on a path, from vectors of another and back.
+#[inline(always)]
+fn sink<V: Vector>(path: Path, rolling: &Rolling<Numbers<V>>, wheel: &WheelGeometry) -> Sunk<Numbers<V>> {
+    let lanes = path.run(Sink { wheel, rolling: to_lanes(rolling.to_array()) });
+    let mut sunk = [Numbers(V::splat(0.0)); SUNK];
+    for (number, lane) in sunk.iter_mut().zip(&lanes) {
+        *number = Numbers(V::load(&lane.0));
+    }
+    Sunk::from_array(sunk)
+}
+
+#[inline(always)]
+fn to_lanes<V: Vector, const N: usize>(numbers: [Numbers<V>; N]) -> [Lane; N] {
+    let mut lanes = [Lane::ZERO; N];
+    for (lane, number) in lanes.iter_mut().zip(numbers) {
+        number.0.store(&mut lane.0);
+    }
+    lanes
 }

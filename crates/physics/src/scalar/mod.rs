@@ -20,6 +20,8 @@ pub trait Real:
     ///
     /// Iterations run on values; one last Newton step on `Self` then carries the exact derivative of the implicit function.
     type Value: Real;
+    /// Whether a number is its value and no more.
+    const PLAIN: bool;
     /// Four numbers side by side, one for each wheel; lanes, which have no room for wheels, name themselves.
     type Four: Real;
 

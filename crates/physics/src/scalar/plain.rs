@@ -8,6 +8,7 @@ macro_rules! impl_real {
     ($number:ty { $($own:tt)* }) => {
         impl Real for $number {
             type Value = Self;
+            const PLAIN: bool = true;
             $($own)*
             #[inline(always)]
             fn value(self) -> Self {

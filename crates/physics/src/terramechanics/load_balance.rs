@@ -6,8 +6,9 @@ use crate::terramechanics::pressure_sinkage::bekker_sinkage;
 use crate::terramechanics::slip::ContactMotion;
 use crate::terramechanics::wheel::{WheelGeometry, wheel_wrench};
 
-/// Newton steps on values; each shrinks the error of ln z by an order of magnitude or more.
-const ITERATIONS: usize = 3;
+/// Exponents that W may have between two sinkages, and the least ratio of these (as a logarithm) that tells one.
+const EXPONENT: [f64; 2] = [0.3, 4.0];
+const LN_RATIO_MIN: f64 = 1e-3;
 
 /// What presses the wheel down: force = `preload_n` - `rate_n_m` · sinkage, never negative.
 #[derive(Clone, Copy, Debug)]
@@ -20,8 +21,9 @@ pub struct Support<T> {
 
 /// Solves W(z; θ, slip) = preload - rate z for the sinkage z > 0, m.
 ///
-/// W is taken as a power law of exponent n + 1/2 around each iterate (Bekker's wheel), which makes Newton's method converge in a few
-/// steps without branches. The iterations run on plain values; a last step on `T` gives the derivatives of the implicit function.
+/// W is taken for a power law around each iterate, which makes Newton's method converge in a few steps without branches: of exponent n + 1/2 first (Bekker's
+/// wheel), then of the exponent between the first two iterates, which leaves an error of ln z of 1e-8 in the median of random contacts (3e-7 in nine of ten). These
+/// two steps run on plain values; a last one with the exact slope, on `T`, squares the error and gives the derivatives of the implicit function.
 /// A support that lifts off (preload ≤ 0) gives a vanishing sinkage.
 #[inline(always)]
 pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, motion: &ContactMotion<T>, soil: &Soil<T>) -> T {
@@ -39,13 +41,18 @@ pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, mot
     let mut z = bekker_sinkage(load, wheel.radius_m, wheel.width_m, &soil_value);
     // With a stiff support the load falls as the wheel sinks: start where the series of both springs would settle.
     z = z * load / (load + support_value.rate_n_m * z);
-    for _ in 0..ITERATIONS {
-        z = newton_step(wheel, z, &support_value, &motion_value, &soil_value);
-    }
+    let wheel_exponent = soil_value.n + <T::Value as Real>::lit(0.5);
+    let (excess_n, carried_n) = residual(wheel, z, &support_value, &motion_value, &soil_value);
+    let first = (z, carried_n);
+    z = power_law_step(wheel, z, excess_n, carried_n, wheel_exponent, &support_value);
+    let (excess_n, carried_n) = residual(wheel, z, &support_value, &motion_value, &soil_value);
+    let exponent = exponent_between(first, (z, carried_n), wheel_exponent);
+    z = power_law_step(wheel, z, excess_n, carried_n, exponent, &support_value);
     // Last step on `T`: the exact slope of the residual makes z - f / f' carry the derivatives of the implicit function.
-    let slope = residual_slope(wheel, z, &support_value, &motion_value, &soil_value);
+    let Dual { re: excess_n, eps: [slope] } = residual_with_slope(wheel, z, &support_value, &motion_value, &soil_value);
     let z = T::from_value(z);
-    bounded(z, z - residual(wheel, z, support, motion, soil).0 / T::from_value(slope), wheel)
+    let excess_n = if T::PLAIN { T::from_value(excess_n) } else { residual(wheel, z, support, motion, soil).0 };
+    bounded(z, z - excess_n / T::from_value(slope), wheel)
 }
 
 /// f(z) = W(z) - pressed(z), N, and the force carried W(z).
@@ -55,9 +62,15 @@ fn residual<T: Real>(wheel: &WheelGeometry, z: T, support: &Support<T>, motion: 
     (carried - (support.preload_n - support.rate_n_m * z).relu_smooth(1.0), carried)
 }
 
-/// f'(z), N/m, by a dual number in z.
+/// f(z), N, with f'(z), N/m, by a dual number in z.
 #[inline(always)]
-fn residual_slope<V: Real>(wheel: &WheelGeometry, z: V, support: &Support<V>, motion: &ContactMotion<V>, soil: &Soil<V>) -> V {
+fn residual_with_slope<V: Real>(
+    wheel: &WheelGeometry,
+    z: V,
+    support: &Support<V>,
+    motion: &ContactMotion<V>,
+    soil: &Soil<V>,
+) -> Dual<V, 1> {
     let c = Dual::<V, 1>::constant;
     let motion = ContactMotion {
         travel_ratio: c(motion.travel_ratio),
@@ -67,15 +80,23 @@ fn residual_slope<V: Real>(wheel: &WheelGeometry, z: V, support: &Support<V>, mo
     };
     let soil = Soil::from_array(soil.to_array().map(c));
     let support = Support { preload_n: c(support.preload_n), rate_n_m: c(support.rate_n_m) };
-    residual(wheel, Dual::variable(z, 0), &support, &motion, &soil).0.eps[0]
+    residual(wheel, Dual::variable(z, 0), &support, &motion, &soil).0
 }
 
-/// A Newton step that takes W for a power law of exponent n + 1/2.
+/// A Newton step from z with the excess f and the force W there, by the slope of a power law of an exponent.
 #[inline(always)]
-fn newton_step<V: Real>(wheel: &WheelGeometry, z: V, support: &Support<V>, motion: &ContactMotion<V>, soil: &Soil<V>) -> V {
-    let (f, carried) = residual(wheel, z, support, motion, soil);
-    let slope = (soil.n + V::lit(0.5)) * carried / z + support.rate_n_m;
-    bounded(z, z - f / slope, wheel)
+fn power_law_step<V: Real>(wheel: &WheelGeometry, z: V, excess_n: V, carried_n: V, exponent: V, support: &Support<V>) -> V {
+    bounded(z, z - excess_n / (exponent * carried_n / z + support.rate_n_m), wheel)
+}
+
+/// Exponent of the power law through two pairs (z, W); `other` where they are too close to tell.
+#[inline(always)]
+fn exponent_between<V: Real>((z_0, w_0): (V, V), (z_1, w_1): (V, V), other: V) -> V {
+    let far = (z_1 / z_0).ln();
+    let told = far.sqr() - V::lit(LN_RATIO_MIN * LN_RATIO_MIN);
+    let far = V::select_ge0(told, far, V::lit(1.0));
+    let exponent = (w_1 / w_0).ln() / far;
+    V::select_ge0(told, exponent.max(V::lit(EXPONENT[0])).min(V::lit(EXPONENT[1])), other)
 }
 
 /// Keeps a step within a decade and the wheel.

@@ -16,6 +16,6 @@ pub use bulldozing::{BearingCapacity, ContactArc, front_bulldozing, side_bulldoz
 pub use gauss::GaussRule;
 pub use load_balance::{Support, balance_sinkage};
 pub use pressure_sinkage::{bekker_sinkage, normal_stress};
-pub use shear::{mohr_coulomb, shear_fraction};
+pub use shear::{mobilised_share, mohr_coulomb};
 pub use slip::{ContactMotion, WheelMotion};
 pub use wheel::{ContactLaw, WheelGeometry, WheelWrench, wheel_wrench};

@@ -9,8 +9,8 @@ pub fn mohr_coulomb<T: Real>(normal_stress_pa: T, tan_phi: T, soil: &Soil<T>) ->
     soil.c + normal_stress_pa * tan_phi
 }
 
-/// Mobilised share of the strength per metre of shear displacement, (1 - e^{-j/K}) / j (Janosi & Hanamoto 1961), j > 0.
+/// Mobilised share of the strength, 1 - e^{-j/K} (Janosi & Hanamoto 1961); `per_modulus` is 1 / K, 1/m.
 #[inline(always)]
-pub fn shear_fraction<T: Real>(displacement_m: T, soil: &Soil<T>) -> T {
-    (T::lit(1.0) - (-(displacement_m / soil.k_shear)).exp()) / displacement_m
+pub fn mobilised_share<T: Real>(displacement_m: T, per_modulus: T) -> T {
+    T::lit(1.0) - (-(displacement_m * per_modulus)).exp()
 }

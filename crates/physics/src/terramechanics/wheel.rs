@@ -5,7 +5,7 @@ use crate::soil::Soil;
 use crate::terramechanics::bulldozing::{ContactArc, side_bulldozing};
 use crate::terramechanics::gauss::GaussRule;
 use crate::terramechanics::pressure_sinkage::normal_stress;
-use crate::terramechanics::shear::{mohr_coulomb, shear_fraction};
+use crate::terramechanics::shear::{mobilised_share, mohr_coulomb};
 use crate::terramechanics::slip::ContactMotion;
 
 /// Shear displacement below which its direction is smoothed, m.
@@ -120,6 +120,7 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
     let peak = entry * (T::lit(wheel.c1) + T::lit(wheel.c2) * slip_size).min(T::lit(0.999));
     let (front, rear) = (entry - peak, peak - exit);
     let tan_phi = soil.phi.tan();
+    let per_modulus = T::lit(1.0) / soil.k_shear;
 
     let zero = T::lit(0.0);
     let mut sum = WheelWrench { thrust_n: zero, resistance_n: zero, side_n: zero, normal_n: zero, torque_n_m: zero };
@@ -135,7 +136,7 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
             let w = arc * T::lit(weight);
             match wheel.law {
                 ContactLaw::WongReece => {
-                    let [tau_x, tau_y] = shear_along_rim(radius, &at, motion, strength, soil);
+                    let [tau_x, tau_y] = shear_along_rim(radius, &at, motion, strength, per_modulus);
                     sum.thrust_n = sum.thrust_n + tau_x * cos * w;
                     sum.resistance_n = sum.resistance_n + sigma * sin * w;
                     sum.side_n = sum.side_n - tau_y * w;
@@ -144,7 +145,7 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
                 }
                 ContactLaw::SoilContactModel => {
                     let across = cos * w;
-                    let [tau_x, tau_y] = shear_in_surface(radius, &at, motion, strength, soil);
+                    let [tau_x, tau_y] = shear_in_surface(radius, &at, motion, strength, per_modulus);
                     sum.thrust_n = sum.thrust_n + tau_x * across;
                     sum.side_n = sum.side_n - tau_y * across;
                     sum.normal_n = sum.normal_n + sigma * across;
@@ -181,11 +182,11 @@ struct ContactPoint<T> {
 
 /// Shear stress (x, y) along the rim, Pa: j_x = r [(θ_1 - θ) - (v_x / rΩ)(sin θ_1 - sin θ)], j_y = r (v_y / rΩ)(θ_1 - θ), combined isotropically (Jia 2011).
 #[inline(always)]
-fn shear_along_rim<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactMotion<T>, strength: T, soil: &Soil<T>) -> [T; 2] {
+fn shear_along_rim<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactMotion<T>, strength: T, per_modulus: T) -> [T; 2] {
     let j_x = (motion.rim_ratio * at.swept - motion.travel_ratio * (at.sin_entry - at.sin)) * T::lit(radius);
     let j_y = motion.lateral_ratio * at.swept * T::lit(radius);
     let j = (j_x * j_x + j_y * j_y + T::lit(SHEAR_FLOOR_M * SHEAR_FLOOR_M)).sqrt();
-    let mobilised = strength * shear_fraction(j, soil);
+    let mobilised = strength * mobilised_share(j, per_modulus) / j;
     [mobilised * j_x, mobilised * j_y]
 }
 
@@ -193,11 +194,11 @@ fn shear_along_rim<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactM
 /// j_x = r [(sin θ_1 - sin θ) - (v_x / rΩ)(θ_1 - θ)], j_y = r (v_y / rΩ)(θ_1 - θ). Neglects that soil sheared by a front wheel stays sheared, and the path of a
 /// point that slides forth and back.
 #[inline(always)]
-fn shear_in_surface<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactMotion<T>, strength: T, soil: &Soil<T>) -> [T; 2] {
+fn shear_in_surface<T: Real>(radius: f64, at: &ContactPoint<T>, motion: &ContactMotion<T>, strength: T, per_modulus: T) -> [T; 2] {
     let j_x = (motion.rim_ratio * (at.sin_entry - at.sin) - motion.travel_ratio * at.swept) * T::lit(radius);
     let j_y = motion.lateral_ratio * at.swept * T::lit(radius);
     let j = (j_x * j_x + j_y * j_y + T::lit(SHEAR_FLOOR_M * SHEAR_FLOOR_M)).sqrt();
     let (u_x, u_y) = (motion.rim_ratio * at.cos - motion.travel_ratio, motion.lateral_ratio);
-    let mobilised = strength * shear_fraction(j, soil) * j / (u_x * u_x + u_y * u_y + T::lit(SLIDING_FLOOR * SLIDING_FLOOR)).sqrt();
+    let mobilised = strength * mobilised_share(j, per_modulus) / (u_x * u_x + u_y * u_y + T::lit(SLIDING_FLOOR * SLIDING_FLOOR)).sqrt();
     [mobilised * u_x, mobilised * u_y]
 }
