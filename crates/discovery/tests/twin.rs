@@ -94,7 +94,7 @@ fn property_a_hypothesis_that_the_reference_does_not_know_is_refused() {
     let bundle = bundle();
     let drives = [drive("d", 1, &[], &bundle.default_soil)];
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
-    let error = nesam_discovery::diagnose(&predictor, &drives, &vec![Some(world())], &options, &|_, _, _| {}).unwrap_err().to_string();
+    let error = nesam_discovery::diagnose(&predictor, &drives, &[Some(world())], &options, &|_, _, _| {}).unwrap_err().to_string();
     assert!(error.contains("another") && error.contains("--make-reference"), "{error}");
 }
 

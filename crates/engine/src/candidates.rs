@@ -55,7 +55,7 @@ impl Drawing {
     /// `EngineError::Invalid` naming the field below `drawing`.
     pub fn check(&self) -> Result<(), EngineError> {
         for (field, sd) in ["speed_sd_m_s", "second_sd"].iter().zip(self.sd) {
-            if !(sd >= 0.0 && sd <= 1e6) {
+            if !(0.0..=1e6).contains(&sd) {
                 return Err(EngineError::invalid(format!("drawing.{field}"), format!("is {sd}, allowed are 0 to 1e6")));
             }
         }

@@ -59,7 +59,7 @@ impl PathCost {
     pub fn check(&self, samples: usize) -> Result<(), EngineError> {
         let fail = |field: &str, reason: String| Err(EngineError::invalid(format!("cost.{field}"), reason));
         let points = self.path.len() / 2;
-        if self.path.len() % 2 != 0 || !(2..=POINTS_MAX).contains(&points) {
+        if !self.path.len().is_multiple_of(2) || !(2..=POINTS_MAX).contains(&points) {
             return fail("path", format!("has {} numbers, allowed are 2 to {POINTS_MAX} points of two", self.path.len()));
         }
         if !self.path.iter().all(|v| v.is_finite()) {
@@ -75,7 +75,7 @@ impl PathCost {
             ("temperature", self.temperature),
         ];
         for (field, value) in at_least_0 {
-            if !(value >= 0.0 && value <= 1e12) {
+            if !(0.0..=1e12).contains(&value) {
                 return fail(field, format!("is {value}, allowed are 0 to 1e12"));
             }
         }

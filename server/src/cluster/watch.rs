@@ -30,10 +30,10 @@ impl Cluster {
     pub(super) async fn compact(self) {
         let mut before = None;
         loop {
-            if let Ok(now) = self.0.etcd.all(Vec::new()).await {
-                if let Some(revision) = before.replace(now.revision) {
-                    let _ = self.0.etcd.compact(revision).await;
-                }
+            if let Ok(now) = self.0.etcd.all(Vec::new()).await
+                && let Some(revision) = before.replace(now.revision)
+            {
+                let _ = self.0.etcd.compact(revision).await;
             }
             tokio::time::sleep(COMPACT_EVERY).await;
         }

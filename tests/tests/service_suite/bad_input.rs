@@ -186,7 +186,7 @@ async fn service_bad_sessions_are_refused() {
         ("initial incomplete", v1::OpenSessionRequest { initial: Some(incomplete), ..good() }, InvalidArgument, "initial.state"),
     ] {
         assert_refused(what, client.open_session(request).await, code, field);
-        assert_eq!(client.list_sessions().await.unwrap(), [before.clone()], "{what}");
+        assert_eq!(client.list_sessions().await.unwrap(), std::slice::from_ref(&before), "{what}");
     }
     assert_refused("get", client.session("nobody").await, NotFound, "session_id");
     assert_refused("close", client.close_session("nobody").await, NotFound, "session_id");

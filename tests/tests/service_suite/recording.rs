@@ -173,7 +173,7 @@ async fn service_what_was_changed_is_found() {
     let parts = record(folder.path(), |_| {}).await;
     let other = folder.path().join("edited");
     edited(&parts[0], &other, |_, _, _| true);
-    assert!(replayed(&[other.clone()]).all_equal(), "the copy loop changes nothing");
+    assert!(replayed(std::slice::from_ref(&other)).all_equal(), "the copy loop changes nothing");
 
     let mut done = false;
     edited(&parts[0], &other, |topic, _, data| {
@@ -186,7 +186,7 @@ async fn service_what_was_changed_is_found() {
         }
         true
     });
-    let report = replayed(&[other.clone()]);
+    let report = replayed(std::slice::from_ref(&other));
     let first = report.first_difference.clone().unwrap();
     assert_eq!((report.total().different, first.field.field.as_str(), first.message.as_str()), (1, "states[5]", "nesam.v1.PredictReply"));
     assert!(!report.all_equal() && first.session == "s" && first.field.recorded != first.field.replayed, "{first:?}");
@@ -200,11 +200,11 @@ async fn service_what_was_changed_is_found() {
         }
         true
     });
-    assert!(replayed(&[other.clone()]).total().different > 0);
+    assert!(replayed(std::slice::from_ref(&other)).total().different > 0);
 
     // A command that is missing ends the replay, and what was before it is compared.
     edited(&parts[0], &other, |_, sequence, _| sequence != 20);
-    let report = replayed(&[other.clone()]);
+    let report = replayed(std::slice::from_ref(&other));
     assert_eq!((report.ending.clone(), report.total().equal), (Some(Ending::Missing { commands: 1, first: 20 }), 19), "{report:?}");
 
     // A message that nobody knows, and bits that fell over.
@@ -214,7 +214,7 @@ async fn service_what_was_changed_is_found() {
         }
         true
     });
-    let mut recording = Recording::open(&[other.clone()]).unwrap();
+    let mut recording = Recording::open(std::slice::from_ref(&other)).unwrap();
     let error = replay(&mut recording, predictor(), false, &mut |_| {}).unwrap_err();
     assert!(error.to_string().contains("cannot be read"), "{error}");
     let mut bytes = std::fs::read(&parts[0]).unwrap();
@@ -246,7 +246,7 @@ async fn service_a_cut_recording_is_read_as_far_as_it_goes_and_garbage_is_refuse
     let (mut most, mut opened) = (0, 0);
     for i in 0..60 {
         std::fs::write(&cut, &bytes[..bytes.len() * i / 60]).unwrap();
-        let Ok(mut recording) = Recording::open(&[cut.clone()]) else { continue };
+        let Ok(mut recording) = Recording::open(std::slice::from_ref(&cut)) else { continue };
         let mut commands = 0;
         while recording.next_command().unwrap().is_some() {
             commands += 1;
@@ -257,7 +257,7 @@ async fn service_a_cut_recording_is_read_as_far_as_it_goes_and_garbage_is_refuse
         assert!(recording.ending() == Some(&Ending::CutOff) || commands > 60, "{:?}", recording.ending());
     }
     assert!(opened > 50 && most > 0);
-    let report = replayed(&[cut.clone()]);
+    let report = replayed(std::slice::from_ref(&cut));
     assert!(report.all_equal(), "{report:?}");
 
     let mut foreign = Writer::create(Vec::new(), "", "somebody").unwrap();
@@ -269,13 +269,13 @@ async fn service_a_cut_recording_is_read_as_far_as_it_goes_and_garbage_is_refuse
         (foreign.finish().unwrap(), "no recording of nesam"),
     ] {
         std::fs::write(&cut, content).unwrap();
-        let message = Recording::open(&[cut.clone()]).unwrap_err().to_string();
+        let message = Recording::open(std::slice::from_ref(&cut)).unwrap_err().to_string();
         assert!(message.contains(words) && message.contains("cut"), "{message}");
     }
     // Random bytes after the magic neither panic nor hang.
     for garbage in garbage(17, 200) {
         std::fs::write(&cut, [&nesam_mcap::MAGIC[..], garbage.as_ref()].concat()).unwrap();
-        assert!(Recording::open(&[cut.clone()]).is_err());
+        assert!(Recording::open(std::slice::from_ref(&cut)).is_err());
     }
     assert!(Recording::open(&[folder.path().join("absent.mcap")]).unwrap_err().to_string().contains("absent.mcap"));
 }

@@ -324,10 +324,10 @@ struct Console {
 impl Console {
     fn show(&self, stage: &str, done: usize, total: usize) {
         let Ok(mut now) = self.stage.lock() else { return };
-        if now.as_ref().is_none_or(|(name, _)| name != stage) {
-            if let Some((_, ended)) = now.replace((stage.to_string(), Progress::start(stage, total))) {
-                ended.finish();
-            }
+        if now.as_ref().is_none_or(|(name, _)| name != stage)
+            && let Some((_, ended)) = now.replace((stage.to_string(), Progress::start(stage, total)))
+        {
+            ended.finish();
         }
         if let Some((_, progress)) = now.as_ref() {
             progress.set(done);

@@ -99,18 +99,18 @@ struct Console {
 
 impl Reporter for Console {
     fn stage(&self, name: &str, total: usize) {
-        if let Ok(mut stage) = self.stage.lock() {
-            if let Some(done) = stage.replace(Progress::start(name, total)) {
-                done.finish();
-            }
+        if let Ok(mut stage) = self.stage.lock()
+            && let Some(done) = stage.replace(Progress::start(name, total))
+        {
+            done.finish();
         }
     }
 
     fn progress(&self, done: usize, remark: &str) {
-        if let Ok(stage) = self.stage.lock() {
-            if let Some(progress) = stage.as_ref() {
-                progress.set_with(done, remark);
-            }
+        if let Ok(stage) = self.stage.lock()
+            && let Some(progress) = stage.as_ref()
+        {
+            progress.set_with(done, remark);
         }
     }
 

@@ -65,6 +65,7 @@ impl<T: Real, const N: usize> Sub for Dual<T, N> {
 impl<T: Real, const N: usize> Mul for Dual<T, N> {
     type Output = Self;
     #[inline(always)]
+    #[allow(clippy::suspicious_arithmetic_impl)] // The product rule is a sum.
     fn mul(self, other: Self) -> Self {
         let product_rule = |a, b| a * other.re + self.re * b;
         self.zip(other, self.re * other.re, product_rule)

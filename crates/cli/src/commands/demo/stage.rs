@@ -199,7 +199,7 @@ impl Stage {
                     state.newest = Some(prediction);
                 }
                 planned.send_replace(Some(at));
-                if regions && cycles % REGION_EVERY == 0 {
+                if regions && cycles.is_multiple_of(REGION_EVERY) {
                     let extras = Some(v1::PredictExtras { covariance: true, ..Default::default() });
                     // A bundle that does not know its errors refuses; it need not be asked again.
                     regions = client.predict(Candidates { extras, ..Candidates::new(NAME, 1, HORIZON, driver) }).await.is_ok();

@@ -72,7 +72,7 @@ impl Player {
     }
 
     async fn wait_for_plan(&mut self, i: usize) {
-        if i % FAST_STRIDE == 0 && i < self.plan_until {
+        if i.is_multiple_of(FAST_STRIDE) && i < self.plan_until {
             let _ = self.planned.wait_for(|planned| planned.is_some_and(|p| p >= i)).await;
         }
     }

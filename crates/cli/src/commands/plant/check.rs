@@ -94,7 +94,7 @@ fn compare(vehicle: &Arc<PlantVehicle>, ground: &Arc<Ground>, drive: &Trajectory
     let mut compared = Vec::new();
     for i in 0..samples.saturating_sub(FREE_STEPS) {
         plant.set_state(&state(i), truth.wheel_speed_rad_s[i], truth.steering_actuator[i]);
-        if i >= FIRST && (i - FIRST) % EVERY == 0 {
+        if i >= FIRST && (i - FIRST).is_multiple_of(EVERY) {
             let mut free = plant.clone();
             for k in 1..=FREE_STEPS {
                 free.advance(command(i + k - 1));
