@@ -41,20 +41,9 @@ impl Kernel for PhysicsStep<'_> {
     type Output = PhysicsOutput;
     #[inline(always)]
     fn run<V: Vector>(self) -> PhysicsOutput {
-        let mut varying = [Numbers(V::splat(0.0)); DIFFERENTIABLE];
-        for (number, lane) in varying.iter_mut().zip(self.varying) {
-            *number = Numbers(V::load(&lane.0));
-        }
-        let mut constant = [Numbers(V::splat(0.0)); CONSTANT];
-        for (number, lane) in constant.iter_mut().zip(self.constant) {
-            *number = Numbers(V::load(&lane.0));
-        }
-        let input = step_input(varying, constant);
+        let input = step_input(from_lanes::<V, _>(self.varying), from_lanes(self.constant));
         let output = symbolic_step_by(self.variant, self.model, &input, |rolling, wheel| sink(self.path, rolling, wheel));
-        let mut increment = [Lane::ZERO; STATE_DIM];
-        for (lane, number) in increment.iter_mut().zip(output.increment.to_array()) {
-            number.0.store(&mut lane.0);
-        }
+        let increment = to_lanes(output.increment.to_array());
         let mut sinkage_m = [Lane::ZERO; WHEELS];
         for (lane, contact) in sinkage_m.iter_mut().zip(&output.contacts) {
             contact.sinkage_m.0.store(&mut lane.0);
@@ -74,23 +63,23 @@ impl Kernel for Sink<'_> {
     type Output = [Lane; SUNK];
     #[inline(always)]
     fn run<V: Vector>(self) -> Self::Output {
-        let mut numbers = [Numbers(V::splat(0.0)); ROLLING];
-        for (number, lane) in numbers.iter_mut().zip(&self.rolling) {
-            *number = Numbers(V::load(&lane.0));
-        }
-        to_lanes(Rolling::from_array(numbers).sink(self.wheel).to_array())
+        to_lanes(Rolling::from_array(from_lanes::<V, _>(&self.rolling)).sink(self.wheel).to_array())
     }
 }
 
 /// The contact of a wheel, worked out on a path, from vectors of another and back.
 #[inline(always)]
 fn sink<V: Vector>(path: Path, rolling: &Rolling<Numbers<V>>, wheel: &WheelGeometry) -> Sunk<Numbers<V>> {
-    let lanes = path.run(Sink { wheel, rolling: to_lanes(rolling.to_array()) });
-    let mut sunk = [Numbers(V::splat(0.0)); SUNK];
-    for (number, lane) in sunk.iter_mut().zip(&lanes) {
+    Sunk::from_array(from_lanes(&path.run(Sink { wheel, rolling: to_lanes(rolling.to_array()) })))
+}
+
+#[inline(always)]
+fn from_lanes<V: Vector, const N: usize>(lanes: &[Lane; N]) -> [Numbers<V>; N] {
+    let mut numbers = [Numbers(V::splat(0.0)); N];
+    for (number, lane) in numbers.iter_mut().zip(lanes) {
         *number = Numbers(V::load(&lane.0));
     }
-    Sunk::from_array(sunk)
+    numbers
 }
 
 #[inline(always)]
