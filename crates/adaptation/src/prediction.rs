@@ -23,6 +23,8 @@ pub struct BufferedTransition {
     pub residual: [f64; STATE_DIM],
     /// Measured y_{k+1} = [v, ω] in Body, m/s and rad/s.
     pub measured_next: [f64; VELOCITY_DIM],
+    /// Share of a lasting resistance that the actuators were observed to make up for before x_k ([`StepModel::observed_share`]); 0 where they are what they are.
+    pub observed_share: f64,
     /// Class of the ground by its look; 0 = not told. Each class has a correction of its own, see [`crate::FilterConfig::classes`].
     pub ground_class: usize,
 }
@@ -31,7 +33,7 @@ impl BufferedTransition {
     /// A transition that ended in a measured state.
     pub fn new(input: StepInput<f64>, residual: [f64; STATE_DIM], end: &VehicleState<f64>) -> Self {
         let ([vx, vy, vz], [wx, wy, wz]) = (end.velocity_m_s, end.angular_velocity_rad_s);
-        Self { input, residual, measured_next: [vx, vy, vz, wx, wy, wz], ground_class: 0 }
+        Self { input, residual, measured_next: [vx, vy, vz, wx, wy, wz], observed_share: 0.0, ground_class: 0 }
     }
 }
 
@@ -47,7 +49,8 @@ pub struct VelocityPrediction {
 /// ŷ_{k+1} = V(F(x_k, u_k, m_k; clip(θ̄_k ⊕ Δθ))) and its Jacobian, in one pass of the physics over dual numbers.
 pub fn predict_velocity(model: &StepModel, transition: &BufferedTransition, correction: &SoilCorrection) -> VelocityPrediction {
     let start = transition.input.state.to_array().map(SoilDual::constant);
-    prediction_of(&next_state(model, transition, &start, corrected(transition, correction, &variables(correction))))
+    let soil = corrected(transition, correction, &variables(correction));
+    prediction_of(&next_state(model, transition, &start, soil, made_up_for_m_s(model, transition, &soil)))
 }
 
 /// The same after every transition of a buffer, each starting where the prediction before it ended; only the first starts from a
@@ -64,6 +67,7 @@ pub(crate) fn predict_along(
 ) -> Vec<VelocityPrediction> {
     let Some(first) = buffer.first() else { return Vec::new() };
     let mut state = first.input.state.to_array().map(SoilDual::constant);
+    let mut made_up_for = None;
     buffer
         .iter()
         .map(|transition| {
@@ -71,7 +75,8 @@ pub(crate) fn predict_along(
             let delta = if varies(transition) { variables(&correction) } else { correction.delta.map(SoilDual::constant) };
             let mut soil = corrected(transition, &correction, &delta);
             with_first_slope(&mut soil, &transition.input.soil, correction.coordinates);
-            state = next_state(model, transition, &state, soil);
+            let made_up_for = *made_up_for.get_or_insert_with(|| made_up_for_m_s(model, transition, &soil));
+            state = next_state(model, transition, &state, soil, made_up_for);
             prediction_of(&state)
         })
         .collect()
@@ -85,9 +90,12 @@ pub(crate) fn velocities_along(
 ) -> Vec<[f64; VELOCITY_DIM]> {
     let Some(first) = buffer.first() else { return Vec::new() };
     let mut state = first.input.state.to_array();
+    let mut made_up_for = None;
     let velocities = buffer.iter().map(|transition| {
         let correction = correction(transition);
-        state = next_state(model, transition, &state, corrected(transition, &correction, &correction.delta));
+        let soil = corrected(transition, &correction, &correction.delta);
+        let made_up_for = *made_up_for.get_or_insert_with(|| made_up_for_m_s(model, transition, &soil));
+        state = next_state(model, transition, &state, soil, made_up_for);
         core::array::from_fn(|c| state[VELOCITY_AT + c])
     });
     velocities.collect()
@@ -113,10 +121,24 @@ fn with_first_slope(soil: &mut [SoilDual; SOIL_DIM], prior: &Soil<f64>, coordina
 }
 
 /// x̂_{k+1} from x_k on a soil; x, y and yaw are carried along without meaning, as the physics reads none of them.
-fn next_state<T: Real>(model: &StepModel, transition: &BufferedTransition, state: &[T; STATE_DIM], soil: [T; SOIL_DIM]) -> [T; STATE_DIM] {
-    let input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
+fn next_state<T: Real>(
+    model: &StepModel,
+    transition: &BufferedTransition,
+    state: &[T; STATE_DIM],
+    soil: [T; SOIL_DIM],
+    made_up_for_m_s: T,
+) -> [T; STATE_DIM] {
+    let mut input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
+    input.wheels.rim_base_m_s = input.wheels.rim_base_m_s.map(|base| base + made_up_for_m_s);
     let increment = model.step(&input).increment.to_array();
     core::array::from_fn(|i| state[i] + increment[i] + T::lit(transition.residual[i]))
+}
+
+/// What the speed control demands beyond what the transition knows because the soil is not its prior: constant over a buffer, as an integral that hardly forgets is.
+fn made_up_for_m_s<T: Real<Value = f64>>(model: &StepModel, transition: &BufferedTransition, soil: &[T; SOIL_DIM]) -> T {
+    let speed_m_s = T::lit(transition.input.state.velocity_m_s[0]);
+    let integral_m = model.compaction_made_up_for_m(&transition.input.soil, &Soil::from_array(*soil), speed_m_s, transition.observed_share);
+    integral_m * T::lit(model.vehicle().driveline.speed_integral_gain_per_s)
 }
 
 fn prediction_of(state: &[SoilDual; STATE_DIM]) -> VelocityPrediction {

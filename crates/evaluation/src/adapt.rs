@@ -226,7 +226,11 @@ fn buffer_at(
     let seen = |(t, end): (Transition, &HistoryStep)| {
         let [x, y, _] = t.input.state.position_m;
         let ground_class = SoilByClass::class_at(Some(map), [x, y]);
-        BufferedTransition { ground_class, ..BufferedTransition::new(t.input, t.residual, &predictor.true_state(&end.state)) }
+        BufferedTransition {
+            observed_share: t.observed_share,
+            ground_class,
+            ..BufferedTransition::new(t.input, t.residual, &predictor.true_state(&end.state))
+        }
     };
     Some(both.map(seen).collect())
 }

@@ -29,35 +29,40 @@ const SCHEMA: &str = "message predictions {
     optional double yaw;
 }";
 
-/// Writes one row per model, window and step: model, trajectory, t0 (s, time of the start in the drive), k (1…K), x, y, z (m), roll,
+/// Writes one row per named model, window and step: model, trajectory, t0 (s, time of the start in the drive), k (1…K), x, y, z (m), roll,
 /// pitch, yaw (rad). What a model does not predict is null. One row group per model, zstd.
 ///
 /// # Errors
 /// `EvaluationError::File` when the file cannot be written.
-pub fn write_predictions(path: &Path, models: &[ModelPaths], windows: &[Window<'_>]) -> Result<(), EvaluationError> {
+pub fn write_predictions(path: &Path, models: &[(&str, &ModelPaths)], windows: &[Window<'_>]) -> Result<(), EvaluationError> {
     write(path, models, windows).map_err(|e| EvaluationError::file(path, e))
 }
 
-fn write(path: &Path, models: &[ModelPaths], windows: &[Window<'_>]) -> Result<(), ParquetError> {
+fn write(path: &Path, models: &[(&str, &ModelPaths)], windows: &[Window<'_>]) -> Result<(), ParquetError> {
     let schema = Arc::new(parse_message_type(SCHEMA)?);
     let properties = WriterProperties::builder().set_compression(Compression::ZSTD(ZstdLevel::default())).build();
     let file = File::create(path)?;
     let mut writer = SerializedFileWriter::new(file, schema, Arc::new(properties))?;
-    for model in models {
+    for (name, model) in models {
         let mut group = writer.next_row_group()?;
-        write_model(&mut group, model, windows)?;
+        write_model(&mut group, name, model, windows)?;
         group.close()?;
     }
     writer.close()?;
     Ok(())
 }
 
-fn write_model(group: &mut SerializedRowGroupWriter<'_, File>, model: &ModelPaths, windows: &[Window<'_>]) -> Result<(), ParquetError> {
+fn write_model(
+    group: &mut SerializedRowGroupWriter<'_, File>,
+    name: &str,
+    model: &ModelPaths,
+    windows: &[Window<'_>],
+) -> Result<(), ParquetError> {
     let steps = |w: &Window<'_>| w.horizon;
     let repeat = |make: &dyn Fn(&Window<'_>) -> ByteArray| -> Vec<ByteArray> {
         windows.iter().flat_map(|w| std::iter::repeat_n(make(w), steps(w))).collect()
     };
-    text(group, &repeat(&|_| ByteArray::from(model.name.as_str())))?;
+    text(group, &repeat(&|_| ByteArray::from(name)))?;
     text(group, &repeat(&|w| ByteArray::from(w.trajectory.id.as_str())))?;
     let t0: Vec<f64> = windows.iter().flat_map(|w| std::iter::repeat_n(w.start_time_s(), steps(w))).collect();
     number(group, &t0, None)?;

@@ -84,7 +84,7 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
 
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("p.parquet");
-    write_predictions(&file, &paths, &windows).unwrap();
+    write_predictions(&file, &paths.iter().map(|p| (p.name.as_str(), p)).collect::<Vec<_>>(), &windows).unwrap();
     let reader = SerializedFileReader::new(File::open(&file).unwrap()).unwrap();
     let (mut x_sum, mut yaw_final, mut rows) = (0.0, 0.0, 0usize);
     for row in reader.get_row_iter(None).unwrap() {

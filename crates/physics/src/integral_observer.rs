@@ -4,9 +4,14 @@
 //! does not tell how far, if the integral is rebuilt from speed errors alone. The motion tells: whatever force moved the vehicle, its drive was asked for.
 
 use crate::driveline::{DrivelineState, limited, unlimited};
+use crate::scalar::Real;
+use crate::soil::Soil;
 use crate::state::{Control, VehicleState};
 use crate::step::StepModel;
+use crate::terramechanics::bekker_sinkage;
+use crate::torque_drive::Grip;
 use crate::vec3::Tilt;
+use crate::vehicle::WHEELS;
 
 /// Slowest motion that says something of the drive, m/s (chosen: below it a climb per way is noise).
 const SLOWEST_M_S: f64 = 0.3;
@@ -55,6 +60,35 @@ impl StepModel {
         let rate = (torque.integral_observer_per_s * dt_s).min(1.0);
         let kept = advanced.speed_error_integral_m;
         DrivelineState { speed_error_integral_m: kept + rate * (integral - kept), ..*advanced }
+    }
+
+    /// The share of a lasting resistance that an integral has been drawn to after so many observed steps.
+    pub fn observed_share(&self, steps: usize) -> f64 {
+        let torque = self.vehicle().driveline.torque.as_ref();
+        torque.map_or(0.0, |torque| 1.0 - (1.0 - torque.integral_observer_per_s * self.dt_s()).clamp(0.0, 1.0).powi(steps as i32))
+    }
+
+    /// What the integral of the speed error, m, has been drawn to beyond [`StepModel::observed_actuators`] where the ground is not the `prior` soil, whose compaction is
+    /// in the usual resistance, but another one: the demand that compaction asks for on the one less that on the other, over the gain. `share` of it is
+    /// told by the history ([`StepModel::observed_share`]). Without it a softer soil predicts a slowing that the speed control made up for long ago.
+    ///
+    /// Compaction is that of four wheels which carry the weight alike at Bekker's static sinkage. Zero at and near rest and where no torque drives the hubs.
+    pub fn compaction_made_up_for_m<T: Real<Value = f64>>(&self, prior: &Soil<f64>, soil: &Soil<T>, speed_m_s: T, share: f64) -> T {
+        let line = &self.vehicle().driveline;
+        let driven = line.torque.as_ref().filter(|_| share > 0.0 && line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S);
+        let Some(torque) = driven.filter(|_| speed_m_s.value() >= SLOWEST_M_S) else { return T::lit(0.0) };
+        let force_n = T::lit(WHEELS as f64) * (self.compaction_n(soil) - T::lit(self.compaction_n(prior)));
+        let engine = 1.0 - self.vehicle().effects.actuator.torque_lost;
+        let demand = force_n * T::lit(self.vehicle().wheel_radius_m) / torque.opened_n_m_per_demand(speed_m_s, engine);
+        let limit = UNSATURATED * line.overspeed_limit_m_s;
+        demand.max(T::lit(-limit)).min(T::lit(limit)) * T::lit(share / line.speed_integral_gain_per_s)
+    }
+
+    /// Force at the rim that compaction takes of a wheel which carries its share of the weight, N.
+    fn compaction_n<T: Real>(&self, soil: &Soil<T>) -> T {
+        let (vehicle, wheel) = (self.vehicle(), &self.wheel);
+        let load_n = T::lit(self.body.mass_kg * vehicle.gravity_m_s2 / WHEELS as f64);
+        Grip::new(wheel, bekker_sinkage(load_n, wheel.radius_m, wheel.width_m, soil), load_n, soil).compaction_n
     }
 
     /// What effects hold against a vehicle that goes straight ahead on level ground at a speed (m/s) above rest, N.

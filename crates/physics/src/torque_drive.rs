@@ -38,7 +38,7 @@ pub(crate) struct Grip<T> {
     /// Length of the contact, m.
     length_m: T,
     /// Force at the rim that compaction takes of the torque, N.
-    compaction_n: T,
+    pub(crate) compaction_n: T,
     /// Slip at which the shear of front and bottom balance, -.
     neutral_slip: T,
 }

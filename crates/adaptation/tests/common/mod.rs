@@ -56,6 +56,7 @@ pub fn twin(model: &StepModel, true_soil: [f64; SOIL_DIM], prior: [f64; SOIL_DIM
             input: StepInput { soil: Soil::from_array(prior), ..input },
             residual: [0.0; 12],
             measured_next,
+            observed_share: 0.0,
             ground_class: 0,
         });
     }

@@ -9,13 +9,15 @@ use std::sync::Arc;
 use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, Disguise, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, ModelName, Resamples, Truth,
-    WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score,
+    Adaptation, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, ModelName, Resamples, Row, Truth, WindowPredictor,
+    adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score, write_predictions,
 };
 use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
-use nesam_terrain::WorldMap;
+use nesam_terrain::{Disguise, WorldMap};
 use nesam_trajectories::Trajectory;
+use rand::{RngExt, SeedableRng};
+use rand_chacha::ChaCha8Rng;
 
 use self::alternatives::Scene;
 use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
@@ -63,7 +65,7 @@ pub struct AdaptArgs {
     /// Score against the noise-free channels, where a set has them
     #[arg(long, value_name = "CHANNELS", value_parser = ["measured", "gt"], default_value = "measured")]
     truth: String,
-    /// Seed of the bootstrap
+    /// Seed of the bootstrap and of what --disguise draws
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Folder for adapt.json and adapt.html [default: nesam-out/adapt-<set>]
@@ -75,12 +77,20 @@ pub struct AdaptArgs {
     /// Write the HTML report here instead
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
+    /// Write every predicted pose of every row of the table as Parquet: model, trajectory, t0, k, x, y, z, roll, pitch, yaw
+    #[arg(long, value_name = "FILE.parquet", conflicts_with = "calibrate")]
+    predictions: Option<PathBuf>,
 }
 
 /// Degrees of freedom of Student's t that a calibrated filter has (chosen on validation drives and o01-o06 of `ood_soil`).
 const TAIL_DOF: f64 = 4.0;
 /// What it makes of heave, roll and pitch, order vx, vy, vz, ωx, ωy, ωz (chosen on the same, ADR 0048).
 const CAUTION: [f64; 6] = [1.0, 1.0, 3.0, 3.0, 3.0, 1.0];
+
+/// Standard deviation of the soil prior that it begins with, in the coordinates of a correction: half as wide again as the default (chosen on the same, ADR 0050).
+const PRIOR_SD: [f64; 6] = [1.05, 1.05, 0.225, 0.75, 0.12, 0.6];
+/// What of it the soil moves from buffer to buffer.
+const PROCESS_SHARE: f64 = 0.1;
 
 /// What else is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -105,6 +115,8 @@ enum DisguiseArg {
     Firmer,
     /// Like the next softer class.
     Softer,
+    /// Some classes firmer, some softer, some as they are, in each world by the seed.
+    Mixed,
 }
 
 /// Runs the command.
@@ -118,7 +130,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
     let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
     if let Some(look) = args.disguise {
-        disguise(&mut drives, look)?;
+        disguise(&mut drives, look, args.seed)?;
     }
     let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
     let horizon = args.window.horizon_on(&drives.drives);
@@ -140,8 +152,14 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     progress.finish();
     let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed);
     let [fixed, adapted] = [0, 1].map(|i| score(&paths[i], &windows, truth, &resamples));
-    let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth, resamples: &resamples };
-    let others = args.also.iter().map(|also| scene.row(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
+    let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth };
+    let others = args.also.iter().map(|also| scene.paths(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
+    if let Some(file) = &args.predictions {
+        let named: Vec<_> =
+            [("fixed", &paths[0]), ("adapted", &paths[1])].into_iter().chain(others.iter().map(|(key, p)| (*key, p))).collect();
+        write_predictions(file, &named, &windows).or_failed()?;
+    }
+    let others: Vec<Row> = others.iter().map(|(key, paths)| Row { key, score: score(paths, &windows, truth, &resamples) }).collect();
     let apart = apart(&drives.drives, &args.apart)?;
     let reference = args.reference.as_deref().map(|set| Ok((set, reference(args, set, horizon, &predictor)?))).transpose()?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
@@ -213,14 +231,16 @@ pub(super) fn filter_in_force(given: &FilterSettings, literal: bool, bundle: &Mo
 }
 
 /// Repaints the map of every drive, each world once.
-fn disguise(drives: &mut Drives, look: DisguiseArg) -> Result<(), Failure> {
-    let disguise = match look {
-        DisguiseArg::Firmer => Disguise::Firmer,
-        DisguiseArg::Softer => Disguise::Softer,
-    };
+fn disguise(drives: &mut Drives, look: DisguiseArg, seed: u64) -> Result<(), Failure> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut painted: BTreeMap<String, Arc<WorldMap>> = BTreeMap::new();
     for map in drives.maps.iter_mut().flatten() {
         if !painted.contains_key(map.hash()) {
+            let disguise = match look {
+                DisguiseArg::Firmer => Disguise::Firmer,
+                DisguiseArg::Softer => Disguise::Softer,
+                DisguiseArg::Mixed => Disguise::Mixed(rng.random()),
+            };
             let other =
                 disguise.of(map).ok_or_else(|| Failure::input(format!("map {} states no colours of soil classes to repaint", map.id())))?;
             painted.insert(map.hash().into(), Arc::new(other));
@@ -238,6 +258,8 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);
+    let prior_sd = *given.prior_sd.get_or_insert(PRIOR_SD);
+    given.process_sd.get_or_insert(prior_sd.map(|sd| PROCESS_SHARE * sd));
     given.caution.get_or_insert(CAUTION);
     if !args.follow_errors {
         given.shared_error_covariance = Some(Vec::new());

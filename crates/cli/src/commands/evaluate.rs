@@ -201,7 +201,8 @@ fn write_results(
         say!("wrote {}", file.display());
     }
     if let Some(file) = &args.predictions {
-        write_predictions(file, paths, windows).or_failed()?;
+        let named: Vec<_> = paths.iter().map(|model| (model.name.as_str(), model)).collect();
+        write_predictions(file, &named, windows).or_failed()?;
         say!("wrote {}", file.display());
     }
     Ok(())

@@ -184,7 +184,8 @@ impl SoilLearner {
             let [x, y, _] = transition.input.state.position_m;
             let ground_class = SoilByClass::class_at(Some(map), [x, y]);
             let end = predictor.true_state(&end.state);
-            BufferedTransition { ground_class, ..BufferedTransition::new(transition.input, transition.residual, &end) }
+            let seen = BufferedTransition::new(transition.input, transition.residual, &end);
+            BufferedTransition { observed_share: transition.observed_share, ground_class, ..seen }
         });
         Some(buffered.collect())
     }

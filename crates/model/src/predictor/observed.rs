@@ -4,7 +4,7 @@ use std::borrow::Cow;
 
 use nesam_physics::driveline::DrivelineState;
 use nesam_physics::effects::SensorTerms;
-use nesam_physics::{Control, SOIL_DIM, VehicleState, wrap_angle};
+use nesam_physics::{Control, SOIL_DIM, Soil, VehicleState, wrap_angle};
 
 use super::Predictor;
 use crate::dims::HISTORY;
@@ -79,6 +79,14 @@ impl Predictor {
     ) -> DrivelineState {
         let model_before = |steps: usize| self.physics.at(clock.before(steps));
         actuators_along(model_before, history, start, first, model_before(0).dt_s())
+    }
+
+    /// What the integral of the speed error has been drawn to beyond [`Predictor::actuators`] at a start on a soil that is not the nominal one, m.
+    pub(super) fn made_up_for_m(&self, nominal: &Soil<f64>, soil: &Soil<f64>, start: &VehicleState<f64>, history_steps: usize) -> f64 {
+        let model = self.step_model();
+        // The last step before the start observes nothing (`actuators_along`).
+        let share = model.observed_share(history_steps.saturating_sub(1));
+        model.compaction_made_up_for_m(nominal, soil, start.velocity_m_s[0], share)
     }
 
     /// A soil at an instant of its drift.

@@ -6,20 +6,21 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, WHEELS};
+use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, WHEELS};
 use rayon::prelude::*;
 
 use super::block::{Block, Cache};
 use super::parts::PartClocks;
 use super::risk::RiskRow;
 use super::validate::{validate, validate_extras};
-use super::{LogClock, Predictor, Sample, control, pose, under};
+use super::{LogClock, Predictor, Sample, control, pose, raw_soil, under};
 use crate::ModelError;
 use crate::fused::{LANES, Prefix};
 use crate::ground::GroundSource;
 use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
+use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
-use crate::terrain_tokens::{Node, TerrainTokens};
+use crate::terrain_tokens::{Node, TerrainToken, TerrainTokens};
 
 /// Everything of a query that is the same for all samples.
 pub(super) struct Scene<'a> {
@@ -133,8 +134,11 @@ impl Predictor {
             flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
         };
         let shared = start(0);
-        let mut samples: Vec<Sample> = (0..rows).map(|row| if history.is_empty() { start(row) } else { shared }).collect();
         let under_start = self.terrain(scene.tokens, &[pose(&start_state)])[0];
+        let mut samples: Vec<Sample> = match history.is_empty() {
+            true => (0..rows).map(start).collect(),
+            false => self.observed_samples(&scene, shared, &under_start, history.len(), rows),
+        };
         let mut rollout = Rollout {
             states: vec![0.0; rows * query.horizon * STATE_DIM],
             sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
@@ -146,6 +150,33 @@ impl Predictor {
         let risk = self.roll_blocks(&scene, &mut samples, &mut rollout);
         rollout.flags = samples.iter().map(|s| s.flags).collect();
         Ok((rollout, risk))
+    }
+
+    /// Every row at the start after a history, which has also told what the speed control makes up for on the soil of the row.
+    fn observed_samples(
+        &self,
+        scene: &Scene<'_>,
+        shared: Sample,
+        under_start: &TerrainToken,
+        history_steps: usize,
+        rows: usize,
+    ) -> Vec<Sample> {
+        let now = |soil: [f64; SOIL_DIM]| Soil::from_array(self.soil_at(soil, scene.clock.before(0)));
+        let nominal = now(from_raw(&raw_soil(under_start)));
+        let mut known: Option<(Soil<f64>, Sample)> = None;
+        let of_row = |row: usize| {
+            let soil = now(under(scene.soil, row, &shared, under_start));
+            if let Some((before, sample)) = &known
+                && *before == soil
+            {
+                return *sample;
+            }
+            let mut sample = shared;
+            sample.actuators.speed_error_integral_m += self.made_up_for_m(&nominal, &soil, &shared.state, history_steps);
+            known = Some((soil, sample));
+            sample
+        };
+        (0..rows).map(of_row).collect()
     }
 
     /// Takes all samples through the horizon.

@@ -24,6 +24,8 @@ pub struct Transition {
     pub input: StepInput<f64>,
     /// Actuators before and after the step: what an effect in the actuator layer starts from.
     pub actuators: [DrivelineState; 2],
+    /// Share of a lasting resistance that the actuators were observed to make up for ([`nesam_physics::step::StepModel::observed_share`]), on the nominal soil.
+    pub observed_share: f64,
     /// Command of the step.
     pub control: Control<f64>,
     /// Learned state residual Δx_res: displacement in the heading frame (m), attitude (rad), velocities in Body.
@@ -75,6 +77,8 @@ impl Predictor {
             actuators: self.actuators(history, &start, first, clock),
             flags: 0,
         };
+        let observed_share = self.step_model().observed_share(history.len().saturating_sub(1));
+        let mut made_up_for_m_s = None;
         let mut transitions = Vec::with_capacity(controls.len());
         for control in controls {
             let token = self.terrain(tokens.as_deref(), &[pose(&sample.state)])[0];
@@ -82,13 +86,20 @@ impl Predictor {
             let lanes: [Row<1>; STATE_CONTROL] = entries.map(|entry| [Lane([entry; LANES])]);
             let context: [Row<1>; HIDDEN] = core::array::from_fn(|i| [Lane([token[i]; LANES])]);
             let said = self.network.step(&prefix, &mut cache, &lanes, &context);
-            let transition = Transition { hidden: cache.hidden(0), ..self.transition_from(&sample, control, &ground, &token, &said) };
+            let seen = self.transition_from(&sample, control, &ground, &token, &said);
+            let transition = Transition { hidden: cache.hidden(0), observed_share, ..seen };
             transitions.push(transition);
             if transitions.len() == controls.len() {
                 break; // nothing starts from the end of the last one
             }
             let soil = self.soil_at(under(soil, 0, &sample, &token), None);
-            let moved = self.step_model().step(&StepInput { soil: Soil::from_array(soil), ..transition.input }).increment.to_array();
+            let mut input = StepInput { soil: Soil::from_array(soil), ..transition.input };
+            let made_up_for_m_s = *made_up_for_m_s.get_or_insert_with(|| {
+                let integral_m = self.made_up_for_m(&transition.input.soil, &input.soil, &sample.state, history.len());
+                integral_m * self.step_model().vehicle().driveline.speed_integral_gain_per_s
+            });
+            input.wheels.rim_base_m_s = input.wheels.rim_base_m_s.map(|base| base + made_up_for_m_s);
+            let moved = self.step_model().step(&input).increment.to_array();
             let total = core::array::from_fn(|i| moved[i] + transition.residual[i]);
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
         }
@@ -161,6 +172,7 @@ impl Predictor {
                 ground: under_wheels,
             },
             actuators: [sample.actuators, after],
+            observed_share: 0.0,
             control: *control,
             residual: core::array::from_fn(|i| f64::from(said.residual[i][0][0] * scales.residual_scale[i])),
             hidden: [0.0; HIDDEN],

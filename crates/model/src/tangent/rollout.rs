@@ -41,6 +41,8 @@ pub struct TangentRollout<'a> {
     pub previous: Option<VehicleState<f64>>,
     /// Actuators after the history; `None` without a history, where they begin as start and first command say.
     pub actuators: Option<DrivelineState>,
+    /// Share of a lasting resistance that the history has told of.
+    pub observed_share: f64,
 }
 
 /// What moves from step to step.
@@ -71,6 +73,18 @@ impl TangentRollout<'_> {
             None => DrivelineState::starting(vehicle, &start, first),
         };
         Motion { state: start, previous: self.previous.map(|state| state.map(T::lit)), actuators }
+    }
+
+    /// The same where the speed control has also made up for what the soil is beyond the nominal one under the start.
+    fn on_soil<T: Number>(&self, motion: Motion<T>, delta: &[T; SOIL_DIM], under_start: &Scenery) -> Motion<T> {
+        let model = self.physics.at(self.clock.start_s);
+        let drift = &model.vehicle().effects.soil;
+        let nominal = Soil::from_array(drift.drifted(under_start.prior, self.clock.start_s));
+        let soil = Soil::from_array(drift.drifted(self.coordinates.correct(&under_start.prior, delta), self.clock.start_s));
+        let made_up_for = model.compaction_made_up_for_m(&nominal, &soil, motion.state.velocity_m_s[0], self.observed_share);
+        let mut actuators = motion.actuators;
+        actuators.speed_error_integral_m = actuators.speed_error_integral_m + made_up_for;
+        Motion { actuators, ..motion }
     }
 
     /// A true state after `k` steps as the sensors measure it.
@@ -174,8 +188,11 @@ impl<'a> Linearisation<'a> {
         let mut scenery = Vec::with_capacity(controls.len());
         let mut reported = Vec::with_capacity(controls.len());
         for (k, control) in controls.iter().enumerate() {
+            let seen = look(k, &motions[k].state);
+            if k == 0 {
+                motions[0] = shared.on_soil(motions[0], &delta, &seen);
+            }
             let motion = motions[k];
-            let seen = look(k, &motion.state);
             let next = shared.step(k, &motion, control, &delta, &seen, &mut cache);
             if !next.state.to_array().iter().all(|v| v.is_finite()) {
                 break;
@@ -218,6 +235,11 @@ impl<'a> Linearisation<'a> {
         control: impl Fn(usize) -> Control<T>,
         delta: &[T; SOIL_DIM],
     ) -> Vec<VehicleState<T>> {
+        if from == 0
+            && let Some(under_start) = self.scenery.first()
+        {
+            motion = self.shared.on_soil(motion, delta, under_start);
+        }
         (from..self.scenery.len())
             .map(|k| {
                 motion = self.shared.step(k, &motion, &control(k), delta, &self.scenery[k], cache);

@@ -4,8 +4,7 @@ use std::sync::Arc;
 
 use nesam_adaptation::FilterConfig;
 use nesam_evaluation::{
-    ModelName, ModelPaths, PosePath, Resamples, Row, TrueSoil, Truth, Window, WindowPredictor, adapt_all, best_correction, predict_all,
-    score,
+    ModelName, ModelPaths, PosePath, TrueSoil, Truth, Window, WindowPredictor, adapt_all, best_correction, predict_all,
 };
 use nesam_model::{Predictor, SoilField};
 use nesam_physics::SoilCorrection;
@@ -24,19 +23,15 @@ pub(super) struct Scene<'a> {
     pub(super) drives: &'a Drives,
     pub(super) windows: &'a [Window<'a>],
     pub(super) truth: Truth,
-    pub(super) resamples: &'a Resamples,
 }
 
 impl Scene<'_> {
-    /// Scores one of them; `filter` tells how wide the prior is.
-    pub(super) fn row(&self, also: AlsoArg, filter: &FilterConfig) -> Result<Row, Failure> {
+    /// What one of them predicts, by its key in the JSON; `filter` tells how wide the prior is.
+    pub(super) fn paths(&self, also: AlsoArg, filter: &FilterConfig) -> Result<(&'static str, ModelPaths), Failure> {
         let predictor = || Arc::clone(self.predictor);
         let on = |soils| WindowPredictor::OnSoil { predictor: predictor(), soils: Arc::new(soils) };
         let (key, model) = match also {
-            AlsoArg::ConstantElsewhere => {
-                let paths = self.constant_elsewhere(filter)?;
-                return Ok(Row { key: "constant_elsewhere", score: score(&paths, self.windows, self.truth, self.resamples) });
-            }
+            AlsoArg::ConstantElsewhere => return Ok(("constant_elsewhere", self.constant_elsewhere(filter)?)),
             AlsoArg::Literal => ("literal", WindowPredictor::Adapted { predictor: predictor(), filtered: Arc::new(self.literal()?) }),
             AlsoArg::OracleSoil => {
                 let soils = (0..self.drives.drives.len()).map(|d| Ok(self.true_soil(d)? as Arc<dyn SoilField>));
@@ -45,8 +40,8 @@ impl Scene<'_> {
             AlsoArg::BestConstant => ("best_constant", on(self.best(false, filter)?)),
             AlsoArg::BestByClass => ("best_by_class", on(self.best(true, filter)?)),
         };
-        let paths = predict_all(&[(ModelName::Nesam, model)], self.windows, &self.drives.maps, &|_| {}).or_failed()?;
-        Ok(Row { key, score: score(&paths[0], self.windows, self.truth, self.resamples) })
+        let mut paths = predict_all(&[(ModelName::Nesam, model)], self.windows, &self.drives.maps, &|_| {}).or_failed()?;
+        Ok((key, paths.remove(0)))
     }
 
     /// Each window predicted with the correction that other stretches of its drive ask for.

@@ -1,6 +1,7 @@
-//! Ground that is not what it looks like, made from drives on ordinary ground: how an adaptation is judged without a test set.
+//! Ground that is not what it looks like, made from drives on ordinary ground: how an adaptation is judged without a test set, and a network is trained
+//! not to believe its eyes alone.
 
-use nesam_terrain::{SoilClassRange, WorldMap};
+use crate::{SoilClassRange, WorldMap};
 
 /// How the semantic image is repainted. The drives stay as they were measured, so soil prior and network believe in another class than the one driven on.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -9,6 +10,9 @@ pub enum Disguise {
     Firmer,
     /// Every class looks like the next softer one.
     Softer,
+    /// Each class looks like the next softer one, like itself or like the next firmer one: digit i of this number in base 3, lowest first, says which of the three for
+    /// the class that is i-th in firmness. Digits beyond the number's length are 0.
+    Mixed(u64),
 }
 
 /// Brightness of a pixel against its palette colour that shading and texture may explain.
@@ -27,10 +31,12 @@ impl Disguise {
         // Firmness = the middle of the range of k_phi.
         classes.sort_by(|(a, _), (b, _)| (a.low[0] * a.high[0]).total_cmp(&(b.low[0] * b.high[0])));
         let last = classes.len() - 1;
-        let looks_like = |class: usize| match self {
-            Self::Firmer => (class + 1).min(last),
-            Self::Softer => class.saturating_sub(1),
+        let steps_up = |class: usize| match self {
+            Self::Firmer => 2,
+            Self::Softer => 0,
+            Self::Mixed(digits) => digits / 3u64.saturating_pow(class as u32) % 3,
         };
+        let looks_like = |class: usize| (class + steps_up(class) as usize).saturating_sub(1).min(last);
         let painted = |pixel: [u8; 3]| {
             let pixel = pixel.map(f64::from);
             let (class, shade) = classify(&classes, pixel);
@@ -38,7 +44,12 @@ impl Disguise {
             std::array::from_fn(|i| (pixel[i] + shade * (to[i] - from[i])).round().clamp(0.0, 255.0) as u8)
         };
         let semantics = map.semantic_rgb()?.into_iter().map(painted).collect();
-        let id = format!("{} as if {}", map.id(), if self == Self::Firmer { "firmer" } else { "softer" });
+        let look = match self {
+            Self::Firmer => "firmer".into(),
+            Self::Softer => "softer".into(),
+            Self::Mixed(digits) => format!("mixed {digits}"),
+        };
+        let id = format!("{} as if {look}", map.id());
         let repainted = WorldMap::from_layers(&id, map.version(), *map.geometry(), map.elevation_m(), Some(semantics)).ok()?;
         Some(repainted.with_soil_classes(map.soil_classes().to_vec()))
     }
@@ -61,9 +72,8 @@ fn classify(classes: &[(&SoilClassRange, [f64; 3])], pixel: [f64; 3]) -> (usize,
 
 #[cfg(test)]
 mod tests {
-    use nesam_terrain::GridGeometry;
-
     use super::*;
+    use crate::GridGeometry;
 
     #[test]
     fn analytic_every_class_takes_the_colour_of_its_neighbour_and_keeps_its_shade() {
@@ -82,6 +92,9 @@ mod tests {
         let of = |disguise: Disguise| disguise.of(&map).unwrap().semantic_rgb().unwrap();
         assert_eq!(of(Disguise::Firmer)[..3], [sand, grass, grass]);
         assert_eq!(of(Disguise::Softer)[..3], [mud, mud, sand]);
+        // Mud stays (1), sand looks softer (0), grass softer (0); and mud firmer (2), sand itself (1), grass firmer, which there is nothing to be.
+        assert_eq!(of(Disguise::Mixed(1))[..3], [mud, mud, sand]);
+        assert_eq!(of(Disguise::Mixed(2 + 3 + 18))[..3], [sand, sand, grass]);
         for (found, wanted) in of(Disguise::Firmer)[3].into_iter().zip(grass) {
             assert!((f64::from(found) - 0.9 * f64::from(wanted)).abs() < 3.0, "{found} {wanted}");
         }
