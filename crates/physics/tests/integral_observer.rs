@@ -139,7 +139,9 @@ fn property_two_soils_tell_what_a_drive_on_the_one_makes_up_for_beyond_the_other
     let car = observed(0.0);
     let made_up_for = |soil: Soil<f64>| {
         let mut drive = Drive { soil, ..Drive::new(car.clone(), SPEED_M_S) };
-        (0..400).for_each(|_| drop(drive.step(SPEED_M_S, 0.0)));
+        for _ in 0..400 {
+            drive.step(SPEED_M_S, 0.0);
+        }
         drive.actuators.speed_error_integral_m
     };
     let model = StepModel::new(&observed(RATE_PER_S), DT_S, 2);
