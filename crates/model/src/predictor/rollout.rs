@@ -162,10 +162,11 @@ impl Predictor {
         rows: usize,
     ) -> Vec<Sample> {
         let now = |soil: [f64; SOIL_DIM]| Soil::from_array(self.soil_at(soil, scene.clock.before(0)));
-        let nominal = now(from_raw(&raw_soil(under_start)));
+        let prior = from_raw(&raw_soil(under_start));
+        let ([x_m, y_m, _], nominal) = (shared.state.position_m, now(prior));
         let mut known: Option<(Soil<f64>, Sample)> = None;
         let of_row = |row: usize| {
-            let soil = now(under(scene.soil, row, &shared, under_start));
+            let soil = now(scene.soil.soil(row, [x_m, y_m], &prior));
             if let Some((before, sample)) = &known
                 && *before == soil
             {
