@@ -102,7 +102,7 @@ impl Default for FilterConfig {
             coordinates: SoilCoordinates::Logarithmic,
             innovation: Innovation::Rollout,
             prior_sd,
-            process_sd: prior_sd.map(|sd| 0.1 * sd),
+            process_sd: Self::process_sd_of(&prior_sd),
             noise: BufferNoise::Channels(default_noise()),
             noise_conditions: None,
             shared_error: None,
@@ -123,6 +123,11 @@ impl Default for FilterConfig {
 }
 
 impl FilterConfig {
+    /// Q_B of a prior, unless it is told: a tenth of it goes in a buffer.
+    pub fn process_sd_of(prior_sd: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
+        prior_sd.map(|sd| 0.1 * sd)
+    }
+
     /// Algorithm 1 word for word: Δθ in physical units, one linearisation, nothing held at a bound, P⁻ = P⁺ + Q_B without a cap.
     pub fn literal() -> Self {
         let prior_sd = [1.0e6, 3.0e3, 0.15, 1.5e3, 0.08, 0.008];
@@ -137,7 +142,7 @@ impl FilterConfig {
             classes: 1,
             class_share: 0.0,
             prior_sd,
-            process_sd: prior_sd.map(|sd| 0.1 * sd),
+            process_sd: Self::process_sd_of(&prior_sd),
             linearisations: 1,
             bounded: false,
             ..Self::default()

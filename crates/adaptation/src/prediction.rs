@@ -129,7 +129,7 @@ fn next_state<T: Real>(
     made_up_for_m_s: T,
 ) -> [T; STATE_DIM] {
     let mut input = StepInput { state: VehicleState::from_array(*state), ..with_soil(&transition.input, Soil::from_array(soil)) };
-    input.wheels.rim_base_m_s = input.wheels.rim_base_m_s.map(|base| base + made_up_for_m_s);
+    input.wheels = input.wheels.demanding_more(made_up_for_m_s);
     let increment = model.step(&input).increment.to_array();
     core::array::from_fn(|i| state[i] + increment[i] + T::lit(transition.residual[i]))
 }

@@ -300,6 +300,12 @@ pub fn measured_wheels<T: Real>(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHE
 }
 
 impl<T: Real> WheelCommand<T> {
+    /// The same from a speed control that demands so much more, m/s: what its integral holds beyond what the command knows of.
+    #[inline(always)]
+    pub fn demanding_more(self, more_m_s: T) -> Self {
+        Self { rim_base_m_s: self.rim_base_m_s.map(|base| base + more_m_s), ..self }
+    }
+
     /// Rim speed of wheel `i`, m/s, given its own and the vehicle's forward speed.
     #[inline(always)]
     pub fn rim_speed_m_s(&self, i: usize, wheel_forward_m_s: T, vehicle_forward_m_s: T) -> T {

@@ -79,7 +79,7 @@ impl StepModel {
         let Some(torque) = driven.filter(|_| speed_m_s.value() >= SLOWEST_M_S) else { return T::lit(0.0) };
         let force_n = T::lit(WHEELS as f64) * (self.compaction_n(soil) - T::lit(self.compaction_n(prior)));
         let engine = 1.0 - self.vehicle().effects.actuator.torque_lost;
-        let demand = force_n * T::lit(self.vehicle().wheel_radius_m) / torque.opened_n_m_per_demand(speed_m_s, engine);
+        let demand = force_n * T::lit(self.vehicle().wheel_radius_m) / torque.driving_n_m_s_m(speed_m_s, engine);
         let limit = UNSATURATED * line.overspeed_limit_m_s;
         demand.max(T::lit(-limit)).min(T::lit(limit)) * T::lit(share / line.speed_integral_gain_per_s)
     }

@@ -99,13 +99,13 @@ impl TorqueDrive {
     /// The demand (m/s) that brings a torque at all wheels together (N m) at a speed above rest (m/s); `None` where no demand brings it.
     pub fn demand_m_s(&self, torque_n_m: f64, speed_m_s: f64, share: f64) -> Option<f64> {
         let opened = torque_n_m + speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S) * self.closed_n_m;
-        let factor = if opened > 0.0 { self.factor(speed_m_s) * share } else { self.brake_ratio };
-        (factor > 0.0).then(|| opened / (factor * self.per_demand_n_m_s_m))
+        let per_demand = if opened > 0.0 { self.driving_n_m_s_m(speed_m_s, share) } else { self.brake_ratio * self.per_demand_n_m_s_m };
+        (per_demand > 0.0).then(|| opened / per_demand)
     }
 
     /// Torque at all wheels together that each m/s of a driving demand brings at a speed (m/s), of an engine that gives `share` of what it should, N m / (m/s).
-    pub fn opened_n_m_per_demand<T: Real>(&self, speed_m_s: T, share: f64) -> T {
-        self.factor(speed_m_s) * T::lit(share * self.per_demand_n_m_s_m)
+    pub fn driving_n_m_s_m<T: Real>(&self, speed_m_s: T, share: f64) -> T {
+        self.factor(speed_m_s) * T::lit(share) * T::lit(self.per_demand_n_m_s_m)
     }
 
     /// What engine and gears make of a demand at a speed over what they make of it at the middle knot, -.

@@ -1,5 +1,4 @@
-//! Ground that is not what it looks like, made from drives on ordinary ground: how an adaptation is judged without a test set, and a network is trained
-//! not to believe its eyes alone.
+//! Ground that is not what it looks like, made from drives on ordinary ground: how an adaptation is judged without a test set.
 
 use crate::{SoilClassRange, WorldMap};
 

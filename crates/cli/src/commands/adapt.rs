@@ -89,8 +89,6 @@ const CAUTION: [f64; 6] = [1.0, 1.0, 3.0, 3.0, 3.0, 1.0];
 
 /// Standard deviation of the soil prior that it begins with, in the coordinates of a correction: half as wide again as the default (chosen on the same, ADR 0050).
 const PRIOR_SD: [f64; 6] = [1.05, 1.05, 0.225, 0.75, 0.12, 0.6];
-/// What of it the soil moves from buffer to buffer.
-const PROCESS_SHARE: f64 = 0.1;
 
 /// What else is scored.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -153,13 +151,8 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed);
     let [fixed, adapted] = [0, 1].map(|i| score(&paths[i], &windows, truth, &resamples));
     let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth };
-    let others = args.also.iter().map(|also| scene.paths(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
-    if let Some(file) = &args.predictions {
-        let named: Vec<_> =
-            [("fixed", &paths[0]), ("adapted", &paths[1])].into_iter().chain(others.iter().map(|(key, p)| (*key, p))).collect();
-        write_predictions(file, &named, &windows).or_failed()?;
-    }
-    let others: Vec<Row> = others.iter().map(|(key, paths)| Row { key, score: score(paths, &windows, truth, &resamples) }).collect();
+    let alternatives = args.also.iter().map(|also| scene.paths(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
+    let others: Vec<Row> = alternatives.iter().map(|(key, paths)| Row { key, score: score(paths, &windows, truth, &resamples) }).collect();
     let apart = apart(&drives.drives, &args.apart)?;
     let reference = args.reference.as_deref().map(|set| Ok((set, reference(args, set, horizon, &predictor)?))).transpose()?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
@@ -190,6 +183,12 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     output::write_file(&json, adaptation.to_json().as_bytes())?;
     output::write_file(&html, report::adaptation_page(&adaptation).as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
+    if let Some(file) = &args.predictions {
+        let own = [("fixed", &paths[0]), ("adapted", &paths[1])].into_iter();
+        let named: Vec<_> = own.chain(alternatives.iter().map(|(key, paths)| (*key, paths))).collect();
+        write_predictions(file, &named, &windows).or_failed()?;
+        say!("wrote {}", file.display());
+    }
     Ok(())
 }
 
@@ -259,7 +258,7 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);
     let prior_sd = *given.prior_sd.get_or_insert(PRIOR_SD);
-    given.process_sd.get_or_insert(prior_sd.map(|sd| PROCESS_SHARE * sd));
+    given.process_sd.get_or_insert(FilterConfig::process_sd_of(&prior_sd));
     given.caution.get_or_insert(CAUTION);
     if !args.follow_errors {
         given.shared_error_covariance = Some(Vec::new());

@@ -82,11 +82,14 @@ impl Predictor {
     }
 
     /// What the integral of the speed error has been drawn to beyond [`Predictor::actuators`] at a start on a soil that is not the nominal one, m.
-    pub(super) fn made_up_for_m(&self, nominal: &Soil<f64>, soil: &Soil<f64>, start: &VehicleState<f64>, history_steps: usize) -> f64 {
-        let model = self.step_model();
-        // The last step before the start observes nothing (`actuators_along`).
-        let share = model.observed_share(history_steps.saturating_sub(1));
-        model.compaction_made_up_for_m(nominal, soil, start.velocity_m_s[0], share)
+    /// `observed_share` is that of the history ([`Predictor::observed_share`]).
+    pub(super) fn made_up_for_m(&self, nominal: &Soil<f64>, soil: &Soil<f64>, start: &VehicleState<f64>, observed_share: f64) -> f64 {
+        self.step_model().compaction_made_up_for_m(nominal, soil, start.velocity_m_s[0], observed_share)
+    }
+
+    /// Share of a lasting resistance that a history has told of: its last step, before the start, observes nothing (`actuators_along`).
+    pub(super) fn observed_share(&self, history: &[HistoryStep]) -> f64 {
+        self.step_model().observed_share(history.len().saturating_sub(1))
     }
 
     /// A soil at an instant of its drift.

@@ -137,7 +137,7 @@ impl Predictor {
         let under_start = self.terrain(scene.tokens, &[pose(&start_state)])[0];
         let mut samples: Vec<Sample> = match history.is_empty() {
             true => (0..rows).map(start).collect(),
-            false => self.observed_samples(&scene, shared, &under_start, history.len(), rows),
+            false => self.observed_samples(&scene, shared, &under_start, self.observed_share(history), rows),
         };
         let mut rollout = Rollout {
             states: vec![0.0; rows * query.horizon * STATE_DIM],
@@ -158,7 +158,7 @@ impl Predictor {
         scene: &Scene<'_>,
         shared: Sample,
         under_start: &TerrainToken,
-        history_steps: usize,
+        observed_share: f64,
         rows: usize,
     ) -> Vec<Sample> {
         let now = |soil: [f64; SOIL_DIM]| Soil::from_array(self.soil_at(soil, scene.clock.before(0)));
@@ -173,7 +173,7 @@ impl Predictor {
                 return *sample;
             }
             let mut sample = shared;
-            sample.actuators.speed_error_integral_m += self.made_up_for_m(&nominal, &soil, &shared.state, history_steps);
+            sample.actuators.speed_error_integral_m += self.made_up_for_m(&nominal, &soil, &shared.state, observed_share);
             known = Some((soil, sample));
             sample
         };

@@ -24,7 +24,8 @@ pub struct Transition {
     pub input: StepInput<f64>,
     /// Actuators before and after the step: what an effect in the actuator layer starts from.
     pub actuators: [DrivelineState; 2],
-    /// Share of a lasting resistance that the actuators were observed to make up for ([`nesam_physics::step::StepModel::observed_share`]), on the nominal soil.
+    /// Share of a lasting resistance that the actuators were observed to make up for ([`nesam_physics::step::StepModel::observed_share`]), on the nominal soil; 0 in a
+    /// transition on its own, as Algorithm 1 to the letter takes it.
     pub observed_share: f64,
     /// Command of the step.
     pub control: Control<f64>,
@@ -77,7 +78,7 @@ impl Predictor {
             actuators: self.actuators(history, &start, first, clock),
             flags: 0,
         };
-        let observed_share = self.step_model().observed_share(history.len().saturating_sub(1));
+        let observed_share = self.observed_share(history);
         let mut made_up_for_m_s = None;
         let mut transitions = Vec::with_capacity(controls.len());
         for control in controls {
@@ -95,10 +96,10 @@ impl Predictor {
             let soil = self.soil_at(under(soil, 0, &sample, &token), None);
             let mut input = StepInput { soil: Soil::from_array(soil), ..transition.input };
             let made_up_for_m_s = *made_up_for_m_s.get_or_insert_with(|| {
-                let integral_m = self.made_up_for_m(&transition.input.soil, &input.soil, &sample.state, history.len());
+                let integral_m = self.made_up_for_m(&transition.input.soil, &input.soil, &sample.state, observed_share);
                 integral_m * self.step_model().vehicle().driveline.speed_integral_gain_per_s
             });
-            input.wheels.rim_base_m_s = input.wheels.rim_base_m_s.map(|base| base + made_up_for_m_s);
+            input.wheels = input.wheels.demanding_more(made_up_for_m_s);
             let moved = self.step_model().step(&input).increment.to_array();
             let total = core::array::from_fn(|i| moved[i] + transition.residual[i]);
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
