@@ -33,6 +33,7 @@ pub(crate) fn bicycle() -> Vehicle {
         },
         gravity_m_s2: 9.81,
         contact_law: Default::default(),
+        soil_damping_pa_s_m: 0.0,
         effects: Default::default(),
     }
 }

@@ -152,6 +152,7 @@ fn nesam_vehicle() -> nesam_physics::Vehicle {
         },
         gravity_m_s2: 9.81,
         contact_law: Default::default(),
+        soil_damping_pa_s_m: 0.0,
         effects: Default::default(),
     }
 }

@@ -46,6 +46,8 @@ pub struct Recipe {
     pub start: Option<ModelBundle>,
     /// With `start`: takes the data's vehicle and fits its drive line anew, instead of the bundle's vehicle.
     pub recalibrate: bool,
+    /// Viscous part of the pressure of fresh soil, Pa s/m; `None` = as the card, or with `start` its bundle, has it.
+    pub soil_damping_pa_s_m: Option<f64>,
     /// Whether the encoders see borders between colours smoothed; `None` = smoothed, or with `start` as its bundle has it.
     pub smooth_borders: Option<bool>,
     /// Output folder.
@@ -90,10 +92,14 @@ pub fn run(
         (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
     };
     let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
-    let fitted = || calibrated(root.vehicle().clone(), &drives, &train_at, recipe.dt_s, reporter);
+    let damped = |vehicle: &Vehicle| Vehicle {
+        soil_damping_pa_s_m: recipe.soil_damping_pa_s_m.unwrap_or(vehicle.soil_damping_pa_s_m),
+        ..vehicle.clone()
+    };
+    let fitted = || calibrated(damped(root.vehicle()), &drives, &train_at, recipe.dt_s, reporter);
     let (vehicle, mut scales) = match &recipe.start {
         Some(bundle) if recipe.recalibrate => (fitted().0, bundle.normalization.clone()),
-        Some(bundle) => (bundle.vehicle.clone(), bundle.normalization.clone()),
+        Some(bundle) => (damped(&bundle.vehicle), bundle.normalization.clone()),
         None => fitted(),
     };
     scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);

@@ -8,7 +8,7 @@ use crate::terramechanics::{ContactMotion, Support, WheelGeometry, WheelWrench, 
 use crate::vehicle::WHEELS;
 
 /// Numbers in a [`Rolling`] and in a [`Sunk`].
-pub const ROLLING: usize = 13;
+pub const ROLLING: usize = 14;
 /// See [`ROLLING`].
 pub const SUNK: usize = 6;
 
@@ -48,17 +48,18 @@ impl<T: Real> Rolling<T> {
         let Self { support, motion, soil, ratio } = *self;
         let [k_phi, k_c, n, c, phi, k_shear] = soil.to_array();
         let Support { preload_n, rate_n_m } = support;
-        let ContactMotion { travel_ratio, rim_ratio, lateral_ratio, slip } = motion;
-        [preload_n, rate_n_m, travel_ratio, rim_ratio, lateral_ratio, slip, k_phi, k_c, n, c, phi, k_shear, ratio]
+        let ContactMotion { travel_ratio, rim_ratio, lateral_ratio, slip, pressing_m_s } = motion;
+        [preload_n, rate_n_m, travel_ratio, rim_ratio, lateral_ratio, slip, pressing_m_s, k_phi, k_c, n, c, phi, k_shear, ratio]
     }
 
     /// From [`Rolling::to_array`].
     #[inline(always)]
     pub fn from_array(numbers: [T; ROLLING]) -> Self {
-        let [preload_n, rate_n_m, travel_ratio, rim_ratio, lateral_ratio, slip, k_phi, k_c, n, c, phi, k_shear, ratio] = numbers;
+        let [preload_n, rate_n_m, travel_ratio, rim_ratio, lateral_ratio, slip, pressing_m_s, k_phi, k_c, n, c, phi, k_shear, ratio] =
+            numbers;
         Self {
             support: Support { preload_n, rate_n_m },
-            motion: ContactMotion { travel_ratio, rim_ratio, lateral_ratio, slip },
+            motion: ContactMotion { travel_ratio, rim_ratio, lateral_ratio, slip, pressing_m_s },
             soil: Soil { k_phi, k_c, n, c, phi, k_shear },
             ratio,
         }

@@ -7,8 +7,8 @@ use crate::driveline::{DrivelineState, limited, unlimited};
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::{Control, VehicleState};
-use crate::step::StepModel;
-use crate::terramechanics::bekker_sinkage;
+use crate::step::{StepModel, fresh_share};
+use crate::terramechanics::Support;
 use crate::torque_drive::Grip;
 use crate::vec3::Tilt;
 use crate::vehicle::WHEELS;
@@ -72,23 +72,25 @@ impl StepModel {
     /// in the usual resistance, but another one: the demand that compaction asks for on the one less that on the other, over the gain. `share` of it is
     /// told by the history ([`StepModel::observed_share`]). Without it a softer soil predicts a slowing that the speed control made up for long ago.
     ///
-    /// Compaction is that of four wheels which carry the weight alike at Bekker's static sinkage. Zero at and near rest and where no torque drives the hubs.
+    /// Compaction is that of four wheels which carry the weight alike at the sinkage of a [`Grip`]. Zero at and near rest and where no torque drives the hubs.
     pub fn compaction_made_up_for_m<T: Real<Value = f64>>(&self, prior: &Soil<f64>, soil: &Soil<T>, speed_m_s: T, share: f64) -> T {
         let line = &self.vehicle().driveline;
         let driven = line.torque.as_ref().filter(|_| share > 0.0 && line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S);
         let Some(torque) = driven.filter(|_| speed_m_s.value() >= SLOWEST_M_S) else { return T::lit(0.0) };
-        let force_n = T::lit(WHEELS as f64) * (self.compaction_n(soil) - T::lit(self.compaction_n(prior)));
+        let prior = Soil::from_array(prior.to_array().map(T::lit));
+        let force_n = self.compaction_n(soil, speed_m_s) - self.compaction_n(&prior, speed_m_s);
         let engine = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let demand = force_n * T::lit(self.vehicle().wheel_radius_m) / torque.driving_n_m_s_m(speed_m_s, engine);
         let limit = UNSATURATED * line.overspeed_limit_m_s;
         demand.max(T::lit(-limit)).min(T::lit(limit)) * T::lit(share / line.speed_integral_gain_per_s)
     }
 
-    /// Force at the rim that compaction takes of a wheel which carries its share of the weight, N.
-    fn compaction_n<T: Real>(&self, soil: &Soil<T>) -> T {
-        let (vehicle, wheel) = (self.vehicle(), &self.wheel);
-        let load_n = T::lit(self.body.mass_kg * vehicle.gravity_m_s2 / WHEELS as f64);
-        Grip::new(wheel, bekker_sinkage(load_n, wheel.radius_m, wheel.width_m, soil), load_n, soil).compaction_n
+    /// Force at the rims that compaction takes of four wheels which carry the weight alike at a speed, N.
+    fn compaction_n<T: Real>(&self, soil: &Soil<T>, speed_m_s: T) -> T {
+        let load_n = T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2 / WHEELS as f64);
+        let weight = Support { preload_n: load_n, rate_n_m: T::lit(0.0) };
+        let of_wheel = |i: usize| Grip::settled(&self.wheel, &weight, speed_m_s * fresh_share(i, T::lit(1.0)), soil).compaction_n;
+        (1..WHEELS).fold(of_wheel(0), |sum, i| sum + of_wheel(i))
     }
 
     /// What effects hold against a vehicle that goes straight ahead on level ground at a speed (m/s) above rest, N.

@@ -11,8 +11,8 @@ use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
-use crate::terramechanics::{Support, WheelGeometry, WheelMotion, WheelWrench};
-use crate::torque_drive::{Driven, Grip};
+use crate::terramechanics::{ContactLaw, Support, WheelGeometry, WheelMotion, WheelWrench};
+use crate::torque_drive::{Driven, Grip, carried_on_n};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -83,6 +83,9 @@ pub struct StepModel {
 /// Speed around which the friction of a dragging wheel changes its sign, m/s (chosen).
 const DRAG_SPEED_M_S: f64 = 0.07;
 
+/// Speed around which the contact of a wheel passes from one side of the axle to the other, m/s (chosen: creep of a parked vehicle).
+const LEAD_SPEED_M_S: f64 = 0.05;
+
 /// Mass, inertia about the reference point, and centre of mass, effects included.
 #[derive(Clone, Debug)]
 pub(crate) struct RigidBody {
@@ -112,14 +115,26 @@ impl RigidBody {
     }
 }
 
-/// How a wheel stands on its ground: axes (ahead, left, normal) and the lever arm of the contact in Body, velocities, and what presses it down.
+/// How a wheel stands on its ground: axes (ahead, left, normal) and the lever arm of the contact in Body, velocities of the contact, and what presses it down.
 #[derive(Clone, Copy, Debug)]
 struct Stance<T> {
     axes: [Vec3<T>; 3],
     lever: Vec3<T>,
+    /// From the point of the ground below the axle to the contact, Body, m; `None` = the contact is there.
+    lead: Option<Vec3<T>>,
     forward_m_s: T,
     left_m_s: T,
     preload_n: T,
+}
+
+impl<T: Real> Stance<T> {
+    /// Puts the contact ahead of the axle in the direction of travel, where it slides by the turning of the wheel (rad/s, Body) too.
+    #[inline(always)]
+    fn lead_by(&mut self, lead_m: T, angular_velocity_rad_s: Vec3<T>) {
+        let ahead_m = lead_m * self.forward_m_s / self.forward_m_s.abs_smooth(LEAD_SPEED_M_S);
+        self.lead = Some(scale(self.axes[0], ahead_m));
+        self.left_m_s = self.left_m_s + ahead_m * dot(angular_velocity_rad_s, self.axes[2]);
+    }
 }
 
 /// How a wheel rolls over its ground, and the direction of it in (-1, 1).
@@ -134,6 +149,7 @@ struct Roll<T> {
 struct Contribution<T> {
     axes: [Vec3<T>; 3],
     lever: Vec3<T>,
+    lead: Option<Vec3<T>>,
     force: [T; 3],
     damping: [T; 3],
     stiffness_n_m: T,
@@ -144,6 +160,9 @@ impl StepModel {
     /// Prepares a vehicle for steps of `dt_s` seconds in `substeps` sub-steps (2 is enough for 0.1 s, see the convergence test).
     pub fn new(vehicle: &Vehicle, dt_s: f64, substeps: usize) -> Self {
         let mut wheel = WheelGeometry::new(vehicle.wheel_radius_m, vehicle.wheel_width_m).with_law(vehicle.contact_law);
+        if vehicle.soil_damping_pa_s_m > 0.0 && vehicle.contact_law == ContactLaw::SoilContactModel {
+            wheel = wheel.on_damped_soil(vehicle.soil_damping_pa_s_m);
+        }
         wheel.recovery = (wheel.recovery + vehicle.effects.soil.recovery).max(0.0);
         wheel.c1 = (wheel.c1 + vehicle.effects.soil.theta_m_shift).max(0.0);
         Self {
@@ -233,8 +252,14 @@ impl StepModel {
             }
         }
 
-        let stances: [Stance<T>; WHEELS] = core::array::from_fn(|i| self.stance(i, state, &tilt, input));
-        let driven = self.driven(&stances.each_ref().map(|s| s.preload_n), &stances.each_ref().map(|s| s.forward_m_s), state, input);
+        let mut stances: [Stance<T>; WHEELS] = core::array::from_fn(|i| self.stance(i, state, &tilt, input));
+        let grips: [Grip<T>; WHEELS] = core::array::from_fn(|i| self.grip(i, stances[i].preload_n, stances[i].forward_m_s, &input.soil));
+        if self.wheel.is_damped() {
+            for (stance, grip) in stances.iter_mut().zip(&grips) {
+                stance.lead_by(grip.lead_m, w);
+            }
+        }
+        let driven = self.driven(&grips, &stances.each_ref().map(|s| s.forward_m_s), state, input);
         let driven = |i: usize| driven.as_ref().map(|driven| &driven[i]);
         let rolls: [Roll<T>; WHEELS] = core::array::from_fn(|i| self.roll(i, &stances[i], driven(i), state, input));
         let sunk = self.sink(rolls.each_ref().map(|roll| &roll.contact), sink);
@@ -281,6 +306,7 @@ impl StepModel {
         Stance {
             axes: [forward, left, normal],
             lever: add(centre, scale(normal, -distance)),
+            lead: None,
             forward_m_s: dot(velocity, forward),
             left_m_s: dot(velocity, left),
             preload_n,
@@ -306,7 +332,10 @@ impl StepModel {
             (None, true) => self.altered_rim_speed(i, state, axes[0], input),
         };
         let wheel_motion = WheelMotion { rim_speed_m_s, forward_m_s, left_m_s };
-        let (direction, motion) = wheel_motion.contact();
+        let (direction, mut motion) = wheel_motion.contact();
+        if self.wheel.is_damped() {
+            motion.pressing_m_s = motion.pressing_m_s * fresh_share(i, direction);
+        }
         let mut soil = input.soil;
         if self.altered.on_wheels {
             ratio = ratio * self.digging(motion.slip);
@@ -335,7 +364,7 @@ impl StepModel {
         input: &StepInput<T>,
     ) -> Contribution<T> {
         let wheel = self.wheel_at(i);
-        let Stance { axes, lever, preload_n, .. } = *stance;
+        let Stance { axes, lever, lead, preload_n, .. } = *stance;
         let Roll { motion: wheel_motion, direction, contact: Rolling { motion, soil, ratio, .. } } = *roll;
         let Sunk { balanced_m: balanced, wrench } = *sunk;
         let (rate, damper) = (T::lit(self.vehicle.suspension_n_m[i]), T::lit(self.vehicle.suspension_n_s_m[i]));
@@ -344,9 +373,8 @@ impl StepModel {
         let share = load / wrench.normal_n.relu_smooth(1.0);
         let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
         if let Some(driven) = driven {
-            let grip = Grip::new(wheel, sinkage, load, &soil);
             let taken = wrench.torque_n_m * share * direction * T::lit(1.0 / wheel.radius_m);
-            let more = grip.carried_on_n(driven.at_rim_n, taken, wrench.thrust_n * share * direction);
+            let more = carried_on_n(wheel, (sinkage, load), &soil, driven.at_rim_n, taken, wrench.thrust_n * share * direction);
             contact.forward_n = contact.forward_n + input.wheels.rim_follow * more;
             drag[0] = drag[0] + input.wheels.rim_follow * (driven.damping_n_s_m - drag[0]);
         }
@@ -358,6 +386,7 @@ impl StepModel {
         Contribution {
             axes,
             lever,
+            lead,
             force: [contact.forward_n, contact.left_n, load],
             damping: [drag[0], drag[1], damper * in_series],
             stiffness_n_m: rate * in_series,
@@ -426,16 +455,32 @@ impl StepModel {
     }
 }
 
-/// Adds a wheel's forces and rates: f += Gᵀ (F - h K ν), A += h Gᵀ (C + h K) G with G the velocity of the contact in its own axes.
+/// Share of the soil before a wheel that no wheel has pressed yet, for a direction of travel in (-1, 1): the wheels of the other axle roll where those of the leading
+/// one have been. Neglects that they leave the ruts in a turn (recorded drives do not side with it).
+#[inline(always)]
+pub(crate) fn fresh_share<T: Real>(wheel: usize, direction: T) -> T {
+    T::lit(0.5) + direction * T::lit(if wheel < 2 { 0.5 } else { -0.5 })
+}
+
+/// Adds a wheel's forces and rates: f += Gᵀ (F - h K ν), A += h Gᵀ (C + h K) G with G the velocity of the contact in its own axes. Springs and dampers of
+/// suspensions feel the axle, so the velocity along the normal is that below it, and the moment of the normal force at its lead is added.
 #[inline(always)]
 fn assemble<T: Real>(wheel: &Contribution<T>, v: Vec3<T>, w: Vec3<T>, h: T, lhs: &mut [[T; 6]; 6], rhs: &mut [T; 6]) {
     for axis in 0..3 {
         let e = wheel.axes[axis];
-        let moment = cross(wheel.lever, e);
+        let lead = wheel.lead.as_ref();
+        let lever = lead.filter(|_| axis == 1).map_or(wheel.lever, |lead| add(wheel.lever, *lead));
+        let moment = cross(lever, e);
         let g = [e[0], e[1], e[2], moment[0], moment[1], moment[2]];
         let mut force = wheel.force[axis];
         let mut damping = wheel.damping[axis];
         if axis == 2 {
+            if let Some(lead) = lead {
+                let ahead = cross(*lead, e);
+                for r in 0..3 {
+                    rhs[r + 3] = rhs[r + 3] + ahead[r] * force;
+                }
+            }
             force = force - h * wheel.stiffness_n_m * (dot(e, v) + dot(moment, w));
             damping = damping + h * wheel.stiffness_n_m;
         }

@@ -2,7 +2,9 @@
 //! Method: closed forms where the soil has no strength; a column of soil that the wheel rolls over, in small steps of time.
 
 use nesam_physics::Soil;
-use nesam_physics::terramechanics::{ContactLaw, ContactMotion, GaussRule, WheelGeometry, wheel_wrench};
+use nesam_physics::terramechanics::{
+    ContactLaw, ContactMotion, GaussRule, Support, WheelGeometry, WheelMotion, balance_sinkage, wheel_wrench,
+};
 
 const RADIUS_M: f64 = 0.467;
 const WIDTH_M: f64 = 0.254;
@@ -32,6 +34,51 @@ fn analytic_soil_without_strength_carries_and_brakes_as_the_closed_forms_say() {
             assert!((got.normal_n / load - 1.0).abs() < 1e-5, "load {} N, closed form {load}", got.normal_n);
         }
     }
+}
+
+#[test]
+fn analytic_damping_carries_and_brakes_as_the_closed_forms_say() {
+    let soft = Soil { c: 0.0, phi: 0.0, ..clay() };
+    let damped = WheelGeometry { soil_damping_pa_s_m: 2e4, ..wheel(24) };
+    for (z, pressing_m_s) in [(0.02, 3.0), (0.1, 2.5), (0.2, 1.0)] {
+        let still = ContactMotion::from_slip(0.1, 0.05);
+        let moving = ContactMotion { pressing_m_s, ..still };
+        let [slow, fast] = [still, moving].map(|motion| wheel_wrench(&damped, z, &motion, &soft));
+        assert_eq!(slow.normal_n, wheel_wrench(&wheel(24), z, &moving, &soft).normal_n, "at rest and without damping");
+        // Pressure d u sin θ: load b r d u ∫ sin θ cos θ dθ, moment b r² d u ∫ sin² θ cos θ dθ.
+        let sin = ((2.0 * RADIUS_M - z) * z).sqrt() / RADIUS_M;
+        let viscous = WIDTH_M * RADIUS_M * 2e4 * pressing_m_s;
+        let (load, moment) = (viscous * sin.powi(2) / 2.0, viscous * RADIUS_M * sin.powi(3) / 3.0);
+        assert!(
+            ((fast.normal_n - slow.normal_n) / load - 1.0).abs() < 1e-6,
+            "z {z}: {} N, closed form {load}",
+            fast.normal_n - slow.normal_n
+        );
+        let braked = fast.torque_n_m - slow.torque_n_m;
+        assert!((braked / moment - 1.0).abs() < 1e-6, "z {z}: {braked} N m, closed form {moment}");
+        assert!(fast.drawbar_n().abs() < 1e-9, "pressure alone pushes along the ground");
+    }
+}
+
+#[test]
+fn property_soil_that_is_pressed_fast_still_carries_the_load() {
+    let soils = [clay(), Soil { k_phi: 1.3e5, n: 0.8, c: 1700.0, phi: 0.14, ..clay() }, Soil { k_phi: 2e7, n: 0.6, ..clay() }];
+    let mut shallower: f64 = 1.0;
+    for (soil, damping, speed) in
+        soils.iter().flat_map(|soil| [1e4, 2e4, 5e4].map(|d| (soil, d))).flat_map(|(soil, d)| [0.3, 1.5, 4.0].map(|v| (soil, d, v)))
+    {
+        let damped = WheelGeometry::new(RADIUS_M, WIDTH_M).with_law(ContactLaw::SoilContactModel).on_damped_soil(damping);
+        let motion = WheelMotion { rim_speed_m_s: 1.1 * speed, forward_m_s: speed, left_m_s: 0.1 }.contact().1;
+        let support = Support { preload_n: 9000.0, rate_n_m: 2e4 };
+        let [z, slow] = [&damped, &WheelGeometry { soil_damping_pa_s_m: 0.0, ..damped.clone() }]
+            .map(|wheel| balance_sinkage(wheel, &support, &motion, soil));
+        let carried = wheel_wrench(&damped, z, &motion, soil).normal_n;
+        let pressed = support.preload_n - support.rate_n_m * z;
+        assert!((carried / pressed - 1.0).abs() < 1e-4, "d {damping}, {speed} m/s: carries {carried} N of {pressed}");
+        assert!(z < slow, "d {damping}, {speed} m/s: {z} m, slowly {slow} m");
+        shallower = shallower.min(z / slow);
+    }
+    assert!(shallower < 0.6, "soft soil under a fast wheel: {shallower}");
 }
 
 /// Thrust and side force of columns of soil that a wheel rolls over, each sheared by what has slid past it (the law of the nodes).

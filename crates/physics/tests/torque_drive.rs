@@ -74,6 +74,30 @@ fn analytic_compaction_is_what_soft_ground_takes_of_the_torque() {
 }
 
 #[test]
+fn analytic_pressure_ahead_of_the_axles_lifts_the_front() {
+    // Moments about the reference point at a steady speed: what the front carries less is the weight times the lead of the pressure over the wheelbase.
+    let mut car = torque_truck();
+    car.driveline.side_coupling_n_m_s = 0.0;
+    let soft = Soil { k_phi: 1.0e6, k_c: 5e3, n: 0.9, c: 4e3, phi: 0.6, k_shear: 0.015 };
+    let ahead_m = |soil_damping_pa_s_m: f64| {
+        let vehicle = Vehicle { soil_damping_pa_s_m, ..car.clone() };
+        let (_, step, gained) = driven(vehicle.clone(), soft, 2.0, 20, 0.0);
+        assert!(gained.abs() < 0.01, "damping {soil_damping_pa_s_m} is not steady: {gained} m/s²");
+        let weight: f64 = step.contacts.iter().map(|c| c.normal_n).sum();
+        let ahead: f64 = (0..4).map(|i| -vehicle.wheel_centre_m[i][0] * step.contacts[i].normal_n / weight).sum();
+        let lead: f64 = step.contacts.iter().map(|c| compaction_n(&vehicle, &soft, c.sinkage_m) * vehicle.wheel_radius_m / weight).sum();
+        (ahead, lead)
+    };
+    // Hardly any damping, so that the moment of the static pressure is all there is.
+    let (ahead, lead) = ahead_m(1e-3);
+    assert!(lead > 0.07 && (ahead / lead - 1.0).abs() < 0.2, "{ahead} m by the loads, {lead} m by the pressure");
+    let (damped, _) = ahead_m(2e4);
+    assert!(damped > ahead, "damping presses at the front of the contact: {damped} m for {ahead} m");
+    let (unled, _) = ahead_m(0.0);
+    assert!(unled.abs() < 5e-3, "without damping forces act below the axle: {unled} m");
+}
+
+#[test]
 fn analytic_grip_limits_what_a_large_torque_does() {
     let vehicle = constant_torque(20.0);
     let loose = Soil { c: 0.0, phi: 0.35, ..firm() };

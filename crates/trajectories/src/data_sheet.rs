@@ -71,6 +71,7 @@ pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
         driveline: driveline(&sheet, second)?,
         gravity_m_s2,
         contact_law: Default::default(),
+        soil_damping_pa_s_m: 0.0,
         effects: Default::default(),
     })
 }

@@ -122,6 +122,17 @@ fn regress_missing_and_bad_keys_are_named() {
 }
 
 #[test]
+fn analytic_a_card_may_say_that_soil_is_damped() {
+    let plain = read(SKID_CARD).unwrap();
+    assert!(!card_to_json(&plain).contains("soil_damping"), "cards of soil without damping know nothing of it");
+    let damped = Vehicle { soil_damping_pa_s_m: 2e4, ..plain };
+    let text = card_to_json(&damped);
+    assert_eq!(card_from_json(&text).unwrap(), damped);
+    let error = card_from_json(&text.replace("20000.0", "-1.0")).unwrap_err().to_string();
+    assert!(error.contains("`soil_damping_pa_s_m` is -1, must not be negative"), "{error}");
+}
+
+#[test]
 fn analytic_stated_ranges_win() {
     let mut card = hmmwv_json();
     card["command_range"] = json!({"speed_m_s": [-1.0, 5.0], "second": [-0.9, 0.9]});

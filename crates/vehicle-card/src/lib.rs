@@ -40,6 +40,8 @@ struct Card {
     gravity_m_s2: f64,
     #[serde(default, with = "Law", skip_serializing_if = "is_classical")]
     contact_law: ContactLaw,
+    #[serde(default, skip_serializing_if = "is_zero")]
+    soil_damping_pa_s_m: f64,
 }
 
 #[derive(Serialize, Deserialize)]
@@ -154,7 +156,7 @@ fn is_identity(rims: &RimServo) -> bool {
     *rims == RimServo::default()
 }
 
-/// An open differential is left out, so that cards written before the coupling was known keep their bytes.
+/// An open differential and soil without damping are left out, so that cards written before these were known keep their bytes.
 #[allow(clippy::trivially_copy_pass_by_ref)]
 fn is_zero(value: &f64) -> bool {
     *value == 0.0
@@ -198,6 +200,7 @@ pub fn to_json(vehicle: &Vehicle) -> String {
         },
         gravity_m_s2: v.gravity_m_s2,
         contact_law: v.contact_law,
+        soil_damping_pa_s_m: v.soil_damping_pa_s_m,
     };
     serde_json::to_string_pretty(&card).expect("plain numbers serialise; this is a bug")
 }
@@ -227,6 +230,9 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
     }
     if !(c.driveline.side_coupling_n_m_s >= 0.0) {
         return Err(CardError(format!("`driveline.side_coupling_n_m_s` is {}, must not be negative", c.driveline.side_coupling_n_m_s)));
+    }
+    if !(c.soil_damping_pa_s_m >= 0.0 && c.soil_damping_pa_s_m.is_finite()) {
+        return Err(CardError(format!("`soil_damping_pa_s_m` is {}, must not be negative", c.soil_damping_pa_s_m)));
     }
     if let Some(fault) = c.driveline.torque.as_ref().and_then(torque_at_fault) {
         return Err(CardError(fault));
@@ -275,6 +281,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
         },
         gravity_m_s2: c.gravity_m_s2,
         contact_law: c.contact_law,
+        soil_damping_pa_s_m: c.soil_damping_pa_s_m,
         effects: Default::default(),
     })
 }

@@ -77,6 +77,10 @@ pub struct TrainArgs {
     /// Fit the drive line anew on these drives instead of taking the bundle's vehicle: after the physics or the card has changed
     #[arg(long, requires = "from")]
     recalibrate: bool,
+    /// Pressure by which fresh soil resists being pressed down, over the speed of that, Pa s/m; a few thousand to tens of thousands, 0 for soil that yields
+    /// however fast it is pressed [default: as the vehicle's card or, with --from, the bundle has it]
+    #[arg(long, value_name = "PA_S_M")]
+    soil_damping: Option<f64>,
     /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right
     #[arg(long)]
     no_mirror: bool,
@@ -155,6 +159,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             return Err(Failure::input(format!("{option} {weight} is not in 0..100")));
         }
     }
+    if let Some(damping) = args.soil_damping.filter(|d| !(0.0..=1e6).contains(d)) {
+        return Err(Failure::input(format!("--soil-damping {damping} is not in 0..1e6 Pa s/m")));
+    }
     if args.sustained > 0.0 && variant.is_end_to_end() {
         return Err(Failure::input(format!("--sustained is for models whose physics carries what lasts; {} has none", args.model)));
     }
@@ -204,6 +211,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         },
         start,
         recalibrate: args.recalibrate,
+        soil_damping_pa_s_m: args.soil_damping,
         smooth_borders: args.borders.as_ref().map(|borders| borders == "smooth"),
         out: out.clone(),
         resume: args.resume,

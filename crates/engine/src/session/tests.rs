@@ -39,6 +39,7 @@ fn cart() -> Vehicle {
         },
         gravity_m_s2: 9.81,
         contact_law: Default::default(),
+        soil_damping_pa_s_m: 0.0,
         effects: Default::default(),
     }
 }

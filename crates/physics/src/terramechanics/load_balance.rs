@@ -4,7 +4,7 @@ use crate::scalar::{Dual, Real};
 use crate::soil::Soil;
 use crate::terramechanics::pressure_sinkage::bekker_sinkage;
 use crate::terramechanics::slip::ContactMotion;
-use crate::terramechanics::wheel::{WheelGeometry, wheel_wrench};
+use crate::terramechanics::wheel::{WheelGeometry, viscous_rate_n_m, wheel_wrench};
 
 /// Exponents that W may have between two sinkages, and the least ratio of these (as a logarithm) that tells one.
 const EXPONENT: [f64; 2] = [0.3, 4.0];
@@ -27,20 +27,14 @@ pub struct Support<T> {
 /// A support that lifts off (preload ≤ 0) gives a vanishing sinkage.
 #[inline(always)]
 pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, motion: &ContactMotion<T>, soil: &Soil<T>) -> T {
-    let values = |m: &ContactMotion<T>| ContactMotion {
-        travel_ratio: m.travel_ratio.value(),
-        rim_ratio: m.rim_ratio.value(),
-        lateral_ratio: m.lateral_ratio.value(),
-        slip: m.slip.value(),
-    };
-    let motion_value = values(motion);
+    let motion_value = motion.map(T::value);
     let soil_value = Soil::from_array(soil.to_array().map(T::value));
     let support_value = Support { preload_n: support.preload_n.value(), rate_n_m: support.rate_n_m.value() };
     let floor_n = <T::Value as Real>::lit(1.0);
     let load = support_value.preload_n.max(floor_n);
+    // With a stiff support the load falls as the wheel sinks, and so does what damping leaves: start where the springs together would settle.
     let mut z = bekker_sinkage(load, wheel.radius_m, wheel.width_m, &soil_value);
-    // With a stiff support the load falls as the wheel sinks: start where the series of both springs would settle.
-    z = z * load / (load + support_value.rate_n_m * z);
+    z = z * load / (load + (support_value.rate_n_m + viscous_rate_n_m(wheel, motion_value.pressing_m_s)) * z);
     let wheel_exponent = soil_value.n + <T::Value as Real>::lit(0.5);
     let (excess_n, carried_n) = residual(wheel, z, &support_value, &motion_value, &soil_value);
     let first = (z, carried_n);
@@ -72,12 +66,7 @@ fn residual_with_slope<V: Real>(
     soil: &Soil<V>,
 ) -> Dual<V, 1> {
     let c = Dual::<V, 1>::constant;
-    let motion = ContactMotion {
-        travel_ratio: c(motion.travel_ratio),
-        rim_ratio: c(motion.rim_ratio),
-        lateral_ratio: c(motion.lateral_ratio),
-        slip: c(motion.slip),
-    };
+    let motion = motion.map(c);
     let soil = Soil::from_array(soil.to_array().map(c));
     let support = Support { preload_n: c(support.preload_n), rate_n_m: c(support.rate_n_m) };
     residual(wheel, Dual::variable(z, 0), &support, &motion, &soil).0

@@ -18,4 +18,5 @@ pub use load_balance::{Support, balance_sinkage};
 pub use pressure_sinkage::{bekker_sinkage, normal_stress};
 pub use shear::{mobilised_share, mohr_coulomb};
 pub use slip::{ContactMotion, WheelMotion};
+pub(crate) use wheel::viscous_rate_n_m;
 pub use wheel::{ContactLaw, WheelGeometry, WheelWrench, wheel_wrench};

@@ -27,13 +27,37 @@ pub struct ContactMotion<T> {
     pub lateral_ratio: T,
     /// Slip s ∈ [-1, 1]: (rΩ - v_x) / max(rΩ, v_x).
     pub slip: T,
+    /// Rim speed rΩ in the rolling direction where the soil is fresh, m/s: what is pressed down at θ ahead of the axle goes down at this times sin θ. Less where a
+    /// wheel has passed before.
+    pub pressing_m_s: T,
 }
 
 impl<T: Real> ContactMotion<T> {
-    /// From a slip and a lateral ratio alone (rolling wheel), as single-wheel tests state them. `slip > -1`.
+    /// From a slip and a lateral ratio alone (wheel that rolls very slowly), as single-wheel tests state them. `slip > -1`.
     pub fn from_slip(slip: f64, tan_slip_angle: f64) -> Self {
         let travel = if slip >= 0.0 { 1.0 - slip } else { 1.0 / (1.0 + slip) };
-        Self { travel_ratio: T::lit(travel), rim_ratio: T::lit(1.0), lateral_ratio: T::lit(travel * tan_slip_angle), slip: T::lit(slip) }
+        Self {
+            travel_ratio: T::lit(travel),
+            rim_ratio: T::lit(1.0),
+            lateral_ratio: T::lit(travel * tan_slip_angle),
+            slip: T::lit(slip),
+            pressing_m_s: T::lit(0.0),
+        }
+    }
+}
+
+impl<T> ContactMotion<T> {
+    /// Each number of it under a function.
+    #[inline(always)]
+    pub fn map<U>(self, of: impl Fn(T) -> U) -> ContactMotion<U> {
+        let Self { travel_ratio, rim_ratio, lateral_ratio, slip, pressing_m_s } = self;
+        ContactMotion {
+            travel_ratio: of(travel_ratio),
+            rim_ratio: of(rim_ratio),
+            lateral_ratio: of(lateral_ratio),
+            slip: of(slip),
+            pressing_m_s: of(pressing_m_s),
+        }
     }
 }
 
@@ -54,6 +78,7 @@ impl<T: Real> WheelMotion<T> {
             rim_ratio: rim * scale,
             lateral_ratio: self.left_m_s * scale,
             slip: slip.max(T::lit(-1.0)).min(T::lit(1.0)),
+            pressing_m_s: rim,
         };
         (direction, motion)
     }

@@ -18,6 +18,8 @@ const SINKAGE_FLOOR_M: f64 = 1e-5;
 const SLIDING_FLOOR: f64 = 0.02;
 /// Recovery λ of the soil contact model (chosen: the elastic part of soils with a stiffness of 4e7 Pa/m under a tonne is a few millimetres).
 const ELASTIC_RECOVERY: f64 = 0.05;
+/// Elastic stiffness of damped soil, Pa/m (that of the simulated drives: it springs back by two to five millimetres under half a tonne).
+const ELASTIC_PA_M: f64 = 4e7;
 
 /// How stresses act under the wheel: a family of laws, of which measured drives choose (`nesam train` keeps the one whose symbolic rollouts are better).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -47,8 +49,13 @@ pub struct WheelGeometry {
     pub c1: f64,
     /// c_2 of the same (0.15).
     pub c2: f64,
-    /// Recovery λ of the exit angle θ_2 = -acos(1 - λ z / r); 0 = the soil does not spring back.
+    /// Recovery λ of the exit angle θ_2 = -acos(1 - λ z / r) beyond what is elastic; 0 = none.
     pub recovery: f64,
+    /// Elastic stiffness of the soil, Pa/m: behind the axle it springs back by its pressure over this. Infinite = not at all.
+    pub elastic_pa_m: f64,
+    /// Pressure by which the soil resists being pressed down, over the speed of that, Pa s/m: viscous part of the contact (soil contact model: Tasora et al.
+    /// 2019; a linear law of rate for the pressure that Grahn 1991 measured to grow with the speed of penetration). 0 = as slow as a plate test.
+    pub soil_damping_pa_s_m: f64,
     /// Unit weight γ of the soil that the side wall pushes aside, N/m³; `None` = no side bulldozing.
     pub side_soil_unit_weight_n_m3: Option<f64>,
     /// How stresses act.
@@ -61,7 +68,18 @@ impl WheelGeometry {
     /// Wheel with the coefficients of Ishigami (2007), five quadrature nodes, and no side bulldozing.
     pub fn new(radius_m: f64, width_m: f64) -> Self {
         let law = ContactLaw::WongReece;
-        Self { radius_m, width_m, c1: 0.4, c2: 0.15, recovery: 0.0, side_soil_unit_weight_n_m3: None, law, rule: GaussRule::new(5) }
+        Self {
+            radius_m,
+            width_m,
+            c1: 0.4,
+            c2: 0.15,
+            recovery: 0.0,
+            elastic_pa_m: f64::INFINITY,
+            soil_damping_pa_s_m: 0.0,
+            side_soil_unit_weight_n_m3: None,
+            law,
+            rule: GaussRule::new(5),
+        }
     }
 
     /// The same wheel under a law, with the coefficients of that law.
@@ -70,6 +88,19 @@ impl WheelGeometry {
             ContactLaw::WongReece => Self { law, ..self },
             ContactLaw::SoilContactModel => Self { law, c1: 0.0, c2: 0.0, recovery: ELASTIC_RECOVERY, ..self },
         }
+    }
+}
+
+impl WheelGeometry {
+    /// The same wheel on soil that resists being pressed fast and springs back by its pressure over its stiffness, instead of by a share of the sinkage.
+    pub fn on_damped_soil(self, soil_damping_pa_s_m: f64) -> Self {
+        Self { soil_damping_pa_s_m, elastic_pa_m: ELASTIC_PA_M, recovery: 0.0, ..self }
+    }
+
+    /// Whether the soil is damped: what follows from where its pressure acts is worked out then only.
+    #[inline(always)]
+    pub(crate) fn is_damped(&self) -> bool {
+        self.soil_damping_pa_s_m > 0.0
     }
 }
 
@@ -107,31 +138,43 @@ pub(super) fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
 
 /// Integrates normal and shear stress over the contact arc at a given sinkage (m).
 ///
-/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - λz/r); maximum stress at θ_m = (c_1 + c_2 |s|) θ_1; directions and shear by the wheel's
-/// [`ContactLaw`]. Side bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
+/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - (λz + e)/r) with e what the soil springs back elastically; maximum stress at θ_m = (c_1 + c_2 |s|) θ_1; directions and shear by the wheel's
+/// [`ContactLaw`]. The rim presses soil down at [`ContactMotion::pressing_m_s`] sin θ, for which the soil's damping adds pressure ahead of the axle and takes it away
+/// behind, down to none; neglects that the axle itself moves up or down. Side bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
 #[inline(always)]
 pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &ContactMotion<T>, soil: &Soil<T>) -> WheelWrench<T> {
     let radius = wheel.radius_m;
     let z = sinkage_m.max(T::lit(SINKAGE_FLOOR_M)).min(T::lit(SINKAGE_SHARE_MAX * radius));
     let share = z * T::lit(1.0 / radius);
     let (entry, sin_entry, cos_entry) = angle_of_depth(share);
-    let exit = -angle_of_depth(share * T::lit(wheel.recovery) + T::lit(1e-24)).0;
+    let mut springs_back = share * T::lit(wheel.recovery) + T::lit(1e-24);
+    if wheel.elastic_pa_m.is_finite() {
+        springs_back = (springs_back + normal_stress(z, wheel.width_m, soil) * T::lit(1.0 / (wheel.elastic_pa_m * radius))).min(share);
+    }
+    let exit = -angle_of_depth(springs_back).0;
     let slip_size = motion.slip.abs_smooth(1e-9);
     let peak = entry * (T::lit(wheel.c1) + T::lit(wheel.c2) * slip_size).min(T::lit(0.999));
     let (front, rear) = (entry - peak, peak - exit);
     let tan_phi = soil.phi.tan();
     let per_modulus = T::lit(1.0) / soil.k_shear;
 
+    let viscous = motion.pressing_m_s * T::lit(wheel.soil_damping_pa_s_m);
     let zero = T::lit(0.0);
     let mut sum = WheelWrench { thrust_n: zero, resistance_n: zero, side_n: zero, normal_n: zero, torque_n_m: zero };
     for &(t2, weight) in wheel.rule.nodes() {
         let theta_front = entry - front * T::lit(t2);
         let front_trig = theta_front.sin_cos();
         // The rear branch mirrors the front stress (Wong & Reece 1967): one evaluation of depth^n serves both.
-        let sigma = normal_stress((front_trig.1 - cos_entry) * T::lit(radius), wheel.width_m, soil);
-        let strength = mohr_coulomb(sigma, tan_phi, soil);
+        let still = normal_stress((front_trig.1 - cos_entry) * T::lit(radius), wheel.width_m, soil);
+        let still_strength = mohr_coulomb(still, tan_phi, soil);
         let theta_rear = exit + rear * T::lit(t2);
         for (theta, (sin, cos), arc) in [(theta_front, front_trig, front), (theta_rear, theta_rear.sin_cos(), rear)] {
+            let (sigma, strength) = if wheel.is_damped() {
+                let sigma = (still + viscous * sin).max(zero);
+                (sigma, mohr_coulomb(sigma, tan_phi, soil))
+            } else {
+                (still, still_strength)
+            };
             let at = ContactPoint { sin, cos, swept: entry - theta, sin_entry };
             let w = arc * T::lit(weight);
             match wheel.law {
@@ -170,6 +213,12 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
         normal_n: sum.normal_n * area,
         torque_n_m: sum.torque_n_m * area * T::lit(radius),
     }
+}
+
+/// Load that damping carries over the sinkage, N/m, of a shallow contact that presses at u: b r d u ∫ sin θ cos θ dθ = b d u (z - z² / 2r).
+#[inline(always)]
+pub(crate) fn viscous_rate_n_m<T: Real>(wheel: &WheelGeometry, pressing_m_s: T) -> T {
+    pressing_m_s.max(T::lit(0.0)) * T::lit(wheel.soil_damping_pa_s_m * wheel.width_m)
 }
 
 /// A point of the contact arc: sine and cosine of its angle, the angle swept since the rim entered the soil, and the sine there.
