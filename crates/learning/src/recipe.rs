@@ -253,7 +253,9 @@ fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64,
     let mut best: Option<(f64, Vehicle)> = None;
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
-    for (law, drive) in ContactLaw::ALL.iter().flat_map(|law| drives_by.iter().map(move |drive| (*law, *drive))) {
+    // Under the other law soil has no damping to ask for.
+    let laws = ContactLaw::ALL.into_iter().filter(|law| vehicle.soil_damping_pa_s_m == 0.0 || *law == ContactLaw::SoilContactModel);
+    for (law, drive) in laws.flat_map(|law| drives_by.iter().map(move |drive| (law, *drive))) {
         let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
         let name = format!("{law:?}, {drive:?}");

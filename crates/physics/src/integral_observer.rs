@@ -7,7 +7,7 @@ use crate::driveline::{DrivelineState, limited, unlimited};
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::{Control, VehicleState};
-use crate::step::{StepModel, fresh_share};
+use crate::step::StepModel;
 use crate::terramechanics::Support;
 use crate::torque_drive::Grip;
 use crate::vec3::Tilt;
@@ -77,20 +77,25 @@ impl StepModel {
         let line = &self.vehicle().driveline;
         let driven = line.torque.as_ref().filter(|_| share > 0.0 && line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S);
         let Some(torque) = driven.filter(|_| speed_m_s.value() >= SLOWEST_M_S) else { return T::lit(0.0) };
-        let prior = Soil::from_array(prior.to_array().map(T::lit));
-        let force_n = self.compaction_n(soil, speed_m_s) - self.compaction_n(&prior, speed_m_s);
+        let usual_n = if self.wheel.is_damped() {
+            self.compaction_n(&Soil::from_array(prior.to_array().map(T::lit)), speed_m_s)
+        } else {
+            T::lit(self.compaction_n(prior, speed_m_s.value()))
+        };
+        let force_n = self.compaction_n(soil, speed_m_s) - usual_n;
         let engine = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let demand = force_n * T::lit(self.vehicle().wheel_radius_m) / torque.driving_n_m_s_m(speed_m_s, engine);
         let limit = UNSATURATED * line.overspeed_limit_m_s;
         demand.max(T::lit(-limit)).min(T::lit(limit)) * T::lit(share / line.speed_integral_gain_per_s)
     }
 
-    /// Force at the rims that compaction takes of four wheels which carry the weight alike at a speed, N.
+    /// Force at the rims that compaction takes of four wheels which carry the weight alike, N; it depends on the speed where the soil is damped, under the leading axle.
     fn compaction_n<T: Real>(&self, soil: &Soil<T>, speed_m_s: T) -> T {
         let load_n = T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2 / WHEELS as f64);
         let weight = Support { preload_n: load_n, rate_n_m: T::lit(0.0) };
-        let of_wheel = |i: usize| Grip::settled(&self.wheel, &weight, speed_m_s * fresh_share(i, T::lit(1.0)), soil).compaction_n;
-        (1..WHEELS).fold(of_wheel(0), |sum, i| sum + of_wheel(i))
+        let of_axle = |pressing_m_s: T| Grip::settled(&self.wheel, &weight, pressing_m_s, soil).compaction_n * T::lit(2.0);
+        let following = of_axle(T::lit(0.0));
+        following + if self.wheel.is_damped() { of_axle(speed_m_s) } else { following }
     }
 
     /// What effects hold against a vehicle that goes straight ahead on level ground at a speed (m/s) above rest, N.

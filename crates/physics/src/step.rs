@@ -12,7 +12,7 @@ use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
 use crate::terramechanics::{ContactLaw, Support, WheelGeometry, WheelMotion, WheelWrench};
-use crate::torque_drive::{Driven, Grip, carried_on_n};
+use crate::torque_drive::{Driven, carried_on_n};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -253,13 +253,13 @@ impl StepModel {
         }
 
         let mut stances: [Stance<T>; WHEELS] = core::array::from_fn(|i| self.stance(i, state, &tilt, input));
-        let grips: [Grip<T>; WHEELS] = core::array::from_fn(|i| self.grip(i, stances[i].preload_n, stances[i].forward_m_s, &input.soil));
-        if self.wheel.is_damped() {
-            for (stance, grip) in stances.iter_mut().zip(&grips) {
+        let grips = self.grips(&stances.each_ref().map(|s| (s.preload_n, s.forward_m_s)), &input.soil);
+        if let Some(grips) = grips.as_ref().filter(|_| self.wheel.is_damped()) {
+            for (stance, grip) in stances.iter_mut().zip(grips) {
                 stance.lead_by(grip.lead_m, w);
             }
         }
-        let driven = self.driven(&grips, &stances.each_ref().map(|s| s.forward_m_s), state, input);
+        let driven = grips.and_then(|grips| self.driven(&grips, &stances.each_ref().map(|s| s.forward_m_s), state, input));
         let driven = |i: usize| driven.as_ref().map(|driven| &driven[i]);
         let rolls: [Roll<T>; WHEELS] = core::array::from_fn(|i| self.roll(i, &stances[i], driven(i), state, input));
         let sunk = self.sink(rolls.each_ref().map(|roll| &roll.contact), sink);

@@ -211,7 +211,7 @@ pub struct Vehicle {
     pub driveline: Driveline,
     /// How the soil acts on the wheels.
     pub contact_law: ContactLaw,
-    /// Pressure by which fresh soil resists being pressed down, over the speed of that, Pa s/m
+    /// Pressure by which fresh soil resists being pressed down under the soil contact model, over the speed of that, Pa s/m
     /// ([`WheelGeometry::soil_damping_pa_s_m`](crate::terramechanics::WheelGeometry::soil_damping_pa_s_m)).
     pub soil_damping_pa_s_m: f64,
     /// Gravity, m/s².

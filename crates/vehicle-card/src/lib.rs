@@ -228,11 +228,9 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
     if let Some((key, value)) = positive.iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
         return Err(CardError(format!("`{key}` is {value}, must be positive")));
     }
-    if !(c.driveline.side_coupling_n_m_s >= 0.0) {
-        return Err(CardError(format!("`driveline.side_coupling_n_m_s` is {}, must not be negative", c.driveline.side_coupling_n_m_s)));
-    }
-    if !(c.soil_damping_pa_s_m >= 0.0 && c.soil_damping_pa_s_m.is_finite()) {
-        return Err(CardError(format!("`soil_damping_pa_s_m` is {}, must not be negative", c.soil_damping_pa_s_m)));
+    let not_negative = [("driveline.side_coupling_n_m_s", c.driveline.side_coupling_n_m_s), ("soil_damping_pa_s_m", c.soil_damping_pa_s_m)];
+    if let Some((key, value)) = not_negative.iter().find(|(_, value)| value.is_nan() || *value < 0.0) {
+        return Err(CardError(format!("`{key}` is {value}, must not be negative")));
     }
     if let Some(fault) = c.driveline.torque.as_ref().and_then(torque_at_fault) {
         return Err(CardError(fault));

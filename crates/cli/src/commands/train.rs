@@ -78,7 +78,7 @@ pub struct TrainArgs {
     #[arg(long, requires = "from")]
     recalibrate: bool,
     /// Pressure by which fresh soil resists being pressed down, over the speed of that, Pa s/m; a few thousand to tens of thousands, 0 for soil that yields
-    /// however fast it is pressed [default: as the vehicle's card or, with --from, the bundle has it]
+    /// however fast it is pressed. Part of the soil contact model, the only contact law that is then calibrated [default: as the card or, with --from, the bundle has it]
     #[arg(long, value_name = "PA_S_M")]
     soil_damping: Option<f64>,
     /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right

@@ -51,7 +51,7 @@ pub struct WheelGeometry {
     pub c2: f64,
     /// Recovery λ of the exit angle θ_2 = -acos(1 - λ z / r) beyond what is elastic; 0 = none.
     pub recovery: f64,
-    /// Elastic stiffness of the soil, Pa/m: behind the axle it springs back by its pressure over this. Infinite = not at all.
+    /// Elastic stiffness of damped soil, Pa/m: behind the axle it springs back by its pressure over this. Infinite = not at all.
     pub elastic_pa_m: f64,
     /// Pressure by which the soil resists being pressed down, over the speed of that, Pa s/m: viscous part of the contact (soil contact model: Tasora et al.
     /// 2019; a linear law of rate for the pressure that Grahn 1991 measured to grow with the speed of penetration). 0 = as slow as a plate test.
@@ -89,9 +89,7 @@ impl WheelGeometry {
             ContactLaw::SoilContactModel => Self { law, c1: 0.0, c2: 0.0, recovery: ELASTIC_RECOVERY, ..self },
         }
     }
-}
 
-impl WheelGeometry {
     /// The same wheel on soil that resists being pressed fast and springs back by its pressure over its stiffness, instead of by a share of the sinkage.
     pub fn on_damped_soil(self, soil_damping_pa_s_m: f64) -> Self {
         Self { soil_damping_pa_s_m, elastic_pa_m: ELASTIC_PA_M, recovery: 0.0, ..self }
@@ -138,17 +136,35 @@ pub(super) fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
 
 /// Integrates normal and shear stress over the contact arc at a given sinkage (m).
 ///
-/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - (λz + e)/r) with e what the soil springs back elastically; maximum stress at θ_m = (c_1 + c_2 |s|) θ_1; directions and shear by the wheel's
-/// [`ContactLaw`]. The rim presses soil down at [`ContactMotion::pressing_m_s`] sin θ, for which the soil's damping adds pressure ahead of the axle and takes it away
-/// behind, down to none; neglects that the axle itself moves up or down. Side bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
+/// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - (λz + e)/r) with e what the soil springs back elastically; maximum stress at
+/// θ_m = (c_1 + c_2 |s|) θ_1; directions and shear by the wheel's [`ContactLaw`]. The rim presses soil down at [`ContactMotion::pressing_m_s`] sin θ, for
+/// which the soil's damping adds pressure ahead of the axle and takes it away behind, down to none; neglects that the axle itself moves up or down. Side
+/// bulldozing is added where the wheel asks for it; neglects the shear of the side wall. Sinkage is limited to [1e-5 m, 0.9 r].
 #[inline(always)]
 pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &ContactMotion<T>, soil: &Soil<T>) -> WheelWrench<T> {
+    if wheel.is_damped() { on_damped_soil(wheel, sinkage_m, motion, soil) } else { integrated::<T, false>(wheel, sinkage_m, motion, soil) }
+}
+
+/// Stands out of the line of soil that is not damped.
+#[cold]
+#[inline(never)]
+fn on_damped_soil<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &ContactMotion<T>, soil: &Soil<T>) -> WheelWrench<T> {
+    integrated::<T, true>(wheel, sinkage_m, motion, soil)
+}
+
+#[inline(always)]
+fn integrated<T: Real, const DAMPED: bool>(
+    wheel: &WheelGeometry,
+    sinkage_m: T,
+    motion: &ContactMotion<T>,
+    soil: &Soil<T>,
+) -> WheelWrench<T> {
     let radius = wheel.radius_m;
     let z = sinkage_m.max(T::lit(SINKAGE_FLOOR_M)).min(T::lit(SINKAGE_SHARE_MAX * radius));
     let share = z * T::lit(1.0 / radius);
     let (entry, sin_entry, cos_entry) = angle_of_depth(share);
     let mut springs_back = share * T::lit(wheel.recovery) + T::lit(1e-24);
-    if wheel.elastic_pa_m.is_finite() {
+    if DAMPED {
         springs_back = (springs_back + normal_stress(z, wheel.width_m, soil) * T::lit(1.0 / (wheel.elastic_pa_m * radius))).min(share);
     }
     let exit = -angle_of_depth(springs_back).0;
@@ -169,7 +185,7 @@ pub fn wheel_wrench<T: Real>(wheel: &WheelGeometry, sinkage_m: T, motion: &Conta
         let still_strength = mohr_coulomb(still, tan_phi, soil);
         let theta_rear = exit + rear * T::lit(t2);
         for (theta, (sin, cos), arc) in [(theta_front, front_trig, front), (theta_rear, theta_rear.sin_cos(), rear)] {
-            let (sigma, strength) = if wheel.is_damped() {
+            let (sigma, strength) = if DAMPED {
                 let sigma = (still + viscous * sin).max(zero);
                 (sigma, mohr_coulomb(sigma, tan_phi, soil))
             } else {
