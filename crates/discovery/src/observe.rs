@@ -7,11 +7,11 @@
 use std::sync::Arc;
 
 use nesam_evaluation::{DriveMaps, history_steps};
-use nesam_model::{GroundSource, Predictor, Transition};
+use nesam_model::{GroundSource, ModelBundle, Predictor, Transition};
 use nesam_physics::driveline::{DrivelineState, command_wheels, rim_twist};
 use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel, StepOutput};
-use nesam_physics::{SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{Ride, SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
@@ -27,22 +27,36 @@ const FIRST_START: usize = 16;
 const FIRST_START_SERVOED: usize = 1;
 /// Over-speed beyond which a wheel spins more than it grips, m/s (chosen: a slip of a fifth at the usual speed).
 const GRIPPING_M_S: f64 = 0.5;
+/// How far apart, m and rad, the poses are that the network is asked about: a few times what a load makes (chosen).
+const ASKED_APART: f64 = 0.01;
 /// Smallest change of tractive force per rim over-speed that is believed, N per m/s (a wheel in the air has none).
 const TRACTION_SLOPE_FLOOR: f64 = 2000.0;
 
-/// Step and sub-steps of the physics.
+/// Step and sub-steps of the physics, and the soil on which the vehicle usually rides.
 #[derive(Clone, Copy, Debug)]
 pub struct Stepping {
     /// Step, s.
     pub dt_s: f64,
     /// Sub-steps.
     pub substeps: usize,
+    /// Usual soil, SI; `None` where no network is asked, so that nobody needs to know how effects shift the ride.
+    pub usual_soil: Option<[f64; SOIL_DIM]>,
 }
 
 impl Stepping {
+    /// As a bundle steps.
+    pub fn of(bundle: &ModelBundle) -> Self {
+        let scales = &bundle.normalization;
+        Self { dt_s: scales.dt_s, substeps: scales.substeps, usual_soil: Some(scales.default_soil()) }
+    }
+
     /// The physics of a vehicle.
     pub fn model(&self, vehicle: &Vehicle) -> StepModel {
-        StepModel::new(vehicle, self.dt_s, self.substeps)
+        let model = StepModel::new(vehicle, self.dt_s, self.substeps);
+        match self.usual_soil {
+            Some(usual) => model.riding_on(&Soil::from_array(usual)),
+            None => model,
+        }
     }
 }
 
@@ -69,6 +83,10 @@ pub struct ObservedDrive {
     map: Option<Arc<WorldMap>>,
     states: Vec<VehicleState<f64>>,
     transitions: Vec<Transition>,
+    /// How what the network says of each sample follows the pose that it is asked about.
+    follows: Vec<Follows>,
+    /// What effects of the bundle make of the ride: the network was asked about poses without it.
+    ride_known: Ride,
     wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,
     road_wheel_angle_rad: Option<Vec<[f64; 2]>>,
     /// ∂(tractive force)/∂(rim over-speed) of each wheel at each sample, N per m/s.
@@ -80,6 +98,34 @@ struct Reading {
     model: StepModel,
     actuators: Vec<[DrivelineState; 2]>,
     states: Vec<VehicleState<f64>>,
+}
+
+/// Change of what the network says of a sample, per metre of height and per rad of roll and pitch that the pose it is asked about is the less.
+#[derive(Clone, Copy, Debug)]
+struct Follows {
+    residual: [[f64; STATE_DIM]; 3],
+    sinkage_log_ratio: [[f64; WHEELS]; 3],
+}
+
+impl Follows {
+    /// From what it says of the pose itself and of poses that are less by [`ASKED_APART`] in height, roll and pitch.
+    fn between(here: &Transition, apart: [&Transition; 3]) -> Self {
+        let slope = |there: f64, here: f64| (there - here) / ASKED_APART;
+        Self {
+            residual: apart.map(|t| core::array::from_fn(|i| slope(t.residual[i], here.residual[i]))),
+            sinkage_log_ratio: apart
+                .map(|t| core::array::from_fn(|w| slope(t.input.sinkage_log_ratio[w], here.input.sinkage_log_ratio[w]))),
+        }
+    }
+
+    /// What the network says where effects shift the ride: of the pose without the shift, since it knows the vehicle without the effects.
+    fn said(&self, transition: &Transition, ride_shift: &Ride) -> ([f64; STATE_DIM], [f64; WHEELS]) {
+        let more = |slopes: [f64; 3]| slopes.iter().zip(ride_shift).map(|(slope, shift)| slope * shift).sum::<f64>();
+        (
+            core::array::from_fn(|i| transition.residual[i] + more(self.residual.map(|r| r[i]))),
+            core::array::from_fn(|w| transition.input.sinkage_log_ratio[w] + more(self.sinkage_log_ratio.map(|s| s[w]))),
+        )
+    }
 }
 
 /// Physics, state and actuators of one sample.
@@ -112,10 +158,17 @@ pub fn observe_all(
 /// `DiscoveryError::NoSegments` when no segment fits on known ground.
 pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<WorldMap>>) -> Result<ObservedDrive, DiscoveryError> {
     let steps = history_steps(drive);
-    let transitions: Vec<Transition> = (0..steps.len().saturating_sub(1))
-        .into_par_iter()
-        .map(|k| predictor.transition(&steps[..k], &steps[k].state, &steps[k].control, map))
-        .collect();
+    let asked = |predictor: &Predictor| -> Vec<Transition> {
+        let of = |k: usize| predictor.transition(&steps[..k], &steps[k].state, &steps[k].control, map);
+        (0..steps.len().saturating_sub(1)).into_par_iter().map(of).collect()
+    };
+    let transitions = asked(predictor);
+    let elsewhere: [Vec<Transition>; 3] = core::array::from_fn(|i| {
+        let mut without = [0.0; 3];
+        without[i] = ASKED_APART;
+        asked(&predictor.asked_without(&without))
+    });
+    let follows = (0..transitions.len()).map(|k| Follows::between(&transitions[k], elsewhere.each_ref().map(|apart| &apart[k]))).collect();
     let last = drive.states.len().saturating_sub(SEGMENT_STEPS + 1);
     let model = predictor.step_model();
     let servoed = rims_servoed(model.vehicle());
@@ -139,6 +192,8 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
         map: map.cloned(),
         states: drive.states.clone(),
         transitions,
+        follows,
+        ride_known: *model.ride_shift(),
         wheel_speed_rad_s: drive.wheel_speed_rad_s.clone(),
         road_wheel_angle_rad: drive.road_wheel_angle_rad.clone(),
         traction_slope,
@@ -351,11 +406,14 @@ impl ObservedDrive {
         add_consistency(&states[start..=start + SEGMENT_STEPS], model.dt_s(), &mut row);
         let mut state = states[start];
         let ground = GroundSource::new(self.map.as_deref(), model, &state);
+        let ride_shift: Ride = core::array::from_fn(|i| model.ride_shift()[i] - self.ride_known[i]);
         for (j, transition) in self.transitions[start..start + SEGMENT_STEPS].iter().enumerate() {
             let [before, after] = &reading.actuators[start + j];
+            let (residual, sinkage_log_ratio) = self.follows[start + j].said(transition, &ride_shift);
             let input = StepInput {
                 state,
                 wheels: command_wheels(model.vehicle(), before, after, &transition.control),
+                sinkage_log_ratio,
                 soil: Soil::from_array(self.soil_at(model, soil, start + j, bench.stepping.dt_s)),
                 ground: ground.under_wheels(model, &state, 0.0).0,
                 ..transition.input
@@ -363,7 +421,7 @@ impl ObservedDrive {
             let StepOutput { increment, contacts } = model.step(&input);
             self.actuators(reading, start + j, j, contacts.map(|c| c.overspeed_m_s), gripping, &mut row);
             let increment = increment.to_array();
-            let total: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + transition.residual[i]);
+            let total: [f64; STATE_DIM] = core::array::from_fn(|i| increment[i] + residual[i]);
             state = VehicleState::from_array(state.advanced(&total));
             for (b, [from, to]) in BINS.iter().enumerate() {
                 if (*from..=*to).contains(&(j + 1)) {

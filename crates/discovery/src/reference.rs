@@ -22,7 +22,7 @@ use crate::evidence::{Group, Nulls};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
 
-const SCHEMA: &str = "nesam.reference/4";
+const SCHEMA: &str = "nesam.reference/5";
 /// Random groups of null drives.
 const NULL_GROUPS: usize = 1000;
 /// Fewest drives of a reference.
@@ -49,7 +49,7 @@ pub struct NullDrive {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reference {
-    /// Always `nesam.reference/4`.
+    /// Always `nesam.reference/5`.
     pub schema: String,
     /// Hash of the data behind it.
     pub data_hash: String,

@@ -110,7 +110,7 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
     let bundle = bundle();
     let recorded = drive("again", 42, &[], &bundle.default_soil);
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 }, catalogue: &[] };
+    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &[] };
     let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
     let mut again = recorded.clone();
     observed.driven_again(&bench, &[], &mut again);

@@ -42,6 +42,7 @@ mod soil_ceiling;
 mod test_vehicle;
 mod true_soil;
 mod twin;
+mod wheel_rates;
 mod windows;
 
 pub use adapt::{Consistency, DriveAdaptation, TimedUpdate, adapt_all, adapt_drive, calibrate_noise, check_forecasts};
@@ -66,4 +67,5 @@ pub use slices::{Slice, slices};
 pub use soil_ceiling::{BestCorrection, best_correction};
 pub use true_soil::TrueSoil;
 pub use twin::{TwinPlan, TwinReport, run_twins, run_twins_against};
+pub use wheel_rates::wheel_rates;
 pub use windows::{Truth, Window, all_windows, history_steps};

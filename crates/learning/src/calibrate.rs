@@ -1,18 +1,11 @@
 //! Calibration of the drive line on measured drives, with the symbolic model alone.
 
-use nesam_model::soil_coordinates::from_raw;
-use nesam_model::{GroundSource, Normalization, history_actuators};
-use nesam_physics::driveline::command_wheels;
-use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{SecondCommand, Soil, TORQUE_KNOTS, TorqueDrive, Vehicle, VehicleState, WHEELS};
-use rayon::prelude::*;
+use nesam_model::Normalization;
+use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
-use crate::class_soil::ClassSoil;
 use crate::drives::Drive;
 use crate::rims::fit_rims;
-
-/// Steps of a calibration rollout.
-const HORIZON: usize = 16;
+use crate::symbolic::symbolic_error;
 
 /// A number of the drive line that is calibrated, with its range.
 pub type Knob = (&'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
@@ -96,54 +89,6 @@ impl DriveLaw {
     }
 }
 
-/// Mean position error (m) over short rollouts of the symbolic model from every `stride`-th sample.
-pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, stride: usize) -> f64 {
-    let model = StepModel::new(vehicle, scales.dt_s, scales.substeps);
-    let default_soil = Soil::from_array(scales.default_soil());
-    // Summed in the order of the drives, so that calibrating again gives the same bits.
-    let sums: Vec<(f64, usize)> = drives
-        .par_iter()
-        .map(|drive| {
-            let (mut sum, mut count) = (0.0, 0usize);
-            let last = drive.states.len().saturating_sub(HORIZON + 1);
-            for i in (8.min(last.saturating_sub(1))..last).step_by(stride) {
-                sum += rollout_error(&model, drive, i, &default_soil, scales);
-                count += 1;
-            }
-            (sum, count)
-        })
-        .collect();
-    let (sum, count) = sums.iter().fold((0.0, 0), |all, one| (all.0 + one.0, all.1 + one.1));
-    sum / count.max(1) as f64
-}
-
-/// The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
-fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> f64 {
-    let mut state = drive.states[i];
-    let ground = GroundSource::new(drive.map.as_deref(), model, &state);
-    let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &state, &drive.controls[i], scales.dt_s);
-    let mut error = 0.0;
-    for k in 0..HORIZON {
-        let control = &drive.controls[i + k];
-        let after = actuators.advance(model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);
-        let [x_m, y_m, _] = state.position_m;
-        let class_soil = drive.map.as_deref().and_then(|map| ClassSoil::at(map, x_m, y_m));
-        let input = StepInput {
-            state,
-            wheels: command_wheels(model.vehicle(), &actuators, &after, control),
-            sinkage_log_ratio: [0.0; WHEELS],
-            soil: class_soil.map_or(*default_soil, |class| Soil::from_array(from_raw(&class.mean))),
-            ground: ground.under_wheels(model, &state, 0.0).0,
-        };
-        let increment = model.step(&input).increment;
-        state = VehicleState::from_array(state.advanced(&increment.to_array()));
-        actuators = after;
-        let measured = drive.states[i + k + 1].position_m;
-        error += (state.position_m[0] - measured[0]).hypot(state.position_m[1] - measured[1]) / HORIZON as f64;
-    }
-    error
-}
-
 /// Numbers that are calibrated on a car.
 pub fn knobs(vehicle: &Vehicle) -> &'static [Knob] {
     if vehicle.driveline.torque.is_some() { &TORQUE } else { &OVERSPEED }
@@ -156,13 +101,13 @@ pub fn calibrate_driveline(
     scales: &Normalization,
     mut progress: impl FnMut(&str, f64, f64),
 ) -> [f64; 2] {
-    let before = symbolic_error(vehicle, drives, scales, 40);
+    let before = symbolic_error(vehicle, drives, scales).position_m;
     if vehicle.second == SecondCommand::YawRateRadS {
         if let Some(servo) = fit_rims(vehicle, drives, scales.dt_s) {
             vehicle.driveline.rims = servo;
             progress("rims", servo.speed_gain, servo.turn_efficiency);
         }
-        return [before, symbolic_error(vehicle, drives, scales, 40)];
+        return [before, symbolic_error(vehicle, drives, scales).position_m];
     }
     let mut best = before;
     for round in 0..3 {
@@ -176,7 +121,7 @@ pub fn calibrate_driveline(
                 for trial in trials.map(|t| t.clamp(low, high)) {
                     let mut candidate = vehicle.clone();
                     *knob(&mut candidate) = trial;
-                    let error = symbolic_error(&candidate, drives, scales, 40);
+                    let error = symbolic_error(&candidate, drives, scales).position_m;
                     if error < best {
                         best = error;
                         *vehicle = candidate;

@@ -1,7 +1,7 @@
 //! Offline training: encoder pre-training and autoregressive rollouts (paper §III-D, §IV).
 //!
 //! A run has four stages: the encoders are pre-trained as autoencoders on patches around the driven places ([`autoencoder`]); the drive line
-//! of the vehicle card is calibrated with the symbolic model alone ([`calibrate`]); the contexts of all measured poses are computed once
+//! and the suspension of the vehicle card are calibrated with the symbolic model alone ([`calibrate`], [`suspension`]); the contexts of all measured poses are computed once
 //! ([`drives`]); and the network is trained through K-step rollouts ([`trainer`]).
 #![forbid(unsafe_code)]
 
@@ -17,6 +17,8 @@ pub mod recipe;
 pub mod rims;
 pub mod scales;
 pub mod schedule;
+pub mod suspension;
+pub mod symbolic;
 pub mod trainer;
 
 pub use drives::{Drive, encode_drives};

@@ -21,6 +21,7 @@ use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
 use crate::pooling::Pooling;
 use crate::scales::{measure, measure_increments};
+use crate::suspension::{TURNS, calibrate_suspension};
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
 
 /// What a run is told; the defaults of the command line are in `nesam train --help`.
@@ -244,7 +245,8 @@ fn mirrored(drives: &[Drive], at: &[usize]) -> Vec<Drive> {
         .collect()
 }
 
-/// The vehicle with its drive line fitted on the training drives under each contact law, the better pair kept, and the scales of the drives.
+/// The vehicle with its drive line fitted on the training drives under each contact law, the better pair kept, its suspension fitted with that, and the scales
+/// of the drives.
 fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
     let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
     let scales = measure(&training, &vehicle, dt_s);
@@ -270,7 +272,20 @@ fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64,
             best = Some((after, candidate));
         }
     }
-    (best.map_or(vehicle, |(_, chosen)| chosen), scales)
+    let mut chosen = best.map_or(vehicle, |(_, chosen)| chosen);
+    reporter.stage("suspension", TURNS);
+    let mut done = 0;
+    let [before, after] = calibrate_suspension(&mut chosen, &training, &scales, |name, value, error| {
+        done += 1;
+        reporter.progress(done, &format!("{name} = {value:.0}, {:.3}°", error.to_degrees()));
+    });
+    let (rates, dampings) = (chosen.suspension_n_m, chosen.suspension_n_s_m);
+    reporter.line(&format!(
+        "suspension, symbolic model alone {:.3}° -> {:.3}° of roll and pitch over 1.6 s; {rates:.0?} N/m, {dampings:.0?} N s/m",
+        before.to_degrees(),
+        after.to_degrees()
+    ));
+    (chosen, scales)
 }
 
 /// Pre-trained encoders, from the output folder if this run was made before.

@@ -142,3 +142,30 @@ fn property_a_raised_map_and_vehicle_are_the_same_scene() {
         }
     }
 }
+
+/// Goal: the network is asked about the pose that the vehicle would have without what effects make of its ride. Method: with a load, what it says of a pose
+/// is what it says without one of the pose without the shift, to the bit.
+#[test]
+fn property_the_network_is_asked_about_the_ride_that_it_knows() {
+    let scene = scene();
+    let loaded = scene.predictor.with_effects(&[Effect::Payload(Payload { mass_kg: 600.0, at_m: [-1.4, 0.2, 0.8] })]);
+    let model = loaded.step_model();
+    let [up_m, roll_rad, pitch_rad] = *model.ride_shift();
+    assert!(up_m < -0.005 && roll_rad < -1e-4 && pitch_rad < -1e-3, "{up_m} m, {roll_rad} {pitch_rad} rad");
+
+    let known: Vec<HistoryStep> = scene.history.iter().map(|step| HistoryStep { state: model.as_known(&step.state), ..*step }).collect();
+    let asked = |predictor: &Predictor, history: &[HistoryStep], start: &VehicleState<f64>| {
+        let control = history[history.len() - 1].control;
+        predictor.transition(history, start, &control, Some(&scene.map))
+    };
+    let with = asked(&loaded, &scene.history, &scene.start);
+    let without = asked(&scene.predictor, &known, &model.as_known(&scene.start));
+    assert_eq!(with.hidden, without.hidden);
+    assert_eq!(with.residual, without.residual);
+    assert_ne!(with.hidden, asked(&scene.predictor, &scene.history, &scene.start).hidden);
+    // Asked from outside, for effects that the bundle does not have, it says the same but for the place of one rounding.
+    let outside = asked(&scene.predictor.asked_without(model.ride_shift()), &scene.history, &scene.start);
+    for (a, b) in with.residual.iter().zip(outside.residual) {
+        assert!((a - b).abs() < 1e-4 * a.abs().max(1e-2), "{a} {b}");
+    }
+}

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use nesam_physics::driveline::DrivelineState;
 use nesam_physics::effects::{Phases, ScheduledEffect};
 use nesam_physics::step::StepModel;
-use nesam_physics::{Control, SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
+use nesam_physics::{Control, Ride, SOIL_DIM, STATE_DIM, Soil, VehicleState, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
 
 use crate::ModelError;
@@ -157,6 +157,13 @@ impl Predictor {
             maps: self.maps.clone(),
             bundle,
         }
+    }
+
+    /// The same predictor whose network sees the vehicle without this much of its ride: what effects that are not the bundle's would make of it.
+    pub fn asked_without(&self, ride_shift: &Ride) -> Self {
+        let mut asked = self.clone();
+        asked.token_scale.mean.iter_mut().zip(ride_shift).for_each(|(mean, shift)| *mean += *shift as f32);
+        asked
     }
 
     /// The same predictor with changed weights of the residual head: what a refit of the learned residual on few drives can change. `weight` is added to
@@ -332,7 +339,8 @@ impl Predictor {
         ground: &GroundSource<'_>,
     ) -> [f32; STATE_CONTROL] {
         let (height, _, _) = ground.at(&model.vehicle().effects.map, state.position_m[0], state.position_m[1]);
-        let raw = token_entries(state, previous, [control.speed_m_s, control.second], height, self.bundle.normalization.dt_s);
+        let (known, dt_s) = (model.as_known(state), self.bundle.normalization.dt_s);
+        let raw = token_entries(&known, previous, [control.speed_m_s, control.second], height, dt_s);
         self.token_scale.apply(raw)
     }
 
@@ -363,7 +371,8 @@ impl Predictor {
 /// The physics of a bundle in each phase between the onsets of its effects.
 fn phases(bundle: &ModelBundle) -> Phases<StepModel> {
     let scales = &bundle.normalization;
-    Phases::new(&bundle.vehicle, &bundle.effects, |vehicle| StepModel::new(vehicle, scales.dt_s, scales.substeps))
+    let usual = Soil::from_array(scales.default_soil());
+    Phases::new(&bundle.vehicle, &bundle.effects, |vehicle| StepModel::new(vehicle, scales.dt_s, scales.substeps).riding_on(&usual))
 }
 
 fn sensors_err(model: &StepModel) -> bool {

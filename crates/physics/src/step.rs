@@ -7,6 +7,7 @@
 use crate::contacts::{Rolling, Sunk};
 use crate::driveline::WheelCommand;
 use crate::linear::solve_spd;
+use crate::ride::Ride;
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
@@ -76,8 +77,9 @@ pub struct StepModel {
     pub(crate) altered: Altered,
     static_load_n: [f64; WHEELS],
     pub(crate) body: RigidBody,
-    substeps: usize,
-    dt_s: f64,
+    pub(crate) ride_shift: Ride,
+    pub(crate) substeps: usize,
+    pub(crate) dt_s: f64,
 }
 
 /// Speed around which the friction of a dragging wheel changes its sign, m/s (chosen).
@@ -170,6 +172,7 @@ impl StepModel {
             wheel,
             static_load_n: vehicle.static_load_n(),
             body: RigidBody::new(vehicle),
+            ride_shift: [0.0; 3],
             vehicle: vehicle.clone(),
             substeps,
             dt_s: dt_s / (1.0 + vehicle.effects.sensor.clock_drift),

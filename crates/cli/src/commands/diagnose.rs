@@ -129,7 +129,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
     let catalogue = catalogue(&hypotheses);
-    let bench = Bench { vehicle: &predictor.bundle().vehicle, stepping: stepping(&bundle), catalogue: &catalogue };
+    let bench = Bench { vehicle: &predictor.bundle().vehicle, stepping: Stepping::of(&bundle), catalogue: &catalogue };
     let progress = Progress::start("validation drives against every effect", observed.len());
     let reference = Reference::measure(&bench, &observed, &drives.root.hash(), &|done| progress.set(done)).or_input()?;
     progress.finish();
@@ -163,10 +163,6 @@ fn take_coupling(bundle: &mut ModelBundle, sheet: &Vehicle) {
         bundle.vehicle.driveline.side_coupling_n_m_s = coupling;
         say!("the card of the bundle now has the coupling of the data sheet, {coupling} N m s/rad between the wheels of an axle");
     }
-}
-
-fn stepping(bundle: &ModelBundle) -> Stepping {
-    Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps }
 }
 
 /// Ids of the drives to fit on; `train` stands for those of the train split.

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use nesam_evaluation::{ResidualPart, look_inside};
+use nesam_evaluation::{ResidualPart, look_inside, wheel_rates};
 use nesam_trajectories::{SoilTruth, read_ground_truth_soil};
 use serde_json::{Map, Value, json};
 
@@ -60,6 +60,12 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
     say!("{}", listed(|part| format!("{:.0} %", 100.0 * part.share)).join(", "));
     say!("and what it adds on average, per second (m, rad, m/s, rad/s):");
     say!("{}", listed(|part| format!("{:.3}", part.mean_per_s)).join(", "));
+    let vehicle = &predictor.bundle().vehicle;
+    let believed = [0, 2].map(|w| vehicle.suspension_n_m[w]);
+    let seen = wheel_rates(vehicle, drives.drives.iter().filter_map(|d| d.truth.as_ref()));
+    if let Some(seen) = seen {
+        say!("\nrate of the suspension at a wheel, front and rear: {believed:.0?} N/m in the bundle, {seen:.0?} N/m by force over travel");
+    }
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.inside/1",
@@ -68,6 +74,7 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
         "quantities": quantities,
         "residual_share": shares,
         "residual_mean_per_s": means,
+        "wheel_rate_n_m": { "bundle": believed, "seen": seen },
         "provenance": provenance(Some(predictor.bundle()), &drives),
     });
     write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())

@@ -213,7 +213,7 @@ impl Stage<'_> {
     pub fn run(&self, hidden: &Hidden, group: usize, scoring: Option<&Scoring>) -> Result<Outcome, DiscoveryError> {
         let start = Instant::now();
         let bundle = self.predictor.bundle();
-        let stepping = Stepping { dt_s: bundle.normalization.dt_s, substeps: bundle.normalization.substeps };
+        let stepping = Stepping::of(bundle);
         let bench = Bench { vehicle: &bundle.vehicle, stepping, catalogue: &self.judge.catalogue };
         let (mut drives, mut maps) = (Vec::new(), Vec::new());
         for m in self.members(group) {

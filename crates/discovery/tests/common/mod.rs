@@ -172,7 +172,7 @@ pub fn bundle() -> ModelBundle {
             let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
             let catalogue = catalogue(&[plough()]);
-            let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping { dt_s: 0.1, substeps: 2 }, catalogue: &catalogue };
+            let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &catalogue };
             let reference = Reference::measure(&bench, &observed, "twin", &|_| {}).unwrap();
             bundle.reference_json = Some(reference.to_json().into());
             bundle

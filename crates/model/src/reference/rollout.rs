@@ -161,7 +161,8 @@ impl ReferenceRollout<'_> {
         control: &Control<f64>,
     ) -> [f32; STATE_CONTROL] {
         let (height, _, _) = row.ground.at(&self.model.vehicle().effects.map, state.position_m[0], state.position_m[1]);
-        let entries = token_entries(state, previous, [control.speed_m_s, control.second], height, self.scales.dt_s);
+        let known = self.model.as_known(state);
+        let entries = token_entries(&known, previous, [control.speed_m_s, control.second], height, self.scales.dt_s);
         self.scales.token_scale().apply(entries)
     }
 
@@ -196,7 +197,9 @@ impl ReferenceRollout<'_> {
             columns(increment, 0, 2)?,
         ];
         let raw = Tensor::cat(&parts, 1)?;
-        let mean = Tensor::from_slice(&self.scales.token_mean[..STATE_DIM], (1, STATE_DIM), &Device::Cpu)?;
+        let mut mean: Vec<f32> = self.scales.token_mean[..STATE_DIM].to_vec();
+        mean.iter_mut().zip(self.model.ride_shift()).for_each(|(mean, shift)| *mean += *shift as f32);
+        let mean = Tensor::from_vec(mean, (1, STATE_DIM), &Device::Cpu)?;
         let scale = Tensor::from_slice(&self.scales.token_scale[..STATE_DIM], (1, STATE_DIM), &Device::Cpu)?;
         let scaled = raw.broadcast_sub(&mean)?.broadcast_div(&scale)?;
         Tensor::cat(&[scaled, columns(&measured, STATE_DIM, CONTROL_DIM)?], 1)

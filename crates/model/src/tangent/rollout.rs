@@ -112,7 +112,8 @@ impl TangentRollout<'_> {
         let model = self.physics.at(time_s);
         let (state, vehicle, scales) = (&motion.state, model.vehicle(), self.scales);
         let height = scenery.reference.height_m(state.position_m[0], state.position_m[1]);
-        let raw = entries_of(state, motion.previous.as_ref(), [control.speed_m_s, control.second], height, scales.dt_s, T::wrapped);
+        let known = model.as_known(state);
+        let raw = entries_of(&known, motion.previous.as_ref(), [control.speed_m_s, control.second], height, scales.dt_s, T::wrapped);
         let lit = |v: f32| T::lit(f64::from(v));
         let entries = core::array::from_fn(|i| (raw[i] - lit(scales.token_mean[i])) / lit(scales.token_scale[i]));
         let (sinkage, residual) = self.network.step(&self.prefix, cache, &entries, &scenery.token);

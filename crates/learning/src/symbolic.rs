@@ -1,0 +1,79 @@
+//! What the symbolic model alone, on the soil that the map tells of, is off by over short rollouts: for calibration of the numbers of a card.
+
+use nesam_model::soil_coordinates::from_raw;
+use nesam_model::{GroundSource, Normalization, history_actuators};
+use nesam_physics::driveline::command_wheels;
+use nesam_physics::step::{StepInput, StepModel};
+use nesam_physics::{Soil, Vehicle, VehicleState, WHEELS};
+use rayon::prelude::*;
+
+use crate::class_soil::ClassSoil;
+use crate::drives::Drive;
+
+/// Steps of a rollout.
+const HORIZON: usize = 16;
+/// Samples from the start of one rollout to that of the next.
+const STRIDE: usize = 40;
+/// Samples before the first rollout of a drive.
+const WARM_UP: usize = 8;
+
+/// Mean absolute errors over rollouts and their steps.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct SymbolicError {
+    /// Horizontal distance, m.
+    pub position_m: f64,
+    /// Roll and pitch together, rad.
+    pub tilt_rad: f64,
+}
+
+/// Errors of a vehicle over rollouts from every fortieth sample of drives.
+pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization) -> SymbolicError {
+    let model = StepModel::new(vehicle, scales.dt_s, scales.substeps);
+    let default_soil = Soil::from_array(scales.default_soil());
+    let of_drive = |drive: &&Drive| {
+        let last = drive.states.len().saturating_sub(HORIZON + 1);
+        let starts = (WARM_UP.min(last.saturating_sub(1))..last).step_by(STRIDE);
+        starts.map(|i| rollout_error(&model, drive, i, &default_soil, scales)).fold(([0.0; 2], 0), plus)
+    };
+    // Summed in the order of the drives, so that calibrating again gives the same bits.
+    let sums: Vec<([f64; 2], usize)> = drives.par_iter().map(of_drive).collect();
+    let (sum, count) = sums.into_iter().fold(([0.0; 2], 0), |all, (sum, count)| (plus(all, sum).0, all.1 + count));
+    let [position_m, tilt_rad] = sum.map(|s| s / count.max(1) as f64);
+    SymbolicError { position_m, tilt_rad }
+}
+
+/// One more rollout in a sum.
+fn plus((sum, count): ([f64; 2], usize), error: [f64; 2]) -> ([f64; 2], usize) {
+    ([sum[0] + error[0], sum[1] + error[1]], count + 1)
+}
+
+/// Position (m) and tilt (rad). The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
+fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> [f64; 2] {
+    let mut state = drive.states[i];
+    let ground = GroundSource::new(drive.map.as_deref(), model, &state);
+    let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &state, &drive.controls[i], scales.dt_s);
+    let mut error = [0.0; 2];
+    for k in 0..HORIZON {
+        let control = &drive.controls[i + k];
+        let after = actuators.advance(model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);
+        let [x_m, y_m, _] = state.position_m;
+        let class_soil = drive.map.as_deref().and_then(|map| ClassSoil::at(map, x_m, y_m));
+        let input = StepInput {
+            state,
+            wheels: command_wheels(model.vehicle(), &actuators, &after, control),
+            sinkage_log_ratio: [0.0; WHEELS],
+            soil: class_soil.map_or(*default_soil, |class| Soil::from_array(from_raw(&class.mean))),
+            ground: ground.under_wheels(model, &state, 0.0).0,
+        };
+        let increment = model.step(&input).increment;
+        state = VehicleState::from_array(state.advanced(&increment.to_array()));
+        actuators = after;
+        let measured = &drive.states[i + k + 1];
+        let off = |a: [f64; 3], b: [f64; 3], axis: usize| a[axis] - b[axis];
+        let position = |axis| off(state.position_m, measured.position_m, axis);
+        let attitude = |axis| off(state.attitude_rad, measured.attitude_rad, axis).abs();
+        error[0] += position(0).hypot(position(1)) / HORIZON as f64;
+        error[1] += (attitude(0) + attitude(1)) / HORIZON as f64;
+    }
+    error
+}
