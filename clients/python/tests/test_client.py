@@ -106,8 +106,8 @@ def test_service_extras_have_shapes_and_agree_with_each_other(driven):
     # A start further ahead is an end further ahead; not one to one, as the network sees how far the vehicle has come since the last measurement.
     np.testing.assert_allclose(extras.jacobian_start[:, :, 0, 0], 1.0, atol=0.3)
     assert extras.wheel_load_n.shape == extras.wheel_slip.shape == (2, 3, 4)
-    # A 2.5-tonne car that was set down on gentle hills, some of its wheels below the ground.
-    np.testing.assert_allclose(extras.wheel_load_n.sum(axis=-1), 24_460, rtol=0.5)
+    # A 2.5-tonne car that was set down on gentle hills, some of its wheels below the ground: it carries its weight once its springs have settled.
+    np.testing.assert_allclose(extras.wheel_load_n[:, 1:].sum(axis=-1), 24_460, rtol=0.1)
     assert ((extras.load_transfer_ratio >= 0) & (extras.load_transfer_ratio <= 1)).all() and extras.traction_reserve.shape == (2, 3)
     assert extras.interpolation_deviation_m is None
     moved = driven.predict("truck", fan(2, 6), extras=nesam.Extras(interpolation_deviation=True)).extras.interpolation_deviation_m
