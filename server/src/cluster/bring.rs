@@ -8,7 +8,7 @@ use nesam_proto::etcd::KeyValue;
 use tonic::Status;
 
 use super::record::{Server, json, of_json, session_of};
-use super::{Cluster, Held, Stage, again, created, delete, get, moved, put};
+use super::{Cluster, Held, Stage, again, created, delete, get, moved, put, written};
 use crate::convert::to_status;
 use crate::store::{StoredSession, resumed};
 
@@ -141,8 +141,8 @@ impl Cluster {
         permit: impl Fn(&str) -> Result<(), Status>,
     ) -> Result<Brought, Status> {
         let mut changes = self.0.changes.subscribe();
-        // Epoch of the owner that was asked; one that took the session since then has not heard.
-        let mut asked = None;
+        // Epoch of the owner that was asked, and the revision at which; one that took the session since then has not heard.
+        let mut asked: Option<(i64, i64)> = None;
         loop {
             if self.is_here(session)? {
                 return Ok(Brought::Here);
@@ -169,16 +169,18 @@ impl Cluster {
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() || zeal == Zeal::IfFree {
-                if asked.is_some() {
-                    let _ = self.0.etcd.all(vec![delete(&self.0.keys.want(session))]).await;
+                if let Some((_, revision)) = asked {
+                    let want = self.0.keys.want(session);
+                    // Unless another one has asked since then.
+                    let _ = self.0.etcd.transaction(vec![written(&want, revision)], vec![delete(&want)]).await;
                 }
                 let reason = format!("session `{session}` is with server `{}` ({}), which has not let go of it", owner.name, owner.address);
                 return Err(again(&reason, self.0.lease.length() / 4));
             }
-            if asked != Some(epoch) {
+            if asked.is_none_or(|(of, _)| of != epoch) {
                 let lease = self.0.lease.id().ok_or_else(|| moved(session))?;
-                self.0.etcd.all(vec![put(&self.0.keys.want(session), json(&self.0.me), lease)]).await?;
-                asked = Some(epoch);
+                let done = self.0.etcd.all(vec![put(&self.0.keys.want(session), json(&self.0.me), lease)]).await?;
+                asked = Some((epoch, done.revision));
             }
             let _ = tokio::time::timeout(left.min(LOOK_AGAIN), changes.changed()).await;
         }
@@ -223,6 +225,7 @@ impl Cluster {
                 held.stage = Stage::Here;
                 state.counts.taken += u64::from(went_on);
                 drop(state);
+                self.heed(session);
                 if went_on {
                     tracing::info!(session, epoch, took_s = begun.elapsed().as_secs_f64(), "session taken");
                 }

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tonic::Status;
 
-use super::{Cluster, Stage, created, delete};
+use super::{Cluster, Held, Stage, created, delete};
 use crate::store::Key;
 
 /// Time for which a session stays at least, so that two askers do not tear at it.
@@ -16,14 +16,23 @@ const LAST_COMMIT: Duration = Duration::from_secs(2);
 const CLOSE: Duration = Duration::from_secs(10);
 
 impl Cluster {
-    /// Writes what there is of a session and lets it go, because another server wants it.
-    pub(super) async fn hand_over(self, session: String) {
-        let Some(held) = self.lock().held.get(&session).copied() else { return };
+    /// Hands a session over if it is here and another server wants it: to be looked at when either begins.
+    pub(super) fn heed(&self, session: &str) {
+        let wanted = self.lock().wanted(session);
+        if let Some(held) = wanted {
+            tokio::spawn(self.clone().hand_over(session.into(), held));
+        }
+    }
+
+    /// Writes what there is of a session and lets it go.
+    async fn hand_over(self, session: String, held: Held) {
         tokio::time::sleep(STAY.saturating_sub(held.since.elapsed())).await;
         {
             let mut state = self.lock();
-            let Some(held) = state.held.get_mut(&session).filter(|now| now.epoch == held.epoch && now.stage == Stage::Here) else { return };
-            held.stage = Stage::Leaving;
+            if state.wanted(&session).is_none_or(|now| now.epoch != held.epoch) {
+                return;
+            }
+            state.held.insert(session.clone(), Held { stage: Stage::Leaving, ..held });
             state.counts.handed_over += 1;
         }
         self.0.keeper.hurry(&Key::Session(session.clone()));

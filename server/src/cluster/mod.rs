@@ -80,6 +80,8 @@ struct State {
     held: BTreeMap<String, Held>,
     /// Lease of the owner of each session of the fleet, as the watch tells.
     owners: BTreeMap<String, i64>,
+    /// Revision at which another server asked for a session, as the watch tells.
+    wants: BTreeMap<String, i64>,
     /// Sessions that are being brought here: one at a time each.
     turns: BTreeMap<String, Arc<tokio::sync::Mutex<()>>>,
     /// When a session was last looked for on behalf of a bus that sends to everybody.
@@ -87,6 +89,14 @@ struct State {
     /// SHA-256 of each map as it was last read or written.
     maps: BTreeMap<String, String>,
     counts: ClusterCounts,
+}
+
+impl State {
+    /// A session that is here and that another server has asked for since this one took it: an older wish was for an earlier owner.
+    fn wanted(&self, session: &str) -> Option<Held> {
+        let held = self.held.get(session).filter(|held| held.stage == Stage::Here)?;
+        self.wants.get(session).is_some_and(|asked| *asked > held.epoch).then_some(*held)
+    }
 }
 
 /// This server among the others; clones share it.
@@ -235,4 +245,30 @@ fn own_name(address: &str) -> String {
     let host = std::fs::read_to_string("/proc/sys/kernel/hostname").unwrap_or_default();
     let port = address.rsplit(':').next().unwrap_or_default();
     format!("{}:{port}", host.trim())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: a wish is heard whenever it comes. Method: the orders in which a watch may tell of it, around a session that arrives.
+    #[test]
+    fn analytic_a_wish_is_heeded_as_soon_as_the_session_is_here() {
+        let mut state = State::default();
+        let arrives = |stage| Held { epoch: 7, since: Instant::now(), stage };
+        state.wants.insert("s".into(), 8);
+        assert!(state.wanted("s").is_none(), "told before etcd's answer to the taking is here");
+        state.held.insert("s".into(), arrives(Stage::Arriving));
+        assert!(state.wanted("s").is_none(), "cannot be handed over yet");
+        state.held.insert("s".into(), arrives(Stage::Here));
+        assert_eq!(state.wanted("s").map(|held| held.epoch), Some(7));
+        state.held.insert("s".into(), arrives(Stage::Leaving));
+        assert!(state.wanted("s").is_none(), "once");
+
+        state.held.insert("s".into(), arrives(Stage::Here));
+        state.wants.insert("s".into(), 6);
+        assert!(state.wanted("s").is_none(), "a wish that the taking has fulfilled, of which the watch has not told yet");
+        state.wants.clear();
+        assert!(state.wanted("s").is_none());
+    }
 }

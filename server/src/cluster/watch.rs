@@ -43,7 +43,11 @@ impl Cluster {
     async fn follow(&self) -> Result<(), Status> {
         let live = self.0.keys.live();
         let all = self.0.etcd.all(vec![get_all(&live)]).await?;
-        self.lock().owners.clear();
+        {
+            let mut state = self.lock();
+            state.owners.clear();
+            state.wants.clear();
+        }
         for found in all.read.iter().flatten() {
             self.apply(found, true).await;
         }
@@ -81,9 +85,15 @@ impl Cluster {
             }
             (Some(Topic::Want(session)), true) => {
                 let by_other = of_json::<Server>(&found.value).is_some_and(|asker| asker != self.0.me);
-                if by_other && self.epoch(session).is_some() {
-                    tokio::spawn(self.clone().hand_over(session.into()));
+                if by_other {
+                    self.lock().wants.insert(session.into(), found.mod_revision);
+                    self.heed(session);
+                } else {
+                    self.lock().wants.remove(session);
                 }
+            }
+            (Some(Topic::Want(session)), false) => {
+                self.lock().wants.remove(session);
             }
             (Some(Topic::Map(map)), true) => {
                 if let Some(MapHead { sha256, .. }) = of_json(&found.value) {
