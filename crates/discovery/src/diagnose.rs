@@ -297,10 +297,7 @@ pub fn diagnose(
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let total = fit_at.len();
     let observed = observe_all(predictor, seen, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
-    // The model itself is tried without its network.
-    let usual_soil = Stepping::of(bundle).usual_soil.filter(|_| options.against == Against::Bundle);
-    let stepping = Stepping { usual_soil, ..Stepping::of(bundle) };
-    let bench = Bench { vehicle: &bundle.vehicle, stepping, catalogue: &catalogue };
+    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(bundle), catalogue: &catalogue };
     let trial = Trial { predictor, drives: &fit_drives, maps: &fit_maps, scoring: &options.scoring };
     let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
     progress("hypotheses", 0, 1);

@@ -11,7 +11,7 @@ use nesam_model::{GroundSource, ModelBundle, Predictor, Transition};
 use nesam_physics::driveline::{DrivelineState, command_wheels, rim_twist};
 use nesam_physics::effects::{Effect, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel, StepOutput};
-use nesam_physics::{Ride, SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState, WHEELS, wrap_angle};
+use nesam_physics::{Ride, SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, UsualRide, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
@@ -32,29 +32,29 @@ const ASKED_APART: f64 = 0.01;
 /// Smallest change of tractive force per rim over-speed that is believed, N per m/s (a wheel in the air has none).
 const TRACTION_SLOPE_FLOOR: f64 = 2000.0;
 
-/// Step and sub-steps of the physics, and the soil on which the vehicle usually rides.
+/// Step and sub-steps of the physics, and how the vehicle usually rides.
 #[derive(Clone, Copy, Debug)]
 pub struct Stepping {
     /// Step, s.
     pub dt_s: f64,
     /// Sub-steps.
     pub substeps: usize,
-    /// Usual soil, SI; `None` where no network is asked, so that nobody needs to know how effects shift the ride.
-    pub usual_soil: Option<[f64; SOIL_DIM]>,
+    /// Ride without effects; `None` where the network says nothing, so that nobody needs to know how effects shift the ride.
+    pub usual_ride: Option<UsualRide>,
 }
 
 impl Stepping {
     /// As a bundle steps.
     pub fn of(bundle: &ModelBundle) -> Self {
         let scales = &bundle.normalization;
-        Self { dt_s: scales.dt_s, substeps: scales.substeps, usual_soil: Some(scales.default_soil()) }
+        Self { dt_s: scales.dt_s, substeps: scales.substeps, usual_ride: bundle.speaks().then(|| bundle.usual_ride()) }
     }
 
     /// The physics of a vehicle.
     pub fn model(&self, vehicle: &Vehicle) -> StepModel {
         let model = StepModel::new(vehicle, self.dt_s, self.substeps);
-        match self.usual_soil {
-            Some(usual) => model.riding_on(&Soil::from_array(usual)),
+        match self.usual_ride {
+            Some(usual) => model.riding_as(|| usual),
             None => model,
         }
     }
@@ -83,7 +83,7 @@ pub struct ObservedDrive {
     map: Option<Arc<WorldMap>>,
     states: Vec<VehicleState<f64>>,
     transitions: Vec<Transition>,
-    /// How what the network says of each sample follows the pose that it is asked about.
+    /// How what the network says of each sample follows the pose that it is asked about; empty where it says nothing.
     follows: Vec<Follows>,
     /// What effects of the bundle make of the ride: the network was asked about poses without it.
     ride_known: Ride,
@@ -163,12 +163,15 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
         (0..steps.len().saturating_sub(1)).into_par_iter().map(of).collect()
     };
     let transitions = asked(predictor);
-    let elsewhere: [Vec<Transition>; 3] = core::array::from_fn(|i| {
-        let mut without = [0.0; 3];
-        without[i] = ASKED_APART;
-        asked(&predictor.asked_without(&without))
-    });
-    let follows = (0..transitions.len()).map(|k| Follows::between(&transitions[k], elsewhere.each_ref().map(|apart| &apart[k]))).collect();
+    let mut follows = Vec::new();
+    if predictor.bundle().speaks() {
+        let elsewhere: [Vec<Transition>; 3] = core::array::from_fn(|i| {
+            let mut without = [0.0; 3];
+            without[i] = ASKED_APART;
+            asked(&predictor.asked_without(&without))
+        });
+        follows.extend((0..transitions.len()).map(|k| Follows::between(&transitions[k], elsewhere.each_ref().map(|apart| &apart[k]))));
+    }
     let last = drive.states.len().saturating_sub(SEGMENT_STEPS + 1);
     let model = predictor.step_model();
     let servoed = rims_servoed(model.vehicle());
@@ -409,7 +412,9 @@ impl ObservedDrive {
         let ride_shift: Ride = core::array::from_fn(|i| model.ride_shift()[i] - self.ride_known[i]);
         for (j, transition) in self.transitions[start..start + SEGMENT_STEPS].iter().enumerate() {
             let [before, after] = &reading.actuators[start + j];
-            let (residual, sinkage_log_ratio) = self.follows[start + j].said(transition, &ride_shift);
+            let unshifted = (transition.residual, transition.input.sinkage_log_ratio);
+            let (residual, sinkage_log_ratio) =
+                self.follows.get(start + j).map_or(unshifted, |follows| follows.said(transition, &ride_shift));
             let input = StepInput {
                 state,
                 wheels: command_wheels(model.vehicle(), before, after, &transition.control),

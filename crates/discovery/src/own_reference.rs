@@ -29,13 +29,7 @@ const FLIPS: usize = 1000;
 /// # Errors
 /// Those of [`Predictor::new`].
 pub fn symbolic(bundle: &ModelBundle) -> Result<Predictor, DiscoveryError> {
-    let mut silent = bundle.clone();
-    for name in ["sinkage.weight", "sinkage.bias", "residual.weight", "residual.bias"] {
-        if let Some(values) = silent.weights.values_mut(name) {
-            values.fill(0.0);
-        }
-    }
-    Predictor::new(std::sync::Arc::new(silent))
+    Predictor::new(std::sync::Arc::new(bundle.silenced()))
         .map_err(|source| nesam_evaluation::EvaluationError::Model { trajectory: String::new(), start: 0, source }.into())
 }
 

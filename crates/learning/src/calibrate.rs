@@ -5,7 +5,7 @@ use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
 use crate::drives::Drive;
 use crate::rims::fit_rims;
-use crate::symbolic::symbolic_error;
+use crate::symbolic::{descend, symbolic_error};
 
 /// A number of the drive line that is calibrated, with its range.
 pub type Knob = (&'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
@@ -112,26 +112,16 @@ pub fn calibrate_driveline(
     let mut best = before;
     for round in 0..3 {
         for &(name, knob, [low, high]) in knobs(vehicle) {
-            let mut reach = if round == 0 { 0.5 } else { 0.5 / f64::from(2 << round) };
-            while reach > 0.02 {
-                let current = *knob(vehicle);
-                let span = high - low;
-                let trials = [current * (1.0 - reach) - 1e-3 * span * reach, current * (1.0 + reach) + 0.05 * span * reach];
-                let mut improved = false;
-                for trial in trials.map(|t| t.clamp(low, high)) {
-                    let mut candidate = vehicle.clone();
-                    *knob(&mut candidate) = trial;
-                    let error = symbolic_error(&candidate, drives, scales).position_m;
-                    if error < best {
-                        best = error;
-                        *vehicle = candidate;
-                        improved = true;
-                    }
-                }
-                if !improved {
-                    reach *= 0.5;
-                }
-            }
+            let reach = if round == 0 { 0.5 } else { 0.5 / f64::from(2 << round) };
+            let trials = |vehicle: &Vehicle, reach: f64| {
+                [(-1.0, 1e-3), (1.0, 0.05)].map(|(sign, of_range)| {
+                    let mut trial = vehicle.clone();
+                    let value = knob(&mut trial);
+                    *value = (*value * (1.0 + sign * reach) + sign * of_range * (high - low) * reach).clamp(low, high);
+                    trial
+                })
+            };
+            best = descend(vehicle, best, reach, trials, |trial| symbolic_error(trial, drives, scales).position_m);
             progress(name, *knob(vehicle), best);
         }
     }

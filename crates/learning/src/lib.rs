@@ -1,8 +1,8 @@
 //! Offline training: encoder pre-training and autoregressive rollouts (paper §III-D, §IV).
 //!
 //! A run has four stages: the encoders are pre-trained as autoencoders on patches around the driven places ([`autoencoder`]); the drive line
-//! and the suspension of the vehicle card are calibrated with the symbolic model alone ([`calibrate`], [`suspension`]); the contexts of all measured poses are computed once
-//! ([`drives`]); and the network is trained through K-step rollouts ([`trainer`]).
+//! and the suspension of the vehicle card are calibrated with the symbolic model alone ([`calibrate`], [`suspension`]); the contexts of all
+//! measured poses are computed once ([`drives`]); and the network is trained through K-step rollouts ([`trainer`]).
 #![forbid(unsafe_code)]
 
 pub mod adam;

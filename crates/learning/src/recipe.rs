@@ -273,6 +273,9 @@ fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64,
         }
     }
     let mut chosen = best.map_or(vehicle, |(_, chosen)| chosen);
+    if training.iter().all(|drive| drive.map.is_none()) {
+        return (chosen, scales);
+    }
     reporter.stage("suspension", TURNS);
     let mut done = 0;
     let [before, after] = calibrate_suspension(&mut chosen, &training, &scales, |name, value, error| {

@@ -7,7 +7,7 @@ use nesam_model::Normalization;
 use nesam_physics::{Vehicle, WHEELS};
 
 use crate::drives::Drive;
-use crate::symbolic::symbolic_error;
+use crate::symbolic::{descend, symbolic_error};
 
 /// What is fitted: wheels of an axle share one number.
 const NUMBERS: [(&str, fn(&mut Vehicle) -> &mut [f64; WHEELS], [usize; 2]); 4] = [
@@ -16,10 +16,8 @@ const NUMBERS: [(&str, fn(&mut Vehicle) -> &mut [f64; WHEELS], [usize; 2]); 4] =
     ("damping, front", |v| &mut v.suspension_n_s_m, [0, 1]),
     ("damping, rear", |v| &mut v.suspension_n_s_m, [2, 3]),
 ];
-/// How often each number has its turn, and shares by which it is changed then: halved until nothing is better.
+/// How often each number has its turn, and the share by which it is first changed then.
 const FIRST_REACH: [f64; 3] = [0.5, 0.2, 0.1];
-/// Smallest share.
-const LAST_REACH: f64 = 0.02;
 /// A number may be this much larger or smaller than the card has it.
 const MOST: f64 = 3.0;
 
@@ -36,33 +34,24 @@ pub fn calibrate_suspension(
 ) -> [f64; 2] {
     let mapped: Vec<&Drive> = drives.iter().copied().filter(|drive| drive.map.is_some()).collect();
     let before = symbolic_error(vehicle, &mapped, scales).tilt_rad;
-    let (card, mut best) = (vehicle.clone(), before);
+    let (mut card, mut best) = (vehicle.clone(), before);
     if mapped.is_empty() {
         return [before, best];
     }
-    for first_reach in FIRST_REACH {
+    for reach in FIRST_REACH {
         for (name, number, wheels) in NUMBERS {
-            let mut reach = first_reach;
-            while reach > LAST_REACH {
-                let mut improved = false;
-                for factor in [1.0 + reach, 1.0 / (1.0 + reach)] {
-                    let mut candidate = vehicle.clone();
+            let of_card = *number(&mut card);
+            let trials = |vehicle: &Vehicle, reach: f64| {
+                [1.0 + reach, 1.0 / (1.0 + reach)].map(|factor| {
+                    let mut trial = vehicle.clone();
                     for wheel in wheels {
-                        let at_first = number(&mut card.clone())[wheel];
-                        let trial = number(&mut candidate)[wheel] * factor;
-                        number(&mut candidate)[wheel] = trial.clamp(at_first / MOST, at_first * MOST);
+                        let value = &mut number(&mut trial)[wheel];
+                        *value = (*value * factor).clamp(of_card[wheel] / MOST, of_card[wheel] * MOST);
                     }
-                    let error = symbolic_error(&candidate, &mapped, scales).tilt_rad;
-                    if error < best {
-                        best = error;
-                        *vehicle = candidate;
-                        improved = true;
-                    }
-                }
-                if !improved {
-                    reach *= 0.5;
-                }
-            }
+                    trial
+                })
+            };
+            best = descend(vehicle, best, reach, trials, |trial| symbolic_error(trial, &mapped, scales).tilt_rad);
             progress(name, number(vehicle)[wheels[0]], best);
         }
     }

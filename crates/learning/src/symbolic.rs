@@ -1,4 +1,5 @@
-//! What the symbolic model alone, on the soil that the map tells of, is off by over short rollouts: for calibration of the numbers of a card.
+//! What the symbolic model alone, on the soil that the map tells of, is off by over short rollouts, and the search that makes it less: for calibration of the
+//! numbers of a card.
 
 use nesam_model::soil_coordinates::from_raw;
 use nesam_model::{GroundSource, Normalization, history_actuators};
@@ -16,6 +17,8 @@ const HORIZON: usize = 16;
 const STRIDE: usize = 40;
 /// Samples before the first rollout of a drive.
 const WARM_UP: usize = 8;
+/// Smallest share by which a number is changed in a search.
+const LAST_REACH: f64 = 0.02;
 
 /// Mean absolute errors over rollouts and their steps.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -69,11 +72,34 @@ fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil
         state = VehicleState::from_array(state.advanced(&increment.to_array()));
         actuators = after;
         let measured = &drive.states[i + k + 1];
-        let off = |a: [f64; 3], b: [f64; 3], axis: usize| a[axis] - b[axis];
-        let position = |axis| off(state.position_m, measured.position_m, axis);
-        let attitude = |axis| off(state.attitude_rad, measured.attitude_rad, axis).abs();
-        error[0] += position(0).hypot(position(1)) / HORIZON as f64;
-        error[1] += (attitude(0) + attitude(1)) / HORIZON as f64;
+        let [x_m, y_m, _] = core::array::from_fn(|axis| state.position_m[axis] - measured.position_m[axis]);
+        let [roll_rad, pitch_rad, _] = core::array::from_fn(|axis| state.attitude_rad[axis] - measured.attitude_rad[axis]);
+        error[0] += f64::hypot(x_m, y_m) / HORIZON as f64;
+        error[1] += (f64::abs(roll_rad) + f64::abs(pitch_rad)) / HORIZON as f64;
     }
     error
+}
+
+/// Searches along one number of a vehicle: takes what lowers the error most of two trials that change it by a share, again and again, and halves the share where
+/// neither does. Returns the error reached, from `best`, that of the vehicle as it comes.
+pub(crate) fn descend(
+    vehicle: &mut Vehicle,
+    mut best: f64,
+    mut reach: f64,
+    trials: impl Fn(&Vehicle, f64) -> [Vehicle; 2],
+    error: impl Fn(&Vehicle) -> f64,
+) -> f64 {
+    while reach > LAST_REACH {
+        let before = best;
+        for trial in trials(vehicle, reach) {
+            let error = error(&trial);
+            if error < best {
+                (best, *vehicle) = (error, trial);
+            }
+        }
+        if best == before {
+            reach *= 0.5;
+        }
+    }
+    best
 }

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use nesam_physics::effects::{Effect, ScheduledEffect};
-use nesam_physics::{SOIL_DIM, Vehicle};
+use nesam_physics::{SOIL_DIM, Soil, UsualRide, Vehicle};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -27,6 +27,8 @@ const REFERENCE: &str = "reference.json";
 const SOIL_FILTER: &str = "soil_filter.json";
 const ROLLOUT_NOISE: &str = "rollout_noise.json";
 const REQUIRED: [&str; 4] = [WEIGHTS, VEHICLE, NORMALIZATION, EFFECTS];
+/// Arrays by which the network says something of sinkage and of the next state.
+const HEADS: [&str; 4] = ["sinkage.weight", "sinkage.bias", "residual.weight", "residual.bias"];
 
 /// Where a bundle comes from; shown by `inspect`, copied into every report.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -199,6 +201,28 @@ impl ModelBundle {
         patched.vehicle = self.vehicle.with_effects(&begun(&effects));
         patched.effects.extend(effects);
         patched
+    }
+
+    /// How the vehicle that the network knows rides: without effects, on the default soil.
+    pub fn usual_ride(&self) -> UsualRide {
+        let scales = &self.normalization;
+        UsualRide::of(&self.vehicle, scales.dt_s, scales.substeps, &Soil::from_array(scales.default_soil()))
+    }
+
+    /// The bundle with its network silenced: nothing is said of sinkage and of the next state, the soil prior stays.
+    pub fn silenced(&self) -> Self {
+        let mut silent = self.clone();
+        for name in HEADS {
+            if let Some(values) = silent.weights.values_mut(name) {
+                values.fill(0.0);
+            }
+        }
+        silent
+    }
+
+    /// Whether the network says anything of sinkage or of the next state.
+    pub fn speaks(&self) -> bool {
+        self.weights.iter().any(|(name, array)| HEADS.contains(&name) && array.values.iter().any(|v| *v != 0.0))
     }
 
     /// Puts the bundle's effects on another vehicle.

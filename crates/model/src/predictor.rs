@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 use nesam_physics::driveline::DrivelineState;
 use nesam_physics::effects::{Phases, ScheduledEffect};
 use nesam_physics::step::StepModel;
-use nesam_physics::{Control, Ride, SOIL_DIM, STATE_DIM, Soil, VehicleState, wrap_angle};
+use nesam_physics::{Control, Ride, SOIL_DIM, STATE_DIM, VehicleState, wrap_angle};
 use nesam_terrain::{Pose2, WorldMap};
 
 use crate::ModelError;
@@ -371,8 +371,8 @@ impl Predictor {
 /// The physics of a bundle in each phase between the onsets of its effects.
 fn phases(bundle: &ModelBundle) -> Phases<StepModel> {
     let scales = &bundle.normalization;
-    let usual = Soil::from_array(scales.default_soil());
-    Phases::new(&bundle.vehicle, &bundle.effects, |vehicle| StepModel::new(vehicle, scales.dt_s, scales.substeps).riding_on(&usual))
+    let usual = || bundle.usual_ride();
+    Phases::new(&bundle.vehicle, &bundle.effects, |vehicle| StepModel::new(vehicle, scales.dt_s, scales.substeps).riding_as(usual))
 }
 
 fn sensors_err(model: &StepModel) -> bool {

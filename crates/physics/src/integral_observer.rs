@@ -89,7 +89,8 @@ impl StepModel {
         demand.max(T::lit(-limit)).min(T::lit(limit)) * T::lit(share / line.speed_integral_gain_per_s)
     }
 
-    /// Force at the rims that compaction takes of four wheels which carry the weight alike, N; it depends on the speed where the soil is damped, under the leading axle.
+    /// Force at the rims that compaction takes of four wheels which carry the weight alike, N; it depends on the speed where the soil is damped, under the
+    /// leading axle.
     fn compaction_n<T: Real>(&self, soil: &Soil<T>, speed_m_s: T) -> T {
         let load_n = T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2 / WHEELS as f64);
         let weight = Support { preload_n: load_n, rate_n_m: T::lit(0.0) };

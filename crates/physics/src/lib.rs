@@ -24,7 +24,7 @@ mod vehicle;
 pub use command_path::CommandPath;
 pub use contacts::{ROLLING, Rolling, SUNK, Sunk};
 pub use contradiction::{CONTRADICTIONS, contradiction};
-pub use ride::Ride;
+pub use ride::{Ride, UsualRide};
 pub use scalar::Real;
 pub use soil::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, Soil};
 pub use soil_correction::{SOIL_LOGARITHMIC, SoilCoordinates, SoilCorrection};

@@ -21,17 +21,31 @@ const SHIFT_MAX: f64 = 0.5;
 /// Height of the reference point over level ground (m), roll and pitch (rad) of a vehicle that goes straight ahead on a soil.
 pub type Ride = [f64; 3];
 
+/// How a vehicle rides without any effect on the soil that is usual for it.
+#[derive(Clone, Copy, Debug)]
+pub struct UsualRide {
+    soil: Soil<f64>,
+    ride: Ride,
+}
+
+impl UsualRide {
+    /// Of a vehicle, whatever effects it has, in steps of `dt_s` seconds in `substeps` sub-steps.
+    pub fn of(vehicle: &Vehicle, dt_s: f64, substeps: usize, soil: &Soil<f64>) -> Self {
+        Self { soil: *soil, ride: ride(vehicle, EffectTerms::default(), dt_s, substeps, soil) }
+    }
+}
+
 impl StepModel {
-    /// The same model, which knows how its effects shift the ride on the soil that is usual for the vehicle.
-    pub fn riding_on(mut self, usual: &Soil<f64>) -> Self {
+    /// The same model, which knows how its effects shift the ride. The usual ride is only asked for where an effect acts on forces or soil.
+    pub fn riding_as(mut self, usual: impl FnOnce() -> UsualRide) -> Self {
         let EffectTerms { force, soil, .. } = self.vehicle.effects;
         let acting = EffectTerms { force, soil, ..EffectTerms::default() };
         if acting == EffectTerms::default() {
             return self;
         }
-        let with = |effects: EffectTerms| Self::new(&Vehicle { effects, ..self.vehicle.clone() }, self.dt_s, self.substeps).ride(usual);
-        let (shifted, own) = (with(acting), with(EffectTerms::default()));
-        let shift: Ride = core::array::from_fn(|i| shifted[i] - own[i]);
+        let usual = usual();
+        let shifted = ride(&self.vehicle, acting, self.dt_s, self.substeps, &usual.soil);
+        let shift: Ride = core::array::from_fn(|i| shifted[i] - usual.ride[i]);
         if shift.iter().all(|s| s.abs() < SHIFT_MAX) {
             self.ride_shift = shift;
         }
@@ -39,7 +53,7 @@ impl StepModel {
     }
 
     /// How much higher (m) and more rolled and pitched (rad) the vehicle rides than it would without its effects; zero where the usual soil is not known
-    /// ([`StepModel::riding_on`]).
+    /// ([`StepModel::riding_as`]).
     pub fn ride_shift(&self) -> &Ride {
         &self.ride_shift
     }
@@ -56,29 +70,30 @@ impl StepModel {
         }
         known
     }
+}
 
-    /// The ride on level ground at a fifth of the top speed, after four seconds.
-    fn ride(&self, soil: &Soil<f64>) -> Ride {
-        let vehicle = self.vehicle();
-        let speed_m_s = SPEED_SHARE * vehicle.command_range[0][1];
-        let control = Control { speed_m_s, second: 0.0 };
-        let lowest_m = vehicle.wheel_centre_m.iter().map(|at| at[2]).sum::<f64>() / WHEELS as f64;
-        let mut state = VehicleState::zero();
-        state.position_m[2] = vehicle.wheel_radius_m - lowest_m;
-        state.velocity_m_s[0] = speed_m_s;
-        let mut actuators = DrivelineState::settled(&control);
-        for _ in 0..(SETTLED_S / self.dt_s()).ceil() as usize {
-            let after = actuators.advance(vehicle, &control, state.velocity_m_s[0], self.dt_s());
-            let input = StepInput {
-                state,
-                wheels: command_wheels(vehicle, &actuators, &after, &control),
-                sinkage_log_ratio: [0.0; WHEELS],
-                soil: *soil,
-                ground: [Ground { height_m: 0.0, slope_ahead: 0.0, slope_left: 0.0 }; WHEELS],
-            };
-            state = VehicleState::from_array(state.advanced(&self.step(&input).increment.to_array()));
-            actuators = after;
-        }
-        [state.position_m[2], state.attitude_rad[0], state.attitude_rad[1]]
+/// The ride of a vehicle with these effects alone on level ground at a fifth of the top speed, after four seconds.
+fn ride(vehicle: &Vehicle, effects: EffectTerms, dt_s: f64, substeps: usize, soil: &Soil<f64>) -> Ride {
+    let vehicle = &Vehicle { effects, ..vehicle.clone() };
+    let model = StepModel::new(vehicle, dt_s, substeps);
+    let speed_m_s = SPEED_SHARE * vehicle.command_range[0][1];
+    let control = Control { speed_m_s, second: 0.0 };
+    let axles_m = vehicle.wheel_centre_m.iter().map(|at| at[2]).sum::<f64>() / WHEELS as f64;
+    let mut state = VehicleState::zero();
+    state.position_m[2] = vehicle.wheel_radius_m - axles_m;
+    state.velocity_m_s[0] = speed_m_s;
+    let mut actuators = DrivelineState::settled(&control);
+    for _ in 0..(SETTLED_S / dt_s).ceil() as usize {
+        let after = actuators.advance(vehicle, &control, state.velocity_m_s[0], dt_s);
+        let input = StepInput {
+            state,
+            wheels: command_wheels(vehicle, &actuators, &after, &control),
+            sinkage_log_ratio: [0.0; WHEELS],
+            soil: *soil,
+            ground: [Ground { height_m: 0.0, slope_ahead: 0.0, slope_left: 0.0 }; WHEELS],
+        };
+        state = VehicleState::from_array(state.advanced(&model.step(&input).increment.to_array()));
+        actuators = after;
     }
+    [state.position_m[2], state.attitude_rad[0], state.attitude_rad[1]]
 }

@@ -86,8 +86,8 @@ impl<T: Real> Grip<T> {
     ///
     /// With u = z / z_1 for Bekker's sinkage z_1 under the whole preload: (1 + √λ) u^m / (1 + d z / r) + x u = 1, m = n + 1/2, x = what spring and damping give
     /// way by; √λ is how much longer the contact is for soil that springs back, d what a deep contact carries less than Bekker's parabola (fitted to the
-    /// contacts of this crate). One step of Newton from the solution for a straight line, bent by 1 - 1 / m. What compaction takes comes out within a quarter, the slip of a rim within
-    /// 0.1 of the contact's own from firm ground to forty centimetres in mud (a test holds it to that).
+    /// contacts of this crate). One step of Newton from the solution for a straight line, bent by 1 - 1 / m. What compaction takes
+    /// comes out within a quarter, the slip of a rim within 0.1 of the contact's own from firm ground to forty centimetres in mud (a test holds it to that).
     #[inline(always)]
     fn on_damped_soil(wheel: &WheelGeometry, support: &Support<T>, pressing_m_s: T, soil: &Soil<T>) -> Self {
         let (radius, one) = (wheel.radius_m, T::lit(1.0));

@@ -2,14 +2,15 @@
 
 use nesam_physics::effects::{Effect, GyroBias, Payload, RollStiffness};
 use nesam_physics::step::StepModel;
-use nesam_physics::{Ride, Soil, Vehicle, VehicleState};
+use nesam_physics::{Ride, Soil, UsualRide, Vehicle, VehicleState};
 use nesam_test_vehicles::torque_truck;
 
 const FIRM: Soil<f64> = Soil { k_phi: 2e9, k_c: 5e4, n: 1.0, c: 4e3, phi: 0.6, k_shear: 0.01 };
 const SOFT: Soil<f64> = Soil { k_phi: 4e5, k_c: 5e3, n: 0.8, c: 3e3, phi: 0.4, k_shear: 0.02 };
 
 fn shift(effects: &[Effect], soil: &Soil<f64>) -> Ride {
-    *StepModel::new(&torque_truck().with_effects(effects), 0.1, 4).riding_on(soil).ride_shift()
+    let vehicle = torque_truck().with_effects(effects);
+    *StepModel::new(&vehicle, 0.1, 4).riding_as(|| UsualRide::of(&vehicle, 0.1, 4, soil)).ride_shift()
 }
 
 /// Goal: on firm ground a load shifts the ride by what the springs give way. Method: statics of a beam on two springs, by hand.
@@ -46,11 +47,11 @@ fn analytic_what_does_not_press_shifts_nothing() {
     let stiffer = shift(&[Effect::RollStiffness(RollStiffness { relative: 0.3 })], &SOFT);
     assert!(stiffer.iter().all(|s| s.abs() < 1e-3), "{stiffer:?}");
 
-    let model =
-        StepModel::new(&torque_truck().with_effects(&[Effect::Payload(Payload { mass_kg: 600.0, at_m: [-1.2, 0.3, 0.8] })]), 0.1, 4);
+    let vehicle = torque_truck().with_effects(&[Effect::Payload(Payload { mass_kg: 600.0, at_m: [-1.2, 0.3, 0.8] })]);
+    let model = StepModel::new(&vehicle, 0.1, 4);
     let state = VehicleState::from_array([1.0, 2.0, 0.6, 0.1, 0.05, 0.3, 2.0, 0.1, 0.0, 0.0, 0.0, 0.2]);
     assert_eq!(model.as_known(&state), state, "without a usual soil the shift is not known");
-    let model = model.riding_on(&SOFT);
+    let model = model.riding_as(|| UsualRide::of(&vehicle, 0.1, 4, &SOFT));
     let [up_m, roll_rad, pitch_rad] = *model.ride_shift();
     let known = model.as_known(&state);
     assert_eq!(known.position_m, [1.0, 2.0, 0.6 - up_m]);

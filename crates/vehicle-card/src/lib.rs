@@ -229,7 +229,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
         return Err(CardError(format!("`{key}` is {value}, must be positive")));
     }
     let not_negative = [("driveline.side_coupling_n_m_s", c.driveline.side_coupling_n_m_s), ("soil_damping_pa_s_m", c.soil_damping_pa_s_m)];
-    if let Some((key, value)) = not_negative.iter().find(|(_, value)| value.is_nan() || *value < 0.0) {
+    if let Some((key, value)) = not_negative.iter().find(|(_, value)| !value.is_finite() || *value < 0.0) {
         return Err(CardError(format!("`{key}` is {value}, must not be negative")));
     }
     if let Some(fault) = c.driveline.torque.as_ref().and_then(torque_at_fault) {

@@ -74,11 +74,12 @@ pub struct TrainArgs {
     /// Start from the weights, scales and vehicle of this bundle (same model, no effects) instead of from nothing
     #[arg(long, value_name = "BUNDLE")]
     from: Option<PathBuf>,
-    /// Fit the drive line anew on these drives instead of taking the bundle's vehicle: after the physics or the card has changed
+    /// Fit drive line and suspension anew on these drives instead of taking the bundle's vehicle: after the physics or the card has changed
     #[arg(long, requires = "from")]
     recalibrate: bool,
     /// Pressure by which fresh soil resists being pressed down, over the speed of that, Pa s/m; a few thousand to tens of thousands, 0 for soil that yields
-    /// however fast it is pressed. Part of the soil contact model, the only contact law that is then calibrated [default: as the card or, with --from, the bundle has it]
+    /// however fast it is pressed. Part of the soil contact model, the only contact law that is then calibrated [default: as the card or, with --from, the
+    /// bundle has it]
     #[arg(long, value_name = "PA_S_M")]
     soil_damping: Option<f64>,
     /// Do not train on the mirror images of the drives; for a vehicle whose left differs from its right

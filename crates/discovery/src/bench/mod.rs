@@ -213,8 +213,7 @@ impl Stage<'_> {
     pub fn run(&self, hidden: &Hidden, group: usize, scoring: Option<&Scoring>) -> Result<Outcome, DiscoveryError> {
         let start = Instant::now();
         let bundle = self.predictor.bundle();
-        let stepping = Stepping::of(bundle);
-        let bench = Bench { vehicle: &bundle.vehicle, stepping, catalogue: &self.judge.catalogue };
+        let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(bundle), catalogue: &self.judge.catalogue };
         let (mut drives, mut maps) = (Vec::new(), Vec::new());
         for m in self.members(group) {
             let (mut drive, mut map) = (self.drives[m].clone(), self.maps[m].clone());
