@@ -35,7 +35,6 @@ fn generate(out: &Path) {
         tonic_prost_build::configure()
             .bytes(".")
             .build_transport(false)
-            .build_server(stem == DESCRIBED)
             .emit_rerun_if_changed(false)
             .out_dir(out)
             .compile_fds(descriptors)

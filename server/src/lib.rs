@@ -26,12 +26,13 @@ mod workers;
 mod zenoh;
 
 pub use clock::MonotonicClock;
+pub use cluster::etcd_endpoint;
 pub use config::{
     ClusterConfig, Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, WorkersConfig,
     ZenohConfig, ZenohMode, is_tls_endpoint,
 };
 pub use error::ServerError;
-pub use one_thread::serve_on_one_thread;
+pub use one_thread::{Sessions, serve_on_one_thread};
 pub use serve::{RunningServer, serve, termination};
 pub use telemetry::Metrics;
 pub use workers::start_workers;

@@ -18,7 +18,7 @@ use tonic_health::server::HealthReporter;
 use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
 use crate::clock::{MonotonicClock, unix_ns};
-use crate::cluster::Cluster;
+use crate::cluster::{Cluster, Etcd};
 use crate::config::{Config, GrpcConfig};
 use crate::convert::SoilTeller;
 use crate::error::ServerError;
@@ -250,7 +250,8 @@ async fn open_store(
         let opened = open_folder(&config.store.directory, keeper, engine.handle()).await;
         return opened.map(|()| None).map_err(|source| ServerError::Store { source });
     }
-    let cluster = Cluster::start(&config.cluster, grpc_addr.to_string(), engine.clone(), keeper.clone()).await?;
+    let etcd = Etcd::new(&config.cluster)?;
+    let cluster = Cluster::start(etcd, &config.cluster, grpc_addr.to_string(), engine.clone(), keeper.clone()).await?;
     let store = EtcdStore::new(cluster.clone(), tokio::runtime::Handle::current());
     let started = keeper.start(Box::new(store), engine.handle().clone(), Restored::default());
     started.map_err(|source| ServerError::Store { source })?;

@@ -1,10 +1,12 @@
 //! Bringing a session here.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use nesam_engine::SessionImage;
 use nesam_proto::etcd::KeyValue;
+use tokio::sync::OwnedMutexGuard;
+use tokio::time::Instant;
 use tonic::Status;
 
 use super::record::{Server, json, of_json, session_of};
@@ -125,10 +127,8 @@ impl Cluster {
             return Ok(Brought::Here);
         }
         let turn = self.lock().turns.entry(session.into()).or_default().clone();
-        let guard = turn.lock().await;
-        let result = self.have_in_turn(session, zeal, until, permit).await;
-        drop(guard);
-        drop(turn);
+        let turn = turn.lock_owned().await;
+        let result = self.have_in_turn(session, zeal, until, permit, turn).await;
         self.lock().turns.retain(|_, turn| Arc::strong_count(turn) > 1);
         result
     }
@@ -139,6 +139,7 @@ impl Cluster {
         zeal: Zeal,
         until: Instant,
         permit: impl Fn(&str) -> Result<(), Status>,
+        mut turn: OwnedMutexGuard<()>,
     ) -> Result<Brought, Status> {
         let mut changes = self.0.changes.subscribe();
         // Epoch of the owner that was asked, and the revision at which; one that took the session since then has not heard.
@@ -157,7 +158,12 @@ impl Cluster {
                 None => {}
             }
             let Some((epoch, lease, owner)) = seen.owner else {
-                if self.take(session).await? {
+                // To its end, and nobody else's turn before, also when the client does not wait any longer: a session half taken would be nobody's.
+                let (cluster, name) = (self.clone(), session.to_owned());
+                let taking = tokio::spawn(async move { (cluster.take(&name).await, turn) });
+                let (taken, back) = taking.await.map_err(|error| Status::internal(format!("taking session `{session}`: {error}")))?;
+                turn = back;
+                if taken? {
                     return Ok(Brought::Here);
                 }
                 continue;

@@ -44,11 +44,15 @@ impl Etcd {
     /// # Errors
     /// `ServerError::Value` for an endpoint that is none, `ServerError::Tls` for files that cannot be used.
     pub fn new(config: &ClusterConfig) -> Result<Self, ServerError> {
-        let endpoints = config.etcd.iter().map(|address| endpoint(address, config)).collect::<Result<Vec<_>, _>>()?;
-        let channel = Channel::balance_list(endpoints.into_iter());
+        let endpoints = config.etcd.iter().map(|address| etcd_endpoint(address, config)).collect::<Result<Vec<_>, _>>()?;
+        Ok(Self::over(Channel::balance_list(endpoints.into_iter())))
+    }
+
+    /// A client over connections that somebody else makes.
+    pub fn over(channel: Channel) -> Self {
         let kv = pb::kv_client::KvClient::new(channel.clone()).max_decoding_message_size(ANSWER_BYTES_MAX);
         let (lease, watch) = (pb::lease_client::LeaseClient::new(channel.clone()), pb::watch_client::WatchClient::new(channel));
-        Ok(Self { kv, lease, watch })
+        Self { kv, lease, watch }
     }
 
     /// Does all of `then` at one instant when every condition holds, and nothing when not.
@@ -131,7 +135,11 @@ async fn within<T>(limit: Duration, asked: impl Future<Output = Result<T, Status
         .unwrap_or_else(|_| Err(Status::deadline_exceeded(format!("etcd did not answer within {:.1} s", limit.as_secs_f64()))))
 }
 
-fn endpoint(address: &str, config: &ClusterConfig) -> Result<Endpoint, ServerError> {
+/// How servers connect to a member of etcd.
+///
+/// # Errors
+/// `ServerError::Value` for an address that is none, `ServerError::Tls` for files that cannot be used.
+pub fn etcd_endpoint(address: &str, config: &ClusterConfig) -> Result<Endpoint, ServerError> {
     let wrong = |reason: String| ServerError::Value { key: "cluster.etcd", reason: format!("`{address}`: {reason}") };
     let endpoint = Endpoint::from_shared(address.to_string()).map_err(|error| wrong(error.to_string()))?;
     let endpoint = endpoint

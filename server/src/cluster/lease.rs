@@ -1,8 +1,9 @@
 //! The lease of this server: for how long nobody else can have its sessions.
 
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use tokio::time::Instant;
 use tonic::Status;
 
 use super::etcd::Etcd;

@@ -23,14 +23,16 @@ mod watch;
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use tokio::sync::{broadcast, watch as latest};
 use tokio::task::JoinHandle;
+use tokio::time::Instant;
 use tonic::Status;
 use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use self::bring::{Brought, Standing};
+pub use self::etcd::etcd_endpoint;
 pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, get_keys, put, written};
 pub(crate) use self::keys::Keys;
 use self::lease::Lease;
@@ -120,12 +122,17 @@ struct Inner {
 }
 
 impl Cluster {
-    /// Connects, and returns when the first lease is there.
+    /// Joins the servers at this etcd, and returns when the first lease is there.
     ///
     /// # Errors
-    /// `ServerError` for endpoints or files that cannot be used, or when etcd does not answer.
-    pub async fn start(config: &ClusterConfig, address: String, engine: EngineClient, keeper: Arc<Keeper>) -> Result<Self, ServerError> {
-        let etcd = Etcd::new(config)?;
+    /// `ServerError` when etcd does not answer.
+    pub async fn start(
+        etcd: Etcd,
+        config: &ClusterConfig,
+        address: String,
+        engine: EngineClient,
+        keeper: Arc<Keeper>,
+    ) -> Result<Self, ServerError> {
         let name = if config.name.is_empty() { own_name(&address) } else { config.name.clone() };
         let (changes, _) = latest::channel(0);
         let (left, _) = broadcast::channel(LEFT_KEPT);

@@ -4,7 +4,9 @@
 //! its own clock, so a server that starts begins to count anew. The removal is conditional on both: a session that somebody has taken or written stays.
 
 use std::collections::BTreeMap;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use tokio::time::Instant;
 
 use super::{Cluster, created, delete, get_keys, written};
 

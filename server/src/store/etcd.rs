@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use tokio::runtime::Handle;
 use tonic::Status;
 
-use super::{Change, Contents, SessionStore, StoreError, StoredSession};
+use super::{Change, Commit, Contents, SessionStore, StoreError, StoredSession};
 use crate::cluster::{Cluster, created, delete, put, session_bytes};
 
 /// Sessions of one transaction at most, and bytes; etcd takes 128 operations and 1.5 MiB.
@@ -111,7 +111,11 @@ impl SessionStore for EtcdStore {
     }
 
     fn commit(&mut self, changes: &[Change]) -> Result<Vec<String>, StoreError> {
+        self.runtime.clone().block_on(self.commit_in_task(changes))
+    }
+
+    fn commit_in_task<'a>(&'a mut self, changes: &'a [Change]) -> Commit<'a> {
         let failed = |status: Status| StoreError::Database { reason: format!("etcd: {}", status.message()) };
-        self.runtime.block_on(self.write_all(changes)).map_err(failed)
+        Box::pin(async move { self.write_all(changes).await.map_err(failed) })
     }
 }

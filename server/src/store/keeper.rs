@@ -211,7 +211,7 @@ impl Keeper {
             tokio::time::sleep(LOOK_EVERY).await;
             let due = self.due(&mut self.lock());
             if !due.is_empty() {
-                work.commit(&due);
+                work.commit_in_task(&due).await;
             }
         }
     }
@@ -331,6 +331,15 @@ impl Keeper {
     }
 }
 
+/// What one commit is to hold.
+struct Batch {
+    changes: Vec<Change>,
+    places: Places,
+    /// Hash of each map in the store after it.
+    maps: BTreeMap<String, String>,
+    bytes: u64,
+}
+
 /// What commits.
 struct Work {
     keeper: Arc<Keeper>,
@@ -354,8 +363,33 @@ impl Work {
     /// Commits these, or sees to it that they are tried again; false when the server stops and will not wait for that.
     fn commit(&mut self, due: &BTreeMap<Key, u64>) -> bool {
         let begun = Instant::now();
-        match self.write(due) {
-            Ok((places, bytes)) => {
+        let batch = self.read(due);
+        let written = batch.and_then(|batch| match self.store.commit(&batch.changes) {
+            Ok(foreign) => Ok((batch, foreign)),
+            Err(error) => Err(error.to_string()),
+        });
+        self.note(due, begun, written)
+    }
+
+    /// The same in a task.
+    async fn commit_in_task(&mut self, due: &BTreeMap<Key, u64>) -> bool {
+        let begun = Instant::now();
+        let written = match self.read(due) {
+            Ok(batch) => match self.store.commit_in_task(&batch.changes).await {
+                Ok(foreign) => Ok((batch, foreign)),
+                Err(error) => Err(error.to_string()),
+            },
+            Err(reason) => Err(reason),
+        };
+        self.note(due, begun, written)
+    }
+
+    /// Notes what was written of these, and which sessions belong to another server.
+    fn note(&mut self, due: &BTreeMap<Key, u64>, begun: Instant, written: Result<(Batch, Vec<String>), String>) -> bool {
+        match written {
+            Ok((Batch { mut places, maps, bytes, .. }, foreign)) => {
+                places.retain(|session, _| !foreign.contains(session));
+                self.maps = maps;
                 self.keeper.committed(due, &places, bytes, begun.elapsed());
                 true
             }
@@ -366,8 +400,8 @@ impl Work {
         }
     }
 
-    /// Commits the present state of these sessions and maps: accepted measurements of each session, and the bytes written.
-    fn write(&mut self, due: &BTreeMap<Key, u64>) -> Result<(Places, u64), String> {
+    /// Reads the present state of these sessions and maps.
+    fn read(&mut self, due: &BTreeMap<Key, u64>) -> Result<Batch, String> {
         let snapshot = self.snapshot(due)?;
         let (mut changes, mut places, mut maps) = (Vec::new(), Places::new(), self.maps.clone());
         for (id, map) in &snapshot.maps {
@@ -393,11 +427,7 @@ impl Work {
         }
         changes.extend(self.keeper.soil(due));
         let bytes = changes.iter().map(weight).sum();
-        for foreign in self.store.commit(&changes).map_err(|error| error.to_string())? {
-            places.remove(&foreign);
-        }
-        self.maps = maps;
-        Ok((places, bytes))
+        Ok(Batch { changes, places, maps, bytes })
     }
 
     fn snapshot(&mut self, due: &BTreeMap<Key, u64>) -> Result<Snapshot, String> {

@@ -19,6 +19,7 @@ mod redb;
 mod restore;
 
 use std::path::PathBuf;
+use std::pin::Pin;
 
 pub(crate) use self::etcd::EtcdStore;
 pub use self::keeper::Keeper;
@@ -46,7 +47,15 @@ pub trait SessionStore: Send {
     /// # Errors
     /// `StoreError` when changes were not made, or when it is not known whether they were; all may be made again.
     fn commit(&mut self, changes: &[Change]) -> Result<Vec<String>, StoreError>;
+
+    /// The same in a task, which must not wait as a thread may.
+    fn commit_in_task<'a>(&'a mut self, changes: &'a [Change]) -> Commit<'a> {
+        Box::pin(std::future::ready(self.commit(changes)))
+    }
 }
+
+/// A commit on its way.
+pub type Commit<'a> = Pin<Box<dyn Future<Output = Result<Vec<String>, StoreError>> + Send + 'a>>;
 
 /// What a store holds.
 #[derive(Clone, Debug, Default, PartialEq)]
