@@ -106,7 +106,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     );
     say!("capacity: {capacity_hz:.1} answers/s to {ASKERS} askers");
     say!(
-        "{:>6} {:>9} {:>11} {:>19} {:>12} {:>9} {:>7} {:>14} {:>20} {:>18}",
+        "{:>6} {:>9} {:>11} {:>19} {:>12} {:>9} {:>7} {:>14} {:>28} {:>18}",
         "load",
         "asked/s",
         "in time/s",
@@ -115,7 +115,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
         "refused/s",
         "late/s",
         "p99 in time ms",
-        "p50, p99 refused ms",
+        "p50, p99 refused ms, in 1 ms",
         "p99 measurement ms"
     );
     let mut rows = Vec::new();
@@ -240,17 +240,19 @@ fn row(load: f64, seconds: f64, tally: &mut Tally) -> Value {
     let (good, refused, late) = (rate(tally.good_ms.len()), rate(tally.refused_ms.len()), rate(tally.late));
     let (good_ms, measured_ms) = (quantile(&mut tally.good_ms, 0.99), quantile(&mut tally.measured_ms, 0.99));
     let [refused_p50_ms, refused_ms] = [0.5, 0.99].map(|q| quantile(&mut tally.refused_ms, q));
+    let at_once = tally.refused_ms.iter().filter(|ms| **ms <= 1.0).count() as f64 / tally.refused_ms.len() as f64;
     let samples = tally.samples as f64 / tally.good_ms.len() as f64;
     let good_of: Vec<f64> = tally.good_of.iter().map(|count| rate(*count)).collect();
     let others = good_of[1..].iter().sum::<f64>() / (good_of.len() - 1) as f64;
-    let (each, refusals) = (format!("{:.1}, {others:.1}", good_of[0]), format!("{refused_p50_ms:.2}, {refused_ms:.2}"));
+    let (each, refusals) =
+        (format!("{:.1}, {others:.1}", good_of[0]), format!("{refused_p50_ms:.2}, {refused_ms:.2}, {:.1} %", 100.0 * at_once));
     say!(
-        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>20} {measured_ms:>18.1}",
+        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>28} {measured_ms:>18.1}",
         rate(asked)
     );
     json!({
         "load": load, "asked_hz": rate(asked), "in_time_hz": good, "in_time_hz_by_vehicle": good_of, "samples_mean": samples, "refused_hz": refused,
-        "late_hz": late, "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "measurement_p99_ms": measured_ms,
+        "late_hz": late, "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "refused_within_1_ms": at_once, "measurement_p99_ms": measured_ms,
         "measurements": tally.measured_ms.len(), "measurements_refused": tally.measurements_refused,
     })
 }
