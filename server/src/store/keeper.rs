@@ -363,41 +363,44 @@ impl Work {
     /// Commits these, or sees to it that they are tried again; false when the server stops and will not wait for that.
     fn commit(&mut self, due: &BTreeMap<Key, u64>) -> bool {
         let begun = Instant::now();
-        let batch = self.read(due);
-        let written = batch.and_then(|batch| match self.store.commit(&batch.changes) {
-            Ok(foreign) => Ok((batch, foreign)),
-            Err(error) => Err(error.to_string()),
-        });
-        self.note(due, begun, written)
+        match self.read(due) {
+            Ok(batch) => {
+                let committed = self.store.commit(&batch.changes);
+                self.note(due, begun, batch, committed)
+            }
+            Err(reason) => self.failed(due, &reason),
+        }
     }
 
     /// The same in a task.
     async fn commit_in_task(&mut self, due: &BTreeMap<Key, u64>) -> bool {
         let begun = Instant::now();
-        let written = match self.read(due) {
-            Ok(batch) => match self.store.commit_in_task(&batch.changes).await {
-                Ok(foreign) => Ok((batch, foreign)),
-                Err(error) => Err(error.to_string()),
-            },
-            Err(reason) => Err(reason),
-        };
-        self.note(due, begun, written)
+        match self.read(due) {
+            Ok(batch) => {
+                let committed = self.store.commit_in_task(&batch.changes).await;
+                self.note(due, begun, batch, committed)
+            }
+            Err(reason) => self.failed(due, &reason),
+        }
     }
 
-    /// Notes what was written of these, and which sessions belong to another server.
-    fn note(&mut self, due: &BTreeMap<Key, u64>, begun: Instant, written: Result<(Batch, Vec<String>), String>) -> bool {
-        match written {
-            Ok((Batch { mut places, maps, bytes, .. }, foreign)) => {
+    /// Notes that a batch was written but for sessions that belong to another server, or that it was not.
+    fn note(&mut self, due: &BTreeMap<Key, u64>, begun: Instant, batch: Batch, committed: Result<Vec<String>, StoreError>) -> bool {
+        match committed {
+            Ok(foreign) => {
+                let Batch { mut places, maps, bytes, .. } = batch;
                 places.retain(|session, _| !foreign.contains(session));
                 self.maps = maps;
                 self.keeper.committed(due, &places, bytes, begun.elapsed());
                 true
             }
-            Err(reason) => {
-                tracing::error!(reason, changes = due.len(), "sessions are not durable: the store did not take them; tried again");
-                !self.keeper.failed(due)
-            }
+            Err(error) => self.failed(due, &error.to_string()),
         }
+    }
+
+    fn failed(&self, due: &BTreeMap<Key, u64>, reason: &str) -> bool {
+        tracing::error!(reason, changes = due.len(), "sessions are not durable: the store did not take them; tried again");
+        !self.keeper.failed(due)
     }
 
     /// Reads the present state of these sessions and maps.

@@ -18,17 +18,20 @@ use std::rc::Rc;
 use std::task::{Context, Poll};
 use std::time::Duration;
 
+use http::Uri;
 use hyper_util::rt::TokioIo;
 use nesam_client::{Client, Outbox, Prediction, outcome_label, v1};
-use rand::RngExt as _;
+use nesam_model::Rollout;
+use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
 use tokio::io::{AsyncRead, AsyncWrite, ReadBuf};
 use tokio::task::JoinHandle;
 use tokio::time::{Instant, sleep, timeout};
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::Code;
+use tonic::transport::Endpoint;
 use tonic::transport::server::Connected;
-use tonic::transport::{Channel, Endpoint};
+use tower::Service;
 use turmoil::Sim;
 use turmoil::net::{TcpListener, TcpStream};
 
@@ -161,15 +164,13 @@ async fn connections() -> Result<(ReceiverStream<io::Result<Socket>>, JoinHandle
     Ok((ReceiverStream::new(connections), accepting))
 }
 
-/// A way to a host that is taken when it is first used, and again when it broke.
-fn channel(endpoint: Endpoint, host: &'static str) -> Channel {
-    let connector = tower::service_fn(move |_| async move { TcpStream::connect((host, PORT)).await.map(TokioIo::new) });
-    endpoint.connect_with_connector_lazy(connector)
+/// The way to a host.
+fn connector(host: &'static str) -> impl Service<Uri, Response = TokioIo<TcpStream>, Error = io::Error, Future: Send> + Send {
+    tower::service_fn(move |_| async move { TcpStream::connect((host, PORT)).await.map(TokioIo::new) })
 }
 
 async fn connect(host: &'static str) -> Result<Client, Failure> {
-    let connector = tower::service_fn(move |_| async move { TcpStream::connect((host, PORT)).await.map(TokioIo::new) });
-    Ok(Client::over(timeout(PATIENCE, Endpoint::from_static("http://server").connect_with_connector(connector)).await??))
+    Ok(Client::over(timeout(PATIENCE, Endpoint::from_static("http://server").connect_with_connector(connector(host))).await??))
 }
 
 /// Owners of sessions as the clients have seen them, at the one time of the simulation.
@@ -195,14 +196,26 @@ impl Owners {
     }
 }
 
+/// The drive that everybody knows, and whom they may ask.
+#[derive(Clone)]
+struct Scene {
+    recorded: Rc<Recorded>,
+    /// Last sample that vehicles send.
+    last: usize,
+    servers: &'static [&'static str],
+}
+
+impl Scene {
+    /// A connection to one of the servers.
+    async fn connect(&self, rng: &mut ChaCha8Rng) -> Result<Client, Failure> {
+        connect(self.servers[rng.random_range(0..self.servers.len())]).await
+    }
+}
+
 /// A vehicle that drives once, whatever happens.
 struct Vehicle {
     session: &'static str,
-    recorded: Rc<Recorded>,
-    /// Last sample that it sends.
-    last: usize,
-    /// Whom it may ask; which one is drawn for each connection.
-    servers: &'static [&'static str],
+    scene: Scene,
     rng: ChaCha8Rng,
     owners: Owners,
     outbox: Outbox,
@@ -219,18 +232,6 @@ struct Seen {
 }
 
 impl Vehicle {
-    fn new(
-        session: &'static str,
-        recorded: Rc<Recorded>,
-        last: usize,
-        servers: &'static [&'static str],
-        rng: ChaCha8Rng,
-        owners: Owners,
-    ) -> Self {
-        let (outbox, begun) = (Outbox::default(), Instant::now());
-        Self { session, recorded, last, servers, rng, owners, outbox, begun, pushed: 0, opened: false }
-    }
-
     async fn drive(mut self) -> Result<Seen, Failure> {
         loop {
             match self.connected().await {
@@ -243,14 +244,14 @@ impl Vehicle {
 
     /// Over one connection, until everything is durable.
     async fn connected(&mut self) -> Result<Seen, Failure> {
-        let mut client = connect(self.servers[self.rng.random_range(0..self.servers.len())]).await?;
+        let mut client = self.scene.connect(&mut self.rng).await?;
         self.enter(&mut client).await?;
         self.outbox.reconnected();
         let mut stream = timeout(PATIENCE, client.measure()).await??;
         loop {
             let driven = self.begun.elapsed().as_nanos() as usize / STEP_NS as usize;
-            while self.pushed <= driven.min(self.last) {
-                self.outbox.push(sample(self.session, &self.recorded.drive, self.pushed));
+            while self.pushed <= driven.min(self.scene.last) {
+                self.outbox.push(sample(self.session, &self.scene.recorded.drive, self.pushed));
                 self.pushed += 1;
             }
             let (mut sent, newest) = (0, self.owners.newest(self.session));
@@ -274,8 +275,8 @@ impl Vehicle {
                 let session = timeout(PATIENCE, client.session(self.session)).await??;
                 self.owners.answered(self.session, newest, session.run)?;
                 self.outbox.durable(session.run, session.durable_place);
-                if self.pushed > self.last && self.outbox.is_empty() {
-                    let query = candidates(self.session, &self.recorded.drive, self.last, 3, 16);
+                if self.pushed > self.scene.last && self.outbox.is_empty() {
+                    let query = candidates(self.session, &self.scene.recorded.drive, self.scene.last, 3, 16);
                     return Ok(Seen { prediction: timeout(PATIENCE, client.predict(query)).await??, session });
                 }
                 sleep(Duration::from_millis(20)).await;
@@ -292,7 +293,7 @@ impl Vehicle {
         if self.opened {
             return Err(Violation(format!("{}: the session is gone", self.session)).into());
         }
-        let (vehicle_id, map_id) = (self.session.into(), self.recorded.world.id().into());
+        let (vehicle_id, map_id) = (self.session.into(), self.scene.recorded.world.id().into());
         let request = v1::OpenSessionRequest { vehicle_id, map_id, ..Default::default() };
         timeout(PATIENCE, client.open_session(request)).await??;
         self.opened = true;
@@ -314,8 +315,7 @@ impl Error for Violation {}
 
 /// Asks for predictions from the first vehicle's session.
 struct Planner {
-    recorded: Rc<Recorded>,
-    servers: &'static [&'static str],
+    scene: Scene,
     rng: ChaCha8Rng,
     /// From then on nothing fails any more, and who asks is answered, or told to ask again, within the time after it.
     calm: Option<(Duration, Duration)>,
@@ -326,13 +326,13 @@ impl Planner {
     async fn plan(mut self, arrived: &Cell<usize>, got: &Cell<usize>) -> Result<(), Failure> {
         while arrived.get() < VEHICLES.len() {
             sleep(Duration::from_millis(100)).await;
-            let Ok(mut client) = connect(self.servers[self.rng.random_range(0..self.servers.len())]).await else { continue };
+            let Ok(mut client) = self.scene.connect(&mut self.rng).await else { continue };
             // On to another server now and then.
             for _ in 0..self.rng.random_range(1..=8) {
                 let asked = turmoil::sim_elapsed().unwrap_or_default();
                 let calm = self.calm.filter(|(since, _)| asked > *since).map(|(_, within)| within);
-                let answer =
-                    timeout(calm.unwrap_or(PATIENCE), client.predict(candidates(VEHICLES[0], &self.recorded.drive, 20, 2, 8))).await;
+                let query = candidates(VEHICLES[0], &self.scene.recorded.drive, 20, 2, 8);
+                let answer = timeout(calm.unwrap_or(PATIENCE), client.predict(query)).await;
                 match answer {
                     Ok(Ok(prediction)) => got.set(got.get() + usize::from(prediction.states.iter().all(|value| value.is_finite()))),
                     // Not open yet, or nothing to predict from yet.
@@ -359,15 +359,54 @@ impl Planner {
     }
 }
 
-/// What a simulation came to.
-struct Run {
-    /// What each vehicle has at its end.
-    seen: Vec<Seen>,
-    /// Starts of servers.
-    starts: usize,
-    /// That the planner got on the way.
-    predictions: usize,
-    simulated: Duration,
+/// The vehicles and their planner in a network, and what they come to.
+struct Crew {
+    seen: Rc<RefCell<Vec<Seen>>>,
+    got: Rc<Cell<usize>>,
+}
+
+impl Crew {
+    /// Vehicles begin when they are `ready` to.
+    fn join(sim: &mut Sim<'_>, scene: &Scene, mut rng: ChaCha8Rng, ready: &Rc<Cell<bool>>, calm: Option<(Duration, Duration)>) -> Self {
+        let (arrived, got, seen) = (Rc::new(Cell::new(0)), Rc::new(Cell::new(0)), Rc::new(RefCell::new(Vec::new())));
+        let owners = Owners::default();
+        for session in VEHICLES {
+            let (arrived, seen, ready) = (arrived.clone(), seen.clone(), ready.clone());
+            let (scene, owners, rng) = (scene.clone(), owners.clone(), ChaCha8Rng::seed_from_u64(rng.random()));
+            sim.client(session, async move {
+                while !ready.get() {
+                    sleep(Duration::from_millis(20)).await;
+                }
+                let (outbox, begun) = (Outbox::default(), Instant::now());
+                let arrives = Vehicle { session, scene, rng, owners, outbox, begun, pushed: 0, opened: false }.drive().await?;
+                seen.borrow_mut().push(arrives);
+                arrived.set(arrived.get() + 1);
+                Ok(())
+            });
+        }
+        let planner = Planner { scene: scene.clone(), rng, calm };
+        let counted = got.clone();
+        sim.client("planner", async move { planner.plan(&arrived, &counted).await });
+        Self { seen, got }
+    }
+
+    /// When the simulation is over: predictions that the planner got on the way. Every vehicle has the session and the prediction of a drive without failures.
+    fn check(self, seed: u64, last: usize, expected: &Rollout) -> usize {
+        let seen = self.seen.borrow();
+        assert_eq!(seen.len(), VEHICLES.len(), "seed {seed}");
+        for Seen { session, prediction } in seen.iter() {
+            assert_eq!(session.accepted, last as u64 + 1, "seed {seed}: {}", session.session_id);
+            assert_same(prediction, expected);
+        }
+        self.got.get()
+    }
+}
+
+/// What a vehicle is to get at its end.
+fn without_failures(scene: &Scene) -> Rollout {
+    let Scene { recorded, last, .. } = scene;
+    let query = candidates(VEHICLES[0], &recorded.drive, *last, 3, 16);
+    offline(recorded, *last, &query, 31, learned(recorded, *last).0)
 }
 
 /// Seeds that are tried when nothing is asked for, or those that are asked for.

@@ -175,7 +175,7 @@ async fn answers(channel: Channel, seed: u64) -> Vec<String> {
 }
 
 #[test]
-fn conformance_the_stand_in_answers_as_etcd_does() {
+fn published_the_stand_in_answers_as_etcd_does() {
     let folder = tempfile::tempdir().unwrap();
     tokio::runtime::Runtime::new().unwrap().block_on(async {
         let Some((_running, etcd)) = real(folder.path()).await else {

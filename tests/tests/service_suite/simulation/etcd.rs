@@ -1,6 +1,6 @@
 //! A stand-in for etcd with the part of its interface that servers use: keys with revisions, transactions, leases, watches.
 //!
-//! `conformance_the_stand_in_answers_as_etcd_does` holds it against etcd itself where that is installed; `tests/fleet/run` has the servers with etcd itself.
+//! `published_the_stand_in_answers_as_etcd_does` holds it against etcd itself where that is installed; `tests/fleet/run` has the servers with etcd itself.
 
 use std::collections::BTreeMap;
 use std::ops::Bound;
