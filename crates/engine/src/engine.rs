@@ -8,7 +8,7 @@ use std::sync::Arc;
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
 use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant};
-use nesam_physics::VehicleState;
+use nesam_physics::{Vehicle, VehicleState};
 use nesam_terrain::WorldMap;
 
 use crate::candidates::Candidates;
@@ -115,6 +115,11 @@ impl Engine {
         &self.limits
     }
 
+    /// Vehicle that the bundle knows.
+    pub fn vehicle(&self) -> &Vehicle {
+        &self.predictor.bundle().vehicle
+    }
+
     /// Answers one command at one instant of the engine's clock. A refused command changes nothing that an answer shows, and neither does a
     /// prediction; both only keep the session that they name from being idle.
     ///
@@ -162,7 +167,7 @@ impl Engine {
         check_name("vehicle_id", &open.vehicle)?;
         let id = if open.session.is_empty() { &open.vehicle } else { &open.session };
         check_name("session_id", id)?;
-        let card = &self.predictor.bundle().vehicle;
+        let card = self.vehicle();
         if !open.vehicle_card.is_empty() && open.vehicle_card != card.name {
             let reason = format!("is `{}`, the bundle was trained for `{}`", open.vehicle_card, card.name);
             return Err(EngineError::invalid("vehicle_card", reason));
@@ -347,7 +352,7 @@ impl Engine {
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
         let session = self.session(&query.session)?;
         let predictor = session.predictor().unwrap_or(&self.predictor);
-        query.check(&self.limits, &self.predictor.bundle().vehicle)?;
+        query.check(&self.limits, self.vehicle())?;
         let exact = query.extras.exact_terrain.then(|| predictor.exactly());
         let predictor = exact.as_ref().unwrap_or(predictor);
         let map = session.map().map(|id| self.maps.get(id)).transpose()?;
@@ -362,7 +367,7 @@ impl Engine {
         self.limits.check_shape(query.samples * soils.len().max(1), horizon)?;
         let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
         let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
-        let commands = query.controls.commands(query.samples, self.predictor.bundle().vehicle.command_range);
+        let commands = query.controls.commands(query.samples, self.vehicle().command_range);
         let controls = forward.prepend(&commands, query.horizon);
         let asked = RolloutQuery {
             history: &history,

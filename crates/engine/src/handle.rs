@@ -4,6 +4,8 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use nesam_physics::Vehicle;
+
 use crate::clock::Clock;
 use crate::command::{Command, Reply};
 use crate::engine::Engine;
@@ -61,6 +63,14 @@ impl Submission {
         Self { submitted_ns, ..self }
     }
 
+    /// Whether a prediction is asked for as it must be; of other commands only the engine knows.
+    fn check(&self, limits: &Limits, vehicle: &Vehicle) -> Result<(), EngineError> {
+        match &self.command {
+            Command::Predict(query) => query.check(limits, vehicle),
+            _ => Ok(()),
+        }
+    }
+
     fn refuse(self, error: EngineError) {
         (self.reply)(Answer { result: Err(error), queued_ns: 0, busy_ns: 0 });
     }
@@ -101,6 +111,7 @@ pub struct EngineHandle {
     queue: Arc<Queue>,
     clock: Arc<dyn Clock>,
     limits: Arc<Limits>,
+    vehicle: Arc<Vehicle>,
     worker: Arc<Worker>,
 }
 
@@ -134,7 +145,7 @@ impl EngineHandle {
     /// When the system refuses to start a thread.
     pub fn spawn_tapped(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
         let queue = Arc::new(Queue::default());
-        let limits = Arc::new(engine.limits().clone());
+        let (limits, vehicle) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()));
         let thread = thread::Builder::new()
             .name("nesam-engine".into())
             .spawn({
@@ -142,21 +153,30 @@ impl EngineHandle {
                 move || run(engine, &queue, clock.as_ref(), tap)
             })
             .expect("the system starts a thread");
-        Self { queue, clock, limits, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
+        Self { queue, clock, limits, vehicle, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
     }
 
     /// An engine without a thread: whoever submits executes all that waits before it goes on, unless somebody else is at it. So a simulation runs on one
     /// thread.
     pub fn unthreaded(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
-        let limits = Arc::new(engine.limits().clone());
-        Self { queue: Arc::default(), clock, limits, worker: Arc::new(Worker::Submitter(Box::new(Mutex::new(Some((engine, tap)))))) }
+        let (limits, vehicle) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()));
+        Self {
+            queue: Arc::default(),
+            clock,
+            limits,
+            vehicle,
+            worker: Arc::new(Worker::Submitter(Box::new(Mutex::new(Some((engine, tap)))))),
+        }
     }
 
-    /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once.
+    /// Puts a command in the queue. The answer always comes, and only through `reply`; a full queue is answered at once, and so is a prediction that would not
+    /// be done in time, with what is wrong with it where that will not change.
     pub fn submit(&self, submission: Submission) {
         if let Err(refused) = self.queue.push(submission.at(self.clock.now_ns()), &self.limits) {
             let (error, submission) = *refused;
-            submission.refuse(error);
+            // Asked wrongly it is in vain however often it is asked again.
+            let wrong = submission.check(&self.limits, &self.vehicle).err();
+            submission.refuse(wrong.unwrap_or(error));
         }
         self.work_off();
     }

@@ -139,6 +139,11 @@ async fn service_what_would_be_late_is_refused_at_once() {
     assert!(refused_after.len() >= 15 && in_time >= 1, "{in_time} in time, {} refused of 30", refused_after.len());
     assert!(refused_after[9 * refused_after.len() / 10] < takes.max(Duration::from_millis(50)), "{refused_after:?}, one takes {takes:?}");
     assert!(server.metrics().predictions() - before <= 15);
+    // Who asks wrongly is told that, and not to ask again later.
+    let mut wrong = heavy.clone();
+    wrong.samples_min = 1025;
+    let refused = client.predict_within(wrong, Some(takes / 2)).await.expect_err("it could not be answered");
+    assert_eq!(refused.code(), Some(Code::InvalidArgument), "{refused}");
     server.shutdown().await;
 }
 
