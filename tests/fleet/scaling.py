@@ -27,11 +27,12 @@ def processor_s(process):
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def resident_bytes(process):
+def resident_bytes(process, field="VmRSS"):
+    """Memory of a process that is resident now: all of it, or the part that a field of /proc/PID/status counts."""
     for line in Path(f"/proc/{process.pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
+        if line.startswith(f"{field}:"):
             return 1024 * int(line.split()[1])
-    raise RuntimeError("no VmRSS")
+    raise RuntimeError(f"no {field}")
 
 
 class Timed(traffic.Planner):

@@ -1,8 +1,10 @@
 """tests/fleet/run --soak SECONDS: whether memory, files and threads of every process stay what they are under load that comes and goes.
 
 Vehicles over gRPC and Zenoh with planners drive, end their sessions and begin new ones, again and again. Sampled every ten seconds; the first third is for
-warming up. Holds when a straight line through the rest rises by no more than the allowance in the time that was watched."""
+warming up. Holds when a straight line through the rest rises by no more than the allowance in the time that was watched. Every sample is written to soak.csv in
+the folder of the run: memory of its own (anonymous), of files and shared."""
 
+import csv
 import os
 import time
 from pathlib import Path
@@ -23,8 +25,19 @@ COUNT_GROWTH = 3.0
 
 
 def sample(process):
+    """Memory in MB (all that is resident, anonymous, of files, shared), open files, threads."""
     folder = Path(f"/proc/{process.pid}")
-    return resident_bytes(process) / 1e6, len(os.listdir(folder / "fd")), len(os.listdir(folder / "task"))
+    parts = [resident_bytes(process, field) / 1e6 for field in ("VmRSS", "RssAnon", "RssFile", "RssShmem")]
+    return *parts, len(os.listdir(folder / "fd")), len(os.listdir(folder / "task"))
+
+
+def keep(samples, file):
+    """Writes all samples."""
+    with open(file, "w", newline="") as out:
+        writer = csv.writer(out)
+        writer.writerow(("process", "time_s", "resident_mb", "anonymous_mb", "file_mb", "shared_mb", "files", "threads"))
+        for name, rows in samples.items():
+            writer.writerows((name, *(f"{value:.3f}" for value in row)) for row in rows)
 
 
 def one_round(fleet, number, violations):
@@ -62,17 +75,19 @@ def soak(fleet, seconds):
         if rounds % 30 == 0:
             print(f"  {now:6.0f} s: {rounds} rounds, {answers} answers, {len(violations)} violations", flush=True)
     print(f"{rounds} rounds, {answers} answers in {time.monotonic() - begun:.0f} s")
-    print(f"{'process':<10} {'memory MB':>10} {'growth MB':>10} {'files':>6} {'growth':>7} {'threads':>8} {'growth':>7}")
+    keep(samples, fleet.folder / "soak.csv")
+    print(f"{'process':<10} {'memory MB':>10} {'growth MB':>10} {'own':>7} {'file':>7} {'shared':>7} {'files':>6} {'growth':>7} {'threads':>8} {'growth':>7}")
     for name, rows in samples.items():
         rows = np.array(rows)[len(rows) // 3 :]
         length_s = rows[-1, 0] - rows[0, 0]
-        growth = [np.polyfit(rows[:, 0], rows[:, column], 1)[0] * length_s for column in (1, 2, 3)]
+        resident, own, of_files, shared, files, threads = [np.polyfit(rows[:, 0], column, 1)[0] * length_s for column in rows[:, 1:].T]
         middle = np.median(rows[:, 1:], axis=0)
-        print(f"{name:<10} {middle[0]:>10.1f} {growth[0]:>10.2f} {middle[1]:>6.0f} {growth[1]:>7.1f} {middle[2]:>8.0f} {growth[2]:>7.1f}")
+        parts = f"{own:>7.2f} {of_files:>7.2f} {shared:>7.2f}"
+        print(f"{name:<10} {middle[0]:>10.1f} {resident:>10.2f} {parts} {middle[4]:>6.0f} {files:>7.1f} {middle[5]:>8.0f} {threads:>7.1f}")
         if name in REPLICAS:
-            if growth[0] > MEMORY_GROWTH * middle[0]:
-                violations.append(f"{name}: memory grew by {growth[0]:.1f} MB of {middle[0]:.0f} MB in {length_s:.0f} s")
-            for what, grown in zip(("files", "threads"), growth[1:]):
+            if resident > MEMORY_GROWTH * middle[0]:
+                violations.append(f"{name}: memory grew by {resident:.1f} MB of {middle[0]:.0f} MB in {length_s:.0f} s")
+            for what, grown in (("files", files), ("threads", threads)):
                 if grown > COUNT_GROWTH:
                     violations.append(f"{name}: {what} grew by {grown:.1f} in {length_s:.0f} s")
     return violations
