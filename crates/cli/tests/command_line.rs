@@ -242,6 +242,8 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     refused(&run(&["--model", "transformer"]), here.path(), &["--from start", "not a transformer"]);
     refused(&run(&["--sustained=-1"]), here.path(), &["--sustained"]);
     refused(&run(&["--soil-prior=nan"]), here.path(), &["--soil-prior"]);
+    refused(&run(&["--device", "gpu"]), here.path(), &["`gpu` is no device", "cuda:1"]);
+    refused(&run(&["--device", "cuda"]), here.path(), &["device cuda:0", "--features nesam/cuda"]);
     refused(&run(&["--dt", "0.2"]), here.path(), &["--from start", "0.1 s", "0.2 s"]);
     let root = tempfile::tempdir().unwrap();
     copy_folder(&sample(), root.path());

@@ -55,7 +55,7 @@ fn decoder_shapes(channels: usize) -> Vec<(String, Vec<usize>)> {
 }
 
 impl Autoencoder {
-    fn new(name: &str, channels: usize, rng: &mut ChaCha8Rng) -> Result<Self> {
+    fn new(name: &str, channels: usize, device: &Device, rng: &mut ChaCha8Rng) -> Result<Self> {
         let variables = encoder_shapes(name, channels)
             .into_iter()
             .chain(decoder_shapes(channels))
@@ -67,7 +67,7 @@ impl Autoencoder {
                     let normal = Normal::new(0.0, (2.0 / shape[1] as f32).sqrt()).expect("positive; this is a bug");
                     (0..count).map(|_| normal.sample(rng)).collect()
                 };
-                Ok((name, Var::from_tensor(&Tensor::from_vec(values, shape, &Device::Cpu)?)?))
+                Ok((name, Var::from_tensor(&Tensor::from_vec(values, shape, device)?)?))
             })
             .collect::<Result<_>>()?;
         Ok(Self { variables, channels })
@@ -100,7 +100,7 @@ impl Autoencoder {
     }
 }
 
-/// Trains one encoder (`name` is `elevation` or `semantic`); `progress(step, loss)` is called after each step.
+/// Trains one encoder (`name` is `elevation` or `semantic`) on a device; `progress(step, loss)` is called after each step.
 ///
 /// # Errors
 /// A candle error.
@@ -109,11 +109,12 @@ pub fn pretrain(
     places: &Places,
     scale: &PatchScale,
     plan: &PretrainPlan,
+    device: &Device,
     mut progress: impl FnMut(usize, f32),
 ) -> Result<Pretrained> {
     let channels = if name == "elevation" { 1 } else { 3 };
     let mut rng = ChaCha8Rng::seed_from_u64(plan.seed);
-    let autoencoder = Autoencoder::new(name, channels, &mut rng)?;
+    let autoencoder = Autoencoder::new(name, channels, device, &mut rng)?;
     let mut adam = Adam::default();
     let mut patch = Patch::new();
     let (mut squared_error, mut variance, mut counted) = (0.0, 0.0, 0);
@@ -128,7 +129,7 @@ pub fn pretrain(
             let area = PATCH_PX * PATCH_PX;
             pixels.extend((0..area).flat_map(|i| (0..channels).map(move |c| planes[c * area + i])));
         }
-        let images = Tensor::from_vec(pixels, (plan.batch, PATCH_PX, PATCH_PX, channels), &Device::Cpu)?;
+        let images = Tensor::from_vec(pixels, (plan.batch, PATCH_PX, PATCH_PX, channels), device)?;
         let loss = autoencoder.loss(&images)?;
         let store = loss.backward()?;
         let mut gradients = HashMap::new();

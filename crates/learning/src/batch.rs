@@ -1,10 +1,11 @@
 //! A batch of training windows: rows for the reference rollout, targets, and terrain tokens along the driven paths.
 
 use std::collections::HashMap;
+use std::ops::Range;
 
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
-use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, HIDDEN};
+use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, FEATURES, HIDDEN};
 use nesam_model::reference::{Network, PredictedStep, Row, TerrainProvider};
 use nesam_model::{GroundSource, Normalization, Variant, history_actuators};
 use nesam_physics::step::StepModel;
@@ -14,6 +15,7 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::class_soil::ClassSoil;
 use crate::drives::{Drive, Place};
+use crate::features::{At, gather};
 use crate::pooling::Pooling;
 
 /// Samples past the window in which a fast prediction may find its place.
@@ -79,7 +81,7 @@ impl Sight<'_> {
         }
         let full: Vec<f32> = network.token_context().flatten_all()?.to_vec1()?;
         let pooled = full.chunks_exact(CONTEXT).flat_map(|row| self.pooling.sum(row)).collect();
-        Tensor::from_vec(pooled, (HIDDEN, self.pooling.width()), &Device::Cpu)
+        Tensor::from_vec(pooled, (HIDDEN, self.pooling.width()), network.device())
     }
 }
 
@@ -112,7 +114,7 @@ pub fn rows<'a>(windows: &[Window<'a>], history: usize, horizon: usize, model: &
 }
 
 /// Measured states after step `k` (0-based) relative to the start, scaled as the predictions are: (batch, 12), yaw unwrapped towards the start.
-pub fn targets(windows: &[Window<'_>], k: usize) -> Result<Tensor> {
+pub fn targets(windows: &[Window<'_>], k: usize, device: &Device) -> Result<Tensor> {
     let mut values = Vec::with_capacity(windows.len() * STATE_DIM);
     for w in windows {
         let start = w.drive.states[w.start].to_array();
@@ -122,12 +124,12 @@ pub fn targets(windows: &[Window<'_>], k: usize) -> Result<Tensor> {
         }
         values.extend(x.map(|v| v as f32));
     }
-    Tensor::from_vec(values, (windows.len(), STATE_DIM), &Device::Cpu)
+    Tensor::from_vec(values, (windows.len(), STATE_DIM), device)
 }
 
 /// Mean over rows of Σ_i (√(1 + e_i²) - 1) with e the scaled error: squared near zero, absolute far out (mean absolute error is what is reported).
 pub fn state_loss(predicted: &Tensor, target: &Tensor, scales: &Normalization) -> Result<Tensor> {
-    let scale = Tensor::from_slice(&scales.loss_scale, (1, STATE_DIM), &Device::Cpu)?;
+    let scale = Tensor::from_slice(&scales.loss_scale, (1, STATE_DIM), predicted.device())?;
     let error = (predicted - target)?;
     // The yaw of a prediction is not wrapped, the measured one is: compare modulo a turn.
     let turns = error.narrow(1, 5, 1)?.detach().affine(1.0 / core::f64::consts::TAU, 0.0)?.round()?;
@@ -168,6 +170,7 @@ pub struct PathTerrain<'a, 'w> {
     first_row: Vec<u32>,
     has_map: bool,
     sight: Sight<'a>,
+    device: Device,
 }
 
 impl<'a, 'w> PathTerrain<'a, 'w> {
@@ -178,43 +181,27 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
     pub fn new(network: &Network, windows: &'w [Window<'a>], history: usize, horizon: usize, sight: Sight<'a>) -> Result<Self> {
         let (variant, width) = (sight.variant, sight.pooling.width());
         let has_map = windows.iter().all(|w| w.drive.has_features());
-        let rows: usize = windows.iter().map(|w| w.last(horizon) - w.start + 1).sum();
-        let (mut context, mut past, mut semantic) = (Vec::new(), Vec::new(), Vec::new());
-        let mut first_row = Vec::with_capacity(windows.len());
-        if has_map {
-            context.reserve(rows * width);
-            for w in windows {
-                first_row.push((context.len() / width) as u32);
-                let new_at = [context.len(), past.len()];
-                for i in w.start..=w.last(horizon) {
-                    w.drive.push_context(i, &mut context);
-                    if variant.has_soil() {
-                        w.drive.push_semantic(i, &mut semantic);
-                    }
-                }
-                for i in w.start - history..w.start {
-                    w.drive.push_context(i, &mut past);
-                }
-                let rows = context[new_at[0]..].chunks_exact_mut(width).chain(past[new_at[1]..].chunks_exact_mut(width));
-                if let Some(factors) = sight.factors(w.dropout) {
-                    rows.for_each(|row| row.iter_mut().zip(&factors).for_each(|(value, factor)| *value *= factor));
-                }
-            }
-        }
-        let device = &Device::Cpu;
+        let each = |of: fn(&Window<'_>, usize) -> Range<usize>, steps: usize| -> Vec<At> {
+            windows.iter().enumerate().flat_map(|(w, window)| of(window, steps).map(move |i| (w, i))).collect()
+        };
+        let ahead = each(|w, horizon| w.start..w.last(horizon) + 1, horizon);
+        let past = each(|w, history| w.start - history..w.start, history);
+        let first_row = ahead.iter().enumerate().filter(|(_, (w, i))| windows[*w].start == *i).map(|(row, _)| row as u32).collect();
+        let device = network.device();
+        let factors: Vec<Option<Vec<f32>>> = windows.iter().map(|w| sight.factors(w.dropout)).collect();
         let projection = if has_map { Some(sight.projection(network)?.t()?) } else { None };
-        let project = |values: Vec<f32>, rows: usize| -> Result<Projected> {
+        let project = |samples: &[At]| -> Result<Projected> {
             let Some(projection) = &projection else {
-                let tokens = Var::zeros((rows, HIDDEN), DType::F32, device)?;
-                return Ok(Projected { context: Tensor::zeros((rows, 1), DType::F32, device)?, tokens });
+                let tokens = Var::zeros((samples.len(), HIDDEN), DType::F32, device)?;
+                return Ok(Projected { context: Tensor::zeros((samples.len(), 1), DType::F32, device)?, tokens });
             };
-            let context = Tensor::from_vec(values, (rows, width), device)?;
+            let context = gather(samples, width, |(w, i)| windows[w].drive.context(i), &factors, device)?;
             let tokens = Var::from_tensor(&context.matmul(projection)?)?;
             Ok(Projected { context, tokens })
         };
-        let past_rows = windows.len() * history;
         let soil = if has_map && variant.has_soil() {
-            let graph = network.soil.raw(&Tensor::from_vec(semantic, (rows, FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS), device)?)?;
+            let features = gather(&ahead, FEATURES, |(w, i)| windows[w].drive.semantic(i), &[], device)?;
+            let graph = network.soil.raw(&features.reshape((ahead.len(), FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS))?)?;
             let leaf = Var::from_tensor(&graph.detach())?;
             Some((graph, leaf))
         } else {
@@ -223,12 +210,13 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         Ok(Self {
             windows,
             horizon,
-            past: if past_rows > 0 { Some(project(past, past_rows)?) } else { None },
-            ahead: project(context, if has_map { rows } else { 1 })?,
+            past: if past.is_empty() { None } else { Some(project(&past)?) },
+            ahead: project(&ahead)?,
             soil,
             first_row,
             has_map,
             sight,
+            device: device.clone(),
         })
     }
 
@@ -243,7 +231,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         let classes: Vec<Option<ClassSoil>> = samples.collect();
         let table = |of: fn(&ClassSoil) -> [f32; SOIL_DIM]| {
             let values: Vec<f32> = classes.iter().flat_map(|class| class.as_ref().map_or([0.0; SOIL_DIM], of)).collect();
-            Tensor::from_vec(values, (classes.len(), SOIL_DIM), &Device::Cpu)
+            Tensor::from_vec(values, (classes.len(), SOIL_DIM), &self.device)
         };
         let (mean, per_sd) = (table(|class| class.mean)?, table(|class| class.sd.map(|sd| 1.0 / sd))?);
         ((graph - mean)? * per_sd)?.sqr()?.sum(1)?.mean_all().map(Some)
@@ -297,7 +285,7 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
 
     /// (1 - share) · row(at) + share · row(at + 1) of each place.
     fn interpolate(&self, table: &Tensor, places: &[Place]) -> Result<Tensor> {
-        let device = &Device::Cpu;
+        let device = &self.device;
         let n = places.len();
         let row = |b: usize, extra: usize| self.first_row[b] + (places[b].at + extra - self.windows[b].start) as u32;
         let pick = |extra: usize| {
@@ -322,9 +310,9 @@ impl TerrainProvider for PathTerrain<'_, '_> {
     fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
         let n = states.len();
         let default_soil =
-            || Tensor::from_slice(&self.sight.default_soil, (1, SOIL_DIM), &Device::Cpu)?.broadcast_as((n, SOIL_DIM))?.contiguous();
+            || Tensor::from_slice(&self.sight.default_soil, (1, SOIL_DIM), &self.device)?.broadcast_as((n, SOIL_DIM))?.contiguous();
         if !self.has_map {
-            return Ok((Tensor::zeros((n, HIDDEN), DType::F32, &Device::Cpu)?, default_soil()?));
+            return Ok((Tensor::zeros((n, HIDDEN), DType::F32, &self.device)?, default_soil()?));
         }
         let places: Vec<Place> =
             self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();

@@ -93,24 +93,15 @@ impl Drive {
         !self.contexts.is_empty()
     }
 
-    /// Appends the pooled context of sample `i` to `out`.
-    pub fn push_context(&self, i: usize, out: &mut Vec<f32>) {
-        push(self.context(i), out);
-    }
-
-    /// Appends the semantic features of sample `i`, (16, 16, 18), to `out`.
-    pub fn push_semantic(&self, i: usize, out: &mut Vec<f32>) {
-        if self.semantics.is_empty() {
-            push(&self.context(i)[FEATURES..], out);
-        } else {
-            push(&self.semantics[i * FEATURES..(i + 1) * FEATURES], out);
-        }
-    }
-
     /// Pooled context of sample `i`.
-    fn context(&self, i: usize) -> &[f16] {
+    pub(crate) fn context(&self, i: usize) -> &[f16] {
         let width = self.contexts.len() / self.states.len();
         &self.contexts[i * width..(i + 1) * width]
+    }
+
+    /// Semantic features of sample `i`, (16, 16, 18).
+    pub(crate) fn semantic(&self, i: usize) -> &[f16] {
+        if self.semantics.is_empty() { &self.context(i)[FEATURES..] } else { &self.semantics[i * FEATURES..(i + 1) * FEATURES] }
     }
 
     /// Where on the path, among samples `first ..= last`, a predicted state is nearest.
@@ -135,13 +126,6 @@ impl Drive {
         let best = candidates.into_iter().flatten().map(project).min_by(|a, b| a.0.total_cmp(&b.0));
         best.map_or(Place { at: first, share: 0.0 }, |(_, place)| place)
     }
-}
-
-/// Appends halves as floats.
-fn push(values: &[f16], out: &mut Vec<f32>) {
-    let at = out.len();
-    out.resize(at + values.len(), 0.0);
-    values.convert_to_f32_slice(&mut out[at..]);
 }
 
 /// Computes the contexts of all drives with a map, in parallel; `progress(done)` counts samples.

@@ -11,6 +11,7 @@ pub mod batch;
 pub mod calibrate;
 pub mod class_soil;
 pub mod drives;
+mod features;
 pub mod initial;
 pub mod pooling;
 pub mod recipe;

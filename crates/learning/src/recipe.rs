@@ -314,15 +314,16 @@ fn encoders(
         .collect();
     reporter.stage("encoders", 2 * plan.steps);
     let done = AtomicUsize::new(0);
+    let device = recipe.plan.device.open()?;
     let results: Vec<_> = std::thread::scope(|scope| {
-        let (places, plan, done) = (&places, &plan, &done);
+        let (places, plan, done, device) = (&places, &plan, &done, &device);
         let running: Vec<_> = ENCODERS
             .iter()
             .map(|(name, _)| {
                 scope.spawn(move || {
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread can be started; this is a bug");
                     pool.install(|| {
-                        pretrain(name, places, &scales.patch_scale(), plan, |_, loss| {
+                        pretrain(name, places, &scales.patch_scale(), plan, device, |_, loss| {
                             reporter.progress(done.fetch_add(1, Ordering::Relaxed) + 1, &format!("{name} loss {loss:.5}"));
                         })
                     })

@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
-use candle_core::{DType, Device, Result, Tensor};
-use nesam_model::reference::{Network, ReferenceRollout};
+use candle_core::{DType, Result, Tensor};
+use nesam_model::reference::{ComputeDevice, Network, ReferenceRollout};
 use nesam_model::{HISTORY, ModelError, Normalization, Variant, Weights};
 use nesam_physics::step::StepModel;
 use rand::{RngExt, SeedableRng};
@@ -33,6 +33,8 @@ pub struct TrainingPlan {
     pub seed: u64,
     /// Steps between validations and checkpoints.
     pub epoch: usize,
+    /// Where the tensors live.
+    pub device: ComputeDevice,
     /// Threads that each take a share of the batch.
     pub shards: usize,
     /// Share of the terrain features that each window is trained without.
@@ -43,6 +45,16 @@ pub struct TrainingPlan {
     pub objective: Objective,
     /// Where checkpoints go.
     pub folder: PathBuf,
+}
+
+impl TrainingPlan {
+    /// Threads of a shard. Where a GPU does the rest, the shards are all that the processor has to do.
+    fn physics_threads(&self) -> usize {
+        match self.device {
+            ComputeDevice::Cpu => 1,
+            ComputeDevice::Cuda(_) => std::thread::available_parallelism().map_or(1, |n| n.get()).div_ceil(self.shards),
+        }
+    }
 }
 
 /// What a form is trained towards.
@@ -145,10 +157,10 @@ impl TrainingSet<'_> {
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
         let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
         let mut terrain = PathTerrain::new(network, windows, history, horizon, self.sight(variant))?;
-        let mut total = Tensor::zeros((), DType::F32, &Device::Cpu)?;
+        let mut total = Tensor::zeros((), DType::F32, network.device())?;
         let steps = rollout.run(&rows, horizon, &mut terrain)?;
         for (k, step) in steps.iter().enumerate() {
-            total = (total + state_loss(&step.state, &targets(windows, k)?, self.scales)?)?;
+            total = (total + state_loss(&step.state, &targets(windows, k, network.device())?, self.scales)?)?;
         }
         let mut loss = (total / horizon as f64)?;
         if objective.sustained > 0.0
@@ -191,7 +203,7 @@ impl TrainingSet<'_> {
             let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
             let mut terrain = PathTerrain::new(network, windows, history, horizon, self.sight(variant))?;
             for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
-                let errors = absolute_errors(&step.state, &targets(windows, k)?)?;
+                let errors = absolute_errors(&step.state, &targets(windows, k, network.device())?)?;
                 for (sum, e) in sums.iter_mut().zip(errors) {
                     *sum += e * windows.len() as f64;
                 }
@@ -240,9 +252,12 @@ pub fn train(
         adam: Adam::default(),
         curve: Vec::new(),
     });
-    let network = Network::from_weights(&checkpoint.latest)?;
+    let device = plan.device.open()?;
+    let network = Network::from_weights(&checkpoint.latest, &device)?;
     let pools: Vec<rayon::ThreadPool> = (0..plan.shards)
-        .map(|_| rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread can be started; this is a bug"))
+        .map(|_| {
+            rayon::ThreadPoolBuilder::new().num_threads(plan.physics_threads()).build().expect("a thread can be started; this is a bug")
+        })
         .collect();
     let (mut loss_sum, mut loss_count, mut since) = (0.0, 0, Instant::now());
     while checkpoint.step < plan.steps {
@@ -268,7 +283,7 @@ pub fn train(
         let stop = interrupted();
         if checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps || stop {
             let step_s = since.elapsed().as_secs_f64() / loss_count as f64;
-            let validation = set.validate(&Network::from_weights(&checkpoint.average)?, plan.horizon, plan.objective.variant)?;
+            let validation = set.validate(&Network::from_weights(&checkpoint.average, &device)?, plan.horizon, plan.objective.variant)?;
             let line = EpochReport { step: checkpoint.step, loss: loss_sum / loss_count as f32, validation, step_s };
             checkpoint.latest = merged(weights, &network.to_weights()?);
             if score(&validation) < checkpoint.best_score {

@@ -5,7 +5,7 @@ mod common;
 
 use std::sync::Arc;
 
-use candle_core::Tensor;
+use candle_core::{Device, Tensor};
 use common::{drive, encoded, measured_scales, single_cells, striped, truck};
 use nesam_learning::batch::Window;
 use nesam_learning::initial::initial_weights;
@@ -30,7 +30,7 @@ fn check(mut made: Drive, entries: &[(&str, usize)], soil_prior: f64, tolerance:
     vehicle.driveline.speed_integral_gain_per_s = 0.0;
     let model = Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps));
     let set = TrainingSet { train: vec![&made], validation: vec![], scales: &scales, model, pooling: single_cells() };
-    let network = Network::from_weights(&weights).expect("all arrays are there");
+    let network = Network::from_weights(&weights, &Device::Cpu).expect("all arrays are there");
     let windows = [12, 30].map(|start| Window { drive: &made, start, dropout: None });
     let objective = Objective { variant: Variant::Full, sustained: 0.0, soil_prior };
     let gradients = || set.gradients(&network, &windows, 8, 6, objective).expect("the loss is differentiable");

@@ -5,49 +5,19 @@ mod common;
 
 use std::sync::Arc;
 
-use candle_core::{Device, Result, Tensor};
-use common::{drive, hills, lively_weights, measured_scales, predictor, truck};
+use candle_core::{Device, Tensor};
+use common::{drive, hills, lively_weights, measured_scales, predictor};
 use nesam_learning::Drive;
 use nesam_model::dims::HIDDEN;
-use nesam_model::reference::{KvCache, Network, ReferenceRollout, Row, TerrainProvider, causal_mask};
+use nesam_model::reference::{ComputeDevice, KvCache, Network, ReferencePredictor, causal_mask};
 use nesam_model::{
-    CacheCounts, GroundSource, HistoryStep, ModelBundle, Normalization, Order, Path, Precision, Predictor, RolloutQuery, Variant, Weights,
-    history_actuators,
+    CacheCounts, HistoryStep, ModelBundle, Normalization, Order, Path, Precision, Predictor, RolloutQuery, Variant, Weights,
 };
-use nesam_physics::step::StepModel;
-use nesam_physics::{SOIL_DIM, SoilCorrection, VehicleState};
+use nesam_physics::{STATE_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::{Pose2, WorldMap};
-
-/// Terrain tokens as the predictor sees them.
-struct FromPredictor<'a> {
-    predictor: &'a Predictor,
-    map: Option<&'a Arc<WorldMap>>,
-    history: Vec<Pose2>,
-}
 
 fn pose(s: &VehicleState<f64>) -> Pose2 {
     Pose2 { x_m: s.position_m[0], y_m: s.position_m[1], yaw_rad: s.attitude_rad[2] }
-}
-
-impl FromPredictor<'_> {
-    fn tensors(&self, poses: &[Pose2]) -> Result<(Tensor, Tensor)> {
-        let tokens = self.predictor.terrain_tokens(self.map, poses);
-        let context: Vec<f32> = tokens.iter().flat_map(|t| t[..HIDDEN].to_vec()).collect();
-        let soil: Vec<f32> = tokens.iter().flat_map(|t| t[HIDDEN..].to_vec()).collect();
-        Ok((
-            Tensor::from_vec(context, (poses.len(), HIDDEN), &Device::Cpu)?,
-            Tensor::from_vec(soil, (poses.len(), SOIL_DIM), &Device::Cpu)?,
-        ))
-    }
-}
-
-impl TerrainProvider for FromPredictor<'_> {
-    fn history(&mut self) -> Result<Tensor> {
-        Ok(self.tensors(&self.history)?.0)
-    }
-    fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
-        self.tensors(&states.iter().map(pose).collect::<Vec<_>>())
-    }
 }
 
 fn compare(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant) {
@@ -75,24 +45,9 @@ fn compare_weights(map: Option<&Arc<WorldMap>>, history: usize, variant: Variant
     };
     let fast = predictor.rollout(&query).expect("a valid query");
 
-    let network = Network::from_weights(&weights).expect("all arrays are there");
-    let model = Arc::new(StepModel::new(&truck(), scales.dt_s, scales.substeps));
-    let row = Row {
-        actuators: history_actuators(&model, &past, &drive.states[start], &drive.controls[start], 0.1),
-        history: past.clone(),
-        start: drive.states[start],
-        controls: drive.controls[start..start + 32].to_vec(),
-        ground: GroundSource::new(map.map(Arc::as_ref), &model, &drive.states[start]),
-    };
-    let mut provider = FromPredictor { predictor: &predictor, map, history: past.iter().map(|s| pose(&s.state)).collect() };
-    let rollout = ReferenceRollout { network: &network, model: &model, scales, variant };
-    let steps = rollout.run(&[row], 32, &mut provider).expect("the reference runs");
-    for (k, step) in steps.iter().enumerate() {
-        let mut slow = step.state.to_vec2::<f32>().expect("readable")[0].clone();
-        for i in 0..3 {
-            slow[i] += drive.states[start].position_m[i] as f32;
-        }
-        for (i, (a, b)) in fast.state(0, k).to_array().iter().zip(&slow).enumerate() {
+    let reference = ReferencePredictor::new(&predictor, ComputeDevice::Cpu).and_then(|reference| reference.rollout(&query));
+    for (k, slow) in reference.expect("the reference runs").chunks_exact(STATE_DIM).enumerate() {
+        for (i, (a, b)) in fast.state(0, k).to_array().iter().zip(slow).enumerate() {
             // 32 steps of f32 with two orders of summation: a millimetre, a tenth of a milliradian.
             assert!((a - b).abs() < 1.5e-3, "step {k}, entry {i}: fast {a}, reference {b} ({variant:?}, history {history})");
         }
@@ -271,12 +226,12 @@ fn property_looking_at_the_soil_prior_encodes_nothing() {
 fn analytic_cached_attention_equals_attention_over_everything() {
     let drive = drive(None, 40);
     let scales = measured_scales(&drive);
-    let network = Network::from_weights(&lively_weights(&scales)).expect("all arrays are there");
+    let network = Network::from_weights(&lively_weights(&scales), &Device::Cpu).expect("all arrays are there");
     let x = Tensor::randn(0f32, 1f32, (3, 20, HIDDEN), &Device::Cpu).expect("a tensor");
-    let whole = network.transformer(&x, &mut KvCache::new(), Some(&causal_mask(20).expect("a mask"))).expect("runs");
+    let whole = network.transformer(&x, &mut KvCache::new(), Some(&causal_mask(20, &Device::Cpu).expect("a mask"))).expect("runs");
     let mut cache = KvCache::new();
     let first = x.narrow(1, 0, 12).and_then(|t| t.contiguous()).expect("a slice");
-    network.transformer(&first, &mut cache, Some(&causal_mask(12).expect("a mask"))).expect("runs");
+    network.transformer(&first, &mut cache, Some(&causal_mask(12, &Device::Cpu).expect("a mask"))).expect("runs");
     for t in 12..20 {
         let token = x.narrow(1, t, 1).and_then(|t| t.contiguous()).expect("a slice");
         let step = network.transformer(&token, &mut cache, None).expect("runs");

@@ -76,6 +76,14 @@ pub enum ModelError {
         /// What was wrong and what was expected.
         reason: String,
     },
+    /// Tensors cannot live there.
+    #[error("device {device}: {reason}")]
+    Device {
+        /// Device asked for.
+        device: reference::ComputeDevice,
+        /// What was wrong and what to do.
+        reason: String,
+    },
     /// candle reported an error.
     #[error(transparent)]
     Tensor(#[from] candle_core::Error),

@@ -17,6 +17,7 @@ use std::time::Instant;
 use clap::{Args, Subcommand};
 use nesam_client::{measurement, v1};
 use nesam_evaluation::{Pose, Truth, absolute_error, all_windows, history_steps, horizontal_distance, roll_out};
+use nesam_model::reference::ComputeDevice;
 use nesam_model::{HISTORY, HistoryStep, MAX_HORIZON, Precision, Predictor, Rollout, RolloutQuery, Variant};
 use nesam_physics::{Control, SoilCorrection};
 use nesam_terrain::WorldMap;
@@ -83,6 +84,9 @@ struct PredictBench {
     /// Also say where the time goes: lookup, network, physics, the rest
     #[arg(long)]
     parts: bool,
+    /// Also time the reference, which is made of candle tensors, on a device: cpu, or cuda in a program built with that feature; may be given twice
+    #[arg(long, value_name = "DEVICE")]
+    reference: Vec<ComputeDevice>,
     /// Write the figures as JSON (schema nesam.bench/1)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
@@ -173,6 +177,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         "terrain_cache": {"hit_rate": hit_rate, "max_error": max_error},
         "rounding_max_error": rounding,
         "parts_ms": args.parts.then(|| sweep::parts(&drive, fresh)).transpose()?,
+        "reference": sweep::reference(&drive, fresh, &args.reference)?,
         "sweep": args.sweep.then(|| sweep::sweep(&drive, fresh)).transpose()?,
         "provenance": provenance(Some(&bundle), &drives),
     });

@@ -5,6 +5,8 @@
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
+use super::host::values;
+
 /// Geometry of a 3×3 convolution with padding 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Conv {
@@ -50,15 +52,6 @@ impl Conv {
                 }
             }
         }
-    }
-}
-
-/// The contiguous values of a tensor's storage.
-pub(crate) fn values<'a>(storage: &'a CpuStorage, layout: &Layout) -> Result<&'a [f32]> {
-    let Some((start, end)) = layout.contiguous_offsets() else { bail!("a custom op needs a contiguous tensor") };
-    match storage {
-        CpuStorage::F32(all) => Ok(&all[start..end]),
-        _ => bail!("a custom op needs f32"),
     }
 }
 
@@ -113,7 +106,29 @@ pub fn im2col(image: &Tensor, conv: Conv) -> Result<Tensor> {
     if (h, w, c) != (conv.px, conv.px, conv.channels) {
         bail!("im2col: image is {h}×{w}×{c}, expected {0}×{0}×{1}", conv.px, conv.channels);
     }
-    image.contiguous()?.apply_op1(Im2Col(conv))
+    if image.device().is_cuda() { from_slices(image, conv) } else { image.contiguous()?.apply_op1(Im2Col(conv)) }
+}
+
+/// The same by candle's own operations, which a GPU has: nine shifted images side by side.
+fn from_slices(image: &Tensor, conv: Conv) -> Result<Tensor> {
+    let (batch, out) = (image.dim(0)?, conv.out_px());
+    // One pixel around the image, and one more for the last stride.
+    let padded = image.pad_with_zeros(1, 1, conv.stride)?.pad_with_zeros(2, 1, conv.stride)?;
+    let every = |x: &Tensor, dim: usize, from: usize| -> Result<Tensor> {
+        let x = x.narrow(dim, from, out * conv.stride)?;
+        let mut shape = x.dims().to_vec();
+        shape[dim] = out;
+        shape.insert(dim + 1, conv.stride);
+        x.contiguous()?.reshape(shape)?.narrow(dim + 1, 0, 1)?.squeeze(dim + 1)
+    };
+    let mut shifted = Vec::with_capacity(9);
+    for ky in 0..3 {
+        let rows = every(&padded, 1, ky)?;
+        for kx in 0..3 {
+            shifted.push(every(&rows, 2, kx)?);
+        }
+    }
+    Tensor::cat(&shifted, 3)?.reshape((batch * out * out, conv.row()))
 }
 
 /// 3×3 convolution, padding 1: (batch, px, px, channels) -> (batch, out, out, filters); weight (filters, 9 · channels).
@@ -153,6 +168,23 @@ mod tests {
             let want = image.permute((0, 3, 1, 2))?.contiguous()?.conv2d(&kernel, 1, stride, 1, 1)?.permute((0, 2, 3, 1))?;
             let error = (got - want)?.abs()?.max_all()?.to_scalar::<f32>()?;
             assert!(error < 1e-4, "stride {stride}: {error}");
+        }
+        Ok(())
+    }
+
+    #[test]
+    fn property_slices_give_the_same_neighbourhoods_and_gradients() -> Result<()> {
+        for (stride, px) in [(1, 6), (2, 6), (2, 8)] {
+            let conv = Conv { px, channels: 3, stride };
+            let image = Var::randn(0f32, 1f32, (2, px, px, 3), &Device::Cpu)?;
+            let (by_op, by_slices) = (im2col(&image, conv)?, from_slices(&image, conv)?);
+            assert_eq!(by_op.to_vec2::<f32>()?, by_slices.to_vec2::<f32>()?, "stride {stride}, {px} pixels");
+            let upstream = Tensor::randn(0f32, 1f32, by_op.shape(), &Device::Cpu)?;
+            let pulled = |rows: &Tensor| -> Result<Tensor> {
+                Ok((rows * &upstream)?.sum_all()?.backward()?.get(&image).expect("the image takes part").clone())
+            };
+            let error = (pulled(&by_op)? - pulled(&by_slices)?)?.abs()?.max_all()?.to_scalar::<f32>()?;
+            assert!(error < 1e-5, "stride {stride}, {px} pixels: gradients {error} apart");
         }
         Ok(())
     }

@@ -1,6 +1,6 @@
 //! Token projection, causal Transformer, heads and soil prior as candle tensors.
 
-use candle_core::{D, DType, Device, Result, Tensor, Var};
+use candle_core::{D, Device, Result, Tensor, Var};
 
 use super::image::{Conv, conv2d};
 use crate::dims::*;
@@ -111,15 +111,15 @@ pub fn trainable_shapes() -> Vec<(String, Vec<usize>)> {
 }
 
 impl Network {
-    /// Trainable variables from weights.
+    /// Trainable variables from weights, on a device.
     ///
     /// # Errors
     /// `ModelError::Weights` when an array is absent or has another shape.
-    pub fn from_weights(weights: &Weights) -> std::result::Result<Self, crate::ModelError> {
+    pub fn from_weights(weights: &Weights, device: &Device) -> std::result::Result<Self, crate::ModelError> {
         let mut variables = Vec::new();
         for (name, shape) in trainable_shapes() {
             let values = weights.get(&name, &shape)?;
-            variables.push((name, Var::from_tensor(&Tensor::from_slice(values, shape, &Device::Cpu)?)?));
+            variables.push((name, Var::from_tensor(&Tensor::from_slice(values, shape, device)?)?));
         }
         let find = |name: &str| {
             let (_, var) = variables.iter().find(|(n, _)| n == name).expect("every name is listed; this is a bug");
@@ -165,6 +165,11 @@ impl Network {
             weights.insert(name.clone(), var.dims(), var.flatten_all()?.to_vec1()?);
         }
         Ok(weights)
+    }
+
+    /// Where the variables are.
+    pub fn device(&self) -> &Device {
+        self.token_bias.device()
     }
 
     /// W_c, (128, context = 9216).
@@ -252,12 +257,7 @@ fn softmax(x: &Tensor) -> Result<Tensor> {
 }
 
 /// Additive causal mask (1, 1, n, n): 0 where a token may look, -1e9 ahead of it.
-pub fn causal_mask(n: usize) -> Result<Tensor> {
+pub fn causal_mask(n: usize, device: &Device) -> Result<Tensor> {
     let values: Vec<f32> = (0..n * n).map(|i| if i % n > i / n { -1e9 } else { 0.0 }).collect();
-    Tensor::from_vec(values, (1, 1, n, n), &Device::Cpu)
-}
-
-/// Zeros (rows, columns).
-pub fn zeros(rows: usize, columns: usize) -> Result<Tensor> {
-    Tensor::zeros((rows, columns), DType::F32, &Device::Cpu)
+    Tensor::from_vec(values, (1, 1, n, n), device)
 }

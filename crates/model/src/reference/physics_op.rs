@@ -1,11 +1,14 @@
 //! The bridge from candle to the physics: one fused op for the whole step, forward in lanes, backward by duals over lanes.
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
-use nesam_physics::scalar::{Dual, f32x8};
-use nesam_physics::step::StepModel;
 use std::sync::Arc;
 
-use super::image::values;
+use candle_core::backend::BackendStorage;
+use candle_core::{CpuStorage, CudaStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use nesam_physics::scalar::{Dual, f32x8};
+use nesam_physics::step::StepModel;
+use rayon::prelude::*;
+
+use super::host::{there_and_back, values};
 use crate::rollout::Variant;
 use crate::step_row::{COLUMNS, CONSTANT, DIFFERENTIABLE, OUTPUTS, step_input};
 use crate::symbolic::symbolic_step;
@@ -21,6 +24,18 @@ fn lanes<const N: usize>(packed: &[f32], base: usize, from: usize) -> [f32x8; N]
     core::array::from_fn(|k| f32x8::from(core::array::from_fn::<f32, LANES, _>(|l| packed[(base + l).min(last) * COLUMNS + from + k])))
 }
 
+/// `N` columns of every row; `of` computes those of the eight rows from one on. Eights are shared among the threads of the pool this runs in.
+fn by_eights<const N: usize>(rows: usize, of: impl Fn(usize) -> [f32x8; N] + Sync) -> CpuStorage {
+    let mut out = vec![0f32; rows * N];
+    out.par_chunks_mut(LANES * N).enumerate().for_each(|(eight, out)| {
+        let columns = of(eight * LANES).map(f32x8::to_array);
+        for (lane, row) in out.chunks_exact_mut(N).enumerate() {
+            row.iter_mut().zip(&columns).for_each(|(value, column)| *value = column[lane]);
+        }
+    });
+    CpuStorage::F32(out)
+}
+
 impl CustomOp1 for Step {
     fn name(&self) -> &'static str {
         "physics-step"
@@ -29,17 +44,15 @@ impl CustomOp1 for Step {
     fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
         let packed = values(storage, layout)?;
         let rows = packed.len() / COLUMNS;
-        let mut out = vec![0f32; rows * OUTPUTS];
-        for base in (0..rows).step_by(LANES) {
+        let increments = by_eights::<OUTPUTS>(rows, |base| {
             let input = step_input::<f32x8>(lanes(packed, base, 0), lanes::<CONSTANT>(packed, base, DIFFERENTIABLE));
-            let increment = symbolic_step(self.0, &self.1, &input).increment.to_array().map(f32x8::to_array);
-            for lane in 0..LANES.min(rows - base) {
-                for (column, value) in increment.iter().enumerate() {
-                    out[(base + lane) * OUTPUTS + column] = value[lane];
-                }
-            }
-        }
-        Ok((CpuStorage::F32(out), Shape::from((rows, OUTPUTS))))
+            symbolic_step(self.0, &self.1, &input).increment.to_array()
+        });
+        Ok((increments, Shape::from((rows, OUTPUTS))))
+    }
+
+    fn cuda_fwd(&self, storage: &CudaStorage, layout: &Layout) -> Result<(CudaStorage, Shape)> {
+        there_and_back(storage, |storage| self.cpu_fwd(storage, layout))
     }
 
     fn bwd(&self, arg: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
@@ -56,8 +69,7 @@ impl CustomOp2 for StepGradient {
     fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout, grad: &CpuStorage, grad_layout: &Layout) -> Result<(CpuStorage, Shape)> {
         let (packed, upstream) = (values(storage, layout)?, values(grad, grad_layout)?);
         let rows = packed.len() / COLUMNS;
-        let mut out = vec![0f32; packed.len()];
-        for base in (0..rows).step_by(LANES) {
+        let gradients = by_eights::<COLUMNS>(rows, |base| {
             let varying = lanes::<DIFFERENTIABLE>(packed, base, 0);
             let varying: [Dual<f32x8, DIFFERENTIABLE>; DIFFERENTIABLE] = core::array::from_fn(|k| Dual::variable(varying[k], k));
             let constant = lanes::<CONSTANT>(packed, base, DIFFERENTIABLE).map(Dual::constant);
@@ -65,21 +77,24 @@ impl CustomOp2 for StepGradient {
             let weight: [f32x8; OUTPUTS] = core::array::from_fn(|o| {
                 f32x8::from(core::array::from_fn::<f32, LANES, _>(|l| upstream[(base + l).min(rows - 1) * OUTPUTS + o]))
             });
-            for column in 0..DIFFERENTIABLE {
-                let sum = (0..OUTPUTS).fold(f32x8::ZERO, |sum, o| sum + increment[o].eps[column] * weight[o]).to_array();
-                for lane in 0..LANES.min(rows - base) {
-                    out[(base + lane) * COLUMNS + column] = sum[lane];
-                }
-            }
-        }
-        Ok((CpuStorage::F32(out), Shape::from((rows, COLUMNS))))
+            core::array::from_fn(|column| match column {
+                0..DIFFERENTIABLE => (0..OUTPUTS).fold(f32x8::ZERO, |sum, o| sum + increment[o].eps[column] * weight[o]),
+                _ => f32x8::ZERO,
+            })
+        });
+        Ok((gradients, Shape::from((rows, COLUMNS))))
+    }
+
+    fn cuda_fwd(&self, storage: &CudaStorage, layout: &Layout, grad: &CudaStorage, grad_layout: &Layout) -> Result<(CudaStorage, Shape)> {
+        let grad = grad.to_cpu_storage()?;
+        there_and_back(storage, |storage| self.cpu_fwd(storage, layout, &grad, grad_layout))
     }
 }
 
 /// Increment of the symbolic half of a form (rows, 12) of packed step inputs (rows, `COLUMNS`), differentiable in the first `DIFFERENTIABLE` columns.
 ///
 /// # Errors
-/// A candle error when the tensor is not (rows, `COLUMNS`) of f32 on the CPU.
+/// A candle error when the tensor is not (rows, `COLUMNS`) of f32.
 pub fn physics_increment(packed: &Tensor, variant: Variant, model: &Arc<StepModel>) -> Result<Tensor> {
     let (_, columns) = packed.dims2()?;
     if columns != COLUMNS {

@@ -9,6 +9,7 @@ use candle_core::{Device, Result, Tensor};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::StepModel;
 use nesam_physics::{Control, STATE_DIM, VehicleState, wrap_angle};
+use rayon::prelude::*;
 
 use super::network::{KvCache, Network, causal_mask, soil_from_raw};
 use super::physics_op::physics_increment;
@@ -74,8 +75,8 @@ fn columns(x: &Tensor, from: usize, n: usize) -> Result<Tensor> {
     x.narrow(1, from, n)
 }
 
-fn rows_tensor<const N: usize>(rows: &[[f32; N]]) -> Result<Tensor> {
-    Tensor::from_slice(rows.as_flattened(), (rows.len(), N), &Device::Cpu)
+fn rows_tensor<const N: usize>(rows: &[[f32; N]], device: &Device) -> Result<Tensor> {
+    Tensor::from_slice(rows.as_flattened(), (rows.len(), N), device)
 }
 
 impl ReferenceRollout<'_> {
@@ -84,7 +85,6 @@ impl ReferenceRollout<'_> {
     /// # Errors
     /// A candle error, also of the provider.
     pub fn run(&self, rows: &[Row<'_>], horizon: usize, provider: &mut dyn TerrainProvider) -> Result<Vec<PredictedStep>> {
-        let batch = rows.len();
         let remembers = self.variant.remembers();
         let mut cache = if remembers { self.prefill(rows, provider)? } else { KvCache::new() };
         let mut states: Vec<VehicleState<f64>> = rows.iter().map(|r| r.start).collect();
@@ -98,7 +98,7 @@ impl ReferenceRollout<'_> {
                 x.map(|v| v as f32)
             })
             .collect();
-        let mut state = rows_tensor(&start)?;
+        let mut state = rows_tensor(&start, self.network.device())?;
         let mut last_increment: Option<Tensor> = None;
         let first_position = HISTORY - 1;
         let mut steps = Vec::with_capacity(horizon);
@@ -114,14 +114,15 @@ impl ReferenceRollout<'_> {
             let hidden = self.network.transformer(&token.unsqueeze(1)?, &mut cache, None)?.squeeze(1)?;
             let (raw_sinkage, raw_residual) = self.network.heads(&hidden)?;
 
-            let mut constants = Vec::with_capacity(batch);
-            for (b, row) in rows.iter().enumerate() {
-                let after = actuators[b].advance(self.model.vehicle(), &controls[b], states[b].velocity_m_s[0], self.scales.dt_s);
-                let wheels = command_wheels(self.model.vehicle(), &actuators[b], &after, &controls[b]);
-                let (ground, _) = row.ground.under_wheels(self.model, &states[b], row.start.position_m[2]);
-                constants.push(pack_constants(&wheels, &ground, states[b].attitude_rad[2]));
-                actuators[b] = after;
-            }
+            let of_row = |(b, actuators): (usize, &mut DrivelineState)| {
+                let (row, state, control) = (&rows[b], &states[b], &controls[b]);
+                let after = actuators.advance(self.model.vehicle(), control, state.velocity_m_s[0], self.scales.dt_s);
+                let wheels = command_wheels(self.model.vehicle(), actuators, &after, control);
+                let (ground, _) = row.ground.under_wheels(self.model, state, row.start.position_m[2]);
+                *actuators = after;
+                pack_constants(&wheels, &ground, state.attitude_rad[2])
+            };
+            let constants: Vec<[f32; CONSTANT]> = actuators.par_iter_mut().enumerate().map(of_row).collect();
             let residual = (self.variant != Variant::NoResidual).then_some(raw_residual);
             let increment = self.increment(&state, &raw_sinkage, residual.as_ref(), &raw_soil, &constants)?;
             state = advance(&state, &increment)?;
@@ -140,16 +141,22 @@ impl ReferenceRollout<'_> {
         if tokens == 0 {
             return Ok(cache);
         }
-        let mut entries = Vec::with_capacity(rows.len() * tokens);
-        for row in rows {
-            for (j, step) in row.history.iter().enumerate() {
-                let previous = j.checked_sub(1).map(|j| &row.history[j].state);
-                entries.push(self.scaled_entries(row, &step.state, previous, &step.control));
-            }
-        }
-        let x = self.network.embed(&rows_tensor(&entries)?, &provider.history()?)?.reshape((rows.len(), tokens, HIDDEN))?;
+        let of_row = |row: &Row<'_>| -> Vec<[f32; STATE_CONTROL]> {
+            let previous = core::iter::once(None).chain(row.history.iter().map(|step| Some(&step.state)));
+            row.history
+                .iter()
+                .zip(previous)
+                .map(|(step, previous)| self.scaled_entries(row, &step.state, previous, &step.control))
+                .collect()
+        };
+        let entries: Vec<[f32; STATE_CONTROL]> = rows.par_iter().flat_map_iter(of_row).collect();
+        let x = self.network.embed(&rows_tensor(&entries, self.network.device())?, &provider.history()?)?.reshape((
+            rows.len(),
+            tokens,
+            HIDDEN,
+        ))?;
         let x = x.broadcast_add(&self.network.positions(HISTORY - 1 - tokens, tokens)?.unsqueeze(0)?)?;
-        self.network.transformer(&x, &mut cache, Some(&causal_mask(tokens)?))?;
+        self.network.transformer(&x, &mut cache, Some(&causal_mask(tokens, self.network.device())?))?;
         Ok(cache)
     }
 
@@ -176,9 +183,12 @@ impl ReferenceRollout<'_> {
         state: &Tensor,
         increment: Option<&Tensor>,
     ) -> Result<Tensor> {
-        let measured: Vec<[f32; STATE_CONTROL]> =
-            (0..rows.len()).map(|b| self.scaled_entries(&rows[b], &states[b], previous[b].as_ref(), &controls[b])).collect();
-        let measured = rows_tensor(&measured)?;
+        let device = self.network.device();
+        let measured: Vec<[f32; STATE_CONTROL]> = (0..rows.len())
+            .into_par_iter()
+            .map(|b| self.scaled_entries(&rows[b], &states[b], previous[b].as_ref(), &controls[b]))
+            .collect();
+        let measured = rows_tensor(&measured, device)?;
         let Some(increment) = increment else { return Ok(measured) };
         // Same numbers as `measured`, but as functions of the prediction; only z enters relative to the ground.
         let height: Vec<f32> = (0..rows.len())
@@ -188,7 +198,7 @@ impl ReferenceRollout<'_> {
                 (ground - rows[b].start.position_m[2]) as f32
             })
             .collect();
-        let height = Tensor::from_vec(height, (rows.len(), 1), &Device::Cpu)?;
+        let height = Tensor::from_vec(height, (rows.len(), 1), device)?;
         let parts = [
             (columns(state, 2, 1)? - height)?,
             columns(state, 3, 2)?,
@@ -199,8 +209,8 @@ impl ReferenceRollout<'_> {
         let raw = Tensor::cat(&parts, 1)?;
         let mut mean: Vec<f32> = self.scales.token_mean[..STATE_DIM].to_vec();
         mean.iter_mut().zip(self.model.ride_shift()).for_each(|(mean, shift)| *mean += *shift as f32);
-        let mean = Tensor::from_vec(mean, (1, STATE_DIM), &Device::Cpu)?;
-        let scale = Tensor::from_slice(&self.scales.token_scale[..STATE_DIM], (1, STATE_DIM), &Device::Cpu)?;
+        let mean = Tensor::from_vec(mean, (1, STATE_DIM), device)?;
+        let scale = Tensor::from_slice(&self.scales.token_scale[..STATE_DIM], (1, STATE_DIM), device)?;
         let scaled = raw.broadcast_sub(&mean)?.broadcast_div(&scale)?;
         Tensor::cat(&[scaled, columns(&measured, STATE_DIM, CONTROL_DIM)?], 1)
     }
@@ -218,12 +228,12 @@ impl ReferenceRollout<'_> {
             Variant::ZeroSinkage => (raw_sinkage.zeros_like()? - 12.0)?,
             _ => (raw_sinkage.tanh()? * f64::from(self.scales.sinkage_log_ratio_max))?,
         };
-        let packed =
-            Tensor::cat(&[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, rows_tensor(constants)?], 1)?;
+        let constants = rows_tensor(constants, state.device())?;
+        let packed = Tensor::cat(&[columns(state, 2, 3)?, columns(state, 6, 6)?, ratio, soil_from_raw(raw_soil)?, constants], 1)?;
         // z, roll, pitch are columns 2..5; yaw (5) does not enter the step.
         let symbolic = physics_increment(&packed, self.variant, self.model)?;
         let Some(raw_residual) = raw_residual else { return Ok(symbolic) };
-        let scale = Tensor::from_slice(&self.scales.residual_scale, (1, STATE_DIM), &Device::Cpu)?;
+        let scale = Tensor::from_slice(&self.scales.residual_scale, (1, STATE_DIM), state.device())?;
         symbolic + raw_residual.broadcast_mul(&scale)?
     }
 

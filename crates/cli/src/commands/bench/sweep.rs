@@ -1,9 +1,11 @@
-//! More of `nesam bench predict`: every path and number of candidates, and where the time goes.
+//! More of `nesam bench predict`: every path and number of candidates, the reference on other devices, and where the time goes.
 
 use std::sync::Arc;
 use std::time::Instant;
 
+use nesam_model::reference::{ComputeDevice, ReferencePredictor};
 use nesam_model::{Path, Precision, Predictor};
+use nesam_physics::STATE_DIM;
 use serde_json::{Value, json};
 
 use super::{Planner, percentile};
@@ -59,6 +61,43 @@ pub fn sweep(drive: &Planner<'_>, predictor: &Predictor) -> Result<Value, Failur
             rows.push(json!({"path": predictor.path().as_str(), "samples": samples, "p50_ms": p50, "min_ms": min}));
         }
         say!("{}", line.trim_end());
+    }
+    Ok(Value::Array(rows))
+}
+
+/// Times the reference on devices in turns with the predictor, terrain warm, and says how far apart they predict.
+pub fn reference(drive: &Planner<'_>, predictor: &Predictor, devices: &[ComputeDevice]) -> Result<Value, Failure> {
+    if devices.is_empty() {
+        return Ok(Value::Null);
+    }
+    let open = |device: &ComputeDevice| Ok((*device, ReferencePredictor::new(predictor, *device).or_input()?, Vec::new(), 0f32));
+    let mut on: Vec<_> = devices.iter().map(open).collect::<Result<_, Failure>>()?;
+    let mut own = Vec::new();
+    for q in 0..=QUERIES {
+        let at = drive.anywhere(q, QUERIES + 1);
+        let controls = drive.controls(at, 5000 + q as u64);
+        // The first time encodes what is missing.
+        drive.ask(predictor, at, &controls)?;
+        let began = Instant::now();
+        let answer = drive.ask(predictor, at, &controls)?;
+        own.push(began.elapsed().as_secs_f64() * 1e3);
+        for (_, reference, times, apart_m) in &mut on {
+            let began = Instant::now();
+            let states = reference.rollout(&drive.query(at, &controls)).or_failed()?;
+            times.push(began.elapsed().as_secs_f64() * 1e3);
+            let pairs = states.chunks_exact(STATE_DIM).zip(answer.states.chunks_exact(STATE_DIM));
+            *apart_m = pairs.map(|(a, b)| f32::hypot(a[0] - b[0], a[1] - b[1])).fold(*apart_m, f32::max);
+        }
+    }
+    let mut rows = Vec::new();
+    for (device, _, times, apart_m) in &mut on {
+        // The first query of a device also loads its kernels.
+        let [p50, own_p50] = [&mut times[1..], &mut own[1..]].map(|times| percentile(times, 0.5));
+        say!(
+            "  reference on {device}: p50 {p50:.1} ms, the predictor in turns with it {own_p50:.1} ms; at most {:.2} mm apart",
+            1e3 * *apart_m
+        );
+        rows.push(json!({"device": device.to_string(), "p50_ms": p50, "predictor_p50_ms": own_p50, "apart_max_m": *apart_m}));
     }
     Ok(Value::Array(rows))
 }
