@@ -103,6 +103,24 @@ pub fn gelu<V: Vector>(x: V) -> V {
     x.div(exp(inner.mul(V::splat(-2.0 * 0.797_884_6))).add(V::splat(1.0)))
 }
 
+/// Slope of [`gelu`].
+#[inline(always)]
+pub fn gelu_slope<V: Vector>(x: V) -> V {
+    let (one, square) = (V::splat(1.0), x.mul(x));
+    let inner = square.mul(x).mul_add(V::splat(0.044_715), x);
+    let share = one.div(exp(inner.mul(V::splat(-2.0 * 0.797_884_6))).add(one));
+    let inner_slope = square.mul_add(V::splat(3.0 * 0.044_715), one).mul(V::splat(2.0 * 0.797_884_6));
+    x.mul(share).mul(one.sub(share)).mul_add(inner_slope, share)
+}
+
+/// Slope of [`silu`].
+#[inline(always)]
+pub fn silu_slope<V: Vector>(x: V) -> V {
+    let one = V::splat(1.0);
+    let share = one.div(exp(x.neg()).add(one));
+    x.mul(share).mul_add(one.sub(share), share)
+}
+
 /// SiLU: x σ(x).
 #[inline(always)]
 pub fn silu<V: Vector>(x: V) -> V {

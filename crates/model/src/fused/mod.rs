@@ -13,11 +13,12 @@ mod transformer;
 mod vector;
 
 pub(crate) use convolution::{Convolution, Image};
+pub(crate) use elementary::{exp, gelu, gelu_slope, silu, silu_slope};
 pub use kernels::Row;
 pub(crate) use kernels::{After, Packed, add_rows, linear, linear_of};
 pub use prefix::Prefix;
 pub(crate) use real::Numbers;
-pub(crate) use transformer::{Block, Dense};
+pub(crate) use transformer::{Block, Dense, SCORE_SCALE};
 pub use transformer::{BlockCache, FusedTransformer, Said};
 pub(crate) use vector::{Kernel, Vector};
 pub use vector::{LANES, Lane, Order, Path};

@@ -14,7 +14,7 @@ use nesam_physics::{STATE_DIM, WHEELS};
 /// Values that the heads give for a sample: raw residual, then tanh of the raw sinkage.
 const HEAD_VALUES: usize = STATE_DIM + WHEELS;
 /// 1 / √(head width): what scores are scaled by.
-pub(super) const SCORE_SCALE: f32 = 0.176_776_7;
+pub(crate) const SCORE_SCALE: f32 = 0.176_776_7;
 
 #[derive(Clone, Debug)]
 pub(crate) struct Dense {

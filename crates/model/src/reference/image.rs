@@ -29,7 +29,7 @@ impl Conv {
         9 * self.channels
     }
 
-    /// Calls `f(row offset, image offset)` for each run of `channels` values that lies inside the image.
+    /// Calls `f(row offset, image offset)` for each run of `channels` values that lies inside the image, by ascending row offset.
     fn for_each_run(&self, batch: usize, mut f: impl FnMut(usize, usize)) {
         let (px, c, out) = (self.px as isize, self.channels, self.out_px());
         for b in 0..batch {
@@ -67,9 +67,13 @@ impl CustomOp1 for Im2Col {
         let (conv, image) = (self.0, values(storage, layout)?);
         let batch = image.len() / (conv.px * conv.px * conv.channels);
         let rows = batch * conv.out_px() * conv.out_px();
-        let mut out = vec![0f32; rows * conv.row()];
-        let c = conv.channels;
-        conv.for_each_run(batch, |row, at| out[row..row + c].copy_from_slice(&image[at..at + c]));
+        let mut out = Vec::with_capacity(rows * conv.row());
+        // In the order of the rows, so that nothing is written twice.
+        conv.for_each_run(batch, |row, at| {
+            out.resize(row, 0.0);
+            out.extend_from_slice(&image[at..at + conv.channels]);
+        });
+        out.resize(rows * conv.row(), 0.0);
         Ok((CpuStorage::F32(out), Shape::from((rows, conv.row()))))
     }
 

@@ -1,9 +1,12 @@
 //! Token projection, causal Transformer, heads and soil prior as candle tensors.
 
-use candle_core::{D, Device, Result, Tensor, Var};
+use candle_core::{Device, Result, Tensor, Var, bail};
 
-use super::image::{Conv, conv2d};
+use super::attention::{Shared, attend_first, attend_next};
+use super::image::{Conv, im2col};
+use super::nodes::{Activation, activate, layer_norm, softmax};
 use crate::dims::*;
+use crate::fused::SCORE_SCALE;
 use crate::soil_coordinates::{LOGARITHMIC, span};
 use crate::weights::Weights;
 use nesam_physics::{SOIL_DIM, STATE_DIM, WHEELS};
@@ -14,17 +17,6 @@ use nesam_physics::{SOIL_DIM, STATE_DIM, WHEELS};
 /// A candle error when shapes disagree.
 pub fn linear(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
     x.matmul(&weight.t()?)?.broadcast_add(bias)
-}
-
-/// Layer normalisation over the last dimension, same shape.
-///
-/// # Errors
-/// A candle error when shapes disagree.
-pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
-    let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
-    let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
-    let normal = centred.broadcast_div(&(variance + f64::from(NORM_EPS))?.sqrt()?)?;
-    normal.broadcast_mul(weight)?.broadcast_add(bias)
 }
 
 /// θ (rows, 6) of raw coordinates (rows, 6): see `soil_coordinates`.
@@ -43,8 +35,66 @@ pub fn soil_from_raw(raw: &Tensor) -> Result<Tensor> {
     Tensor::cat(&columns, 1)
 }
 
-/// Keys and values of one block: each (batch, heads, positions, head width).
-pub type KvCache = Vec<Option<(Tensor, Tensor)>>;
+/// What the tokens so far have left behind, for those to come.
+#[derive(Default)]
+pub struct KvCache {
+    blocks: [Past; BLOCKS],
+}
+
+/// The past of one block.
+#[derive(Default)]
+struct Past {
+    /// Keys and values, each (batch, heads, positions, head width).
+    tokens: Option<(Tensor, Tensor)>,
+    /// The same and those of the steps, once single tokens follow on a processor.
+    memory: Option<Shared>,
+}
+
+impl KvCache {
+    /// Nothing yet.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Forgets all.
+    pub fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+impl Past {
+    /// Attention of `new` tokens of each of `batch` rows, queries, keys and values (batch · new, 384), over the past and each other as far as the mask
+    /// lets them: (batch · new, 128). They become part of the past.
+    fn attend(&mut self, qkv: &Tensor, batch: usize, new: usize, mask: Option<&Tensor>) -> Result<Tensor> {
+        if new == 1 && mask.is_none() && qkv.device().is_cpu() {
+            return match &self.memory {
+                Some(memory) => attend_next(qkv, memory),
+                None => {
+                    let (attended, memory) = attend_first(qkv, self.tokens.as_ref())?;
+                    self.memory = Some(memory);
+                    Ok(attended)
+                }
+            };
+        }
+        if self.memory.is_some() {
+            bail!("attention: after single tokens only single ones can follow");
+        }
+        let qkv = qkv.reshape((batch, new, 3, HEADS, HEAD_DIM))?;
+        let part = |i: usize| qkv.narrow(2, i, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous();
+        let (q, mut k, mut v) = (part(0)?, part(1)?, part(2)?);
+        if let Some((old_k, old_v)) = &self.tokens {
+            k = Tensor::cat(&[old_k, &k], 2)?.contiguous()?;
+            v = Tensor::cat(&[old_v, &v], 2)?.contiguous()?;
+        }
+        let mut scores = q.matmul(&k.transpose(2, 3)?)?;
+        if let Some(mask) = mask {
+            scores = scores.broadcast_add(mask)?;
+        }
+        let attended = softmax(&scores, SCORE_SCALE)?.matmul(&v)?.transpose(1, 2)?.reshape((batch * new, HIDDEN))?;
+        self.tokens = Some((k, v));
+        Ok(attended)
+    }
+}
 
 struct Block {
     norm1: [Tensor; 2],
@@ -195,32 +245,19 @@ impl Network {
 
     /// Runs `x` (batch, new, 128), already with positions, through the causal Transformer, extending the cache.
     ///
-    /// `mask` (batch or 1, 1, new, cached + new) is added to the scores; `None` lets every new token see everything.
+    /// `mask` (batch or 1, 1, new, cached + new) is added to the scores before they are scaled; `None` lets every new token see everything.
     ///
     /// # Errors
     /// A candle error when shapes disagree.
     pub fn transformer(&self, x: &Tensor, cache: &mut KvCache, mask: Option<&Tensor>) -> Result<Tensor> {
         let (batch, new, _) = x.dims3()?;
         let mut x = x.reshape((batch * new, HIDDEN))?;
-        cache.resize(BLOCKS, None);
-        for (block, slot) in self.blocks.iter().zip(cache.iter_mut()) {
+        for (block, past) in self.blocks.iter().zip(&mut cache.blocks) {
             let normal = layer_norm(&x, &block.norm1[0], &block.norm1[1])?;
-            let qkv = linear(&normal, &block.qkv[0], &block.qkv[1])?.reshape((batch, new, 3, HEADS, HEAD_DIM))?;
-            let part = |i: usize| qkv.narrow(2, i, 1)?.squeeze(2)?.transpose(1, 2)?.contiguous();
-            let (q, mut k, mut v) = (part(0)?, part(1)?, part(2)?);
-            if let Some((old_k, old_v)) = slot.as_ref() {
-                k = Tensor::cat(&[old_k, &k], 2)?.contiguous()?;
-                v = Tensor::cat(&[old_v, &v], 2)?.contiguous()?;
-            }
-            let mut scores = (q.matmul(&k.transpose(2, 3)?)? * (1.0 / (HEAD_DIM as f64).sqrt()))?;
-            if let Some(mask) = mask {
-                scores = scores.broadcast_add(mask)?;
-            }
-            let attended = softmax(&scores)?.matmul(&v)?.transpose(1, 2)?.reshape((batch * new, HIDDEN))?;
-            *slot = Some((k, v));
+            let attended = past.attend(&linear(&normal, &block.qkv[0], &block.qkv[1])?, batch, new, mask)?;
             x = (x + linear(&attended, &block.out[0], &block.out[1])?)?;
             let normal = layer_norm(&x, &block.norm2[0], &block.norm2[1])?;
-            let hidden = linear(&normal, &block.up[0], &block.up[1])?.gelu()?;
+            let hidden = activate(&normal.matmul(&block.up[0].t()?)?, &block.up[1], Activation::Gelu)?;
             x = (x + linear(&hidden, &block.down[0], &block.down[1])?)?;
         }
         layer_norm(&x, &self.norm[0], &self.norm[1])?.reshape((batch, new, HIDDEN))
@@ -241,19 +278,15 @@ impl SoilPriorHead {
     /// # Errors
     /// A candle error when shapes disagree.
     pub fn raw(&self, features: &Tensor) -> Result<Tensor> {
-        let conv = |px, channels| Conv { px, channels, stride: 2 };
-        let h = conv2d(features, conv(FEATURE_PX, FEATURE_CHANNELS), &self.conv1[0], &self.conv1[1])?.silu()?;
-        let h = conv2d(&h, conv(FEATURE_PX / 2, 32), &self.conv2[0], &self.conv2[1])?.silu()?;
-        let rows = h.dim(0)?;
-        let pooled = h.reshape((rows, 16, 64))?.mean(1)?;
-        linear(&linear(&pooled, &self.hidden[0], &self.hidden[1])?.silu()?, &self.out[0], &self.out[1])
+        let silu = |x: &Tensor, [weight, bias]: &[Tensor; 2]| activate(&x.matmul(&weight.t()?)?, bias, Activation::Silu);
+        let (first, second) =
+            (Conv { px: FEATURE_PX, channels: FEATURE_CHANNELS, stride: 2 }, Conv { px: FEATURE_PX / 2, channels: 32, stride: 2 });
+        let (rows, half) = (features.dim(0)?, first.out_px());
+        let h = silu(&im2col(features, first)?, &self.conv1)?.reshape((rows, half, half, 32))?;
+        let h = silu(&im2col(&h, second)?, &self.conv2)?;
+        let pooled = h.reshape((rows, second.out_px() * second.out_px(), 64))?.mean(1)?;
+        linear(&silu(&pooled, &self.hidden)?, &self.out[0], &self.out[1])
     }
-}
-
-/// Softmax over the last dimension.
-fn softmax(x: &Tensor) -> Result<Tensor> {
-    let shifted = x.broadcast_sub(&x.max_keepdim(D::Minus1)?.detach())?.exp()?;
-    shifted.broadcast_div(&shifted.sum_keepdim(D::Minus1)?)
 }
 
 /// Additive causal mask (1, 1, n, n): 0 where a token may look, -1e9 ahead of it.
