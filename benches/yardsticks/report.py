@@ -4,7 +4,7 @@ import os
 import platform
 import statistics
 import subprocess
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import List
 
@@ -28,10 +28,19 @@ def environment(args) -> dict:
         "nesam": subprocess.run([args.nesam, "--version"], capture_output=True, text=True).stdout.split("\n")[0],
         "bundle": args.bundle.name,
         "python": platform.python_version(),
-        **{name: version(name) for name in PACKAGES},
+        **{name: installed(name) for name in PACKAGES},
+        "bf16": args.bf16,
         "niceness": os.nice(0),
         "rounds": args.rounds,
     }
+
+
+def installed(package: str) -> str:
+    """Version of a package, or that it is not there."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def load() -> list:
@@ -107,7 +116,7 @@ def markdown(figures: dict) -> str:
     packages = ", ".join(f"{name} {env[name]}" for name in PACKAGES)
     has = " ".join(env["instructions"])
     lines = [
-        f"{env['processor']}, {env['processors']} processors ({has}), {env['threads']} threads each; {env['nesam']}, bundle {env['bundle']}; {packages}; "
+        f"{env['processor']}, {env['processors']} processors ({has}), {env['threads']} threads each; {env['nesam']}{' in bf16' if env['bf16'] else ''}, bundle {env['bundle']}; {packages}; "
         f"load {figures['load_before'][0]} before, {figures['load_after'][0]} after; niceness {env['niceness']}; {env['rounds']} rounds.",
         "",
         "| 32 steps | how | median s | processor s | times ours (rounds) | fastest over fastest |",
@@ -125,7 +134,8 @@ def markdown(figures: dict) -> str:
         how = f"{r['setting']}; 32 768 × (torch crop {r['crop_us']:.0f} µs + network {r['network_us']:.0f} µs) + fastest torch trunk"
         ratio = f"**{r['ratio']:.3g}** ({span(r['ratios'])})"
         lines.append(f"| {r['name']}, encoders at every pose, N = 1024, extrapolated | {how} | {r['median_s']:.3g} | | {ratio} | {r['ratio_of_fastest']:.3g} |")
-    lines += ["", f"Scaling held against one whole query of the eager peer with the best batch, after the rounds: {figures['whole_eager_query_s']:.1f} s."]
+    if "whole_eager_query_s" in figures:
+        lines += ["", f"Scaling held against one whole query of the eager peer with the best batch, after the rounds: {figures['whole_eager_query_s']:.1f} s."]
     lines += ["", "| target | asked | measured | holds |", "|---|---|---|---|"]
     names = {"eager": "PyTorch eager, best batch", "tuned": "tuned bf16", "cached": "the same terrain cache (fastest such peer)"}
     for kind, t in figures["targets"].items():

@@ -8,10 +8,15 @@ from typing import Callable, Dict
 
 import numpy as np
 import onnxruntime
-import openvino
 import torch
 
 from network import TerrainNetwork
+
+try:
+    import openvino
+except ImportError:
+    # Not for every Python; the rest is timed without it.
+    openvino = None
 
 BATCHES = (16, 32, 64, 128)
 
@@ -65,7 +70,7 @@ def prepare(network: TerrainNetwork, patches: np.ndarray, threads: int) -> Dict[
         path = Path(folder) / "terrain.onnx"
         export(network, path)
         ways = {"ONNX Runtime f32": {"": onnx_runtime(path, threads)}}
-        for precision in ("f32", "bf16"):
+        for precision in ("f32", "bf16") if openvino else ():
             ways[f"OpenVINO {precision}"] = {hint: open_vino(path, threads, precision, hint) for hint in ("LATENCY", "THROUGHPUT")}
     prepared = {}
     for name, hints in ways.items():

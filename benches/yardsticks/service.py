@@ -17,9 +17,9 @@ SESSION, STEP_NS = "yardstick", 100_000_000
 
 
 @contextlib.contextmanager
-def server(binary: str, bundle: str) -> Iterator[Tuple[nesam.Client, int]]:
+def server(binary: str, bundle: str, bf16: bool = False) -> Iterator[Tuple[nesam.Client, int]]:
     """A client of a server of its own on a free loopback port, and the server's process id."""
-    command = [binary, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh", "--bundle", bundle]
+    command = [binary, "serve", "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh", "--bundle", bundle, *(["--bf16"] if bf16 else [])]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         address = None

@@ -211,7 +211,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             seed: args.seed,
             epoch: args.batches,
             device: args.device,
-            shards: shards,
+            shards,
             dropout: args.dropout,
             decay: args.decay,
             objective: Objective { variant, sustained: args.sustained, soil_prior: args.soil_prior },
