@@ -9,12 +9,11 @@ mod common;
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use common::{drive, encoded, hills, lively_weights, measured_scales, predictor, single_cells, truck};
+use common::{drive, encoded, from_sample_33, hills, lively_weights, measured_scales, predictor, single_cells, truck};
 use nesam_learning::batch::{Dropout, Window};
 use nesam_learning::{Objective, TrainingSet};
 use nesam_model::reference::{ComputeDevice, Network, ReferencePredictor};
 use nesam_model::{RolloutQuery, Variant};
-use nesam_physics::SoilCorrection;
 use nesam_physics::step::StepModel;
 
 const GPU: ComputeDevice = ComputeDevice::Cuda(0);
@@ -33,18 +32,7 @@ fn property_rollouts_on_a_gpu_equal_those_on_the_processor() {
         .flat_map(|(control, off)| [(control.speed_m_s + off) as f32, (control.second + off) as f32])
         .collect();
     for variant in Variant::ALL {
-        let query = RolloutQuery {
-            history: &past,
-            start: drive.states[33],
-            controls: &controls,
-            samples,
-            horizon,
-            map: Some(&map),
-            soil_correction: SoilCorrection::NONE,
-            variant,
-            start_time_s: None,
-            wheels: None,
-        };
+        let query = RolloutQuery { variant, ..from_sample_33(&drive, &past, &controls, samples, &map) };
         let on = |device| ReferencePredictor::new(&predictor, device).and_then(|reference| reference.rollout(&query)).expect("it runs");
         let (gpu, cpu) = (on(GPU), on(ComputeDevice::Cpu));
         let apart = gpu.iter().zip(&cpu).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);

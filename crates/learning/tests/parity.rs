@@ -6,12 +6,12 @@ mod common;
 use std::sync::Arc;
 
 use candle_core::{Device, Tensor};
-use common::{drive, hills, lively_weights, measured_scales, predictor};
+use common::{drive, from_sample_33, hills, lively_weights, measured_scales, predictor};
 use nesam_learning::Drive;
 use nesam_model::dims::HIDDEN;
 use nesam_model::reference::{ComputeDevice, KvCache, Network, ReferencePredictor, causal_mask};
 use nesam_model::{
-    CacheCounts, HistoryStep, ModelBundle, Normalization, Order, Path, Precision, Predictor, RolloutQuery, Variant, Weights,
+    CacheCounts, MeasuredWheels, ModelBundle, Normalization, Order, Path, Precision, Predictor, RolloutQuery, Variant, Weights,
 };
 use nesam_physics::{STATE_DIM, SoilCorrection, VehicleState};
 use nesam_terrain::{Pose2, WorldMap};
@@ -76,28 +76,6 @@ fn property_fast_path_equals_the_reference_on_shipped_weights() {
 /// Commands that differ from candidate to candidate and from step to step, (samples, horizon, 2).
 fn wavy_controls(samples: usize, horizon: usize) -> Vec<f32> {
     (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect()
-}
-
-/// A query of all candidates from the 33rd sample of a drive on.
-fn from_sample_33<'a>(
-    drive: &Drive,
-    past: &'a [HistoryStep],
-    controls: &'a [f32],
-    samples: usize,
-    map: &'a Arc<WorldMap>,
-) -> RolloutQuery<'a> {
-    RolloutQuery {
-        history: past,
-        start: drive.states[33],
-        controls,
-        samples,
-        horizon: controls.len() / (2 * samples),
-        map: Some(map),
-        soil_correction: SoilCorrection::NONE,
-        variant: Variant::Full,
-        start_time_s: None,
-        wheels: None,
-    }
 }
 
 #[test]
@@ -245,4 +223,27 @@ fn analytic_cached_attention_equals_attention_over_everything() {
 fn published_soil_prior_has_the_papers_parameters() {
     let drive = drive(None, 40);
     assert_eq!(lively_weights(&measured_scales(&drive)).parameters("soil."), 28_262);
+}
+
+#[test]
+fn property_what_the_reference_does_not_know_is_refused_by_name() {
+    let map = hills();
+    let drive = drive(Some(&map), 80);
+    let scales = measured_scales(&drive);
+    let reference =
+        ReferencePredictor::new(&predictor(&scales, lively_weights(&scales)), ComputeDevice::Cpu).expect("a bundle without effects");
+    let (past, controls) = (drive.history(2, 33), wavy_controls(2, 4));
+    let wheels = [MeasuredWheels { speed_rad_s: [5.0; 4], angle_rad: [0.0; 4] }; 4];
+    let sound = from_sample_33(&drive, &past, &controls, 2, &map);
+    assert_eq!(reference.rollout(&sound).expect("a valid query").len(), 2 * 4 * STATE_DIM);
+    let wrong = [
+        ("horizon", RolloutQuery { horizon: 0, ..sound.clone() }),
+        ("controls", RolloutQuery { samples: 3, ..sound.clone() }),
+        ("soil_correction", RolloutQuery { soil_correction: SoilCorrection { delta: [0.1; 6], ..SoilCorrection::NONE }, ..sound.clone() }),
+        ("wheels", RolloutQuery { wheels: Some(&wheels), ..sound }),
+    ];
+    for (field, query) in wrong {
+        let refused = reference.rollout(&query).expect_err(field).to_string();
+        assert!(refused.contains(field), "{field}: {refused}");
+    }
 }

@@ -35,7 +35,7 @@ mod validate;
 pub(crate) use self::observed::LogClock;
 pub use self::parts::PartTimes;
 pub use self::transitions::Transition;
-use self::validate::validate;
+pub(crate) use self::validate::validate;
 
 /// Maps whose terrain tokens are kept.
 const MAPS_MAX: usize = 16;
@@ -229,7 +229,7 @@ impl Predictor {
     }
 
     /// Form that a query asks for.
-    fn form_of(&self, query: &RolloutQuery<'_>) -> Variant {
+    pub(crate) fn form_of(&self, query: &RolloutQuery<'_>) -> Variant {
         if query.variant == Variant::Full { self.bundle.form } else { query.variant }
     }
 
@@ -379,7 +379,7 @@ fn sensors_err(model: &StepModel) -> bool {
     model.vehicle().effects.sensor.alters_states()
 }
 
-fn pose(state: &VehicleState<f64>) -> Pose2 {
+pub(crate) fn pose(state: &VehicleState<f64>) -> Pose2 {
     Pose2 { x_m: state.position_m[0], y_m: state.position_m[1], yaw_rad: state.attitude_rad[2] }
 }
 
@@ -392,7 +392,7 @@ fn raw_soil(token: &TerrainToken) -> [f32; SOIL_DIM] {
     core::array::from_fn(|i| token[HIDDEN + i])
 }
 
-fn control(query: &RolloutQuery<'_>, sample: usize, k: usize) -> Control<f64> {
+pub(crate) fn control(query: &RolloutQuery<'_>, sample: usize, k: usize) -> Control<f64> {
     let at = (sample * query.horizon + k) * 2;
     Control { speed_m_s: f64::from(query.controls[at]), second: f64::from(query.controls[at + 1]) }
 }

@@ -3,7 +3,7 @@
 use std::ops::Range;
 use std::sync::Arc;
 
-use crate::dims::{CONTEXT, FEATURES};
+use crate::dims::{CONTEXT, FEATURES, HISTORY};
 use crate::soil_field::SoilField;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
@@ -109,6 +109,11 @@ impl Variant {
             _ => 0..0,
         }
     }
+}
+
+/// The last steps of a history, as many as the network has positions for.
+pub(crate) fn remembered(history: &[HistoryStep]) -> &[HistoryStep] {
+    &history[history.len().saturating_sub(HISTORY - 1)..]
 }
 
 /// A batch of candidate command sequences from one start state.

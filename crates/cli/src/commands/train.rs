@@ -174,12 +174,12 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if args.soil_prior > 0.0 && !variant.has_soil() {
         return Err(Failure::input(format!("--soil-prior is for models that read a soil off the map; {} does not", args.model)));
     }
-    args.device.open().or_input()?;
     let start = args.from.as_deref().map(|dir| start_of(dir, variant, args.data.dt)).transpose()?;
     // Each thread of `--threads` works on its own share of a batch, so candle's own element-wise threads would only get in their way (0.67 s against 0.42 s per
     // step, measured), and without a set number candle reads the processor list at every matrix product. What a step gives back the next one takes again.
     let threads = std::thread::available_parallelism().map_or(1, |n| n.get()).to_string();
     restart_with(&[("CANDLE_NUM_THREADS", "1"), ("RAYON_NUM_THREADS", &threads), (PURGE_DELAY, "-1")])?;
+    args.device.open().or_input()?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
     if let (Some(bundle), given) = (&start, drives.root.vehicle()) {
         let own = &bundle.vehicle;

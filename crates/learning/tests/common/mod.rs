@@ -6,10 +6,10 @@ use std::sync::Arc;
 use nesam_learning::initial::initial_weights;
 use nesam_learning::{Drive, Pooling, encode_drives, scales};
 use nesam_model::encoder::TerrainEncoders;
-use nesam_model::{GroundSource, ModelBundle, Normalization, Predictor, Provenance, Variant, Weights};
+use nesam_model::{GroundSource, HistoryStep, ModelBundle, Normalization, Predictor, Provenance, RolloutQuery, Variant, Weights};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{Control, Driveline, Soil, Vehicle, VehicleState};
+use nesam_physics::{Control, Driveline, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
 
 /// The car with a speed controller that integrates, and with sides that are alike to the digit.
@@ -126,4 +126,26 @@ pub fn encoded(mut drive: Drive, weights: &Weights, scales: &Normalization) -> D
     let encoders = TerrainEncoders::new(weights).expect("all arrays are there");
     encode_drives(core::slice::from_mut(&mut drive), &encoders, &scales.patch_scale(), &single_cells(), |_| {});
     drive
+}
+
+/// A query of all candidates from the 33rd sample of a drive on.
+pub fn from_sample_33<'a>(
+    drive: &Drive,
+    past: &'a [HistoryStep],
+    controls: &'a [f32],
+    samples: usize,
+    map: &'a Arc<WorldMap>,
+) -> RolloutQuery<'a> {
+    RolloutQuery {
+        history: past,
+        start: drive.states[33],
+        controls,
+        samples,
+        horizon: controls.len() / (2 * samples),
+        map: Some(map),
+        soil_correction: SoilCorrection::NONE,
+        variant: Variant::Full,
+        start_time_s: None,
+        wheels: None,
+    }
 }

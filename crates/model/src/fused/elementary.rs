@@ -96,35 +96,46 @@ pub fn tanh<V: Vector>(x: V) -> V {
     one.sub(V::splat(2.0).div(exp(x.add(x)).add(one)))
 }
 
+/// 1 / σ(2 √(2/π) (x + 0.044715 x³)).
+#[inline(always)]
+fn gelu_divisor<V: Vector>(x: V) -> V {
+    let inner = x.mul(x).mul(x).mul_add(V::splat(0.044_715), x);
+    exp(inner.mul(V::splat(-2.0 * 0.797_884_6))).add(V::splat(1.0))
+}
+
 /// GELU, tanh form: x σ(2 √(2/π) (x + 0.044715 x³)).
 #[inline(always)]
 pub fn gelu<V: Vector>(x: V) -> V {
-    let inner = x.mul(x).mul(x).mul_add(V::splat(0.044_715), x);
-    x.div(exp(inner.mul(V::splat(-2.0 * 0.797_884_6))).add(V::splat(1.0)))
+    x.div(gelu_divisor(x))
 }
 
 /// Slope of [`gelu`].
 #[inline(always)]
 pub fn gelu_slope<V: Vector>(x: V) -> V {
-    let (one, square) = (V::splat(1.0), x.mul(x));
-    let inner = square.mul(x).mul_add(V::splat(0.044_715), x);
-    let share = one.div(exp(inner.mul(V::splat(-2.0 * 0.797_884_6))).add(one));
-    let inner_slope = square.mul_add(V::splat(3.0 * 0.044_715), one).mul(V::splat(2.0 * 0.797_884_6));
+    let one = V::splat(1.0);
+    let share = one.div(gelu_divisor(x));
+    let inner_slope = x.mul(x).mul_add(V::splat(3.0 * 0.044_715), one).mul(V::splat(2.0 * 0.797_884_6));
     x.mul(share).mul(one.sub(share)).mul_add(inner_slope, share)
+}
+
+/// 1 / σ(x).
+#[inline(always)]
+fn silu_divisor<V: Vector>(x: V) -> V {
+    exp(x.neg()).add(V::splat(1.0))
+}
+
+/// SiLU: x σ(x).
+#[inline(always)]
+pub fn silu<V: Vector>(x: V) -> V {
+    x.div(silu_divisor(x))
 }
 
 /// Slope of [`silu`].
 #[inline(always)]
 pub fn silu_slope<V: Vector>(x: V) -> V {
     let one = V::splat(1.0);
-    let share = one.div(exp(x.neg()).add(one));
+    let share = one.div(silu_divisor(x));
     x.mul(share).mul_add(one.sub(share), share)
-}
-
-/// SiLU: x σ(x).
-#[inline(always)]
-pub fn silu<V: Vector>(x: V) -> V {
-    x.div(exp(x.neg()).add(V::splat(1.0)))
 }
 
 #[cfg(test)]

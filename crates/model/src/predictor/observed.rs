@@ -7,9 +7,8 @@ use nesam_physics::effects::SensorTerms;
 use nesam_physics::{Control, SOIL_DIM, Soil, VehicleState, wrap_angle};
 
 use super::Predictor;
-use crate::dims::HISTORY;
 use crate::ground::actuators_along;
-use crate::rollout::HistoryStep;
+use crate::rollout::{HistoryStep, remembered};
 
 /// When the steps around the start of a prediction begin.
 #[derive(Clone, Copy, Debug)]
@@ -60,7 +59,7 @@ impl Predictor {
         start: &VehicleState<f64>,
         clock: LogClock,
     ) -> (Cow<'h, [HistoryStep]>, VehicleState<f64>) {
-        let history = &history[history.len().saturating_sub(HISTORY - 1)..];
+        let history = remembered(history);
         if !self.sensors_err {
             return (Cow::Borrowed(history), *start);
         }

@@ -5,7 +5,7 @@ use crate::dims::MAX_HORIZON;
 use crate::rollout::{HistoryStep, RolloutExtras, RolloutQuery};
 
 /// Refuses a query whose shapes disagree or that holds a number that is not finite.
-pub(super) fn validate(query: &RolloutQuery<'_>) -> Result<(), ModelError> {
+pub(crate) fn validate(query: &RolloutQuery<'_>) -> Result<(), ModelError> {
     let fail = |field, reason: String| Err(ModelError::Query { field, reason });
     if query.samples == 0 {
         return fail("samples", "is 0, at least one candidate is needed".into());

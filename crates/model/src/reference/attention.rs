@@ -6,17 +6,17 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CustomOp1, CustomOp3, Layout, Result, Shape, Tensor, bail};
 
-use super::host::values;
-use super::nodes::shares;
+use super::host::{from_values, values};
+use super::nodes::{shares, softmax_gradient};
 use crate::dims::{HEAD_DIM, HEADS, HIDDEN};
+use crate::fused::SCORE_SCALE as SCALE;
 
 /// Queries, keys and values of a token.
 const QKV: usize = 3 * HIDDEN;
 /// Keys and values of a token.
 const KV: usize = 2 * HIDDEN;
-const SCALE: f32 = crate::fused::SCORE_SCALE;
 
 /// Keys and values of a row, and their gradients: (tokens, 2 · 128).
 #[derive(Debug, Default)]
@@ -61,10 +61,6 @@ pub fn attend_first(qkv: &Tensor, prefix: Option<&(Tensor, Tensor)>) -> Result<(
 
 /// The token at place `step` of the memory.
 struct Attend {
-    memory: Shared,
-    step: usize,
-}
-struct AttendGradient {
     memory: Shared,
     step: usize,
 }
@@ -127,8 +123,39 @@ impl Attend {
     }
 
     fn backward(&self, qkv: &Tensor, grad: &Tensor) -> Result<Tensor> {
-        let gradient = AttendGradient { memory: self.memory.clone(), step: self.step };
-        qkv.apply_op2_no_bwd(&grad.contiguous()?, &gradient)
+        from_values([qkv, grad], qkv.shape(), |[qkv, grad]| self.gradient(qkv, grad))
+    }
+
+    /// Gradient by queries, keys and values, given that by what came of them.
+    fn gradient(&self, qkv: &[f32], grad: &[f32]) -> Vec<f32> {
+        let mut memory = locked(&self.memory);
+        let mut out = vec![0f32; qkv.len()];
+        let (mut scores, mut paid, mut by_share) = (Vec::new(), Vec::new(), Vec::new());
+        let tokens = self.step + 1;
+        let each = memory.rows.iter_mut().zip(qkv.chunks_exact(QKV)).zip(grad.chunks_exact(HIDDEN)).zip(out.chunks_exact_mut(QKV));
+        for (((row, qkv), grad), out) in each {
+            let kv = &row.kv[..tokens * KV];
+            row.gradients.resize(row.gradients.len().max(kv.len()), 0.0);
+            for h in 0..HEADS {
+                let (query, upstream) = (head(qkv, h), head(grad, h));
+                attention(h, qkv, kv, &mut scores, &mut paid);
+                by_share.clear();
+                by_share.extend(kv.chunks_exact(KV).map(|kv| dot(upstream, head(&kv[HIDDEN..], h))));
+                // The scores have done their work: what they were is now the gradient by them.
+                softmax_gradient(SCALE, &paid, &by_share, &mut scores);
+                let tokens = kv.chunks_exact(KV).zip(row.gradients.chunks_exact_mut(KV)).zip(scores.iter().zip(&paid));
+                for ((kv, gradients), (by_score, share)) in tokens {
+                    add_scaled(head_mut(out, h), *by_score, head(kv, h));
+                    add_scaled(head_mut(gradients, h), *by_score, query);
+                    add_scaled(head_mut(&mut gradients[HIDDEN..], h), *share, upstream);
+                }
+            }
+            // Complete now, and taken, so that a graph can be pulled back again.
+            let own = &mut row.gradients[self.step * KV..tokens * KV];
+            out[HIDDEN..].copy_from_slice(own);
+            own.fill(0.0);
+        }
+        out
     }
 }
 
@@ -195,45 +222,6 @@ fn each_part(tokens: usize, row: usize, mut f: impl FnMut((usize, usize), usize)
                 f((part, ((row * HEADS + h) * tokens + token) * HEAD_DIM), token * KV + part * HIDDEN + h * HEAD_DIM);
             }
         }
-    }
-}
-
-impl CustomOp2 for AttendGradient {
-    fn name(&self) -> &'static str {
-        "attention-step-gradient"
-    }
-
-    fn cpu_fwd(&self, qkv: &CpuStorage, layout: &Layout, grad: &CpuStorage, grad_layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (qkv, grad) = (values(qkv, layout)?, values(grad, grad_layout)?);
-        let mut memory = locked(&self.memory);
-        let rows = memory.rows.len();
-        let mut out = vec![0f32; rows * QKV];
-        let (mut scores, mut paid, mut by_share) = (Vec::new(), Vec::new(), Vec::new());
-        let tokens = self.step + 1;
-        let each = memory.rows.iter_mut().zip(qkv.chunks_exact(QKV)).zip(grad.chunks_exact(HIDDEN)).zip(out.chunks_exact_mut(QKV));
-        for (((row, qkv), grad), out) in each {
-            let kv = &row.kv[..tokens * KV];
-            row.gradients.resize(row.gradients.len().max(kv.len()), 0.0);
-            for h in 0..HEADS {
-                let (query, upstream) = (head(qkv, h), head(grad, h));
-                attention(h, qkv, kv, &mut scores, &mut paid);
-                by_share.clear();
-                by_share.extend(kv.chunks_exact(KV).map(|kv| dot(upstream, head(&kv[HIDDEN..], h))));
-                let mean: f32 = by_share.iter().zip(&paid).map(|(by_share, share)| by_share * share).sum();
-                let tokens = kv.chunks_exact(KV).zip(row.gradients.chunks_exact_mut(KV)).zip(by_share.iter().zip(&paid));
-                for ((kv, gradients), (by_share, share)) in tokens {
-                    let by_score = SCALE * share * (by_share - mean);
-                    add_scaled(head_mut(out, h), by_score, head(kv, h));
-                    add_scaled(head_mut(gradients, h), by_score, query);
-                    add_scaled(head_mut(&mut gradients[HIDDEN..], h), *share, upstream);
-                }
-            }
-            // Complete now, and taken, so that a graph can be pulled back again.
-            let own = &mut row.gradients[self.step * KV..tokens * KV];
-            out[HIDDEN..].copy_from_slice(own);
-            own.fill(0.0);
-        }
-        Ok((CpuStorage::F32(out), Shape::from((rows, QKV))))
     }
 }
 

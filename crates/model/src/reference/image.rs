@@ -5,7 +5,7 @@
 
 use candle_core::{CpuStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 
-use super::host::values;
+use super::host::{from_values, values};
 
 /// Geometry of a 3×3 convolution with padding 1.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -56,7 +56,6 @@ impl Conv {
 }
 
 struct Im2Col(Conv);
-struct Col2Im(Conv);
 
 impl CustomOp1 for Im2Col {
     fn name(&self) -> &'static str {
@@ -77,27 +76,19 @@ impl CustomOp1 for Im2Col {
         Ok((CpuStorage::F32(out), Shape::from((rows, conv.row()))))
     }
 
-    fn bwd(&self, _arg: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
-        Ok(Some(grad.contiguous()?.apply_op1_no_bwd(&Col2Im(self.0))?))
-    }
-}
-
-impl CustomOp1 for Col2Im {
-    fn name(&self) -> &'static str {
-        "col2im"
-    }
-
-    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (conv, rows) = (self.0, values(storage, layout)?);
-        let batch = rows.len() / (conv.out_px() * conv.out_px() * conv.row());
-        let mut image = vec![0f32; batch * conv.px * conv.px * conv.channels];
-        let c = conv.channels;
-        conv.for_each_run(batch, |row, at| {
-            for (pixel, value) in image[at..at + c].iter_mut().zip(&rows[row..row + c]) {
-                *pixel += value;
-            }
-        });
-        Ok((CpuStorage::F32(image), Shape::from((batch, conv.px, conv.px, c))))
+    fn bwd(&self, image: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
+        let (conv, batch) = (self.0, image.dim(0)?);
+        from_values([grad], image.shape(), |[rows]| {
+            let mut image = vec![0f32; batch * conv.px * conv.px * conv.channels];
+            let c = conv.channels;
+            conv.for_each_run(batch, |row, at| {
+                for (pixel, value) in image[at..at + c].iter_mut().zip(&rows[row..row + c]) {
+                    *pixel += value;
+                }
+            });
+            image
+        })
+        .map(Some)
     }
 }
 

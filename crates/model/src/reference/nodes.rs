@@ -5,7 +5,7 @@
 
 use candle_core::{CpuStorage, CustomOp1, CustomOp2, CustomOp3, D, Layout, Result, Shape, Tensor, bail};
 
-use super::host::values;
+use super::host::{from_values, values};
 use crate::dims::NORM_EPS;
 use crate::fused::{Kernel, LANES, Path, Vector, exp, gelu, gelu_slope, silu, silu_slope};
 
@@ -27,11 +27,7 @@ pub fn activate(x: &Tensor, bias: &Tensor, activation: Activation) -> Result<Ten
     if bias.dim(0)? != width {
         bail!("activation: rows of {width} and biases of {:?}", bias.shape());
     }
-    match activation {
-        _ if x.device().is_cpu() => x.contiguous()?.apply_op2(bias, Activate(activation)),
-        Activation::Gelu => x.broadcast_add(bias)?.gelu(),
-        Activation::Silu => x.broadcast_add(bias)?.silu(),
-    }
+    if x.device().is_cpu() { x.contiguous()?.apply_op2(bias, Activate(activation)) } else { in_operations::activate(x, bias, activation) }
 }
 
 /// Layer normalisation over the last dimension, same shape; `weight` and `bias` have its size, a multiple of sixteen.
@@ -43,13 +39,7 @@ pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> 
     if x.dim(D::Minus1)? != width || bias.dim(0)? != width || width % LANES != 0 {
         bail!("layer norm: {:?} by weights of {width} and biases of {:?}", x.shape(), bias.shape());
     }
-    if x.device().is_cpu() {
-        return x.contiguous()?.apply_op3(weight, bias, LayerNorm);
-    }
-    let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
-    let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
-    let normal = centred.broadcast_div(&(variance + f64::from(NORM_EPS))?.sqrt()?)?;
-    normal.broadcast_mul(weight)?.broadcast_add(bias)
+    if x.device().is_cpu() { x.contiguous()?.apply_op3(weight, bias, LayerNorm) } else { in_operations::layer_norm(x, weight, bias) }
 }
 
 /// Softmax of `scale` · x over the last dimension.
@@ -57,12 +47,36 @@ pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> 
 /// # Errors
 /// A candle error when the tensor is not of f32.
 pub fn softmax(x: &Tensor, scale: f32) -> Result<Tensor> {
-    if x.device().is_cpu() {
-        return x.contiguous()?.apply_op1(Softmax { scale, width: x.dim(D::Minus1)? });
+    if !x.device().is_cpu() {
+        return in_operations::softmax(x, scale);
     }
-    let x = (x * f64::from(scale))?;
-    let shifted = x.broadcast_sub(&x.max_keepdim(D::Minus1)?.detach())?.exp()?;
-    shifted.broadcast_div(&shifted.sum_keepdim(D::Minus1)?)
+    x.contiguous()?.apply_op1(Softmax { scale, width: x.dim(D::Minus1)? })
+}
+
+/// The same in candle's operations: what a GPU runs, and what the nodes are tested against.
+mod in_operations {
+    use super::{Activation, D, NORM_EPS, Result, Tensor};
+
+    pub fn activate(x: &Tensor, bias: &Tensor, activation: Activation) -> Result<Tensor> {
+        let x = x.broadcast_add(bias)?;
+        match activation {
+            Activation::Gelu => x.gelu(),
+            Activation::Silu => x.silu(),
+        }
+    }
+
+    pub fn layer_norm(x: &Tensor, weight: &Tensor, bias: &Tensor) -> Result<Tensor> {
+        let centred = x.broadcast_sub(&x.mean_keepdim(D::Minus1)?)?;
+        let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
+        let normal = centred.broadcast_div(&(variance + f64::from(NORM_EPS))?.sqrt()?)?;
+        normal.broadcast_mul(weight)?.broadcast_add(bias)
+    }
+
+    pub fn softmax(x: &Tensor, scale: f32) -> Result<Tensor> {
+        let x = (x * f64::from(scale))?;
+        let shifted = x.broadcast_sub(&x.max_keepdim(D::Minus1)?.detach())?.exp()?;
+        shifted.broadcast_div(&shifted.sum_keepdim(D::Minus1)?)
+    }
 }
 
 /// Calls `f` for sixteen values of each of the inputs at a time, and stores what it makes of them; past the end the inputs are 0.
@@ -98,8 +112,15 @@ pub(super) fn shares(scale: f32, width: usize, x: &[f32], out: &mut [f32]) {
     Path::run_on_target(Shares { scale, width, x, out });
 }
 
+/// Gradient by the numbers of one softmax of `scale` · x, given its shares and the gradient by them.
+pub(super) fn softmax_gradient(scale: f32, shares: &[f32], upstream: &[f32], out: &mut [f32]) {
+    let mean: f32 = upstream.iter().zip(shares).map(|(upstream, share)| upstream * share).sum();
+    for ((out, share), upstream) in out.iter_mut().zip(shares).zip(upstream) {
+        *out = scale * share * (upstream - mean);
+    }
+}
+
 struct Activate(Activation);
-struct ActivateGradient(Activation);
 
 struct Activated<'a> {
     activation: Activation,
@@ -161,36 +182,17 @@ impl CustomOp2 for Activate {
     }
 
     fn bwd(&self, x: &Tensor, bias: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<(Option<Tensor>, Option<Tensor>)> {
-        let all = x.apply_op3_no_bwd(bias, &grad.contiguous()?, &ActivateGradient(self.0))?;
-        let rows = x.dim(0)?;
+        let (rows, width) = x.dims2()?;
+        let all = from_values([x, bias, grad], (rows + 1, width), |[x, bias, upstream]| {
+            let mut out = vec![0.0; x.len() + bias.len()];
+            Path::run_on_target(ActivatedGradient { activation: self.0, x, bias, upstream, out: &mut out });
+            out
+        })?;
         Ok((Some(all.narrow(0, 0, rows)?), Some(all.narrow(0, rows, 1)?.squeeze(0)?)))
     }
 }
 
-impl CustomOp3 for ActivateGradient {
-    fn name(&self) -> &'static str {
-        "activation-gradient"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        layout: &Layout,
-        bias: &CpuStorage,
-        bias_layout: &Layout,
-        grad: &CpuStorage,
-        grad_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (x, bias) = (values(x, layout)?, values(bias, bias_layout)?);
-        let rows = x.len() / bias.len() + 1;
-        let mut out = vec![0.0; rows * bias.len()];
-        Path::run_on_target(ActivatedGradient { activation: self.0, x, bias, upstream: values(grad, grad_layout)?, out: &mut out });
-        Ok((CpuStorage::F32(out), Shape::from((rows, bias.len()))))
-    }
-}
-
 struct LayerNorm;
-struct LayerNormGradient;
 
 /// Mean of a row and the inverse of its standard deviation.
 #[inline(always)]
@@ -295,40 +297,19 @@ impl CustomOp3 for LayerNorm {
         _res: &Tensor,
         grad: &Tensor,
     ) -> Result<(Option<Tensor>, Option<Tensor>, Option<Tensor>)> {
-        let all = x.contiguous()?.apply_op3_no_bwd(weight, &grad.contiguous()?, &LayerNormGradient)?;
-        let rows = all.dim(0)? - 2;
+        let width = weight.dim(0)?;
+        let rows = x.elem_count() / width;
+        let all = from_values([x, weight, grad], (rows + 2, width), |[x, weight, upstream]| {
+            let mut out = vec![0.0; x.len() + 2 * weight.len()];
+            Path::run_on_target(NormalisedGradient { x, weight, upstream, out: &mut out });
+            out
+        })?;
         let own = |row: usize| all.narrow(0, rows + row, 1)?.squeeze(0);
         Ok((Some(all.narrow(0, 0, rows)?.reshape(x.shape())?), Some(own(0)?), Some(own(1)?)))
     }
 }
 
-impl CustomOp3 for LayerNormGradient {
-    fn name(&self) -> &'static str {
-        "layer-norm-gradient"
-    }
-
-    fn cpu_fwd(
-        &self,
-        x: &CpuStorage,
-        layout: &Layout,
-        weight: &CpuStorage,
-        weight_layout: &Layout,
-        grad: &CpuStorage,
-        grad_layout: &Layout,
-    ) -> Result<(CpuStorage, Shape)> {
-        let (x, weight) = (values(x, layout)?, values(weight, weight_layout)?);
-        let rows = x.len() / weight.len() + 2;
-        let mut out = vec![0.0; rows * weight.len()];
-        Path::run_on_target(NormalisedGradient { x, weight, upstream: values(grad, grad_layout)?, out: &mut out });
-        Ok((CpuStorage::F32(out), Shape::from((rows, weight.len()))))
-    }
-}
-
 struct Softmax {
-    scale: f32,
-    width: usize,
-}
-struct SoftmaxGradient {
     scale: f32,
     width: usize,
 }
@@ -348,13 +329,8 @@ impl Kernel for Shares<'_> {
         for (x, out) in self.x.chunks_exact(self.width).zip(self.out.chunks_exact_mut(self.width)) {
             let top = V::splat(x.iter().copied().fold(f32::NEG_INFINITY, f32::max));
             by_vectors::<V, 1>([x], out, |[x]| exp(x.sub(top).mul(scale)));
-            let share = V::splat(1.0 / out.iter().sum::<f32>());
-            for value in out.as_chunks_mut::<LANES>().0 {
-                V::load(value).mul(share).store(value);
-            }
-            let mut lanes = [0.0; LANES];
-            share.store(&mut lanes);
-            out.as_chunks_mut::<LANES>().1.iter_mut().for_each(|value| *value *= lanes[0]);
+            let share = 1.0 / out.iter().sum::<f32>();
+            out.iter_mut().for_each(|value| *value *= share);
         }
     }
 }
@@ -372,27 +348,13 @@ impl CustomOp1 for Softmax {
     }
 
     fn bwd(&self, _arg: &Tensor, res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
-        let gradient = SoftmaxGradient { scale: self.scale, width: self.width };
-        res.contiguous()?.apply_op2_no_bwd(&grad.contiguous()?, &gradient).map(Some)
-    }
-}
-
-impl CustomOp2 for SoftmaxGradient {
-    fn name(&self) -> &'static str {
-        "softmax-gradient"
-    }
-
-    fn cpu_fwd(&self, shares: &CpuStorage, layout: &Layout, grad: &CpuStorage, grad_layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (shares, grad) = (values(shares, layout)?, values(grad, grad_layout)?);
-        let mut out = vec![0.0; shares.len()];
-        let rows = shares.chunks_exact(self.width).zip(grad.chunks_exact(self.width)).zip(out.chunks_exact_mut(self.width));
-        for ((shares, grad), out) in rows {
-            let mean: f32 = shares.iter().zip(grad).map(|(share, grad)| share * grad).sum();
-            for ((out, share), grad) in out.iter_mut().zip(shares).zip(grad) {
-                *out = self.scale * share * (grad - mean);
-            }
-        }
-        Ok((CpuStorage::F32(out), layout.shape().clone()))
+        from_values([res, grad], res.shape(), |[shares, upstream]| {
+            let mut out = vec![0.0; shares.len()];
+            let rows = shares.chunks_exact(self.width).zip(upstream.chunks_exact(self.width)).zip(out.chunks_exact_mut(self.width));
+            rows.for_each(|((shares, upstream), out)| softmax_gradient(self.scale, shares, upstream, out));
+            out
+        })
+        .map(Some)
     }
 }
 
@@ -423,25 +385,17 @@ mod tests {
         let own = |mean: f32, width: usize| Var::randn(mean, 0.5f32, width, &Device::Cpu).expect("a tensor");
         for shape in [[15, 64], [7, 33], [1, 16], [2, 3]] {
             let bias = [own(0.0, shape[1])];
-            check("gelu", &shape, |x| activate(&x[0], &x[1], Activation::Gelu), |x| x[0].broadcast_add(&x[1])?.gelu(), &bias);
-            check("silu", &shape, |x| activate(&x[0], &x[1], Activation::Silu), |x| x[0].broadcast_add(&x[1])?.silu(), &bias);
+            for activation in [Activation::Gelu, Activation::Silu] {
+                let node = |x: &[Var]| activate(&x[0], &x[1], activation);
+                check(&format!("{activation:?}"), &shape, node, |x| in_operations::activate(&x[0], &x[1], activation), &bias);
+            }
         }
         for shape in [&[3, 5, 64][..], &[7, 33], &[1, 16], &[2, 3]] {
-            let plain = |x: &[Var]| {
-                let scaled = (x[0].as_tensor() * 0.3)?;
-                let shifted = scaled.exp()?;
-                shifted.broadcast_div(&shifted.sum_keepdim(D::Minus1)?)
-            };
-            check("softmax", shape, |x| softmax(&x[0], 0.3), plain, &[]);
+            check("softmax", shape, |x| softmax(&x[0], 0.3), |x| in_operations::softmax(&x[0], 0.3), &[]);
         }
         for shape in [&[3, 5, 64][..], &[9, 16], &[1, 128]] {
             let width = shape[shape.len() - 1];
-            let plain = |x: &[Var]| {
-                let centred = x[0].broadcast_sub(&x[0].mean_keepdim(D::Minus1)?)?;
-                let variance = centred.sqr()?.mean_keepdim(D::Minus1)?;
-                let normal = centred.broadcast_div(&(variance + f64::from(NORM_EPS))?.sqrt()?)?;
-                normal.broadcast_mul(&x[1])?.broadcast_add(&x[2])
-            };
+            let plain = |x: &[Var]| in_operations::layer_norm(&x[0], &x[1], &x[2]);
             check("layer norm", shape, |x| layer_norm(&x[0], &x[1], &x[2]), plain, &[own(1.0, width), own(0.0, width)]);
         }
     }

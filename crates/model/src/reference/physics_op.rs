@@ -2,13 +2,12 @@
 
 use std::sync::Arc;
 
-use candle_core::backend::BackendStorage;
-use candle_core::{CpuStorage, CudaStorage, CustomOp1, CustomOp2, Layout, Result, Shape, Tensor, bail};
+use candle_core::{CpuStorage, CudaStorage, CustomOp1, Layout, Result, Shape, Tensor, bail};
 use nesam_physics::scalar::{Dual, f32x8};
 use nesam_physics::step::StepModel;
 use rayon::prelude::*;
 
-use super::host::{there_and_back, values};
+use super::host::{from_values, there_and_back, values};
 use crate::rollout::Variant;
 use crate::step_row::{COLUMNS, CONSTANT, DIFFERENTIABLE, OUTPUTS, step_input};
 use crate::symbolic::symbolic_step;
@@ -16,7 +15,6 @@ use crate::symbolic::symbolic_step;
 const LANES: usize = 8;
 
 struct Step(Variant, Arc<StepModel>);
-struct StepGradient(Variant, Arc<StepModel>);
 
 /// Columns `from..from + N` of eight rows as lanes; rows past the end repeat the last one.
 fn lanes<const N: usize>(packed: &[f32], base: usize, from: usize) -> [f32x8; N] {
@@ -25,7 +23,7 @@ fn lanes<const N: usize>(packed: &[f32], base: usize, from: usize) -> [f32x8; N]
 }
 
 /// `N` columns of every row; `of` computes those of the eight rows from one on. Eights are shared among the threads of the pool this runs in.
-fn by_eights<const N: usize>(rows: usize, of: impl Fn(usize) -> [f32x8; N] + Sync) -> CpuStorage {
+fn by_eights<const N: usize>(rows: usize, of: impl Fn(usize) -> [f32x8; N] + Sync) -> Vec<f32> {
     let mut out = vec![0f32; rows * N];
     out.par_chunks_mut(LANES * N).enumerate().for_each(|(eight, out)| {
         let columns = of(eight * LANES).map(f32x8::to_array);
@@ -33,7 +31,7 @@ fn by_eights<const N: usize>(rows: usize, of: impl Fn(usize) -> [f32x8; N] + Syn
             row.iter_mut().zip(&columns).for_each(|(value, column)| *value = column[lane]);
         }
     });
-    CpuStorage::F32(out)
+    out
 }
 
 impl CustomOp1 for Step {
@@ -48,7 +46,7 @@ impl CustomOp1 for Step {
             let input = step_input::<f32x8>(lanes(packed, base, 0), lanes::<CONSTANT>(packed, base, DIFFERENTIABLE));
             symbolic_step(self.0, &self.1, &input).increment.to_array()
         });
-        Ok((increments, Shape::from((rows, OUTPUTS))))
+        Ok((CpuStorage::F32(increments), Shape::from((rows, OUTPUTS))))
     }
 
     fn cuda_fwd(&self, storage: &CudaStorage, layout: &Layout) -> Result<(CudaStorage, Shape)> {
@@ -56,20 +54,15 @@ impl CustomOp1 for Step {
     }
 
     fn bwd(&self, arg: &Tensor, _res: &Tensor, grad: &Tensor) -> Result<Option<Tensor>> {
-        let gradient = StepGradient(self.0, self.1.clone());
-        Ok(Some(arg.contiguous()?.apply_op2_no_bwd(&grad.contiguous()?, &gradient)?))
+        from_values([arg, grad], arg.shape(), |[packed, upstream]| self.gradient(packed, upstream)).map(Some)
     }
 }
 
-impl CustomOp2 for StepGradient {
-    fn name(&self) -> &'static str {
-        "physics-step-gradient"
-    }
-
-    fn cpu_fwd(&self, storage: &CpuStorage, layout: &Layout, grad: &CpuStorage, grad_layout: &Layout) -> Result<(CpuStorage, Shape)> {
-        let (packed, upstream) = (values(storage, layout)?, values(grad, grad_layout)?);
+impl Step {
+    /// Gradient by packed inputs (rows, `COLUMNS`), given that by the increments (rows, 12).
+    fn gradient(&self, packed: &[f32], upstream: &[f32]) -> Vec<f32> {
         let rows = packed.len() / COLUMNS;
-        let gradients = by_eights::<COLUMNS>(rows, |base| {
+        by_eights::<COLUMNS>(rows, |base| {
             let varying = lanes::<DIFFERENTIABLE>(packed, base, 0);
             let varying: [Dual<f32x8, DIFFERENTIABLE>; DIFFERENTIABLE] = core::array::from_fn(|k| Dual::variable(varying[k], k));
             let constant = lanes::<CONSTANT>(packed, base, DIFFERENTIABLE).map(Dual::constant);
@@ -81,13 +74,7 @@ impl CustomOp2 for StepGradient {
                 0..DIFFERENTIABLE => (0..OUTPUTS).fold(f32x8::ZERO, |sum, o| sum + increment[o].eps[column] * weight[o]),
                 _ => f32x8::ZERO,
             })
-        });
-        Ok((gradients, Shape::from((rows, COLUMNS))))
-    }
-
-    fn cuda_fwd(&self, storage: &CudaStorage, layout: &Layout, grad: &CudaStorage, grad_layout: &Layout) -> Result<(CudaStorage, Shape)> {
-        let grad = grad.to_cpu_storage()?;
-        there_and_back(storage, |storage| self.cpu_fwd(storage, layout, &grad, grad_layout))
+        })
     }
 }
 

@@ -5,16 +5,15 @@ use std::sync::Arc;
 use candle_core::{Result, Tensor};
 use nesam_physics::step::StepModel;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, wrap_angle};
-use nesam_terrain::{Pose2, WorldMap};
 
 use super::device::ComputeDevice;
 use super::network::Network;
 use super::rollout::{ReferenceRollout, Row, TerrainProvider};
-use crate::dims::{HIDDEN, HISTORY};
+use crate::ModelError;
+use crate::dims::HIDDEN;
 use crate::ground::{GroundSource, history_actuators};
-use crate::predictor::Predictor;
-use crate::rollout::{HistoryStep, RolloutQuery, Variant};
-use crate::{ModelError, TerrainToken};
+use crate::predictor::{Predictor, control, pose, validate};
+use crate::rollout::{RolloutQuery, remembered};
 
 /// A predictor whose network is made of candle tensors; terrain tokens are those of the fast path.
 pub struct ReferencePredictor {
@@ -43,29 +42,30 @@ impl ReferencePredictor {
     /// States of every candidate after each step, (samples, horizon, 12), as [`crate::Rollout::states`].
     ///
     /// # Errors
-    /// `ModelError::Query` when the query corrects the soil, which the reference does not know; a candle error.
+    /// As [`Predictor::rollout`]; `ModelError::Query` also when the query corrects the soil or gives measured wheels, which the reference does not know; a
+    /// candle error.
     pub fn rollout(&self, query: &RolloutQuery<'_>) -> std::result::Result<Vec<f32>, ModelError> {
-        if query.soil_correction != SoilCorrection::NONE {
-            return Err(ModelError::Query { field: "soil_correction", reason: "the reference knows none".into() });
+        validate(query)?;
+        for (field, known) in [("soil_correction", query.soil_correction == SoilCorrection::NONE), ("wheels", query.wheels.is_none())] {
+            if !known {
+                return Err(ModelError::Query { field, reason: "the reference knows none".into() });
+            }
         }
-        let bundle = self.predictor.bundle();
-        let variant = if query.variant == Variant::Full { bundle.form } else { query.variant };
+        let (scales, variant) = (&self.predictor.bundle().normalization, self.predictor.form_of(query));
         let ground = GroundSource::new(query.map.map(Arc::as_ref), &self.model, &query.start);
-        let history = remembered(query);
-        let row = |commands: &[f32]| {
-            let command = |c: &[f32]| Control { speed_m_s: f64::from(c[0]), second: f64::from(c[1]) };
-            let controls: Vec<Control<f64>> = commands.chunks_exact(2).map(command).collect();
-            let dt_s = bundle.normalization.dt_s;
+        let history = remembered(query.history);
+        let row = |sample: usize| {
+            let controls: Vec<Control<f64>> = (0..query.horizon).map(|k| control(query, sample, k)).collect();
             Row {
-                actuators: history_actuators(&self.model, history, &query.start, &controls[0], dt_s),
+                actuators: history_actuators(&self.model, history, &query.start, &controls[0], scales.dt_s),
                 history: history.to_vec(),
                 start: query.start,
                 controls,
                 ground,
             }
         };
-        let rows: Vec<Row<'_>> = query.controls.chunks_exact(2 * query.horizon).map(row).collect();
-        let rollout = ReferenceRollout { network: &self.network, model: &self.model, scales: &bundle.normalization, variant };
+        let rows: Vec<Row<'_>> = (0..query.samples).map(row).collect();
+        let rollout = ReferenceRollout { network: &self.network, model: &self.model, scales, variant };
         let steps = rollout.run(&rows, query.horizon, &mut Tokens { reference: self, query })?;
         let mut states = vec![0f32; rows.len() * query.horizon * STATE_DIM];
         for (k, step) in steps.iter().enumerate() {
@@ -80,11 +80,6 @@ impl ReferencePredictor {
     }
 }
 
-/// The part of a query's history that the network has positions for.
-fn remembered<'a>(query: &RolloutQuery<'a>) -> &'a [HistoryStep] {
-    &query.history[query.history.len().saturating_sub(HISTORY - 1)..]
-}
-
 /// Terrain tokens as the fast path sees them.
 struct Tokens<'a> {
     reference: &'a ReferencePredictor,
@@ -92,10 +87,8 @@ struct Tokens<'a> {
 }
 
 impl Tokens<'_> {
-    fn tensors(&self, states: impl Iterator<Item = VehicleState<f64>>) -> Result<(Tensor, Tensor)> {
-        let pose = |s: VehicleState<f64>| Pose2 { x_m: s.position_m[0], y_m: s.position_m[1], yaw_rad: s.attitude_rad[2] };
-        let map: Option<&Arc<WorldMap>> = self.query.map;
-        let tokens: Vec<TerrainToken> = self.reference.predictor.terrain_tokens(map, &states.map(pose).collect::<Vec<_>>());
+    fn tensors<'s>(&self, states: impl Iterator<Item = &'s VehicleState<f64>>) -> Result<(Tensor, Tensor)> {
+        let tokens = self.reference.predictor.terrain_tokens(self.query.map, &states.map(pose).collect::<Vec<_>>());
         let device = self.reference.network.device();
         let context: Vec<f32> = tokens.iter().flat_map(|token| &token[..HIDDEN]).copied().collect();
         let soil: Vec<f32> = tokens.iter().flat_map(|token| &token[HIDDEN..]).copied().collect();
@@ -106,11 +99,11 @@ impl Tokens<'_> {
 impl TerrainProvider for Tokens<'_> {
     fn history(&mut self) -> Result<Tensor> {
         // The same for every candidate.
-        let (context, _) = self.tensors(remembered(self.query).iter().map(|step| step.state))?;
+        let (context, _) = self.tensors(remembered(self.query.history).iter().map(|step| &step.state))?;
         context.repeat((self.query.samples, 1))
     }
 
     fn at(&mut self, _k: usize, states: &[VehicleState<f64>]) -> Result<(Tensor, Tensor)> {
-        self.tensors(states.iter().copied())
+        self.tensors(states.iter())
     }
 }
