@@ -68,3 +68,17 @@ fn service_pinned_workers_stay_on_one_processor_each() {
     let available = std::thread::available_parallelism().unwrap().get();
     assert_eq!(distinct.len(), available.min(3));
 }
+
+/// The system must not make huge pages of what a server has given back (ADR 0056).
+#[test]
+#[cfg(target_os = "linux")]
+fn service_memory_of_a_server_is_not_gathered_into_huge_pages() {
+    let here = tempfile::tempdir().unwrap();
+    let (mut server, _) = common::start(here.path(), &["--no-http"]);
+    let status = std::fs::read_to_string(format!("/proc/{}/status", server.id())).unwrap();
+    server.kill().unwrap();
+    server.wait().unwrap();
+    let enabled = status.lines().find_map(|line| line.strip_prefix("THP_enabled:"));
+    // Kernels before 5.0 do not tell.
+    assert!(enabled.is_none_or(|value| value.trim() == "0"), "{enabled:?}");
+}

@@ -11,7 +11,7 @@ use nesam_server::{Config, RunningServer, ZenohConfig, access, serve, start_work
 use tracing_subscriber::EnvFilter;
 
 use crate::args::BundleArgs;
-use crate::environment::{PURGE_DELAY, restart_with};
+use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::sources::{load_bundle, rounded};
@@ -75,7 +75,7 @@ pub struct ServeArgs {
 /// Runs the command.
 pub fn run(args: &ServeArgs) -> Result<(), Failure> {
     // Longer than the pause between the questions of a planner.
-    restart_with(&[(PURGE_DELAY, "1000")])?;
+    restart_with(&OF_A_SERVER)?;
     let config = configuration(args)?;
     log_to_stderr("info");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;

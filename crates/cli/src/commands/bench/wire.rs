@@ -12,7 +12,7 @@ use serde_json::{Value, json};
 use super::{DRIVEN, percentile, straight_on};
 use crate::args::BundleArgs;
 use crate::commands::serve::start;
-use crate::environment::{PURGE_DELAY, restart_with};
+use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{command_line, say, write_file};
 use crate::progress::Progress;
@@ -68,7 +68,7 @@ pub(super) fn run(args: &WireBench) -> Result<(), Failure> {
     if args.queries == 0 {
         return Err(Failure::input("--queries must be at least 1"));
     }
-    restart_with(&[(PURGE_DELAY, "1000")])?; // as `nesam serve`
+    restart_with(&OF_A_SERVER)?;
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(measure(args, bundle))
