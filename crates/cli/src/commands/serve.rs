@@ -74,7 +74,6 @@ pub struct ServeArgs {
 
 /// Runs the command.
 pub fn run(args: &ServeArgs) -> Result<(), Failure> {
-    // Longer than the pause between the questions of a planner.
     restart_with(&OF_A_SERVER)?;
     let config = configuration(args)?;
     log_to_stderr("info");
