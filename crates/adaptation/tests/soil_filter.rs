@@ -106,7 +106,7 @@ fn property_twin_errors_are_as_large_as_the_filter_says() {
     let coordinates = SoilCoordinates::Logarithmic;
     let truth = coordinates.between(&LOAM, &SOFT);
     let (mut inside, mut all) = (0, 0);
-    for seed in 0..12 {
+    for seed in 0..24 {
         let (filter, _) = run(config(coordinates), &model, &twin(&model, SOFT, LOAM, 200, seed));
         let posterior = filter.posterior();
         for i in (0..SOIL_DIM).filter(|i| posterior.learned[*i]) {
@@ -115,7 +115,7 @@ fn property_twin_errors_are_as_large_as_the_filter_says() {
         }
     }
     println!("{inside} of {all} learned parameters within 2.5 standard deviations");
-    assert!(all > 12 && inside as f64 > 0.7 * all as f64, "{inside} of {all}");
+    assert!(all > 24 && inside as f64 > 0.7 * all as f64, "{inside} of {all}");
 }
 
 #[test]

@@ -81,6 +81,27 @@ fn property_soil_that_is_pressed_fast_still_carries_the_load() {
     assert!(shallower < 0.6, "soft soil under a fast wheel: {shallower}");
 }
 
+#[test]
+fn property_a_wheel_about_to_lift_off_carries_what_presses_it() {
+    let wheel = WheelGeometry::new(RADIUS_M, WIDTH_M).with_law(ContactLaw::SoilContactModel);
+    let soils = [clay(), Soil { k_phi: 1.3e5, n: 0.8, c: 1700.0, phi: 0.14, ..clay() }, Soil { k_phi: 1.2e7, n: 0.9, ..clay() }];
+    let motion = WheelMotion { rim_speed_m_s: 2.2, forward_m_s: 2.0, left_m_s: 0.1 }.contact().1;
+    let mut furthest = [0.0f64; 2];
+    for (soil, preload_n) in soils.iter().flat_map(|soil| [-2000.0, -200.0, -20.0, 0.0, 20.0, 200.0, 2000.0].map(|n| (soil, n))) {
+        let support = Support { preload_n, rate_n_m: 2.5e5 };
+        let single = |x: f64| x as f32;
+        let support_f32 = Support { preload_n: single(preload_n), rate_n_m: 2.5e5 };
+        let z_f32 = balance_sinkage(&wheel, &support_f32, &motion.map(single), &Soil::from_array(soil.to_array().map(single)));
+        for (z, furthest) in [balance_sinkage(&wheel, &support, &motion, soil), f64::from(z_f32)].into_iter().zip(&mut furthest) {
+            let pressed = support.preload_n - support.rate_n_m * z;
+            let pressed = 0.5 * (pressed + (pressed * pressed + 4.0).sqrt());
+            *furthest = furthest.max((wheel_wrench(&wheel, z, &motion, soil).normal_n - pressed).abs());
+        }
+    }
+    // A quarter of a newton is the least that a contact carries.
+    assert!(furthest.iter().all(|newtons| *newtons < 0.3), "off by {furthest:?} N in f64 and f32");
+}
+
 /// Thrust and side force of columns of soil that a wheel rolls over, each sheared by what has slid past it (the law of the nodes).
 fn marched(z: f64, slip: f64, tan_slip_angle: f64, soil: &Soil<f64>) -> [f64; 2] {
     let (rim, travel) = (1.0, if slip >= 0.0 { 1.0 - slip } else { 1.0 / (1.0 + slip) });

@@ -70,6 +70,16 @@ pub fn sin_cos<V: Vector>(x: V) -> (V, V) {
     (sin_positive.select_ge0(s, s.neg()), cos_positive.select_ge0(c, c.neg()))
 }
 
+/// (sin x, cos x) for |x| <= 1.58, a little more than a quarter turn, with an error below 2e-7.
+#[inline(always)]
+pub fn sin_cos_of_half_turn<V: Vector>(x: V) -> (V, V) {
+    let square = x.mul(x);
+    let sine = square.mul(x).mul_add(polynomial(square, [-0.166_666_57, 0.008_333_006, -1.980_581_1e-4, 2.598_275_2e-6]), x);
+    let fourth = square.mul(square);
+    let tail = polynomial(square, [0.041_666_657, -0.001_388_855_7, 2.476_855_3e-5, -2.617_818e-7]);
+    (sine, fourth.mul_add(tail, square.mul_add(V::splat(-0.5), V::splat(1.0))))
+}
+
 /// arctan x with an error below 2e-7.
 #[inline(always)]
 pub fn atan<V: Vector>(x: V) -> V {
@@ -143,17 +153,19 @@ mod tests {
     use super::super::vector::{Kernel, LANES, Lane, Path};
     use super::*;
 
-    /// All functions of one lane of numbers: exp, ln of the absolute, sin, cos, atan, tanh, gelu, silu.
+    /// All functions of one lane of numbers: exp, ln of the absolute, sin, cos, atan, tanh, gelu, silu, sin and cos of half a turn.
     struct Functions(Lane);
 
     impl Kernel for Functions {
-        type Output = [Lane; 8];
+        type Output = [Lane; 10];
         #[inline(always)]
         fn run<V: Vector>(self) -> Self::Output {
             let x = V::load(&self.0.0);
             let (sin, cos) = sin_cos(x);
-            let mut out = [Lane::ZERO; 8];
-            for (out, value) in out.iter_mut().zip([exp(x), ln(x.abs()), sin, cos, atan(x), tanh(x), gelu(x), silu(x)]) {
+            let (sin_near, cos_near) = sin_cos_of_half_turn(x);
+            let mut out = [Lane::ZERO; 10];
+            for (out, value) in out.iter_mut().zip([exp(x), ln(x.abs()), sin, cos, atan(x), tanh(x), gelu(x), silu(x), sin_near, cos_near])
+            {
                 value.store(&mut out.0);
             }
             out
@@ -184,6 +196,9 @@ mod tests {
                 assert!(x == 0.0 || (of(1) - ln).abs() < 5e-8f64.max(2e-7 * ln.abs()), "ln {x}: {} {ln}", of(1));
                 if x.abs() < 1000.0 {
                     assert!((of(2) - x.sin()).abs() < 2e-7 && (of(3) - x.cos()).abs() < 2e-7, "sin, cos {x}: {} {}", of(2), of(3));
+                }
+                if x.abs() <= 1.58 {
+                    assert!((of(8) - x.sin()).abs() < 2e-7 && (of(9) - x.cos()).abs() < 2e-7, "sin, cos {x}: {} {}", of(8), of(9));
                 }
                 assert!((of(4) - x.atan()).abs() < 2e-7, "atan {x}: {}", of(4));
                 assert!((of(5) - x.tanh()).abs() < 2e-7, "tanh {x}: {}", of(5));

@@ -50,6 +50,7 @@ impl<V: Vector> Neg for Numbers<V> {
 impl<V: Vector> Real for Numbers<V> {
     type Value = Self;
     const PLAIN: bool = true;
+    const SINGLE: bool = true;
     type Four = Self;
     #[inline(always)]
     fn value(self) -> Self {
@@ -78,6 +79,11 @@ impl<V: Vector> Real for Numbers<V> {
     #[inline(always)]
     fn sin_cos(self) -> (Self, Self) {
         let (sin, cos) = elementary::sin_cos(self.0);
+        (Self(sin), Self(cos))
+    }
+    #[inline(always)]
+    fn sin_cos_of_half_turn(self) -> (Self, Self) {
+        let (sin, cos) = elementary::sin_cos_of_half_turn(self.0);
         (Self(sin), Self(cos))
     }
     #[inline(always)]

@@ -95,6 +95,7 @@ impl<T: Real, const N: usize> Neg for Dual<T, N> {
 impl<T: Real, const N: usize> Real for Dual<T, N> {
     type Value = T;
     const PLAIN: bool = false;
+    const SINGLE: bool = false;
     type Four = Dual<T::Four, N>;
     #[inline(always)]
     fn abreast([a, b, c, d]: [&Self; 4]) -> Option<Self::Four> {

@@ -22,6 +22,8 @@ pub trait Real:
     type Value: Real;
     /// Whether a number is its value and no more.
     const PLAIN: bool;
+    /// Whether it is a plain number of single precision: what is below that is not worth another step of an iteration.
+    const SINGLE: bool;
     /// Four numbers side by side, one for each wheel; lanes, which have no room for wheels, name themselves.
     type Four: Real;
 
@@ -49,6 +51,11 @@ pub trait Real:
     fn sqrt(self) -> Self;
     /// Sine and cosine.
     fn sin_cos(self) -> (Self, Self);
+    /// Sine and cosine of an angle within ±π/2, which need not be brought there first.
+    #[inline(always)]
+    fn sin_cos_of_half_turn(self) -> (Self, Self) {
+        self.sin_cos()
+    }
     /// Arc tangent.
     fn atan(self) -> Self;
     /// `a` where `condition >= 0`, else `b`. Derivatives follow the chosen branch.

@@ -61,6 +61,7 @@ macro_rules! impl_real_for_float {
 macro_rules! impl_real_for_lanes {
     ($lanes:ty, $float:ty) => {
         impl_real!($lanes {
+            const SINGLE: bool = <$float as Real>::SINGLE;
             type Four = Self;
             #[inline(always)]
             fn lit(x: f64) -> Self {
@@ -75,9 +76,11 @@ macro_rules! impl_real_for_lanes {
 }
 
 impl_real_for_float!(f32 {
+    const SINGLE: bool = true;
     type Four = Self;
 });
 impl_real_for_float!(f64 {
+    const SINGLE: bool = false;
     type Four = f64x4;
     #[inline(always)]
     fn abreast(four: [&Self; 4]) -> Option<f64x4> {

@@ -4,7 +4,7 @@ use crate::scalar::{Dual, Real};
 use crate::soil::Soil;
 use crate::terramechanics::pressure_sinkage::bekker_sinkage;
 use crate::terramechanics::slip::ContactMotion;
-use crate::terramechanics::wheel::{WheelGeometry, viscous_rate_n_m, wheel_wrench};
+use crate::terramechanics::wheel::{ContactLaw, WheelGeometry, viscous_rate_n_m, wheel_wrench};
 
 /// Exponents that W may have between two sinkages, and the least ratio of these (as a logarithm) that tells one.
 const EXPONENT: [f64; 2] = [0.3, 4.0];
@@ -23,7 +23,8 @@ pub struct Support<T> {
 ///
 /// W is taken for a power law around each iterate, which makes Newton's method converge in a few steps without branches: of exponent n + 1/2 first (Bekker's
 /// wheel), then of the exponent between the first two iterates, which leaves an error of ln z of 1e-8 in the median of random contacts (3e-7 in nine of ten). These
-/// two steps run on plain values; a last one with the exact slope, on `T`, squares the error and gives the derivatives of the implicit function.
+/// two steps run on plain values, and single precision tells no more, but on damped soil; a last one with the exact slope, on `T`, squares the error and gives the
+/// derivatives of the implicit function.
 /// A support that lifts off (preload ≤ 0) gives a vanishing sinkage.
 #[inline(always)]
 pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, motion: &ContactMotion<T>, soil: &Soil<T>) -> T {
@@ -42,6 +43,9 @@ pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, mot
     let (excess_n, carried_n) = residual(wheel, z, &support_value, &motion_value, &soil_value);
     let exponent = exponent_between(first, (z, carried_n), wheel_exponent);
     z = power_law_step(wheel, z, excess_n, carried_n, exponent, &support_value);
+    if T::SINGLE && wheel.law == ContactLaw::SoilContactModel && !wheel.is_damped() {
+        return T::from_value(z);
+    }
     // Last step on `T`: the exact slope of the residual makes z - f / f' carry the derivatives of the implicit function.
     let Dual { re: excess_n, eps: [slope] } = residual_with_slope(wheel, z, &support_value, &motion_value, &soil_value);
     let z = T::from_value(z);
@@ -72,10 +76,14 @@ fn residual_with_slope<V: Real>(
     residual(wheel, Dual::variable(z, 0), &support, &motion, &soil).0
 }
 
-/// A Newton step from z with the excess f and the force W there, by the slope of a power law of an exponent.
+/// A Newton step from z with the excess f and the force W there, by the slope of a power law of an exponent and that of the support, which lets go where the
+/// wheel lifts off.
 #[inline(always)]
 fn power_law_step<V: Real>(wheel: &WheelGeometry, z: V, excess_n: V, carried_n: V, exponent: V, support: &Support<V>) -> V {
-    bounded(z, z - excess_n / (exponent * carried_n / z + support.rate_n_m), wheel)
+    // Slope of `relu_smooth(pushed, 1)`, whose value is W - f.
+    let pushed = support.preload_n - support.rate_n_m * z;
+    let rate_n_m = support.rate_n_m * (carried_n - excess_n) / (pushed.sqr() + V::lit(4.0)).sqrt();
+    bounded(z, z - excess_n / (exponent * carried_n / z + rate_n_m), wheel)
 }
 
 /// Exponent of the power law through two pairs (z, W); `other` where they are too close to tell.

@@ -179,12 +179,12 @@ fn integrated<T: Real, const DAMPED: bool>(
     let mut sum = WheelWrench { thrust_n: zero, resistance_n: zero, side_n: zero, normal_n: zero, torque_n_m: zero };
     for &(t2, weight) in wheel.rule.nodes() {
         let theta_front = entry - front * T::lit(t2);
-        let front_trig = theta_front.sin_cos();
+        let front_trig = theta_front.sin_cos_of_half_turn();
         // The rear branch mirrors the front stress (Wong & Reece 1967): one evaluation of depth^n serves both.
         let still = normal_stress((front_trig.1 - cos_entry) * T::lit(radius), wheel.width_m, soil);
         let still_strength = mohr_coulomb(still, tan_phi, soil);
         let theta_rear = exit + rear * T::lit(t2);
-        for (theta, (sin, cos), arc) in [(theta_front, front_trig, front), (theta_rear, theta_rear.sin_cos(), rear)] {
+        for (theta, (sin, cos), arc) in [(theta_front, front_trig, front), (theta_rear, theta_rear.sin_cos_of_half_turn(), rear)] {
             let (sigma, strength) = if DAMPED {
                 let sigma = (still + viscous * sin).max(zero);
                 (sigma, mohr_coulomb(sigma, tan_phi, soil))

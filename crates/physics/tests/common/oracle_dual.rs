@@ -45,6 +45,7 @@ impl<const N: usize> Neg for Nd<N> {
 
 impl<const N: usize> Real for Nd<N> {
     type Value = f64;
+    const SINGLE: bool = false;
     const PLAIN: bool = false;
     type Four = Self;
     fn value(self) -> f64 {
