@@ -15,6 +15,7 @@ use tokio::time::{sleep_until, timeout};
 use super::{DRIVEN, percentile, straight_on};
 use crate::args::BundleArgs;
 use crate::commands::serve::start;
+use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{command_line, say, write_file};
 use crate::sources::load_bundle;
@@ -80,6 +81,7 @@ pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
     if args.vehicles == 0 || args.greedy == 0 || args.samples == 0 || args.horizon == 0 || !positive {
         return Err(Failure::input("all options must be positive".to_string()));
     }
+    restart_with(&OF_A_SERVER)?;
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(measure(args, bundle))
