@@ -12,7 +12,7 @@ import nesam
 import scaling
 import soak
 import traffic
-from services import REPLICAS, Fleet
+from services import REPLICAS, Fleet, slow_disk, why_no_slow_disk
 
 VEHICLES = 6
 ZENOH_VEHICLES = 2
@@ -20,15 +20,18 @@ ZENOH_VEHICLES = 2
 FAULT_AFTER_S = 2.0
 TAKEOVER_S = 2.0
 """Longest time that a planner may go without an answer, besides its own pause between two calls."""
+SYNC_S = 0.1
+"""How much longer each write to a slow disk takes."""
+CUTS, SLOW_DISKS = "cuts", "slow disks"
 IDLE_S = 20.0
 """Time after which a session that nobody uses is closed, or removed where no server has it."""
 
 
 class Check:
-    """One fault under load. `needs_cut`: only where hosts can be cut off; `members`: only with so many members of etcd."""
+    """One fault under load. `needs`: what this machine has to allow, CUTS or SLOW_DISKS; `members`: only with so many members of etcd."""
 
-    def __init__(self, name, what, fault, needs_cut=False, takes_over=True, members=1):
-        self.name, self.what, self.fault, self.needs_cut, self.takes_over, self.members = name, what, fault, needs_cut, takes_over, members
+    def __init__(self, name, what, fault, needs=None, takes_over=True, members=1):
+        self.name, self.what, self.fault, self.needs, self.takes_over, self.members = name, what, fault, needs, takes_over, members
 
 
 def victim(fleet, run):
@@ -82,6 +85,15 @@ def cut_from_all(fleet, run):
 
 
 def slow_store(fleet, run):
+    with slow_disk(fleet.processes[fleet.leader()].pid, SYNC_S):
+        write_s = fleet.write_s()
+        time.sleep(3.0)
+    if write_s < SYNC_S:
+        run.violations.append(f"the disk of etcd is not slow: a write takes {write_s:.2f} s")
+    yield
+
+
+def store_stutters(fleet, run):
     leader = fleet.processes[fleet.leader()]
     for _ in range(6):
         leader.signal(signal.SIGSTOP)
@@ -125,9 +137,10 @@ def upgrade(fleet, run):
 CHECKS = [
     Check("kill", "SIGKILL of the replica with most sessions", kill),
     Check("stop", "SIGSTOP of an owner, SIGCONT when others have its sessions", stop_and_resume),
-    Check("partition-store", "an owner cut off from etcd, not from its clients", cut_from_etcd, needs_cut=True),
-    Check("partition", "an owner cut off from everybody", cut_from_all, needs_cut=True),
-    Check("slow-store", "etcd, of several members the leader, stopped for 0.3 s, six times in 3 s", slow_store, takes_over=False),
+    Check("partition-store", "an owner cut off from etcd, not from its clients", cut_from_etcd, needs=CUTS),
+    Check("partition", "an owner cut off from everybody", cut_from_all, needs=CUTS),
+    Check("slow-store", f"a disk of etcd, of several members of the leader, that takes {SYNC_S} s longer for each write, for 3 s", slow_store, needs=SLOW_DISKS),
+    Check("store-stutters", "etcd, of several members the leader, stopped for 0.3 s, six times in 3 s", store_stutters, takes_over=False),
     Check("store-restart", "SIGKILL of etcd, of several members of the leader, and restart", store_restarts, takes_over=False),
     Check("store-leader", "SIGKILL of the leading member of etcd, restart after the drives", store_leader_dies, members=3),
     Check("router-restart", "SIGKILL of the Zenoh router and restart", router_restarts, takes_over=False),
@@ -275,13 +288,14 @@ def main():
             print("\n".join(violations) or "holds")
             return 1 if violations else 0
         oracle = traffic.without_failures(arguments.server, lambda command: hosts.command("client", command))
+        missing = {CUTS: "" if hosts.can_cut else "needs network namespaces", SLOW_DISKS: why_no_slow_disk()}
         row("check", "result", dict(zip(COLUMNS, COLUMNS)), "what happens, two seconds after the start of the drives")
         for check in CHECKS:
             if (only and check.name not in only) or check.members > arguments.members:
                 continue
-            if check.needs_cut and not hosts.can_cut:
+            if missing.get(check.needs):
                 skipped.append(check.name)
-                row(check.name, "not run", {}, "needs network namespaces")
+                row(check.name, "not run", {}, missing[check.needs])
                 continue
             figures, violations, late = perform(check, fleet, oracle, 1)
             if late and not violations:

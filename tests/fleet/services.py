@@ -1,6 +1,7 @@
 """The processes of the fleet: etcd, HAProxy with the shipped configuration, a Zenoh router, and the replicas."""
 
 import base64
+import contextlib
 import json
 import os
 import re
@@ -57,6 +58,43 @@ class Process:
     @property
     def pid(self):
         return self._child.pid
+
+
+@contextlib.contextmanager
+def slow_disk(pid, delay_s):
+    """While it lasts, each wait of a process for its disk takes so much longer. Raises OSError where processes cannot be traced."""
+    syncs = "fsync,fdatasync"
+    command = ["strace", "-f", "-qq", "-o", os.devnull, "-e", f"trace={syncs}", "-e", f"inject={syncs}:delay_exit={delay_s * 1e6:.0f}", "-p", str(pid)]
+    tracer = subprocess.Popen(command, stderr=subprocess.PIPE)
+    try:
+        if not _traced_by(pid, tracer):
+            raise OSError(f"strace: {tracer.communicate()[1].decode().strip()}")
+        yield
+    finally:
+        # It lets go of what it traces.
+        tracer.terminate()
+        tracer.communicate()
+
+
+def _traced_by(pid, tracer):
+    """Whether a process is traced, once its tracer has begun or given up."""
+    while tracer.poll() is None:
+        if f"TracerPid:\t{tracer.pid}\n" in Path(f"/proc/{pid}/status").read_text():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def why_no_slow_disk():
+    """Why disks cannot be slowed down here; empty if they can."""
+    with subprocess.Popen(["sleep", "60"]) as sleeper:
+        try:
+            with slow_disk(sleeper.pid, 1.0):
+                return ""
+        except OSError as error:
+            return str(error)
+        finally:
+            sleeper.kill()
 
 
 class Fleet:
@@ -165,6 +203,12 @@ class Fleet:
     def revision(self):
         with self._etcd("/v3/kv/range", {"key": base64.b64encode(b"x").decode()}) as reply:
             return int(json.load(reply)["header"]["revision"])
+
+    def write_s(self):
+        """How long etcd takes for a write."""
+        begun = time.monotonic()
+        self._etcd("/v3/kv/put", {"key": base64.b64encode(b"fleet/written").decode()}).close()
+        return time.monotonic() - begun
 
     def owners(self):
         """Name of the server that has each session."""
