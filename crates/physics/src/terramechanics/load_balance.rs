@@ -9,6 +9,8 @@ use crate::terramechanics::wheel::{ContactLaw, WheelGeometry, viscous_rate_n_m, 
 /// Exponents that W may have between two sinkages, and the least ratio of these (as a logarithm) that tells one.
 const EXPONENT: [f64; 2] = [0.3, 4.0];
 const LN_RATIO_MIN: f64 = 1e-3;
+/// Force over which a support ends smoothly, N.
+const LETS_GO_N: f64 = 1.0;
 
 /// What presses the wheel down: force = `preload_n` - `rate_n_m` · sinkage, never negative.
 #[derive(Clone, Copy, Debug)]
@@ -17,6 +19,20 @@ pub struct Support<T> {
     pub preload_n: T,
     /// Loss of force per metre of sinkage, N/m; 0 = dead load.
     pub rate_n_m: T,
+}
+
+impl<T: Real> Support<T> {
+    /// Force at a sinkage (m), N; smooth where the support lets go.
+    #[inline(always)]
+    fn pressed_n(&self, z: T) -> T {
+        (self.preload_n - self.rate_n_m * z).relu_smooth(LETS_GO_N)
+    }
+
+    /// Loss of force per metre at a sinkage (m) where it presses with `pressed_n`, N/m: the slope of [`Self::pressed_n`].
+    #[inline(always)]
+    fn rate_there_n_m(&self, z: T, pressed_n: T) -> T {
+        self.rate_n_m * pressed_n / ((self.preload_n - self.rate_n_m * z).sqr() + T::lit(4.0 * LETS_GO_N * LETS_GO_N)).sqrt()
+    }
 }
 
 /// Solves W(z; θ, slip) = preload - rate z for the sinkage z > 0, m.
@@ -57,7 +73,7 @@ pub fn balance_sinkage<T: Real>(wheel: &WheelGeometry, support: &Support<T>, mot
 #[inline(always)]
 fn residual<T: Real>(wheel: &WheelGeometry, z: T, support: &Support<T>, motion: &ContactMotion<T>, soil: &Soil<T>) -> (T, T) {
     let carried = wheel_wrench(wheel, z, motion, soil).normal_n;
-    (carried - (support.preload_n - support.rate_n_m * z).relu_smooth(1.0), carried)
+    (carried - support.pressed_n(z), carried)
 }
 
 /// f(z), N, with f'(z), N/m, by a dual number in z.
@@ -80,9 +96,7 @@ fn residual_with_slope<V: Real>(
 /// wheel lifts off.
 #[inline(always)]
 fn power_law_step<V: Real>(wheel: &WheelGeometry, z: V, excess_n: V, carried_n: V, exponent: V, support: &Support<V>) -> V {
-    // Slope of `relu_smooth(pushed, 1)`, whose value is W - f.
-    let pushed = support.preload_n - support.rate_n_m * z;
-    let rate_n_m = support.rate_n_m * (carried_n - excess_n) / (pushed.sqr() + V::lit(4.0)).sqrt();
+    let rate_n_m = support.rate_there_n_m(z, carried_n - excess_n);
     bounded(z, z - excess_n / (exponent * carried_n / z + rate_n_m), wheel)
 }
 
