@@ -141,17 +141,17 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
 }
 
-/// Share of short sleeps that end more than 1 ms late, for so long: what the machine alone adds to the times below.
+/// Share of short sleeps that end more than 1 ms late, for so long: what the machine alone may add to a time that is measured.
 fn woken_late(time: Duration) -> f64 {
     const SLEEP: Duration = Duration::from_millis(2);
-    let (begin, mut sleeps, mut late) = (Instant::now(), 0.0, 0.0);
+    let (begin, mut sleeps, mut late) = (Instant::now(), 0_u32, 0_u32);
     while begin.elapsed() < time {
         let slept = Instant::now();
         std::thread::sleep(SLEEP);
-        sleeps += 1.0;
-        late += f64::from(u8::from(slept.elapsed() > SLEEP + Duration::from_millis(1)));
+        sleeps += 1;
+        late += u32::from(slept.elapsed() > SLEEP + Duration::from_millis(1));
     }
-    late / sleeps
+    f64::from(late) / f64::from(sleeps)
 }
 
 fn name(vehicle: usize) -> String {
