@@ -77,9 +77,12 @@ struct Tally {
 
 /// Runs the command.
 pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
-    let positive = [args.deadline_ms, args.seconds].iter().chain(&args.loads).all(|v| *v > 0.0 && v.is_finite());
-    if args.vehicles == 0 || args.greedy == 0 || args.samples == 0 || args.horizon == 0 || !positive {
-        return Err(Failure::input("all options must be positive".to_string()));
+    let counts = [("--vehicles", args.vehicles), ("--greedy", args.greedy), ("--samples", args.samples), ("--horizon", args.horizon)];
+    let times = [("--deadline-ms", args.deadline_ms), ("--seconds", args.seconds)];
+    let loads = args.loads.iter().map(|load| ("--loads", *load));
+    let mut numbers = counts.map(|(name, count)| (name, count as f64)).into_iter().chain(times).chain(loads);
+    if let Some((name, value)) = numbers.find(|(_, value)| !(*value > 0.0 && value.is_finite())) {
+        return Err(Failure::input(format!("{name} must be positive and finite, not {value}")));
     }
     restart_with(&OF_A_SERVER)?;
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
