@@ -78,6 +78,11 @@ fn wavy_controls(samples: usize, horizon: usize) -> Vec<f32> {
     (0..samples * horizon).flat_map(|i| [2.0 + (i as f32 * 0.37).sin(), (i as f32 * 0.11).cos()]).collect()
 }
 
+/// With two threads 37 candidates are more than sixteen for each, and go in blocks of thirty-two.
+fn on_two_threads<R: Send>(work: impl FnOnce() -> R + Send) -> R {
+    rayon::ThreadPoolBuilder::new().num_threads(2).build().expect("two threads").install(work)
+}
+
 #[test]
 fn property_every_path_gives_the_same_bytes() {
     let map = hills();
@@ -85,13 +90,13 @@ fn property_every_path_gives_the_same_bytes() {
     let scales = measured_scales(&drive);
     let fastest = predictor(&scales, lively_weights(&scales));
     let past = drive.history(2, 33);
-    let (samples, horizon) = (19, 12);
+    let (samples, horizon) = (37, 12);
     let controls = wavy_controls(samples, horizon);
     let query = from_sample_33(&drive, &past, &controls, samples, &map);
-    let expected = fastest.rollout(&query).expect("a valid query");
+    let expected = on_two_threads(|| fastest.rollout(&query)).expect("a valid query");
     // Without a fused multiply-add in the target the portable path rounds otherwise.
     for path in Path::available().into_iter().filter(|path| cfg!(target_feature = "fma") || *path == fastest.path()) {
-        assert_eq!(fastest.on_path(path).rollout(&query).expect("a valid query"), expected, "on {}", path.as_str());
+        assert_eq!(on_two_threads(|| fastest.on_path(path).rollout(&query)).expect("a valid query"), expected, "on {}", path.as_str());
     }
     // A repeated query meets a warm cache, and other threads.
     assert_eq!(fastest.rollout(&query).expect("a valid query"), expected);
@@ -107,19 +112,25 @@ fn property_bf16_gives_the_same_bytes_on_every_path_and_touches_rollouts_alone()
     let scales = measured_scales(&drive);
     let in_f32 = predictor(&scales, lively_weights(&scales));
     let past = drive.history(2, 33);
-    let (samples, horizon) = (19, 12);
+    let (samples, horizon) = (37, 12);
     let controls = wavy_controls(samples, horizon);
     let query = from_sample_33(&drive, &past, &controls, samples, &map);
     let exact = in_f32.rollout(&query).expect("a valid query");
     for precision in IN_BF16 {
         let rounded = in_f32.in_precision(precision);
-        let expected = rounded.rollout(&query).expect("a valid query");
+        let expected = on_two_threads(|| rounded.rollout(&query)).expect("a valid query");
         assert_ne!(expected.states, exact.states, "{}", precision.as_str());
         // Products of two bf16 are exact in f32, so that even a path without fused multiply-add gives the same sums; what is not rounded may differ there.
         for path in Path::available().into_iter().filter(|_| cfg!(target_feature = "fma")) {
             let on_path = rounded.on_path(path);
             assert_eq!(on_path.precision(), precision);
-            assert_eq!(on_path.rollout(&query).expect("a valid query"), expected, "{} on {}", precision.as_str(), path.as_str());
+            assert_eq!(
+                on_two_threads(|| on_path.rollout(&query)).expect("a valid query"),
+                expected,
+                "{} on {}",
+                precision.as_str(),
+                path.as_str()
+            );
         }
         let own = &controls[7 * horizon * 2..8 * horizon * 2];
         let alone = rounded.rollout(&RolloutQuery { controls: own, samples: 1, ..query.clone() }).expect("a valid query");
@@ -172,8 +183,8 @@ fn property_row_of_a_batch_equals_the_row_alone() {
     let query = from_sample_33(&drive, &past, &controls, samples, &map);
     // Without a history the actuators begin as each row's own first command says.
     for query in [query.clone(), RolloutQuery { history: &[], ..query }] {
-        let batch = predictor.rollout(&query).expect("a valid query");
-        for n in [0, 7, 16, 36] {
+        let batch = on_two_threads(|| predictor.rollout(&query)).expect("a valid query");
+        for n in [0, 7, 16, 31, 36] {
             let own = &controls[n * horizon * 2..(n + 1) * horizon * 2];
             let alone = predictor.rollout(&RolloutQuery { controls: own, samples: 1, ..query.clone() }).expect("a valid query");
             for k in 0..horizon {

@@ -32,6 +32,8 @@ mod rollout;
 mod transitions;
 mod validate;
 
+use rollout::BlockCaches;
+
 pub(crate) use self::observed::LogClock;
 pub use self::parts::PartTimes;
 pub use self::transitions::Transition;
@@ -70,6 +72,7 @@ pub struct Predictor {
     token_scale: TokenScale,
     mode: TerrainMode,
     maps: Arc<Mutex<Vec<TokensOfMap>>>,
+    caches: Arc<BlockCaches>,
 }
 
 /// One candidate while it is rolled out.
@@ -105,6 +108,7 @@ impl Predictor {
             token_scale: scales.token_scale(),
             mode: TerrainMode::Grid,
             maps: Arc::default(),
+            caches: Arc::default(),
             bundle,
         })
     }
@@ -155,6 +159,7 @@ impl Predictor {
             token_scale: scales.token_scale(),
             mode: self.mode,
             maps: self.maps.clone(),
+            caches: self.caches.clone(),
             bundle,
         }
     }

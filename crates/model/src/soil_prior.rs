@@ -4,7 +4,7 @@ use nesam_physics::SOIL_DIM;
 
 use crate::ModelError;
 use crate::dims::{FEATURE_CHANNELS, FEATURE_PX, SOIL_PRIOR_PARAMETERS};
-use crate::fused::{After, Lane, Packed, Row, Vector, add_rows, linear, linear_of};
+use crate::fused::{After, Lane, PANEL, Packed, Row, Vector, add_rows, linear, linear_of};
 use crate::weights::Weights;
 
 /// Filters of the two convolutions.
@@ -45,7 +45,7 @@ fn convolve<V: Vector, const H: usize>(
                 };
             }
         }
-        linear_of::<V, H, _>(matrix, After::Silu, Rows(&inputs), filters);
+        linear_of::<V, H, _>(matrix, After::Silu, Rows(&inputs), filters.chunks_exact_mut(PANEL));
         store(pixel, filters);
     }
 }

@@ -2,7 +2,7 @@
 
 use nesam_physics::step::{StepInput, StepModel, StepOutput, WheelContact};
 use nesam_physics::terramechanics::WheelGeometry;
-use nesam_physics::{Real, Rolling, Soil, Sunk, VehicleState, WHEELS};
+use nesam_physics::{Real, Rolling, Soil, Sunk, VehicleState, WHEELS, Wheels};
 
 use crate::rollout::Variant;
 
@@ -14,7 +14,7 @@ const SPEED_LAG_S: f64 = 0.5;
 /// Increment Δx of the symbolic half and the contacts of the wheels; all zero where a form has no soil.
 #[inline(always)]
 pub fn symbolic_step<T: Real>(variant: Variant, model: &StepModel, input: &StepInput<T>) -> StepOutput<T> {
-    symbolic_step_by(variant, model, input, Rolling::sink)
+    symbolic_step_by(variant, model, input, Rolling::sink_each)
 }
 
 /// The same with somebody else who works the contacts out ([`StepModel::step_by`]).
@@ -23,7 +23,7 @@ pub fn symbolic_step_by<T: Real>(
     variant: Variant,
     model: &StepModel,
     input: &StepInput<T>,
-    sink: impl Fn(&Rolling<T>, &WheelGeometry) -> Sunk<T>,
+    sink: impl Fn(Wheels<'_, Rolling<T>>, Wheels<'_, WheelGeometry>) -> [Sunk<T>; WHEELS],
 ) -> StepOutput<T> {
     let zero = T::lit(0.0);
     let none = WheelContact { sinkage_m: zero, normal_n: zero, forward_n: zero, left_n: zero, slip: zero, overspeed_m_s: zero };

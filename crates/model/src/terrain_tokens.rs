@@ -6,6 +6,7 @@
 
 mod store;
 
+use std::cell::RefCell;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -15,7 +16,7 @@ use rayon::prelude::*;
 
 use crate::dims::{CONTEXT, FEATURES, HIDDEN};
 use crate::encoder::{EncoderScratch, TerrainEncoders};
-use crate::fused::{After, Kernel, LANES, Lane, Packed, Path, Vector, linear};
+use crate::fused::{After, Kernel, LANES, Lane, PANEL, Packed, Path, Row, Vector, linear};
 use crate::soil_prior::SoilPrior;
 use store::NodeStore;
 
@@ -35,29 +36,26 @@ pub type Node = (i32, i32, i32);
 #[derive(Clone, Debug)]
 pub struct TerrainProjection {
     encoders: TerrainEncoders,
-    /// W_c, (128, 9216).
-    context: Packed,
+    /// W_c, (128, 9216), eight outputs each.
+    context: Vec<Packed>,
     soil: SoilPrior,
     scale: PatchScale,
     path: Path,
 }
 
-/// Buffers of one worker.
-#[derive(Default)]
-struct Scratch {
-    patch: Patch,
-    encoder: EncoderScratch,
-    /// Contexts of a batch of patches, one after the other.
-    contexts: Vec<f32>,
-}
-
 /// Patches that are projected together: two vectors.
 const BATCH: usize = 2 * LANES;
+
+thread_local! {
+    /// Buffers of a worker that crops and encodes.
+    static SCRATCH: RefCell<(Patch, EncoderScratch)> = RefCell::default();
+}
 
 impl TerrainProjection {
     /// Bundles the parts; `context` is W_c, (128, 9216) row-major.
     pub fn new(encoders: TerrainEncoders, context: &[f32], soil: SoilPrior, scale: PatchScale) -> Self {
-        Self { encoders, context: Packed::from_rows(context, &[0.0; HIDDEN]), soil, scale, path: Path::fastest() }
+        let context = context.chunks(PANEL * CONTEXT).map(|rows| Packed::from_rows(rows, &[0.0; PANEL])).collect();
+        Self { encoders, context, soil, scale, path: Path::fastest() }
     }
 
     /// The same on another path.
@@ -65,56 +63,64 @@ impl TerrainProjection {
         Self { path, encoders: self.encoders.on(path), ..self.clone() }
     }
 
-    /// The exact tokens at up to [`BATCH`] poses. A pose's token does not depend on the others.
-    fn tokens(&self, map: &WorldMap, poses: &[Pose2], scratch: &mut Scratch) -> Vec<TerrainToken> {
-        let Scratch { patch, encoder, contexts } = scratch;
-        contexts.resize(poses.len() * CONTEXT, 0.0);
-        for (pose, context) in poses.iter().zip(contexts.chunks_exact_mut(CONTEXT)) {
-            sample_patch(map, *pose, &self.scale, patch);
-            self.encoders.encode(patch, encoder, context);
-        }
-        self.path.run(Project { projection: self, contexts })
-    }
-
-    /// The exact tokens at poses, in parallel.
+    /// The exact tokens at poses, in parallel. A pose's token does not depend on the others.
     pub fn exact(&self, map: &WorldMap, poses: &[Pose2]) -> Vec<TerrainToken> {
-        // Every worker gets a batch, even when that leaves lanes empty.
-        let batch = poses.len().div_ceil(rayon::current_num_threads()).clamp(1, BATCH);
-        let of_batch = |scratch: &mut Scratch, poses: &[Pose2]| self.tokens(map, poses, scratch);
-        poses.par_chunks(batch).map_init(Scratch::default, of_batch).flatten_iter().collect()
+        let tokens = |poses: &[Pose2]| match poses.len() {
+            ..=LANES => self.tokens::<1>(map, poses),
+            _ => self.tokens::<2>(map, poses),
+        };
+        poses.chunks(BATCH * rayon::current_num_threads()).flat_map(tokens).collect()
+    }
+
+    /// The exact tokens at a few poses: each worker encodes some of the patches and then works out some of the outputs of all of them, so that W_c, far larger
+    /// than what is near a processor, is read once and not by every worker.
+    fn tokens<const H: usize>(&self, map: &WorldMap, poses: &[Pose2]) -> Vec<TerrainToken> {
+        let mut contexts = vec![0.0; poses.len() * CONTEXT];
+        contexts.par_chunks_exact_mut(CONTEXT).zip(poses).with_max_len(1).for_each(|(context, pose)| {
+            SCRATCH.with_borrow_mut(|(patch, scratch)| {
+                sample_patch(map, *pose, &self.scale, patch);
+                self.encoders.encode(patch, scratch, context);
+            });
+        });
+        let size = H * LANES;
+        let batches: Vec<Vec<Row<H>>> = contexts.par_chunks(size * CONTEXT).map(in_lanes).collect();
+        let of_part = |part: usize| batches.iter().map(|rows| self.path.run(Project { projection: self, part, rows })).collect();
+        let parts: Vec<Vec<[Row<H>; PANEL]>> = (0..VALUES.div_ceil(PANEL)).into_par_iter().with_max_len(1).map(of_part).collect();
+        let value = |patch: usize, i: usize| parts[i / PANEL][patch / size][i % PANEL][patch % size / LANES][patch % LANES];
+        (0..poses.len()).map(|patch| core::array::from_fn(|i| value(patch, i))).collect()
     }
 }
 
-/// Vectors of a batch.
-const H: usize = BATCH / LANES;
-
-/// Contexts of up to [`BATCH`] patches to their tokens, a patch in each lane.
-struct Project<'a> {
-    projection: &'a TerrainProjection,
-    contexts: &'a [f32],
-}
-
-impl Kernel for Project<'_> {
-    type Output = Vec<TerrainToken>;
-    #[inline(always)]
-    fn run<V: Vector>(self) -> Vec<TerrainToken> {
-        let patches = self.contexts.len() / CONTEXT;
-        let mut rows = vec![[Lane::ZERO; H]; CONTEXT];
-        for (group, rows) in rows.chunks_exact_mut(LANES).enumerate() {
-            for (patch, context) in self.contexts.chunks_exact(CONTEXT).enumerate() {
-                for (row, value) in rows.iter_mut().zip(&context[group * LANES..(group + 1) * LANES]) {
-                    row[patch / LANES][patch % LANES] = *value;
-                }
+/// Contexts of up to 16 H patches as rows, a patch in each lane.
+fn in_lanes<const H: usize>(contexts: &[f32]) -> Vec<Row<H>> {
+    let mut rows = vec![[Lane::ZERO; H]; CONTEXT];
+    for (group, rows) in rows.chunks_exact_mut(LANES).enumerate() {
+        for (patch, context) in contexts.chunks_exact(CONTEXT).enumerate() {
+            for (row, value) in rows.iter_mut().zip(&context[group * LANES..(group + 1) * LANES]) {
+                row[patch / LANES][patch % LANES] = *value;
             }
         }
-        let mut context = [[Lane::ZERO; H]; HIDDEN];
-        linear::<V, H>(&self.projection.context, After::Store, &rows, &mut context);
-        let soil = self.projection.soil.raw::<V, H>(&rows[FEATURES..]);
-        let value = |patch: usize, i: usize| {
-            let row = if i < HIDDEN { &context[i] } else { &soil[i - HIDDEN] };
-            row[patch / LANES][patch % LANES]
-        };
-        (0..patches).map(|patch| core::array::from_fn(|i| value(patch, i))).collect()
+    }
+    rows
+}
+
+/// Eight values of a token for a batch of contexts: of W_c c, or the soil in the part after the last of these.
+struct Project<'a, const H: usize> {
+    projection: &'a TerrainProjection,
+    part: usize,
+    rows: &'a [Row<H>],
+}
+
+impl<const H: usize> Kernel for Project<'_, H> {
+    type Output = [Row<H>; PANEL];
+    #[inline(always)]
+    fn run<V: Vector>(self) -> Self::Output {
+        let mut values = [[Lane::ZERO; H]; PANEL];
+        match self.projection.context.get(self.part) {
+            Some(panel) => linear::<V, H>(panel, After::Store, self.rows, &mut values),
+            None => values[..SOIL_DIM].copy_from_slice(&self.projection.soil.raw::<V, H>(&self.rows[FEATURES..])),
+        }
+        values
     }
 }
 
@@ -212,6 +218,22 @@ impl TerrainTokens {
         }
     }
 
+    /// Adds the nodes that are not there of paths that begin where one is not.
+    pub fn add_missing(&self, paths: impl Iterator<Item = impl Iterator<Item = Pose2>>, missing: &mut Vec<Node>) {
+        let nodes = self.nodes.read();
+        for path in paths {
+            let before = missing.len();
+            for pose in path {
+                missing.extend(
+                    corners(&pose).into_iter().filter(|(node, weight)| *weight > 0.0 && nodes.get(*node).is_none()).map(|(node, _)| node),
+                );
+                if missing.len() == before {
+                    break;
+                }
+            }
+        }
+    }
+
     /// The token at a pose if all of its nodes are there. It is not counted as a lookup.
     pub fn known(&self, pose: &Pose2) -> Option<TerrainToken> {
         let nodes = self.nodes.read();
@@ -247,4 +269,28 @@ fn add_weighted(sum: &mut TerrainToken, weight: f32, values: &TerrainToken) {
 fn pose_of((x, y, heading): Node) -> Pose2 {
     let yaw_rad = f64::from(heading) / f64::from(HEADINGS) * core::f64::consts::TAU;
     Pose2 { x_m: f64::from(x) * GRID_M, y_m: f64::from(y) * GRID_M, yaw_rad }
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_terrain::GridGeometry;
+
+    use super::*;
+
+    #[test]
+    fn property_a_path_is_followed_where_it_begins_in_the_unknown() {
+        let geometry = GridGeometry { origin_m: [0.0; 2], resolution_m: 1.0, width: 8, height: 8 };
+        let map = WorldMap::from_layers("flat", 1, geometry, vec![0.0; 64], None).expect("a valid map");
+        let tokens = TerrainTokens::new(Arc::new(map));
+        let pose = |x_m: f64| Pose2 { x_m, y_m: 1.1, yaw_rad: 0.3 };
+        let nodes = |x_m: f64| corners(&pose(x_m)).map(|(node, _)| node).to_vec();
+        tokens.nodes.insert(nodes(1.1).into_iter().map(|node| (node, [0.0; VALUES])));
+        let missing = |path: &[f64]| {
+            let mut missing = Vec::new();
+            tokens.add_missing(std::iter::once(path.iter().map(|x_m| pose(*x_m))), &mut missing);
+            missing
+        };
+        assert_eq!(missing(&[1.1, 2.1, 3.1]), [], "its terrain is there, so nobody waits");
+        assert_eq!(missing(&[2.1, 1.1, 3.1]), [nodes(2.1), nodes(3.1)].concat());
+    }
 }

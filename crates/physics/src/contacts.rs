@@ -12,6 +12,9 @@ pub const ROLLING: usize = 14;
 /// See [`ROLLING`].
 pub const SUNK: usize = 6;
 
+/// One of something for each wheel.
+pub type Wheels<'a, S> = [&'a S; WHEELS];
+
 /// What the contact of a wheel depends on.
 #[derive(Clone, Copy, Debug)]
 pub struct Rolling<T> {
@@ -42,6 +45,12 @@ impl<T: Real> Rolling<T> {
         Sunk { balanced_m, wrench: wheel_wrench(wheel, balanced_m * self.ratio, &self.motion, &self.soil) }
     }
 
+    /// The contacts of four wheels, one after the other.
+    #[inline(always)]
+    pub fn sink_each(wheels: Wheels<'_, Self>, geometries: Wheels<'_, WheelGeometry>) -> [Sunk<T>; WHEELS] {
+        core::array::from_fn(|i| wheels[i].sink(geometries[i]))
+    }
+
     /// Its numbers: support, motion, soil, ratio, each in the order of its fields.
     #[inline(always)]
     pub fn to_array(&self) -> [T; ROLLING] {
@@ -67,7 +76,7 @@ impl<T: Real> Rolling<T> {
 
     /// The contacts of four wheels of one geometry, where the scalar has room for them side by side.
     #[inline(always)]
-    pub(crate) fn sink_abreast(wheels: [&Self; WHEELS], wheel: &WheelGeometry) -> Option<[Sunk<T>; WHEELS]> {
+    pub(crate) fn sink_abreast(wheels: Wheels<'_, Self>, wheel: &WheelGeometry) -> Option<[Sunk<T>; WHEELS]> {
         let [a, b, c, d] = [wheels[0].to_array(), wheels[1].to_array(), wheels[2].to_array(), wheels[3].to_array()];
         let mut abreast = [T::abreast([&a[0], &b[0], &c[0], &d[0]])?; ROLLING];
         for (i, four) in abreast.iter_mut().enumerate().skip(1) {

@@ -22,7 +22,7 @@ pub mod vec3;
 mod vehicle;
 
 pub use command_path::CommandPath;
-pub use contacts::{ROLLING, Rolling, SUNK, Sunk};
+pub use contacts::{ROLLING, Rolling, SUNK, Sunk, Wheels};
 pub use contradiction::{CONTRADICTIONS, contradiction};
 pub use ride::{Ride, UsualRide};
 pub use scalar::Real;

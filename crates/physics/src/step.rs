@@ -4,7 +4,7 @@
 //! the current state, and their damping and stiffness enter the mass matrix, (M + h C + h² K) Δν = h (f - h K ν). The matrix is
 //! symmetric positive definite, so the step is stable for a parked 50-kg robot and a rolling 2.5-tonne truck alike.
 
-use crate::contacts::{Rolling, Sunk};
+use crate::contacts::{Rolling, Sunk, Wheels};
 use crate::driveline::WheelCommand;
 use crate::linear::solve_spd;
 use crate::ride::Ride;
@@ -198,12 +198,16 @@ impl StepModel {
     /// Advances the state by one Δt and returns the increment (paper: Δx_NE) and the contacts.
     #[inline(always)]
     pub fn step<T: Real>(&self, input: &StepInput<T>) -> StepOutput<T> {
-        self.step_by(input, Rolling::sink)
+        self.step_by(input, Rolling::sink_each)
     }
 
-    /// The same with somebody else who works [`Rolling::sink`] out, which is most of a step's work, in faster instructions.
+    /// The same with somebody else who works [`Rolling::sink_each`] out, which is most of a step's work, in faster instructions.
     #[inline(always)]
-    pub fn step_by<T: Real>(&self, input: &StepInput<T>, sink: impl Fn(&Rolling<T>, &WheelGeometry) -> Sunk<T>) -> StepOutput<T> {
+    pub fn step_by<T: Real>(
+        &self,
+        input: &StepInput<T>,
+        sink: impl Fn(Wheels<'_, Rolling<T>>, Wheels<'_, WheelGeometry>) -> [Sunk<T>; WHEELS],
+    ) -> StepOutput<T> {
         let h = T::lit(self.dt_s / self.substeps as f64);
         let zero = T::lit(0.0);
         let mut state = input.state;
@@ -226,7 +230,7 @@ impl StepModel {
         state: &mut VehicleState<T>,
         input: &StepInput<T>,
         h: T,
-        sink: &impl Fn(&Rolling<T>, &WheelGeometry) -> Sunk<T>,
+        sink: &impl Fn(Wheels<'_, Rolling<T>>, Wheels<'_, WheelGeometry>) -> [Sunk<T>; WHEELS],
     ) -> [WheelContact<T>; WHEELS] {
         let tilt = Tilt::new(state.attitude_rad[0], state.attitude_rad[1]);
         let (v, w) = (state.velocity_m_s, state.angular_velocity_rad_s);
@@ -266,11 +270,11 @@ impl StepModel {
         let driven = |i: usize| driven.as_ref().map(|driven| &driven[i]);
         let rolls: [Roll<T>; WHEELS] = core::array::from_fn(|i| self.roll(i, &stances[i], driven(i), state, input));
         let sunk = self.sink(rolls.each_ref().map(|roll| &roll.contact), sink);
-        let contributions: [Contribution<T>; WHEELS] =
-            core::array::from_fn(|i| self.wheel_contribution(i, &stances[i], driven(i), &rolls[i], &sunk[i], input));
-        for wheel in &contributions {
-            assemble(wheel, v, w, h, &mut lhs, &mut rhs);
-        }
+        let contacts = core::array::from_fn(|i| {
+            let wheel = self.wheel_contribution(i, &stances[i], driven(i), &rolls[i], &sunk[i], input);
+            assemble(&wheel, v, w, h, &mut lhs, &mut rhs);
+            wheel.contact
+        });
         let delta = solve_spd(lhs, rhs.map(|f| f * h));
 
         let mean = |now: Vec3<T>, change: [T; 3]| add(now, scale(change, T::lit(0.5)));
@@ -284,7 +288,7 @@ impl StepModel {
         state.attitude_rad = add(state.attitude_rad, scale(rates, h));
         state.velocity_m_s = add(v, dv);
         state.angular_velocity_rad_s = add(w, dw);
-        core::array::from_fn(|i| contributions[i].contact)
+        contacts
     }
 
     /// How a wheel stands on its ground, before it is known how it turns.
@@ -350,9 +354,13 @@ impl StepModel {
 
     /// The contacts of all wheels.
     #[inline(always)]
-    fn sink<T: Real>(&self, wheels: [&Rolling<T>; WHEELS], sink: &impl Fn(&Rolling<T>, &WheelGeometry) -> Sunk<T>) -> [Sunk<T>; WHEELS] {
+    fn sink<T: Real>(
+        &self,
+        wheels: Wheels<'_, Rolling<T>>,
+        sink: &impl Fn(Wheels<'_, Rolling<T>>, Wheels<'_, WheelGeometry>) -> [Sunk<T>; WHEELS],
+    ) -> [Sunk<T>; WHEELS] {
         let abreast = if self.of_one_geometry() { Rolling::sink_abreast(wheels, &self.wheel) } else { None };
-        abreast.unwrap_or_else(|| core::array::from_fn(|i| sink(wheels[i], self.wheel_at(i))))
+        abreast.unwrap_or_else(|| sink(wheels, core::array::from_fn(|i| self.wheel_at(i))))
     }
 
     /// Forces of one wheel and how they change with its velocity.

@@ -36,6 +36,7 @@ impl GridGeometry {
     }
 
     /// Grid coordinates (column, row) of a World point, in cells; may lie outside the grid.
+    #[inline]
     pub fn to_grid(&self, x_m: f64, y_m: f64) -> [f64; 2] {
         [(x_m - self.origin_m[0]) / self.resolution_m, (y_m - self.origin_m[1]) / self.resolution_m]
     }
@@ -48,6 +49,7 @@ impl GridGeometry {
     /// Whether a World point lies in the closed rectangle spanned by the cell points.
     ///
     /// A slack of 1e-9 cells keeps the outermost points inside in spite of rounding.
+    #[inline]
     pub fn contains(&self, x_m: f64, y_m: f64) -> bool {
         const SLACK: f64 = 1e-9;
         let [u, v] = self.to_grid(x_m, y_m);
@@ -88,6 +90,7 @@ pub(crate) struct Bilinear {
 
 impl GridGeometry {
     /// Bilinear lookup at a World point; points outside are clamped to the border (NaN to the origin).
+    #[inline]
     pub(crate) fn bilinear(&self, x_m: f64, y_m: f64) -> Bilinear {
         let [u, v] = self.to_grid(x_m, y_m);
         let (column, east) = split(u, self.width);
@@ -97,6 +100,7 @@ impl GridGeometry {
 }
 
 /// Splits a grid coordinate into a cell that has an upper neighbour, and the fraction towards it.
+#[inline]
 fn split(coordinate: f64, side: usize) -> (usize, f64) {
     // `max` before `min`: a NaN becomes 0.
     let clamped = coordinate.max(0.0).min((side - 1) as f64);

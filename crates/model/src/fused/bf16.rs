@@ -9,7 +9,7 @@ use super::vector::{LANES, Lane, Order, TILE_PANELS, Tile, Vector};
 /// Inputs of a tile.
 const INPUTS: usize = 2 * LANES;
 /// Outputs of the panels of a group.
-const OUTPUTS: usize = TILE_PANELS * LANES;
+pub const OUTPUTS: usize = TILE_PANELS * LANES;
 
 /// A matrix packed for [`linear`]: groups of four panels of sixteen outputs; what is beyond the last output or input is zero.
 #[derive(Clone, Debug)]
@@ -21,7 +21,7 @@ pub struct PackedBf16 {
     order: Order,
 }
 
-/// Inputs as tiles, and sums of a group of outputs.
+/// Inputs of each vector as tiles, and sums of a group of outputs.
 #[derive(Clone, Debug)]
 pub struct Bf16Buffers {
     inputs: Vec<Tile>,
@@ -68,24 +68,32 @@ impl PackedBf16 {
     }
 }
 
-/// y = W x + b, or what `after` makes of it: `x` (inputs) rows, `y` (outputs) rows.
+/// y = W x + b, or what `after` makes of it: `x` (inputs) rows, `y` (outputs) rows in groups of [`OUTPUTS`].
 #[inline(always)]
-pub fn linear<V: Vector, const H: usize>(matrix: &PackedBf16, after: After, x: &[Row<H>], y: &mut [Row<H>], buffers: &mut Bf16Buffers) {
+pub fn linear<'a, V: Vector, const H: usize>(
+    matrix: &PackedBf16,
+    after: After,
+    x: &[Row<H>],
+    y: impl Iterator<Item = &'a mut [Row<H>]>,
+    buffers: &mut Bf16Buffers,
+) {
     let tiles = matrix.inputs.div_ceil(INPUTS);
-    buffers.inputs.resize(tiles, Tile::ZERO);
-    for h in 0..H {
-        let pairs = buffers.inputs.iter_mut().flat_map(|tile| &mut tile.0);
+    buffers.inputs.resize(H * tiles, Tile::ZERO);
+    for (h, inputs) in buffers.inputs.chunks_exact_mut(tiles).enumerate() {
         let mut rows = x[..matrix.inputs].chunks_exact(2);
-        for to in pairs {
+        for to in inputs.iter_mut().flat_map(|tile| &mut tile.0) {
             match rows.next() {
                 Some(rows) => V::load(&rows[0][h].0).store_pairs(V::load(&rows[1][h].0), to),
                 None => *to = [0; LANES],
             }
         }
-        let groups = matrix.groups.chunks_exact(tiles).zip(matrix.bias.chunks(OUTPUTS)).zip(y.chunks_mut(OUTPUTS));
-        for ((weights, bias), y) in groups {
-            V::products(matrix.order, weights, &buffers.inputs, &mut buffers.sums);
-            for ((sum, bias), y) in buffers.sums.iter().flatten().zip(bias).zip(y) {
+    }
+    // A group of weights is read once and stays near the processor for the other vectors.
+    let groups = matrix.groups.chunks_exact(tiles).zip(matrix.bias.chunks(OUTPUTS)).zip(y);
+    for ((weights, bias), y) in groups {
+        for (h, inputs) in buffers.inputs.chunks_exact(tiles).enumerate() {
+            V::products(matrix.order, weights, inputs, &mut buffers.sums);
+            for ((sum, bias), y) in buffers.sums.iter().flatten().zip(bias).zip(y.iter_mut()) {
                 after.store(V::load(&sum.0).add(V::splat(*bias)), &mut y[h]);
             }
         }
@@ -104,7 +112,7 @@ mod tests {
         #[inline(always)]
         fn run<V: Vector>(self) -> Self::Output {
             let mut y = vec![[Lane([0.5; LANES]); H]; self.2];
-            linear::<V, H>(self.0, After::Add, self.1, &mut y, &mut Bf16Buffers::default());
+            linear::<V, H>(self.0, After::Add, self.1, y.chunks_mut(OUTPUTS), &mut Bf16Buffers::default());
             y
         }
     }

@@ -78,16 +78,16 @@ impl After {
 /// y = W x + b, or what `after` makes of it: `x` (inputs) rows, `y` (padded outputs) rows. Sums run over the inputs in order.
 #[inline(always)]
 pub fn linear<V: Vector, const H: usize>(matrix: &Packed, after: After, x: &[Row<H>], y: &mut [Row<H>]) {
-    linear_of::<V, H, _>(matrix, after, &x[..matrix.inputs], y);
+    linear_of::<V, H, _>(matrix, after, &x[..matrix.inputs], y.chunks_exact_mut(PANEL));
 }
 
-/// The same with inputs that lie anywhere: any collection that gives as many rows as the matrix has inputs.
+/// The same with rows that lie anywhere: inputs as any collection that gives as many as the matrix has, outputs as panels of eight.
 #[inline(always)]
-pub fn linear_of<'a, V: Vector, const H: usize, X>(matrix: &Packed, after: After, x: X, y: &mut [Row<H>])
+pub fn linear_of<'a, V: Vector, const H: usize, X>(matrix: &Packed, after: After, x: X, y: impl Iterator<Item = &'a mut [Row<H>]>)
 where
     X: IntoIterator<Item = &'a Row<H>> + Copy,
 {
-    let panels = matrix.panels.chunks_exact(matrix.inputs).zip(&matrix.bias).zip(y.chunks_exact_mut(PANEL));
+    let panels = matrix.panels.chunks_exact(matrix.inputs).zip(&matrix.bias).zip(y);
     for ((weights, bias), y) in panels {
         if V::WIDE {
             tile::<V, PANEL, H, H>(weights, bias, 0, 0, after, x, y);

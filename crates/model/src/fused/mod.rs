@@ -15,7 +15,7 @@ mod vector;
 pub(crate) use convolution::{Convolution, Image};
 pub(crate) use elementary::{exp, gelu, gelu_slope, silu, silu_slope};
 pub use kernels::Row;
-pub(crate) use kernels::{After, Packed, add_rows, linear, linear_of};
+pub(crate) use kernels::{After, PANEL, Packed, add_rows, linear, linear_of};
 pub use prefix::Prefix;
 pub(crate) use real::Numbers;
 pub(crate) use transformer::{Block, Dense, SCORE_SCALE};

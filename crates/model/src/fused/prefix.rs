@@ -104,7 +104,9 @@ impl Kernel for Project<'_> {
     #[inline(always)]
     fn run<V: Vector>(self) {
         let mut normal = [[Lane::ZERO; 2]; HIDDEN];
-        project::<V, 2>(self.block, self.x, &mut normal, self.qkv, &mut Bf16Buffers::default());
+        let (queries, rest) = self.qkv.split_at_mut(HIDDEN);
+        let (keys, values) = rest.split_at_mut(HIDDEN);
+        project::<V, 2>(self.block, self.x, &mut normal, [queries, keys, values], &mut Bf16Buffers::default());
     }
 }
 

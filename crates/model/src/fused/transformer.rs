@@ -2,7 +2,7 @@
 
 use super::bf16::{self, Bf16Buffers, PackedBf16};
 use super::elementary::tanh;
-use super::kernels::{After, Packed, Row, add_rows, layer_norm, linear, own_scores, own_values, softmax};
+use super::kernels::{After, PANEL, Packed, Row, add_rows, layer_norm, linear, linear_of, own_scores, own_values, softmax};
 use super::prefix::Prefix;
 use super::vector::{Kernel, Lane, Path, Vector};
 use crate::ModelError;
@@ -30,12 +30,15 @@ impl Dense {
         Self { weight: weight.to_vec(), bias: bias.to_vec(), packed: Packed::from_rows(weight, bias), rounded: None }
     }
 
-    /// y = W x + b, or what `after` makes of it.
+    /// y = W x + b, or what `after` makes of it; `y` in parts that lie anywhere, each of a multiple of 64 rows.
     #[inline(always)]
-    fn apply<V: Vector, const H: usize>(&self, after: After, x: &[Row<H>], y: &mut [Row<H>], buffers: &mut Bf16Buffers) {
+    fn apply<V: Vector, const H: usize>(&self, after: After, x: &[Row<H>], y: &mut [&mut [Row<H>]], buffers: &mut Bf16Buffers) {
         match &self.rounded {
-            Some(rounded) => bf16::linear::<V, H>(rounded, after, x, y, buffers),
-            None => linear::<V, H>(&self.packed, after, x, y),
+            Some(rounded) => {
+                let groups = y.iter_mut().flat_map(|part| part.chunks_exact_mut(bf16::OUTPUTS));
+                bf16::linear::<V, H>(rounded, after, x, groups, buffers);
+            }
+            None => linear_of::<V, H, _>(&self.packed, after, x, y.iter_mut().flat_map(|part| part.chunks_exact_mut(PANEL))),
         }
     }
 }
@@ -88,28 +91,27 @@ pub struct BlockCache<const H: usize> {
 struct Buffers<const H: usize> {
     x: Vec<Row<H>>,
     normal: Vec<Row<H>>,
-    qkv: Vec<Row<H>>,
+    queries: Vec<Row<H>>,
     attended: Vec<Row<H>>,
     hidden: Vec<Row<H>>,
     scores: Vec<Row<H>>,
     rounded: Bf16Buffers,
 }
 
-impl<const H: usize> BlockCache<H> {
-    /// An empty cache with room for `horizon` steps; one that does not remember holds a single step at a time.
-    pub fn new(horizon: usize, remembers: bool) -> Self {
-        let room = if remembers { horizon } else { 1 };
+impl<const H: usize> Default for BlockCache<H> {
+    /// A cache without room; [`Self::restart`] makes some.
+    fn default() -> Self {
         let rows = |count: usize| vec![[Lane::ZERO; H]; count];
         Self {
-            keys: core::array::from_fn(|_| rows(room * HIDDEN)),
-            values: core::array::from_fn(|_| rows(room * HIDDEN)),
-            room,
+            keys: Default::default(),
+            values: Default::default(),
+            room: 0,
             steps: 0,
-            remembers,
+            remembers: false,
             buffers: Buffers {
                 x: rows(HIDDEN),
                 normal: rows(HIDDEN),
-                qkv: rows(3 * HIDDEN),
+                queries: rows(HIDDEN),
                 attended: rows(HIDDEN),
                 hidden: rows(FEED_FORWARD),
                 scores: rows(POSITIONS),
@@ -117,15 +119,29 @@ impl<const H: usize> BlockCache<H> {
             },
         }
     }
+}
+
+impl<const H: usize> BlockCache<H> {
+    /// An empty cache with room for `horizon` steps; one that does not remember holds a single step at a time.
+    pub fn new(horizon: usize, remembers: bool) -> Self {
+        let mut cache = Self::default();
+        cache.restart(horizon, remembers);
+        cache
+    }
+
+    /// Forgets the steps, for another block of samples, and makes room for `horizon` new ones.
+    pub fn restart(&mut self, horizon: usize, remembers: bool) {
+        (self.room, self.steps, self.remembers) = (if remembers { horizon } else { 1 }, 0, remembers);
+        for rows in self.keys.iter_mut().chain(&mut self.values) {
+            if rows.len() < self.room * HIDDEN {
+                rows.resize(self.room * HIDDEN, [Lane::ZERO; H]);
+            }
+        }
+    }
 
     /// What the heads were given at the last step of one of the 16 samples of a lane.
     pub fn hidden(&self, lane: usize) -> [f32; HIDDEN] {
         core::array::from_fn(|i| self.buffers.normal[i][0].0[lane])
-    }
-
-    /// Forgets the steps, for another block of samples.
-    pub fn clear(&mut self) {
-        self.steps = 0;
     }
 }
 
@@ -209,7 +225,7 @@ impl FusedTransformer {
         context: &[Row<H>; HIDDEN],
     ) -> Said<H> {
         if !cache.remembers {
-            cache.clear();
+            cache.steps = 0;
         }
         assert!(cache.steps < cache.room, "a rollout has no more steps than its cache has room for; this is a bug");
         self.path.run_with_bf16(Step { network: self, prefix, cache, entries, context })
@@ -232,16 +248,14 @@ impl<const H: usize> Kernel for Step<'_, H> {
         let Self { network, prefix, cache, entries, context } = self;
         let step = cache.steps;
         let BlockCache { keys, values, buffers, .. } = cache;
-        let Buffers { x, normal, qkv, attended, hidden, scores, rounded } = buffers;
+        let Buffers { x, normal, queries, attended, hidden, scores, rounded } = buffers;
         embed::<V, H>(network, Some(HISTORY - 1 + step), entries, context, x);
         for (index, block) in network.blocks.iter().enumerate() {
-            project::<V, H>(block, x, normal, qkv, rounded);
             let own = step * HIDDEN..(step + 1) * HIDDEN;
-            keys[index][own.clone()].copy_from_slice(&qkv[HIDDEN..2 * HIDDEN]);
-            values[index][own].copy_from_slice(&qkv[2 * HIDDEN..]);
-            let (keys, values) = (&keys[index][..(step + 1) * HIDDEN], &values[index][..(step + 1) * HIDDEN]);
+            project::<V, H>(block, x, normal, [queries, &mut keys[index][own.clone()], &mut values[index][own.clone()]], rounded);
+            let (keys, values) = (&keys[index][..own.end], &values[index][..own.end]);
             for head in 0..HEADS {
-                attend::<V, H>(head, &qkv[..HIDDEN], prefix, index, keys, values, scores, attended);
+                attend::<V, H>(head, queries, prefix, index, keys, values, scores, attended);
             }
             finish::<V, H>(block, x, attended, normal, hidden, rounded);
         }
@@ -280,17 +294,17 @@ pub(super) fn embed<V: Vector, const H: usize>(
     }
 }
 
-/// Queries, keys and values (384) of pre-normalised hidden states.
+/// Queries, keys and values (128 each) of pre-normalised hidden states.
 #[inline(always)]
 pub(super) fn project<V: Vector, const H: usize>(
     block: &Block,
     x: &[Row<H>],
     normal: &mut [Row<H>],
-    qkv: &mut [Row<H>],
+    mut qkv: [&mut [Row<H>]; 3],
     rounded: &mut Bf16Buffers,
 ) {
     layer_norm::<V, H>(x, &block.norm1.weight, &block.norm1.bias, NORM_EPS, normal);
-    block.qkv.apply::<V, H>(After::Store, normal, qkv, rounded);
+    block.qkv.apply::<V, H>(After::Store, normal, &mut qkv, rounded);
 }
 
 /// Output projection and feed-forward network, both added to x.
@@ -303,10 +317,10 @@ pub(super) fn finish<V: Vector, const H: usize>(
     hidden: &mut [Row<H>],
     rounded: &mut Bf16Buffers,
 ) {
-    block.out.apply::<V, H>(After::Add, attended, x, rounded);
+    block.out.apply::<V, H>(After::Add, attended, &mut [x], rounded);
     layer_norm::<V, H>(x, &block.norm2.weight, &block.norm2.bias, NORM_EPS, normal);
-    block.up.apply::<V, H>(After::Gelu, normal, hidden, rounded);
-    block.down.apply::<V, H>(After::Add, hidden, x, rounded);
+    block.up.apply::<V, H>(After::Gelu, normal, &mut [hidden], rounded);
+    block.down.apply::<V, H>(After::Add, hidden, &mut [x], rounded);
 }
 
 /// Attention of one head of a block of samples over the shared history and their own steps.

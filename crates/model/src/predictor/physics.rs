@@ -5,7 +5,7 @@
 
 use nesam_physics::step::StepModel;
 use nesam_physics::terramechanics::WheelGeometry;
-use nesam_physics::{ROLLING, Rolling, STATE_DIM, SUNK, Sunk, WHEELS};
+use nesam_physics::{ROLLING, Rolling, STATE_DIM, SUNK, Sunk, WHEELS, Wheels};
 
 use super::risk::{RiskRow, of_lanes};
 use crate::fused::{Kernel, LANES, Lane, Numbers, Path, Vector};
@@ -42,8 +42,8 @@ impl Kernel for PhysicsStep<'_> {
     #[inline(always)]
     fn run<V: Vector>(self) -> PhysicsOutput {
         let input = step_input(from_lanes::<V, _>(self.varying), from_lanes(self.constant));
-        let output = symbolic_step_by(self.variant, self.model, &input, |rolling, wheel| sink(self.path, rolling, wheel));
-        let increment = to_lanes(output.increment.to_array());
+        let output = symbolic_step_by(self.variant, self.model, &input, |wheels, geometries| sink(self.path, wheels, geometries));
+        let increment = to_lanes(&output.increment.to_array());
         let mut sinkage_m = [Lane::ZERO; WHEELS];
         for (lane, contact) in sinkage_m.iter_mut().zip(&output.contacts) {
             contact.sinkage_m.0.store(&mut lane.0);
@@ -53,24 +53,35 @@ impl Kernel for PhysicsStep<'_> {
     }
 }
 
-/// [`Rolling::sink`] of a wheel of sixteen vehicles.
+/// [`Rolling::sink_each`] for the wheels of sixteen vehicles.
 struct Sink<'a> {
-    wheel: &'a WheelGeometry,
-    rolling: [Lane; ROLLING],
+    wheels: &'a [[Lane; ROLLING]; WHEELS],
+    geometries: Wheels<'a, WheelGeometry>,
 }
 
 impl Kernel for Sink<'_> {
-    type Output = [Lane; SUNK];
+    type Output = [[Lane; SUNK]; WHEELS];
     #[inline(always)]
     fn run<V: Vector>(self) -> Self::Output {
-        to_lanes(Rolling::from_array(from_lanes::<V, _>(&self.rolling)).sink(self.wheel).to_array())
+        let mut sunk = [[Lane::ZERO; SUNK]; WHEELS];
+        for ((sunk, wheel), geometry) in sunk.iter_mut().zip(self.wheels).zip(self.geometries) {
+            *sunk = to_lanes(&Rolling::from_array(from_lanes::<V, _>(wheel)).sink(geometry).to_array());
+        }
+        sunk
     }
 }
 
-/// The contact of a wheel, worked out on a path, from vectors of another and back.
+/// The contacts of all wheels, worked out on a path, from vectors of another and back. All are stored before the first is loaded: a wide vector that was just stored in
+/// halves has to wait until they have reached the cache.
 #[inline(always)]
-fn sink<V: Vector>(path: Path, rolling: &Rolling<Numbers<V>>, wheel: &WheelGeometry) -> Sunk<Numbers<V>> {
-    Sunk::from_array(from_lanes(&path.run(Sink { wheel, rolling: to_lanes(rolling.to_array()) })))
+fn sink<V: Vector>(
+    path: Path,
+    wheels: Wheels<'_, Rolling<Numbers<V>>>,
+    geometries: Wheels<'_, WheelGeometry>,
+) -> [Sunk<Numbers<V>>; WHEELS] {
+    let wheels = wheels.map(|wheel| to_lanes(&wheel.to_array()));
+    let sunk = path.run(Sink { wheels: &wheels, geometries });
+    sunk.each_ref().map(|wheel| Sunk::from_array(from_lanes(wheel)))
 }
 
 #[inline(always)]
@@ -83,7 +94,7 @@ fn from_lanes<V: Vector, const N: usize>(lanes: &[Lane; N]) -> [Numbers<V>; N] {
 }
 
 #[inline(always)]
-fn to_lanes<V: Vector, const N: usize>(numbers: [Numbers<V>; N]) -> [Lane; N] {
+fn to_lanes<V: Vector, const N: usize>(numbers: &[Numbers<V>; N]) -> [Lane; N] {
     let mut lanes = [Lane::ZERO; N];
     for (lane, number) in lanes.iter_mut().zip(numbers) {
         number.0.store(&mut lane.0);

@@ -1,22 +1,23 @@
 //! Rollouts of all candidates of a query.
 //!
-//! Blocks of sixteen samples go through the horizon on their own, so that what a block remembers stays near the processor. A block that meets terrain which is
-//! not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they go on. Which block waits for
-//! what changes nothing in the results: a node of the terrain is a function of its pose alone.
+//! Blocks of thirty-two samples, of sixteen where there are few, go through the horizon on their own, so that what a block remembers stays near the processor. A
+//! block that meets terrain which is not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they
+//! go on. Which block waits for what changes nothing in the results: a node of the terrain is a function of its pose alone.
 
 use std::sync::{Arc, Mutex, PoisonError};
 
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, WHEELS};
 use rayon::prelude::*;
 
-use super::block::{Block, Cache};
+use super::block::Block;
 use super::parts::PartClocks;
 use super::risk::RiskRow;
 use super::validate::{validate, validate_extras};
 use super::{LogClock, Predictor, Sample, control, pose, raw_soil, under};
 use crate::ModelError;
-use crate::fused::{LANES, Prefix};
+use crate::fused::{BlockCache, LANES, Prefix};
 use crate::ground::GroundSource;
+use crate::precision::Precision;
 use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
@@ -33,7 +34,6 @@ pub(super) struct Scene<'a> {
     pub(super) risk: bool,
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
-    pub(super) caches: Caches,
     pub(super) clocks: Option<&'a PartClocks>,
 }
 
@@ -44,30 +44,33 @@ impl Scene<'_> {
     }
 }
 
-/// Caches of blocks, used again by the next block: as many as there are blocks under way.
-pub(super) struct Caches {
-    free: Mutex<Vec<Cache>>,
-    horizon: usize,
-    remembers: bool,
+/// Caches of blocks of 16 H samples, used again by the next block and the next query: as many as threads work on blocks.
+#[derive(Debug, Default)]
+pub(super) struct Caches<const H: usize>(Mutex<Vec<BlockCache<H>>>);
+
+impl<const H: usize> Caches<H> {
+    /// A cache without steps and with room for `horizon`.
+    pub(super) fn take(&self, horizon: usize, remembers: bool) -> BlockCache<H> {
+        let free = self.0.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let mut cache = free.unwrap_or_default();
+        cache.restart(horizon, remembers);
+        cache
+    }
+
+    /// Gives one back. More than threads can use at once are there only while blocks wait for terrain.
+    pub(super) fn give(&self, cache: BlockCache<H>) {
+        let mut free = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if free.len() < rayon::current_num_threads() {
+            free.push(cache);
+        }
+    }
 }
 
-impl Caches {
-    /// A cache without steps.
-    pub(super) fn take(&self) -> Cache {
-        let free = self.free.lock().unwrap_or_else(PoisonError::into_inner).pop();
-        free.map_or_else(
-            || Cache::new(self.horizon, self.remembers),
-            |mut cache| {
-                cache.clear();
-                cache
-            },
-        )
-    }
-
-    /// Gives one back.
-    pub(super) fn give(&self, cache: Cache) {
-        self.free.lock().unwrap_or_else(PoisonError::into_inner).push(cache);
-    }
+/// Caches for blocks of two vectors and of one.
+#[derive(Debug, Default)]
+pub(super) struct BlockCaches {
+    wide: Caches<2>,
+    narrow: Caches<1>,
 }
 
 /// A correction for each group of `samples` rows.
@@ -122,7 +125,6 @@ impl Predictor {
             risk: extras.risk,
             clock,
             tokens: tokens.as_deref(),
-            caches: Caches { free: Mutex::default(), horizon: query.horizon, remembers: variant.remembers() },
             clocks,
         };
         let rows = extras.soils.len().max(1) * query.samples;
@@ -147,7 +149,13 @@ impl Predictor {
             samples: rows,
             horizon: query.horizon,
         };
-        let risk = self.roll_blocks(&scene, &mut samples, &mut rollout);
+        // Blocks of two vectors read weights half as often. In bf16 these are half as large already, and what two vectors remember costs more than that saves; few
+        // candidates keep all threads busy in smaller blocks.
+        let wide = self.precision() == Precision::F32 && rows > LANES * rayon::current_num_threads();
+        let risk = match wide {
+            true => self.roll_blocks(&scene, &self.caches.wide, &mut samples, &mut rollout),
+            false => self.roll_blocks(&scene, &self.caches.narrow, &mut samples, &mut rollout),
+        };
         rollout.flags = samples.iter().map(|s| s.flags).collect();
         Ok((rollout, risk))
     }
@@ -180,16 +188,23 @@ impl Predictor {
         (0..rows).map(of_row).collect()
     }
 
-    /// Takes all samples through the horizon.
-    fn roll_blocks(&self, scene: &Scene<'_>, samples: &mut [Sample], rollout: &mut Rollout) -> Option<RiskOutputs> {
+    /// Takes all samples through the horizon, 16 H at a time.
+    fn roll_blocks<const H: usize>(
+        &self,
+        scene: &Scene<'_>,
+        caches: &Caches<H>,
+        samples: &mut [Sample],
+        rollout: &mut Rollout,
+    ) -> Option<RiskOutputs> {
         let (rows, horizon) = (samples.len(), rollout.horizon);
-        let mut blocks: Vec<Block<'_>> = samples
-            .chunks_mut(LANES)
-            .zip(rollout.states.chunks_mut(LANES * horizon * STATE_DIM))
-            .zip(rollout.sinkage_m.chunks_mut(LANES * horizon * WHEELS))
+        let size = H * LANES;
+        let mut blocks: Vec<Block<'_, H>> = samples
+            .chunks_mut(size)
+            .zip(rollout.states.chunks_mut(size * horizon * STATE_DIM))
+            .zip(rollout.sinkage_m.chunks_mut(size * horizon * WHEELS))
             .enumerate()
             .map(|(index, ((samples, states), sinkage_m))| Block {
-                first: index * LANES,
+                first: index * size,
                 done: 0,
                 risk: vec![RiskRow::default(); if scene.risk { samples.len() * horizon } else { 0 }],
                 samples,
@@ -200,7 +215,7 @@ impl Predictor {
             })
             .collect();
         loop {
-            blocks.par_iter_mut().filter(|block| block.done < horizon).for_each(|block| self.advance_block(scene, block));
+            blocks.par_iter_mut().filter(|block| block.done < horizon).for_each(|block| self.advance_block(scene, caches, block));
             let missing: Vec<Node> = blocks.iter_mut().flat_map(|block| block.missing.drain(..)).collect();
             match scene.tokens {
                 Some(tokens) if !missing.is_empty() => tokens.encode(&self.projection, missing),
