@@ -421,7 +421,6 @@ impl ObservedDrive {
                 sinkage_log_ratio,
                 soil: Soil::from_array(self.soil_at(model, soil, start + j, bench.stepping.dt_s)),
                 ground: ground.under_wheels(model, &state, 0.0).0,
-                ..transition.input
             };
             let StepOutput { increment, contacts } = model.step(&input);
             self.actuators(reading, start + j, j, contacts.map(|c| c.overspeed_m_s), gripping, &mut row);
