@@ -141,6 +141,17 @@ fn property_unsafe_code_stands_in_one_module() {
     }
 }
 
+/// What `deny.toml` says why an advisory does not concern this program: the code it is about is not compiled.
+#[test]
+fn property_zenoh_is_built_without_compression() {
+    let metadata = MetadataCommand::new().manifest_path(repository().join("Cargo.toml")).exec().expect("cargo metadata runs");
+    let transport = metadata.packages.iter().find(|p| p.name.as_str() == "zenoh-transport").expect("Zenoh's transport is in the graph");
+    assert!(transport.features.contains_key("transport_compression"), "the feature has another name now: see deny.toml");
+    let resolve = metadata.resolve.expect("a resolved graph");
+    let node = resolve.nodes.iter().find(|n| n.id == transport.id).expect("a node");
+    assert!(node.features.iter().all(|feature| **feature != *"transport_compression"), "see deny.toml");
+}
+
 /// Calls `f` with every Rust source below a folder of the repository.
 fn for_each_source(folder: &str, mut f: impl FnMut(&Path, &str)) {
     let mut open = vec![repository().join(folder)];
