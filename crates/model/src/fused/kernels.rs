@@ -198,23 +198,37 @@ pub fn softmax<V: Vector, const H: usize>(scores: &mut [Row<H>], scale: f32) {
 /// scores(t) = Σ_d keys(t, d) query(d) of each sample's own keys: `keys` (tokens) by (stride) rows, of which the first `query.len()` count.
 #[inline(always)]
 pub fn own_scores<V: Vector, const H: usize>(keys: &[Row<H>], stride: usize, query: &[Row<H>], scores: &mut [Row<H>]) {
+    if V::WIDE {
+        scores_of::<V, H, H>(keys, stride, query, scores);
+    } else {
+        scores_of::<V, 1, H>(keys, stride, query, scores);
+    }
+}
+
+/// The same for W of the H vectors of a row at a time.
+#[inline(always)]
+fn scores_of<V: Vector, const W: usize, const H: usize>(keys: &[Row<H>], stride: usize, query: &[Row<H>], scores: &mut [Row<H>]) {
     const T: usize = 4;
     for (group, scores) in scores.chunks_mut(T).enumerate() {
-        for h in 0..H {
-            let mut sums = [V::splat(0.0); T];
-            // Past the last token the cache holds older numbers; their sums are not stored.
-            let tokens: [&[Row<H>]; T] = core::array::from_fn(|t| {
-                let at = (group * T + t.min(scores.len() - 1)) * stride;
-                &keys[at..at + query.len()]
-            });
+        // Past the last token the cache holds older numbers; their sums are not stored.
+        let tokens: [&[Row<H>]; T] = core::array::from_fn(|t| {
+            let at = (group * T + t.min(scores.len() - 1)) * stride;
+            &keys[at..at + query.len()]
+        });
+        for from in (0..H).step_by(W) {
+            let mut sums = [[V::splat(0.0); W]; T];
             for (d, query) in query.iter().enumerate() {
-                let query = V::load(&query[h].0);
-                for t in 0..T {
-                    sums[t] = V::load(&tokens[t][d][h].0).mul_add(query, sums[t]);
+                for w in 0..W {
+                    let query = V::load(&query[from + w].0);
+                    for t in 0..T {
+                        sums[t][w] = V::load(&tokens[t][d][from + w].0).mul_add(query, sums[t][w]);
+                    }
                 }
             }
-            for (score, sum) in scores.iter_mut().zip(sums) {
-                sum.store(&mut score[h].0);
+            for (score, sums) in scores.iter_mut().zip(sums) {
+                for w in 0..W {
+                    sums[w].store(&mut score[from + w].0);
+                }
             }
         }
     }
@@ -223,22 +237,38 @@ pub fn own_scores<V: Vector, const H: usize>(keys: &[Row<H>], stride: usize, que
 /// out(d) += Σ_t weights(t) values(t, d) of each sample's own values, laid out as the keys of [`own_scores`].
 #[inline(always)]
 pub fn own_values<V: Vector, const H: usize>(values: &[Row<H>], stride: usize, weights: &[Row<H>], out: &mut [Row<H>]) {
+    if V::WIDE {
+        values_of::<V, H, H>(values, stride, weights, out);
+    } else {
+        values_of::<V, 1, H>(values, stride, weights, out);
+    }
+}
+
+/// The same for W of the H vectors of a row at a time.
+#[inline(always)]
+fn values_of<V: Vector, const W: usize, const H: usize>(values: &[Row<H>], stride: usize, weights: &[Row<H>], out: &mut [Row<H>]) {
     const D: usize = 8;
     for (group, out) in out.chunks_exact_mut(D).enumerate() {
-        for h in 0..H {
-            let mut sums = [V::splat(0.0); D];
+        for from in (0..H).step_by(W) {
+            let mut sums = [[V::splat(0.0); W]; D];
             for d in 0..D {
-                sums[d] = V::load(&out[d][h].0);
+                for w in 0..W {
+                    sums[d][w] = V::load(&out[d][from + w].0);
+                }
             }
             for (t, weight) in weights.iter().enumerate() {
-                let weight = V::load(&weight[h].0);
                 let values = &values[t * stride + group * D..][..D];
-                for d in 0..D {
-                    sums[d] = V::load(&values[d][h].0).mul_add(weight, sums[d]);
+                for w in 0..W {
+                    let weight = V::load(&weight[from + w].0);
+                    for d in 0..D {
+                        sums[d][w] = V::load(&values[d][from + w].0).mul_add(weight, sums[d][w]);
+                    }
                 }
             }
             for d in 0..D {
-                sums[d].store(&mut out[d][h].0);
+                for w in 0..W {
+                    sums[d][w].store(&mut out[d][from + w].0);
+                }
             }
         }
     }
