@@ -32,10 +32,9 @@ mod rollout;
 mod transitions;
 mod validate;
 
-use rollout::BlockCaches;
-
 pub(crate) use self::observed::LogClock;
 pub use self::parts::PartTimes;
+use self::rollout::BlockCaches;
 pub use self::transitions::Transition;
 pub(crate) use self::validate::validate;
 

@@ -72,7 +72,8 @@ impl Predictor {
                 if !block.missing.is_empty() {
                     let dt_s = self.bundle.normalization.dt_s;
                     let steps = LOOK_AHEAD.min(scene.query.horizon - block.done - 1);
-                    tokens.add_missing(block.samples.iter().map(|sample| ahead(&sample.state, dt_s).take(1 + steps)), &mut block.missing);
+                    let paths = block.samples[..distinct].iter().map(|sample| ahead(&sample.state, dt_s).take(1 + steps));
+                    tokens.add_missing(paths, &mut block.missing);
                     return false;
                 }
                 self.default_soil(scene.tokens, &mut terrain[..distinct]);
