@@ -211,7 +211,7 @@ SessionStatus from_message(const v1::Session& message) {
   if (message.has_forecasts()) {
     const v1::ForecastCheck& check = message.forecasts();
     status.forecasts = ForecastCheck{check.checked(), {check.error_rms_m().begin(), check.error_rms_m().end()},
-                                     {check.expected_rms_m().begin(), check.expected_rms_m().end()}, check.scale()};
+                                     {check.expected_rms_m().begin(), check.expected_rms_m().end()}, check.scale(), check.height_scale()};
   }
   return status;
 }

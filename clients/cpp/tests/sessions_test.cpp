@@ -159,7 +159,7 @@ void service_predictions_are_held_against_what_came(nesam::Client& client, const
   if (!status.ok() || !status->forecasts) return;
   const nesam::ForecastCheck& told = *status->forecasts;
   check(told.checked == 1 && told.error_rms_m.size() == 3 && told.expected_rms_m.size() == 3, "at three steps");
-  check(told.error_rms_m.back() > 0.0 && told.expected_rms_m.back() > 0.0 && told.scale >= 0.5, "errors and what was expected");
+  check(told.error_rms_m.back() > 0.0 && told.expected_rms_m.back() > 0.0 && told.scale >= 0.5 && told.height_scale >= 0.5, "errors and what was expected");
   check_ok(session.close(), "close");
 }
 

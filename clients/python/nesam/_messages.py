@@ -109,6 +109,7 @@ def forecast_check(message: sessions_pb2.ForecastCheck) -> t.ForecastCheck:
         error_rms_m=np.array(message.error_rms_m),
         expected_rms_m=np.array(message.expected_rms_m),
         scale=message.scale,
+        height_scale=message.height_scale,
     )
 
 

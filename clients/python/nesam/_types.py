@@ -139,13 +139,15 @@ class ForecastCheck:
     """Predictions of a session held against what was measured in the end, one every 3.2 s.
 
     checked: comparisons so far. error_rms_m, expected_rms_m: (3,), root mean square of the distance in (x, y) after 0.8, 1.6 and 3.2 s over about the last
-    minute, as measured and as bundle and soil filter expected it. scale: how many times the model's part of predicted covariances counts for it.
+    minute, as measured and as bundle and soil filter expected it. scale, height_scale: how many times the model's part of predicted covariances counts for it,
+    that of the height by how predicted heights came true, all else by (x, y).
     """
 
     checked: int
     error_rms_m: np.ndarray
     expected_rms_m: np.ndarray
     scale: float
+    height_scale: float
 
 
 @dataclass(frozen=True)

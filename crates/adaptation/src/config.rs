@@ -80,6 +80,9 @@ pub struct FilterConfig {
     pub trust_memory: f64,
     /// Log odds, before any evidence, that the correction helps. Lower: less harm on ground that is what it looks like, and a slower start elsewhere.
     pub trust_log_odds: f64,
+    /// Beyond Algorithm 1: probability, before a buffer is looked at, that the ground has changed since the last one to something that nothing learned tells of; 0 =
+    /// never. A buffer that fits P₀ better than P⁻ then moves P⁻ towards P₀, as far as it is likely that the ground has changed.
+    pub change_probability: f64,
     /// A buffer whose NIS would be exceeded with less than this probability is rejected. 0 accepts everything.
     pub gate_tail_probability: f64,
     /// Beyond Algorithm 1: times that one buffer is linearised at most, 1 to 10 (Gauss-Newton on the same posterior; 1 = once, at Δθ⁻). Soil acts
@@ -115,6 +118,7 @@ impl Default for FilterConfig {
             scale_memory: 5.0,
             trust_memory: 10.0,
             trust_log_odds: -3.0,
+            change_probability: 0.0,
             gate_tail_probability: 1e-9,
             linearisations: 4,
             bounded: true,
@@ -164,8 +168,10 @@ impl FilterConfig {
         if !self.process_sd.iter().all(|v| v.is_finite() && *v >= 0.0) {
             return fail("process_sd", format!("is {:?}; all six must be at least 0", self.process_sd));
         }
-        if !(0.0..1.0).contains(&self.gate_tail_probability) {
-            return fail("gate_tail_probability", format!("is {}, it must lie in [0, 1)", self.gate_tail_probability));
+        for (setting, value) in [("gate_tail_probability", self.gate_tail_probability), ("change_probability", self.change_probability)] {
+            if !(0.0..1.0).contains(&value) {
+                return fail(setting, format!("is {value}, it must lie in [0, 1)"));
+            }
         }
         if self.linearisations == 0 || self.linearisations > LINEARISATIONS_MAX {
             return fail("linearisations", format!("is {}, allowed are 1 to {LINEARISATIONS_MAX}", self.linearisations));

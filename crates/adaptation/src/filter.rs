@@ -47,6 +47,8 @@ impl SoilPosterior {
 pub struct SoilUpdate {
     /// The estimate from now on; the one from before when the buffer was rejected.
     pub posterior: SoilPosterior,
+    /// What the filter itself believed of that ground when it met the buffer, how likely the ground had changed since included: Δ⁻ and P⁻.
+    pub before: ClassBelief,
     /// Y - Ŷ, row 6 k + c for channel c of transition or block k.
     pub innovation: Vec<f64>,
     /// Normalised innovation squared.
@@ -223,7 +225,7 @@ impl SoilFilter {
     /// them, solve for the same posterior from a better point: e_i = Y - Ŷ(Δ_i) - H_i (Δθ⁻ - Δ_i). Differences and H are divided by the root of the factor
     /// on R_B, so that what carries on is the same number in every buffer.
     fn update(&mut self, model: &StepModel, buffer: &[BufferedTransition]) -> Result<SoilUpdate, AdaptationError> {
-        let ahead = self.state.predicted(&self.config);
+        let mut ahead = self.state.predicted(&self.config);
         let before = ahead.soils();
         let factor = self.config.noise_conditions.map_or(1.0, |c| c.factor(&conditions(buffer)));
         let noise_scale = self.scale.value() * factor;
@@ -239,7 +241,12 @@ impl SoilFilter {
         let (nis, dof) = (judged.nis, first.innovation.len());
         let excitation = self.excitation(&first.jacobian)?;
         self.scale.observe(nis / dof as f64);
-        let rejected = chi_square_tail(dof, nis) < self.config.gate_tail_probability;
+        let mut gated = nis;
+        if let Some(widened) = ahead.changed(&self.config, &first, &(self.config.with_caution(&rest) * self.config.shared_buffers))? {
+            gated = widened.step(&first, &before, &rest)?.nis;
+            ahead = widened;
+        }
+        let rejected = chi_square_tail(dof, gated) < self.config.gate_tail_probability;
         let excited = excitation >= self.config.excitation_min;
         if !rejected && excited {
             self.judge(model, buffer, unit, &judged)?;
@@ -266,6 +273,7 @@ impl SoilFilter {
         let trust = self.trust.weight();
         Ok(SoilUpdate {
             posterior: self.posterior(),
+            before: self.belief_in(&ahead, self.here),
             innovation,
             nis,
             dof,

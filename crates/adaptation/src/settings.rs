@@ -75,6 +75,9 @@ pub struct FilterSettings {
     /// R_B of channels: vx, vy, vz, ωx, ωy, ωz.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub noise: Option<[ChannelNoise; VELOCITY_DIM]>,
+    /// Probability, before a buffer, that the ground has changed.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub change_probability: Option<f64>,
     /// Tail probability below which a buffer is rejected.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gate_tail_probability: Option<f64>,
@@ -136,6 +139,7 @@ impl FilterSettings {
             trust_memory: Some(config.trust_memory),
             trust_log_odds: Some(config.trust_log_odds),
             noise,
+            change_probability: Some(config.change_probability),
             gate_tail_probability: Some(config.gate_tail_probability),
             linearisations: Some(config.linearisations),
             bounded: Some(config.bounded),
@@ -185,6 +189,7 @@ impl FilterSettings {
             scale_memory: self.scale_memory.unwrap_or(base.scale_memory),
             trust_memory: self.trust_memory.unwrap_or(base.trust_memory),
             trust_log_odds: self.trust_log_odds.unwrap_or(base.trust_log_odds),
+            change_probability: self.change_probability.unwrap_or(base.change_probability),
             gate_tail_probability: self.gate_tail_probability.unwrap_or(base.gate_tail_probability),
             linearisations: self.linearisations.unwrap_or(base.linearisations),
             bounded: self.bounded.unwrap_or(base.bounded),

@@ -244,6 +244,7 @@ fn property_unusable_settings_are_refused_by_name() {
     assert_eq!(refused(FilterConfig { prior_sd: [0.0; 6], ..base() }), "prior_sd");
     assert_eq!(refused(FilterConfig { process_sd: [f64::NAN; 6], ..base() }), "process_sd");
     assert_eq!(refused(FilterConfig { gate_tail_probability: 1.0, ..base() }), "gate_tail_probability");
+    assert_eq!(refused(FilterConfig { change_probability: 1.0, ..base() }), "change_probability");
     assert_eq!(refused(FilterConfig { block: 3, ..base() }), "block");
     assert_eq!(refused(FilterConfig { shared_buffers: 0.5, ..base() }), "shared_buffers");
     assert_eq!(refused(FilterConfig { caution: [1.0, 1.0, 0.5, 1.0, 1.0, 1.0], ..base() }), "caution");

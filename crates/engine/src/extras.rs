@@ -1,6 +1,6 @@
 //! What a prediction may compute beyond states: Jacobians, covariance, risk, what-if soils. What is not asked for costs nothing.
 
-use nesam_model::rollout_noise::{POSE, RolloutNoise, SoilCovariance, StateCovariance};
+use nesam_model::rollout_noise::{NoiseScale, POSE, RolloutNoise, SoilCovariance, StateCovariance};
 use nesam_model::{Linearisation, RiskOutputs};
 use nesam_physics::{SOIL_DIM, STATE_DIM, SoilCorrection};
 use rayon::prelude::*;
@@ -218,7 +218,7 @@ fn covariances(
     rolled: usize,
     start: &StateCovariance,
     soil: &SoilCovariance,
-    scale: f64,
+    scale: NoiseScale,
     noise: &RolloutNoise,
 ) -> Vec<f32> {
     let mut yaws = linearisation.states().map(|state| state.attitude_rad[2]);

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use nesam_adaptation::{FORECAST_AHEAD, ForecastCheck, SoilFilter};
 use nesam_fleet_soil::FleetPrior;
+use nesam_model::rollout_noise::NoiseScale;
 use nesam_model::{HistoryStep, Predictor, RolloutNoise, SoilByClass};
 use nesam_physics::{SOIL_DIM, Vehicle};
 use nesam_terrain::WorldMap;
@@ -136,8 +137,9 @@ impl SoilEstimate {
     }
 
     /// How many times the covariance of the model's errors counts in a prediction.
-    pub fn model_noise_scale(&self) -> f64 {
-        self.noise_scale * self.forecasts.scale()
+    pub fn model_noise_scale(&self) -> NoiseScale {
+        let Self { noise_scale, forecasts, .. } = self;
+        NoiseScale { height: noise_scale * forecasts.height_scale(), rest: noise_scale * forecasts.scale() }
     }
 }
 

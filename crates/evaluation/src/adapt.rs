@@ -7,6 +7,7 @@ use nesam_adaptation::{
     AdaptationError, BufferedTransition, FORECAST_AHEAD, FORECAST_STEPS, FilterConfig, ForecastCheck, Innovation, NoiseCalibration,
     SoilFilter, SoilPosterior, SoilUpdate, UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
 };
+use nesam_model::rollout_noise::NoiseScale;
 use nesam_model::{HISTORY, HistoryStep, Predictor, RolloutNoise, SoilByClass, SoilField, Transition};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
@@ -46,8 +47,8 @@ pub struct DriveAdaptation {
     pub updates: Vec<TimedUpdate>,
     /// Buffers that were given up because a number was not finite or S was singular.
     pub failed: usize,
-    /// Last samples of predictions that came true, ascending, and the scale of forecasts from then on ([`check_forecasts`]).
-    pub forecasts: Vec<(usize, f64)>,
+    /// Last samples of predictions that came true, ascending, and how they have come true until then ([`check_forecasts`]).
+    pub forecasts: Vec<(usize, ForecastCheck)>,
 }
 
 impl DriveAdaptation {
@@ -59,9 +60,11 @@ impl DriveAdaptation {
 
     /// How many times the model's noise counts as far as measurements up to `sample` tell: by accepted updates of the filter, times what predictions that came true
     /// have told; 1 before the first of either.
-    pub fn noise_scale_at(&self, sample: usize) -> f64 {
+    pub fn noise_scale_at(&self, sample: usize) -> NoiseScale {
         let told = self.forecasts.partition_point(|(last, _)| *last <= sample);
-        self.filter_scale_at(sample) * told.checked_sub(1).map_or(1.0, |last| self.forecasts[last].1)
+        let forecasts = told.checked_sub(1).map_or_else(ForecastCheck::default, |last| self.forecasts[last].1);
+        let filter = self.filter_scale_at(sample);
+        NoiseScale { height: filter * forecasts.height_scale(), rest: filter * forecasts.scale() }
     }
 
     /// The filter's part of it.
@@ -160,10 +163,10 @@ pub fn check_forecasts(
             .map(|start| {
                 let soil = adapted.soil_at(start, Some(map));
                 let errors = predictor.forecast_errors(&steps, start, FORECAST_STEPS, &soil, map);
-                if let (Some(errors), Some(expected)) = (errors, noise.planar(FORECAST_STEPS, adapted.filter_scale_at(start))) {
+                if let (Some(errors), Some(expected)) = (errors, noise.of_position(FORECAST_STEPS, adapted.filter_scale_at(start))) {
                     check.observe(&errors, &expected);
                 }
-                (start + FORECAST_AHEAD, check.scale())
+                (start + FORECAST_AHEAD, check)
             })
             .collect();
     });

@@ -9,6 +9,7 @@ use serde::Serialize;
 
 use crate::adapt::{Consistency, DriveAdaptation};
 use crate::evaluate::{DriveMaps, ModelScore};
+use crate::known_soil::KnownSoil;
 use crate::output::Provenance;
 use crate::score::{ErrorSummary, ErrorTree, PerDimension, PositionError, paired_difference, paired_ratio, summarise};
 use crate::{Resamples, Truth};
@@ -46,6 +47,8 @@ pub struct Adaptation<'a> {
     pub reference: Option<(&'a str, &'a ErrorSummary)>,
     /// What the filter did on each drive.
     pub filtered: &'a [DriveAdaptation],
+    /// How that agrees with the simulator's soil, where it was read.
+    pub known_soil: Option<&'a KnownSoil>,
     /// Settings of the filter.
     pub filter: &'a FilterConfig,
     /// Seed of the bootstrap.
@@ -113,6 +116,8 @@ struct ConsistencyJson {
     nis_mean_over_dof: Option<f64>,
     inside_95: Option<f64>,
     nis_median_over_dof: Option<f64>,
+    /// With `oracle_soil`: what was learned against the simulator's soil.
+    known_soil: Option<KnownSoil>,
 }
 
 /// What there is to gain: the same model on ground that is what it looks like.
@@ -225,6 +230,7 @@ impl Adaptation<'_> {
                 nis_mean_over_dof: consistency.nis_mean_over_dof,
                 inside_95: consistency.inside_95,
                 nis_median_over_dof: consistency.nis_median_over_dof,
+                known_soil: self.known_soil.cloned(),
             },
             updates: consistency.updates,
             rejected: consistency.rejected,

@@ -2,7 +2,7 @@
 
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use nesam_model::rollout_noise::{SoilCovariance, StateCovariance, sandwich, turned};
+use nesam_model::rollout_noise::{NoiseScale, SoilCovariance, StateCovariance, sandwich, turned};
 use nesam_model::{Predictor, RolloutQuery, Variant};
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, wrap_angle};
 use rayon::prelude::*;
@@ -25,8 +25,8 @@ pub struct LinearisedWindow {
     pub of_start: Vec<StateCovariance>,
     /// J_θ P_θ J_θᵀ of these steps in the same frame.
     pub of_soil: Vec<StateCovariance>,
-    /// How many times the model's noise counts on this ground, as far as the drive has told; 1 without a filter.
-    pub noise_scale: f64,
+    /// How many times the model's noise counts on this ground, as far as the drive has told; as the bundle says without a filter.
+    pub noise_scale: NoiseScale,
 }
 
 /// What is known of the soil of each window.
@@ -68,7 +68,7 @@ fn linearise(
 ) -> Result<LinearisedWindow, EvaluationError> {
     let drive = window.trajectory;
     let (correction, soil_covariance, noise_scale) = match soil {
-        SoilKnowledge::Prior(covariance) => (SoilCorrection::NONE, *covariance, 1.0),
+        SoilKnowledge::Prior(covariance) => (SoilCorrection::NONE, *covariance, NoiseScale::USUAL),
         SoilKnowledge::Learned(filtered, prior) => {
             let of_drive = &filtered[window.drive];
             let scale = of_drive.noise_scale_at(window.start);

@@ -55,7 +55,7 @@ fn residual_covariance(windows: &[LinearisedWindow], k: usize) -> StateCovarianc
     let (mut sum, mut count) = (Matrix::zeros(), 0.0);
     for window in windows.iter().filter(|w| w.errors.len() > k) {
         let e = &window.errors[k];
-        sum += Matrix::from_fn(|r, c| (e[r] * e[c] - window.of_start[k][r][c] - window.of_soil[k][r][c]) / window.noise_scale);
+        sum += Matrix::from_fn(|r, c| (e[r] * e[c] - window.of_start[k][r][c] - window.of_soil[k][r][c]) / window.noise_scale.of(r, c));
         count += 1.0;
     }
     // Units differ by orders of magnitude: the projection is made with every entry scaled to its own size.
@@ -84,7 +84,7 @@ impl Distances {
     fn of(window: &LinearisedWindow, k: usize, noise: &RolloutNoise) -> Option<Self> {
         let e = window.errors.get(k - 1)?;
         let q = noise.residual(k);
-        let p = |r: usize, c: usize| window.of_start[k - 1][r][c] + window.of_soil[k - 1][r][c] + window.noise_scale * q[r][c];
+        let p = |r: usize, c: usize| window.of_start[k - 1][r][c] + window.of_soil[k - 1][r][c] + window.noise_scale.of(r, c) * q[r][c];
         let (xx, xy, yy) = (p(0, 0), p(0, 1), p(1, 1));
         let planar = planar_mahalanobis(&[e[0], e[1]], &[[xx, xy], [xy, yy]]);
         Some(Self { planar, single: core::array::from_fn(|i| e[i] * e[i] / p(i, i)), radius_m: (xx * yy - xy * xy).sqrt().sqrt() })
@@ -140,6 +140,7 @@ pub fn coverage(windows: &[LinearisedWindow], noise: &RolloutNoise, resamples: &
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nesam_model::rollout_noise::NoiseScale;
     use rand::{RngExt, SeedableRng};
     use rand_chacha::ChaCha8Rng;
 
@@ -157,7 +158,7 @@ mod tests {
                 errors: (0..32).map(&mut error).collect(),
                 of_start: vec![NOTHING; 32],
                 of_soil: vec![NOTHING; 32],
-                noise_scale: scale,
+                noise_scale: NoiseScale::alike(scale),
             })
             .collect()
     }

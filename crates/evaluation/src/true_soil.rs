@@ -49,6 +49,11 @@ impl TrueSoil {
         self.at(position_m).map(|(_, class)| class)
     }
 
+    /// The soil of a place, clipped to the bounds of the physics; `None` off the map.
+    pub fn soil_at(&self, position_m: [f64; 2]) -> Option<[f64; SOIL_DIM]> {
+        self.at(position_m).map(|(soil, _)| soil)
+    }
+
     fn at(&self, [x_m, y_m]: [f64; 2]) -> Option<([f64; SOIL_DIM], usize)> {
         if !self.geometry.contains(x_m, y_m) {
             return None;
@@ -62,6 +67,6 @@ impl TrueSoil {
 impl SoilField for TrueSoil {
     /// The true soil under the reference point, clipped to the bounds of the physics; the prior off the map.
     fn soil(&self, _sample: usize, position_m: [f64; 2], prior: &[f64; SOIL_DIM]) -> [f64; SOIL_DIM] {
-        self.at(position_m).map_or(*prior, |(soil, _)| soil)
+        self.soil_at(position_m).unwrap_or(*prior)
     }
 }

@@ -8,6 +8,8 @@ use crate::tangent::StateJacobian;
 
 /// Covariance of a state, order and units of the state.
 pub type StateCovariance = [[f64; STATE_DIM]; STATE_DIM];
+/// Index of the height in a state.
+const HEIGHT: usize = 2;
 /// Covariance of a soil correction in its coordinates.
 pub type SoilCovariance = [[f64; SOIL_DIM]; SOIL_DIM];
 
@@ -17,6 +19,34 @@ pub const POSE: usize = 6;
 const SCHEMA: &str = "nesam.rollout_noise/1";
 /// Numbers of a lower triangle.
 const TRIANGLE: usize = STATE_DIM * (STATE_DIM + 1) / 2;
+
+/// How many times Q_k counts for a drive on which the model errs more, or less, than its bundle says.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct NoiseScale {
+    /// Of the height.
+    pub height: f64,
+    /// Of everything else.
+    pub rest: f64,
+}
+
+impl NoiseScale {
+    /// As the bundle says.
+    pub const USUAL: Self = Self::alike(1.0);
+
+    /// The same for all.
+    pub const fn alike(scale: f64) -> Self {
+        Self { height: scale, rest: scale }
+    }
+
+    /// Of one entry of a covariance. An entry between two that count s and t times counts √(s t) times, so that no variance becomes negative.
+    pub fn of(&self, row: usize, column: usize) -> f64 {
+        match (row == HEIGHT, column == HEIGHT) {
+            (true, true) => self.height,
+            (false, false) => self.rest,
+            _ => (self.height * self.rest).sqrt(),
+        }
+    }
+}
 
 /// What a bundle knows of its own errors: how far measured states lie from rollouts when start and soil are accounted for.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -108,18 +138,18 @@ impl RolloutNoise {
         })
     }
 
-    /// s Q_k of (x, y) at each of these steps, in the heading frame; `None` where one is beyond [`RolloutNoise::steps`].
-    pub fn planar<const N: usize>(&self, ahead: [usize; N], scale: f64) -> Option<[[[f64; 2]; 2]; N]> {
+    /// s Q_k of (x, y, z) at each of these steps, x and y in the heading frame; `None` where one is beyond [`RolloutNoise::steps`].
+    pub fn of_position<const N: usize>(&self, ahead: [usize; N], scale: f64) -> Option<[[[f64; 3]; 3]; N]> {
         let known = ahead.iter().all(|k| (1..=self.steps()).contains(k));
         known.then(|| {
             ahead.map(|k| {
                 let q = self.residual(k);
-                [[scale * q[0][0], scale * q[0][1]], [scale * q[1][0], scale * q[1][1]]]
+                core::array::from_fn(|r| core::array::from_fn(|c| scale * q[r][c]))
             })
         })
     }
 
-    /// P_k in World of step `k` (1 …) whose predicted yaw and derivatives are given, for covariances of start and soil; Q_k counts `scale` times.
+    /// P_k in World of step `k` (1 …) whose predicted yaw and derivatives are given, for covariances of start and soil; Q_k counts as `scale` says.
     pub fn covariance(
         &self,
         k: usize,
@@ -127,11 +157,11 @@ impl RolloutNoise {
         jacobian: &StateJacobian,
         start: &StateCovariance,
         soil: &SoilCovariance,
-        scale: f64,
+        scale: NoiseScale,
     ) -> StateCovariance {
         let (of_start, of_soil) = (sandwich(&jacobian.start, start), sandwich(&jacobian.soil, soil));
         let of_model = turned(&self.residual(k), yaw_rad);
-        core::array::from_fn(|r| core::array::from_fn(|c| of_start[r][c] + of_soil[r][c] + scale * of_model[r][c]))
+        core::array::from_fn(|r| core::array::from_fn(|c| of_start[r][c] + of_soil[r][c] + scale.of(r, c) * of_model[r][c]))
     }
 }
 
@@ -164,8 +194,20 @@ mod tests {
     fn analytic_without_start_and_soil_only_the_residual_is_left() {
         let noise = RolloutNoise::new([0.0; STATE_DIM], &[some(), some()]);
         let nothing = StateJacobian { start: [[1.0; STATE_DIM]; STATE_DIM], soil: [[1.0; SOIL_DIM]; STATE_DIM] };
-        let p = noise.covariance(2, 0.0, &nothing, &noise.start_covariance(), &[[0.0; SOIL_DIM]; SOIL_DIM], 1.0);
+        let p = noise.covariance(2, 0.0, &nothing, &noise.start_covariance(), &[[0.0; SOIL_DIM]; SOIL_DIM], NoiseScale::USUAL);
         assert_eq!(p, some());
+    }
+
+    #[test]
+    fn analytic_a_height_that_errs_more_leaves_the_rest_as_it_is() {
+        let noise = RolloutNoise::new([0.0; STATE_DIM], &[some()]);
+        let nothing = StateJacobian { start: [[0.0; STATE_DIM]; STATE_DIM], soil: [[0.0; SOIL_DIM]; STATE_DIM] };
+        let scale = NoiseScale { height: 9.0, rest: 4.0 };
+        let p = noise.covariance(1, 0.0, &nothing, &noise.start_covariance(), &[[0.0; SOIL_DIM]; SOIL_DIM], scale);
+        for (r, c, times) in [(0, 0, 4.0), (0, 1, 4.0), (2, 2, 9.0), (2, 3, 6.0), (8, 2, 6.0), (11, 11, 4.0)] {
+            assert_eq!(p[r][c], times * some()[r][c], "{r} {c}");
+        }
+        assert_eq!([1.7, 0.3].map(|s| NoiseScale::alike(s).of(2, 3)), [1.7, 0.3]);
     }
 
     #[test]

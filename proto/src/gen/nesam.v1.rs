@@ -1717,7 +1717,8 @@ pub struct SessionContent {
     pub effects_source: ::prost::alloc::string::String,
     #[prost(message, optional, tag = "30")]
     pub watch: ::core::option::Option<WatchImage>,
-    /// How predictions came true: comparisons so far, and the 8 numbers behind their means; empty where an older service wrote it.
+    /// How predictions came true: comparisons so far, and the 9 numbers behind their means; 8 (heights not compared) or none where an older
+    /// service wrote it.
     #[prost(uint64, tag = "31")]
     pub forecasts_checked: u64,
     #[prost(double, repeated, tag = "32")]
@@ -1991,9 +1992,12 @@ pub struct ForecastCheck {
     /// The same as the bundle and the soil filter expected it, m.
     #[prost(double, repeated, tag = "3")]
     pub expected_rms_m: ::prost::alloc::vec::Vec<f64>,
-    /// How many times the model's part of predicted covariances counts for it, 1 = as expected.
+    /// How many times the model's part of predicted covariances counts for it, 1 = as expected: of all but the height.
     #[prost(double, tag = "4")]
     pub scale: f64,
+    /// The same of the height, by how predicted heights came true.
+    #[prost(double, tag = "5")]
+    pub height_scale: f64,
 }
 /// The part of the vehicle card that a client needs to form valid commands.
 #[derive(Clone, PartialEq, ::prost::Message)]

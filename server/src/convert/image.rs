@@ -197,7 +197,7 @@ fn from_soil(content: &pb::SessionContent) -> Result<SoilEstimate, EngineError> 
     };
     let forecasts = match content.forecasts.as_slice() {
         [] => ForecastCheck::default(),
-        values => ForecastCheck::restored(content.forecasts_checked, &array(values)?)
+        values => ForecastCheck::restored(content.forecasts_checked, values)
             .ok_or_else(|| refused("has numbers that no check of forecasts can have"))?,
     };
     Ok(SoilEstimate { state, covariance: matrix(&soil.covariance)?, noise_scale: content.soil_noise_scale, forecasts })

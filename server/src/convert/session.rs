@@ -58,6 +58,7 @@ fn forecast_check(check: &ForecastCheck) -> Option<pb::ForecastCheck> {
         error_rms_m: error_rms_m.to_vec(),
         expected_rms_m: expected_rms_m.to_vec(),
         scale: check.scale(),
+        height_scale: check.height_scale(),
     })
 }
 

@@ -12,13 +12,16 @@ const FIRST: usize = 31;
 /// Steps from one comparison to the next.
 const APART: usize = 32;
 
-/// Samples of a vehicle that slides along x on top of its motion, by so much a second, without its velocities telling.
-fn sliding(session: &str, recorded: &Recorded, last: usize, slide_m_s: f64) -> Vec<v1::Measurement> {
-    let slid = |mut message: v1::Measurement, i: usize| {
-        message.state.as_mut().unwrap().position_m.as_mut().unwrap().x += slide_m_s * 0.1 * i as f64;
+/// Samples of a vehicle that slides along x on top of its motion, by so much a second, and whose height is measured up to so much too high and too low in turns of
+/// 3.2 s, without its velocities telling.
+fn displaced(session: &str, recorded: &Recorded, last: usize, slide_m_s: f64, heave_m: f64) -> Vec<v1::Measurement> {
+    let moved = |mut message: v1::Measurement, i: usize| {
+        let position = message.state.as_mut().unwrap().position_m.as_mut().unwrap();
+        position.x += slide_m_s * 0.1 * i as f64;
+        position.z += heave_m * (std::f64::consts::PI * i as f64 / APART as f64).cos();
         message
     };
-    samples(session, &recorded.drive, last).into_iter().enumerate().map(|(i, message)| slid(message, i)).collect()
+    samples(session, &recorded.drive, last).into_iter().enumerate().map(|(i, message)| moved(message, i)).collect()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -55,8 +58,10 @@ async fn service_predictions_are_held_against_what_came() {
     let mut adapted = adapt_all(&predictor, &drives, &maps, &filter_config(), &|_| {}).unwrap();
     check_forecasts(&predictor, &drives, &maps, &noise, &mut adapted);
     let told = client.session("s").await.unwrap().forecasts.unwrap();
-    let (at, scale) = adapted[0].forecasts[told.checked as usize - 1];
-    assert_eq!((at, scale.to_bits()), (FIRST + 4 * APART, told.scale.to_bits()), "as `nesam evaluate --coverage` has it");
+    let (at, check) = adapted[0].forecasts[told.checked as usize - 1];
+    assert_eq!(at, FIRST + 4 * APART);
+    let [offline, served] = [[check.scale(), check.height_scale()], [told.scale, told.height_scale]].map(|scales| scales.map(f64::to_bits));
+    assert_eq!(offline, served, "as `nesam evaluate --coverage` has it");
     server.shutdown().await;
 }
 
@@ -65,21 +70,24 @@ async fn service_what_predictions_got_wrong_widens_their_regions() {
     let (server, mut client, recorded) = start_on_map().await;
     let last = FIRST + 3 * APART + OPEN_STEPS;
     let mut told = Vec::new();
-    for (session, slide_m_s) in [("straight", 0.0), ("sliding", 0.4)] {
+    for (session, slide_m_s, heave_m) in [("straight", 0.0, 0.0), ("sliding", 0.4, 0.0), ("heaving", 0.0, 0.1)] {
         open(&mut client, session, recorded.world.id()).await;
-        client.feed(sliding(session, &recorded, last, slide_m_s)).await.unwrap();
+        client.feed(displaced(session, &recorded, last, slide_m_s, heave_m)).await.unwrap();
         let mut asked = candidates(session, &recorded.drive, last, 1, APART);
         asked.extras = Some(v1::PredictExtras { covariance: true, ..Default::default() });
         let covariance = client.predict(asked).await.unwrap().extras.covariance;
         let at_end = &covariance[(APART - 1) * 144..];
-        told.push((client.session(session).await.unwrap().forecasts.unwrap(), f64::from(at_end[0] + at_end[13])));
+        told.push((client.session(session).await.unwrap().forecasts.unwrap(), [at_end[0] + at_end[13], at_end[26]].map(f64::from)));
     }
-    let [(straight, usual), (sliding, wide)] = told.try_into().unwrap();
-    assert_eq!((straight.checked, sliding.checked), (3, 3));
+    let [(straight, usual), (sliding, wide), (heaving, high)] = told.try_into().unwrap();
+    assert_eq!([&straight, &sliding, &heaving].map(|check| check.checked), [3; 3]);
     // 0.4 m/s over 3.2 s on top of what the model errs by.
     assert!(sliding.error_rms_m[2] > 0.8 && straight.error_rms_m[2] < 0.6, "{sliding:?} {straight:?}");
     assert!(sliding.scale > 3.0 * straight.scale, "{} and {}", sliding.scale, straight.scale);
-    assert!(wide > 2.0 * usual, "{wide} and {usual} m²");
+    assert!(wide[0] > 2.0 * usual[0], "{wide:?} and {usual:?} m²");
+    // A height that comes out wrong says nothing of where the vehicle is.
+    assert!(heaving.height_scale > 3.0 * straight.height_scale && heaving.height_scale > 3.0 * heaving.scale, "{heaving:?} {straight:?}");
+    assert!(high[1] / usual[1] > 2.0 * high[0] / usual[0], "{high:?} and {usual:?} m²");
     server.shutdown().await;
 }
 

@@ -18,8 +18,9 @@ struct ForecastCheck {
   /// Root mean square of the distance in (x, y) after 0.8, 1.6 and 3.2 s over about the last minute, m: as measured, and as bundle and soil filter expected it.
   std::vector<double> error_rms_m;
   std::vector<double> expected_rms_m;
-  /// How many times the model's part of predicted covariances counts for it, 1 = as expected.
+  /// How many times the model's part of predicted covariances counts for it, 1 = as expected: of all but the height, and of the height.
   double scale = 1.0;
+  double height_scale = 1.0;
 };
 
 /// A session as the service holds it.

@@ -62,13 +62,7 @@ impl SoilFilter {
         self.belief_in(&self.state, self.here)
     }
 
-    /// Δ⁻ and P⁻ of the next update, for every class of ground.
-    pub fn predicted_beliefs(&self) -> Vec<ClassBelief> {
-        let ahead = self.state.predicted(&self.config);
-        (0..self.config.classes).map(|class| self.belief_in(&ahead, class)).collect()
-    }
-
-    fn belief_in(&self, state: &JointState, class: usize) -> ClassBelief {
+    pub(super) fn belief_in(&self, state: &JointState, class: usize) -> ClassBelief {
         let class = if class < self.config.classes { class } else { 0 };
         let (soils, covariance) = (state.soils(), state.soil_covariance(class));
         ClassBelief {

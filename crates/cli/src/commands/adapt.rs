@@ -9,8 +9,8 @@ use std::sync::Arc;
 use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, ModelName, Resamples, Row, Truth, WindowPredictor,
-    adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score, write_predictions,
+    Adaptation, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, KnownSoil, ModelName, Resamples, Row, Truth,
+    WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score, write_predictions,
 };
 use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
@@ -87,6 +87,11 @@ const TAIL_DOF: f64 = 4.0;
 /// What it makes of heave, roll and pitch, order vx, vy, vz, ωx, ωy, ωz (chosen on the same, ADR 0048).
 const CAUTION: [f64; 6] = [1.0, 1.0, 3.0, 3.0, 3.0, 1.0];
 
+/// How likely it thinks that the ground has changed before each buffer of a second: one change in ten seconds (chosen on the same and on twins, ADR 0059).
+const CHANGE_PROBABILITY: f64 = 0.1;
+/// Buffers over which it scales R_B to the drive, and its log odds that a correction helps before any evidence (chosen with that).
+const SCALE_MEMORY: f64 = 3.0;
+const TRUST_LOG_ODDS: f64 = -4.0;
 /// Standard deviation of the soil prior that it begins with, in the coordinates of a correction: half as wide again as the default (chosen on the same, ADR 0050).
 const PRIOR_SD: [f64; 6] = [1.05, 1.05, 0.225, 0.75, 0.12, 0.6];
 
@@ -151,6 +156,11 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed);
     let [fixed, adapted] = [0, 1].map(|i| score(&paths[i], &windows, truth, &resamples));
     let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth };
+    let known_soil = if args.also.contains(&AlsoArg::OracleSoil) {
+        KnownSoil::of(&drives.drives, &filtered, &scene.true_soils()?, &resamples)
+    } else {
+        None
+    };
     let alternatives = args.also.iter().map(|also| scene.paths(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
     let others: Vec<Row> = alternatives.iter().map(|(key, paths)| Row { key, score: score(paths, &windows, truth, &resamples) }).collect();
     let apart = apart(&drives.drives, &args.apart)?;
@@ -172,6 +182,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         apart: &apart,
         reference: reference.as_ref().map(|(set, summary)| (*set, summary)),
         filtered: &filtered,
+        known_soil: known_soil.as_ref(),
         filter: &filter,
         seed: args.seed,
         resamples: &resamples,
@@ -260,6 +271,9 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let prior_sd = *given.prior_sd.get_or_insert(PRIOR_SD);
     given.process_sd.get_or_insert(FilterConfig::process_sd_of(&prior_sd));
     given.caution.get_or_insert(CAUTION);
+    given.change_probability.get_or_insert(CHANGE_PROBABILITY);
+    given.scale_memory.get_or_insert(SCALE_MEMORY);
+    given.trust_log_odds.get_or_insert(TRUST_LOG_ODDS);
     if !args.follow_errors {
         given.shared_error_covariance = Some(Vec::new());
     }
@@ -335,6 +349,22 @@ fn print_table(a: &Adaptation<'_>) {
         number(c.nis_median_over_dof),
         number(c.inside_95)
     );
+    if let Some(known) = a.known_soil {
+        let between = |interval: Option<[f64; 2]>| interval.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
+        say!(
+            "the simulator's soil, {} updates: NEES over 6 median {:.2}, inside 95 %: {:.2}{}; 90 % intervals hold it: {:.2}{}",
+            known.updates,
+            known.nees_median_over_dof,
+            known.nees_inside_95,
+            between(known.nees_inside_95_ci95),
+            known.coverage_90,
+            between(known.coverage_90_ci95)
+        );
+        let row = |values: &[f64]| values.iter().map(|v| format!("{v:>11.2}")).collect::<String>();
+        say!("{:<22}{}", "", SOIL_NAMES.map(|n| format!("{n:>11}")).concat());
+        say!("{:<22}{}", "90 % intervals hold", row(&known.coverage_90_by_parameter));
+        say!("{:<22}{}", "error over the prior's", row(&known.error_over_prior));
+    }
     print_soil(a);
 }
 

@@ -38,7 +38,7 @@ impl OpenForecast {
     pub(super) fn compare(&self, predictor: &Predictor, noise: &RolloutNoise, map: &Arc<WorldMap>, check: &mut ForecastCheck) {
         let soil = SoilByClass::new(Some(map), self.corrections.clone());
         let errors = predictor.forecast_errors(&self.steps, HISTORY - 1, FORECAST_STEPS, &soil, map);
-        if let (Some(errors), Some(expected)) = (errors, noise.planar(FORECAST_STEPS, self.noise_scale)) {
+        if let (Some(errors), Some(expected)) = (errors, noise.of_position(FORECAST_STEPS, self.noise_scale)) {
             check.observe(&errors, &expected);
         }
     }

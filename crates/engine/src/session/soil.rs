@@ -10,8 +10,9 @@ use nesam_terrain::WorldMap;
 
 use crate::fleet::Brought;
 
-/// What the fleet may say at most on whether the correction helps, log odds: a vehicle that finds it wrong unlearns it within a few buffers. Chosen.
-const VOTES_MAX: f64 = 4.0;
+/// What the fleet may say at most on whether the correction helps, log odds: from odds of e⁻⁴ before any evidence to e, so that a vehicle that finds it wrong
+/// unlearns it within a few buffers. Chosen.
+const VOTES_MAX: f64 = 5.0;
 
 /// Distance in a buffer, m, and commanded speed, m/s, below which a vehicle stands. Chosen.
 const STANDING: [f64; 2] = [0.5, 0.5];
@@ -153,14 +154,14 @@ impl SoilLearner {
         let shifted = models.shifted.iter().map(|model| self.transitions(model, map).map(|buffer| (model.step_model(), buffer)));
         let shifted: Vec<_> = shifted.collect::<Option<_>>()?;
         self.filter.consider(models.usual.step_model(), &buffer, &shifted).ok()?;
-        let (predicted, log_odds) = (self.filter.predicted_beliefs(), self.filter.snapshot().trust_log_odds);
+        let log_odds = self.filter.snapshot().trust_log_odds;
         let mut update = None;
         for buffered in buffer {
             update = self.filter.push(models.usual.step_model(), buffered).ok()?;
         }
         let update = update?;
         let [x, y, _] = self.steps[(first + last) / 2].state.position_m;
-        let increment = if update.rejected { None } else { self.increment(&predicted, log_odds) };
+        let increment = if update.rejected { None } else { self.increment(&update.before, log_odds) };
         let brought = increment.map(|increment| Brought { position_m: [x, y], increment });
         let states: Vec<_> = self.steps[first..=last].iter().map(|step| models.usual.true_state(&step.state)).collect();
         let contradiction = contradiction(&states, models.usual.bundle().normalization.dt_s);
@@ -190,14 +191,13 @@ impl SoilLearner {
         Some(buffered.collect())
     }
 
-    /// What the last update knows more than it was predicted, and how it voted on whether the correction helps.
-    fn increment(&self, predicted: &[ClassBelief], log_odds: f64) -> Option<Increment> {
+    /// What the last update knows more than was believed before it, and how it voted on whether the correction helps.
+    fn increment(&self, before: &ClassBelief, log_odds: f64) -> Option<Increment> {
         let (after, config) = (self.filter.snapshot(), self.filter.config());
         let kept = 1.0 - 1.0 / config.trust_memory.max(1.0);
         let over = |log_odds: f64| log_odds - config.trust_log_odds;
         let vote = if config.trust_memory > 0.0 { over(after.trust_log_odds) - kept * over(log_odds) } else { 0.0 };
-        let prior = predicted.get(after.ground_class).or(predicted.first())?;
-        Increment::between(&soil_belief(prior), &soil_belief(&self.filter.belief()), vote).ok()
+        Increment::between(&soil_belief(before), &soil_belief(&self.filter.belief()), vote).ok()
     }
 
     /// Begins from what the fleet knows. Says whether it does.

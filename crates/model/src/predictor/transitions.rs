@@ -126,8 +126,8 @@ impl Predictor {
         transitions.iter().all(|t| t.ground_known).then_some(transitions)
     }
 
-    /// How far a prediction from `steps[start]` on a given soil, under the commands measured since, lies from what was measured then: measured minus predicted (x, y)
-    /// in the heading frame of the predicted state, m, after each of `ahead` steps (ascending). History and start are those before and at `start`. `None` where the
+    /// How far a prediction from `steps[start]` on a given soil, under the commands measured since, lies from what was measured then: measured minus predicted (x, y, z),
+    /// x and y in the heading frame of the predicted state, m, after each of `ahead` steps (ascending). History and start are those before and at `start`. `None` where the
     /// steps do not reach so far, or a wheel of the prediction stands off the map.
     pub fn forecast_errors<const N: usize>(
         &self,
@@ -136,7 +136,7 @@ impl Predictor {
         ahead: [usize; N],
         soil: &dyn SoilField,
         map: &Arc<WorldMap>,
-    ) -> Option<[[f64; 2]; N]> {
+    ) -> Option<[[f64; 3]; N]> {
         let last = start + ahead.last()?;
         if last >= steps.len() {
             return None;
@@ -145,9 +145,9 @@ impl Predictor {
         Some(ahead.map(|k| {
             let at = &predicted[k].input.state;
             let measured = self.true_state(&steps[start + k].state);
-            let [dx, dy] = [0, 1].map(|i| measured.position_m[i] - at.position_m[i]);
+            let [dx, dy, dz] = core::array::from_fn(|i| measured.position_m[i] - at.position_m[i]);
             let (sin, cos) = at.attitude_rad[2].sin_cos();
-            [cos * dx + sin * dy, cos * dy - sin * dx]
+            [cos * dx + sin * dy, cos * dy - sin * dx, dz]
         }))
     }
 

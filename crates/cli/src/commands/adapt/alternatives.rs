@@ -34,8 +34,8 @@ impl Scene<'_> {
             AlsoArg::ConstantElsewhere => return Ok(("constant_elsewhere", self.constant_elsewhere(filter)?)),
             AlsoArg::Literal => ("literal", WindowPredictor::Adapted { predictor: predictor(), filtered: Arc::new(self.literal()?) }),
             AlsoArg::OracleSoil => {
-                let soils = (0..self.drives.drives.len()).map(|d| Ok(self.true_soil(d)? as Arc<dyn SoilField>));
-                ("oracle_soil", on(soils.collect::<Result<_, Failure>>()?))
+                let soils = self.true_soils()?.into_iter().map(|soil| soil as Arc<dyn SoilField>);
+                ("oracle_soil", on(soils.collect::<Vec<_>>()))
             }
             AlsoArg::BestConstant => ("best_constant", on(self.best(false, filter)?)),
             AlsoArg::BestByClass => ("best_by_class", on(self.best(true, filter)?)),
@@ -89,6 +89,11 @@ impl Scene<'_> {
 
     fn literal(&self) -> Result<Vec<nesam_evaluation::DriveAdaptation>, Failure> {
         adapt_all(self.predictor, &self.drives.drives, &self.drives.maps, &FilterConfig::literal(), &|_| {}).or_input()
+    }
+
+    /// The simulator's soil of every drive.
+    pub(super) fn true_soils(&self) -> Result<Vec<Arc<TrueSoil>>, Failure> {
+        (0..self.drives.drives.len()).map(|drive| self.true_soil(drive)).collect()
     }
 
     fn true_soil(&self, drive: usize) -> Result<Arc<TrueSoil>, Failure> {

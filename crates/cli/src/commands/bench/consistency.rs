@@ -72,10 +72,11 @@ pub(super) fn run(args: &ConsistencyBench) -> Result<(), Failure> {
 fn print_report(r: &TwinReport) {
     say!("{} simulated drives, {} buffers, {} rejected", r.runs, r.buffers, r.rejected);
     say!(
-        "NEES over 6 at the end: median {:.2} (χ²: 0.89), mean {:.2}; inside the two-sided 95 % interval: {:.3} of the drives",
+        "NEES over 6 at the end: median {:.2} (χ²: 0.89), mean {:.2}; inside the two-sided 95 % interval: {:.3} of the drives, above it {:.3}",
         r.nees_median_over_dof,
         r.nees_mean_over_dof,
-        r.nees_inside_95
+        r.nees_inside_95,
+        r.nees_above_95
     );
     say!("NIS over its degrees of freedom: mean {:.2}; inside: {:.3} of the buffers", r.nis_mean_over_dof, r.nis_inside_95);
     say!("90 % intervals that hold the truth: {:.3}; of the posterior as it goes out: {:.3}", r.coverage_90, r.coverage_90_posterior);
