@@ -2,7 +2,9 @@
 
 use std::time::Duration;
 
+use nesam_adaptation::FilterConfig;
 use nesam_client::v1;
+use nesam_engine::{Command, Engine, FleetSoilSettings, Limits, OpenSession, Reply};
 use prost::Message as _;
 use tonic::Code;
 
@@ -69,4 +71,24 @@ async fn service_without_the_map_every_session_begins_alone() {
     assert_eq!(answer.soil_epoch, 0);
     assert_refused("no map", client.fleet_soil("").await, Code::FailedPrecondition, "map_id");
     tokio::time::timeout(Duration::from_secs(20), server.shutdown()).await.unwrap();
+}
+
+#[test]
+fn property_a_buffer_that_tells_nothing_brings_nothing() {
+    let recorded = recorded();
+    let cells = |excitation_min: f64| {
+        let filter = FilterConfig { excitation_min, ..filter_config() };
+        let engine = Engine::new(predictor(), Limits::default()).unwrap().with_filter(filter).unwrap();
+        let mut engine = engine.with_fleet_soil(FleetSoilSettings::default()).unwrap();
+        let mut call = |command: Command| engine.execute(0, &command).unwrap();
+        call(Command::PutMap { map: recorded.world.clone(), base: None });
+        call(Command::Open(OpenSession { vehicle: "truck".into(), map: recorded.world.id().into(), ..Default::default() }));
+        for i in 0..=60 {
+            call(Command::Measure { session: "truck".into(), vehicle: None, measurement: engine_sample(&recorded.drive, i) });
+        }
+        let Reply::FleetShares(_, shares) = call(Command::TellFleetSoil) else { panic!("another reply") };
+        shares.iter().map(|share| share.cells.len()).sum::<usize>()
+    };
+    assert!(cells(filter_config().excitation_min) > 0);
+    assert_eq!(cells(1e12), 0, "the estimate stayed as it was while P was expected to widen: no difference of the two is evidence");
 }

@@ -161,7 +161,9 @@ impl SoilLearner {
         }
         let update = update?;
         let [x, y, _] = self.steps[(first + last) / 2].state.position_m;
-        let increment = if update.rejected { None } else { self.increment(&update.before, log_odds) };
+        // A buffer that told nothing left the estimate as it was: it brings nothing, and no vote.
+        let told = update.excited && !update.rejected;
+        let increment = if told { self.increment(&update.before, log_odds) } else { None };
         let brought = increment.map(|increment| Brought { position_m: [x, y], increment });
         let states: Vec<_> = self.steps[first..=last].iter().map(|step| models.usual.true_state(&step.state)).collect();
         let contradiction = contradiction(&states, models.usual.bundle().normalization.dt_s);
