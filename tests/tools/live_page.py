@@ -39,6 +39,47 @@ FOREIGN = "performance.getEntriesByType('resource').filter((e) => !e.name.starts
 PAINTED = """(() => { const c = document.querySelector('#map'), d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data, seen = new Set();
   for (let i = 0; i < d.length; i += 4 * 97) seen.add(d[i] << 16 | d[i + 1] << 8 | d[i + 2]); return seen.size; })()"""
 
+RATES = """(async () => {
+  const { Store } = await import("/store.js"), store = new Store();
+  for (let i = 1; i <= 240; i++) {
+    const timings = Array.from({ length: 50 }, () => [i / 8, 0.1, 2, 64]);
+    store.apply({ now_s: i / 8, service: { predictions: 50 * i }, alarms: [], sessions: [], timings });
+  }
+  return [store.rate("predictions"), store.rate("candidates"), store.timings.length, store.now - store.timings[0][0]];
+})()"""
+BESIDE_A_HOLE = """(async () => {
+  const { Ground } = await import("/ground.js"), ground = new Ground("m", "a");
+  Object.assign(ground, { about: { columns: 5, rows: 5, resolution_m: 1, height_range_m: [0, 1] }, contour_m: 0.1, heights: new Float32Array(25).fill(0.55) });
+  ground.heights[12] = NaN;
+  const { data } = ground.paint("elevation", false).getContext("2d").getImageData(0, 0, 5, 5);
+  return [...new Set(Array.from({ length: 25 }, (_, i) => (data[4 * i + 3] ? data[4 * i] : "hole")))].length;
+})()"""
+LOADS = """(async () => {
+  const { MapView } = await import("/map.js"), map = { id: "m", version: 1, hash: "a" };
+  const view = Object.assign(Object.create(MapView.prototype), { store: { session: { map } }, grounds: new Map(), notBefore: new Map(), changed() {} });
+  const about = { origin_m: [0, 0], resolution_m: 1, columns: 1, rows: 1, height_range_m: [0, 1], semantics: false, classes: [] };
+  const fetched = window.fetch, told = [];
+  let fails = true, asked = 0;
+  window.fetch = async (url) => {
+    asked += 1;
+    return fails ? new Response("busy", { status: 503 }) : url.endsWith("/elevation") ? new Response(new Uint8Array(2)) : Response.json(about);
+  };
+  const look = async (ms) => {
+    view.fetchGround();
+    await new Promise((resolve) => setTimeout(resolve, ms));
+    told.push([asked, view.ground?.hash ?? null]);
+  };
+  await look(100);
+  fails = false;
+  await look(2100);
+  await look(100);
+  await look(100);
+  map.hash = "b";
+  await look(100);
+  window.fetch = fetched;
+  return told;
+})()"""
+
 
 class Program:
     """A running `nesam`, and the address of its page."""
@@ -78,6 +119,15 @@ def check(condition, what):
     print(f"  {what}")
 
 
+def modules(browser):
+    predictions, candidates, kept, oldest_s = browser.value(RATES)
+    check((predictions, candidates) == (400, 25600), "400 predictions of 64 candidates a second are told as so many")
+    check(300 <= kept <= 1200 and oldest_s > 29, "their times are thinned evenly")
+    check(browser.value(BESIDE_A_HOLE) == 2, "level ground beside a hole looks like level ground")
+    loads = browser.value(LOADS)
+    check(loads == [[1, None], [1, None], [3, "a"], [3, "a"], [5, "b"]], f"a map that did not come is asked for again, and one of another hash is another one {loads}")
+
+
 def without_vehicles(browser, nesam, shots):
     with tempfile.TemporaryDirectory() as folder:
         pathlib.Path(folder, "steering.json").write_text(json.dumps(REPORT))
@@ -93,6 +143,7 @@ def without_vehicles(browser, nesam, shots):
             widths = browser.value("[...document.querySelectorAll('#reports i')].map((i) => i.getBoundingClientRect().width)")
             check(widths[0] > widths[1] > widths[2] > 0 and abs(widths[2] / widths[0] - 0.25) < 0.02, "its bars are as long as the errors")
             browser.screenshot(shots / "empty.png")
+            modules(browser)
         finally:
             server.stop()
         browser.wait("document.getElementById('link').dataset.state === 'lost'")

@@ -121,14 +121,17 @@ class DurableStreamImpl {
       auto answer = exchange(kept.measurement, std::min(left(end), bounded(options_.reconnect)));
       if (!answer) return answer.error();
       if (no_room(*answer)) return Error(Code::unavailable, "", answer->is<Rejected>()->message);
-      if (counted_by_another(answer->run)) return Error(Code::unavailable, "", "another run of the server counts now");
-      run_ = answer->run;
+      // A refusal need not tell who counts.
+      if (answer->place != 0) {
+        if (counted_by_another(answer->run)) return Error(Code::unavailable, "", "another run of the server counts now");
+        run_ = answer->run;
+      }
       kept.place = answer->place;
       newest = std::move(*answer);
     }
     if (!newest) return Error(Code::internal, "", "nothing to send; this is a bug");
     // A place of 0 is that of a refused measurement, which nobody keeps.
-    durable(newest->run, newest->durable_place);
+    durable(run_, newest->run == run_ ? newest->durable_place : 0);
     return *std::move(newest);
   }
 

@@ -12,6 +12,10 @@ import socket
 import sys
 
 
+# From the rear axle, about which the car turns, ahead to the reference point, whose position and velocity are told, m.
+REFERENCE_M = 1.7
+
+
 class Bicycle:
     """A car on a level floor: the speed follows its command within half a second, the wheels do not slip."""
 
@@ -22,14 +26,14 @@ class Bicycle:
         for _ in range(10):
             self.speed += 0.01 / 0.5 * (speed_m_s - self.speed)
             self.rate = self.speed * math.tan(0.37 * second) / 3.3
-            x, y, yaw = self.pose
-            self.pose = [x + 0.01 * self.speed * math.cos(yaw), y + 0.01 * self.speed * math.sin(yaw), yaw + 0.01 * self.rate]
+            (x, y, yaw), vx, vy = self.pose, self.speed, REFERENCE_M * self.rate
+            east, north = vx * math.cos(yaw) - vy * math.sin(yaw), vx * math.sin(yaw) + vy * math.cos(yaw)
+            self.pose = [x + 0.01 * east, y + 0.01 * north, yaw + 0.01 * self.rate]
 
     def state(self):
         x, y, yaw = self.pose
         yaw = math.remainder(yaw, math.tau)
-        # The reference point of the car lies 1.7 m ahead of the rear axle, about which it turns.
-        return [x, y, 0.6, 0.0, 0.0, yaw, self.speed, 1.7 * self.rate, 0.0, 0.0, 0.0, self.rate]
+        return [x, y, 0.6, 0.0, 0.0, yaw, self.speed, REFERENCE_M * self.rate, 0.0, 0.0, 0.0, self.rate]
 
 
 def main(address):

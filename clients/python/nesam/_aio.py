@@ -11,12 +11,13 @@ from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._connection import arguments
-from ._errors import Unavailable, from_rpc
+from ._errors import DeadlineExceeded, Unavailable, from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
 from .v1 import (
     alarms_pb2,
+    measurements_pb2,
     measurements_pb2_grpc,
     prediction_pb2_grpc,
     sessions_pb2_grpc,
@@ -229,13 +230,16 @@ class AsyncMeasurementStream:
     async def __aexit__(self, *_: object) -> None:
         await self.close()
 
-    async def send(self, measurement: t.Measurement) -> t.Answer:
-        """Sends one measurement and awaits its answer. Raises Unavailable when the stream has ended."""
+    async def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
+        """As `MeasurementStream.send`."""
         message = m.measurement_message(measurement)
+        timeout_s = self._client.timeout_s if timeout_s is None else timeout_s
         async with self._turn:
             try:
-                await self._stream.write(message)
-                reply = await self._stream.read()
+                reply = await asyncio.wait_for(self._exchange(message), timeout_s)
+            except asyncio.TimeoutError:
+                self._stream.cancel()
+                raise DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s") from None
             except asyncio.InvalidStateError:
                 raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed") from None
             except grpc.RpcError as error:
@@ -245,6 +249,10 @@ class AsyncMeasurementStream:
         answer = m.answer(reply)
         self._client._known_states.measured(measurement, answer)
         return answer
+
+    async def _exchange(self, message: measurements_pb2.Measurement) -> measurements_pb2.MeasurementAnswer:
+        await self._stream.write(message)
+        return await self._stream.read()
 
     async def close(self) -> None:
         """Says that no more measurements come."""

@@ -2,7 +2,9 @@
 
 import queue
 import threading
-from typing import Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+import time
+from collections import deque
+from typing import Any, Deque, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -13,7 +15,7 @@ from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._connection import arguments
 from ._durable import DurableStream
-from ._errors import Unavailable, from_rpc
+from ._errors import DeadlineExceeded, NesamError, Unavailable, from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
@@ -182,22 +184,12 @@ class Client:
     # Measurements
 
     def measure(self, measurements: Iterable[t.Measurement]) -> List[t.Answer]:
-        """Sends measurements and returns the answer to each, in order. A bad measurement is answered, not raised."""
-        sent: List[t.Measurement] = []
+        """Sends measurements and returns the answer to each, in order. A bad measurement is answered, not raised.
 
-        def messages() -> Iterator[measurements_pb2.Measurement]:
-            for measurement in measurements:
-                sent.append(measurement)
-                yield m.measurement_message(measurement)
-
-        answers = []
-        try:
-            for message in self._measurements.Stream(messages()):
-                answers.append(m.answer(message))
-                self._known_states.measured(sent[len(answers) - 1], answers[-1])
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
-        return answers
+        Raises DeadlineExceeded when an answer takes longer than the client's `timeout_s`, Unavailable.
+        """
+        with self.measurement_stream() as stream:
+            return list(stream._exchange(measurements, self.timeout_s))
 
     def measurement_stream(self) -> "MeasurementStream":
         """An open stream for a vehicle that reports at its own pace; use it in a `with` block."""
@@ -275,9 +267,14 @@ class MeasurementStream:
 
     def __init__(self, client: Client):
         self._client = client
-        self._outgoing: "queue.Queue[Optional[measurements_pb2.Measurement]]" = queue.Queue()
-        self._closed = threading.Event()
-        self._answers = client._measurements.Stream(iter(self._outgoing.get, None))
+        self._outgoing: "queue.SimpleQueue[Optional[measurements_pb2.Measurement]]" = queue.SimpleQueue()
+        self._heard: "queue.SimpleQueue[Any]" = queue.SimpleQueue()
+        self._waiting: Deque[t.Measurement] = deque()
+        # Since when the oldest of those that wait has been waited for.
+        self._since = 0.0
+        self._closed = False
+        self._call = client._measurements.Stream(iter(self._outgoing.get, None))
+        threading.Thread(target=_listen, args=(self._call, self._heard), daemon=True).start()
 
     def __enter__(self) -> "MeasurementStream":
         return self
@@ -285,22 +282,58 @@ class MeasurementStream:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def send(self, measurement: t.Measurement) -> t.Answer:
-        """Sends one measurement and awaits its answer. Raises Unavailable when the stream has ended."""
-        if self._closed.is_set():
-            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed")
-        self._outgoing.put(m.measurement_message(measurement))
-        try:
-            answer = m.answer(next(self._answers))
-        except StopIteration:
-            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream") from None
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
-        self._client._known_states.measured(measurement, answer)
-        return answer
+    def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
+        """Sends one measurement and awaits its answer, at most for `timeout_s`, default that of the client.
+
+        Raises DeadlineExceeded when none comes in time, which ends the stream, and Unavailable when the stream has ended.
+        """
+        self._put(measurement)
+        return self._next(self._client.timeout_s if timeout_s is None else timeout_s)
 
     def close(self) -> None:
         """Says that no more measurements come."""
-        if not self._closed.is_set():
-            self._closed.set()
+        if not self._closed:
+            self._closed = True
             self._outgoing.put(None)
+
+    def _exchange(self, measurements: Iterable[t.Measurement], timeout_s: float) -> Iterator[t.Answer]:
+        """The answers to measurements that are sent without waiting for them."""
+        for measurement in measurements:
+            self._put(measurement)
+            while self._waiting and (not self._heard.empty() or time.monotonic() > self._since + timeout_s):
+                yield self._next(timeout_s)
+        while self._waiting:
+            yield self._next(timeout_s)
+
+    def _put(self, measurement: t.Measurement) -> None:
+        if self._closed:
+            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed")
+        message = m.measurement_message(measurement)
+        if not self._waiting:
+            self._since = time.monotonic()
+        self._waiting.append(measurement)
+        self._outgoing.put(message)
+
+    def _next(self, timeout_s: float) -> t.Answer:
+        """The answer to the oldest measurement that waits for one."""
+        try:
+            heard = self._heard.get(timeout=max(0.0, self._since + timeout_s - time.monotonic()))
+        except queue.Empty:
+            self._call.cancel()
+            heard = DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s")
+        if isinstance(heard, NesamError):
+            self.close()
+            raise heard
+        answer, self._since = m.answer(heard), time.monotonic()
+        self._client._known_states.measured(self._waiting.popleft(), answer)
+        return answer
+
+
+def _listen(call: Iterable[measurements_pb2.MeasurementAnswer], heard: "queue.SimpleQueue[Any]") -> None:
+    """Tells every answer on a stream, and then what ended it."""
+    try:
+        for message in call:
+            heard.put(message)
+        heard.put(Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream"))
+    except grpc.RpcError as error:
+        heard.put(from_rpc(error))

@@ -95,7 +95,7 @@ def session(message: sessions_pb2.Session) -> t.Session:
         accepted=message.accepted,
         durable_place=message.durable_place,
         run=message.run,
-        effects=tuple(effect(effect) for effect in message.effects),
+        effects=tuple(effect(one) for one in message.effects),
         effects_source=message.effects_source,
         alarm=alarm(message.alarm) if message.HasField("alarm") else None,
         forecasts=forecast_check(message.forecasts) if message.HasField("forecasts") else None,

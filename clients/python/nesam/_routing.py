@@ -14,7 +14,12 @@ class _Details(
     pass
 
 
-class VehicleHeader(grpc.UnaryUnaryClientInterceptor, grpc.StreamUnaryClientInterceptor, grpc.StreamStreamClientInterceptor):
+class VehicleHeader(
+    grpc.UnaryUnaryClientInterceptor,
+    grpc.UnaryStreamClientInterceptor,
+    grpc.StreamUnaryClientInterceptor,
+    grpc.StreamStreamClientInterceptor,
+):
     """Adds the metadata `x-vehicle-id`."""
 
     def __init__(self, vehicle_id: str):
@@ -27,6 +32,9 @@ class VehicleHeader(grpc.UnaryUnaryClientInterceptor, grpc.StreamUnaryClientInte
         )
 
     def intercept_unary_unary(self, continuation, details, request):
+        return continuation(self._with_header(details), request)
+
+    def intercept_unary_stream(self, continuation, details, request):
         return continuation(self._with_header(details), request)
 
     def intercept_stream_unary(self, continuation, details, requests):

@@ -7,7 +7,7 @@
 Needs casadi, which this package does not install.
 """
 
-from typing import Any, Dict, List, Optional, Tuple
+from typing import Any, Dict, List, Optional
 
 import casadi
 import numpy as np
@@ -24,7 +24,8 @@ class Rollout(casadi.Callback):
 
     Order of a state: x y z roll pitch yaw vx vy vz wx wy wz; a command is speed m/s and the second command in the unit of the vehicle card; one step is
     0.1 s. `options` are arguments of `Client.predict`. The start replaces the newest measured state of the session, whose history and soil are used. Jacobians
-    hold the terrain as the rollout met it. Keep a reference to the object as long as functions are made from it, as CasADi asks.
+    hold the terrain as the rollout met it. Each evaluation asks the service, of the session as it is then. Keep a reference to the object as long as
+    functions are made from it, as CasADi asks.
 
     `eval` raises what `Client.predict` raises. Bound the commands to the range of the vehicle card: beyond it the service refuses.
     """
@@ -33,7 +34,6 @@ class Rollout(casadi.Callback):
         casadi.Callback.__init__(self)
         self._client, self._session_id, self.horizon, self._options = client, session_id, horizon, options
         self._jacobian: Optional["_Jacobian"] = None
-        self._known: Tuple[bytes, Optional[Prediction]] = (b"", None)
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -56,7 +56,7 @@ class Rollout(casadi.Callback):
 
     def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
         """The states."""
-        return [casadi.DM(self.predict(*arguments).states[0].astype(np.float64).T)]
+        return [casadi.DM(self._predict(*arguments).states[0].astype(np.float64).T)]
 
     def has_jacobian(self) -> bool:
         return True
@@ -66,14 +66,9 @@ class Rollout(casadi.Callback):
         self._jacobian = _Jacobian(name, self, inames, onames, options)
         return self._jacobian
 
-    def predict(self, x0: casadi.DM, u: casadi.DM) -> Prediction:
-        """States and Jacobians together: solvers ask for both at the same place, so the newest answer is kept."""
+    def _predict(self, x0: casadi.DM, u: casadi.DM, extras: Optional[Extras] = None) -> Prediction:
         start, controls = np.array(x0).reshape(-1), np.array(u).T[None]
-        place = start.tobytes() + controls.tobytes()
-        if self._known[0] != place:
-            answer = self._client.predict(self._session_id, controls, start=start, extras=Extras(jacobians=True), **self._options)
-            self._known = (place, answer)
-        return self._known[1]
+        return self._client.predict(self._session_id, controls, start=start, extras=extras, **self._options)
 
 
 class _Jacobian(casadi.Callback):
@@ -104,7 +99,7 @@ class _Jacobian(casadi.Callback):
         return casadi.Sparsity.dense(_STATE * horizon, (_STATE, _COMMAND * horizon)[i])
 
     def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
-        extras = self._rollout.predict(arguments[0], arguments[1]).extras
+        extras = self._rollout._predict(arguments[0], arguments[1], Extras(jacobians=True)).extras
         rows = _STATE * self._rollout.horizon
         start = extras.jacobian_start[0].reshape(rows, _STATE)
         controls = extras.jacobian_controls[0].reshape(rows, _COMMAND * self._rollout.horizon)

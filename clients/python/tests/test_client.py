@@ -162,6 +162,16 @@ def test_service_forked_session_goes_its_own_way(driven):
     assert caught.value.field == "new_session_id"
 
 
+def test_service_effects_are_told_as_they_were_sent(driven):
+    effects = (nesam.Effect("steering_offset", {"second": 0.08}, {"second": 0.01}), nesam.Effect("speed_gain", {"relative": 0.1}))
+    applied = driven.apply_effects("truck", effects, source="a test")
+    assert (applied.effects, applied.effects_source) == (effects, "a test")
+    assert driven.session("truck").effects == effects and [s.effects for s in driven.sessions()] == [effects]
+    assert driven.fork_session("truck", "copy").effects == effects
+    assert driven.import_session(driven.export_session("truck"), "again").effects == effects
+    assert driven.revert_effects("truck").effects == driven.session("truck").effects == ()
+
+
 def test_service_measurement_answers_are_typed(driven):
     with driven.measurement_stream() as stream:
         again = list(straight("truck", 42))

@@ -1,6 +1,10 @@
-"""Goal: a vehicle that keeps what is not durable loses nothing when the server is killed. Method: the real binary, SIGKILL, a restart on its store."""
+"""Goal: a vehicle that keeps what is not durable loses nothing when the server is killed or stands still, and does not wait for it for ever. Method: the real
+binary, SIGKILL and a restart on its store, SIGSTOP and SIGCONT."""
 
+import os
+import signal
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -55,3 +59,33 @@ def test_service_a_killed_server_costs_nothing(start, hills):
         other = client.session("other")
         np.testing.assert_array_equal(session.soil.delta, other.soil.delta)
         np.testing.assert_array_equal(session.soil.covariance, other.soil.covariance)
+
+
+def test_service_a_server_that_stands_still_is_given_up_and_loses_nothing(start, hills):
+    drive = list(straight("truck", 30))
+    process, address = start()
+    with nesam.Client(address, timeout_s=60.0) as client:
+        client.upload_map(hills)
+        client.open_session("truck", map_id="hills")
+        with client.durable_stream("truck", reconnect_s=1.5) as stream:
+            for measurement in drive[:10]:
+                stream.send(measurement)
+            process.send_signal(signal.SIGSTOP)
+            os.waitpid(process.pid, os.WUNTRACED)
+            begun = time.monotonic()
+            with pytest.raises(nesam.Unavailable):
+                stream.send(drive[10])
+            assert 1.4 < time.monotonic() - begun < 3.0
+            begun = time.monotonic()
+            with pytest.raises(nesam.DeadlineExceeded):
+                stream.flush(timeout_s=0.5)
+            assert time.monotonic() - begun < 2.0 and stream.pending[-1].sequence == 11
+            process.send_signal(signal.SIGCONT)
+            stream.flush()
+            for measurement in drive[11:]:
+                assert stream.send(measurement).outcome in ("APPLIED", "GATED")
+            stream.flush()
+            assert not stream.pending
+        session = client.session("truck")
+        assert session.accepted == session.durable_place == 30 and session.last_sequence == 30
+        np.testing.assert_array_equal(session.state, drive[-1].state)

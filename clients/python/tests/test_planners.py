@@ -29,6 +29,25 @@ def test_service_casadi_has_the_jacobians_of_the_service(driven):
     assert (last[:-1] == 0).all() and (last[-1] != 0).any()
 
 
+def test_service_casadi_answers_from_the_session_as_it_is(driven):
+    casadi = pytest.importorskip("casadi")
+    from nesam.casadi import Rollout
+
+    horizon = 8
+    start, controls = driven.session("truck").state, fan(1, horizon)[0]
+    rollout = Rollout("rollout", driven, "truck", horizon)
+    u = casadi.MX.sym("u", 2, horizon)
+    x = rollout(start, u)
+    function = casadi.Function("f", [u], [x, casadi.jacobian(casadi.vec(x), casadi.vec(u))])
+    before = [np.array(value) for value in function(controls.T)]
+    driven.apply_effects("truck", [nesam.Effect("speed_gain", {"relative": 0.1})])
+    after = [np.array(value) for value in function(controls.T)]
+    full = driven.predict("truck", controls[None], start=start, extras=nesam.Extras(jacobians=True))
+    np.testing.assert_array_equal(after[0], full.states[0].T)
+    np.testing.assert_array_equal(after[1], full.extras.jacobian_controls[0].reshape(12 * horizon, 2 * horizon))
+    assert (after[0] != before[0]).any() and (after[1] != before[1]).any()
+
+
 def test_service_a_gradient_planner_drives_to_its_goal(driven):
     casadi = pytest.importorskip("casadi")
     from nesam.casadi import Rollout

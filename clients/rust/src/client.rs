@@ -13,8 +13,8 @@ use crate::measure::{MeasurementStream, WAITING_MAX};
 use crate::prediction::{Candidates, Prediction};
 use crate::tls::Tls;
 
-/// Largest reply accepted, bytes: 64 for each of 131 072 sample-steps, and some room.
-const REPLY_BYTES_MAX: usize = 16 << 20;
+/// Largest reply accepted, bytes: the soil map of a fleet takes 25 MiB at the default limits of a server, a prediction 64 for each of 131 072 sample-steps.
+const REPLY_BYTES_MAX: usize = 64 << 20;
 
 /// Metadata by which a proxy in front of several servers keeps the calls of a vehicle together.
 const VEHICLE: &str = "x-vehicle-id";
@@ -112,6 +112,10 @@ impl Client {
 
     fn prediction(&self) -> v1::prediction_client::PredictionClient<Routed> {
         v1::prediction_client::PredictionClient::new(self.routed()).max_decoding_message_size(REPLY_BYTES_MAX)
+    }
+
+    fn soil(&self) -> v1::soil_client::SoilClient<Routed> {
+        v1::soil_client::SoilClient::new(self.routed()).max_decoding_message_size(REPLY_BYTES_MAX)
     }
 
     /// Opens a session.
@@ -257,13 +261,11 @@ impl Client {
 
     /// What the fleet has learned of the ground; an empty name means all maps.
     pub async fn fleet_soil(&mut self, map: &str) -> Result<v1::FleetSoilMap, ClientError> {
-        let mut soil = v1::soil_client::SoilClient::new(self.routed());
-        Ok(soil.map(v1::FleetSoilRequest { map_id: map.into() }).await?.into_inner())
+        Ok(self.soil().map(v1::FleetSoilRequest { map_id: map.into() }).await?.into_inner())
     }
 
     /// Watches the soil estimate of a session.
     pub async fn watch_soil(&mut self, session: &str) -> Result<tonic::Streaming<v1::SoilEstimate>, ClientError> {
-        let mut client = v1::soil_client::SoilClient::new(self.routed());
-        Ok(client.watch(v1::WatchSoilRequest { session_id: session.into() }).await?.into_inner())
+        Ok(self.soil().watch(v1::WatchSoilRequest { session_id: session.into() }).await?.into_inner())
     }
 }

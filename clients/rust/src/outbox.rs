@@ -9,8 +9,8 @@ use nesam_proto::v1;
 enum Progress {
     /// Not sent, or sent over a connection that broke.
     Unsent,
-    /// Sent, not answered.
-    Sent,
+    /// Sent, not answered; counted in the order of sending, which is that of the answers.
+    Sent(u64),
     /// Answered: its place among those that the session has accepted.
     Received(u64),
 }
@@ -22,6 +22,8 @@ enum Progress {
 #[derive(Clone, Debug, Default)]
 pub struct Outbox {
     kept: VecDeque<(v1::Measurement, Progress)>,
+    /// How often a measurement was sent.
+    sent: u64,
     /// Who counts the places.
     run: u64,
 }
@@ -35,15 +37,23 @@ impl Outbox {
     /// The next measurement to send; it counts as sent from now on.
     pub fn next_unsent(&mut self) -> Option<v1::Measurement> {
         let (measurement, progress) = self.kept.iter_mut().find(|(_, progress)| *progress == Progress::Unsent)?;
-        *progress = Progress::Sent;
+        self.sent += 1;
+        *progress = Progress::Sent(self.sent);
         Some(measurement.clone())
     }
 
-    /// Takes the answer to the oldest measurement that was sent and not answered. A refused measurement is not kept, but for one that the service had no room
-    /// for: that is sent again.
+    /// Takes the answer to the measurement that was sent first of those not answered. A refused measurement is not kept, but for one that the service had no
+    /// room for: that is sent again.
     pub fn answered(&mut self, answer: &v1::MeasurementAnswer) {
-        self.counted_by(answer.run);
-        if let Some(at) = self.kept.iter().position(|(_, progress)| *progress == Progress::Sent) {
+        // A refusal need not tell who counts.
+        if answer.place != 0 {
+            self.counted_by(answer.run);
+        }
+        let sent = self.kept.iter().enumerate().filter_map(|(at, (_, progress))| match progress {
+            Progress::Sent(number) => Some((*number, at)),
+            _ => None,
+        });
+        if let Some((_, at)) = sent.min() {
             match &answer.outcome {
                 Some(v1::measurement_answer::Outcome::Rejected(rejected))
                     if [tonic::Code::ResourceExhausted, tonic::Code::Unavailable].contains(&rejected.code.into()) =>
@@ -54,7 +64,9 @@ impl Outbox {
                 _ => self.kept[at].1 = Progress::Received(answer.place),
             }
         }
-        self.durable(answer.run, answer.durable_place);
+        if answer.run == self.run {
+            self.durable(answer.run, answer.durable_place);
+        }
     }
 
     /// Takes a `durable_place` and the `run` that told it, for example by `Sessions.Get`. Another run than the one that answered says nothing of its places:
@@ -97,6 +109,11 @@ mod tests {
         v1::MeasurementAnswer { place, durable_place, ..Default::default() }
     }
 
+    fn no_room() -> v1::MeasurementAnswer {
+        let rejected = v1::Rejected { code: tonic::Code::ResourceExhausted.into(), ..Default::default() };
+        v1::MeasurementAnswer { outcome: Some(v1::measurement_answer::Outcome::Rejected(rejected)), ..Default::default() }
+    }
+
     fn sequences(outbox: &mut Outbox) -> Vec<u64> {
         std::iter::from_fn(|| outbox.next_unsent()).map(|m| m.sequence).collect()
     }
@@ -111,8 +128,7 @@ mod tests {
         assert_eq!(outbox.len(), 3);
         // Refused for good: not kept. No room: sent again.
         outbox.answered(&answer(0, 1));
-        let rejected = v1::Rejected { code: 8, ..Default::default() };
-        outbox.answered(&v1::MeasurementAnswer { outcome: Some(v1::measurement_answer::Outcome::Rejected(rejected)), ..answer(0, 1) });
+        outbox.answered(&no_room());
         assert_eq!(sequences(&mut outbox), [4]);
         outbox.reconnected();
         assert_eq!(sequences(&mut outbox), [2, 4]);
@@ -138,6 +154,32 @@ mod tests {
         assert_eq!(sequences(&mut outbox), [2]);
         outbox.answered(&v1::MeasurementAnswer { run: 6, ..answer(10, 9) });
         outbox.durable(6, 10);
+        assert!(outbox.is_empty());
+    }
+
+    #[test]
+    fn analytic_a_measurement_that_is_sent_again_is_answered_last() {
+        let mut outbox = Outbox::default();
+        (1..=3).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        assert_eq!(sequences(&mut outbox), [1, 2, 3]);
+        outbox.answered(&no_room());
+        assert_eq!(sequences(&mut outbox), [1]);
+        // The answers to 2 and 3 come before that to 1.
+        outbox.answered(&answer(1, 1));
+        outbox.answered(&answer(2, 2));
+        outbox.reconnected();
+        assert_eq!(sequences(&mut outbox), [1]);
+    }
+
+    #[test]
+    fn analytic_a_refusal_without_a_run_takes_no_place_away() {
+        let mut outbox = Outbox::default();
+        (1..=2).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        assert_eq!(sequences(&mut outbox), [1, 2]);
+        outbox.answered(&v1::MeasurementAnswer { run: 5, ..answer(1, 0) });
+        outbox.answered(&answer(0, 0));
+        assert!(sequences(&mut outbox).is_empty() && outbox.len() == 1, "1 has its place, 2 was refused for good");
+        outbox.durable(5, 1);
         assert!(outbox.is_empty());
     }
 }

@@ -242,7 +242,8 @@ impl SoilFilter {
         let excitation = self.excitation(&first.jacobian)?;
         self.scale.observe(nis / dof as f64);
         let mut gated = nis;
-        if let Some(widened) = ahead.changed(&self.config, &first, &(self.config.with_caution(&rest) * self.config.shared_buffers))? {
+        let cautious = self.config.with_caution(&rest);
+        if let Some(widened) = ahead.changed(&self.config, &first, &cautious)? {
             gated = widened.step(&first, &before, &rest)?.nis;
             ahead = widened;
         }
@@ -251,7 +252,7 @@ impl SoilFilter {
         if !rejected && excited {
             self.judge(model, buffer, unit, &judged)?;
             let tail = if self.config.tail_dof > 0.0 { (self.config.tail_dof + nis) / (self.config.tail_dof + dof as f64) } else { 1.0 };
-            let noise = self.config.with_caution(&rest) * (self.config.shared_buffers * tail.max(1.0));
+            let noise = cautious * (self.config.shared_buffers * tail.max(1.0));
             let mut linear = first;
             let mut step = ahead.step(&linear, &before, &noise)?;
             let mut delta = self.held(ahead.moved_soils(&step), buffer);

@@ -83,11 +83,12 @@ impl JointState {
 
     /// The same where the ground may have changed; `None` where the settings expect no change. P⁻ moves towards P₀ by the probability of a change that a buffer
     /// tells of, which is [`FilterConfig::change_probability`] before it is looked at. The mean stays: what was learned is the best guess of what is new.
+    /// `cautious` is R_B with the caution of the settings on it.
     pub(crate) fn changed(
         &self,
         config: &FilterConfig,
         buffer: &Linearisation,
-        noise: &DMatrix<f64>,
+        cautious: &DMatrix<f64>,
     ) -> Result<Option<Self>, AdaptationError> {
         let before = config.change_probability;
         if before == 0.0 {
@@ -95,8 +96,8 @@ impl JointState {
         }
         let mut new = self.clone();
         new.covariance.view_mut((0, 0), (self.soils, self.soils)).copy_from(&Self::prior(config).soils_covariance());
-        let at = self.soils();
-        let [usual, wide] = [self, &new].map(|state| state.step(buffer, &at, noise).map(|step| -0.5 * (step.nis + step.log_det)));
+        let (at, noise) = (self.soils(), cautious * config.shared_buffers);
+        let [usual, wide] = [self, &new].map(|state| state.step(buffer, &at, &noise).map(|step| -0.5 * (step.nis + step.log_det)));
         let odds = before / (1.0 - before) * (wide? - usual?).exp();
         let probability = if odds.is_finite() { odds / (1.0 + odds) } else { 1.0 };
         new.covariance = &self.covariance + (&new.covariance - &self.covariance) * probability;

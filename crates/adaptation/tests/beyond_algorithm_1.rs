@@ -66,13 +66,13 @@ fn property_ground_that_changes_unannounced_is_learned_anew() {
         // k_phi, φ and K: what this drive can tell. n and c act through sums with them.
         [0, 4, 5].map(|i| ((posterior.correction.delta[i] - truth[i]) / plain().prior_sd[i]).powi(2)).iter().sum::<f64>().sqrt()
     };
-    let (mut stubborn, mut open) = (0.0, 0.0);
+    let (mut settled, mut open) = (0.0, 0.0);
     for seed in 0..4 {
         // Half a drive on soft ground, half on ground that is what it looks like.
         let (soft, usual) = (twin(&model, SOFT, LOAM, 150, seed), twin(&model, LOAM, LOAM, 150, seed + 10));
         let whole: Vec<BufferedTransition> = soft.iter().chain(&usual).copied().collect();
         let expects_change = FilterConfig { change_probability: 0.03, ..plain() };
-        stubborn += distance(&run(plain(), &model, &whole).0, LOAM);
+        settled += distance(&run(plain(), &model, &whole).0, LOAM);
         let mut filter = SoilFilter::new(expects_change.clone()).unwrap();
         for transition in &whole {
             let update = filter.push(&model, *transition).unwrap();
@@ -91,10 +91,10 @@ fn property_ground_that_changes_unannounced_is_learned_anew() {
     }
     println!(
         "standard deviations of the prior that the estimate is off 15 s after a change: {} without, {} with",
-        stubborn / 4.0,
+        settled / 4.0,
         open / 4.0
     );
-    assert!(open < 0.5 * stubborn, "{open} and {stubborn}");
+    assert!(open < 0.5 * settled, "{open} and {settled}");
 }
 
 #[test]

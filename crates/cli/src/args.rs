@@ -73,18 +73,13 @@ pub struct BundleArgs {
 pub struct WindowArgs {
     /// Steps to predict [default: 32, fewer where every drive is shorter]
     #[arg(long, value_name = "STEPS", value_parser = positive)]
-    horizon: Option<usize>,
+    pub horizon: Option<usize>,
     /// Steps of measured history that the model may see, the start included
     #[arg(long, value_name = "STEPS", default_value_t = 32, value_parser = positive)]
     pub history: usize,
 }
 
 impl WindowArgs {
-    /// Steps to predict where no drive limits them.
-    pub fn horizon(&self) -> usize {
-        self.horizon.unwrap_or(MAX_HORIZON)
-    }
-
     /// Steps to predict on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows.
     pub fn horizon_on(&self, drives: &[Trajectory]) -> usize {
         if let Some(asked) = self.horizon {

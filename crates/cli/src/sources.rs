@@ -7,12 +7,13 @@ use std::sync::Arc;
 use nesam_client::MapLayers;
 use nesam_learning::recipe::is_validation;
 use nesam_model::{ModelBundle, Precision, Predictor};
-use nesam_physics::DT_S;
+use nesam_physics::{DT_S, Vehicle};
+use nesam_server::recording::RecordingHeader;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, Trajectory};
 
 use crate::args::{DataArgs, SplitArg};
-use crate::bundle_path::{bundle_dir, bundle_of_vehicle, sample_root};
+use crate::bundle_path::{bundle_dir, bundle_of_hash, bundle_of_vehicle, sample_root};
 use crate::failure::{Failure, OrFail};
 
 /// The drives of one set, with the map of each.
@@ -143,18 +144,70 @@ pub fn load_bundle_for(given: Option<&Path>, root: &DataRoot) -> Result<ModelBun
     load_bundle(given.or(own.as_deref()))
 }
 
-/// A bundle as a predictor of the vehicle of a data root. The bundle's own card is the calibrated one; only where the data root is of
-/// another vehicle does the physics take the new card, while the learned parts stay. This is said on stderr.
-pub fn predictor_for(mut bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Predictor>, Failure> {
+/// The bundle that a server was recorded with: the given one, else the shipped one of the recorded hash.
+pub fn load_recorded_bundle(given: Option<&Path>, header: &RecordingHeader) -> Result<ModelBundle, Failure> {
+    let found = if given.is_none() { bundle_of_hash(&header.bundle_hash) } else { None };
+    if given.is_none() && found.is_none() {
+        return Err(Failure::input(format!(
+            "the recording was made with bundle {} {}, which is not in deploy/bundles; give it with --bundle DIR",
+            header.bundle, header.bundle_hash
+        )));
+    }
+    load_bundle(given.or(found.as_deref()))
+}
+
+/// The bundle as a predictor of the vehicle of a data root, see [`on_vehicle_of`].
+pub fn predictor_for(bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Predictor>, Failure> {
+    Ok(Arc::new(Predictor::new(Arc::new(on_vehicle_of(bundle, root))).or_input()?))
+}
+
+/// The bundle on the vehicle of a data root. The bundle's own card is the calibrated one; only where the data root is of another vehicle does the physics take
+/// the new card, while the learned parts stay. This is said on stderr, and so is what a card of the same name says otherwise.
+pub fn on_vehicle_of(mut bundle: ModelBundle, root: &DataRoot) -> ModelBundle {
     let (own, given) = (&bundle.vehicle, root.vehicle());
+    let otherwise = uncalibrated_differences(own, given);
     if own.second != given.second || own.name != given.name {
         eprintln!(
             "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained",
             bundle.name, own.name, given.name
         );
         bundle.move_to(given);
+    } else if !otherwise.is_empty() {
+        eprintln!(
+            "note: {} has another {} than the card of bundle {}, which counts; a card under another vehicle name is used as it is",
+            root.card().display(),
+            otherwise.join(", "),
+            bundle.name
+        );
     }
-    Ok(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?))
+    bundle
+}
+
+/// Relative difference up to which two numbers of cards are the same: digits that a text drops.
+const SAME_SHARE: f64 = 1e-6;
+
+/// What calibration leaves alone and two cards say differently.
+fn uncalibrated_differences(a: &Vehicle, b: &Vehicle) -> Vec<&'static str> {
+    let steering = |v: &Vehicle| match &v.steering {
+        Some(table) => [table.command.as_slice(), table.front_left_rad.as_slice(), table.front_right_rad.as_slice()].concat(),
+        None => Vec::new(),
+    };
+    let of = |v: &Vehicle| {
+        [
+            ("mass", vec![v.mass_kg]),
+            ("inertia", v.inertia_kg_m2.as_flattened().to_vec()),
+            ("wheel centre", v.wheel_centre_m.as_flattened().to_vec()),
+            ("wheel radius", vec![v.wheel_radius_m]),
+            ("wheel width", vec![v.wheel_width_m]),
+            ("steering table", steering(v)),
+            ("command range", v.command_range.as_flattened().to_vec()),
+        ]
+    };
+    let differ = |a: &[f64], b: &[f64]| {
+        let largest = a.iter().chain(b).fold(0.0, |largest: f64, value| largest.max(value.abs()));
+        a.len() != b.len() || a.iter().zip(b).any(|(a, b)| (a - b).abs() > SAME_SHARE * largest)
+    };
+    of(a).into_iter().zip(of(b)).filter(|((_, a), (_, b))| differ(a, b)).map(|((name, _), _)| name).collect()
 }
 
 /// The predictor as it is, or with the network's products in rollouts rounded to bf16. `key` is the option that asks for it.

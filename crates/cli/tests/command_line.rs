@@ -48,6 +48,11 @@ fn copy_folder(from: &Path, to: &Path) {
     }
 }
 
+/// The bundle that is shipped for the vehicle of the sample.
+fn shipped() -> String {
+    sample().join("../../../deploy/bundles/hmmwv-nominal").display().to_string()
+}
+
 /// A set of the sample with index rows, and its first drive.
 fn some_set() -> (String, Vec<Value>) {
     for set in ["nominal", "ood_soil", "effect_open/payload"] {
@@ -141,6 +146,7 @@ fn chrono_wrong_input_is_refused_with_exit_code_2() {
     with(&["--set", &set, "--dt", "0"], &["--dt"]);
     let nowhere = here.path().to_str().unwrap();
     with(&["--set", &set, "--models", "tal_elev", "--baselines", nowhere], &["tal_elev", "nesam train --model"]);
+    with(&["--set", &set, "--baselines", "no/such/folder"], &["--baselines no/such/folder is not a folder"]);
     with(&["--set", &set, "--resamples", "10"], &["--resamples", "1000"]);
     refused(&["evaluate", "--data", "no/such/root"], here.path(), &["no/such/root", "not a folder"]);
     let id = rows[0]["trajectory"].as_str().unwrap();
@@ -180,6 +186,81 @@ fn chrono_the_sample_is_sound() {
     let inspect = nesam(&["inspect", &data], Path::new("."));
     assert_eq!(inspect.status.code(), Some(0), "{}", stderr(&inspect));
     assert!(stdout(&inspect).contains("mass_kg"));
+}
+
+#[test]
+fn service_a_root_without_samples_says_what_makes_a_set() {
+    let here = tempfile::tempdir().unwrap();
+    std::fs::copy(sample().join("vehicle_hmmwv.json"), here.path().join("vehicle_hmmwv.json")).unwrap();
+    std::fs::create_dir(here.path().join("first")).unwrap();
+    std::fs::write(here.path().join("first/index.json"), "[]").unwrap();
+    let check = nesam(&["check", "."], here.path());
+    let said = stdout(&check);
+    assert!(check.status.code() == Some(2) && said.contains("no folder with samples.parquet") && !said.contains("index"), "{said}");
+}
+
+#[test]
+fn service_bench_names_the_one_option_that_is_at_fault() {
+    let here = tempfile::tempdir().unwrap();
+    for (args, words) in [
+        (["predict", "--queries", "0"], "--queries must be at least 1, not 0"),
+        (["predict", "--samples", "0"], "--samples must be at least 1, not 0"),
+        (["predict", "--horizon", "33"], "--horizon must be 1 to 32, not 33"),
+        (["wire", "--horizon", "33"], "--horizon must be 1 to 32, not 33"),
+        (["wire", "--samples", "100000"], "--samples must be 1 to"),
+        (["wire", "--queries", "0"], "--queries must be at least 1, not 0"),
+        (["consistency", "--border", "30"], "--border must be 0 to 29, not 30"),
+    ] {
+        refused(&[&["bench"][..], &args].concat(), here.path(), &[words]);
+    }
+    refused(&["bench", "plant", "--worlds", "w01", "--drives", "1"], here.path(), &["--drives must be at least 2, not 1"]);
+}
+
+/// Goal: a drive of 2 s is predicted without options, as far as it goes, and commands of one's own say how many steps there are. Method: the first 20 samples
+/// of the log of the book.
+#[test]
+fn service_predict_takes_what_a_short_drive_allows() {
+    let here = tempfile::tempdir().unwrap();
+    let log = std::fs::read_to_string(sample().join("../../../docs/example/run.csv")).unwrap();
+    let short: Vec<&str> = log.lines().take(21).collect();
+    std::fs::write(here.path().join("short.csv"), short.join("\n") + "\n").unwrap();
+    let (card, bundle) = (sample().join("vehicle_hmmwv.json").display().to_string(), shipped());
+    let imported = nesam(&["import", "short.csv", "--to", "root", "--set", "short", "--vehicle", &card], here.path());
+    assert_eq!(imported.status.code(), Some(0), "{}", stderr(&imported));
+    let base = ["predict", "--data", "root", "--bundle", &bundle];
+    let steps = |more: &[&str]| {
+        let output = nesam(&[&base[..], more].concat(), here.path());
+        assert_eq!(output.status.code(), Some(0), "{more:?}: {}", stderr(&output));
+        let json: Value = serde_json::from_str(&stdout(&output)).unwrap();
+        (json["steps"].as_array().unwrap().len(), stderr(&output))
+    };
+    assert_eq!(steps(&[]).0, 19);
+    assert_eq!(steps(&["--horizon", "5"]).0, 5);
+    let told = |rows: usize| std::fs::write(here.path().join("c.csv"), format!("speed_m_s,second\n{}", "2,0.1\n".repeat(rows))).unwrap();
+    told(7);
+    let (count, said) = steps(&["--controls", "c.csv"]);
+    assert!(count == 7 && !said.contains("note:"), "{count}: {said}");
+    let (count, said) = steps(&["--controls", "c.csv", "--horizon", "3"]);
+    assert!(count == 3 && said.contains("note: the first 3 of 7 commands"), "{count}: {said}");
+    told(33);
+    refused(&[&base[..], &["--controls", "c.csv"]].concat(), here.path(), &["33 steps exceed the model's 32"]);
+}
+
+#[test]
+fn chrono_a_card_that_says_otherwise_than_the_bundle_is_told() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), root.path());
+    let bundle = shipped();
+    let said = || {
+        let output = nesam(&["predict", "--data", ".", "--set", "nominal", "--bundle", &bundle, "--horizon", "2"], root.path());
+        assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+        stderr(&output)
+    };
+    assert!(!said().contains("note:"), "{}", said());
+    let card = root.path().join("vehicle_hmmwv.json");
+    let heavier = std::fs::read_to_string(&card).unwrap().replace("\"mass_total\": 2493.56", "\"mass_total\": 2992.27");
+    std::fs::write(&card, heavier).unwrap();
+    assert!(said().contains("has another mass than the card of bundle hmmwv-nominal, which counts"), "{}", said());
 }
 
 #[test]
@@ -254,6 +335,9 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     refused(&other, here.path(), &["--from", "HMMWV", "Another"]);
     refused(&["train", "--model", "transformer", "--sustained=0.2"], here.path(), &["--sustained", "transformer"]);
     refused(&["train", "--model", "transformer", "--soil-prior=0.2"], here.path(), &["--soil-prior", "transformer"]);
+    for horizon in ["0", "34"] {
+        refused(&["train", "--horizon", horizon], here.path(), &[&format!("--horizon {horizon} is not 1 to 32")]);
+    }
 }
 
 /// Goal: train → inspect → predict → evaluate hold together, and a damaged bundle is refused by name. Method: a bundle of two training
@@ -303,7 +387,7 @@ fn chrono_a_bundle_made_in_seconds_predicts_and_a_damaged_one_is_refused() {
 fn chrono_diagnose_names_a_steering_offset_and_nothing_without_one() {
     let here = tempfile::tempdir().unwrap();
     let root = sample().display().to_string();
-    let shipped = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal").display().to_string();
+    let shipped = shipped();
     let run = |set: &str, out: &str| -> Value {
         let output = nesam(&["diagnose", "--data", &root, "--set", set, "--bundle", &shipped, "--out", out], here.path());
         assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
@@ -413,7 +497,7 @@ fn service_a_configuration_is_checked_without_serving() {
 #[test]
 fn service_laps_with_a_diagnosed_bundle_differ_by_its_effects_alone() {
     let folder = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample().display().to_string(), sample().join("../../../deploy/bundles/hmmwv-nominal").display().to_string());
+    let (root, bundle) = (sample().display().to_string(), shipped());
     let quick = ["--worlds", "w01", "--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
     let asked = |more: &[&'static str]| [&["navigate", "--data", &root, "--bundle", &bundle][..], &quick, more].concat();
     refused(&asked(&["--configurations", "diagnosed"]), folder.path(), &["--diagnosed"]);
@@ -425,6 +509,49 @@ fn service_laps_with_a_diagnosed_bundle_differ_by_its_effects_alone() {
     let ((first, adapted), (second, diagnosed)) = (of(0), of(1));
     assert_eq!((first.as_str(), second.as_str()), ("adapted", "diagnosed"));
     assert!(adapted["measurements"]["APPLIED"].as_u64() > Some(50) && adapted == diagnosed, "{adapted} {diagnosed}");
+}
+
+/// A copy of one world of the sample with a vehicle card.
+fn root_of_a_world(card: &Path, name: &str) -> tempfile::TempDir {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample().join("worlds/w01"), &root.path().join("worlds/w01"));
+    std::fs::copy(card, root.path().join(name)).unwrap();
+    root
+}
+
+/// Goal: laps are taken from an earlier run only where card and true soil are what they were. Method: both files, one after the other, with one byte more.
+#[test]
+fn service_laps_are_driven_again_where_card_or_soil_changed() {
+    let root = root_of_a_world(&sample().join("vehicle_hmmwv.json"), "vehicle_hmmwv.json");
+    let bundle = shipped();
+    let drive = || {
+        let quick = ["--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
+        let asked = ["navigate", "--data", ".", "--bundle", &bundle, "--worlds", "w01", "--configurations", "kinematic"];
+        let output = nesam(&[&asked[..], &quick].concat(), root.path());
+        assert!(output.status.success(), "{}", stderr(&output));
+        stderr(&output).contains("driven with other settings")
+    };
+    assert!(!drive() && !drive(), "the same laps");
+    for file in ["worlds/w01/gt_soil.json", "vehicle_hmmwv.json"] {
+        let text = std::fs::read_to_string(root.path().join(file)).unwrap();
+        std::fs::write(root.path().join(file), text + "\n").unwrap();
+        assert!(drive(), "{file}");
+    }
+}
+
+/// Goal: nobody drives laps of one vehicle with the model of another without being told. Method: the car's bundle on the card of a skid-steer robot, which the
+/// built-in plant is not.
+#[test]
+fn service_laps_of_another_vehicle_than_that_of_the_bundle_are_told() {
+    let root = root_of_a_world(&sample().join("../../../deploy/bundles/clearpath-husky/vehicle.json"), "vehicle_husky.json");
+    let bundle = shipped();
+    let asked =
+        |more: &[&'static str]| [&["navigate", "--data", ".", "--bundle", &bundle, "--worlds", "w01", "--runs", "1"][..], more].concat();
+    let moved = "was trained for `HMMWV";
+    refused(&asked(&["--speed", "3.5"]), root.path(), &[moved, "--speed 3.5 is not 0.5 to 3 m/s"]);
+    let words = [moved, "no kinematic model fitted for `Clearpath Husky"];
+    refused(&asked(&["--configurations", "kinematic"]), root.path(), &words);
+    refused(&asked(&[]), root.path(), &[moved, "kinematic is left out", "vehicle_husky.json"]);
 }
 
 /// A bias of the gyro in three drives of the plant: found, sized, and written down with what was hidden.

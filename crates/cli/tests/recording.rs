@@ -123,3 +123,35 @@ async fn service_a_run_in_bf16_replays_in_bf16() {
     let json: Value = serde_json::from_str(&std::fs::read_to_string(here.path().join("out.json")).unwrap()).unwrap();
     assert_eq!((json["kinds"]["predict"]["equal"].as_u64(), json["total"]["different"].as_u64()), (Some(1), Some(0)));
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_diagnosis_takes_the_bundle_of_the_recording() {
+    let here = tempfile::tempdir().unwrap();
+    // A bundle that is not shipped: the shipped one under another name.
+    let own = here.path().join("own");
+    std::fs::create_dir(&own).unwrap();
+    for entry in std::fs::read_dir(bundle("hmmwv-nominal")).unwrap().flatten() {
+        std::fs::copy(entry.path(), own.join(entry.file_name())).unwrap();
+    }
+    let manifest = std::fs::read_to_string(own.join("manifest.toml")).unwrap();
+    std::fs::write(own.join("manifest.toml"), manifest.replace("name = \"hmmwv-nominal\"", "name = \"own\"")).unwrap();
+    let (mut server, lines) = common::start_on(here.path(), "own", &["--no-http", "--record", "run"]);
+    drive(&format!("http://{}", common::told(&lines, "grpc").expect("an address"))).await;
+    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+
+    // Two seconds are too few for a diagnosis, which is said once the bundle is right.
+    let (shipped, other) = (bundle("hmmwv-nominal"), bundle("clearpath-husky"));
+    for (given, words) in [
+        (None, vec!["was made with bundle own", "not in deploy/bundles", "--bundle DIR"]),
+        (Some(other.as_str()), vec!["was trained for `Clearpath Husky", "the recording is of `HMMWV"]),
+        (Some(shipped.as_str()), vec!["note: the recording was made with bundle own", "no 4 s"]),
+        (Some("own"), vec!["no 4 s"]),
+    ] {
+        let more = given.map_or(Vec::new(), |dir| vec!["--bundle", dir]);
+        let output = nesam(&[&["diagnose", "--recording", "run", "--session", "truck"][..], more.as_slice()].concat(), here.path());
+        let said = said(&output);
+        assert!(output.status.code() == Some(2) && words.iter().all(|word| said.contains(word)), "{given:?}: {said}");
+        assert_eq!(said.contains("note:"), given == Some(shipped.as_str()), "{said}");
+    }
+}

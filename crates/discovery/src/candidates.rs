@@ -252,6 +252,15 @@ impl Candidate {
         self.line.scalings[0].share(unit, value)
     }
 
+    /// By how much a free parameter changes when the effect grows by its own size, ∂v / ∂ ln share: what its uncertainty is held against. That is |v| for a size or
+    /// a limit, and |v ln v| for a factor, which is absent at 1.
+    pub fn magnitude(&self, i: usize, value: f64) -> f64 {
+        match self.line.scalings[i] {
+            Scaling::Factor => (value * value.ln()).abs(),
+            _ => value.abs(),
+        }
+    }
+
     /// Physical range of a free parameter.
     pub fn range(&self, i: usize) -> [f64; 2] {
         let range = self.of(&self.line.columns[0]).parameters()[self.line.free[i].parameter].range;

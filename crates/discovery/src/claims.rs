@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use nesam_evaluation::report::Short;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use rayon::prelude::*;
@@ -125,6 +126,23 @@ impl Settled {
         rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
         (best, rivals)
     }
+
+    /// Whether drives that chose `chosen` stand for a hypothesis that `counts`: they chose a member, and of the members one that counts is best on the drives for
+    /// which `inside` holds, or not decided against. Effects near zero, which a choice looks at, do not tell a large delay from a lag.
+    pub(crate) fn stands(
+        &self,
+        yardstick: &Yardstick,
+        chosen: &[usize],
+        before: &Group,
+        inside: impl Fn(usize) -> bool,
+        counts: impl Fn(usize) -> bool,
+    ) -> bool {
+        if !chosen.iter().any(|h| self.members.contains(h)) {
+            return false;
+        }
+        let (best, others) = self.compare(yardstick, before, inside);
+        counts(self.members[best]) || others.iter().any(|r| r.difference < DECISIVE && counts(r.hypothesis))
+    }
 }
 
 /// A set of drives, ready to be judged.
@@ -140,6 +158,8 @@ pub struct Case<'a> {
     pub prepared: Vec<Prepared>,
     /// Deviations of each drive without any effect.
     pub rows: Vec<Vec<Row>>,
+    /// Onset of each hypothesis, from which on its columns are there; `None` until they were looked for.
+    pub onsets: Option<Vec<Option<Onset>>>,
 }
 
 impl Case<'_> {
@@ -148,11 +168,15 @@ impl Case<'_> {
         self.prepared.iter().map(|p| &p.condensed)
     }
 
-    /// Selects effects, looks for the onset of the strongest, and lets the columns begin there where an onset is sure.
+    /// Selects effects, looks for the onset of the strongest, and lets the columns begin there where an onset is sure. Onsets are looked for once: columns that
+    /// begin somewhere tell of no onset.
     pub fn select(&mut self, yardstick: &Yardstick) -> (Selection, Vec<Option<Onset>>) {
-        let mut onsets: Vec<Option<Onset>> = vec![None; yardstick.catalogue.len()];
         let group = yardstick.group(self.condensed());
         let selection = yardstick.select(&group);
+        if let Some(onsets) = &self.onsets {
+            return (selection, onsets.clone());
+        }
+        let mut onsets: Vec<Option<Onset>> = vec![None; yardstick.catalogue.len()];
         if !selection.differs() {
             return (selection, onsets);
         }
@@ -168,6 +192,7 @@ impl Case<'_> {
             let dispersion = columns.iter().map(|c| yardstick.nulls.dispersion(*c)).fold(1.0, f64::max);
             onsets[h] = onset::find(&self.metric, &drives, &rows, self.bench.stepping.dt_s, &columns, &shares, dispersion);
         }
+        self.onsets = Some(onsets.clone());
         if onsets.iter().all(Option::is_none) {
             return (selection, onsets);
         }
@@ -243,9 +268,8 @@ impl Case<'_> {
         let left = members.iter().map(|h| self.left(&self.size(yardstick, &before, &with(*h), onsets))).collect();
         let settled = Settled { members, others, left };
         let (best, mut rivals) = settled.compare(yardstick, &before, |_| true);
-        selection.chosen = settled.with(best);
-        let far = selection.rivals[0].iter().filter(|r| !settled.members.contains(&r.hypothesis)).cloned();
-        rivals.extend(far);
+        rivals.extend(selection.rivals[0].iter().filter(|r| !settled.members.contains(&r.hypothesis)).cloned());
+        selection.choose(yardstick, &before, settled.with(best));
         selection.rivals[0] = rivals;
         selection.remaining = yardstick.remaining_after_fit(&settled.group(yardstick, best, |_| true), &before, &selection.chosen);
         Some(settled)
@@ -288,9 +312,7 @@ impl Case<'_> {
 
     /// Share of half-samples of the drives that choose a hypothesis, one of its rivals, or something that they cannot tell from it.
     ///
-    /// A half-sample looks at effects near zero, where a large delay is much like a lag. What was compared through the physics on all drives is therefore
-    /// compared in the same way on the half: its choice counts for the class if the hypothesis or a rival of it is best there, or within the
-    /// criterion of the best.
+    /// What was compared through the physics on all drives is compared in the same way on the half ([`Settled::stands`]).
     fn stability(&self, yardstick: &Yardstick, own: Candidate, rivals: &[Member], settled: Option<&Settled>) -> f64 {
         let drives = self.prepared.len();
         let n = drives.min(STABILITY_PARTS);
@@ -304,14 +326,9 @@ impl Case<'_> {
             .par_iter()
             .filter(|subset| {
                 let inside = |i: usize| **subset & (1 << part_of(i, drives, STABILITY_PARTS)) != 0;
-                let part = || yardstick.group((0..drives).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
-                let chosen = yardstick.select(&part()).chosen;
-                if chosen.iter().any(|h| in_class(*h)) {
-                    return true;
-                }
-                let Some(settled) = settled.filter(|s| chosen.iter().any(|h| s.members.contains(h))) else { return false };
-                let (best, others) = settled.compare(yardstick, &part(), inside);
-                in_class(settled.members[best]) || others.iter().any(|r| r.difference < DECISIVE && in_class(r.hypothesis))
+                let part = yardstick.group((0..drives).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
+                let chosen = yardstick.select(&part).chosen;
+                chosen.iter().any(|h| in_class(*h)) || settled.is_some_and(|s| s.stands(yardstick, &chosen, &part, inside, in_class))
             })
             .count();
         hits as f64 / subsets.len().max(1) as f64
@@ -385,7 +402,7 @@ fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
         .map(|(p, parameter)| {
             let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
                 // The first value is the magnitude, which answers for the scale of the response.
-                let scale = if i == 0 { 1.96 * mismatch(candidate.layer()) * fit.values[term][i] } else { 0.0 };
+                let scale = if i == 0 { 1.96 * mismatch(candidate.layer()) * candidate.magnitude(i, fit.values[term][i]) } else { 0.0 };
                 let half = half_width(group, fit, term, &[(i, 1.0)], |values| values[i]).hypot(scale);
                 let end = if quantities[p].complete { parameter.range[1] } else { f64::INFINITY };
                 [parameter.value - half, (parameter.value + half).min(end)]
@@ -410,7 +427,7 @@ fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<S
     let free = finding.candidate.free();
     if let Some(i) = fit.held[term].iter().position(|h| *h) {
         let e = &finding.estimates[free[i].parameter];
-        return Some(format!("{} = {:.3} {} lies at the end of its physical range", e.name, e.value, e.unit));
+        return Some(format!("{} = {} {} lies at the end of its physical range", e.name, Short(e.value), e.unit));
     }
     if finding.stability < STABILITY_MIN {
         return Some(format!("only {:.0} % of half-samples of the drives choose it", 100.0 * finding.stability));
@@ -419,10 +436,57 @@ fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<S
     let payload = finding.candidate.id() == "payload";
     let relative = free
         .iter()
-        .filter(|f| f.parameter == free[0].parameter || finding.candidate.unit().is_none() && f.mean == 0.0 && !payload)
-        .filter_map(|f| finding.estimates.get(f.parameter))
-        .filter_map(|e| e.ci95.map(|[low, high]| 0.5 * (high - low) / e.value.abs().max(1e-12)))
+        .enumerate()
+        .filter(|(_, f)| f.parameter == free[0].parameter || finding.candidate.unit().is_none() && f.mean == 0.0 && !payload)
+        .filter_map(|(i, f)| {
+            let e = finding.estimates.get(f.parameter)?;
+            e.ci95.map(|[low, high]| 0.5 * (high - low) / finding.candidate.magnitude(i, e.value).max(1e-12))
+        })
         .chain(payload.then(|| moments(group, fit, term)).into_iter().flatten())
         .fold(f64::INFINITY, f64::min);
     (relative > MAGNITUDE_HALF_MAX).then(|| format!("its size is known to ±{:.0} % only", 100.0 * relative))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+    use crate::candidates::catalogue;
+
+    /// Why a torque limit of 0.95 is refused that is known to ±`half`.
+    fn refused(half: f64) -> Option<String> {
+        let catalogue = catalogue(&[]);
+        let hypothesis = catalogue.iter().position(|c| c.id() == "torque_limit").unwrap();
+        let candidate = catalogue[hypothesis];
+        let group = Group { score: DVector::zeros(0), information: DMatrix::zeros(0, 0), covariance: DMatrix::zeros(0, 0) };
+        let fit = Fit {
+            terms: vec![Term { candidate, onset_s: 0.0 }],
+            values: vec![vec![0.95]],
+            covariance: DMatrix::zeros(1, 1),
+            held: vec![vec![false]],
+            jackknife: Vec::new(),
+        };
+        let finding = Finding {
+            hypothesis,
+            candidate,
+            weight: 1.0,
+            z: 9.0,
+            alone: 9.0,
+            delta_bic: 81.0,
+            stability: 1.0,
+            estimates: vec![Estimate { name: "fraction", unit: "-", value: 0.95, ci95: Some([0.95 - half, 0.95 + half]) }],
+            onset: None,
+            rivals: Vec::new(),
+            refused: None,
+        };
+        refusal(&group, &finding, &fit, 0)
+    }
+
+    /// A torque that is whole is a fraction of 1: 0.95 takes 0.05 of it away, and 0.5 is ten times that.
+    #[test]
+    fn analytic_a_factor_is_known_by_its_distance_from_one() {
+        assert!(refused(0.5).is_some_and(|why| why.contains("its size is known to")));
+        assert_eq!(refused(0.02), None);
+    }
 }

@@ -8,7 +8,7 @@ use nesam_physics::effects::{Effect, Layer, Written};
 use nesam_trajectories::Trajectory;
 
 use crate::candidates::{Candidate, catalogue};
-use crate::claims::{Case, Estimate, Finding, Trace};
+use crate::claims::{Case, Estimate, Finding, Settled, Trace};
 use crate::condense::{Condensed, best_soil};
 use crate::controls::{Kind, NullDrives, Setting};
 use crate::error::DiscoveryError;
@@ -47,7 +47,7 @@ pub enum Against {
 /// What the command line says.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Ids to fit on; `None` = each drive is left out once.
+    /// Ids to fit on, in any order; `None` = each drive is left out once.
     pub fit_on: Option<Vec<String>>,
     /// Ids of effects that are not considered.
     pub without: Vec<String>,
@@ -151,6 +151,8 @@ pub struct Judgement {
     pub selection: Selection,
     /// Findings, refused or not.
     pub findings: Vec<Finding>,
+    /// What was compared through the physics with the first finding; `None` when nothing was.
+    pub settled: Option<Settled>,
     /// Fit of all chosen effects together; `None` when nothing was chosen.
     pub fit: Option<Fit>,
     /// Verdict before the proof.
@@ -175,7 +177,7 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     loop {
         if selection.chosen.is_empty() {
             let (verdict, reason) = nothing_chosen(&selection);
-            return Judgement { selection, findings: left_out, fit: None, verdict, reason };
+            return Judgement { selection, findings: left_out, settled, fit: None, verdict, reason };
         }
         let group = yardstick.group(case.condensed());
         let fit = case.size(yardstick, &group, &selection.chosen, &onsets);
@@ -193,7 +195,7 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
                 let (verdict, reason) = provisional(&selection, &findings, yardstick.model_on_trial);
                 left_out.retain(|dropped| findings.iter().all(|f| f.hypothesis != dropped.hypothesis));
                 findings.extend(left_out);
-                return Judgement { selection, findings, fit: Some(fit), verdict, reason };
+                return Judgement { selection, findings, settled, fit: Some(fit), verdict, reason };
             }
         }
     }
@@ -309,12 +311,12 @@ pub fn diagnose(
         }
         _ => None,
     };
-    let learned = learn(fewer.as_ref().unwrap_or(&yardstick), &case, &judgement, options, drives.len());
     let held_at: Vec<usize> = match options.fit_on {
         Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
         None if total > 1 => (0..drives.len()).collect(),
         None => Vec::new(),
     };
+    let learned = learn(fewer.as_ref().unwrap_or(&yardstick), &case, &judgement, options, held_at.len());
     let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
@@ -430,23 +432,23 @@ fn score_controls(
     Ok((made.iter().map(|c| (c.kind, c.parameters)).collect(), free_form))
 }
 
-/// What each held-out drive is predicted with, of `drives` drives in all; `fewer` judges one drive less than were fitted.
-fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, options: &Options, drives: usize) -> Vec<Learned> {
-    let total = case.prepared.len();
+/// What each of `held_out` drives is predicted with; `fewer` judges one drive less than were fitted.
+fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, options: &Options, held_out: usize) -> Vec<Learned> {
     match options.fit_on {
         Some(_) => {
             let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
-            vec![Learned { soil: best_soil(case.condensed()), effects }; drives - total]
+            vec![Learned { soil: best_soil(case.condensed()), effects }; held_out]
         }
-        None if total > 1 => leave_each_out(fewer, case, judgement),
+        None if held_out > 0 => leave_each_out(fewer, case, judgement),
         None => Vec::new(),
     }
 }
 
-/// Indices of the drives to fit on.
+/// Indices of the drives to fit on, each once, in the order of the set.
 fn fitted(drives: &[Trajectory], options: &Options) -> Result<Vec<usize>, DiscoveryError> {
     let Some(ids) = &options.fit_on else { return Ok((0..drives.len()).collect()) };
-    ids.iter()
+    let mut at = ids
+        .iter()
         .map(|id| {
             let present = || match drives {
                 [first, .., last] => format!("{} drives from {} to {}", drives.len(), first.id, last.id),
@@ -457,7 +459,10 @@ fn fitted(drives: &[Trajectory], options: &Options) -> Result<Vec<usize>, Discov
                 .position(|d| d.id == *id)
                 .ok_or_else(|| DiscoveryError::Drives { reason: format!("no drive `{id}` to fit on; the set has {}", present()) })
         })
-        .collect()
+        .collect::<Result<Vec<usize>, _>>()?;
+    at.sort_unstable();
+    at.dedup();
+    Ok(at)
 }
 
 /// The fitted effects that are claimed.
@@ -466,20 +471,23 @@ fn keep<T: Clone>(judgement: &Judgement, effects: Vec<T>) -> Vec<T> {
 }
 
 /// What each drive is predicted with: learned without it. Detection and choice follow from the other drives alone, the size from one step of the whole fit.
+/// What was compared through the physics on all drives is compared in the same way on the others ([`Settled::stands`]).
 fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement) -> Vec<Learned> {
     (0..case.prepared.len())
         .map(|left_out| {
-            let others = || (0..case.prepared.len()).filter(|d| *d != left_out).map(|d| &case.prepared[d].condensed);
+            let inside = |d: usize| d != left_out;
+            let others = || (0..case.prepared.len()).filter(|d| inside(*d)).map(|d| &case.prepared[d].condensed);
             let soil = best_soil(others());
-            let chosen = yardstick.select(&yardstick.group(others())).chosen;
+            let group = yardstick.group(others());
+            let chosen = yardstick.select(&group).chosen;
+            let stands = |i: usize| {
+                let named = judgement.findings[i].hypothesis;
+                let settled = judgement.settled.as_ref().filter(|_| i == 0);
+                chosen.contains(&named) || settled.is_some_and(|s| s.stands(yardstick, &chosen, &group, inside, |h| h == named))
+            };
             let effects = judgement.fit.as_ref().map_or_else(Vec::new, |fit| {
                 let without = fit.effects_without(left_out);
-                judgement
-                    .claimed()
-                    .iter()
-                    .filter(|i| chosen.contains(&judgement.findings[**i].hypothesis))
-                    .filter_map(|i| without.get(*i).copied())
-                    .collect()
+                judgement.claimed().iter().filter(|i| stands(**i)).filter_map(|i| without.get(*i).copied()).collect()
             });
             Learned { soil, effects }
         })

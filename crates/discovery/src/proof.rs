@@ -14,10 +14,14 @@ const WINDOWS_MAX: usize = 1000;
 const RISE_MIN: f64 = 0.02;
 
 /// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the model
-/// before and against the best soil alone.
+/// before and against the best soil alone, which errors of one drive cannot show.
 pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>) -> Option<String> {
     const WHERE: &str = "on drives that were not fitted";
     let [before, soil, after] = &scores.scores;
+    let scored = &after.errors.trajectory;
+    if least_gain.is_some() && scored.iter().all(|d| Some(d) == scored.first()) {
+        return Some("only one drive that was left out can be scored, which proves nothing: leave out two or more".into());
+    }
     for (gain, against) in least_gain.into_iter().flat_map(|gain| [(gain, soil), (gain, before)]) {
         if !falls_surely(against, after, gain, &scores.resamples) {
             let share = if gain > 0.0 { format!(" by {:.0} %", 100.0 * gain) } else { String::new() };

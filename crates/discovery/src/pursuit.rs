@@ -118,6 +118,8 @@ fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>)
     let bench = case.bench;
     let rows: Vec<Vec<Row>> = case.prepared.par_iter().map(|p| p.drive.deviations(&bench, &effects, &SoilCorrection::NONE)).collect();
     case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
+    // Signatures that are measured again are whole.
+    case.onsets = None;
     let total = case.prepared.len();
     let mut left = Vec::with_capacity(total);
     for (done, (prepared, rows)) in case.prepared.iter_mut().zip(&rows).enumerate() {

@@ -1,6 +1,6 @@
 //! The JSON (`nesam.diagnose/1`) and the HTML page of a diagnosis.
 
-use nesam_evaluation::report::{LinePlot, Page, Series, Table};
+use nesam_evaluation::report::{LinePlot, Page, Series, Short, Table};
 use nesam_evaluation::{DIMENSION_KEYS, ErrorTree, ModelScore, POSE_DIM, Provenance, paired_difference};
 use nesam_physics::effects::Layer;
 use serde_json::{Value, json};
@@ -13,7 +13,7 @@ use crate::diagnose::{Against, Diagnosis, Verdict};
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
-pub const STOP_RULE: &str = "4: up to three effects, pairwise criterion 6, at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree";
+pub const STOP_RULE: &str = "5: up to three effects, pairwise criterion 6, at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree; a factor known by its distance from 1";
 const STAGES: [&str; 3] = ["before", "soil only", "after"];
 
 /// What a report is made from.
@@ -90,7 +90,9 @@ impl Report<'_> {
                 let parameters: Vec<Value> =
                     effect.parameters().iter().map(|p| json!({"name": p.name, "unit": p.unit, "value": p.value})).collect();
                 map.insert("effect".into(), json!({"id": effect.id(), "layer": effect.layer().as_str(), "parameters": parameters}));
-                map.insert("before".into(), json!(scores.map(|s| &s.scores[2].summary)));
+                // It is fitted to what the claimed effects leave; without a claim, to everything.
+                let before = if d.claimed.is_empty() { 0 } else { 2 };
+                map.insert("before".into(), json!(scores.map(|s| &s.scores[before].summary)));
                 map.insert("bundle".into(), json!(self.free_form_bundle));
             }
             tree
@@ -239,7 +241,7 @@ impl Report<'_> {
         if let Some(effect) = &self.diagnosis.free_form {
             let mut table = Table::new("The free form: coefficients and valid region", &["parameter", "value", "unit"]);
             for p in effect.parameters() {
-                table.row(vec![p.name.into(), format!("{:.4}", p.value).into(), p.unit.into()]);
+                table.row(vec![p.name.into(), Short(p.value).to_string().into(), p.unit.into()]);
             }
             page.table(&table);
         }
@@ -289,8 +291,8 @@ impl Report<'_> {
     fn estimate_table(&self) -> Table {
         let mut table = Table::new("Parameters with 95 % intervals", &["parameter", "value", "interval", "unit"]);
         for e in &self.diagnosis.estimates {
-            let interval = e.ci95.map_or("-".into(), |[l, h]| format!("[{l:.3}, {h:.3}]"));
-            table.row(vec![e.name.into(), format!("{:.3}", e.value).into(), interval.into(), e.unit.into()]);
+            let interval = e.ci95.map_or("-".into(), |[l, h]| format!("[{}, {}]", Short(l), Short(h)));
+            table.row(vec![e.name.into(), Short(e.value).to_string().into(), interval.into(), e.unit.into()]);
         }
         table
     }
@@ -380,7 +382,7 @@ fn trace_plot(trace: &Trace) -> LinePlot {
 
 /// An effect in words.
 pub fn describe(finding: &Finding) -> String {
-    let parameters: Vec<String> = finding.estimates.iter().map(|p| format!("{} {:.3}", p.name, p.value)).collect();
+    let parameters: Vec<String> = finding.estimates.iter().map(|p| format!("{} {}", p.name, Short(p.value))).collect();
     let onset = finding.onset.map_or(String::new(), |o| format!(" from {:.1} s on", o.at_s));
     parameters.join(", ") + &onset
 }

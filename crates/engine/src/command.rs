@@ -112,7 +112,30 @@ pub enum Command {
 }
 
 impl Command {
-    /// Name for metrics and logs.
+    /// The names of all commands: counters of what seldom happens are there before it does.
+    pub const LABELS: [&str; 19] = [
+        "open",
+        "get",
+        "list",
+        "fork",
+        "export",
+        "snapshot",
+        "import",
+        "close",
+        "set_effects",
+        "expire",
+        "measure",
+        "fleet_soil",
+        "tell_fleet_soil",
+        "hear_fleet_soil",
+        "predict",
+        "put_map",
+        "get_map",
+        "list_maps",
+        "delete_map",
+    ];
+
+    /// Name for metrics and logs, one of [`Command::LABELS`].
     pub fn label(&self) -> &'static str {
         match self {
             Self::Open(_) => "open",

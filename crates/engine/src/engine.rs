@@ -181,7 +181,7 @@ impl Engine {
         if self.watches() {
             session.begin_watch();
         }
-        if self.drives(&open.vehicle) {
+        if self.brings(&open.vehicle) {
             session.bring_nothing();
         }
         if let Some(initial) = &open.initial {
@@ -190,7 +190,9 @@ impl Engine {
             if let crate::Outcome::NotFinite { field } = observed.outcome {
                 return Err(EngineError::invalid(format!("initial.{field}"), "is not finite"));
             }
-            session.learn(&self.predictor, self.noise.as_ref(), map.and_then(|id| self.maps.get(id).ok()), self.step_ns, observed.outcome);
+            let map = map.and_then(|id| self.maps.get(id).ok());
+            session.begin_from(self.fleet.as_mut(), map, now_ns);
+            session.learn(&self.predictor, self.noise.as_ref(), map, self.step_ns, observed.outcome);
         }
         Ok(self.insert(session))
     }
@@ -211,9 +213,9 @@ impl Engine {
         Reply::Session(Box::new(view))
     }
 
-    /// Whether a session of this vehicle is open.
-    fn drives(&self, vehicle: &str) -> bool {
-        self.sessions.values().any(|session| session.vehicle() == vehicle)
+    /// Whether a session of this vehicle brings what it learns to the soil map of the fleet.
+    fn brings(&self, vehicle: &str) -> bool {
+        self.sessions.values().any(|session| session.vehicle() == vehicle && session.brings())
     }
 
     /// Whether one more session of this name may be open.
@@ -285,7 +287,7 @@ impl Engine {
         if self.watches() {
             session.begin_watch();
         }
-        if self.drives(&image.vehicle) {
+        if self.brings(&image.vehicle) {
             session.bring_nothing();
         }
         Ok(self.insert(session))
@@ -321,12 +323,7 @@ impl Engine {
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
         let Observed { outcome, reordered } = session.observe(measurement, now_ns, rules)?;
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
-        if let (Some(fleet), Some(map)) = (&mut self.fleet, &map)
-            && let Some(position_m) = session.begins_at()
-            && let Some(prior) = fleet.prior(map, position_m, self.filter.config(), now_ns)
-        {
-            session.begin_from(&prior);
-        }
+        session.begin_from(self.fleet.as_mut(), map.as_ref(), now_ns);
         let outcome = session.learn(&self.predictor, self.noise.as_ref(), map.as_ref(), self.step_ns, outcome);
         let (vehicle, brought, told) = (session.vehicle().to_string(), session.take_brought(), session.take_told());
         let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
@@ -451,6 +448,9 @@ impl Engine {
             return Err(EngineError::MapInUse { map: id.into(), session: user.id().into() });
         }
         self.maps.delete(id)?;
+        if let Some(fleet) = &mut self.fleet {
+            fleet.forget_colours(id);
+        }
         self.emit(Event::MapChanged { map: id.into() });
         Ok(Reply::Done)
     }

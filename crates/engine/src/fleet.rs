@@ -94,6 +94,11 @@ impl Fleet {
             .count()
     }
 
+    /// Forgets what the ground of a world map that is gone looks like; what was learned of it stays.
+    pub fn forget_colours(&mut self, world: &str) {
+        self.colours.remove(world);
+    }
+
     /// Edge of a cell, m.
     pub fn cell_m(&self) -> f64 {
         self.map.settings().cell_m
@@ -127,4 +132,23 @@ fn aged(key: &CellKey, evidence: &CellEvidence, now_ns: u64) -> FleetCell {
 
 fn seconds(now_ns: u64) -> f64 {
     now_ns as f64 * 1e-9
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_terrain::GridGeometry;
+
+    use super::*;
+
+    #[test]
+    fn property_colours_of_a_deleted_map_are_forgotten() {
+        let mut fleet = Fleet::new(FleetSoilSettings::default()).unwrap();
+        let geometry = GridGeometry { origin_m: [0.0; 2], resolution_m: 1.0, width: 4, height: 4 };
+        for id in ["gone", "held"] {
+            let world = WorldMap::from_layers(id, 1, geometry, vec![0.0; 16], Some(vec![[90, 100, 110]; 16])).unwrap();
+            assert_eq!(fleet.colour(&world, [1.5, 1.5]), [90, 100, 110]);
+        }
+        fleet.forget_colours("gone");
+        assert_eq!(fleet.colours.keys().collect::<Vec<_>>(), ["held"]);
+    }
 }

@@ -250,7 +250,9 @@ fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, 
         }),
         Turn::Prediction(mut submission) => {
             if let Command::Predict(query) = &mut submission.command {
-                let fits = queue.fit(query, submission.deadline_ns, clock.now_ns());
+                // Of one that is asked wrongly fewer samples may be within the limits: it stays whole, to be refused for what is wrong with it.
+                let right = query.samples_min == 0 || query.check(engine.limits(), engine.vehicle()).is_ok();
+                let fits = if right { queue.fit(query, submission.deadline_ns, clock.now_ns()) } else { Ok(()) };
                 let work = work(query, query.samples);
                 answer(engine, *submission, fits, clock, tap, |took_ns| queue.done(work, took_ns, clock.now_ns()));
             }

@@ -11,7 +11,7 @@ use crate::limits::{Limits, outside_card};
 use crate::ranking::{PathCost, Ranking};
 use crate::session::SoilEstimate;
 
-/// Bit of `Rollout::flags` that the engine adds to those of the model: the drive has not updated the soil yet, the prior alone speaks.
+/// Bit of `Rollout::flags` that the engine adds to those of the model: the drive has told nothing of the soil yet, the prior alone speaks.
 pub const SOIL_NOT_LEARNED: u32 = 128;
 
 /// A batch of candidate command sequences from one session.
@@ -98,15 +98,8 @@ impl PredictQuery {
         if self.samples_min == 0 { self.samples } else { self.samples_min.min(self.samples) }
     }
 
-    /// Leaves the first samples only. A query whose counts do not fit each other stays as it is, to be refused for what is wrong with it.
+    /// Leaves the first samples only, of a query that was checked.
     pub(crate) fn keep_first(&mut self, samples: usize) {
-        let given = match &self.controls {
-            Candidates::Given(controls) => controls.len() == self.samples * self.horizon * 2,
-            Candidates::Drawn(_) => true,
-        };
-        if !given || self.cost.as_ref().is_some_and(|cost| cost.best > self.samples) {
-            return;
-        }
         self.samples = samples;
         if let Candidates::Given(controls) = &mut self.controls {
             controls.truncate(samples * self.horizon * 2);

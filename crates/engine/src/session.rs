@@ -4,7 +4,6 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use nesam_adaptation::{FORECAST_AHEAD, ForecastCheck, SoilFilter};
-use nesam_fleet_soil::FleetPrior;
 use nesam_model::rollout_noise::NoiseScale;
 use nesam_model::{HistoryStep, Predictor, RolloutNoise, SoilByClass};
 use nesam_physics::{SOIL_DIM, Vehicle};
@@ -28,10 +27,10 @@ pub use self::image::{SessionImage, TrackImage, WatchImage};
 use self::order::{Order, Verdict};
 pub use self::soil::{BufferTest, SoilState};
 use self::soil::{Judged, Models, SoilLearner};
-use self::track::{Taken, Track};
+use self::track::{Stamped, Taken, Track};
 use self::watch::{Watch, WatchedBuffer};
 use crate::error::EngineError;
-use crate::fleet::Brought;
+use crate::fleet::{Brought, Fleet};
 use crate::forward::Newest;
 use crate::limits::{Limits, outside_card};
 use crate::measurement::{Measurement, Outcome};
@@ -278,6 +277,10 @@ impl Session {
             let Leaving::Measured(measurement) = leaving else {
                 self.settled = Track::default();
                 self.forget_open();
+                // What follows has the stamps of another clock.
+                if let Some(watch) = &mut self.watch {
+                    watch.window.clear();
+                }
                 continue;
             };
             let (first, second) = match self.settled.take(&measurement, step_ns) {
@@ -289,7 +292,7 @@ impl Session {
                 }
             };
             for step in [Some(first), second].into_iter().flatten() {
-                if let Some(nis) = self.learn_step(step, models, map) {
+                if let Some(nis) = self.learn_step(step, step_ns, models, map) {
                     outcome = Outcome::Gated { nis };
                 }
                 self.check_forecast(models.usual, noise, map);
@@ -323,13 +326,12 @@ impl Session {
     }
 
     /// Lets the filter learn from one final step; NIS of the buffer that it ended if that was refused.
-    fn learn_step(&mut self, step: HistoryStep, models: Models<'_>, map: Option<&Arc<WorldMap>>) -> Option<f64> {
+    fn learn_step(&mut self, (end_ns, step): Stamped, step_ns: i64, models: Models<'_>, map: Option<&Arc<WorldMap>>) -> Option<f64> {
         self.settled.push(step);
-        let stamp_ns = self.settled.grid.map(|grid| grid.last_ns());
         let (newest, before) = self.settled.history.make_contiguous().split_last()?;
         let Judged { update, brought, contradiction, standing } = self.learner.step(models, before, newest, map)?;
-        if let (Some(watch), Some(end_ns), Some(grid)) = (self.watch.as_mut().filter(|_| !standing), stamp_ns, self.settled.grid) {
-            let begin_ns = end_ns.saturating_sub(grid.step_ns * self.learner.buffer() as i64);
+        if let Some(watch) = self.watch.as_mut().filter(|_| !standing) {
+            let begin_ns = watch.begin_ns(end_ns.saturating_sub(step_ns * self.learner.buffer() as i64), step_ns);
             self.told.extend(watch.feed(WatchedBuffer::new([begin_ns, end_ns], &update.agreement, contradiction)));
         }
         self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
@@ -339,15 +341,19 @@ impl Session {
             self.soil.state.last_buffer = last_buffer;
             return Some(update.nis);
         }
-        let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, stamp_ns) };
+        let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, Some(end_ns)) };
         self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale, ..self.soil };
         None
     }
 
     /// Puts effects on the vehicle of this session, or takes them away, and begins to learn the soil from the prior of `filter`: what was learned answered for
-    /// another vehicle.
+    /// another vehicle. Effects that act already make no other one: then only their source changes.
     pub(crate) fn act(&mut self, acting: Option<Arc<Acting>>, filter: SoilFilter) {
+        let before = self.applied();
         self.acting = acting;
+        if self.applied().effects == before.effects {
+            return;
+        }
         self.told.extend(self.watch.as_mut().and_then(Watch::begin_again));
         self.learner = SoilLearner::new(filter);
         self.forecast = None;
@@ -381,16 +387,13 @@ impl Session {
         self.acting.as_ref().map(|acting| acting.applied().clone()).unwrap_or_default()
     }
 
-    /// Position at which the session begins, once it has one; then never again. World, m.
-    pub(crate) fn begins_at(&mut self) -> Option<[f64; 2]> {
-        let [x, y, _] = self.newest().filter(|_| self.fleet.asks)?.state.position_m;
+    /// Begins from what the fleet knows of the ground at its first step, once it has one; then never again.
+    pub(crate) fn begin_from(&mut self, fleet: Option<&mut Fleet>, map: Option<&Arc<WorldMap>>, now_ns: u64) {
+        let Some([x, y, _]) = self.newest().filter(|_| self.fleet.asks).map(|step| step.state.position_m) else { return };
         self.fleet.asks = false;
-        Some([x, y])
-    }
-
-    /// Begins from what the fleet knows of the ground.
-    pub(crate) fn begin_from(&mut self, prior: &FleetPrior) {
-        if self.learner.begin_from(prior) {
+        let (filter, _, _) = self.learner.parts();
+        let prior = fleet.zip(map).and_then(|(fleet, map)| fleet.prior(map, [x, y], filter.config(), now_ns));
+        if prior.is_some_and(|prior| self.learner.begin_from(&prior)) {
             let state = self.learner.state(self.soil.state.epoch + 1, None);
             self.soil = SoilEstimate { state, covariance: self.learner.covariance(), ..self.soil };
         }
@@ -399,6 +402,11 @@ impl Session {
     /// What the session learns does not go into the soil map of the fleet.
     pub(crate) fn bring_nothing(&mut self) {
         self.fleet.brings = false;
+    }
+
+    /// Whether it goes there.
+    pub(crate) fn brings(&self) -> bool {
+        self.fleet.brings
     }
 
     /// What the session has brought for the map of the fleet since the last time.

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 
 use nesam_adaptation::{
     AdaptationError, BufferedTransition, FORECAST_AHEAD, FORECAST_STEPS, FilterConfig, ForecastCheck, Innovation, NoiseCalibration,
-    SoilFilter, SoilPosterior, SoilUpdate, UncorrectedBuffer, calibrate, chi_square_tail, uncorrected,
+    SoilFilter, SoilPosterior, SoilUpdate, UncorrectedBuffer, calibrate, uncorrected,
 };
 use nesam_model::rollout_noise::NoiseScale;
 use nesam_model::{HISTORY, HistoryStep, Predictor, RolloutNoise, SoilByClass, SoilField, Transition};
@@ -16,6 +16,7 @@ use rayon::prelude::*;
 
 use crate::error::EvaluationError;
 use crate::evaluate::DriveMaps;
+use crate::known_soil::inside_95;
 use crate::windows::history_steps;
 
 /// An update and the instant at which it was known.
@@ -108,7 +109,7 @@ impl Consistency {
     pub fn of(drives: &[DriveAdaptation]) -> Self {
         let all: Vec<&SoilUpdate> = drives.iter().flat_map(|d| d.updates.iter().map(|u| &u.update)).collect();
         let ratios: Vec<f64> = all.iter().map(|u| u.nis / u.dof as f64).collect();
-        let inside = all.iter().filter(|u| (0.025..=0.975).contains(&chi_square_tail(u.dof, u.nis))).count();
+        let inside = all.iter().filter(|u| inside_95(u.dof, u.nis)).count();
         let share = |part: f64| (!all.is_empty()).then(|| part / all.len() as f64);
         let rejected = all.iter().filter(|u| u.rejected).count();
         Self {

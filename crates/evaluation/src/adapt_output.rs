@@ -29,7 +29,7 @@ pub struct Adaptation<'a> {
     pub path_m_median: f64,
     /// What errors are measured against.
     pub truth: Truth,
-    /// Time at which each window starts in its drive, s.
+    /// Time since the start of its log at which each window starts, s.
     pub starts_s: &'a [f64],
     /// Map of each drive.
     pub maps: &'a DriveMaps,
@@ -210,9 +210,10 @@ impl Adaptation<'_> {
         Consistency::of(self.filtered)
     }
 
-    /// Time of a sample in its drive, s.
-    pub(crate) fn time_s(&self, drive: usize, sample: usize) -> f64 {
-        self.drives[drive].time_s[sample]
+    /// Time of a sample since the start of its log, s: clocks of vehicles do not begin at zero.
+    pub(crate) fn since_log_start_s(&self, drive: usize, sample: usize) -> f64 {
+        let time_s = &self.drives[drive].time_s;
+        time_s[sample] - time_s[0]
     }
 
     /// The JSON document, pretty-printed, with a trailing newline.
@@ -267,7 +268,7 @@ impl Adaptation<'_> {
     fn soil_rows(&self) -> Vec<SoilRow<'_>> {
         let row = |drive: usize, timed: &crate::adapt::TimedUpdate| SoilRow {
             trajectory: &self.drives[drive].id,
-            t_s: self.time_s(drive, timed.sample),
+            t_s: self.drives[drive].time_s[timed.sample],
             region: self.class_name(drive, timed.class),
             theta: timed.soil(),
             sd: timed.update.posterior.sd(&timed.prior),

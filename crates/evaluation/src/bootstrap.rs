@@ -40,14 +40,14 @@ impl Resamples {
 
     /// 95 % interval of the mean over windows. `rows` holds one value per window, `cluster` the drive of each window.
     ///
-    /// `None` where an interval would mean nothing: fewer than two drives, or a value that is not finite.
+    /// `None` where an interval would mean nothing: windows of fewer than two drives, or a value that is not finite.
     pub fn mean_interval(&self, rows: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
         let (mut sum, mut number) = (vec![0.0; self.clusters], vec![0.0; self.clusters]);
         for (&value, &c) in rows.iter().zip(cluster) {
             sum[c] += value;
             number[c] += 1.0;
         }
-        self.interval(|weight| {
+        self.interval(cluster, |weight| {
             let pick = |per: &[f64]| -> f64 { per.iter().zip(weight).map(|(v, &w)| v * f64::from(w)).sum() };
             pick(&sum) / pick(&number)
         })
@@ -61,7 +61,7 @@ impl Resamples {
             sums[c][0] += above;
             sums[c][1] += below;
         }
-        self.interval(|weight| {
+        self.interval(cluster, |weight| {
             let pick = |which: usize| -> f64 { sums.iter().zip(weight).map(|(s, &w)| s[which] * f64::from(w)).sum() };
             let below = pick(1);
             if below > 0.0 { pick(0) / below } else { f64::NAN }
@@ -72,11 +72,13 @@ impl Resamples {
     pub fn median_interval(&self, rows: &[f64], cluster: &[usize]) -> Option<[f64; 2]> {
         let mut sorted: Vec<(f64, usize)> = rows.iter().copied().zip(cluster.iter().copied()).filter(|(v, _)| !v.is_nan()).collect();
         sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
-        self.interval(|weight| weighted_median(&sorted, weight))
+        let kept: Vec<usize> = sorted.iter().map(|(_, c)| *c).collect();
+        self.interval(&kept, |weight| weighted_median(&sorted, weight))
     }
 
-    fn interval(&self, mut statistic: impl FnMut(&[u32]) -> f64) -> Option<[f64; 2]> {
-        if self.clusters < 2 || self.weights.is_empty() {
+    /// Of a statistic of rows of these drives: one drive that is drawn more or less often says nothing of how drives differ.
+    fn interval(&self, cluster: &[usize], mut statistic: impl FnMut(&[u32]) -> f64) -> Option<[f64; 2]> {
+        if cluster.iter().all(|c| Some(c) == cluster.first()) || self.weights.is_empty() {
             return None;
         }
         let mut values: Vec<f64> = self.weights.iter().map(|w| statistic(w)).filter(|v| !v.is_nan()).collect();
@@ -167,5 +169,12 @@ mod tests {
     #[test]
     fn analytic_one_drive_has_no_interval() {
         assert_eq!(Resamples::draw(1, 1000, 0).mean_interval(&[1.0, 2.0], &[0, 0]), None);
+        // Of five drives one alone has windows.
+        let five = Resamples::draw(5, 1000, 0);
+        assert_eq!(five.mean_interval(&[1.0, 2.0], &[3, 3]), None);
+        assert_eq!(five.ratio_interval(&[1.0, 2.0], &[2.0, 2.0], &[3, 3]), None);
+        assert_eq!(five.median_interval(&[1.0, 2.0, f64::NAN], &[3, 3, 4]), None);
+        assert_eq!(five.mean_interval(&[], &[]), None);
+        assert!(five.mean_interval(&[1.0, 2.0], &[3, 4]).is_some());
     }
 }

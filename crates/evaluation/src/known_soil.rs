@@ -1,5 +1,7 @@
 //! What a filter learned and how sure it is, held against soil that is known.
 
+use std::sync::Arc;
+
 use nalgebra::{SMatrix, SVector};
 use nesam_adaptation::chi_square_tail;
 use nesam_physics::SOIL_DIM;
@@ -12,6 +14,11 @@ use crate::true_soil::TrueSoil;
 
 /// Standard deviations of a 90 % interval.
 const NINETY: f64 = 1.645;
+
+/// Whether a sum of squares of this many degrees of freedom lies inside the two-sided 95 % interval of χ².
+pub(crate) fn inside_95(dof: usize, sum: f64) -> bool {
+    (0.025..=0.975).contains(&chi_square_tail(dof, sum))
+}
 
 /// One belief held against the truth.
 #[derive(Clone, Copy, Debug)]
@@ -34,7 +41,7 @@ impl Held {
 
     /// Whether NEES lies inside the two-sided 95 % interval of χ².
     pub(crate) fn nees_inside_95(&self) -> bool {
-        (0.025..=0.975).contains(&chi_square_tail(SOIL_DIM, self.nees))
+        inside_95(SOIL_DIM, self.nees)
     }
 
     /// Whether it lies above: the belief is surer than it should be.
@@ -67,12 +74,7 @@ pub struct KnownSoil {
 
 impl KnownSoil {
     /// Of drives whose true soil is known; `None` without an accepted update there.
-    pub fn of(
-        drives: &[Trajectory],
-        filtered: &[DriveAdaptation],
-        truth: &[std::sync::Arc<TrueSoil>],
-        resamples: &Resamples,
-    ) -> Option<Self> {
+    pub fn of(drives: &[Trajectory], filtered: &[DriveAdaptation], truth: &[Arc<TrueSoil>], resamples: &Resamples) -> Option<Self> {
         let (mut held, mut of_drive, mut squared) = (Vec::new(), Vec::new(), [[0.0; 2]; SOIL_DIM]);
         for (d, ((drive, filtered), truth)) in drives.iter().zip(filtered).zip(truth).enumerate() {
             for timed in filtered.updates.iter().filter(|timed| !timed.update.rejected) {

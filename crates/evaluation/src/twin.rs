@@ -2,7 +2,7 @@
 //! its own errors can be held against them.
 
 use nalgebra::{DMatrix, DVector, SMatrix};
-use nesam_adaptation::{AdaptationError, BufferedTransition, FilterConfig, SoilFilter, SoilPosterior, chi_square_tail, conditions};
+use nesam_adaptation::{AdaptationError, BufferedTransition, FilterConfig, SoilFilter, SoilPosterior, conditions};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{Ground, StepInput, StepModel};
 use nesam_physics::{Control, DT_S, SOIL_BOUNDS, SOIL_DIM, SecondCommand, Soil, SoilCorrection, VehicleState};
@@ -12,7 +12,7 @@ use rand_distr::{ChiSquared, Distribution, StandardNormal};
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::known_soil::Held;
+use crate::known_soil::{Held, inside_95};
 
 /// Priors of the runs in turn: firm ground, loam, sand (chosen in the middle of published ranges).
 const PRIORS: [[f64; SOIL_DIM]; 3] =
@@ -103,7 +103,6 @@ pub fn run_twins_against(
 fn report(outcomes: &[Outcome], prior_sd: &[f64; SOIL_DIM]) -> TwinReport {
     let runs = outcomes.len().max(1) as f64;
     let dof = SOIL_DIM as f64;
-    let inside = |tail: f64| (0.025..=0.975).contains(&tail);
     let buffers: Vec<&(usize, f64, bool)> = outcomes.iter().flat_map(|o| &o.nis).collect();
     let count = buffers.len().max(1) as f64;
     let share = |of: &dyn Fn(&Outcome, usize) -> bool, i: usize| outcomes.iter().filter(|o| of(o, i)).count() as f64 / runs;
@@ -122,7 +121,7 @@ fn report(outcomes: &[Outcome], prior_sd: &[f64; SOIL_DIM]) -> TwinReport {
         nees_inside_95: outcomes.iter().filter(|o| o.estimate.nees_inside_95()).count() as f64 / runs,
         nees_above_95: outcomes.iter().filter(|o| o.estimate.nees_above_95()).count() as f64 / runs,
         nis_mean_over_dof: buffers.iter().map(|(dof, nis, _)| nis / *dof as f64).sum::<f64>() / count,
-        nis_inside_95: buffers.iter().filter(|(dof, nis, _)| inside(chi_square_tail(*dof, *nis))).count() as f64 / count,
+        nis_inside_95: buffers.iter().filter(|(dof, nis, _)| inside_95(*dof, *nis)).count() as f64 / count,
         coverage_90: mean(by_parameter),
         coverage_90_by_parameter: by_parameter,
         coverage_90_posterior: mean(posterior),

@@ -41,8 +41,8 @@ pub struct EvidenceParts {
 const HEARD_MAX: usize = 64;
 /// Share of its weight below which evidence of another map is not taken any more.
 const FADED: f64 = 1e-3;
-/// Largest difference of two entries of Λ that should be equal, as a share of its largest.
-const ASYMMETRY_MAX: f64 = 1e-6;
+/// What rounding may make of Λ, as a share of its largest entry: a difference of two entries that should be equal, a diagonal below 0.
+const ROUNDING_MAX: f64 = 1e-6;
 
 /// Evidence by cell.
 type Cells = BTreeMap<CellKey, CellEvidence>;
@@ -74,7 +74,7 @@ impl CellEvidence {
     /// Evidence that somebody told.
     ///
     /// # Errors
-    /// `FleetSoilError::Evidence` when a number is not finite, or Λ has a negative diagonal or no symmetry.
+    /// `FleetSoilError::Evidence` when a number is not finite, or Λ has a negative diagonal or no symmetry beyond what rounding makes.
     pub fn from_parts(parts: &EvidenceParts) -> Result<Self, FleetSoilError> {
         let EvidenceParts { information, vector, buffers, votes, stamp_s, revision } = *parts;
         let matrix = Matrix::from_fn(|r, c| information[r][c]);
@@ -83,10 +83,11 @@ impl CellEvidence {
         if numbers.into_iter().any(|v| !v.is_finite()) {
             return refused("a number is not finite");
         }
-        if buffers < 0.0 || (0..SOIL_DIM).any(|i| matrix[(i, i)] < 0.0) {
+        let rounding = ROUNDING_MAX * matrix.amax();
+        if buffers < 0.0 || (0..SOIL_DIM).any(|i| matrix[(i, i)] < -rounding) {
             return refused("its buffers or the diagonal of its information are negative");
         }
-        if (matrix - matrix.transpose()).amax() > ASYMMETRY_MAX * matrix.amax() {
+        if (matrix - matrix.transpose()).amax() > rounding {
             return refused("its information is not symmetric");
         }
         Ok(Self { information: matrix, vector: Vector::from(vector), buffers, votes, stamp_s, revision })
@@ -417,6 +418,8 @@ mod tests {
         assert!(with(|parts| parts.vector[3] = f64::NAN).is_err());
         assert!(with(|parts| parts.information[1][4] = 7.0).is_err());
         assert!(with(|parts| parts.information[2][2] = -1.0).is_err());
+        assert!(with(|parts| parts.information[3][3] = -1.0).is_err());
+        assert!(with(|parts| parts.information[3][3] = -1e-14).is_ok(), "a sum of differences is rounded");
         assert!(with(|parts| parts.buffers = -1.0).is_err());
         for i in 0..200 {
             let parts = EvidenceParts { stamp_s: f64::from(i), ..late.parts() };

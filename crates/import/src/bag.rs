@@ -1,7 +1,7 @@
 //! ROS 2 bags in MCAP files: odometry, commands and, where it is wanted, another gyro.
 //!
-//! One row per odometry message. Commands hold until the next one, as the vehicle does; a gyro reading counts until the next one. Commands without a
-//! stamp of their own count from when they were recorded, and so does everything when the stamps of the odometry are of another clock.
+//! One row per odometry message. Commands hold until the next one, as the vehicle does; a gyro reading counts until the next one. A message counts from its
+//! stamp; from when it was recorded where it has none, where the stamps of its topic are of another clock, or those of the odometry.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -16,7 +16,7 @@ use crate::log::Log;
 use crate::part::Notes;
 
 /// Stamps further from the recorder's clock than this are of another one, ns.
-const CLOCKS_APART_NS: i64 = 1_000_000_000;
+const CLOCKS_APART_NS: u64 = 1_000_000_000;
 
 /// Topics to read; `None` = the only one of a type that fits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -57,25 +57,58 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
     for (at, (recorded_ns, bytes)) in odometries.iter().enumerate() {
         rows.push((*recorded_ns, odometry(bytes).ok_or_else(|| unreadable("odometry", at))?));
     }
-    let mut apart: Vec<i64> = rows.iter().map(|(recorded_ns, o)| (recorded_ns - o.stamp_ns).abs()).collect();
-    apart.sort_unstable();
-    let foreign_clock = apart.get(apart.len() / 2).is_some_and(|ns| *ns > CLOCKS_APART_NS);
+    let foreign_clock = is_foreign(rows.iter().map(|(recorded_ns, o)| (*recorded_ns, o.stamp_ns)));
     if foreign_clock {
-        notes.push("the stamps of the odometry are of another clock than the recorder's: times of recording are used".into());
+        notes.push(of_another_clock("odometry"));
     }
     let stamped = kind.ends_with("Stamped");
-    let read: fn(&[u8], bool) -> Option<[f64; 2]> = if kind.starts_with("ackermann") { ackermann } else { twist };
-    let mut told: Vec<(i64, [f64; 2])> = Vec::new();
+    let read: fn(&[u8], bool) -> Option<(Option<i64>, [f64; 2])> = if kind.starts_with("ackermann") { ackermann } else { twist };
+    let mut told: Vec<Received<[f64; 2]>> = Vec::new();
     for (at, (recorded_ns, bytes)) in commands.iter().enumerate() {
-        told.push((*recorded_ns, read(bytes, stamped).ok_or_else(|| unreadable("command", at))?));
+        let (stamp_ns, value) = read(bytes, stamped).ok_or_else(|| unreadable("command", at))?;
+        told.push(Received { recorded_ns: *recorded_ns, stamp_ns, value });
     }
-    let mut turned: Vec<(i64, [f64; 3])> = Vec::new();
+    let mut turned: Vec<Received<[f64; 3]>> = Vec::new();
     for (at, (recorded_ns, bytes)) in gyro.iter().flat_map(|(_, messages)| messages.iter()).enumerate() {
-        let (stamp_ns, rates) = imu(bytes).ok_or_else(|| unreadable("imu", at))?;
-        turned.push((if foreign_clock { *recorded_ns } else { stamp_ns }, rates));
+        let (stamp_ns, value) = imu(bytes).ok_or_else(|| unreadable("imu", at))?;
+        turned.push(Received { recorded_ns: *recorded_ns, stamp_ns: Some(stamp_ns), value });
     }
+    let told = by_instant("commands", told, foreign_clock, &mut notes);
+    let turned = by_instant("imu", turned, foreign_clock, &mut notes);
     let times: Vec<i64> = rows.iter().map(|(recorded_ns, o)| if foreign_clock { *recorded_ns } else { o.stamp_ns }).collect();
     Ok((log(path, &times, &rows, (kind, told.as_slice()), gyro.is_some().then_some(turned.as_slice())), notes))
+}
+
+/// A message of a topic that is held between its messages.
+struct Received<T> {
+    recorded_ns: i64,
+    stamp_ns: Option<i64>,
+    value: T,
+}
+
+/// Whether stamps are of another clock than the recorder's: (recorded, stamp) of the messages of a topic, ns.
+fn is_foreign(times: impl Iterator<Item = (i64, i64)>) -> bool {
+    let mut apart: Vec<u64> = times.map(|(recorded_ns, stamp_ns)| recorded_ns.abs_diff(stamp_ns)).collect();
+    apart.sort_unstable();
+    apart.get(apart.len() / 2).is_some_and(|ns| *ns > CLOCKS_APART_NS)
+}
+
+fn of_another_clock(topic: &str) -> String {
+    format!("the stamps of the {topic} are of another clock than the recorder's: times of recording are used")
+}
+
+/// The messages of a topic in the order of the instants from which they count.
+fn by_instant<T>(topic: &str, mut messages: Vec<Received<T>>, as_recorded: bool, notes: &mut Notes) -> Vec<(i64, T)> {
+    // A stamp of zero is one that nobody set.
+    messages.iter_mut().for_each(|message| message.stamp_ns = message.stamp_ns.filter(|ns| !as_recorded && *ns != 0));
+    let foreign_clock = is_foreign(messages.iter().filter_map(|message| Some((message.recorded_ns, message.stamp_ns?))));
+    if foreign_clock {
+        notes.push(of_another_clock(topic));
+    }
+    let instant = |message: &Received<T>| message.stamp_ns.filter(|_| !foreign_clock).unwrap_or(message.recorded_ns);
+    let mut entries: Vec<(i64, T)> = messages.into_iter().map(|message| (instant(&message), message.value)).collect();
+    entries.sort_by_key(|(ns, _)| *ns);
+    entries
 }
 
 fn log(
@@ -187,20 +220,25 @@ mod tests {
     use super::*;
     use crate::part::{Options, drives};
 
-    fn odometry_bytes(stamp_ns: i64, x: f64, speed: f64) -> Vec<u8> {
+    /// A message that begins with a header: stamp, texts, doubles.
+    fn stamped(stamp_ns: i64, texts: &[&str], values: &[f64]) -> Vec<u8> {
         let mut body: Vec<u8> =
             [((stamp_ns / 1_000_000_000) as i32).to_le_bytes(), ((stamp_ns % 1_000_000_000) as i32).to_le_bytes()].concat();
-        for text in ["odom", "base_link"] {
+        for text in texts {
             body.resize(body.len().next_multiple_of(4), 0);
             body.extend((text.len() as u32 + 1).to_le_bytes());
             body.extend(text.as_bytes());
             body.push(0);
         }
         body.resize(body.len().next_multiple_of(8), 0);
+        values.iter().for_each(|v| body.extend(v.to_le_bytes()));
+        [vec![0, 1, 0, 0], body].concat()
+    }
+
+    fn odometry_bytes(stamp_ns: i64, x: f64, speed: f64) -> Vec<u8> {
         let mut values = vec![0.0; 85];
         (values[0], values[6], values[43]) = (x, 1.0, speed);
-        values.iter().for_each(|v: &f64| body.extend(v.to_le_bytes()));
-        [vec![0, 1, 0, 0], body].concat()
+        stamped(stamp_ns, &["odom", "base_link"], &values)
     }
 
     fn bag(path: &Path, commands: &[&str]) {
@@ -235,6 +273,44 @@ mod tests {
         assert_eq!((column("t").len(), column("x")[1], column("vbx")[0]), (39, 0.2, 2.0));
         assert_eq!((column("cmd_speed")[0], column("cmd_speed")[9], column("cmd_speed")[10]), (2.0, 2.0, 12.0), "held until the next");
         assert_eq!((column("cmd_yaw_rate")[0], column("yaw")[0]), (0.5, 0.0));
+    }
+
+    /// Goal: what was measured or told at an instant counts from it. Method: odometry and stamped commands of one clock, commands recorded 0.4 s late, a gyro
+    /// whose clock began when it was switched on.
+    #[test]
+    fn analytic_messages_count_from_their_stamps_unless_they_are_of_another_clock() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("run.mcap");
+        let mut writer = Writer::create(File::create(&path).expect("made"), "ros2", "test").expect("made");
+        let mut channel = |name: &str, topic: &str| {
+            let schema = writer.add_schema(name, "ros2msg", b"").expect("added");
+            writer.add_channel(schema, topic, "cdr").expect("added")
+        };
+        let odometry = channel("nav_msgs/msg/Odometry", "/odom");
+        let twist = channel("geometry_msgs/msg/TwistStamped", "/cmd_vel");
+        let gyro = channel("sensor_msgs/msg/Imu", "/imu");
+        let begin = 1_700_000_000_000_000_000_i64;
+        for i in 0..40_i64 {
+            let at = begin + i * 50_000_000;
+            let mut write =
+                |channel, recorded_ns: i64, bytes: Vec<u8>| writer.write(channel, 0, recorded_ns as u64, &bytes).expect("written");
+            write(odometry, at + 2_000_000, odometry_bytes(at, 0.1 * i as f64, 2.0));
+            if i % 10 == 0 {
+                write(twist, at + 400_000_000, stamped(at, &["base_link"], &[1.0 + i as f64, 0.0, 0.0, 0.0, 0.0, 0.5]));
+            }
+            let mut rates = [0.0; 37];
+            rates[15] = i as f64;
+            write(gyro, at + 1_000_000, stamped(5_000_000_000 + i * 50_000_000, &["imu"], &rates));
+        }
+        writer.finish().expect("finished");
+        let (log, notes) = read_bag(&path, &Topics { imu: Some("/imu".into()), ..Topics::default() }).expect("readable");
+        assert_eq!(notes, [of_another_clock("imu")]);
+        let column = |name: &str| log.column(name).expect("there");
+        let commanded = column("cmd_speed");
+        assert_eq!((commanded[0], commanded[9], commanded[10], commanded[39]), (Some(1.0), Some(1.0), Some(11.0), Some(31.0)));
+        // The reading of a row is recorded 1 ms after the stamp of its odometry: the one before counts.
+        let turned = column("wz");
+        assert_eq!((turned[0], turned[1], turned[39]), (None, Some(0.0), Some(38.0)));
     }
 
     #[test]

@@ -81,24 +81,20 @@ pub(crate) fn imu(message: &[u8]) -> Option<(i64, [f64; 3])> {
     Some((stamp_ns, cdr.numbers()?))
 }
 
-/// geometry_msgs/msg/Twist and TwistStamped: speed forward, yaw rate.
-pub(crate) fn twist(message: &[u8], stamped: bool) -> Option<[f64; 2]> {
+/// geometry_msgs/msg/Twist and TwistStamped: stamp in ns where it has one; speed forward, yaw rate.
+pub(crate) fn twist(message: &[u8], stamped: bool) -> Option<(Option<i64>, [f64; 2])> {
     let mut cdr = Cdr::new(message)?;
-    if stamped {
-        cdr.header()?;
-    }
+    let stamp_ns = if stamped { Some(cdr.header()?) } else { None };
     let values: [f64; 6] = cdr.numbers()?;
-    Some([values[0], values[5]])
+    Some((stamp_ns, [values[0], values[5]]))
 }
 
-/// ackermann_msgs/msg/AckermannDrive and AckermannDriveStamped: speed, road-wheel angle.
-pub(crate) fn ackermann(message: &[u8], stamped: bool) -> Option<[f64; 2]> {
+/// ackermann_msgs/msg/AckermannDrive and AckermannDriveStamped: stamp in ns where it has one; speed, road-wheel angle.
+pub(crate) fn ackermann(message: &[u8], stamped: bool) -> Option<(Option<i64>, [f64; 2])> {
     let mut cdr = Cdr::new(message)?;
-    if stamped {
-        cdr.header()?;
-    }
+    let stamp_ns = if stamped { Some(cdr.header()?) } else { None };
     let (angle, _, speed) = (cdr.f32()?, cdr.f32()?, cdr.f32()?);
-    Some([speed, angle])
+    Some((stamp_ns, [speed, angle]))
 }
 
 #[cfg(test)]
@@ -112,7 +108,7 @@ mod tests {
         for value in [1.5f64, 0.0, 0.0, 0.0, 0.0, -0.25] {
             message.extend(value.to_le_bytes());
         }
-        assert_eq!(twist(&message, false), Some([1.5, -0.25]));
+        assert_eq!(twist(&message, false), Some((None, [1.5, -0.25])));
         assert_eq!(twist(&message[..50], false), None, "cut off");
         message[1] = 0;
         assert_eq!(twist(&message, false), None, "big-endian");

@@ -1,5 +1,7 @@
 //! Drives from a log: channels, conventions, gaps.
 
+use std::collections::HashMap;
+
 use crate::error::ImportError;
 use crate::frame::{FrameConvention, attitude_of};
 use crate::log::Log;
@@ -7,6 +9,8 @@ use crate::mapping::Mapping;
 
 /// Longest pause within a drive, s, unless five usual steps are longer: what readers of data roots bridge.
 const GAP_S: f64 = 0.5;
+/// Longest usual step, s: what readers of data roots take for seconds.
+const STEP_MAX_S: f64 = 10.0;
 /// Shorter drives hold no prediction and are left out, s.
 const DRIVE_MIN_S: f64 = 1.0;
 /// A channel that is missing in a larger share of the rows is left out; else the rows are.
@@ -64,23 +68,23 @@ type Channel = (String, Vec<Option<f64>>);
 /// Makes drives of a log.
 ///
 /// # Errors
-/// `ImportError::Log` naming the channel that is missing, or the line at which time goes backwards.
+/// `ImportError::Log` naming the channel that is missing, the line at which time goes backwards, or time stamps that count no seconds.
 pub fn drives(log: &Log, options: &Options) -> Result<(Vec<Drive>, Notes), ImportError> {
     let mut notes = Notes::new();
+    let names = options.mapping.texts(log, "trajectory");
     let mut channels = vec![("t".to_string(), time(log, options, &mut notes)?)];
     channels.extend(pose(log, options, &mut notes)?);
-    channels.extend(commands(log, options)?);
+    channels.extend(commands(log, options, names.as_deref())?);
     let needed = channels.len();
     for group in GROUPS {
         channels.extend(motion(log, options, group, &mut notes)?);
     }
     channels.extend(sides(log, options)?);
     let whole = leave_out(&mut channels, needed, log.rows, &mut notes);
-    let names = options.mapping.texts(log, "trajectory");
     let mut drives = Vec::new();
     for (name, rows) in by_name(&whole, names.as_deref(), &options.name) {
         let rows = ascending(log, &channels[0].1, rows, &mut notes)?;
-        let parts = at_gaps(&channels[0].1, &rows);
+        let parts = at_gaps(log, &channels[0].1, &rows)?;
         let several = parts.len() > 1;
         for (i, part) in parts.into_iter().enumerate() {
             let id = if several { format!("{name}-{}", i + 1) } else { name.clone() };
@@ -161,15 +165,18 @@ fn turned(channels: [Vec<Option<f64>>; 3], turn: impl Fn([f64; 3]) -> [f64; 3]) 
     std::array::from_fn(|axis| rows.iter().map(|v| v.map(|v| v[axis])).collect())
 }
 
-/// Commands; each holds until the next.
-fn commands(log: &Log, options: &Options) -> Result<Vec<Channel>, ImportError> {
+/// Commands; each holds until the next of its drive.
+fn commands(log: &Log, options: &Options, names: Option<&[String]>) -> Result<Vec<Channel>, ImportError> {
     let hold = |values: Vec<Option<f64>>| {
-        let mut last = None;
-        let held = |v: Option<f64>| {
-            last = v.or(last);
-            last
+        let mut last: HashMap<&str, f64> = HashMap::new();
+        let held = |(row, value): (usize, Option<f64>)| {
+            let name = names.map_or("", |names| names[row].as_str());
+            if let Some(value) = value {
+                last.insert(name, value);
+            }
+            last.get(name).copied()
         };
-        values.into_iter().map(held).collect::<Vec<_>>()
+        values.into_iter().enumerate().map(held).collect::<Vec<_>>()
     };
     let mut channels = vec![("cmd_speed".to_string(), hold(required(log, options, "cmd_speed", " (commanded speed)")?))];
     for name in SECOND {
@@ -272,11 +279,17 @@ fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Note
 }
 
 /// Parts of a drive between gaps.
-fn at_gaps(time: &[Option<f64>], rows: &[usize]) -> Vec<Vec<usize>> {
+fn at_gaps(log: &Log, time: &[Option<f64>], rows: &[usize]) -> Result<Vec<Vec<usize>>, ImportError> {
     let step = |pair: &[usize]| time[pair[1]].zip(time[pair[0]]).map_or(f64::NAN, |(b, a)| b - a);
     let mut steps: Vec<f64> = rows.windows(2).map(step).collect();
     steps.sort_by(f64::total_cmp);
-    let limit_s = GAP_S.max(5.0 * steps.get(steps.len() / 2).copied().unwrap_or(0.0));
+    let median_s = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
+    if median_s > STEP_MAX_S {
+        let what = format!("samples lie {median_s} s apart in `t`, at most {STEP_MAX_S} s are usual");
+        let advice = "where its unit is not the second, name it: --column t=COLUMN:ns, or ms, us";
+        return Err(ImportError::log(&log.path, format!("{what}; {advice}")));
+    }
+    let limit_s = GAP_S.max(5.0 * median_s);
     let mut parts: Vec<Vec<usize>> = Vec::new();
     for (i, row) in rows.iter().enumerate() {
         if i == 0 || step(&rows[i - 1..=i]) > limit_s {
@@ -284,5 +297,5 @@ fn at_gaps(time: &[Option<f64>], rows: &[usize]) -> Vec<Vec<usize>> {
         }
         parts.last_mut().expect("a part was begun; this is a bug").push(*row);
     }
-    parts
+    Ok(parts)
 }

@@ -130,3 +130,42 @@ fn analytic_gaps_part_drives_and_what_is_left_out_is_told() {
     let told = drives(&read_csv(&path).expect("a table"), &Options { flat: true, ..strict }).expect_err("backwards").to_string();
     assert!(told.contains("line 3: time goes backwards"), "{told}");
 }
+
+#[test]
+fn analytic_a_drive_begins_with_its_own_first_command() {
+    // Two drives in one table, row by row in turn, then one after the other; the second is told nothing for its first half second.
+    let row = |name: &str, k: i32| {
+        let command = if name == "b" && k < 5 { ",".to_string() } else { format!("{},0.1", if name == "a" { 1.0 } else { 2.0 }) };
+        format!("{name},{},{},0,0,{command}\n", 0.1 * f64::from(k), 0.1 * f64::from(k))
+    };
+    let head = "trajectory,t,x,y,yaw,cmd_speed,cmd_steer\n";
+    let in_turn: String = (0..30).flat_map(|k| [row("a", k), row("b", k)]).collect();
+    let one_by_one: String = (0..60).map(|i| row(if i < 30 { "a" } else { "b" }, i % 30)).collect();
+    for rows in [in_turn, one_by_one] {
+        let folder = tempfile::tempdir().expect("a folder");
+        let path = folder.path().join("log.csv");
+        std::fs::write(&path, format!("{head}{rows}")).expect("written");
+        let flat = Options { flat: true, ..options(&[], FrameConvention::EnuFlu) };
+        let (found, notes) = drives(&read_csv(&path).expect("a table"), &flat).expect("two drives");
+        assert_eq!(found.iter().map(|d| (d.id.as_str(), d.time_s().len())).collect::<Vec<_>>(), [("a", 30), ("b", 25)]);
+        assert!(notes.iter().any(|n| n.contains("5 of 60 rows left out") && n.contains("cmd_speed 5")), "{notes:?}");
+        let speeds = &found[1].columns.iter().find(|(name, _)| name == "cmd_speed").expect("there").1;
+        assert!(speeds.iter().all(|speed| *speed == 2.0), "{speeds:?}");
+    }
+}
+
+#[test]
+fn analytic_time_stamps_that_are_no_seconds_are_refused() {
+    let mut table = "t,x,y,yaw,cmd_speed,cmd_steer\n".to_string();
+    for k in 0..30u64 {
+        let _ = writeln!(table, "{},{},0,0,1,0", 1_700_000_000_000_000_000 + k * 100_000_000, 0.1 * k as f64);
+    }
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("log.csv");
+    std::fs::write(&path, table).expect("written");
+    let flat = |lines: &[&str]| Options { flat: true, ..options(lines, FrameConvention::EnuFlu) };
+    let log = read_csv(&path).expect("a table");
+    let told = drives(&log, &flat(&[])).expect_err("nanoseconds").to_string();
+    assert!(told.contains("`t`") && told.contains("--column t=COLUMN:ns"), "{told}");
+    assert_eq!(drives(&log, &flat(&["t=t:ns"])).expect("a drive").0[0].time_s().len(), 30);
+}

@@ -324,19 +324,14 @@ impl TerrainProvider for PathTerrain<'_, '_> {
     }
 }
 
-/// Mean absolute errors of predictions over a batch: horizontal position (m), z (m), roll, pitch, yaw (rad).
-pub fn absolute_errors(predicted: &Tensor, target: &Tensor) -> Result<[f64; 5]> {
+/// Absolute errors of each prediction of a batch: horizontal position (m), z (m), roll, pitch, yaw (rad).
+pub fn absolute_errors(predicted: &Tensor, target: &Tensor) -> Result<Vec<[f64; 5]>> {
     let (p, t): (Vec<Vec<f32>>, Vec<Vec<f32>>) = (predicted.to_vec2()?, target.to_vec2()?);
-    let mut sums = [0.0; 5];
-    for (p, t) in p.iter().zip(&t) {
+    let of_row = |(p, t): (&Vec<f32>, &Vec<f32>)| {
         let e = |i: usize| f64::from(p[i] - t[i]);
-        sums[0] += e(0).hypot(e(1));
-        sums[1] += e(2).abs();
-        sums[2] += e(3).abs();
-        sums[3] += e(4).abs();
-        sums[4] += wrap_angle(e(5)).abs();
-    }
-    Ok(sums.map(|s| s / p.len() as f64))
+        [e(0).hypot(e(1)), e(2).abs(), e(3).abs(), e(4).abs(), wrap_angle(e(5)).abs()]
+    };
+    Ok(p.iter().zip(&t).map(of_row).collect())
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, W
 use nesam_physics::step::StepModel;
 use nesam_physics::terramechanics::ContactLaw;
 use nesam_physics::{STATE_DIM, SecondCommand, Vehicle};
-use nesam_terrain::WorldMap;
+use nesam_terrain::{PatchScale, WorldMap};
 use nesam_trajectories::{DataRoot, Trajectory};
 
 use crate::autoencoder::{Places, PretrainPlan, pretrain};
@@ -136,7 +136,7 @@ pub fn run(
 
     let set = TrainingSet {
         train: train_at.iter().map(|&i| &drives[i]).collect(),
-        validation: if validation_at.is_empty() { &train_at } else { &validation_at }.iter().map(|&i| &drives[i]).collect(),
+        validation: validation_at.iter().map(|&i| &drives[i]).collect(),
         scales: &scales,
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
         pooling: recipe.pooling.clone(),
@@ -144,7 +144,7 @@ pub fn run(
     reporter.line(&format!(
         "{} drives train, {} validate, {} parameters",
         set.train.len(),
-        validation_at.len(),
+        set.validation.iter().filter(|drive| drive.states.len() > recipe.plan.horizon).count(),
         trained_parameters(&weights, recipe.plan.objective.variant)
     ));
     reporter.stage("training", recipe.plan.steps);
@@ -208,8 +208,12 @@ fn optimisation_s(curve: &[EpochReport]) -> f64 {
 /// One line of the loss curve for people.
 fn describe(line: &EpochReport) -> String {
     let [position, z, roll, pitch, yaw] = line.validation;
+    let diverged = match line.diverged {
+        0 => String::new(),
+        windows => format!(", windows left out because they diverged: {windows}"),
+    };
     format!(
-        "step {}: loss {:.3}; validation, mean over the horizon: position {position:.3} m, z {z:.3} m, roll {:.2}°, pitch {:.2}°, yaw {:.2}°; {:.2} s per step",
+        "step {}: loss {:.3}; validation, mean over the horizon: position {position:.3} m, z {z:.3} m, roll {:.2}°, pitch {:.2}°, yaw {:.2}°{diverged}; {:.2} s per step",
         line.step,
         line.loss,
         roll.to_degrees(),
@@ -291,6 +295,13 @@ fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64,
     (chosen, scales)
 }
 
+/// Name of the file with encoders, by all that they are trained on: the plan, the places, and how much of them the pixels show.
+fn encoders_file(plan: &PretrainPlan, pixels: &PatchScale, places: &Places) -> String {
+    let places: Vec<String> = places.iter().map(|(map, x_m, y_m)| format!("{} {x_m} {y_m}", map.hash())).collect();
+    let key = sha256_hex(format!("{plan:?} {pixels:?} {}", places.join(" ")).as_bytes());
+    format!("encoders-{}.safetensors", &key[..12])
+}
+
 /// Pre-trained encoders, from the output folder if this run was made before.
 fn encoders(
     drives: &[Drive],
@@ -301,17 +312,16 @@ fn encoders(
     interrupted: &dyn Fn() -> bool,
 ) -> Result<Weights, TrainingError> {
     let plan = PretrainPlan { steps: recipe.encoder_steps, batch: recipe.encoder_batch, rate: recipe.encoder_rate, seed: recipe.plan.seed };
-    let key = sha256_hex(format!("{plan:?} {:?}", train_at.iter().map(|&i| &drives[i].id).collect::<Vec<_>>()).as_bytes());
-    let path = recipe.out.join(format!("encoders-{}.safetensors", &key[..12]));
-    if let Ok(bytes) = std::fs::read(&path) {
-        reporter.line(&format!("encoders taken from {}", path.display()));
-        return Ok(Weights::from_bytes(&bytes, &path)?);
-    }
     let places: Places = train_at
         .iter()
         .filter_map(|&i| drives[i].map.as_ref().map(|map| (map, &drives[i])))
         .flat_map(|(map, drive)| drive.states.iter().step_by(3).map(move |s| (map.clone(), s.position_m[0], s.position_m[1])))
         .collect();
+    let path = recipe.out.join(encoders_file(&plan, &scales.patch_scale(), &places));
+    if let Ok(bytes) = std::fs::read(&path) {
+        reporter.line(&format!("encoders taken from {}", path.display()));
+        return Ok(Weights::from_bytes(&bytes, &path)?);
+    }
     reporter.stage("encoders", 2 * plan.steps);
     let done = AtomicUsize::new(0);
     let device = recipe.plan.device.open()?;
@@ -353,4 +363,29 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {
         std::fs::create_dir_all(parent).map_err(|e| fail(e.to_string()))?;
     }
     std::fs::write(path, bytes).map_err(|e| fail(e.to_string()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nesam_terrain::GridGeometry;
+
+    #[test]
+    fn property_encoders_are_taken_for_the_same_pixels_of_the_same_places_alone() {
+        let map = |height_m: f32| {
+            let geometry = GridGeometry { origin_m: [0.0; 2], resolution_m: 0.1, width: 2, height: 2 };
+            Arc::new(WorldMap::from_layers("plain", 1, geometry, vec![height_m; 4], None).unwrap())
+        };
+        let plan = PretrainPlan { steps: 3, batch: 4, rate: 1e-3, seed: 1 };
+        let hard = PatchScale::default();
+        let smooth = PatchScale { smooth_semantics: true, ..hard };
+        let [here, again, there, higher] =
+            [(0.0, 0.2), (0.0, 0.2), (0.0, 0.3), (0.1, 0.2)].map(|(height_m, y)| vec![(map(height_m), 0.1, y)]);
+        let name = encoders_file(&plan, &hard, &here);
+        assert_eq!(encoders_file(&plan, &hard, &again), name);
+        for (pixels, places) in [(&smooth, &here), (&hard, &there), (&hard, &higher)] {
+            assert_ne!(encoders_file(&plan, pixels, places), name, "{pixels:?} {places:?}");
+        }
+        assert_ne!(encoders_file(&PretrainPlan { seed: 2, ..plan }, &hard, &here), name);
+    }
 }

@@ -6,11 +6,13 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use candle_core::{DType, Result, Tensor};
+use nesam_model::bundle::sha256_hex;
 use nesam_model::reference::{ComputeDevice, Network, ReferenceRollout};
 use nesam_model::{HISTORY, ModelError, Normalization, Variant, Weights};
 use nesam_physics::step::StepModel;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Deserializer, Serialize};
 
 use crate::adam::Adam;
 use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, sustained_residual, targets};
@@ -68,25 +70,40 @@ pub struct Objective {
     pub soil_prior: f64,
 }
 
-/// One line of the loss curve.
-#[derive(Clone, Copy, Debug, serde::Serialize, serde::Deserialize)]
+/// One line of the loss curve. A number that is none is null in JSON.
+#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
 pub struct EpochReport {
     /// Optimiser steps taken.
     pub step: usize,
-    /// Mean training loss since the last report.
+    /// Mean of the finite training losses since the last report.
+    #[serde(deserialize_with = "or_nan")]
     pub loss: f32,
-    /// Mean absolute errors on validation drives, mean over the horizon: position (m), z (m), roll, pitch, yaw (rad).
+    /// Mean absolute errors on validation drives, mean over the horizon: position (m), z (m), roll, pitch, yaw (rad). NaN where every window diverged.
+    #[serde(deserialize_with = "each_or_nan")]
     pub validation: [f64; 5],
+    /// Validation windows that diverged and are left out of the mean.
+    #[serde(default)]
+    pub diverged: usize,
     /// Seconds per step since the last report.
     pub step_s: f64,
 }
 
+fn or_nan<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<f32, D::Error> {
+    Ok(Option::<f32>::deserialize(from)?.unwrap_or(f32::NAN))
+}
+
+fn each_or_nan<'de, D: Deserializer<'de>>(from: D) -> std::result::Result<[f64; 5], D::Error> {
+    Ok(<[Option<f64>; 5]>::deserialize(from)?.map(|number| number.unwrap_or(f64::NAN)))
+}
+
 /// Memory of the running mean of the weights, in steps: about two epochs.
 const AVERAGED_STEPS: f32 = 500.0;
+/// Score of a window that diverged (chosen: hundreds of kilometres).
+const DIVERGED: f64 = 1e6;
 
 /// Result of a run.
 pub struct Trained {
-    /// Running mean of the weights (Polyak & Juditsky 1992) with the lowest validation error.
+    /// Running mean of the weights (Polyak & Juditsky 1992) with the lowest validation error; the last one where no validation gave a number.
     pub weights: Weights,
     /// Loss curve.
     pub curve: Vec<EpochReport>,
@@ -126,7 +143,7 @@ impl From<candle_core::Error> for TrainingError {
 pub struct TrainingSet<'a> {
     /// Drives to learn from.
     pub train: Vec<&'a Drive>,
-    /// Drives to choose the checkpoint on; never the test split.
+    /// Drives to choose the checkpoint on; never the test split. Where none is longer than the horizon, those to learn from.
     pub validation: Vec<&'a Drive>,
     /// Scales.
     pub scales: &'a Normalization,
@@ -184,39 +201,51 @@ impl TrainingSet<'_> {
         Ok((loss.to_scalar::<f32>()?, gradients))
     }
 
-    /// Mean absolute errors over fixed windows of the validation drives.
-    fn validate(&self, network: &Network, horizon: usize, variant: Variant) -> Result<[f64; 5]> {
-        let windows: Vec<Window<'_>> = self
-            .validation
-            .iter()
-            .flat_map(|drive| {
-                let first = (HISTORY - 1).min(drive.states.len().saturating_sub(horizon + 1));
-                (first..drive.states.len().saturating_sub(horizon)).step_by(40).map(move |start| Window { drive, start, dropout: None })
-            })
-            .collect();
+    /// Mean absolute errors over fixed windows of the validation drives, and how many of these diverged and are left out.
+    fn validate(&self, network: &Network, horizon: usize, variant: Variant) -> Result<([f64; 5], usize)> {
+        let mut windows = fixed_windows(&self.validation, horizon);
+        if windows.is_empty() {
+            windows = fixed_windows(&self.train, horizon);
+        }
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
-        let mut sums = [0.0; 5];
-        let mut count = 0.0;
+        let mut errors: Vec<[f64; 5]> = Vec::with_capacity(windows.len());
         for windows in windows.chunks(64) {
             let available = windows.iter().map(|w| w.start).min().unwrap_or(0).min(HISTORY - 1);
             let history = steps_needed(variant, available);
             let rows = rows(windows, history, horizon, &self.model, self.scales.dt_s);
             let mut terrain = PathTerrain::new(network, windows, history, horizon, self.sight(variant))?;
+            let mut means = vec![[0.0; 5]; windows.len()];
             for (k, step) in rollout.run(&rows, horizon, &mut terrain)?.iter().enumerate() {
-                let errors = absolute_errors(&step.state, &targets(windows, k, network.device())?)?;
-                for (sum, e) in sums.iter_mut().zip(errors) {
-                    *sum += e * windows.len() as f64;
-                }
-                count += windows.len() as f64;
+                let of_step = absolute_errors(&step.state, &targets(windows, k, network.device())?)?;
+                means.iter_mut().flatten().zip(of_step.iter().flatten()).for_each(|(mean, e)| *mean += e / horizon as f64);
             }
+            errors.extend(means);
         }
-        Ok(sums.map(|s| s / count))
+        let count = errors.len();
+        errors.retain(|window| window.iter().all(|e| e.is_finite()));
+        let mean = core::array::from_fn(|i| errors.iter().map(|window| window[i]).sum::<f64>() / errors.len() as f64);
+        Ok((mean, count - errors.len()))
     }
 }
 
-/// Errors weighted as the targets of the evaluation weigh them: one number to choose a checkpoint by.
-fn score(errors: &[f64; 5]) -> f64 {
-    errors[0] / 0.20 + errors[1] / 0.045 + (errors[2] / 0.8 + errors[3] / 0.7 + errors[4] / 1.7).to_degrees()
+/// Every fortieth window of drives.
+fn fixed_windows<'a>(drives: &[&'a Drive], horizon: usize) -> Vec<Window<'a>> {
+    drives
+        .iter()
+        .copied()
+        .flat_map(|drive| {
+            let starts = drive.states.len().saturating_sub(horizon);
+            let first = (HISTORY - 1).min(starts.saturating_sub(1));
+            (first..starts).step_by(40).map(move |start| Window { drive, start, dropout: None })
+        })
+        .collect()
+}
+
+/// Errors weighted as the targets of the evaluation weigh them: one number to choose a checkpoint by. A window that diverged weighs more than any error.
+fn score(line: &EpochReport) -> f64 {
+    let errors = &line.validation;
+    let weighted = errors[0] / 0.20 + errors[1] / 0.045 + (errors[2] / 0.8 + errors[3] / 0.7 + errors[4] / 1.7).to_degrees();
+    weighted + DIVERGED * line.diverged as f64
 }
 
 /// Steps of history for a training step: all of it mostly, less one time in six, so that a fresh session predicts well too.
@@ -259,7 +288,7 @@ pub fn train(
             rayon::ThreadPoolBuilder::new().num_threads(plan.physics_threads()).build().expect("a thread can be started; this is a bug")
         })
         .collect();
-    let (mut loss_sum, mut loss_count, mut since) = (0.0, 0, Instant::now());
+    let (mut losses, mut steps, mut since) = (Vec::new(), 0_u32, Instant::now());
     while checkpoint.step < plan.steps {
         let step = checkpoint.step;
         // Each step has its own random stream, so a resumed run draws the batches that an uninterrupted one would have drawn.
@@ -277,29 +306,34 @@ pub fn train(
         let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0, plan.decay)?;
         checkpoint.step += 1;
         average_in(&mut checkpoint.average, &network.to_weights()?, checkpoint.step);
-        loss_sum += loss;
-        loss_count += 1;
+        if loss.is_finite() {
+            losses.push(loss);
+        }
+        steps += 1;
         progress(checkpoint.step, loss, norm);
         let stop = interrupted();
         if checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps || stop {
-            let step_s = since.elapsed().as_secs_f64() / loss_count as f64;
-            let validation = set.validate(&Network::from_weights(&checkpoint.average, &device)?, plan.horizon, plan.objective.variant)?;
-            let line = EpochReport { step: checkpoint.step, loss: loss_sum / loss_count as f32, validation, step_s };
+            let step_s = since.elapsed().as_secs_f64() / f64::from(steps);
+            let averaged = Network::from_weights(&checkpoint.average, &device)?;
+            let (validation, diverged) = set.validate(&averaged, plan.horizon, plan.objective.variant)?;
+            let loss = losses.iter().sum::<f32>() / losses.len() as f32;
+            let line = EpochReport { step: checkpoint.step, loss, validation, diverged, step_s };
             checkpoint.latest = merged(weights, &network.to_weights()?);
-            if score(&validation) < checkpoint.best_score {
-                checkpoint.best_score = score(&validation);
+            if score(&line) < checkpoint.best_score {
+                checkpoint.best_score = score(&line);
                 checkpoint.best = checkpoint.average.clone();
             }
             checkpoint.curve.push(line);
             checkpoint.save(&plan.folder)?;
             report(&line);
-            (loss_sum, loss_count, since) = (0.0, 0, Instant::now());
+            (losses, steps, since) = (Vec::new(), 0, Instant::now());
         }
         if stop {
             return Err(TrainingError::Interrupted(checkpoint.step));
         }
     }
-    Ok(Trained { weights: checkpoint.best, curve: checkpoint.curve, steps: checkpoint.step })
+    let chosen = if checkpoint.best_score.is_finite() { checkpoint.best } else { checkpoint.average };
+    Ok(Trained { weights: chosen, curve: checkpoint.curve, steps: checkpoint.step })
 }
 
 /// Every (drive, start) whose rollout fits.
@@ -387,15 +421,16 @@ impl Checkpoint {
         std::fs::create_dir_all(folder).map_err(|e| fail(folder, e))?;
         let mut moments = Weights::default();
         self.adam.save(&mut moments);
-        let state = serde_json::json!({ "step": self.step, "best_score": self.best_score, "curve": self.curve });
-        let files = [
+        let arrays = [
             ("best.safetensors", self.best.to_bytes()),
             ("latest.safetensors", self.latest.to_bytes()),
             ("average.safetensors", self.average.to_bytes()),
             ("adam.safetensors", moments.to_bytes()),
-            // Written last: a run killed in between resumes from files that agree.
-            ("state.json", state.to_string().into_bytes()),
         ];
+        let hashes: HashMap<&str, String> = arrays.iter().map(|(name, bytes)| (*name, sha256_hex(bytes))).collect();
+        let state = serde_json::json!({ "step": self.step, "best_score": self.best_score, "curve": self.curve, "hashes": hashes });
+        // The state is renamed first: of a run that is killed in between, `load` finds the arrays of that state under either name.
+        let files: Vec<(&str, Vec<u8>)> = std::iter::once(("state.json", state.to_string().into_bytes())).chain(arrays).collect();
         for (name, bytes) in &files {
             let path = folder.join(format!("{name}.new"));
             std::fs::write(&path, bytes).map_err(|e| fail(&path, e))?;
@@ -413,13 +448,19 @@ impl Checkpoint {
             return Ok(None);
         }
         let fail = |path: &Path, reason: String| TrainingError::Checkpoint { path: path.to_path_buf(), reason };
-        let read = |name: &str| {
-            let path = folder.join(name);
-            std::fs::read(&path).map_err(|e| fail(&path, e.to_string()))
+        let bytes = std::fs::read(&state_path).map_err(|e| fail(&state_path, e.to_string()))?;
+        let state: serde_json::Value = serde_json::from_slice(&bytes).map_err(|e| fail(&state_path, e.to_string()))?;
+        let arrays = |name: &str| -> std::result::Result<Weights, TrainingError> {
+            let (path, unnamed) = (folder.join(name), folder.join(format!("{name}.new")));
+            let hash = state["hashes"][name].as_str();
+            let of_state = |path: &Path| std::fs::read(path).ok().filter(|bytes| hash.is_none_or(|hash| hash == sha256_hex(bytes)));
+            if of_state(&path).is_none() && of_state(&unnamed).is_some() {
+                std::fs::rename(&unnamed, &path).map_err(|e| fail(&path, e.to_string()))?;
+            }
+            let lost = "is missing or of another step than state.json; start without --resume";
+            let bytes = of_state(&path).ok_or_else(|| fail(&path, lost.into()))?;
+            Ok(Weights::from_bytes(&bytes, &path)?)
         };
-        let arrays =
-            |name: &str| -> std::result::Result<Weights, TrainingError> { Ok(Weights::from_bytes(&read(name)?, &folder.join(name))?) };
-        let state: serde_json::Value = serde_json::from_slice(&read("state.json")?).map_err(|e| fail(&state_path, e.to_string()))?;
         let missing = |key: &str| fail(&state_path, format!("`{key}` is missing"));
         Ok(Some(Self {
             step: state["step"].as_u64().ok_or_else(|| missing("step"))? as usize,
@@ -430,5 +471,58 @@ impl Checkpoint {
             average: arrays("average.safetensors")?,
             adam: Adam::load(&arrays("adam.safetensors")?),
         }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn checkpoint(step: usize, line: EpochReport) -> Checkpoint {
+        let mut weights = Weights::default();
+        weights.insert("w", &[1], vec![step as f32]);
+        Checkpoint {
+            step,
+            best_score: f64::INFINITY,
+            best: weights.clone(),
+            latest: weights.clone(),
+            average: weights,
+            adam: Adam::default(),
+            curve: vec![line],
+        }
+    }
+
+    const LINE: EpochReport = EpochReport { step: 2, loss: f32::NAN, validation: [0.5, f64::NAN, 0.0, 0.0, 0.0], diverged: 3, step_s: 0.1 };
+
+    #[test]
+    fn regress_a_checkpoint_with_numbers_that_are_none_can_be_read() {
+        let folder = tempfile::tempdir().unwrap();
+        checkpoint(2, LINE).save(folder.path()).unwrap();
+        let found = Checkpoint::load(folder.path()).unwrap().unwrap();
+        assert_eq!((found.step, found.best_score, found.best.clone()), (2, f64::INFINITY, found.latest));
+        let line = found.curve[0];
+        assert!(line.loss.is_nan() && line.validation[0] == 0.5 && line.validation[1].is_nan() && line.diverged == 3, "{line:?}");
+    }
+
+    #[test]
+    fn property_a_run_killed_while_it_saved_goes_on_and_mixed_files_are_refused() {
+        let [folder, later] = [2, 4].map(|step| {
+            let folder = tempfile::tempdir().unwrap();
+            checkpoint(step, LINE).save(folder.path()).unwrap();
+            folder
+        });
+        let take = |from: &str, to: &str| std::fs::copy(later.path().join(from), folder.path().join(to)).unwrap();
+        take("best.safetensors", "best.safetensors");
+        let error = Checkpoint::load(folder.path()).err().expect("files of two steps").to_string();
+        assert!(error.contains("best.safetensors") && error.contains("another step"), "{error}");
+        // Two of five have their names.
+        take("state.json", "state.json");
+        for name in ["latest", "average", "adam"] {
+            take(&format!("{name}.safetensors"), &format!("{name}.safetensors.new"));
+        }
+        for _ in 0..2 {
+            let found = Checkpoint::load(folder.path()).unwrap().unwrap();
+            assert_eq!((found.step, found.latest), (4, checkpoint(4, LINE).latest));
+        }
     }
 }

@@ -5,11 +5,12 @@ mod common;
 
 use std::sync::{Arc, OnceLock};
 
-use common::{drive, hills, lively_weights, measured_scales, predictor};
+use common::{drive, hills, lively_weights, measured_scales, predictor_of, truck};
 use nesam_model::{HistoryStep, Predictor, Rollout, RolloutQuery, Variant};
 use nesam_physics::effects::*;
-use nesam_physics::{SoilCorrection, VehicleState};
+use nesam_physics::{Driveline, SoilCoordinates, SoilCorrection, TorqueDrive, Vehicle, VehicleState};
 use nesam_terrain::WorldMap;
+use nesam_test_vehicles::torque_truck;
 
 struct Scene {
     map: Arc<WorldMap>,
@@ -17,20 +18,35 @@ struct Scene {
     history: Vec<HistoryStep>,
     start: VehicleState<f64>,
     controls: Vec<f32>,
+    soil_correction: SoilCorrection,
 }
 
 const HORIZON: usize = 12;
 
 fn scene() -> &'static Scene {
     static SCENE: OnceLock<Scene> = OnceLock::new();
+    SCENE.get_or_init(|| scene_of(truck(), SoilCorrection::NONE))
+}
+
+/// The same with a speed control whose integral is observed, on ground that is known to be softer than it looks.
+fn observed_scene() -> &'static Scene {
+    static SCENE: OnceLock<Scene> = OnceLock::new();
     SCENE.get_or_init(|| {
-        let map = hills();
-        let drive = drive(Some(&map), 60);
-        let scales = measured_scales(&drive);
-        let controls = drive.controls[33..33 + HORIZON].iter().flat_map(|c| [c.speed_m_s as f32 + 0.3, c.second as f32 + 0.1]).collect();
-        let predictor = predictor(&scales, lively_weights(&scales));
-        Scene { predictor, history: drive.history(2, 33), start: drive.states[33], controls, map }
+        let car = torque_truck();
+        let torque = car.driveline.torque.map(|torque| TorqueDrive { integral_observer_per_s: 1.0, ..torque });
+        let driveline = Driveline { torque, ..car.driveline.clone() };
+        let delta = [-0.8, -0.8, 0.0, 0.0, 0.0, 0.0];
+        scene_of(Vehicle { driveline, ..car }, SoilCorrection { coordinates: SoilCoordinates::Logarithmic, delta })
     })
+}
+
+fn scene_of(vehicle: Vehicle, soil_correction: SoilCorrection) -> Scene {
+    let map = hills();
+    let drive = drive(Some(&map), 60);
+    let scales = measured_scales(&drive);
+    let controls = drive.controls[33..33 + HORIZON].iter().flat_map(|c| [c.speed_m_s as f32 + 0.3, c.second as f32 + 0.1]).collect();
+    let predictor = predictor_of(vehicle, &scales, lively_weights(&scales));
+    Scene { predictor, history: drive.history(2, 33), start: drive.states[33], controls, map, soil_correction }
 }
 
 impl Scene {
@@ -42,7 +58,7 @@ impl Scene {
             samples: 1,
             horizon: HORIZON,
             map: Some(&self.map),
-            soil_correction: SoilCorrection::NONE,
+            soil_correction: self.soil_correction,
             variant: Variant::Full,
             start_time_s,
             wheels: None,
@@ -51,6 +67,20 @@ impl Scene {
 
     fn with<E: Copy + Into<ScheduledEffect>>(&self, effects: &[E], start_time_s: Option<f64>) -> Rollout {
         self.predictor.with_effects(effects).rollout(&self.query(start_time_s)).expect("a valid query")
+    }
+
+    /// The rollout from 4 s on, which the tangents have to agree with.
+    fn agreeing(&self, scheduled: ScheduledEffect) -> Rollout {
+        let (predictor, query) = (self.predictor.with_effects(&[scheduled]), self.query(Some(4.0)));
+        let fast = predictor.rollout(&query).expect("a valid query");
+        let exact = predictor.linearise(&query).expect("a valid query").remove(0);
+        for (k, state) in exact.states().enumerate() {
+            for (i, (a, b)) in fast.state(0, k).to_array().iter().zip(state.to_array()).enumerate() {
+                // f32 against f64, and the ground at the pose against the ground in the table of the fast path.
+                assert!((f64::from(*a) - b).abs() < 2e-3, "{} step {k}, entry {i}: {a} {b}", scheduled.effect.id());
+            }
+        }
+        fast
     }
 }
 
@@ -67,34 +97,37 @@ fn property_tangents_and_fast_path_agree_on_every_effect() {
     let scene = scene();
     let plain = scene.with::<Effect>(&[], Some(4.0));
     for effect in Effect::examples() {
-        let predictor = scene.predictor.with_effects(&[effect]);
-        let query = scene.query(Some(4.0));
-        let fast = predictor.rollout(&query).expect("a valid query");
-        let exact = predictor.linearise(&query).expect("a valid query").remove(0);
-        for (k, state) in exact.states().enumerate() {
-            for (i, (a, b)) in fast.state(0, k).to_array().iter().zip(state.to_array()).enumerate() {
-                // f32 against f64, and the ground at the pose against the ground in the table of the fast path.
-                assert!((f64::from(*a) - b).abs() < 2e-3, "{} step {k}, entry {i}: {a} {b}", effect.id());
-            }
-        }
+        let fast = scene.agreeing(effect.into());
         let moved = fast.states.iter().zip(&plain.states).any(|(a, b)| (a - b).abs() > 1e-5);
         // Of a car the rims are not turned against each other.
         assert!(moved || ["skid_steer_track", "turn_limit"].contains(&effect.id()), "{} moves nothing", effect.id());
     }
 }
 
+/// What the speed control made up for before the start is another thing with more weight, less torque or another contact.
+#[test]
+fn property_tangents_and_fast_path_agree_on_effects_that_begin_on_the_way() {
+    for id in ["payload", "torque_limit", "elastic_recovery"] {
+        let effect = Effect::example(id).expect("an effect of the catalogue");
+        observed_scene().agreeing(ScheduledEffect { effect, onset_s: 4.5 });
+    }
+}
+
 #[test]
 fn property_an_effect_acts_from_its_onset_on() {
-    let scene = scene();
-    let plain = scene.with::<Effect>(&[], Some(4.0));
-    for effect in Effect::examples() {
-        let from = |onset_s: f64| scene.with(&[ScheduledEffect { effect, onset_s }], Some(4.0));
-        assert_eq!(from(4.0 + 0.1 * HORIZON as f64 + 0.05), plain, "{} after the horizon", effect.id());
-        let later = from(4.5);
-        for k in 0..4 {
-            assert_eq!(later.state(0, k), plain.state(0, k), "{} before its onset, step {k}", effect.id());
+    for scene in [scene(), observed_scene()] {
+        let plain = scene.with::<Effect>(&[], Some(4.0));
+        for effect in Effect::examples() {
+            let from = |onset_s: f64| scene.with(&[ScheduledEffect { effect, onset_s }], Some(4.0));
+            assert_eq!(from(4.0 + 0.1 * HORIZON as f64 + 0.05), plain, "{} after the horizon", effect.id());
+            let later = from(4.5);
+            for k in 0..4 {
+                assert_eq!(later.state(0, k), plain.state(0, k), "{} before its onset, step {k}", effect.id());
+            }
         }
     }
+    let scene = scene();
+    let plain = scene.with::<Effect>(&[], Some(4.0));
     let offset = Effect::SteeringOffset(SteeringOffset { second: 0.1 });
     let scheduled = ScheduledEffect { effect: offset, onset_s: 4.5 };
     let (later, always) = (scene.with(&[scheduled], Some(4.0)), scene.with(&[offset], Some(4.0)));

@@ -8,8 +8,6 @@ use crate::tangent::StateJacobian;
 
 /// Covariance of a state, order and units of the state.
 pub type StateCovariance = [[f64; STATE_DIM]; STATE_DIM];
-/// Index of the height in a state.
-const HEIGHT: usize = 2;
 /// Covariance of a soil correction in its coordinates.
 pub type SoilCovariance = [[f64; SOIL_DIM]; SOIL_DIM];
 
@@ -17,6 +15,8 @@ pub type SoilCovariance = [[f64; SOIL_DIM]; SOIL_DIM];
 pub const POSE: usize = 6;
 /// Schema of [`RolloutNoise`].
 const SCHEMA: &str = "nesam.rollout_noise/1";
+/// Index of the height in a state.
+const HEIGHT: usize = 2;
 /// Numbers of a lower triangle.
 const TRIANGLE: usize = STATE_DIM * (STATE_DIM + 1) / 2;
 

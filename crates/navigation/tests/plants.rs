@@ -110,6 +110,13 @@ fn service_python_plant_drives_a_lap() {
     let child = Process::new("python3").arg(script).arg(&address).stdout(Stdio::null()).spawn();
     let _stub = Ended(child.expect("python3 runs the reference plant"));
     let mut remote = RemotePlant::connect(&address, 7).unwrap();
+    // Position and velocity are those of one point: on a steady circle it moves as its velocity says, but for 0.1 mm of the stub's Euler steps.
+    remote.reset(&start("w35")).unwrap();
+    let circle: Vec<[f64; 12]> = (0..40).map(|_| remote.step(Control { speed_m_s: 2.0, second: 0.5 }).unwrap().measured).collect();
+    let (before, after) = (circle[38], circle[39]);
+    let (sin, cos) = (0.5 * (before[5] + after[5])).sin_cos();
+    let moved = [0.1 * (after[6] * cos - after[7] * sin), 0.1 * (after[6] * sin + after[7] * cos)];
+    (0..2).for_each(|i| assert!((after[i] - before[i] - moved[i]).abs() < 1e-3, "{before:?} {after:?}"));
     let lap = lap_on(&mut remote, "w35", 1);
     assert!(lap.completed && lap.hausdorff_m < 3.0, "{:?}", Lap { path: Vec::new(), ..lap });
 }

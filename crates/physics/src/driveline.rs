@@ -73,7 +73,8 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         let servo = &vehicle.driveline.rims;
         let gains = [servo.speed_gain * (1.0 + vehicle.effects.actuator.speed_gain), servo.yaw_gain];
         let [speed_m_s, second] = core::array::from_fn(|i| twist[i] * T::lit(1.0 / gains[i]));
-        let path = CommandPath::settled(&Control { speed_m_s, second });
+        let mut path = CommandPath::settled(&Control { speed_m_s, second });
+        path.play = twist[1]; // the play lies behind the servo
         Self { steering: twist[1], speed_error_integral_m: T::lit(0.0), rim_speed_m_s: twist[0], rim_demand: twist, path }
     }
 

@@ -3,6 +3,7 @@
 use crate::scalar::Real;
 use crate::step::{StepInput, StepModel, WheelContact};
 use crate::terramechanics::{ContactMotion, Support, balance_sinkage, wheel_wrench};
+use crate::vec3::Tilt;
 use crate::vehicle::WHEELS;
 
 /// Slip at which the traction that is left is counted (chosen: beyond it a wheel digs more than it pulls).
@@ -26,22 +27,44 @@ impl StepModel {
     ///
     /// DP_i(s*) = thrust - compaction resistance of wheel i (Wong, *Theory of Ground Vehicles*, ch. 2) at slip s* = [`RESERVE_SLIP`], at the sinkage that
     /// carries the wheel's load with this slip, times the learned ratio; γ is the climb of the body's x axis, d in (-1, 1) the direction of travel (0 at
-    /// rest). Drawbar pull over weight equals the tangent of the steepest slope that a vehicle climbs, hence the unit. Neglects side forces, the torque limit
-    /// of the drive and obstacles. `contacts` are those of the step with this input.
+    /// rest). Drawbar pull over weight equals the tangent of the steepest slope that a vehicle climbs, hence the unit. Effects act on wheel, soil and pull as in
+    /// a step, and a force that they put on the body counts like the slope. Neglects side forces, the torque limit of the drive, friction at hubs (which
+    /// torque overcomes) and obstacles. `contacts` are those of the step with this input.
     pub fn traction_reserve<T: Real>(&self, input: &StepInput<T>, contacts: &[WheelContact<T>; WHEELS]) -> T {
         let motion = ContactMotion::<T>::from_slip(RESERVE_SLIP, 0.0);
         let mut pull_n = T::lit(0.0);
-        for (contact, log_ratio) in contacts.iter().zip(input.sinkage_log_ratio) {
-            let support = Support { preload_n: contact.normal_n, rate_n_m: T::lit(0.0) };
-            let sinkage = balance_sinkage(&self.wheel, &support, &motion, &input.soil) * log_ratio.exp();
-            let wrench = wheel_wrench(&self.wheel, sinkage, &motion, &input.soil);
-            pull_n = pull_n + wrench.drawbar_n() * contact.normal_n / wrench.normal_n.relu_smooth(1.0);
+        for (i, (contact, log_ratio)) in contacts.iter().zip(input.sinkage_log_ratio).enumerate() {
+            let (wheel, support) = (self.wheel_at(i), Support { preload_n: contact.normal_n, rate_n_m: T::lit(0.0) });
+            let (mut soil, mut ratio) = (input.soil, log_ratio.exp());
+            if self.altered.on_wheels {
+                ratio = ratio * self.digging(motion.slip);
+                soil = self.soil_under(i, &support, ratio, &motion, &soil);
+            }
+            let sinkage = balance_sinkage(wheel, &support, &motion, &soil) * ratio;
+            let wrench = wheel_wrench(wheel, sinkage, &motion, &soil);
+            let mut pulled = wrench.drawbar_n() * contact.normal_n / wrench.normal_n.relu_smooth(1.0);
+            if self.altered.on_wheels {
+                pulled = self.altered_pull_n(i, contact.normal_n, sinkage, pulled, &soil);
+            }
+            pull_n = pull_n + pulled;
         }
         let speed = input.state.velocity_m_s[0];
         let direction = speed / speed.abs_smooth(DIRECTION_SPEED_M_S);
         // Pitch is positive nose down, so the body climbs by -pitch.
         let climb = -input.state.attitude_rad[1].sin_cos().0;
-        pull_n / T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2) - direction * climb
+        let weight_n = T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2);
+        let reserve = pull_n / weight_n - direction * climb;
+        if self.altered.on_body { reserve + direction * self.pushed_ahead_n(input) / weight_n } else { reserve }
+    }
+
+    /// Force that effects put on the body along its x axis, N.
+    fn pushed_ahead_n<T: Real>(&self, input: &StepInput<T>) -> T {
+        // The heading is that of the input: a step counts its own from there.
+        let mut state = input.state;
+        state.attitude_rad[2] = T::lit(0.0);
+        let mut on_body = [T::lit(0.0); 6];
+        self.add_body_forces(&state, input, &Tilt::new(state.attitude_rad[0], state.attitude_rad[1]), &mut on_body);
+        on_body[0]
     }
 }
 

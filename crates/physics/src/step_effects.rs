@@ -209,27 +209,51 @@ impl StepModel {
         damping: &mut [T; 2],
         contact: &mut WheelContact<T>,
     ) {
-        let effects = &self.vehicle.effects;
         let wheel = self.wheel_at(i);
-        let [front_share, front_weight] = effects.soil.front_bulldozing;
-        let mut resistance = T::lit(effects.force.rolling_resistance) * contact.normal_n;
-        if front_share != 0.0 && i < 2 {
-            resistance = resistance + T::lit(front_share) * front_bulldozing(wheel.width_m, contact.sinkage_m, front_weight, soil);
-        }
+        let resistance = self.resistance_n(i, contact.normal_n, contact.sinkage_m, soil);
         let speed = wheel_motion.forward_m_s.abs_smooth(RESISTANCE_SPEED_M_S);
         contact.forward_n = contact.forward_n - resistance * wheel_motion.forward_m_s / speed;
         damping[0] = damping[0] + (resistance / speed).max(T::lit(0.0));
-        let [side_share, side_weight] = effects.soil.side_bulldozing;
+        let [side_share, side_weight] = self.vehicle.effects.soil.side_bulldozing;
         if side_share != 0.0 {
-            let arc = ContactArc::of(wheel, contact.sinkage_m);
+            let arc = ContactArc::of(wheel, contact.sinkage_m, soil);
             let side = T::lit(side_share) * share * side_bulldozing(wheel, side_weight, &arc, motion, soil);
             contact.left_n = contact.left_n + side;
             damping[1] = damping[1] + (-side * wheel_motion.left_m_s).max(T::lit(0.0)) / wheel_motion.left_m_s.abs_smooth(0.02).sqr();
         }
-        if effects.force.friction_cap_inverse != 0.0 {
-            let tangential = (contact.forward_n.sqr() + contact.left_n.sqr() + T::lit(1.0)).sqrt();
-            let kept = (contact.normal_n * T::lit(1.0 / effects.force.friction_cap_inverse) / tangential).min(T::lit(1.0));
+        if self.vehicle.effects.force.friction_cap_inverse != 0.0 {
+            let kept = self.kept_by_cap(contact.normal_n, [contact.forward_n, contact.left_n]);
             (contact.forward_n, contact.left_n) = (contact.forward_n * kept, contact.left_n * kept);
+            // The slopes of a force that is capped are capped with it.
+            *damping = damping.map(|d| d * kept);
+        }
+    }
+
+    /// Force that effects hold against the rolling of a wheel at a load (N) and a sinkage (m), N.
+    fn resistance_n<T: Real>(&self, i: usize, normal_n: T, sinkage_m: T, soil: &Soil<T>) -> T {
+        let effects = &self.vehicle.effects;
+        let [front_share, front_weight] = effects.soil.front_bulldozing;
+        let rolling = T::lit(effects.force.rolling_resistance) * normal_n;
+        if front_share == 0.0 || i > 1 {
+            return rolling;
+        }
+        rolling + T::lit(front_share) * front_bulldozing(self.wheel_at(i).width_m, sinkage_m, front_weight, soil)
+    }
+
+    /// Share of a tangential force (forward, left; N) that a cap on friction leaves at a load, N.
+    fn kept_by_cap<T: Real>(&self, normal_n: T, [forward_n, left_n]: [T; 2]) -> T {
+        let tangential = (forward_n.sqr() + left_n.sqr() + T::lit(1.0)).sqrt();
+        (normal_n * T::lit(1.0 / self.vehicle.effects.force.friction_cap_inverse) / tangential).min(T::lit(1.0))
+    }
+
+    /// What a wheel at this load (N), sinkage (m) and drawbar pull (N) pulls on with the resistances and the cap of effects, N.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn altered_pull_n<T: Real>(&self, i: usize, normal_n: T, sinkage_m: T, drawbar_n: T, soil: &Soil<T>) -> T {
+        let pull = drawbar_n - self.resistance_n(i, normal_n, sinkage_m, soil);
+        match self.vehicle.effects.force.friction_cap_inverse {
+            0.0 => pull,
+            _ => pull * self.kept_by_cap(normal_n, [pull, T::lit(0.0)]),
         }
     }
 }

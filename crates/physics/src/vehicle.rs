@@ -262,9 +262,9 @@ impl Vehicle {
         rims
     }
 
-    /// Whether the command lies in the range of the card (both ends included).
+    /// Whether the command lies in the range of the card. Compared in f32, as the service does, so that the ends of the range are admitted in both precisions.
     pub fn admits(&self, control: &Control<f64>) -> bool {
-        let inside = |v: f64, r: [f64; 2]| v >= r[0] && v <= r[1];
+        let inside = |v: f64, r: [f64; 2]| v as f32 >= r[0] as f32 && v as f32 <= r[1] as f32;
         inside(control.speed_m_s, self.command_range[0]) && inside(control.second, self.command_range[1])
     }
 }

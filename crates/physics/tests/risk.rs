@@ -3,8 +3,10 @@
 mod common;
 
 use common::Drive;
+use nesam_physics::DT_S;
+use nesam_physics::effects::{Effect, FrictionCap, Grousers, RollingResistance, Tow};
 use nesam_physics::risk::load_transfer_ratio;
-use nesam_physics::step::WheelContact;
+use nesam_physics::step::{StepModel, WheelContact};
 use nesam_test_vehicles::{robot, truck};
 
 /// A vehicle that has come to rest on a plane, and its contacts.
@@ -65,4 +67,27 @@ fn analytic_traction_reserve_loses_the_slope_and_the_strength_of_the_soil() {
     assert!(softer < level, "{softer} on softer ground, {level}");
     (drive.soil.c, drive.soil.phi) = (60.0, 0.1);
     assert!(reserve(&drive, 0.0) < 0.0, "no strength: {}", reserve(&drive, 0.0));
+}
+
+/// A pull backwards and a resistance of the wheels are missing from the reserve over the weight, no wheel pulls beyond a cap on its friction, and soil that
+/// effects make stronger holds more; an effect of no size changes no bit.
+#[test]
+fn analytic_traction_reserve_is_that_of_the_vehicle_with_its_effects() {
+    let (mut drive, contacts) = at_rest(truck(), [0.0; 2]);
+    drive.state.velocity_m_s[0] = 2.0;
+    drive.state.attitude_rad[1] = 0.0;
+    let (input, _) = drive.input(&nesam_physics::Control { speed_m_s: 2.0, second: 0.0 });
+    let reserve = |effects: &[Effect]| StepModel::new(&truck().with_effects(effects), DT_S, 2).traction_reserve(&input, &contacts);
+    let (level, weight) = (reserve(&[]), truck().mass_kg * truck().gravity_m_s2);
+
+    let tow = Effect::Tow(Tow { force_n: 800.0, z_m: 0.0 });
+    assert!((level - reserve(&[tow]) - 800.0 / weight).abs() < 1e-4, "{} of {level}", reserve(&[tow]));
+    assert_eq!(reserve(&[tow.scaled(0.0)]).to_bits(), level.to_bits());
+    // Loads and weight agree within a thousandth, as above.
+    let resisted = reserve(&[Effect::RollingResistance(RollingResistance { coefficient: 0.03 })]);
+    assert!((level - resisted - 0.03).abs() < 1e-4, "{resisted} of {level}");
+    let capped = reserve(&[Effect::FrictionCap(FrictionCap { mu: 0.06 })]);
+    assert!((0.059..0.0601).contains(&capped) && capped < level, "{capped} of {level}");
+    let grousers = reserve(&[Effect::Grousers(Grousers { metres: 0.03 })]);
+    assert!(grousers > level + 0.01, "{grousers} of {level}");
 }

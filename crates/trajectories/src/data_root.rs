@@ -83,6 +83,7 @@ impl SetQuery {
 #[derive(Debug)]
 pub struct DataRoot {
     root: PathBuf,
+    card: PathBuf,
     vehicle: Vehicle,
     worlds: Mutex<HashMap<String, Arc<WorldMap>>>,
     /// Relative path and SHA-256 of the set files read so far.
@@ -95,7 +96,7 @@ impl DataRoot {
     /// # Errors
     /// `TrajectoryError::Layout` when the root is not a folder or has no card or several; the errors of [`read_vehicle_card`].
     pub fn open(root: &Path, vehicle: Option<&Path>) -> Result<Self, TrajectoryError> {
-        let found = match vehicle {
+        let card = match vehicle {
             Some(path) => {
                 if !root.is_dir() {
                     return Err(TrajectoryError::layout(root, "is not a folder"));
@@ -104,12 +105,18 @@ impl DataRoot {
             }
             None => find_card(root)?,
         };
-        Ok(Self { root: root.into(), vehicle: read_vehicle_card(&found)?, worlds: Mutex::default(), hashes: Mutex::default() })
+        let vehicle = read_vehicle_card(&card)?;
+        Ok(Self { root: root.into(), card, vehicle, worlds: Mutex::default(), hashes: Mutex::default() })
     }
 
     /// The vehicle that drove.
     pub fn vehicle(&self) -> &Vehicle {
         &self.vehicle
+    }
+
+    /// File of its card.
+    pub fn card(&self) -> &Path {
+        &self.card
     }
 
     /// The folder.

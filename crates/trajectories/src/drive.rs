@@ -107,7 +107,7 @@ fn wheel_speeds(channels: &Channels, rows: &[usize]) -> Result<Option<Vec<[f64; 
 /// Body velocity: measured in Body, else measured in World, else estimated from positions.
 ///
 /// The estimate begins with what is known at the first sample: the mean rim speed where wheel speeds are measured, else the commanded
-/// speed.
+/// speed. The vehicle is as fast as its card or its fastest command says.
 fn velocity(channels: &Channels, rows: &[usize], vehicle: &Vehicle, log: &Log) -> Result<(Vec<[f64; 3]>, VelocitySource), TrajectoryError> {
     if let Some(body) = optional(&channels.body_velocity, rows)? {
         return Ok((body, VelocitySource::Body));
@@ -118,7 +118,8 @@ fn velocity(channels: &Channels, rows: &[usize], vehicle: &Vehicle, log: &Log) -
     }
     let rim = log.wheel_speed.as_ref().map(|w| w[0].iter().sum::<f64>() / WHEELS as f64 * vehicle.wheel_radius_m);
     let forward = rim.unwrap_or(log.command[0][0]);
-    let largest_m_s = vehicle.command_range[0].iter().fold(0.0, |a: f64, b| a.max(b.abs()));
+    let commanded = log.command.iter().map(|command| command[0]);
+    let largest_m_s = vehicle.command_range[0].into_iter().chain(commanded).fold(0.0, |a: f64, b| a.max(b.abs()));
     let estimate = from_positions(&log.time_s, &log.position, &log.attitude, [forward, 0.0, 0.0], largest_m_s);
     Ok((estimate, VelocitySource::Positions))
 }

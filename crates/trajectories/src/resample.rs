@@ -4,6 +4,10 @@ use nesam_physics::wrap_angle;
 
 /// Longest gap between samples that is bridged, s, unless five source steps are longer (chosen: beyond it the motion is unknown).
 const GAP_LIMIT_S: f64 = 0.5;
+/// Longest usual step of a log, s: the longest that drives are resampled to. What is longer counts milliseconds or the like.
+const STEP_MAX_S: f64 = 10.0;
+/// Samples of a drive at most: eleven days at 10 Hz. A longer one would take gigabytes.
+const SAMPLES_MAX: f64 = 1e7;
 
 /// Where each sample of the model lies among the samples of the log: share `1 - share` of `at`, `share` of the next one.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,7 +24,7 @@ pub(crate) struct Grid {
 }
 
 impl Grid {
-    /// Plans the resampling of ascending time stamps to a step; a gap that is too long gives its index and an explanation.
+    /// Plans the resampling of ascending time stamps to a step; a gap that is too long, or stamps that count no seconds, give an index and an explanation.
     ///
     /// Where the source step divides the step (20 Hz to 10 Hz) samples are picked and nothing is interpolated.
     pub(crate) fn new(time_s: &[f64], dt_s: f64) -> Result<Self, (usize, String)> {
@@ -31,6 +35,10 @@ impl Grid {
         let mut sorted = steps.clone();
         sorted.sort_by(f64::total_cmp);
         let median_s = sorted.get(sorted.len() / 2).copied().unwrap_or(dt_s);
+        if median_s > STEP_MAX_S {
+            let reason = format!("samples lie {median_s} s apart, at most {STEP_MAX_S} s are usual; time stamps must be in seconds");
+            return Err((0, reason));
+        }
         if let Some(picked) = pick(time_s, dt_s, median_s) {
             return Ok(picked);
         }
@@ -39,8 +47,13 @@ impl Grid {
             let reason = format!("a gap of {:.3} s follows, at most {limit_s:.3} s are bridged; split the drive there", steps[gap]);
             return Err((gap, reason));
         }
-        let count = ((last - first) / dt_s + 1e-6).floor() as usize + 1;
-        let grid: Vec<f64> = (0..count).map(|k| first + k as f64 * dt_s).collect();
+        let count = ((last - first) / dt_s + 1e-6).floor() + 1.0;
+        if count > SAMPLES_MAX {
+            let reason =
+                format!("the drive of {} s has {count} samples at steps of {dt_s} s, at most {SAMPLES_MAX}; split it", last - first);
+            return Err((0, reason));
+        }
+        let grid: Vec<f64> = (0..count as usize).map(|k| first + k as f64 * dt_s).collect();
         let mut at = 0;
         let places = grid
             .iter()
@@ -150,5 +163,8 @@ mod tests {
         assert_eq!(Grid::new(&[], 0.1).unwrap().time_s.len(), 0);
         assert_eq!(Grid::new(&[7.0], 0.1).unwrap().time_s, [7.0]);
         assert_eq!(Grid::new(&[0.0, 0.5], 0.1).unwrap().time_s.len(), 6);
+        assert_eq!(Grid::new(&clock(30, 10.0), 10.0).unwrap().time_s.len(), 30, "the longest step there is");
+        let (at, reason) = Grid::new(&clock(4000, 7.0), 0.001).unwrap_err();
+        assert!(at == 0 && reason.contains("27993001 samples"), "{reason}");
     }
 }

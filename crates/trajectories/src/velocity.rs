@@ -10,8 +10,12 @@ use crate::trajectory::MeasuredChannels;
 /// central differences over 0.8 s the error is least (0.17 m/s forward) between 0.25 and 0.4 s; the shorter one lags less.
 const SMOOTHING_S: f64 = 0.25;
 
+/// Shortest time over which a difference is taken, s: a step at 20 Hz, the rate of that robot's log, less 1 ms for jitter. Steps that are not shorter are taken
+/// one by one.
+const SPAN_S: f64 = 0.049;
+
 /// A position that moves faster than this many times the largest speed of the vehicle has jumped, and is not a motion. Two, because a
-/// pose that was repeated once moves twice as far in the next step.
+/// pose that was repeated once in a log of 20 Hz or less moves twice as far in the next step.
 const JUMP_FACTOR: f64 = 2.0;
 
 /// R_WB^T v: a World vector in Body, for R_WB = Rz(yaw) Ry(pitch) Rx(roll).
@@ -26,20 +30,23 @@ pub fn to_body([roll, pitch, yaw]: [f64; 3], v: [f64; 3]) -> [f64; 3] {
 
 /// Backward differences of a channel, smoothed; sample 0 is `first`, since nothing is known of the past there.
 ///
-/// `difference(k)` is the rate between samples k - 1 and k; a rate above `limit` is left out. The estimate at k uses samples up to k only.
-fn smoothed(time_s: &[f64], first: [f64; 3], limit: f64, difference: impl Fn(usize) -> [f64; 3]) -> Vec<[f64; 3]> {
-    let mut estimate = first;
+/// `rate(from, k)` is the rate between two samples; one above `limit` is left out. The estimate at k uses samples up to k only. In a log faster than 20 Hz a
+/// difference spans 50 ms or more and ends where the value changes: poses come slower than such a log, which repeats them. A value that stays for as long as the
+/// smoothing remembers stands still.
+fn smoothed(time_s: &[f64], values: &[[f64; 3]], first: [f64; 3], limit: f64, rate: impl Fn(usize, usize) -> [f64; 3]) -> Vec<[f64; 3]> {
+    let (mut estimate, mut from) = (first, 0);
     let mut all = Vec::with_capacity(time_s.len());
     for k in 0..time_s.len() {
-        if k > 0 {
-            let step = time_s[k] - time_s[k - 1];
-            let weight = step / (SMOOTHING_S + step);
-            let rate = difference(k);
+        let (step, span) = (time_s[k] - time_s[k.saturating_sub(1)], time_s[k] - time_s[from]);
+        let passed_over = step < SPAN_S && (span < SPAN_S || (values[k] == values[k - 1] && span < SMOOTHING_S));
+        if !passed_over {
+            let (weight, rate) = (span / (SMOOTHING_S + span), rate(from, k));
             if rate.iter().map(|r| r * r).sum::<f64>().sqrt() <= limit {
                 for i in 0..3 {
                     estimate[i] += weight * (rate[i] - estimate[i]);
                 }
             }
+            from = k;
         }
         all.push(estimate);
     }
@@ -54,9 +61,9 @@ pub(crate) fn from_positions(
     first_m_s: [f64; 3],
     largest_m_s: f64,
 ) -> Vec<[f64; 3]> {
-    smoothed(time_s, first_m_s, JUMP_FACTOR * largest_m_s, |k| {
-        let step = time_s[k] - time_s[k - 1];
-        let rate = core::array::from_fn(|i| (position_m[k][i] - position_m[k - 1][i]) / step);
+    smoothed(time_s, position_m, first_m_s, JUMP_FACTOR * largest_m_s, |from, k| {
+        let span = time_s[k] - time_s[from];
+        let rate = core::array::from_fn(|i| (position_m[k][i] - position_m[from][i]) / span);
         to_body(attitude_rad[k], rate)
     })
 }
@@ -69,9 +76,9 @@ fn turning([roll, pitch, _]: [f64; 3], [roll_rate, pitch_rate, yaw_rate]: [f64; 
 
 /// Body angular velocity from attitudes, rad/s.
 pub(crate) fn from_attitudes(time_s: &[f64], attitude_rad: &[[f64; 3]], first_rad_s: [f64; 3]) -> Vec<[f64; 3]> {
-    smoothed(time_s, first_rad_s, f64::INFINITY, |k| {
-        let step = time_s[k] - time_s[k - 1];
-        turning(attitude_rad[k], core::array::from_fn(|i| wrap_angle(attitude_rad[k][i] - attitude_rad[k - 1][i]) / step))
+    smoothed(time_s, attitude_rad, first_rad_s, f64::INFINITY, |from, k| {
+        let span = time_s[k] - time_s[from];
+        turning(attitude_rad[k], core::array::from_fn(|i| wrap_angle(attitude_rad[k][i] - attitude_rad[from][i]) / span))
     })
 }
 
@@ -174,6 +181,53 @@ mod tests {
         let whole = from_positions(&time, &position, &attitude, [0.2, 0.0, 0.0], 5.0);
         let part = from_positions(&time[..8], &position[..8], &attitude[..8], [0.2, 0.0, 0.0], 5.0);
         assert_eq!(&whole[..8], &part[..]);
+    }
+
+    /// Poses at 10 Hz of a motion along x and a turn to the left, held in a log at `log_hz` for 10 s.
+    fn held(log_hz: u32, speed: f64, yaw_rate: f64) -> (Vec<f64>, Vec<[f64; 3]>, Vec<[f64; 3]>) {
+        let (step, repeats) = (1.0 / f64::from(log_hz), log_hz / 10);
+        let pose_s = |k: u32| 0.1 * f64::from(k / repeats);
+        let all = 0..10 * log_hz;
+        (
+            all.clone().map(|k| step * f64::from(k)).collect(),
+            all.clone().map(|k| [speed * pose_s(k), 0.0, 0.3]).collect(),
+            all.map(|k| [0.0, 0.0, wrap_angle(yaw_rate * pose_s(k))]).collect(),
+        )
+    }
+
+    #[test]
+    fn analytic_poses_that_a_faster_log_repeats_give_the_speed() {
+        // Poses at 10 Hz held at 50 to 200 Hz: what is estimated is the motion, neither the steps nor the pauses between them. After 5 s (20 time
+        // constants) nothing of the start is left.
+        for log_hz in [50, 100, 200] {
+            let (time, position, attitude) = held(log_hz, 1.0, 0.4);
+            let half = time.len() / 2;
+            let v = from_positions(&time, &position, &vec![[0.0; 3]; time.len()], [0.0; 3], 3.0);
+            assert!(v[half..].iter().all(|v| (v[0] - 1.0).abs() < 0.05 && v[1] == 0.0), "{log_hz} Hz: {:?}", v[time.len() - 1]);
+            let w = from_attitudes(&time, &attitude, [0.0; 3]);
+            assert!(w[half..].iter().all(|w| (w[2] - 0.4).abs() < 0.02), "{log_hz} Hz: {:?}", w[time.len() - 1]);
+            // A vehicle that stands is not taken for one whose pose is late.
+            let (time, position, attitude) = held(log_hz, 0.0, 0.0);
+            let still = from_positions(&time, &position, &attitude, [1.0, 0.0, 0.0], 3.0);
+            assert!(still[half..].iter().all(|v| v[0].abs() < 1e-3), "{log_hz} Hz: {:?}", still[half]);
+        }
+    }
+
+    #[test]
+    fn property_logs_of_20_hz_and_less_are_taken_step_by_step() {
+        // What the smoothing was chosen for, repeated poses included: the plain recursion over all steps, to the last bit.
+        for step in [0.05, 0.1] {
+            let time: Vec<f64> = (0..60).map(|k| step * f64::from(k)).collect();
+            let position: Vec<[f64; 3]> = (0..60).map(|k| [0.07 * f64::from(k / 2), (0.1 * f64::from(k)).sin(), 0.0]).collect();
+            let estimate = from_positions(&time, &position, &[[0.0; 3]; 60], [0.2, 0.0, 0.0], 3.0);
+            let mut expected = [0.2, 0.0, 0.0];
+            for k in 1..60 {
+                let span = time[k] - time[k - 1];
+                let rate = to_body([0.0; 3], core::array::from_fn(|i| (position[k][i] - position[k - 1][i]) / span));
+                (0..3).for_each(|i| expected[i] += span / (SMOOTHING_S + span) * (rate[i] - expected[i]));
+                assert_eq!(estimate[k], expected, "{k}");
+            }
+        }
     }
 
     #[test]

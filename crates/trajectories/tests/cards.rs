@@ -45,6 +45,15 @@ fn published_hmmwv_card() {
 }
 
 #[test]
+fn property_both_precisions_reach_the_ends_of_the_range() {
+    // 0.1 in f32 lies above 0.1 in f64: the service admits it, and so does every command.
+    let single = f64::from(0.1f32);
+    let v = Vehicle { command_range: [[-0.1, 0.1]; 2], ..read_vehicle_card(&hmmwv_path()).unwrap() };
+    assert!(v.admits(&Control { speed_m_s: single, second: -single }) && v.admits(&Control { speed_m_s: 0.1, second: -0.1 }));
+    assert!(!v.admits(&Control { speed_m_s: 0.1001, second: 0.0 }) && !v.admits(&Control { speed_m_s: f64::NAN, second: 0.0 }));
+}
+
+#[test]
 fn published_husky_card() {
     let Some(path) = shared("real/husky/vehicle_husky.json") else { return };
     let v = read_vehicle_card(&path).unwrap();

@@ -119,6 +119,34 @@ fn regress_time_must_ascend() {
 }
 
 #[test]
+fn regress_time_must_be_in_seconds() {
+    // Milliseconds, microseconds and nanoseconds, from the start and since 1970: refused before memory is asked for.
+    for factor in [1e3, 1e6, 1e9] {
+        for begin in [0.0, 1.7e9] {
+            let mut columns = two_drives();
+            if let Column::Double(times) = column(&mut columns, "t") {
+                times.iter_mut().flatten().for_each(|t| *t = factor * (begin + *t));
+            }
+            let error = refusal(&columns);
+            assert!(error.contains("column `t`, row 0") && error.contains("must be in seconds"), "{factor} {begin}: {error}");
+        }
+    }
+}
+
+#[test]
+fn analytic_commands_say_how_fast_a_vehicle_is() {
+    // Eight times as fast as the circle, and as the card of the robot, which says 3 m/s at most: the command says that it is no jump.
+    let mut columns = two_drives();
+    for name in ["x", "y", "cmd_speed"] {
+        if let Column::Double(values) = column(&mut columns, name) {
+            values.iter_mut().flatten().for_each(|v| *v *= 8.0);
+        }
+    }
+    let last = load(&root_of(&columns)).unwrap()[0].states[19];
+    assert!((last.velocity_m_s[0] - 8.0).abs() < 0.1, "{last:?}");
+}
+
+#[test]
 fn property_channels_that_were_not_recorded_may_be_null() {
     let mut columns = two_drives();
     (40..80).for_each(|row| set(&mut columns, "om_l", row, None));

@@ -1726,6 +1726,12 @@ pub struct SessionContent {
     /// The prediction that is compared next; absent when none waits.
     #[prost(message, optional, tag = "33")]
     pub forecast: ::core::option::Option<ForecastImage>,
+    /// It has no step yet and has to ask the soil map of the fleet what is known of the ground under its first one; false where an older service wrote it.
+    #[prost(bool, tag = "34")]
+    pub asks_fleet: bool,
+    /// What it learns does not go into that map, as that of a copy; false where an older service wrote it.
+    #[prost(bool, tag = "35")]
+    pub brings_nothing: bool,
 }
 /// A prediction that waits for what comes true.
 #[derive(Clone, PartialEq, ::prost::Message)]

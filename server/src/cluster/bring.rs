@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use nesam_engine::SessionImage;
+use nesam_engine::{EngineError, SessionImage};
 use nesam_proto::etcd::KeyValue;
 use tokio::sync::OwnedMutexGuard;
 use tokio::time::Instant;
@@ -22,6 +22,8 @@ const LOOK_AGAIN: Duration = Duration::from_millis(100);
 const LEASE_PAUSE: Duration = Duration::from_millis(20);
 /// Shortest pause between two searches for one session on behalf of a bus.
 const SEARCH_PAUSE: Duration = Duration::from_millis(200);
+/// Pause before a session is asked for again that the engine had no turn for.
+const NO_TURN: Duration = Duration::from_millis(100);
 
 /// What came of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -49,7 +51,7 @@ enum Zeal {
     IfFree,
     /// Ask its owner for it.
     Ask,
-    /// Have its name, also when there is no such session yet.
+    /// Have its name where there is no such session yet.
     Create,
 }
 
@@ -70,13 +72,14 @@ impl Cluster {
         self.have(session, Zeal::Ask, budget, permit).await
     }
 
-    /// Makes this server the owner of a name under which a session is to begin. A session that has the name already is brought here: the engine will say
-    /// that it is there.
+    /// Makes this server the owner of a name under which a session is to begin. A session that has the name already stays where it is: who may only open
+    /// sessions must not move those of others.
     ///
     /// # Errors
-    /// As [`Cluster::bring`].
-    pub async fn claim(&self, session: &str, budget: Duration) -> Result<(), Status> {
-        self.have(session, Zeal::Create, budget, |_| Ok(())).await.map(drop)
+    /// ALREADY_EXISTS for `field` when a session of this name is stored; else as [`Cluster::bring`].
+    pub async fn claim(&self, session: &str, field: &'static str, budget: Duration) -> Result<(), Status> {
+        let taken = |_: &str| Err(to_status(EngineError::SessionExists { session: session.into(), field }));
+        self.have(session, Zeal::Create, budget, taken).await.map(drop)
     }
 
     /// Lets a claimed name go if no session has begun under it.
@@ -225,12 +228,12 @@ impl Cluster {
         };
         match begun_here {
             Ok(went_on) => {
-                let mut state = self.lock();
-                // The lease may have ended meanwhile; then everything was let go of.
-                let Some(held) = state.held.get_mut(session).filter(|held| held.epoch == epoch) else { return Err(moved(session)) };
-                held.stage = Stage::Here;
-                state.counts.taken += u64::from(went_on);
-                drop(state);
+                if !self.arrived(session, epoch) {
+                    // The lease has ended meanwhile, perhaps before the engine had the session, so that nothing was closed then.
+                    self.forget(session).await;
+                    return Err(moved(session));
+                }
+                self.lock().counts.taken += u64::from(went_on);
                 self.heed(session);
                 if went_on {
                     tracing::info!(session, epoch, took_s = begun.elapsed().as_secs_f64(), "session taken");
@@ -244,16 +247,27 @@ impl Cluster {
         }
     }
 
+    /// Notes that a session can be used from now on; false when it is not held any more.
+    fn arrived(&self, session: &str, epoch: i64) -> bool {
+        let mut state = self.lock();
+        let Some(held) = state.held.get_mut(session).filter(|held| held.epoch == epoch) else { return false };
+        held.stage = Stage::Here;
+        true
+    }
+
     /// Puts a stored session and its map into the engine.
     async fn go_on(&self, session: &str, stored: &StoredSession) -> Result<(), Status> {
         let mut image: SessionImage = resumed(stored).map_err(to_status)?;
         if let Some((map, hash)) = &mut image.map {
             *hash = self.have_map(map).await?;
         }
-        let refused = |error: nesam_engine::EngineError| {
-            Status::failed_precondition(format!(
+        let refused = |error: EngineError| match error {
+            EngineError::Expired | EngineError::Overloaded { .. } | EngineError::Stopped => {
+                again(&format!("session `{session}` has not gone on on this server yet: {error}"), NO_TURN)
+            }
+            error => Status::failed_precondition(format!(
                 "session `{session}` cannot go on on this server: {error}; its servers must have the same bundle and limits"
-            ))
+            )),
         };
         self.0.engine.import(image, session, WAIT_MAX).await.map(drop).map_err(refused)
     }

@@ -8,6 +8,7 @@ use pb::request_op::Request;
 use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
 use tonic::{Status, Streaming};
 
+use super::again;
 use super::keys::behind;
 use crate::config::ClusterConfig;
 use crate::error::ServerError;
@@ -16,6 +17,8 @@ use crate::error::ServerError;
 const CONNECT: Duration = Duration::from_millis(500);
 /// Longest wait for a transaction.
 const TRANSACTION: Duration = Duration::from_secs(2);
+/// Pause before something that etcd has not done is asked for again.
+const RETRY_AFTER: Duration = Duration::from_millis(100);
 /// Answers with all parts of a map may be this large, bytes.
 const ANSWER_BYTES_MAX: usize = 256 << 20;
 
@@ -58,7 +61,7 @@ impl Etcd {
     /// Does all of `then` at one instant when every condition holds, and nothing when not.
     ///
     /// # Errors
-    /// What etcd or the way to it says; whether the transaction was done is not known then.
+    /// UNAVAILABLE with what etcd or the way to it says; whether the transaction was done is not known then.
     pub async fn transaction(&self, conditions: Vec<pb::Compare>, then: Vec<Request>) -> Result<Done, Status> {
         let success = then.into_iter().map(|request| pb::RequestOp { request: Some(request) }).collect();
         let request = pb::TxnRequest { compare: conditions, success };
@@ -128,11 +131,15 @@ impl Etcd {
     }
 }
 
-/// Waits at most so long.
+/// Waits at most so long. Whatever goes wrong is UNAVAILABLE: the codes of etcd are about its own leases and keys, and whoever asked this server for a session has
+/// asked for nothing wrong.
 async fn within<T>(limit: Duration, asked: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
-    tokio::time::timeout(limit, asked)
-        .await
-        .unwrap_or_else(|_| Err(Status::deadline_exceeded(format!("etcd did not answer within {:.1} s", limit.as_secs_f64()))))
+    let reason = match tokio::time::timeout(limit, asked).await {
+        Ok(Ok(answer)) => return Ok(answer),
+        Ok(Err(status)) => status.message().to_string(),
+        Err(_) => format!("no answer within {:.1} s", limit.as_secs_f64()),
+    };
+    Err(again(&format!("etcd: {reason}"), RETRY_AFTER))
 }
 
 /// How servers connect to a member of etcd.
@@ -217,4 +224,25 @@ pub(crate) fn delete(key: &str) -> Request {
 /// Removes all keys with a prefix.
 pub(crate) fn delete_all(prefix: &str) -> Request {
     Request::RequestDeleteRange(pb::DeleteRangeRequest { key: bytes(prefix), range_end: behind(prefix).into() })
+}
+
+#[cfg(test)]
+mod tests {
+    use tonic::Code;
+    use tonic_types::StatusExt as _;
+
+    use super::*;
+
+    #[tokio::test]
+    async fn analytic_whatever_etcd_says_is_to_be_asked_again() {
+        let asked_again = |status: Status| (status.code(), status.get_details_retry_info().and_then(|info| info.retry_delay));
+        let expected = (Code::Unavailable, Some(RETRY_AFTER));
+        for code in [Code::NotFound, Code::Unknown, Code::Cancelled, Code::DeadlineExceeded, Code::Internal] {
+            let status = within(TRANSACTION, async { Err::<(), _>(Status::new(code, "requested lease not found")) }).await.unwrap_err();
+            assert!(status.message().contains("requested lease not found"), "{status}");
+            assert_eq!(asked_again(status), expected, "{code:?}");
+        }
+        let late = within(Duration::ZERO, std::future::pending::<Result<(), Status>>()).await.unwrap_err();
+        assert_eq!(asked_again(late), expected);
+    }
 }

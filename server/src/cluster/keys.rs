@@ -3,7 +3,7 @@
 //! ```text
 //! <prefix>/live/owner/<session>     who has the session: an Owner, under the owner's lease; its create revision is the epoch
 //! <prefix>/live/want/<session>      who asks the owner for it, under the asker's lease
-//! <prefix>/live/map/<map>           hash and number of parts of the newest map
+//! <prefix>/live/map/<map>           hash, number of parts and version of the newest map
 //! <prefix>/session/<session>        the session's image
 //! <prefix>/part/<map>/<hash>/<n>    bytes of a map, in order
 //! ```
@@ -54,6 +54,11 @@ impl Keys {
         format!("{}{session}", self.sessions())
     }
 
+    /// The session whose image stands under a key.
+    pub fn session_name<'a>(&self, key: &'a [u8]) -> Option<&'a str> {
+        std::str::from_utf8(key).ok()?.strip_prefix(&self.sessions())
+    }
+
     /// Before all parts of one content of a map; without a hash, of all its contents.
     pub fn parts(&self, map: &str, hash: Option<&str>) -> String {
         hash.map_or_else(|| format!("{}/part/{map}/", self.prefix), |hash| format!("{}/part/{map}/{hash}/", self.prefix))
@@ -99,6 +104,8 @@ mod tests {
         for other in [keys.session("t-7"), keys.part("hill", "ab", 3), "a/bc/live/owner/x".into(), String::new()] {
             assert_eq!(keys.topic(other.as_bytes()), None, "{other}");
         }
+        assert_eq!(keys.session_name(keys.session("t-7").as_bytes()), Some("t-7"));
+        assert_eq!(keys.session_name(keys.owner("t-7").as_bytes()), None);
         assert_eq!(behind("a/"), b"a0");
         assert!(keys.part("m", "h", 9) < keys.part("m", "h", 10));
     }

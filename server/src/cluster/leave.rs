@@ -79,7 +79,7 @@ impl Cluster {
     }
 
     /// Takes a session out of the engine. It is not held any more, so nothing that the store does from now on changes what is stored of it.
-    async fn forget(&self, session: &str) {
+    pub(super) async fn forget(&self, session: &str) {
         self.0.keeper.forget(session);
         // A name that was only claimed is not in the engine.
         let _ = self.0.engine.close(session, CLOSE).await;

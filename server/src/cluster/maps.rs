@@ -1,15 +1,18 @@
 //! Maps that servers share: whoever takes a session brings its map, and a newer one replaces what is held.
 
+use nesam_engine::EngineError;
 use sha2::{Digest as _, Sha256};
 use tonic::Status;
 
-use super::record::{MapHead, json, of_json};
-use super::{Cluster, delete, delete_all, get, get_all, put, written};
-use crate::convert::to_status;
-use crate::store::map_of;
+use super::record::{MapHead, json, of_json, session_of};
+use super::{Cluster, delete, delete_all, get, get_all, get_keys, put, written};
+use crate::convert::{session_image, to_status};
+use crate::store::{map_of, map_version};
 
 /// Size of a part, bytes; etcd takes requests of 1.5 MiB.
 const PART_BYTES: usize = 512 << 10;
+/// Images of sessions that are read at once.
+const IMAGES_AT_ONCE: usize = 32;
 /// Attempts at a map that somebody else writes at the same time.
 const ATTEMPTS: usize = 5;
 /// Longest wait for the engine.
@@ -44,9 +47,7 @@ impl Cluster {
             return match put {
                 Ok(_) => Ok(hash),
                 // A newer one was put here a moment ago.
-                Err(nesam_engine::EngineError::MapExists { .. }) => {
-                    Ok(self.0.engine.get_map(map, PUT).await.map_err(to_status)?.hash().to_string())
-                }
+                Err(EngineError::MapExists { .. }) => Ok(self.0.engine.get_map(map, PUT).await.map_err(to_status)?.hash().to_string()),
                 Err(error) => Err(to_status(error)),
             };
         }
@@ -72,18 +73,57 @@ impl Cluster {
         }
     }
 
-    /// Writes a map; the last writer's stands.
+    /// Takes note of a map that is not in etcd any more, because another server has deleted it. It goes here too, but where a session drives on it: the map of a
+    /// session that moves must be there, so it is written again.
+    pub(super) async fn lose_map(self, map: String) {
+        let known = self.lock().maps.contains_key(&map);
+        // Nothing is lost where somebody has written it again meanwhile.
+        if !known || matches!(self.map_head(&map).await, Ok(Some(_))) {
+            return;
+        }
+        self.lock().maps.remove(&map);
+        let used = matches!(self.0.engine.delete_map(&map, PUT).await, Err(EngineError::MapInUse { .. }));
+        self.0.keeper.lost_map(&map);
+        tracing::info!(map, used, "map deleted by another server; it is written again where it is used");
+    }
+
+    /// A session that drives on a map, on whatever server it is, or on none. Reads the images of all sessions; one that has begun a moment ago has none yet.
+    ///
+    /// # Errors
+    /// What etcd says.
+    pub async fn map_user(&self, map: &str) -> Result<Option<String>, Status> {
+        let keys = &self.0.keys;
+        let read = self.0.etcd.all(vec![get_keys(&keys.sessions())]).await?.read;
+        let names: Vec<&str> = read.iter().flatten().filter_map(|found| keys.session_name(&found.key)).collect();
+        for some in names.chunks(IMAGES_AT_ONCE) {
+            let read = self.0.etcd.all(some.iter().map(|name| get(&keys.session(name))).collect()).await?.read;
+            let found = some.iter().zip(&read).find(|(name, found)| found.iter().any(|found| drives_on(name, &found.value, map)));
+            if let Some((name, _)) = found {
+                return Ok(Some((*name).to_owned()));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Writes a map unless a newer version stands there; of two of one version the last writer's stands.
     ///
     /// # Errors
     /// What etcd says.
     pub(crate) async fn write_map(&self, map: &str, bytes: &[u8]) -> Result<(), Status> {
         let (keys, sha256) = (&self.0.keys, sha256(bytes));
         let parts = bytes.chunks(PART_BYTES);
-        let head = MapHead { sha256: sha256.clone(), parts: parts.len() };
+        let head = MapHead { sha256: sha256.clone(), parts: parts.len(), version: map_version(bytes) };
         for _ in 0..ATTEMPTS {
             let before = self.map_head(map).await?;
-            self.lock().maps.insert(map.into(), sha256.clone());
-            if before.as_ref().is_some_and(|(before, _)| *before == head) {
+            if before.is_some() {
+                // Before it is written, so that the watch finds nothing new in it. A map that is not there yet is nothing that could be lost.
+                self.lock().maps.insert(map.into(), sha256.clone());
+            }
+            if before.as_ref().is_some_and(|(before, _)| before.sha256 == head.sha256) {
+                return Ok(());
+            }
+            if let Some((newer, _)) = before.as_ref().filter(|(before, _)| before.version > head.version) {
+                tokio::spawn(self.clone().renew_map(map.into(), newer.sha256.clone()));
                 return Ok(());
             }
             for (number, part) in parts.clone().enumerate() {
@@ -93,20 +133,28 @@ impl Cluster {
             let mut then = vec![put(&keys.map(map), json(&head), 0)];
             then.extend(before.map(|(before, _)| delete_all(&keys.parts(map, Some(&before.sha256)))));
             if self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then).await?.held {
+                self.lock().maps.insert(map.into(), sha256);
                 return Ok(());
             }
         }
         Err(Status::aborted(format!("map `{map}` is written by others all the time")))
     }
 
-    /// Removes a map.
+    /// Removes a map, if what stands there is what this server has read or written last.
     ///
     /// # Errors
     /// What etcd says.
     pub(crate) async fn remove_map(&self, map: &str) -> Result<(), Status> {
         let keys = &self.0.keys;
+        let known = self.lock().maps.get(map).cloned();
+        if let Some((head, revision)) = self.map_head(map).await?
+            && known == Some(head.sha256)
+        {
+            let removed = vec![delete(&keys.map(map)), delete_all(&keys.parts(map, None))];
+            self.0.etcd.transaction(vec![written(&keys.map(map), revision)], removed).await?;
+        }
         self.lock().maps.remove(map);
-        self.0.etcd.all(vec![delete(&keys.map(map)), delete_all(&keys.parts(map, None))]).await.map(drop)
+        Ok(())
     }
 
     /// What etcd says of a map, and the revision at which it was said.
@@ -116,6 +164,12 @@ impl Cluster {
         let head = of_json(&found.value).ok_or_else(|| Status::data_loss(format!("what etcd holds of map `{map}` is no map")))?;
         Ok(Some((head, found.mod_revision)))
     }
+}
+
+/// Whether the session whose image this is drives on a map.
+fn drives_on(session: &str, image: &[u8], map: &str) -> bool {
+    let image = session_of(session, image).and_then(|stored| session_image(&stored.image).ok());
+    image.and_then(|image| image.map).is_some_and(|(id, _)| id == map)
 }
 
 fn sha256(bytes: &[u8]) -> String {

@@ -88,7 +88,7 @@ struct State {
     turns: BTreeMap<String, Arc<tokio::sync::Mutex<()>>>,
     /// When a session was last looked for on behalf of a bus that sends to everybody.
     looked: BTreeMap<String, Instant>,
-    /// SHA-256 of each map as it was last read or written.
+    /// SHA-256 of each map that is in etcd, as it was last read or written.
     maps: BTreeMap<String, String>,
     counts: ClusterCounts,
 }

@@ -47,11 +47,10 @@ impl Cluster {
 
     /// Images whose session has no owner as far as this server knows, with the revision of their last write; `None` without etcd.
     async fn without_owner(&self) -> Option<BTreeMap<String, i64>> {
-        let all = self.0.keys.sessions();
-        let read = self.0.etcd.all(vec![get_keys(&all)]).await.ok()?.read;
+        let keys = &self.0.keys;
+        let read = self.0.etcd.all(vec![get_keys(&keys.sessions())]).await.ok()?.read;
         let state = self.lock();
-        let name = |key: &[u8]| std::str::from_utf8(key).ok()?.strip_prefix(&all).map(str::to_owned);
-        let found = read.iter().flatten().filter_map(|kv| Some((name(&kv.key)?, kv.mod_revision)));
+        let found = read.iter().flatten().filter_map(|kv| Some((keys.session_name(&kv.key)?.to_owned(), kv.mod_revision)));
         Some(found.filter(|(session, _)| !state.held.contains_key(session) && !state.owners.contains_key(session)).collect())
     }
 }

@@ -20,6 +20,9 @@ pub(super) struct MapHead {
     pub sha256: String,
     /// Into how many parts they are cut.
     pub parts: usize,
+    /// Version of the map; 0 = written by a server that did not say so.
+    #[serde(default)]
+    pub version: u64,
 }
 
 /// As JSON.
@@ -53,5 +56,8 @@ mod tests {
         assert_eq!(session_of("a", &session_bytes(&session)), Some(session));
         assert_eq!(session_of("a", &[0; 7]), None);
         assert_eq!(of_json::<Server>(b"{}"), None);
+        // As servers wrote it before it had a version.
+        let head = of_json::<MapHead>(br#"{"sha256":"ab","parts":2}"#);
+        assert_eq!(head, Some(MapHead { sha256: "ab".into(), parts: 2, version: 0 }));
     }
 }

@@ -43,10 +43,15 @@ impl Cluster {
     async fn follow(&self) -> Result<(), Status> {
         let live = self.0.keys.live();
         let all = self.0.etcd.all(vec![get_all(&live)]).await?;
-        {
+        let gone: Vec<String> = {
             let mut state = self.lock();
             state.owners.clear();
             state.wants.clear();
+            let there = |map: &str| all.read.iter().flatten().any(|found| self.0.keys.topic(&found.key) == Some(Topic::Map(map)));
+            state.maps.keys().filter(|map| !there(map)).cloned().collect()
+        };
+        for map in gone {
+            tokio::spawn(self.clone().lose_map(map));
         }
         for found in all.read.iter().flatten() {
             self.apply(found, true).await;
@@ -100,7 +105,10 @@ impl Cluster {
                     tokio::spawn(self.clone().renew_map(map.into(), sha256));
                 }
             }
-            _ => {}
+            (Some(Topic::Map(map)), false) => {
+                tokio::spawn(self.clone().lose_map(map.into()));
+            }
+            (None, _) => {}
         }
     }
 

@@ -103,6 +103,8 @@ fn content(image: &SessionImage) -> pb::SessionContent {
             corrections: forecast.corrections.iter().flat_map(|c| c.delta).collect(),
             noise_scale: forecast.noise_scale,
         }),
+        asks_fleet: image.asks_fleet,
+        brings_nothing: image.brings_nothing,
     }
 }
 
@@ -170,6 +172,8 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
         soil,
         effects: applied_effects(&content.effects_source, &content.effects),
         watch: content.watch.as_ref().map(from_watch_image).transpose()?,
+        asks_fleet: content.asks_fleet,
+        brings_nothing: content.brings_nothing,
     })
 }
 

@@ -133,24 +133,29 @@ impl Edge {
             .unwrap_or_else(|_| Err(Status::deadline_exceeded(format!("map `{map}` did not come from etcd in time"))))
     }
 
-    /// Begins a session under a name that no server has yet.
+    /// Begins a session under a name that no server has yet; `field` asked for it.
     ///
     /// # Errors
-    /// What `begin` says; UNAVAILABLE when the name cannot be claimed.
+    /// What `begin` says; ALREADY_EXISTS where another server has a session of that name; UNAVAILABLE when the name cannot be claimed.
     pub async fn begin(
         &self,
+        field: &'static str,
         name: &str,
         budget: Duration,
         begin: impl Future<Output = Result<SessionView, EngineError>>,
     ) -> Result<SessionView, Status> {
-        let Some(cluster) = &self.cluster else { return begin.await.map_err(to_status) };
-        check_name("session_id", name).map_err(to_status)?;
-        cluster.claim(name, budget).await?;
+        let (Some(cluster), Some(keeper)) = (&self.cluster, &self.keeper) else { return begin.await.map_err(to_status) };
+        check_name(field, name).map_err(to_status)?;
+        if self.access.directory.vehicle(name).is_none() {
+            // One of this name may have been closed a moment ago: the name goes with the commit of that, and so would what begins under it before.
+            keeper.settled(&Key::Session(name.into()), budget).await;
+        }
+        cluster.claim(name, field, budget).await?;
         match begin.await {
             Ok(view) => Ok(view),
             Err(error) => {
                 cluster.unclaim(name).await;
-                Err(to_status(error))
+                Err(self.status(error))
             }
         }
     }
@@ -180,13 +185,19 @@ impl Edge {
     /// Resolves when the change that was just made is on stable storage, at once without a store.
     ///
     /// # Errors
-    /// UNAVAILABLE when the store did not take it within `budget`; the change is made nevertheless.
+    /// UNAVAILABLE when the store did not take it within `budget`; the change is made nevertheless. UNAVAILABLE as well when the session has left for another
+    /// server meanwhile: the change may be lost.
     pub async fn settled(&self, key: Key, budget: Duration) -> Result<(), Status> {
         let Some(keeper) = &self.keeper else { return Ok(()) };
         if keeper.settled(&key, budget).await {
             return Ok(());
         }
-        Err(Status::unavailable("done, but the store did not take it in time: it is not durable yet; look again before asking again"))
+        match &key {
+            Key::Session(session) if keeper.has_left(session) => Err(moved(session)),
+            _ => Err(Status::unavailable(
+                "done, but the store did not take it in time: it is not durable yet; look again before asking again",
+            )),
+        }
     }
 
     /// Time that one message of a stream may take.

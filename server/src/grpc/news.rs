@@ -8,7 +8,7 @@ use tonic::{Request, Response, Status};
 
 use super::{Edge, ReplyStream, stopped};
 use crate::access::{Caller, Wish};
-use crate::convert::to_status;
+use crate::cluster::moved;
 
 /// Messages that wait for a watcher.
 const WAITING: usize = 16;
@@ -22,7 +22,7 @@ pub(super) struct News<M> {
 /// Begins to tell whoever asks the news of one session, first what it says now.
 ///
 /// # Errors
-/// As [`Edge::allow`]; NOT_FOUND for a session that is not open.
+/// As [`Edge::allow`]; NOT_FOUND for a session that is not open, UNAVAILABLE for one that has just left.
 pub(super) async fn tell<T, M: Send + 'static>(
     edge: Edge,
     request: &Request<T>,
@@ -33,7 +33,7 @@ pub(super) async fn tell<T, M: Send + 'static>(
     edge.allow_caller(&caller, Wish::ReadSession(&session), edge.budget(request)).await?;
     // Listening starts before reading, so that nothing falls between the two.
     let events = edge.events.subscribe();
-    let view = edge.engine.get(&session, edge.stream_budget()).await.map_err(to_status)?;
+    let view = edge.engine.get(&session, edge.stream_budget()).await.map_err(|error| edge.status(error))?;
     let (sender, receiver) = mpsc::channel(WAITING);
     if let Some(message) = (news.of_session)(&session, &view) {
         let _ = sender.try_send(Ok(message));
@@ -42,45 +42,61 @@ pub(super) async fn tell<T, M: Send + 'static>(
     Ok(Response::new(Box::pin(ReceiverStream::new(receiver))))
 }
 
-/// Sends the news until the session closes, the watcher leaves or has no right to it any more, or the server stops.
+/// Sends the news, last why they end where that is not the session's close.
 async fn forward<M: Send + 'static>(
     edge: Edge,
     caller: Caller,
     session: String,
     news: News<M>,
-    mut events: broadcast::Receiver<Event>,
+    events: broadcast::Receiver<Event>,
     sender: mpsc::Sender<Result<M, Status>>,
 ) {
+    if let Err(status) = follow(&edge, &caller, &session, &news, events, &sender).await {
+        let _ = sender.send(Err(status)).await;
+    }
+}
+
+/// Sends the news until the session closes or the watcher leaves.
+///
+/// # Errors
+/// PERMISSION_DENIED once the watcher has no right to them any more; UNAVAILABLE when the server stops and when the session has left for another one; what keeps
+/// a watcher that missed something from reading the session again.
+async fn follow<M: Send + 'static>(
+    edge: &Edge,
+    caller: &Caller,
+    session: &str,
+    news: &News<M>,
+    mut events: broadcast::Receiver<Event>,
+    sender: &mpsc::Sender<Result<M, Status>>,
+) -> Result<(), Status> {
     let stop = stopped(edge.stopping.clone());
-    let lost = caller.loses(Wish::ReadSession(&session));
+    let lost = caller.loses(Wish::ReadSession(session));
     tokio::pin!(stop, lost);
     loop {
         let event = tokio::select! {
             event = events.recv() => event,
-            () = sender.closed() => return,
-            status = &mut lost => {
-                let _ = sender.send(Err(status)).await;
-                return;
-            }
-            () = &mut stop => {
-                let _ = sender.send(Err(Status::unavailable(EngineError::Stopped.to_string()))).await;
-                return;
-            }
+            () = sender.closed() => return Ok(()),
+            status = &mut lost => return Err(status),
+            () = &mut stop => return Err(Status::unavailable(EngineError::Stopped.to_string())),
         };
         let message = match event {
-            Ok(Event::SessionClosed { session: closed, .. }) if closed == session => return,
-            Ok(event) => (news.of_event)(&session, event),
+            Ok(Event::SessionClosed { session: closed, .. }) if closed == session => {
+                let left = edge.keeper.as_ref().is_some_and(|keeper| keeper.has_left(session));
+                return if left { Err(moved(session)) } else { Ok(()) };
+            }
+            Ok(event) => (news.of_event)(session, event),
             // Too slow a watcher misses what has passed, never what holds.
-            Err(RecvError::Lagged(_)) => match edge.engine.get(&session, edge.stream_budget()).await {
-                Ok(view) => (news.of_session)(&session, &view),
-                Err(_) => return,
+            Err(RecvError::Lagged(_)) => match edge.engine.get(session, edge.stream_budget()).await {
+                Ok(view) => (news.of_session)(session, &view),
+                Err(EngineError::UnknownSession { .. }) if edge.cluster.is_none() => return Ok(()),
+                Err(error) => return Err(edge.status(error)),
             },
-            Err(RecvError::Closed) => return,
+            Err(RecvError::Closed) => return Ok(()),
         };
         if let Some(message) = message
             && sender.send(Ok(message)).await.is_err()
         {
-            return;
+            return Ok(());
         }
     }
 }

@@ -56,7 +56,7 @@ impl pb::sessions_server::Sessions for Service {
         let open = open_session(request.get_ref()).map_err(to_status)?;
         let name = if session.is_empty() { vehicle } else { session };
         self.0.bring_map(&open.map, budget).await?;
-        let view = self.0.begin(name, budget, self.0.engine.open(open, budget)).await?;
+        let view = self.0.begin("session_id", name, budget, self.0.engine.open(open, budget)).await?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session opened");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
@@ -85,7 +85,8 @@ impl pb::sessions_server::Sessions for Service {
         if let Some(vehicle) = self.0.allow_caller(&caller, Wish::ChangeSession(&session_id), budget).await? {
             caller.may(Wish::OpenSession { vehicle: &vehicle, session: &new_session_id })?;
         }
-        let view = self.0.begin(&new_session_id, budget, self.0.engine.fork(&session_id, &new_session_id, budget)).await?;
+        let copy = self.0.engine.fork(&session_id, &new_session_id, budget);
+        let view = self.0.begin("new_session_id", &new_session_id, budget, copy).await?;
         tracing::info!(session = session_id, copy = view.session, "session copied");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))
@@ -111,7 +112,7 @@ impl pb::sessions_server::Sessions for Service {
             self.0.bring_map(map, budget).await?;
         }
         let name = name.clone();
-        let view = self.0.begin(&name, budget, self.0.engine.import(image, &session_id, budget)).await?;
+        let view = self.0.begin("session_id", &name, budget, self.0.engine.import(image, &session_id, budget)).await?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session imported");
         self.0.settled(Key::Session(view.session.clone()), budget).await?;
         Ok(Response::new(self.0.session(&view)))

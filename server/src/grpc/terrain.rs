@@ -55,6 +55,8 @@ impl pb::terrain_server::Terrain for Service {
             .await
             .map_err(|_| Status::deadline_exceeded(format!("the upload took longer than {} s", edge.config.upload_deadline_s)))??;
         let map = off_thread(move || builder.finish()).await?;
+        // Another server may have a newer version.
+        edge.bring_map(map.id(), edge.stream_budget()).await?;
         let map = edge.engine.put_map(map.into(), None, edge.stream_budget()).await.map_err(to_status)?;
         tracing::info!(map = map.id(), version = map.version(), cells = map.geometry().cells(), "map uploaded");
         edge.settled(Key::Map(map.id().into()), edge.stream_budget()).await?;
@@ -101,6 +103,11 @@ impl pb::terrain_server::Terrain for Service {
         self.0.allow(&request, Wish::ChangeMap(&request.get_ref().map_id)).await?;
         let map = request.into_inner().map_id;
         self.0.bring_map(&map, budget).await?;
+        if let Some(cluster) = &self.0.cluster
+            && let Some(session) = cluster.map_user(&map).await?
+        {
+            return Err(to_status(EngineError::MapInUse { map, session }));
+        }
         self.0.engine.delete_map(&map, budget).await.map_err(to_status)?;
         self.0.settled(Key::Map(map), budget).await?;
         Ok(Response::new(pb::DeleteMapReply {}))

@@ -115,7 +115,7 @@ impl SessionStore for EtcdStore {
     }
 
     fn commit_in_task<'a>(&'a mut self, changes: &'a [Change]) -> Commit<'a> {
-        let failed = |status: Status| StoreError::Database { reason: format!("etcd: {}", status.message()) };
+        let failed = |status: Status| StoreError::Database { reason: status.message().into() };
         Box::pin(async move { self.write_all(changes).await.map_err(failed) })
     }
 }

@@ -12,7 +12,7 @@ use tokio::sync::watch;
 use tokio::time::Instant;
 
 use super::map_bytes::map_bytes;
-use super::restore::Restored;
+use super::restore::{Restored, StoredMap};
 use super::{Change, SessionStore, StoreError, StoredSession, StoredSoil};
 use crate::clock::unix_ns;
 use crate::convert::{SoilTeller, image_bytes};
@@ -21,8 +21,10 @@ use crate::convert::{SoilTeller, image_bytes};
 const RETRY_AFTER: Duration = Duration::from_secs(1);
 /// Pause between two looks of a keeper without a thread.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
+/// Time for which it is remembered that a session left, for those who still wait for the store or learn of it late.
+const LEFT_KEPT: Duration = Duration::from_secs(60);
 
-/// Accepted measurements of each session in a commit; `None` = the session is gone.
+/// Accepted measurements of each session in a commit; `None` = the session was closed. One that belongs to another server is not among them.
 type Places = BTreeMap<String, Option<u64>>;
 
 /// What can change.
@@ -67,8 +69,39 @@ struct State {
     soil: BTreeMap<CellKey, (f64, FleetCell, i64)>,
     /// Sessions that are taken out of the engine without being closed: other servers have them.
     gone: BTreeSet<String>,
+    /// Last change of sessions that left, up to which nobody knows what was written, and when they did; until this server writes one of that name again.
+    left: BTreeMap<String, (u64, Instant)>,
+    /// Maps that were taken out of the store by somebody else.
+    lost_maps: BTreeSet<String>,
     counts: StoreCounts,
     stopping: bool,
+}
+
+impl State {
+    /// Notes a change that is to be written at this instant; gives its number.
+    fn change(&mut self, key: Key, due: Instant) -> u64 {
+        self.changes += 1;
+        let latest = self.changes;
+        let entry = self.dirty.entry(key).or_insert(Dirty { first: latest, latest, due });
+        *entry = Dirty { first: entry.first, latest, due: due.min(entry.due) };
+        latest
+    }
+
+    /// Notes that a session is another server's, whose changes up to this one may not be written.
+    fn leave(&mut self, session: &str, change: u64) {
+        let before = self.left.get(session).map_or(0, |(before, _)| *before);
+        self.left.insert(session.into(), (change.max(before), Instant::now()));
+    }
+
+    /// Whether the changes of a session or map up to this one are on stable storage; `None` = not yet.
+    fn settled(&self, key: &Key, latest: u64) -> Option<bool> {
+        if let Key::Session(session) = key
+            && self.left.get(session).is_some_and(|(left, _)| latest <= *left)
+        {
+            return Some(false);
+        }
+        self.dirty.get(key).is_none_or(|dirty| dirty.first > latest).then_some(true)
+    }
 }
 
 /// Knows what is durable and sees to it that everything becomes so.
@@ -76,7 +109,7 @@ struct State {
 pub struct Keeper {
     state: Mutex<State>,
     changed: Condvar,
-    /// Counts the commits, for those who wait for one.
+    /// Counts the commits and the sessions that left, for those who wait for one.
     committed: watch::Sender<u64>,
     interval: Duration,
     /// Whose soil map is kept; `None` = nobody's.
@@ -130,10 +163,7 @@ impl Keeper {
             }
             state.gone.remove(session);
         }
-        state.changes += 1;
-        let (latest, due) = (state.changes, Instant::now() + wait);
-        let entry = state.dirty.entry(key).or_insert(Dirty { first: latest, latest, due });
-        *entry = Dirty { first: entry.first, latest, due: due.min(entry.due) };
+        let latest = state.change(key, Instant::now() + wait);
         if let Event::SessionOpened { session, .. } | Event::SessionClosed { session, .. } = event {
             state.durable.remove(session);
             state.renamed.insert(session.clone(), latest);
@@ -154,18 +184,29 @@ impl Keeper {
         StoreCounts { waiting: state.dirty.len(), ..state.counts }
     }
 
-    /// Resolves when every change that is noted now of a session or map is on stable storage; says whether that was within `budget`.
+    /// Resolves when every change that is noted now of a session or map is on stable storage; says whether that was within `budget`. A session that left for
+    /// another server before is not: nobody knows what was written of it.
     pub(crate) async fn settled(&self, key: &Key, budget: Duration) -> bool {
         let mut committed = self.committed.subscribe();
-        let Some(latest) = self.lock().dirty.get(key).map(|dirty| dirty.latest) else { return true };
+        // 0 = nothing waits.
+        let latest = self.lock().dirty.get(key).map_or(0, |dirty| dirty.latest);
         let wait = async {
-            while self.lock().dirty.get(key).is_some_and(|dirty| dirty.first <= latest) {
+            loop {
+                let settled = self.lock().settled(key, latest);
+                if let Some(settled) = settled {
+                    return settled;
+                }
                 if committed.changed().await.is_err() {
-                    return;
+                    return false;
                 }
             }
         };
-        tokio::time::timeout(budget, wait).await.is_ok()
+        tokio::time::timeout(budget, wait).await.unwrap_or(false)
+    }
+
+    /// Whether a session has left for another server a moment ago, and was not written here since then.
+    pub(crate) fn has_left(&self, session: &str) -> bool {
+        self.lock().left.contains_key(session)
     }
 
     /// Makes what waits for a commit due now.
@@ -182,15 +223,27 @@ impl Keeper {
         state.changes += 1;
         let latest = state.changes;
         state.dirty.remove(&Key::Session(session.into()));
+        state.leave(session, latest);
         state.durable.remove(session);
         // A commit that runs now says nothing of a session of that name that comes later.
         state.renamed.insert(session.into(), latest);
         state.gone.insert(session.into());
+        drop(state);
+        self.committed.send_modify(|commits| *commits += 1);
     }
 
     /// The engine did not have a forgotten session, or has lost it: from now on its name is like any other.
     pub fn forgotten(&self, session: &str) {
         self.lock().gone.remove(session);
+    }
+
+    /// The store does not hold a map any more: it is written again if the engine holds it.
+    pub(crate) fn lost_map(&self, map: &str) {
+        let mut state = self.lock();
+        state.lost_maps.insert(map.into());
+        state.change(Key::Map(map.into()), Instant::now());
+        drop(state);
+        self.changed.notify_one();
     }
 
     /// What was restored is durable already.
@@ -301,15 +354,23 @@ impl Keeper {
                 }
                 Key::Soil(_) | Key::Map(_) => continue,
             };
+            let place = places.get(session).copied();
+            if place.is_none() {
+                state.leave(session, *written);
+            }
             if state.renamed.get(session).is_some_and(|renamed| renamed > written) {
                 continue;
             }
             state.renamed.remove(session);
-            match places.get(session).copied().flatten() {
+            match place.flatten() {
                 Some(accepted) => state.durable.insert(session.clone(), accepted),
                 None => state.durable.remove(session),
             };
+            if place.is_some() {
+                state.left.remove(session);
+            }
         }
+        state.left.retain(|_, (_, since)| since.elapsed() < LEFT_KEPT);
         state.counts.commits += 1;
         state.counts.bytes += bytes;
         state.counts.commit_s += took.as_secs_f64();
@@ -335,8 +396,8 @@ impl Keeper {
 struct Batch {
     changes: Vec<Change>,
     places: Places,
-    /// Hash of each map in the store after it.
-    maps: BTreeMap<String, String>,
+    /// Each map in the store after it.
+    maps: BTreeMap<String, StoredMap>,
     bytes: u64,
 }
 
@@ -345,8 +406,8 @@ struct Work {
     keeper: Arc<Keeper>,
     store: Box<dyn SessionStore>,
     engine: EngineHandle,
-    /// Hash of each map in the store.
-    maps: BTreeMap<String, String>,
+    /// Each map in the store.
+    maps: BTreeMap<String, StoredMap>,
 }
 
 impl Work {
@@ -405,15 +466,19 @@ impl Work {
 
     /// Reads the present state of these sessions and maps.
     fn read(&mut self, due: &BTreeMap<Key, u64>) -> Result<Batch, String> {
+        let lost_maps = std::mem::take(&mut self.keeper.lock().lost_maps);
+        self.maps.retain(|map, _| !lost_maps.contains(map));
         let snapshot = self.snapshot(due)?;
         let (mut changes, mut places, mut maps) = (Vec::new(), Places::new(), self.maps.clone());
         for (id, map) in &snapshot.maps {
             match map {
-                Some(map) if maps.get(id).map(String::as_str) != Some(map.hash()) => {
-                    maps.insert(id.clone(), map.hash().into());
-                    changes.push(Change::PutMap(id.clone(), map_bytes(map)));
+                Some(map) => {
+                    let stored = StoredMap::of(map);
+                    if maps.get(id) != Some(&stored) {
+                        maps.insert(id.clone(), stored);
+                        changes.push(Change::PutMap(id.clone(), map_bytes(map)));
+                    }
                 }
-                Some(_) => {}
                 None => {
                     maps.remove(id);
                     changes.push(Change::RemoveMap(id.clone()));
@@ -459,3 +524,6 @@ fn weight(change: &Change) -> u64 {
         Change::RemoveSession(_) | Change::RemoveMap(_) | Change::RemoveSoil(_) => 0,
     }
 }
+
+#[cfg(test)]
+mod tests;

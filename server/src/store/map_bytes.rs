@@ -17,6 +17,14 @@ pub fn map_bytes(map: &WorldMap) -> Vec<u8> {
     bytes
 }
 
+/// Version of the map in such bytes; 0 where they are no map.
+pub fn map_version(bytes: &[u8]) -> u64 {
+    match pb::UploadMapRequest::decode_length_delimited(bytes).ok().and_then(|message| message.part) {
+        Some(Part::Header(header)) => header.version,
+        Some(Part::Tile(_)) | None => 0,
+    }
+}
+
 /// The map in such bytes.
 ///
 /// # Errors
@@ -33,4 +41,17 @@ pub fn map_of(bytes: &[u8], limits: &Limits) -> Result<WorldMap, String> {
         }
     }
     builder.ok_or("has no header")?.finish().map_err(|error| error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_the_version_stands_in_the_header() {
+        let header = pb::MapHeader { map_id: "m".into(), version: 7, ..Default::default() };
+        let message = pb::UploadMapRequest { part: Some(Part::Header(header)) };
+        assert_eq!(map_version(&message.encode_length_delimited_to_vec()), 7);
+        assert_eq!((map_version(&[]), map_version(b"no map")), (0, 0));
+    }
 }

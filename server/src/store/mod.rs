@@ -24,7 +24,7 @@ use std::pin::Pin;
 pub(crate) use self::etcd::EtcdStore;
 pub use self::keeper::Keeper;
 pub(crate) use self::keeper::{Key, StoreCounts};
-pub(crate) use self::map_bytes::map_of;
+pub(crate) use self::map_bytes::{map_of, map_version};
 pub use self::redb::RedbStore;
 pub use self::restore::Restored;
 pub(crate) use self::restore::{restore, resumed};

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use nesam_engine::{Command, EngineError, EngineHandle, Reply, SessionImage};
 use nesam_proto::v1 as pb;
+use nesam_terrain::WorldMap;
 use prost::Message as _;
 
 use super::map_bytes::map_of;
@@ -11,13 +12,29 @@ use super::{Contents, StoreError, StoredSession, StoredSoil};
 use crate::clock::unix_ns;
 use crate::convert::{SoilTeller, session_image};
 
+/// Which content of a map a store holds. A newer version may have the same content.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct StoredMap {
+    /// Version.
+    pub version: u64,
+    /// Hash of the content.
+    pub hash: String,
+}
+
+impl StoredMap {
+    /// That of a map.
+    pub fn of(map: &WorldMap) -> Self {
+        Self { version: map.version(), hash: map.hash().into() }
+    }
+}
+
 /// What came back.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct Restored {
     /// Measurements that each session had accepted.
     pub accepted: BTreeMap<String, u64>,
-    /// Hash of each map.
-    pub maps: BTreeMap<String, String>,
+    /// Each map.
+    pub maps: BTreeMap<String, StoredMap>,
     /// Keys of evidence of the soil that has faded.
     pub faded: Vec<String>,
 }
@@ -31,7 +48,7 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Optio
     for (id, bytes) in &contents.maps {
         let refused = |reason: String| StoreError::Content { what: format!("map `{id}`"), reason };
         let map = map_of(bytes, engine.limits()).map_err(refused)?;
-        restored.maps.insert(id.clone(), map.hash().into());
+        restored.maps.insert(id.clone(), StoredMap::of(&map));
         engine.call(Command::PutMap { map: map.into(), base: None }).map_err(|error| refused(error.to_string()))?;
     }
     for session in &contents.sessions {
@@ -76,13 +93,13 @@ fn recall(stored: &StoredSoil, of: &SoilTeller, engine: &EngineHandle) -> Option
     }
 }
 
-fn import(stored: &StoredSession, maps: &BTreeMap<String, String>, engine: &EngineHandle) -> Result<u64, EngineError> {
+fn import(stored: &StoredSession, maps: &BTreeMap<String, StoredMap>, engine: &EngineHandle) -> Result<u64, EngineError> {
     let mut image = resumed(stored)?;
     // The map may have been patched since the session was saved; it drives on what is held.
     if let Some((id, hash)) = &mut image.map
         && let Some(held) = maps.get(id)
     {
-        hash.clone_from(held);
+        hash.clone_from(&held.hash);
     }
     let accepted = image.accepted;
     engine.call(Command::Import { image: Box::new(image), session: stored.name.clone() })?;

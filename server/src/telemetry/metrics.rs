@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use nesam_engine::{Answer, EngineError, Event, Reply};
+use nesam_engine::{Answer, Command, EngineError, Event, Reply};
 
 use super::alarms::AlarmCounts;
 use super::histogram::Histogram;
@@ -110,6 +110,12 @@ impl Metrics {
     /// Everything in Prometheus' text format.
     pub fn render(&self, waiting_commands: usize, waiting_predictions: usize) -> String {
         let mut out = String::new();
+        if let Ok(mut commands) = self.commands.lock() {
+            // Each from the start, so that the first internal error of a command is an increase.
+            for command in Command::LABELS {
+                commands.entry((command, "internal")).or_default();
+            }
+        }
         let tables = [
             ("nesam_requests_total", "Requests by transport and method.", ["transport", "method"], &self.requests),
             ("nesam_commands_total", "Engine commands by kind and result.", ["command", "result"], &self.commands),
@@ -167,6 +173,8 @@ mod tests {
         for line in [
             "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
             "nesam_commands_total{command=\"predict\",result=\"deadline_exceeded\"} 1",
+            "nesam_commands_total{command=\"predict\",result=\"internal\"} 0",
+            "nesam_commands_total{command=\"delete_map\",result=\"internal\"} 0",
             "nesam_measurements_total{transport=\"zenoh\",outcome=\"applied\"} 1",
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",

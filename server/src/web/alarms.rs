@@ -206,7 +206,7 @@ mod tests {
     fn measured(at_s: f64) -> SessionNotes {
         let (state, command) = (VehicleState::zero(), Control { speed_m_s: 1.0, second: 0.0 });
         let measurement = Measurement { sequence: None, boot: None, stamp_ns: 0, state, command, wheels: WheelMeasurement::default() };
-        SessionNotes { newest: Some((measurement, at_s)), map: Some(("w".into(), 1)), ..SessionNotes::default() }
+        SessionNotes { newest: Some((measurement, at_s)), map: Some(("w".into(), 1, "hash".into())), ..SessionNotes::default() }
     }
 
     fn found(session: SessionNotes, now_s: f64) -> Vec<String> {

@@ -39,8 +39,8 @@ pub(crate) enum Note {
     Session(Box<SessionView>),
     /// Sessions that are no more.
     Ended(Vec<String>),
-    /// A map has this version now.
-    Map(String, u64),
+    /// A map has this version and this hash now.
+    Map(String, u64, String),
     /// A command that was refused.
     Refused(&'static str, EngineError),
     /// An alarm that somebody else has found begins or ends.
@@ -126,7 +126,7 @@ impl Passing {
             (What::Closed(session), Ok(_)) => Note::Ended(vec![session]),
             (_, Ok(Reply::Session(view))) => Note::Session(view.clone()),
             (_, Ok(Reply::Expired(sessions))) if !sessions.is_empty() => Note::Ended(sessions.clone()),
-            (_, Ok(Reply::Map(map))) => Note::Map(map.id().into(), map.version()),
+            (_, Ok(Reply::Map(map))) => Note::Map(map.id().into(), map.version(), map.hash().into()),
             _ => return,
         };
         self.feed.note(note);

@@ -59,7 +59,7 @@ impl Scenery {
         self.priors.retain(|name, _| notes.sessions.contains_key(name));
         for (name, session) in &notes.sessions {
             let Some((measurement, _)) = &session.newest else { continue };
-            let map = session.map.as_ref().map(|(id, _)| self.maps.get(id));
+            let map = session.map.as_ref().map(|(id, ..)| self.maps.get(id));
             // A map that the engine has not handed over yet says nothing.
             let (None | Some(Some(_))) = map else { continue };
             let [x_m, y_m, _] = measurement.state.position_m;
@@ -131,7 +131,7 @@ fn session_json(name: &str, session: &SessionNotes, seen: &mut SeenSession, scen
     json!({
         "session": name,
         "vehicle": session.vehicle,
-        "map": session.map.as_ref().map(|(id, version)| json!({"id": id, "version": version})),
+        "map": session.map.as_ref().map(|(id, version, hash)| json!({"id": id, "version": version, "hash": hash})),
         "history_steps": session.history_steps,
         "outcomes": session.outcomes,
         "newest": newest,

@@ -94,8 +94,8 @@ pub(crate) struct PredictionTiming {
 pub(crate) struct SessionNotes {
     /// Vehicle that it belongs to.
     pub vehicle: String,
-    /// World map and its version.
-    pub map: Option<(String, u64)>,
+    /// World map, its version and its hash.
+    pub map: Option<(String, u64, String)>,
     /// Newest accepted measurement, and when it came, s.
     pub newest: Option<(Measurement, f64)>,
     /// Driven path: stamp in s, x, y, speed over ground.
@@ -151,9 +151,12 @@ impl Notes {
                 self.sessions.remove(session);
                 self.raised.retain(|raised| raised.session.as_ref() != Some(session));
             }),
-            Note::Map(id, version) => {
-                let users = self.sessions.values_mut().filter_map(|session| session.map.as_mut()).filter(|(map, _)| *map == id);
-                users.for_each(|(_, held)| *held = version);
+            Note::Map(id, version, hash) => {
+                let users = self.sessions.values_mut().filter_map(|session| session.map.as_mut()).filter(|(map, ..)| *map == id);
+                users.for_each(|(_, held_version, held_hash)| {
+                    *held_version = version;
+                    held_hash.clone_from(&hash);
+                });
             }
             Note::Refused(command, error) => self.refusals.push((at_s, command, error), REFUSALS_MAX),
             Note::Alarm(raised) => self.raise(raised),
@@ -179,7 +182,7 @@ impl Notes {
         view.alarm.iter().for_each(|alarm| self.raise(Raised::by_watch(&view.session, alarm)));
         let Some(session) = self.session(view.session.clone()) else { return };
         session.vehicle.clone_from(&view.vehicle);
-        session.map = view.provenance.map.as_ref().map(|(id, version, _)| (id.clone(), *version));
+        session.map.clone_from(&view.provenance.map);
         session.history_steps = view.history_steps;
         session.soil = Some(view.soil);
         if let (None, Some(step)) = (&session.newest, &view.newest) {
@@ -247,6 +250,15 @@ mod tests {
         (0..7).for_each(|i| ring.push(i, 4));
         let after = |seen| ring.after(seen).copied().collect::<Vec<_>>();
         assert_eq!((after(0), after(5), after(7)), (vec![3, 4, 5, 6], vec![5, 6], vec![]));
+    }
+
+    #[test]
+    fn property_another_map_of_the_same_version_is_told() {
+        let on = |hash: &str| Some(("m".to_string(), 1, hash.to_string()));
+        let mut notes = Notes::default();
+        notes.sessions.insert("a".into(), SessionNotes { map: on("former"), ..Default::default() });
+        notes.take(Note::Map("m".into(), 1, "present".into()), 0.0);
+        assert_eq!(notes.sessions["a"].map, on("present"));
     }
 
     #[test]

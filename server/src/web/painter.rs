@@ -228,15 +228,17 @@ impl Painter {
         }
     }
 
-    /// Brings the maps up to date that sessions drive on; one question for each version.
+    /// Brings the maps up to date that sessions drive on; one question for each change.
     fn fetch_maps(&self, canvas: &mut Canvas) {
-        let wanted: BTreeSet<(String, u64)> = canvas.notes.sessions.values().filter_map(|session| session.map.clone()).collect();
-        let maps = &mut canvas.scenery.maps;
-        maps.retain(|id, _| wanted.iter().any(|(held, _)| held == id));
-        for (id, version) in wanted {
-            let is_current = maps.get(&id).is_some_and(|map| map.version() >= version);
+        let wanted: BTreeSet<(String, u64, String)> = canvas.notes.sessions.values().filter_map(|session| session.map.clone()).collect();
+        let Canvas { notes, scenery, .. } = canvas;
+        scenery.maps.retain(|id, _| wanted.iter().any(|(held, ..)| held == id));
+        for (id, _, hash) in wanted {
+            let is_current = scenery.maps.get(&id).is_some_and(|map| map.hash() == hash);
             if !is_current && let Some(Reply::Map(map)) = self.ask(Command::GetMap { map: id.clone() }) {
-                maps.insert(id, map);
+                // The engine may have gone on since the note.
+                notes.take(Note::Map(id.clone(), map.version(), map.hash().into()), self.now_s());
+                scenery.maps.insert(id, map);
             }
         }
     }

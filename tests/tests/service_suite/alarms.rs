@@ -5,11 +5,13 @@
 //! The committed drives last 25 s, so the drive goes on with a second one in the same world after a pause of a second: 13 s of the first and 12 s of the second
 //! are diagnosed, cut into five pieces that stand for drives.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use nesam_client::{Client, measurement, v1};
 use nesam_discovery::bench::{Change, apply};
 use nesam_discovery::{Options, Scoring, Verdict, diagnose};
+use nesam_engine::{AlarmKind, Command, Engine, Limits, OpenSession, Reply, WatchImage};
 use nesam_server::recording::{Recording, window};
 use nesam_terrain::WorldMap;
 use nesam_tests::sample_root;
@@ -30,7 +32,7 @@ const DIAGNOSED_AT: usize = 120;
 const HORIZON: usize = 32;
 
 /// Both drives of a world, the effect hidden from the onset on.
-fn drives(change: Option<Change>) -> ([Trajectory; 2], std::sync::Arc<WorldMap>) {
+fn drives(change: Option<Change>) -> ([Trajectory; 2], Arc<WorldMap>) {
     let root = DataRoot::open(&sample_root(), None).unwrap();
     let query = SetQuery { trajectories: Some(vec!["n0001".into(), "n0049".into()]), ..SetQuery::all("nominal") };
     let mut drives: [Trajectory; 2] = root.load_set(&query).unwrap().try_into().unwrap();
@@ -198,4 +200,62 @@ async fn service_a_drive_without_a_change_raises_nothing() {
     assert_eq!((session.alarm, session.accepted), (None, 2 * drives[0].states.len() as u64 + 300));
     assert!(server.metrics().render(0, 0).contains("nesam_alarms_total{kind=\"motion_jump\"} 0\n"));
     server.shutdown().await;
+}
+
+/// An engine that watches the session `s` in a world.
+fn watching(world: &Arc<WorldMap>) -> Engine {
+    let mut engine = Engine::new(predictor(), Limits::default()).unwrap();
+    engine.execute(0, &Command::PutMap { map: world.clone(), base: None }).unwrap();
+    engine.execute(0, &Command::Open(OpenSession { vehicle: "s".into(), map: world.id().into(), ..Default::default() })).unwrap();
+    engine
+}
+
+fn measure(engine: &mut Engine, measurement: nesam_engine::Measurement) {
+    engine.execute(0, &Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+}
+
+/// What the watch of the session remembers.
+fn watched(engine: &mut Engine) -> WatchImage {
+    let Reply::Image(image) = engine.execute(0, &Command::Export { session: "s".into() }).unwrap() else { panic!("another reply") };
+    image.watch.expect("a bundle with a calibrated filter")
+}
+
+#[test]
+fn property_stamps_that_jitter_raise_the_alarm_of_exact_ones() {
+    let (drives, world) = drives(Some(Change::GyroBias(0.01)));
+    let [exact, jittered] = [0, 1].map(|jitter| {
+        let mut engine = watching(&world);
+        for i in 0..drives[0].states.len() {
+            let mut measurement = engine_sample(&drives[0], i);
+            measurement.stamp_ns += jitter * (i as i64 * 7919 % 1000);
+            measure(&mut engine, measurement);
+        }
+        watched(&mut engine)
+    });
+    // Which buffers follow the one before them.
+    let follow = |watch: &WatchImage| watch.stamps_ns.windows(2).map(|pair| pair[0][1] == pair[1][0]).collect::<Vec<_>>();
+    assert!(follow(&exact).contains(&true) && exact.values == jittered.values);
+    assert_eq!(follow(&exact), follow(&jittered));
+    let [exact, jittered] = [exact, jittered].map(|watch| watch.active.expect("the bias is told"));
+    assert_eq!((exact.kind, exact.channel_name()), (AlarmKind::SensorJump, "turn_minus_gyro_yaw_rad_s"));
+    assert_eq!((jittered.kind, jittered.channel, jittered.statistic), (exact.kind, exact.channel, exact.statistic));
+    assert!((jittered.stamp_ns - exact.stamp_ns).abs() < 1000, "{jittered:?} {exact:?}");
+}
+
+#[test]
+fn property_buffers_of_a_restarted_vehicle_are_not_mixed_with_those_before() {
+    let (drives, world) = drives(Some(Change::GyroBias(0.01)));
+    let mut engine = watching(&world);
+    for i in 0..drives[0].states.len() {
+        let before = engine_sample(&drives[0], i);
+        measure(&mut engine, nesam_engine::Measurement { boot: Some(1), stamp_ns: before.stamp_ns + 3600 * 10 * STEP_NS, ..before });
+    }
+    let raised = watched(&mut engine).active.expect("the bias is told");
+    let last = 40;
+    for i in 0..=last {
+        measure(&mut engine, nesam_engine::Measurement { boot: Some(2), ..engine_sample(&drives[1], i) });
+    }
+    let watch = watched(&mut engine);
+    assert!(!watch.stamps_ns.is_empty() && watch.stamps_ns.iter().all(|[_, end_ns]| *end_ns <= last as i64 * STEP_NS), "{watch:?}");
+    assert_eq!(watch.active, Some(raised), "the episode goes on");
 }

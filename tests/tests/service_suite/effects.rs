@@ -77,6 +77,10 @@ async fn service_effects_act_in_their_session_alone_until_reverted() {
     assert!(soils[0] == soils[2] && soils[0].delta != soils[1].delta && soils[0].delta != Some(v1::SoilVector::default()));
     let query = candidates("s", &recorded.drive, 120, 2, 24);
     assert_eq!(states(&mut client, &query, "s").await, states(&mut client, &query, "copy").await);
+    let learned = client.session("s").await.unwrap();
+    assert_eq!(client.apply_effects("s", "a test", both()).await.unwrap(), learned, "the same again is nothing");
+    let renamed = client.apply_effects("s", "another test", both()).await.unwrap();
+    assert_eq!(renamed, v1::Session { effects_source: "another test".into(), ..learned });
 
     let reverted = client.revert_effects("s").await.unwrap();
     assert!(reverted.effects.is_empty() && reverted.effects_source.is_empty());

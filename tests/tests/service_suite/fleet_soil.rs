@@ -4,9 +4,11 @@ use std::time::Duration;
 
 use nesam_adaptation::FilterConfig;
 use nesam_client::v1;
-use nesam_engine::{Command, Engine, FleetSoilSettings, Limits, OpenSession, Reply};
+use nesam_engine::{Command, Engine, FleetSoilSettings, Limits, OpenSession, Reply, SOIL_NOT_LEARNED, SessionImage, SessionView};
+use nesam_server::convert::{image_bytes, session_image};
 use prost::Message as _;
-use tonic::Code;
+use tokio_stream::wrappers::TcpListenerStream;
+use tonic::{Code, Request, Response, Status};
 
 use crate::stage::*;
 use crate::zenoh_network::{PATIENCE, behind, router};
@@ -76,7 +78,7 @@ async fn service_without_the_map_every_session_begins_alone() {
 #[test]
 fn property_a_buffer_that_tells_nothing_brings_nothing() {
     let recorded = recorded();
-    let cells = |excitation_min: f64| {
+    let cells_and_flags = |excitation_min: f64| {
         let filter = FilterConfig { excitation_min, ..filter_config() };
         let engine = Engine::new(predictor(), Limits::default()).unwrap().with_filter(filter).unwrap();
         let mut engine = engine.with_fleet_soil(FleetSoilSettings::default()).unwrap();
@@ -87,8 +89,172 @@ fn property_a_buffer_that_tells_nothing_brings_nothing() {
             call(Command::Measure { session: "truck".into(), vehicle: None, measurement: engine_sample(&recorded.drive, i) });
         }
         let Reply::FleetShares(_, shares) = call(Command::TellFleetSoil) else { panic!("another reply") };
-        shares.iter().map(|share| share.cells.len()).sum::<usize>()
+        let query = engine_query("truck", &recorded.drive, 60, 1, 1);
+        let Reply::Predicted(prediction) = call(Command::Predict(query)) else { panic!("another reply") };
+        (shares.iter().map(|share| share.cells.len()).sum::<usize>(), prediction.rollout.flags[0] & SOIL_NOT_LEARNED)
     };
-    assert!(cells(filter_config().excitation_min) > 0);
-    assert_eq!(cells(1e12), 0, "the estimate stayed as it was while P was expected to widen: no difference of the two is evidence");
+    let (cells, not_learned) = cells_and_flags(filter_config().excitation_min);
+    assert!(cells > 0 && not_learned == 0);
+    // The estimate stayed as it was while P was expected to widen: no difference of the two is evidence.
+    assert_eq!(cells_and_flags(1e12), (0, SOIL_NOT_LEARNED));
+}
+
+/// An engine that keeps a soil map of the fleet, with the recorded world.
+struct Sharing {
+    engine: Engine,
+    recorded: Recorded,
+}
+
+impl Sharing {
+    fn new() -> Self {
+        let engine = Engine::new(predictor(), Limits::default()).unwrap();
+        let mut sharing = Self { engine: engine.with_fleet_soil(FleetSoilSettings::default()).unwrap(), recorded: recorded() };
+        sharing.ask(Command::PutMap { map: sharing.recorded.world.clone(), base: None });
+        sharing
+    }
+
+    fn ask(&mut self, command: Command) -> Reply {
+        self.engine.execute(0, &command).unwrap()
+    }
+
+    fn open(&mut self, vehicle: &str, initial: Option<nesam_engine::Measurement>) -> SessionView {
+        let map = self.recorded.world.id().into();
+        let open = OpenSession { vehicle: vehicle.into(), map, initial, ..Default::default() };
+        let Reply::Session(view) = self.ask(Command::Open(open)) else { panic!("another reply") };
+        *view
+    }
+
+    fn measure(&mut self, session: &str, measurement: nesam_engine::Measurement) -> nesam_engine::MeasureAnswer {
+        let Reply::Measured(answer) = self.ask(Command::Measure { session: session.into(), vehicle: None, measurement }) else {
+            panic!("another reply")
+        };
+        *answer
+    }
+
+    fn drive(&mut self, session: &str, samples: core::ops::RangeInclusive<usize>) {
+        for i in samples {
+            self.measure(session, engine_sample(&self.recorded.drive, i));
+        }
+    }
+
+    /// A session as a server reads what another one wrote.
+    fn exported(&mut self, session: &str) -> SessionImage {
+        let Reply::Image(image) = self.ask(Command::Export { session: session.into() }) else { panic!("another reply") };
+        session_image(&image_bytes(&image)).unwrap()
+    }
+
+    fn import(&mut self, image: SessionImage) {
+        self.ask(Command::Import { image: Box::new(image), session: String::new() });
+    }
+
+    /// Buffers that were brought here.
+    fn brought(&mut self) -> f64 {
+        let Reply::FleetShares(_, shares) = self.ask(Command::TellFleetSoil) else { panic!("another reply") };
+        shares.iter().flat_map(|share| &share.cells).map(|cell| cell.evidence.buffers()).sum()
+    }
+}
+
+#[test]
+fn property_after_a_restart_the_same_session_brings() {
+    let mut before = Sharing::new();
+    before.open("truck", None);
+    before.drive("truck", 0..=40);
+    before.ask(Command::Fork { session: "truck".into(), copy: "probe".into() });
+    // A store gives the sessions back by their names, the copy first.
+    let images = ["probe", "truck"].map(|session| before.exported(session));
+    let mut after = Sharing::new();
+    images.into_iter().for_each(|image| after.import(image));
+    after.drive("probe", 41..=70);
+    assert_eq!(after.brought(), 0.0);
+    after.drive("truck", 41..=70);
+    assert!(after.brought() > 1.0);
+}
+
+#[test]
+fn property_a_copy_does_not_silence_the_session_that_comes_after() {
+    let mut sharing = Sharing::new();
+    sharing.open("truck", None);
+    sharing.ask(Command::Fork { session: "truck".into(), copy: "probe".into() });
+    sharing.ask(Command::Close { session: "truck".into() });
+    sharing.open("truck", None);
+    sharing.drive("truck", 0..=40);
+    assert!(sharing.brought() > 1.0);
+}
+
+#[test]
+fn property_a_session_that_moves_before_its_first_step_begins_from_the_fleet() {
+    let mut sharing = Sharing::new();
+    sharing.open("first", None);
+    sharing.drive("first", 0..=70);
+    sharing.open("second", None);
+    let image = sharing.exported("second");
+    // An older service does not say it.
+    for (asks_fleet, soil_epoch) in [(true, 1), (false, 0)] {
+        sharing.ask(Command::Close { session: "second".into() });
+        assert!(image.asks_fleet && !image.brings_nothing);
+        sharing.import(SessionImage { asks_fleet, ..image.clone() });
+        let begun = sharing.measure("second", engine_sample(&sharing.recorded.drive, 0));
+        assert_eq!(begun.soil.state.epoch, soil_epoch);
+    }
+    // Nor does one that has begun begin again.
+    assert!(!sharing.exported("second").asks_fleet);
+}
+
+#[test]
+fn property_a_session_that_opens_with_a_measurement_begins_from_the_fleet() {
+    let mut sharing = Sharing::new();
+    sharing.open("first", None);
+    sharing.drive("first", 0..=70);
+    let sample = engine_sample(&sharing.recorded.drive, 0);
+    sharing.open("second", None);
+    let expected = sharing.measure("second", sample).soil;
+    assert_eq!(expected.state.epoch, 1);
+    assert_eq!(sharing.open("third", Some(sample)).soil, expected);
+    // What is refused changes nothing.
+    let mut not_finite = engine_sample(&sharing.recorded.drive, 1);
+    not_finite.state.position_m[0] = f64::NAN;
+    for (measurement, label) in [(sample, "duplicate"), (not_finite, "not_finite")] {
+        let refused = sharing.measure("third", measurement);
+        assert_eq!((refused.outcome.label(), refused.soil), (label, expected));
+    }
+}
+
+/// Answers with a soil map of as many cells as the settings allow by default.
+struct Full;
+
+#[tonic::async_trait]
+impl v1::soil_server::Soil for Full {
+    type WatchStream = tokio_stream::Empty<Result<v1::SoilEstimate, Status>>;
+
+    async fn watch(&self, _: Request<v1::WatchSoilRequest>) -> Result<Response<Self::WatchStream>, Status> {
+        Err(Status::unimplemented("not asked for here"))
+    }
+
+    async fn map(&self, request: Request<v1::FleetSoilRequest>) -> Result<Response<v1::FleetSoilMap>, Status> {
+        let vector = v1::SoilVector { k_phi: 0.1, k_c: 0.1, n: 0.1, c_pa: 0.1, phi_rad: 0.1, k_shear_m: 0.1 };
+        let cell = v1::FleetSoilCell {
+            map_id: request.into_inner().map_id,
+            colour_rgb: 0x80_60_40,
+            column: -12,
+            row: 40,
+            information: vec![0.1; 36],
+            vector: Some(vector),
+            buffers: 0.1,
+            age_s: 0.1,
+        };
+        let cells = vec![cell; FleetSoilSettings::default().cells_max];
+        Ok(Response::new(v1::FleetSoilMap { cells, ..Default::default() }))
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_full_soil_map_is_read() {
+    let socket = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = format!("http://{}", socket.local_addr().unwrap());
+    let router = tonic::transport::Server::builder().add_service(v1::soil_server::SoilServer::new(Full));
+    let serving = tokio::spawn(router.serve_with_incoming(TcpListenerStream::new(socket)));
+    let map = nesam_client::Client::connect(&address).await.unwrap().fleet_soil("quarry-7").await.unwrap();
+    assert_eq!(map.cells.len(), FleetSoilSettings::default().cells_max);
+    assert!(map.encoded_len() > 16 << 20, "{} bytes are more than most limits allow", map.encoded_len());
+    serving.abort();
 }

@@ -107,6 +107,7 @@ async fn service_the_live_page_sees_what_passes() {
     assert!((told[0] - f64::from(expected[0])).abs() < 0.006 && (told[1] - f64::from(expected[1])).abs() < 0.006, "{told:?}");
     assert_eq!(session["soil"]["names"].as_array().unwrap().len(), 6);
     assert_eq!(session["map"]["id"].as_str(), Some(recorded.world.id()));
+    assert_eq!(session["map"]["hash"].as_str(), Some(recorded.world.hash()));
     assert!(update["service"]["terrain_cache"]["looked_up"].as_u64().unwrap() > 0);
     let bundle_knows_its_errors = region.is_ok();
     assert!(

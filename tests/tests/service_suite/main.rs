@@ -27,6 +27,7 @@ mod routing;
 mod security;
 mod session_model;
 mod sessions;
+mod sharing;
 mod simulation;
 mod soil;
 mod stage;

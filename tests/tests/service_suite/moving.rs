@@ -73,7 +73,7 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
     };
     let newer = v1::SessionImage { version: 4, ..outer }.encode_to_vec();
     type Change<'a> = &'a dyn Fn(&mut v1::SessionContent);
-    let changes: [(&str, Change<'_>); 15] = [
+    let changes: [(&str, Change<'_>); 16] = [
         ("bundle", &|c| c.bundle_hash = "0".repeat(64)),
         ("filter", &|c| c.filter_settings.push('x')),
         ("NaN state", &|c| c.live.as_mut().unwrap().history[3].state[1] = f64::NAN),
@@ -89,6 +89,7 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
         ("half a correction", &|c| c.forecast.as_mut().unwrap().corrections.truncate(5)),
         ("NaN in a forecast", &|c| c.forecast.as_mut().unwrap().corrections[2] = f64::NAN),
         ("impossible check", &|c| c.forecasts[0] = -1.0),
+        ("steps before its beginning", &|c| c.asks_fleet = true),
     ];
     assert_refused("newer", client.import_session(newer, "t").await, Code::InvalidArgument, "image");
     for (what, change) in changes {

@@ -1,10 +1,11 @@
 //! Goal: too much is refused at once and typed, measurements still get through, and the server lives on.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use nesam_client::{outcome_label, v1};
-use nesam_engine::{Clock, Command, Engine, EngineHandle, Limits, ManualClock, OpenSession, Submission};
+use nesam_engine::{Clock, Command, Engine, EngineHandle, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Submission};
 use tonic::Code;
 
 use crate::stage::*;
@@ -66,6 +67,43 @@ fn service_one_after_the_other_is_never_too_many() {
     }));
     receiver.recv().unwrap().unwrap();
     handle.stop();
+}
+
+/// Goes on by this much whenever somebody looks at it.
+const TICK_NS: u64 = 10_000_000;
+
+#[derive(Default)]
+struct Ticking(AtomicU64);
+
+impl Clock for Ticking {
+    fn now_ns(&self) -> u64 {
+        self.0.fetch_add(TICK_NS, Ordering::Relaxed)
+    }
+}
+
+/// Nine samples are too many for Jacobians, also where there is time for one of them alone and the asker would take it.
+#[test]
+fn service_a_limit_holds_whatever_the_load() {
+    let recorded = recorded();
+    let engine = Engine::new(predictor(), Limits::default()).unwrap();
+    let handle = EngineHandle::unthreaded(engine, Arc::new(Ticking::default()), None);
+    handle.call(Command::Open(OpenSession { vehicle: "s".into(), ..Default::default() })).unwrap();
+    for i in 0..3 {
+        let measurement = engine_sample(&recorded.drive, i);
+        handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+    }
+    // It takes a tick: the engine expects eight for nine samples with Jacobians, two for one.
+    handle.call(Command::Predict(engine_query("s", &recorded.drive, 2, 1, 2))).unwrap();
+    let extras = PredictExtras { jacobians: true, ..Default::default() };
+    let query = PredictQuery { samples_min: 1, extras, ..engine_query("s", &recorded.drive, 2, 9, 2) };
+    for within_ns in [None, Some(8 * TICK_NS)] {
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let mut asked = Submission::new(Command::Predict(query.clone()), move |answer| sender.send(answer.result).unwrap());
+        asked.deadline_ns = within_ns.map(|within_ns| handle.now_ns() + within_ns);
+        handle.submit(asked);
+        let refused = receiver.recv().unwrap().expect_err("too many samples");
+        assert_eq!(refused.field(), "extras.jacobians", "{refused}");
+    }
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -5,11 +5,11 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nesam_client::v1;
+use nesam_client::{outcome_label, v1};
 use nesam_mcap::{Reader, Record, Writer};
 use nesam_model::{ModelBundle, Predictor};
 use nesam_server::Config;
-use nesam_server::recording::{Ending, Recording, RecordingError, ReplayReport, replay};
+use nesam_server::recording::{Ending, RecordedWindow, Recording, RecordingError, ReplayReport, replay, window};
 use prost::Message as _;
 use tonic::Code;
 
@@ -62,6 +62,12 @@ async fn record(folder: &Path, change: impl FnOnce(&mut Config)) -> Vec<PathBuf>
     client.list_sessions().await.unwrap();
     client.list_maps().await.unwrap();
     client.close_session("t").await.unwrap();
+    // Whatever is counted has a counter of internal errors beside it.
+    let counts = server.metrics().render(0, 0);
+    for line in counts.lines().filter_map(|line| line.strip_prefix("nesam_commands_total{command=\"")) {
+        let (command, _) = line.split_once('"').unwrap();
+        assert!(counts.contains(&format!("nesam_commands_total{{command=\"{command}\",result=\"internal\"}} 0\n")), "{command}: {counts}");
+    }
     let recorder = server.recorder().unwrap();
     assert_eq!(recorder.counts().dropped, 0);
     let parts = recorder.parts();
@@ -132,6 +138,42 @@ async fn service_a_recorded_run_comes_out_bit_for_bit() {
     }
     assert_eq!(seen["/measurement nesam.v1.Measurement"], seen["/measurement/answer nesam.v1.MeasurementAnswer"]);
     assert!(seen["/soil nesam.v1.SoilEstimate"] > 0 && seen["/map/patch nesam.v1.PatchTileRequest"] == 1, "{seen:?}");
+}
+
+/// Measurements of another clock, or of another session of the same name, never come between those of one drive.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_window_keeps_drives_of_one_name_apart() {
+    let (folder, recorded) = (tempfile::tempdir().unwrap(), recorded());
+    let (server, mut client) =
+        start_with(|config| (config.recording.enabled, config.recording.directory) = (true, folder.path().into())).await;
+    client.upload_map(&layers(&recorded.world)).await.unwrap();
+    open(&mut client, "s", "").await;
+    // The clock is set back in the middle: the first stamp is taken for an error, the second proves it.
+    let at = |number: usize, stamp_ns: i64| v1::Measurement { stamp_ns, ..sample("s", &recorded.drive, number) };
+    let set_back: Vec<i64> = (0..5).map(|i| i * STEP_NS + STEP_NS / 2).collect();
+    let answers = client.feed(samples("s", &recorded.drive, 7)).await.unwrap();
+    assert!(answers.iter().all(|answer| answer.place > 0));
+    let answers = client.feed(set_back.iter().enumerate().map(|(i, stamp_ns)| at(8 + i, *stamp_ns)).collect()).await.unwrap();
+    assert_eq!(answers.iter().map(outcome_label).collect::<Vec<_>>(), ["TOO_OLD", "CLOCK_JUMP", "APPLIED", "APPLIED", "APPLIED"]);
+    // The next session of that name begins with a first measurement and has stamps that were there before.
+    client.close_session("s").await.unwrap();
+    let (vehicle_id, session_id, initial) = ("truck".into(), "s".into(), Some(at(0, 0)));
+    client.open_session(v1::OpenSessionRequest { vehicle_id, session_id, initial, ..Default::default() }).await.unwrap();
+    client.feed((1..=3).map(|i| sample("s", &recorded.drive, i)).collect()).await.unwrap();
+    // Another one drives on a map, later.
+    let late_ns = 1000 * STEP_NS;
+    client.close_session("s").await.unwrap();
+    open(&mut client, "s", recorded.world.id()).await;
+    client.feed((0..=3).map(|i| at(i, late_ns + i as i64 * STEP_NS)).collect()).await.unwrap();
+    server.shutdown().await;
+
+    let of = |to_ns: i64| window(&mut Recording::open(&[folder.path().into()]).unwrap(), "s", i64::MIN, to_ns).unwrap();
+    let stamps = |window: &RecordedWindow| window.measurements.iter().map(|m| m.stamp_ns).collect::<Vec<_>>();
+    let early = of(late_ns - 1);
+    let steps = |from_ns: i64, last: i64| (0..=last).map(move |i| from_ns + i * STEP_NS).collect::<Vec<_>>();
+    assert_eq!((stamps(&early), early.map.is_some()), ([steps(0, 7), set_back[1..].to_vec(), steps(0, 3)].concat(), false));
+    let all = of(i64::MAX);
+    assert_eq!((stamps(&all), all.map.is_some()), (steps(late_ns, 3), true), "one map at a time");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -5,7 +5,7 @@
 
 mod alone;
 mod conformance;
-mod etcd;
+pub mod etcd;
 mod shared;
 
 use std::cell::{Cell, RefCell};
@@ -245,7 +245,10 @@ impl Vehicle {
     /// Over one connection, until everything is durable.
     async fn connected(&mut self) -> Result<Seen, Failure> {
         let mut client = self.scene.connect(&mut self.rng).await?;
-        self.enter(&mut client).await?;
+        // Once it is open the stream is the first to ask for it, and meets whatever there is on its way here.
+        if !self.opened {
+            self.enter(&mut client).await?;
+        }
         self.outbox.reconnected();
         let mut stream = timeout(PATIENCE, client.measure()).await??;
         loop {
@@ -272,7 +275,11 @@ impl Vehicle {
             }
             if sent == 0 {
                 let newest = self.owners.newest(self.session);
-                let session = timeout(PATIENCE, client.session(self.session)).await??;
+                let session = timeout(PATIENCE, client.session(self.session)).await?;
+                if self.opened && session.as_ref().is_err_and(|error| error.code() == Some(Code::NotFound)) {
+                    return Err(Violation(format!("{}: the session is gone", self.session)).into());
+                }
+                let session = session?;
                 self.owners.answered(self.session, newest, session.run)?;
                 self.outbox.durable(session.run, session.durable_place);
                 if self.pushed > self.scene.last && self.outbox.is_empty() {
@@ -289,9 +296,6 @@ impl Vehicle {
         let Err(error) = timeout(PATIENCE, client.session(self.session)).await? else { return Ok(()) };
         if error.code() != Some(Code::NotFound) {
             return Err(error.into());
-        }
-        if self.opened {
-            return Err(Violation(format!("{}: the session is gone", self.session)).into());
         }
         let (vehicle_id, map_id) = (self.session.into(), self.scene.recorded.world.id().into());
         let request = v1::OpenSessionRequest { vehicle_id, map_id, ..Default::default() };

@@ -8,9 +8,10 @@ use std::sync::Arc;
 
 use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
+use nesam_evaluation::report::{Short, adaptation_page};
 use nesam_evaluation::{
     Adaptation, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, KnownSoil, ModelName, Resamples, Row, Truth,
-    WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, report, score, write_predictions,
+    WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, score, write_predictions,
 };
 use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
@@ -19,7 +20,7 @@ use nesam_trajectories::Trajectory;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use self::alternatives::Scene;
+use self::alternatives::{Scene, read_true_soils};
 use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
@@ -111,6 +112,13 @@ pub(super) enum AlsoArg {
     ConstantElsewhere,
 }
 
+impl AlsoArg {
+    /// Whether the simulator's own soil, or its classes, must be read for it.
+    fn needs_true_soil(self) -> bool {
+        matches!(self, Self::OracleSoil | Self::BestByClass)
+    }
+}
+
 /// How the ground is made to look.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum DisguiseArg {
@@ -135,6 +143,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     if let Some(look) = args.disguise {
         disguise(&mut drives, look, args.seed)?;
     }
+    let true_soils = if args.also.iter().any(|also| also.needs_true_soil()) { read_true_soils(&drives)? } else { Vec::new() };
     let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
@@ -155,12 +164,9 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     progress.finish();
     let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed);
     let [fixed, adapted] = [0, 1].map(|i| score(&paths[i], &windows, truth, &resamples));
-    let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth };
-    let known_soil = if args.also.contains(&AlsoArg::OracleSoil) {
-        KnownSoil::of(&drives.drives, &filtered, &scene.true_soils()?, &resamples)
-    } else {
-        None
-    };
+    let scene = Scene { predictor: &predictor, drives: &drives, windows: &windows, truth, true_soils: &true_soils };
+    let known_soil =
+        if args.also.contains(&AlsoArg::OracleSoil) { KnownSoil::of(&drives.drives, &filtered, &true_soils, &resamples) } else { None };
     let alternatives = args.also.iter().map(|also| scene.paths(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
     let others: Vec<Row> = alternatives.iter().map(|(key, paths)| Row { key, score: score(paths, &windows, truth, &resamples) }).collect();
     let apart = apart(&drives.drives, &args.apart)?;
@@ -173,7 +179,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         dt_s: args.data.dt,
         path_m_median: path_median_m(&windows, truth),
         truth,
-        starts_s: &windows.iter().map(nesam_evaluation::Window::start_time_s).collect::<Vec<_>>(),
+        starts_s: &windows.iter().map(nesam_evaluation::Window::since_log_start_s).collect::<Vec<_>>(),
         maps: &drives.maps,
         drives: &drives.drives,
         fixed: &fixed,
@@ -192,7 +198,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let (json, html) =
         (args.json.clone().unwrap_or_else(|| out.join("adapt.json")), args.html.clone().unwrap_or_else(|| out.join("adapt.html")));
     output::write_file(&json, adaptation.to_json().as_bytes())?;
-    output::write_file(&html, report::adaptation_page(&adaptation).as_bytes())?;
+    output::write_file(&html, adaptation_page(&adaptation).as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
     if let Some(file) = &args.predictions {
         let own = [("fixed", &paths[0]), ("adapted", &paths[1])].into_iter();
@@ -391,26 +397,11 @@ fn print_soil(a: &Adaptation<'_>) {
         let Some(last) = filtered.updates.last() else { continue };
         let cells = |value: &dyn Fn(usize) -> String| (0..SOIL_NAMES.len()).map(|i| format!("{:>11}", value(i))).collect::<String>();
         let soil = last.soil();
-        let shown = |i: usize| if last.update.posterior.learned[i] { format!("{}", Short(soil[i])) } else { "·".into() };
+        let shown = |i: usize| if last.update.posterior.learned[i] { Short(soil[i]).to_string() } else { "·".into() };
         say!("{:<22}{}", drive.id, cells(&shown));
         if a.drives.len() <= 4 {
-            say!("{:<22}{}", "  prior there", cells(&|i| format!("{}", Short(last.prior[i]))));
+            say!("{:<22}{}", "  prior there", cells(&|i| Short(last.prior[i]).to_string()));
         }
     }
     say!("(· = not learned: the drive did not tell)");
-}
-
-/// A number in as few characters as it needs: exponents for large ones.
-struct Short(f64);
-
-impl std::fmt::Display for Short {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        if self.0.abs() >= 1e4 {
-            write!(f, "{:.2e}", self.0)
-        } else if self.0.abs() >= 10.0 {
-            write!(f, "{:.0}", self.0)
-        } else {
-            write!(f, "{:.3}", self.0)
-        }
-    }
 }

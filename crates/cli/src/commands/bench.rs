@@ -10,6 +10,7 @@ mod serve;
 mod sweep;
 mod wire;
 
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -119,9 +120,9 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
 
 fn predict(args: &PredictBench) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
-    if args.samples == 0 || args.queries == 0 || !(1..=MAX_HORIZON).contains(&args.horizon) {
-        return Err(Failure::input(format!("--samples and --queries must be at least 1, --horizon 1…{MAX_HORIZON}")));
-    }
+    check_count("--samples", args.samples, 1..=usize::MAX)?;
+    check_count("--queries", args.queries, 1..=usize::MAX)?;
+    check_count("--horizon", args.horizon, 1..=MAX_HORIZON)?;
     let drives = read_drives(&args.data, false)?;
     let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?;
     let drive = Planner::new(&drives, args)?;
@@ -218,6 +219,18 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         }
         None => Ok(()),
     }
+}
+
+/// Refuses a number that an option does not take.
+fn check_count(option: &str, value: usize, allowed: RangeInclusive<usize>) -> Result<(), Failure> {
+    if allowed.contains(&value) {
+        return Ok(());
+    }
+    let limits = match allowed.into_inner() {
+        (least, usize::MAX) => format!("at least {least}"),
+        (least, most) => format!("{least} to {most}"),
+    };
+    Err(Failure::input(format!("{option} must be {limits}, not {value}")))
 }
 
 /// A recorded drive from whose samples queries start.

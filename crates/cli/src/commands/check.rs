@@ -132,7 +132,7 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     }
     card_doubts(root.vehicle()).iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", root.vehicle().name), doubt));
     if root.sets().is_empty() {
-        findings.error("no set: no folder with index.parquet or index.json and samples.parquet");
+        findings.error("no set: no folder with samples.parquet");
     }
     for set in root.sets() {
         check_set(&root, &set, findings);

@@ -10,6 +10,7 @@ use clap::Args;
 use nesam_discovery::channels::CHANNELS;
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, catalogue, diagnose, observe_all};
+use nesam_evaluation::report::Short;
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::Vehicle;
@@ -41,7 +42,8 @@ pub struct DiagnoseArgs {
     window: WindowArgs,
     #[command(flatten)]
     recording: RecordingArgs,
-    /// Fit on these drives only and score on the others; `train` stands for those of the train split [default: leave each drive out once]
+    /// Fit on these drives only and score on the others, of which one alone proves nothing; `train` stands for those of the train split [default: leave each
+    /// drive out once]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     fit_on: Option<Vec<String>>,
     /// Effects that are not considered
@@ -259,8 +261,8 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
             describe(f)
         );
         for e in &f.estimates {
-            let interval = e.ci95.map_or(String::new(), |[low, high]| format!("[{low:.4}, {high:.4}] "));
-            say!("  {} = {:.4} {interval}{}", e.name, e.value, e.unit);
+            let interval = e.ci95.map_or(String::new(), |[low, high]| format!("[{}, {}] ", Short(low), Short(high)));
+            say!("  {} = {} {interval}{}", e.name, Short(e.value), e.unit);
         }
     }
     say!("left after that: z = {:.1} in {}", s.remaining.0, s.remaining.1);

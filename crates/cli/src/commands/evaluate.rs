@@ -130,6 +130,9 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         return if args.coverage { coverage::run(args) } else { coverage::calibrate(args) };
     }
     let names = model_names(args)?;
+    if let Some(missing) = args.baselines.as_ref().filter(|folder| !folder.is_dir()) {
+        return Err(Failure::input(format!("--baselines {} is not a folder", missing.display())));
+    }
     interrupt::exit_on_ctrl_c("nothing was written");
     let noise_free = args.start == TruthArg::Gt;
     let truth = if noise_free || args.truth == TruthArg::Gt { Truth::Gt } else { Truth::Measured };

@@ -89,15 +89,23 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
         all.extend(found);
     }
     let card = card(args)?;
-    let notes = write_set(&folder, &all, args.world.as_deref(), args.split.as_deref()).or_input()?;
-    notes.iter().for_each(|note| say!("  note: {note}"));
-    if let Err(failure) = put_card(args, card.as_deref()).and_then(|()| judge(args)) {
+    // The topmost folder that is made for the set.
+    let made = folder.ancestors().take_while(|dir| !dir.as_os_str().is_empty() && !dir.exists()).last().unwrap_or(&folder);
+    if let Err(failure) = write(args, &folder, &all, card) {
         // What cannot be read again is no set.
-        let _ = std::fs::remove_dir_all(&folder);
+        let _ = std::fs::remove_dir_all(made);
         return Err(failure);
     }
     say!("{} drives in {}", all.len(), folder.display());
     Ok(())
+}
+
+/// Writes the set, judges it, and puts the card into a data root that has none.
+fn write(args: &ImportArgs, folder: &Path, drives: &[Drive], card: Option<&Path>) -> Result<(), Failure> {
+    let notes = write_set(folder, drives, args.world.as_deref(), args.split.as_deref()).or_input()?;
+    notes.iter().for_each(|note| say!("  note: {note}"));
+    judge(args, card)?;
+    card.map_or(Ok(()), |card| put_card(args, card))
 }
 
 /// The folder of the new set.
@@ -151,30 +159,37 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
 }
 
 /// The card to copy: the one given, where the data root has none.
-fn card(args: &ImportArgs) -> Result<Option<PathBuf>, Failure> {
-    if let Some(file) = &args.vehicle {
-        read_vehicle_card(file).or_input()?;
-    }
+fn card(args: &ImportArgs) -> Result<Option<&Path>, Failure> {
+    let given = args.vehicle.as_deref();
+    let described = given.map(read_vehicle_card).transpose().or_input()?;
     let is_card = |name: &str| name.starts_with("vehicle_") && name.ends_with(".json");
     let entries = std::fs::read_dir(&args.to).into_iter().flatten().flatten();
-    let there = entries.map(|e| e.file_name().to_string_lossy().into_owned()).any(|name| is_card(&name));
-    match (&args.vehicle, there) {
-        (Some(file), false) => Ok(Some(file.clone())),
-        (None, false) => Err(Failure::input(format!("{} has no vehicle card yet; give one with --vehicle FILE", args.to.display()))),
-        (_, true) => Ok(None),
+    if !entries.map(|e| e.file_name().to_string_lossy().into_owned()).any(|name| is_card(&name)) {
+        let missing = || Failure::input(format!("{} has no vehicle card yet; give one with --vehicle FILE", args.to.display()));
+        return given.map(Some).ok_or_else(missing);
     }
+    if let (Some(given), Some(described)) = (given, described) {
+        let root = DataRoot::open(&args.to, None).or_input()?;
+        if root.vehicle() != &described {
+            say!(
+                "  note: {} counts, the card of the data root; {} says something else and is not used",
+                root.card().display(),
+                given.display()
+            );
+        }
+    }
+    Ok(None)
 }
 
-fn put_card(args: &ImportArgs, card: Option<&Path>) -> Result<(), Failure> {
-    let Some(card) = card else { return Ok(()) };
+fn put_card(args: &ImportArgs, card: &Path) -> Result<(), Failure> {
     let name = card.file_stem().map_or_else(|| "card".into(), |name| name.to_string_lossy().into_owned());
     let name = format!("vehicle_{}.json", name.trim_start_matches("vehicle_"));
     std::fs::copy(card, args.to.join(name)).map(|_| ()).map_err(|e| Failure::Failed(format!("cannot copy the card: {e}")))
 }
 
 /// Reads the set as every other command will, and says what does not fit together.
-fn judge(args: &ImportArgs) -> Result<(), Failure> {
-    let root = DataRoot::open(&args.to, None).or_input()?;
+fn judge(args: &ImportArgs, card: Option<&Path>) -> Result<(), Failure> {
+    let root = DataRoot::open(&args.to, card).or_input()?;
     let drives = root.load_set(&SetQuery::all(&args.set)).or_input()?;
     for doubt in doubts(&drives, root.vehicle()) {
         say!("  doubt: {}; {}", doubt.what, doubt.advice);

@@ -1,6 +1,6 @@
 //! `nesam predict`: one offline rollout from one instant of a recorded drive.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
@@ -29,10 +29,11 @@ pub struct PredictArgs {
     /// Drive to start from [default: the first of the set]
     #[arg(long, value_name = "ID")]
     trajectory: Option<String>,
-    /// Instant of the drive at which the prediction starts, s [default: as soon as the history is full]
+    /// Instant of the drive at which the prediction starts, s [default: as soon as the history is full, earlier where the drive ends too soon for that]
     #[arg(long, value_name = "SECONDS")]
     at: Option<f64>,
-    /// Commands to predict under, CSV with the header speed_m_s,second [default: the recorded ones]
+    /// Commands to predict under, CSV with the header speed_m_s,second; as many steps as it has rows, unless --horizon says fewer [default: the recorded
+    /// commands]
     #[arg(long, value_name = "FILE.csv")]
     controls: Option<PathBuf>,
     /// Which form of the model
@@ -75,11 +76,10 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
         data.trajectories = Some(vec![id.clone()]);
     }
     let drives = read_drives(&data, false)?;
-    let window = window(args, &drives)?;
-    let controls = match &args.controls {
-        Some(file) => read_controls(file, args.window.horizon())?,
-        None => recorded(&window)?,
-    };
+    let given = args.controls.as_deref().map(|file| read_controls(file, args.window.horizon)).transpose()?;
+    let horizon = given.as_ref().map_or_else(|| args.window.horizon_on(&drives.drives[..1]), Vec::len);
+    let window = window(args, &drives, horizon)?;
+    let controls = given.map_or_else(|| recorded(&window), Ok)?;
     if controls.len() > MAX_HORIZON {
         return Err(Failure::input(format!("{} steps exceed the model's {MAX_HORIZON}; use a shorter --horizon", controls.len())));
     }
@@ -90,7 +90,6 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
             controls[bad].speed_m_s, controls[bad].second
         )));
     }
-    let window = Window { horizon: controls.len(), ..window };
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let predictor = rounded(predictor, args.bf16, "--bf16")?;
     let map = drives.maps[0].as_ref();
@@ -110,11 +109,12 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
 }
 
 /// The window that the options name. Without `--controls` it must lie in the drive whole.
-fn window<'a>(args: &PredictArgs, drives: &'a Drives) -> Result<Window<'a>, Failure> {
+fn window<'a>(args: &PredictArgs, drives: &'a Drives, horizon: usize) -> Result<Window<'a>, Failure> {
     let drive = &drives.drives[0];
     let last = drive.states.len() - 1;
+    let recorded_steps = if args.controls.is_none() { horizon } else { 0 };
     let start = match args.at {
-        None => (args.window.history.max(1) - 1).min(last),
+        None => (args.window.history.max(1) - 1).min(last.saturating_sub(recorded_steps)),
         Some(at) => {
             let end = drive.time_s[last];
             if !at.is_finite() || at < drive.time_s[0] || at > end {
@@ -124,14 +124,14 @@ fn window<'a>(args: &PredictArgs, drives: &'a Drives) -> Result<Window<'a>, Fail
         }
     };
     let first_history = (start + 1).saturating_sub(args.window.history);
-    Ok(Window { trajectory: drive, drive: 0, start, first_history, horizon: args.window.horizon() })
+    Ok(Window { trajectory: drive, drive: 0, start, first_history, horizon })
 }
 
 fn recorded(window: &Window<'_>) -> Result<Vec<Control<f64>>, Failure> {
     let drive = window.trajectory;
     drive.controls.get(window.start..window.start + window.horizon).map(<[_]>::to_vec).ok_or_else(|| {
         Failure::input(format!(
-            "drive `{}` ends {} steps after {:.1} s, --horizon asks for {}; start earlier, predict fewer steps or give --controls",
+            "drive `{}` ends {} steps after {:.1} s, too soon for {}; start earlier with --at, predict fewer with --horizon, or give --controls",
             drive.id,
             drive.states.len() - 1 - window.start,
             window.start_time_s(),
@@ -140,8 +140,8 @@ fn recorded(window: &Window<'_>) -> Result<Vec<Control<f64>>, Failure> {
     })
 }
 
-/// Reads commands; errors name file, line and what was expected.
-fn read_controls(file: &std::path::Path, horizon: usize) -> Result<Vec<Control<f64>>, Failure> {
+/// Reads commands, no more than `horizon` where one is asked for; errors name file, line and what was expected.
+fn read_controls(file: &Path, horizon: Option<usize>) -> Result<Vec<Control<f64>>, Failure> {
     let text = std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?;
     let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
     let header = lines.next().map_or("", |(_, l)| l.trim());
@@ -149,7 +149,7 @@ fn read_controls(file: &std::path::Path, horizon: usize) -> Result<Vec<Control<f
         return Err(Failure::input(format!("{}: line 1 is `{header}`, expected `speed_m_s,second`", file.display())));
     }
     let mut controls = Vec::new();
-    for (i, line) in lines.take(horizon) {
+    for (i, line) in lines {
         let cells: Vec<Option<f64>> = line.split(',').map(|c| c.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect();
         let [Some(speed_m_s), Some(second)] = cells[..] else {
             return Err(Failure::input(format!("{}: line {}: `{line}` is not two finite numbers", file.display(), i + 1)));
@@ -158,6 +158,10 @@ fn read_controls(file: &std::path::Path, horizon: usize) -> Result<Vec<Control<f
     }
     if controls.is_empty() {
         return Err(Failure::input(format!("{}: no commands below the header", file.display())));
+    }
+    if let Some(horizon) = horizon.filter(|horizon| *horizon < controls.len()) {
+        eprintln!("note: the first {horizon} of {} commands in {} are used, as --horizon says", controls.len(), file.display());
+        controls.truncate(horizon);
     }
     Ok(controls)
 }

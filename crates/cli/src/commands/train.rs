@@ -9,7 +9,7 @@ use nesam_evaluation::Baselines;
 use nesam_learning::recipe::{Recipe, Reporter, run as train};
 use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
 use nesam_model::reference::ComputeDevice;
-use nesam_model::{ModelBundle, Variant};
+use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 
 use crate::args::{DataArgs, SplitArg};
 use crate::environment::{PURGE_DELAY, restart_with};
@@ -47,7 +47,7 @@ pub struct TrainArgs {
     /// Windows per batch
     #[arg(long, default_value_t = 32)]
     batch_size: usize,
-    /// Steps of each training rollout
+    /// Steps of each training rollout, at most 32
     #[arg(long, value_name = "STEPS", default_value_t = 32)]
     horizon: usize,
     /// Peak learning rate
@@ -152,6 +152,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let shards = args.threads.unwrap_or(if args.device == ComputeDevice::Cpu { 2 } else { 1 });
     if args.batches * args.batch_size * shards == 0 || (args.epochs == 0 && args.from.is_none()) {
         return Err(Failure::input("--batches, --batch-size and --threads must be at least 1, and so must --epochs without --from"));
+    }
+    if !(1..=MAX_HORIZON).contains(&args.horizon) {
+        return Err(Failure::input(format!("--horizon {} is not 1 to {MAX_HORIZON}", args.horizon)));
     }
     if !(0.0..0.9).contains(&args.dropout) {
         return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));

@@ -17,8 +17,13 @@ pub fn bundle(name: &str) -> String {
 
 /// Starts a server without Zenoh in a folder and gives its process and what it said before it was ready.
 pub fn start(folder: &Path, options: &[&str]) -> (Child, Vec<String>) {
+    start_on(folder, &bundle("hmmwv-nominal"), options)
+}
+
+/// The same with another bundle.
+pub fn start_on(folder: &Path, bundle: &str, options: &[&str]) -> (Child, Vec<String>) {
     let mut server = Command::new(BINARY)
-        .args(["serve", "--bundle", &bundle("hmmwv-nominal"), "--grpc", "127.0.0.1:0", "--no-zenoh"])
+        .args(["serve", "--bundle", bundle, "--grpc", "127.0.0.1:0", "--no-zenoh"])
         .args(options)
         .current_dir(folder)
         .stdout(Stdio::piped())

@@ -6,18 +6,22 @@ use crate::error::EngineError;
 use crate::session::{Acting, Alarm, AppliedEffects};
 
 impl Engine {
-    /// Puts effects on a session, in place of those that were applied before.
+    /// Puts effects on a session, in place of those that were applied before. The same again change their source alone.
     pub(super) fn set_effects(&mut self, id: &str, effects: &AppliedEffects) -> Result<Reply, EngineError> {
         self.session(id)?;
         let acting = Acting::new(&self.predictor, effects)?;
         let filter = self.filter.clone();
         let session = self.sessions.get_mut(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })?;
-        if acting.is_some() || session.predictor().is_some() {
-            session.act(acting, filter);
+        let before = session.applied();
+        session.act(acting, filter);
+        let after = session.applied();
+        if after != before {
             let (vehicle, soil, told) = (session.vehicle().to_string(), Box::new(*session.soil()), session.take_told());
             self.emit_alarms(id, &vehicle, told);
             self.emit(Event::EffectsChanged { session: id.into(), vehicle: vehicle.clone() });
-            self.emit(Event::SoilChanged { session: id.into(), vehicle, soil });
+            if after.effects != before.effects {
+                self.emit(Event::SoilChanged { session: id.into(), vehicle, soil });
+            }
         }
         Ok(Reply::Session(Box::new(self.view(self.session(id)?))))
     }

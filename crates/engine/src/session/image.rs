@@ -67,6 +67,10 @@ pub struct SessionImage {
     pub effects: AppliedEffects,
     /// The watch of the innovations; `None` = not watched.
     pub watch: Option<WatchImage>,
+    /// It has no step yet and has to ask the fleet what it knows of the ground under its first one.
+    pub asks_fleet: bool,
+    /// What it learns does not go into the soil map of the fleet.
+    pub brings_nothing: bool,
 }
 
 /// What a watch remembers.
@@ -151,6 +155,8 @@ impl Session {
             forecast: self.forecast.clone(),
             effects: self.applied(),
             watch: self.watch.as_ref().map(WatchImage::of),
+            asks_fleet: self.fleet.asks,
+            brings_nothing: !self.fleet.brings,
         }
     }
 
@@ -196,7 +202,7 @@ impl Session {
             learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first),
             soil: image.soil,
             forecast: image.forecast.clone(),
-            fleet: FleetPart { asks: false, brings: true, brought: Vec::new() },
+            fleet: FleetPart { asks: image.asks_fleet, brings: !image.brings_nothing, brought: Vec::new() },
             acting,
             watch: image.watch.as_ref().map(WatchImage::watch),
             told: Vec::new(),
@@ -226,6 +232,7 @@ impl SessionImage {
             ("a soil that is not finite", self.soil.covariance.as_flattened().iter().all(|v| v.is_finite())),
             ("a noise scale that is not positive", self.soil.noise_scale > 0.0 && self.soil.noise_scale.is_finite()),
             ("an impossible forecast", self.forecast.as_ref().is_none_or(OpenForecast::is_possible)),
+            ("steps before its beginning", !self.asks_fleet || self.live.history.is_empty()),
             ("an impossible watch", self.watch.as_ref().is_none_or(|watch| watch.watch().is_possible())),
             ("a soil that is not finite", self.soil.state.correction.delta.iter().all(|v| v.is_finite())),
         ];

@@ -48,9 +48,9 @@ pub struct BufferTest {
 }
 
 impl SoilState {
-    /// Whether the prior alone speaks: nothing was learned, or it was forgotten because other effects act now.
+    /// Whether the prior alone speaks: nothing was told of the soil, or it was forgotten because other effects act now.
     pub fn is_prior(&self) -> bool {
-        self.epoch == 0 || (self.stamp_ns.is_none() && self.correction.delta == [0.0; SOIL_DIM])
+        self.correction.delta == [0.0; SOIL_DIM]
     }
 
     /// Variance of a corrected soil in physical units squared, to first order.

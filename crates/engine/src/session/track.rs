@@ -8,13 +8,16 @@ use nesam_physics::VehicleState;
 use crate::grid::{Place, StepAt, StepGrid};
 use crate::measurement::Measurement;
 
+/// A step and its instant, ns.
+pub(super) type Stamped = (i64, HistoryStep);
+
 /// What a measurement made of a track.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) enum Taken {
     /// These steps follow, one or two; the caller pushes them.
-    Steps(HistoryStep, Option<HistoryStep>),
+    Steps(Stamped, Option<Stamped>),
     /// This step follows after a pause, ns; the history before is forgotten.
-    AfterGap(HistoryStep, i64),
+    AfterGap(Stamped, i64),
     /// None: time until the next grid point, ns.
     Waiting(i64),
 }
@@ -33,7 +36,7 @@ pub(super) struct Track {
 impl Track {
     /// Takes a measurement later than all before. Its steps are not in the history yet: see [`Track::push`].
     pub(super) fn take(&mut self, measurement: &Measurement, step_ns: i64) -> Taken {
-        let own = HistoryStep { state: measurement.state, control: measurement.command };
+        let own = (measurement.stamp_ns, HistoryStep { state: measurement.state, control: measurement.command });
         let before = self.before.replace(*measurement);
         let (Some(grid), Some(before)) = (self.grid.as_mut(), before) else {
             self.grid = Some(StepGrid::start(measurement.stamp_ns, step_ns));
@@ -41,7 +44,7 @@ impl Track {
         };
         let step = |at: StepAt| match at {
             StepAt::Stamp => own,
-            StepAt::Between(at_ns) => interpolate(&before, measurement, at_ns),
+            StepAt::Between(at_ns) => (at_ns, interpolate(&before, measurement, at_ns)),
         };
         match grid.take(measurement.stamp_ns) {
             Place::Steps { first, second } => Taken::Steps(step(first), second.map(step)),
@@ -66,8 +69,8 @@ impl Track {
     pub(super) fn advance(&mut self, measurement: &Measurement, step_ns: i64) -> Taken {
         let taken = self.take(measurement, step_ns);
         match &taken {
-            Taken::Steps(first, second) => [Some(*first), *second].into_iter().flatten().for_each(|step| self.push(step)),
-            Taken::AfterGap(step, _) => self.push(*step),
+            Taken::Steps(first, second) => [Some(*first), *second].into_iter().flatten().for_each(|(_, step)| self.push(step)),
+            Taken::AfterGap((_, step), _) => self.push(*step),
             Taken::Waiting(_) => {}
         }
         taken
@@ -119,13 +122,23 @@ mod tests {
         let mut track = Track::default();
         track.advance(&at(0, 3.0, 1.0), STEP_NS);
         assert_eq!(track.advance(&at(66_666_666, 3.1, 2.0), STEP_NS), Taken::Waiting(33_333_334));
-        let Taken::Steps(step, None) = track.advance(&at(133_333_334, 3.3 - core::f64::consts::TAU, 3.0), STEP_NS) else {
+        let Taken::Steps((at_ns, step), None) = track.advance(&at(133_333_334, 3.3 - core::f64::consts::TAU, 3.0), STEP_NS) else {
             panic!("one step")
         };
+        assert_eq!(at_ns, STEP_NS);
         let [x, yaw, v] = [step.state.position_m[0], step.state.attitude_rad[2], step.state.velocity_m_s[0]];
         assert!((x - 0.2).abs() < 1e-12 && (yaw - 3.2).abs() < 1e-12 && v == 2.0, "{x} {yaw} {v}");
         assert_eq!(step.control.speed_m_s, 2.0, "the command that is in effect at the grid point");
         assert_eq!(track.history.len(), 2);
+    }
+
+    #[test]
+    fn analytic_each_of_two_steps_has_its_own_stamp() {
+        let mut track = Track::default();
+        track.advance(&at(0, 0.0, 1.0), STEP_NS);
+        track.advance(&at(STEP_NS / 10 * 8, 0.0, 1.0), STEP_NS);
+        let Taken::Steps(first, Some(second)) = track.take(&at(2 * STEP_NS, 0.0, 1.0), STEP_NS) else { panic!("two steps") };
+        assert_eq!((first.0, second.0), (STEP_NS, 2 * STEP_NS));
     }
 
     #[test]

@@ -129,6 +129,13 @@ impl Reading {
 }
 
 impl Watch {
+    /// First stamp of a buffer that began about then: the last one of the buffer before, where that is less than half a step away, as after a gap it is not. The stamps
+    /// of a vehicle are no exact multiples of the step.
+    pub fn begin_ns(&self, about_ns: i64, step_ns: i64) -> i64 {
+        let before_ns = self.window.back().map(|b| b.stamps_ns[1]);
+        before_ns.filter(|end_ns| end_ns.abs_diff(about_ns) < step_ns.unsigned_abs() / 2).unwrap_or(about_ns)
+    }
+
     /// Takes the next buffer; the alarm that it raises or clears. A buffer with a number that is not finite is left out.
     pub fn feed(&mut self, buffer: WatchedBuffer) -> Option<Alarm> {
         if !buffer.to_values().iter().all(|v| v.is_finite()) {

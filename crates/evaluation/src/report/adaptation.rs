@@ -1,11 +1,14 @@
 //! The report of `nesam adapt`.
 
+use std::collections::BTreeMap;
+
 use nesam_adaptation::{SoilUpdate, chi_square_tail};
 use nesam_physics::{SOIL_DIM, SOIL_LOGARITHMIC, SOIL_NAMES};
 
 use crate::adapt_output::Adaptation;
 use crate::dimension::{DIMENSION_KEYS, POSE_DIM};
 use crate::evaluate::ModelScore;
+use crate::known_soil::KnownSoil;
 use crate::report::table::Cell;
 use crate::report::{LinePlot, Page, Series, Table};
 use crate::score::{PerDimension, paired_difference};
@@ -43,6 +46,9 @@ pub fn adaptation_page(adaptation: &Adaptation<'_>) -> String {
         share(c.nis_median_over_dof),
         share(c.inside_95),
     ));
+    if let Some(known) = adaptation.known_soil {
+        add_known_soil(&mut page, known);
+    }
     page.plots(
         &[nis_plot(adaptation), trust_plot(adaptation), scale_plot(adaptation)],
         "NIS over degrees of freedom of every buffer: a consistent filter stays near 1, and a buffer above the gate is rejected. Trust is the weight of the correction \
@@ -104,6 +110,29 @@ fn error_table(a: &Adaptation<'_>, last: bool) -> Table {
     table
 }
 
+/// Adds what was learned, held against the simulator's own soil.
+fn add_known_soil(page: &mut Page, known: &KnownSoil) {
+    let between = |ci95: Option<[f64; 2]>| ci95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
+    page.text(&format!(
+        "Held against the simulator's own soil after {} updates: median of NEES over 6 {:.2} (0.89 for a consistent filter), share inside its 95 % interval \
+         {:.2}{}; share of 90 % intervals that hold the true parameter {:.2}{}.",
+        known.updates,
+        known.nees_median_over_dof,
+        known.nees_inside_95,
+        between(known.nees_inside_95_ci95),
+        known.coverage_90,
+        between(known.coverage_90_ci95)
+    ));
+    let head: Vec<&str> = std::iter::once("what was learned").chain(SOIL_NAMES).collect();
+    let mut table = Table::new("By parameter; an error below 1 is nearer to the simulator's soil than the prior", &head);
+    for (name, values) in
+        [("90 % intervals that hold it", &known.coverage_90_by_parameter), ("error over the prior's", &known.error_over_prior)]
+    {
+        table.row(std::iter::once(name.into()).chain(values.iter().map(|v| format!("{v:.2}").into())).collect());
+    }
+    page.table(&table);
+}
+
 fn horizon_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
     let panels = [(POSE_DIM, "horizontal position", "m"), (2, "z", "m"), (3, "roll", "deg"), (4, "pitch", "deg"), (5, "yaw", "deg")];
     let time = |k: usize| (k + 1) as f64 * a.dt_s;
@@ -156,7 +185,7 @@ fn by_buffer(a: &Adaptation<'_>, title: &str, label: &str, value: impl Fn(&SoilU
     let mut plot = LinePlot::new(title, "time in the drive [s]", label);
     plot.from_zero = true;
     for (drive, filtered) in a.filtered.iter().enumerate().take(DRIVES_PLOTTED) {
-        let points = filtered.updates.iter().map(|u| (a.time_s(drive, u.sample), value(&u.update))).collect();
+        let points = filtered.updates.iter().map(|u| (a.since_log_start_s(drive, u.sample), value(&u.update))).collect();
         plot.series.push(Series::line(&a.drives[drive].id, drive + 1, points));
     }
     plot
@@ -167,16 +196,15 @@ fn over_time_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
     const EVERY_S: f64 = 5.0;
     let panels = [(POSE_DIM, "horizontal position", "m"), (5, "yaw", "deg"), (2, "z", "m")];
     let line = |name: &str, colour: usize, model: &ModelScore, d: usize| {
-        let mut bins: Vec<[f64; 2]> = Vec::new();
+        let mut bins: BTreeMap<usize, [f64; 2]> = BTreeMap::new();
         for (w, start_s) in a.starts_s.iter().enumerate().take(model.errors.windows()) {
             let steps = model.errors.window(w);
-            let bin = (start_s / EVERY_S) as usize;
-            bins.resize(bins.len().max(bin + 1), [0.0; 2]);
-            bins[bin][0] += steps.iter().map(|s| if d < POSE_DIM { s.absolute[d] } else { s.position_m }).sum::<f64>() / steps.len() as f64;
-            bins[bin][1] += 1.0;
+            let bin = bins.entry((start_s / EVERY_S) as usize).or_default();
+            bin[0] += steps.iter().map(|s| if d < POSE_DIM { s.absolute[d] } else { s.position_m }).sum::<f64>() / steps.len() as f64;
+            bin[1] += 1.0;
         }
-        let point = |(bin, [sum, count]): (usize, &[f64; 2])| ((bin as f64 + 0.5) * EVERY_S, sum / count);
-        Series::line(name, colour, bins.iter().enumerate().filter(|(_, b)| b[1] > 0.0).map(point).collect())
+        let point = |(bin, [sum, count]): (&usize, &[f64; 2])| ((*bin as f64 + 0.5) * EVERY_S, sum / count);
+        Series::line(name, colour, bins.iter().map(point).collect())
     };
     let plot = |(d, name, unit): (usize, &str, &str)| {
         let mut plot = LinePlot::new(name, "start of the window in the drive [s]", &format!("mean absolute error [{unit}]"));
@@ -195,7 +223,7 @@ fn soil_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
             let unit = if logarithmic { format!("log10 of {}", SOIL_UNITS[i]) } else { SOIL_UNITS[i].into() };
             let mut plot = LinePlot::new(SOIL_NAMES[i], "time in the drive [s]", &format!("{} [{unit}]", SOIL_NAMES[i]));
             for (drive, filtered) in a.filtered.iter().enumerate().take(DRIVES_PLOTTED) {
-                let at = |u: &crate::adapt::TimedUpdate| a.time_s(drive, u.sample);
+                let at = |u: &crate::adapt::TimedUpdate| a.since_log_start_s(drive, u.sample);
                 let soil: Vec<(f64, f64)> = filtered.updates.iter().map(|u| (at(u), shown(u.soil()[i]))).collect();
                 let mut series = Series::line(&a.drives[drive].id, drive + 1, soil);
                 series.band = filtered
@@ -211,10 +239,119 @@ fn soil_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
                 plot.series.push(series);
             }
             if let (Some(filtered), Some(drive)) = (a.filtered.first(), a.drives.first()) {
-                let prior = filtered.updates.iter().map(|u| (a.time_s(0, u.sample), shown(u.prior[i]))).collect();
+                let prior = filtered.updates.iter().map(|u| (a.since_log_start_s(0, u.sample), shown(u.prior[i]))).collect();
                 plot.series.push(Series::line(&format!("prior, {}", drive.id), 0, prior));
             }
             plot
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_adaptation::{Agreement, ClassBelief, FilterConfig, SoilPosterior, VELOCITY_DIM};
+    use nesam_physics::{Control, SoilCorrection, VehicleState};
+    use nesam_trajectories::{MeasuredChannels, Trajectory};
+
+    use super::*;
+    use crate::{
+        DriveAdaptation, ModelName, Provenance, Resamples, TimedUpdate, Truth, Window, WindowPredictor, all_windows, predict_all, score,
+    };
+
+    /// Steps of an eighth of a second from `start_s` on, which numbers of any clock hold exactly.
+    fn drive(start_s: f64) -> Trajectory {
+        const SAMPLES: usize = 70;
+        let state = |i: usize| VehicleState { position_m: [0.01 * (i * i) as f64, 0.0, 0.0], ..VehicleState::zero() };
+        Trajectory {
+            id: "a".into(),
+            set: "synthetic".into(),
+            world: None,
+            split: None,
+            dt_s: 0.125,
+            time_s: (0..SAMPLES).map(|i| start_s + 0.125 * i as f64).collect(),
+            states: (0..SAMPLES).map(state).collect(),
+            controls: vec![Control { speed_m_s: 2.0, second: 0.0 }; SAMPLES],
+            wheel_speed_rad_s: None,
+            road_wheel_angle_rad: None,
+            measured: MeasuredChannels::POSE_AND_TWIST,
+            truth: None,
+        }
+    }
+
+    fn update(sample: usize) -> TimedUpdate {
+        let covariance = [[0.01; SOIL_DIM]; SOIL_DIM];
+        let agreement =
+            Agreement { nis: 6.0, dof: 6, mean: [0.0; VELOCITY_DIM], normalised: [0.0; VELOCITY_DIM], weighed: 6.0, beyond_soil: 6.0 };
+        let update = SoilUpdate {
+            posterior: SoilPosterior { correction: SoilCorrection::NONE, covariance, learned: [true; SOIL_DIM] },
+            before: ClassBelief { delta: [0.0; SOIL_DIM], covariance },
+            innovation: Vec::new(),
+            nis: 6.0,
+            dof: 6,
+            agreement,
+            rejected: false,
+            excited: true,
+            excitation: 1.0,
+            log_likelihood: 0.0,
+            trust: 0.5,
+            noise_scale: 1.0,
+        };
+        TimedUpdate { sample, prior: [1.3e6, 8.0e3, 0.8, 3.0e3, 0.42, 0.015], update, class: 0, corrections: Vec::new() }
+    }
+
+    /// The page of a drive whose clock begins at `start_s`.
+    fn page(start_s: f64, known_soil: Option<&KnownSoil>) -> String {
+        let drives = [drive(start_s)];
+        let windows = all_windows(&drives, 8, 8, Truth::Measured).unwrap();
+        let models = [(ModelName::ConstantVelocity, WindowPredictor::ConstantVelocity)];
+        let paths = predict_all(&models, &windows, &[None], &|_| {}).unwrap();
+        let resamples = Resamples::draw(1, 100, 1);
+        let scored = score(&paths[0], &windows, Truth::Measured, &resamples);
+        adaptation_page(&Adaptation {
+            set: "synthetic",
+            split: "all",
+            horizon_steps: 8,
+            dt_s: 0.125,
+            path_m_median: 1.0,
+            truth: Truth::Measured,
+            starts_s: &windows.iter().map(Window::since_log_start_s).collect::<Vec<_>>(),
+            maps: &[None],
+            drives: &drives,
+            fixed: &scored,
+            adapted: &scored,
+            others: &[],
+            apart: &[],
+            reference: None,
+            filtered: &[DriveAdaptation { updates: vec![update(16), update(56)], ..DriveAdaptation::default() }],
+            known_soil,
+            filter: &FilterConfig::default(),
+            seed: 1,
+            resamples: &resamples,
+            provenance: &Provenance::default(),
+        })
+    }
+
+    #[test]
+    fn property_plots_over_time_do_not_depend_on_the_clock_of_the_vehicle() {
+        assert!(page(0.0, None) == page(1.75e9, None), "a clock that counts from 1970 changes the page");
+    }
+
+    #[test]
+    fn property_known_soil_is_on_the_page_where_it_was_read() {
+        let known = KnownSoil {
+            updates: 17,
+            nees_median_over_dof: 1.25,
+            nees_inside_95: 0.75,
+            nees_inside_95_ci95: None,
+            coverage_90: 0.91,
+            coverage_90_ci95: Some([0.5, 1.0]),
+            coverage_90_by_parameter: [0.87; SOIL_DIM],
+            error_over_prior: [0.63; SOIL_DIM],
+        };
+        let with = page(0.0, Some(&known));
+        for told in ["after 17 updates", "over 6 1.25", "0.91 [0.50, 1.00]", "<td>0.87</td>", "<td>0.63</td>"] {
+            assert!(with.contains(told), "{told} is not on the page");
+        }
+        assert!(!page(0.0, None).contains("simulator"));
+    }
 }

@@ -9,6 +9,7 @@ mod evaluation;
 mod line_plot;
 mod page;
 mod scale;
+mod short;
 mod table;
 
 pub use adaptation::adaptation_page;
@@ -16,4 +17,5 @@ pub use evaluation::{evaluation_markdown, evaluation_page};
 pub use line_plot::{LinePlot, Series};
 pub use page::{Page, escape};
 pub use scale::ticks;
+pub use short::Short;
 pub use table::Table;

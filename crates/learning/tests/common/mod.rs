@@ -97,11 +97,16 @@ pub fn measured_scales(drive: &Drive) -> Normalization {
 
 /// A predictor of untrained weights.
 pub fn predictor(scales: &Normalization, weights: Weights) -> Predictor {
+    predictor_of(truck(), scales, weights)
+}
+
+/// The same for another vehicle.
+pub fn predictor_of(vehicle: Vehicle, scales: &Normalization, weights: Weights) -> Predictor {
     let bundle = ModelBundle {
         name: "untrained".into(),
         hash: String::new(),
         form: Variant::Full,
-        vehicle: truck(),
+        vehicle,
         default_soil: scales.default_soil(),
         parameters: 0,
         normalization: scales.clone(),

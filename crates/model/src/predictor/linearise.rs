@@ -42,7 +42,7 @@ impl Predictor {
             coordinates: query.soil_correction.coordinates,
             wheels: query.wheels,
             previous: history.last().map(|step| step.state),
-            observed_share: self.observed_share(history),
+            observed_share: self.observed_share(history, clock),
             actuators: (!history.is_empty()).then(|| self.actuators(history, &start, &first, clock)),
         });
         let look = |k: usize, state: &VehicleState<f64>| {

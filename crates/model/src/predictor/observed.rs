@@ -82,13 +82,20 @@ impl Predictor {
 
     /// What the integral of the speed error has been drawn to beyond [`Predictor::actuators`] at a start on a soil that is not the nominal one, m.
     /// `observed_share` is that of the history ([`Predictor::observed_share`]).
-    pub(super) fn made_up_for_m(&self, nominal: &Soil<f64>, soil: &Soil<f64>, start: &VehicleState<f64>, observed_share: f64) -> f64 {
-        self.step_model().compaction_made_up_for_m(nominal, soil, start.velocity_m_s[0], observed_share)
+    pub(super) fn made_up_for_m(
+        &self,
+        nominal: &Soil<f64>,
+        soil: &Soil<f64>,
+        start: &VehicleState<f64>,
+        observed_share: f64,
+        clock: LogClock,
+    ) -> f64 {
+        self.physics.at(clock.start_s).compaction_made_up_for_m(nominal, soil, start.velocity_m_s[0], observed_share)
     }
 
     /// Share of a lasting resistance that a history has told of: its last step, before the start, observes nothing (`actuators_along`).
-    pub(super) fn observed_share(&self, history: &[HistoryStep]) -> f64 {
-        self.step_model().observed_share(history.len().saturating_sub(1))
+    pub(super) fn observed_share(&self, history: &[HistoryStep], clock: LogClock) -> f64 {
+        self.physics.at(clock.start_s).observed_share(history.len().saturating_sub(1))
     }
 
     /// A soil at an instant of its drift.

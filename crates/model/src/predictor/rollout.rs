@@ -139,7 +139,7 @@ impl Predictor {
         let under_start = self.terrain(scene.tokens, &[pose(&start_state)])[0];
         let mut samples: Vec<Sample> = match history.is_empty() {
             true => (0..rows).map(start).collect(),
-            false => self.observed_samples(&scene, shared, &under_start, self.observed_share(history), rows),
+            false => self.observed_samples(&scene, shared, &under_start, self.observed_share(history, clock), rows),
         };
         let mut rollout = Rollout {
             states: vec![0.0; rows * query.horizon * STATE_DIM],
@@ -181,7 +181,7 @@ impl Predictor {
                 return *sample;
             }
             let mut sample = shared;
-            sample.actuators.speed_error_integral_m += self.made_up_for_m(&nominal, &soil, &shared.state, observed_share);
+            sample.actuators.speed_error_integral_m += self.made_up_for_m(&nominal, &soil, &shared.state, observed_share, scene.clock);
             known = Some((soil, sample));
             sample
         };

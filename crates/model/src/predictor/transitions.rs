@@ -78,7 +78,7 @@ impl Predictor {
             actuators: self.actuators(history, &start, first, clock),
             flags: 0,
         };
-        let observed_share = self.observed_share(history);
+        let observed_share = self.observed_share(history, clock);
         let mut made_up_for_m_s = None;
         let mut transitions = Vec::with_capacity(controls.len());
         for control in controls {
@@ -96,7 +96,7 @@ impl Predictor {
             let soil = self.soil_at(under(soil, 0, &sample, &token), None);
             let mut input = StepInput { soil: Soil::from_array(soil), ..transition.input };
             let made_up_for_m_s = *made_up_for_m_s.get_or_insert_with(|| {
-                let integral_m = self.made_up_for_m(&transition.input.soil, &input.soil, &sample.state, observed_share);
+                let integral_m = self.made_up_for_m(&transition.input.soil, &input.soil, &sample.state, observed_share, clock);
                 integral_m * self.step_model().vehicle().driveline.speed_integral_gain_per_s
             });
             input.wheels = input.wheels.demanding_more(made_up_for_m_s);

@@ -7,7 +7,7 @@
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::terramechanics::slip::ContactMotion;
-use crate::terramechanics::wheel::{WheelGeometry, angle_of_depth};
+use crate::terramechanics::wheel::{WheelGeometry, angle_of_depth, exit_angle};
 
 /// Slip angle within which the side resistance grows to its full size, rad (chosen: about one degree, so that it is smooth at zero).
 const SLIP_ANGLE_SCALE_RAD: f64 = 0.02;
@@ -27,10 +27,11 @@ pub struct ContactArc<T> {
 
 impl<T: Real> ContactArc<T> {
     /// Arc of a wheel at a sinkage, m, with the angles of [`wheel_wrench`](super::wheel_wrench).
-    pub fn of(wheel: &WheelGeometry, sinkage_m: T) -> Self {
-        let share = sinkage_m.max(T::lit(1e-5)).min(T::lit(0.9 * wheel.radius_m)) * T::lit(1.0 / wheel.radius_m);
+    pub fn of(wheel: &WheelGeometry, sinkage_m: T, soil: &Soil<T>) -> Self {
+        let z = sinkage_m.max(T::lit(1e-5)).min(T::lit(0.9 * wheel.radius_m));
+        let share = z * T::lit(1.0 / wheel.radius_m);
         let (entry_rad, _, cos_entry) = angle_of_depth(share);
-        Self { entry_rad, exit_rad: -angle_of_depth(share * T::lit(wheel.recovery) + T::lit(1e-24)).0, cos_entry }
+        Self { entry_rad, exit_rad: exit_angle(wheel, z, share, wheel.is_damped(), soil), cos_entry }
     }
 }
 
@@ -176,6 +177,20 @@ mod tests {
             assert!((left + right).abs() < 1e-9, "odd in the slip angle");
             assert!(left <= previous, "slip angle {tan}");
             previous = left;
+        }
+    }
+
+    /// The arc of a wheel on its own is that of the wrench, also where soil springs back elastically.
+    #[test]
+    fn property_an_arc_has_the_angles_of_the_wrench() {
+        let soil = Soil { k_phi: 2e6, k_c: 5e3, n: 0.8, ..soil() };
+        let motion = ContactMotion::from_slip(0.2, 0.5);
+        let settled = WheelGeometry::new(0.467, 0.254);
+        for plain in [WheelGeometry { recovery: 0.05, ..settled.clone() }, settled.on_damped_soil(1e4)] {
+            let with_wall = WheelGeometry { side_soil_unit_weight_n_m3: Some(13e3), ..plain.clone() };
+            let [with, without] = [&with_wall, &plain].map(|wheel| wheel_wrench(wheel, 0.04, &motion, &soil).side_n);
+            let arc = ContactArc::of(&plain, 0.04, &soil);
+            close(side_bulldozing(&plain, 13e3, &arc, &motion, &soil), with - without, 1e-9);
         }
     }
 

@@ -134,6 +134,17 @@ pub(super) fn angle_of_depth<T: Real>(depth_share: T) -> (T, T, T) {
     ((sin / (T::lit(1.0) + cos)).atan() * T::lit(2.0), sin, cos)
 }
 
+/// Exit angle θ_2 = -acos(1 - (λz + e)/r) of a sinkage z (m), which is this share of the radius, rad.
+#[inline(always)]
+pub(super) fn exit_angle<T: Real>(wheel: &WheelGeometry, z: T, share: T, damped: bool, soil: &Soil<T>) -> T {
+    let mut springs_back = share * T::lit(wheel.recovery) + T::lit(1e-24);
+    if damped {
+        let elastic = normal_stress(z, wheel.width_m, soil) * T::lit(1.0 / (wheel.elastic_pa_m * wheel.radius_m));
+        springs_back = (springs_back + elastic).min(share);
+    }
+    -angle_of_depth(springs_back).0
+}
+
 /// Integrates normal and shear stress over the contact arc at a given sinkage (m).
 ///
 /// Entry angle θ_1 = acos(1 - z/r); exit θ_2 = -acos(1 - (λz + e)/r) with e what the soil springs back elastically; maximum stress at
@@ -163,11 +174,7 @@ fn integrated<T: Real, const DAMPED: bool>(
     let z = sinkage_m.max(T::lit(SINKAGE_FLOOR_M)).min(T::lit(SINKAGE_SHARE_MAX * radius));
     let share = z * T::lit(1.0 / radius);
     let (entry, sin_entry, cos_entry) = angle_of_depth(share);
-    let mut springs_back = share * T::lit(wheel.recovery) + T::lit(1e-24);
-    if DAMPED {
-        springs_back = (springs_back + normal_stress(z, wheel.width_m, soil) * T::lit(1.0 / (wheel.elastic_pa_m * radius))).min(share);
-    }
-    let exit = -angle_of_depth(springs_back).0;
+    let exit = exit_angle(wheel, z, share, DAMPED, soil);
     let slip_size = motion.slip.abs_smooth(1e-9);
     let peak = entry * (T::lit(wheel.c1) + T::lit(wheel.c2) * slip_size).min(T::lit(0.999));
     let (front, rear) = (entry - peak, peak - exit);

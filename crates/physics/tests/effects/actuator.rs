@@ -167,6 +167,18 @@ fn analytic_a_lag_begins_at_what_the_rims_do() {
 }
 
 #[test]
+fn analytic_play_begins_at_what_the_rims_do() {
+    let mut vehicle = robot().with_effects(&[Effect::SteeringBacklash(SteeringBacklash { second: 0.2 })]);
+    vehicle.driveline.rims.yaw_gain = 1.5;
+    let turning = DrivelineState::turning(&vehicle, [0.5, 0.9]);
+    // The command that keeps the rims turning so.
+    let held = Control { speed_m_s: 0.5, second: 0.6 };
+    let wheels: WheelCommand<f64> = command_wheels(&vehicle, &turning, &turning.advance(&vehicle, &held, 0.5, DT_S), &held);
+    let apart = wheels.rim_base_m_s[1] - wheels.rim_base_m_s[0];
+    assert!((apart - 0.9 * vehicle.track_m).abs() < 1e-12, "{apart}");
+}
+
+#[test]
 fn analytic_a_turn_limit_holds_the_rims_and_leaves_slower_turns() {
     let limited = robot().with_effects(&[Effect::TurnLimit(TurnLimit { rad_s: 1.5 })]);
     let turning = |vehicle: &Vehicle, told: f64| follow(vehicle, &[[0.5, told]; 40])[39].0.steering;

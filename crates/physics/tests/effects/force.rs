@@ -179,6 +179,23 @@ fn analytic_a_friction_cap_holds_at_every_wheel() {
     assert_eq!(bits(&[Effect::FrictionCap(FrictionCap { mu: 3.0 })]), bits(&[]), "a cap that is not reached changes no bit");
 }
 
+/// In a slide, M (Δv / h + ω × v) of a sub-step is what the wheels are left with. Within a third: forces change with the velocity on the way.
+#[test]
+fn analytic_a_friction_cap_bounds_what_moves_the_body() {
+    let (mu, h, turn_rad_s) = (0.03, 0.05, 0.6);
+    let (mut drive, _) = settle(&[], 2.0, 0.0, 40);
+    drive.model = StepModel::new(&truck().with_effects(&[Effect::FrictionCap(FrictionCap { mu })]), h, 1);
+    let velocity_m_s = [6.0, -2.0, 0.0];
+    (drive.state.velocity_m_s, drive.state.angular_velocity_rad_s) = (velocity_m_s, [0.0, 0.0, turn_rad_s]);
+    let (input, _) = drive.input(&Control { speed_m_s: 6.0, second: 0.0 });
+    let output = drive.model.step(&input);
+    let gained = output.increment.velocity_m_s;
+    let ahead = gained[0] / h - turn_rad_s * velocity_m_s[1];
+    let left = gained[1] / h + turn_rad_s * velocity_m_s[0];
+    let (force, load) = (truck().mass_kg * ahead.hypot(left), output.contacts.iter().map(|c| c.normal_n).sum::<f64>());
+    assert!(force < 1.3 * mu * load, "{force} N at a load of {load} N");
+}
+
 #[test]
 fn analytic_a_free_form_is_its_wrench_inside_its_region_and_held_outside() {
     let mut form = FreeForm { speed_low_m_s: 1.0, speed_high_m_s: 3.0, angle_max_rad: 0.4, slope_max: 0.2, ..FreeForm::default() };

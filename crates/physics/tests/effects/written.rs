@@ -53,6 +53,15 @@ fn property_a_written_wrench_is_bounded_and_at_most_four_act() {
 }
 
 #[test]
+fn property_what_is_no_number_is_nothing() {
+    let nothing = in_free_space(&[], 2.0);
+    let undefined = written("undefined", &[("force_x", "f * (v_ahead - v_ahead) / (v_ahead - v_ahead)")], &[("f", 1e3, "N")]);
+    assert_eq!(in_free_space(&[undefined], 2.0), nothing, "0 / 0");
+    let infinite = written("infinite", &[("force_x", "f / (v_ahead * 0)")], &[("f", 1.0, "N m/s")]);
+    assert_eq!(in_free_space(&[infinite.scaled(0.0)], 2.0), nothing, "an infinite force, scaled away");
+}
+
+#[test]
 fn property_a_written_effect_is_read_once_and_none_of_the_catalogue() {
     let [one, two] = [0, 1].map(|_| written("twice", &[("force_z", "f")], &[("f", 1.0, "N")]));
     assert_eq!(one, two);

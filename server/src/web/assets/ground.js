@@ -4,10 +4,9 @@ const HOLE = 65535;
 const STEPS = [0.1, 0.2, 0.25, 0.5, 1, 2, 2.5, 5, 10, 20, 50, 100];
 
 export class Ground {
-  // Fetches a map. `done` is called when a picture is ready, `failed` with a reason otherwise.
-  constructor(id, version, done, failed) {
-    Object.assign(this, { id, version, about: null, heights: null, colours: null, pictures: new Map() });
-    this.load().then(done, failed);
+  // The map with this hash; empty until `load` is done.
+  constructor(id, hash) {
+    Object.assign(this, { id, hash, about: null, heights: null, colours: null, pictures: new Map() });
   }
 
   async load() {
@@ -49,12 +48,19 @@ export class Ground {
     return classes.find((c) => c.colour && c.colour.every((v, i) => v === rgb[i]))?.name ?? null;
   }
 
+  // Heights of the cells to the east, west, north and south; at the edge and beside a hole that of the cell itself.
+  around(row, column) {
+    const { columns, rows } = this.about, z = this.heights, own = z[row * columns + column];
+    const at = (r, c) => {
+      const h = r < 0 || c < 0 || r >= rows || c >= columns ? NaN : z[r * columns + c];
+      return Number.isNaN(h) ? own : h;
+    };
+    return [at(row, column + 1), at(row, column - 1), at(row + 1, column), at(row - 1, column)];
+  }
+
   // Light from the north-west, 45 degrees high; slopes of open country are exaggerated to be seen.
-  shade(row, column) {
-    const { columns, rows, resolution_m } = this.about, z = this.heights;
-    const at = (r, c) => z[Math.min(Math.max(r, 0), rows - 1) * columns + Math.min(Math.max(c, 0), columns - 1)];
-    const gain = 1.6 / (2 * resolution_m);
-    const dx = (at(row, column + 1) - at(row, column - 1)) * gain, dy = (at(row + 1, column) - at(row - 1, column)) * gain;
+  shade([east, west, north, south]) {
+    const gain = 1.6 / (2 * this.about.resolution_m), dx = (east - west) * gain, dy = (north - south) * gain;
     return (0.5 * dx - 0.5 * dy + 0.7071) / Math.hypot(dx, dy, 1);
   }
 
@@ -75,9 +81,10 @@ export class Ground {
       for (let column = 0; column < columns; column++) {
         const cell = row * columns + column, pixel = 4 * ((rows - 1 - row) * columns + column), h = z[cell];
         if (Number.isNaN(h)) continue;
-        const light = Math.min(Math.max(0.58 + 0.6 * this.shade(row, column), 0.4), 1.2);
-        const level = Math.floor(h / this.contour_m), right = z[cell + (column + 1 < columns ? 1 : 0)], up = z[cell + (row + 1 < rows ? columns : 0)];
-        const contour = layer === "elevation" && (Math.floor(right / this.contour_m) !== level || Math.floor(up / this.contour_m) !== level) ? line : 1;
+        const around = this.around(row, column), [east, , north] = around;
+        const light = Math.min(Math.max(0.58 + 0.6 * this.shade(around), 0.4), 1.2);
+        const level = Math.floor(h / this.contour_m);
+        const contour = layer === "elevation" && (Math.floor(east / this.contour_m) !== level || Math.floor(north / this.contour_m) !== level) ? line : 1;
         const share = (h - low) / (high - low || 1);
         for (let c = 0; c < 3; c++) {
           const base = layer === "semantics" ? this.colours[3 * cell + c] * (dark ? 0.55 : 0.72) + (dark ? 8 : 66) : from[c] + share * (to[c] - from[c]);

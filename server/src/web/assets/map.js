@@ -2,12 +2,13 @@
 
 import { Ground } from "./ground.js";
 
+const RETRY_MS = 2000;
 const FOLLOW_PX_PER_M = 24, PX_PER_M = [0.5, 150], GRID = [1, 2, 5, 10, 20, 50, 100, 200, 500];
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 export class MapView {
   constructor(canvas, store, changed) {
-    Object.assign(this, { canvas, store, changed, grounds: new Map(), layer: "elevation", mode: "follow", scale: FOLLOW_PX_PER_M, centre: [0, 0], pointer: null });
+    Object.assign(this, { canvas, store, changed, grounds: new Map(), notBefore: new Map(), layer: "elevation", mode: "follow", scale: FOLLOW_PX_PER_M, centre: [0, 0], pointer: null });
     this.dark = matchMedia("(prefers-color-scheme: dark)");
     this.dark.addEventListener("change", changed);
     new ResizeObserver(changed).observe(canvas);
@@ -94,23 +95,24 @@ export class MapView {
   }
 
   get ground() {
-    const map = this.store.session?.map;
-    const ground = map && this.grounds.get(map.id);
-    return ground?.about ? ground : null;
+    return this.grounds.get(this.store.session?.map?.id) ?? null;
   }
 
   fetchGround() {
     const map = this.store.session?.map;
     if (!map) return;
-    const held = this.grounds.get(map.id);
-    if (held && held.version === map.version) return;
-    const fresh = new Ground(map.id, map.version, () => {
+    if (this.grounds.get(map.id)?.hash === map.hash || performance.now() < (this.notBefore.get(map.id) ?? 0)) return;
+    // One load of a map at a time; what it was before stays on the screen until then.
+    this.notBefore.set(map.id, Infinity);
+    const fresh = new Ground(map.id, map.hash);
+    fresh.load().then(() => {
+      this.notBefore.delete(map.id);
       this.grounds.set(map.id, fresh);
       this.changed();
-    }, (reason) => console.warn(`map ${map.id}: ${reason}`));
-    // The former version stays on the screen until the new one is there.
-    if (held?.about) held.version = map.version;
-    else this.grounds.set(map.id, fresh);
+    }, (reason) => {
+      this.notBefore.set(map.id, performance.now() + RETRY_MS);
+      console.warn(`map ${map.id}: ${reason}`);
+    });
   }
 
   aim() {

@@ -75,10 +75,10 @@ export function alarms(element, count, store) {
 export function service(element, store) {
   const s = store.service;
   if (!s) return put(element, "");
-  const recent = store.timings.filter((t) => t[0] > store.now - 5), span = Math.min(5, store.now) || 1, cache = s.terrain_cache;
+  const cache = s.terrain_cache;
   const percent = (rate) => (rate === null ? "\u2013" : fixed(100 * rate, 1));
   put(element, [
-    reading("predictions", fixed(recent.length / span, 1), "/s"), reading("candidates", fixed(recent.reduce((sum, t) => sum + t[3], 0) / span, 0), "/s"),
+    reading("predictions", fixed(store.rate("predictions"), 1), "/s"), reading("candidates", fixed(store.rate("candidates"), 0), "/s"),
     reading("waiting", s.waiting.predictions + s.waiting.commands), reading("answered", s.predictions),
     reading("cache, 10 s", percent(cache.recent_hit_rate), "%", false, "share of terrain lookups that needed no encoding, last ten seconds"), reading("cache, all", percent(cache.hit_rate), "%", false, `${cache.looked_up} lookups, ${cache.encoded} encoded`),
     reading("vehicles", s.vehicles_alive ? s.vehicles_alive.length : "\u2013", s.vehicles_alive ? "on Zenoh" : ""), reading("recording", s.recording ? fixed(s.recording.bytes / 1e6, 1) : "off", s.recording ? "MB" : ""),

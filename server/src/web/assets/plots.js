@@ -1,10 +1,10 @@
 // Two small plots: consistency of the soil filter, time of predictions.
 
-import { chiSquareInterval, quantile } from "./store.js";
+import { chiSquareInterval, quantile, TIMINGS_S } from "./store.js";
 
 const NS = "http://www.w3.org/2000/svg";
 const esc = (text) => String(text).replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
-const SHOWN_TESTS = 60, SHOWN_S = 60;
+const SHOWN_TESTS = 60;
 
 class Plot {
   constructor(place, label) {
@@ -76,18 +76,18 @@ export class NisPlot extends Plot {
   }
 }
 
-// Queue and computation of every prediction of the last minute.
+// Queue and computation of predictions of the last minute.
 export class LatencyPlot extends Plot {
   draw(store) {
     this.last = store;
-    const shown = store.timings.filter((t) => t[0] > store.now - SHOWN_S);
+    const shown = store.timings;
     if (!shown.length) {
-      this.say(store.timings.length ? "no prediction was asked for within a minute" : "no prediction was asked for yet", true);
+      this.say(store.timed ? "no prediction was asked for within a minute" : "no prediction was asked for yet", true);
       return "";
     }
     const f = this.frame(), total = (t) => t[1] + t[2], sorted = shown.map(total).sort((a, b) => a - b);
     const top = Math.max(quantile(sorted, 0.995) * 1.25, 2);
-    const x = (at) => f.right - ((store.now - at) / SHOWN_S) * (f.right - f.left), y = (ms) => f.bottom - (Math.min(ms, top) / top) * (f.bottom - f.top);
+    const x = (at) => f.right - ((store.now - at) / TIMINGS_S) * (f.right - f.left), y = (ms) => f.bottom - (Math.min(ms, top) / top) * (f.bottom - f.top);
     const step = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => top / s <= 4) ?? 5000;
     let svg = "";
     for (let t = 0; t <= top; t += step) svg += `<path class="grid" d="M${f.left} ${y(t)}H${f.right}"/><text x="${f.left - 6}" y="${y(t) + 4}" text-anchor="end">${t}</text>`;

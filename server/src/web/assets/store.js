@@ -1,6 +1,7 @@
 // What the page knows: updates of the service, put together.
 
-const TRAIL_MAX = 600, TESTS_MAX = 200, TIMINGS_MAX = 600;
+const TRAIL_MAX = 600, TESTS_MAX = 200, TIMINGS_MAX = 1200, RATES_S = 5;
+export const TIMINGS_S = 60;
 
 function keepLast(list, fresh, most) {
   list.push(...fresh);
@@ -18,6 +19,9 @@ export class Store {
   reset() {
     this.sessions = new Map();
     this.timings = [];
+    this.timed = 0;
+    this.timedEvery = 1;
+    this.counts = [];
     this.alarms = [];
     this.service = null;
     this.now = 0;
@@ -28,11 +32,31 @@ export class Store {
     this.service = update.service;
     this.alarms = update.alarms;
     if (update.reports) this.reports = update.reports;
-    keepLast(this.timings, update.timings, TIMINGS_MAX);
+    this.applyTimings(update.timings);
     const names = new Set(update.sessions.map((s) => s.session));
     for (const name of this.sessions.keys()) if (!names.has(name)) this.sessions.delete(name);
     for (const fresh of update.sessions) this.applySession(fresh);
     if (!this.sessions.has(this.selected)) this.selected = this.sessions.keys().next().value ?? null;
+  }
+
+  // Timings of the last minute; of too many every second, fourth, ... is kept, so that they are evenly chosen.
+  applyTimings(fresh) {
+    const candidates = fresh.reduce((sum, t) => sum + t[3], this.counts.at(-1)?.candidates ?? 0);
+    this.counts.push({ at_s: this.now, predictions: this.service.predictions, candidates });
+    while (this.counts.length > 2 && this.counts[1].at_s <= this.now - RATES_S) this.counts.shift();
+    const kept = fresh.filter(() => this.timed++ % this.timedEvery === 0);
+    this.timings = [...this.timings, ...kept].filter((t) => t[0] > this.now - TIMINGS_S);
+    if (this.timings.length < TIMINGS_MAX / 4) this.timedEvery = Math.max(this.timedEvery / 2, 1);
+    while (this.timings.length > TIMINGS_MAX) {
+      this.timings = this.timings.filter((_, i) => i % 2 === 0);
+      this.timedEvery *= 2;
+    }
+  }
+
+  // Predictions or candidates a second, over the last seconds.
+  rate(what) {
+    const first = this.counts[0], last = this.counts.at(-1);
+    return first === last ? NaN : (last[what] - first[what]) / (last.at_s - first.at_s);
   }
 
   applySession(fresh) {

@@ -15,7 +15,7 @@ use pb::response_op::Response as Told;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt as _};
-use tonic::{Request, Response, Status, Streaming};
+use tonic::{Code, Request, Response, Status, Streaming};
 
 /// Between two looks for leases that have ended.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
@@ -41,10 +41,20 @@ struct Held {
     history: Vec<(i64, pb::Event)>,
 }
 
+/// What goes wrong with transactions.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Trouble {
+    /// Each waits this long before it is done.
+    pub delay: Duration,
+    /// None is done, and all are answered with this code.
+    pub refusal: Option<Code>,
+}
+
 /// What etcd holds; clones share it, and it outlives the host that serves it as a disk does.
 #[derive(Clone, Debug)]
 pub struct Etcd {
     held: Arc<Mutex<Held>>,
+    trouble: Arc<Mutex<Trouble>>,
     /// The newest revision.
     changed: watch::Sender<i64>,
 }
@@ -54,7 +64,7 @@ impl Default for Etcd {
     fn default() -> Self {
         let (keys, leases, history) = (BTreeMap::new(), BTreeMap::new(), Vec::new());
         let held = Held { revision: 1, keys, leases, granted: 0, now: Duration::ZERO, compacted: 0, history };
-        Self { held: Arc::new(Mutex::new(held)), changed: watch::channel(1).0 }
+        Self { held: Arc::new(Mutex::new(held)), trouble: Arc::default(), changed: watch::channel(1).0 }
     }
 }
 
@@ -161,6 +171,27 @@ impl Etcd {
         done
     }
 
+    /// Goes wrong in this way from now on.
+    pub fn trouble(&self, trouble: Trouble) {
+        *self.trouble.lock().unwrap() = trouble;
+    }
+
+    /// A key as it is now.
+    pub fn get(&self, key: &str) -> Option<pb::KeyValue> {
+        self.lock().keys.get(key.as_bytes()).cloned()
+    }
+
+    /// Removes all keys with a prefix, as another server would.
+    pub fn delete_all(&self, prefix: &str) {
+        // Behind `/` comes `0`.
+        let end = format!("{}0", prefix.strip_suffix('/').unwrap());
+        self.with(|held| {
+            let revision = held.revision + 1;
+            let gone = held.remove(revision, prefix.as_bytes(), end.as_bytes());
+            held.revision += i64::from(gone > 0);
+        });
+    }
+
     /// Everything that happened so far, with its revision.
     pub fn history(&self) -> Vec<(i64, pb::Event)> {
         self.lock().history.clone()
@@ -233,6 +264,13 @@ impl Etcd {
 #[tonic::async_trait]
 impl pb::kv_server::Kv for Etcd {
     async fn txn(&self, request: Request<pb::TxnRequest>) -> Result<Response<pb::TxnResponse>, Status> {
+        let Trouble { delay, refusal } = *self.trouble.lock().unwrap();
+        if !delay.is_zero() {
+            tokio::time::sleep(delay).await;
+        }
+        if let Some(code) = refusal {
+            return Err(Status::new(code, "simulated"));
+        }
         self.with(|held| held.transaction(request.into_inner())).map(Response::new)
     }
 

@@ -8,6 +8,8 @@ use nesam_evaluation::{
 };
 use nesam_model::{Predictor, SoilField};
 use nesam_physics::SoilCorrection;
+use nesam_terrain::WorldMap;
+use nesam_trajectories::Trajectory;
 
 use super::AlsoArg;
 use crate::failure::{Failure, OrFail};
@@ -23,6 +25,18 @@ pub(super) struct Scene<'a> {
     pub(super) drives: &'a Drives,
     pub(super) windows: &'a [Window<'a>],
     pub(super) truth: Truth,
+    /// The simulator's soil of every drive; empty where no row asks for it.
+    pub(super) true_soils: &'a [Arc<TrueSoil>],
+}
+
+/// The simulator's soil of every drive.
+pub(super) fn read_true_soils(drives: &Drives) -> Result<Vec<Arc<TrueSoil>>, Failure> {
+    let of = |(drive, map): (&Trajectory, &Option<Arc<WorldMap>>)| {
+        let place = drive.world.as_deref().zip(map.as_ref());
+        let (world, map) = place.ok_or_else(|| Failure::input(format!("drive {} has no world, so no true soil", drive.id)))?;
+        TrueSoil::read(&drives.root.world_dir(world), map).or_input()
+    };
+    drives.drives.iter().zip(&drives.maps).map(of).collect()
 }
 
 impl Scene<'_> {
@@ -34,7 +48,7 @@ impl Scene<'_> {
             AlsoArg::ConstantElsewhere => return Ok(("constant_elsewhere", self.constant_elsewhere(filter)?)),
             AlsoArg::Literal => ("literal", WindowPredictor::Adapted { predictor: predictor(), filtered: Arc::new(self.literal()?) }),
             AlsoArg::OracleSoil => {
-                let soils = self.true_soils()?.into_iter().map(|soil| soil as Arc<dyn SoilField>);
+                let soils = self.true_soils.iter().map(|soil| Arc::clone(soil) as Arc<dyn SoilField>);
                 ("oracle_soil", on(soils.collect::<Vec<_>>()))
             }
             AlsoArg::BestConstant => ("best_constant", on(self.best(false, filter)?)),
@@ -91,25 +105,13 @@ impl Scene<'_> {
         adapt_all(self.predictor, &self.drives.drives, &self.drives.maps, &FilterConfig::literal(), &|_| {}).or_input()
     }
 
-    /// The simulator's soil of every drive.
-    pub(super) fn true_soils(&self) -> Result<Vec<Arc<TrueSoil>>, Failure> {
-        (0..self.drives.drives.len()).map(|drive| self.true_soil(drive)).collect()
-    }
-
-    fn true_soil(&self, drive: usize) -> Result<Arc<TrueSoil>, Failure> {
-        let trajectory = &self.drives.drives[drive];
-        let place = trajectory.world.as_deref().zip(self.drives.maps[drive].as_ref());
-        let (world, map) = place.ok_or_else(|| Failure::input(format!("drive {} has no world, so no true soil", trajectory.id)))?;
-        TrueSoil::read(&self.drives.root.world_dir(world), map).or_input()
-    }
-
     fn best(&self, by_class: bool, filter: &FilterConfig) -> Result<Vec<Arc<dyn SoilField>>, Failure> {
         let progress = Progress::start("drives fitted", self.drives.drives.len());
         let fit = |drive: usize| -> Result<Arc<dyn SoilField>, Failure> {
             let windows: Vec<Window<'_>> = self.windows.iter().filter(|w| w.drive == drive).copied().collect();
-            let classes = if by_class { Some(self.true_soil(drive)?) } else { None };
+            let classes = if by_class { self.true_soils.get(drive) } else { None };
             let map = self.drives.maps[drive].as_ref();
-            let found = best_correction(self.predictor, &windows, map, self.truth, &filter.prior_sd, classes.as_ref()).or_failed()?;
+            let found = best_correction(self.predictor, &windows, map, self.truth, &filter.prior_sd, classes).or_failed()?;
             progress.set(drive + 1);
             Ok(Arc::new(found))
         };

@@ -10,6 +10,7 @@ use nesam_physics::SOIL_NAMES;
 use serde_json::json;
 use std::sync::Arc;
 
+use super::check_count;
 use crate::args::BundleArgs;
 use crate::commands::adapt::{filter_in_force, settings_file};
 use crate::failure::{Failure, OrFail};
@@ -46,8 +47,10 @@ pub(super) struct ConsistencyBench {
 
 /// Runs the command.
 pub(super) fn run(args: &ConsistencyBench) -> Result<(), Failure> {
-    if args.runs == 0 || args.buffers == 0 || args.border.is_some_and(|b| b >= args.buffers) {
-        return Err(Failure::input("--runs and --buffers must be at least 1, --border less than --buffers".to_string()));
+    check_count("--runs", args.runs, 1..=usize::MAX)?;
+    check_count("--buffers", args.buffers, 1..=usize::MAX)?;
+    if let Some(border) = args.border {
+        check_count("--border", border, 0..=args.buffers - 1)?;
     }
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let config = filter_in_force(&settings_file(args.filter.as_deref())?, args.literal, &bundle)?;

@@ -6,8 +6,10 @@ use std::path::PathBuf;
 use clap::Args;
 use nesam_discovery::bench::{Hidden, METHODS, MethodScores, Outcome, Scores, Stage, method_scores, plan, scores};
 use nesam_discovery::{Judge, Scoring};
+use nesam_evaluation::report::Short;
 use serde_json::json;
 
+use super::check_count;
 use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output::{provenance, say, write_file};
@@ -89,8 +91,9 @@ pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
 
 /// What is run: hidden effects with their group of drives. Without effects every group is tried once, because there are so few.
 fn chosen(args: &DiscoveryBench, groups: usize) -> Result<Vec<(Hidden, usize)>, Failure> {
-    if groups == 0 || args.every_hidden == 0 {
-        return Err(Failure::input("bench discovery needs at least five validation drives and --every-hidden of at least 1".to_string()));
+    check_count("--every-hidden", args.every_hidden, 1..=usize::MAX)?;
+    if groups == 0 {
+        return Err(Failure::input("bench discovery needs at least five validation drives"));
     }
     let plan = plan();
     if let Some(unknown) = args.sets.iter().find(|s| !plan.iter().any(|h| h.set == s.as_str())) {
@@ -134,7 +137,9 @@ fn print(outcomes: &[Outcome], sets: &BTreeMap<&str, Scores>) {
                 let values: Vec<String> = c
                     .parameters
                     .iter()
-                    .map(|(name, v, ci)| ci.map_or(format!("{name} {v}"), |[l, h]| format!("{name} {v:.4} [{l:.4}, {h:.4}]")))
+                    .map(|(name, v, ci)| {
+                        ci.map_or(format!("{name} {v}"), |[l, h]| format!("{name} {} [{}, {}]", Short(*v), Short(l), Short(h)))
+                    })
                     .collect();
                 let onset = c.onset_s.map_or(String::new(), |t| format!(" from {t:.1} s"));
                 let rivals = if c.rivals.is_empty() { String::new() } else { format!(" or {}", c.rivals.join(" or ")) };

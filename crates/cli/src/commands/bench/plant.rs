@@ -13,6 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use serde_json::json;
 
+use super::check_count;
 use crate::args::{BundleArgs, DataArgs};
 use crate::commands::plant::write::{Asked, copy_vehicle_and_worlds, write_drives};
 use crate::failure::{Failure, OrFail};
@@ -133,8 +134,9 @@ pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
 
 fn chosen(args: &PlantBench) -> Result<Vec<Dose>, Failure> {
     asked(args, 0).check()?;
-    if args.drives < 2 || args.doses.iter().any(|factor| !(factor.is_finite() && *factor > 0.0)) {
-        return Err(Failure::input("--drives must be at least 2 and --doses above 0"));
+    check_count("--drives", args.drives, 2..=usize::MAX)?;
+    if let Some(wrong) = args.doses.iter().find(|factor| !(factor.is_finite() && **factor > 0.0)) {
+        return Err(Failure::input(format!("--doses must be above 0, not {wrong}")));
     }
     if let Some(unknown) = args.effects.iter().find(|id| !DOSES.iter().any(|dose| dose.0 == id.as_str())) {
         let known: Vec<&str> = DOSES.iter().map(|dose| dose.0).collect();

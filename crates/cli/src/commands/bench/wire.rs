@@ -9,7 +9,7 @@ use nesam_client::{Candidates, Client, ClientError, Prediction, v1};
 use nesam_server::Config;
 use serde_json::{Value, json};
 
-use super::{DRIVEN, percentile, straight_on};
+use super::{DRIVEN, check_count, percentile, straight_on};
 use crate::args::BundleArgs;
 use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
@@ -58,16 +58,10 @@ impl Way {
 /// Runs the command.
 pub(super) fn run(args: &WireBench) -> Result<(), Failure> {
     let limits = Config::ephemeral().limits;
-    let (samples, horizon) = (1..=limits.samples_max, 1..=limits.horizon_max);
-    if !samples.contains(&args.samples) || !horizon.contains(&args.horizon) || args.samples * args.horizon > limits.sample_steps_max {
-        let most = limits.sample_steps_max;
-        return Err(Failure::input(format!(
-            "--samples is in {samples:?}, --horizon in {horizon:?}, and both together give at most {most} steps"
-        )));
-    }
-    if args.queries == 0 {
-        return Err(Failure::input("--queries must be at least 1"));
-    }
+    check_count("--horizon", args.horizon, 1..=limits.horizon_max)?;
+    // Both together have a limit too.
+    check_count("--samples", args.samples, 1..=limits.samples_max.min(limits.sample_steps_max / args.horizon))?;
+    check_count("--queries", args.queries, 1..=usize::MAX)?;
     restart_with(&OF_A_SERVER)?;
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;

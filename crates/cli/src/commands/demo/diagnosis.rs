@@ -3,6 +3,7 @@
 use nesam_discovery::report::Report;
 use nesam_discovery::{Options, Scoring, Verdict, diagnose};
 use nesam_evaluation::DEFAULT_RESAMPLES;
+use nesam_evaluation::report::Short;
 use nesam_model::{HISTORY, ModelBundle, Predictor};
 use serde_json::{Value, json};
 
@@ -51,8 +52,8 @@ fn of_set(predictor: &Predictor, data: DataArgs, show: &dyn Fn(Value)) -> Result
     let position: Vec<Option<f64>> = found.scores.iter().flat_map(|s| s.scores.iter().map(|m| m.summary.tree.position_m.mean)).collect();
     if found.verdict == Verdict::Explained {
         for e in &found.estimates {
-            let interval = e.ci95.map_or(String::new(), |[low, high]| format!(" [{low:.3}, {high:.3}]"));
-            say!("  {:<25} {} = {:.3}{interval} {}", "", e.name, e.value, e.unit);
+            let interval = e.ci95.map_or(String::new(), |[low, high]| format!(" [{}, {}]", Short(low), Short(high)));
+            say!("  {:<25} {} = {}{interval} {}", "", e.name, Short(e.value), e.unit);
         }
         let metres: Vec<String> = position.iter().map(|p| p.map_or("–".into(), |p| format!("{p:.3}"))).collect();
         say!("  {:<25} position error before → best soil alone → with the effect: {} m", "", metres.join(" → "));

@@ -4,20 +4,22 @@ use std::path::PathBuf;
 
 use clap::Args;
 use nesam_engine::Measurement;
+use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_server::recording::{Recording, window};
+use nesam_server::recording::{Recording, RecordingHeader, window};
 use nesam_trajectories::{Report, drives_of_reports};
 
 use super::Input;
 use crate::args::BundleArgs;
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, say};
-use crate::sources::{load_bundle, maps_hash};
+use crate::sources::{load_recorded_bundle, maps_hash};
 
 /// Options that take the drives from a recording.
 #[derive(Args, Debug)]
 pub struct RecordingArgs {
-    /// Diagnose what a server recorded of a session instead of a set: files of one recording, or its folder
+    /// Diagnose what a server recorded of a session instead of a set: files of one recording, or its folder. Without --bundle it is the recorded bundle, found
+    /// by its hash in deploy/bundles
     #[arg(long, value_name = "PATH", num_args = 1.., requires = "session", conflicts_with_all = ["data", "set", "trajectories", "vehicle"])]
     pub recording: Vec<PathBuf>,
     /// Session to diagnose
@@ -39,6 +41,7 @@ impl RecordingArgs {
     pub fn input(&self, bundle: &BundleArgs, dt_s: f64) -> Result<Input, Failure> {
         let session = self.session.as_deref().unwrap_or_default();
         let mut recording = Recording::open(&self.recording).or_input()?;
+        let bundle = recorded_bundle(bundle, recording.header())?;
         let window = window(&mut recording, session, self.from_ns, self.to_ns).or_input()?;
         let reports: Vec<Report> = window.measurements.iter().map(report).collect();
         let drives = drives_of_reports(session, &reports, dt_s, self.pieces);
@@ -55,11 +58,28 @@ impl RecordingArgs {
         let numbers = reports.iter().flat_map(|r| r.state.to_array().into_iter().chain([r.time_s, r.command.speed_m_s, r.command.second]));
         let data_hash = sha256_hex(&numbers.flat_map(f64::to_le_bytes).collect::<Vec<u8>>());
         let maps = vec![window.map; drives.len()];
-        let bundle = load_bundle(bundle.bundle.as_deref())?;
         let provenance = output::provenance_of(Some(&bundle), &data_hash, &maps_hash(&maps));
         let predictor = std::sync::Arc::new(nesam_model::Predictor::new(std::sync::Arc::new(bundle)).or_input()?);
         Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance })
     }
+}
+
+/// The bundle of the recording, or the given one where it is of the same vehicle.
+fn recorded_bundle(args: &BundleArgs, header: &RecordingHeader) -> Result<ModelBundle, Failure> {
+    let bundle = load_recorded_bundle(args.bundle.as_deref(), header)?;
+    if bundle.vehicle.name != header.vehicle {
+        return Err(Failure::input(format!(
+            "bundle {} was trained for `{}`, the recording is of `{}`; give a bundle of that vehicle with --bundle DIR",
+            bundle.name, bundle.vehicle.name, header.vehicle
+        )));
+    }
+    if bundle.hash != header.bundle_hash {
+        eprintln!(
+            "note: the recording was made with bundle {} {}; {} {} is diagnosed",
+            header.bundle, header.bundle_hash, bundle.name, bundle.hash
+        );
+    }
+    Ok(bundle)
 }
 
 fn report(m: &Measurement) -> Report {

@@ -2,12 +2,15 @@
 
 mod stage;
 
+use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
+use nesam_model::ModelBundle;
+use nesam_model::bundle::sha256_hex;
 use nesam_navigation::{MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, TrackingCost};
-use nesam_physics::{Vehicle, driveline::road_wheel_angles};
+use nesam_physics::{SecondCommand, Vehicle, driveline::road_wheel_angles};
 use nesam_plant::HiddenEffects;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, read_ground_truth_soil};
@@ -17,9 +20,9 @@ use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, say};
 use crate::progress::Progress;
-use crate::sources::{load_bundle_for, open_root};
+use crate::sources::{load_bundle_for, on_vehicle_of, open_root};
 
-use stage::{Bundles, Stage};
+use stage::{Bundles, Stage, kinematic_of};
 
 /// Correlation of the planner's noise from step to step, its standard deviation (m/s; share of full steering) and the temperature of its weights.
 const NOISE_CORRELATION: f64 = 0.8;
@@ -138,11 +141,16 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     check(args)?;
     let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
     let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
-    let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &root)?;
-    let diagnosed = args.diagnosed.as_deref().map(|dir| load_bundle_for(Some(dir), &root)).transpose()?;
+    let load = |dir: Option<&Path>| load_bundle_for(dir, &root).map(|bundle| on_vehicle_of(bundle, &root));
+    let bundle = load(args.bundle.bundle.as_deref())?;
+    let diagnosed = args.diagnosed.as_deref().map(|dir| load(Some(dir))).transpose()?;
+    check_speed(args.speed, &bundle.vehicle)?;
+    let configurations = configurations(args, &bundle)?;
     let worlds = worlds_of(args, &root)?;
-    let tasks = tasks_of(args, &worlds);
-    let settings = settings_of(args, &bundle.hash, diagnosed.as_ref().map(|bundle| bundle.hash.as_str()));
+    let tasks = tasks_of(args, &worlds, &configurations);
+    let settings = settings_of(args, &bundle, diagnosed.as_ref());
+    let settings_of_laps = worlds.iter().map(|(world, _)| Ok((world.clone(), settings_of_lap(&settings, &root, world)?)));
+    let settings_of_laps: HashMap<String, Value> = settings_of_laps.collect::<Result<_, Failure>>()?;
     let out = output::out_dir(args.out.as_deref(), "navigate", "laps")?;
     super::serve::log_to_stderr("error");
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
@@ -157,7 +165,8 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     let mut runs = Vec::new();
     for (done, task) in tasks.iter().enumerate() {
         let file = out.join(task.file_name());
-        let known = earlier(&file, &settings);
+        let settings = &settings_of_laps[&task.world];
+        let known = earlier(&file, settings);
         let run = match known {
             Some(run) => run,
             None => {
@@ -184,19 +193,43 @@ fn check(args: &NavigateArgs) -> Result<(), Failure> {
     if args.horizon == 0 || args.horizon > HORIZON_MAX || args.plan_every > args.horizon {
         return Err(Failure::input(format!("--horizon {} is not 1 to {HORIZON_MAX}, or shorter than --plan-every", args.horizon)));
     }
-    if configurations(args).contains(&Configuration::Diagnosed) && args.diagnosed.is_none() {
+    if args.configurations.iter().flatten().any(|c| *c == Configuration::Diagnosed) && args.diagnosed.is_none() {
         return Err(Failure::input("the configuration `diagnosed` needs --diagnosed, a bundle that a diagnosis has written"));
-    }
-    if !(SPEED_LIMITS_M_S[0]..=SPEED_LIMITS_M_S[1]).contains(&args.speed) {
-        return Err(Failure::input(format!("--speed {} is not {} to {} m/s", args.speed, SPEED_LIMITS_M_S[0], SPEED_LIMITS_M_S[1])));
     }
     Ok(())
 }
 
-/// Where predictions come from, unless it is told.
-fn configurations(args: &NavigateArgs) -> Vec<Configuration> {
+/// Speed commands that training covers and the card admits, m/s.
+fn speed_limits_m_s(vehicle: &Vehicle) -> [f64; 2] {
+    let ([low, high], [least, most]) = (SPEED_LIMITS_M_S, vehicle.command_range[0]);
+    [low.max(least), high.min(most)]
+}
+
+fn check_speed(speed_m_s: f64, vehicle: &Vehicle) -> Result<(), Failure> {
+    let [low, high] = speed_limits_m_s(vehicle);
+    if (low..=high).contains(&speed_m_s) {
+        return Ok(());
+    }
+    Err(Failure::input(format!(
+        "--speed {speed_m_s} is not {low} to {high} m/s, what training covers and the card of `{}` admits",
+        vehicle.name
+    )))
+}
+
+/// Where predictions come from: what is told, else the usual that the bundle allows.
+fn configurations(args: &NavigateArgs, bundle: &ModelBundle) -> Result<Vec<Configuration>, Failure> {
     let usual = || Configuration::USUAL.into_iter().chain(args.diagnosed.is_some().then_some(Configuration::Diagnosed)).collect();
-    args.configurations.clone().unwrap_or_else(usual)
+    let mut chosen: Vec<Configuration> = args.configurations.clone().unwrap_or_else(usual);
+    if chosen.contains(&Configuration::Kinematic)
+        && let Err(failure) = kinematic_of(bundle)
+    {
+        if args.configurations.is_some() {
+            return Err(failure);
+        }
+        eprintln!("note: kinematic is left out: {failure}");
+        chosen.retain(|c| *c != Configuration::Kinematic);
+    }
+    Ok(chosen)
 }
 
 /// The worlds to drive in, with the kind of their soil.
@@ -236,21 +269,21 @@ fn soil_kind(world_dir: &Path, map: &WorldMap) -> Result<SoilKind, Failure> {
 }
 
 /// Laps in the order in which they are driven: an interrupted command has about as many of each configuration.
-fn tasks_of(args: &NavigateArgs, worlds: &[(String, SoilKind)]) -> Vec<Task> {
-    let (places, configurations) = (2 * worlds.len(), configurations(args));
+fn tasks_of(args: &NavigateArgs, worlds: &[(String, SoilKind)], configurations: &[Configuration]) -> Vec<Task> {
+    let places = 2 * worlds.len();
     (0..args.runs)
         .flat_map(|i| {
             let (world, soil) = &worlds[i % worlds.len()];
             let (start, seed) = ((i % places) / worlds.len(), args.seed + (i / places) as u64);
-            configurations.clone().into_iter().map(move |c| Task { configuration: c, world: world.clone(), soil: *soil, start, seed })
+            configurations.iter().map(move |c| Task { configuration: *c, world: world.clone(), soil: *soil, start, seed })
         })
         .collect()
 }
 
-fn settings_of(args: &NavigateArgs, bundle_hash: &str, diagnosed_hash: Option<&str>) -> Value {
+fn settings_of(args: &NavigateArgs, bundle: &ModelBundle, diagnosed: Option<&ModelBundle>) -> Value {
     json!({
-        "bundle_hash": bundle_hash,
-        "diagnosed_hash": diagnosed_hash,
+        "bundle_hash": bundle.hash,
+        "diagnosed_hash": diagnosed.map(|bundle| &bundle.hash),
         "candidates": args.candidates,
         "horizon": args.horizon,
         "plan_every": args.plan_every,
@@ -258,10 +291,21 @@ fn settings_of(args: &NavigateArgs, bundle_hash: &str, diagnosed_hash: Option<&s
         "noise_sd": NOISE_SD,
         "noise_correlation": NOISE_CORRELATION,
         "temperature": TEMPERATURE,
-        "speed_limits_m_s": SPEED_LIMITS_M_S,
+        "speed_limits_m_s": speed_limits_m_s(&bundle.vehicle),
         "effect": args.effect,
         "plant": args.plant.map(|address| address.to_string()),
     })
+}
+
+/// The settings with the vehicle and the ground of a lap: what the planner knows of them, and the truth of the built-in plant.
+fn settings_of_lap(settings: &Value, root: &DataRoot, world: &str) -> Result<Value, Failure> {
+    let hash = |file: &Path| std::fs::read(file).ok().map(|content| sha256_hex(&content));
+    let truth = |name: &str| hash(&root.world_dir(world).join(name));
+    let mut settings = settings.clone();
+    settings["card_hash"] = json!(hash(root.card()));
+    settings["map_hash"] = json!(root.world(world).or_input()?.hash());
+    settings["true_soil_hash"] = json!([truth("gt_soil.json"), truth("gt_region.png")]);
+    Ok(settings)
 }
 
 fn cost_of(args: &NavigateArgs) -> TrackingCost {
@@ -273,16 +317,19 @@ fn mppi_of(args: &NavigateArgs, vehicle: &Vehicle) -> MppiSettings {
     let half = 0.5 * (high - low);
     MppiSettings {
         candidates: args.candidates,
-        limits: [SPEED_LIMITS_M_S, [low, high]],
+        limits: [speed_limits_m_s(vehicle), [low, high]],
         noise_sd: [NOISE_SD[0], NOISE_SD[1] * half],
         noise_correlation: NOISE_CORRELATION,
         temperature: TEMPERATURE,
     }
 }
 
-/// Steering that follows the mean curvature of the path on ground that does not give.
-fn steering_guess(vehicle: &Vehicle, path: &ReferencePath) -> f64 {
+/// Second command that follows the mean curvature of the path at a speed, on ground that does not give.
+fn steering_guess(vehicle: &Vehicle, path: &ReferencePath, speed_m_s: f64) -> f64 {
     let full = vehicle.command_range[1][1];
+    if vehicle.second == SecondCommand::YawRateRadS {
+        return (speed_m_s * std::f64::consts::TAU / path.length_m()).min(full);
+    }
     let [left, right, ..] = road_wheel_angles(vehicle, full);
     let angle = (vehicle.wheelbase_m * std::f64::consts::TAU / path.length_m()).atan();
     (full * 2.0 * angle / (left + right)).min(full)
@@ -316,4 +363,23 @@ fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> 
         output::write_file(file, report.page().render().as_bytes())?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const HUSKY: &str = include_str!("../../../../../deploy/bundles/clearpath-husky/vehicle.json");
+
+    #[test]
+    fn analytic_a_vehicle_that_is_told_its_yaw_rate_is_told_that_of_the_path() {
+        let (husky, path) = (nesam_trajectories::card_from_json(HUSKY).expect("a card"), ReferencePath::of_ood_soil());
+        // 2 m/s once round a path of about 150 m.
+        let (guess, lap_s) = (steering_guess(&husky, &path, 2.0), path.length_m() / 2.0);
+        assert!((guess * lap_s - std::f64::consts::TAU).abs() < 1e-9, "{guess}");
+        assert_eq!(speed_limits_m_s(&husky), [0.5, 3.0], "not the 4 m/s of the training drives");
+        assert!(check_speed(3.0, &husky).is_ok());
+        let refused = check_speed(3.5, &husky).expect_err("too fast").to_string();
+        assert!(refused.contains("--speed 3.5 is not 0.5 to 3 m/s") && refused.contains("Clearpath Husky"), "{refused}");
+    }
 }

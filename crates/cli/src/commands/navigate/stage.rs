@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use nesam_client::Client;
-use nesam_evaluation::Baselines;
+use nesam_evaluation::{Baselines, Kinematic};
 use nesam_model::ModelBundle;
 use nesam_navigation::{
     BuiltInPlant, Forecaster, KinematicForecaster, LapPlan, PlantLink, ReferencePath, RemotePlant, Run, ServedForecaster, SoilAhead,
@@ -95,7 +95,7 @@ impl<'a> Stage<'a> {
             mppi: mppi_of(self.args, &self.bundles.shipped.vehicle),
             horizon: self.args.horizon,
             plan_every: self.args.plan_every,
-            steering_guess: steering_guess(&self.bundles.shipped.vehicle, &self.path),
+            steering_guess: steering_guess(&self.bundles.shipped.vehicle, &self.path, self.args.speed),
         };
         let lap = run_lap(&plan, self.plant.as_mut(), &mut model).await.or_failed()?;
         if let Forecaster::Served(served) = model {
@@ -128,9 +128,7 @@ impl<'a> Stage<'a> {
 
     fn kinematic(&self, world: &str) -> Result<Forecaster, Failure> {
         let bundle = &self.bundles.shipped;
-        let json = bundle.baselines_json.as_deref();
-        let json = json.ok_or_else(|| Failure::input(format!("bundle {} carries no fitted kinematic model", bundle.name)))?;
-        let model = Baselines::from_json(json).or_input()?.kinematic;
+        let model = kinematic_of(bundle)?;
         let map = self.root.world(world).or_input()?;
         Ok(Forecaster::Kinematic(KinematicForecaster { model, vehicle: Arc::new(bundle.vehicle.clone()), map }))
     }
@@ -171,6 +169,15 @@ impl<'a> Stage<'a> {
         let told = SoilAhead::along(&mut client, world, &ground, &self.path, stretch_m).await.or_failed()?;
         self.told.push((world.into(), told.clone()));
         Ok(told)
+    }
+}
+
+/// The kinematic model that was fitted for the vehicle of a bundle.
+pub fn kinematic_of(bundle: &ModelBundle) -> Result<Kinematic, Failure> {
+    let fitted = bundle.baselines_json.as_deref().map(Baselines::from_json).transpose().or_input()?;
+    match fitted {
+        Some(baselines) if baselines.vehicle == bundle.vehicle.name => Ok(baselines.kinematic),
+        _ => Err(Failure::input(format!("bundle {} carries no kinematic model fitted for `{}`", bundle.name, bundle.vehicle.name))),
     }
 }
 

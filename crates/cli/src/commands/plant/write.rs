@@ -88,8 +88,11 @@ impl Asked<'_> {
     /// # Errors
     /// `Failure` naming the option.
     pub fn check(&self) -> Result<(), Failure> {
-        if !(1.0..=600.0).contains(&self.seconds) || self.drives == 0 || self.drives > 10_000 {
-            return Err(Failure::input("--seconds must be 1 to 600 and --drives 1 to 10000"));
+        if !(1.0..=600.0).contains(&self.seconds) {
+            return Err(Failure::input(format!("--seconds must be 1 to 600, not {}", self.seconds)));
+        }
+        if !(1..=10_000).contains(&self.drives) {
+            return Err(Failure::input(format!("--drives must be 1 to 10000, not {}", self.drives)));
         }
         match self.worlds.iter().find(|world| !is_plain(world)) {
             Some(world) => Err(Failure::input(format!("--worlds {world}: must be a plain name"))),

@@ -1,6 +1,6 @@
 //! Repeats a recording and says what came out differently.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -9,11 +9,10 @@ use nesam_server::recording::{Ending, KindCount, Recording, RecordingError, Reco
 use serde_json::json;
 
 use super::ReplayArgs;
-use crate::bundle_path::bundle_of_hash;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::{self, say};
-use crate::sources::load_bundle;
+use crate::sources::load_recorded_bundle;
 
 /// Time between two lines of progress.
 const SAY_EVERY: Duration = Duration::from_secs(10);
@@ -23,7 +22,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("the replay was not finished");
     let mut recording = Recording::open(&args.recording).or_input()?;
     let header = recording.header().clone();
-    let bundle = Arc::new(load(args.bundle.bundle.as_deref(), &header)?);
+    let bundle = Arc::new(load_recorded_bundle(args.bundle.bundle.as_deref(), &header)?);
     let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?.in_precision(header.precision));
     let started = Instant::now();
     let mut said = started;
@@ -50,18 +49,6 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
         }));
     }
     Ok(())
-}
-
-/// The given bundle, else the shipped one with the recorded hash.
-fn load(given: Option<&Path>, header: &RecordingHeader) -> Result<ModelBundle, Failure> {
-    let found = if given.is_none() { bundle_of_hash(&header.bundle_hash) } else { None };
-    if given.is_none() && found.is_none() {
-        return Err(Failure::input(format!(
-            "the recording was made with bundle {} {}, which is not in deploy/bundles; give it with --bundle DIR",
-            header.bundle, header.bundle_hash
-        )));
-    }
-    load_bundle(given.or(found.as_deref()))
 }
 
 fn print(header: &RecordingHeader, report: &ReplayReport) {

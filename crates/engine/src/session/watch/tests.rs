@@ -95,6 +95,23 @@ fn analytic_the_same_error_again_and_again_is_correlated() {
 }
 
 #[test]
+fn property_stamps_that_jitter_do_not_part_buffers() {
+    const STEP_NS: i64 = SECOND_NS / 10;
+    let (mut exact, mut jittered, mut noise) = (Watch::default(), Watch::default(), Noise::of(9));
+    for k in 0..12 {
+        let buffer = usual(k, &mut noise);
+        let end_ns = buffer.stamps_ns[1] + k * 7919 % 1000;
+        let begin_ns = jittered.begin_ns(end_ns - SECOND_NS, STEP_NS);
+        jittered.feed(WatchedBuffer { stamps_ns: [begin_ns, end_ns], ..buffer });
+        exact.feed(buffer);
+        assert_eq!(jittered.sensor_jump().unwrap().statistic, exact.sensor_jump().unwrap().statistic, "buffer {k}");
+    }
+    // The shortest gap is no jitter.
+    let after_ns = jittered.window[11].stamps_ns[1] + STEP_NS / 2 * 3;
+    assert_eq!(jittered.begin_ns(after_ns, STEP_NS), after_ns);
+}
+
+#[test]
 fn property_a_gap_forgives_the_noise_of_its_ends() {
     // The noise of positions telescopes over buffers that follow each other; over buffers that do not it adds up, and the bound knows.
     let (mut together, mut apart, mut noise) = (Watch::default(), Watch::default(), Noise::of(3));

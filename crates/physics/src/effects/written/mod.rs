@@ -1,8 +1,8 @@
 //! Effects that an engineer writes down: a wrench on the body as formulas with units, read from a bundle and not compiled in.
 //!
 //! A formula may use its own parameters and the variables of [`VARIABLES`]. Formulas are checked for dimensions when they are read and bounded when they
-//! act, so none can throw a rollout out of its range. A written effect has an id of its own, which is none of the catalogue. It acts at a share of what is
-//! written, and that share is what a diagnosis estimates when it is given the effect as a hypothesis.
+//! act, so none can throw a rollout out of its range; one that gives no number (0 / 0) gives no force. A written effect has an id of its own, which is none of
+//! the catalogue. It acts at a share of what is written, and that share is what a diagnosis estimates when it is given the effect as a hypothesis.
 
 mod program;
 mod unit;
@@ -153,15 +153,17 @@ impl Written {
         }
     }
 
-    /// Force (N) and moment (N m) about the reference point, Body, at the values of [`VARIABLES`]; bounded.
+    /// Force (N) and moment (N m) about the reference point, Body, at the values of [`VARIABLES`]; bounded, and nothing where a formula gives no number.
     pub(crate) fn wrench<T: Real>(&self, variables: &[T; VARIABLES.len()], mass_kg: f64) -> [T; 6] {
-        let bound = T::lit(BOUND_M_S2 * mass_kg);
+        let (bound, nothing) = (T::lit(BOUND_M_S2 * mass_kg), T::lit(0.0));
         core::array::from_fn(|axis| {
             let program = &self.definition.programs[axis];
             if program.is_empty() {
-                return T::lit(0.0);
+                return nothing;
             }
-            (program.at(variables) * T::lit(self.share)).min(bound).max(-bound)
+            let written = program.at(variables) * T::lit(self.share);
+            // A square is at least 0 unless it is no number.
+            T::select_ge0(written.sqr(), written, nothing).min(bound).max(-bound)
         })
     }
 }

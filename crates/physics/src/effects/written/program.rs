@@ -8,6 +8,8 @@ const STACK: usize = 12;
 const OPERATIONS_MAX: usize = 96;
 /// Smoothing of `abs` and `sign`, in the unit of the argument.
 const SMOOTH: f64 = 1e-3;
+/// Added under a root, in the unit of the argument, so that it has a slope at 0.
+const ROOT_FLOOR: f64 = 1e-12;
 
 /// One step of a stack machine.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -85,7 +87,7 @@ impl Program {
                 Operation::Larger => (2, a.max(b)),
                 Operation::Negate => (1, -b),
                 Operation::Power(n) => (1, (1..n).fold(b, |power, _| power * b)),
-                Operation::Root => (1, b.max(T::lit(0.0)).sqrt()),
+                Operation::Root => (1, (b.max(T::lit(0.0)) + T::lit(ROOT_FLOOR)).sqrt()),
                 Operation::Absolute => (1, b.abs_smooth(SMOOTH)),
                 Operation::Sine => (1, b.sin_cos().0),
                 Operation::Cosine => (1, b.sin_cos().1),
@@ -347,6 +349,14 @@ mod tests {
             parse("a^3 * tanh(a) + sqrt(1 + a)", Dimension::NONE).unwrap().at(&[Dual::<f64, 1>::constant(0.0), Dual::variable(a, 0)]);
         let slope = 3.0 * a * a * a.tanh() + a.powi(3) * (1.0 - a.tanh().powi(2)) + 0.5 / (1.0 + a).sqrt();
         assert!((found.eps[0] - slope).abs() < 1e-12, "{found:?} {slope}");
+    }
+
+    #[test]
+    fn property_roots_have_finite_derivatives_at_and_below_nothing() {
+        for (text, a) in [("sqrt(a)", 0.0), ("sqrt(a^2)", 0.0), ("sqrt(abs(a) * v / v)", 0.0), ("sqrt(a)", -0.5)] {
+            let found = parse(text, Dimension::NONE).unwrap().at(&[Dual::<f64, 1>::constant(2.0), Dual::variable(a, 0)]);
+            assert!(found.re.abs() < 0.1 && found.eps[0].is_finite(), "{text}: {found:?}");
+        }
     }
 
     #[test]

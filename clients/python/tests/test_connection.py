@@ -1,0 +1,173 @@
+"""Goal: every call brings its vehicle along, takes large replies, and is given up when nobody answers it. Method: listeners in the place of the service, which
+look at metadata, answer much, late or never."""
+
+import asyncio
+import time
+from concurrent import futures
+from contextlib import contextmanager
+
+import grpc
+import numpy as np
+import pytest
+from conftest import straight
+
+import nesam
+from nesam.v1 import measurements_pb2, sessions_pb2, soil_pb2, types_pb2
+
+
+@contextmanager
+def listening(*services, interceptors=()):
+    """The address of a server with these services, (name, method, handler)."""
+    server = grpc.server(futures.ThreadPoolExecutor(8), interceptors=interceptors)
+    server.add_generic_rpc_handlers([grpc.method_handlers_generic_handler(name, {method: handler}) for name, method, handler in services])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    yield f"127.0.0.1:{port}"
+    server.stop(None)
+
+
+def measurements(stream):
+    """The service of measurements by a function of requests and context."""
+    read, write = measurements_pb2.Measurement.FromString, measurements_pb2.MeasurementAnswer.SerializeToString
+    return ("nesam.v1.Measurements", "Stream", grpc.stream_stream_rpc_method_handler(stream, read, write))
+
+
+def never(requests, _):
+    """Hears everything and answers nothing, as a process that stands still."""
+    for _ in requests:
+        pass
+    return iter(())
+
+
+def at_once(requests, _):
+    for request in requests:
+        yield measurements_pb2.MeasurementAnswer(sequence=request.sequence, applied=measurements_pb2.Applied())
+
+
+class Vehicles(grpc.ServerInterceptor):
+    """The vehicle that each call names, by method."""
+
+    def __init__(self):
+        self.told = {}
+
+    def intercept_service(self, continuation, details):
+        self.told[details.method.rsplit("/", 1)[1]] = dict(details.invocation_metadata).get("x-vehicle-id")
+        return continuation(details)
+
+
+def test_service_calls_of_all_shapes_name_their_vehicle(hills):
+    asked = {"Get": "truck-7", "UploadMap": "truck-7", "WatchAlarms": "truck-7", "Watch": "truck-7", "Stream": "truck-7"}
+    measurement = next(straight("truck", 1))
+    vehicles = Vehicles()
+    with listening(interceptors=[vehicles]) as address:
+        # Nobody answers here: UNIMPLEMENTED.
+        with nesam.Client(address, vehicle_id="truck-7") as client:
+            for call in (
+                lambda: client.session("s"),
+                lambda: client.upload_map(hills),
+                lambda: next(client.alarms("s")),
+                lambda: next(client.watch_soil("s")),
+                lambda: client.measure([measurement]),
+            ):
+                with pytest.raises(nesam.NesamError):
+                    call()
+        assert vehicles.told == asked
+        vehicles.told.clear()
+
+        async def work():
+            async with nesam.AsyncClient(address, vehicle_id="truck-7") as client:
+                for call in (
+                    lambda: client.session("s"),
+                    lambda: client.upload_map(hills),
+                    lambda: client.alarms("s").__anext__(),
+                    lambda: client.watch_soil("s").__anext__(),
+                    lambda: client.measurement_stream().send(measurement),
+                ):
+                    with pytest.raises(nesam.NesamError):
+                        await call()
+
+        asyncio.run(work())
+        assert vehicles.told == asked
+
+
+def test_service_a_full_soil_map_is_read():
+    vector = types_pb2.SoilVector(k_phi=0.1, k_c=0.1, n=0.1, c_pa=0.1, phi_rad=0.1, k_shear_m=0.1)
+    cell = soil_pb2.FleetSoilCell(
+        map_id="quarry-7", colour_rgb=0x806040, column=-12, row=40, information=[0.1] * 36, vector=vector, buffers=0.1, age_s=0.1
+    )
+    cells = 65_536  # as many as a server keeps by default
+    full = soil_pb2.FleetSoilMap(cell_m=10.0, cells=[cell] * cells)
+    handler = grpc.unary_unary_rpc_method_handler(lambda *_: full, None, soil_pb2.FleetSoilMap.SerializeToString)
+    with listening(("nesam.v1.Soil", "Map", handler)) as address, nesam.Client(address, timeout_s=60.0) as client:
+        assert full.ByteSize() > 16 << 20 and len(client.fleet_soil().cells) == cells
+
+
+def test_service_a_silent_service_is_given_up():
+    drive = list(straight("truck", 40))
+
+    def slowly():
+        for measurement in drive:
+            time.sleep(0.1)
+            yield measurement
+
+    with listening(measurements(never)) as address:
+        with nesam.Client(address, timeout_s=0.5) as client:
+            for call in (
+                lambda: client.measure(drive),
+                lambda: client.measure(slowly()),
+                lambda: client.measurement_stream().send(drive[0]),
+                lambda: client.measurement_stream().send(drive[0], timeout_s=0.4),
+            ):
+                begun = time.monotonic()
+                with pytest.raises(nesam.DeadlineExceeded):
+                    call()
+                assert 0.3 < time.monotonic() - begun < 2.0
+            stream = client.measurement_stream()
+            with pytest.raises(nesam.DeadlineExceeded):
+                stream.send(drive[0])
+            with pytest.raises(nesam.Unavailable):
+                stream.send(drive[1])
+
+        async def work():
+            async with nesam.AsyncClient(address, timeout_s=0.5) as client, client.measurement_stream() as stream:
+                with pytest.raises(nesam.DeadlineExceeded):
+                    await stream.send(drive[0])
+                with pytest.raises(nesam.Unavailable):
+                    await stream.send(drive[1])
+
+        asyncio.run(asyncio.wait_for(work(), 5.0))
+
+
+def test_service_a_refusal_takes_no_place_away():
+    heard = []
+
+    def second_is_refused(requests, _):
+        for request in requests:
+            heard.append(request.sequence)
+            if request.sequence == 1:
+                yield measurements_pb2.MeasurementAnswer(place=1, run=5, applied=measurements_pb2.Applied())
+            else:
+                yield measurements_pb2.MeasurementAnswer(rejected=measurements_pb2.Rejected(code=grpc.StatusCode.PERMISSION_DENIED.value[0]))
+
+    session = sessions_pb2.Session(session_id="truck", run=5, durable_place=1)
+    get = grpc.unary_unary_rpc_method_handler(lambda *_: session, None, sessions_pb2.Session.SerializeToString)
+    with listening(measurements(second_is_refused), ("nesam.v1.Sessions", "Get", get)) as address, nesam.Client(address) as client:
+        first, second = straight("truck", 2)
+        with client.durable_stream("truck") as stream:
+            stream.send(first)
+            assert stream.send(second).outcome == "REJECTED" and [m.sequence for m in stream.pending] == [1]
+            stream.flush()
+            assert heard == [1, 2] and not stream.pending
+
+
+def test_service_a_slow_vehicle_is_not_a_silent_service():
+    def slowly():
+        for measurement in straight("truck", 4):
+            time.sleep(0.4)
+            yield measurement
+
+    with listening(measurements(at_once)) as address, nesam.Client(address, timeout_s=0.3) as client:
+        assert [answer.sequence for answer in client.measure(slowly())] == [1, 2, 3, 4]
+        assert [answer.sequence for answer in client.measure(straight("truck", 2000))] == list(range(1, 2001))
+        with pytest.raises(ValueError, match="state"), client.measurement_stream() as stream:
+            stream.send(nesam.Measurement("truck", 0, np.zeros(6), (1.0, 0.0)))
