@@ -135,7 +135,7 @@ pub(crate) fn is_skid(vehicle: &Vehicle) -> bool {
 }
 
 /// Curvature of the ideal bicycle for an actuator position, 1/m: tan of the mean front angle over the wheelbase.
-fn curvature_1_m(vehicle: &Vehicle, steering: f64) -> f64 {
+pub fn curvature_1_m(vehicle: &Vehicle, steering: f64) -> f64 {
     let angle = road_wheel_angles(vehicle, steering);
     (0.5 * (angle[0] + angle[1])).tan() / vehicle.wheelbase_m
 }
@@ -144,7 +144,7 @@ fn curvature_1_m(vehicle: &Vehicle, steering: f64) -> f64 {
 ///
 /// With slopes s_x, s_y along the yaw-aligned axes the plane's normal is (-s_x, -s_y, 1), hence pitch = -atan(s_x) (nose down is
 /// positive) and roll = atan(s_y cos pitch).
-fn ground_pose(vehicle: &Vehicle, map: &WorldMap, x_m: f64, y_m: f64, yaw_rad: f64) -> Option<[f64; 3]> {
+pub fn ground_pose(vehicle: &Vehicle, map: &WorldMap, x_m: f64, y_m: f64, yaw_rad: f64) -> Option<[f64; 3]> {
     let (sin, cos) = yaw_rad.sin_cos();
     let mut height = [0.0; WHEELS];
     for (h, [bx, by, _]) in height.iter_mut().zip(vehicle.wheel_centre_m) {

@@ -58,7 +58,7 @@ pub use error::EvaluationError;
 pub use errors::{PosePath, StepError, WindowErrors, path_length_m};
 pub use evaluate::{DriveMaps, HorizonCurve, ModelPaths, ModelScore, path_median_m, predict_all, score};
 pub use inside::{Agreement, Comparison, Pairs, ResidualPart, look_inside};
-pub use kinematic::{KINEMATIC_PARAMETERS, Kinematic};
+pub use kinematic::{KINEMATIC_PARAMETERS, Kinematic, curvature_1_m, ground_pose};
 pub use known_soil::KnownSoil;
 pub use models::ModelName;
 pub use output::{Evaluation, Provenance};

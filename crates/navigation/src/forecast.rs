@@ -7,6 +7,7 @@ use nesam_physics::{Control, DT_S, Vehicle, VehicleState};
 use nesam_terrain::WorldMap;
 
 use crate::error::NavigationError;
+use crate::reference_path::ReferencePath;
 use crate::session::ServedForecaster;
 
 /// What is known when a plan is made.
@@ -53,6 +54,24 @@ impl Forecaster {
         match self {
             Self::Served(served) => served.forecast(situation, controls, horizon).await,
             Self::Kinematic(kinematic) => Ok(kinematic.forecast(situation, &controls, horizon)),
+        }
+    }
+
+    /// How far outside the path a vehicle would be after two seconds, m, that begins on it at an arc length, whatever it steers; `None` from a model that knows of no
+    /// ground that gives, and beyond the map.
+    ///
+    /// # Errors
+    /// `NavigationError::Service` when the service is gone or refuses.
+    pub async fn slide_m(
+        &mut self,
+        measured: &[f64; 12],
+        path: &ReferencePath,
+        arc_m: f64,
+        speed_m_s: f64,
+    ) -> Result<Option<f64>, NavigationError> {
+        match self {
+            Self::Served(served) => served.slide_m(measured, path, arc_m, speed_m_s).await,
+            Self::Kinematic(_) => Ok(None),
         }
     }
 }

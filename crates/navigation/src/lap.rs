@@ -5,6 +5,7 @@ use std::collections::BTreeMap;
 use nesam_physics::{Control, DT_S};
 use serde::{Deserialize, Serialize};
 
+use crate::caution::{Caution, CautionSettings};
 use crate::error::NavigationError;
 use crate::forecast::{Forecaster, Situation};
 use crate::link::{PlantLink, Reading, Start};
@@ -48,6 +49,8 @@ pub struct LapPlan {
     pub plan_every: usize,
     /// Steering that follows the path on firm ground, the planner's first guess.
     pub steering_guess: f64,
+    /// What is tried further ahead than candidates reach; `None` = nothing.
+    pub caution: Option<CautionSettings>,
 }
 
 /// What came of it. Distances and angles are those of the true motion where the plant tells it.
@@ -96,6 +99,7 @@ pub async fn run_lap(plan: &LapPlan, plant: &mut dyn PlantLink, model: &mut Fore
         planner: Mppi::new(plan.mppi, vec![guess; plan.horizon], plan.seed.wrapping_mul(0x9e37_79b9) ^ 0x5bd1),
         past: Vec::new(),
         stamp_ns: 0,
+        caution: Caution::new(plan.caution),
     };
     let straight = Control { speed_m_s: plan.cost.speed_m_s, second: 0.0 };
     for _ in 0..ACCELERATION_STEPS {
@@ -107,6 +111,7 @@ pub async fn run_lap(plan: &LapPlan, plant: &mut dyn PlantLink, model: &mut Fore
     while track.end(plan).is_none() {
         let command = drive.planner.next_command();
         drive.tell(model, &reading, command).await?;
+        drive.look_ahead(model, &reading, track.phi, step).await?;
         if step % plan.plan_every == 0 {
             drive.think(model, &reading, track.phi).await?;
         }
@@ -128,6 +133,7 @@ struct Driver<'a> {
     planner: Mppi,
     past: Vec<Control<f64>>,
     stamp_ns: i64,
+    caution: Caution,
 }
 
 impl Driver<'_> {
@@ -146,12 +152,27 @@ impl Driver<'_> {
         Situation { stamp_ns: self.stamp_ns, measured: &reading.measured, sent, past }
     }
 
+    /// Tries places of the path ahead, every few steps.
+    async fn look_ahead(&mut self, model: &mut Forecaster, reading: &Reading, phi: f64, step: usize) -> Result<(), NavigationError> {
+        let Some(settings) = self.caution.settings().copied().filter(|s| step % s.every_steps == 0) else { return Ok(()) };
+        let path = &self.plan.path;
+        for ahead_m in settings.ahead_m {
+            let arc_m = path.arc_m(phi) + ahead_m;
+            if let Some(slide_m) = model.slide_m(&reading.measured, path, arc_m, settings.trial_speed_m_s).await? {
+                self.caution.note(arc_m, slide_m);
+            }
+        }
+        Ok(())
+    }
+
     /// Moves the plan, which begins with the command after the one just sent.
     async fn think(&mut self, model: &mut Forecaster, reading: &Reading, phi: f64) -> Result<(), NavigationError> {
+        let arc_m = self.plan.path.arc_m(phi);
+        self.planner.limit_speed(self.caution.speed_limits_m_s(arc_m, self.plan.mppi.limits[0]));
         let controls = self.planner.propose(&[]);
         let poses = model.forecast(&self.situation(reading), controls, self.plan.horizon).await?;
-        let costs: Vec<f64> =
-            poses.chunks_exact(self.plan.horizon).map(|rows| self.plan.cost.of(&self.plan.path, phi, rows, DT_S)).collect();
+        let (plan, caution) = (self.plan, &self.caution);
+        let costs: Vec<f64> = poses.chunks_exact(plan.horizon).map(|rows| plan.cost.of(&plan.path, caution, phi, rows, DT_S)).collect();
         self.planner.improve(&costs);
         Ok(())
     }

@@ -2,9 +2,10 @@
 //!
 //! One [`run`](run_lap) is a lap of a closed [`ReferencePath`]. Every 0.1 s of the plant's time the plant is measured, the measurement goes to the
 //! service, and every few steps the [`Mppi`] planner asks a [`Forecaster`] what its candidates would do *from the next step on*: the command of the present
-//! step has already been sent. All time is the plant's: planning costs none of it, and the same seeds give the same lap.
+//! step has already been sent. Places further ahead are tried through the same service, and come to with [`Caution`] where the vehicle would slide. All time is the plant's: planning costs none of it, and the same seeds give the same lap.
 #![forbid(unsafe_code)]
 
+mod caution;
 mod error;
 mod forecast;
 mod lap;
@@ -17,7 +18,9 @@ mod report;
 mod score;
 mod session;
 mod tracker;
+mod trial;
 
+pub use caution::{Caution, CautionSettings};
 pub use error::NavigationError;
 pub use forecast::{Forecaster, KinematicForecaster, Situation};
 pub use lap::{Lap, LapPlan, run_lap};
@@ -30,3 +33,4 @@ pub use report::{NavigationReport, SoilKind};
 pub use score::{Figures, Ratio, Run, Summary, configuration_names, ratio, summarise};
 pub use session::{ServedForecaster, session_request};
 pub use tracker::TrackingCost;
+pub use trial::Surroundings;

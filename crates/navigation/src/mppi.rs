@@ -43,6 +43,11 @@ impl Mppi {
         Self { settings, plan, rng: ChaCha8Rng::seed_from_u64(seed), candidates: Vec::new() }
     }
 
+    /// Admitted speed commands from now on, m/s.
+    pub fn limit_speed(&mut self, limits_m_s: [f64; 2]) {
+        self.settings.limits[0] = limits_m_s;
+    }
+
     /// Candidates of a cycle, row-major (candidates, horizon, 2): the `fixed` sequences (whole horizons), the plan, then the plan with correlated noise.
     pub fn propose(&mut self, fixed: &[Control<f64>]) -> Vec<f32> {
         let horizon = self.plan.len();

@@ -8,6 +8,8 @@ use nesam_physics::DT_S;
 use crate::error::NavigationError;
 use crate::forecast::{Poses, Situation};
 use crate::oracle::SoilAhead;
+use crate::reference_path::ReferencePath;
+use crate::trial::{Surroundings, TRIAL_STEPS};
 
 /// Channels x, y, roll and pitch of a prediction.
 const CHANNELS: u32 = 1 | 1 << 1 | 1 << 3 | 1 << 4;
@@ -20,6 +22,7 @@ pub struct ServedForecaster {
     sequence: u64,
     /// For the oracle: corrections of the soil prior along the path.
     told: Option<SoilAhead>,
+    surroundings: Surroundings,
     /// What became of the measurements.
     pub outcomes: BTreeMap<&'static str, usize>,
     /// Correction of the soil prior that the service holds, in the order of its soil vector.
@@ -36,10 +39,16 @@ impl ServedForecaster {
     ///
     /// # Errors
     /// `NavigationError::Service` as the service says.
-    pub async fn open(mut client: Client, session: &str, map: &str, told: Option<SoilAhead>) -> Result<Self, NavigationError> {
-        client.open_session(session_request(session, map)).await?;
+    pub async fn open(
+        mut client: Client,
+        session: &str,
+        surroundings: Surroundings,
+        told: Option<SoilAhead>,
+    ) -> Result<Self, NavigationError> {
+        client.open_session(session_request(session, surroundings.map.id())).await?;
         let stream = client.measure().await?;
-        Ok(Self { client, stream, session: session.into(), sequence: 0, told, outcomes: BTreeMap::new(), soil_delta: None })
+        let outcomes = BTreeMap::new();
+        Ok(Self { client, stream, session: session.into(), sequence: 0, told, surroundings, outcomes, soil_delta: None })
     }
 
     /// Closes the session.
@@ -71,11 +80,34 @@ impl ServedForecaster {
         let samples = controls.len() / (2 * horizon);
         let sent = vec![(situation.stamp_ns, [situation.sent.speed_m_s, situation.sent.second])];
         let from_ns = situation.stamp_ns + (DT_S * 1e9).round() as i64;
-        let mut candidates = Candidates::new(&self.session, samples, horizon, controls).starting_at(from_ns, sent);
+        let candidates = Candidates::new(&self.session, samples, horizon, controls).starting_at(from_ns, sent);
+        self.predict(candidates, [situation.measured[0], situation.measured[1]]).await
+    }
+
+    pub(crate) async fn slide_m(
+        &mut self,
+        measured: &[f64; 12],
+        path: &ReferencePath,
+        arc_m: f64,
+        speed_m_s: f64,
+    ) -> Result<Option<f64>, NavigationError> {
+        let Some(start) = self.surroundings.on_path(path, arc_m, speed_m_s, measured) else { return Ok(None) };
+        let steerings = self.surroundings.steerings(path, arc_m, speed_m_s);
+        let controls = steerings.iter().flat_map(|steering| [speed_m_s as f32, *steering as f32].repeat(TRIAL_STEPS)).collect();
+        let mut candidates = Candidates::new(&self.session, steerings.len(), TRIAL_STEPS, controls);
+        candidates.start = Some(start);
+        candidates.use_history = false;
+        let poses = self.predict(candidates, [start[0], start[1]]).await?;
+        let ends = poses.chunks_exact(TRIAL_STEPS).map(|rows| rows[TRIAL_STEPS - 1]);
+        let slide_m = ends.map(|[x, y, ..]| path.offset(x, y).outside_m).fold(f64::INFINITY, f64::min);
+        Ok(slide_m.is_finite().then_some(slide_m))
+    }
+
+    /// x, y, roll and pitch of candidates, on the soil that this session is told for a place if it is told one.
+    async fn predict(&mut self, mut candidates: Candidates, place_m: [f64; 2]) -> Result<Poses, NavigationError> {
         candidates.output = v1::OutputSelection { channels: CHANNELS, ..Default::default() };
         candidates.extras = self.told.as_ref().map(|told| {
-            let delta = told.ahead_of([situation.measured[0], situation.measured[1]]);
-            let packed: Vec<u8> = delta.iter().flat_map(|d| (*d as f32).to_le_bytes()).collect();
+            let packed: Vec<u8> = told.ahead_of(place_m).iter().flat_map(|d| (*d as f32).to_le_bytes()).collect();
             v1::PredictExtras { soil_deltas: packed.into(), ..Default::default() }
         });
         let prediction = self.client.predict(candidates).await?;

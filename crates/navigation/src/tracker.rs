@@ -2,10 +2,11 @@
 
 use serde::Serialize;
 
+use crate::caution::Caution;
 use crate::reference_path::{ReferencePath, unwrapped};
 
 /// Weights of the tracking cost: the mean over the horizon of d^2 + `lag` l^2 + `tilt` (roll^2 + pitch^2), d the distance from the path and l what the
-/// vehicle is short of the progress at the wanted speed (both m), angles in rad.
+/// vehicle is short of the progress at the wanted speed (both m), angles in rad. Caution moves the path inside and wants less speed.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize)]
 pub struct TrackingCost {
     /// Wanted speed, m/s.
@@ -21,13 +22,14 @@ const INVALID_COST: f64 = 1e6;
 
 impl TrackingCost {
     /// Cost of the poses (x, y, roll, pitch) at steps of `dt_s` after a place that has come as far as `from_phi`.
-    pub fn of(&self, path: &ReferencePath, from_phi: f64, poses: &[[f64; 4]], dt_s: f64) -> f64 {
+    pub fn of(&self, path: &ReferencePath, caution: &Caution, from_phi: f64, poses: &[[f64; 4]], dt_s: f64) -> f64 {
         let start_m = path.arc_m(from_phi);
         let step = |(k, [x, y, roll, pitch]): (usize, &[f64; 4])| {
             let at = path.offset(*x, *y);
-            let wanted = start_m + self.speed_m_s * dt_s * (k + 1) as f64;
-            let lag = wanted - path.arc_m(unwrapped(at.phi, from_phi));
-            at.outside_m * at.outside_m + self.lag * lag * lag + self.tilt * (roll * roll + pitch * pitch)
+            let arc_m = path.arc_m(unwrapped(at.phi, from_phi));
+            let wanted = start_m + caution.speed_m_s(arc_m, self.speed_m_s) * dt_s * (k + 1) as f64;
+            let (lag, outside_m) = (wanted - arc_m, at.outside_m + caution.inside_m(arc_m));
+            outside_m * outside_m + self.lag * lag * lag + self.tilt * (roll * roll + pitch * pitch)
         };
         let cost = poses.iter().enumerate().map(step).sum::<f64>() / poses.len().max(1) as f64;
         if cost.is_finite() { cost.min(INVALID_COST) } else { INVALID_COST }
@@ -50,9 +52,10 @@ mod tests {
                 })
                 .collect()
         };
-        let of = |speed, off| cost.of(&path, 1.0, &along(speed, off), 0.1);
+        let none = Caution::new(None);
+        let of = |speed, off| cost.of(&path, &none, 1.0, &along(speed, off), 0.1);
         assert!(of(3.0, 0.0) < 1e-4 && of(2.0, 0.0) > 0.1 && of(3.0, 1.0) > 0.9);
         let broken = vec![[f64::NAN, 0.0, 0.0, 0.0]; 30];
-        assert_eq!(cost.of(&path, 1.0, &broken, 0.1), INVALID_COST);
+        assert_eq!(cost.of(&path, &none, 1.0, &broken, 0.1), INVALID_COST);
     }
 }

@@ -141,6 +141,7 @@ fn lap_on(plant: &mut dyn PlantLink, world: &str, seed: u64) -> Lap {
         horizon: 20,
         plan_every: 3,
         steering_guess: 0.4,
+        caution: None,
     };
     // The kinematic model never waits for anybody.
     let waker = std::task::Waker::noop();

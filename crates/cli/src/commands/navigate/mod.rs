@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_navigation::{MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, TrackingCost};
+use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, TrackingCost};
 use nesam_physics::{SecondCommand, Vehicle, driveline::road_wheel_angles};
 use nesam_plant::HiddenEffects;
 use nesam_terrain::WorldMap;
@@ -33,6 +33,20 @@ const SPEED_LIMITS_M_S: [f64; 2] = [0.5, 4.0];
 /// Weights of progress and tilt against the squared distance from the path.
 const LAG_WEIGHT: f64 = 0.1;
 const TILT_WEIGHT: f64 = 2.0;
+/// What the planner does about ground further ahead that will not hold the vehicle on the path (ADR 0061).
+const CAUTION: CautionSettings = CautionSettings {
+    ahead_m: [6.0, 10.0, 14.0, 18.0],
+    every_steps: 10,
+    trial_speed_m_s: 2.5,
+    slowed_by_m: [0.7, 1.2],
+    slow_m_s: 2.2,
+    slow_limits_m_s: [1.5, 2.5],
+    moved_by_m: [1.0, 2.0],
+    inside_m: 2.2,
+    lead_m: 12.0,
+    ramp_m: 6.0,
+    behind_m: 3.0,
+};
 /// Worlds of the scenario, where the data root has them.
 const SCENARIO: [&str; 5] = ["w35", "w36", "w37", "w38", "w39"];
 /// Steps of a candidate at most: one of the 32 positions of the model is the step whose command is already on its way.
@@ -70,6 +84,10 @@ pub struct NavigateArgs {
     /// Steps of 0.1 s from plan to plan
     #[arg(long, value_name = "STEPS", default_value_t = 2)]
     plan_every: usize,
+    /// Look no further ahead than candidates reach: without it the planner tries places of the path up to 18 m ahead and comes slower and further inside to those
+    /// that will not hold the vehicle
+    #[arg(long)]
+    no_caution: bool,
     /// Wanted speed, m/s
     #[arg(long, value_name = "M/S", default_value_t = 3.0)]
     speed: f64,
@@ -292,6 +310,7 @@ fn settings_of(args: &NavigateArgs, bundle: &ModelBundle, diagnosed: Option<&Mod
         "noise_correlation": NOISE_CORRELATION,
         "temperature": TEMPERATURE,
         "speed_limits_m_s": speed_limits_m_s(&bundle.vehicle),
+        "caution": caution_of(args),
         "effect": args.effect,
         "plant": args.plant.map(|address| address.to_string()),
     })
@@ -310,6 +329,10 @@ fn settings_of_lap(settings: &Value, root: &DataRoot, world: &str) -> Result<Val
 
 fn cost_of(args: &NavigateArgs) -> TrackingCost {
     TrackingCost { speed_m_s: args.speed, lag: LAG_WEIGHT, tilt: TILT_WEIGHT }
+}
+
+fn caution_of(args: &NavigateArgs) -> Option<CautionSettings> {
+    (!args.no_caution).then_some(CAUTION)
 }
 
 fn mppi_of(args: &NavigateArgs, vehicle: &Vehicle) -> MppiSettings {

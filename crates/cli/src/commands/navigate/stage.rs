@@ -10,7 +10,7 @@ use nesam_evaluation::{Baselines, Kinematic};
 use nesam_model::ModelBundle;
 use nesam_navigation::{
     BuiltInPlant, Forecaster, KinematicForecaster, LapPlan, PlantLink, ReferencePath, RemotePlant, Run, ServedForecaster, SoilAhead,
-    run_lap,
+    Surroundings, run_lap,
 };
 use nesam_physics::DT_S;
 use nesam_plant::{Ground, HiddenEffects};
@@ -18,7 +18,7 @@ use nesam_server::{Config, RunningServer};
 use nesam_trajectories::DataRoot;
 use serde_json::{Value, json};
 
-use super::{Configuration, NavigateArgs, Task, cost_of, mppi_of, steering_guess};
+use super::{Configuration, NavigateArgs, Task, caution_of, cost_of, mppi_of, steering_guess};
 use crate::commands::serve;
 use crate::failure::{Failure, OrFail};
 use crate::sources::map_layers;
@@ -96,6 +96,7 @@ impl<'a> Stage<'a> {
             horizon: self.args.horizon,
             plan_every: self.args.plan_every,
             steering_guess: steering_guess(&self.bundles.shipped.vehicle, &self.path, self.args.speed),
+            caution: caution_of(self.args),
         };
         let lap = run_lap(&plan, self.plant.as_mut(), &mut model).await.or_failed()?;
         if let Forecaster::Served(served) = model {
@@ -122,7 +123,9 @@ impl<'a> Stage<'a> {
         let client = self.raise(kind, &task.world).await?.client.clone();
         let told = if task.configuration == Configuration::Oracle { Some(self.told(client.clone(), &task.world).await?) } else { None };
         self.driven += 1;
-        let served = ServedForecaster::open(client, &format!("lap-{}", self.driven), &task.world, told).await.or_failed()?;
+        let map = self.root.world(&task.world).or_input()?;
+        let surroundings = Surroundings { map, vehicle: Arc::new(self.bundles.shipped.vehicle.clone()) };
+        let served = ServedForecaster::open(client, &format!("lap-{}", self.driven), surroundings, told).await.or_failed()?;
         Ok(Forecaster::Served(Box::new(served)))
     }
 
