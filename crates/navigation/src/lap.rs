@@ -154,7 +154,7 @@ impl Driver<'_> {
 
     /// Tries places of the path ahead, every few steps.
     async fn look_ahead(&mut self, model: &mut Forecaster, reading: &Reading, phi: f64, step: usize) -> Result<(), NavigationError> {
-        let Some(settings) = self.caution.settings().copied().filter(|s| step % s.every_steps == 0) else { return Ok(()) };
+        let Some(settings) = self.caution.settings().copied().filter(|s| step.is_multiple_of(s.every_steps)) else { return Ok(()) };
         let path = &self.plan.path;
         for ahead_m in settings.ahead_m {
             let arc_m = path.arc_m(phi) + ahead_m;
