@@ -42,14 +42,15 @@ impl Cluster {
             let read = read.unwrap_or_else(|_| Err("reading it panicked; this is a bug".into()));
             let read = read.map_err(|reason| Status::data_loss(format!("map `{map}` as etcd holds it: {reason}")))?;
             let hash = read.hash().to_string();
-            self.lock().maps.insert(map.into(), head.sha256);
-            let put = self.0.engine.put_map(read.into(), None, PUT).await;
-            return match put {
-                Ok(_) => Ok(hash),
+            let hash = match self.0.engine.put_map(read.into(), None, PUT).await {
+                Ok(_) => hash,
                 // A newer one was put here a moment ago.
-                Err(EngineError::MapExists { .. }) => Ok(self.0.engine.get_map(map, PUT).await.map_err(to_status)?.hash().to_string()),
-                Err(error) => Err(to_status(error)),
+                Err(EngineError::MapExists { .. }) => self.0.engine.get_map(map, PUT).await.map_err(to_status)?.hash().to_string(),
+                Err(error) => return Err(to_status(error)),
             };
+            // After the engine has it: what this server knows and does not hold may be removed.
+            self.lock().maps.insert(map.into(), head.sha256);
+            return Ok(hash);
         }
         Err(Status::unavailable(format!("map `{map}` changes faster than it can be read; ask again")))
     }
@@ -119,7 +120,9 @@ impl Cluster {
                 // Before it is written, so that the watch finds nothing new in it. A map that is not there yet is nothing that could be lost.
                 self.lock().maps.insert(map.into(), sha256.clone());
             }
-            if before.as_ref().is_some_and(|(before, _)| before.sha256 == head.sha256) {
+            let same = before.as_ref().is_some_and(|(before, _)| before.sha256 == head.sha256);
+            // Whoever removed a map meanwhile took the parts of one that was not named yet with it.
+            if same && self.count_parts(map, &sha256).await? == head.parts {
                 return Ok(());
             }
             if let Some((newer, _)) = before.as_ref().filter(|(before, _)| before.version > head.version) {
@@ -131,21 +134,32 @@ impl Cluster {
             }
             let revision = before.as_ref().map_or(0, |(_, revision)| *revision);
             let mut then = vec![put(&keys.map(map), json(&head), 0)];
-            then.extend(before.map(|(before, _)| delete_all(&keys.parts(map, Some(&before.sha256)))));
+            then.extend(before.filter(|_| !same).map(|(before, _)| delete_all(&keys.parts(map, Some(&before.sha256)))));
             if self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then).await?.held {
-                self.lock().maps.insert(map.into(), sha256);
-                return Ok(());
+                self.lock().maps.insert(map.into(), sha256.clone());
+                if self.count_parts(map, &sha256).await? == head.parts {
+                    return Ok(());
+                }
             }
         }
         Err(Status::aborted(format!("map `{map}` is written by others all the time")))
     }
 
-    /// Removes a map, if what stands there is what this server has read or written last.
+    /// Parts of one content of a map that are there.
+    async fn count_parts(&self, map: &str, sha256: &str) -> Result<usize, Status> {
+        let parts = self.0.etcd.all(vec![get_keys(&self.0.keys.parts(map, Some(sha256)))]).await?.read;
+        Ok(parts.into_iter().flatten().count())
+    }
+
+    /// Removes a map, if what stands there is what this server has read or written last, and the engine has not got it again meanwhile.
     ///
     /// # Errors
     /// What etcd says.
     pub(crate) async fn remove_map(&self, map: &str) -> Result<(), Status> {
         let keys = &self.0.keys;
+        if self.0.engine.get_map(map, PUT).await.is_ok() {
+            return Ok(());
+        }
         let known = self.lock().maps.get(map).cloned();
         if let Some((head, revision)) = self.map_head(map).await?
             && known == Some(head.sha256)
