@@ -56,7 +56,7 @@ class Rollout(casadi.Callback):
 
     def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
         """The states."""
-        return [casadi.DM(self._predict(*arguments).states[0].astype(np.float64).T)]
+        return [casadi.DM(self.predict(*arguments).states[0].astype(np.float64).T)]
 
     def has_jacobian(self) -> bool:
         return True
@@ -66,7 +66,8 @@ class Rollout(casadi.Callback):
         self._jacobian = _Jacobian(name, self, inames, onames, options)
         return self._jacobian
 
-    def _predict(self, x0: casadi.DM, u: casadi.DM, extras: Optional[Extras] = None) -> Prediction:
+    def predict(self, x0: casadi.DM, u: casadi.DM, extras: Optional[Extras] = None) -> Prediction:
+        """What the service predicts from a start (12,) under commands (2, horizon), with these extras."""
         start, controls = np.array(x0).reshape(-1), np.array(u).T[None]
         return self._client.predict(self._session_id, controls, start=start, extras=extras, **self._options)
 
@@ -99,7 +100,7 @@ class _Jacobian(casadi.Callback):
         return casadi.Sparsity.dense(_STATE * horizon, (_STATE, _COMMAND * horizon)[i])
 
     def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
-        extras = self._rollout._predict(arguments[0], arguments[1], Extras(jacobians=True)).extras
+        extras = self._rollout.predict(arguments[0], arguments[1], Extras(jacobians=True)).extras
         rows = _STATE * self._rollout.horizon
         start = extras.jacobian_start[0].reshape(rows, _STATE)
         controls = extras.jacobian_controls[0].reshape(rows, _COMMAND * self._rollout.horizon)

@@ -109,6 +109,12 @@ mod tests {
         v1::MeasurementAnswer { place, durable_place, ..Default::default() }
     }
 
+    fn holding(measurements: u64) -> Outbox {
+        let mut outbox = Outbox::default();
+        (1..=measurements).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        outbox
+    }
+
     fn no_room() -> v1::MeasurementAnswer {
         let rejected = v1::Rejected { code: tonic::Code::ResourceExhausted.into(), ..Default::default() };
         v1::MeasurementAnswer { outcome: Some(v1::measurement_answer::Outcome::Rejected(rejected)), ..Default::default() }
@@ -120,8 +126,7 @@ mod tests {
 
     #[test]
     fn analytic_only_what_is_durable_is_forgotten() {
-        let mut outbox = Outbox::default();
-        (1..=4).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        let mut outbox = holding(4);
         assert_eq!(sequences(&mut outbox), [1, 2, 3, 4]);
         outbox.answered(&answer(1, 0));
         outbox.answered(&answer(2, 1));
@@ -143,8 +148,7 @@ mod tests {
 
     #[test]
     fn analytic_places_of_another_run_say_nothing() {
-        let mut outbox = Outbox::default();
-        (1..=2).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        let mut outbox = holding(2);
         assert_eq!(sequences(&mut outbox), [1, 2]);
         outbox.answered(&v1::MeasurementAnswer { run: 5, ..answer(1, 0) });
         outbox.answered(&v1::MeasurementAnswer { run: 5, ..answer(2, 1) });
@@ -159,8 +163,7 @@ mod tests {
 
     #[test]
     fn analytic_a_measurement_that_is_sent_again_is_answered_last() {
-        let mut outbox = Outbox::default();
-        (1..=3).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        let mut outbox = holding(3);
         assert_eq!(sequences(&mut outbox), [1, 2, 3]);
         outbox.answered(&no_room());
         assert_eq!(sequences(&mut outbox), [1]);
@@ -173,8 +176,7 @@ mod tests {
 
     #[test]
     fn analytic_a_refusal_without_a_run_takes_no_place_away() {
-        let mut outbox = Outbox::default();
-        (1..=2).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        let mut outbox = holding(2);
         assert_eq!(sequences(&mut outbox), [1, 2]);
         outbox.answered(&v1::MeasurementAnswer { run: 5, ..answer(1, 0) });
         outbox.answered(&answer(0, 0));

@@ -1,5 +1,6 @@
 //! Options that several commands share.
 
+use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
@@ -112,6 +113,21 @@ impl WindowArgs {
 pub fn longest_horizon(drives: &[Trajectory]) -> usize {
     let longest = drives.iter().map(|d| d.states.len()).max().unwrap_or(0);
     MAX_HORIZON.min(longest.saturating_sub(1)).max(1)
+}
+
+/// Refuses a number that an option does not take.
+///
+/// # Errors
+/// Wrong usage: the option and what it takes.
+pub fn check_count(option: &str, value: usize, allowed: RangeInclusive<usize>) -> Result<(), Failure> {
+    if allowed.contains(&value) {
+        return Ok(());
+    }
+    let limits = match allowed.into_inner() {
+        (least, usize::MAX) => format!("at least {least}"),
+        (least, most) => format!("{least} to {most}"),
+    };
+    Err(Failure::input(format!("{option} must be {limits}, not {value}")))
 }
 
 fn positive(text: &str) -> Result<usize, String> {

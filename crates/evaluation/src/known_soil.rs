@@ -73,6 +73,26 @@ pub struct KnownSoil {
 }
 
 impl KnownSoil {
+    /// In words; what there is of each parameter is in [`KnownSoil::by_parameter`].
+    pub fn sentence(&self) -> String {
+        let between = |ci95: Option<[f64; 2]>| ci95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
+        format!(
+            "Held against the simulator's own soil after {} updates: median of NEES over 6 {:.2} (0.89 for a consistent filter), share inside its 95 % \
+             interval {:.2}{}; share of 90 % intervals that hold the true parameter {:.2}{}.",
+            self.updates,
+            self.nees_median_over_dof,
+            self.nees_inside_95,
+            between(self.nees_inside_95_ci95),
+            self.coverage_90,
+            between(self.coverage_90_ci95)
+        )
+    }
+
+    /// Rows of a table over the parameters, with their names.
+    pub fn by_parameter(&self) -> [(&'static str, &[f64; SOIL_DIM]); 2] {
+        [("90 % intervals hold", &self.coverage_90_by_parameter), ("error over the prior's", &self.error_over_prior)]
+    }
+
     /// Of drives whose true soil is known; `None` without an accepted update there.
     pub fn of(drives: &[Trajectory], filtered: &[DriveAdaptation], truth: &[Arc<TrueSoil>], resamples: &Resamples) -> Option<Self> {
         let (mut held, mut of_drive, mut squared) = (Vec::new(), Vec::new(), [[0.0; 2]; SOIL_DIM]);

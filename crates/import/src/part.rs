@@ -2,15 +2,13 @@
 
 use std::collections::HashMap;
 
+use nesam_trajectories::{STEP_MAX_S, gap_limit_s};
+
 use crate::error::ImportError;
 use crate::frame::{FrameConvention, attitude_of};
 use crate::log::Log;
 use crate::mapping::Mapping;
 
-/// Longest pause within a drive, s, unless five usual steps are longer: what readers of data roots bridge.
-const GAP_S: f64 = 0.5;
-/// Longest usual step, s: what readers of data roots take for seconds.
-const STEP_MAX_S: f64 = 10.0;
 /// Shorter drives hold no prediction and are left out, s.
 const DRIVE_MIN_S: f64 = 1.0;
 /// A channel that is missing in a larger share of the rows is left out; else the rows are.
@@ -289,7 +287,7 @@ fn at_gaps(log: &Log, time: &[Option<f64>], rows: &[usize]) -> Result<Vec<Vec<us
         let advice = "where its unit is not the second, name it: --column t=COLUMN:ns, or ms, us";
         return Err(ImportError::log(&log.path, format!("{what}; {advice}")));
     }
-    let limit_s = GAP_S.max(5.0 * median_s);
+    let limit_s = gap_limit_s(median_s);
     let mut parts: Vec<Vec<usize>> = Vec::new();
     for (i, row) in rows.iter().enumerate() {
         if i == 0 || step(&rows[i - 1..=i]) > limit_s {

@@ -110,7 +110,7 @@ fn service_python_plant_drives_a_lap() {
     let child = Process::new("python3").arg(script).arg(&address).stdout(Stdio::null()).spawn();
     let _stub = Ended(child.expect("python3 runs the reference plant"));
     let mut remote = RemotePlant::connect(&address, 7).unwrap();
-    // Position and velocity are those of one point: on a steady circle it moves as its velocity says, but for 0.1 mm of the stub's Euler steps.
+    // Position and velocity are those of one point: on a steady circle it moves as its velocity says, but for 0.1 mm of the Euler steps of that plant.
     remote.reset(&start("w35")).unwrap();
     let circle: Vec<[f64; 12]> = (0..40).map(|_| remote.step(Control { speed_m_s: 2.0, second: 0.5 }).unwrap().measured).collect();
     let (before, after) = (circle[38], circle[39]);

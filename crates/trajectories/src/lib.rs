@@ -29,6 +29,7 @@ pub use data_sheet::{card_from_json, card_to_json, read_vehicle_card};
 pub use error::TrajectoryError;
 pub use ground_truth::GroundTruth;
 pub use reports::{Report, drives_of_reports};
+pub use resample::{STEP_MAX_S, gap_limit_s};
 pub use soil_truth::{RegionSoil, SoilTruth, read_ground_truth_soil};
 pub use trajectory::{MeasuredChannels, Split, Trajectory, VelocitySource};
 pub use velocity::to_body;

@@ -2,12 +2,15 @@
 
 use nesam_physics::wrap_angle;
 
-/// Longest gap between samples that is bridged, s, unless five source steps are longer (chosen: beyond it the motion is unknown).
-const GAP_LIMIT_S: f64 = 0.5;
 /// Longest usual step of a log, s: the longest that drives are resampled to. What is longer counts milliseconds or the like.
-const STEP_MAX_S: f64 = 10.0;
+pub const STEP_MAX_S: f64 = 10.0;
 /// Samples of a drive at most: eleven days at 10 Hz. A longer one would take gigabytes.
 const SAMPLES_MAX: f64 = 1e7;
+
+/// Longest gap between samples that is bridged in a log of this usual step, s: five steps, at least half a second (chosen: beyond it the motion is unknown).
+pub fn gap_limit_s(usual_step_s: f64) -> f64 {
+    (5.0 * usual_step_s).max(0.5)
+}
 
 /// Where each sample of the model lies among the samples of the log: share `1 - share` of `at`, `share` of the next one.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,7 +45,7 @@ impl Grid {
         if let Some(picked) = pick(time_s, dt_s, median_s) {
             return Ok(picked);
         }
-        let limit_s = GAP_LIMIT_S.max(5.0 * median_s);
+        let limit_s = gap_limit_s(median_s);
         if let Some(gap) = steps.iter().position(|step| *step > limit_s) {
             let reason = format!("a gap of {:.3} s follows, at most {limit_s:.3} s are bridged; split the drive there", steps[gap]);
             return Err((gap, reason));

@@ -135,12 +135,8 @@ impl Cluster {
             let revision = before.as_ref().map_or(0, |(_, revision)| *revision);
             let mut then = vec![put(&keys.map(map), json(&head), 0)];
             then.extend(before.filter(|_| !same).map(|(before, _)| delete_all(&keys.parts(map, Some(&before.sha256)))));
-            if self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then).await?.held {
-                self.lock().maps.insert(map.into(), sha256.clone());
-                if self.count_parts(map, &sha256).await? == head.parts {
-                    return Ok(());
-                }
-            }
+            // Whether it holds, and is whole, is seen next.
+            self.0.etcd.transaction(vec![written(&keys.map(map), revision)], then).await?;
         }
         Err(Status::aborted(format!("map `{map}` is written by others all the time")))
     }

@@ -356,20 +356,11 @@ fn print_table(a: &Adaptation<'_>) {
         number(c.inside_95)
     );
     if let Some(known) = a.known_soil {
-        let between = |interval: Option<[f64; 2]>| interval.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
-        say!(
-            "the simulator's soil, {} updates: NEES over 6 median {:.2}, inside 95 %: {:.2}{}; 90 % intervals hold it: {:.2}{}",
-            known.updates,
-            known.nees_median_over_dof,
-            known.nees_inside_95,
-            between(known.nees_inside_95_ci95),
-            known.coverage_90,
-            between(known.coverage_90_ci95)
-        );
-        let row = |values: &[f64]| values.iter().map(|v| format!("{v:>11.2}")).collect::<String>();
+        say!("{}", known.sentence());
         say!("{:<22}{}", "", SOIL_NAMES.map(|n| format!("{n:>11}")).concat());
-        say!("{:<22}{}", "90 % intervals hold", row(&known.coverage_90_by_parameter));
-        say!("{:<22}{}", "error over the prior's", row(&known.error_over_prior));
+        for (name, values) in known.by_parameter() {
+            say!("{name:<22}{}", values.map(|v| format!("{v:>11.2}")).concat());
+        }
     }
     print_soil(a);
 }

@@ -10,7 +10,6 @@ mod serve;
 mod sweep;
 mod wire;
 
-use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
@@ -26,7 +25,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde_json::json;
 
-use crate::args::{BundleArgs, DataArgs};
+use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::output::{provenance, say, write_file};
 use crate::progress::Progress;
@@ -219,18 +218,6 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         }
         None => Ok(()),
     }
-}
-
-/// Refuses a number that an option does not take.
-fn check_count(option: &str, value: usize, allowed: RangeInclusive<usize>) -> Result<(), Failure> {
-    if allowed.contains(&value) {
-        return Ok(());
-    }
-    let limits = match allowed.into_inner() {
-        (least, usize::MAX) => format!("at least {least}"),
-        (least, most) => format!("{least} to {most}"),
-    };
-    Err(Failure::input(format!("{option} must be {limits}, not {value}")))
 }
 
 /// A recorded drive from whose samples queries start.

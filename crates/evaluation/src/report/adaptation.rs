@@ -112,22 +112,10 @@ fn error_table(a: &Adaptation<'_>, last: bool) -> Table {
 
 /// Adds what was learned, held against the simulator's own soil.
 fn add_known_soil(page: &mut Page, known: &KnownSoil) {
-    let between = |ci95: Option<[f64; 2]>| ci95.map_or(String::new(), |[low, high]| format!(" [{low:.2}, {high:.2}]"));
-    page.text(&format!(
-        "Held against the simulator's own soil after {} updates: median of NEES over 6 {:.2} (0.89 for a consistent filter), share inside its 95 % interval \
-         {:.2}{}; share of 90 % intervals that hold the true parameter {:.2}{}.",
-        known.updates,
-        known.nees_median_over_dof,
-        known.nees_inside_95,
-        between(known.nees_inside_95_ci95),
-        known.coverage_90,
-        between(known.coverage_90_ci95)
-    ));
+    page.text(&known.sentence());
     let head: Vec<&str> = std::iter::once("what was learned").chain(SOIL_NAMES).collect();
     let mut table = Table::new("By parameter; an error below 1 is nearer to the simulator's soil than the prior", &head);
-    for (name, values) in
-        [("90 % intervals that hold it", &known.coverage_90_by_parameter), ("error over the prior's", &known.error_over_prior)]
-    {
+    for (name, values) in known.by_parameter() {
         table.row(std::iter::once(name.into()).chain(values.iter().map(|v| format!("{v:.2}").into())).collect());
     }
     page.table(&table);

@@ -10,8 +10,7 @@ use nesam_physics::SOIL_NAMES;
 use serde_json::json;
 use std::sync::Arc;
 
-use super::check_count;
-use crate::args::BundleArgs;
+use crate::args::{BundleArgs, check_count};
 use crate::commands::adapt::{filter_in_force, settings_file};
 use crate::failure::{Failure, OrFail};
 use crate::output::{command_line, say, write_file};

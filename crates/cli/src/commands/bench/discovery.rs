@@ -9,8 +9,7 @@ use nesam_discovery::{Judge, Scoring};
 use nesam_evaluation::report::Short;
 use serde_json::json;
 
-use super::check_count;
-use crate::args::{BundleArgs, DataArgs};
+use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::output::{provenance, say, write_file};
 use crate::progress::Progress;

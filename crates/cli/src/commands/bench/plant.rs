@@ -13,8 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
 use serde_json::json;
 
-use super::check_count;
-use crate::args::{BundleArgs, DataArgs};
+use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::commands::plant::write::{Asked, copy_vehicle_and_worlds, write_drives};
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, say, write_file};

@@ -9,8 +9,8 @@ use nesam_client::{Candidates, Client, ClientError, Prediction, v1};
 use nesam_server::Config;
 use serde_json::{Value, json};
 
-use super::{DRIVEN, check_count, percentile, straight_on};
-use crate::args::BundleArgs;
+use super::{DRIVEN, percentile, straight_on};
+use crate::args::{BundleArgs, check_count};
 use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};

@@ -10,6 +10,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::{effects_of, root_of};
+use crate::args::check_count;
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
@@ -91,9 +92,7 @@ impl Asked<'_> {
         if !(1.0..=600.0).contains(&self.seconds) {
             return Err(Failure::input(format!("--seconds must be 1 to 600, not {}", self.seconds)));
         }
-        if !(1..=10_000).contains(&self.drives) {
-            return Err(Failure::input(format!("--drives must be 1 to 10000, not {}", self.drives)));
-        }
+        check_count("--drives", self.drives, 1..=10_000)?;
         match self.worlds.iter().find(|world| !is_plain(world)) {
             Some(world) => Err(Failure::input(format!("--worlds {world}: must be a plain name"))),
             None => Ok(()),
