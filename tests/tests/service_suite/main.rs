@@ -29,6 +29,7 @@ mod session_model;
 mod sessions;
 mod sharing;
 mod simulation;
+mod slides;
 mod soil;
 mod stage;
 mod streams;
