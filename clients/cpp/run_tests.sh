@@ -91,7 +91,7 @@ finish_server() {
 
 failed=no
 start_server "$@"
-for test in client_test extras_test predictions_test sessions_test streams_test; do
+for test in client_test extras_test fallback_test predictions_test sessions_test streams_test; do
   timeout 300 "$build/$test" "$address" || failed=yes
 done
 timeout 120 "$build/examples/planner" "$address" 5 || failed=yes

@@ -252,6 +252,16 @@ pub fn measured(answer: Answer) -> Result<MeasureAnswer, EngineError> {
     }
 }
 
+/// Why a measurement never reached the engine, with where its session stands if the answer to `Command::Get` tells of a session of its vehicle (`None` = of any).
+pub fn unmeasured(cause: EngineError, vehicle: Option<&str>, session: Answer) -> EngineError {
+    match session.result {
+        Ok(Reply::Session(view)) if vehicle.is_none_or(|vehicle| vehicle == view.vehicle) => {
+            EngineError::RefusedMeasurement { cause: Box::new(cause), standing: Box::new(view.provenance) }
+        }
+        _ => cause,
+    }
+}
+
 fn mismatch(command: &str) -> EngineError {
     EngineError::Internal { reason: format!("command `{command}` was answered with another reply") }
 }

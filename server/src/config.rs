@@ -1,6 +1,7 @@
 //! The configuration. `deploy/config/default.toml` says the same with comments; a test keeps the two equal.
 
 mod cluster;
+mod diagnosis;
 mod store;
 mod tls;
 
@@ -13,6 +14,7 @@ use nesam_engine::{FleetSoilSettings, Limits, check_name};
 use serde::{Deserialize, Serialize};
 
 pub use self::cluster::ClusterConfig;
+pub use self::diagnosis::DiagnosisConfig;
 pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
 use crate::error::ServerError;
@@ -44,6 +46,8 @@ pub struct Config {
     pub store: StoreConfig,
     /// Servers that share sessions.
     pub cluster: ClusterConfig,
+    /// Diagnoses of what was recorded.
+    pub diagnosis: DiagnosisConfig,
 }
 
 /// gRPC.
@@ -426,6 +430,7 @@ impl Config {
             ("limits.session_idle_s", self.limits.session_idle_s),
             ("limits.clock_ahead_max_s", self.limits.clock_ahead_max_s),
             ("store.interval_s", self.store.interval_s),
+            ("diagnosis.limit_s", self.diagnosis.limit_s),
             ("zenoh.status_interval_s", self.zenoh.status_interval_s),
         ];
         for (key, value) in seconds {
@@ -463,6 +468,7 @@ impl Config {
         self.http.health_address()?;
         self.tls.check()?;
         self.cluster.check()?;
+        self.diagnosis.check()?;
         if self.cluster.enabled() && self.store.enabled {
             let reason = "is on, but with `cluster.etcd` sessions are kept in etcd; choose one".into();
             return Err(ServerError::Value { key: "store.enabled", reason });
@@ -566,6 +572,10 @@ mod tests {
                 "zenoh.listen",
             ),
             ("[http]\nhealth = \"everywhere\"\n", "http.health"),
+            ("[diagnosis]\nlimit_s = 0.0\n", "diagnosis.limit_s"),
+            ("[diagnosis]\nthreads = 0\n", "diagnosis.threads"),
+            ("[diagnosis]\nat_once = 5000\n", "diagnosis.at_once"),
+            ("[diagnosis]\nkept_max = 0\n", "diagnosis.kept_max"),
             ("[cluster]\netcd = [\"etcd:2379\"]\n", "cluster.etcd"),
             ("[cluster]\netcd = [\"https://e:2379\"]\n", "cluster.authority"),
             ("[cluster]\netcd = [\"http://e:2379\"]\nlease_s = 0\n", "cluster.lease_s"),

@@ -11,6 +11,7 @@ mod clock;
 mod cluster;
 mod config;
 pub mod convert;
+mod diagnosis;
 mod error;
 mod expiry;
 mod grpc;
@@ -28,8 +29,8 @@ mod zenoh;
 pub use clock::MonotonicClock;
 pub use cluster::etcd_endpoint;
 pub use config::{
-    ClusterConfig, Config, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig, WorkersConfig,
-    ZenohConfig, ZenohMode, is_tls_endpoint,
+    ClusterConfig, Config, DiagnosisConfig, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig,
+    WorkersConfig, ZenohConfig, ZenohMode, is_tls_endpoint,
 };
 pub use error::ServerError;
 pub use one_thread::{Sessions, serve_on_one_thread};

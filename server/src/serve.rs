@@ -21,6 +21,7 @@ use crate::clock::{MonotonicClock, unix_ns};
 use crate::cluster::{Cluster, Etcd};
 use crate::config::{Config, GrpcConfig};
 use crate::convert::SoilTeller;
+use crate::diagnosis::Diagnoses;
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, stopped};
@@ -36,8 +37,8 @@ use crate::zenoh::{Presence, RenewedBus};
 pub(crate) const EVENTS_KEPT: usize = 1024;
 
 /// Names under which health is reported; the empty one stands for the whole server.
-const HEALTH_NAMES: [&str; 6] =
-    ["", "nesam.v1.Sessions", "nesam.v1.Prediction", "nesam.v1.Measurements", "nesam.v1.Terrain", "nesam.v1.Soil"];
+const HEALTH_NAMES: [&str; 7] =
+    ["", "nesam.v1.Sessions", "nesam.v1.Prediction", "nesam.v1.Measurements", "nesam.v1.Terrain", "nesam.v1.Soil", "nesam.v1.Diagnosis"];
 
 /// A server that listens. Dropping it leaves its tasks running; end it with [`RunningServer::shutdown`].
 pub struct RunningServer {
@@ -112,7 +113,9 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
+    let diagnoses = Some(Arc::new(Diagnoses::new(&config, recorder.clone(), live.clone())));
     let edge = Edge {
+        diagnoses,
         presence: config.zenoh.enabled.then(Presence::default),
         run,
         keeper: keeper.clone(),
@@ -311,16 +314,19 @@ fn builder(config: &GrpcConfig) -> tonic::transport::Server {
         .http2_max_pending_accept_reset_streams(Some(64))
 }
 
-/// All services, health and reflection.
+/// All services, health and reflection (v1 and v1alpha).
 pub(crate) fn router(edge: &Edge, health: &HealthReporter) -> Router {
     let health =
         tonic_health::pb::health_server::HealthServer::new(tonic_health::server::HealthService::from_health_reporter(health.clone()));
-    let reflection = tonic_reflection::server::Builder::configure()
-        .register_encoded_file_descriptor_set(pb::FILE_DESCRIPTOR_SET)
-        .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
-        .build_v1()
-        .expect("the committed descriptor set decodes; this is a bug");
-    builder(&edge.config).add_routes(grpc::routes(edge).add_service(health).add_service(reflection))
+    let described = || {
+        tonic_reflection::server::Builder::configure()
+            .register_encoded_file_descriptor_set(pb::FILE_DESCRIPTOR_SET)
+            .register_encoded_file_descriptor_set(tonic_health::pb::FILE_DESCRIPTOR_SET)
+    };
+    let reflection = described().build_v1().expect("the committed descriptor set decodes; this is a bug");
+    // For clients that know no other, as that of Python does.
+    let reflection_v1alpha = described().build_v1alpha().expect("the committed descriptor set decodes; this is a bug");
+    builder(&edge.config).add_routes(grpc::routes(edge).add_service(health).add_service(reflection).add_service(reflection_v1alpha))
 }
 
 fn spawn_grpc(

@@ -141,6 +141,21 @@ fn property_unsafe_code_stands_in_one_module() {
     }
 }
 
+/// The macros of the standard library panic where the stream is full or closed: a server would cancel the call that logged, a command would lose its work.
+#[test]
+fn property_no_source_prints_with_macros_that_panic() {
+    for root in ["crates", "server"] {
+        for_each_source(root, |path, text| {
+            let inside = path.strip_prefix(repository().join(root)).expect("a path below the root");
+            let ours = inside.components().any(|c| c.as_os_str() == "src");
+            // `println!`, `eprintln!` and those that end no line.
+            for macro_name in ["println!(", "print!("] {
+                assert!(!ours || !text.contains(macro_name), "{} uses {macro_name}; see crates/cli/src/output.rs", path.display());
+            }
+        });
+    }
+}
+
 /// What `deny.toml` says why an advisory does not concern this program: the code it is about is not compiled.
 #[test]
 fn property_zenoh_is_built_without_compression() {

@@ -18,6 +18,7 @@ struct AlarmNews {
     return core.sessions->AsyncWatchAlarms(&context, request, &queue, nullptr);
   }
   static Value value(const News& message) { return from_message(message); }
+  static Error over() { return session_closed(); }
 };
 
 class AlarmWatchImpl : public Watch<AlarmNews> {
@@ -28,7 +29,7 @@ class AlarmWatchImpl : public Watch<AlarmNews> {
 }  // namespace detail
 
 AlarmWatch::AlarmWatch(std::shared_ptr<detail::Core> core, const std::string& session_id)
-    : impl_(std::make_unique<detail::AlarmWatchImpl>(std::move(core), session_id)) {}
+    : impl_(std::make_unique<detail::AlarmWatchImpl>(std::move(core), detail::about<detail::AlarmNews>(session_id))) {}
 AlarmWatch::AlarmWatch(AlarmWatch&&) noexcept = default;
 AlarmWatch& AlarmWatch::operator=(AlarmWatch&&) noexcept = default;
 AlarmWatch::~AlarmWatch() = default;

@@ -61,6 +61,8 @@ Result<FleetSoilMap> Client::fleet_soil(const std::string& map_id, Timeout timeo
   return detail::from_message(*reply);
 }
 
+Diagnosis Client::diagnose(const DiagnosisRequest& request) const { return Diagnosis(core_, request); }
+
 Result<MapDescription> Client::upload_map(const Map& map, Timeout timeout) { return core_->upload(map, timeout); }
 
 Result<MapDescription> Client::patch_tile(const std::string& map_id, std::uint64_t base_version, const MapTile& tile, Timeout timeout) {

@@ -162,6 +162,8 @@ v1::MapHeader to_header(const Map& map) {
   header.set_width(map.geometry.width);
   header.set_height(map.geometry.height);
   header.set_semantic(!map.semantic_rgb.empty());
+  if (map.stamp_ns) header.set_stamp_ns(*map.stamp_ns);
+  header.set_frame(map.frame);
   return header;
 }
 
@@ -228,6 +230,8 @@ MeasurementAnswer from_message(const v1::MeasurementAnswer& message) {
   answer.place = message.place();
   answer.durable_place = message.durable_place();
   answer.run = message.run();
+  answer.map_version = message.map_version();
+  answer.bundle_hash = message.bundle_hash();
   switch (message.outcome_case()) {
     case v1::MeasurementAnswer::kApplied: answer.outcome = Applied{message.applied().history_steps()}; break;
     case v1::MeasurementAnswer::kBuffered: answer.outcome = Buffered{message.buffered().next_step_in_s()}; break;
@@ -253,6 +257,9 @@ SoilEstimate from_message(const v1::SoilEstimate& message) {
   estimate.soil_epoch = message.soil_epoch();
   if (message.has_stamp_ns()) estimate.stamp_ns = message.stamp_ns();
   estimate.correction = from_message(message.correction());
+  estimate.history_epoch = message.history_epoch();
+  estimate.map_version = message.map_version();
+  estimate.bundle_hash = message.bundle_hash();
   return estimate;
 }
 
@@ -301,6 +308,8 @@ MapDescription from_message(const v1::MapDescription& message) {
   description.hash = message.hash();
   description.geometry = {{message.origin_x_m(), message.origin_y_m()}, message.resolution_m(), message.width(), message.height()};
   description.semantic = message.semantic();
+  if (message.has_stamp_ns()) description.stamp_ns = message.stamp_ns();
+  description.frame = message.frame();
   return description;
 }
 

@@ -5,6 +5,7 @@
 
 #include "convert.hpp"
 #include "convert_prediction.hpp"
+#include "fallback_prediction.hpp"
 
 namespace nesam::detail {
 
@@ -57,7 +58,8 @@ Core::Core(const std::string& target, const ClientOptions& settings)
       prediction(v1::Prediction::NewStub(channel)),
       measurements(v1::Measurements::NewStub(channel)),
       soil(v1::Soil::NewStub(channel)),
-      terrain(v1::Terrain::NewStub(channel)) {}
+      terrain(v1::Terrain::NewStub(channel)),
+      diagnosis(v1::Diagnosis::NewStub(channel)) {}
 
 Result<SessionStatus> Core::session(const std::string& id, Timeout timeout) const {
   v1::GetSessionRequest request;
@@ -72,6 +74,7 @@ Result<void> Core::close(const std::string& id, Timeout timeout) const {
   request.set_session_id(id);
   auto reply = call(*sessions, &v1::Sessions::Stub::Close, request, timeout);
   if (!reply) return reply.error();
+  known_states.forget(id);
   return {};
 }
 
@@ -87,8 +90,13 @@ Result<Prediction> Core::predict(const std::string& id, const PredictRequest& re
   auto message = to_message(id, request);
   if (!message) return message.error();
   auto reply = call(*prediction, &v1::Prediction::Stub::Predict, *message, timeout);
-  if (!reply) return reply.error();
-  return from_message(*reply, Asked(request));
+  if (!reply) {
+    if (auto fallback = fallback_prediction(request, known_states.of(id), reply.error())) return *std::move(fallback);
+    return reply.error();
+  }
+  auto predicted = from_message(*reply, Asked(request));
+  if (predicted) known_states.predicted(id, request, *predicted);
+  return predicted;
 }
 
 }  // namespace nesam::detail

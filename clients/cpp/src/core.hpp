@@ -10,6 +10,8 @@
 #include <grpcpp/grpcpp.h>
 
 #include <nesam/client.hpp>
+#include "known_states.hpp"
+#include "nesam/v1/diagnosis.grpc.pb.h"
 #include "nesam/v1/measurements.grpc.pb.h"
 #include "nesam/v1/prediction.grpc.pb.h"
 #include "nesam/v1/sessions.grpc.pb.h"
@@ -77,6 +79,9 @@ class Core {
   const std::unique_ptr<v1::Measurements::Stub> measurements;
   const std::unique_ptr<v1::Soil::Stub> soil;
   const std::unique_ptr<v1::Terrain::Stub> terrain;
+  /// Guards itself; what is known of a session is no setting of the connection.
+  mutable KnownStates known_states;
+  const std::unique_ptr<v1::Diagnosis::Stub> diagnosis;
 };
 
 }  // namespace nesam::detail

@@ -197,7 +197,7 @@ bool DuplexStream<Kind>::take(const Reply& reply) {
     sent = &unanswered_.front();
   }
   // Only this thread takes requests off, and others that are added leave this one where it is: no lock is held while a large reply is unpacked.
-  Answer answer = Kind::answer(reply, *sent);
+  Answer answer = Kind::answer(*core_, reply, *sent);
   {
     const std::lock_guard lock(mutex_);
     inbox_.push_back(std::move(answer));

@@ -16,7 +16,11 @@ struct MeasurementExchange {
   static constexpr std::size_t pending_max = MeasurementStream::pending_max;
 
   static auto open(Core& core, grpc::ClientContext& context) { return core.measurements->Stream(&context); }
-  static Answer answer(const Reply& reply, const Sent&) { return from_message(reply); }
+  static Answer answer(const Core& core, const Reply& reply, const Sent& sent) {
+    Answer answer = from_message(reply);
+    core.known_states.measured(sent, answer);
+    return answer;
+  }
 };
 
 class MeasurementStreamImpl : public DuplexStream<MeasurementExchange> {

@@ -39,9 +39,9 @@ Control command_from_twist(const VehicleCard& card, double speed_m_s, double yaw
 }
 
 VelocityRollout::VelocityRollout(std::shared_ptr<const Session> session, MotionModelOptions options)
-    : session_(std::move(session)), options_(options), fineness_(fineness_of(options.model_dt_s)) {
+    : session_(std::move(session)), options_(std::move(options)), fineness_(fineness_of(options_.model_dt_s)) {
   if (fineness_ == 0) {
-    throw Error(Code::invalid_argument, "model_dt_s", "`model_dt_s`: " + std::to_string(options.model_dt_s) + " s, must be 0.1 s or a whole fraction of it");
+    throw Error(Code::invalid_argument, "model_dt_s", "`model_dt_s`: " + std::to_string(options_.model_dt_s) + " s, must be 0.1 s or a whole fraction of it");
   }
 }
 
@@ -76,6 +76,7 @@ void VelocityRollout::predict(View3<const float> commands, View3<float> velociti
   PredictRequest request;
   request.controls = {Span<const float>(asked), commands.samples(), steps, 2};
   request.channels = bit(Channel::x) | bit(Channel::y) | bit(Channel::yaw);
+  request.fallback = options_.fallback;
   auto answer = session_->predict(request, options_.timeout);
   if (!answer) {
     failure_ = answer.error();
@@ -90,7 +91,7 @@ void VelocityRollout::predict(View3<const float> commands, View3<float> velociti
     return;
   }
   failures_ = 0;
-  failure_.reset();
+  failure_ = answer->fallback_reason;
   prediction_ = std::move(*answer);
   for (std::size_t n = 0; n < commands.samples(); ++n) follow(n, velocities);
 }

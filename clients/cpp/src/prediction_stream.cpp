@@ -16,7 +16,7 @@ struct PredictionExchange {
   static constexpr std::size_t pending_max = PredictionStream::pending_max;
 
   static auto open(Core& core, grpc::ClientContext& context) { return core.prediction->PredictStream(&context); }
-  static Answer answer(const Reply& reply, const Sent& asked) { return from_message(reply, asked); }
+  static Answer answer(const Core&, const Reply& reply, const Sent& asked) { return from_message(reply, asked); }
 };
 
 class PredictionStreamImpl : public DuplexStream<PredictionExchange> {

@@ -18,6 +18,7 @@ struct SoilNews {
     return core.soil->AsyncWatch(&context, request, &queue, nullptr);
   }
   static Value value(const News& message) { return from_message(message); }
+  static Error over() { return session_closed(); }
 };
 
 class SoilWatchImpl : public Watch<SoilNews> {
@@ -28,7 +29,7 @@ class SoilWatchImpl : public Watch<SoilNews> {
 }  // namespace detail
 
 SoilWatch::SoilWatch(std::shared_ptr<detail::Core> core, const std::string& session_id)
-    : impl_(std::make_unique<detail::SoilWatchImpl>(std::move(core), session_id)) {}
+    : impl_(std::make_unique<detail::SoilWatchImpl>(std::move(core), detail::about<detail::SoilNews>(session_id))) {}
 SoilWatch::SoilWatch(SoilWatch&&) noexcept = default;
 SoilWatch& SoilWatch::operator=(SoilWatch&&) noexcept = default;
 SoilWatch::~SoilWatch() = default;

@@ -10,16 +10,27 @@
 
 namespace nesam::detail {
 
-/// A server stream that tells what becomes of a session. It has no thread of its own: one operation is under way at a time, and `receive` waits for it.
+/// The request for what becomes of a session.
+template <class Kind>
+typename Kind::Request about(const std::string& session_id) {
+  typename Kind::Request request;
+  request.set_session_id(session_id);
+  return request;
+}
+
+/// What it means that the news of a session have ended.
+inline Error session_closed() { return Error(Code::not_found, "session_id", "the session was closed"); }
+
+/// A server stream that tells what becomes of a session, or of work on it. It has no thread of its own: one operation is under way at a time, and `receive` waits for it.
 ///
-/// `Kind` says what travels: the message `Request` that names the session, the messages `News` and what becomes of them (`Value`), how the stream is opened
-/// (`open`), how a message is read (`value`), and what did not come when the time is over (`awaited`).
+/// `Kind` says what travels: the message `Request` that asks for it, the messages `News` and what becomes of them (`Value`), how the stream is opened
+/// (`open`), how a message is read (`value`), what did not come when the time is over (`awaited`), and what it means that nothing more comes (`over`).
 template <class Kind>
 class Watch {
  public:
   using Value = typename Kind::Value;
 
-  Watch(std::shared_ptr<Core> core, const std::string& session_id);
+  Watch(std::shared_ptr<Core> core, const typename Kind::Request& request);
   ~Watch();
 
   Result<Value> receive(std::chrono::nanoseconds timeout);
@@ -40,10 +51,8 @@ class Watch {
 };
 
 template <class Kind>
-Watch<Kind>::Watch(std::shared_ptr<Core> core, const std::string& session_id) : core_(std::move(core)) {
+Watch<Kind>::Watch(std::shared_ptr<Core> core, const typename Kind::Request& request) : core_(std::move(core)) {
   core_->introduce(context_);
-  typename Kind::Request request;
-  request.set_session_id(session_id);
   reader_ = Kind::open(*core_, context_, request, queue_);
 }
 
@@ -70,7 +79,7 @@ auto Watch<Kind>::receive(std::chrono::nanoseconds timeout) -> Result<Value> {
     if (auto value = go_on(done)) return *std::move(value);
   }
   if (!status_.ok()) return error_from(status_, context_);
-  return Error(Code::not_found, "session_id", "the session was closed");
+  return Kind::over();
 }
 
 template <class Kind>

@@ -66,9 +66,10 @@ void service_maps(nesam::Client& client) {
   const std::vector<float> elevation_m(std::size_t{side} * side, 1.0F);
   const std::vector<std::uint8_t> rgb(std::size_t{3} * side * side, 90);
   const std::string large_id = unique("large");
-  const nesam::Map large{large_id, 3, {{0.0, 0.0}, 0.1, side, side}, elevation_m, rgb};
+  const nesam::Map large{large_id, 3, {{0.0, 0.0}, 0.1, side, side}, elevation_m, rgb, -5, "odom"};
   const auto uploaded = client.upload_map(large);
   check(uploaded.ok() && uploaded->version == 3, uploaded.ok() ? "large map" : uploaded.error().what());
+  check(uploaded.ok() && uploaded->stamp_ns == -5 && uploaded->frame == "odom" && !described->stamp_ns && described->frame.empty(), "stamp and frame");
 
   nesam::OpenOptions options;
   options.vehicle_id = unique("mapper");

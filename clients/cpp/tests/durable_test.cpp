@@ -120,6 +120,15 @@ void service_streams_outlive_a_restart(const Place& place) {
   check_error(stream.send(cruise(2, card)), nesam::Code::unavailable, "", "nobody is there");
   check(std::chrono::steady_clock::now() - begin < 20s, "it gives up in time");
   check(stream.pending().size() == 1, "and keeps the measurement");
+  // A prediction that was asked for with a fallback comes all the same, from the newest measurement that was answered, and says so.
+  const auto controls = varied_controls(2, 4, card);
+  nesam::PredictRequest request = request_of(controls, 2, 4);
+  check_error(session.predict(request, 20s), nesam::Code::unavailable, "", "a prediction without one");
+  request.fallback = nesam::KinematicFallback{card};
+  const auto fallback = session.predict(request, 20s);
+  check(fallback.ok() && fallback->computed_by == nesam::ComputedBy::kinematic_fallback && fallback->fallback_reason &&
+            fallback->fallback_reason->code() == nesam::Code::unavailable && fallback->start.position_m == cruise(1, card).state.position_m,
+        fallback.ok() ? "the fallback is marked" : fallback.error().what());
   server.start();
   check_ok(client.connect(30s), "the server is there again");
   check_ok(stream.flush(30s), "flush sends it");

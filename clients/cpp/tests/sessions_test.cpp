@@ -250,6 +250,15 @@ void run_all(nesam::Client& client) {
   run("service_tiles_are_patched", [&] { service_tiles_are_patched(client); });
   run("service_there_is_no_soil_map_by_default",
       [&] { check_error(client.fleet_soil(map_id), nesam::Code::failed_precondition, "map_id", "a service without a map of the soil"); });
+  run("service_what_is_not_recorded_is_not_diagnosed", [&] {
+    nesam::DiagnosisRequest request;
+    request.session_id = "anybody";
+    check_error(client.diagnose(request).receive(30s), nesam::Code::failed_precondition, "recording", "a service that records nothing");
+    request.from_stamp_ns = 2;
+    request.to_stamp_ns = 1;
+    nesam::Diagnosis diagnosis = client.diagnose(request);
+    for (int i = 0; i < 2; ++i) check_error(diagnosis.receive(30s), nesam::Code::invalid_argument, "to_stamp_ns", "a window that ends before it begins");
+  });
   client.delete_map(map_id).value();
 }
 

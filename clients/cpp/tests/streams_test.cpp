@@ -193,6 +193,8 @@ void service_the_soil_is_watched(nesam::Session& session) {
     const auto told = watch.receive(30s);
     if (!check_ok(told, "an update")) return;
     check(told->soil_epoch == epoch && told->stamp_ns && *told->stamp_ns <= measurement.stamp_ns, "update " + std::to_string(epoch) + " is told");
+    check(told->history_epoch == answer->history_epoch && told->map_version == answer->map_version && told->map_version > 0, "where the session stands");
+    check(told->bundle_hash == answer->bundle_hash && told->bundle_hash.size() == 64, "the bundle");
     const auto status = session.status();
     check(status.ok() && status->soil_correction.delta.k_phi == told->correction.delta.k_phi, "the session has learned the same");
     const auto& covariance = told->correction.covariance;

@@ -1,4 +1,4 @@
-"""A plant for `nesam navigate --plant ADDRESS:PORT`: the smallest simulator that speaks the protocol of docs/plant-adapter.md.
+"""A plant for `nesam navigate --plant HOST:PORT`: the smallest simulator that speaks the protocol of docs/plant-adapter.md.
 
     python3 plant_stub.py 127.0.0.1:5599
 
@@ -12,6 +12,8 @@ import socket
 import sys
 
 
+# Name, version, settings: laps on plants of one name are laps on one plant. Change it with whatever changes the motion.
+NAME = "bicycle of the example, 1"
 # From the rear axle, about which the car turns, ahead to the reference point, whose position and velocity are told, m.
 REFERENCE_M = 1.7
 
@@ -36,20 +38,29 @@ class Bicycle:
         return [x, y, 0.6, 0.0, 0.0, yaw, self.speed, REFERENCE_M * self.rate, 0.0, 0.0, 0.0, self.rate]
 
 
+def answer(plant, request):
+    if request["type"] == "reset":
+        plant.reset(*(request[key] for key in ("world", "seed", "x_m", "y_m", "yaw_rad")))
+        return {"plant": NAME, "state": plant.state()}
+    if not hasattr(plant, "pose"):
+        return {"error": "reset comes first"}
+    plant.step(request["speed_m_s"], request["second"])
+    return {"state": plant.state()}
+
+
 def main(address):
     host, port = address.rsplit(":", 1)
     plug = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     plug.bind((host, int(port)))
-    plant, last = Bicycle(), None
+    plant, last, client = Bicycle(), {}, None
     while True:
         request, sender = plug.recvfrom(2048)
         request = json.loads(request)
-        if last is None or last["id"] != request["id"]:  # asked again: answer again, move nothing
-            if request["type"] == "reset":
-                plant.reset(*(request[key] for key in ("world", "seed", "x_m", "y_m", "yaw_rad")))
-            else:
-                plant.step(request["speed_m_s"], request["second"])
-            last = {"nesam_plant": 1, "id": request["id"], "state": plant.state()}
+        number = request["id"]
+        if sender == client and number < last["id"]:  # a late copy: it has been answered long ago
+            continue
+        if sender != client or number > last["id"]:  # else asked again: answer again, move nothing
+            last, client = {"nesam_plant": 1, "id": number, **answer(plant, request)}, sender
         plug.sendto(json.dumps(last).encode(), sender)
 
 

@@ -7,6 +7,7 @@ import grpc
 import numpy as np
 
 from . import _calls as calls
+from . import _diagnosis as diagnosis
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
@@ -17,6 +18,7 @@ from ._fallback import KinematicFallback
 from ._routing import HEADER
 from .v1 import (
     alarms_pb2,
+    diagnosis_pb2_grpc,
     measurements_pb2,
     measurements_pb2_grpc,
     prediction_pb2_grpc,
@@ -46,6 +48,7 @@ class AsyncClient:
             "prediction": prediction_pb2_grpc.PredictionStub(channel),
             "terrain": terrain_pb2_grpc.TerrainStub(channel),
             "soil": soil_pb2_grpc.SoilStub(channel),
+            "diagnosis": diagnosis_pb2_grpc.DiagnosisStub(channel),
             "measurements": measurements_pb2_grpc.MeasurementsStub(channel),
         }
         self._known_states = calls.KnownStates()
@@ -69,11 +72,15 @@ class AsyncClient:
             raise from_rpc(error) from None
 
     async def _watch(self, service: str, method: str, request, read):
+        call = getattr(self._stubs[service], method)(request, metadata=self._metadata)
         try:
-            async for message in getattr(self._stubs[service], method)(request, metadata=self._metadata):
+            async for message in call:
                 yield read(message)
         except grpc.RpcError as error:
             raise from_rpc(error) from None
+        finally:
+            # Whoever stops listening ends the call, and what the service does for it.
+            call.cancel()
 
     # Sessions
 
@@ -126,6 +133,20 @@ class AsyncClient:
     def alarms(self, session_id: str) -> AsyncIterator[t.Alarm]:
         """As `Client.alarms`, for `async for`."""
         return self._watch("sessions", "WatchAlarms", alarms_pb2.WatchAlarmsRequest(session_id=session_id), m.alarm)
+
+    def diagnose(
+        self,
+        session_id: str,
+        recording: str = "",
+        from_stamp_ns: Optional[int] = None,
+        to_stamp_ns: Optional[int] = None,
+        seed: Optional[int] = None,
+        reference: str = "bundle",
+        controls: bool = True,
+    ) -> AsyncIterator[t.DiagnosisEvent]:
+        """As `Client.diagnose`, for `async for`; `aclose()` or the end of the task ends it."""
+        request = diagnosis.request(session_id, recording, from_stamp_ns, to_stamp_ns, seed, reference, controls)
+        return self._watch("diagnosis", "Start", request, diagnosis.event)
 
     # Soil
 

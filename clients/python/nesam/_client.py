@@ -10,6 +10,7 @@ import grpc
 import numpy as np
 
 from . import _calls as calls
+from . import _diagnosis as diagnosis
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
@@ -21,6 +22,7 @@ from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
 from .v1 import (
     alarms_pb2,
+    diagnosis_pb2_grpc,
     measurements_pb2,
     measurements_pb2_grpc,
     prediction_pb2_grpc,
@@ -49,6 +51,7 @@ class Client:
             "prediction": prediction_pb2_grpc.PredictionStub(self._channel),
             "terrain": terrain_pb2_grpc.TerrainStub(self._channel),
             "soil": soil_pb2_grpc.SoilStub(self._channel),
+            "diagnosis": diagnosis_pb2_grpc.DiagnosisStub(self._channel),
         }
         self._measurements = measurements_pb2_grpc.MeasurementsStub(self._channel)
         self._known_states = calls.KnownStates()
@@ -71,11 +74,15 @@ class Client:
             raise from_rpc(error) from None
 
     def _watch(self, service: str, method: str, request, read):
+        call = getattr(self._stubs[service], method)(request)
         try:
-            for message in getattr(self._stubs[service], method)(request):
+            for message in call:
                 yield read(message)
         except grpc.RpcError as error:
             raise from_rpc(error) from None
+        finally:
+            # Whoever stops listening ends the call, and what the service does for it.
+            call.cancel()
 
     # Sessions
 
@@ -137,6 +144,28 @@ class Client:
     def alarms(self, session_id: str) -> Iterator[t.Alarm]:
         """The alarms of a session as they come: the active one first, then each that is raised or cleared. Ends when the session closes. Raises NotFound."""
         return self._watch("sessions", "WatchAlarms", alarms_pb2.WatchAlarmsRequest(session_id=session_id), m.alarm)
+
+    def diagnose(
+        self,
+        session_id: str,
+        recording: str = "",
+        from_stamp_ns: Optional[int] = None,
+        to_stamp_ns: Optional[int] = None,
+        seed: Optional[int] = None,
+        reference: str = "bundle",
+        controls: bool = True,
+    ) -> Iterator[t.DiagnosisEvent]:
+        """Diagnoses what the service recorded of a session: which effect does the model lack? Tells the start, progress, and last the report; it takes minutes.
+
+        It begins when the first event is asked for; leaving the iterator ends it. recording: name of an earlier run of the server, "" = what it has recorded until
+        now. Stamps bound the window by the vehicle's clock, None = all. reference: "bundle" or "physics". controls: whether to try what would expose a wrong claim,
+        too. Needs the rights of an operator.
+
+        Raises FailedPrecondition (nothing is recorded, or what was cannot be diagnosed), NotFound (recording), InvalidArgument, Overloaded (others run),
+        DeadlineExceeded (`diagnosis.limit_s` of the service), PermissionDenied as NesamError; ValueError for an unknown reference.
+        """
+        request = diagnosis.request(session_id, recording, from_stamp_ns, to_stamp_ns, seed, reference, controls)
+        return self._watch("diagnosis", "Start", request, diagnosis.event)
 
     # Soil
 

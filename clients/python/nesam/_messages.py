@@ -66,6 +66,8 @@ def answer(message: measurements_pb2.MeasurementAnswer) -> t.Answer:
         durable_place=message.durable_place,
         run=message.run,
         code=getattr(detail, "code", 0),
+        map_version=message.map_version,
+        bundle_hash=message.bundle_hash,
     )
 
 
@@ -180,6 +182,8 @@ def upload_messages(world: t.WorldMap, elevation: np.ndarray) -> Iterator[terrai
         width=width,
         height=height,
         semantic=world.semantic_rgb is not None,
+        stamp_ns=world.stamp_ns,
+        frame=world.frame,
     )
     return iter([terrain_pb2.UploadMapRequest(header=header), *(terrain_pb2.UploadMapRequest(tile=tile) for tile in tiles)])
 
@@ -195,6 +199,8 @@ def map_description(message: terrain_pb2.MapDescription) -> t.MapDescription:
         width=message.width,
         height=message.height,
         semantic=message.semantic,
+        stamp_ns=message.stamp_ns if message.HasField("stamp_ns") else None,
+        frame=message.frame,
     )
 
 

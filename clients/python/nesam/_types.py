@@ -3,7 +3,7 @@
 import enum
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Tuple
+from typing import Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
 
@@ -23,6 +23,7 @@ class Validity(enum.IntFlag):
     SLOPE_UNTRAINED = 32
     OVERTURNED = 64
     SOIL_NOT_LEARNED = 128
+    ALARM_ACTIVE = 256
 
 
 @dataclass(frozen=True)
@@ -67,13 +68,16 @@ class Soil:
 @dataclass(frozen=True)
 class SoilEstimate:
     """What a session knows of the soil after an update. soil_epoch counts the updates, 0 = none yet; stamp_ns: last measurement that went in, of the vehicle's clock, None before
-    the first update.
+    the first update. history_epoch, map_version (0 = no map) and bundle_hash: where the session stood then.
     """
 
     session_id: str
     soil_epoch: int
     stamp_ns: Optional[int]
     soil: Soil
+    history_epoch: int = 0
+    map_version: int = 0
+    bundle_hash: str = ""
 
 
 @dataclass(frozen=True)
@@ -132,6 +136,45 @@ class Alarm:
     soil_share: float
     description: str
     diagnose: str
+
+
+@dataclass(frozen=True)
+class DiagnosisStarted:
+    """A diagnosis has begun. recording: the one that is read. Stamps: the window as it was asked for, None = to its end."""
+
+    diagnosis_id: str
+    recording: str
+    from_stamp_ns: Optional[int]
+    to_stamp_ns: Optional[int]
+
+
+@dataclass(frozen=True)
+class DiagnosisProgress:
+    """How far a stage of a diagnosis is: `done` of `total` parts."""
+
+    stage: str
+    done: int
+    total: int
+
+
+@dataclass(frozen=True)
+class DiagnosisReport:
+    """What a diagnosis found. verdict: none, explained, ambiguous or unexplained, and why in `reason` (docs/read-a-diagnosis.md). effects: what is claimed, ready for
+    `Client.apply_effects`. json: the whole report, schema nesam.diagnose/1. folder, bundle: where the server has the reports and the patched bundle; "" = none.
+    """
+
+    diagnosis_id: str
+    verdict: str
+    reason: str
+    effects: Tuple[Effect, ...]
+    json: str
+    folder: str
+    bundle: str
+    bundle_hash: str
+    notes: Tuple[str, ...]
+
+
+DiagnosisEvent = Union[DiagnosisStarted, DiagnosisProgress, DiagnosisReport]
 
 
 @dataclass(frozen=True)
@@ -227,6 +270,8 @@ class Answer:
     field and message say what was wrong with a NOT_FINITE or REJECTED one, code is its gRPC number. soil: after this measurement, None when it was
     rejected. place: of the measurement among the accepted ones, 0 when it was refused; it survives a crash of the server as soon as a durable_place
     reaches it, which is 0 where the server keeps no store. run: which server in which run counts; places of different runs say nothing of each other.
+    history_epoch, soil_epoch, map_version (0 = no map), bundle_hash: where the session stands after it; 0 and "" for a REJECTED one whose session was not
+    looked at, as it is not open, not the sender's, or the service overloaded.
     """
 
     outcome: str
@@ -243,6 +288,8 @@ class Answer:
     durable_place: int = 0
     code: int = 0
     run: int = 0
+    map_version: int = 0
+    bundle_hash: str = ""
 
 
 @dataclass(frozen=True)
@@ -250,6 +297,8 @@ class WorldMap:
     """A map to upload; row 0 is the southernmost.
 
     elevation_m: (height, width) float32, NaN = hole. semantic_rgb: (height, width, 3) uint8 or None. origin_m: World position of cell (0, 0).
+    stamp_ns: instant that it was made at, of the vehicle's clock; frame: as its source names it, at most 64 bytes, "" = World. Both are carried for those who
+    read the map, nothing is computed from them.
     """
 
     map_id: str
@@ -258,6 +307,8 @@ class WorldMap:
     origin_m: Tuple[float, float] = (0.0, 0.0)
     semantic_rgb: Optional[np.ndarray] = None
     version: int = 1
+    stamp_ns: Optional[int] = None
+    frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -272,6 +323,8 @@ class MapDescription:
     width: int
     height: int
     semantic: bool
+    stamp_ns: Optional[int] = None
+    frame: str = ""
 
 
 @dataclass(frozen=True)
@@ -353,7 +406,15 @@ def soil(message: types_pb2.SoilCorrection) -> Soil:
 def soil_estimate(message: soil_pb2.SoilEstimate) -> SoilEstimate:
     """An estimate from its message."""
     stamp_ns = message.stamp_ns if message.HasField("stamp_ns") else None
-    return SoilEstimate(message.session_id, message.soil_epoch, stamp_ns, soil(message.correction))
+    return SoilEstimate(
+        session_id=message.session_id,
+        soil_epoch=message.soil_epoch,
+        stamp_ns=stamp_ns,
+        soil=soil(message.correction),
+        history_epoch=message.history_epoch,
+        map_version=message.map_version,
+        bundle_hash=message.bundle_hash,
+    )
 
 
 def fleet_soil(message: soil_pb2.FleetSoilMap) -> FleetSoil:

@@ -27,7 +27,7 @@ class Rollout(casadi.Callback):
     hold the terrain as the rollout met it. Each evaluation asks the service, of the session as it is then. Keep a reference to the object as long as
     functions are made from it, as CasADi asks.
 
-    `eval` raises what `Client.predict` raises. Bound the commands to the range of the vehicle card: beyond it the service refuses.
+    `eval` raises what `Client.predict` raises; with a `fallback` among the options states come all the same, Jacobians do not. Bound the commands to the range of the vehicle card: beyond it the service refuses.
     """
 
     def __init__(self, name: str, client: Client, session_id: str, horizon: int, **options: Any):
@@ -100,7 +100,11 @@ class _Jacobian(casadi.Callback):
         return casadi.Sparsity.dense(_STATE * horizon, (_STATE, _COMMAND * horizon)[i])
 
     def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
-        extras = self._rollout.predict(arguments[0], arguments[1], Extras(jacobians=True)).extras
+        prediction = self._rollout.predict(arguments[0], arguments[1], Extras(jacobians=True))
+        if prediction.fallback_reason is not None:
+            # A fallback knows no Jacobians: why the service did not tell them is what the caller has to know.
+            raise prediction.fallback_reason
+        extras = prediction.extras
         rows = _STATE * self._rollout.horizon
         start = extras.jacobian_start[0].reshape(rows, _STATE)
         controls = extras.jacobian_controls[0].reshape(rows, _COMMAND * self._rollout.horizon)

@@ -10,6 +10,7 @@ import pytest
 
 import nesam
 from conftest import straight
+from nesam.v1 import prediction_pb2
 
 
 def fan(samples, horizon, speed=2.0):
@@ -149,6 +150,14 @@ def test_service_soil_is_in_every_reply(driven):
         assert soil.coordinates == "logarithmic" and soil.learned.dtype == bool
         assert (soil.delta == session.soil.delta).all() and (soil.covariance == session.soil.covariance).all()
     assert (np.linalg.eigvalsh(session.soil.covariance) > 0).all()
+    named = (answer.history_epoch, answer.soil_epoch, answer.map_version, answer.bundle_hash)
+    provenance = session.provenance
+    assert named == (provenance.history_epoch, provenance.soil_epoch, provenance.map_version, provenance.bundle_hash)
+
+
+def test_validity_names_every_bit_of_the_service():
+    bits = {name[len("VALIDITY_") :]: value for name, value in prediction_pb2.Validity.items() if value}
+    assert bits == {bit.name: bit.value for bit in nesam.Validity}
 
 
 def test_service_forked_session_goes_its_own_way(driven):
@@ -245,6 +254,9 @@ def test_service_sessions_and_maps(client, hills):
     assert patched.version == 2 and patched.hash != description.hash
     with pytest.raises(nesam.NesamError, match="ABORTED"):
         client.patch_tile("hills", 1, 10, 20, np.full((5, 6), 0.1))
+    local = client.upload_map(nesam.WorldMap("local", np.zeros((4, 4)), 0.5, stamp_ns=-5, frame="odom"))
+    assert (local.stamp_ns, local.frame, description.stamp_ns, description.frame) == (-5, "odom", None, "")
+    client.delete_map("local")
     assert [m.map_id for m in client.maps()] == ["hills"] and client.map("hills") == patched
     client.close_session("s")
     with pytest.raises(nesam.NotFound):

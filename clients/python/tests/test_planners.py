@@ -48,6 +48,21 @@ def test_service_casadi_answers_from_the_session_as_it_is(driven):
     assert (after[0] != before[0]).any() and (after[1] != before[1]).any()
 
 
+def test_regress_casadi_says_why_a_fallback_has_no_jacobians():
+    casadi = pytest.importorskip("casadi")
+    from nesam.casadi import Rollout
+
+    card = nesam.VehicleCard("cart", "yaw_rate_rad_s", (-1.0, 3.0), (-1.0, 1.0), 1.0, 0.0)
+    with nesam.Client("127.0.0.1:1", timeout_s=0.5) as away:
+        rollout = Rollout("rollout", away, "s", 3, fallback=nesam.KinematicFallback(card))
+        start, controls = casadi.DM.zeros(12), casadi.DM([[1.0] * 3, [0.0] * 3])
+        states = np.array(rollout(start, controls))
+        np.testing.assert_allclose(states[0], [0.1, 0.2, 0.3], rtol=1e-6)
+        jacobian = rollout.get_jacobian("jacobian", ["x0", "u", "out_x"], ["jac_x_x0", "jac_x_u"], {})
+        with pytest.raises((nesam.Unavailable, nesam.DeadlineExceeded)):
+            jacobian.eval([start, controls, states])
+
+
 def test_service_a_gradient_planner_drives_to_its_goal(driven):
     casadi = pytest.importorskip("casadi")
     from nesam.casadi import Rollout

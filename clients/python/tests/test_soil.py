@@ -84,6 +84,8 @@ def test_service_the_soil_is_watched_until_the_session_closes(driven, server_add
     first = next(driven.watch_soil("truck"))
     assert first.session_id == "truck" and first.soil.delta.shape == (6,)
     assert (first.stamp_ns is None) == (first.soil_epoch == 0)
+    provenance = driven.session("truck").provenance
+    assert (first.history_epoch, first.map_version, first.bundle_hash) == (provenance.history_epoch, 1, provenance.bundle_hash)
 
     async def watched():
         async with nesam.AsyncClient(server_address, timeout_s=60.0) as client:

@@ -1,5 +1,7 @@
 //! The gRPC client.
 
+use std::time::Duration;
+
 use nesam_proto::v1;
 use tokio_stream::wrappers::ReceiverStream;
 use tonic::metadata::{Ascii, MetadataValue};
@@ -8,6 +10,7 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 
 use crate::error::ClientError;
+use crate::known_states::{KnownStates, Reported};
 use crate::map::MapLayers;
 use crate::measure::{MeasurementStream, WAITING_MAX};
 use crate::prediction::{Candidates, Prediction};
@@ -15,6 +18,10 @@ use crate::tls::Tls;
 
 /// Largest reply accepted, bytes: the soil map of a fleet takes 25 MiB at the default limits of a server, a prediction 64 for each of 131 072 sample-steps.
 const REPLY_BYTES_MAX: usize = 64 << 20;
+
+/// Time between keep-alive pings and longest wait for the answer to one, as in the other clients: a server that has gone without a word is noticed after 40 s, also
+/// while a stream rests.
+const KEEPALIVE: Duration = Duration::from_secs(20);
 
 /// Metadata by which a proxy in front of several servers keeps the calls of a vehicle together.
 const VEHICLE: &str = "x-vehicle-id";
@@ -39,6 +46,7 @@ type Routed = InterceptedService<Channel, Route>;
 pub struct Client {
     channel: Channel,
     route: Route,
+    known: KnownStates,
 }
 
 impl Client {
@@ -47,7 +55,7 @@ impl Client {
     /// # Errors
     /// `ClientError::Connect` when the address is wrong or nobody answers there.
     pub async fn connect(address: &str) -> Result<Self, ClientError> {
-        Self::connect_over(address, None).await
+        Self::connect_over(address, None, KEEPALIVE).await
     }
 
     /// Connects over TLS, e.g. to `https://server:50051`.
@@ -55,22 +63,25 @@ impl Client {
     /// # Errors
     /// `ClientError::Connect` as [`Client::connect`], or when the handshake fails.
     pub async fn connect_tls(address: &str, tls: &Tls) -> Result<Self, ClientError> {
-        Self::connect_over(address, Some(tls)).await
+        Self::connect_over(address, Some(tls), KEEPALIVE).await
     }
 
     /// A client over a connection that somebody else made.
     pub fn over(channel: Channel) -> Self {
-        Self { channel, route: Route::default() }
+        Self { channel, route: Route::default(), known: KnownStates::default() }
     }
 
-    async fn connect_over(address: &str, tls: Option<&Tls>) -> Result<Self, ClientError> {
+    async fn connect_over(address: &str, tls: Option<&Tls>, keepalive: Duration) -> Result<Self, ClientError> {
         let failed = |source| ClientError::Connect { address: address.into(), source };
         let endpoint = Endpoint::from_shared(address.to_string()).map_err(failed)?;
         let endpoint = endpoint
             .tcp_nodelay(true)
             .initial_stream_window_size(nesam_proto::STREAM_WINDOW_BYTES)
             .initial_connection_window_size(nesam_proto::CONNECTION_WINDOW_BYTES)
-            .max_frame_size(nesam_proto::FRAME_BYTES_MAX);
+            .max_frame_size(nesam_proto::FRAME_BYTES_MAX)
+            .http2_keep_alive_interval(keepalive)
+            .keep_alive_timeout(keepalive)
+            .keep_alive_while_idle(true);
         let endpoint = match tls {
             Some(tls) => endpoint.tls_config(tls.config()).map_err(failed)?,
             None => endpoint,
@@ -170,14 +181,22 @@ impl Client {
         Ok(self.sessions().watch_alarms(v1::WatchAlarmsRequest { session_id: session.into() }).await?.into_inner())
     }
 
+    /// Starts a diagnosis of what was recorded of a session, and hears how it goes: the start, progress, at last the report. Dropping the stream ends it.
+    pub async fn diagnose(&mut self, request: v1::StartDiagnosisRequest) -> Result<tonic::Streaming<v1::DiagnosisEvent>, ClientError> {
+        let client = v1::diagnosis_client::DiagnosisClient::new(self.routed());
+        Ok(client.max_decoding_message_size(REPLY_BYTES_MAX).start(request).await?.into_inner())
+    }
+
     /// Closes a session.
     pub async fn close_session(&mut self, session: &str) -> Result<(), ClientError> {
         self.sessions().close(v1::CloseSessionRequest { session_id: session.into() }).await?;
+        self.known.forget(session);
         Ok(())
     }
 
-    /// Uploads a map in tiles.
+    /// Uploads a map in tiles. INVALID_ARGUMENT without a call when a layer does not have the size that width and height say.
     pub async fn upload_map(&mut self, map: &MapLayers) -> Result<v1::MapDescription, ClientError> {
+        map.check()?;
         self.upload_messages(map.messages()).await
     }
 
@@ -212,36 +231,63 @@ impl Client {
         let (sender, receiver) = tokio::sync::mpsc::channel(WAITING_MAX);
         let mut client = v1::measurements_client::MeasurementsClient::new(self.routed());
         let answers = client.stream(ReceiverStream::new(receiver)).await?.into_inner();
-        Ok(MeasurementStream { sender, answers })
+        Ok(MeasurementStream::new(sender, answers, self.known.clone()))
     }
 
     /// Sends measurements and collects their answers.
     pub async fn feed(&mut self, measurements: Vec<v1::Measurement>) -> Result<Vec<v1::MeasurementAnswer>, ClientError> {
         let mut client = v1::measurements_client::MeasurementsClient::new(self.routed());
+        let reported: Vec<Reported> = measurements.iter().map(Reported::new).collect();
         let mut inbound = client.stream(tokio_stream::iter(measurements)).await?.into_inner();
-        let mut answers = Vec::new();
+        let mut answers = Vec::with_capacity(reported.len());
         while let Some(answer) = inbound.message().await? {
+            if let Some(reported) = reported.get(answers.len()) {
+                self.known.measured(reported, &answer);
+            }
             answers.push(answer);
         }
         Ok(answers)
     }
 
-    /// Rolls candidates out.
+    /// Rolls candidates out. A [`Candidates::fallback`] answers where the service is overloaded or away; without a deadline it is never late.
     pub async fn predict(&mut self, candidates: Candidates) -> Result<Prediction, ClientError> {
         self.predict_within(candidates, None).await
     }
 
-    /// Rolls candidates out within a deadline.
-    pub async fn predict_within(
-        &mut self,
-        candidates: Candidates,
-        deadline: Option<std::time::Duration>,
-    ) -> Result<Prediction, ClientError> {
+    /// Rolls candidates out within a deadline, which also holds while there is no connection. A [`Candidates::fallback`] answers where the service does not in
+    /// time, is overloaded or away, and [`Prediction::computed_by`] says so.
+    ///
+    /// # Errors
+    /// `ClientError::Refused` with the service's reason. A fallback leaves it where neither a start is given nor a state of the session is known.
+    pub async fn predict_within(&mut self, candidates: Candidates, deadline: Option<Duration>) -> Result<Prediction, ClientError> {
         let mut request = tonic::Request::new(candidates.to_message());
         if let Some(deadline) = deadline {
             request.set_timeout(deadline);
         }
-        Prediction::from_message(&self.prediction().predict(request).await?.into_inner())
+        match self.ask(request, deadline).await {
+            Ok(prediction) => {
+                self.known.predicted(&candidates, &prediction);
+                Ok(prediction)
+            }
+            Err(error) => {
+                let known = self.known.of(&candidates.session);
+                candidates.fallback.as_ref().and_then(|fallback| fallback.answer(&candidates, known, &error)).ok_or(error)
+            }
+        }
+    }
+
+    /// Asks for a prediction. The transport looks at the deadline once it has a connection, and one that is being made may take minutes.
+    async fn ask(&mut self, request: tonic::Request<v1::PredictRequest>, deadline: Option<Duration>) -> Result<Prediction, ClientError> {
+        let mut client = self.prediction();
+        let reply = client.predict(request);
+        let reply = match deadline {
+            Some(deadline) => match tokio::time::timeout(deadline, reply).await {
+                Ok(reply) => reply,
+                Err(_) => Err(tonic::Status::deadline_exceeded("no answer came in time")),
+            },
+            None => reply.await,
+        };
+        Prediction::from_message(&reply?.into_inner())
     }
 
     /// Rolls a ready message out; the reply is not unpacked.
@@ -267,5 +313,29 @@ impl Client {
     /// Watches the soil estimate of a session.
     pub async fn watch_soil(&mut self, session: &str) -> Result<tonic::Streaming<v1::SoilEstimate>, ClientError> {
         Ok(self.soil().watch(v1::WatchSoilRequest { session_id: session.into() }).await?.into_inner())
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    /// Goal: a server that has gone without a word is noticed by a call without a deadline. Method: a listener that takes connections and says nothing, pings
+    /// every 50 ms instead of 20 s.
+    #[tokio::test]
+    async fn service_a_silent_server_is_noticed() {
+        let listener = tokio::net::TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let address = format!("http://{}", listener.local_addr().unwrap());
+        let silent = tokio::spawn(async move {
+            let mut sockets = Vec::new();
+            while let Ok((socket, _)) = listener.accept().await {
+                sockets.push(socket);
+            }
+        });
+        let mut client = Client::connect_over(&address, None, Duration::from_millis(50)).await.unwrap();
+        let asked = tokio::time::timeout(Duration::from_secs(20), client.session("s")).await.expect("the call ends");
+        assert_eq!(asked.unwrap_err().code(), Some(tonic::Code::Unavailable));
+        silent.abort();
     }
 }

@@ -1,5 +1,6 @@
 //! What can go wrong between a client and the service.
 
+use std::error::Error as _;
 use std::time::Duration;
 
 use tonic_types::StatusExt as _;
@@ -85,7 +86,14 @@ impl From<tonic::Status> for ClientError {
         let retry_after = status.get_details_retry_info().and_then(|info| info.retry_delay);
         // How the server's transport says that the time the client gave was over, where it notices before engine and client do.
         let late = status.code() == tonic::Code::Cancelled && status.message() == "Timeout expired";
-        let code = if late { tonic::Code::DeadlineExceeded } else { status.code() };
+        // A connection that broke under the call: the transport says how it broke, as the source, where an answer of the service has none.
+        let how = [tonic::Code::Cancelled, tonic::Code::Unknown, tonic::Code::Internal];
+        let broken = status.source().is_some() && how.contains(&status.code());
+        let code = match (late, broken) {
+            (true, _) => tonic::Code::DeadlineExceeded,
+            (false, true) => tonic::Code::Unavailable,
+            (false, false) => status.code(),
+        };
         Self::Refused { code, field, message: status.message().into(), retry_after }
     }
 }
@@ -99,5 +107,15 @@ mod tests {
         let of = |message: &str| ClientError::from(tonic::Status::cancelled(message)).code();
         assert_eq!(of("Timeout expired"), Some(tonic::Code::DeadlineExceeded));
         assert_eq!(of("the server is gone"), Some(tonic::Code::Cancelled));
+    }
+
+    /// Goal: a server that dies under a call looks like one that is away, as in the other clients. Method: what tonic makes of an error of the transport, and
+    /// the same code as an answer of the service.
+    #[test]
+    fn regress_a_connection_that_breaks_is_unavailable() {
+        let broken = tonic::Status::from_error(Box::new(std::io::Error::other("broken pipe")));
+        assert_eq!(broken.code(), tonic::Code::Unknown);
+        assert_eq!(ClientError::from(broken).code(), Some(tonic::Code::Unavailable));
+        assert_eq!(ClientError::from(tonic::Status::unknown("said by the service")).code(), Some(tonic::Code::Unknown));
     }
 }

@@ -18,10 +18,28 @@
 //! # Ok(())
 //! # }
 //! ```
+//!
+//! A planner that must have an answer in every cycle gives a deadline and a declared fallback, and is told which of the two has answered:
+//!
+//! ```no_run
+//! # async fn example(mut client: nesam_client::Client, controls: Vec<f32>) -> Result<(), nesam_client::ClientError> {
+//! use nesam_client::{Candidates, ComputedBy, KinematicFallback};
+//!
+//! let card = client.session("truck-1").await?.vehicle.unwrap_or_default();
+//! let candidates = Candidates::new("truck-1", 64, 32, controls).or_fall_back(KinematicFallback::new(card));
+//! let prediction = client.predict_within(candidates, Some(std::time::Duration::from_millis(50))).await?;
+//! if prediction.computed_by == ComputedBy::KinematicFallback {
+//!     println!("without terrain and soil: {:?}", prediction.fallback_reason);
+//! }
+//! # Ok(())
+//! # }
+//! ```
 #![forbid(unsafe_code)]
 
 mod client;
 mod error;
+mod fallback;
+mod known_states;
 mod map;
 mod measure;
 mod message;
@@ -32,10 +50,11 @@ pub mod zenoh_vehicle;
 
 pub use client::Client;
 pub use error::ClientError;
+pub use fallback::KinematicFallback;
 pub use map::MapLayers;
 pub use measure::MeasurementStream;
 pub use message::{measurement, outcome_label, state_array, state_message};
 pub use nesam_proto::v1;
 pub use outbox::Outbox;
-pub use prediction::{Candidates, ExtraOutputs, Prediction};
+pub use prediction::{Candidates, ComputedBy, ExtraOutputs, FallbackReason, Prediction};
 pub use tls::Tls;

@@ -1,10 +1,14 @@
 //! A stream of measurements.
 
+use std::collections::VecDeque;
+use std::sync::{Mutex, PoisonError};
+
 use nesam_proto::v1;
 use tokio::sync::mpsc;
 use tonic::Streaming;
 
 use crate::error::ClientError;
+use crate::known_states::{KnownStates, Reported};
 
 /// Measurements that may wait in the client.
 pub(crate) const WAITING_MAX: usize = 64;
@@ -12,17 +16,29 @@ pub(crate) const WAITING_MAX: usize = 64;
 /// An open stream: measurements go in, answers come out in the same order.
 #[derive(Debug)]
 pub struct MeasurementStream {
-    pub(crate) sender: mpsc::Sender<v1::Measurement>,
-    pub(crate) answers: Streaming<v1::MeasurementAnswer>,
+    sender: mpsc::Sender<v1::Measurement>,
+    answers: Streaming<v1::MeasurementAnswer>,
+    known: KnownStates,
+    /// What was sent and not answered yet, oldest first.
+    waiting: Mutex<VecDeque<Reported>>,
 }
 
 impl MeasurementStream {
+    pub(crate) fn new(sender: mpsc::Sender<v1::Measurement>, answers: Streaming<v1::MeasurementAnswer>, known: KnownStates) -> Self {
+        Self { sender, answers, known, waiting: Mutex::default() }
+    }
+
     /// Sends one measurement; waits only while the service is behind.
     ///
     /// # Errors
     /// `ClientError::Protocol` when the stream has ended.
     pub async fn send(&self, measurement: v1::Measurement) -> Result<(), ClientError> {
-        self.sender.send(measurement).await.map_err(|_| ClientError::protocol("the measurement stream has ended"))
+        let place = self.sender.reserve().await.map_err(|_| ClientError::protocol("the measurement stream has ended"))?;
+        // Under the lock, so that both queues have the same order.
+        let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        waiting.push_back(Reported::new(&measurement));
+        place.send(measurement);
+        Ok(())
     }
 
     /// The next answer; `None` after the last.
@@ -30,7 +46,14 @@ impl MeasurementStream {
     /// # Errors
     /// `ClientError::Refused` when the service ended the stream.
     pub async fn answer(&mut self) -> Result<Option<v1::MeasurementAnswer>, ClientError> {
-        Ok(self.answers.message().await?)
+        let answer = self.answers.message().await?;
+        if let Some(answer) = &answer {
+            let waiting = self.waiting.get_mut().unwrap_or_else(PoisonError::into_inner);
+            if let Some(reported) = waiting.pop_front() {
+                self.known.measured(&reported, answer);
+            }
+        }
+        Ok(answer)
     }
 
     /// Sends one measurement and awaits its answer.

@@ -4,6 +4,7 @@ use nesam_proto::packed::pack;
 use nesam_proto::v1;
 
 use crate::error::ClientError;
+use crate::fallback::KinematicFallback;
 use crate::message::{state_array, state_message, unpack};
 
 /// Candidate command sequences to roll out.
@@ -37,6 +38,10 @@ pub struct Candidates {
     pub extras: Option<v1::PredictExtras>,
     /// Copied to the prediction.
     pub tag: u64,
+    /// Answers [`Client::predict`](crate::Client::predict) and [`Client::predict_within`](crate::Client::predict_within) when the service is late, overloaded
+    /// or away, from `start` or the newest state that the client knows; `None` = nothing does. It does not roll forward and has no extras, costs or
+    /// what-if soils; of a drawing it predicts the nominal sequence alone.
+    pub fallback: Option<KinematicFallback>,
 }
 
 impl Candidates {
@@ -59,6 +64,7 @@ impl Candidates {
             output,
             extras: None,
             tag: 0,
+            fallback: None,
         }
     }
 
@@ -78,7 +84,12 @@ impl Candidates {
         Self { start_stamp_ns: Some(start_stamp_ns), sent, ..self }
     }
 
-    /// The same as message.
+    /// The same candidates, predicted by this fallback when the service does not answer in time.
+    pub fn or_fall_back(self, fallback: KinematicFallback) -> Self {
+        Self { fallback: Some(fallback), ..self }
+    }
+
+    /// The same as message, which tells nothing of a fallback.
     pub fn to_message(&self) -> v1::PredictRequest {
         let history_use = if self.use_history { v1::HistoryUse::Measured } else { v1::HistoryUse::None };
         v1::PredictRequest {
@@ -104,7 +115,27 @@ fn sent_command(stamp_ns: i64, [speed_m_s, second]: [f64; 2]) -> v1::SentCommand
     v1::SentCommand { stamp_ns, command: Some(v1::Control { speed_m_s, second }) }
 }
 
-/// Predicted trajectories.
+/// Who computed a prediction.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum ComputedBy {
+    /// The service.
+    #[default]
+    Service,
+    /// [`Candidates::fallback`], because the service did not answer in time.
+    KinematicFallback,
+}
+
+/// The service's error that a fallback has answered instead of.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct FallbackReason {
+    /// gRPC code: DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED or UNAVAILABLE.
+    pub code: tonic::Code,
+    /// What the service or the transport said.
+    pub message: String,
+}
+
+/// Predicted trajectories. With [`ComputedBy::KinematicFallback`], `soil` is not a number, `validity` is 0 and everything else that only the service
+/// knows is empty: provenance, sinkage, soil correction, extras, costs.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
     /// Copied from the candidates.
@@ -155,6 +186,10 @@ pub struct Prediction {
     pub best: Vec<u32>,
     /// (horizon, 2): mean of all samples by their cost.
     pub mean_controls: Vec<f32>,
+    /// Who computed it.
+    pub computed_by: ComputedBy,
+    /// Why a fallback answers; `None` when the service does.
+    pub fallback_reason: Option<FallbackReason>,
 }
 
 /// What was computed beyond the states, row-major; empty unless asked for. The fields and their shapes are those of `v1::PredictReply`.
@@ -256,6 +291,8 @@ impl Prediction {
             costs: plain("costs", &reply.costs)?,
             best: reply.best.clone(),
             mean_controls: plain("mean_controls", &reply.mean_controls)?,
+            computed_by: ComputedBy::Service,
+            fallback_reason: None,
         })
     }
 

@@ -46,6 +46,14 @@ fn no_shared_memory(config: &mut zenoh::Config) -> Result<(), ClientError> {
     config.insert_json5("transport/shared_memory/enabled", "false").map_err(failed)
 }
 
+/// What an error reply says: the service tells a `PredictError`, Zenoh itself a text, for example that nobody has answered in time.
+fn refusal(payload: &[u8]) -> ClientError {
+    match v1::PredictError::decode(payload) {
+        Ok(v1::PredictError { code, field, message, .. }) => ClientError::Refused { code: code.into(), field, message, retry_after: None },
+        Err(_) => failed(String::from_utf8_lossy(payload)),
+    }
+}
+
 /// The bytes of a payload where they lie, in shared memory or as received; copied only where they are in pieces.
 fn in_place(payload: &ZBytes) -> Bytes {
     struct Piece(ZBytes);
@@ -157,11 +165,7 @@ impl ZenohVehicle {
                 let reply = v1::PredictReply::decode(in_place(sample.payload()));
                 Prediction::from_message(&reply.map_err(|error| ClientError::protocol(error.to_string()))?)
             }
-            Err(error) => {
-                let error = v1::PredictError::decode(error.payload().to_bytes().as_ref());
-                let v1::PredictError { code, field, message, .. } = error.map_err(|error| ClientError::protocol(error.to_string()))?;
-                Err(ClientError::Refused { code: code.into(), field, message, retry_after: None })
-            }
+            Err(error) => Err(refusal(&error.payload().to_bytes())),
         }
     }
 
@@ -171,5 +175,19 @@ impl ZenohVehicle {
     /// `ClientError::Zenoh`.
     pub async fn close(self) -> Result<(), ClientError> {
         self.session.close().await.map_err(failed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: who is not answered in time is told so. Method: an error reply of the service, and the text that Zenoh replies with when the time of a query is over.
+    #[test]
+    fn regress_a_query_that_zenoh_gives_up_is_no_protocol_error() {
+        let said = v1::PredictError { code: tonic::Code::NotFound.into(), field: "session_id".into(), ..Default::default() };
+        let refused = refusal(&said.encode_to_vec());
+        assert_eq!((refused.code(), refused.field()), (Some(tonic::Code::NotFound), "session_id"));
+        assert!(matches!(refusal(b"Timeout"), ClientError::Zenoh { reason } if reason == "Timeout"));
     }
 }

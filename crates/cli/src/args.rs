@@ -4,10 +4,12 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+use nesam_evaluation::Inputs;
 use nesam_model::MAX_HORIZON;
 use nesam_trajectories::Trajectory;
 
 use crate::failure::Failure;
+use crate::output::note;
 
 /// Which drives to read.
 #[derive(Args, Clone, Debug)]
@@ -61,6 +63,46 @@ impl SplitArg {
     }
 }
 
+/// What drives a prediction over its horizon.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum InputsArg {
+    /// The recorded commands: what a planner knows.
+    Commands,
+    /// The measured wheel speeds and steering angles of the future: for studying the model, not for planning; the baselines that read no wheels keep
+    /// the commands.
+    Wheels,
+}
+
+impl From<InputsArg> for Inputs {
+    fn from(inputs: InputsArg) -> Self {
+        match inputs {
+            InputsArg::Commands => Self::Commands,
+            InputsArg::Wheels => Self::Wheels,
+        }
+    }
+}
+
+/// What drives the predictions of a command that knows commands alone.
+#[derive(Args, Clone, Copy, Debug)]
+pub struct CommandsArgs {
+    /// What drives the prediction over the horizon; here the recorded commands alone, `wheels` is for `nesam evaluate`
+    #[arg(long, value_name = "INPUTS", value_enum, default_value_t = InputsArg::Commands, hide_possible_values = true)]
+    inputs: InputsArg,
+}
+
+impl CommandsArgs {
+    /// Refuses measured wheels of the future.
+    ///
+    /// # Errors
+    /// Wrong usage: `why` this command has no use for them.
+    pub fn check(self, why: &str) -> Result<(), Failure> {
+        match self.inputs {
+            InputsArg::Commands => Ok(()),
+            InputsArg::Wheels => Err(Failure::input(format!("--inputs wheels: {why}; `nesam evaluate --inputs wheels` scores them"))),
+        }
+    }
+}
+
 /// Which model to use.
 #[derive(Args, Clone, Debug)]
 pub struct BundleArgs {
@@ -88,7 +130,7 @@ impl WindowArgs {
         }
         let horizon = longest_horizon(drives);
         if horizon < MAX_HORIZON {
-            eprintln!(
+            note!(
                 "note: predicting {horizon} steps, as many as the longest drive allows ({MAX_HORIZON} where drives are longer); --horizon sets another number"
             );
         }

@@ -52,6 +52,7 @@ pub fn sample_root() -> Option<PathBuf> {
 
 /// Whether `dir` lies in a bundle (or is one), where no command may write.
 pub fn inside_bundle(dir: &Path) -> bool {
+    let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
     let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_path_buf());
     absolute.ancestors().any(|a| a.join(MANIFEST).is_file())
 }

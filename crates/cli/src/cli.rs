@@ -5,7 +5,7 @@ use clap::{CommandFactory, Parser, Subcommand};
 use crate::bundle_path::{MANIFEST, default_bundle};
 use crate::commands;
 use crate::failure::Failure;
-use crate::output::say;
+use crate::output::{check_printed, note, say};
 
 /// Predicts how an off-road vehicle will move over deformable ground, as a service for planners.
 ///
@@ -33,6 +33,7 @@ const EXAMPLES: &str = "Examples:
   nesam replay DIR                            does it give the same answers here, bit for bit?
   nesam bench predict                         milliseconds per planner query on this machine
   nesam import LOG.csv --to ROOT --set NAME --vehicle CARD.json
+  nesam calibrate --data ROOT --set NAME      the card of a vehicle fitted to its logs
   nesam inspect deploy/bundles/NAME           what a bundle holds and where it comes from
   nesam check ROOT                            what is wrong with a data root, bundle or configuration; do units and frames fit?
 
@@ -64,6 +65,8 @@ enum Command {
     Predict(commands::predict::PredictArgs),
     /// Repeat a recorded run and compare every answer, or drive recorded drives through a bad radio link
     Replay(commands::replay::ReplayArgs),
+    /// Fit the card of a vehicle to its logs, with the physics alone: drive line, contact law, suspension
+    Calibrate(commands::calibrate::CalibrateArgs),
     /// Train a bundle on the train split of a set
     Train(commands::train::TrainArgs),
     /// Compare the physics inside with what a simulator says of wheels and soil
@@ -78,16 +81,21 @@ enum Command {
     Check(commands::check::CheckArgs),
 }
 
-/// Parses the arguments and runs the command.
+/// Parses the arguments and runs the command, whose results must have been printed whole.
 pub fn run() -> Result<(), Failure> {
     let cli = Cli::parse();
     if cli.version {
         say!("{}", version());
-        return Ok(());
+    } else {
+        command(cli.command)?;
     }
-    match cli.command {
+    check_printed()
+}
+
+fn command(command: Option<Command>) -> Result<(), Failure> {
+    match command {
         None => {
-            eprintln!("{}", Cli::command().render_help());
+            note!("{}", Cli::command().render_help());
             Err(Failure::input("no command given"))
         }
         Some(Command::Demo(args)) => commands::demo::run(&args),
@@ -102,6 +110,7 @@ pub fn run() -> Result<(), Failure> {
         Some(Command::Plant(args)) => commands::plant::run(&args),
         Some(Command::Predict(args)) => commands::predict::run(&args),
         Some(Command::Replay(args)) => commands::replay::run(&args),
+        Some(Command::Calibrate(args)) => commands::calibrate::run(&args),
         Some(Command::Train(args)) => commands::train::run(&args),
         Some(Command::Inside(args)) => commands::inside::run(&args),
         Some(Command::Bench(args)) => commands::bench::run(&args),

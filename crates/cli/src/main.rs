@@ -22,7 +22,7 @@ fn main() -> ExitCode {
     match cli::run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("error: {failure}");
+            output::note!("error: {failure}");
             failure.exit_code()
         }
     }

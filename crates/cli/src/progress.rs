@@ -6,6 +6,8 @@ use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
+use crate::output::note;
+
 /// Seconds between plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
@@ -42,7 +44,7 @@ impl Progress {
         let Ok(mut last) = self.last_line.lock() else { return };
         if last.elapsed() >= LINE_EVERY {
             *last = Instant::now();
-            eprintln!("{}: {done}/{} after {:.0} s", self.label, self.total, self.started.elapsed().as_secs_f64());
+            note!("{}: {done}/{} after {:.0} s", self.label, self.total, self.started.elapsed().as_secs_f64());
         }
     }
 
@@ -59,6 +61,6 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        eprintln!("{}: {} in {:.1} s", self.label, self.total, self.started.elapsed().as_secs_f64());
+        note!("{}: {} in {:.1} s", self.label, self.total, self.started.elapsed().as_secs_f64());
     }
 }

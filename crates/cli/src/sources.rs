@@ -15,6 +15,7 @@ use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, Trajectory};
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::{bundle_dir, bundle_of_hash, bundle_of_vehicle, sample_root};
 use crate::failure::{Failure, OrFail};
+use crate::output::note;
 
 /// The drives of one set, with the map of each.
 pub struct Drives {
@@ -35,7 +36,7 @@ pub fn open_root(args: &DataArgs) -> Result<(DataRoot, PathBuf), Failure> {
         None => {
             let sample = sample_root()
                 .ok_or_else(|| Failure::input("no --data given and no shipped sample found; give a data root with --data ROOT"))?;
-            eprintln!("no --data given: reading the shipped sample {}", sample.display());
+            note!("no --data given: reading the shipped sample {}", sample.display());
             sample
         }
     };
@@ -66,6 +67,9 @@ pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failur
     let drives = root.load_set(&query(args, &set, args.split, ground_truth)).or_input()?;
     if drives.is_empty() {
         return Err(Failure::input(format!("set `{set}` has no drive in split `{}`", args.split.as_str())));
+    }
+    for note in root.notes() {
+        crate::output::note!("note: {note}");
     }
     let maps = maps_of(&root, &drives)?;
     Ok(Drives { root, set, drives, maps })
@@ -113,7 +117,7 @@ pub fn query(args: &DataArgs, set: &str, split: SplitArg, ground_truth: bool) ->
     SetQuery { set: set.into(), split, trajectories: args.trajectories.clone(), dt_s: args.dt, ground_truth }
 }
 
-/// The map of each drive. A drive without a world has none; a world that cannot be read is an error.
+/// The map of each drive. A drive without a world has none; a world that is there and cannot be read is an error.
 pub fn maps_of(root: &DataRoot, drives: &[Trajectory]) -> Result<Vec<Option<Arc<WorldMap>>>, Failure> {
     drives.iter().map(|d| d.world.as_deref().map(|world| root.world(world).or_input()).transpose()).collect()
 }
@@ -130,6 +134,8 @@ pub fn map_layers(map: &WorldMap) -> MapLayers {
         height: g.height,
         elevation_m: map.elevation_m(),
         semantic_rgb: map.semantic_rgb(),
+        stamp_ns: map.source().stamp_ns,
+        frame: map.source().frame.clone(),
     }
 }
 
@@ -167,13 +173,15 @@ pub fn on_vehicle_of(mut bundle: ModelBundle, root: &DataRoot) -> ModelBundle {
     let (own, given) = (&bundle.vehicle, root.vehicle());
     let otherwise = uncalibrated_differences(own, given);
     if own.second != given.second || own.name != given.name {
-        eprintln!(
+        note!(
             "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained",
-            bundle.name, own.name, given.name
+            bundle.name,
+            own.name,
+            given.name
         );
         bundle.move_to(given);
     } else if !otherwise.is_empty() {
-        eprintln!(
+        note!(
             "note: {} has another {} than the card of bundle {}, which counts; a card under another vehicle name is used as it is",
             root.card().display(),
             otherwise.join(", "),

@@ -80,7 +80,7 @@ fn service_help_teaches_every_command_and_version_is_printed() {
     let here = tempfile::tempdir().unwrap();
     let help = nesam(&["--help"], here.path());
     assert_eq!(help.status.code(), Some(0));
-    for word in ["serve", "demo", "train", "evaluate", "predict", "inspect", "check", "Examples:", "Exit codes"] {
+    for word in ["serve", "demo", "calibrate", "train", "evaluate", "predict", "inspect", "check", "Examples:", "Exit codes"] {
         assert!(stdout(&help).contains(word), "help should show `{word}`");
     }
     let version = nesam(&["--version"], here.path());

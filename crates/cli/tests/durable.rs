@@ -53,6 +53,8 @@ fn recorded() -> Drive {
         height: geometry.height,
         elevation_m: world.elevation_m(),
         semantic_rgb: world.semantic_rgb(),
+        stamp_ns: None,
+        frame: String::new(),
     };
     Drive { drive, map }
 }

@@ -39,6 +39,8 @@ fn service_an_imported_log_is_a_set() {
     let (code, said) = import(folder.path(), "mine/first", &["--split", "test"]);
     assert_eq!(code, Some(0), "{said}");
     assert!(said.contains("run: 11.9 s, 120 samples, 10.0 Hz") && !said.contains("doubt"), "{said}");
+    let page = std::fs::read_to_string(folder.path().join("root/mine/first/import.html")).unwrap();
+    assert!(page.matches("<svg class=\"plot\"").count() == 3 && said.contains("wrote root/mine/first/import.html"), "{said}");
     let check = nesam(folder.path(), &["check", "root"]);
     let said = String::from_utf8_lossy(&check.stdout).into_owned();
     assert!(check.status.success() && said.contains("set mine/first: 1 drives, 120 samples") && said.contains("sound"), "{said}");
@@ -88,6 +90,46 @@ fn service_time_stamps_in_nanoseconds_are_refused_without_their_unit() {
     assert!(!folder.path().join("root").exists(), "what was refused leaves nothing behind");
     let (code, said) = import_of(folder.path(), &log, &card(), "mine/first", &["--column", "t=t:ns"]);
     assert!(code == Some(0) && said.contains("120 samples, 10.0 Hz"), "{said}");
+}
+
+#[test]
+fn service_folders_are_bags_or_refused_with_what_to_do() {
+    let folder = tempfile::tempdir().unwrap();
+    let bag = folder.path().join("bag");
+    std::fs::create_dir(&bag).unwrap();
+    let (code, said) = import_of(folder.path(), &bag, &card(), "first", &[]);
+    assert!(code == Some(2) && said.contains("neither metadata.yaml nor MCAP files"), "{said}");
+    std::fs::write(bag.join("metadata.yaml"), "rosbag2_bagfile_information:\n  relative_file_paths:\n    - bag_0.db3\n").unwrap();
+    std::fs::write(bag.join("bag_0.db3"), "SQLite format 3").unwrap();
+    for log in [bag.clone(), bag.join("bag_0.db3")] {
+        let (code, said) = import_of(folder.path(), &log, &card(), "first", &[]);
+        assert!(code == Some(2) && said.contains("ros2 bag convert -i") && said.contains("storage_id: mcap"), "{said}");
+    }
+    assert!(!folder.path().join("root").exists(), "what was refused leaves nothing behind");
+}
+
+#[test]
+fn regress_a_flat_log_is_a_set_whose_heights_are_not_scored() {
+    // Goal: what a log lacks, every command does without. Method: the example without z, roll and pitch, imported and scored.
+    let folder = tempfile::tempdir().unwrap();
+    let text = std::fs::read_to_string(example()).unwrap();
+    let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+    let kept: Vec<usize> = (0..head.len()).filter(|i| !["z", "roll", "pitch"].contains(&head[*i])).collect();
+    let row = |line: &str| {
+        let cells: Vec<&str> = line.split(',').collect();
+        kept.iter().map(|i| cells[*i]).collect::<Vec<_>>().join(",") + "\n"
+    };
+    let log = folder.path().join("level.csv");
+    std::fs::write(&log, text.lines().map(row).collect::<String>()).unwrap();
+    let (code, said) = import_of(folder.path(), &log, &card(), "level", &["--flat"]);
+    assert!(code == Some(0) && said.contains("no z, roll, pitch in the set"), "{said}");
+    let args = ["evaluate", "--data", "root", "--set", "level", "--models", "constant_velocity", "--json", "scores.json"];
+    let output = nesam(folder.path(), &args);
+    let told = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success() && told.contains("note: set `level`: z, roll, pitch not measured in 1 drives"), "{told}");
+    let json: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.path().join("scores.json")).unwrap()).unwrap();
+    let scores = &json["models"]["constant_velocity"]["mae_mean"];
+    assert!(scores["z_m"].is_null() && scores["roll_deg"].is_null() && scores["x_m"].is_f64() && scores["yaw_deg"].is_f64(), "{scores}");
 }
 
 #[test]

@@ -90,7 +90,8 @@ pub fn summarise(
     let [mut of_degraded, mut of_clean] = [WindowErrors::empty(horizon), WindowErrors::empty(horizon)];
     for (at, drive) in drives.iter().enumerate() {
         let m = &drive.measured;
-        let measured = [m.position, m.position, m.height, m.attitude, m.attitude, m.attitude];
+        let [roll, pitch, yaw] = m.attitude;
+        let measured = [m.position, m.position, m.height, roll, pitch, yaw];
         for asked in &passages[at].asked {
             let Some(other) = clean[at].asked.iter().find(|other| other.sample == asked.sample) else { continue };
             of_degraded.push(at, &asked.start, &asked.path, &asked.truth, measured);

@@ -55,10 +55,12 @@ pub fn layer(channel: usize) -> &'static str {
 /// which is known where velocity is measured. Without a map, height, roll and pitch tell of the ground and not of the vehicle.
 pub fn available(measured: &MeasuredChannels, rims_servoed: bool, mapped: bool) -> [bool; CHANNELS] {
     let w = measured.angular_velocity;
-    let (position, height, attitude, velocity) = (measured.position, measured.height, measured.attitude, measured.linear_velocity);
-    let (level, tilt) = (height && mapped, attitude && mapped);
+    let (position, height, velocity, [roll, pitch, yaw]) =
+        (measured.position, measured.height, measured.linear_velocity, measured.attitude);
+    let attitude = roll && pitch && yaw;
     let (heave, sway) = (velocity && mapped, [w[0] && mapped, w[1] && mapped]);
-    let state = [position, position, level, tilt, tilt, attitude, velocity, velocity, heave, sway[0], sway[1], w[2]];
+    let tilt = [roll && mapped, pitch && mapped];
+    let state = [position, position, height && mapped, tilt[0], tilt[1], yaw, velocity, velocity, heave, sway[0], sway[1], w[2]];
     core::array::from_fn(|c| match c {
         c if c < STEERING_AT => state[c % STATE_CHANNELS],
         c if c < RIM_AT => measured.road_wheel_angle,
@@ -66,4 +68,28 @@ pub fn available(measured: &MeasuredChannels, rims_servoed: bool, mapped: bool) 
         c if c < TURN_AT => position && velocity && attitude && (height || c < PATH_AT + 2),
         _ => attitude && w[c - TURN_AT],
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regress_roll_and_pitch_that_are_not_measured_are_not_compared() {
+        let all = available(&MeasuredChannels::POSE_AND_TWIST, false, true);
+        let level = MeasuredChannels { attitude: [false, true, true], ..MeasuredChannels::POSE_AND_TWIST };
+        let lost: Vec<String> = (0..CHANNELS).filter(|c| all[*c] && !available(&level, false, true)[*c]).map(name).collect();
+        // What needs the whole attitude goes with it: velocities turned into World, and changes of attitude against the gyro.
+        let expected = [
+            "early_roll_rad",
+            "late_roll_rad",
+            "path_minus_velocity_ahead_m",
+            "path_minus_velocity_left_m",
+            "path_minus_velocity_up_m",
+            "turn_minus_gyro_roll_rad",
+            "turn_minus_gyro_pitch_rad",
+            "turn_minus_gyro_yaw_rad",
+        ];
+        assert_eq!(lost, expected);
+    }
 }

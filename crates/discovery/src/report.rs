@@ -1,7 +1,7 @@
 //! The JSON (`nesam.diagnose/1`) and the HTML page of a diagnosis.
 
 use nesam_evaluation::report::{LinePlot, Page, Series, Short, Table};
-use nesam_evaluation::{DIMENSION_KEYS, ErrorTree, ModelScore, POSE_DIM, Provenance, paired_difference};
+use nesam_evaluation::{DIMENSION_KEYS, ErrorSummary, ErrorTree, ModelScore, POSE_DIM, Provenance, paired_difference};
 use nesam_physics::effects::Layer;
 use serde_json::{Value, json};
 
@@ -39,11 +39,10 @@ impl Report<'_> {
     /// The JSON document.
     pub fn to_json(&self) -> String {
         let d = self.diagnosis;
-        let stage = |i: usize| d.scores.as_ref().map(|s| &s.scores[i].summary);
-        let improvement = d.scores.as_ref().map(|s| {
-            let (difference, interval) = paired_difference(&s.scores[1].errors, &s.scores[2].errors, &s.resamples);
-            (json!(difference), json!(interval))
-        });
+        // Where no drive is held out, every number is null and there are no windows.
+        let stage = |i: usize| d.scores.as_ref().map_or_else(ErrorSummary::default, |s| s.scores[i].summary.clone());
+        let compared = d.scores.as_ref().map(|s| paired_difference(&s.scores[1].errors, &s.scores[2].errors, &s.resamples));
+        let (improvement, improvement_ci95) = compared.unwrap_or_default();
         let mut document = json!({
             "schema": "nesam.diagnose/1",
             "set": self.set,
@@ -54,12 +53,12 @@ impl Report<'_> {
             "before": stage(0),
             "soil_only": stage(1),
             "after": stage(2),
-            "improvement_ci95": improvement.as_ref().map(|(_, i)| i),
+            "improvement_ci95": improvement_ci95,
             "controls": self.controls(),
             "attainable_p": d.selection.probability.map(|[_, attainable]| attainable),
             "bundle": self.bundle,
             "reason": d.reason,
-            "improvement": improvement.as_ref().map(|(m, _)| m),
+            "improvement": improvement,
             "p_family_wise": d.selection.probability.map(|[p, _]| p),
             "threshold_z": d.selection.threshold,
             "remaining": {"z": d.selection.remaining.0, "what": d.selection.remaining.1},
@@ -107,7 +106,7 @@ impl Report<'_> {
             })
         });
         json!({
-            "black_box_refit": of(&|k| matches!(k, Kind::BlackBox)).pop(),
+            "black_box_refit": of(&|k| matches!(k, Kind::BlackBox)).pop().unwrap_or_else(|| json!(ErrorSummary::default())),
             "placebo_rival": of(&|k| matches!(k, Kind::Placebo(_))).pop(),
             "rivals_refitted": of(&|k| matches!(k, Kind::Rival(_))),
             "before_onset": early.map(|[_, after]| &after.summary),
@@ -406,4 +405,63 @@ fn effect_json(finding: &Finding) -> Value {
 
 fn layer_name(layer: Layer) -> String {
     layer.as_str().into()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::select::Selection;
+
+    /// Goal: readers find every key of the errors where no drive was held out. Method: a diagnosis without scores.
+    #[test]
+    fn property_errors_without_held_out_drives_have_keys_and_no_numbers() {
+        let selection = Selection {
+            z: Vec::new(),
+            levels: Vec::new(),
+            threshold: 4.0,
+            probability: None,
+            chosen: Vec::new(),
+            alone: Vec::new(),
+            rivals: Vec::new(),
+            remaining: (0.0, String::new()),
+        };
+        let diagnosis = Diagnosis {
+            verdict: Verdict::None,
+            reason: "nothing stands out".into(),
+            catalogue: Vec::new(),
+            channels: Vec::new(),
+            levels: Vec::new(),
+            traces: Vec::new(),
+            controls: Vec::new(),
+            free_form: None,
+            null_drives: None,
+            selection,
+            findings: Vec::new(),
+            estimates: Vec::new(),
+            claimed: Vec::new(),
+            fit_on: vec!["the only one".into()],
+            held_out: Vec::new(),
+            learned: Vec::new(),
+            scores: None,
+        };
+        let provenance = Provenance::default();
+        let report = Report {
+            set: "alone",
+            diagnosis: &diagnosis,
+            bundle: None,
+            free_form_bundle: None,
+            provenance: &provenance,
+            dt_s: 0.1,
+            against: Against::Bundle,
+        };
+        let json: Value = serde_json::from_str(&report.to_json()).unwrap();
+        let without_numbers = json!(ErrorSummary::default());
+        assert_eq!(without_numbers["windows"], 0);
+        for errors in [&json["before"], &json["soil_only"], &json["after"], &json["controls"]["black_box_refit"]] {
+            assert_eq!(errors, &without_numbers);
+        }
+        for gain in ["improvement", "improvement_ci95"] {
+            assert!(json[gain]["position_m"].is_object() && json[gain]["position_m"]["mean"].is_null(), "{}", json[gain]);
+        }
+    }
 }

@@ -195,6 +195,7 @@ impl Yardstick {
             remaining: (largest, String::new()),
         };
         if largest < selection.threshold {
+            selection.remaining.1 = self.named(&selection, largest);
             return selection;
         }
         while selection.chosen.len() < EFFECTS_MAX && selection.remaining.0 >= selection.threshold {
@@ -205,6 +206,13 @@ impl Yardstick {
         }
         self.describe(group, &mut selection);
         selection
+    }
+
+    /// What has this evidence alone; empty where nothing has.
+    fn named(&self, selection: &Selection, evidence: f64) -> String {
+        let hypothesis = selection.z.iter().position(|z| *z == Some(evidence)).map(|e| self.catalogue[e].label());
+        let level = || selection.levels.iter().position(|z| *z == evidence).map(|i| level_name(self.channels[i]));
+        hypothesis.or_else(level).unwrap_or_default()
     }
 
     /// What speaks for each chosen hypothesis, its rivals, and what is left.
@@ -289,10 +297,14 @@ impl Yardstick {
         let levels = self.channels.iter().enumerate().filter(|(_, c)| told(c)).map(|(i, c)| {
             let z = left.remainder_since(before, &columns, &[level_column(&self.catalogue, *c)], worst).z
                 / self.spread(self.catalogue.len() + i);
-            (z, format!("the level of {}", crate::channels::name(*c)))
+            (z, level_name(*c))
         });
         hypotheses.chain(levels).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
     }
+}
+
+fn level_name(channel: usize) -> String {
+    format!("the level of {}", crate::channels::name(channel))
 }
 
 /// The chosen hypotheses but for the `i`-th.

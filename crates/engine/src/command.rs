@@ -236,8 +236,8 @@ pub struct MeasureAnswer {
     pub reordered: bool,
     /// Steps in the history.
     pub history_steps: usize,
-    /// Changes of the history since the session was opened.
-    pub history_epoch: u64,
+    /// What a prediction made now would be computed from.
+    pub provenance: Provenance,
     /// Measurements that the session has accepted, this one included where it was.
     pub accepted: u64,
     /// What is known of the soil now.
@@ -284,6 +284,8 @@ pub enum Event {
         vehicle: String,
         /// The new estimate.
         soil: Box<SoilEstimate>,
+        /// What a prediction made now would be computed from.
+        provenance: Box<Provenance>,
     },
     /// A session has brought evidence into the soil map of the fleet.
     FleetSoilChanged {

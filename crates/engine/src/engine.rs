@@ -20,7 +20,7 @@ use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
-use crate::query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
+use crate::query::{PredictQuery, Prediction, Provenance};
 use crate::session::{Acting, Observed, Rules, Session, SessionImage, refused};
 
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
@@ -321,13 +321,19 @@ impl Engine {
         }
         let before = (session.soil().state, session.accepted());
         let rules = Rules { step_ns: self.step_ns, vehicle: &self.predictor.bundle().vehicle, limits: &self.limits };
-        let Observed { outcome, reordered } = session.observe(measurement, now_ns, rules)?;
+        let Observed { outcome, reordered } = match session.observe(measurement, now_ns, rules) {
+            Ok(observed) => observed,
+            Err(cause) => {
+                let standing = self.provenance(self.session(id)?).into();
+                return Err(EngineError::RefusedMeasurement { cause: cause.into(), standing });
+            }
+        };
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
         session.begin_from(self.fleet.as_mut(), map.as_ref(), now_ns);
         let outcome = session.learn(&self.predictor, self.noise.as_ref(), map.as_ref(), self.step_ns, outcome);
         let (vehicle, brought, told) = (session.vehicle().to_string(), session.take_brought(), session.take_told());
-        let (soil, history_steps, history_epoch) = (*session.soil(), session.history().len(), session.history_epoch());
-        let accepted = session.accepted();
+        let (soil, history_steps, accepted) = (*session.soil(), session.history().len(), session.accepted());
+        let provenance = self.provenance(self.session(id)?);
         if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
             let cell_m = fleet.cell_m();
             let changed: Vec<[FleetCell; 2]> = brought.iter().filter_map(|brought| fleet.add(map, brought, now_ns)).collect();
@@ -341,9 +347,10 @@ impl Engine {
         }
         self.emit_alarms(id, &vehicle, told);
         if soil.state.epoch != before.0.epoch {
-            self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into() });
+            let provenance = provenance.clone().into();
+            self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into(), provenance });
         }
-        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, history_epoch, accepted, soil })))
+        Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, provenance, accepted, soil })))
     }
 
     fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
@@ -395,9 +402,8 @@ impl Engine {
                 query.extras.derive(&linearisations, forward.steps(), session.soil(), self.noise.as_ref())?;
         }
         let (rolled, mut rollout) = forward.split(rollout);
-        if session.soil().state.is_prior() {
-            rollout.flags.iter_mut().for_each(|flags| *flags |= SOIL_NOT_LEARNED);
-        }
+        let of_session = session.flags();
+        rollout.flags.iter_mut().for_each(|flags| *flags |= of_session);
         let ranking = query.cost.as_ref().map(|cost| cost.rank(&rollout, &commands));
         if let Some(ranking) = &ranking {
             rollout = ranking.best_of(&rollout);

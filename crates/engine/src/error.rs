@@ -2,6 +2,8 @@
 
 use nesam_model::ModelError;
 
+use crate::query::Provenance;
+
 /// Why a command was refused. No refused command changes anything.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum EngineError {
@@ -88,6 +90,14 @@ pub enum EngineError {
     /// The deadline passed before the computation began.
     #[error("the deadline passed before the prediction was started; ask for fewer samples or allow more time")]
     Expired,
+    /// A measurement was refused, and its session stays as it is.
+    #[error("{cause}")]
+    RefusedMeasurement {
+        /// Why.
+        cause: Box<EngineError>,
+        /// Where the session stands.
+        standing: Box<Provenance>,
+    },
     /// The asker has gone.
     #[error("the asker did not wait for the prediction")]
     Abandoned,
@@ -108,6 +118,22 @@ impl EngineError {
         Self::Invalid { field: field.into(), reason: reason.into() }
     }
 
+    /// The refusal without where a session stands.
+    pub fn refusal(&self) -> &Self {
+        match self {
+            Self::RefusedMeasurement { cause, .. } => cause.refusal(),
+            other => other,
+        }
+    }
+
+    /// Where the session of a refused measurement stands, as far as it was looked at.
+    pub fn standing(&self) -> Option<&Provenance> {
+        match self {
+            Self::RefusedMeasurement { standing, .. } => Some(standing),
+            _ => None,
+        }
+    }
+
     /// Path of the field at fault; empty when none is.
     pub fn field(&self) -> &str {
         match self {
@@ -116,6 +142,7 @@ impl EngineError {
             Self::UnknownSession { .. } => "session_id",
             Self::UnknownMap { .. } | Self::MapExists { .. } | Self::MapInUse { .. } => "map_id",
             Self::MapChanged { .. } => "base_version",
+            Self::RefusedMeasurement { cause, .. } => cause.field(),
             Self::Overloaded { .. } | Self::Expired | Self::Abandoned | Self::Stopped | Self::Internal { .. } => "",
         }
     }

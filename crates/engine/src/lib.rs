@@ -53,7 +53,7 @@ pub use maps::MapRegistry;
 pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FORECAST_AHEAD, FilterSnapshot, ForecastCheck, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, EvidenceParts, FleetSoilError, FleetSoilSettings};
-pub use query::{PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
+pub use query::{ALARM_ACTIVE, PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
 pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{
     Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, OpenForecast, Session, SessionImage,

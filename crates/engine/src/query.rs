@@ -14,6 +14,9 @@ use crate::session::SoilEstimate;
 /// Bit of `Rollout::flags` that the engine adds to those of the model: the drive has told nothing of the soil yet, the prior alone speaks.
 pub const SOIL_NOT_LEARNED: u32 = 128;
 
+/// The same: an alarm of the session is active, its measurements disagree with its predictions.
+pub const ALARM_ACTIVE: u32 = 256;
+
 /// A batch of candidate command sequences from one session.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PredictQuery {
@@ -52,6 +55,13 @@ pub struct Provenance {
     pub bundle_name: String,
     /// Hash of the bundle.
     pub bundle_hash: String,
+}
+
+impl Provenance {
+    /// Version of the map; 0 = no map.
+    pub fn map_version(&self) -> u64 {
+        self.map.as_ref().map_or(0, |(_, version, _)| *version)
+    }
 }
 
 /// An answered prediction.

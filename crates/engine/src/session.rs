@@ -34,6 +34,7 @@ use crate::fleet::{Brought, Fleet};
 use crate::forward::Newest;
 use crate::limits::{Limits, outside_card};
 use crate::measurement::{Measurement, Outcome};
+use crate::query::{ALARM_ACTIVE, SOIL_NOT_LEARNED};
 
 /// Measurements that the reorder window holds at most; more become final early. 200 Hz over the longest window.
 const OPEN_MAX: usize = 200;
@@ -370,6 +371,12 @@ impl Session {
     /// The alarm of the present episode.
     pub fn alarm(&self) -> Option<Alarm> {
         self.watch.as_ref().and_then(|watch| watch.active)
+    }
+
+    /// Flags of all its predictions, beside those of the model.
+    pub(crate) fn flags(&self) -> u32 {
+        let not_learned = if self.soil.state.is_prior() { SOIL_NOT_LEARNED } else { 0 };
+        not_learned | if self.alarm().is_some() { ALARM_ACTIVE } else { 0 }
     }
 
     /// Alarms that were raised or cleared since the last time.

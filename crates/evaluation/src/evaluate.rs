@@ -115,7 +115,8 @@ fn curve(errors: &WindowErrors, dimension: usize, resamples: &Resamples) -> Hori
 /// Dimensions that the drive of a window measures.
 fn measured_dimensions(window: &Window<'_>) -> [bool; POSE_DIM] {
     let m = &window.trajectory.measured;
-    [m.position, m.position, m.height, m.attitude, m.attitude, m.attitude]
+    let [roll, pitch, yaw] = m.attitude;
+    [m.position, m.position, m.height, roll, pitch, yaw]
 }
 
 /// Median over windows of the true path length, m.

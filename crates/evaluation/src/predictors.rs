@@ -116,6 +116,17 @@ impl WindowPredictor {
         }
     }
 
+    /// Refuses a window whose drive does not measure what this model reads over the horizon.
+    ///
+    /// # Errors
+    /// `EvaluationError::NoWheels` naming the drive.
+    pub fn check_inputs(&self, window: &Window<'_>) -> Result<(), EvaluationError> {
+        match self {
+            Self::Nesam { predictor, inputs: Inputs::Wheels, .. } => window.measured_wheels(is_steered(predictor)).map(|_| ()),
+            _ => Ok(()),
+        }
+    }
+
     /// Predicts the poses after steps 1…K of a window from what is known at its start: measured history, map and future commands.
     ///
     /// # Errors
@@ -128,7 +139,7 @@ impl WindowPredictor {
             Self::Nesam { predictor, variant, inputs } => {
                 let wheels = match inputs {
                     Inputs::Commands => None,
-                    Inputs::Wheels => Some(window.measured_wheels(predictor.bundle().vehicle.second != SecondCommand::YawRateRadS)?),
+                    Inputs::Wheels => Some(window.measured_wheels(is_steered(predictor))?),
                 };
                 return roll_out(predictor, *variant, SoilCorrection::NONE, window, wheels.as_deref(), map);
             }
@@ -147,6 +158,11 @@ impl WindowPredictor {
         };
         Ok(PosePath { poses, predicts: [true; POSE_DIM] })
     }
+}
+
+/// Whether the vehicle of a bundle has road-wheel angles.
+fn is_steered(predictor: &Predictor) -> bool {
+    predictor.bundle().vehicle.second != SecondCommand::YawRateRadS
 }
 
 /// Rolls the model out from the start of a window under its recorded commands.

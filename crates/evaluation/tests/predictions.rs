@@ -110,6 +110,24 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
 }
 
 #[test]
+fn regress_what_a_drive_does_not_measure_is_null() {
+    // Goal: zeros that stand for heights and pitches are not scored. Method: one of two drives lacks them.
+    let mut drives = [drive("a", 120, 9.0), drive("b", 90, -15.0)];
+    drives[1].measured = MeasuredChannels { height: false, attitude: [true, false, true], ..MeasuredChannels::POSE_AND_TWIST };
+    let windows = all_windows(&drives, 32, 32, Truth::Measured).unwrap();
+    let models = [(ModelName::ConstantVelocity, WindowPredictor::ConstantVelocity)];
+    let paths = predict_all(&models, &windows, &[None, None], &|_| {}).unwrap();
+    let scores = score(&paths[0], &windows, Truth::Measured, &Resamples::draw(2, 1000, 5));
+    let json = serde_json::to_value(&scores.summary).unwrap();
+    for block in [&json["mae_mean"], &json["mae_final"], &json["ci95"]["mae_mean"]] {
+        for (key, scored) in [("x_m", true), ("y_m", true), ("z_m", false), ("roll_deg", true), ("pitch_deg", false), ("yaw_deg", true)] {
+            assert_eq!(!block[key].is_null(), scored, "{key}: {block}");
+        }
+    }
+    assert!(json["position_m"]["mean"].is_f64());
+}
+
+#[test]
 fn property_refusals_name_what_was_wrong() {
     let drives = [drive("short", 20, 9.0)];
     let none = all_windows(&drives, 32, 32, Truth::Measured).unwrap_err().to_string();

@@ -10,6 +10,7 @@ use std::path::Path;
 
 use nesam_mcap::{ReadError, Reader, Record};
 
+use crate::bag_folder::parts;
 use crate::cdr::{Odometry, ackermann, imu, odometry, twist};
 use crate::error::ImportError;
 use crate::log::Log;
@@ -41,10 +42,10 @@ const IMU: &[&str] = &["sensor_msgs/msg/Imu"];
 /// Messages of a bag: by topic the type, when each was recorded in ns, and its bytes.
 type Messages = BTreeMap<String, (String, Vec<(i64, Vec<u8>)>)>;
 
-/// Reads a bag as a log with the columns `t x y z qx qy qz qw vbx vby vbz wx wy wz cmd_speed` and `cmd_yaw_rate` or `cmd_road_wheel_angle`.
+/// Reads a bag, a file or a folder with its parts, as a log with the columns `t x y z qx qy qz qw vbx vby vbz wx wy wz cmd_speed` and `cmd_yaw_rate` or `cmd_road_wheel_angle`.
 ///
 /// # Errors
-/// `ImportError::Log` when the file is no MCAP file or compressed, a topic is missing, ambiguous or of another type, or a message is not readable.
+/// `ImportError::Log` when a file is no MCAP file or compressed, a folder is no bag, a topic is missing, ambiguous or of another type, or a message is not readable.
 pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportError> {
     let (messages, mut notes) = messages(path)?;
     let pick = |wanted: &Option<String>, types: &[&str], option: &str| choose(path, &messages, wanted.as_deref(), types, option);
@@ -150,11 +151,32 @@ fn held<T: Copy>(entries: &[(i64, T)], at_ns: i64) -> Option<T> {
     entries[..entries.partition_point(|(ns, _)| *ns <= at_ns)].last().map(|(_, value)| *value)
 }
 
+/// Messages of all parts of a bag, those of each topic in the order in which they were recorded.
 fn messages(path: &Path) -> Result<(Messages, Notes), ImportError> {
+    let (files, mut notes) = parts(path)?;
+    let mut messages = Messages::new();
+    for file in &files {
+        if add_messages(file, &mut messages)? == Ending::CutOff {
+            let what = if files.len() > 1 { file.display().to_string() } else { "the bag".into() };
+            notes.push(format!("{what} was cut off: what is whole of it is used"));
+        }
+    }
+    messages.values_mut().for_each(|(_, kept)| kept.sort_by_key(|(ns, _)| *ns));
+    Ok((messages, notes))
+}
+
+/// How a file of a bag ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Ending {
+    Whole,
+    CutOff,
+}
+
+/// Adds the messages of a file; ids of schemas and channels count within it.
+fn add_messages(path: &Path, messages: &mut Messages) -> Result<Ending, ImportError> {
     let file = File::open(path).map_err(|source| ImportError::file(path, source))?;
     let mut reader = Reader::new(BufReader::new(file));
     let (mut types, mut channels) = (BTreeMap::new(), BTreeMap::new());
-    let (mut messages, mut notes) = (Messages::new(), Notes::new());
     loop {
         match reader.next_record() {
             Ok(Some(Record::Schema { id, name, .. })) => drop(types.insert(id, name)),
@@ -172,16 +194,11 @@ fn messages(path: &Path) -> Result<(Messages, Notes), ImportError> {
                 }
             }
             Ok(Some(_)) => {}
-            Ok(None) => break,
-            Err(ReadError::CutOff) => {
-                notes.push("the bag was cut off: what is whole of it is used".into());
-                break;
-            }
+            Ok(None) => return Ok(Ending::Whole),
+            Err(ReadError::CutOff) => return Ok(Ending::CutOff),
             Err(error) => return Err(ImportError::log(path, error.to_string())),
         }
     }
-    messages.values_mut().for_each(|(_, kept)| kept.sort_by_key(|(ns, _)| *ns));
-    Ok((messages, notes))
 }
 
 /// Type and messages of a topic.
@@ -242,13 +259,18 @@ mod tests {
     }
 
     fn bag(path: &Path, commands: &[&str]) {
+        part(path, commands, 0..40);
+    }
+
+    /// Twentieths of a second of a bag.
+    fn part(path: &Path, commands: &[&str], instants: std::ops::Range<i64>) {
         let mut writer = Writer::create(File::create(path).expect("made"), "ros2", "test").expect("made");
         let odometry = writer.add_schema("nav_msgs/msg/Odometry", "ros2msg", b"").expect("added");
         let twist = writer.add_schema("geometry_msgs/msg/Twist", "ros2msg", b"").expect("added");
         let odometry = writer.add_channel(odometry, "/odom", "cdr").expect("added");
         let commands: Vec<u16> = commands.iter().map(|topic| writer.add_channel(twist, topic, "cdr").expect("added")).collect();
         let begin = 1_700_000_000_000_000_000_i64;
-        for i in 0..40_i64 {
+        for i in instants {
             let at = begin + i * 50_000_000;
             for channel in commands.iter().filter(|_| i % 10 == 1) {
                 let values: Vec<u8> = [1.0 + i as f64, 0.0, 0.0, 0.0, 0.0, 0.5].iter().flat_map(|v: &f64| v.to_le_bytes()).collect();
@@ -273,6 +295,23 @@ mod tests {
         assert_eq!((column("t").len(), column("x")[1], column("vbx")[0]), (39, 0.2, 2.0));
         assert_eq!((column("cmd_speed")[0], column("cmd_speed")[9], column("cmd_speed")[10]), (2.0, 2.0, 12.0), "held until the next");
         assert_eq!((column("cmd_yaw_rate")[0], column("yaw")[0]), (0.5, 0.0));
+    }
+
+    #[test]
+    fn analytic_parts_in_a_folder_are_one_bag() {
+        // Goal: a recording that was split is read as if it were not. Method: two parts of 2 s whose channels have other ids, named against their order.
+        let folder = tempfile::tempdir().expect("a folder");
+        let (whole, split) = (folder.path().join("whole.mcap"), folder.path().join("split"));
+        part(&whole, &["/cmd_vel"], 0..80);
+        std::fs::create_dir(&split).expect("made");
+        part(&split.join("b.mcap"), &["/cmd_vel"], 0..40);
+        part(&split.join("a.mcap"), &["/joy_vel", "/cmd_vel"], 40..80);
+        std::fs::write(split.join("metadata.yaml"), "relative_file_paths:\n  - b.mcap\n  - a.mcap\n  - c.mcap\n").expect("written");
+        let topics = Topics { command: Some("/cmd_vel".into()), ..Topics::default() };
+        let (one, _) = read_bag(&whole, &topics).expect("readable");
+        let (two, notes) = read_bag(&split, &topics).expect("readable");
+        assert_eq!((one.rows, &one.numbers), (80, &two.numbers));
+        assert!(notes.len() == 1 && notes[0].contains("c.mcap"), "{notes:?}");
     }
 
     /// Goal: what was measured or told at an instant counts from it. Method: odometry and stamped commands of one clock, commands recorded 0.4 s late, a gyro

@@ -9,6 +9,7 @@
 #![forbid(unsafe_code)]
 
 mod bag;
+mod bag_folder;
 mod cdr;
 mod error;
 mod frame;
@@ -20,6 +21,7 @@ mod table;
 mod write;
 
 pub use bag::{Topics, read_bag};
+pub use bag_folder::CONVERT;
 pub use error::ImportError;
 pub use frame::FrameConvention;
 pub use log::Log;

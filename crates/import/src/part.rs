@@ -35,7 +35,7 @@ pub struct Options {
     pub mapping: Mapping,
     /// Axes of the log.
     pub frame: FrameConvention,
-    /// Heights, roll and pitch that the log does not have are zero.
+    /// The log may lack heights, roll and pitch: the drives then lack them too, and readers take them for zero and as not measured.
     pub flat: bool,
     /// Name of the drives where the log has none.
     pub name: String,
@@ -131,7 +131,7 @@ fn pose(log: &Log, options: &Options, notes: &mut Notes) -> Result<Vec<Channel>,
     let or_flat = |found: Option<Vec<Option<f64>>>, target: &str| match found {
         Some(values) => Ok(values),
         None if options.flat => Ok(zero()),
-        None => Err(absent(log, target, " (with --flat it is zero)")),
+        None => Err(absent(log, target, " (with --flat it may be missing and is taken for zero)")),
     };
     let number = |target: &str| options.mapping.numbers(log, target);
     let position = [required(log, options, "x", "")?, required(log, options, "y", "")?, or_flat(number("z")?, "z")?];
@@ -144,12 +144,16 @@ fn pose(log: &Log, options: &Options, notes: &mut Notes) -> Result<Vec<Channel>,
         let yaw = required(log, options, "yaw", " nor a quaternion `qx` to `qw`")?;
         [or_flat(number("roll")?, "roll")?, or_flat(number("pitch")?, "pitch")?, yaw]
     };
-    if options.flat && number("z")?.is_none() {
-        notes.push("heights, and roll and pitch where the log has none, are zero as --flat says".into());
+    let of_quaternion = number("yaw")?.is_none();
+    let given = [number("z")?.is_some(), of_quaternion || number("roll")?.is_some(), of_quaternion || number("pitch")?.is_some()];
+    let lacking: Vec<&str> = ["z", "roll", "pitch"].into_iter().zip(given).filter(|(_, given)| !given).map(|(name, _)| name).collect();
+    if !lacking.is_empty() {
+        notes.push(format!("no {} in the set, as --flat allows: taken for zero, on level ground, and not scored", lacking.join(", ")));
     }
     let position = turned(position, |v| options.frame.world(v));
     let attitude = turned(attitude, |v| options.frame.attitude(v));
-    Ok(named(&["x", "y", "z"], position).chain(named(&["roll", "pitch", "yaw"], attitude)).collect())
+    let all = named(&["x", "y", "z"], position).chain(named(&["roll", "pitch", "yaw"], attitude));
+    Ok(all.filter(|(name, _)| !lacking.contains(&name.as_str())).collect())
 }
 
 fn named<const N: usize>(names: &[&str; N], values: [Vec<Option<f64>>; N]) -> impl Iterator<Item = Channel> {

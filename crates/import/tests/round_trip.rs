@@ -132,6 +132,23 @@ fn analytic_gaps_part_drives_and_what_is_left_out_is_told() {
 }
 
 #[test]
+fn regress_what_a_log_lacks_is_not_measured_in_the_set() {
+    // Goal: zeros that nobody measured are not written. Method: a level log in two frames, once with roll; the set is read as a data root does.
+    for (frame, name, attitude) in
+        [(FrameConvention::EnuFlu, "bank", [false, false, true]), (FrameConvention::NedFrd, "roll", [true, false, true])]
+    {
+        let mut table = format!("t,x,y,yaw,cmd_speed,cmd_steer,{name}\n");
+        for k in 0..30 {
+            let _ = writeln!(table, "{},{},0,0.5,1,0,0.1", 0.1 * f64::from(k), 0.1 * f64::from(k));
+        }
+        let read = &imported(&table, &Options { flat: true, ..options(&[], frame) })[0];
+        assert!(!read.measured.height && read.measured.attitude == attitude, "{:?}", read.measured);
+        let roll = if attitude[0] { 0.1 } else { 0.0 };
+        assert!(read.states.iter().all(|s| s.position_m[2] == 0.0 && s.attitude_rad[0] == roll && s.attitude_rad[1] == 0.0));
+    }
+}
+
+#[test]
 fn analytic_a_drive_begins_with_its_own_first_command() {
     // Two drives in one table, row by row in turn, then one after the other; the second is told nothing for its first half second.
     let row = |name: &str, k: i32| {

@@ -1,10 +1,14 @@
-//! Calibration of the drive line on measured drives, with the symbolic model alone.
+//! Calibration of a vehicle's card on measured drives, with the symbolic model alone: how soil and engine act, the drive line, the suspension.
 
 use nesam_model::Normalization;
+use nesam_physics::terramechanics::ContactLaw;
 use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
 use crate::drives::Drive;
+use crate::recipe::Reporter;
 use crate::rims::fit_rims;
+use crate::scales::measure;
+use crate::suspension::{TURNS, calibrate_suspension};
 use crate::symbolic::{descend, symbolic_error};
 
 /// A number of the drive line that is calibrated, with its range.
@@ -87,6 +91,51 @@ impl DriveLaw {
         });
         Some(vehicle)
     }
+}
+
+/// The vehicle with its drive line fitted on drives under each contact law and drive, the best pair kept, its suspension fitted with that where drives have a
+/// map, and the scales of the drives.
+pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
+    let scales = measure(training, &vehicle, dt_s);
+    let samples: usize = training.iter().map(|d| d.states.len()).sum();
+    let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
+    let mut best: Option<(f64, Vehicle)> = None;
+    let skid = vehicle.second == SecondCommand::YawRateRadS;
+    let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
+    // Under the other law soil has no damping to ask for.
+    let laws = ContactLaw::ALL.into_iter().filter(|law| vehicle.soil_damping_pa_s_m == 0.0 || *law == ContactLaw::SoilContactModel);
+    for (law, drive) in laws.flat_map(|law| drives_by.iter().map(move |drive| (law, *drive))) {
+        let Some(start) = drive.of(&vehicle, &few) else { continue };
+        let mut candidate = Vehicle { contact_law: law, ..start };
+        let name = format!("{law:?}, {drive:?}");
+        reporter.stage(&format!("drive line, {name}"), 3 * knobs(&candidate).len());
+        let mut done = 0;
+        let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, |name, value, error| {
+            done += 1;
+            reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
+        });
+        reporter.line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", candidate.driveline));
+        if best.as_ref().is_none_or(|(error, _)| after < *error) {
+            best = Some((after, candidate));
+        }
+    }
+    let mut chosen = best.map_or(vehicle, |(_, chosen)| chosen);
+    if training.iter().all(|drive| drive.map.is_none()) {
+        return (chosen, scales);
+    }
+    reporter.stage("suspension", TURNS);
+    let mut done = 0;
+    let [before, after] = calibrate_suspension(&mut chosen, training, &scales, |name, value, error| {
+        done += 1;
+        reporter.progress(done, &format!("{name} = {value:.0}, {:.3}°", error.to_degrees()));
+    });
+    let (rates, dampings) = (chosen.suspension_n_m, chosen.suspension_n_s_m);
+    reporter.line(&format!(
+        "suspension, symbolic model alone {:.3}° -> {:.3}° of roll and pitch over 1.6 s; {rates:.0?} N/m, {dampings:.0?} N s/m",
+        before.to_degrees(),
+        after.to_degrees()
+    ));
+    (chosen, scales)
 }
 
 /// Numbers that are calibrated on a car.

@@ -10,18 +10,16 @@ use nesam_model::dims::CONTEXT;
 use nesam_model::encoder::{ENCODERS, TerrainEncoders};
 use nesam_model::{ModelBundle, ModelError, Normalization, Provenance, Variant, Weights};
 use nesam_physics::step::StepModel;
-use nesam_physics::terramechanics::ContactLaw;
-use nesam_physics::{STATE_DIM, SecondCommand, Vehicle};
+use nesam_physics::{STATE_DIM, Vehicle};
 use nesam_terrain::{PatchScale, WorldMap};
 use nesam_trajectories::{DataRoot, Trajectory};
 
 use crate::autoencoder::{Places, PretrainPlan, pretrain};
-use crate::calibrate::{DriveLaw, calibrate_driveline, knobs};
+use crate::calibrate::calibrate_vehicle;
 use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
 use crate::pooling::Pooling;
-use crate::scales::{measure, measure_increments};
-use crate::suspension::{TURNS, calibrate_suspension};
+use crate::scales::measure_increments;
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
 
 /// What a run is told; the defaults of the command line are in `nesam train --help`.
@@ -97,7 +95,10 @@ pub fn run(
         soil_damping_pa_s_m: recipe.soil_damping_pa_s_m.unwrap_or(vehicle.soil_damping_pa_s_m),
         ..vehicle.clone()
     };
-    let fitted = || calibrated(damped(root.vehicle()), &drives, &train_at, recipe.dt_s, reporter);
+    let fitted = || {
+        let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
+        calibrate_vehicle(damped(root.vehicle()), &training, recipe.dt_s, reporter)
+    };
     let (vehicle, mut scales) = match &recipe.start {
         Some(bundle) if recipe.recalibrate => (fitted().0, bundle.normalization.clone()),
         Some(bundle) => (damped(&bundle.vehicle), bundle.normalization.clone()),
@@ -224,7 +225,10 @@ fn describe(line: &EpochReport) -> String {
 }
 
 /// Measured channels of the trajectories with their maps, in the order of their ids.
-fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<Drive>, TrainingError> {
+///
+/// # Errors
+/// `TrainingError::Drives` when the map of one cannot be read.
+pub fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<Drive>, TrainingError> {
     let mut sorted: Vec<&Trajectory> = trajectories.iter().collect();
     sorted.sort_by(|a, b| a.id.cmp(&b.id));
     sorted
@@ -247,52 +251,6 @@ fn mirrored(drives: &[Drive], at: &[usize]) -> Vec<Drive> {
             drives[i].mirrored(map)
         })
         .collect()
-}
-
-/// The vehicle with its drive line fitted on the training drives under each contact law, the better pair kept, its suspension fitted with that, and the scales
-/// of the drives.
-fn calibrated(vehicle: Vehicle, drives: &[Drive], train_at: &[usize], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
-    let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
-    let scales = measure(&training, &vehicle, dt_s);
-    let samples: usize = training.iter().map(|d| d.states.len()).sum();
-    let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
-    let mut best: Option<(f64, Vehicle)> = None;
-    let skid = vehicle.second == SecondCommand::YawRateRadS;
-    let drives_by: &[DriveLaw] = if skid { &DriveLaw::ALL[..1] } else { &DriveLaw::ALL };
-    // Under the other law soil has no damping to ask for.
-    let laws = ContactLaw::ALL.into_iter().filter(|law| vehicle.soil_damping_pa_s_m == 0.0 || *law == ContactLaw::SoilContactModel);
-    for (law, drive) in laws.flat_map(|law| drives_by.iter().map(move |drive| (law, *drive))) {
-        let Some(start) = drive.of(&vehicle, &few) else { continue };
-        let mut candidate = Vehicle { contact_law: law, ..start };
-        let name = format!("{law:?}, {drive:?}");
-        reporter.stage(&format!("drive line, {name}"), 3 * knobs(&candidate).len());
-        let mut done = 0;
-        let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, |name, value, error| {
-            done += 1;
-            reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
-        });
-        reporter.line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", candidate.driveline));
-        if best.as_ref().is_none_or(|(error, _)| after < *error) {
-            best = Some((after, candidate));
-        }
-    }
-    let mut chosen = best.map_or(vehicle, |(_, chosen)| chosen);
-    if training.iter().all(|drive| drive.map.is_none()) {
-        return (chosen, scales);
-    }
-    reporter.stage("suspension", TURNS);
-    let mut done = 0;
-    let [before, after] = calibrate_suspension(&mut chosen, &training, &scales, |name, value, error| {
-        done += 1;
-        reporter.progress(done, &format!("{name} = {value:.0}, {:.3}°", error.to_degrees()));
-    });
-    let (rates, dampings) = (chosen.suspension_n_m, chosen.suspension_n_s_m);
-    reporter.line(&format!(
-        "suspension, symbolic model alone {:.3}° -> {:.3}° of roll and pitch over 1.6 s; {rates:.0?} N/m, {dampings:.0?} N s/m",
-        before.to_degrees(),
-        after.to_degrees()
-    ));
-    (chosen, scales)
 }
 
 /// Name of the file with encoders, by all that they are trained on: the plan, the places, and how much of them the pixels show.
@@ -342,9 +300,6 @@ fn encoders(
             .collect();
         running.into_iter().map(|r| r.join().expect("pre-training does not panic; this is a bug")).collect()
     });
-    if interrupted() {
-        return Err(TrainingError::Interrupted(0));
-    }
     let mut weights = Weights::default();
     for ((name, _), result) in ENCODERS.iter().zip(results) {
         let pretrained = result?;
@@ -354,7 +309,8 @@ fn encoders(
         }
     }
     write(&path, &weights.to_bytes())?;
-    Ok(weights)
+    // Asked for meanwhile: pre-training runs to its end, and what it made is kept for the run that resumes this one.
+    if interrupted() { Err(TrainingError::Interrupted(0)) } else { Ok(weights) }
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {

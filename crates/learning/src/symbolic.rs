@@ -11,8 +11,8 @@ use rayon::prelude::*;
 use crate::class_soil::ClassSoil;
 use crate::drives::Drive;
 
-/// Steps of a rollout.
-const HORIZON: usize = 16;
+/// Steps of a rollout; a drive must have two samples more to be rolled out.
+pub const HORIZON: usize = 16;
 /// Samples from the start of one rollout to that of the next.
 const STRIDE: usize = 40;
 /// Samples before the first rollout of a drive.

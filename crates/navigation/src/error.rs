@@ -16,6 +16,14 @@ pub enum NavigationError {
         /// What was wrong.
         reason: String,
     },
+    /// The plant has lost a lap that had begun: it answers no more, or was started anew. The lap can be driven again from `reset`.
+    #[error("plant {address}: {reason}")]
+    Lost {
+        /// Where it was expected.
+        address: String,
+        /// What was wrong.
+        reason: String,
+    },
     /// The built-in plant cannot be made.
     #[error(transparent)]
     BuiltIn(#[from] nesam_plant::PlantError),

@@ -10,6 +10,7 @@ use crate::error::NavigationError;
 use crate::forecast::{Forecaster, Situation};
 use crate::link::{PlantLink, Reading, Start};
 use crate::mppi::{Mppi, MppiSettings};
+use crate::plausibility::{VelocityCheck, usable};
 use crate::reference_path::{ReferencePath, distance_to_line, hausdorff_m, unwrapped};
 use crate::tracker::TrackingCost;
 
@@ -53,12 +54,33 @@ pub struct LapPlan {
     pub caution: Option<CautionSettings>,
 }
 
+impl LapPlan {
+    /// Where the vehicle is set down: on the tangent, so far behind the beginning of the lap that the run-up ends there.
+    pub fn start(&self) -> Start {
+        let ([x, y], yaw_rad) = (self.path.point(self.start_phi), self.path.heading(self.start_phi));
+        let run_up_m = RUN_UP_SHARE * self.cost.speed_m_s * DT_S * ACCELERATION_STEPS as f64;
+        let position_m = [x - run_up_m * yaw_rad.cos(), y - run_up_m * yaw_rad.sin()];
+        Start { world: self.world.clone(), seed: self.seed, position_m, yaw_rad }
+    }
+}
+
+/// What a lap is scored by.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Scored {
+    /// The true motion.
+    #[default]
+    Truth,
+    /// What the sensors say, of a plant that does not tell the truth.
+    State,
+}
+
 /// What came of it. Distances and angles are those of the true motion where the plant tells it.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Lap {
     /// Whether the whole lap was driven in time and never more than 5 m off the path.
     pub completed: bool,
-    /// `complete`, `off_path` or `too_slow`.
+    /// `complete`, `off_path`, `too_slow`, `overturned`, `plant_lost`, or the text with which the plant ended the lap.
     pub end: String,
     /// Time from the beginning of the lap to its end, s.
     pub time_s: f64,
@@ -76,6 +98,13 @@ pub struct Lap {
     pub measurements: BTreeMap<String, usize>,
     /// Correction of the soil prior that the service held at the end.
     pub soil_delta: Option<[f64; 6]>,
+    /// What distances and angles are those of.
+    #[serde(default)]
+    pub scored: Scored,
+    /// Root mean square, over the lap, of what measured positions and measured velocities (Body) say differently of the horizontal motion of a second, m/s; `None`
+    /// for a lap of less than a second.
+    #[serde(default)]
+    pub velocity_mismatch_m_s: Option<f64>,
     /// x, y driven, every 0.2 s, m.
     pub path: Vec<[f64; 2]>,
 }
@@ -83,16 +112,8 @@ pub struct Lap {
 /// Drives a lap.
 ///
 /// # Errors
-/// `NavigationError` when plant or service fail; leaving the path or getting stuck is a result.
+/// `NavigationError` when plant or service fail; leaving the path, getting stuck, overturning or a simulation that diverges is a result.
 pub async fn run_lap(plan: &LapPlan, plant: &mut dyn PlantLink, model: &mut Forecaster) -> Result<Lap, NavigationError> {
-    let ([x, y], yaw_rad) = (plan.path.point(plan.start_phi), plan.path.heading(plan.start_phi));
-    let run_up_m = RUN_UP_SHARE * plan.cost.speed_m_s * DT_S * ACCELERATION_STEPS as f64;
-    let position_m = [x - run_up_m * yaw_rad.cos(), y - run_up_m * yaw_rad.sin()];
-    let start = Start { world: plan.world.clone(), seed: plan.seed, position_m, yaw_rad };
-    let mut reading = plant.reset(&start)?;
-    for _ in 0..SETTLE_STEPS {
-        reading = plant.step(Control { speed_m_s: 0.0, second: 0.0 })?;
-    }
     let guess = Control { speed_m_s: plan.cost.speed_m_s, second: plan.steering_guess };
     let mut drive = Driver {
         plan,
@@ -101,25 +122,10 @@ pub async fn run_lap(plan: &LapPlan, plant: &mut dyn PlantLink, model: &mut Fore
         stamp_ns: 0,
         caution: Caution::new(plan.caution),
     };
-    let straight = Control { speed_m_s: plan.cost.speed_m_s, second: 0.0 };
-    for _ in 0..ACCELERATION_STEPS {
-        drive.tell(model, &reading, straight).await?;
-        reading = plant.step(straight)?;
-    }
-    let mut track = Track::new(plan, &reading);
-    let mut step = 0;
-    while track.end(plan).is_none() {
-        let command = drive.planner.next_command();
-        drive.tell(model, &reading, command).await?;
-        drive.look_ahead(model, &reading, track.phi, step).await?;
-        if step % plan.plan_every == 0 {
-            drive.think(model, &reading, track.phi).await?;
-        }
-        reading = plant.step(command)?;
-        track.add(plan, &reading);
-        step += 1;
-    }
-    let mut lap = track.lap(plan);
+    let mut lap = match drive.run_up(plant, model).await? {
+        Ok(reading) => drive.circuit(reading, plant, model).await?.lap(plan),
+        Err(end) => Track { ended: Some(end), ..Track::at(plan, plan.start().position_m) }.lap(plan),
+    };
     if let Forecaster::Served(served) = model {
         lap.measurements = served.outcomes.iter().map(|(name, count)| ((*name).to_string(), *count)).collect();
         lap.soil_delta = served.soil_delta;
@@ -137,6 +143,48 @@ struct Driver<'a> {
 }
 
 impl Driver<'_> {
+    /// Sets the vehicle down, lets it settle and accelerates it. Gives the reading with which the lap begins, or how it ends before.
+    async fn run_up(&mut self, plant: &mut dyn PlantLink, model: &mut Forecaster) -> Result<Result<Reading, String>, NavigationError> {
+        let mut next = usable(&plant.reset(&self.plan.start())?);
+        for _ in 0..SETTLE_STEPS {
+            if next.is_err() {
+                return Ok(next);
+            }
+            next = usable(&plant.step(Control { speed_m_s: 0.0, second: 0.0 })?);
+        }
+        let straight = Control { speed_m_s: self.plan.cost.speed_m_s, second: 0.0 };
+        for _ in 0..ACCELERATION_STEPS {
+            let Ok(reading) = &next else { break };
+            self.tell(model, reading, straight).await?;
+            next = usable(&plant.step(straight)?);
+        }
+        Ok(next)
+    }
+
+    /// Drives from the beginning of the lap to its end.
+    async fn circuit(&mut self, mut reading: Reading, plant: &mut dyn PlantLink, model: &mut Forecaster) -> Result<Track, NavigationError> {
+        let plan = self.plan;
+        let mut track = Track::new(plan, &reading);
+        let mut step = 0;
+        while track.end(plan).is_none() {
+            let command = self.planner.next_command();
+            self.tell(model, &reading, command).await?;
+            self.look_ahead(model, &reading, track.phi, step).await?;
+            if step % plan.plan_every == 0 {
+                self.think(model, &reading, track.phi).await?;
+            }
+            match usable(&plant.step(command)?) {
+                Ok(next) => {
+                    track.add(plan, &next);
+                    reading = next;
+                }
+                Err(end) => track.ended = Some(end),
+            }
+            step += 1;
+        }
+        Ok(track)
+    }
+
     /// Tells the model what was measured and what is commanded from now on.
     async fn tell(&mut self, model: &mut Forecaster, reading: &Reading, command: Control<f64>) -> Result<(), NavigationError> {
         self.stamp_ns += (DT_S * 1e9).round() as i64;
@@ -189,26 +237,55 @@ struct Track {
     roll_sum: f64,
     pitch_sum: f64,
     local: Vec<[f64; 2]>,
+    scored: Scored,
+    velocity: VelocityCheck,
+    /// How the lap ended before its time: the vehicle or its simulation is beyond driving.
+    ended: Option<String>,
 }
 
 impl Track {
-    fn new(plan: &LapPlan, reading: &Reading) -> Self {
-        let [x, y] = [reading.truth[0], reading.truth[1]];
+    /// A lap that begins at a place of which nothing has been read yet.
+    fn at(plan: &LapPlan, [x, y]: [f64; 2]) -> Self {
         let phi = unwrapped(plan.path.offset(x, y).phi, plan.start_phi);
-        let local = plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M);
-        let nothing = (0.0, 0.0, 0.0, 0.0);
-        let (off_path_m, off_path_sum_m, roll_sum, pitch_sum) = nothing;
-        Self { begun_phi: phi, phi, positions: vec![[x, y]], off_path_m, off_path_sum_m, roll_sum, pitch_sum, local }
+        Self {
+            begun_phi: phi,
+            phi,
+            positions: vec![[x, y]],
+            off_path_m: 0.0,
+            off_path_sum_m: 0.0,
+            roll_sum: 0.0,
+            pitch_sum: 0.0,
+            local: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
+            scored: Scored::Truth,
+            velocity: VelocityCheck::default(),
+            ended: None,
+        }
+    }
+
+    fn new(plan: &LapPlan, reading: &Reading) -> Self {
+        let [x, y, ..] = *reading.scored();
+        let mut track = Self::at(plan, [x, y]);
+        track.note(reading);
+        track
+    }
+
+    /// What is kept of every reading beside its place.
+    fn note(&mut self, reading: &Reading) {
+        if reading.truth.is_none() {
+            self.scored = Scored::State;
+        }
+        self.velocity.add(&reading.measured);
     }
 
     fn add(&mut self, plan: &LapPlan, reading: &Reading) {
-        let [x, y] = [reading.truth[0], reading.truth[1]];
+        let [x, y, _, roll, pitch, ..] = *reading.scored();
         self.phi = unwrapped(plan.path.offset(x, y).phi, self.phi);
         self.positions.push([x, y]);
         self.off_path_m = distance_to_line([x, y], &self.local);
         self.off_path_sum_m += self.off_path_m;
-        self.roll_sum += reading.truth[3].abs();
-        self.pitch_sum += reading.truth[4].abs();
+        self.roll_sum += roll.abs();
+        self.pitch_sum += pitch.abs();
+        self.note(reading);
     }
 
     fn progress(&self, plan: &LapPlan) -> f64 {
@@ -219,9 +296,11 @@ impl Track {
         (self.positions.len() - 1) as f64 * DT_S
     }
 
-    fn end(&self, plan: &LapPlan) -> Option<&'static str> {
-        // A position that is not a number is off any path.
-        if !(self.off_path_m <= OFF_PATH_MAX_M) {
+    fn end(&self, plan: &LapPlan) -> Option<&str> {
+        if self.ended.is_some() {
+            return self.ended.as_deref();
+        }
+        if self.off_path_m > OFF_PATH_MAX_M {
             return Some("off_path");
         }
         if self.progress(plan) >= 1.0 {
@@ -236,7 +315,8 @@ impl Track {
         let reached = self.phi.max(self.begun_phi + 1e-3);
         let part = plan.path.points_between(self.begun_phi, reached, REFERENCE_STEP_M);
         Lap {
-            completed: end == "complete",
+            // Whatever a plant calls the end that it makes, it is none of a whole lap.
+            completed: self.ended.is_none() && end == "complete",
             end: end.into(),
             time_s: self.time_s(),
             progress: self.progress(plan).clamp(0.0, 1.0),
@@ -246,6 +326,8 @@ impl Track {
             pitch_deg: (self.pitch_sum / steps).to_degrees(),
             measurements: BTreeMap::new(),
             soil_delta: None,
+            scored: self.scored,
+            velocity_mismatch_m_s: self.velocity.mismatch_m_s(),
             path: self.positions.iter().step_by(2).copied().collect(),
         }
     }

@@ -27,8 +27,34 @@ pub struct Start {
 pub struct Reading {
     /// Measured x y z roll pitch yaw vx vy vz wx wy wz.
     pub measured: [f64; 12],
-    /// The same without sensor errors, for the score only; as measured where the plant does not tell.
-    pub truth: [f64; 12],
+    /// The same without sensor errors, for the score only; `None` where the plant does not tell.
+    pub truth: Option<[f64; 12]>,
+}
+
+impl Reading {
+    /// What laps are scored by: the truth where the plant tells it.
+    pub fn scored(&self) -> &[f64; 12] {
+        self.truth.as_ref().unwrap_or(&self.measured)
+    }
+}
+
+/// What a plant answers.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Answer {
+    /// What is the case now.
+    Reading(Reading),
+    /// The lap is over for this plant, and why.
+    Ended(String),
+}
+
+impl Answer {
+    /// The reading, where it is one.
+    pub fn reading(&self) -> Option<Reading> {
+        match self {
+            Self::Reading(reading) => Some(*reading),
+            Self::Ended(_) => None,
+        }
+    }
 }
 
 /// A plant in lock-step: it moves only when it is told to, 0.1 s at a time.
@@ -37,13 +63,21 @@ pub trait PlantLink {
     ///
     /// # Errors
     /// `NavigationError` when there is no such plant or world.
-    fn reset(&mut self, start: &Start) -> Result<Reading, NavigationError>;
+    fn reset(&mut self, start: &Start) -> Result<Answer, NavigationError>;
 
     /// Holds a command for 0.1 s.
     ///
     /// # Errors
-    /// `NavigationError` when the plant does not answer.
-    fn step(&mut self, command: Control<f64>) -> Result<Reading, NavigationError>;
+    /// `NavigationError` when the plant does not answer; `NavigationError::Lost` when the lap can be driven again from `reset`.
+    fn step(&mut self, command: Control<f64>) -> Result<Answer, NavigationError>;
+
+    /// What the plant calls itself; `None` where it does not tell. A plant that has to be asked is set down at `start`.
+    ///
+    /// # Errors
+    /// As [`PlantLink::reset`].
+    fn name(&mut self, _start: &Start) -> Result<Option<String>, NavigationError> {
+        Ok(None)
+    }
 }
 
 /// The plant of `tests/plant` in this process.
@@ -80,17 +114,17 @@ impl BuiltInPlant {
 }
 
 impl PlantLink for BuiltInPlant {
-    fn reset(&mut self, start: &Start) -> Result<Reading, NavigationError> {
+    fn reset(&mut self, start: &Start) -> Result<Answer, NavigationError> {
         let ground = self.ground(&start.world)?;
         let [x, y] = start.position_m;
         let plant = Plant::at_rest(Arc::clone(&self.vehicle), ground, self.effects, x, y, start.yaw_rad);
         let mut sensors = Sensors::new(start.seed, &self.effects);
-        let reading = read(&plant, &mut sensors);
+        let answer = read(&plant, &mut sensors);
         self.running = Some((plant, sensors));
-        Ok(reading)
+        Ok(answer)
     }
 
-    fn step(&mut self, command: Control<f64>) -> Result<Reading, NavigationError> {
+    fn step(&mut self, command: Control<f64>) -> Result<Answer, NavigationError> {
         let (plant, sensors) = self.running.as_mut().ok_or_else(|| NavigationError::Plant {
             address: "in this process".into(),
             reason: "reset comes before the first step".into(),
@@ -100,8 +134,8 @@ impl PlantLink for BuiltInPlant {
     }
 }
 
-fn read(plant: &Plant, sensors: &mut Sensors) -> Reading {
+fn read(plant: &Plant, sensors: &mut Sensors) -> Answer {
     let truth = plant.truth();
     let Measured { state, .. } = sensors.read(&truth);
-    Reading { measured: state, truth: truth.state }
+    Answer::Reading(Reading { measured: state, truth: Some(truth.state) })
 }

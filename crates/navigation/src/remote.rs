@@ -1,94 +1,206 @@
 //! Another simulator in the plant's place: datagrams of JSON in lock-step (docs/plant-adapter.md).
 
-use std::net::UdpSocket;
+use std::net::{ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
 
-use nesam_physics::Control;
+use nesam_physics::{Control, wrap_angle};
 use serde_json::{Value, json};
 
 use crate::error::NavigationError;
-use crate::link::{PlantLink, Reading, Start};
+use crate::link::{Answer, PlantLink, Reading, Start};
+use crate::plant_message::{read_json, twelve};
 
 /// Version of the protocol.
 const VERSION: u64 = 1;
 /// Time after which an unanswered request is sent again.
 const ASK_AGAIN: Duration = Duration::from_millis(500);
-/// Time after which nobody is expected to answer any more: a slow simulator may take two minutes for a step.
-const GIVE_UP: Duration = Duration::from_secs(120);
 /// Largest datagram read, bytes.
 const DATAGRAM_MAX: usize = 65_536;
+/// How far from where it was asked to be a vehicle may be after `reset`: m and rad. More is another frame, another point or another unit.
+const PLACED_WITHIN: [f64; 2] = [1.0, 0.2];
+/// What a plant says to `step` that knows of no `reset`, because it was started anew.
+const RESET_FIRST: &str = "reset comes first";
+/// Longest text of a plant that becomes the end of a lap, characters.
+const END_MAX: usize = 200;
 
 /// A plant behind a UDP address.
 pub struct RemotePlant {
     address: String,
     socket: UdpSocket,
     number: u64,
+    timeout: Duration,
+    /// What the plant calls itself.
+    name: Option<String>,
+    /// The answer to a `reset` that was asked to learn the name: the vehicle stands there.
+    prepared: Option<(Start, Answer)>,
 }
 
 impl RemotePlant {
-    /// Prepares to talk to a plant, e.g. at `127.0.0.1:5599`. `first_number` is the number of the first request; another one than in an earlier
-    /// conversation keeps a plant that remembers its last answer from repeating it.
+    /// Prepares to talk to a plant, e.g. at `127.0.0.1:5599` or `localhost:5599`; of several addresses of a name the first of IPv4 is taken. `first_number` is the
+    /// number before that of the first request; a larger one than in any earlier conversation keeps a plant that remembers its last answer from repeating it.
+    /// After `timeout` without an answer nobody is expected to answer any more.
     ///
     /// # Errors
     /// `NavigationError::Plant` when the address cannot be used.
-    pub fn connect(address: &str, first_number: u64) -> Result<Self, NavigationError> {
+    pub fn connect(address: &str, first_number: u64, timeout: Duration) -> Result<Self, NavigationError> {
         let failed = |e: std::io::Error| NavigationError::Plant { address: address.into(), reason: e.to_string() };
-        let any = if address.starts_with('[') { "[::]:0" } else { "0.0.0.0:0" };
-        let socket = UdpSocket::bind(any).map_err(failed)?;
-        socket.connect(address).map_err(failed)?;
+        let found: Vec<_> = address.to_socket_addrs().map_err(failed)?.collect();
+        let to = found.iter().find(|to| to.is_ipv4()).or(found.first());
+        let to = to.ok_or_else(|| NavigationError::Plant { address: address.into(), reason: "the name has no address".into() })?;
+        let socket = UdpSocket::bind(if to.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" }).map_err(failed)?;
+        socket.connect(to).map_err(failed)?;
         socket.set_read_timeout(Some(ASK_AGAIN)).map_err(failed)?;
-        Ok(Self { address: address.into(), socket, number: first_number })
+        Ok(Self { address: address.into(), socket, number: first_number, timeout, name: None, prepared: None })
     }
 
     fn wrong(&self, reason: impl Into<String>) -> NavigationError {
         NavigationError::Plant { address: self.address.clone(), reason: reason.into() }
     }
 
-    /// Sends a request until it is answered.
-    fn ask(&mut self, mut request: Value) -> Result<Reading, NavigationError> {
+    fn lost(&self, reason: impl Into<String>) -> NavigationError {
+        NavigationError::Lost { address: self.address.clone(), reason: reason.into() }
+    }
+
+    /// Sends a request until it is answered; else what was heard instead.
+    fn ask(&mut self, mut request: Value) -> Result<Value, String> {
         self.number += 1;
         request["nesam_plant"] = VERSION.into();
         request["id"] = self.number.into();
         let datagram = request.to_string();
         let mut buffer = vec![0; DATAGRAM_MAX];
-        let begin = Instant::now();
-        while begin.elapsed() < GIVE_UP {
+        let mut strays = Strays::default();
+        let mut begin = Instant::now();
+        while begin.elapsed() < self.timeout {
             let sent = Instant::now();
-            let mut answer = self.socket.send(datagram.as_bytes()).and_then(|_| self.socket.recv(&mut buffer));
-            while let Ok(length) = answer {
-                let reply: Value =
-                    serde_json::from_slice(&buffer[..length]).map_err(|e| self.wrong(format!("its reply is not JSON: {e}")))?;
-                if reply.get("id").and_then(Value::as_u64) == Some(self.number) {
-                    return self.reading(&reply);
-                }
-                answer = self.socket.recv(&mut buffer);
-            }
             // Where nobody listens yet the datagram is refused at once; the plant may still come.
-            std::thread::sleep(ASK_AGAIN.saturating_sub(sent.elapsed()));
+            let mut heard = self.socket.send(datagram.as_bytes()).is_ok();
+            while heard && sent.elapsed() < ASK_AGAIN && begin.elapsed() < self.timeout {
+                let Ok(length) = self.socket.recv(&mut buffer) else {
+                    heard = false;
+                    continue;
+                };
+                match read_json(&buffer[..length]) {
+                    None => strays.unreadable += 1,
+                    // 30.0 is 30: some languages know one kind of number.
+                    Some(reply) if reply["id"].as_f64() != Some(self.number as f64) => strays.note(&reply),
+                    Some(reply) if reply["busy"] == true => begin = Instant::now(),
+                    Some(reply) => return Ok(reply),
+                }
+            }
+            let left = self.timeout.saturating_sub(begin.elapsed());
+            std::thread::sleep(ASK_AGAIN.saturating_sub(sent.elapsed()).min(left));
         }
-        Err(self.wrong(format!("no answer within {} s", GIVE_UP.as_secs())))
+        Err(format!("no answer within {} s{}", self.timeout.as_secs_f64(), strays.text()))
     }
 
-    fn reading(&self, reply: &Value) -> Result<Reading, NavigationError> {
-        if let Some(reason) = reply.get("error").and_then(Value::as_str) {
-            return Err(self.wrong(reason));
+    fn answer(&self, reply: &Value) -> Result<Answer, NavigationError> {
+        if let Some(version) = reply.get("nesam_plant").filter(|v| v.as_f64() != Some(VERSION as f64)) {
+            return Err(self.wrong(format!("it speaks version {version} of the protocol, this program version {VERSION}")));
         }
-        let state = |key: &str| -> Option<[f64; 12]> {
-            let numbers: Vec<f64> = reply.get(key)?.as_array()?.iter().map(Value::as_f64).collect::<Option<_>>()?;
-            numbers.try_into().ok()
+        if let Some(reason) = reply.get("error").filter(|v| !v.is_null()) {
+            return Err(self.wrong(reason.as_str().map_or_else(|| reason.to_string(), str::to_string)));
+        }
+        match &reply["ended"] {
+            Value::Null | Value::Bool(false) => {}
+            Value::String(why) if !why.trim().is_empty() => return Ok(Answer::Ended(why.trim().chars().take(END_MAX).collect())),
+            _ => return Ok(Answer::Ended("plant_lost".into())),
+        }
+        let measured = reply.get("state").and_then(twelve).ok_or_else(|| self.wrong("`state` must be twelve numbers"))?;
+        let not_true = || self.wrong("`truth` must be twelve finite numbers, or be left out");
+        let truth = match &reply["truth"] {
+            Value::Null => None,
+            told => Some(twelve(told).ok_or_else(not_true)?),
         };
-        let measured = state("state").ok_or_else(|| self.wrong("`state` must be twelve numbers"))?;
-        Ok(Reading { measured, truth: state("truth").unwrap_or(measured) })
+        // Where the vehicle itself is lost its truth may be, too.
+        let finite = |state: &[f64; 12]| state.iter().all(|v| v.is_finite());
+        if finite(&measured) && truth.as_ref().is_some_and(|state| !finite(state)) {
+            return Err(not_true());
+        }
+        Ok(Answer::Reading(Reading { measured, truth }))
+    }
+
+    /// The vehicle has to be where it was asked to be; a number that is none is the end of the lap and no matter of place.
+    fn check_place(&self, start: &Start, answer: &Answer) -> Result<(), NavigationError> {
+        let Some(Reading { measured, .. }) = answer.reading().filter(|r| r.measured.iter().all(|v| v.is_finite())) else { return Ok(()) };
+        let [x_m, y_m] = start.position_m;
+        let [within_m, within_rad] = PLACED_WITHIN;
+        let channels = [("x", measured[0], x_m, within_m), ("y", measured[1], y_m, within_m)];
+        let yaw = ("yaw", start.yaw_rad + wrap_angle(measured[5] - start.yaw_rad), start.yaw_rad, within_rad);
+        let off = channels.into_iter().chain([yaw]).find(|(_, is, asked, within)| (is - asked).abs() > *within);
+        off.map_or(Ok(()), |(channel, is, asked, within)| {
+            Err(self.wrong(format!(
+                "after `reset` {channel} reads {is:.3} where {asked:.3} was asked for (within {within}): `state` begins with x, y, z of the reference point in World, \
+                 in m, and roll, pitch, yaw in rad"
+            )))
+        })
+    }
+
+    /// One campaign is one plant: another name is another plant at the same address.
+    fn note_name(&mut self, reply: &Value) -> Result<(), NavigationError> {
+        let Some(name) = reply["plant"].as_str() else { return Ok(()) };
+        if let Some(before) = self.name.as_deref().filter(|before| *before != name) {
+            return Err(self.wrong(format!("it calls itself `{name}` and was `{before}` before")));
+        }
+        self.name = Some(name.into());
+        Ok(())
     }
 }
 
 impl PlantLink for RemotePlant {
-    fn reset(&mut self, start: &Start) -> Result<Reading, NavigationError> {
+    fn reset(&mut self, start: &Start) -> Result<Answer, NavigationError> {
+        if let Some((prepared, answer)) = self.prepared.take()
+            && prepared == *start
+        {
+            return Ok(answer);
+        }
         let [x_m, y_m] = start.position_m;
-        self.ask(json!({ "type": "reset", "world": start.world, "seed": start.seed, "x_m": x_m, "y_m": y_m, "yaw_rad": start.yaw_rad }))
+        let request =
+            json!({ "type": "reset", "world": start.world, "seed": start.seed, "x_m": x_m, "y_m": y_m, "yaw_rad": start.yaw_rad });
+        let reply = self.ask(request).map_err(|reason| self.wrong(reason))?;
+        let answer = self.answer(&reply)?;
+        self.note_name(&reply)?;
+        self.check_place(start, &answer)?;
+        Ok(answer)
     }
 
-    fn step(&mut self, command: Control<f64>) -> Result<Reading, NavigationError> {
-        self.ask(json!({ "type": "step", "speed_m_s": command.speed_m_s, "second": command.second }))
+    fn step(&mut self, command: Control<f64>) -> Result<Answer, NavigationError> {
+        let request = json!({ "type": "step", "speed_m_s": command.speed_m_s, "second": command.second });
+        let reply = self.ask(request).map_err(|reason| self.lost(reason))?;
+        match reply["error"].as_str() {
+            Some(reason) if reason.contains(RESET_FIRST) => Err(self.lost(reason)),
+            _ => self.answer(&reply),
+        }
+    }
+
+    fn name(&mut self, start: &Start) -> Result<Option<String>, NavigationError> {
+        let answer = self.reset(start)?;
+        self.prepared = Some((start.clone(), answer));
+        Ok(self.name.clone())
+    }
+}
+
+/// Datagrams from the plant's address that answered nothing.
+#[derive(Default)]
+struct Strays {
+    others: usize,
+    last: String,
+    unreadable: usize,
+}
+
+impl Strays {
+    fn note(&mut self, reply: &Value) {
+        self.others += 1;
+        self.last = reply["id"].to_string();
+    }
+
+    fn text(&self) -> String {
+        let mut text = String::new();
+        if self.others > 0 {
+            text += &format!("; {} answers came with other ids, the last was {}", self.others, self.last);
+        }
+        if self.unreadable > 0 {
+            text += &format!("; {} datagrams were no JSON", self.unreadable);
+        }
+        text
     }
 }

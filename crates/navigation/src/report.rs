@@ -18,13 +18,15 @@ pub enum SoilKind {
     Firm,
     /// Some softer, some firmer.
     Mixed,
-    /// As promised, or not known.
+    /// As promised.
     Nominal,
+    /// Not known: the data root does not tell the true soil.
+    Unknown,
 }
 
 impl SoilKind {
     /// All, in the order of reports.
-    pub const ALL: [Self; 4] = [Self::Soft, Self::Firm, Self::Mixed, Self::Nominal];
+    pub const ALL: [Self; 5] = [Self::Soft, Self::Firm, Self::Mixed, Self::Nominal, Self::Unknown];
 
     /// As in JSON.
     pub fn as_str(self) -> &'static str {
@@ -33,6 +35,7 @@ impl SoilKind {
             Self::Firm => "firm",
             Self::Mixed => "mixed",
             Self::Nominal => "nominal",
+            Self::Unknown => "unknown",
         }
     }
 }
@@ -232,9 +235,27 @@ mod tests {
                 assert!(of[quantity].get("mean").is_some() && of[quantity].get("sd").is_some(), "{name}.{quantity}");
             }
         }
-        assert!(value["configurations"]["fixed"]["time_s"]["mean"].is_null(), "no lap of `fixed` was completed");
+        let time_s = &value["configurations"]["fixed"]["time_s"];
+        assert!(time_s["mean"].is_null() && time_s["sd"].is_null(), "no lap of `fixed` was completed: {time_s}");
         assert_eq!(value["configurations"]["adapted"]["over_fixed"]["soft"]["hausdorff_m"]["ratio"], 0.5);
+        // What somebody who measures the same laps from outside needs.
+        for key in ["configuration", "world", "soil", "start", "seed"] {
+            assert!(!value["each"][0][key].is_null(), "{key}");
+        }
+        for key in ["completed", "end", "time_s", "progress", "hausdorff_m", "off_path_mean_m", "roll_deg", "pitch_deg", "scored"] {
+            assert!(!value["each"][0]["lap"][key].is_null(), "{key}");
+        }
         let html = report.page().render();
         assert!(html.contains("path to follow") && html.contains("off_path") && !html.contains("http://"));
+    }
+    /// Goal: laps on ground of unknown soil are not told among those whose soil is as promised. Method: one of each.
+    #[test]
+    fn property_unknown_soil_is_a_kind_of_its_own() {
+        let known = |soil: SoilKind, seed: u64| Run { soil, ..run("fixed", "a", 0, seed, 2.0, true) };
+        let runs = vec![known(SoilKind::Nominal, 1), known(SoilKind::Unknown, 2)];
+        let value = NavigationReport { runs, settings: json!({}), provenance: Vec::new() }.to_json();
+        let kinds = &value["configurations"]["fixed"]["by_soil"];
+        assert!(kinds["nominal"]["runs"] == 1 && kinds["unknown"]["runs"] == 1, "{kinds}");
+        assert_eq!(value["each"][1]["soil"], "unknown");
     }
 }

@@ -40,7 +40,7 @@ impl Run {
 pub struct Figures {
     /// Mean; NaN without runs.
     pub mean: f64,
-    /// Standard deviation over runs.
+    /// Standard deviation over runs; NaN without runs.
     pub sd: f64,
     /// Interval of the mean; `None` with fewer than two places.
     pub ci95: Option<[f64; 2]>,
@@ -147,7 +147,8 @@ fn figures(runs: &[&Run], of: fn(&Lap) -> f64) -> Figures {
     let values: Vec<f64> = runs.iter().map(|r| of(&r.lap)).collect();
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
-    let sd = (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0)).sqrt();
+    let sd =
+        if values.is_empty() { f64::NAN } else { (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0)).sqrt() };
     let (cluster, places) = places(runs);
     Figures { mean, sd, ci95: Resamples::draw(places, DEFAULT_RESAMPLES, BOOTSTRAP_SEED).mean_interval(&values, &cluster) }
 }
@@ -164,6 +165,7 @@ fn wilson(share: f64, count: usize) -> [f64; 2] {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
+    use crate::lap::Scored;
 
     pub(crate) fn run(configuration: &str, world: &str, start: usize, seed: u64, hausdorff_m: f64, completed: bool) -> Run {
         let lap = Lap {
@@ -177,6 +179,8 @@ pub(crate) mod tests {
             pitch_deg: 3.0,
             measurements: Default::default(),
             soil_delta: None,
+            scored: Scored::Truth,
+            velocity_mismatch_m_s: None,
             path: vec![[23.5, 0.0], [23.0, 2.0]],
         };
         Run { configuration: configuration.into(), world: world.into(), soil: SoilKind::Soft, start, seed, lap }

@@ -13,6 +13,9 @@ use crate::world_map::{SoilClassRange, WorldMap};
 /// Names of the soil parameters in `soil_prior_ranges`, in the order of the soil vector.
 const SOIL_KEYS: [&str; SOIL_DIM] = ["Kphi", "Kc", "n", "c", "phi", "K"];
 
+/// Name of the elevation image where `world.json` gives none.
+const ELEVATION: &str = "elevation.png";
+
 /// Index of the friction angle in the soil vector: files give it in degrees.
 const PHI: usize = 4;
 
@@ -35,7 +38,7 @@ impl WorldMap {
             let reason = format!("scale {scale_m} m and offset {offset_m} m do not give heights within 10 km");
             return Err(json.wrong("elevation.scale_m", reason));
         }
-        let elevation_png = world_dir.join(json.file("elevation.file", "elevation.png")?);
+        let elevation_png = world_dir.join(json.file("elevation.file", ELEVATION)?);
         let gray = read_image(&elevation_png, GRAY_16, width, height)?;
         let to_height = |b: &[u8]| (offset_m + scale_m * f64::from(u16::from_be_bytes([b[0], b[1]]))) as f32;
         let elevation_m: Vec<f32> = gray.chunks_exact(2).map(to_height).collect();
@@ -51,6 +54,12 @@ impl WorldMap {
         let id = world_dir.file_name().map(|n| n.to_string_lossy().into_owned()).unwrap_or_default();
         let map = Self::from_layers(&id, 1, geometry, elevation_m, semantic_rgb)?;
         Ok(map.with_soil_classes(json.soil_classes()?))
+    }
+
+    /// Whether a world folder has its elevation image: the one that `world.json` names, else `elevation.png`. Without it there is no map to load.
+    pub fn has_elevation(world_dir: &Path) -> bool {
+        let named = WorldJson::read(&world_dir.join("world.json")).and_then(|json| json.file("elevation.file", ELEVATION));
+        world_dir.join(named.unwrap_or_else(|_| ELEVATION.into())).is_file()
     }
 }
 

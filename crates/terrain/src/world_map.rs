@@ -24,6 +24,15 @@ pub struct SoilClassRange {
     pub high: [f64; SOIL_DIM],
 }
 
+/// What the source of a map says of it. It is carried, and nothing is computed from it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct MapSource {
+    /// Instant that the map was made at, ns of the vehicle's clock, where it is told.
+    pub stamp_ns: Option<i64>,
+    /// Frame that the source names; empty = World.
+    pub frame: String,
+}
+
 /// Ground under a point.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ground {
@@ -52,6 +61,7 @@ pub struct WorldMap {
     /// The same without hard borders, made when it is first asked for.
     smooth_colour: OnceLock<Vec<u32>>,
     soil_classes: Vec<SoilClassRange>,
+    source: MapSource,
 }
 
 impl WorldMap {
@@ -90,12 +100,19 @@ impl WorldMap {
             fill_holes(&geometry, elevation_m).ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
         let slope = footprint_slopes(&geometry, &height_m);
         let surface = Surface { height_m, slope, known };
-        Ok(Self { id: id.into(), version, hash, geometry, surface, colour, smooth_colour: OnceLock::new(), soil_classes: Vec::new() })
+        let (smooth_colour, soil_classes, source) = (OnceLock::new(), Vec::new(), MapSource::default());
+        Ok(Self { id: id.into(), version, hash, geometry, surface, colour, smooth_colour, soil_classes, source })
     }
 
     /// The same map with the prior soil ranges of its semantic classes.
     pub fn with_soil_classes(mut self, soil_classes: Vec<SoilClassRange>) -> Self {
         self.soil_classes = soil_classes;
+        self
+    }
+
+    /// The same map with what its source says of it; the hash stays.
+    pub fn with_source(mut self, source: MapSource) -> Self {
+        self.source = source;
         self
     }
 
@@ -147,7 +164,7 @@ impl WorldMap {
             }
         }
         let patched = Self::from_layers(&self.id, self.version + 1, self.geometry, elevation, semantic)?;
-        Ok(patched.with_soil_classes(self.soil_classes.clone()))
+        Ok(patched.with_soil_classes(self.soil_classes.clone()).with_source(self.source.clone()))
     }
 
     /// The map seen in a mirror: y becomes -y. What drives on it with mirrored commands moves as the mirror image.
@@ -175,6 +192,11 @@ impl WorldMap {
     /// SHA-256 (hex) over geometry and layers: equal content has an equal hash, whatever id and version.
     pub fn hash(&self) -> &str {
         &self.hash
+    }
+
+    /// What its source says of it.
+    pub fn source(&self) -> &MapSource {
+        &self.source
     }
 
     /// The grid.

@@ -12,8 +12,11 @@ pub(crate) const WHEEL_SUFFIXES: [&str; WHEELS] = ["fl", "fr", "rl", "rr"];
 /// Columns by meaning; what a vehicle does not measure is `None`. Columns are read whole, values are checked per drive.
 pub(crate) struct Channels {
     pub(crate) time: Numbers,
-    pub(crate) position: [Numbers; 3],
-    pub(crate) attitude: [Numbers; 3],
+    pub(crate) position: [Numbers; 2],
+    pub(crate) height: Option<Numbers>,
+    /// Roll and pitch.
+    pub(crate) tilt: [Option<Numbers>; 2],
+    pub(crate) yaw: Numbers,
     pub(crate) body_velocity: Option<[Numbers; 3]>,
     pub(crate) world_velocity: Option<[Numbers; 3]>,
     pub(crate) angular_velocity: [Option<Numbers>; 3],
@@ -25,13 +28,15 @@ pub(crate) struct Channels {
 }
 
 impl Channels {
-    /// Reads the columns; position, attitude, time and the commands must be there, `gt_` columns only where ground truth is asked for.
+    /// Reads the columns; horizontal position, yaw, time and the commands must be there, `gt_` columns only where ground truth is asked for.
     pub(crate) fn read(table: &Table, second: SecondCommand, ground_truth: bool) -> Result<Self, TrajectoryError> {
         let one = |name: &str| if table.has(name) { table.numbers(name).map(Some) } else { Ok(None) };
         Ok(Self {
             time: table.numbers("t")?,
-            position: all(table, ["x", "y", "z"])?,
-            attitude: all(table, ["roll", "pitch", "yaw"])?,
+            position: all(table, ["x", "y"])?,
+            height: one("z")?,
+            tilt: [one("roll")?, one("pitch")?],
+            yaw: table.numbers("yaw")?,
             body_velocity: group(table, ["vbx", "vby", "vbz"])?,
             world_velocity: group(table, ["vx", "vy", "vz"])?,
             angular_velocity: [one("wx")?, one("wy")?, one("wz")?],

@@ -88,6 +88,8 @@ pub struct DataRoot {
     worlds: Mutex<HashMap<String, Arc<WorldMap>>>,
     /// Relative path and SHA-256 of the set files read so far.
     hashes: Mutex<BTreeMap<String, String>>,
+    /// What the sets read so far lack, one sentence each.
+    notes: Mutex<BTreeSet<String>>,
 }
 
 impl DataRoot {
@@ -106,7 +108,7 @@ impl DataRoot {
             None => find_card(root)?,
         };
         let vehicle = read_vehicle_card(&card)?;
-        Ok(Self { root: root.into(), card, vehicle, worlds: Mutex::default(), hashes: Mutex::default() })
+        Ok(Self { root: root.into(), card, vehicle, worlds: Mutex::default(), hashes: Mutex::default(), notes: Mutex::default() })
     }
 
     /// The vehicle that drove.
@@ -162,6 +164,11 @@ impl DataRoot {
         Ok(map)
     }
 
+    /// What the sets loaded so far lack and is done without, one sentence each: maps that the index names and that are not there, channels of the pose.
+    pub fn notes(&self) -> Vec<String> {
+        self.notes.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    }
+
     /// SHA-256 (hex) over all set files read so far: samples and indices, by relative path.
     pub fn hash(&self) -> String {
         hash_of(self.hashes.lock().unwrap_or_else(PoisonError::into_inner).iter())
@@ -179,7 +186,8 @@ impl DataRoot {
 
     /// Loads drives in the order of the samples file.
     ///
-    /// A drive without an index entry has neither split nor world. Where the root has no `worlds/` folder at all, `world` is `None`.
+    /// A drive without an index entry has neither split nor world. `world` is `None` where the root has no map of it, and where the drive does not measure its
+    /// whole pose; [`DataRoot::notes`] then says so, unless the root has no `worlds/` folder at all.
     ///
     /// # Errors
     /// `TrajectoryError` naming file, column and row of the first value that is not usable among the drives asked for, the sets
@@ -194,7 +202,8 @@ impl DataRoot {
         let drives = rows_by_trajectory(&table)?;
         let wanted = wanted(query, &index, &drives, table.path())?;
         let channels = Channels::read(&table, self.vehicle.second, query.ground_truth)?;
-        let worlds = self.world_ids();
+        let has_worlds = !self.world_ids().is_empty();
+        let mut lacking = Lacking::default();
         let mut loaded = Vec::with_capacity(wanted.len());
         for at in wanted {
             let (id, rows) = &drives[at];
@@ -203,10 +212,12 @@ impl DataRoot {
             trajectory.set.clone_from(&query.set);
             if let Some(entry) = index.entries.get(id) {
                 trajectory.split = entry.split;
-                trajectory.world = self.known_world(entry.world.as_deref(), entry.row, &index, &worlds)?;
+                trajectory.world = entry.world.clone().filter(|_| has_worlds);
             }
+            self.leave_off_map(&mut trajectory, &mut lacking);
             loaded.push(trajectory);
         }
+        self.notes.lock().unwrap_or_else(PoisonError::into_inner).extend(lacking.sentences(&query.set));
         Ok(loaded)
     }
 
@@ -228,14 +239,22 @@ impl DataRoot {
         Err(TrajectoryError::layout(&self.root, reason))
     }
 
-    fn known_world(&self, world: Option<&str>, row: usize, index: &Index, present: &[String]) -> Result<Option<String>, TrajectoryError> {
-        let Some(world) = world.filter(|_| !present.is_empty()) else { return Ok(None) };
-        if present.iter().any(|id| id == world) {
-            return Ok(Some(world.into()));
+    /// Takes the world from a drive that cannot be put on its map, and counts why.
+    fn leave_off_map(&self, drive: &mut Trajectory, lacking: &mut Lacking) {
+        let poses = [("z", drive.measured.height), ("roll", drive.measured.attitude[0]), ("pitch", drive.measured.attitude[1])];
+        let assumed: Vec<&str> = poses.into_iter().filter(|(_, measured)| !measured).map(|(name, _)| name).collect();
+        if !assumed.is_empty() {
+            *lacking.channels.entry(assumed.join(", ")).or_default() += 1;
         }
-        let path = index.path.as_deref().unwrap_or(&self.root);
-        let reason = format!("no world `{world}` in the data root; present: {}", listed(present.to_vec()));
-        Err(TrajectoryError::cell(path, "world", row, reason))
+        let Some(world) = drive.world.take() else { return };
+        let dir = self.world_dir(&world);
+        if !is_plain_name(&world) || !dir.is_dir() {
+            *lacking.maps.entry(format!("the data root has no world `{world}`")).or_default() += 1;
+        } else if !WorldMap::has_elevation(&dir) {
+            *lacking.maps.entry(format!("world `{world}` has no elevation image")).or_default() += 1;
+        } else if drive.measured.whole_pose() {
+            drive.world = Some(world);
+        }
     }
 
     fn note_hashes(&self, set: &str, table: &Table, index: &Index) -> Result<(), TrajectoryError> {
@@ -247,6 +266,27 @@ impl DataRoot {
             hashes.insert(format!("{set}/{name}"), hex(&Sha256::digest(content)));
         }
         Ok(())
+    }
+}
+
+/// What the drives of a set lack and are loaded without: how many of them, by what it is.
+#[derive(Default)]
+struct Lacking {
+    /// By channels of the pose that are taken for zero.
+    channels: BTreeMap<String, usize>,
+    /// By what is wrong with the map.
+    maps: BTreeMap<String, usize>,
+}
+
+impl Lacking {
+    fn sentences(&self, set: &str) -> Vec<String> {
+        let channels = self.channels.iter().map(|(names, count)| {
+            format!("set `{set}`: {names} not measured in {count} drives: taken for zero, on level ground without a map, and not scored")
+        });
+        let maps = self.maps.iter().map(|(what, count)| {
+            format!("set `{set}`: {what}: {count} drives have no map, and are predicted on level ground of the default soil")
+        });
+        channels.chain(maps).collect()
     }
 }
 

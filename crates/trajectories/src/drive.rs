@@ -28,10 +28,12 @@ pub(crate) fn build(
     path: &std::path::Path,
     dt_s: f64,
 ) -> Result<Trajectory, TrajectoryError> {
+    let (position, height_measured) = positions(channels, rows)?;
+    let (attitude, attitude_measured) = attitudes(channels, rows)?;
     let log = Log {
         time_s: times(channels, rows, path)?,
-        position: together(&channels.position, rows)?,
-        attitude: together(&channels.attitude, rows)?,
+        position,
+        attitude,
         command: together(&channels.command, rows)?,
         wheel_speed: wheel_speeds(channels, rows)?,
         road_wheel_angle: optional(&channels.road_wheel_angle, rows)?,
@@ -50,8 +52,8 @@ pub(crate) fn build(
     let controls = grid.held(&log.command).into_iter().map(|[speed_m_s, second]| Control { speed_m_s, second });
     let measured = MeasuredChannels {
         position: true,
-        height: true,
-        attitude: true,
+        height: height_measured,
+        attitude: attitude_measured,
         linear_velocity: source != VelocitySource::Positions,
         velocity_source: source,
         angular_velocity: angular_measured,
@@ -85,6 +87,35 @@ fn times(channels: &Channels, rows: &[usize], path: &std::path::Path) -> Result<
         }
     }
     Ok(time_s)
+}
+
+/// Positions, and whether heights are measured; zero where they are not.
+fn positions(channels: &Channels, rows: &[usize]) -> Result<(Vec<[f64; 3]>, bool), TrajectoryError> {
+    let mut positions: Vec<[f64; 3]> = together(&channels.position, rows)?.into_iter().map(|[x, y]| [x, y, 0.0]).collect();
+    let height = recorded(channels.height.as_ref(), rows)?;
+    for (position, z) in positions.iter_mut().zip(height.iter().flatten()) {
+        position[2] = *z;
+    }
+    Ok((positions, height.is_some()))
+}
+
+/// Roll, pitch and yaw, and which of them are measured; zero where they are not.
+fn attitudes(channels: &Channels, rows: &[usize]) -> Result<(Vec<[f64; 3]>, [bool; 3]), TrajectoryError> {
+    let mut attitudes: Vec<[f64; 3]> = channels.yaw.finite(rows)?.into_iter().map(|yaw| [0.0, 0.0, yaw]).collect();
+    let mut measured = [false, false, true];
+    for (axis, column) in channels.tilt.iter().enumerate() {
+        let Some(angles) = recorded(column.as_ref(), rows)? else { continue };
+        measured[axis] = true;
+        for (attitude, angle) in attitudes.iter_mut().zip(angles) {
+            attitude[axis] = angle;
+        }
+    }
+    Ok((attitudes, measured))
+}
+
+/// A channel that may be missing: no column, or one that is null all along the drive.
+fn recorded(column: Option<&Numbers>, rows: &[usize]) -> Result<Option<Vec<f64>>, TrajectoryError> {
+    column.filter(|column| !column.is_absent(rows)).map(|column| column.finite(rows)).transpose()
 }
 
 /// Channels that may be missing: no columns, or columns that are null all along the drive.
@@ -135,9 +166,9 @@ fn angular_velocity(
     let mut rates = from_attitudes(&log.time_s, &log.attitude, [0.0, 0.0, yaw_rate]);
     let mut measured = [false; 3];
     for (axis, column) in channels.angular_velocity.iter().enumerate() {
-        let Some(column) = column.as_ref().filter(|c| !c.is_absent(rows)) else { continue };
+        let Some(values) = recorded(column.as_ref(), rows)? else { continue };
         measured[axis] = true;
-        for (rate, value) in rates.iter_mut().zip(column.finite(rows)?) {
+        for (rate, value) in rates.iter_mut().zip(values) {
             rate[axis] = value;
         }
     }

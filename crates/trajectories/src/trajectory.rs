@@ -35,15 +35,15 @@ pub enum VelocitySource {
     Positions,
 }
 
-/// Which channels of the states are measurements; the others are causal estimates.
+/// Which channels of the states are measurements; the others are causal estimates, and of a pose zeros.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct MeasuredChannels {
     /// Horizontal position.
     pub position: bool,
-    /// Height.
+    /// Height; false = taken for zero.
     pub height: bool,
-    /// Roll, pitch and yaw.
-    pub attitude: bool,
+    /// Roll, pitch and yaw; false = taken for zero.
+    pub attitude: [bool; 3],
     /// Linear velocity; false = estimated from positions.
     pub linear_velocity: bool,
     /// Where the linear velocity comes from.
@@ -61,7 +61,7 @@ impl MeasuredChannels {
     pub const POSE_AND_TWIST: Self = Self {
         position: true,
         height: true,
-        attitude: true,
+        attitude: [true; 3],
         linear_velocity: true,
         velocity_source: VelocitySource::Body,
         angular_velocity: [true; 3],
@@ -77,7 +77,8 @@ pub struct Trajectory {
     pub id: String,
     /// Set, as it was asked for.
     pub set: String,
-    /// World of the drive; `None` where the index names none or the root has no maps.
+    /// World of the drive; `None` where the index names none, the root has no map of it, or height, roll or pitch are not measured: on a map a state with
+    /// zeros for them stands in the ground or in the air.
     pub world: Option<String>,
     /// Split; `None` where there is no index.
     pub split: Option<Split>,
@@ -97,6 +98,13 @@ pub struct Trajectory {
     pub measured: MeasuredChannels,
     /// Ground truth, only where it was asked for.
     pub truth: Option<GroundTruth>,
+}
+
+impl MeasuredChannels {
+    /// Whether a state says where the vehicle is in three dimensions, so that it can be put on a map.
+    pub fn whole_pose(&self) -> bool {
+        self.position && self.height && self.attitude == [true; 3]
+    }
 }
 
 impl Trajectory {

@@ -134,6 +134,481 @@ pub struct EffectParameter {
     #[prost(double, tag = "3")]
     pub sd: f64,
 }
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct StartDiagnosisRequest {
+    /// Session whose measurements are read; it need not be open any more.
+    #[prost(string, tag = "1")]
+    pub session_id: ::prost::alloc::string::String,
+    /// Recording to read, by the name of its run: that of its files without `.<part>.mcap`, for instance `nesam-20260131T120000Z-17`. Empty = what this server has
+    /// recorded until now.
+    #[prost(string, tag = "2")]
+    pub recording: ::prost::alloc::string::String,
+    /// First and last stamp of the window, ns of the vehicle's clock; absent = from the first, to the last. An alarm tells its `onset_stamp_ns`.
+    #[prost(int64, optional, tag = "3")]
+    pub from_stamp_ns: ::core::option::Option<i64>,
+    #[prost(int64, optional, tag = "4")]
+    pub to_stamp_ns: ::core::option::Option<i64>,
+    /// Seed of the bootstrap; absent = 1. The same seed on the same window gives the same findings.
+    #[prost(uint64, optional, tag = "5")]
+    pub seed: ::core::option::Option<u64>,
+    #[prost(enumeration = "DiagnosisReference", tag = "6")]
+    pub reference: i32,
+    /// Leaves out the controls (rivals refitted, a black box, a free form of what is left), which take most of the time where something is found.
+    #[prost(bool, tag = "7")]
+    pub without_controls: bool,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct DiagnosisEvent {
+    #[prost(oneof = "diagnosis_event::Event", tags = "1, 2, 3")]
+    pub event: ::core::option::Option<diagnosis_event::Event>,
+}
+/// Nested message and enum types in `DiagnosisEvent`.
+pub mod diagnosis_event {
+    #[derive(Clone, PartialEq, ::prost::Oneof)]
+    pub enum Event {
+        /// The first, once.
+        #[prost(message, tag = "1")]
+        Started(super::DiagnosisStarted),
+        /// Any number, fewer where the caller does not read them.
+        #[prost(message, tag = "2")]
+        Progress(super::DiagnosisProgress),
+        /// The last, once; then the stream ends with OK.
+        #[prost(message, tag = "3")]
+        Report(super::DiagnosisReport),
+    }
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct DiagnosisStarted {
+    /// Name of this diagnosis.
+    #[prost(string, tag = "1")]
+    pub diagnosis_id: ::prost::alloc::string::String,
+    /// Recording that is read.
+    #[prost(string, tag = "2")]
+    pub recording: ::prost::alloc::string::String,
+    /// The window as it was asked for.
+    #[prost(int64, optional, tag = "3")]
+    pub from_stamp_ns: ::core::option::Option<i64>,
+    #[prost(int64, optional, tag = "4")]
+    pub to_stamp_ns: ::core::option::Option<i64>,
+}
+#[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
+pub struct DiagnosisProgress {
+    /// What is being done, for people.
+    #[prost(string, tag = "1")]
+    pub stage: ::prost::alloc::string::String,
+    /// Parts of this stage that are done, and all of them.
+    #[prost(uint64, tag = "2")]
+    pub done: u64,
+    #[prost(uint64, tag = "3")]
+    pub total: u64,
+}
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct DiagnosisReport {
+    #[prost(string, tag = "1")]
+    pub diagnosis_id: ::prost::alloc::string::String,
+    #[prost(enumeration = "DiagnosisVerdict", tag = "2")]
+    pub verdict: i32,
+    /// Why, in one sentence.
+    #[prost(string, tag = "3")]
+    pub reason: ::prost::alloc::string::String,
+    /// The claimed effects, ready for `Sessions.ApplyEffects`; empty when none is claimed. A standard deviation is that of the 95 % interval, for as many parameters
+    /// as a session takes with one. An effect that was written as formulas does not travel: it is in the report and in the patched bundle only.
+    #[prost(message, repeated, tag = "4")]
+    pub effects: ::prost::alloc::vec::Vec<Effect>,
+    /// The whole report, JSON of the schema `nesam.diagnose/1`.
+    #[prost(string, tag = "5")]
+    pub json: ::prost::alloc::string::String,
+    /// Folder of the server with `diagnose.json` and `diagnose.html`; kept for the newest `diagnosis.kept_max` diagnoses.
+    #[prost(string, tag = "6")]
+    pub folder: ::prost::alloc::string::String,
+    /// Folder of the patched bundle below it, and its hash; empty when no effect is claimed.
+    #[prost(string, tag = "7")]
+    pub bundle: ::prost::alloc::string::String,
+    #[prost(string, tag = "8")]
+    pub bundle_hash: ::prost::alloc::string::String,
+    /// What the command remarked, for instance that the recording was made with another bundle.
+    #[prost(string, repeated, tag = "9")]
+    pub notes: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+}
+/// What the measurements are held against.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum DiagnosisReference {
+    /// As BUNDLE.
+    Unspecified = 0,
+    /// The change against the drives without an effect that the bundle knows.
+    Bundle = 1,
+    /// The symbolic model itself, the network silent; needs at least 8 pieces of recording.
+    Physics = 2,
+}
+impl DiagnosisReference {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "DIAGNOSIS_REFERENCE_UNSPECIFIED",
+            Self::Bundle => "DIAGNOSIS_REFERENCE_BUNDLE",
+            Self::Physics => "DIAGNOSIS_REFERENCE_PHYSICS",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "DIAGNOSIS_REFERENCE_UNSPECIFIED" => Some(Self::Unspecified),
+            "DIAGNOSIS_REFERENCE_BUNDLE" => Some(Self::Bundle),
+            "DIAGNOSIS_REFERENCE_PHYSICS" => Some(Self::Physics),
+            _ => None,
+        }
+    }
+}
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
+#[repr(i32)]
+pub enum DiagnosisVerdict {
+    Unspecified = 0,
+    /// Nothing differs from the reference beyond chance.
+    None = 1,
+    /// One effect, or several together, explain it and help on pieces that were not fitted.
+    Explained = 2,
+    /// Several effects explain it about as well.
+    Ambiguous = 3,
+    /// Something differs, but no effect of the catalogue may be claimed.
+    Unexplained = 4,
+}
+impl DiagnosisVerdict {
+    /// String value of the enum field names used in the ProtoBuf definition.
+    ///
+    /// The values are not transformed in any way and thus are considered stable
+    /// (if the ProtoBuf definition does not change) and safe for programmatic use.
+    pub fn as_str_name(&self) -> &'static str {
+        match self {
+            Self::Unspecified => "DIAGNOSIS_VERDICT_UNSPECIFIED",
+            Self::None => "DIAGNOSIS_VERDICT_NONE",
+            Self::Explained => "DIAGNOSIS_VERDICT_EXPLAINED",
+            Self::Ambiguous => "DIAGNOSIS_VERDICT_AMBIGUOUS",
+            Self::Unexplained => "DIAGNOSIS_VERDICT_UNEXPLAINED",
+        }
+    }
+    /// Creates an enum from field names used in the ProtoBuf definition.
+    pub fn from_str_name(value: &str) -> ::core::option::Option<Self> {
+        match value {
+            "DIAGNOSIS_VERDICT_UNSPECIFIED" => Some(Self::Unspecified),
+            "DIAGNOSIS_VERDICT_NONE" => Some(Self::None),
+            "DIAGNOSIS_VERDICT_EXPLAINED" => Some(Self::Explained),
+            "DIAGNOSIS_VERDICT_AMBIGUOUS" => Some(Self::Ambiguous),
+            "DIAGNOSIS_VERDICT_UNEXPLAINED" => Some(Self::Unexplained),
+            _ => None,
+        }
+    }
+}
+/// Generated client implementations.
+pub mod diagnosis_client {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    use tonic::codegen::http::Uri;
+    /// Diagnoses what a server recorded of a session: which physical effect does the model lack? It is `nesam diagnose --recording`, run by the server in a process
+    /// of its own; what it finds is put on a session with `Sessions.ApplyEffects` and taken away with `Sessions.RevertEffects`.
+    #[derive(Debug, Clone)]
+    pub struct DiagnosisClient<T> {
+        inner: tonic::client::Grpc<T>,
+    }
+    impl<T> DiagnosisClient<T>
+    where
+        T: tonic::client::GrpcService<tonic::body::Body>,
+        T::Error: Into<StdError>,
+        T::ResponseBody: Body<Data = Bytes> + std::marker::Send + 'static,
+        <T::ResponseBody as Body>::Error: Into<StdError> + std::marker::Send,
+    {
+        pub fn new(inner: T) -> Self {
+            let inner = tonic::client::Grpc::new(inner);
+            Self { inner }
+        }
+        pub fn with_origin(inner: T, origin: Uri) -> Self {
+            let inner = tonic::client::Grpc::with_origin(inner, origin);
+            Self { inner }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> DiagnosisClient<InterceptedService<T, F>>
+        where
+            F: tonic::service::Interceptor,
+            T::ResponseBody: Default,
+            T: tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+                Response = http::Response<
+                    <T as tonic::client::GrpcService<tonic::body::Body>>::ResponseBody,
+                >,
+            >,
+            <T as tonic::codegen::Service<
+                http::Request<tonic::body::Body>,
+            >>::Error: Into<StdError> + std::marker::Send + std::marker::Sync,
+        {
+            DiagnosisClient::new(InterceptedService::new(inner, interceptor))
+        }
+        /// Compress requests with the given encoding.
+        ///
+        /// This requires the server to support it otherwise it might respond with an
+        /// error.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.send_compressed(encoding);
+            self
+        }
+        /// Enable decompressing responses.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.inner = self.inner.accept_compressed(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_decoding_message_size(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.inner = self.inner.max_encoding_message_size(limit);
+            self
+        }
+        /// Starts a diagnosis and tells how it goes: that it has begun, how far it is, at last the report. It takes minutes. Ending the call ends it, and so does the
+        /// end of the server (UNAVAILABLE). Needs the rights of an operator.
+        ///
+        /// INVALID_ARGUMENT: a bad name, an unknown reference, a window that ends before it begins. NOT_FOUND: no recording of that name. FAILED_PRECONDITION naming
+        /// `recording`: none is named and the server records nothing. FAILED_PRECONDITION: what was recorded cannot be diagnosed, in the words of the command: the
+        /// session is not in it, less than 4 s were measured, the bundle has no reference. RESOURCE_EXHAUSTED: as many run as `diagnosis.at_once` allows.
+        /// DEADLINE_EXCEEDED: it took longer than `diagnosis.limit_s`, or than the caller gave it. INTERNAL: the process failed.
+        pub async fn start(
+            &mut self,
+            request: impl tonic::IntoRequest<super::StartDiagnosisRequest>,
+        ) -> std::result::Result<
+            tonic::Response<tonic::codec::Streaming<super::DiagnosisEvent>>,
+            tonic::Status,
+        > {
+            self.inner
+                .ready()
+                .await
+                .map_err(|e| {
+                    tonic::Status::unknown(
+                        format!("Service was not ready: {}", e.into()),
+                    )
+                })?;
+            let codec = tonic_prost::ProstCodec::default();
+            let path = http::uri::PathAndQuery::from_static("/nesam.v1.Diagnosis/Start");
+            let mut req = request.into_request();
+            req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Diagnosis", "Start"));
+            self.inner.server_streaming(req, path, codec).await
+        }
+    }
+}
+/// Generated server implementations.
+pub mod diagnosis_server {
+    #![allow(
+        unused_variables,
+        dead_code,
+        missing_docs,
+        clippy::wildcard_imports,
+        clippy::let_unit_value,
+    )]
+    use tonic::codegen::*;
+    /// Generated trait containing gRPC methods that should be implemented for use with DiagnosisServer.
+    #[async_trait]
+    pub trait Diagnosis: std::marker::Send + std::marker::Sync + 'static {
+        /// Server streaming response type for the Start method.
+        type StartStream: tonic::codegen::tokio_stream::Stream<
+                Item = std::result::Result<super::DiagnosisEvent, tonic::Status>,
+            >
+            + std::marker::Send
+            + 'static;
+        /// Starts a diagnosis and tells how it goes: that it has begun, how far it is, at last the report. It takes minutes. Ending the call ends it, and so does the
+        /// end of the server (UNAVAILABLE). Needs the rights of an operator.
+        ///
+        /// INVALID_ARGUMENT: a bad name, an unknown reference, a window that ends before it begins. NOT_FOUND: no recording of that name. FAILED_PRECONDITION naming
+        /// `recording`: none is named and the server records nothing. FAILED_PRECONDITION: what was recorded cannot be diagnosed, in the words of the command: the
+        /// session is not in it, less than 4 s were measured, the bundle has no reference. RESOURCE_EXHAUSTED: as many run as `diagnosis.at_once` allows.
+        /// DEADLINE_EXCEEDED: it took longer than `diagnosis.limit_s`, or than the caller gave it. INTERNAL: the process failed.
+        async fn start(
+            &self,
+            request: tonic::Request<super::StartDiagnosisRequest>,
+        ) -> std::result::Result<tonic::Response<Self::StartStream>, tonic::Status>;
+    }
+    /// Diagnoses what a server recorded of a session: which physical effect does the model lack? It is `nesam diagnose --recording`, run by the server in a process
+    /// of its own; what it finds is put on a session with `Sessions.ApplyEffects` and taken away with `Sessions.RevertEffects`.
+    #[derive(Debug)]
+    pub struct DiagnosisServer<T> {
+        inner: Arc<T>,
+        accept_compression_encodings: EnabledCompressionEncodings,
+        send_compression_encodings: EnabledCompressionEncodings,
+        max_decoding_message_size: Option<usize>,
+        max_encoding_message_size: Option<usize>,
+    }
+    impl<T> DiagnosisServer<T> {
+        pub fn new(inner: T) -> Self {
+            Self::from_arc(Arc::new(inner))
+        }
+        pub fn from_arc(inner: Arc<T>) -> Self {
+            Self {
+                inner,
+                accept_compression_encodings: Default::default(),
+                send_compression_encodings: Default::default(),
+                max_decoding_message_size: None,
+                max_encoding_message_size: None,
+            }
+        }
+        pub fn with_interceptor<F>(
+            inner: T,
+            interceptor: F,
+        ) -> InterceptedService<Self, F>
+        where
+            F: tonic::service::Interceptor,
+        {
+            InterceptedService::new(Self::new(inner), interceptor)
+        }
+        /// Enable decompressing requests with the given encoding.
+        #[must_use]
+        pub fn accept_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.accept_compression_encodings.enable(encoding);
+            self
+        }
+        /// Compress responses with the given encoding, if the client supports it.
+        #[must_use]
+        pub fn send_compressed(mut self, encoding: CompressionEncoding) -> Self {
+            self.send_compression_encodings.enable(encoding);
+            self
+        }
+        /// Limits the maximum size of a decoded message.
+        ///
+        /// Default: `4MB`
+        #[must_use]
+        pub fn max_decoding_message_size(mut self, limit: usize) -> Self {
+            self.max_decoding_message_size = Some(limit);
+            self
+        }
+        /// Limits the maximum size of an encoded message.
+        ///
+        /// Default: `usize::MAX`
+        #[must_use]
+        pub fn max_encoding_message_size(mut self, limit: usize) -> Self {
+            self.max_encoding_message_size = Some(limit);
+            self
+        }
+    }
+    impl<T, B> tonic::codegen::Service<http::Request<B>> for DiagnosisServer<T>
+    where
+        T: Diagnosis,
+        B: Body + std::marker::Send + 'static,
+        B::Error: Into<StdError> + std::marker::Send + 'static,
+    {
+        type Response = http::Response<tonic::body::Body>;
+        type Error = std::convert::Infallible;
+        type Future = BoxFuture<Self::Response, Self::Error>;
+        fn poll_ready(
+            &mut self,
+            _cx: &mut Context<'_>,
+        ) -> Poll<std::result::Result<(), Self::Error>> {
+            Poll::Ready(Ok(()))
+        }
+        fn call(&mut self, req: http::Request<B>) -> Self::Future {
+            match req.uri().path() {
+                "/nesam.v1.Diagnosis/Start" => {
+                    #[allow(non_camel_case_types)]
+                    struct StartSvc<T: Diagnosis>(pub Arc<T>);
+                    impl<
+                        T: Diagnosis,
+                    > tonic::server::ServerStreamingService<super::StartDiagnosisRequest>
+                    for StartSvc<T> {
+                        type Response = super::DiagnosisEvent;
+                        type ResponseStream = T::StartStream;
+                        type Future = BoxFuture<
+                            tonic::Response<Self::ResponseStream>,
+                            tonic::Status,
+                        >;
+                        fn call(
+                            &mut self,
+                            request: tonic::Request<super::StartDiagnosisRequest>,
+                        ) -> Self::Future {
+                            let inner = Arc::clone(&self.0);
+                            let fut = async move {
+                                <T as Diagnosis>::start(&inner, request).await
+                            };
+                            Box::pin(fut)
+                        }
+                    }
+                    let accept_compression_encodings = self.accept_compression_encodings;
+                    let send_compression_encodings = self.send_compression_encodings;
+                    let max_decoding_message_size = self.max_decoding_message_size;
+                    let max_encoding_message_size = self.max_encoding_message_size;
+                    let inner = self.inner.clone();
+                    let fut = async move {
+                        let method = StartSvc(inner);
+                        let codec = tonic_prost::ProstCodec::default();
+                        let mut grpc = tonic::server::Grpc::new(codec)
+                            .apply_compression_config(
+                                accept_compression_encodings,
+                                send_compression_encodings,
+                            )
+                            .apply_max_message_size_config(
+                                max_decoding_message_size,
+                                max_encoding_message_size,
+                            );
+                        let res = grpc.server_streaming(method, req).await;
+                        Ok(res)
+                    };
+                    Box::pin(fut)
+                }
+                _ => {
+                    Box::pin(async move {
+                        let mut response = http::Response::new(
+                            tonic::body::Body::default(),
+                        );
+                        let headers = response.headers_mut();
+                        headers
+                            .insert(
+                                tonic::Status::GRPC_STATUS,
+                                (tonic::Code::Unimplemented as i32).into(),
+                            );
+                        headers
+                            .insert(
+                                http::header::CONTENT_TYPE,
+                                tonic::metadata::GRPC_CONTENT_TYPE,
+                            );
+                        Ok(response)
+                    })
+                }
+            }
+        }
+    }
+    impl<T> Clone for DiagnosisServer<T> {
+        fn clone(&self) -> Self {
+            let inner = self.inner.clone();
+            Self {
+                inner,
+                accept_compression_encodings: self.accept_compression_encodings,
+                send_compression_encodings: self.send_compression_encodings,
+                max_decoding_message_size: self.max_decoding_message_size,
+                max_encoding_message_size: self.max_encoding_message_size,
+            }
+        }
+    }
+    /// Generated gRPC service name
+    pub const SERVICE_NAME: &str = "nesam.v1.Diagnosis";
+    impl<T> tonic::server::NamedService for DiagnosisServer<T> {
+        const NAME: &'static str = SERVICE_NAME;
+    }
+}
 /// Three numbers along x, y, z of the frame and in the unit that the field names.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct Vector3 {
@@ -303,7 +778,7 @@ impl SoilCoordinates {
         }
     }
 }
-/// What a vehicle knows at one instant.
+/// What a vehicle knows at one instant. Covariances are not taken: the soil filter knows the noise from the bundle and from the drive (ADR 0062).
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Measurement {
     /// Session to feed. On Zenoh it may be empty: the session named like the vehicle of the key.
@@ -356,7 +831,8 @@ pub struct MeasurementAnswer {
     /// Copied from the measurement.
     #[prost(int64, tag = "3")]
     pub stamp_ns: i64,
-    /// History epoch after this measurement.
+    /// History epoch after this measurement. It, the soil epoch, the version of the map and the bundle are 0 and empty where the measurement was
+    /// REJECTED without a look at the session: it is not open, belongs to another vehicle or may not be fed by the sender, or the service is overloaded or stops.
     #[prost(uint64, tag = "4")]
     pub history_epoch: u64,
     /// Soil epoch after this measurement.
@@ -381,6 +857,12 @@ pub struct MeasurementAnswer {
     /// is not known to be durable is sent again.
     #[prost(uint64, tag = "21")]
     pub run: u64,
+    /// Version of the map of the session; 0 = no map.
+    #[prost(uint64, tag = "22")]
+    pub map_version: u64,
+    /// SHA-256 (hex) of the manifest of the model bundle.
+    #[prost(string, tag = "23")]
+    pub bundle_hash: ::prost::alloc::string::String,
     #[prost(
         oneof = "measurement_answer::Outcome",
         tags = "10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20"
@@ -1184,6 +1666,8 @@ pub enum Validity {
     Overturned = 64,
     /// The drive has not updated the soil yet: the prior alone speaks.
     SoilNotLearned = 128,
+    /// An alarm of the session is active (`Session.alarm`): its measurements disagree with its predictions for longer than chance and soil explain.
+    AlarmActive = 256,
 }
 impl Validity {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1201,6 +1685,7 @@ impl Validity {
             Self::SlopeUntrained => "VALIDITY_SLOPE_UNTRAINED",
             Self::Overturned => "VALIDITY_OVERTURNED",
             Self::SoilNotLearned => "VALIDITY_SOIL_NOT_LEARNED",
+            Self::AlarmActive => "VALIDITY_ALARM_ACTIVE",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1215,6 +1700,7 @@ impl Validity {
             "VALIDITY_SLOPE_UNTRAINED" => Some(Self::SlopeUntrained),
             "VALIDITY_OVERTURNED" => Some(Self::Overturned),
             "VALIDITY_SOIL_NOT_LEARNED" => Some(Self::SoilNotLearned),
+            "VALIDITY_ALARM_ACTIVE" => Some(Self::AlarmActive),
             _ => None,
         }
     }
@@ -3012,6 +3498,15 @@ pub struct SoilEstimate {
     pub stamp_ns: ::core::option::Option<i64>,
     #[prost(message, optional, tag = "4")]
     pub correction: ::core::option::Option<SoilCorrection>,
+    /// Counts the changes of the session's history; 0 = no measurement yet.
+    #[prost(uint64, tag = "5")]
+    pub history_epoch: u64,
+    /// Version of the map of the session; 0 = no map.
+    #[prost(uint64, tag = "6")]
+    pub map_version: u64,
+    /// SHA-256 (hex) of the manifest of the model bundle.
+    #[prost(string, tag = "7")]
+    pub bundle_hash: ::prost::alloc::string::String,
 }
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct FleetSoilRequest {
@@ -3550,6 +4045,14 @@ pub struct MapHeader {
     /// Whether the tiles carry colour; without it the soil prior is the stated default.
     #[prost(bool, tag = "8")]
     pub semantic: bool,
+    /// Instant that the map was made at, ns of the vehicle's clock, as of a rolling local map; absent = not told. Carried for those who read the map: nothing is
+    /// computed from it, and a patch leaves it as it is.
+    #[prost(int64, optional, tag = "9")]
+    pub stamp_ns: ::core::option::Option<i64>,
+    /// Frame that the source of the map names, for instance `map` or `odom`, at most 64 bytes; empty = World. Carried in the same way: whatever it says, positions
+    /// of the map and of the vehicle are taken to be in one World.
+    #[prost(string, tag = "10")]
+    pub frame: ::prost::alloc::string::String,
 }
 /// A rectangle of pixels.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
@@ -3623,6 +4126,12 @@ pub struct MapDescription {
     pub height: u32,
     #[prost(bool, tag = "9")]
     pub semantic: bool,
+    /// As `MapHeader.stamp_ns`.
+    #[prost(int64, optional, tag = "10")]
+    pub stamp_ns: ::core::option::Option<i64>,
+    /// As `MapHeader.frame`.
+    #[prost(string, tag = "11")]
+    pub frame: ::prost::alloc::string::String,
 }
 /// Generated client implementations.
 pub mod terrain_client {

@@ -129,7 +129,8 @@ impl FleetFile {
         }
     }
 
-    /// Whether it may change what a session takes its vehicle to be: every planner of the vehicle would be answered for another one.
+    /// Whether it may change what a session takes its vehicle to be: every planner of the vehicle would be answered for another one. Also whether it may diagnose:
+    /// recordings hold all vehicles, and the work takes processors from everybody.
     pub fn may_operate(&self, identity: &Identity) -> bool {
         matches!(identity, Identity::Operator(_)) && self.knows(identity)
     }

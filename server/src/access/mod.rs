@@ -41,6 +41,8 @@ pub enum Wish<'a> {
     },
     /// Put effects on the vehicle of an open session, or take them away.
     ApplyEffects(&'a str),
+    /// Diagnose what was recorded of a session, which need not be open any more.
+    Diagnose(&'a str),
     /// Upload, patch or delete a map.
     ChangeMap(&'a str),
 }
@@ -80,7 +82,7 @@ impl<'a> Wish<'a> {
     pub fn session(self) -> Option<&'a str> {
         match self {
             Self::ReadSession(session) | Self::ChangeSession(session) | Self::ApplyEffects(session) => Some(session),
-            Self::OpenSession { .. } | Self::ChangeMap(_) => None,
+            Self::OpenSession { .. } | Self::Diagnose(_) | Self::ChangeMap(_) => None,
         }
     }
 }
@@ -198,7 +200,7 @@ fn decide(fleet: &FleetFile, identity: &Identity, wish: Wish<'_>, vehicle: Optio
             return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
         }
         (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
-        (Wish::ApplyEffects(_), Some(_)) => fleet.may_operate(identity),
+        (Wish::ApplyEffects(_), Some(_)) | (Wish::Diagnose(_), _) => fleet.may_operate(identity),
         (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
         (Wish::OpenSession { vehicle, session }, _) => {
             let name = if session.is_empty() { vehicle } else { session };
@@ -218,6 +220,7 @@ impl core::fmt::Display for Wish<'_> {
         match self {
             Self::ReadSession(session) => write!(f, "read session `{session}`"),
             Self::ApplyEffects(session) => write!(f, "change the effects of session `{session}`"),
+            Self::Diagnose(session) => write!(f, "diagnose session `{session}`"),
             Self::ChangeSession(session) => write!(f, "change session `{session}`"),
             Self::OpenSession { vehicle, session } => write!(f, "open session `{session}` of vehicle `{vehicle}`"),
             Self::ChangeMap(map) => write!(f, "change map `{map}`"),

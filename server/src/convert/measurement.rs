@@ -1,6 +1,6 @@
 //! Measurements and their answers, the same for gRPC and Zenoh.
 
-use nesam_engine::{EngineError, MeasureAnswer, Measurement, Outcome, WheelMeasurement};
+use nesam_engine::{EngineError, MeasureAnswer, Measurement, Outcome, Provenance, WheelMeasurement};
 use nesam_proto::v1 as pb;
 
 use super::{code, control, soil_correction, vehicle_state};
@@ -47,20 +47,30 @@ pub fn measurement_answer(message: &pb::Measurement, session: &str, result: Resu
         pb::MeasurementAnswer { session_id: session.into(), sequence: message.sequence, stamp_ns: message.stamp_ns, ..Default::default() };
     match result {
         Ok(measured) => {
-            answer.history_epoch = measured.history_epoch;
+            put_standing(&mut answer, &measured.provenance);
             answer.reordered = measured.reordered;
             let known = measured.outcome.accepted() || measured.outcome == Outcome::Duplicate;
             answer.place = if known { measured.accepted } else { 0 };
-            answer.soil_epoch = measured.soil.state.epoch;
             answer.soil_correction = Some(soil_correction(&measured.soil));
             answer.outcome = Some(outcome(measured));
         }
         Err(error) => {
+            if let Some(standing) = error.standing() {
+                put_standing(&mut answer, standing);
+            }
             let rejected = pb::Rejected { code: code(&error).into(), field: error.field().into(), message: error.to_string() };
             answer.outcome = Some(pb::measurement_answer::Outcome::Rejected(rejected));
         }
     }
     answer
+}
+
+/// Says where the session stands.
+fn put_standing(answer: &mut pb::MeasurementAnswer, standing: &Provenance) {
+    answer.history_epoch = standing.history_epoch;
+    answer.soil_epoch = standing.soil_epoch;
+    answer.map_version = standing.map_version();
+    answer.bundle_hash.clone_from(&standing.bundle_hash);
 }
 
 fn outcome(measured: MeasureAnswer) -> pb::measurement_answer::Outcome {

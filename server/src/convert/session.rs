@@ -131,12 +131,15 @@ pub fn soil_correction(soil: &SoilEstimate) -> pb::SoilCorrection {
     }
 }
 
-/// A soil estimate as message.
-pub fn soil_estimate(session: &str, soil: &SoilEstimate) -> pb::SoilEstimate {
+/// A soil estimate as message, with where its session stands.
+pub fn soil_estimate(session: &str, soil: &SoilEstimate, standing: &Provenance) -> pb::SoilEstimate {
     pb::SoilEstimate {
         session_id: session.into(),
         soil_epoch: soil.state.epoch,
         stamp_ns: soil.state.stamp_ns,
         correction: Some(soil_correction(soil)),
+        history_epoch: standing.history_epoch,
+        map_version: standing.map_version(),
+        bundle_hash: standing.bundle_hash.clone(),
     }
 }

@@ -21,6 +21,7 @@ pub fn code(error: &EngineError) -> Code {
         EngineError::Expired => Code::DeadlineExceeded,
         EngineError::Abandoned => Code::Cancelled,
         EngineError::Stopped => Code::Unavailable,
+        EngineError::RefusedMeasurement { cause, .. } => code(cause),
         EngineError::Internal { .. } => Code::Internal,
     }
 }

@@ -2,9 +2,12 @@
 
 use nesam_engine::{EngineError, Limits, check_name};
 use nesam_proto::v1 as pb;
-use nesam_terrain::{GridGeometry, TerrainError, WorldMap};
+use nesam_terrain::{GridGeometry, MapSource, TerrainError, WorldMap};
 
 use super::decode_f32;
+
+/// Longest name of a frame, bytes.
+const FRAME_LENGTH_MAX: usize = 64;
 
 /// A map that is being uploaded.
 #[derive(Debug)]
@@ -12,6 +15,7 @@ pub struct MapBuilder {
     id: String,
     version: u64,
     geometry: GridGeometry,
+    source: MapSource,
     elevation_m: Vec<f32>,
     semantic_rgb: Option<Vec<[u8; 3]>>,
 }
@@ -72,10 +76,15 @@ impl MapBuilder {
         if !(geometry.resolution_m.is_finite() && geometry.origin_m.iter().all(|v| v.is_finite())) {
             return Err(EngineError::invalid("header.resolution_m", "resolution and origin must be finite"));
         }
+        if header.frame.len() > FRAME_LENGTH_MAX {
+            let reason = format!("has {} bytes, at most {FRAME_LENGTH_MAX} are allowed", header.frame.len());
+            return Err(EngineError::invalid("header.frame", reason));
+        }
         Ok(Self {
             id: header.map_id.clone(),
             version: header.version,
             geometry,
+            source: MapSource { stamp_ns: header.stamp_ns, frame: header.frame.clone() },
             elevation_m: vec![f32::NAN; width * height],
             semantic_rgb: header.semantic.then(|| vec![[0; 3]; width * height]),
         })
@@ -103,7 +112,8 @@ impl MapBuilder {
     /// # Errors
     /// `Invalid` naming what is wrong with the layers.
     pub fn finish(self) -> Result<WorldMap, EngineError> {
-        WorldMap::from_layers(&self.id, self.version, self.geometry, self.elevation_m, self.semantic_rgb).map_err(|e| layers("header", e))
+        let map = WorldMap::from_layers(&self.id, self.version, self.geometry, self.elevation_m, self.semantic_rgb);
+        map.map(|map| map.with_source(self.source)).map_err(|e| layers("header", e))
     }
 }
 
@@ -129,7 +139,7 @@ fn layers(parent: &str, error: TerrainError) -> EngineError {
 
 /// A map without its layers.
 pub fn description(map: &WorldMap) -> pb::MapDescription {
-    let geometry = map.geometry();
+    let (geometry, source) = (map.geometry(), map.source());
     pb::MapDescription {
         map_id: map.id().into(),
         version: map.version(),
@@ -140,5 +150,7 @@ pub fn description(map: &WorldMap) -> pb::MapDescription {
         width: geometry.width as u32,
         height: geometry.height as u32,
         semantic: map.has_semantics(),
+        stamp_ns: source.stamp_ns,
+        frame: source.frame.clone(),
     }
 }

@@ -49,7 +49,7 @@ impl Layers {
 /// The messages that upload a map: the header, then tiles of whole rows.
 pub(crate) fn upload(map: &WorldMap) -> Vec<pb::UploadMapRequest> {
     use pb::upload_map_request::Part;
-    let geometry = map.geometry();
+    let (geometry, source) = (map.geometry(), map.source());
     let header = pb::MapHeader {
         map_id: map.id().into(),
         version: map.version(),
@@ -59,6 +59,8 @@ pub(crate) fn upload(map: &WorldMap) -> Vec<pb::UploadMapRequest> {
         width: geometry.width as u32,
         height: geometry.height as u32,
         semantic: map.has_semantics(),
+        stamp_ns: source.stamp_ns,
+        frame: source.frame.clone(),
     };
     let layers = Layers::of(map);
     let rows = (TILE_CELLS_MAX / geometry.width.max(1)).max(1);
@@ -67,9 +69,9 @@ pub(crate) fn upload(map: &WorldMap) -> Vec<pb::UploadMapRequest> {
     std::iter::once(Part::Header(header)).chain(tiles).map(|part| pb::UploadMapRequest { part: Some(part) }).collect()
 }
 
-/// The smallest tile that makes the map `to` of `from`; `None` where they do not share a grid, or one has colours and the other has not.
+/// The smallest tile that makes the map `to` of `from`; `None` where they do not share a grid or a source, or one has colours and the other has not.
 pub(crate) fn changed_tile(from: &WorldMap, to: &WorldMap) -> Option<pb::MapTile> {
-    if from.geometry() != to.geometry() || from.has_semantics() != to.has_semantics() {
+    if from.geometry() != to.geometry() || from.source() != to.source() || from.has_semantics() != to.has_semantics() {
         return None;
     }
     let (old, new) = (Layers::of(from), Layers::of(to));
@@ -87,7 +89,7 @@ pub(crate) fn changed_tile(from: &WorldMap, to: &WorldMap) -> Option<pb::MapTile
 #[cfg(test)]
 mod tests {
     use nesam_engine::Limits;
-    use nesam_terrain::GridGeometry;
+    use nesam_terrain::{GridGeometry, MapSource};
 
     use super::*;
     use crate::convert::{MapBuilder, patched};
@@ -97,7 +99,8 @@ mod tests {
         let mut elevation_m: Vec<f32> = (0..geometry.cells()).map(|i| (i as f32 * 0.01).sin()).collect();
         elevation_m[4321] = f32::NAN;
         let rgb = semantic.then(|| (0..geometry.cells()).map(|i| [i as u8, (i >> 8) as u8, 7]).collect());
-        WorldMap::from_layers("w", 3, geometry, elevation_m, rgb).unwrap()
+        let source = MapSource { stamp_ns: semantic.then_some(-5), frame: "odom".into() };
+        WorldMap::from_layers("w", 3, geometry, elevation_m, rgb).unwrap().with_source(source)
     }
 
     #[test]
@@ -114,7 +117,7 @@ mod tests {
                 tiles += 1;
             }
             let back = builder.finish().unwrap();
-            assert_eq!((back.hash(), back.id(), back.version()), (map.hash(), map.id(), map.version()));
+            assert_eq!((back.hash(), back.id(), back.version(), back.source()), (map.hash(), map.id(), map.version(), map.source()));
             assert!(tiles > 1);
         }
     }
@@ -128,7 +131,7 @@ mod tests {
             let tile = changed_tile(&map, &next).unwrap();
             assert_eq!((tile.row, tile.column, tile.rows, tile.columns), (500, 30, 2, 3));
             let back = patched(&map, &tile).unwrap();
-            assert_eq!((back.hash(), back.version()), (next.hash(), 4));
+            assert_eq!((back.hash(), back.version(), back.source()), (next.hash(), 4, map.source()));
             let unchanged = changed_tile(&map, &map).unwrap();
             assert_eq!(patched(&map, &unchanged).unwrap().hash(), map.hash());
         }

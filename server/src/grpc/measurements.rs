@@ -10,7 +10,7 @@ use tonic::{Code, Request, Response, Status, Streaming};
 use super::used::Used;
 use super::{Edge, ReplyStream, stopped};
 use crate::access::{Caller, Wish};
-use crate::call::{Pending, measured};
+use crate::call::{Pending, measured, unmeasured};
 use crate::cluster::moved;
 use crate::convert::{measurement, measurement_answer};
 use crate::telemetry::Transport;
@@ -23,7 +23,8 @@ type InFlight = (pb::Measurement, Result<Pending, Refused>);
 
 /// Why a measurement did not reach the engine.
 enum Refused {
-    Invalid(EngineError),
+    /// By what it says; the session is read in its place, so that the answer tells where it stands.
+    Invalid(EngineError, Pending),
     /// By the rights, or by where the session is.
     Status(Status),
 }
@@ -79,18 +80,20 @@ async fn submit_all(edge: Edge, caller: Caller, mut inbound: Streaming<pb::Measu
 
 /// Puts one measurement into the queue. The engine looks once more whether the session belongs to the vehicle that the sender may feed.
 async fn submit(edge: &Edge, caller: &Caller, used: &mut Used, message: &pb::Measurement) -> Result<Pending, Refused> {
-    let measurement = measurement(message).map_err(Refused::Invalid)?;
     let vehicle = used.enter(edge, caller, Wish::ChangeSession(&message.session_id)).await.map_err(Refused::Status)?;
     let vehicle = vehicle.map(|vehicle| vehicle.to_string());
-    let command = Command::Measure { session: message.session_id.clone(), vehicle, measurement };
-    edge.check_run(&message.session_id, message.run).map_err(Refused::Invalid)?;
-    Ok(edge.engine.submit(command, edge.stream_budget()))
+    let session = message.session_id.clone();
+    let checked = measurement(message).and_then(|measurement| edge.check_run(&session, message.run).map(|()| measurement));
+    match checked {
+        Ok(measurement) => Ok(edge.engine.submit(Command::Measure { session, vehicle, measurement }, edge.stream_budget())),
+        Err(error) => Err(Refused::Invalid(error, edge.engine.submit(Command::Get { session }, edge.stream_budget()))),
+    }
 }
 
 async fn answer(edge: &Edge, (message, pending): InFlight) -> Result<pb::MeasurementAnswer, Status> {
     let result = match pending {
         Ok(pending) => measured(pending.await),
-        Err(Refused::Invalid(error)) => Err(error),
+        Err(Refused::Invalid(error, session)) => Err(unmeasured(error, None, session.await)),
         Err(Refused::Status(status)) => {
             edge.engine.metrics().measurement(Transport::Grpc, "rejected");
             let rejected = pb::Rejected { code: status.code().into(), field: "session_id".into(), message: status.message().into() };

@@ -1,6 +1,7 @@
 //! The gRPC services: one file each, handlers that convert, ask the engine and convert back.
 
 mod deadline;
+mod diagnosis;
 mod measurements;
 mod news;
 mod prediction;
@@ -27,6 +28,7 @@ use crate::clock::unix_ns;
 use crate::cluster::{Brought, Cluster, moved};
 use crate::config::GrpcConfig;
 use crate::convert::to_status;
+use crate::diagnosis::Diagnoses;
 use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
 
@@ -55,6 +57,8 @@ pub(crate) struct Edge {
     pub keeper: Option<Arc<Keeper>>,
     /// The servers that share sessions; `None` for a server that is alone.
     pub cluster: Option<Cluster>,
+    /// Diagnoses of what was recorded; `None` for a server that starts none.
+    pub diagnoses: Option<Arc<Diagnoses>>,
     /// For what a thread of the bus begins and does not wait for.
     pub runtime: tokio::runtime::Handle,
     /// Who may do what.
@@ -62,7 +66,7 @@ pub(crate) struct Edge {
 }
 
 impl Edge {
-    /// Of a server without store, cluster and bus.
+    /// Of a server without store, cluster, bus and diagnoses.
     pub fn alone(
         engine: EngineClient,
         predictor: Arc<Predictor>,
@@ -82,6 +86,7 @@ impl Edge {
             run: unix_ns().unsigned_abs(),
             keeper: None,
             cluster: None,
+            diagnoses: None,
             runtime: tokio::runtime::Handle::current(),
             access,
         }
@@ -225,4 +230,5 @@ pub(crate) fn routes(edge: &Edge) -> Routes {
         )
         .add_service(pb::terrain_server::TerrainServer::new(terrain::Service(edge.clone())).max_decoding_message_size(tiles))
         .add_service(pb::soil_server::SoilServer::new(soil::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE))
+        .add_service(pb::diagnosis_server::DiagnosisServer::new(diagnosis::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE))
 }

@@ -21,10 +21,12 @@ impl pb::soil_server::Soil for Service {
         edge.engine.metrics().request(Transport::Grpc, "watch_soil");
         let news = News {
             of_event: |session, event| match event {
-                Event::SoilChanged { session: changed, soil, .. } if changed == session => Some(soil_estimate(session, &soil)),
+                Event::SoilChanged { session: changed, soil, provenance, .. } if changed == session => {
+                    Some(soil_estimate(session, &soil, &provenance))
+                }
                 _ => None,
             },
-            of_session: |session, view| Some(soil_estimate(session, &view.soil)),
+            of_session: |session, view| Some(soil_estimate(session, &view.soil, &view.provenance)),
         };
         tell(edge, &request, request.get_ref().session_id.clone(), news).await
     }

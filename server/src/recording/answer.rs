@@ -86,7 +86,7 @@ impl SoilEpochs {
             (Command::Measure { session, .. }, Ok(Reply::Measured(answer))) => {
                 let epoch = answer.soil.state.epoch;
                 let known = self.0.insert(session.clone(), epoch).unwrap_or(0);
-                (epoch != known).then(|| (Topic::Soil, soil_estimate(session, &answer.soil).encode_to_vec()))
+                (epoch != known).then(|| (Topic::Soil, soil_estimate(session, &answer.soil, &answer.provenance).encode_to_vec()))
             }
             (Command::Fork { .. } | Command::Import { .. }, Ok(Reply::Session(view))) => {
                 self.0.insert(view.session.clone(), view.provenance.soil_epoch);

@@ -45,6 +45,8 @@ pub fn map_of(bytes: &[u8], limits: &Limits) -> Result<WorldMap, String> {
 
 #[cfg(test)]
 mod tests {
+    use nesam_terrain::{GridGeometry, MapSource};
+
     use super::*;
 
     #[test]
@@ -53,5 +55,18 @@ mod tests {
         let message = pb::UploadMapRequest { part: Some(Part::Header(header)) };
         assert_eq!(map_version(&message.encode_length_delimited_to_vec()), 7);
         assert_eq!((map_version(&[]), map_version(b"no map")), (0, 0));
+    }
+
+    #[test]
+    fn property_stamp_and_frame_are_kept_and_older_bytes_have_none() {
+        let geometry = GridGeometry { origin_m: [0.0; 2], resolution_m: 0.5, width: 2, height: 2 };
+        let plain = WorldMap::from_layers("m", 1, geometry, vec![0.0; 4], None).unwrap();
+        // Bytes of a map that tells neither are those of before there was a place for them.
+        let read = |map: &WorldMap| map_of(&map_bytes(map), &Limits::default()).unwrap();
+        assert_eq!(read(&plain).source(), &MapSource::default());
+        let source = MapSource { stamp_ns: Some(0), frame: "odom".into() };
+        let hash = plain.hash().to_string();
+        let told = read(&plain.with_source(source.clone()));
+        assert_eq!((told.source(), told.hash()), (&source, hash.as_str()));
     }
 }

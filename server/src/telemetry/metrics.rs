@@ -65,6 +65,7 @@ fn refusal(error: &EngineError) -> &'static str {
         EngineError::Expired => "deadline_exceeded",
         EngineError::Abandoned => "abandoned",
         EngineError::Stopped => "stopped",
+        EngineError::RefusedMeasurement { cause, .. } => refusal(cause),
         EngineError::Internal { .. } => "internal",
     }
 }

@@ -112,7 +112,7 @@ impl Passing {
     /// Notes the answer. This runs on the engine's thread: it copies and returns.
     pub fn answered(self, answer: &Answer) {
         let note = match (self.what, &answer.result) {
-            (_, Err(error)) => Note::Refused(self.label, error.clone()),
+            (_, Err(error)) => Note::Refused(self.label, error.refusal().clone()),
             (What::Measured(asked), Ok(Reply::Measured(answer))) => {
                 let (session, measurement) = *asked;
                 Note::Measured(Box::new((session, measurement, (**answer).clone())))

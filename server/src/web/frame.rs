@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
-use nesam_engine::{FORECAST_AHEAD, ForecastCheck};
+use nesam_engine::{ALARM_ACTIVE, FORECAST_AHEAD, ForecastCheck, SOIL_NOT_LEARNED};
 use nesam_model::{Predictor, flag};
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, STATE_DIM};
 use nesam_terrain::{Pose2, WorldMap};
@@ -19,6 +19,8 @@ const FAN_POINTS: usize = 16;
 const REGIONS: usize = 8;
 /// Half width of a two-sided 95 % interval in standard deviations.
 const TWO_SIDED_95: f64 = 1.96;
+/// Flags that speak of the session and not of the candidate.
+const OF_SESSION: u32 = flag::NO_MAP | SOIL_NOT_LEARNED | ALARM_ACTIVE;
 /// Units in the order of `SOIL_NAMES`.
 const SOIL_UNITS: [&str; SOIL_DIM] = ["N/m^(n+2)", "N/m^(n+1)", "-", "Pa", "rad", "m"];
 
@@ -217,7 +219,7 @@ fn fan_json(fan: &Shown, scenery: &Scenery) -> Value {
         "soils": prediction.extras.soil_groups,
         "horizon_s": rollout.horizon as f64 * scenery.predictor.bundle().normalization.dt_s,
         "paths": paths,
-        "flagged": flags.iter().map(|f| f & !(flag::NO_MAP | nesam_engine::SOIL_NOT_LEARNED) != 0).collect::<Vec<_>>(),
+        "flagged": flags.iter().map(|f| f & !OF_SESSION != 0).collect::<Vec<_>>(),
     })
 }
 

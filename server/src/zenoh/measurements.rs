@@ -7,7 +7,7 @@ use nesam_proto::v1 as pb;
 use tokio::sync::mpsc;
 
 use super::{MEASUREMENT_BYTES_MAX, Outgoing, decode, encode, keys};
-use crate::call::measured;
+use crate::call::{measured, unmeasured};
 use crate::cluster::{Brought, Standing};
 use crate::convert::{measurement, measurement_answer};
 use crate::grpc::Edge;
@@ -58,8 +58,21 @@ fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &:
             let command = Command::Measure { session, vehicle: Some(vehicle.into()), measurement };
             edge.engine.handle().submit(edge.engine.submission(command, move |answer| path.answer(measured(answer))));
         }
-        Err(error) => path.answer(Err(error)),
+        Err(error) => refuse(edge, session, path, error),
     }
+}
+
+/// Answers a measurement that never reaches the engine; the session is read in its place, so that the answer tells where it stands. Where much waits the answer
+/// goes without: what is sent wrongly must not take the place of what is not.
+fn refuse(edge: &Edge, session: String, path: ReturnPath, error: EngineError) {
+    let handle = edge.engine.handle();
+    if handle.waiting().0 >= handle.limits().waiting_measurements_per_vehicle_max {
+        return path.answer(Err(error));
+    }
+    handle.submit(edge.engine.submission(Command::Get { session }, move |answer| {
+        let error = unmeasured(error, Some(&path.vehicle), answer);
+        path.answer(Err(error));
+    }));
 }
 
 impl ReturnPath {

@@ -18,9 +18,9 @@ pub async fn publish_changes(
 ) {
     loop {
         match events.recv().await {
-            Ok(Event::SoilChanged { session, vehicle, soil }) => {
+            Ok(Event::SoilChanged { session, vehicle, soil, provenance }) => {
                 let key = keys::of_vehicle(&fleet, &vehicle, "soil");
-                if sender.send((key, encode(&soil_estimate(&session, &soil)))).await.is_err() {
+                if sender.send((key, encode(&soil_estimate(&session, &soil, &provenance)))).await.is_err() {
                     return;
                 }
             }

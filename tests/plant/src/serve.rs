@@ -1,6 +1,6 @@
 //! The plant's side of the plant adapter: datagrams of JSON in lock-step, as `docs/plant-adapter.md` defines.
 
-use std::net::UdpSocket;
+use std::net::{SocketAddr, UdpSocket};
 
 use serde_json::{Value, json};
 
@@ -65,25 +65,37 @@ type Make = Box<dyn FnMut(&str, u64, [f64; 3]) -> Result<(Plant, Sensors), Strin
 /// Answers datagrams with a plant behind them.
 pub struct PlantServer {
     make: Make,
+    name: String,
     running: Option<(Plant, Sensors)>,
-    /// Number of the last request carried out, and its answer, for clients that ask again.
-    last: Option<(u64, Answer)>,
+    last: Option<Last>,
+}
+
+/// The last request carried out, for clients that ask again.
+struct Last {
+    from: SocketAddr,
+    id: u64,
+    answer: Answer,
 }
 
 impl PlantServer {
-    /// A server that makes its plants from world, seed and pose.
-    pub fn new(make: impl FnMut(&str, u64, [f64; 3]) -> Result<(Plant, Sensors), String> + Send + 'static) -> Self {
-        Self { make: Box::new(make), running: None, last: None }
+    /// A server that makes its plants from world, seed and pose. `name` says in every answer to `reset` which plant it is: laps on plants of one name are laps
+    /// on one plant.
+    pub fn new(
+        name: impl Into<String>,
+        make: impl FnMut(&str, u64, [f64; 3]) -> Result<(Plant, Sensors), String> + Send + 'static,
+    ) -> Self {
+        Self { make: Box::new(make), name: name.into(), running: None, last: None }
     }
 
-    /// The answer to one datagram. The same number asked again gets the same answer and moves nothing.
-    pub fn answer(&mut self, datagram: &[u8]) -> Answer {
+    /// The answer to one datagram. The same number from the same sender asked again gets the same answer and moves nothing; a smaller one is a late copy and gets
+    /// none. Another sender begins another conversation.
+    pub fn answer(&mut self, from: SocketAddr, datagram: &[u8]) -> Option<Answer> {
         let (id, request) = match Request::parse(datagram) {
             Ok(parsed) => parsed,
-            Err((id, reason)) => return error(id, &reason),
+            Err((id, reason)) => return Some(error(id, &reason)),
         };
-        if let Some((_, again)) = self.last.as_ref().filter(|(last, _)| *last == id) {
-            return again.clone();
+        if let Some(last) = self.last.as_ref().filter(|last| last.from == from && id <= last.id) {
+            return (id == last.id).then(|| last.answer.clone());
         }
         let answer = match self.carry_out(request) {
             Ok(reading) => {
@@ -93,13 +105,14 @@ impl PlantServer {
                 }
                 Answer(reply.to_string().into_bytes())
             }
-            Err(reason) => return error(id, &reason),
+            Err(reason) => return Some(error(id, &reason)),
         };
-        self.last = Some((id, answer.clone()));
-        answer
+        self.last = Some(Last { from, id, answer: answer.clone() });
+        Some(answer)
     }
 
     fn carry_out(&mut self, request: Request) -> Result<Value, String> {
+        let begins = matches!(request, Request::Reset { .. });
         match request {
             Request::Reset { world, seed, pose } => self.running = Some((self.make)(&world, seed, pose)?),
             Request::Step(command) => self.running.as_mut().ok_or("reset comes first")?.0.advance(command),
@@ -107,13 +120,17 @@ impl PlantServer {
         let (plant, sensors) = self.running.as_mut().ok_or("reset comes first")?;
         let truth = plant.truth();
         let measured = sensors.read(&truth);
-        Ok(json!({
+        let mut reading = json!({
             "t_s": truth.time_s,
             "state": measured.state,
             "wheel_rad_s": measured.wheel_rad_s,
             "road_wheel_rad": measured.road_wheel_rad,
             "truth": truth.state,
-        }))
+        });
+        if begins {
+            reading["plant"] = self.name.as_str().into();
+        }
+        Ok(reading)
     }
 
     /// Answers until the socket fails.
@@ -124,8 +141,9 @@ impl PlantServer {
         let mut buffer = [0; DATAGRAM_MAX];
         loop {
             let (length, from) = socket.recv_from(&mut buffer)?;
-            let answer = self.answer(&buffer[..length]);
-            socket.send_to(&answer.0, from)?;
+            if let Some(answer) = self.answer(from, &buffer[..length]) {
+                socket.send_to(&answer.0, from)?;
+            }
         }
     }
 }

@@ -71,6 +71,14 @@ async fn position_error_m(client: &mut Client, session: &str, drive: &Trajectory
     (0..HORIZON).map(distance).sum::<f64>() / HORIZON as f64
 }
 
+/// Whether predictions of a session say that its alarm is active.
+async fn flagged(client: &mut Client, session: &str, drive: &Trajectory) -> bool {
+    let prediction = client.predict(candidates(session, drive, 0, 2, 2)).await.unwrap();
+    let flags: Vec<bool> = prediction.validity.iter().map(|flags| flags & v1::Validity::AlarmActive as u32 != 0).collect();
+    assert_eq!(flags[0], flags[1], "it is of the session, not of a candidate");
+    flags[0]
+}
+
 /// Standard deviation of measured positions (`DATA.md` of the drives).
 const POSITION_NOISE_M: f64 = 0.015;
 
@@ -87,6 +95,7 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
 
     client.feed((0..onset).map(|i| on_clock("s", &drives, 0, i)).collect()).await.unwrap();
     assert_eq!(client.session("s").await.unwrap().alarm, None, "nothing before the onset");
+    assert!(!flagged(&mut client, "s", &drives[0]).await);
     client.feed((onset..drives[0].states.len()).map(|i| on_clock("s", &drives, 0, i)).collect()).await.unwrap();
     let alarm = tokio::time::timeout(Duration::from_secs(60), alarms.message()).await.expect("an alarm").unwrap().unwrap();
     println!("{alarm:?}");
@@ -97,6 +106,7 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     assert!((seconds(alarm.onset_stamp_ns) - ONSET_S).abs() <= 2.0, "dated {} s", seconds(alarm.onset_stamp_ns));
     assert!(alarm.size < 0.0 && alarm.description.contains("contradict each other ahead"), "{}", alarm.description);
     assert_eq!(client.session("s").await.unwrap().alarm.as_ref(), Some(&alarm));
+    assert!(flagged(&mut client, "s", &drives[0]).await);
     let text = server.metrics().render(0, 0);
     assert!(text.contains("nesam_alarms_total{kind=\"sensor_jump\"} 1\n") && text.contains("nesam_alarms_active 1\n"), "{text}");
 
@@ -152,6 +162,7 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     assert_eq!((applied.effects, applied.alarm), (effects, None), "another vehicle begins without an alarm");
     let cleared = tokio::time::timeout(Duration::from_secs(60), alarms.message()).await.expect("the end of it").unwrap().unwrap();
     assert!(!cleared.active && cleared.episode == 1, "{cleared:?}");
+    assert!(!flagged(&mut client, "s", &drives[0]).await && flagged(&mut client, "without", &drives[0]).await);
 
     // What follows in the drive, predicted by the session with the effect and by its copy without.
     let (mut with, mut without) = (Vec::new(), Vec::new());

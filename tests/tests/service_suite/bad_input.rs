@@ -142,6 +142,9 @@ async fn service_bad_measurements_are_answered_and_change_nothing() {
             sweep.push(("not finite", v1::Measurement { state: Some(with_entry(state, i, value)), ..good() }, "NOT_FINITE", ""));
         }
     }
+    let provenance = before.provenance.clone().unwrap();
+    assert_eq!((provenance.history_epoch, provenance.map_version), (40, 1));
+    let standing = (provenance.history_epoch, provenance.soil_epoch, provenance.map_version, provenance.bundle_hash.as_str());
     let mut stream = client.measure().await.unwrap();
     for (what, measurement, label, field) in sweep {
         let answer = stream.exchange(measurement).await.unwrap();
@@ -153,6 +156,9 @@ async fn service_bad_measurements_are_answered_and_change_nothing() {
             }
             _ => {}
         }
+        // Whatever is wrong, the answer says where the session stands, if there is one.
+        let named = (answer.history_epoch, answer.soil_epoch, answer.map_version, answer.bundle_hash.as_str());
+        assert_eq!(named, if answer.session_id == "s" { standing } else { (0, 0, 0, "") }, "{what}");
         assert_eq!(client.session("s").await.unwrap(), before, "{what}");
     }
     // The stream still works, and nothing was lost.
@@ -236,6 +242,7 @@ async fn service_bad_maps_are_refused() {
         ("NaN resolution", with_header(v1::MapHeader { resolution_m: f64::NAN, ..header() }), InvalidArgument, "header.resolution_m"),
         ("resolution 0", with_header(v1::MapHeader { resolution_m: 0.0, ..header() }), InvalidArgument, "header.resolution_m"),
         ("infinite origin", with_header(v1::MapHeader { origin_x_m: f64::INFINITY, ..header() }), InvalidArgument, "header.resolution_m"),
+        ("long frame", with_header(v1::MapHeader { frame: "x".repeat(65), ..header() }), InvalidArgument, "header.frame"),
         ("tile too high", with_tile(v1::MapTile { row: 1, ..tile() }), InvalidArgument, "tile.rows"),
         ("tile far right", with_tile(v1::MapTile { column: u32::MAX, ..tile() }), InvalidArgument, "tile.columns"),
         ("empty tile", with_tile(v1::MapTile { rows: 0, ..tile() }), InvalidArgument, "tile.rows"),
@@ -277,6 +284,15 @@ async fn service_bad_maps_are_refused() {
     assert_ne!(patched.hash, world.hash);
     let prediction = client.predict(candidates("s", &recorded.drive, 39, 1, 1)).await.unwrap();
     assert_eq!((prediction.provenance.map_version, &prediction.provenance.map_hash), (2, &patched.hash));
+
+    // Stamp and frame are carried, past a patch too, and are no part of the hash.
+    let plain = client.upload_messages(with_header(header())).await.unwrap();
+    let local = v1::MapHeader { map_id: "local".into(), stamp_ns: Some(-5), frame: "odom".into(), ..header() };
+    let local = client.upload_messages(with_header(local)).await.unwrap();
+    assert_eq!((local.stamp_ns, local.frame.as_str(), &local.hash), (Some(-5), "odom", &plain.hash));
+    assert_eq!((plain.stamp_ns, plain.frame.as_str()), (None, ""));
+    let local = client.patch_tile(patch("local", 1, Some(tile()))).await.unwrap();
+    assert_eq!((local.version, local.stamp_ns, local.frame.as_str()), (2, Some(-5), "odom"));
     server.shutdown().await;
 }
 

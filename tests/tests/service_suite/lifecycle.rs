@@ -12,6 +12,7 @@ use tonic_health::pb::{HealthCheckRequest, health_client::HealthClient};
 use tonic_reflection::pb::v1::server_reflection_request::MessageRequest;
 use tonic_reflection::pb::v1::server_reflection_response::MessageResponse;
 use tonic_reflection::pb::v1::{ServerReflectionRequest, server_reflection_client::ServerReflectionClient};
+use tonic_reflection::pb::v1alpha;
 
 use crate::stage::*;
 
@@ -29,11 +30,25 @@ async fn health(client: &Client, service: &str) -> ServingStatus {
     HealthClient::new(client.channel()).check(request).await.unwrap().into_inner().status()
 }
 
+/// The services that reflection lists for clients that know v1alpha alone.
+async fn reflected_by_v1alpha(client: &Client) -> Vec<String> {
+    use v1alpha::server_reflection_request::MessageRequest;
+    use v1alpha::server_reflection_response::MessageResponse;
+    let message_request = Some(MessageRequest::ListServices(String::new()));
+    let list = v1alpha::ServerReflectionRequest { host: String::new(), message_request };
+    let mut reflection = v1alpha::server_reflection_client::ServerReflectionClient::new(client.channel());
+    let mut replies = reflection.server_reflection_info(tokio_stream::once(list)).await.unwrap().into_inner();
+    match replies.next().await.unwrap().unwrap().message_response {
+        Some(MessageResponse::ListServicesResponse(list)) => list.service.into_iter().map(|service| service.name).collect(),
+        other => panic!("no list of services: {other:?}"),
+    }
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn service_health_reflection_metrics_and_status() {
     let recorded = recorded();
     let (server, mut client) = start().await;
-    for name in ["", "nesam.v1.Prediction", "nesam.v1.Measurements"] {
+    for name in ["", "nesam.v1.Prediction", "nesam.v1.Measurements", "nesam.v1.Diagnosis"] {
         assert_eq!(health(&client, name).await, ServingStatus::Serving, "{name}");
     }
     let list = ServerReflectionRequest { host: String::new(), message_request: Some(MessageRequest::ListServices(String::new())) };
@@ -42,8 +57,11 @@ async fn service_health_reflection_metrics_and_status() {
     let Some(MessageResponse::ListServicesResponse(list)) = replies.next().await.unwrap().unwrap().message_response else {
         panic!("no list of services")
     };
-    for name in ["Sessions", "Prediction", "Measurements", "Terrain", "Soil"] {
-        assert!(list.service.iter().any(|s| s.name == format!("nesam.v1.{name}")), "{name}");
+    let older = reflected_by_v1alpha(&client).await;
+    for name in ["Sessions", "Prediction", "Measurements", "Terrain", "Soil", "Diagnosis"] {
+        let name = format!("nesam.v1.{name}");
+        assert!(list.service.iter().any(|s| s.name == name), "{name}");
+        assert!(older.contains(&name), "{name} by v1alpha");
     }
 
     open(&mut client, "s", "").await;

@@ -6,6 +6,7 @@ mod authority;
 mod bad_input;
 mod effects;
 mod extras;
+mod fallback;
 mod fleet_soil;
 mod fleet_soil_sharing;
 mod forecasts;

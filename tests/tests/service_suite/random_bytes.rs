@@ -92,6 +92,8 @@ fn valid_message(path: &str, recorded: &Recorded, map: &str) -> Vec<u8> {
         }
         "RevertEffects" => v1::RevertEffectsRequest { session_id: session_id() }.encode_to_vec(),
         "WatchAlarms" => v1::WatchAlarmsRequest { session_id: session_id() }.encode_to_vec(),
+        // Nothing is recorded here, so that the whole of it is refused too.
+        "Start" => v1::StartDiagnosisRequest { session_id: session_id(), from_stamp_ns: Some(-1), ..Default::default() }.encode_to_vec(),
         "Close" => v1::CloseSessionRequest { session_id: session_id() }.encode_to_vec(),
         "Predict" | "PredictStream" => candidates("s", &recorded.drive, 39, 2, 3)
             .starting_at(39 * STEP_NS, vec![(40 * STEP_NS, [1.0, 0.0])])

@@ -47,7 +47,8 @@ async fn service_every_call_names_its_vehicle() {
     call!(client.list_maps());
     call!(client.feed(vec![]));
     call!(client.watch_alarms("s"));
-    assert_eq!(calls.len(), 5);
+    call!(client.diagnose(v1::StartDiagnosisRequest::default()));
+    assert_eq!(calls.len(), 6);
     assert!(plain.clone().list_sessions().await.is_err());
     assert_eq!(told.recv().await.unwrap(), ("/nesam.v1.Sessions/List".to_string(), None));
     assert_refused("a line break", plain.for_vehicle("a\nb").map(drop), Code::InvalidArgument, "vehicle_id");

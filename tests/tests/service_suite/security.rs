@@ -23,6 +23,10 @@ fn offset() -> Vec<v1::Effect> {
     vec![v1::Effect { id: "steering_offset".into(), parameters }]
 }
 
+fn diagnosis(session: &str) -> v1::StartDiagnosisRequest {
+    v1::StartDiagnosisRequest { session_id: session.into(), ..Default::default() }
+}
+
 /// Asserts PERMISSION_DENIED with the name of whoever asked.
 fn denied<T: core::fmt::Debug>(what: &str, result: Result<T, ClientError>, who: &str) {
     let error = result.expect_err(what);
@@ -60,6 +64,7 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
         denied("import", client.import_session(operator.export_session("truck").await.unwrap(), "copy").await, who);
         denied("effects", client.apply_effects("truck", "", offset()).await, who);
         denied("revert", client.revert_effects("truck").await, who);
+        denied("diagnose", client.diagnose(diagnosis("truck")).await, who);
         denied("map", client.upload_map(&layers(&recorded.world)).await, who);
         denied("delete", client.delete_map(recorded.world.id()).await, who);
         let answers = client.feed(samples("truck", &recorded.drive, 3)).await.unwrap();
@@ -69,6 +74,8 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
         }
     }
     denied("its own effects", truck.apply_effects("truck", "", offset()).await, "vehicle `truck`");
+    denied("its own diagnosis", truck.diagnose(diagnosis("truck")).await, "vehicle `truck`");
+    denied("a diagnosis of nobody", other.diagnose(diagnosis("nobody")).await, "vehicle `other`");
     denied("alarms", other.watch_alarms("truck").await, "vehicle `other`");
     denied("get", other.session("truck").await, "vehicle `other`");
     denied("export", other.export_session("truck").await, "vehicle `other`");
@@ -87,6 +94,9 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
 
     // A replayed measurement changes nothing either.
     assert_eq!(outcome_label(&truck.feed(vec![sample("truck", &recorded.drive, 40)]).await.unwrap()[0]), "DUPLICATE");
+
+    // An operator may diagnose, if only something were recorded.
+    assert_refused("no recording", operator.diagnose(diagnosis("truck")).await, Code::FailedPrecondition, "recording");
 
     // What a vehicle is taken to be is for operators.
     assert_eq!(operator.apply_effects("truck", "", offset()).await.unwrap().effects, offset());

@@ -36,7 +36,11 @@ async fn service_every_reply_carries_soil_and_covariance() {
         assert_eq!(soil, watched.correction.as_ref(), "sample {i}");
         if i % 7 == 0 || full {
             let session = client.session("s").await.unwrap();
-            assert_eq!((soil, session.provenance.unwrap().soil_epoch), (session.soil_correction.as_ref(), epoch));
+            let provenance = session.provenance.unwrap();
+            assert_eq!((soil, provenance.soil_epoch), (session.soil_correction.as_ref(), epoch));
+            let named = (answer.history_epoch, answer.map_version, &answer.bundle_hash);
+            assert_eq!(named, (provenance.history_epoch, provenance.map_version, &provenance.bundle_hash));
+            assert_eq!((watched.map_version, &watched.bundle_hash), (provenance.map_version, &provenance.bundle_hash));
             let prediction = client.predict(candidates("s", &recorded.drive, i, 1, 1)).await.unwrap();
             assert_eq!((soil, prediction.provenance.soil_epoch), (Some(&prediction.soil_correction), epoch));
             assert_eq!(prediction.validity[0] & v1::Validity::SoilNotLearned as u32 != 0, epoch == 0);

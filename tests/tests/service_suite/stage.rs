@@ -111,6 +111,8 @@ pub fn layers(world: &WorldMap) -> MapLayers {
         height: geometry.height,
         elevation_m: world.elevation_m(),
         semantic_rgb: world.semantic_rgb(),
+        stamp_ns: None,
+        frame: String::new(),
     }
 }
 

@@ -67,8 +67,15 @@ async fn service_measurements_over_a_zenoh_router_give_the_identical_prediction(
                 (session, epoch, Some(answer.stamp_ns - OPEN_STEPS as i64 * STEP_NS))
             );
             assert_eq!(estimate.correction, answer.soil_correction);
+            let named = (estimate.history_epoch, estimate.map_version, &estimate.bundle_hash);
+            assert_eq!(named, (answer.history_epoch, 1, &answer.bundle_hash));
         }
     }
+    // What is refused before the engine sees it says where the session stands, too.
+    vehicle.publish(&v1::Measurement { state: None, ..sample("", &recorded.drive, last + 1) }).await.unwrap();
+    let refused = vehicle.answer(PATIENCE).await.unwrap().expect("an answer on the status key");
+    assert_eq!((outcome_label(&refused), refused.history_epoch, refused.map_version), ("REJECTED", last as u64 + 1, 1));
+    assert_eq!(refused.bundle_hash, predictor().bundle().hash);
     // The posterior is the same to the last bit, the covariance included.
     let (one, other) = (client.session("grpc").await.unwrap(), client.session("truck").await.unwrap());
     assert!(one.provenance.as_ref().unwrap().soil_epoch >= 2 && one.provenance == other.provenance);

@@ -7,6 +7,7 @@
 #include <string>
 #include <vector>
 
+#include <nesam/diagnosis.hpp>
 #include <nesam/error.hpp>
 #include <nesam/fleet_soil.hpp>
 #include <nesam/session.hpp>
@@ -82,6 +83,10 @@ class Client {
 
   /// What the fleet has learned of the ground of a map; empty = of all maps. FAILED_PRECONDITION: the service keeps no such map (`fleet_soil.enabled`).
   Result<FleetSoilMap> fleet_soil(const std::string& map_id = {}, Timeout timeout = {}) const;
+
+  /// Starts a diagnosis of what the server has recorded of a session: which physical effect does the model lack? It takes minutes. Needs the rights of an
+  /// operator. Everything that is refused comes out of its first `receive`.
+  Diagnosis diagnose(const DiagnosisRequest& request) const;
 
   /// Uploads a map in tiles.
   ///

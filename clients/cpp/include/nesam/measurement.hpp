@@ -82,7 +82,9 @@ struct MeasurementAnswer {
   std::string session_id;
   std::uint64_t sequence = 0;       ///< Copied from the measurement.
   std::int64_t stamp_ns = 0;        ///< Copied from the measurement.
-  std::uint64_t history_epoch = 0;  ///< After this measurement.
+  /// After this measurement. It, `soil_epoch`, `map_version` and `bundle_hash` are 0 and empty for one that was `Rejected` without a look at the session: it is
+  /// not open or not the sender's, or the service is overloaded.
+  std::uint64_t history_epoch = 0;
   std::uint64_t soil_epoch = 0;     ///< After this measurement.
   /// What the session knows of the soil after this measurement; absent when it was rejected.
   std::optional<SoilCorrection> soil_correction;
@@ -94,6 +96,8 @@ struct MeasurementAnswer {
   std::uint64_t durable_place = 0;
   /// Which server in which run counts the places. When it changes, everything that is not known to be durable has to be sent again.
   std::uint64_t run = 0;
+  std::uint64_t map_version = 0;    ///< Version of the map of the session; 0 = no map.
+  std::string bundle_hash;          ///< SHA-256 (hex) of the manifest of the model bundle.
   std::variant<Applied, Buffered, Duplicate, TooOld, NotFinite, Gated, Gap, Future, ClockJump, Restarted, Rejected, Unrecognised> outcome = Unrecognised{};
 
   /// The outcome if it is of this type, else null.

@@ -8,6 +8,7 @@
 #include <utility>
 #include <vector>
 
+#include <nesam/fallback.hpp>
 #include <nesam/prediction.hpp>
 #include <nesam/session.hpp>
 #include <nesam/span.hpp>
@@ -32,6 +33,9 @@ struct MotionModelOptions {
   bool lateral = true;
   /// Predictions that may fail in a row. Until then velocities follow the commands, as in nav2's own models; one more, and `predict` throws.
   unsigned failures_max = 5;
+  /// Predicts instead of the service when that is late, overloaded or away, from the newest state that the client knows; absent = nothing does. Such a cycle is no
+  /// failure, however many there are: `VelocityRollout::failure` and `Prediction::computed_by` tell them.
+  std::optional<KinematicFallback> fallback;
 };
 
 /// Velocities of a batch of command sequences, by the prediction service: what a planner that integrates velocities itself needs.
@@ -54,7 +58,7 @@ class VelocityRollout {
   const MotionModelOptions& options() const noexcept { return options_; }
   /// The last prediction, for critics that read validity or provenance; absent before the first.
   const std::optional<Prediction>& prediction() const noexcept { return prediction_; }
-  /// Why the last call fell back to the commands; absent when it did not.
+  /// Why the last call fell back to the commands or, where `prediction()->computed_by` says so, to `MotionModelOptions::fallback`; absent when it did not.
   const std::optional<Error>& failure() const noexcept { return failure_; }
 
  private:
@@ -78,7 +82,7 @@ template <class Base, class State>
 class RemoteMotionModel : public Base {
  public:
   /// Throws as `VelocityRollout`.
-  explicit RemoteMotionModel(std::shared_ptr<const Session> session, MotionModelOptions options = {}) : rollout_(std::move(session), options) {}
+  explicit RemoteMotionModel(std::shared_ptr<const Session> session, MotionModelOptions options = {}) : rollout_(std::move(session), std::move(options)) {}
 
   /// Throws as `VelocityRollout::predict`.
   void predict(State& state) override {

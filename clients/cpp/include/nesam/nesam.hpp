@@ -6,10 +6,12 @@
 #include <nesam/alarm_watch.hpp>
 #include <nesam/array.hpp>
 #include <nesam/client.hpp>
+#include <nesam/diagnosis.hpp>
 #include <nesam/durable_stream.hpp>
 #include <nesam/effect.hpp>
 #include <nesam/error.hpp>
 #include <nesam/extras.hpp>
+#include <nesam/fallback.hpp>
 #include <nesam/fleet_soil.hpp>
 #include <nesam/measurement.hpp>
 #include <nesam/measurement_stream.hpp>

@@ -4,7 +4,9 @@
 #include <optional>
 #include <vector>
 
+#include <nesam/error.hpp>
 #include <nesam/extras.hpp>
+#include <nesam/fallback.hpp>
 #include <nesam/span.hpp>
 #include <nesam/types.hpp>
 
@@ -29,6 +31,7 @@ enum Validity : std::uint32_t {
   validity_slope_untrained = 32,    ///< Roll or pitch lies outside the trained range.
   validity_overturned = 64,         ///< |roll| or |pitch| over 60 degrees.
   validity_soil_not_learned = 128,  ///< The drive has not updated the soil yet: the prior alone speaks.
+  validity_alarm_active = 256,      ///< An alarm of the session is active (`SessionStatus::alarm`): its measurements disagree with its predictions.
 };
 
 /// Whether the measured history of the session may speak for the start state.
@@ -111,9 +114,19 @@ struct PredictRequest {
   std::optional<PathCost> cost;
   /// What to compute beyond the states.
   Extras extras;
+  /// Answers `Session::predict` when the service is late, overloaded or away, from `start` or the newest state that this client knows; absent = nothing does. It
+  /// does not roll forward and has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone. Streams leave it unread.
+  std::optional<KinematicFallback> fallback;
 };
 
-/// The predicted states and what they were computed from.
+/// Who computed a prediction.
+enum class ComputedBy {
+  service = 0,
+  kinematic_fallback = 1,  ///< `PredictRequest::fallback`, because the service did not answer in time.
+};
+
+/// The predicted states and what they were computed from. With `ComputedBy::kinematic_fallback`, `soil` is not a number, `validity` is 0 and everything else that only
+/// the service knows is empty: provenance, sinkage, soil correction, extras, costs.
 class Prediction {
  public:
   /// Shape (rows, floor(K / stride), C) with C = number of channels asked for, in the order of `Channel`; yaw in (-pi, pi]. Step k (from 0) is the state
@@ -181,6 +194,10 @@ class Prediction {
   double compute_s = 0.0;
   /// What was computed beyond the states.
   ExtraOutputs extras;
+  /// Who computed it.
+  ComputedBy computed_by = ComputedBy::service;
+  /// The service's error that a fallback has answered instead of; absent when the service has answered.
+  std::optional<Error> fallback_reason;
 };
 
 }  // namespace nesam

@@ -61,7 +61,8 @@ class Session {
   /// service encodes the terrain there.
   ///
   /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: the session was closed. FAILED_PRECONDITION: no start state and no measurement yet, or the
-  /// measured position lies outside the map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not in time.
+  /// measured position lies outside the map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not in time. Instead of the last two and UNAVAILABLE
+  /// `PredictRequest::fallback` answers, where there is one and a start is given or known, and `Prediction::computed_by` says so.
   Result<Prediction> predict(const PredictRequest& request, Timeout timeout = {}) const;
 
   /// Opens a stream of predictions from this session, for planners with a fixed rate. UNAVAILABLE comes out of its first `receive`.

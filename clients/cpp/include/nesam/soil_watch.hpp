@@ -24,6 +24,9 @@ struct SoilEstimate {
   /// Stamp of the last measurement that went into the estimate, ns of the vehicle's clock; absent before the first update.
   std::optional<std::int64_t> stamp_ns;
   SoilCorrection correction;
+  std::uint64_t history_epoch = 0;  ///< Counts the changes of the session's history; 0 = no measurement yet.
+  std::uint64_t map_version = 0;    ///< Version of the map of the session; 0 = no map.
+  std::string bundle_hash;          ///< SHA-256 (hex) of the manifest of the model bundle.
 };
 
 /// Tells what one session learns of the soil: the present estimate first, then each change until the session closes.

@@ -2,6 +2,7 @@
 
 #include <array>
 #include <cstdint>
+#include <optional>
 #include <string>
 
 #include <nesam/span.hpp>
@@ -30,6 +31,10 @@ struct Map {
   Span<const float> elevation_m;
   /// Shape (height, width, 3), row-major: red, green, blue of the semantic map. Empty = no colours: the soil prior is the stated default.
   Span<const std::uint8_t> semantic_rgb;
+  /// Instant that the map was made at, ns of the vehicle's clock; absent = not told. Carried for those who read the map, nothing is computed from it.
+  std::optional<std::int64_t> stamp_ns{};
+  /// Frame that the source of the map names, at most 64 bytes; empty = World. Carried in the same way.
+  std::string frame{};
 };
 
 /// A rectangle of pixels to put into a map. The layers are only read during the call.
@@ -55,6 +60,9 @@ struct MapDescription {
   MapGeometry geometry;
   /// Whether the map has colours.
   bool semantic = false;
+  /// As `Map::stamp_ns` and `Map::frame`.
+  std::optional<std::int64_t> stamp_ns{};
+  std::string frame{};
 };
 
 }  // namespace nesam

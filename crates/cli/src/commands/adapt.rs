@@ -21,10 +21,10 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use self::alternatives::{Scene, read_true_soils};
-use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::args::{BundleArgs, CommandsArgs, DataArgs, SplitArg, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
-use crate::output::say;
+use crate::output::{note, say};
 use crate::progress::Progress;
 use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
@@ -38,6 +38,8 @@ pub struct AdaptArgs {
     bundle: BundleArgs,
     #[command(flatten)]
     window: WindowArgs,
+    #[command(flatten)]
+    inputs: CommandsArgs,
     /// Settings of the soil filter, JSON as in the `filter` block of a report; what is absent stays as by default
     #[arg(long, value_name = "FILE.json")]
     filter: Option<PathBuf>,
@@ -134,6 +136,7 @@ enum DisguiseArg {
 pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
     args.window.check_horizon()?;
+    args.inputs.check("what the soil is learned for is predictions under commands")?;
     if args.calibrate {
         return calibrate(args);
     }
@@ -144,7 +147,9 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         disguise(&mut drives, look, args.seed)?;
     }
     let true_soils = if args.also.iter().any(|also| also.needs_true_soil()) { read_true_soils(&drives)? } else { Vec::new() };
-    let out = output::out_dir(args.out.as_deref(), "adapt", &drives.set)?;
+    let names = [(&args.json, "adapt.json"), (&args.html, "adapt.html")];
+    let [json, html] = output::result_files(args.out.as_deref(), "adapt", &drives.set, names)?;
+    args.predictions.iter().try_for_each(|file| output::check_file(file))?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
@@ -195,15 +200,13 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         provenance: &provenance,
     };
     print_table(&adaptation);
-    let (json, html) =
-        (args.json.clone().unwrap_or_else(|| out.join("adapt.json")), args.html.clone().unwrap_or_else(|| out.join("adapt.html")));
     output::write_file(&json, adaptation.to_json().as_bytes())?;
     output::write_file(&html, adaptation_page(&adaptation).as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
     if let Some(file) = &args.predictions {
         let own = [("fixed", &paths[0]), ("adapted", &paths[1])].into_iter();
         let named: Vec<_> = own.chain(alternatives.iter().map(|(key, paths)| (*key, paths))).collect();
-        write_predictions(file, &named, &windows).or_failed()?;
+        output::write_with(file, |draft| write_predictions(draft, &named, &windows).or_failed())?;
         say!("wrote {}", file.display());
     }
     Ok(())
@@ -236,10 +239,7 @@ pub(super) fn filter_in_force(given: &FilterSettings, literal: bool, bundle: &Mo
     }
     match &bundle.soil_filter_json {
         None => {
-            eprintln!(
-                "note: bundle {} carries no noise of the soil filter; defaults stand in (see `nesam adapt --calibrate`)",
-                bundle.name
-            );
+            note!("note: bundle {} carries no noise of the soil filter; defaults stand in (see `nesam adapt --calibrate`)", bundle.name);
             Ok(given.over_defaults(false))
         }
         Some(json) => Ok(given.over(CalibratedFilter::from_json(json).or_input()?.config())),
@@ -310,7 +310,7 @@ pub(super) fn settings_file(file: Option<&Path>) -> Result<FilterSettings, Failu
 fn warn_about_velocities(drives: &Drives) {
     let estimated = drives.drives.iter().filter(|d| !d.measured.linear_velocity || d.measured.angular_velocity.contains(&false)).count();
     if estimated > 0 {
-        eprintln!(
+        note!(
             "note: {estimated} drives do not measure all velocities; estimates from positions and attitudes stand in, and the filter trusts them as if measured"
         );
     }

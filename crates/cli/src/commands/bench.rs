@@ -27,6 +27,7 @@ use serde_json::json;
 
 use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{provenance, say, write_file};
 use crate::progress::Progress;
 use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
@@ -122,6 +123,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
     check_count("--samples", args.samples, 1..=usize::MAX)?;
     check_count("--queries", args.queries, 1..=usize::MAX)?;
     check_count("--horizon", args.horizon, 1..=MAX_HORIZON)?;
+    exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
     let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?;
     let drive = Planner::new(&drives, args)?;

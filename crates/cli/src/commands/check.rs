@@ -137,6 +137,7 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     for set in root.sets() {
         check_set(&root, &set, findings);
     }
+    root.notes().into_iter().for_each(|note| findings.note(note));
 }
 
 fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {

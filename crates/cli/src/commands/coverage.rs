@@ -21,6 +21,7 @@ use crate::{interrupt, output};
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
+    let [file] = output::result_files(args.out.as_deref(), "coverage", &drives.set, [(&args.json, "coverage.json")])?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let noise = noise_of(predictor.bundle())?;
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
@@ -47,8 +48,6 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         "learned": learned,
         "provenance": provenance,
     });
-    let out = output::out_dir(args.out.as_deref(), "coverage", &drives.set)?;
-    let file = args.json.clone().unwrap_or_else(|| out.join("coverage.json"));
     let text = serde_json::to_string_pretty(&document).or_failed()?;
     output::write_file(&file, text.as_bytes())?;
     say!("\nwrote {}", file.display());

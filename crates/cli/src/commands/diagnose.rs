@@ -1,5 +1,6 @@
 //! `nesam diagnose`: from a measured residual to the physical effect that the model lacks.
 
+mod fitted;
 mod hypotheses;
 mod recording;
 
@@ -19,7 +20,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::{Split, Trajectory};
 
 use self::recording::RecordingArgs;
-use crate::args::{BundleArgs, DataArgs, WindowArgs};
+use crate::args::{BundleArgs, CommandsArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::bundle_version::save_with_effects;
 use crate::failure::{Failure, OrFail};
@@ -41,6 +42,8 @@ pub struct DiagnoseArgs {
     #[command(flatten)]
     window: WindowArgs,
     #[command(flatten)]
+    inputs: CommandsArgs,
+    #[command(flatten)]
     recording: RecordingArgs,
     /// Fit on these drives only and score on the others, of which one alone proves nothing; `train` stands for those of the train split [default: leave each
     /// drive out once]
@@ -53,9 +56,9 @@ pub struct DiagnoseArgs {
     /// have been measured for them, with --make-reference, and then knows them without this
     #[arg(long, value_name = "FILE")]
     hypotheses: Option<PathBuf>,
-    /// What the change is measured against
-    #[arg(long, value_enum, default_value_t = ReferenceArg::Bundle)]
-    reference: ReferenceArg,
+    /// What the change is measured against [default: bundle; physics where the bundle carries no reference, which is said]
+    #[arg(long, value_enum)]
+    reference: Option<ReferenceArg>,
     /// Measure the reference on the drives of the train split that training left for validation, and put it into the bundle
     #[arg(long, conflicts_with_all = ["fit_on", "without", "recording"])]
     make_reference: bool,
@@ -93,6 +96,21 @@ impl From<ReferenceArg> for Against {
     }
 }
 
+/// What is asked for, else what the bundle can do: a bundle without a reference knows of no drives without an effect, and then the model itself is on trial.
+fn reference(asked: Option<ReferenceArg>, bundle: &ModelBundle) -> ReferenceArg {
+    match asked {
+        Some(reference) => reference,
+        None if bundle.reference_json.is_some() => ReferenceArg::Bundle,
+        None => {
+            crate::output::note!(
+                "note: bundle {} carries no reference, so the model itself is tested, as with --reference physics; --make-reference measures one",
+                bundle.name
+            );
+            ReferenceArg::Physics
+        }
+    }
+}
+
 /// What is diagnosed.
 struct Input {
     set: String,
@@ -116,6 +134,7 @@ fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
 pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
     args.window.check_horizon()?;
+    args.inputs.check("what is diagnosed are predictions under commands")?;
     if args.make_reference { make_reference(args) } else { diagnose_set(args) }
 }
 
@@ -184,12 +203,14 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
     let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.data.dt)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
+    args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
     let predictor = Arc::clone(&drives.predictor);
+    let reference = reference(args.reference, predictor.bundle());
     let options = Options {
         fit_on: args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?,
         without: args.without.clone(),
         hypotheses,
-        against: args.reference.into(),
+        against: reference.into(),
         scoring: Scoring {
             horizon: args.window.horizon_on(&drives.drives),
             history: args.window.history,
@@ -202,15 +223,16 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let found =
         diagnose(&predictor, &drives.drives, &drives.maps, &options, &|stage, done, total| console.show(stage, done, total)).or_input()?;
     console.end();
+    let data_hash = if args.fit_on.is_some() { fitted::hash(&drives.drives, &found.fit_on) } else { drives.data_hash.clone() };
     let bundle = match found.claimed.as_slice() {
         [] => None,
-        claimed => Some(save_with_effects(predictor.bundle(), claimed, &drives.data_hash, &out.join("bundle"))?),
+        claimed => Some(save_with_effects(predictor.bundle(), claimed, &data_hash, &out.join("bundle"))?),
     };
     let with_free_form: Vec<ScheduledEffect> = found.claimed.iter().copied().chain(found.free_form.map(Into::into)).collect();
     // What silences the network finds is no addition to a network that speaks.
-    let free_form_bundle = match found.free_form.filter(|_| args.reference == ReferenceArg::Bundle) {
+    let free_form_bundle = match found.free_form.filter(|_| reference == ReferenceArg::Bundle) {
         None => None,
-        Some(_) => Some(save_with_effects(predictor.bundle(), &with_free_form, &drives.data_hash, &out.join("bundle-free-form"))?),
+        Some(_) => Some(save_with_effects(predictor.bundle(), &with_free_form, &data_hash, &out.join("bundle-free-form"))?),
     };
     let [shown, free_form_bundle] = [bundle, free_form_bundle].map(|b| b.map(|p| p.display().to_string()));
     let report = Report {
@@ -220,7 +242,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         free_form_bundle: free_form_bundle.as_deref(),
         provenance: &drives.provenance,
         dt_s: args.data.dt,
-        against: args.reference.into(),
+        against: reference.into(),
     };
     summary(&report, &found);
     let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
@@ -265,7 +287,9 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
             say!("  {} = {} {interval}{}", e.name, Short(e.value), e.unit);
         }
     }
-    say!("left after that: z = {:.1} in {}", s.remaining.0, s.remaining.1);
+    let (z, what) = &s.remaining;
+    let place = if what.is_empty() { String::new() } else { format!(" in {what}") };
+    say!("{}: z = {z:.1}{place}", if s.chosen.is_empty() { "the most that stands out" } else { "left after that" });
     let stages = report.stages();
     if stages.is_empty() {
         return;
@@ -335,6 +359,27 @@ impl Console {
     fn end(&self) {
         if let Some((_, ended)) = self.stage.lock().ok().and_then(|mut now| now.take()) {
             ended.finish();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::*;
+
+    #[test]
+    fn regress_a_bundle_without_a_reference_is_held_against_itself_unless_asked() {
+        let shipped = |name: &str| {
+            let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles").join(name);
+            ModelBundle::load(&dir).expect("a shipped bundle")
+        };
+        let (with, without) = (shipped("hmmwv-nominal"), shipped("clearpath-husky"));
+        assert!(with.reference_json.is_some() && without.reference_json.is_none());
+        assert_eq!((reference(None, &with), reference(None, &without)), (ReferenceArg::Bundle, ReferenceArg::Physics));
+        for asked in [ReferenceArg::Bundle, ReferenceArg::Physics] {
+            assert_eq!([&with, &without].map(|bundle| reference(Some(asked), bundle)), [asked; 2], "what is asked for counts");
         }
     }
 }

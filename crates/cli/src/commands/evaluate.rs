@@ -1,6 +1,6 @@
 //! `nesam evaluate`: errors of the models on recorded drives.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use clap::{Args, ValueEnum};
@@ -12,10 +12,10 @@ use nesam_model::Predictor;
 use nesam_trajectories::Trajectory;
 
 use super::coverage;
-use crate::args::{BundleArgs, DataArgs, SplitArg, WindowArgs};
+use crate::args::{BundleArgs, DataArgs, InputsArg, SplitArg, WindowArgs};
 use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
-use crate::output::say;
+use crate::output::{note, say};
 use crate::progress::Progress;
 use crate::sources::{
     Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, rounded, training_drives, worlds_of,
@@ -90,24 +90,6 @@ pub struct EvaluateArgs {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum InputsArg {
-    /// The recorded commands: what a planner knows.
-    Commands,
-    /// The measured wheel speeds and steering angles of the future: for studying the model, not for planning; the baselines that read no wheels keep
-    /// the commands.
-    Wheels,
-}
-
-impl From<InputsArg> for Inputs {
-    fn from(inputs: InputsArg) -> Self {
-        match inputs {
-            InputsArg::Commands => Self::Commands,
-            InputsArg::Wheels => Self::Wheels,
-        }
-    }
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 enum TruthArg {
     /// The measured channels.
     Measured,
@@ -127,6 +109,9 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     if args.coverage || args.calibrate_coverage {
         check_model_step(args.data.dt)?;
         args.window.check_horizon()?;
+        if args.inputs == InputsArg::Wheels {
+            return Err(Failure::input("--inputs wheels: the covariance of a prediction is that of one under commands"));
+        }
         return if args.coverage { coverage::run(args) } else { coverage::calibrate(args) };
     }
     let names = model_names(args)?;
@@ -140,13 +125,16 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     if noise_free {
         start_noise_free(&mut drives)?;
     }
-    let out = output::out_dir(args.out.as_deref(), "evaluate", &drives.set)?;
+    let names_of_files = [(&args.json, "evaluate.json"), (&args.html, "evaluate.html")];
+    let files = output::result_files(args.out.as_deref(), "evaluate", &drives.set, names_of_files)?;
+    args.markdown.iter().chain(&args.predictions).try_for_each(|file| output::check_file(file))?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     warn_about_training_drives(args, &drives);
 
     let training = training_drives(&drives, &args.data);
     let models = Models::prepare(args, &names, &drives, training.as_deref(), horizon)?;
+    models.check_inputs(&windows)?;
     let progress = Progress::start("windows predicted", windows.len());
     let paths = predict_all(&models.ready, &windows, &drives.maps, &|done| progress.set(done)).or_failed()?;
     progress.finish();
@@ -173,7 +161,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         provenance: &provenance,
     };
     print_table(&evaluation);
-    write_results(args, &out, &evaluation, &paths, &windows)
+    write_results(args, &files, &evaluation, &paths, &windows)
 }
 
 /// Puts the noise-free states in the place of the measured ones.
@@ -189,15 +177,13 @@ fn start_noise_free(drives: &mut Drives) -> Result<(), Failure> {
 
 fn write_results(
     args: &EvaluateArgs,
-    out: &Path,
+    [json, html]: &[PathBuf; 2],
     evaluation: &Evaluation<'_>,
     paths: &[ModelPaths],
     windows: &[Window<'_>],
 ) -> Result<(), Failure> {
-    let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
-    let (json, html) = (at(&args.json, "evaluate.json"), at(&args.html, "evaluate.html"));
-    output::write_file(&json, evaluation.to_json().as_bytes())?;
-    output::write_file(&html, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
+    output::write_file(json, evaluation.to_json().as_bytes())?;
+    output::write_file(html, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
     if let Some(file) = &args.markdown {
         output::write_file(file, report::evaluation_markdown(evaluation).as_bytes())?;
@@ -205,7 +191,7 @@ fn write_results(
     }
     if let Some(file) = &args.predictions {
         let named: Vec<_> = paths.iter().map(|model| (model.name.as_str(), model)).collect();
-        write_predictions(file, &named, windows).or_failed()?;
+        output::write_with(file, |draft| write_predictions(draft, &named, windows).or_failed())?;
         say!("wrote {}", file.display());
     }
     Ok(())
@@ -226,7 +212,7 @@ fn model_names(args: &EvaluateArgs) -> Result<Vec<ModelName>, Failure> {
 fn warn_about_training_drives(args: &EvaluateArgs, drives: &Drives) {
     let trained_on = drives.drives.iter().filter(|d| d.split == Some(nesam_trajectories::Split::Train)).count();
     if trained_on > 0 && args.data.split == SplitArg::All {
-        eprintln!("note: {trained_on} of {} drives belong to the train split; --split test scores unseen drives only", drives.drives.len());
+        note!("note: {trained_on} of {} drives belong to the train split; --split test scores unseen drives only", drives.drives.len());
     }
 }
 
@@ -274,18 +260,18 @@ impl Models {
                 continue;
             }
             if name.is_ablation() {
-                eprintln!("note: {name} is the switch at inference: no bundle of that form for this vehicle in the folder of baselines");
+                note!("note: {name} is the switch at inference: no bundle of that form for this vehicle in the folder of baselines");
             }
             if name.is_trained_baseline() {
                 if args.models.is_some() {
                     let hint = "train one with `nesam train --model`, and give its folder with --baselines";
                     return Err(Failure::input(format!("no bundle of the form {name} for this vehicle; {hint}")));
                 }
-                eprintln!("note: {name} is left out: no bundle of that form for this vehicle in the folder of baselines");
+                note!("note: {name} is left out: no bundle of that form for this vehicle in the folder of baselines");
                 continue;
             }
             if name == ModelName::Kinematic && kinematic.is_none() && args.models.is_none() {
-                eprintln!(
+                note!(
                     "note: kinematic is left out: the bundle carries no fit for this vehicle and no set of the data root has a train split"
                 );
                 continue;
@@ -293,6 +279,12 @@ impl Models {
             ready.push((name, WindowPredictor::new(name, predictor.as_ref(), &vehicle, kinematic, args.inputs.into()).or_input()?));
         }
         Ok(Self { predictor, ready })
+    }
+
+    /// Refuses windows of drives that do not measure what a model reads.
+    fn check_inputs(&self, windows: &[Window<'_>]) -> Result<(), Failure> {
+        let read = self.ready.iter().flat_map(|(_, model)| windows.iter().map(move |window| model.check_inputs(window)));
+        read.collect::<Result<(), _>>().or_input()
     }
 }
 
@@ -334,7 +326,7 @@ fn kinematic(
         }
     }
     let Some(training) = training else { return Ok(None) };
-    eprintln!("fitting the kinematic baseline on {} training drives", training.len());
+    note!("fitting the kinematic baseline on {} training drives", training.len());
     Ok(Some(Baselines::fit(drives.root.vehicle(), training, horizon).or_failed()?.kinematic))
 }
 

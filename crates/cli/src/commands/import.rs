@@ -1,20 +1,22 @@
 //! `nesam import`: a log of another tool becomes a set of a data root.
 
+mod page;
+
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
-use nesam_import::{Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, write_set};
-use nesam_trajectories::{DataRoot, SetQuery, read_vehicle_card};
+use nesam_import::{CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, write_set};
+use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
-use crate::output::say;
+use crate::output::{say, write_file};
 
 /// Options of `nesam import`.
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct ImportArgs {
-    /// CSV tables and ROS 2 bags (MCAP); each is a drive or, with a column `trajectory`, several
+    /// CSV tables and ROS 2 bags (MCAP files, or the folders of `ros2 bag record` with their parts); each is a drive or, with a column `trajectory`, several
     #[arg(value_name = "LOG", required = true)]
     logs: Vec<PathBuf>,
     /// Data root to write into; made where there is none
@@ -35,7 +37,7 @@ pub struct ImportArgs {
     /// Axes of the log
     #[arg(long, value_enum, default_value_t = FrameArg::EnuFlu)]
     frame: FrameArg,
-    /// Take heights, roll and pitch that the log does not have for zero
+    /// Do without heights, roll and pitch that the log does not have: they are not written, taken for zero, on level ground, and not scored
     #[arg(long)]
     flat: bool,
     /// World map of the drives, a folder in ROOT/worlds [default: none, flat ground and the default soil]
@@ -53,6 +55,9 @@ pub struct ImportArgs {
     /// Topic of a gyro in a bag [default: the twist of the odometry]
     #[arg(long, value_name = "TOPIC")]
     imu: Option<String>,
+    /// Write the plots of the drives here instead [default: import.html in the set's folder]
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
 }
 
 const EXAMPLES: &str =
@@ -63,7 +68,7 @@ steer_fl steer_fr; trajectory where one file has several drives.
 Examples:
   nesam import run.csv --to mine --set first --vehicle card.json
   nesam import run.csv --to mine --set first --vehicle card.json --column t=stamp:ns --column yaw=heading:deg
-  nesam import bag/run_0.mcap --to mine --set bags --vehicle card.json --command /cmd_vel
+  nesam import bag --to mine --set bags --vehicle card.json --command /cmd_vel
   nesam check mine && nesam diagnose --data mine --set first";
 
 /// Axes of a log.
@@ -104,7 +109,7 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
 fn write(args: &ImportArgs, folder: &Path, drives: &[Drive], card: Option<&Path>) -> Result<(), Failure> {
     let notes = write_set(folder, drives, args.world.as_deref(), args.split.as_deref()).or_input()?;
     notes.iter().for_each(|note| say!("  note: {note}"));
-    judge(args, card)?;
+    judge(args, card, &args.html.clone().unwrap_or_else(|| folder.join("import.html")))?;
     card.map_or(Ok(()), |card| put_card(args, card))
 }
 
@@ -128,17 +133,21 @@ fn target(args: &ImportArgs) -> Result<PathBuf, Failure> {
     Ok(folder)
 }
 
+fn extension(log: &Path) -> String {
+    log.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default()
+}
+
 fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, Failure> {
-    let name = log.file_stem().map_or_else(|| "log".into(), |name| name.to_string_lossy().into_owned());
-    let kind = log.extension().map(|e| e.to_string_lossy().to_ascii_lowercase()).unwrap_or_default();
+    // A folder is a bag whatever its name ends in.
+    let (name, kind) = if log.is_dir() { (log.file_name(), "mcap".into()) } else { (log.file_stem(), extension(log)) };
+    let name = name.map_or_else(|| "log".into(), |name| name.to_string_lossy().into_owned());
     let (table, mut notes) = match kind.as_str() {
         "mcap" => {
             let topics = Topics { odometry: args.odometry.clone(), command: args.command.clone(), imu: args.imu.clone() };
             read_bag(log, &topics).or_input()?
         }
-        "db3" | "bag" => {
-            let reason = "only bags in MCAP files are read; convert it with `ros2 bag convert` to storage id mcap, without compression";
-            return Err(Failure::input(format!("{}: {reason}", log.display())));
+        "db3" | "bag" | "zstd" => {
+            return Err(Failure::input(format!("{}: {CONVERT}", log.display())));
         }
         _ => (read_csv(log).or_input()?, Vec::new()),
     };
@@ -187,10 +196,13 @@ fn put_card(args: &ImportArgs, card: &Path) -> Result<(), Failure> {
     std::fs::copy(card, args.to.join(name)).map(|_| ()).map_err(|e| Failure::Failed(format!("cannot copy the card: {e}")))
 }
 
-/// Reads the set as every other command will, and says what does not fit together.
-fn judge(args: &ImportArgs, card: Option<&Path>) -> Result<(), Failure> {
+/// Reads the set as every other command will, says what does not fit together, and draws what was driven.
+fn judge(args: &ImportArgs, card: Option<&Path>, html: &Path) -> Result<(), Failure> {
     let root = DataRoot::open(&args.to, card).or_input()?;
-    let drives = root.load_set(&SetQuery::all(&args.set)).or_input()?;
+    let drives: Vec<Trajectory> = root.load_set(&SetQuery::all(&args.set)).or_input()?;
+    for note in root.notes().iter().filter(|_| args.world.is_some()) {
+        say!("  note: {note}");
+    }
     for doubt in doubts(&drives, root.vehicle()) {
         say!("  doubt: {}; {}", doubt.what, doubt.advice);
     }
@@ -198,5 +210,7 @@ fn judge(args: &ImportArgs, card: Option<&Path>) -> Result<(), Failure> {
     if refused > 0 {
         say!("  doubt: {refused} drives command beyond the range of the card; see the units of the commands");
     }
+    write_file(html, page::page(&args.set, &drives, root.vehicle()).as_bytes())?;
+    say!("wrote {}", html.display());
     Ok(())
 }

@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use nesam_model::ModelBundle;
+use nesam_physics::effects::ScheduledEffect;
 use nesam_physics::{DT_S, SOIL_NAMES, SecondCommand, Vehicle};
 use nesam_trajectories::{DataRoot, SetQuery, Split, SplitFilter};
 use serde_json::{Map, Value, json};
@@ -58,11 +59,19 @@ fn bundle(path: &Path) -> Result<Value, Failure> {
         "vehicle": vehicle(&bundle.vehicle),
         "default_soil": soil,
         "fitted_baselines": bundle.baselines_json.is_some(),
+        "effects": bundle.effects.iter().map(effect).collect::<Vec<_>>(),
         "made_by": {
             "command": p.command, "seed": p.seed, "data_hash": p.data_hash, "steps": p.steps, "training_s": p.training_s,
             "program": p.program, "derived_from": p.parent,
         },
     }))
+}
+
+/// An effect that a bundle has beside its card; an onset of 0 = it acts always.
+fn effect(scheduled: &ScheduledEffect) -> Value {
+    let parameters = scheduled.effect.parameters();
+    let parameters: Vec<Value> = parameters.iter().map(|p| json!({"name": p.name, "unit": p.unit, "value": p.value})).collect();
+    json!({"id": scheduled.effect.id(), "layer": scheduled.effect.layer().as_str(), "onset_s": scheduled.onset_s, "parameters": parameters})
 }
 
 fn data_root(path: &Path, card: Option<&Path>) -> Result<Value, Failure> {
@@ -138,11 +147,25 @@ fn print_tree(value: &Value, depth: usize) {
 fn print_row(value: &Value, depth: usize) {
     let Value::Object(fields) = value else { return };
     // The row's own name comes first; the rest keeps the order of the object.
-    let rest = fields.iter().filter(|(name, _)| *name != "set");
-    let cells: Vec<String> = fields.get("set").map(plain).into_iter().chain(rest.map(|(name, v)| format!("{name} {}", plain(v)))).collect();
+    let own = |name: &str| ["set", "id"].contains(&name);
+    let rest = fields.iter().filter(|(name, _)| !own(name));
+    let named = fields.iter().find(|(name, _)| own(name));
+    let cells: Vec<String> = named.map(|(_, v)| plain(v)).into_iter().chain(rest.map(|(name, v)| format!("{name} {}", plain(v)))).collect();
     say!("{}{}", "  ".repeat(depth), cells.join(" · "));
 }
 
 fn plain(value: &Value) -> String {
-    value.as_str().map_or_else(|| value.to_string(), str::to_string)
+    match value {
+        Value::String(text) => text.clone(),
+        Value::Array(items) if items.iter().any(|item| item["name"].is_string()) => {
+            items.iter().map(parameter).collect::<Vec<_>>().join(", ")
+        }
+        other => other.to_string(),
+    }
+}
+
+/// Name, value and unit of a parameter.
+fn parameter(p: &Value) -> String {
+    let unit = p["unit"].as_str().filter(|unit| *unit != "-").map_or(String::new(), |unit| format!(" {unit}"));
+    format!("{} {}{unit}", plain(&p["name"]), p["value"])
 }

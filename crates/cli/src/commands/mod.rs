@@ -2,6 +2,7 @@
 
 pub mod adapt;
 pub mod bench;
+pub mod calibrate;
 pub mod check;
 mod coverage;
 pub mod demo;

@@ -11,10 +11,10 @@ use nesam_physics::{Control, SOIL_NAMES, SoilCorrection};
 use nesam_terrain::WorldMap;
 use serde_json::{Map, Value, json};
 
-use crate::args::{BundleArgs, DataArgs, WindowArgs};
+use crate::args::{BundleArgs, CommandsArgs, DataArgs, WindowArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output;
-use crate::output::say;
+use crate::output::{note, say};
 use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives, rounded};
 
 /// Options of `nesam predict`.
@@ -26,6 +26,8 @@ pub struct PredictArgs {
     bundle: BundleArgs,
     #[command(flatten)]
     window: WindowArgs,
+    #[command(flatten)]
+    inputs: CommandsArgs,
     /// Drive to start from [default: the first of the set]
     #[arg(long, value_name = "ID")]
     trajectory: Option<String>,
@@ -71,6 +73,7 @@ enum Format {
 /// Runs the command.
 pub fn run(args: &PredictArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
+    args.inputs.check("a prediction is made as the service makes it, under commands alone")?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
         data.trajectories = Some(vec![id.clone()]);
@@ -100,7 +103,7 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
         Format::Html => as_html(&drives, &predictor, &window, &rollout),
     };
     match &args.out {
-        Some(file) => output::write_file(file, text.as_bytes()).inspect(|()| eprintln!("wrote {}", file.display())),
+        Some(file) => output::write_file(file, text.as_bytes()).inspect(|()| note!("wrote {}", file.display())),
         None => {
             say!("{}", text.trim_end());
             Ok(())
@@ -160,7 +163,7 @@ fn read_controls(file: &Path, horizon: Option<usize>) -> Result<Vec<Control<f64>
         return Err(Failure::input(format!("{}: no commands below the header", file.display())));
     }
     if let Some(horizon) = horizon.filter(|horizon| *horizon < controls.len()) {
-        eprintln!("note: the first {horizon} of {} commands in {} are used, as --horizon says", controls.len(), file.display());
+        note!("note: the first {horizon} of {} commands in {} are used, as --horizon says", controls.len(), file.display());
         controls.truncate(horizon);
     }
     Ok(controls)

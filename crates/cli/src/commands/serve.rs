@@ -11,6 +11,7 @@ use nesam_server::{Config, RunningServer, ZenohConfig, access, serve, start_work
 use tracing_subscriber::EnvFilter;
 
 use crate::args::BundleArgs;
+use crate::bundle_path::bundle_dir;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
@@ -75,9 +76,13 @@ pub struct ServeArgs {
 /// Runs the command.
 pub fn run(args: &ServeArgs) -> Result<(), Failure> {
     restart_with(&OF_A_SERVER)?;
-    let config = configuration(args)?;
+    let mut config = configuration(args)?;
     log_to_stderr("info");
-    let bundle = load_bundle(args.bundle.bundle.as_deref())?;
+    let served = bundle_dir(args.bundle.bundle.as_deref())?;
+    let bundle = load_bundle(Some(&served))?;
+    if config.diagnosis.bundle.as_os_str().is_empty() {
+        config.diagnosis.bundle = std::path::absolute(&served).or_failed()?;
+    }
     if args.check {
         return checked(&config, bundle);
     }
@@ -188,11 +193,13 @@ fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     }
 }
 
-/// Structured logs on standard error; `RUST_LOG` changes what is shown.
+/// Structured logs on standard error; `RUST_LOG` changes what is shown. A line that standard error does not take is lost: the subscriber would print of its own
+/// failure there, and panic in the call that logged.
 pub fn log_to_stderr(default: &str) {
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format!("{default},zenoh=warn")));
     let _ = tracing_subscriber::fmt()
         .with_env_filter(filter)
+        .log_internal_errors(false)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .try_init();

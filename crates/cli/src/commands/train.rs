@@ -14,6 +14,7 @@ use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 use crate::args::{DataArgs, SplitArg};
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
+use crate::output::{note, out_place};
 use crate::progress::Progress;
 use crate::sources::{load_bundle, read_drives};
 
@@ -22,7 +23,7 @@ use crate::sources::{load_bundle, read_drives};
 pub struct TrainArgs {
     #[command(flatten)]
     data: DataArgs,
-    /// Folder of the new bundle and its checkpoints [default: nesam-out/train-<set>]
+    /// Folder of the new bundle and its checkpoints [default: nesam-out/train-<set>, for another model than nesam nesam-out/train-<set>-<model>]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Name of the new bundle [default: <vehicle's first word>-<set>]
@@ -102,7 +103,7 @@ pub struct TrainArgs {
 
 /// Shows the stages of a run as progress bars or lines.
 #[derive(Default)]
-struct Console {
+pub struct Console {
     stage: Mutex<Option<Progress>>,
 }
 
@@ -124,22 +125,23 @@ impl Reporter for Console {
     }
 
     fn line(&self, text: &str) {
-        eprintln!("{text}");
+        note!("{text}");
     }
 }
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 
-/// The first Ctrl-C asks for a checkpoint after the step in work; the second ends the program at once.
+/// The first Ctrl-C asks for a checkpoint after the step in work, or for the encoders in work; the second ends the program at once.
 fn stop_on_ctrl_c() {
     std::thread::spawn(|| {
         let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
         runtime.block_on(async {
             while tokio::signal::ctrl_c().await.is_ok() {
                 if INTERRUPTED.swap(true, Ordering::SeqCst) {
+                    note!("\nstopped at once: what was done since the last checkpoint is lost, and encoders that are not finished");
                     std::process::exit(1);
                 }
-                eprintln!("\nstopping after this step; Ctrl-C again to stop at once");
+                note!("\nstopping after this step, or when the encoders are finished; Ctrl-C again to stop at once");
             }
         });
     });
@@ -147,6 +149,9 @@ fn stop_on_ctrl_c() {
 
 /// Runs the command.
 pub fn run(args: &TrainArgs) -> Result<(), Failure> {
+    if args.data.split == SplitArg::Test {
+        return Err(Failure::input("--split test: training reads the train split alone, so that the test split can score it"));
+    }
     let variant = Variant::from_name(&args.model)
         .ok_or_else(|| Failure::input(format!("no model `{}`; one of {}", args.model, Variant::ALL.map(Variant::as_str).join(", "))))?;
     let shards = args.threads.unwrap_or(if args.device == ComputeDevice::Cpu { 2 } else { 1 });
@@ -192,12 +197,12 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     }
     let hash = drives.root.hash();
     let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, args.horizon).or_input()?;
+    let form = if variant == Variant::Full { String::new() } else { format!("-{}", variant.as_str().replace('_', "-")) };
+    let out = out_place(args.out.as_deref(), "train", &format!("{}{form}", drives.set))?;
     let name = args.name.clone().unwrap_or_else(|| {
         let vehicle = drives.root.vehicle().name.split_whitespace().next().unwrap_or("vehicle").to_lowercase();
-        let form = if variant == Variant::Full { String::new() } else { format!("-{}", variant.as_str().replace('_', "-")) };
         format!("{vehicle}-{}{form}", drives.set.replace('/', "-"))
     });
-    let out = args.out.clone().unwrap_or_else(|| PathBuf::from("nesam-out").join(format!("train-{name}")));
     let recipe = Recipe {
         name,
         dt_s: args.data.dt,
@@ -236,7 +241,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         Err(error @ TrainingError::Drives(_)) => return Err(Failure::input(error.to_string())),
         other => other.or_failed()?,
     };
-    eprintln!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
+    note!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
     Ok(())
 }
 

@@ -20,7 +20,8 @@ impl Engine {
             self.emit_alarms(id, &vehicle, told);
             self.emit(Event::EffectsChanged { session: id.into(), vehicle: vehicle.clone() });
             if after.effects != before.effects {
-                self.emit(Event::SoilChanged { session: id.into(), vehicle, soil });
+                let provenance = self.provenance(self.session(id)?).into();
+                self.emit(Event::SoilChanged { session: id.into(), vehicle, soil, provenance });
             }
         }
         Ok(Reply::Session(Box::new(self.view(self.session(id)?))))

@@ -13,6 +13,7 @@ use std::sync::Arc;
 use crate::args::{BundleArgs, check_count};
 use crate::commands::adapt::{filter_in_force, settings_file};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{command_line, say, write_file};
 use crate::sources::load_bundle;
 
@@ -51,6 +52,7 @@ pub(super) fn run(args: &ConsistencyBench) -> Result<(), Failure> {
     if let Some(border) = args.border {
         check_count("--border", border, 0..=args.buffers - 1)?;
     }
+    exit_on_ctrl_c("nothing was written");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let config = filter_in_force(&settings_file(args.filter.as_deref())?, args.literal, &bundle)?;
     let (name, hash) = (bundle.name.clone(), bundle.hash.clone());

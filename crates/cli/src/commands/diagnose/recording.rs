@@ -12,7 +12,7 @@ use nesam_trajectories::{Report, drives_of_reports};
 use super::Input;
 use crate::args::BundleArgs;
 use crate::failure::{Failure, OrFail};
-use crate::output::{self, say};
+use crate::output::{self, note, say};
 use crate::sources::{load_recorded_bundle, maps_hash};
 
 /// Options that take the drives from a recording.
@@ -74,9 +74,12 @@ fn recorded_bundle(args: &BundleArgs, header: &RecordingHeader) -> Result<ModelB
         )));
     }
     if bundle.hash != header.bundle_hash {
-        eprintln!(
+        note!(
             "note: the recording was made with bundle {} {}; {} {} is diagnosed",
-            header.bundle, header.bundle_hash, bundle.name, bundle.hash
+            header.bundle,
+            header.bundle_hash,
+            bundle.name,
+            bundle.hash
         );
     }
     Ok(bundle)

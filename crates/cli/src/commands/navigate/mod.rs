@@ -1,15 +1,15 @@
 //! `nesam navigate`: laps of a closed path on a simulated vehicle, with predictions from the service and without.
 
+mod laps;
 mod stage;
 
 use std::collections::HashMap;
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use clap::{Args, ValueEnum};
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, TrackingCost};
+use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, SoilKind, TrackingCost};
 use nesam_physics::{SecondCommand, Vehicle, driveline::road_wheel_angles};
 use nesam_plant::HiddenEffects;
 use nesam_terrain::WorldMap;
@@ -19,9 +19,9 @@ use serde_json::{Value, json};
 use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, say};
-use crate::progress::Progress;
 use crate::sources::{load_bundle_for, on_vehicle_of, open_root};
 
+use laps::{Identity, Kept, drive_all};
 use stage::{Bundles, Stage, kinematic_of};
 
 /// Correlation of the planner's noise from step to step, its standard deviation (m/s; share of full steering) and the temperature of its weights.
@@ -95,9 +95,15 @@ pub struct NavigateArgs {
     #[arg(long, value_name = "ID=MAGNITUDE")]
     effect: Vec<String>,
     /// Drive another simulator that speaks the plant protocol over UDP (docs/plant-adapter.md)
-    #[arg(long, value_name = "ADDRESS:PORT", conflicts_with = "effect")]
-    plant: Option<SocketAddr>,
-    /// Folder for one file per lap; laps that are there already are not driven again [default: nesam-out/navigate-laps]
+    #[arg(long, value_name = "HOST:PORT", conflicts_with = "effect")]
+    plant: Option<String>,
+    /// How long another simulator may take for an answer before it counts as gone [default: 1800]
+    #[arg(long, value_name = "SECONDS", requires = "plant")]
+    plant_timeout: Option<u64>,
+    /// Take laps that are there already of a simulator that does not say which it is: it is the one that drove them
+    #[arg(long, requires = "plant")]
+    resume: bool,
+    /// Folder for one file per lap; laps that are there already, with the same settings on the same plant, are not driven again [default: nesam-out/navigate-laps]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Write the results as JSON
@@ -163,43 +169,43 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     let bundle = load(args.bundle.bundle.as_deref())?;
     let diagnosed = args.diagnosed.as_deref().map(|dir| load(Some(dir))).transpose()?;
     check_speed(args.speed, &bundle.vehicle)?;
-    let configurations = configurations(args, &bundle)?;
     let worlds = worlds_of(args, &root)?;
+    let configurations = configurations(args, &bundle, &root, &worlds)?;
     let tasks = tasks_of(args, &worlds, &configurations);
-    let settings = settings_of(args, &bundle, diagnosed.as_ref());
-    let settings_of_laps = worlds.iter().map(|(world, _)| Ok((world.clone(), settings_of_lap(&settings, &root, world)?)));
-    let settings_of_laps: HashMap<String, Value> = settings_of_laps.collect::<Result<_, Failure>>()?;
+    let mut settings = settings_of(args, &bundle, diagnosed.as_ref());
+    let of_worlds = worlds.iter().map(|(world, _)| Ok((world.clone(), settings_of_lap(&settings, &root, world)?)));
+    let mut of_worlds: HashMap<String, Value> = of_worlds.collect::<Result<_, Failure>>()?;
     let out = output::out_dir(args.out.as_deref(), "navigate", "laps")?;
     super::serve::log_to_stderr("error");
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
-    let provenance = vec![
+    let mut provenance = vec![
         ("command".to_string(), output::command_line()),
         ("version".to_string(), format!("nesam {}", env!("CARGO_PKG_VERSION"))),
         ("bundle".to_string(), format!("{} {}", bundle.name, bundle.hash)),
-        ("plant".to_string(), args.plant.map_or("built in".into(), |address| address.to_string())),
     ];
     let mut stage = Stage::new(args, root, path, Bundles { shipped: bundle, diagnosed }, effects)?;
-    let progress = Progress::start("laps", tasks.len());
-    let mut runs = Vec::new();
-    for (done, task) in tasks.iter().enumerate() {
-        let file = out.join(task.file_name());
-        let settings = &settings_of_laps[&task.world];
-        let known = earlier(&file, settings);
-        let run = match known {
-            Some(run) => run,
-            None => {
-                let run = runtime.block_on(stage.drive(task))?;
-                let text = serde_json::to_string_pretty(&json!({ "settings": settings, "run": &run })).or_failed()?;
-                output::write_file(&file, text.as_bytes())?;
-                run
-            }
-        };
-        progress.set_with(done + 1, &format!("{} {} {}", task.configuration.as_str(), task.world, run.lap.end));
-        runs.push(run);
+    let plant = stage.identity(&tasks[0])?;
+    provenance.push(("plant".to_string(), plant_text(args, &plant)));
+    of_worlds.values_mut().chain([&mut settings]).for_each(|settings| settings["plant"] = plant.in_settings());
+    let kept = Kept { out, settings: of_worlds, plant, resume: args.resume };
+    let (runs, ended) = drive_all(&mut stage, &runtime, &tasks, &kept);
+    if ended.is_ok() {
+        runtime.block_on(stage.stop());
+    } else {
+        provenance.push(("ended early".to_string(), format!("{} of {} laps", runs.len(), tasks.len())));
     }
-    runtime.block_on(stage.stop());
-    progress.finish();
-    report(args, NavigationReport { runs, settings, provenance })
+    let reported = if runs.is_empty() { Ok(()) } else { report(args, NavigationReport { runs, settings, provenance }) };
+    ended.and(reported)
+}
+
+/// The plant as it is told of in reports.
+fn plant_text(args: &NavigateArgs, plant: &Identity) -> String {
+    let address = args.plant.as_deref().unwrap_or_default();
+    match plant {
+        Identity::BuiltIn => "built in".into(),
+        Identity::Named(name) => format!("{address}: {name}"),
+        Identity::Unnamed => format!("{address}, which does not say what it is"),
+    }
 }
 
 fn check(args: &NavigateArgs) -> Result<(), Failure> {
@@ -210,6 +216,9 @@ fn check(args: &NavigateArgs) -> Result<(), Failure> {
     }
     if args.horizon == 0 || args.horizon > HORIZON_MAX || args.plan_every > args.horizon {
         return Err(Failure::input(format!("--horizon {} is not 1 to {HORIZON_MAX}, or shorter than --plan-every", args.horizon)));
+    }
+    if args.plant_timeout == Some(0) {
+        return Err(Failure::input("--plant-timeout 0 leaves no time to answer; give a second or more"));
     }
     if args.configurations.iter().flatten().any(|c| *c == Configuration::Diagnosed) && args.diagnosed.is_none() {
         return Err(Failure::input("the configuration `diagnosed` needs --diagnosed, a bundle that a diagnosis has written"));
@@ -234,18 +243,31 @@ fn check_speed(speed_m_s: f64, vehicle: &Vehicle) -> Result<(), Failure> {
     )))
 }
 
-/// Where predictions come from: what is told, else the usual that the bundle allows.
-fn configurations(args: &NavigateArgs, bundle: &ModelBundle) -> Result<Vec<Configuration>, Failure> {
+/// Where predictions come from: what is told, else the usual that the bundle and the worlds allow.
+fn configurations(
+    args: &NavigateArgs,
+    bundle: &ModelBundle,
+    root: &DataRoot,
+    worlds: &[(String, SoilKind)],
+) -> Result<Vec<Configuration>, Failure> {
     let usual = || Configuration::USUAL.into_iter().chain(args.diagnosed.is_some().then_some(Configuration::Diagnosed)).collect();
     let mut chosen: Vec<Configuration> = args.configurations.clone().unwrap_or_else(usual);
-    if chosen.contains(&Configuration::Kinematic)
-        && let Err(failure) = kinematic_of(bundle)
-    {
-        if args.configurations.is_some() {
-            return Err(failure);
+    let untold = worlds.iter().find(|(world, _)| !has_true_soil(root, world));
+    let oracle = untold.map_or(Ok(()), |(world, _)| {
+        let lacks = "the data root does not have the true soil (gt_soil.json, gt_region.png)";
+        Err(Failure::input(format!("{lacks} of {world}, which the oracle is told")))
+    });
+    let possible = [(Configuration::Kinematic, kinematic_of(bundle).map(|_| ())), (Configuration::Oracle, oracle)];
+    for (configuration, possible) in possible {
+        if let Err(failure) = possible
+            && chosen.contains(&configuration)
+        {
+            if args.configurations.is_some() {
+                return Err(failure);
+            }
+            crate::output::note!("note: {} is left out: {failure}", configuration.as_str());
+            chosen.retain(|c| *c != configuration);
         }
-        eprintln!("note: kinematic is left out: {failure}");
-        chosen.retain(|c| *c != Configuration::Kinematic);
     }
     Ok(chosen)
 }
@@ -254,11 +276,13 @@ fn configurations(args: &NavigateArgs, bundle: &ModelBundle) -> Result<Vec<Confi
 fn worlds_of(args: &NavigateArgs, root: &DataRoot) -> Result<Vec<(String, SoilKind)>, Failure> {
     let there = root.world_ids();
     let scenario: Vec<String> = SCENARIO.iter().map(|w| (*w).to_string()).filter(|w| there.contains(w)).collect();
-    let with_truth = |world: &String| root.world_dir(world).join("gt_soil.json").exists();
+    let with_truth: Vec<String> = there.iter().filter(|world| has_true_soil(root, world)).cloned().collect();
     let chosen = match &args.worlds {
         Some(given) => given.clone(),
         None if !scenario.is_empty() => scenario,
-        None => there.into_iter().filter(with_truth).collect(),
+        // Another simulator knows its soil itself.
+        None if with_truth.is_empty() && args.plant.is_some() => there,
+        None => with_truth,
     };
     if chosen.is_empty() {
         return Err(Failure::input("the data root has no world with true soil (gt_soil.json) to drive in"));
@@ -266,10 +290,15 @@ fn worlds_of(args: &NavigateArgs, root: &DataRoot) -> Result<Vec<(String, SoilKi
     chosen.into_iter().map(|world| Ok((world.clone(), soil_kind(&root.world_dir(&world), &*root.world(&world).or_input()?)?))).collect()
 }
 
+/// Whether a root tells the true soil of a world.
+fn has_true_soil(root: &DataRoot, world: &str) -> bool {
+    ["gt_soil.json", "gt_region.png"].iter().all(|file| root.world_dir(world).join(file).exists())
+}
+
 /// Compares the true sinkage modulus of every region with what its class promises.
 fn soil_kind(world_dir: &Path, map: &WorldMap) -> Result<SoilKind, Failure> {
     if !world_dir.join("gt_soil.json").exists() {
-        return Ok(SoilKind::Nominal);
+        return Ok(SoilKind::Unknown);
     }
     let truth = read_ground_truth_soil(world_dir).or_input()?;
     let (mut softer, mut firmer) = (false, false);
@@ -312,7 +341,7 @@ fn settings_of(args: &NavigateArgs, bundle: &ModelBundle, diagnosed: Option<&Mod
         "speed_limits_m_s": speed_limits_m_s(&bundle.vehicle),
         "caution": caution_of(args),
         "effect": args.effect,
-        "plant": args.plant.map(|address| address.to_string()),
+        "plant": Identity::BuiltIn.in_settings(),
     })
 }
 
@@ -356,16 +385,6 @@ fn steering_guess(vehicle: &Vehicle, path: &ReferencePath, speed_m_s: f64) -> f6
     let [left, right, ..] = road_wheel_angles(vehicle, full);
     let angle = (vehicle.wheelbase_m * std::f64::consts::TAU / path.length_m()).atan();
     (full * 2.0 * angle / (left + right)).min(full)
-}
-
-/// A lap that was driven before with the same settings.
-fn earlier(file: &Path, settings: &Value) -> Option<Run> {
-    let read: Value = serde_json::from_slice(&std::fs::read(file).ok()?).ok()?;
-    let same = read.get("settings") == Some(settings);
-    if !same {
-        eprintln!("{} was driven with other settings; it is driven again", file.display());
-    }
-    same.then(|| serde_json::from_value(read.get("run")?.clone()).ok()).flatten()
 }
 
 fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> {

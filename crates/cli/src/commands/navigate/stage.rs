@@ -4,13 +4,14 @@ use std::collections::btree_map::Entry;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use nesam_client::Client;
 use nesam_evaluation::{Baselines, Kinematic};
 use nesam_model::ModelBundle;
 use nesam_navigation::{
-    BuiltInPlant, Forecaster, KinematicForecaster, LapPlan, PlantLink, ReferencePath, RemotePlant, Run, ServedForecaster, SoilAhead,
-    Surroundings, run_lap,
+    BuiltInPlant, Forecaster, KinematicForecaster, Lap, LapPlan, NavigationError, PlantLink, ReferencePath, RemotePlant, Run,
+    ServedForecaster, SoilAhead, Surroundings, run_lap,
 };
 use nesam_physics::DT_S;
 use nesam_plant::{Ground, HiddenEffects};
@@ -18,6 +19,7 @@ use nesam_server::{Config, RunningServer};
 use nesam_trajectories::DataRoot;
 use serde_json::{Value, json};
 
+use super::laps::Identity;
 use super::{Configuration, NavigateArgs, Task, caution_of, cost_of, mppi_of, steering_guess};
 use crate::commands::serve;
 use crate::failure::{Failure, OrFail};
@@ -30,6 +32,9 @@ const CLOCK_AHEAD_S: f64 = 1e6;
 
 /// Longest wait of a query, s: on a busy machine a lap takes longer and is the same lap.
 const DEADLINE_S: f64 = 3600.0;
+
+/// Time after which a plant that is silent counts as gone, s: the slowest simulators take minutes to set a vehicle down.
+const PLANT_TIMEOUT_S: u64 = 1800;
 
 /// A server on loopback with a client and the maps that it holds.
 struct Service {
@@ -75,18 +80,32 @@ impl<'a> Stage<'a> {
     /// Prepares the plant; servers start when they are needed.
     pub fn new(args: &'a NavigateArgs, root: DataRoot, data: PathBuf, bundles: Bundles, effects: HiddenEffects) -> Result<Self, Failure> {
         let plant: Box<dyn PlantLink> = match &args.plant {
-            // The number of the first request differs from process to process, so that a plant never takes it for one that it has answered.
-            Some(address) => Box::new(RemotePlant::connect(&address.to_string(), u64::from(std::process::id()) << 20).or_input()?),
+            Some(address) => {
+                let timeout = Duration::from_secs(args.plant_timeout.unwrap_or(PLANT_TIMEOUT_S));
+                Box::new(RemotePlant::connect(address, first_number(), timeout).or_input()?)
+            }
             None => Box::new(BuiltInPlant::new(&data, effects).or_input()?),
         };
         let path = ReferencePath::of_ood_soil();
         Ok(Self { args, root, data, bundles, plant, path, services: BTreeMap::new(), told: Vec::new(), driven: 0 })
     }
 
-    /// Drives one lap.
-    pub async fn drive(&mut self, task: &Task) -> Result<Run, Failure> {
-        let mut model = self.model(task).await?;
-        let plan = LapPlan {
+    /// Which plant it is: another simulator is asked for the start of the first lap.
+    pub fn identity(&mut self, first: &Task) -> Result<Identity, Failure> {
+        let Some(address) = &self.args.plant else { return Ok(Identity::BuiltIn) };
+        crate::output::note!("plant {address}: asking for the start of the first lap");
+        let start = self.plan_of(first).start();
+        let name = self.plant.name(&start).or_failed()?;
+        if name.is_none() && !self.args.resume {
+            crate::output::note!(
+                "note: the plant does not say which it is (`plant` in its answer to `reset`): earlier laps are driven again; --resume takes them"
+            );
+        }
+        Ok(name.map_or(Identity::Unnamed, Identity::Named))
+    }
+
+    fn plan_of(&self, task: &Task) -> LapPlan {
+        LapPlan {
             world: task.world.clone(),
             start_phi: std::f64::consts::PI * task.start as f64,
             seed: task.seed,
@@ -97,13 +116,34 @@ impl<'a> Stage<'a> {
             plan_every: self.args.plan_every,
             steering_guess: steering_guess(&self.bundles.shipped.vehicle, &self.path, self.args.speed),
             caution: caution_of(self.args),
-        };
-        let lap = run_lap(&plan, self.plant.as_mut(), &mut model).await.or_failed()?;
-        if let Forecaster::Served(served) = model {
-            served.close().await.or_failed()?;
         }
+    }
+
+    /// Drives one lap; once again where the plant lost it on the way.
+    pub async fn drive(&mut self, task: &Task) -> Result<Run, Failure> {
+        let lap = match self.lap(task).await? {
+            Err(lost @ NavigationError::Lost { .. }) => {
+                crate::output::note!("note: {}: {lost}; it is driven once again", task.file_name());
+                self.lap(task).await?
+            }
+            other => other,
+        };
         let (configuration, world) = (task.configuration.as_str().to_string(), task.world.clone());
-        Ok(Run { configuration, world, soil: task.soil, start: task.start, seed: task.seed, lap })
+        Ok(Run { configuration, world, soil: task.soil, start: task.start, seed: task.seed, lap: lap.or_failed()? })
+    }
+
+    /// One try of a lap, with a session of its own; what failed on the way is told apart from what failed before.
+    async fn lap(&mut self, task: &Task) -> Result<Result<Lap, NavigationError>, Failure> {
+        let mut model = self.model(task).await?;
+        let lap = run_lap(&self.plan_of(task), self.plant.as_mut(), &mut model).await;
+        if let Forecaster::Served(served) = model {
+            let closed = served.close().await;
+            // A lap that failed says more than the session that it leaves.
+            if lap.is_ok() {
+                closed.or_failed()?;
+            }
+        }
+        Ok(lap)
     }
 
     /// Stops the servers.
@@ -184,6 +224,12 @@ pub fn kinematic_of(bundle: &ModelBundle) -> Result<Kinematic, Failure> {
     }
 }
 
+/// Microseconds since 1970, which later commands have more of, so that a plant never takes a request for one that it has answered; below 2^53, which every
+/// language counts to exactly, until 2255.
+fn first_number() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_micros() as u64)
+}
+
 fn world_dir(data: &Path, world: &str) -> PathBuf {
     data.join("worlds").join(world)
 }
@@ -196,4 +242,19 @@ fn without_learning(bundle: &ModelBundle) -> Result<ModelBundle, Failure> {
     };
     filter["settings"]["excitation_min"] = json!(NEVER_EXCITED);
     Ok(ModelBundle { soil_filter_json: Some(filter.to_string()), ..bundle.clone() })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: ids of a later command are above those of an earlier one, wherever either runs. Method: the clock against 2024 and 2^53; a campaign asks less than once
+    /// in a microsecond.
+    #[test]
+    fn property_ids_grow_from_command_to_command() {
+        let number = first_number();
+        assert!((1_704_067_200_000_000..1 << 53).contains(&number), "{number}");
+        std::thread::sleep(Duration::from_millis(1));
+        assert!(first_number() > number);
+    }
 }

@@ -8,6 +8,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 
 use clap::{Args, Subcommand};
+use nesam_model::bundle::sha256_hex;
 use nesam_plant::{EFFECTS, Ground, HiddenEffects, Plant, PlantServer, PlantVehicle, Sensors};
 
 use crate::args::DataArgs;
@@ -73,11 +74,14 @@ fn effects_of(given: &[String]) -> Result<HiddenEffects, Failure> {
 }
 
 fn serve(args: &ServeArgs) -> Result<(), Failure> {
-    let root = root_of(args.data.as_ref())?;
+    let (data, root) = open_root(&DataArgs::of(args.data.clone()))?;
     let effects = effects_of(&args.effect)?;
     let vehicle = Arc::new(PlantVehicle::of_root(&root).or_input()?);
     let mut known: Option<(String, Arc<Ground>)> = None;
-    let mut server = PlantServer::new(move |world, seed, [x, y, yaw]| {
+    let hidden = if args.effect.is_empty() { "no hidden effect".to_string() } else { args.effect.join(" ") };
+    let card = sha256_hex(&std::fs::read(data.card()).or_input()?);
+    let name = format!("nesam plant {}, {hidden}, card {}", env!("CARGO_PKG_VERSION"), &card[..12]);
+    let mut server = PlantServer::new(name, move |world, seed, [x, y, yaw]| {
         // The name becomes part of a path: only what a world folder is called.
         if world.is_empty() || !world.chars().all(|c| c.is_ascii_alphanumeric() || c == '_' || c == '-') {
             return Err(format!("`{world}` is no name of a world"));

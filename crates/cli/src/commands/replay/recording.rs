@@ -11,7 +11,7 @@ use serde_json::json;
 use super::ReplayArgs;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
-use crate::output::{self, say};
+use crate::output::{self, note, say};
 use crate::sources::load_recorded_bundle;
 
 /// Time between two lines of progress.
@@ -29,7 +29,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     let mut progress = |commands: u64| {
         if said.elapsed() >= SAY_EVERY {
             said = Instant::now();
-            eprintln!("commands replayed: {commands} after {:.0} s", started.elapsed().as_secs_f64());
+            note!("commands replayed: {commands} after {:.0} s", started.elapsed().as_secs_f64());
         }
     };
     let report = replay(&mut recording, predictor, args.force, &mut progress).map_err(|error| {

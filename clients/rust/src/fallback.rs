@@ -1,0 +1,248 @@
+//! A declared fallback for planners that must have an answer.
+
+use std::borrow::Cow;
+use std::f64::consts::{PI, TAU};
+
+use nesam_proto::packed::unpack;
+use nesam_proto::v1;
+use tonic::Code;
+
+use crate::error::ClientError;
+use crate::prediction::{Candidates, ComputedBy, ExtraOutputs, FallbackReason, Prediction};
+
+/// Entries of a state.
+const STATE: usize = 12;
+
+/// What a fallback may answer instead of.
+const LATE: [Code; 3] = [Code::DeadlineExceeded, Code::ResourceExhausted, Code::Unavailable];
+
+/// Flat-ground kinematics of a vehicle card: the commanded speed is reached at once, a bicycle turns with tan(angle) / wheelbase, a skid-steer vehicle
+/// with the commanded yaw rate. It knows no terrain, soil or slip; height, roll and pitch stay those of the start. It answers only where a caller puts
+/// it into [`Candidates::fallback`], and the prediction says so in [`Prediction::computed_by`].
+#[derive(Clone, Debug, PartialEq)]
+pub struct KinematicFallback {
+    /// Vehicle card, as a session tells it.
+    pub vehicle: v1::VehicleCard,
+    /// Step, s.
+    pub dt_s: f64,
+}
+
+impl KinematicFallback {
+    /// The kinematics of a card in steps of 0.1 s, those of the service.
+    pub fn new(vehicle: v1::VehicleCard) -> Self {
+        Self { vehicle, dt_s: 0.1 }
+    }
+
+    /// Yaw rate that a command means.
+    pub fn yaw_rate_rad_s(&self, speed_m_s: f64, second: f64) -> f64 {
+        let kind = self.vehicle.second();
+        if kind == v1::SecondCommand::YawRateRadS {
+            return second;
+        }
+        let normalised = kind == v1::SecondCommand::SteeringNormalised;
+        let angle_rad = if normalised { second * self.vehicle.road_wheel_angle_max_rad } else { second };
+        speed_m_s * angle_rad.tan() / self.vehicle.wheelbase_m
+    }
+
+    /// States, row-major (samples, horizon, 12), from a start and controls, row-major (samples, horizon, 2). Numbers at the end that make no whole sample
+    /// are left out.
+    pub fn rollout(&self, start: &[f64; STATE], controls: &[f32], horizon: usize) -> Vec<f32> {
+        let mut states = Vec::with_capacity(controls.len() / 2 * STATE);
+        for sample in controls.chunks_exact((2 * horizon).max(1)) {
+            let mut state = *start;
+            let mut yaw = start[5];
+            for command in sample.chunks_exact(2) {
+                let (speed, second) = (f64::from(command[0]), f64::from(command[1]));
+                let rate = self.yaw_rate_rad_s(speed, second);
+                let half_turn = 0.5 * rate * self.dt_s;
+                // Exact for an arc: the chord is speed dt sin(h) / h with h = half of the turned angle.
+                let chord = speed * self.dt_s * if half_turn == 0.0 { 1.0 } else { half_turn.sin() / half_turn };
+                let (sin_middle, cos_middle) = (yaw + half_turn).sin_cos();
+                yaw += rate * self.dt_s;
+                state[0] += chord * cos_middle;
+                state[1] += chord * sin_middle;
+                state[5] = PI - (PI - yaw).rem_euclid(TAU);
+                state[6..].copy_from_slice(&[speed, 0.0, 0.0, 0.0, 0.0, rate]);
+                states.extend(state.iter().map(|value| *value as f32));
+            }
+        }
+        states
+    }
+
+    /// What it answers instead of the service, and why. `None` where the error is no lateness, where there is neither a start nor a known state, or where
+    /// the candidates contradict themselves.
+    pub(crate) fn answer(&self, candidates: &Candidates, known: Option<[f64; STATE]>, error: &ClientError) -> Option<Prediction> {
+        let reason = match error {
+            ClientError::Refused { code, message, .. } if LATE.contains(code) => FallbackReason { code: *code, message: message.clone() },
+            _ => return None,
+        };
+        let start = candidates.start.or(known)?;
+        let (samples, controls) = match &candidates.drawing {
+            Some(drawing) => (1, Cow::Owned(unpack(&drawing.nominal))),
+            None => (candidates.samples, Cow::Borrowed(candidates.controls.as_slice())),
+        };
+        let horizon = candidates.horizon;
+        if controls.is_empty() || controls.len() != samples.checked_mul(horizon)?.checked_mul(2)? {
+            return None;
+        }
+        let asked = candidates.output.channels;
+        let channels: Vec<usize> = (0..STATE).filter(|i| asked == 0 || asked >> i & 1 == 1).collect();
+        let stride = (candidates.output.stride as usize).max(1);
+        let mut states = Vec::with_capacity(samples * (horizon / stride) * channels.len());
+        for sample in self.rollout(&start, &controls, horizon).chunks_exact(STATE * horizon) {
+            for state in sample.chunks_exact(STATE).skip(stride - 1).step_by(stride) {
+                states.extend(channels.iter().map(|channel| state[*channel]));
+            }
+        }
+        Some(Prediction {
+            tag: candidates.tag,
+            samples,
+            steps: horizon / stride,
+            channels,
+            states,
+            sinkage_m: Vec::new(),
+            validity: vec![0; samples],
+            start,
+            start_stamp_ns: None,
+            rolled_forward_steps: 0,
+            history_steps: 0,
+            soil: [f64::NAN; 6],
+            soil_variance: None,
+            soil_correction: v1::SoilCorrection::default(),
+            measurement_age_s: None,
+            provenance: v1::Provenance::default(),
+            queue_s: 0.0,
+            compute_s: 0.0,
+            soil_groups: 1,
+            extras: ExtraOutputs::default(),
+            drawn_controls: Vec::new(),
+            costs: Vec::new(),
+            best: Vec::new(),
+            mean_controls: Vec::new(),
+            computed_by: ComputedBy::KinematicFallback,
+            fallback_reason: Some(reason),
+        })
+    }
+}
+
+#[cfg(test)]
+#[allow(clippy::unwrap_used)]
+mod tests {
+    use super::*;
+
+    fn card(second: v1::SecondCommand, wheelbase_m: f64) -> v1::VehicleCard {
+        v1::VehicleCard { second: second.into(), wheelbase_m, road_wheel_angle_max_rad: 0.5, ..Default::default() }
+    }
+
+    fn late() -> ClientError {
+        tonic::Status::deadline_exceeded("no answer came in time").into()
+    }
+
+    /// Goal: the fallback is the one of the Python client. Method: x, y, yaw, vx, wz that `nesam.KinematicFallback` gives for the same start, commands and
+    /// cards, with a yaw that passes pi both ways. Tolerance: some units in the last place of f32.
+    #[test]
+    fn regress_the_numbers_of_the_python_client() {
+        use v1::SecondCommand::{RoadWheelAngleRad, SteeringNormalised, YawRateRadS};
+        let start = [1.0, 2.0, 0.5, 0.05, -0.02, 3.1, 1.0, 0.1, 0.0, 0.0, 0.0, 0.2];
+        let controls = [2.0, 0.5, 1.5, -0.25, -1.0, 0.5, 0.0, 1.0];
+        let expected = [
+            (
+                card(SteeringNormalised, 3.25),
+                [
+                    [0.800115883, 2.00674582, 3.11571336, 2.0, 0.15713349],
+                    [0.650178194, 2.01106215, 3.10991383, 1.5, -0.0579946786],
+                    [0.75011456, 2.00750208, 3.10205722, -1.0, -0.0785667449],
+                    [0.75011456, 2.00750208, 3.10205722, 0.0, 0.0],
+                ],
+            ),
+            (
+                card(RoadWheelAngleRad, 2.5),
+                [
+                    [0.800054908, 2.0039475, -3.13948107, 2.0, 0.437041998],
+                    [0.650058687, 2.00477982, 3.12838364, 1.5, -0.153205156],
+                    [0.750027537, 2.00236654, 3.10653162, -1.0, -0.218520999],
+                    [0.750027537, 2.00236654, 3.10653162, 0.0, 0.0],
+                ],
+            ),
+            (
+                card(YawRateRadS, 1.0),
+                [
+                    [0.800048351, 2.00331807, -3.13318539, 2.0, 0.5],
+                    [0.650053501, 2.003932, 3.125, 1.5, -0.25],
+                    [0.750039577, 2.00477266, -3.10818529, -1.0, 0.5],
+                    [0.750039577, 2.00477266, -3.00818539, 0.0, 1.0],
+                ],
+            ),
+        ];
+        for (vehicle, rows) in expected {
+            let states = KinematicFallback::new(vehicle).rollout(&start, &controls, 4);
+            assert_eq!(states.len(), 4 * STATE);
+            for (state, row) in states.chunks_exact(STATE).zip(rows) {
+                for (channel, value) in [0, 1, 5, 6, 11].into_iter().zip(row) {
+                    assert!((f64::from(state[channel]) - value).abs() < 1e-6, "channel {channel}: {} for {value}", state[channel]);
+                }
+                assert_eq!((&state[2..5], &state[7..11]), ([0.5_f32, 0.05, -0.02].as_slice(), [0.0_f32; 4].as_slice()));
+            }
+        }
+    }
+
+    /// Goal: straight lines and arcs come out exactly. Method: a bicycle to the north, straight on and to the left; the second has to stay at its radius
+    /// from a centre to the left. Tolerance: single precision at some metres.
+    #[test]
+    fn analytic_a_fallback_drives_arcs() {
+        let mut start = [0.0; STATE];
+        start[5] = 0.5 * PI;
+        let controls: Vec<f32> = (0..64).flat_map(|step| [2.0, if step < 32 { 0.0 } else { 0.3 }]).collect();
+        let states = KinematicFallback::new(card(v1::SecondCommand::RoadWheelAngleRad, 2.5)).rollout(&start, &controls, 32);
+        let radius = 2.5 / f64::from(0.3_f32).tan();
+        for k in 0..32 {
+            let (ahead, turning) = (&states[STATE * k..], &states[STATE * (32 + k)..]);
+            assert!((f64::from(ahead[1]) - 0.2 * (k + 1) as f64).abs() < 1e-5 && ahead[0].abs() < 1e-5, "{k}");
+            assert!(((f64::from(turning[0]) + radius).hypot(f64::from(turning[1])) - radius).abs() < 1e-4, "{k}");
+            assert!((f64::from(turning[11]) - 2.0 / radius).abs() < 1e-6, "{k}");
+        }
+    }
+
+    /// Goal: what was selected is returned and marked. Method: two candidates, every second step, two channels; then the nominal sequence of a drawing.
+    #[test]
+    fn analytic_a_fallback_answers_what_was_asked_and_says_so() {
+        let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
+        let start = [3.0; STATE];
+        let mut asked = Candidates::new("s", 2, 5, vec![1.0; 20]);
+        (asked.output.channels, asked.output.stride, asked.tag) = ((1 << 1) | (1 << 6), 2, 9);
+        let answered = fallback.answer(&asked, Some(start), &late()).unwrap();
+        let whole = fallback.rollout(&start, &asked.controls, 5);
+        assert_eq!((answered.computed_by, answered.tag, answered.samples, answered.steps), (ComputedBy::KinematicFallback, 9, 2, 2));
+        assert_eq!(answered.state(1, 1), [whole[STATE * 8 + 1], whole[STATE * 8 + 6]]);
+        assert_eq!((answered.channels, answered.validity, answered.start), (vec![1, 6], vec![0, 0], start));
+        assert_eq!(answered.fallback_reason.unwrap().code, Code::DeadlineExceeded);
+        assert!(
+            answered.soil.iter().all(|value| value.is_nan()) && answered.provenance.bundle_hash.is_empty() && answered.sinkage_m.is_empty()
+        );
+        let drawn = Candidates::drawn("s", 64, &[1.0, 0.1, 1.0, 0.2], v1::CandidateDrawing::default());
+        let nominal = fallback.answer(&drawn, Some(start), &late()).unwrap();
+        assert_eq!((nominal.samples, nominal.states), (1, fallback.rollout(&start, &[1.0, 0.1, 1.0, 0.2], 2)));
+    }
+
+    /// Goal: nothing but lateness is answered, and nothing is made up. Method: other errors, no state, controls without their shape.
+    #[test]
+    fn analytic_a_fallback_keeps_out_of_everything_else() {
+        let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
+        let asked = Candidates::new("s", 1, 1, vec![1.0, 0.0]);
+        let known = Some([0.0; STATE]);
+        for status in [tonic::Status::resource_exhausted(""), tonic::Status::unavailable("")] {
+            assert!(fallback.answer(&asked, known, &status.into()).is_some());
+        }
+        for status in [tonic::Status::invalid_argument(""), tonic::Status::not_found(""), tonic::Status::failed_precondition("")] {
+            assert!(fallback.answer(&asked, known, &status.into()).is_none());
+        }
+        assert!(fallback.answer(&asked, known, &ClientError::protocol("a part is missing")).is_none());
+        assert!(fallback.answer(&asked, None, &late()).is_none());
+        let given = Candidates { start: known, ..asked.clone() };
+        assert!(fallback.answer(&given, None, &late()).is_some());
+        for (samples, horizon) in [(2, 1), (1, 2), (usize::MAX, 2), (0, 1)] {
+            assert!(fallback.answer(&Candidates { samples, horizon, ..asked.clone() }, known, &late()).is_none(), "{samples} x {horizon}");
+        }
+        assert!(fallback.answer(&Candidates::new("s", 0, 0, Vec::new()), known, &late()).is_none());
+    }
+}

@@ -1,0 +1,291 @@
+//! `nesam calibrate`: what the card of a vehicle does not say, from its logs, with the physics alone.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use clap::Args;
+use nesam_learning::Drive;
+use nesam_learning::calibrate::calibrate_vehicle;
+use nesam_learning::recipe::{Reporter, load_drives};
+use nesam_learning::scales::measure;
+use nesam_learning::symbolic::{HORIZON, symbolic_error};
+use nesam_model::{ModelBundle, Provenance};
+use nesam_physics::{SecondCommand, Vehicle};
+use nesam_trajectories::card_to_json;
+use serde_json::{Value, json};
+
+use super::train::Console;
+use crate::args::DataArgs;
+use crate::failure::{Failure, OrFail};
+use crate::interrupt;
+use crate::output::{command_line, out_dir, provenance, say, write_file};
+use crate::progress::Progress;
+use crate::sources::{Drives, load_bundle, read_drives};
+
+/// Parts of the drives that are left out in turn: every part costs one more calibration.
+const FOLDS: usize = 5;
+/// Name of the fitted card.
+const CARD: &str = "vehicle_calibrated.json";
+
+const OUTCOME: &str = "The fitted card is complete: give it as --vehicle where a data root is read, or copy it into a data root in place of \
+its own. `nesam train` fits the same numbers before it trains. A bundle keeps the card that it was trained with for a vehicle of the same name; \
+with --bundle DIR its copy in the output folder has the fitted card and the learned parts as trained, without soil filter, regions and reference, \
+which were measured with the old card: make them again with `nesam adapt --calibrate`, `nesam evaluate --calibrate-coverage` and \
+`nesam diagnose --make-reference`.
+
+What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
+rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds.
+
+Examples:
+  nesam calibrate --data mine --set first --out mine-calibrated
+  nesam diagnose --data mine --set first --vehicle mine-calibrated/vehicle_calibrated.json --reference physics";
+
+/// Options of `nesam calibrate`.
+#[derive(Args, Debug)]
+#[command(after_help = OUTCOME)]
+pub struct CalibrateArgs {
+    #[command(flatten)]
+    data: DataArgs,
+    /// Also write this bundle anew, with the fitted card [default: none, the card alone]
+    #[arg(long, value_name = "DIR")]
+    bundle: Option<PathBuf>,
+    /// Folder for the card, the JSON and the bundle [default: nesam-out/calibrate-<set>]
+    #[arg(long, value_name = "DIR")]
+    out: Option<PathBuf>,
+    /// Write the JSON (schema nesam.calibrate/1) here instead
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+}
+
+/// What the physics is off by on a drive, with the card as it came and with the fitted one.
+struct Scored {
+    trajectory: String,
+    before: Errors,
+    after: Errors,
+}
+
+/// Mean absolute errors of the symbolic model over rollouts.
+#[derive(Clone, Copy, Default)]
+struct Errors {
+    position_m: f64,
+    /// Roll and pitch together; `None` without a map, where they tell of the ground.
+    tilt_rad: Option<f64>,
+}
+
+/// A calibration on a part of the drives says nothing.
+struct Silent;
+
+impl Reporter for Silent {
+    fn stage(&self, _name: &str, _total: usize) {}
+    fn progress(&self, _done: usize, _remark: &str) {}
+    fn line(&self, _text: &str) {}
+}
+
+/// Runs the command.
+pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
+    interrupt::exit_on_ctrl_c("nothing was written");
+    let drives = read_drives(&args.data, false)?;
+    let card = drives.root.vehicle();
+    let bundle = args.bundle.as_deref().map(|dir| bundle_to_change(dir, args.data.dt)).transpose()?;
+    let out = out_dir(args.out.as_deref(), "calibrate", &drives.set)?;
+    let measured = load_drives(&drives.root, &drives.drives).or_input()?;
+    let usable: Vec<&Drive> = measured.iter().filter(|drive| drive.states.len() > HORIZON + 1).collect();
+    if usable.is_empty() {
+        let needed_s = (HORIZON + 1) as f64 * args.data.dt;
+        return Err(Failure::input(format!("no drive of set `{}` is of {needed_s:.1} s or more, so nothing can be predicted", drives.set)));
+    }
+    let (vehicle, _) = calibrate_vehicle(card.clone(), &usable, args.data.dt, &Console::default());
+    let scored =
+        if usable.len() > 1 { held_out(card, &usable, args.data.dt) } else { scored(card, &vehicle, &usable, &usable, args.data.dt) };
+    let changes = changes(card, &vehicle);
+    let path = out.join(CARD);
+    let seconds = HORIZON as f64 * args.data.dt;
+    summary(&scored, &changes, usable.len() > 1, seconds);
+    if card.second == SecondCommand::YawRateRadS && usable.iter().all(|d| d.wheel_speed_rad_s.is_none()) {
+        say!("the servo of the rims stays as the card has it: wheel speeds would tell it, and no drive has them");
+    }
+    write_file(&path, (card_to_json(&vehicle) + "\n").as_bytes())?;
+    say!("wrote {}", path.display());
+    let document = document(args, &drives, &scored, &changes, &path);
+    let saved = bundle.as_ref().map(|base| save_bundle(base, &vehicle, &drives.root.hash(), &out.join("bundle"))).transpose()?;
+    let document = with_bundle(document, saved.as_deref(), provenance(bundle.as_ref(), &drives));
+    let file = args.json.clone().unwrap_or_else(|| out.join("calibrate.json"));
+    write_file(&file, (serde_json::to_string_pretty(&document).expect("numbers and text serialise; this is a bug") + "\n").as_bytes())?;
+    say!("wrote {}", file.display());
+    Ok(())
+}
+
+/// The bundle whose card is replaced; the effects of one that has some were found beside its old card.
+fn bundle_to_change(dir: &Path, dt_s: f64) -> Result<ModelBundle, Failure> {
+    let bundle = load_bundle(Some(dir))?;
+    if !bundle.effects.is_empty() {
+        return Err(Failure::input(format!("--bundle {}: it carries effects; give the bundle that they were added to", dir.display())));
+    }
+    if (bundle.normalization.dt_s - dt_s).abs() > 1e-9 {
+        return Err(Failure::input(format!("--bundle {}: it steps by {} s, --dt is {dt_s} s", dir.display(), bundle.normalization.dt_s)));
+    }
+    Ok(bundle)
+}
+
+/// Errors of every drive with a card that was fitted on others.
+fn held_out(card: &Vehicle, drives: &[&Drive], dt_s: f64) -> Vec<Scored> {
+    let folds = FOLDS.min(drives.len());
+    let progress = Progress::start("drives left out in turn", folds);
+    let mut all: Vec<Scored> = Vec::with_capacity(drives.len());
+    for fold in 0..folds {
+        let part = |held: bool| -> Vec<&Drive> {
+            drives.iter().enumerate().filter(|(i, _)| (i % folds == fold) == held).map(|(_, drive)| *drive).collect()
+        };
+        let fitted = calibrate_vehicle(card.clone(), &part(false), dt_s, &Silent).0;
+        all.extend(scored(card, &fitted, &part(true), drives, dt_s));
+        progress.set(fold + 1);
+    }
+    progress.finish();
+    all.sort_by(|a, b| a.trajectory.cmp(&b.trajectory));
+    all
+}
+
+/// Errors of `drives` with two cards, with the scales of `scale`.
+fn scored(card: &Vehicle, fitted: &Vehicle, drives: &[&Drive], scale: &[&Drive], dt_s: f64) -> Vec<Scored> {
+    let scales = measure(scale, card, dt_s);
+    let errors = |vehicle: &Vehicle, drive: &Drive| {
+        let error = symbolic_error(vehicle, &[drive], &scales);
+        Errors { position_m: error.position_m, tilt_rad: drive.map.is_some().then_some(error.tilt_rad) }
+    };
+    drives.iter().map(|drive| Scored { trajectory: drive.id.clone(), before: errors(card, drive), after: errors(fitted, drive) }).collect()
+}
+
+/// Mean over drives; of roll and pitch over those with a map.
+fn mean(errors: impl Iterator<Item = Errors>) -> Errors {
+    let all: Vec<Errors> = errors.collect();
+    let tilts: Vec<f64> = all.iter().filter_map(|e| e.tilt_rad).collect();
+    Errors {
+        position_m: all.iter().map(|e| e.position_m).sum::<f64>() / all.len().max(1) as f64,
+        tilt_rad: (!tilts.is_empty()).then(|| tilts.iter().sum::<f64>() / tilts.len() as f64),
+    }
+}
+
+/// Numbers of the card that the fit changed: as the card has them, as fitted; null where one of the two does not have it.
+fn changes(card: &Vehicle, fitted: &Vehicle) -> BTreeMap<String, [Value; 2]> {
+    let leaves = |vehicle: &Vehicle| {
+        let mut found = BTreeMap::new();
+        let card: Value = serde_json::from_str(&card_to_json(vehicle)).expect("a card is JSON; this is a bug");
+        collect_leaves("", &card, &mut found);
+        found
+    };
+    let (before, after) = (leaves(card), leaves(fitted));
+    let of = |held: &BTreeMap<String, Value>, name: &String| held.get(name).cloned().unwrap_or(Value::Null);
+    let names = before.keys().chain(after.keys());
+    names.map(|name| (name.clone(), [of(&before, name), of(&after, name)])).filter(|(_, [before, after])| before != after).collect()
+}
+
+/// Adds what is no object to `found`, under its keys joined by dots; an array is one value.
+fn collect_leaves(prefix: &str, value: &Value, found: &mut BTreeMap<String, Value>) {
+    let Value::Object(fields) = value else {
+        found.insert(prefix.into(), value.clone());
+        return;
+    };
+    for (key, value) in fields {
+        let name = if prefix.is_empty() { key.clone() } else { format!("{prefix}.{key}") };
+        collect_leaves(&name, value, found);
+    }
+}
+
+fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: bool, seconds: f64) {
+    let on = if held_out {
+        "each with a card fitted on other drives"
+    } else {
+        "the drive that the card was fitted on: of another one this says nothing"
+    };
+    let (before, after) = (mean(scored.iter().map(|s| s.before)), mean(scored.iter().map(|s| s.after)));
+    say!("\nerror of the physics alone over {seconds:.1} s, card -> fitted, {} drives, {on}:", scored.len());
+    say!("  position {:.3} m -> {:.3} m", before.position_m, after.position_m);
+    if let (Some(before), Some(after)) = (before.tilt_rad, after.tilt_rad) {
+        say!("  roll and pitch together {:.3}° -> {:.3}°", before.to_degrees(), after.to_degrees());
+    }
+    let better = scored.iter().filter(|s| s.after.position_m < s.before.position_m).count();
+    say!("  position is better on {better} of {} drives", scored.len());
+    say!("\ncard -> fitted:");
+    let shown = |value: &Value| if value.is_null() { "–".into() } else { value.to_string() };
+    for (name, [before, after]) in changes {
+        say!("  {name}: {} -> {}", shown(before), shown(after));
+    }
+}
+
+fn document(args: &CalibrateArgs, drives: &Drives, scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, card: &Path) -> Value {
+    let errors = |e: Errors| json!({"position_m": e.position_m, "tilt_deg": e.tilt_rad.map(f64::to_degrees)});
+    let parameters: Vec<Value> =
+        changes.iter().map(|(name, [before, after])| json!({"name": name, "card": before, "fitted": after})).collect();
+    let trajectories: Vec<Value> =
+        scored.iter().map(|s| json!({"trajectory": s.trajectory, "before": errors(s.before), "after": errors(s.after)})).collect();
+    json!({
+        "schema": "nesam.calibrate/1",
+        "set": drives.set,
+        "split": args.data.split.as_str(),
+        "dt_s": args.data.dt,
+        "horizon_steps": HORIZON,
+        "held_out": scored.len() > 1,
+        "before": errors(mean(scored.iter().map(|s| s.before))),
+        "after": errors(mean(scored.iter().map(|s| s.after))),
+        "trajectories": trajectories,
+        "parameters": parameters,
+        "vehicle": card.display().to_string(),
+    })
+}
+
+/// The document with the bundle that was written, and what all of it was made from.
+fn with_bundle(mut document: Value, bundle: Option<&Path>, provenance: nesam_evaluation::Provenance) -> Value {
+    document["bundle"] = json!(bundle.map(|path| path.display().to_string()));
+    document["provenance"] = json!(provenance);
+    document
+}
+
+/// Writes a bundle with another card; what was measured with the old one is left out.
+fn save_bundle(base: &ModelBundle, vehicle: &Vehicle, data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
+    let same_vehicle = base.vehicle.name == vehicle.name;
+    let mut bundle = ModelBundle {
+        vehicle: vehicle.clone(),
+        baselines_json: base.baselines_json.clone().filter(|_| same_vehicle),
+        reference_json: None,
+        soil_filter_json: None,
+        rollout_noise_json: None,
+        provenance: Provenance {
+            command: command_line(),
+            data_hash: data_hash.into(),
+            program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
+            parent: Some(base.hash.clone()),
+            ..base.provenance.clone()
+        },
+        ..base.clone()
+    };
+    let path = bundle.save(to).or_failed()?;
+    say!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], path.display());
+    Ok(path)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_changes_of_a_card_are_named_by_their_keys() {
+        let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal/vehicle.json");
+        let card = nesam_trajectories::read_vehicle_card(&dir).expect("a shipped card");
+        assert!(changes(&card, &card).is_empty());
+        let mut fitted = card.clone();
+        fitted.driveline.steering_lag_s += 0.25;
+        fitted.driveline.torque = None;
+        let found = changes(&card, &fitted);
+        let lag = found["driveline.steering_lag_s"][1].as_f64().expect("a number");
+        assert!((lag - fitted.driveline.steering_lag_s).abs() < 1e-12, "{lag}");
+        assert!(found.len() > 1 && found.iter().all(|(name, [_, after])| name.starts_with("driveline.torque.") == after.is_null()));
+    }
+
+    #[test]
+    fn analytic_means_are_of_what_was_measured() {
+        let error = |position_m, tilt_rad| Errors { position_m, tilt_rad };
+        let all = mean([error(1.0, None), error(3.0, Some(0.2))].into_iter());
+        assert_eq!((all.position_m, all.tilt_rad), (2.0, Some(0.2)));
+        assert_eq!(mean([error(1.0, None)].into_iter()).tilt_rad, None);
+    }
+}

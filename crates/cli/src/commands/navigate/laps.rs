@@ -1,0 +1,150 @@
+//! Laps one after the other: taken from the files of earlier commands, or driven.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+
+use nesam_navigation::{Run, Scored};
+use serde_json::{Value, json};
+use tokio::runtime::Runtime;
+
+use super::Task;
+use super::stage::Stage;
+use crate::failure::{Failure, OrFail};
+use crate::output;
+use crate::progress::Progress;
+
+/// Measured positions and velocities that differ by more are not those of one point in one frame, m/s: noise of a few centimetres makes a tenth of it.
+const VELOCITY_MISMATCH_MAX_M_S: f64 = 0.5;
+
+/// Which plant laps are driven on.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Identity {
+    /// That of this program.
+    BuiltIn,
+    /// Another that says which it is.
+    Named(String),
+    /// Another that does not.
+    Unnamed,
+}
+
+impl Identity {
+    /// As in the settings of a lap.
+    pub fn in_settings(&self) -> Value {
+        match self {
+            Self::BuiltIn => Value::Null,
+            Self::Named(name) => json!({ "name": name }),
+            Self::Unnamed => json!({ "name": null }),
+        }
+    }
+}
+
+/// The files of laps: where they are, and with which settings a lap is the same.
+pub struct Kept {
+    /// Folder.
+    pub out: PathBuf,
+    /// Settings of a lap by its world.
+    pub settings: HashMap<String, Value>,
+    /// The plant.
+    pub plant: Identity,
+    /// Whether laps of a plant that does not say which it is are taken nevertheless.
+    pub resume: bool,
+}
+
+impl Kept {
+    fn file(&self, task: &Task) -> PathBuf {
+        self.out.join(task.file_name())
+    }
+
+    /// A lap that was driven before with the same settings, on the same plant.
+    fn earlier(&self, task: &Task) -> Option<Run> {
+        if self.plant == Identity::Unnamed && !self.resume {
+            return None;
+        }
+        let file = self.file(task);
+        let read: Value = serde_json::from_slice(&std::fs::read(&file).ok()?).ok()?;
+        let same = read.get("settings") == self.settings.get(&task.world);
+        if !same {
+            crate::output::note!("{} was driven with other settings; it is driven again", file.display());
+        }
+        same.then(|| serde_json::from_value(read.get("run")?.clone()).ok()).flatten()
+    }
+
+    fn keep(&self, task: &Task, run: &Run) -> Result<(), Failure> {
+        let text = serde_json::to_string_pretty(&json!({ "settings": self.settings.get(&task.world), "run": run })).or_failed()?;
+        output::write_file(&self.file(task), text.as_bytes())
+    }
+
+    /// What to do when a command has ended after so many laps.
+    fn to_go_on(&self, failure: Failure, laps: usize) -> Failure {
+        if laps == 0 {
+            return failure;
+        }
+        let with = if self.plant == Identity::Unnamed { " with --resume" } else { "" };
+        let text = format!("{failure}; {laps} laps are kept in {}: the same command{with} goes on after them", self.out.display());
+        match failure {
+            Failure::Input(_) => Failure::Input(text),
+            Failure::Failed(_) => Failure::Failed(text),
+        }
+    }
+}
+
+/// Drives the laps that are not in files yet. Gives the laps there are, in the order of the tasks, and why there are no more where one failed.
+pub fn drive_all(stage: &mut Stage<'_>, runtime: &Runtime, tasks: &[Task], kept: &Kept) -> (Vec<Run>, Result<(), Failure>) {
+    let progress = Progress::start("laps", tasks.len());
+    let mut notes = Notes { of_another: kept.plant != Identity::BuiltIn, no_truth: false, velocity: false };
+    let (mut runs, mut taken, mut ended) = (Vec::new(), 0, Ok(()));
+    for task in tasks {
+        let run = match kept.earlier(task) {
+            Some(run) => {
+                taken += 1;
+                Ok(run)
+            }
+            None => runtime.block_on(stage.drive(task)).and_then(|run| kept.keep(task, &run).map(|()| run)),
+        };
+        match run {
+            Ok(run) => {
+                progress.set_with(runs.len() + 1, &format!("{} {} {}", task.configuration.as_str(), task.world, run.lap.end));
+                notes.of(task, &run);
+                runs.push(run);
+            }
+            Err(failure) => {
+                ended = Err(kept.to_go_on(failure, runs.len()));
+                break;
+            }
+        }
+    }
+    if ended.is_ok() {
+        progress.finish();
+    }
+    if taken > 0 {
+        crate::output::note!("{taken} laps taken from {}", kept.out.display());
+    }
+    (runs, ended)
+}
+
+/// What is to be said once of laps on another simulator.
+struct Notes {
+    of_another: bool,
+    no_truth: bool,
+    velocity: bool,
+}
+
+impl Notes {
+    fn of(&mut self, task: &Task, run: &Run) {
+        if !self.of_another {
+            return;
+        }
+        if run.lap.scored == Scored::State && !self.no_truth {
+            self.no_truth = true;
+            crate::output::note!("note: the plant tells no `truth`: laps are scored by `state`, with its noise");
+        }
+        let mismatch_m_s = run.lap.velocity_mismatch_m_s.filter(|m_s| *m_s > VELOCITY_MISMATCH_MAX_M_S && !self.velocity);
+        if let Some(mismatch_m_s) = mismatch_m_s {
+            self.velocity = true;
+            crate::output::note!(
+                "warning: {}: positions and velocities of `state` differ by {mismatch_m_s:.2} m/s (rms): are velocities in Body, and those of the reference point?",
+                task.file_name()
+            );
+        }
+    }
+}

@@ -1,0 +1,78 @@
+//! Goal: the card of a vehicle can be fitted to its logs, and used. Method: the real binary on the committed sample.
+#![allow(clippy::unwrap_used)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn repository() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
+}
+
+fn sample() -> String {
+    repository().join("tests/data/chrono_sample").display().to_string()
+}
+
+fn shipped(name: &str) -> String {
+    repository().join("deploy/bundles").join(name).display().to_string()
+}
+
+fn nesam(args: &[&str], folder: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
+}
+
+fn said(output: &Output) -> String {
+    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
+}
+
+/// Goal: the fit is that of training, it is scored on drives that it did not see, and card and bundle can be passed on. Method: the two drives of the train split.
+#[test]
+fn chrono_a_card_is_fitted_as_training_does_and_helps_on_other_drives() {
+    let here = tempfile::tempdir().unwrap();
+    let (data, bundle) = (sample(), shipped("hmmwv-nominal"));
+    let set = ["--data", data.as_str(), "--set", "nominal", "--split", "train"];
+    let calibrated = nesam(&[&["calibrate"], &set[..], &["--bundle", &bundle, "--out", "fit"]].concat(), here.path());
+    assert_eq!(calibrated.status.code(), Some(0), "{}", said(&calibrated));
+    let json: Value = serde_json::from_slice(&std::fs::read(here.path().join("fit/calibrate.json")).unwrap()).unwrap();
+    for (key, value) in [("schema", "nesam.calibrate/1"), ("set", "nominal"), ("split", "train")] {
+        assert_eq!(json[key], value);
+    }
+    assert!(json["held_out"] == true && json["trajectories"].as_array().unwrap().len() == 2, "{json}");
+    // The data sheet says nothing of the drive line and takes another contact law: what is fitted on one drive helps on the other.
+    let error = |stage: &str| json[stage]["position_m"].as_f64().unwrap();
+    assert!(error("after") < error("before") && json["after"]["tilt_deg"].is_f64(), "{json}");
+    let parameters = json["parameters"].as_array().unwrap();
+    assert!(parameters.iter().any(|p| p["name"] == "driveline.steering_lag_s" && p["card"] != p["fitted"]), "{json}");
+    assert!(json["provenance"]["command"].as_str().unwrap().starts_with("nesam calibrate"));
+
+    let args = ["--from", bundle.as_str(), "--recalibrate", "--epochs", "0", "--no-mirror", "--out", "trained"];
+    let trained = nesam(&[&["train"], &set[..], &args[..]].concat(), here.path());
+    assert_eq!(trained.status.code(), Some(0), "{}", said(&trained));
+    let text = |file: &str| std::fs::read_to_string(here.path().join(file)).unwrap().trim().to_string();
+    let card = text("fit/vehicle_calibrated.json");
+    assert_eq!(card, text("trained/bundle/vehicle.json"));
+    assert_eq!(card, text("fit/bundle/vehicle.json"));
+    assert!(!here.path().join("fit/bundle/reference.json").exists(), "it was measured with the old card");
+
+    let inspected = nesam(&["inspect", "fit/bundle"], here.path());
+    assert!(inspected.status.success() && said(&inspected).contains("nesam calibrate"), "{}", said(&inspected));
+    let checked = nesam(&["check", "--vehicle", "fit/vehicle_calibrated.json", &data], here.path());
+    assert!(checked.status.success(), "{}", said(&checked));
+}
+
+#[test]
+fn chrono_a_single_drive_is_scored_on_itself_and_says_so() {
+    let here = tempfile::tempdir().unwrap();
+    let (data, bundle) = (sample(), shipped("hmmwv-nominal"));
+    let args = ["calibrate", "--data", &data, "--set", "nominal", "--trajectories", "n0001", "--out", "fit", "--json", "c.json"];
+    let output = nesam(&args, here.path());
+    assert!(output.status.success() && said(&output).contains("the drive that the card was fitted on"), "{}", said(&output));
+    let json: Value = serde_json::from_slice(&std::fs::read(here.path().join("c.json")).unwrap()).unwrap();
+    assert!(json["held_out"] == false && json["bundle"].is_null(), "{json}");
+    let second = ["calibrate", "--data", &data, "--set", "nominal", "--dt", "0.2", "--bundle", &bundle];
+    for (args, words) in [(&second[..], "it steps by 0.1 s"), (&["calibrate", "--set", "nowhere"][..], "no set `nowhere`")] {
+        let output = nesam(args, here.path());
+        assert!(output.status.code() == Some(2) && said(&output).contains(words), "{}", said(&output));
+    }
+}

@@ -1,0 +1,157 @@
+//! Goal: laps on simulators of others, as a person drives them. Method: the real binary on a bicycle behind the plant protocol, which ends its laps early.
+#![allow(clippy::unwrap_used)]
+
+#[path = "../../navigation/tests/common/bicycle.rs"]
+mod bicycle;
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use bicycle::bicycle;
+use serde_json::Value;
+
+fn sample() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample")
+}
+
+/// Drives laps with small plans; `more` has a plant.
+fn navigate(folder: &Path, root: &Path, more: &[&str]) -> Output {
+    let bundle = sample().join("../../../deploy/bundles/hmmwv-nominal");
+    let quick = ["--worlds", "w01", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
+    let mut command = Command::new(env!("CARGO_BIN_EXE_nesam"));
+    command.current_dir(folder).arg("navigate").arg("--data").arg(root).arg("--bundle").arg(bundle).args(quick).args(more);
+    command.output().expect("the binary runs")
+}
+
+fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+fn json(file: &Path) -> Value {
+    serde_json::from_slice(&std::fs::read(file).unwrap()).unwrap()
+}
+
+/// A plant whose laps end half a second after their beginning.
+fn plant(name: Option<&'static str>) -> String {
+    bicycle(move |request, steps, mut reply| {
+        if let (Some(name), true) = (name, request["type"] == "reset") {
+            reply["plant"] = name.into();
+        }
+        if steps == 30 {
+            reply["ended"] = "the test is over".into();
+        }
+        vec![reply.to_string()]
+    })
+}
+
+const KINEMATIC: [&str; 4] = ["--configurations", "kinematic", "--runs", "1"];
+
+/// Goal: laps are taken from earlier commands where the plant is the one that drove them, wherever it listens, and nowhere else. Method: plants of one name, of
+/// another and of none.
+#[test]
+fn service_laps_are_taken_on_the_same_plant_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    let taken = |address: &str, more: &[&str]| {
+        let output = navigate(folder.path(), &sample(), &[&KINEMATIC[..], &["--plant", address], more].concat());
+        let said = stderr(&output);
+        assert!(output.status.success(), "{said}");
+        (said.contains("1 laps taken from laps"), said)
+    };
+    let first = plant(Some("one"));
+    assert!(!taken(&first, &[]).0 && taken(&first, &[]).0 && taken(&plant(Some("one")), &[]).0);
+    let (other, said) = taken(&plant(Some("two")), &[]);
+    assert!(!other && said.contains("driven with other settings"), "{said}");
+    let unnamed = plant(None);
+    let (before, said) = taken(&unnamed, &[]);
+    assert!(!before && said.contains("--resume") && said.contains("scored by `state`"), "{said}");
+    assert!(!taken(&unnamed, &[]).0 && taken(&unnamed, &["--resume"]).0);
+    // Nor is a lap of another plant one of the built-in.
+    let built_in = navigate(folder.path(), &sample(), &KINEMATIC);
+    assert!(built_in.status.success() && !stderr(&built_in).contains("taken from"), "{}", stderr(&built_in));
+}
+
+/// Goal: a simulator that was started anew on the way costs one lap twice. Method: a plant that once says so, twenty steps into its first lap.
+#[test]
+fn service_a_lap_that_was_lost_is_driven_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut forgets = true;
+    let address = bicycle(move |_, steps, mut reply| {
+        if steps == 45 && std::mem::take(&mut forgets) {
+            reply["error"] = "reset comes first".into();
+        }
+        if steps == 60 {
+            reply["ended"] = "the test is over".into();
+        }
+        vec![reply.to_string()]
+    });
+    let output = navigate(folder.path(), &sample(), &[&KINEMATIC[..], &["--plant", &address, "--json", "laps.json"]].concat());
+    assert!(output.status.success() && stderr(&output).contains("it is driven once again"), "{}", stderr(&output));
+    let lap = &json(&folder.path().join("laps.json"))["each"][0]["lap"];
+    assert!(lap["end"] == "the test is over" && lap["scored"] == "state" && lap["completed"] == false, "{lap}");
+}
+
+/// Goal: laps that were driven before a simulator failed are kept, told of, and gone on from. Method: it fails at its second `reset`.
+#[test]
+fn service_laps_before_a_failure_are_kept() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut resets = 0;
+    let address = bicycle(move |request, steps, mut reply| {
+        resets += usize::from(request["type"] == "reset");
+        if resets == 2 {
+            reply["error"] = "no licence".into();
+        }
+        if steps == 30 {
+            reply["ended"] = "the test is over".into();
+        }
+        vec![reply.to_string()]
+    });
+    let asked = ["--configurations", "kinematic", "--runs", "2", "--plant", &address, "--json", "laps.json", "--html", "laps.html"];
+    let output = navigate(folder.path(), &sample(), &asked);
+    let said = stderr(&output);
+    assert!(output.status.code() == Some(1) && said.contains("no licence"), "{said}");
+    assert!(said.contains("1 laps are kept in laps: the same command with --resume goes on after them"), "{said}");
+    let laps = json(&folder.path().join("laps.json"));
+    assert!(laps["runs"] == 1 && laps["provenance"]["ended early"] == "1 of 2 laps", "{laps}");
+    assert!(folder.path().join("laps.html").exists());
+    let again = navigate(folder.path(), &sample(), &[&asked[..], &["--resume"]].concat());
+    assert!(again.status.success() && stderr(&again).contains("1 laps taken from laps"), "{}", stderr(&again));
+    assert_eq!(json(&folder.path().join("laps.json"))["runs"], 2);
+}
+
+/// Goal: a data root without true soil serves another simulator. Method: one world of the sample without its `gt_` files; the oracle is left out, or refused where
+/// it is asked for.
+#[test]
+fn service_a_root_without_true_soil_serves_another_simulator() {
+    let (folder, root) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let world = root.path().join("worlds/w01");
+    std::fs::create_dir_all(&world).unwrap();
+    for file in ["elevation.png", "semantic.png", "world.json"] {
+        std::fs::copy(sample().join("worlds/w01").join(file), world.join(file)).unwrap();
+    }
+    std::fs::copy(sample().join("vehicle_hmmwv.json"), root.path().join("vehicle_hmmwv.json")).unwrap();
+    let address = plant(None);
+    let refused = navigate(folder.path(), root.path(), &["--plant", &address, "--runs", "1", "--configurations", "fixed,oracle"]);
+    assert!(refused.status.code() == Some(2) && stderr(&refused).contains("gt_soil.json"), "{}", stderr(&refused));
+    let output = navigate(folder.path(), root.path(), &["--plant", &address, "--runs", "1", "--json", "laps.json"]);
+    assert!(output.status.success() && stderr(&output).contains("oracle is left out"), "{}", stderr(&output));
+    let laps = json(&folder.path().join("laps.json"));
+    let driven: Vec<[&str; 2]> =
+        laps["each"].as_array().unwrap().iter().map(|run| ["configuration", "soil"].map(|key| run[key].as_str().unwrap())).collect();
+    assert_eq!(driven, [["fixed", "unknown"], ["adapted", "unknown"], ["kinematic", "unknown"]]);
+    assert_eq!(laps["configurations"]["fixed"]["by_soil"]["unknown"]["runs"], 1);
+    assert!(laps["configurations"]["fixed"]["time_s"]["sd"].is_null(), "no lap was completed");
+}
+
+#[test]
+fn service_options_of_another_simulator_without_one_are_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    for (asked, word) in [
+        (&["--resume"][..], "--plant"),
+        (&["--plant-timeout", "5"][..], "--plant"),
+        (&["--plant", "localhost:5599", "--plant-timeout", "0"][..], "--plant-timeout 0"),
+        (&["--plant", "localhost", "--configurations", "kinematic"][..], "plant localhost"),
+    ] {
+        let output = navigate(folder.path(), &sample(), asked);
+        assert!(output.status.code() == Some(2) && stderr(&output).contains(word), "{asked:?}: {}", stderr(&output));
+    }
+}

@@ -1,0 +1,178 @@
+//! Diagnoses of what was recorded, started by clients.
+//!
+//! A diagnosis is minutes of work on all that a session measured. It runs as `nesam diagnose --recording` in a process of its own (ADR 0063), so that it can
+//! neither stop the service nor take its memory: what it does is heard on its standard error, what it found is read from its JSON. Whoever waits for it holds
+//! it: when the call ends, for whatever reason, the process is killed and its folder removed.
+//!
+//! ```text
+//! Start ──► Diagnoses::prepare ──► Work::run ──► nesam diagnose ──► lines of progress, diagnose.json, bundle/
+//! ```
+
+mod folder;
+mod line;
+mod report;
+mod work;
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use nesam_engine::check_name;
+use nesam_proto::v1 as pb;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tonic::{Code, Status};
+
+use crate::config::{Config, DiagnosisConfig};
+use crate::convert::{FIELD_METADATA, to_status};
+use crate::recording::Recorder;
+use crate::web::Live;
+
+pub(crate) use work::Told;
+
+/// What a server needs to diagnose.
+#[derive(Debug)]
+pub(crate) struct Diagnoses {
+    config: DiagnosisConfig,
+    /// Folder for reports and bundles, from the root on: reports name it.
+    directory: PathBuf,
+    /// Folder with the recordings of this server.
+    recordings: PathBuf,
+    recorder: Option<Arc<Recorder>>,
+    /// One for each that may run at a time.
+    places: Arc<Semaphore>,
+    /// Shows reports.
+    live: Live,
+}
+
+/// Parts of a recording.
+#[derive(Debug)]
+struct Source {
+    /// Name of the run.
+    run: String,
+    files: Vec<PathBuf>,
+    /// Whether it is being written.
+    live: bool,
+}
+
+/// A diagnosis that may begin.
+#[derive(Debug)]
+pub(crate) struct Work {
+    diagnoses: Arc<Diagnoses>,
+    asked: pb::StartDiagnosisRequest,
+    against_physics: bool,
+    source: Source,
+    /// Held until it has ended.
+    _place: OwnedSemaphorePermit,
+}
+
+impl Diagnoses {
+    /// Of a server with this configuration.
+    pub fn new(config: &Config, recorder: Option<Arc<Recorder>>, live: Live) -> Self {
+        let directory = &config.diagnosis.directory;
+        Self {
+            directory: std::path::absolute(directory).unwrap_or_else(|_| directory.clone()),
+            recordings: config.recording.directory.clone(),
+            recorder,
+            places: Arc::new(Semaphore::new(config.diagnosis.at_once)),
+            live,
+            config: config.diagnosis.clone(),
+        }
+    }
+
+    /// Longest duration of one.
+    pub fn longest(&self) -> Duration {
+        Duration::from_secs_f64(self.config.limit_s)
+    }
+
+    /// Looks whether a diagnosis can be made, and takes a place for it.
+    ///
+    /// # Errors
+    /// INVALID_ARGUMENT, NOT_FOUND or FAILED_PRECONDITION naming the field; RESOURCE_EXHAUSTED when as many run as may.
+    pub fn prepare(self: &Arc<Self>, asked: pb::StartDiagnosisRequest) -> Result<Work, Status> {
+        check_name("session_id", &asked.session_id).map_err(to_status)?;
+        let Ok(reference) = pb::DiagnosisReference::try_from(asked.reference) else {
+            return Err(refused(Code::InvalidArgument, "reference", format!("{} is none that this server knows", asked.reference)));
+        };
+        if asked.from_stamp_ns.zip(asked.to_stamp_ns).is_some_and(|(from, to)| to < from) {
+            return Err(refused(Code::InvalidArgument, "to_stamp_ns", "lies before from_stamp_ns"));
+        }
+        let source = self.source(&asked.recording)?;
+        let most = self.config.at_once;
+        let place = Arc::clone(&self.places).try_acquire_owned().map_err(|_| {
+            let reason = format!("{most} may run at a time, as many as run now; wait for one to end, or raise `diagnosis.at_once`");
+            refused(Code::ResourceExhausted, "diagnosis.at_once", reason)
+        })?;
+        Ok(Work {
+            diagnoses: Arc::clone(self),
+            asked,
+            against_physics: reference == pb::DiagnosisReference::Physics,
+            source,
+            _place: place,
+        })
+    }
+
+    /// The named recording; an empty name means the one that is being written.
+    fn source(&self, named: &str) -> Result<Source, Status> {
+        let now = self.recorder.as_ref().map(|recorder| recorder.parts()).unwrap_or_default();
+        let run = now.first().and_then(|part| run_of(part));
+        if let Some(run) = run.filter(|run| named.is_empty() || named == *run) {
+            return Ok(Source { run: run.into(), files: now.clone(), live: true });
+        }
+        if named.is_empty() {
+            let reason =
+                "this server records nothing; start it with `nesam serve --record DIR` (`recording.enabled`), or name an earlier recording";
+            return Err(refused(Code::FailedPrecondition, "recording", reason));
+        }
+        check_name("recording", named).map_err(to_status)?;
+        let files = parts_of(&self.recordings, named);
+        if files.is_empty() {
+            let reason = format!("`{named}` is not in the folder of the recordings of this server (`recording.directory`)");
+            return Err(refused(Code::NotFound, "recording", reason));
+        }
+        Ok(Source { run: named.into(), files, live: false })
+    }
+}
+
+/// A refusal that names the field at fault, as [`to_status`] does.
+fn refused(code: Code, field: &str, reason: impl core::fmt::Display) -> Status {
+    let mut status = Status::new(code, format!("`{field}`: {reason}"));
+    if let Ok(field) = field.parse() {
+        status.metadata_mut().insert(FIELD_METADATA, field);
+    }
+    status
+}
+
+/// Name of the run that a part belongs to: `<run>.<part>.mcap`.
+fn run_of(path: &Path) -> Option<&str> {
+    let (run, part) = path.file_name()?.to_str()?.strip_suffix(".mcap")?.rsplit_once('.')?;
+    (!part.is_empty() && part.bytes().all(|byte| byte.is_ascii_digit())).then_some(run)
+}
+
+/// The parts of a run in a folder; none when there is no such folder.
+fn parts_of(folder: &Path, run: &str) -> Vec<PathBuf> {
+    let entries = std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());
+    let mut parts: Vec<PathBuf> = entries.filter(|path| run_of(path) == Some(run)).collect();
+    parts.sort();
+    parts
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: a recording is found by the name of its run alone, whatever else lies beside it. Method: a folder with parts of two runs and strangers.
+    #[test]
+    fn property_the_parts_of_a_run_are_those_of_its_name() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["a.0002.mcap", "a.0001.mcap", "a.mcap", "a.b.0001.mcap", "ab.0001.mcap", "a.0001.mcap.part", "a.x.mcap", "a..mcap"] {
+            std::fs::write(folder.path().join(name), "").unwrap();
+        }
+        let found = |run: &str| -> Vec<String> {
+            parts_of(folder.path(), run).iter().filter_map(|path| Some(path.file_name()?.to_str()?.to_string())).collect()
+        };
+        assert_eq!(found("a"), ["a.0001.mcap", "a.0002.mcap"]);
+        assert_eq!(found("a.b"), ["a.b.0001.mcap"]);
+        assert_eq!(found(".."), [""; 0]);
+        assert_eq!(parts_of(&folder.path().join("none"), "a"), Vec::<PathBuf>::new());
+    }
+}
