@@ -10,12 +10,14 @@ use rayon::prelude::*;
 use crate::candidates::Candidate;
 use crate::channels::{self, Row};
 use crate::condense::{Condensed, condense, part_of};
+use crate::dating::Dating;
 use crate::evidence::Group;
 use crate::fit::{Fit, Prepared, Start, Term, fit};
 use crate::metric::Metric;
 use crate::observe::Bench;
-use crate::onset::{self, Onset};
-use crate::select::{DECISIVE, RIVALS_MAX, Rival, Selection, Yardstick, mismatch};
+use crate::onset::Onset;
+use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick, mismatch};
+use crate::settled::Settled;
 
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
 /// pass for this one on a drive, but seldom with the same size on all.
@@ -26,10 +28,6 @@ const STABILITY_MIN: f64 = 0.6;
 const STABILITY_PARTS: usize = 10;
 /// Weight of the priors of a fit where the model itself is on trial: they only keep in place what cannot be seen (chosen).
 const PRIOR_ON_TRIAL: f64 = 0.01;
-/// Contenders for which an onset is looked for.
-const ONSET_CONTENDERS: usize = 3;
-/// Criterion within which a rival is sized through the physics before it is judged.
-const SETTLED: f64 = 40.0;
 /// Student's t for the thirty drives behind a reference.
 const T_NULLS: f64 = 2.05;
 const T_975: [f64; 10] = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23];
@@ -81,6 +79,8 @@ pub struct Finding {
     pub rivals: Vec<Member>,
     /// Why it is not claimed.
     pub refused: Option<String>,
+    /// Whether that is for its size, which lies at the end of its range or is hardly known.
+    pub refused_for_size: bool,
 }
 
 /// Course of a channel over the drives.
@@ -92,57 +92,6 @@ pub struct Trace {
     pub before: Vec<(f64, f64)>,
     /// The same with the claimed effects.
     pub after: Vec<(f64, f64)>,
-}
-
-/// Hypotheses that were compared through the physics: what each, sized on all drives, leaves of each drive.
-#[derive(Clone, Debug)]
-pub struct Settled {
-    /// The hypotheses.
-    pub members: Vec<usize>,
-    /// Hypotheses that were fitted beside each.
-    others: Vec<usize>,
-    /// Scores of what each member leaves, drive by drive.
-    left: Vec<Vec<Condensed>>,
-}
-
-impl Settled {
-    fn with(&self, member: usize) -> Vec<usize> {
-        std::iter::once(self.members[member]).chain(self.others.iter().copied()).collect()
-    }
-
-    /// What a member leaves of the drives for which `inside` holds.
-    fn group(&self, yardstick: &Yardstick, member: usize, inside: impl Fn(usize) -> bool) -> Group {
-        yardstick.group(self.left[member].iter().enumerate().filter(|(d, _)| inside(*d)).map(|(_, c)| c))
-    }
-
-    /// Position of the member that is best on the drives for which `inside` holds, whose scores before any fit are `before`, and the others, closest first.
-    fn compare(&self, yardstick: &Yardstick, before: &Group, inside: impl Fn(usize) -> bool) -> (usize, Vec<Rival>) {
-        let left: Vec<Group> = (0..self.members.len()).map(|m| self.group(yardstick, m, &inside)).collect();
-        let z = |k: usize, j: usize| yardstick.after_fit(&left[j], before, &self.with(j), self.members[k]).0;
-        let difference = |j: usize, k: usize| z(j, k).powi(2) - z(k, j).powi(2);
-        let best = (1..self.members.len()).fold(0, |best, k| if difference(best, k) < 0.0 { k } else { best });
-        let rival = |k: usize| Rival { hypothesis: self.members[k], difference: difference(best, k) };
-        let mut rivals: Vec<Rival> = (0..self.members.len()).filter(|k| *k != best).map(rival).collect();
-        rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
-        (best, rivals)
-    }
-
-    /// Whether drives that chose `chosen` stand for a hypothesis that `counts`: they chose a member, and of the members one that counts is best on the drives for
-    /// which `inside` holds, or not decided against. Effects near zero, which a choice looks at, do not tell a large delay from a lag.
-    pub(crate) fn stands(
-        &self,
-        yardstick: &Yardstick,
-        chosen: &[usize],
-        before: &Group,
-        inside: impl Fn(usize) -> bool,
-        counts: impl Fn(usize) -> bool,
-    ) -> bool {
-        if !chosen.iter().any(|h| self.members.contains(h)) {
-            return false;
-        }
-        let (best, others) = self.compare(yardstick, before, inside);
-        counts(self.members[best]) || others.iter().any(|r| r.difference < DECISIVE && counts(r.hypothesis))
-    }
 }
 
 /// A set of drives, ready to be judged.
@@ -158,64 +107,14 @@ pub struct Case<'a> {
     pub prepared: Vec<Prepared>,
     /// Deviations of each drive without any effect.
     pub rows: Vec<Vec<Row>>,
-    /// Onset of each hypothesis, from which on its columns are there; `None` until they were looked for.
-    pub onsets: Option<Vec<Option<Onset>>>,
+    /// From when on the columns of each hypothesis are there; `None` until onsets were looked for.
+    pub(crate) dating: Option<Dating>,
 }
 
 impl Case<'_> {
     /// Scores of all drives.
     pub fn condensed(&self) -> impl Iterator<Item = &Condensed> {
         self.prepared.iter().map(|p| &p.condensed)
-    }
-
-    /// Selects effects, looks for the onset of the strongest, and lets the columns begin there where an onset is sure. Onsets are looked for once: columns that
-    /// begin somewhere tell of no onset.
-    pub fn select(&mut self, yardstick: &Yardstick) -> (Selection, Vec<Option<Onset>>) {
-        let group = yardstick.group(self.condensed());
-        let selection = yardstick.select(&group);
-        if let Some(onsets) = &self.onsets {
-            return (selection, onsets.clone());
-        }
-        let mut onsets: Vec<Option<Onset>> = vec![None; yardstick.catalogue.len()];
-        if !selection.differs() {
-            return (selection, onsets);
-        }
-        let mut contenders: Vec<(usize, f64)> =
-            (0..yardstick.catalogue.len()).filter(|h| yardstick.considered[*h]).map(|h| (h, yardstick.after(&group, &[], h).1)).collect();
-        contenders.sort_by(|a, b| b.1.total_cmp(&a.1));
-        let firsts: Vec<usize> = contenders.iter().take(ONSET_CONTENDERS).filter(|c| c.1 > 0.0).map(|c| c.0).collect();
-        for h in firsts {
-            let columns = yardstick.catalogue[h].columns();
-            let shares = group.remainder(&[], &columns, 0.0).shares;
-            let drives: Vec<&Prepared> = self.prepared.iter().collect();
-            let rows: Vec<&[Row]> = self.rows.iter().map(Vec::as_slice).collect();
-            let dispersion = columns.iter().map(|c| yardstick.nulls.dispersion(*c)).fold(1.0, f64::max);
-            onsets[h] = onset::find(&self.metric, &drives, &rows, self.bench.stepping.dt_s, &columns, &shares, dispersion);
-        }
-        self.onsets = Some(onsets.clone());
-        if onsets.iter().all(Option::is_none) {
-            return (selection, onsets);
-        }
-        self.begin_at(yardstick, &onsets);
-        (yardstick.select(&yardstick.group(self.condensed())), onsets)
-    }
-
-    fn begin_at(&mut self, yardstick: &Yardstick, onsets: &[Option<Onset>]) {
-        let (metric, dt_s) = (&self.metric, self.bench.stepping.dt_s);
-        self.prepared.par_iter_mut().zip(&self.rows).for_each(|(prepared, rows)| {
-            let times = prepared.drive.times_s(dt_s);
-            for (h, onset) in onsets.iter().enumerate() {
-                let Some(onset) = onset else { continue };
-                for column in yardstick.catalogue[h].columns() {
-                    for (row, time) in prepared.signatures.columns[column].iter_mut().zip(&times) {
-                        if *time < onset.at_s {
-                            *row = [0.0; channels::CHANNELS];
-                        }
-                    }
-                }
-            }
-            prepared.condensed = condense(metric, rows, &prepared.signatures);
-        });
     }
 
     /// Sizes the chosen effects together.
@@ -256,33 +155,14 @@ impl Case<'_> {
             .collect()
     }
 
-    /// Compares the first chosen effect with its closest rivals once more, each sized through the physics, because a large delay or drag is no multiple of a small one.
-    /// The best comes first, the others remain its rivals; what is left is that of the fit. `None` when nothing was chosen, or what an earlier look settled.
-    pub fn settle(&self, yardstick: &Yardstick, selection: &mut Selection, onsets: &[Option<Onset>]) -> Option<Settled> {
-        let &first = selection.chosen.first().filter(|h| yardstick.known(**h).is_none())?;
-        let before = yardstick.group(self.condensed());
-        let close = selection.rivals[0].iter().filter(|r| r.difference < SETTLED).take(2 * RIVALS_MAX).map(|r| r.hypothesis);
-        let members: Vec<usize> = std::iter::once(first).chain(close).collect();
-        let others = selection.chosen[1..].to_vec();
-        let with = |h: usize| -> Vec<usize> { std::iter::once(h).chain(others.iter().copied()).collect() };
-        let left = members.iter().map(|h| self.left(&self.size(yardstick, &before, &with(*h), onsets))).collect();
-        let settled = Settled { members, others, left };
-        let (best, mut rivals) = settled.compare(yardstick, &before, |_| true);
-        rivals.extend(selection.rivals[0].iter().filter(|r| !settled.members.contains(&r.hypothesis)).cloned());
-        selection.choose(yardstick, &before, settled.with(best));
-        selection.rivals[0] = rivals;
-        selection.remaining = yardstick.remaining_after_fit(&settled.group(yardstick, best, |_| true), &before, &selection.chosen);
-        Some(settled)
-    }
-
-    /// Findings of a selection, in its order, refused or not.
+    /// Findings of a selection, in its order, refused or not; with what each was compared with through the physics.
     pub fn findings(
         &self,
         yardstick: &Yardstick,
         selection: &Selection,
         onsets: &[Option<Onset>],
         fit: &Fit,
-        settled: Option<&Settled>,
+        settled: &[Option<Settled>],
     ) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
         (0..selection.chosen.len())
@@ -298,13 +178,16 @@ impl Case<'_> {
                     z: selection.z[hypothesis].unwrap_or(0.0),
                     alone: selection.alone[i],
                     delta_bic: other.map_or(selection.alone[i].powi(2), |r| r.difference),
-                    stability: self.stability(yardstick, candidate, &rivals, settled.filter(|_| i == 0)),
+                    stability: self.stability(yardstick, candidate, &rivals, settled.get(i).and_then(Option::as_ref)),
                     estimates: estimates(&group, fit, i),
                     onset: onsets[hypothesis],
                     rivals,
                     refused: None,
+                    refused_for_size: false,
                 };
-                finding.refused = refusal(&group, &finding, fit, i);
+                if let Some((why, for_size)) = refusal(&group, &finding, fit, i) {
+                    (finding.refused, finding.refused_for_size) = (Some(why), for_size);
+                }
                 finding
             })
             .collect()
@@ -422,15 +305,15 @@ fn moments(group: &Group, fit: &Fit, term: usize) -> impl Iterator<Item = f64> {
     })
 }
 
-/// Why a fit is not claimed even if it is the best.
-fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<String> {
+/// Why a fit is not claimed even if it is the best, and whether that is for its size.
+fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<(String, bool)> {
     let free = finding.candidate.free();
     if let Some(i) = fit.held[term].iter().position(|h| *h) {
         let e = &finding.estimates[free[i].parameter];
-        return Some(format!("{} = {} {} lies at the end of its physical range", e.name, Short(e.value), e.unit));
+        return Some((format!("{} = {} {} lies at the end of its physical range", e.name, Short(e.value), e.unit), true));
     }
     if finding.stability < STABILITY_MIN {
-        return Some(format!("only {:.0} % of half-samples of the drives choose it", 100.0 * finding.stability));
+        return Some((format!("only {:.0} % of half-samples of the drives choose it", 100.0 * finding.stability), false));
     }
     // An effect of several magnitudes, such as a wind, is known when one of them is.
     let payload = finding.candidate.id() == "payload";
@@ -444,7 +327,7 @@ fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<S
         })
         .chain(payload.then(|| moments(group, fit, term)).into_iter().flatten())
         .fold(f64::INFINITY, f64::min);
-    (relative > MAGNITUDE_HALF_MAX).then(|| format!("its size is known to ±{:.0} % only", 100.0 * relative))
+    (relative > MAGNITUDE_HALF_MAX).then(|| (format!("its size is known to ±{:.0} % only", 100.0 * relative), true))
 }
 
 #[cfg(test)]
@@ -455,7 +338,7 @@ mod tests {
     use crate::candidates::catalogue;
 
     /// Why a torque limit of 0.95 is refused that is known to ±`half`.
-    fn refused(half: f64) -> Option<String> {
+    fn refused(half: f64) -> Option<(String, bool)> {
         let catalogue = catalogue(&[]);
         let hypothesis = catalogue.iter().position(|c| c.id() == "torque_limit").unwrap();
         let candidate = catalogue[hypothesis];
@@ -479,6 +362,7 @@ mod tests {
             onset: None,
             rivals: Vec::new(),
             refused: None,
+            refused_for_size: false,
         };
         refusal(&group, &finding, &fit, 0)
     }
@@ -486,7 +370,7 @@ mod tests {
     /// A torque that is whole is a fraction of 1: 0.95 takes 0.05 of it away, and 0.5 is ten times that.
     #[test]
     fn analytic_a_factor_is_known_by_its_distance_from_one() {
-        assert!(refused(0.5).is_some_and(|why| why.contains("its size is known to")));
+        assert!(refused(0.5).is_some_and(|(why, for_size)| why.contains("its size is known to") && for_size));
         assert_eq!(refused(0.02), None);
     }
 }

@@ -17,6 +17,15 @@ pub struct Learned {
     pub soil: SoilCorrection,
     /// Effects claimed; empty when nothing was.
     pub effects: Vec<ScheduledEffect>,
+    /// Hypothesis of each of them, as its index in the catalogue.
+    pub hypotheses: Vec<usize>,
+}
+
+impl Learned {
+    /// The effects but for that of a hypothesis.
+    pub fn without(&self, hypothesis: usize) -> Vec<ScheduledEffect> {
+        self.effects.iter().zip(&self.hypotheses).filter(|(_, h)| **h != hypothesis).map(|(effect, _)| *effect).collect()
+    }
 }
 
 /// Scores on the held-out drives.

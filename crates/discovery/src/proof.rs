@@ -13,16 +13,17 @@ const WINDOWS_MAX: usize = 1000;
 /// Share of an error by which it may rise without being counted (chosen).
 const RISE_MIN: f64 = 0.02;
 
-/// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the model
-/// before and against the best soil alone, which errors of one drive cannot show.
-pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>) -> Option<String> {
+/// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the best soil
+/// alone and against the model before, which errors of one drive cannot show. Effects that `each` proved themselves beside the others may cancel in part: the model
+/// before is then no measure of what they explain, and must only not be surely better.
+pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Option<String> {
     const WHERE: &str = "on drives that were not fitted";
     let [before, soil, after] = &scores.scores;
-    let scored = &after.errors.trajectory;
-    if least_gain.is_some() && scored.iter().all(|d| Some(d) == scored.first()) {
+    if least_gain.is_some() && !several_scored(scores) {
         return Some("only one drive that was left out can be scored, which proves nothing: leave out two or more".into());
     }
-    for (gain, against) in least_gain.into_iter().flat_map(|gain| [(gain, soil), (gain, before)]) {
+    let against = [soil, before].into_iter().take(if each { 1 } else { 2 });
+    for (against, gain) in against.filter_map(|score| Some((score, least_gain?))) {
         if !falls_surely(against, after, gain, &scores.resamples) {
             let share = if gain > 0.0 { format!(" by {:.0} %", 100.0 * gain) } else { String::new() };
             return Some(format!("no error falls surely{share} {WHERE}"));
@@ -32,8 +33,14 @@ pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>) -> Option<String> {
         .map(|[name, from, by]| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
 }
 
+/// Whether more than one held-out drive has windows.
+pub(crate) fn several_scored(scores: &HeldOut) -> bool {
+    let scored = &scores.scores[2].errors.trajectory;
+    scored.iter().any(|d| Some(d) != scored.first())
+}
+
 /// Whether an error surely falls by at least a share of itself.
-fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, resamples: &Resamples) -> bool {
+pub(crate) fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, resamples: &Resamples) -> bool {
     let (_, interval) = paired_difference(&before.errors, &after.errors, resamples);
     let falls = |(i, b): (Option<[f64; 2]>, Option<f64>)| matches!((i, b), (Some([low, _]), Some(b)) if low > 0.0 && low >= gain * b);
     interval.row(false).into_iter().zip(before.summary.tree.row(false)).any(falls)

@@ -52,19 +52,19 @@ pub(crate) fn pursue(
 ) -> Result<Pursued, DiscoveryError> {
     let (mut known, mut refused): (Vec<Known>, Vec<Finding>) = (Vec::new(), Vec::new());
     for _ in 0..LOOKS {
-        let (mut selection, onsets) = case.select(&yardstick);
+        let (mut selection, mut onsets) = case.select(&yardstick);
         let Some(first) = selection.chosen.get(..known.len() + 1) else { break };
         let Some(&new) = first.iter().find(|h| yardstick.known(**h).is_none()) else { break };
         // What was found last is held against its rivals through the physics.
         let chosen = std::iter::once(new).chain(first.iter().copied().filter(|h| *h != new)).collect();
         let group = yardstick.group(case.condensed());
         selection.choose(&yardstick, &group, chosen);
-        case.settle(&yardstick, &mut selection, &onsets);
+        case.settle(&yardstick, &mut selection, &mut onsets, &[]);
         selection.chosen = needed(case, &yardstick, &group, &selection.chosen, &onsets);
         let Some((fit, fitted)) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
         let others = case.size(&yardstick, &group, &selection.chosen[1..], &onsets);
         if let Some(why) = trial.no_better(&others.effects(), &fit.effects())? {
-            let found = case.findings(&yardstick, &selection, &onsets, &fit, None).into_iter().next();
+            let found = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
             refused.extend(found.map(|finding| Finding { refused: Some(why), ..finding }));
             yardstick.refused.push(selection.chosen[0]);
             continue;
@@ -119,7 +119,7 @@ fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>)
     let rows: Vec<Vec<Row>> = case.prepared.par_iter().map(|p| p.drive.deviations(&bench, &effects, &SoilCorrection::NONE)).collect();
     case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
     // Signatures that are measured again are whole.
-    case.onsets = None;
+    case.dating = None;
     let total = case.prepared.len();
     let mut left = Vec::with_capacity(total);
     for (done, (prepared, rows)) in case.prepared.iter_mut().zip(&rows).enumerate() {

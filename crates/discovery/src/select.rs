@@ -145,7 +145,8 @@ impl Yardstick {
         self.nulls.group(drives)
     }
 
-    fn columns(&self, hypotheses: &[usize]) -> Vec<usize> {
+    /// Columns of hypotheses, one after the other.
+    pub(crate) fn columns(&self, hypotheses: &[usize]) -> Vec<usize> {
         hypotheses.iter().flat_map(|h| self.catalogue[*h].columns()).collect()
     }
 

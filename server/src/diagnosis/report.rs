@@ -108,7 +108,7 @@ mod tests {
             "effects": [
                 {"id": "steering_offset", "parameters": [{"name": "second", "value": 0.05, "ci95": [0.0304, 0.06]}]},
                 {"id": "push", "parameters": [{"name": "f", "value": 1.0, "ci95": null}]},
-                {"id": "wheel_drag", "parameters": [{"name": "wheel", "value": 1.0, "ci95": null}, {"name": "torque_n_m", "value": 900.0, "ci95": [802.0, 998.0]}]},
+                {"id": "wheel_drag", "parameters": [{"name": "wheel", "value": 1.0, "ci95": null}, {"name": "torque_nm", "value": 900.0, "ci95": [802.0, 998.0]}]},
             ],
             "bundle": null,
         }))

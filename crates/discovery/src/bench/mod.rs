@@ -32,10 +32,10 @@ pub use comparators::Comparison;
 pub use score::{MethodScores, Outcome, Scores, clopper_pearson, method_scores, scores};
 
 use self::comparators::Compared;
-use crate::diagnose::judge;
 use crate::error::DiscoveryError;
 use crate::held_out::Scoring;
 use crate::judge::Judge;
+use crate::judgement::judge;
 use crate::observe::{Bench, Stepping, observe, observe_all};
 use rand::SeedableRng;
 use rand::seq::index::sample;

@@ -4,7 +4,7 @@ use serde::Serialize;
 
 use super::{Comparison, Hidden};
 use crate::claims::Finding;
-use crate::diagnose::{Judgement, Verdict};
+use crate::judgement::{Judgement, Verdict};
 use crate::report::describe;
 
 /// A claim in a run.

@@ -1,0 +1,242 @@
+//! Which of the effects that drives speak for began midway.
+//!
+//! A column that is there from the start tells little of an effect that begins: another effect may then stand for it, or take half of its size. So what is chosen is
+//! dated, the columns begin there, and it is chosen again. Each effect is dated beside the others that are chosen, because what an effect leaves that is always there
+//! looks like one that begins wherever the drives happen to show it, and its rivals with it, so that none is ahead for its onset alone.
+
+use std::collections::BTreeMap;
+
+use rayon::prelude::*;
+
+use crate::channels::Row;
+use crate::claims::Case;
+use crate::condense::{Signatures, condense};
+use crate::evidence::Group;
+use crate::onset::{self, Course, DISPERSION_MIN, Onset};
+use crate::select::{DECISIVE, Selection, Yardstick, without};
+
+/// Most times that effects are dated and chosen again (chosen).
+const LOOKS: usize = 3;
+/// Strongest hypotheses that are dated at first, chosen or not.
+const STRONGEST: usize = 3;
+/// Prior standard deviation of the share of an effect beside which another is dated (chosen): loose, it is whatever the drives say.
+const BESIDE_SD: f64 = 10.0;
+
+/// Hypotheses with the time from which each acts, s; `None` = from the start.
+type Acting = Vec<(usize, Option<f64>)>;
+
+/// What is known of the onsets of all hypotheses.
+#[derive(Clone, Debug)]
+pub(crate) struct Dating {
+    /// Onset of each hypothesis, from which on its columns are there.
+    onsets: Vec<Option<Onset>>,
+    /// What each hypothesis was last dated beside; `None` = it was not dated.
+    beside: Vec<Option<Acting>>,
+    /// The whole of each column that begins midway, by drive.
+    whole: Vec<BTreeMap<usize, Vec<Row>>>,
+}
+
+impl Dating {
+    fn none(hypotheses: usize, drives: usize) -> Self {
+        Self { onsets: vec![None; hypotheses], beside: vec![None; hypotheses], whole: vec![BTreeMap::new(); drives] }
+    }
+
+    fn acting(&self, hypotheses: &[usize]) -> Acting {
+        hypotheses.iter().map(|h| (*h, self.onsets[*h].map(|o| o.at_s))).collect()
+    }
+}
+
+impl Case<'_> {
+    /// Onset of each hypothesis as far as it was looked for.
+    pub fn onsets(&self, yardstick: &Yardstick) -> Vec<Option<Onset>> {
+        self.dating.as_ref().map_or_else(|| vec![None; yardstick.catalogue.len()], |dating| dating.onsets.clone())
+    }
+
+    /// Selects effects, dates them with their close rivals, lets the columns begin there where an onset is sure, and selects again, until no onset changes. What
+    /// was dated by an earlier call is dated again where other effects are chosen beside it.
+    pub fn select(&mut self, yardstick: &Yardstick) -> (Selection, Vec<Option<Onset>>) {
+        let mut group = yardstick.group(self.condensed());
+        let mut selection = yardstick.select(&group);
+        if !selection.differs() {
+            return (selection, self.onsets(yardstick));
+        }
+        let strongest = if self.dating.is_none() { strongest(yardstick, &group) } else { Vec::new() };
+        let mut dating = self.dating.take().unwrap_or_else(|| Dating::none(yardstick.catalogue.len(), self.prepared.len()));
+        for look in 0..LOOKS {
+            let mut moved = false;
+            let more = if look == 0 { strongest.as_slice() } else { &[] };
+            for (hypothesis, beside) in places(&selection, more) {
+                let acting = dating.acting(&beside);
+                if dating.beside[hypothesis].as_ref() == Some(&acting) {
+                    continue;
+                }
+                let onset = self.date(yardstick, &group, &dating, hypothesis, &beside);
+                dating.beside[hypothesis] = Some(acting);
+                let before = std::mem::replace(&mut dating.onsets[hypothesis], onset);
+                if before.map(|o| o.at_s) != onset.map(|o| o.at_s) {
+                    self.begin(yardstick, &mut dating, hypothesis);
+                    moved = true;
+                }
+            }
+            if !moved {
+                break;
+            }
+            self.condense_again();
+            group = yardstick.group(self.condensed());
+            selection = yardstick.select(&group);
+        }
+        let onsets = dating.onsets.clone();
+        self.dating = Some(dating);
+        (selection, onsets)
+    }
+
+    /// Onset of a hypothesis that acts beside others, each from its own onset on.
+    fn date(&self, yardstick: &Yardstick, group: &Group, dating: &Dating, hypothesis: usize, beside: &[usize]) -> Option<Onset> {
+        let dt_s = self.bench.stepping.dt_s;
+        let (columns, others) = (yardstick.catalogue[hypothesis].columns(), yardstick.columns(beside));
+        let shares = group.remainder(&others, &columns, 0.0).shares;
+        let drives: Vec<Course<'_>> = self
+            .prepared
+            .iter()
+            .zip(&self.rows)
+            .zip(&dating.whole)
+            .map(|((prepared, rows), whole)| {
+                let signatures = &prepared.signatures;
+                let own: Vec<&Vec<Row>> = columns.iter().map(|c| whole.get(c).unwrap_or(&signatures.columns[*c])).collect();
+                let shift = |k: usize, c: usize| -> f64 { own.iter().zip(&shares).map(|(column, share)| share * column[k][c]).sum() };
+                let loose = others.iter().map(|c| scaled(&signatures.columns[*c], BESIDE_SD));
+                Course {
+                    times_s: prepared.drive.times_s(dt_s),
+                    rows,
+                    shift: (0..rows.len()).map(|k| core::array::from_fn(|c| shift(k, c))).collect(),
+                    beside: signatures.soil.iter().cloned().chain(loose).collect(),
+                }
+            })
+            .collect();
+        onset::find(&self.metric, &drives, dt_s, dispersion(yardstick, hypothesis))
+    }
+
+    /// Lets the columns of a hypothesis begin at its onset.
+    fn begin(&mut self, yardstick: &Yardstick, dating: &mut Dating, hypothesis: usize) {
+        let (dt_s, at_s) = (self.bench.stepping.dt_s, dating.onsets[hypothesis].map(|o| o.at_s));
+        for (prepared, whole) in self.prepared.iter_mut().zip(&mut dating.whole) {
+            let times_s = prepared.drive.times_s(dt_s);
+            for column in yardstick.catalogue[hypothesis].columns() {
+                begin(whole, &mut prepared.signatures, column, &times_s, at_s);
+            }
+        }
+    }
+
+    fn condense_again(&mut self) {
+        let metric = &self.metric;
+        self.prepared.par_iter_mut().zip(&self.rows).for_each(|(prepared, rows)| {
+            prepared.condensed = condense(metric, rows, &prepared.signatures);
+        });
+    }
+}
+
+/// Lets a column of a drive begin at a time, or be there from the start, whatever it was before. `whole` keeps what is cut off.
+fn begin(whole: &mut BTreeMap<usize, Vec<Row>>, signatures: &mut Signatures, column: usize, times_s: &[f64], at_s: Option<f64>) {
+    let now = &mut signatures.columns[column];
+    match at_s {
+        Some(at_s) => {
+            let all = whole.entry(column).or_insert_with(|| now.clone());
+            *now = onset::begun(all, times_s, at_s);
+        }
+        None => {
+            if let Some(all) = whole.remove(&column) {
+                *now = all;
+            }
+        }
+    }
+}
+
+/// Hypotheses to be dated, each once, with those that act beside it: the chosen ones, rivals that are not decided against, each in the place of the one that it competes
+/// with, and `more` in the place of the one that they are closest to.
+fn places(selection: &Selection, more: &[usize]) -> Vec<(usize, Vec<usize>)> {
+    let chosen = &selection.chosen;
+    let mut places: Vec<(usize, Vec<usize>)> = Vec::new();
+    for (i, hypothesis) in chosen.iter().enumerate() {
+        let close = selection.rivals[i].iter().filter(|r| r.difference < DECISIVE).map(|r| r.hypothesis);
+        places.extend(std::iter::once(*hypothesis).chain(close).map(|h| (h, without(chosen, i))));
+    }
+    for hypothesis in more {
+        let against = |i: usize| selection.rivals[i].iter().find(|r| r.hypothesis == *hypothesis).map(|r| (i, r.difference));
+        let closest = (0..chosen.len()).filter_map(against).min_by(|a, b| a.1.total_cmp(&b.1));
+        places.push((*hypothesis, closest.map_or_else(|| chosen.clone(), |(i, _)| without(chosen, i))));
+    }
+    let mut seen = Vec::new();
+    places.retain(|(hypothesis, _)| {
+        let new = !seen.contains(hypothesis);
+        seen.push(*hypothesis);
+        new
+    });
+    places
+}
+
+/// The hypotheses that explain most for how their scores scatter.
+fn strongest(yardstick: &Yardstick, group: &Group) -> Vec<usize> {
+    let gain = |h: usize| yardstick.after(group, &[], h).1 / dispersion(yardstick, h);
+    let mut gains: Vec<(usize, f64)> = (0..yardstick.catalogue.len()).filter(|h| yardstick.considered[*h]).map(|h| (h, gain(h))).collect();
+    gains.sort_by(|a, b| b.1.total_cmp(&a.1));
+    gains.into_iter().take(STRONGEST).filter(|(_, gain)| *gain > 0.0).map(|(h, _)| h).collect()
+}
+
+/// How much more the scores of a hypothesis scatter than the metric says.
+fn dispersion(yardstick: &Yardstick, hypothesis: usize) -> f64 {
+    yardstick.catalogue[hypothesis].columns().into_iter().map(|c| yardstick.nulls.dispersion(c)).fold(DISPERSION_MIN, f64::max)
+}
+
+fn scaled(column: &[Row], factor: f64) -> Vec<Row> {
+    column.iter().map(|row| row.map(|v| v * factor)).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::channels::CHANNELS;
+    use crate::select::Rival;
+
+    fn selection(chosen: &[usize], rivals: &[&[(usize, f64)]]) -> Selection {
+        let of = |rivals: &[(usize, f64)]| -> Vec<Rival> {
+            rivals.iter().map(|&(hypothesis, difference)| Rival { hypothesis, difference }).collect()
+        };
+        Selection {
+            z: Vec::new(),
+            levels: Vec::new(),
+            threshold: 4.0,
+            probability: None,
+            chosen: chosen.to_vec(),
+            alone: Vec::new(),
+            rivals: rivals.iter().copied().map(of).collect(),
+            remaining: (0.0, String::new()),
+        }
+    }
+
+    /// Goal: every chosen effect is dated beside the others, and its close rivals in its place. Method: two chosen ones, a close rival of each, one of both, a far one
+    /// that is among the strongest, and one that is no rival.
+    #[test]
+    fn analytic_effects_are_dated_beside_one_another() {
+        let two = selection(&[7, 3], &[&[(5, 1.0), (9, 2.0), (4, 80.0)], &[(8, -1.0), (9, 3.0), (4, 60.0)]]);
+        let of = |hypothesis: usize, beside: &[usize]| (hypothesis, beside.to_vec());
+        assert_eq!(places(&two, &[]), [of(7, &[3]), of(5, &[3]), of(9, &[3]), of(3, &[7]), of(8, &[7])]);
+        assert_eq!(places(&two, &[7, 4, 1])[5..], [of(4, &[7]), of(1, &[7, 3])]);
+        assert_eq!(places(&selection(&[], &[]), &[2]), [of(2, &[])]);
+    }
+
+    /// Goal: an onset can be revised. Method: a column begins late, then earlier, then with the drive.
+    #[test]
+    fn analytic_a_column_that_begins_earlier_after_all_is_whole_again() {
+        let times_s: Vec<f64> = (0..10).map(f64::from).collect();
+        let column: Vec<Row> = times_s.iter().map(|t| [1.0 + t; CHANNELS]).collect();
+        let mut signatures = Signatures { columns: vec![column.clone()], soil: Vec::new() };
+        let mut whole = BTreeMap::new();
+        for at_s in [8.0, 3.0] {
+            begin(&mut whole, &mut signatures, 0, &times_s, Some(at_s));
+            let there = signatures.columns[0].iter().zip(&times_s).all(|(row, t)| row[0] == if *t >= at_s { 1.0 + t } else { 0.0 });
+            assert!(there, "from {at_s} s on: {:?}", signatures.columns[0]);
+        }
+        begin(&mut whole, &mut signatures, 0, &times_s, None);
+        assert_eq!(signatures.columns[0], column);
+    }
+}

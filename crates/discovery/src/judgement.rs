@@ -1,0 +1,239 @@
+//! What a set of drives says before the proof: effects that are chosen, sized, refused or left.
+
+use crate::candidates::Candidate;
+use crate::claims::{Case, Finding};
+use crate::fit::Fit;
+use crate::onset::Onset;
+use crate::select::{DECISIVE, Selection, Yardstick, without};
+use crate::settled::{Settled, onset_in_place};
+
+/// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
+/// exact, but most of what is different must be explained before anything is claimed.
+const LEFT_MAX: f64 = 0.4;
+/// How far beyond the family-wise threshold the largest evidence must be before drives count as different without a known cause (chosen, as in ADR 0008):
+/// one set in twenty without an effect is beyond the threshold itself.
+const UNEXPLAINED_MARGIN: f64 = 1.5;
+/// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
+const LEFT_MAX_GEOMETRY: f64 = 0.2;
+
+/// Outcome for a person in a hurry.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// Nothing differs from the reference beyond chance.
+    None,
+    /// One effect, or several together, explain it and help on drives that were not fitted.
+    Explained,
+    /// Several effects explain it about as well.
+    Ambiguous,
+    /// Something differs, but no effect of the catalogue may be claimed.
+    Unexplained,
+}
+
+impl Verdict {
+    /// As in JSON.
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::None => "none",
+            Self::Explained => "explained",
+            Self::Ambiguous => "ambiguous",
+            Self::Unexplained => "unexplained",
+        }
+    }
+}
+
+/// A judgement without the proof on held-out drives.
+#[derive(Debug)]
+pub struct Judgement {
+    /// Selection on all fitted drives.
+    pub selection: Selection,
+    /// Findings, refused or not.
+    pub findings: Vec<Finding>,
+    /// Onset of each hypothesis, where one was looked for and is sure.
+    pub onsets: Vec<Option<Onset>>,
+    /// What was compared through the physics with each of the first findings; `None` for one with which nothing was.
+    pub settled: Vec<Option<Settled>>,
+    /// Fit of all chosen effects together; `None` when nothing was chosen.
+    pub fit: Option<Fit>,
+    /// Verdict before the proof.
+    pub verdict: Verdict,
+    /// Why.
+    pub reason: String,
+}
+
+impl Judgement {
+    /// Positions in the findings of those that may be claimed.
+    pub fn claimed(&self) -> Vec<usize> {
+        let any = matches!(self.verdict, Verdict::Explained | Verdict::Ambiguous);
+        (0..self.findings.len()).filter(|i| any && self.findings[*i].refused.is_none()).collect()
+    }
+
+    /// The same without one of several claims, which is refused for this reason: the others are settled and sized again.
+    pub(crate) fn dropping(mut self, case: &Case<'_>, yardstick: &Yardstick, i: usize, why: String) -> Self {
+        let dropped = self.selection.chosen[i];
+        self.findings[i].refused = Some(why);
+        let others = without(&self.selection.chosen, i);
+        self.selection.choose(yardstick, &yardstick.group(case.condensed()), others);
+        let left_out = self.findings.into_iter().filter(|f| f.refused.is_some()).collect();
+        concluded(case, yardstick, self.selection, self.onsets, &[dropped], left_out)
+    }
+}
+
+/// Detects, selects and sizes, without the proof.
+pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
+    let (selection, onsets) = case.select(yardstick);
+    let judgement = concluded(case, yardstick, selection, onsets, &[], Vec::new());
+    rival_instead(case, yardstick, judgement)
+}
+
+/// Settles, sizes and doubts what is chosen until nothing is refused, or only the first is left. What is `passed_over` takes no place; `left_out` was refused before.
+fn concluded(
+    case: &Case<'_>,
+    yardstick: &Yardstick,
+    mut selection: Selection,
+    mut onsets: Vec<Option<Onset>>,
+    passed_over: &[usize],
+    mut left_out: Vec<Finding>,
+) -> Judgement {
+    let group = yardstick.group(case.condensed());
+    loop {
+        let settled = case.settle(yardstick, &mut selection, &mut onsets, passed_over);
+        if selection.chosen.is_empty() {
+            let (verdict, reason) = nothing_chosen(&selection);
+            return Judgement { selection, findings: left_out, onsets, settled, fit: None, verdict, reason };
+        }
+        let fit = case.size(yardstick, &group, &selection.chosen, &onsets);
+        let mut findings = case.findings(yardstick, &selection, &onsets, &fit, &settled);
+        // A further effect that may not be claimed is dropped and the others are sized again without it.
+        let dropped = findings.iter().rposition(|f| f.refused.is_some());
+        match dropped {
+            Some(i) if findings.len() > 1 => {
+                left_out.push(findings.remove(i));
+                let others = without(&selection.chosen, i);
+                selection.choose(yardstick, &group, others);
+            }
+            _ => {
+                let (verdict, reason) = provisional(&selection, &findings, yardstick.model_on_trial);
+                left_out.retain(|dropped| findings.iter().all(|f| f.hypothesis != dropped.hypothesis));
+                findings.extend(left_out);
+                return Judgement { selection, findings, onsets, settled, fit: Some(fit), verdict, reason };
+            }
+        }
+    }
+}
+
+/// Where the only effect that is left is refused for its size, its closest rival of another id, if that may be claimed: a payload whose size nobody can tell is seldom
+/// one. A model on trial takes one effect after the other and tries each for itself.
+fn rival_instead(case: &Case<'_>, yardstick: &Yardstick, judgement: Judgement) -> Judgement {
+    let Some(first) = judgement.findings.first().filter(|f| f.refused_for_size && !yardstick.model_on_trial) else { return judgement };
+    let Some(rival) = closest_of_another_id(&judgement.selection, &yardstick.catalogue) else { return judgement };
+    let (mut selection, mut onsets) = (judgement.selection.clone(), judgement.onsets.clone());
+    onsets[rival] = onset_in_place(&onsets, rival, first.hypothesis);
+    selection.choose(yardstick, &yardstick.group(case.condensed()), vec![rival]);
+    let instead = concluded(case, yardstick, selection, onsets, &[first.hypothesis], judgement.findings.clone());
+    if instead.claimed().is_empty() { judgement } else { instead }
+}
+
+/// The closest rival of the only chosen hypothesis that has another id and is not decided against.
+fn closest_of_another_id(selection: &Selection, catalogue: &[Candidate]) -> Option<usize> {
+    let [only] = selection.chosen[..] else { return None };
+    let close = selection.rivals[0].iter().filter(|r| r.difference < DECISIVE);
+    close.map(|r| r.hypothesis).find(|h| catalogue[*h].id() != catalogue[only].id())
+}
+
+fn nothing_chosen(selection: &Selection) -> (Verdict, String) {
+    if !surely_differs(selection) && selection.differs() {
+        let z = selection.largest();
+        return (Verdict::None, format!("the evidence that anything differs is weak (z = {z:.1}), and no effect may be claimed"));
+    }
+    if selection.differs() {
+        let (z, what) = &selection.remaining;
+        return (
+            Verdict::Unexplained,
+            format!("the drives differ from the reference, most in {what} (z = {z:.1}), but no effect of the catalogue stands out"),
+        );
+    }
+    (Verdict::None, "nothing stands out from drives without an effect".into())
+}
+
+/// Whether the drives differ from the reference beyond doubt, so that it must be said even when no cause can be named.
+fn surely_differs(selection: &Selection) -> bool {
+    selection.largest() >= UNEXPLAINED_MARGIN * selection.threshold
+}
+
+fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool) -> (Verdict, String) {
+    let first = &findings[0];
+    if let Some(refused) = first.refused.as_ref().filter(|_| !surely_differs(selection)) {
+        let (z, label) = (selection.largest(), first.candidate.label());
+        return (
+            Verdict::None,
+            format!("the evidence that anything differs is weak (z = {z:.1}), and {label} cannot be claimed: {refused}"),
+        );
+    }
+    if let Some(refused) = &first.refused {
+        return (
+            Verdict::Unexplained,
+            format!("the drives differ from the reference, but {} cannot be claimed: {refused}", first.candidate.label()),
+        );
+    }
+    let (left, what) = &selection.remaining;
+    let share = left / selection.largest().max(1e-9);
+    let force = findings.iter().any(|f| f.candidate.through_contact());
+    if !model_on_trial && *left >= selection.threshold && share > if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY } {
+        return (
+            Verdict::Unexplained,
+            format!(
+                "{} explains too little: {what} still stands out with z = {left:.1} of {:.1}",
+                first.candidate.label(),
+                selection.largest()
+            ),
+        );
+    }
+    let named: Vec<String> = findings.iter().map(|f| f.candidate.label()).collect();
+    let rivals: Vec<String> = findings.iter().flat_map(|f| &f.rivals).map(|m| m.candidate.label()).collect();
+    if rivals.is_empty() {
+        (Verdict::Explained, format!("{} explains it", together(&named)))
+    } else {
+        (Verdict::Ambiguous, format!("{} explains it, but {} would do about as well", together(&named), rivals.join(" or ")))
+    }
+}
+
+fn together(named: &[String]) -> String {
+    match named {
+        [first, others @ ..] if !others.is_empty() => format!("{first} with {}", others.join(" and ")),
+        _ => named.concat(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::candidates::catalogue;
+    use crate::select::Rival;
+
+    /// Goal: what stands in for an effect that is refused for its size is close to it and something else. Method: a drag of one wheel with rivals: other wheels, then a
+    /// tow that is close or decided against.
+    #[test]
+    fn analytic_the_closest_rival_of_another_id_stands_in() {
+        let catalogue = catalogue(&[]);
+        let at = |label: &str| catalogue.iter().position(|c| c.label() == label).unwrap();
+        let stands_in = |chosen: &[&str], rivals: &[(&str, f64)]| {
+            let rivals: Vec<Rival> =
+                rivals.iter().map(|(label, difference)| Rival { hypothesis: at(label), difference: *difference }).collect();
+            let selection = Selection {
+                z: Vec::new(),
+                levels: Vec::new(),
+                threshold: 4.0,
+                probability: None,
+                chosen: chosen.iter().map(|label| at(label)).collect(),
+                alone: Vec::new(),
+                rivals: vec![rivals; chosen.len()],
+                remaining: (0.0, String::new()),
+            };
+            closest_of_another_id(&selection, &catalogue)
+        };
+        let close = [("wheel_drag RR", 0.5), ("tow", 5.9), ("linear_drag", 5.95)];
+        assert_eq!(stands_in(&["wheel_drag FR"], &close), Some(at("tow")));
+        assert_eq!(stands_in(&["wheel_drag FR"], &[("wheel_drag RR", 0.5), ("tow", 6.1)]), None);
+        assert_eq!(stands_in(&["wheel_drag FR", "gyro_bias"], &close), None, "the other one can be claimed");
+    }
+}

@@ -1,0 +1,293 @@
+//! What drives that were not fitted are predicted with, and whether that proves a judgement.
+
+use nesam_evaluation::{DriveMaps, EvaluationError, ModelScore};
+use nesam_model::Predictor;
+use nesam_physics::SoilCorrection;
+use nesam_physics::effects::Layer;
+use nesam_trajectories::Trajectory;
+
+use crate::claims::{Case, Finding};
+use crate::condense::best_soil;
+use crate::diagnose::Options;
+use crate::held_out::{HeldOut, Learned, score_held_out, score_models};
+use crate::judgement::{Judgement, Verdict};
+use crate::proof::{falls_surely, not_proven, several_scored};
+use crate::select::Yardstick;
+
+/// Share by which an error on held-out drives must surely fall where the model itself is on trial (chosen). A model of a new vehicle is wrong in many ways at
+/// once, and evidence by the scatter of the judged drives themselves saturates; what is left is therefore no measure of what was explained there.
+const GAIN_ON_TRIAL: f64 = 0.1;
+/// Evidence, in thresholds, from which an effect is claimed where no drive is left to prove it on (chosen).
+const WITHOUT_PROOF: f64 = 2.5;
+
+/// Drives that are predicted to prove a judgement.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct HeldDrives<'a> {
+    /// The model without effects.
+    pub predictor: &'a Predictor,
+    /// The drives.
+    pub drives: &'a [Trajectory],
+    /// Their maps.
+    pub maps: &'a DriveMaps,
+    /// What the command line says.
+    pub options: &'a Options,
+}
+
+/// A judgement with what held-out drives say of it.
+#[derive(Debug)]
+pub(crate) struct Proven {
+    /// The judgement, without the claims that were not needed.
+    pub judgement: Judgement,
+    /// What each held-out drive was predicted with.
+    pub learned: Vec<Learned>,
+    /// Scores; `None` when no drive is held out.
+    pub scores: Option<HeldOut>,
+    /// Verdict after the proof.
+    pub verdict: Verdict,
+    /// Why.
+    pub reason: String,
+}
+
+/// Predicts held-out drives with what is claimed. Of several claims, one that the others do as well without is dropped; they are sized again and have to prove
+/// themselves again. `fewer` judges one drive less than were fitted.
+///
+/// # Errors
+/// Those of the model.
+pub(crate) fn prove(
+    case: &Case<'_>,
+    yardstick: &Yardstick,
+    fewer: &Yardstick,
+    mut judgement: Judgement,
+    held: &HeldDrives<'_>,
+) -> Result<Proven, EvaluationError> {
+    let HeldDrives { predictor, drives, maps, options } = *held;
+    loop {
+        let learned = learn(fewer, case, &judgement, options, drives.len());
+        let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
+        let needless = match &scores {
+            Some(scores) => last_needless(&judgement, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
+            None => None,
+        };
+        let Some(i) = needless else {
+            let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial);
+            return Ok(Proven { judgement, learned, scores, verdict, reason });
+        };
+        let why = "no error falls surely with it beside the others on drives that were not fitted";
+        judgement = judgement.dropping(case, yardstick, i, why.into());
+    }
+}
+
+impl HeldDrives<'_> {
+    /// Score of the drives with what was learned but for a hypothesis.
+    fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<ModelScore, EvaluationError> {
+        let windows = self.options.scoring.windows(self.drives)?;
+        let predictors: Vec<Predictor> = learned.iter().map(|l| self.predictor.with_effects(&l.without(hypothesis))).collect();
+        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
+        score_models(&windows, self.maps, &models, scores.scores[2].parameters, &scores.resamples)
+    }
+}
+
+/// Position of the last of several claims that changes how the vehicle moves and without which no error is surely larger; `without` scores the drives with all others.
+fn last_needless<E>(judgement: &Judgement, scores: &HeldOut, without: impl Fn(usize) -> Result<ModelScore, E>) -> Result<Option<usize>, E> {
+    let claimed = judgement.claimed();
+    if claimed.len() < 2 || !several_scored(scores) {
+        return Ok(None);
+    }
+    for i in claimed.into_iter().rev().filter(|i| acts(&judgement.findings[*i])) {
+        if !falls_surely(&without(judgement.findings[i].hypothesis)?, &scores.scores[2], 0.0, &scores.resamples) {
+            return Ok(Some(i));
+        }
+    }
+    Ok(None)
+}
+
+/// What each of `held_out` drives is predicted with; `fewer` judges one drive less than were fitted.
+fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, options: &Options, held_out: usize) -> Vec<Learned> {
+    match options.fit_on {
+        Some(_) => {
+            let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
+            let hypotheses = keep(judgement, judgement.selection.chosen.clone());
+            vec![Learned { soil: best_soil(case.condensed()), effects, hypotheses }; held_out]
+        }
+        None if held_out > 0 => leave_each_out(fewer, case, judgement),
+        None => Vec::new(),
+    }
+}
+
+/// The fitted effects that are claimed.
+pub(crate) fn keep<T: Clone>(judgement: &Judgement, effects: Vec<T>) -> Vec<T> {
+    judgement.claimed().iter().filter_map(|i| effects.get(*i).cloned()).collect()
+}
+
+/// What each drive is predicted with: learned without it. Detection and choice follow from the other drives alone, the size from one step of the whole fit.
+/// What was compared through the physics on all drives is compared in the same way on the others ([`Settled::stands`](crate::settled::Settled::stands)).
+fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement) -> Vec<Learned> {
+    (0..case.prepared.len())
+        .map(|left_out| {
+            let inside = |d: usize| d != left_out;
+            let others = || (0..case.prepared.len()).filter(|d| inside(*d)).map(|d| &case.prepared[d].condensed);
+            let soil = best_soil(others());
+            let group = yardstick.group(others());
+            let chosen = yardstick.select(&group).chosen;
+            let stands = |i: usize| {
+                let named = judgement.findings[i].hypothesis;
+                let settled = judgement.settled.get(i).and_then(Option::as_ref);
+                chosen.contains(&named) || settled.is_some_and(|s| s.stands(yardstick, &chosen, &group, inside, |h| h == named))
+            };
+            let without = judgement.fit.as_ref().map_or_else(Vec::new, |fit| fit.effects_without(left_out));
+            let stood = judgement.claimed().into_iter().filter(|i| stands(*i));
+            let (effects, hypotheses) = stood.filter_map(|i| Some((*without.get(i)?, judgement.findings[i].hypothesis))).unzip();
+            Learned { soil, effects, hypotheses }
+        })
+        .collect()
+}
+
+/// Verdict after the proof on held-out drives.
+fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool) -> (Verdict, String) {
+    let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
+    let (verdict, reason) = (judgement.verdict, judgement.reason.clone());
+    let Some(first) = claimed.first() else { return (verdict, reason) };
+    let refused = |why: String| (Verdict::Unexplained, format!("{} fits, but {why}", first.candidate.label()));
+    let Some(scores) = scores else {
+        let stands = !model_on_trial && beyond_doubt(&claimed, judgement.selection.threshold);
+        return if stands { (verdict, reason) } else { refused("no drive is left to prove it on".into()) };
+    };
+    let must_help = model_on_trial || claimed.iter().any(|f| acts(f));
+    let least_gain = must_help.then_some(if model_on_trial { GAIN_ON_TRIAL } else { 0.0 });
+    if let Some(why) = not_proven(scores, least_gain, claimed.len() > 1 && !model_on_trial) {
+        return refused(why);
+    }
+    let helps = if must_help { "; it helps on drives that were not fitted" } else { "" };
+    let more = if model_on_trial { format!(", and {}", left(judgement)) } else { String::new() };
+    (verdict, format!("{reason}{helps}{more}"))
+}
+
+/// Whether an effect changes how the vehicle moves. A wrong sensor shows in the sensors; whether predictions from it get better is another question, unless the model
+/// itself is on trial.
+fn acts(finding: &Finding) -> bool {
+    matches!(finding.candidate.layer(), Layer::Force | Layer::Actuator | Layer::Soil)
+}
+
+/// Whether claims stand without a proof: each far beyond chance, and no more than one of those that change how the vehicle moves, which stand in for one another.
+fn beyond_doubt(claimed: &[&Finding], threshold: f64) -> bool {
+    claimed.iter().all(|f| f.alone >= WITHOUT_PROOF * threshold) && claimed.iter().filter(|f| acts(f)).count() <= 1
+}
+
+fn left(judgement: &Judgement) -> String {
+    let (z, what) = &judgement.selection.remaining;
+    format!("the model lacks more than that: what is left shows most in {what} (z = {z:.1})")
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_evaluation::{ModelName, POSE_DIM, Resamples, StepError, WindowErrors, summarise};
+
+    use super::*;
+    use crate::candidates::catalogue;
+    use crate::select::Selection;
+
+    /// A judgement that claims effects of this evidence after the others, held against a threshold of 4.
+    fn judgement(claims: &[(&str, f64)]) -> Judgement {
+        let catalogue = catalogue(&[]);
+        let finding = |&(id, alone): &(&str, f64)| {
+            let hypothesis = catalogue.iter().position(|c| c.id() == id).unwrap();
+            Finding {
+                hypothesis,
+                candidate: catalogue[hypothesis],
+                weight: 1.0,
+                z: alone,
+                alone,
+                delta_bic: 50.0,
+                stability: 1.0,
+                estimates: Vec::new(),
+                onset: None,
+                rivals: Vec::new(),
+                refused: None,
+                refused_for_size: false,
+            }
+        };
+        let findings: Vec<Finding> = claims.iter().map(finding).collect();
+        let selection = Selection {
+            z: Vec::new(),
+            levels: Vec::new(),
+            threshold: 4.0,
+            probability: None,
+            chosen: findings.iter().map(|f| f.hypothesis).collect(),
+            alone: findings.iter().map(|f| f.alone).collect(),
+            rivals: vec![Vec::new(); findings.len()],
+            remaining: (1.0, String::new()),
+        };
+        Judgement {
+            selection,
+            findings,
+            onsets: Vec::new(),
+            settled: Vec::new(),
+            fit: None,
+            verdict: Verdict::Explained,
+            reason: "they explain it".into(),
+        }
+    }
+
+    /// Goal: nothing weak or ambiguous is claimed of drives that prove nothing. Method: judgements without scores; 2.5 thresholds of 4 are 10.
+    #[test]
+    fn analytic_without_a_drive_to_prove_it_on_only_what_stands_far_out_is_claimed() {
+        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), None, on_trial);
+        let explained = (Verdict::Explained, "they explain it".to_string());
+        assert_eq!(said(&[("steering_offset", 10.0)], false), explained);
+        assert_eq!(said(&[("steering_offset", 12.0), ("gyro_bias", 11.0)], false), explained);
+        for claims in [&[("map_offset", 9.9)][..], &[("steering_offset", 12.0), ("tow", 12.0)], &[("gyro_bias", 12.0), ("tow", 9.0)]] {
+            let (verdict, reason) = said(claims, false);
+            let why = format!("{} fits, but no drive is left to prove it on", claims[0].0);
+            assert_eq!((verdict, reason), (Verdict::Unexplained, why));
+        }
+        assert_eq!(said(&[("steering_offset", 40.0)], true).0, Verdict::Unexplained);
+    }
+
+    /// Scores of six drives of one window in which every error is this large.
+    fn score(error: f64) -> ModelScore {
+        let drives = 6;
+        let errors = WindowErrors {
+            horizon: 1,
+            scored: [true; POSE_DIM],
+            trajectory: (0..drives).collect(),
+            path_m: vec![5.0; drives],
+            steps: vec![StepError { absolute: [error; POSE_DIM], position_m: error }; drives],
+            not_finite: 0,
+        };
+        let summary = summarise(&errors, &Resamples::draw(drives, 50, 1));
+        ModelScore { name: ModelName::Nesam, parameters: 0, summary, errors, curves: core::array::from_fn(|_| None) }
+    }
+
+    /// Scores before, with the best soil, after.
+    fn held_out(errors: [f64; 3]) -> HeldOut {
+        HeldOut { scores: errors.map(score), controls: Vec::new(), before_onset: None, resamples: Resamples::draw(6, 50, 1) }
+    }
+
+    /// The claim that is needless where the drives have this error without each of some hypotheses, and `after` with all.
+    fn needless(claims: &[&str], scores: &HeldOut, without: &[(&str, f64)]) -> Option<usize> {
+        let judged = judgement(&claims.iter().map(|id| (*id, 12.0)).collect::<Vec<_>>());
+        let of = |hypothesis: usize| {
+            let id = judged.findings.iter().find(|f| f.hypothesis == hypothesis).unwrap().candidate.id();
+            without.iter().find(|w| w.0 == id).map(|w| score(w.1)).ok_or(id)
+        };
+        last_needless(&judged, scores, of).unwrap()
+    }
+
+    /// Goal: each of several effects is proven by itself. Method: scores by hand. Two that cancel in part help only together; a second that rides on the first does not
+    /// help; sensors and single claims are not asked.
+    #[test]
+    fn analytic_each_of_several_claims_has_to_help_beside_the_others() {
+        let cancelling = held_out([0.10, 0.12, 0.10]);
+        assert_eq!(needless(&["steering_offset", "tow"], &cancelling, &[("steering_offset", 0.2), ("tow", 0.3)]), None);
+        let two = judgement(&[("steering_offset", 12.0), ("tow", 12.0)]);
+        assert_eq!(proven(&two, Some(&cancelling), false).0, Verdict::Explained);
+        assert_eq!(proven(&two, Some(&cancelling), true).0, Verdict::Unexplained, "a model on trial has to get better");
+        let one = judgement(&[("tow", 12.0)]);
+        assert_eq!(proven(&one, Some(&cancelling), false).0, Verdict::Unexplained);
+        let riding = held_out([0.20, 0.18, 0.10]);
+        assert_eq!(needless(&["steering_offset", "tow"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(1));
+        assert_eq!(needless(&["tow", "steering_offset"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(0));
+        assert_eq!(needless(&["steering_offset", "gyro_bias"], &riding, &[("steering_offset", 0.2)]), None);
+        assert_eq!(needless(&["tow"], &riding, &[]), None);
+    }
+}
