@@ -10,6 +10,7 @@
 #include <grpcpp/grpcpp.h>
 
 #include <nesam/client.hpp>
+
 #include "known_states.hpp"
 #include "nesam/v1/diagnosis.grpc.pb.h"
 #include "nesam/v1/measurements.grpc.pb.h"
@@ -79,9 +80,9 @@ class Core {
   const std::unique_ptr<v1::Measurements::Stub> measurements;
   const std::unique_ptr<v1::Soil::Stub> soil;
   const std::unique_ptr<v1::Terrain::Stub> terrain;
+  const std::unique_ptr<v1::Diagnosis::Stub> diagnosis;
   /// Guards itself; what is known of a session is no setting of the connection.
   mutable KnownStates known_states;
-  const std::unique_ptr<v1::Diagnosis::Stub> diagnosis;
 };
 
 }  // namespace nesam::detail

@@ -27,7 +27,7 @@ double wrapped(double angle_rad) noexcept {
 
 /// What a fallback may answer instead of.
 bool late(const Error& error) noexcept {
-  return error.code() == Code::deadline_exceeded || error.code() == Code::resource_exhausted || error.code() == Code::unavailable;
+  return error.retryable() || error.code() == Code::deadline_exceeded;
 }
 
 }  // namespace
