@@ -1,4 +1,4 @@
-//! The next version of a bundle: the same with further effects.
+//! The next version of a bundle.
 
 use std::path::{Path, PathBuf};
 
@@ -8,15 +8,20 @@ use nesam_physics::effects::ScheduledEffect;
 use crate::failure::{Failure, OrFail};
 use crate::output::command_line;
 
-/// Writes a bundle with further effects into a folder; its manifest names this command, the data it was made from and the bundle before as its parent.
-pub fn save_with_effects(base: &ModelBundle, effects: &[ScheduledEffect], data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
-    let mut bundle = base.with_effects(effects);
-    bundle.provenance = Provenance {
+/// Where a bundle that is made of another comes from: this command, the data, and the bundle before as its parent.
+pub fn derived_from(base: &ModelBundle, data_hash: &str) -> Provenance {
+    Provenance {
         command: command_line(),
         data_hash: data_hash.into(),
         program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
         parent: Some(base.hash.clone()),
         ..base.provenance.clone()
-    };
+    }
+}
+
+/// Writes a bundle with further effects into a folder; its manifest names this command, the data it was made from and the bundle before as its parent.
+pub fn save_with_effects(base: &ModelBundle, effects: &[ScheduledEffect], data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
+    let mut bundle = base.with_effects(effects);
+    bundle.provenance = derived_from(base, data_hash);
     bundle.save(to).or_failed()
 }

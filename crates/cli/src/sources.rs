@@ -4,7 +4,6 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nesam_client::MapLayers;
 use nesam_learning::recipe::is_validation;
 use nesam_model::{ModelBundle, Precision, Predictor};
 use nesam_physics::{DT_S, Vehicle};
@@ -120,23 +119,6 @@ pub fn query(args: &DataArgs, set: &str, split: SplitArg, ground_truth: bool) ->
 /// The map of each drive. A drive without a world has none; a world that is there and cannot be read is an error.
 pub fn maps_of(root: &DataRoot, drives: &[Trajectory]) -> Result<Vec<Option<Arc<WorldMap>>>, Failure> {
     drives.iter().map(|d| d.world.as_deref().map(|world| root.world(world).or_input()).transpose()).collect()
-}
-
-/// A map as a client uploads it.
-pub fn map_layers(map: &WorldMap) -> MapLayers {
-    let g = map.geometry();
-    MapLayers {
-        id: map.id().into(),
-        version: 1,
-        origin_m: g.origin_m,
-        resolution_m: g.resolution_m,
-        width: g.width,
-        height: g.height,
-        elevation_m: map.elevation_m(),
-        semantic_rgb: map.semantic_rgb(),
-        stamp_ns: map.source().stamp_ns,
-        frame: map.source().frame.clone(),
-    }
 }
 
 /// Loads and verifies a bundle.

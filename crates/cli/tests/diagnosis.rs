@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 
 use common::repository;
 use nesam_client::v1::diagnosis_event::Event;
-use nesam_client::{Client, MapLayers, measurement, v1};
+use nesam_client::{Client, measurement, v1};
 use nesam_trajectories::{DataRoot, SetQuery};
 use serde_json::Value;
 
@@ -37,20 +37,7 @@ async fn drive(client: &mut Client) {
     let query = SetQuery { trajectories: Some(vec!["n0001".into()]), ..SetQuery::all("nominal") };
     let drive = root.load_set(&query).unwrap().remove(0);
     let world = root.world(drive.world.as_ref().unwrap()).unwrap();
-    let geometry = world.geometry();
-    let map = MapLayers {
-        id: world.id().into(),
-        version: 1,
-        origin_m: geometry.origin_m,
-        resolution_m: geometry.resolution_m,
-        width: geometry.width,
-        height: geometry.height,
-        elevation_m: world.elevation_m(),
-        semantic_rgb: world.semantic_rgb(),
-        stamp_ns: None,
-        frame: String::new(),
-    };
-    client.upload_map(&map).await.unwrap();
+    client.upload_map(&nesam_navigation::map_layers(&world)).await.unwrap();
     for (session, map_id) in [("truck", world.id()), ("mapless", "")] {
         let (vehicle_id, map_id) = (session.to_string(), map_id.to_string());
         client.open_session(v1::OpenSessionRequest { vehicle_id, map_id, ..Default::default() }).await.unwrap();

@@ -43,19 +43,7 @@ fn recorded() -> Drive {
     let root = DataRoot::open(&repository().join("tests/data/chrono_sample"), None).unwrap();
     let drive = root.load_set(&SetQuery { trajectories: Some(vec!["n0005".into()]), ..SetQuery::all("nominal") }).unwrap().remove(0);
     let world = root.world(drive.world.as_ref().unwrap()).unwrap();
-    let geometry = world.geometry();
-    let map = MapLayers {
-        id: world.id().into(),
-        version: 3,
-        origin_m: geometry.origin_m,
-        resolution_m: geometry.resolution_m,
-        width: geometry.width,
-        height: geometry.height,
-        elevation_m: world.elevation_m(),
-        semantic_rgb: world.semantic_rgb(),
-        stamp_ns: None,
-        frame: String::new(),
-    };
+    let map = MapLayers { version: 3, ..nesam_navigation::map_layers(&world) };
     Drive { drive, map }
 }
 

@@ -89,9 +89,7 @@ pub fn summarise(
 ) -> RowSummary {
     let [mut of_degraded, mut of_clean] = [WindowErrors::empty(horizon), WindowErrors::empty(horizon)];
     for (at, drive) in drives.iter().enumerate() {
-        let m = &drive.measured;
-        let [roll, pitch, yaw] = m.attitude;
-        let measured = [m.position, m.position, m.height, roll, pitch, yaw];
+        let measured = drive.measured.pose();
         for asked in &passages[at].asked {
             let Some(other) = clean[at].asked.iter().find(|other| other.sample == asked.sample) else { continue };
             of_degraded.push(at, &asked.start, &asked.path, &asked.truth, measured);

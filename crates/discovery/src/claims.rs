@@ -1,4 +1,4 @@
-//! From a selection to claims: onset, size with interval, stability over sub-samples of drives, and the reasons why a claim is refused.
+//! From a selection to claims: size with interval, stability over sub-samples of drives, and the reasons why a claim is refused.
 
 use std::collections::BTreeMap;
 
@@ -123,7 +123,7 @@ impl Case<'_> {
             .iter()
             .map(|h| Term { candidate: yardstick.catalogue[*h], onset_s: onsets[*h].map_or(0.0, |o| o.at_s.max(0.0)) })
             .collect();
-        let columns: Vec<usize> = chosen.iter().flat_map(|h| yardstick.catalogue[*h].columns()).collect();
+        let columns = yardstick.columns(chosen);
         let mut shares = group.joint_shares(&columns);
         let mut offset = Vec::new();
         let values = terms

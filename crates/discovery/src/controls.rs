@@ -119,7 +119,7 @@ impl Setting<'_> {
         if !self.claimed || chosen.is_empty() {
             return None;
         }
-        let columns: Vec<usize> = chosen.iter().flat_map(|h| self.yardstick.catalogue[*h].columns()).collect();
+        let columns = self.yardstick.columns(chosen);
         let shares = DVector::from_vec(self.yardstick.group(self.case.condensed()).joint_shares(&columns));
         let gain = |d: &Condensed| {
             let information = d.information.select_rows(&columns).select_columns(&columns);

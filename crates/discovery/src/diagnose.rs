@@ -2,7 +2,6 @@
 
 use nesam_evaluation::DriveMaps;
 use nesam_model::{ModelBundle, Predictor};
-use nesam_physics::SoilCorrection;
 use nesam_physics::effects::written::WRITTEN_MAX;
 use nesam_physics::effects::{Effect, Written};
 use nesam_trajectories::Trajectory;
@@ -12,7 +11,7 @@ use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::Condensed;
 use crate::controls::{Kind, NullDrives, Setting};
 use crate::error::DiscoveryError;
-use crate::held_out::{HeldOut, Learned, Scoring, score_models};
+use crate::held_out::{HeldOut, Learned, Scoring};
 use crate::judge::{Judge, case_of, own_yardstick};
 use crate::judgement::{Verdict, judge};
 use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
@@ -99,7 +98,7 @@ pub struct Diagnosis {
 impl Diagnosis {
     /// The claimed findings.
     pub fn claims(&self) -> impl Iterator<Item = &Finding> {
-        let any = matches!(self.verdict, Verdict::Explained | Verdict::Ambiguous);
+        let any = self.verdict.claims();
         self.findings.iter().filter(move |f| any && f.refused.is_none())
     }
 }
@@ -164,13 +163,13 @@ pub fn diagnose(
     let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options };
     let Proven { judgement, learned, mut scores, verdict, reason } =
         prove(&case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &held_drives)?;
-    let any = matches!(verdict, Verdict::Explained | Verdict::Ambiguous);
+    let any = verdict.claims();
     let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
     let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: any, predictor, held_out: &places };
     let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {
         Some(scores) => {
             progress("controls", 0, held.len());
-            score_controls(&setting, scores, &held, &held_maps, options)?
+            score_controls(&setting, scores, &held_drives)?
         }
         None => (Vec::new(), None),
     };
@@ -257,18 +256,10 @@ fn held_against<'a>(
 type Tried = (Vec<(Kind, usize)>, Option<Effect>);
 
 /// Makes the controls and adds their scores on the held-out drives to `scores`.
-fn score_controls(
-    setting: &Setting<'_>,
-    scores: &mut HeldOut,
-    held: &[Trajectory],
-    maps: &DriveMaps,
-    options: &Options,
-) -> Result<Tried, DiscoveryError> {
+fn score_controls(setting: &Setting<'_>, scores: &mut HeldOut, held: &HeldDrives<'_>) -> Result<Tried, DiscoveryError> {
     let (made, free_form) = setting.controls()?;
-    let windows = options.scoring.windows(held)?;
     for control in &made {
-        let models: Vec<_> = control.predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
-        let score = score_models(&windows, maps, &models, control.parameters, &scores.resamples)?;
+        let score = held.score(&control.predictors, control.parameters, &scores.resamples)?;
         scores.controls.push(score);
     }
     Ok((made.iter().map(|c| (c.kind, c.parameters)).collect(), free_form))

@@ -30,6 +30,11 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// Whether effects are claimed.
+    pub fn claims(self) -> bool {
+        matches!(self, Self::Explained | Self::Ambiguous)
+    }
+
     /// As in JSON.
     pub fn as_str(self) -> &'static str {
         match self {
@@ -63,7 +68,7 @@ pub struct Judgement {
 impl Judgement {
     /// Positions in the findings of those that may be claimed.
     pub fn claimed(&self) -> Vec<usize> {
-        let any = matches!(self.verdict, Verdict::Explained | Verdict::Ambiguous);
+        let any = self.verdict.claims();
         (0..self.findings.len()).filter(|i| any && self.findings[*i].refused.is_none()).collect()
     }
 

@@ -1,6 +1,6 @@
 //! What drives that were not fitted are predicted with, and whether that proves a judgement.
 
-use nesam_evaluation::{DriveMaps, EvaluationError, ModelScore};
+use nesam_evaluation::{DriveMaps, EvaluationError, ModelScore, Resamples};
 use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::Layer;
@@ -78,12 +78,17 @@ pub(crate) fn prove(
 }
 
 impl HeldDrives<'_> {
+    /// Score of the drives with a model for each.
+    pub(crate) fn score(&self, predictors: &[Predictor], parameters: usize, resamples: &Resamples) -> Result<ModelScore, EvaluationError> {
+        let windows = self.options.scoring.windows(self.drives)?;
+        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
+        score_models(&windows, self.maps, &models, parameters, resamples)
+    }
+
     /// Score of the drives with what was learned but for a hypothesis.
     fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<ModelScore, EvaluationError> {
-        let windows = self.options.scoring.windows(self.drives)?;
         let predictors: Vec<Predictor> = learned.iter().map(|l| self.predictor.with_effects(&l.without(hypothesis))).collect();
-        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
-        score_models(&windows, self.maps, &models, scores.scores[2].parameters, &scores.resamples)
+        self.score(&predictors, scores.scores[2].parameters, &scores.resamples)
     }
 }
 
@@ -180,7 +185,7 @@ fn left(judgement: &Judgement) -> String {
 
 #[cfg(test)]
 mod tests {
-    use nesam_evaluation::{ModelName, POSE_DIM, Resamples, StepError, WindowErrors, summarise};
+    use nesam_evaluation::{ModelName, POSE_DIM, StepError, WindowErrors, summarise};
 
     use super::*;
     use crate::candidates::catalogue;

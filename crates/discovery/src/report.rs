@@ -10,7 +10,6 @@ use crate::channels;
 use crate::claims::{Finding, Trace};
 use crate::controls::Kind;
 use crate::diagnose::{Against, Diagnosis};
-use crate::judgement::Verdict;
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
@@ -189,7 +188,7 @@ impl Report<'_> {
                 d.selection.threshold
             ))
             .table(&self.hypothesis_table());
-        if !d.estimates.is_empty() && matches!(d.verdict, Verdict::Explained | Verdict::Ambiguous) {
+        if !d.estimates.is_empty() && d.verdict.claims() {
             page.section("What was added").table(&self.estimate_table());
         }
         if let Some(scores) = &d.scores {
@@ -411,6 +410,7 @@ fn layer_name(layer: Layer) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::judgement::Verdict;
     use crate::select::Selection;
 
     /// Goal: readers find every key of the errors where no drive was held out. Method: a diagnosis without scores.

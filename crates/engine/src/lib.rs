@@ -57,5 +57,5 @@ pub use query::{ALARM_ACTIVE, PredictQuery, Prediction, Provenance, SOIL_NOT_LEA
 pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{
     Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, OpenForecast, Session, SessionImage,
-    SoilEstimate, SoilState, TrackImage, WatchImage,
+    SoilEstimate, SoilState, TrackImage, UNCERTAIN_MAX, WatchImage,
 };

@@ -20,7 +20,7 @@ mod watch;
 
 pub use self::alarm::{Alarm, AlarmKind};
 pub(crate) use self::effects::Acting;
-pub use self::effects::{AppliedEffect, AppliedEffects, AppliedParameter};
+pub use self::effects::{AppliedEffect, AppliedEffects, AppliedParameter, UNCERTAIN_MAX};
 pub use self::forecast::OpenForecast;
 pub(crate) use self::image::refused;
 pub use self::image::{SessionImage, TrackImage, WatchImage};

@@ -96,7 +96,7 @@ pub fn score(model: &ModelPaths, windows: &[Window<'_>], truth: Truth, resamples
     let horizon = windows.first().map_or(0, |w| w.horizon);
     let mut errors = WindowErrors::empty(horizon);
     for (window, path) in windows.iter().zip(&model.paths) {
-        errors.push(window.drive, &window.start_pose(), path, &window.truth(truth), measured_dimensions(window));
+        errors.push(window.drive, &window.start_pose(), path, &window.truth(truth), window.trajectory.measured.pose());
     }
     let curves = std::array::from_fn(|d| {
         let scored = if d < POSE_DIM { errors.scored[d] } else { errors.scored[0] && errors.scored[1] };
@@ -110,13 +110,6 @@ fn curve(errors: &WindowErrors, dimension: usize, resamples: &Resamples) -> Hori
     let mean = columns.iter().map(|c| c.iter().sum::<f64>() / c.len() as f64).collect();
     let ci95 = columns.par_iter().filter_map(|c| resamples.mean_interval(c, &errors.trajectory)).collect();
     HorizonCurve { mean, ci95 }
-}
-
-/// Dimensions that the drive of a window measures.
-fn measured_dimensions(window: &Window<'_>) -> [bool; POSE_DIM] {
-    let m = &window.trajectory.measured;
-    let [roll, pitch, yaw] = m.attitude;
-    [m.position, m.position, m.height, roll, pitch, yaw]
 }
 
 /// Median over windows of the true path length, m.

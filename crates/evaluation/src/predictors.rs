@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nesam_model::{HistoryStep, MeasuredWheels, Predictor, RolloutQuery, SoilField, Variant};
-use nesam_physics::{SecondCommand, SoilCorrection, Vehicle};
+use nesam_physics::{SoilCorrection, Vehicle};
 use nesam_terrain::WorldMap;
 
 use crate::adapt::DriveAdaptation;
@@ -11,7 +11,7 @@ use crate::constant_velocity::constant_velocity;
 use crate::dimension::{POSE_DIM, pose_of};
 use crate::error::EvaluationError;
 use crate::errors::PosePath;
-use crate::kinematic::{KINEMATIC_PARAMETERS, Kinematic};
+use crate::kinematic::{KINEMATIC_PARAMETERS, Kinematic, is_skid};
 use crate::models::ModelName;
 use crate::windows::Window;
 
@@ -162,7 +162,7 @@ impl WindowPredictor {
 
 /// Whether the vehicle of a bundle has road-wheel angles.
 fn is_steered(predictor: &Predictor) -> bool {
-    predictor.bundle().vehicle.second != SecondCommand::YawRateRadS
+    !is_skid(&predictor.bundle().vehicle)
 }
 
 /// Rolls the model out from the start of a window under its recorded commands.

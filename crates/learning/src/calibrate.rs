@@ -9,7 +9,7 @@ use crate::recipe::Reporter;
 use crate::rims::fit_rims;
 use crate::scales::measure;
 use crate::suspension::{TURNS, calibrate_suspension};
-use crate::symbolic::{descend, symbolic_error};
+use crate::symbolic::{HORIZON, descend, symbolic_error};
 
 /// A number of the drive line that is calibrated, with its range.
 pub type Knob = (&'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
@@ -97,6 +97,7 @@ impl DriveLaw {
 /// map, and the scales of the drives.
 pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
     let scales = measure(training, &vehicle, dt_s);
+    let seconds = HORIZON as f64 * dt_s;
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
     let few: Vec<&Drive> = training.iter().copied().step_by((samples / 15_000).max(1)).collect();
     let mut best: Option<(f64, Vehicle)> = None;
@@ -114,7 +115,8 @@ pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, repor
             done += 1;
             reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
         });
-        reporter.line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over 1.6 s; {:?}", candidate.driveline));
+        reporter
+            .line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s; {:?}", candidate.driveline));
         if best.as_ref().is_none_or(|(error, _)| after < *error) {
             best = Some((after, candidate));
         }
@@ -131,7 +133,7 @@ pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, repor
     });
     let (rates, dampings) = (chosen.suspension_n_m, chosen.suspension_n_s_m);
     reporter.line(&format!(
-        "suspension, symbolic model alone {:.3}° -> {:.3}° of roll and pitch over 1.6 s; {rates:.0?} N/m, {dampings:.0?} N s/m",
+        "suspension, symbolic model alone {:.3}° -> {:.3}° of roll and pitch over {seconds:.1} s; {rates:.0?} N/m, {dampings:.0?} N s/m",
         before.to_degrees(),
         after.to_degrees()
     ));

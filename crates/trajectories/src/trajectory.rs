@@ -68,6 +68,17 @@ impl MeasuredChannels {
         wheel_speed: false,
         road_wheel_angle: false,
     };
+
+    /// Which of x, y, z, roll, pitch and yaw are measured.
+    pub fn pose(&self) -> [bool; 6] {
+        let [roll, pitch, yaw] = self.attitude;
+        [self.position, self.position, self.height, roll, pitch, yaw]
+    }
+
+    /// Whether a state says where the vehicle is in three dimensions, so that it can be put on a map.
+    pub fn whole_pose(&self) -> bool {
+        self.pose() == [true; 6]
+    }
 }
 
 /// A recorded drive, resampled to a fixed step; all vectors have one entry per sample.
@@ -98,13 +109,6 @@ pub struct Trajectory {
     pub measured: MeasuredChannels,
     /// Ground truth, only where it was asked for.
     pub truth: Option<GroundTruth>,
-}
-
-impl MeasuredChannels {
-    /// Whether a state says where the vehicle is in three dimensions, so that it can be put on a map.
-    pub fn whole_pose(&self) -> bool {
-        self.position && self.height && self.attitude == [true; 3]
-    }
 }
 
 impl Trajectory {

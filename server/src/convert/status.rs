@@ -31,14 +31,23 @@ pub fn to_status(error: EngineError) -> Status {
     if matches!(error, EngineError::Internal { .. }) {
         tracing::error!(%error, "internal error");
     }
-    let mut status = match &error {
+    let status = match &error {
         EngineError::Overloaded { retry_after_ns, .. } => {
             let details = ErrorDetails::with_retry_info(Some(Duration::from_nanos(*retry_after_ns)));
             Status::with_error_details(code(&error), error.to_string(), details)
         }
         _ => Status::new(code(&error), error.to_string()),
     };
-    if let Ok(field) = error.field().parse() {
+    at_field(status, error.field())
+}
+
+/// A refusal that names the field at fault, in its message and in the metadata.
+pub(crate) fn refused(code: Code, field: &str, reason: impl core::fmt::Display) -> Status {
+    at_field(Status::new(code, format!("`{field}`: {reason}")), field)
+}
+
+fn at_field(mut status: Status, field: &str) -> Status {
+    if let Ok(field) = field.parse() {
         status.metadata_mut().insert(FIELD_METADATA, field);
     }
     status

@@ -23,7 +23,7 @@ use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tonic::{Code, Status};
 
 use crate::config::{Config, DiagnosisConfig};
-use crate::convert::{FIELD_METADATA, to_status};
+use crate::convert::{refused, to_status};
 use crate::recording::Recorder;
 use crate::web::Live;
 
@@ -59,7 +59,6 @@ struct Source {
 pub(crate) struct Work {
     diagnoses: Arc<Diagnoses>,
     asked: pb::StartDiagnosisRequest,
-    against_physics: bool,
     source: Source,
     /// Held until it has ended.
     _place: OwnedSemaphorePermit,
@@ -90,9 +89,9 @@ impl Diagnoses {
     /// INVALID_ARGUMENT, NOT_FOUND or FAILED_PRECONDITION naming the field; RESOURCE_EXHAUSTED when as many run as may.
     pub fn prepare(self: &Arc<Self>, asked: pb::StartDiagnosisRequest) -> Result<Work, Status> {
         check_name("session_id", &asked.session_id).map_err(to_status)?;
-        let Ok(reference) = pb::DiagnosisReference::try_from(asked.reference) else {
+        if pb::DiagnosisReference::try_from(asked.reference).is_err() {
             return Err(refused(Code::InvalidArgument, "reference", format!("{} is none that this server knows", asked.reference)));
-        };
+        }
         if asked.from_stamp_ns.zip(asked.to_stamp_ns).is_some_and(|(from, to)| to < from) {
             return Err(refused(Code::InvalidArgument, "to_stamp_ns", "lies before from_stamp_ns"));
         }
@@ -102,13 +101,7 @@ impl Diagnoses {
             let reason = format!("{most} may run at a time, as many as run now; wait for one to end, or raise `diagnosis.at_once`");
             refused(Code::ResourceExhausted, "diagnosis.at_once", reason)
         })?;
-        Ok(Work {
-            diagnoses: Arc::clone(self),
-            asked,
-            against_physics: reference == pb::DiagnosisReference::Physics,
-            source,
-            _place: place,
-        })
+        Ok(Work { diagnoses: Arc::clone(self), asked, source, _place: place })
     }
 
     /// The named recording; an empty name means the one that is being written.
@@ -131,15 +124,6 @@ impl Diagnoses {
         }
         Ok(Source { run: named.into(), files, live: false })
     }
-}
-
-/// A refusal that names the field at fault, as [`to_status`] does.
-fn refused(code: Code, field: &str, reason: impl core::fmt::Display) -> Status {
-    let mut status = Status::new(code, format!("`{field}`: {reason}"));
-    if let Ok(field) = field.parse() {
-        status.metadata_mut().insert(FIELD_METADATA, field);
-    }
-    status
 }
 
 /// Name of the run that a part belongs to: `<run>.<part>.mcap`.

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
+use nesam_engine::UNCERTAIN_MAX;
 use nesam_model::bundle::sha256_hex;
 use nesam_model::named_effect;
 use nesam_proto::v1 as pb;
@@ -12,8 +13,6 @@ use super::folder::REPORT;
 
 /// Largest report that is read, bytes; those of five pieces have some tens of thousands.
 const BYTES_MAX: u64 = 8 << 20;
-/// Parameters with a standard deviation that a session takes at most.
-const UNCERTAIN_MAX: usize = 8;
 /// Half width of a 95 % interval, standard deviations.
 const HALF_WIDTH: f64 = 1.96;
 

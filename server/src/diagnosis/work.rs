@@ -15,9 +15,10 @@ use super::folder::Folder;
 use super::line::Line;
 use super::{Work, refused, report};
 use crate::clock::unix_ns;
+use crate::recording::FLUSH_EVERY;
 
 /// After this everything that was recorded before is in the file: twice the interval at which a recording is flushed.
-const WRITTEN_AFTER: Duration = Duration::from_secs(1);
+const WRITTEN_AFTER: Duration = FLUSH_EVERY.saturating_mul(2);
 /// Remarks of the command that are kept.
 const NOTES_MAX: usize = 16;
 /// Characters of the command's reason that are told: a status has to fit into headers.
@@ -99,9 +100,10 @@ impl Work {
         if let Some(seed) = asked.seed {
             command.arg(format!("--seed={seed}"));
         }
-        if self.against_physics {
-            command.arg("--reference=physics");
-        }
+        command.arg(match asked.reference() {
+            pb::DiagnosisReference::Physics => "--reference=physics",
+            pb::DiagnosisReference::Bundle | pb::DiagnosisReference::Unspecified => "--reference=bundle",
+        });
         if asked.without_controls {
             command.arg("--no-controls");
         }
@@ -113,19 +115,22 @@ impl Work {
 }
 
 impl Said {
-    fn note(&mut self, line: &str) {
+    /// Takes a line; gives the progress where it tells some.
+    fn hear(&mut self, line: &str) -> Option<pb::DiagnosisProgress> {
         if let Some(error) = &mut self.error {
             // The reason goes on over several lines.
             error.push('\n');
             error.push_str(line);
-            return;
+            return None;
         }
         match Line::of(line) {
+            Line::Progress { stage, done, total } => return Some(pb::DiagnosisProgress { stage: stage.into(), done, total }),
             Line::Note(note) if self.notes.len() < NOTES_MAX => self.notes.push(note.into()),
             Line::Error(error) => self.error = Some(error.into()),
             Line::Other(text) if !text.trim().is_empty() => self.last = text.into(),
             _ => {}
         }
+        None
     }
 
     /// Why the process failed. Exit code 2 means that the input is at fault.
@@ -144,12 +149,8 @@ async fn listen(stderr: impl AsyncRead + Unpin, told: &Told) -> Said {
     let mut said = Said::default();
     let mut lines = BufReader::new(stderr).lines();
     while let Ok(Some(line)) = lines.next_line().await {
-        match Line::of(&line) {
-            Line::Progress { stage, done, total } if said.error.is_none() => {
-                let progress = pb::DiagnosisProgress { stage: stage.into(), done, total };
-                let _ = told.try_send(Ok(pb::DiagnosisEvent { event: Some(Event::Progress(progress)) }));
-            }
-            _ => said.note(&line),
+        if let Some(progress) = said.hear(&line) {
+            let _ = told.try_send(Ok(pb::DiagnosisEvent { event: Some(Event::Progress(progress)) }));
         }
     }
     said

@@ -34,6 +34,7 @@ pub use difference::FieldDifference;
 pub use error::RecordingError;
 pub use header::RecordingHeader;
 pub use reader::{Ending, RecordedCommand, Recording};
+pub(crate) use recorder::FLUSH_EVERY;
 pub use recorder::{Recorder, RecorderCounts};
 pub use replay::{Difference, KindCount, ReplayReport, replay};
 pub use topic::Topic;

@@ -24,7 +24,7 @@ const WAITING_MAX: usize = 1 << 16;
 /// What a command without arrays weighs, bytes.
 const COMMAND_BYTES: u64 = 2048;
 /// Longest time that a command stays in memory only: what a crash loses at most.
-const FLUSH_EVERY: Duration = Duration::from_millis(500);
+pub(crate) const FLUSH_EVERY: Duration = Duration::from_millis(500);
 
 /// A command on its way to the disk.
 struct Item {

@@ -19,8 +19,17 @@ const LOOK_EVERY_S: f64 = 5.0;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct Reports {
     folder: Option<PathBuf>,
-    added: Arc<Mutex<Vec<Value>>>,
+    added: Arc<Mutex<Added>>,
     looked: Arc<Mutex<Option<(Instant, u64)>>>,
+}
+
+/// Reports that the program itself added.
+#[derive(Debug, Default)]
+struct Added {
+    /// All that ever were.
+    count: u64,
+    /// Those that are shown, the newest first.
+    newest: Vec<Value>,
 }
 
 impl Reports {
@@ -32,14 +41,15 @@ impl Reports {
     /// Adds one. What is not a report of a diagnosis is left out.
     pub fn add(&self, report: Value) {
         if let (Some(summary), Ok(mut added)) = (summary(&report, None), self.added.lock()) {
-            added.insert(0, summary);
-            added.truncate(SHOWN_MAX);
+            added.count += 1;
+            added.newest.insert(0, summary);
+            added.newest.truncate(SHOWN_MAX);
         }
     }
 
     /// Changes whenever the reports do; looks into the folder every few seconds.
     pub fn version(&self) -> u64 {
-        let added = self.added.lock().map_or(0, |added| added.len() as u64);
+        let added = self.added.lock().map_or(0, |added| added.count);
         let Ok(mut looked) = self.looked.lock() else { return added };
         let seen = match *looked {
             Some((at, seen)) if at.elapsed().as_secs_f64() < LOOK_EVERY_S => seen,
@@ -58,7 +68,7 @@ impl Reports {
 
     /// What the page shows of each report, the newest first.
     pub fn read(&self) -> Value {
-        let mut shown = self.added.lock().map(|added| added.clone()).unwrap_or_default();
+        let mut shown = self.added.lock().map(|added| added.newest.clone()).unwrap_or_default();
         for (_, file) in self.folder.as_deref().map(files).unwrap_or_default() {
             if shown.len() >= SHOWN_MAX {
                 break;
@@ -133,5 +143,11 @@ mod tests {
         reports.add(json!({"schema": "nesam.adapt/1"}));
         assert_eq!(reports.version(), before + 1);
         assert_eq!(reports.read()[0]["set"], "t");
+        // More than are shown change the version, too.
+        for _ in 0..SHOWN_MAX {
+            let before = reports.version();
+            reports.add(json!({"schema": "nesam.diagnose/1", "set": "u", "verdict": "none"}));
+            assert_eq!(reports.version(), before + 1);
+        }
     }
 }

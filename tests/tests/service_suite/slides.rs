@@ -2,15 +2,12 @@
 
 use std::sync::Arc;
 
-use nesam_client::Client;
-use nesam_model::{ModelBundle, Predictor};
 use nesam_navigation::{Forecaster, ReferencePath, ServedForecaster, SoilAhead, Surroundings};
 use nesam_plant::Ground;
-use nesam_server::{Config, serve};
 use nesam_terrain::WorldMap;
-use nesam_tests::{sample_root, shipped_bundle};
+use nesam_tests::sample_root;
 
-use crate::stage::layers;
+use crate::stage::{layers, predictor, start};
 
 /// Where the path of `w35` crosses soft mud that falls outwards, and where it is level, m of the path.
 const SLOPE_M: f64 = 88.0;
@@ -21,10 +18,8 @@ const LEVEL_M: f64 = 20.0;
 async fn service_a_soft_slope_ahead_slides_where_its_soil_is_known() {
     let folder = sample_root().join("worlds/w35");
     let (map, ground) = (Arc::new(WorldMap::load(&folder).unwrap()), Ground::read(&folder).unwrap());
-    let predictor = Arc::new(Predictor::new(Arc::new(ModelBundle::load(&shipped_bundle()).unwrap())).unwrap());
-    let vehicle = Arc::new(predictor.bundle().vehicle.clone());
-    let server = serve(Config::ephemeral(), predictor).await.unwrap();
-    let mut client = Client::connect(&format!("http://{}", server.grpc_addr)).await.unwrap();
+    let vehicle = Arc::new(predictor().bundle().vehicle.clone());
+    let (server, mut client) = start().await;
     client.upload_map(&layers(&map)).await.unwrap();
     let path = ReferencePath::of_ood_soil();
     let truth = SoilAhead::along(&mut client, map.id(), &ground, &path, 9.0).await.unwrap();

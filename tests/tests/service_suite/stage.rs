@@ -4,7 +4,7 @@ use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 use nesam_adaptation::{CalibratedFilter, FilterConfig};
-use nesam_client::{Candidates, Client, MapLayers, Prediction, measurement, v1};
+use nesam_client::{Candidates, Client, Prediction, measurement, v1};
 use nesam_engine::{PredictExtras, PredictQuery, WheelMeasurement};
 use nesam_evaluation::adapt_drive;
 use nesam_learning::{Drive, initial::initial_weights, scales};
@@ -17,6 +17,8 @@ use nesam_trajectories::{DataRoot, SetQuery, Trajectory};
 use prost::bytes::Bytes;
 use rand::{RngExt as _, SeedableRng as _};
 use rand_chacha::ChaCha8Rng;
+
+pub use nesam_navigation::map_layers as layers;
 
 /// Step of the model, ns.
 pub const STEP_NS: i64 = 100_000_000;
@@ -97,23 +99,6 @@ pub async fn start_with(change: impl FnOnce(&mut Config)) -> (RunningServer, Cli
 /// A server with defaults on free ports, and a client of it.
 pub async fn start() -> (RunningServer, Client) {
     start_with(|_| {}).await
-}
-
-/// A world as the client uploads it.
-pub fn layers(world: &WorldMap) -> MapLayers {
-    let geometry = world.geometry();
-    MapLayers {
-        id: world.id().into(),
-        version: 1,
-        origin_m: geometry.origin_m,
-        resolution_m: geometry.resolution_m,
-        width: geometry.width,
-        height: geometry.height,
-        elevation_m: world.elevation_m(),
-        semantic_rgb: world.semantic_rgb(),
-        stamp_ns: None,
-        frame: String::new(),
-    }
 }
 
 /// Opens a session on a map.

@@ -7,18 +7,18 @@ use clap::Args;
 use nesam_learning::Drive;
 use nesam_learning::calibrate::calibrate_vehicle;
 use nesam_learning::recipe::{Reporter, load_drives};
-use nesam_learning::scales::measure;
 use nesam_learning::symbolic::{HORIZON, symbolic_error};
-use nesam_model::{ModelBundle, Provenance};
+use nesam_model::{ModelBundle, Normalization};
 use nesam_physics::{SecondCommand, Vehicle};
 use nesam_trajectories::card_to_json;
 use serde_json::{Value, json};
 
 use super::train::Console;
 use crate::args::DataArgs;
+use crate::bundle_version::derived_from;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
-use crate::output::{command_line, out_dir, provenance, say, write_file};
+use crate::output::{check_file, out_dir, provenance, say, write_file};
 use crate::progress::Progress;
 use crate::sources::{Drives, load_bundle, read_drives};
 
@@ -88,15 +88,15 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     let card = drives.root.vehicle();
     let bundle = args.bundle.as_deref().map(|dir| bundle_to_change(dir, args.data.dt)).transpose()?;
     let out = out_dir(args.out.as_deref(), "calibrate", &drives.set)?;
+    args.json.iter().try_for_each(|file| check_file(file))?;
     let measured = load_drives(&drives.root, &drives.drives).or_input()?;
     let usable: Vec<&Drive> = measured.iter().filter(|drive| drive.states.len() > HORIZON + 1).collect();
     if usable.is_empty() {
         let needed_s = (HORIZON + 1) as f64 * args.data.dt;
         return Err(Failure::input(format!("no drive of set `{}` is of {needed_s:.1} s or more, so nothing can be predicted", drives.set)));
     }
-    let (vehicle, _) = calibrate_vehicle(card.clone(), &usable, args.data.dt, &Console::default());
-    let scored =
-        if usable.len() > 1 { held_out(card, &usable, args.data.dt) } else { scored(card, &vehicle, &usable, &usable, args.data.dt) };
+    let (vehicle, scales) = calibrate_vehicle(card.clone(), &usable, args.data.dt, &Console::default());
+    let scored = if usable.len() > 1 { held_out(card, &usable, &scales) } else { scored(card, &vehicle, &usable, &scales) };
     let changes = changes(card, &vehicle);
     let path = out.join(CARD);
     let seconds = HORIZON as f64 * args.data.dt;
@@ -128,7 +128,7 @@ fn bundle_to_change(dir: &Path, dt_s: f64) -> Result<ModelBundle, Failure> {
 }
 
 /// Errors of every drive with a card that was fitted on others.
-fn held_out(card: &Vehicle, drives: &[&Drive], dt_s: f64) -> Vec<Scored> {
+fn held_out(card: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Scored> {
     let folds = FOLDS.min(drives.len());
     let progress = Progress::start("drives left out in turn", folds);
     let mut all: Vec<Scored> = Vec::with_capacity(drives.len());
@@ -136,8 +136,8 @@ fn held_out(card: &Vehicle, drives: &[&Drive], dt_s: f64) -> Vec<Scored> {
         let part = |held: bool| -> Vec<&Drive> {
             drives.iter().enumerate().filter(|(i, _)| (i % folds == fold) == held).map(|(_, drive)| *drive).collect()
         };
-        let fitted = calibrate_vehicle(card.clone(), &part(false), dt_s, &Silent).0;
-        all.extend(scored(card, &fitted, &part(true), drives, dt_s));
+        let fitted = calibrate_vehicle(card.clone(), &part(false), scales.dt_s, &Silent).0;
+        all.extend(scored(card, &fitted, &part(true), scales));
         progress.set(fold + 1);
     }
     progress.finish();
@@ -145,11 +145,10 @@ fn held_out(card: &Vehicle, drives: &[&Drive], dt_s: f64) -> Vec<Scored> {
     all
 }
 
-/// Errors of `drives` with two cards, with the scales of `scale`.
-fn scored(card: &Vehicle, fitted: &Vehicle, drives: &[&Drive], scale: &[&Drive], dt_s: f64) -> Vec<Scored> {
-    let scales = measure(scale, card, dt_s);
+/// Errors of `drives` with two cards.
+fn scored(card: &Vehicle, fitted: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Scored> {
     let errors = |vehicle: &Vehicle, drive: &Drive| {
-        let error = symbolic_error(vehicle, &[drive], &scales);
+        let error = symbolic_error(vehicle, &[drive], scales);
         Errors { position_m: error.position_m, tilt_rad: drive.map.is_some().then_some(error.tilt_rad) }
     };
     drives.iter().map(|drive| Scored { trajectory: drive.id.clone(), before: errors(card, drive), after: errors(fitted, drive) }).collect()
@@ -249,13 +248,7 @@ fn save_bundle(base: &ModelBundle, vehicle: &Vehicle, data_hash: &str, to: &Path
         reference_json: None,
         soil_filter_json: None,
         rollout_noise_json: None,
-        provenance: Provenance {
-            command: command_line(),
-            data_hash: data_hash.into(),
-            program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
-            parent: Some(base.hash.clone()),
-            ..base.provenance.clone()
-        },
+        provenance: derived_from(base, data_hash),
         ..base.clone()
     };
     let path = bundle.save(to).or_failed()?;

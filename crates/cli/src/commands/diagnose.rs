@@ -80,7 +80,7 @@ pub struct DiagnoseArgs {
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum ReferenceArg {
+pub enum ReferenceArg {
     /// The change against the frozen bundle.
     Bundle,
     /// The symbolic model itself, the network silent but for its soil prior; at least 8 drives to fit on.
@@ -98,17 +98,7 @@ impl From<ReferenceArg> for Against {
 
 /// What is asked for, else what the bundle can do: a bundle without a reference knows of no drives without an effect, and then the model itself is on trial.
 fn reference(asked: Option<ReferenceArg>, bundle: &ModelBundle) -> ReferenceArg {
-    match asked {
-        Some(reference) => reference,
-        None if bundle.reference_json.is_some() => ReferenceArg::Bundle,
-        None => {
-            crate::output::note!(
-                "note: bundle {} carries no reference, so the model itself is tested, as with --reference physics; --make-reference measures one",
-                bundle.name
-            );
-            ReferenceArg::Physics
-        }
-    }
+    asked.unwrap_or(if bundle.reference_json.is_some() { ReferenceArg::Bundle } else { ReferenceArg::Physics })
 }
 
 /// What is diagnosed.
@@ -201,11 +191,21 @@ fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure>
 fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
-    let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.data.dt)? };
+    let drives = if args.recording.recording.is_empty() {
+        of_set(args)?
+    } else {
+        args.recording.input(&args.bundle, args.data.dt, args.reference)?
+    };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
     args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
     let predictor = Arc::clone(&drives.predictor);
     let reference = reference(args.reference, predictor.bundle());
+    if args.reference.is_none() && reference == ReferenceArg::Physics {
+        output::note!(
+            "note: bundle {} carries no reference, so the model itself is tested, as with --reference physics; --make-reference measures one",
+            predictor.bundle().name
+        );
+    }
     let options = Options {
         fit_on: args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?,
         without: args.without.clone(),

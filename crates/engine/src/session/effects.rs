@@ -11,7 +11,7 @@ use crate::error::EngineError;
 /// Effects in one session at most.
 const EFFECTS_MAX: usize = 16;
 /// Parameters with a standard deviation at most: each costs every buffer of the soil filter one more rollout.
-const UNCERTAIN_MAX: usize = 8;
+pub const UNCERTAIN_MAX: usize = 8;
 /// Bytes of the text that says where they come from.
 const SOURCE_BYTES_MAX: usize = 256;
 

@@ -22,7 +22,6 @@ use super::vehicle::{FAST_STRIDE, Player};
 use crate::commands::serve;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
-use crate::sources::map_layers;
 
 /// Name of the vehicle, its session and its fleet.
 const NAME: &str = "demo";
@@ -147,7 +146,7 @@ impl Stage {
     async fn prepare(&self, client: &mut Client) -> Result<(), Failure> {
         let mut map_id = String::new();
         if let Some(map) = &self.map {
-            let uploaded = client.upload_map(&map_layers(map)).await.or_failed()?;
+            let uploaded = client.upload_map(&nesam_navigation::map_layers(map)).await.or_failed()?;
             say!("map       {} uploaded, {} x {} cells of {} m", uploaded.map_id, uploaded.width, uploaded.height, uploaded.resolution_m);
             map_id = uploaded.map_id;
         }

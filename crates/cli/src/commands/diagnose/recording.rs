@@ -9,11 +9,16 @@ use nesam_model::bundle::sha256_hex;
 use nesam_server::recording::{Recording, RecordingHeader, window};
 use nesam_trajectories::{Report, drives_of_reports};
 
-use super::Input;
+use super::{Input, ReferenceArg, reference};
 use crate::args::BundleArgs;
 use crate::failure::{Failure, OrFail};
 use crate::output::{self, note, say};
 use crate::sources::{load_recorded_bundle, maps_hash};
+
+/// Pieces of a recording that stand for drives.
+const PIECES: usize = 5;
+/// The same where the model itself is tested, which needs eight drives: pauses cut unevenly.
+const PIECES_OF_THE_MODEL: usize = 10;
 
 /// Options that take the drives from a recording.
 #[derive(Args, Debug)]
@@ -31,20 +36,25 @@ pub struct RecordingArgs {
     /// Last stamp of the window, ns of the vehicle's clock [default: the last]
     #[arg(long, value_name = "NS", requires = "recording", allow_negative_numbers = true, default_value_t = i64::MAX, hide_default_value = true)]
     to_ns: i64,
-    /// Pieces that stand for drives. They share ground and driver, so the evidence is weaker than that of as many drives
-    #[arg(long, value_name = "N", default_value_t = 5, requires = "recording")]
-    pieces: usize,
+    /// Pieces that stand for drives. They share ground and driver, so the evidence is weaker than that of as many drives [default: 5; 10 with --reference
+    /// physics, which needs eight]
+    #[arg(long, value_name = "N", requires = "recording")]
+    pieces: Option<usize>,
 }
 
 impl RecordingArgs {
     /// The pieces of the window with the map of the session.
-    pub fn input(&self, bundle: &BundleArgs, dt_s: f64) -> Result<Input, Failure> {
+    pub fn input(&self, bundle: &BundleArgs, dt_s: f64, asked: Option<ReferenceArg>) -> Result<Input, Failure> {
         let session = self.session.as_deref().unwrap_or_default();
         let mut recording = Recording::open(&self.recording).or_input()?;
         let bundle = recorded_bundle(bundle, recording.header())?;
+        let pieces = self.pieces.unwrap_or(match reference(asked, &bundle) {
+            ReferenceArg::Bundle => PIECES,
+            ReferenceArg::Physics => PIECES_OF_THE_MODEL,
+        });
         let window = window(&mut recording, session, self.from_ns, self.to_ns).or_input()?;
         let reports: Vec<Report> = window.measurements.iter().map(report).collect();
-        let drives = drives_of_reports(session, &reports, dt_s, self.pieces);
+        let drives = drives_of_reports(session, &reports, dt_s, pieces);
         if drives.is_empty() {
             return Err(Failure::input(format!("session `{session}` has no 4 s of measurements without a pause in this window")));
         }

@@ -23,7 +23,6 @@ use super::laps::Identity;
 use super::{Configuration, NavigateArgs, Task, caution_of, cost_of, mppi_of, steering_guess};
 use crate::commands::serve;
 use crate::failure::{Failure, OrFail};
-use crate::sources::map_layers;
 
 /// What a buffer would have to add, as share of the prior information, for a filter that is not to learn: no buffer does.
 const NEVER_EXCITED: f64 = 1e12;
@@ -197,7 +196,7 @@ impl<'a> Stage<'a> {
         };
         if service.maps.insert(world.into()) {
             let map = self.root.world(world).or_input()?;
-            service.client.upload_map(&map_layers(&map)).await.or_failed()?;
+            service.client.upload_map(&nesam_navigation::map_layers(&map)).await.or_failed()?;
         }
         Ok(service)
     }
