@@ -295,7 +295,7 @@ impl ObservedDrive {
 
     fn reading(&self, bench: &Bench<'_>, effects: &[Effect]) -> Reading {
         let vehicle = bench.vehicle.with_effects(effects);
-        let states: Vec<VehicleState<f64>> = self.states.iter().map(|s| vehicle.effects.sensor.to_true(s)).collect();
+        let states = vehicle.effects.sensor.to_true_along(&self.states, bench.stepping.dt_s);
         let model = bench.stepping.model(&vehicle);
         let mut now = self.first_actuators(&vehicle, &states[0]);
         let actuators = self

@@ -10,7 +10,7 @@ use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
-use crate::output::{say, write_file};
+use crate::output::{check_file, say, write_file};
 
 /// Options of `nesam import`.
 #[derive(Args, Debug)]
@@ -83,6 +83,7 @@ enum FrameArg {
 /// Runs the command.
 pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     let folder = target(args)?;
+    args.html.iter().try_for_each(|file| check_file(file))?;
     let lines = match &args.columns {
         Some(file) => std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?,
         None => String::new(),

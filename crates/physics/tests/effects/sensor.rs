@@ -71,6 +71,69 @@ fn analytic_latency_is_the_place_on_the_circle_before() {
 }
 
 #[test]
+fn analytic_a_series_tells_the_way_within_a_latency() {
+    // Speeds up and turns ever faster: x' = v cos ψ with v = 1 + a t, ψ = c t²; places by Simpson's rule on a fine grid.
+    let (a, c, dt) = (1.5f64, 0.1, 0.1);
+    let velocity = |t: f64| [(1.0 + a * t) * (c * t * t).cos(), (1.0 + a * t) * (c * t * t).sin()];
+    let place = |t: f64| {
+        let (n, mut sum) = (2000, [0.0; 3]);
+        for i in 0..=n {
+            let weight = if i == 0 || i == n {
+                1.0
+            } else if i % 2 == 1 {
+                4.0
+            } else {
+                2.0
+            };
+            let v = velocity(t * i as f64 / n as f64);
+            (sum[0], sum[1]) = (sum[0] + weight * v[0] * t / n as f64 / 3.0, sum[1] + weight * v[1] * t / n as f64 / 3.0);
+        }
+        sum
+    };
+    let at = |t: f64, pose_of: f64| VehicleState {
+        position_m: place(pose_of),
+        attitude_rad: [0.0, 0.0, c * t * t],
+        velocity_m_s: [1.0 + a * t, 0.0, 0.0],
+        angular_velocity_rad_s: [0.0, 0.0, 2.0 * c * t],
+    };
+    let series = |latency: f64, pose: bool| -> Vec<_> {
+        let of = |k: usize| {
+            let t = k as f64 * dt;
+            let mut state = at(t, t - latency);
+            if pose {
+                state.attitude_rad[2] = c * (t - latency).powi(2);
+            }
+            state
+        };
+        (0..40).map(of).collect()
+    };
+    for latency in [0.35, 0.1, 0.02, -0.15] {
+        let position = terms(&[Effect::PositionLatency(PositionLatency { seconds: latency })]);
+        let pose = terms(&[Effect::PoseLatency(PoseLatency { seconds: latency })]);
+        for (sensors, measured) in [(position, series(latency, false)), (pose, series(latency, true))] {
+            let truth = sensors.to_true_along(&measured, dt);
+            for (k, state) in truth.iter().enumerate().skip(5).take(30) {
+                let t = k as f64 * dt;
+                let off = (0..3).map(|i| (state.position_m[i] - place(t)[i]).abs()).fold(0.0, f64::max);
+                assert!(off < 2e-3, "{latency} s, sample {k}: {off} m");
+                assert!((state.attitude_rad[2] - c * t * t).abs() < 1e-3, "{latency} s, sample {k}: {:?}", state.attitude_rad);
+            }
+        }
+    }
+    let late = terms(&[Effect::PositionLatency(PositionLatency { seconds: 0.35 })]);
+    let mut measured = series(0.35, false);
+    let present = |k: usize| (late.to_true(&measured[k]).position_m[0] - place(k as f64 * dt)[0]).abs();
+    assert!(present(20) > 0.05, "the present velocity alone would do: {} m", present(20));
+    // A sample that is not there spoils itself and no other; the first has nobody before it.
+    let whole = late.to_true_along(&measured, dt);
+    measured[18].velocity_m_s[0] = f64::NAN;
+    let holed = late.to_true_along(&measured, dt);
+    assert!(holed.iter().enumerate().all(|(k, s)| k == 18 || s.position_m[0].is_finite()));
+    assert_eq!((holed[17], holed[23]), (whole[17], whole[23]));
+    assert!((whole[0].position_m[0] - late.to_true(&measured[0]).position_m[0]).abs() < 1e-12);
+}
+
+#[test]
 fn analytic_a_lever_arm_moves_with_the_body() {
     let sensors = terms(&[Effect::LeverArm(LeverArm { x_m: 0.5, y_m: -0.2 })]);
     let x = moving();

@@ -40,9 +40,9 @@ const CAUTION: CautionSettings = CautionSettings {
     trial_speed_m_s: 2.5,
     slowed_by_m: [0.7, 1.2],
     slow_m_s: 2.2,
-    slow_limits_m_s: [1.5, 2.5],
+    slow_limits_m_s: [2.0, 2.6],
     moved_by_m: [1.0, 2.0],
-    inside_m: 2.2,
+    inside_m: 1.8,
     lead_m: 12.0,
     ramp_m: 6.0,
     behind_m: 3.0,
@@ -163,6 +163,7 @@ impl Task {
 /// Runs the command.
 pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     check(args)?;
+    args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
     let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
     let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
     let load = |dir: Option<&Path>| load_bundle_for(dir, &root).map(|bundle| on_vehicle_of(bundle, &root));
@@ -341,7 +342,6 @@ fn settings_of(args: &NavigateArgs, bundle: &ModelBundle, diagnosed: Option<&Mod
         "speed_limits_m_s": speed_limits_m_s(&bundle.vehicle),
         "caution": caution_of(args),
         "effect": args.effect,
-        "plant": Identity::BuiltIn.in_settings(),
     })
 }
 
