@@ -6,7 +6,7 @@ use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
 use crate::drives::Drive;
 use crate::recipe::Reporter;
-use crate::rims::fit_rims;
+use crate::rims::{fit_rims, fit_rims_to_motion};
 use crate::scales::measure;
 use crate::suspension::{TURNS, calibrate_suspension};
 use crate::symbolic::{HORIZON, descend, symbolic_error};
@@ -157,6 +157,12 @@ pub fn calibrate_driveline(
         if let Some(servo) = fit_rims(vehicle, drives, scales.dt_s) {
             vehicle.driveline.rims = servo;
             progress("rims", servo.speed_gain, servo.turn_efficiency);
+        } else {
+            let mut turn = 0.0;
+            vehicle.driveline.rims = fit_rims_to_motion(vehicle, drives, scales, |error| {
+                turn += 1.0;
+                progress("rims, from the motion", turn, error);
+            });
         }
         return [before, symbolic_error(vehicle, drives, scales).position_m];
     }

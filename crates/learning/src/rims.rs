@@ -1,10 +1,12 @@
-//! Calibration of a skid-steer base's rim servo on measured wheel speeds: what it makes of a commanded twist, apart from what the ground makes of
-//! the rims.
+//! Calibration of a skid-steer base's rim servo: what it makes of a commanded twist, on measured wheel speeds apart from what the ground makes of the rims, or,
+//! where nobody measured them, together with that on the motion.
 
+use nesam_model::Normalization;
 use nesam_physics::driveline::{DrivelineState, rim_twist};
-use nesam_physics::{RimServo, Vehicle};
+use nesam_physics::{Control, RimServo, Vehicle};
 
 use crate::drives::Drive;
+use crate::symbolic::{descend, symbolic_error};
 
 /// A number of the servo that is fitted, with its range.
 type Knob = (fn(&mut RimServo) -> &mut f64, [f64; 2]);
@@ -82,6 +84,43 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
         servo.turn_efficiency = share;
     }
     Some(servo)
+}
+
+/// The servo with which the symbolic model follows the measured motion best, for a base whose wheel speeds nobody measured. The error, m, is that of the position
+/// with what the error of the heading moves a wheel by, half of the track away. The servo stays as it is where none that is found is better; `progress` is told the
+/// error after each turn of a number.
+pub fn fit_rims_to_motion(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, mut progress: impl FnMut(f64)) -> RimServo {
+    let error = |vehicle: &Vehicle| {
+        let of = symbolic_error(vehicle, drives, scales);
+        of.position_m + 0.5 * vehicle.track_m * of.yaw_rad
+    };
+    let before = error(vehicle);
+    let mut begun = vehicle.clone();
+    // Limits begin where the commands do not reach them: from there a search sees them.
+    let largest = |of: &dyn Fn(&Control<f64>) -> f64| drives.iter().flat_map(|d| &d.controls).map(of).fold(0.1, f64::max);
+    begun.driveline.rims = RimServo {
+        yaw_limit_rad_s: largest(&|c| c.second.abs()),
+        rim_limit_m_s: largest(&|c| c.speed_m_s.abs() + 0.5 * vehicle.track_m * c.second.abs()),
+        speed_lag_s: 0.2,
+        yaw_lag_s: 0.2,
+        ..begun.driveline.rims
+    };
+    let mut best = error(&begun);
+    for reach in [0.5, 0.2, 0.1] {
+        for (knob, [low, high]) in KNOBS {
+            let trials = |vehicle: &Vehicle, reach: f64| {
+                [1.0 / (1.0 + reach), 1.0 + reach].map(|factor| {
+                    let mut trial = vehicle.clone();
+                    let value = knob(&mut trial.driveline.rims);
+                    *value = (*value * factor).clamp(low, high);
+                    trial
+                })
+            };
+            best = descend(&mut begun, best, reach, trials, error);
+            progress(best);
+        }
+    }
+    if best < before { begun.driveline.rims } else { vehicle.driveline.rims }
 }
 
 /// Yaw rate of the vehicle per turning of its rims, by least squares; `None` if the rims never turn or the vehicle does not follow them.

@@ -5,7 +5,7 @@ use nesam_model::soil_coordinates::from_raw;
 use nesam_model::{GroundSource, Normalization, history_actuators};
 use nesam_physics::driveline::command_wheels;
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{Soil, Vehicle, VehicleState, WHEELS};
+use nesam_physics::{Soil, Vehicle, VehicleState, WHEELS, wrap_angle};
 use rayon::prelude::*;
 
 use crate::class_soil::ClassSoil;
@@ -27,6 +27,8 @@ pub struct SymbolicError {
     pub position_m: f64,
     /// Roll and pitch together, rad.
     pub tilt_rad: f64,
+    /// Heading, rad.
+    pub yaw_rad: f64,
 }
 
 /// Errors of a vehicle over rollouts from every fortieth sample of drives.
@@ -36,26 +38,26 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
     let of_drive = |drive: &&Drive| {
         let last = drive.states.len().saturating_sub(HORIZON + 1);
         let starts = (WARM_UP.min(last.saturating_sub(1))..last).step_by(STRIDE);
-        starts.map(|i| rollout_error(&model, drive, i, &default_soil, scales)).fold(([0.0; 2], 0), plus)
+        starts.map(|i| rollout_error(&model, drive, i, &default_soil, scales)).fold(([0.0; 3], 0), plus)
     };
     // Summed in the order of the drives, so that calibrating again gives the same bits.
-    let sums: Vec<([f64; 2], usize)> = drives.par_iter().map(of_drive).collect();
-    let (sum, count) = sums.into_iter().fold(([0.0; 2], 0), |all, (sum, count)| (plus(all, sum).0, all.1 + count));
-    let [position_m, tilt_rad] = sum.map(|s| s / count.max(1) as f64);
-    SymbolicError { position_m, tilt_rad }
+    let sums: Vec<([f64; 3], usize)> = drives.par_iter().map(of_drive).collect();
+    let (sum, count) = sums.into_iter().fold(([0.0; 3], 0), |all, (sum, count)| (plus(all, sum).0, all.1 + count));
+    let [position_m, tilt_rad, yaw_rad] = sum.map(|s| s / count.max(1) as f64);
+    SymbolicError { position_m, tilt_rad, yaw_rad }
 }
 
 /// One more rollout in a sum.
-fn plus((sum, count): ([f64; 2], usize), error: [f64; 2]) -> ([f64; 2], usize) {
-    ([sum[0] + error[0], sum[1] + error[1]], count + 1)
+fn plus((sum, count): ([f64; 3], usize), error: [f64; 3]) -> ([f64; 3], usize) {
+    (core::array::from_fn(|i| sum[i] + error[i]), count + 1)
 }
 
-/// Position (m) and tilt (rad). The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
-fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> [f64; 2] {
+/// Position (m), tilt and heading (rad). The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
+fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> [f64; 3] {
     let mut state = drive.states[i];
     let ground = GroundSource::new(drive.map.as_deref(), model, &state);
     let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &state, &drive.controls[i], scales.dt_s);
-    let mut error = [0.0; 2];
+    let mut error = [0.0; 3];
     for k in 0..HORIZON {
         let control = &drive.controls[i + k];
         let after = actuators.advance(model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);
@@ -73,9 +75,10 @@ fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil
         actuators = after;
         let measured = &drive.states[i + k + 1];
         let [x_m, y_m, _] = core::array::from_fn(|axis| state.position_m[axis] - measured.position_m[axis]);
-        let [roll_rad, pitch_rad, _] = core::array::from_fn(|axis| state.attitude_rad[axis] - measured.attitude_rad[axis]);
+        let [roll_rad, pitch_rad, yaw_rad] = core::array::from_fn(|axis| state.attitude_rad[axis] - measured.attitude_rad[axis]);
         error[0] += f64::hypot(x_m, y_m) / HORIZON as f64;
         error[1] += (f64::abs(roll_rad) + f64::abs(pitch_rad)) / HORIZON as f64;
+        error[2] += wrap_angle(yaw_rad).abs() / HORIZON as f64;
     }
     error
 }

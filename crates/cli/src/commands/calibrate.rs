@@ -68,6 +68,7 @@ struct Scored {
 #[derive(Clone, Copy, Default)]
 struct Errors {
     position_m: f64,
+    yaw_rad: f64,
     /// Roll and pitch together; `None` without a map, where they tell of the ground.
     tilt_rad: Option<f64>,
 }
@@ -149,7 +150,7 @@ fn held_out(card: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Sc
 fn scored(card: &Vehicle, fitted: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Scored> {
     let errors = |vehicle: &Vehicle, drive: &Drive| {
         let error = symbolic_error(vehicle, &[drive], scales);
-        Errors { position_m: error.position_m, tilt_rad: drive.map.is_some().then_some(error.tilt_rad) }
+        Errors { position_m: error.position_m, yaw_rad: error.yaw_rad, tilt_rad: drive.map.is_some().then_some(error.tilt_rad) }
     };
     drives.iter().map(|drive| Scored { trajectory: drive.id.clone(), before: errors(card, drive), after: errors(fitted, drive) }).collect()
 }
@@ -157,9 +158,11 @@ fn scored(card: &Vehicle, fitted: &Vehicle, drives: &[&Drive], scales: &Normaliz
 /// Mean over drives; of roll and pitch over those with a map.
 fn mean(errors: impl Iterator<Item = Errors>) -> Errors {
     let all: Vec<Errors> = errors.collect();
+    let over = |of: fn(&Errors) -> f64| all.iter().map(of).sum::<f64>() / all.len().max(1) as f64;
     let tilts: Vec<f64> = all.iter().filter_map(|e| e.tilt_rad).collect();
     Errors {
-        position_m: all.iter().map(|e| e.position_m).sum::<f64>() / all.len().max(1) as f64,
+        position_m: over(|e| e.position_m),
+        yaw_rad: over(|e| e.yaw_rad),
         tilt_rad: (!tilts.is_empty()).then(|| tilts.iter().sum::<f64>() / tilts.len() as f64),
     }
 }
@@ -199,6 +202,7 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
     let (before, after) = (mean(scored.iter().map(|s| s.before)), mean(scored.iter().map(|s| s.after)));
     say!("\nerror of the physics alone over {seconds:.1} s, card -> fitted, {} drives, {on}:", scored.len());
     say!("  position {:.3} m -> {:.3} m", before.position_m, after.position_m);
+    say!("  yaw {:.3}° -> {:.3}°", before.yaw_rad.to_degrees(), after.yaw_rad.to_degrees());
     if let (Some(before), Some(after)) = (before.tilt_rad, after.tilt_rad) {
         say!("  roll and pitch together {:.3}° -> {:.3}°", before.to_degrees(), after.to_degrees());
     }
@@ -212,7 +216,8 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
 }
 
 fn document(args: &CalibrateArgs, drives: &Drives, scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, card: &Path) -> Value {
-    let errors = |e: Errors| json!({"position_m": e.position_m, "tilt_deg": e.tilt_rad.map(f64::to_degrees)});
+    let errors =
+        |e: Errors| json!({"position_m": e.position_m, "yaw_deg": e.yaw_rad.to_degrees(), "tilt_deg": e.tilt_rad.map(f64::to_degrees)});
     let parameters: Vec<Value> =
         changes.iter().map(|(name, [before, after])| json!({"name": name, "card": before, "fitted": after})).collect();
     let trajectories: Vec<Value> =
@@ -276,7 +281,7 @@ mod tests {
 
     #[test]
     fn analytic_means_are_of_what_was_measured() {
-        let error = |position_m, tilt_rad| Errors { position_m, tilt_rad };
+        let error = |position_m, tilt_rad| Errors { position_m, yaw_rad: 0.1, tilt_rad };
         let all = mean([error(1.0, None), error(3.0, Some(0.2))].into_iter());
         assert_eq!((all.position_m, all.tilt_rad), (2.0, Some(0.2)));
         assert_eq!(mean([error(1.0, None)].into_iter()).tilt_rad, None);
