@@ -150,13 +150,15 @@ pub fn predictor_for(bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Predict
 }
 
 /// The bundle on the vehicle of a data root. The bundle's own card is the calibrated one; only where the data root is of another vehicle does the physics take
-/// the new card, while the learned parts stay. This is said on stderr, and so is what a card of the same name says otherwise.
+/// the new card, while the learned parts stay and what was measured of the bundle's vehicle is dropped ([`ModelBundle::move_to`]). This is said on stderr,
+/// and so is what a card of the same name says otherwise.
 pub fn on_vehicle_of(mut bundle: ModelBundle, root: &DataRoot) -> ModelBundle {
     let (own, given) = (&bundle.vehicle, root.vehicle());
     let otherwise = uncalibrated_differences(own, given);
-    if own.second != given.second || own.name != given.name {
+    if !bundle.is_of(given) {
         note!(
-            "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained",
+            "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained, and what it knows of its errors \
+             (reference, soil filter, covariance) is left out",
             bundle.name,
             own.name,
             given.name
@@ -171,6 +173,18 @@ pub fn on_vehicle_of(mut bundle: ModelBundle, root: &DataRoot) -> ModelBundle {
         );
     }
     bundle
+}
+
+/// Refuses to write into a bundle, as `option` does, what was measured on the drives of another vehicle: a bundle drops it there.
+pub fn check_own_vehicle(bundle: &ModelBundle, root: &DataRoot, option: &str) -> Result<(), Failure> {
+    let vehicle = root.vehicle();
+    if bundle.is_of(vehicle) {
+        return Ok(());
+    }
+    Err(Failure::input(format!(
+        "{option}: bundle {} is of `{}`, the data root of `{}`; make a bundle of that vehicle first, with `nesam calibrate --bundle DIR` or `nesam train`",
+        bundle.name, bundle.vehicle.name, vehicle.name
+    )))
 }
 
 /// Relative difference up to which two numbers of cards are the same: digits that a text drops.
@@ -225,4 +239,19 @@ pub fn check_model_step(dt_s: f64) -> Result<(), Failure> {
     Err(Failure::input(format!(
         "the model predicts in steps of {DT_S} s; --dt {dt_s} works with --models kinematic,constant_velocity only"
     )))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: no bundle is given what was measured on another vehicle. Method: the shipped bundles of car and robot, on the car's drives.
+    #[test]
+    fn regress_what_another_vehicle_measured_is_not_written_into_a_bundle() {
+        let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let bundle = |name: &str| ModelBundle::load(&repository.join("deploy/bundles").join(name)).expect("a shipped bundle");
+        let root = DataRoot::open(&repository.join("tests/data/chrono_sample"), None).expect("the shipped sample");
+        assert!(check_own_vehicle(&bundle("hmmwv-nominal"), &root, "--make-reference").is_ok());
+        assert!(check_own_vehicle(&bundle("clearpath-husky"), &root, "--make-reference").is_err());
+    }
 }

@@ -386,7 +386,7 @@ impl Engine {
             wheels: None,
         };
         let learned = session.soil_field(map);
-        let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk };
+        let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false };
         let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
         let looked_at = query.extras.interpolation_deviation && map.is_some();
         let deviation_m = looked_at.then(|| predictor.interpolation_deviation_m(&asked, &asked_extras, &rollout)).transpose()?;

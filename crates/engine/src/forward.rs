@@ -144,7 +144,7 @@ impl RollForward {
         let start = VehicleState::from_array(rollout.state(0, last).to_array().map(f64::from));
         let (states, sinkage_m) =
             (self.tail(&rollout.states, rollout.horizon, STATE_DIM), self.tail(&rollout.sinkage_m, rollout.horizon, WHEELS));
-        (Some(start), Rollout { states, sinkage_m, horizon: rollout.horizon - self.steps(), ..rollout })
+        (Some(start), Rollout { states, position_m: Vec::new(), sinkage_m, horizon: rollout.horizon - self.steps(), ..rollout })
     }
 }
 

@@ -179,6 +179,7 @@ impl Ranking {
     pub fn best_of(&self, rollout: &Rollout) -> Rollout {
         Rollout {
             states: self.rows_of_best(&rollout.states, rollout.horizon * STATE_DIM),
+            position_m: Vec::new(),
             sinkage_m: self.rows_of_best(&rollout.sinkage_m, rollout.horizon * WHEELS),
             flags: self.best.iter().map(|n| rollout.flags[*n as usize]).collect(),
             samples: self.best.len(),

@@ -213,7 +213,7 @@ pub fn roll_out_on(
         start: window.start,
         source,
     })?;
-    let poses = (0..window.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
+    let poses = (0..window.horizon).map(|k| pose_of(&rollout.state_f64(0, k))).collect();
     Ok(PosePath { poses, predicts: [true; POSE_DIM] })
 }
 

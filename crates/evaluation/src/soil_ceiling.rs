@@ -186,7 +186,7 @@ impl Fit<'_> {
         })?;
         let truth = window.truth(self.truth);
         let error = |n: usize, k: usize| -> Pose {
-            let predicted = pose_of(&rollout.state(n, k).map(f64::from));
+            let predicted = pose_of(&rollout.state_f64(n, k));
             std::array::from_fn(|d| {
                 let difference = truth[k][d] - predicted[d];
                 if d < 3 { difference } else { wrap_angle(difference) }

@@ -3,12 +3,14 @@
 //! recomputed from it and from the drive alone.
 
 use std::fs::File;
+use std::path::Path;
 use std::sync::Arc;
 
 use nesam_evaluation::{
     Evaluation, Inputs, ModelName, Provenance, Resamples, Truth, WindowPredictor, all_windows, path_median_m, predict_all, report, score,
     slices, write_predictions,
 };
+use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::{Control, VehicleState};
 use nesam_trajectories::{MeasuredChannels, Trajectory};
 use parquet::file::reader::{FileReader, SerializedFileReader};
@@ -125,6 +127,33 @@ fn regress_what_a_drive_does_not_measure_is_null() {
         }
     }
     assert!(json["position_m"]["mean"].is_f64());
+}
+
+/// Goal: errors do not depend on where the origin lies. Method: the shipped bundle on a drive and on the same drive at UTM coordinates, where f32 is rounded to
+/// half a metre; f64 is to a nanometre, which the network's f32 may carry to a few micrometres.
+#[test]
+fn regress_predictions_far_from_the_origin_are_those_near_it() {
+    let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal");
+    let predictor = Arc::new(Predictor::new(Arc::new(ModelBundle::load(&dir).unwrap())).unwrap());
+    let origin = [431_000.0, 4_583_000.0];
+    let (near, mut far) = (drive("near", 80, 9.0), drive("far", 80, 9.0));
+    for state in &mut far.states {
+        state.position_m[0] += origin[0];
+        state.position_m[1] += origin[1];
+    }
+    let drives = [near, far];
+    let windows = all_windows(&drives, 32, 32, Truth::Measured).unwrap();
+    let model = WindowPredictor::Nesam { predictor, variant: Variant::Full, inputs: Inputs::Commands };
+    let [near, far] = [0, 1].map(|drive| {
+        let window = windows.iter().find(|window| window.drive == drive).unwrap();
+        model.predict(window, None).unwrap().poses
+    });
+    assert_eq!((near.len(), far.len()), (32, 32));
+    for (near, far) in near.iter().zip(&far) {
+        for d in 0..2 {
+            assert!((far[d] - origin[d] - near[d]).abs() < 1e-4, "{far:?} for {near:?}");
+        }
+    }
 }
 
 #[test]

@@ -225,8 +225,20 @@ impl ModelBundle {
         self.weights.iter().any(|(name, array)| HEADS.contains(&name) && array.values.iter().any(|v| *v != 0.0))
     }
 
-    /// Puts the bundle's effects on another vehicle.
+    /// Whether the bundle is of this vehicle: that of its name, commanded in the same way.
+    pub fn is_of(&self, vehicle: &Vehicle) -> bool {
+        self.vehicle.name == vehicle.name && self.vehicle.second == vehicle.second
+    }
+
+    /// Puts the bundle's effects on another vehicle. What was measured of the bundle's own vehicle does not hold for one that the bundle is not of, and is
+    /// dropped: fitted baselines, the reference of diagnoses, the settings of the soil filter and the covariance of errors.
     pub fn move_to(&mut self, vehicle: &Vehicle) {
+        if !self.is_of(vehicle) {
+            self.baselines_json = None;
+            self.reference_json = None;
+            self.soil_filter_json = None;
+            self.rollout_noise_json = None;
+        }
         self.vehicle = vehicle.with_effects(&begun(&self.effects));
     }
 
@@ -270,5 +282,36 @@ impl ModelBundle {
         folder.write(MANIFEST, text.as_bytes())?;
         self.hash = sha256_hex(text.as_bytes());
         Ok(dir.to_path_buf())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: nothing that was measured with one vehicle is taken for another. Method: the shipped bundle of the car, put on its own card and on the card of
+    /// the shipped robot.
+    #[test]
+    fn regress_what_was_measured_does_not_move_to_another_vehicle() {
+        let shipped = |name: &str| {
+            let dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles").join(name);
+            ModelBundle::load(&dir).expect("a shipped bundle")
+        };
+        let measured = |bundle: &ModelBundle| {
+            let texts = [&bundle.baselines_json, &bundle.soil_filter_json, &bundle.rollout_noise_json].map(|text| text.is_some());
+            (texts, bundle.reference_json.is_some())
+        };
+        let (mut car, robot) = (shipped("hmmwv-nominal"), shipped("clearpath-husky"));
+        let own = car.vehicle.clone();
+        car.move_to(&own);
+        assert_eq!(measured(&car), ([true; 3], true), "its own vehicle changes nothing");
+        let mut otherwise = own.clone();
+        otherwise.second = robot.vehicle.second;
+        for another in [&robot.vehicle, &otherwise] {
+            let mut moved = car.clone();
+            moved.move_to(another);
+            assert!(!car.is_of(another) && moved.is_of(another));
+            assert_eq!(measured(&moved), ([false; 3], false));
+        }
     }
 }

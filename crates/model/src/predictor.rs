@@ -203,12 +203,13 @@ impl Predictor {
         self.rollout_with(query, &RolloutExtras::default()).map(|(rollout, _)| rollout)
     }
 
-    /// The same on a soil that may differ from place to place and from sample to sample; the correction of the query stands aside.
+    /// The same on a soil that may differ from place to place and from sample to sample, with positions that are not rounded ([`Rollout::position_m`]); the
+    /// correction of the query stands aside.
     ///
     /// # Errors
     /// As [`Predictor::rollout`].
     pub fn rollout_on(&self, query: &RolloutQuery<'_>, soil: &dyn SoilField) -> Result<Rollout, ModelError> {
-        self.rollout_with(query, &RolloutExtras { field: Some(soil), ..Default::default() }).map(|(rollout, _)| rollout)
+        self.rollout_with(query, &RolloutExtras { field: Some(soil), unrounded: true, ..Default::default() }).map(|(rollout, _)| rollout)
     }
 
     /// How far the first candidate of an answer lies from the same candidate with the terrain encoded at every pose: horizontal distance, mean over the

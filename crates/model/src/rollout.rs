@@ -161,6 +161,8 @@ pub struct RolloutExtras<'a> {
     pub soils: &'a [SoilCorrection],
     /// Whether to compute [`RiskOutputs`]; only forms with soil can.
     pub risk: bool,
+    /// Whether to keep [`Rollout::position_m`], for scores far from the origin.
+    pub unrounded: bool,
 }
 
 /// How near each step is to a limit, row-major (samples, horizon) or (samples, horizon, 4) with the wheels FL, FR, RL, RR.
@@ -199,6 +201,9 @@ pub mod flag {
 pub struct Rollout {
     /// Row-major (samples, horizon, state = 12), order of `VehicleState::to_array`; yaw is wrapped into (-pi, pi].
     pub states: Vec<f32>,
+    /// Row-major (samples, horizon): positions in f64, which [`Rollout::states`] rounds to half a metre at UTM coordinates of millions of metres. Empty unless
+    /// asked for ([`RolloutExtras::unrounded`]).
+    pub position_m: Vec<[f64; 3]>,
     /// Row-major (samples, horizon, 4): wheel sinkages, m.
     pub sinkage_m: Vec<f32>,
     /// Validity flags per sample, see [`flag`].
@@ -218,6 +223,15 @@ impl Rollout {
         let mut x = [0.0; STATE_DIM];
         x.copy_from_slice(&self.states[at..at + STATE_DIM]);
         VehicleState::from_array(x)
+    }
+
+    /// The same in f64, with the position that is not rounded where it was asked for.
+    pub fn state_f64(&self, n: usize, k: usize) -> VehicleState<f64> {
+        let mut state = self.state(n, k).map(f64::from);
+        if let Some(position_m) = self.position_m.get(n * self.horizon + k) {
+            state.position_m = *position_m;
+        }
+        state
     }
 
     /// Sinkage of sample `n` during step `k`, m.

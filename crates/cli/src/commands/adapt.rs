@@ -26,7 +26,9 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{
+    Drives, check_model_step, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives,
+};
 use crate::{interrupt, output};
 
 /// Options of `nesam adapt`.
@@ -239,7 +241,11 @@ pub(super) fn filter_in_force(given: &FilterSettings, literal: bool, bundle: &Mo
     }
     match &bundle.soil_filter_json {
         None => {
-            note!("note: bundle {} carries no noise of the soil filter; defaults stand in (see `nesam adapt --calibrate`)", bundle.name);
+            note!(
+                "note: bundle {} carries no noise of the soil filter for `{}`; defaults stand in (see `nesam adapt --calibrate`)",
+                bundle.name,
+                bundle.vehicle.name
+            );
             Ok(given.over_defaults(false))
         }
         Some(json) => Ok(given.over(CalibratedFilter::from_json(json).or_input()?.config())),
@@ -271,6 +277,7 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
     let drives = validation_drives(&args.data, "--calibrate", "the noise is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
+    check_own_vehicle(&bundle, &drives.root, "--calibrate")?;
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);

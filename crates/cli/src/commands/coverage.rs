@@ -14,7 +14,7 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{Drives, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{Drives, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Share of windows that the 90 % regions hold, with the soil prior and with what the drive has taught.
@@ -65,6 +65,7 @@ pub fn calibrate(args: &EvaluateArgs) -> Result<(), Failure> {
         .map_err(|_| Failure::input(format!("--start-sd has {} numbers, {STATE_DIM} are needed", args.start_sd.len())))?;
     let drives = validation_drives(&args.data, "--calibrate-coverage", "the covariance is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
+    check_own_vehicle(&bundle, &drives.root, "--calibrate-coverage")?;
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let start = RolloutNoise::new(start_sd, &[]).start_covariance();
     let filter = CalibratedFilter::config_of(bundle.soil_filter_json.as_deref()).or_input()?;
@@ -93,11 +94,11 @@ pub fn calibrate(args: &EvaluateArgs) -> Result<(), Failure> {
 }
 
 fn noise_of(bundle: &ModelBundle) -> Result<RolloutNoise, Failure> {
-    let hint = "run `nesam evaluate --calibrate-coverage --split train` on its training data";
-    let json = bundle
-        .rollout_noise_json
-        .as_deref()
-        .ok_or_else(|| Failure::input(format!("bundle {} does not know the covariance of its errors; {hint}", bundle.name)))?;
+    let hint = "run `nesam evaluate --calibrate-coverage --split train` on training data of that vehicle, with a bundle of it";
+    let json = bundle.rollout_noise_json.as_deref().ok_or_else(|| {
+        let (name, vehicle) = (&bundle.name, &bundle.vehicle.name);
+        Failure::input(format!("bundle {name} does not know the covariance of its errors with `{vehicle}`; {hint}"))
+    })?;
     RolloutNoise::from_json(json).or_input()
 }
 

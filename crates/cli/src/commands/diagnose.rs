@@ -26,7 +26,7 @@ use crate::bundle_version::save_with_effects;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{check_model_step, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Hypotheses in the printed table.
@@ -56,7 +56,7 @@ pub struct DiagnoseArgs {
     /// have been measured for them, with --make-reference, and then knows them without this
     #[arg(long, value_name = "FILE")]
     hypotheses: Option<PathBuf>,
-    /// What the change is measured against [default: bundle; physics where the bundle carries no reference, which is said]
+    /// What the change is measured against [default: bundle; physics where the bundle carries no reference for the vehicle, which is said]
     #[arg(long, value_enum)]
     reference: Option<ReferenceArg>,
     /// Measure the reference on the drives of the train split that training left for validation, and put it into the bundle
@@ -134,6 +134,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let dir = bundle_dir(args.bundle.bundle.as_deref())?;
     let drives = validation_drives(&args.data, "--make-reference", "the reference is measured")?;
     let mut bundle = load_bundle(Some(&dir))?;
+    check_own_vehicle(&bundle, &drives.root, "--make-reference")?;
     take_coupling(&mut bundle, drives.root.vehicle());
     let predictor = predictor_for(bundle.clone(), &drives.root)?;
     let progress = Progress::start("validation drives, as the model sees them", drives.drives.len());
@@ -202,8 +203,10 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let reference = reference(args.reference, predictor.bundle());
     if args.reference.is_none() && reference == ReferenceArg::Physics {
         output::note!(
-            "note: bundle {} carries no reference, so the model itself is tested, as with --reference physics; --make-reference measures one",
-            predictor.bundle().name
+            "note: bundle {} carries no reference for `{}`, so the model itself is tested, as with --reference physics; --make-reference \
+             measures one",
+            predictor.bundle().name,
+            predictor.bundle().vehicle.name
         );
     }
     let options = Options {
@@ -377,6 +380,9 @@ mod tests {
         };
         let (with, without) = (shipped("hmmwv-nominal"), shipped("clearpath-husky"));
         assert!(with.reference_json.is_some() && without.reference_json.is_none());
+        let mut moved = with.clone();
+        moved.move_to(&without.vehicle);
+        assert_eq!(reference(None, &moved), ReferenceArg::Physics, "the reference of another vehicle is none");
         assert_eq!((reference(None, &with), reference(None, &without)), (ReferenceArg::Bundle, ReferenceArg::Physics));
         for asked in [ReferenceArg::Bundle, ReferenceArg::Physics] {
             assert_eq!([&with, &without].map(|bundle| reference(Some(asked), bundle)), [asked; 2], "what is asked for counts");

@@ -194,7 +194,7 @@ fn rollout(
         start_time_s: Some(window.since_log_start_s()),
         wheels: None,
     };
-    predictor.rollout(&query).or_failed()
+    predictor.rollout_on(&query, &query.soil_correction).or_failed()
 }
 
 const STATE_KEYS: [&str; 12] =
@@ -227,7 +227,7 @@ fn as_json(drives: &Drives, predictor: &Predictor, window: &Window<'_>, controls
                 "k": k + 1,
                 "t_s": window.start_time_s() + (k + 1) as f64 * drive.dt_s,
                 "command": {"speed_m_s": controls[k].speed_m_s, "second": controls[k].second},
-                "state": named(rollout.state(0, k).to_array().map(f64::from)),
+                "state": named(rollout.state_f64(0, k).to_array()),
                 "sinkage_m": rollout.sinkage(0, k),
                 "measured": measured,
             })
@@ -255,8 +255,9 @@ fn as_csv(window: &Window<'_>, controls: &[Control<f64>], rollout: &Rollout) -> 
     let mut text = format!("k,t_s,cmd_speed_m_s,cmd_second,{},{}\n", STATE_KEYS.join(","), sinkage.join(","));
     for (k, command) in controls.iter().enumerate() {
         let t = window.start_time_s() + (k + 1) as f64 * window.trajectory.dt_s;
-        let numbers = rollout.state(0, k).to_array().into_iter().chain(rollout.sinkage(0, k)).map(|v| v.to_string());
-        let numbers: Vec<String> = numbers.collect();
+        let position = rollout.state_f64(0, k).position_m.map(|v| v.to_string());
+        let rest = rollout.state(0, k).to_array().into_iter().skip(3).chain(rollout.sinkage(0, k)).map(|v| v.to_string());
+        let numbers: Vec<String> = position.into_iter().chain(rest).collect();
         text += &format!("{},{t},{},{},{}\n", k + 1, command.speed_m_s, command.second, numbers.join(","));
     }
     text
@@ -265,7 +266,7 @@ fn as_csv(window: &Window<'_>, controls: &[Control<f64>], rollout: &Rollout) -> 
 fn as_html(drives: &Drives, predictor: &Predictor, window: &Window<'_>, rollout: &Rollout) -> String {
     let drive = window.trajectory;
     let start = window.start_pose();
-    let predicted: Vec<_> = (0..rollout.horizon).map(|k| pose_of(&rollout.state(0, k).map(f64::from))).collect();
+    let predicted: Vec<_> = (0..rollout.horizon).map(|k| pose_of(&rollout.state_f64(0, k))).collect();
     let covered = window.horizon.min(drive.states.len() - 1 - window.start);
     let measured = Window { horizon: covered, ..*window }.truth(Truth::Measured);
     let last_error = covered.checked_sub(1).map_or(f64::NAN, |k| horizontal_distance(&predicted[k], &measured[k]));

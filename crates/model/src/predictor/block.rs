@@ -31,6 +31,8 @@ pub(super) struct Block<'a, const H: usize> {
     pub(super) states: &'a mut [f32],
     /// (samples, horizon, 4), m.
     pub(super) sinkage_m: &'a mut [f32],
+    /// (samples, horizon) when positions are asked for unrounded, else empty.
+    pub(super) position_m: Vec<[f64; 3]>,
     /// (samples, horizon) when risk is asked for, else empty.
     pub(super) risk: Vec<RiskRow>,
     /// Held from the first step to the last.
@@ -189,6 +191,9 @@ impl<const H: usize> Block<'_, H> {
         let (row, l) = (at * horizon + k, at % LANES);
         for (out, value) in self.states[row * STATE_DIM..(row + 1) * STATE_DIM].iter_mut().zip(state.to_array()) {
             *out = value as f32;
+        }
+        if let Some(position_m) = self.position_m.get_mut(row) {
+            *position_m = state.position_m;
         }
         for (out, lane) in self.sinkage_m[row * WHEELS..(row + 1) * WHEELS].iter_mut().zip(&output.sinkage_m) {
             *out = lane[l];

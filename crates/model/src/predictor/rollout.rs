@@ -32,6 +32,7 @@ pub(super) struct Scene<'a> {
     pub(super) datum_m: f64,
     pub(super) variant: Variant,
     pub(super) risk: bool,
+    pub(super) unrounded: bool,
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
     pub(super) clocks: Option<&'a PartClocks>,
@@ -123,6 +124,7 @@ impl Predictor {
             datum_m: start_state.position_m[2],
             variant,
             risk: extras.risk,
+            unrounded: extras.unrounded,
             clock,
             tokens: tokens.as_deref(),
             clocks,
@@ -143,6 +145,7 @@ impl Predictor {
         };
         let mut rollout = Rollout {
             states: vec![0.0; rows * query.horizon * STATE_DIM],
+            position_m: Vec::new(),
             sinkage_m: vec![0.0; rows * query.horizon * WHEELS],
             flags: Vec::new(),
             soil: self.soil_at(under(scene.soil, 0, &shared, &under_start), clock.before(0)),
@@ -207,6 +210,7 @@ impl Predictor {
                 first: index * size,
                 done: 0,
                 risk: vec![RiskRow::default(); if scene.risk { samples.len() * horizon } else { 0 }],
+                position_m: vec![[0.0; 3]; if scene.unrounded { samples.len() * horizon } else { 0 }],
                 samples,
                 states,
                 sinkage_m,
@@ -222,7 +226,7 @@ impl Predictor {
                 _ => break,
             }
         }
-        scene.risk.then(|| {
+        let risk = scene.risk.then(|| {
             let mut risk = RiskOutputs::zero(rows * horizon);
             for block in &blocks {
                 for (row, values) in block.risk.iter().enumerate() {
@@ -230,6 +234,8 @@ impl Predictor {
                 }
             }
             risk
-        })
+        });
+        rollout.position_m = blocks.into_iter().flat_map(|block| block.position_m).collect();
+        risk
     }
 }
