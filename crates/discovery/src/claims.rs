@@ -22,6 +22,8 @@ use crate::settled::Settled;
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
 /// pass for this one on a drive, but seldom with the same size on all.
 const MAGNITUDE_HALF_MAX: f64 = 0.7;
+/// The same from which it is no longer told in percent: a size near zero has any share.
+const MAGNITUDE_HALF_UNKNOWN: f64 = 100.0;
 /// Share of half-samples of the drives that must choose a claimed effect or one of its rivals.
 const STABILITY_MIN: f64 = 0.6;
 /// Parts of neighbouring drives of which all half-samples are looked at; every drive is a part where there are fewer.
@@ -327,6 +329,9 @@ fn refusal(group: &Group, finding: &Finding, fit: &Fit, term: usize) -> Option<(
         })
         .chain(payload.then(|| moments(group, fit, term)).into_iter().flatten())
         .fold(f64::INFINITY, f64::min);
+    if relative > MAGNITUDE_HALF_UNKNOWN {
+        return Some(("its size is as good as unknown: half of its interval is more than a hundred times as large".into(), true));
+    }
     (relative > MAGNITUDE_HALF_MAX).then(|| (format!("its size is known to ±{:.0} % only", 100.0 * relative), true))
 }
 
@@ -372,5 +377,6 @@ mod tests {
     fn analytic_a_factor_is_known_by_its_distance_from_one() {
         assert!(refused(0.5).is_some_and(|(why, for_size)| why.contains("its size is known to") && for_size));
         assert_eq!(refused(0.02), None);
+        assert!(refused(1e9).is_some_and(|(why, _)| !why.contains('%')), "as good as unknown");
     }
 }

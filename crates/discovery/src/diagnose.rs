@@ -144,8 +144,7 @@ pub fn diagnose(
     let trial = Trial { predictor, drives: &fit_drives, maps: &fit_maps, scoring: &options.scoring };
     let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
     progress("hypotheses", 0, 1);
-    let mut judgement = judge(&mut case, &yardstick);
-    judgement.findings.extend(refused);
+    let judgement = judge(&mut case, &yardstick).with_refused(refused);
     let fewer = match &judge_by {
         Some(judge_by) if options.fit_on.is_none() && total > 1 => {
             Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?)

@@ -10,6 +10,8 @@ use rayon::prelude::*;
 
 use nesam_physics::effects::ScheduledEffect;
 
+use crate::proof::{Counted, counted};
+
 /// What was learned without a drive, for that drive.
 #[derive(Clone, Debug)]
 pub struct Learned {
@@ -39,6 +41,8 @@ pub struct HeldOut {
     pub before_onset: Option<[ModelScore; 2]>,
     /// Draws behind the intervals.
     pub resamples: Resamples,
+    /// Errors that prove or refute something.
+    pub counted: Counted,
 }
 
 /// How the rollouts are cut and scored.
@@ -102,6 +106,7 @@ pub fn score_held_out(
         controls: Vec::new(),
         before_onset: (!early.is_empty()).then(|| [of(0, &early), of(2, &early)]),
         resamples,
+        counted: counted(maps),
     })
 }
 

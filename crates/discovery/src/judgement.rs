@@ -72,6 +72,21 @@ impl Judgement {
         (0..self.findings.len()).filter(|i| any && self.findings[*i].refused.is_none()).collect()
     }
 
+    /// The same with what earlier looks refused, which is named where nothing else stands out.
+    pub(crate) fn with_refused(mut self, refused: Vec<Finding>) -> Self {
+        let strongest = refused.iter().filter(|f| f.z >= self.selection.threshold).max_by(|a, b| a.z.total_cmp(&b.z));
+        let why = strongest.and_then(|f| Some((f, f.refused.as_ref()?)));
+        if let Some((finding, why)) = why.filter(|_| self.verdict == Verdict::Unexplained && self.selection.chosen.is_empty()) {
+            let ((z, what), label) = (&self.selection.remaining, finding.candidate.label());
+            self.reason = format!(
+                "the drives differ from the reference, most in {what} (z = {z:.1}); {label} stands out (z = {:.1}) but was refused: {why}",
+                finding.z
+            );
+        }
+        self.findings.extend(refused);
+        self
+    }
+
     /// The same without one of several claims, which is refused for this reason: the others are settled and sized again.
     pub(crate) fn dropping(mut self, case: &Case<'_>, yardstick: &Yardstick, i: usize, why: String) -> Self {
         let dropped = self.selection.chosen[i];
@@ -240,5 +255,52 @@ mod tests {
         assert_eq!(stands_in(&["wheel_drag FR"], &close), Some(at("tow")));
         assert_eq!(stands_in(&["wheel_drag FR"], &[("wheel_drag RR", 0.5), ("tow", 6.1)]), None);
         assert_eq!(stands_in(&["wheel_drag FR", "gyro_bias"], &close), None, "the other one can be claimed");
+    }
+
+    /// Goal: a reason does not say that nothing stands out where something was refused. Method: two findings that earlier looks refused, with nothing chosen and with
+    /// another verdict.
+    #[test]
+    fn analytic_what_was_refused_is_named_where_nothing_else_stands_out() {
+        let catalogue = catalogue(&[]);
+        let finding = |id: &str, z: f64| {
+            let hypothesis = catalogue.iter().position(|c| c.id() == id).unwrap();
+            Finding {
+                hypothesis,
+                candidate: catalogue[hypothesis],
+                weight: 1.0,
+                z,
+                alone: z,
+                delta_bic: 50.0,
+                stability: 1.0,
+                estimates: Vec::new(),
+                onset: None,
+                rivals: Vec::new(),
+                refused: Some(format!("{id} does not help")),
+                refused_for_size: false,
+            }
+        };
+        let judged = |verdict: Verdict, refused: Vec<Finding>| {
+            let selection = Selection {
+                z: Vec::new(),
+                levels: vec![146.1],
+                threshold: 4.0,
+                probability: None,
+                chosen: Vec::new(),
+                alone: Vec::new(),
+                rivals: Vec::new(),
+                remaining: (146.1, "a level".into()),
+            };
+            let reason = nothing_chosen(&selection).1;
+            let judgement =
+                Judgement { selection, findings: Vec::new(), onsets: Vec::new(), settled: Vec::new(), fit: None, verdict, reason };
+            judgement.with_refused(refused)
+        };
+        let named = judged(Verdict::Unexplained, vec![finding("tow", 5.4), finding("gyro_bias", 148.0)]);
+        let end = "most in a level (z = 146.1); gyro_bias stands out (z = 148.0) but was refused: gyro_bias does not help";
+        assert!(named.reason.ends_with(end), "{}", named.reason);
+        assert_eq!(named.findings.len(), 2);
+        for reason in [judged(Verdict::Unexplained, Vec::new()).reason, judged(Verdict::None, vec![finding("tow", 5.4)]).reason] {
+            assert!(reason.ends_with("no effect of the catalogue stands out"), "{reason}");
+        }
     }
 }

@@ -1,17 +1,28 @@
 //! When predictions count as better: by errors of full rollouts, paired by drive, with intervals.
 
-use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, EvaluationError, ModelScore, Resamples, Window, paired_difference};
+use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, EvaluationError, ModelScore, POSE_DIM, Resamples, Window, paired_difference};
 use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_trajectories::Trajectory;
 
+use crate::consistency::Contradictions;
 use crate::held_out::{HeldOut, Scoring, score_models};
 
 /// Most windows of a trial.
 const WINDOWS_MAX: usize = 1000;
 /// Share of an error by which it may rise without being counted (chosen).
-const RISE_MIN: f64 = 0.02;
+pub(crate) const RISE_MIN: f64 = 0.02;
+
+/// Which errors prove or refute something, in the order of the dimensions, then the position.
+pub type Counted = [bool; POSE_DIM + 1];
+
+/// Errors that count on drives with these maps. Where one has none, height, roll and pitch tell of the ground and not of the vehicle, as in
+/// [`available`](crate::channels::available).
+pub fn counted(maps: &DriveMaps) -> Counted {
+    let mapped = maps.iter().all(Option::is_some);
+    [true, true, mapped, mapped, mapped, true, true]
+}
 
 /// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the best soil
 /// alone and against the model before, which errors of one drive cannot show. Effects that `each` proved themselves beside the others may cancel in part: the model
@@ -24,12 +35,12 @@ pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Opti
     }
     let against = [soil, before].into_iter().take(if each { 1 } else { 2 });
     for (against, gain) in against.filter_map(|score| Some((score, least_gain?))) {
-        if !falls_surely(against, after, gain, &scores.resamples) {
+        if !falls_surely(against, after, gain, scores.counted, &scores.resamples) {
             let share = if gain > 0.0 { format!(" by {:.0} %", 100.0 * gain) } else { String::new() };
             return Some(format!("no error falls surely{share} {WHERE}"));
         }
     }
-    rises_surely(before, after, &scores.resamples)
+    rises_surely(before, after, scores.counted, &scores.resamples)
         .map(|[name, from, by]| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
 }
 
@@ -39,19 +50,20 @@ pub(crate) fn several_scored(scores: &HeldOut) -> bool {
     scored.iter().any(|d| Some(d) != scored.first())
 }
 
-/// Whether an error surely falls by at least a share of itself.
-pub(crate) fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, resamples: &Resamples) -> bool {
+/// Whether an error that counts surely falls by at least a share of itself.
+pub(crate) fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, counted: Counted, resamples: &Resamples) -> bool {
     let (_, interval) = paired_difference(&before.errors, &after.errors, resamples);
     let falls = |(i, b): (Option<[f64; 2]>, Option<f64>)| matches!((i, b), (Some([low, _]), Some(b)) if low > 0.0 && low >= gain * b);
-    interval.row(false).into_iter().zip(before.summary.tree.row(false)).any(falls)
+    let rows = interval.row(false).into_iter().zip(before.summary.tree.row(false));
+    rows.zip(counted).filter_map(|(row, counts)| counts.then_some(row)).any(falls)
 }
 
-/// The first error that surely rises, and by more than is negligible: its name, where from, by how much.
-fn rises_surely(before: &ModelScore, after: &ModelScore, resamples: &Resamples) -> Option<[String; 3]> {
+/// The first error that counts and surely rises, and by more than is negligible: its name, where from, by how much.
+fn rises_surely(before: &ModelScore, after: &ModelScore, counted: Counted, resamples: &Resamples) -> Option<[String; 3]> {
     let (difference, interval) = paired_difference(&after.errors, &before.errors, resamples);
     let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
     let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(before.summary.tree.row(false));
-    rows.zip(names).find_map(|(((d, i), b), name)| match (d, i, b) {
+    rows.zip(names).zip(counted).filter_map(|(row, counts)| counts.then_some(row)).find_map(|(((d, i), b), name)| match (d, i, b) {
         (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > RISE_MIN * b => Some([(*name).into(), format!("{b:.4}"), format!("{d:.4}")]),
         _ => None,
     })
@@ -71,27 +83,92 @@ pub struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// Why predictions of these drives are not better with the second effects than with the first; `None` where they are.
+    /// Why predictions of these drives are not better with the second effects than with the first; `None` where they are. Where `sensors_tell` they must only not be
+    /// surely worse.
     ///
     /// # Errors
     /// `EvaluationError::NoWindows` when no window fits; the first error of the model.
-    pub fn no_better(&self, without: &[ScheduledEffect], with: &[ScheduledEffect]) -> Result<Option<String>, EvaluationError> {
+    pub fn no_better(
+        &self,
+        without: &[ScheduledEffect],
+        with: &[ScheduledEffect],
+        sensors_tell: bool,
+    ) -> Result<Option<String>, EvaluationError> {
         let windows = self.scoring.windows(self.drives)?;
         let every = windows.len().div_ceil(WINDOWS_MAX);
         let windows: Vec<Window<'_>> = windows.into_iter().step_by(every).collect();
-        let resamples = Resamples::draw(self.drives.len(), self.scoring.resamples, self.scoring.seed);
+        let (resamples, counted) = (self.resamples(), counted(self.maps));
         let scored = |effects: &[ScheduledEffect]| {
             let predictor = self.predictor.with_effects(effects);
             let models = vec![(&predictor, SoilCorrection::NONE); self.drives.len()];
             score_models(&windows, self.maps, &models, 0, &resamples)
         };
         let (before, after) = (scored(without)?, scored(with)?);
-        if !falls_surely(&before, &after, 0.0, &resamples) {
+        if !sensors_tell && !falls_surely(&before, &after, 0.0, counted, &resamples) {
             return Ok(Some("no error of predictions of the fitted drives falls surely with it".into()));
         }
         let told = |[name, from, by]: [String; 3]| {
             format!("the error of {name} of predictions of the fitted drives rises surely with it, from {from} by {by}")
         };
-        Ok(rises_surely(&before, &after, &resamples).map(told))
+        Ok(rises_surely(&before, &after, counted, &resamples).map(told))
+    }
+
+    /// Channels in which measurements contradict one another otherwise with the second effects than with the first, if they surely do less; else none.
+    pub(crate) fn agreeing(&self, without: &[ScheduledEffect], with: &[ScheduledEffect]) -> Vec<usize> {
+        let vehicle = &self.predictor.bundle().vehicle;
+        let [before, after] = [without, with].map(|effects| Contradictions::of(vehicle, self.drives, |_| effects));
+        if before.fall_surely(&after, 0.0, &self.resamples()) { before.changed(&after) } else { Vec::new() }
+    }
+
+    fn resamples(&self) -> Resamples {
+        Resamples::draw(self.drives.len(), self.scoring.resamples, self.scoring.seed)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_evaluation::{ModelName, StepError, WindowErrors, summarise};
+
+    use super::*;
+
+    /// Scores of six drives of one window with these errors.
+    fn score(absolute: [f64; POSE_DIM]) -> ModelScore {
+        let drives = 6;
+        let errors = WindowErrors {
+            horizon: 1,
+            scored: [true; POSE_DIM],
+            trajectory: (0..drives).collect(),
+            path_m: vec![5.0; drives],
+            steps: vec![StepError { absolute, position_m: absolute[0] }; drives],
+            not_finite: 0,
+        };
+        let summary = summarise(&errors, &Resamples::draw(drives, 50, 1));
+        ModelScore { name: ModelName::Nesam, parameters: 0, summary, errors, curves: core::array::from_fn(|_| None) }
+    }
+
+    /// Goal: without a map the tilt of the ground neither proves nor refutes. Method: errors by hand; in one case yaw falls and pitch rises, in the other pitch alone falls.
+    #[test]
+    fn analytic_height_roll_and_pitch_count_on_a_map_only() {
+        let flat = counted(&[None, None]);
+        assert_eq!(flat, [true, true, false, false, false, true, true]);
+        let proof = |after: [f64; POSE_DIM], counted: Counted| {
+            let before = [0.1, 0.1, 0.1, 0.8, 0.8, 20.0];
+            let scores = HeldOut {
+                scores: [before, before, after].map(score),
+                controls: Vec::new(),
+                before_onset: None,
+                resamples: Resamples::draw(6, 50, 1),
+                counted,
+            };
+            not_proven(&scores, Some(0.1), false)
+        };
+        let all = counted(&[]);
+        assert_eq!(all, [true; POSE_DIM + 1]);
+        let limit = [0.1, 0.1, 0.1, 0.8, 0.83, 10.0];
+        assert_eq!(proof(limit, flat), None);
+        assert!(proof(limit, all).is_some_and(|why| why.contains("pitch_deg rises surely")));
+        let tilt = [0.1, 0.1, 0.1, 0.8, 0.4, 20.0];
+        assert!(proof(tilt, flat).is_some_and(|why| why.contains("no error falls surely")));
+        assert_eq!(proof(tilt, all), None);
     }
 }

@@ -8,6 +8,7 @@ use nesam_trajectories::Trajectory;
 
 use crate::claims::{Case, Finding};
 use crate::condense::best_soil;
+use crate::consistency::Contradictions;
 use crate::diagnose::Options;
 use crate::held_out::{HeldOut, Learned, score_held_out, score_models};
 use crate::judgement::{Judgement, Verdict};
@@ -69,7 +70,8 @@ pub(crate) fn prove(
             None => None,
         };
         let Some(i) = needless else {
-            let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial);
+            let agree = yardstick.model_on_trial && scores.as_ref().is_some_and(|scores| held.sensors_agree(&learned, scores));
+            let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial, agree);
             return Ok(Proven { judgement, learned, scores, verdict, reason });
         };
         let why = "no error falls surely with it beside the others on drives that were not fitted";
@@ -83,6 +85,14 @@ impl HeldDrives<'_> {
         let windows = self.options.scoring.windows(self.drives)?;
         let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
         score_models(&windows, self.maps, &models, parameters, resamples)
+    }
+
+    /// Whether the measurements of the drives surely contradict one another less, by a share as errors of predictions must fall, with what was learned.
+    fn sensors_agree(&self, learned: &[Learned], scores: &HeldOut) -> bool {
+        let vehicle = &self.predictor.bundle().vehicle;
+        let before = Contradictions::of(vehicle, self.drives, |_| &[]);
+        let after = Contradictions::of(vehicle, self.drives, |d| learned[d].effects.as_slice());
+        before.fall_surely(&after, GAIN_ON_TRIAL, &scores.resamples)
     }
 
     /// Score of the drives with what was learned but for a hypothesis.
@@ -99,7 +109,7 @@ fn last_needless<E>(judgement: &Judgement, scores: &HeldOut, without: impl Fn(us
         return Ok(None);
     }
     for i in claimed.into_iter().rev().filter(|i| acts(&judgement.findings[*i])) {
-        if !falls_surely(&without(judgement.findings[i].hypothesis)?, &scores.scores[2], 0.0, &scores.resamples) {
+        if !falls_surely(&without(judgement.findings[i].hypothesis)?, &scores.scores[2], 0.0, scores.counted, &scores.resamples) {
             return Ok(Some(i));
         }
     }
@@ -147,8 +157,8 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
         .collect()
 }
 
-/// Verdict after the proof on held-out drives.
-fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool) -> (Verdict, String) {
+/// Verdict after the proof on held-out drives. `sensors_agree` says whether their measurements surely contradict one another less with what is claimed.
+fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool, sensors_agree: bool) -> (Verdict, String) {
     let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
     let (verdict, reason) = (judgement.verdict, judgement.reason.clone());
     let Some(first) = claimed.first() else { return (verdict, reason) };
@@ -157,18 +167,24 @@ fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool)
         let stands = !model_on_trial && beyond_doubt(&claimed, judgement.selection.threshold);
         return if stands { (verdict, reason) } else { refused("no drive is left to prove it on".into()) };
     };
-    let must_help = model_on_trial || claimed.iter().any(|f| acts(f));
+    // Predictions hardly hang on a sensor that measurements speak against: a gyro's bias is gone from them after the first step.
+    let told = model_on_trial && sensors_agree && claimed.iter().all(|f| f.candidate.layer() == Layer::Sensor);
+    let must_help = model_on_trial && !told || claimed.iter().any(|f| acts(f));
     let least_gain = must_help.then_some(if model_on_trial { GAIN_ON_TRIAL } else { 0.0 });
     if let Some(why) = not_proven(scores, least_gain, claimed.len() > 1 && !model_on_trial) {
         return refused(why);
     }
-    let helps = if must_help { "; it helps on drives that were not fitted" } else { "" };
+    let helps = match (must_help, told) {
+        (true, _) => "; it helps on drives that were not fitted",
+        (_, true) => "; with it the measurements of drives that were not fitted contradict one another less",
+        _ => "",
+    };
     let more = if model_on_trial { format!(", and {}", left(judgement)) } else { String::new() };
     (verdict, format!("{reason}{helps}{more}"))
 }
 
 /// Whether an effect changes how the vehicle moves. A wrong sensor shows in the sensors; whether predictions from it get better is another question, unless the model
-/// itself is on trial.
+/// itself is on trial and nothing that is measured twice speaks for it.
 fn acts(finding: &Finding) -> bool {
     matches!(finding.candidate.layer(), Layer::Force | Layer::Actuator | Layer::Soil)
 }
@@ -236,7 +252,7 @@ mod tests {
     /// Goal: nothing weak or ambiguous is claimed of drives that prove nothing. Method: judgements without scores; 2.5 thresholds of 4 are 10.
     #[test]
     fn analytic_without_a_drive_to_prove_it_on_only_what_stands_far_out_is_claimed() {
-        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), None, on_trial);
+        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), None, on_trial, false);
         let explained = (Verdict::Explained, "they explain it".to_string());
         assert_eq!(said(&[("steering_offset", 10.0)], false), explained);
         assert_eq!(said(&[("steering_offset", 12.0), ("gyro_bias", 11.0)], false), explained);
@@ -265,7 +281,8 @@ mod tests {
 
     /// Scores before, with the best soil, after.
     fn held_out(errors: [f64; 3]) -> HeldOut {
-        HeldOut { scores: errors.map(score), controls: Vec::new(), before_onset: None, resamples: Resamples::draw(6, 50, 1) }
+        let (resamples, counted) = (Resamples::draw(6, 50, 1), [true; POSE_DIM + 1]);
+        HeldOut { scores: errors.map(score), controls: Vec::new(), before_onset: None, resamples, counted }
     }
 
     /// The claim that is needless where the drives have this error without each of some hypotheses, and `after` with all.
@@ -285,14 +302,31 @@ mod tests {
         let cancelling = held_out([0.10, 0.12, 0.10]);
         assert_eq!(needless(&["steering_offset", "tow"], &cancelling, &[("steering_offset", 0.2), ("tow", 0.3)]), None);
         let two = judgement(&[("steering_offset", 12.0), ("tow", 12.0)]);
-        assert_eq!(proven(&two, Some(&cancelling), false).0, Verdict::Explained);
-        assert_eq!(proven(&two, Some(&cancelling), true).0, Verdict::Unexplained, "a model on trial has to get better");
+        assert_eq!(proven(&two, Some(&cancelling), false, false).0, Verdict::Explained);
+        assert_eq!(proven(&two, Some(&cancelling), true, false).0, Verdict::Unexplained, "a model on trial has to get better");
         let one = judgement(&[("tow", 12.0)]);
-        assert_eq!(proven(&one, Some(&cancelling), false).0, Verdict::Unexplained);
+        assert_eq!(proven(&one, Some(&cancelling), false, false).0, Verdict::Unexplained);
         let riding = held_out([0.20, 0.18, 0.10]);
         assert_eq!(needless(&["steering_offset", "tow"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(1));
         assert_eq!(needless(&["tow", "steering_offset"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(0));
         assert_eq!(needless(&["steering_offset", "gyro_bias"], &riding, &[("steering_offset", 0.2)]), None);
         assert_eq!(needless(&["tow"], &riding, &[]), None);
+    }
+
+    /// Goal: a sensor that measurements speak against is proven by them, though predictions are as before, and nothing else is. Method: scores that stay and that rise,
+    /// under a model on trial, with and without measurements that agree.
+    #[test]
+    fn analytic_a_sensor_of_a_model_on_trial_is_proven_by_what_measurements_contradict() {
+        let (same, worse) = (held_out([0.1, 0.1, 0.1]), held_out([0.1, 0.1, 0.11]));
+        let verdict = |claims: &[(&str, f64)], scores: &HeldOut, agree: bool| proven(&judgement(claims), Some(scores), true, agree).0;
+        let (bias, tow) = (("gyro_bias", 12.0), ("tow", 12.0));
+        assert_eq!(verdict(&[bias], &same, true), Verdict::Explained);
+        assert_eq!(verdict(&[bias], &same, false), Verdict::Unexplained);
+        assert_eq!(verdict(&[bias], &worse, true), Verdict::Unexplained, "predictions may not get worse");
+        for acting in [&[tow][..], &[bias, tow], &[("map_offset", 12.0)]] {
+            assert_eq!(verdict(acting, &same, true), Verdict::Unexplained, "{acting:?} must help");
+        }
+        let (_, reason) = proven(&judgement(&[bias]), Some(&same), true, true);
+        assert!(reason.contains("contradict one another less") && !reason.contains("it helps"), "{reason}");
     }
 }

@@ -7,8 +7,9 @@
 //! be doubted or refused by everything that follows. It was held against its rivals when it was found, each sized through the physics in its place; their tangents beside
 //! it say nothing more of that.
 
+use nesam_evaluation::EvaluationError;
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::ScheduledEffect;
+use nesam_physics::effects::{Layer, ScheduledEffect};
 use rayon::prelude::*;
 
 use crate::channels::Row;
@@ -35,7 +36,7 @@ const LEAST_SHARE: f64 = 1e-3;
 pub(crate) struct Pursued {
     /// What the last look is judged by; the case holds its signatures and scores.
     pub yardstick: Yardstick,
-    /// What stood out in a look and does not help predictions.
+    /// What stood out in a look and does not help predictions, or ends at its range.
     pub refused: Vec<Finding>,
 }
 
@@ -61,14 +62,22 @@ pub(crate) fn pursue(
         selection.choose(&yardstick, &group, chosen);
         case.settle(&yardstick, &mut selection, &mut onsets, &[]);
         selection.chosen = needed(case, &yardstick, &group, &selection.chosen, &onsets);
-        let Some((fit, fitted)) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
-        let others = case.size(&yardstick, &group, &selection.chosen[1..], &onsets);
-        if let Some(why) = trial.no_better(&others.effects(), &fit.effects())? {
-            let found = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
-            refused.extend(found.map(|finding| Finding { refused: Some(why), ..finding }));
+        let Some(fit) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
+        let (fitted, why) = match found(&fit) {
+            Found::Fitted(fitted) => match not_better(case, &yardstick, &group, &selection.chosen, &onsets, &fit, trial)? {
+                Some(why) => (None, Some(why)),
+                None => (Some(fitted), None),
+            },
+            // Its finding is refused for its size; without it others may stand out.
+            Found::AtItsEnd => (None, None),
+            Found::Nothing => break,
+        };
+        let Some(fitted) = fitted else {
+            let finding = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
+            refused.extend(finding.map(|own| Finding { refused: why.or_else(|| own.refused.clone()), ..own }));
             yardstick.refused.push(selection.chosen[0]);
             continue;
-        }
+        };
         known.retain(|k| selection.chosen.contains(&k.hypothesis));
         known.push(Known { hypothesis: selection.chosen[0], rivals: selection.rivals.swap_remove(0) });
         let left = look_beside(case, &fitted, progress)?;
@@ -94,22 +103,60 @@ fn needed(case: &Case<'_>, yardstick: &Yardstick, group: &Group, chosen: &[usize
     kept
 }
 
-/// Hypotheses sized together; `None` where one cannot stand as a single column that is always there, or ends at its range.
-fn sized(case: &Case<'_>, yardstick: &Yardstick, group: &Group, chosen: &[usize], onsets: &[Option<Onset>]) -> Option<(Fit, Vec<Beside>)> {
+/// Hypotheses sized together; `None` where one cannot stand as a single column that is always there.
+fn sized(case: &Case<'_>, yardstick: &Yardstick, group: &Group, chosen: &[usize], onsets: &[Option<Onset>]) -> Option<Fit> {
     let plain = |h: &usize| onsets[*h].is_none() && yardstick.catalogue[*h].columns().len() == 1;
-    if !chosen.iter().all(plain) {
-        return None;
+    chosen.iter().all(plain).then(|| case.size(yardstick, group, chosen, onsets))
+}
+
+/// What a fit makes of hypotheses, the newest first.
+#[derive(Debug)]
+enum Found {
+    /// Effects beside which others can be sought.
+    Fitted(Vec<Beside>),
+    /// The newest ends at its range.
+    AtItsEnd,
+    /// An earlier one ends at its range now, or one is not there.
+    Nothing,
+}
+
+fn found(fit: &Fit) -> Found {
+    let mut ends = fit.held.iter().map(|held| held.iter().any(|held| *held));
+    if ends.next() == Some(true) {
+        return Found::AtItsEnd;
     }
-    let fit = case.size(yardstick, group, chosen, onsets);
-    if fit.held.iter().flatten().any(|held| *held) {
-        return None;
+    if ends.any(|held| held) {
+        return Found::Nothing;
     }
     let beside = |((term, values), effect): ((&Term, &Vec<f64>), ScheduledEffect)| {
         let share = term.candidate.share(values[0]);
         (share.abs() > LEAST_SHARE).then_some(Beside { candidate: term.candidate, effect, share })
     };
-    let fitted = fit.terms.iter().zip(&fit.values).zip(fit.effects()).map(beside).collect::<Option<_>>()?;
-    Some((fit, fitted))
+    let fitted: Option<Vec<Beside>> = fit.terms.iter().zip(&fit.values).zip(fit.effects()).map(beside).collect();
+    fitted.map_or(Found::Nothing, Found::Fitted)
+}
+
+/// Why predictions are not better with the newest of the chosen hypotheses; `None` where they are, or where it is a sensor's that the measurements themselves tell.
+fn not_better(
+    case: &Case<'_>,
+    yardstick: &Yardstick,
+    group: &Group,
+    chosen: &[usize],
+    onsets: &[Option<Onset>],
+    fit: &Fit,
+    trial: &Trial<'_>,
+) -> Result<Option<String>, EvaluationError> {
+    let (without, with) = (case.size(yardstick, group, &chosen[1..], onsets).effects(), fit.effects());
+    let sensors_tell = yardstick.catalogue[chosen[0]].layer() == Layer::Sensor && {
+        let own = trial.agreeing(&without, &with);
+        !own.is_empty() && settled(yardstick, &yardstick.group(case.left(fit).iter()), &own)
+    };
+    trial.no_better(&without, &with, sensors_tell)
+}
+
+/// Whether the level of none of these channels stands out in what a fit left.
+fn settled(yardstick: &Yardstick, left: &Group, channels: &[usize]) -> bool {
+    channels.iter().all(|channel| yardstick.level(left, *channel) < yardstick.threshold())
 }
 
 /// Measures scatter and signatures of every drive beside fitted effects; returns what these leave of each drive.
@@ -133,4 +180,62 @@ fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>)
         left.push(after);
     }
     Ok(left)
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{DMatrix, DVector};
+
+    use super::*;
+    use crate::candidates::{Candidate, catalogue};
+    use crate::channels::TURN_AT;
+    use crate::condense::level_column;
+    use crate::evidence::Nulls;
+
+    fn named(id: &str) -> Candidate {
+        catalogue(&[]).into_iter().find(|c| c.id() == id).unwrap()
+    }
+
+    /// A fit of these sizes, each held by its range or not.
+    fn fit(sizes: &[(&str, f64, bool)]) -> Fit {
+        Fit {
+            terms: sizes.iter().map(|(id, ..)| Term { candidate: named(id), onset_s: 0.0 }).collect(),
+            values: sizes.iter().map(|(_, value, _)| vec![*value]).collect(),
+            covariance: DMatrix::identity(sizes.len(), sizes.len()),
+            held: sizes.iter().map(|(.., held)| vec![*held]).collect(),
+            jackknife: Vec::new(),
+        }
+    }
+
+    /// Goal: only the newest effect is passed over for its range; a pursuit goes on without it. Method: fits by hand, the newest first.
+    #[test]
+    fn analytic_only_the_newest_effect_is_passed_over_for_its_range() {
+        let (offset, gain) = (("steering_offset", 0.1, false), ("speed_gain", 0.2, false));
+        assert!(matches!(found(&fit(&[offset, gain])), Found::Fitted(fitted) if fitted.len() == 2));
+        assert!(matches!(found(&fit(&[("cg_height", -1.0, true), gain])), Found::AtItsEnd));
+        assert!(matches!(found(&fit(&[offset, ("cg_height", -1.0, true)])), Found::Nothing));
+        assert!(matches!(found(&fit(&[("steering_offset", 0.0, false)])), Found::Nothing));
+    }
+
+    /// Goal: a sensor settles what its own channels show and no other. Method: a level by hand in what is left, of the turn about z, of half and of nine
+    /// standard deviations.
+    #[test]
+    fn analytic_levels_that_stand_out_are_not_settled() {
+        let catalogue = catalogue(&[]);
+        let [yaw, roll] = [TURN_AT + 2, TURN_AT];
+        let (size, at) = (level_column(&catalogue, yaw) + 1, level_column(&catalogue, yaw));
+        let drive = |score: f64| {
+            let mut scores = DVector::<f64>::zeros(size);
+            scores[at] = score;
+            let information = DMatrix::<f64>::identity(size, size) * 100.0;
+            Condensed { score: scores, information, square: 0.0, soil_score: DVector::zeros(0), soil_information: DMatrix::zeros(0, 0) }
+        };
+        let nulls = [10.0, -10.0, 10.0, -10.0].map(drive);
+        let nulls = Nulls::about_zero(&nulls.each_ref()).unwrap();
+        let yardstick = Yardstick::new(nulls, None, &catalogue, &[roll, yaw], &[]);
+        let left = |score: f64| yardstick.group([drive(score)].iter());
+        assert!(settled(&yardstick, &left(5.0), &[roll, yaw]));
+        assert!(!settled(&yardstick, &left(100.0), &[roll, yaw]));
+        assert!(settled(&yardstick, &left(100.0), &[roll]), "another's");
+    }
 }

@@ -177,6 +177,12 @@ impl Yardstick {
         self.after(group, &with(k), j).0.powi(2) - self.after(group, &with(j), k).0.powi(2)
     }
 
+    /// Evidence that the level of a channel is unusual in the scores of a group; zero for one that is not compared.
+    pub(crate) fn level(&self, group: &Group, channel: usize) -> f64 {
+        let Some(i) = self.channels.iter().position(|c| *c == channel) else { return 0.0 };
+        group.remainder(&[], &[level_column(&self.catalogue, channel)], 0.0).z / self.spread(self.catalogue.len() + i)
+    }
+
     /// Judges a group of drives.
     pub fn select(&self, group: &Group) -> Selection {
         let count = self.catalogue.len();

@@ -273,6 +273,15 @@ fn property_a_new_skid_steer_base_is_judged_by_short_logs_without_a_map() {
 }
 
 #[test]
+fn property_a_gyro_of_a_new_base_is_told_by_what_measurements_contradict() {
+    // Predictions hardly hang on it, so that no error of theirs falls by a tenth.
+    let found = diagnose_rover(&[Effect::GyroBias(GyroBias { rad_s: 0.08 })]);
+    assert!(explained_by(&found, "gyro_bias"), "{}; z {:?}", found.reason, found.selection.z);
+    let (rad_s, ci95) = value(&found, "rad_s");
+    assert!((rad_s - 0.08).abs() < 0.008, "{rad_s} {ci95:?}");
+}
+
+#[test]
 fn property_a_large_effect_hides_no_other() {
     // What a data sheet says nothing of: each is seen only beside the others. Sizes within a tenth, a lag of the steering within a fifth.
     let (gain, lag, limit) = (SpeedGain { relative: 0.6 }, SpeedLag { seconds: 0.4 }, TurnLimit { rad_s: 0.4 });
