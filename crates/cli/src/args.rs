@@ -123,18 +123,10 @@ pub struct WindowArgs {
 }
 
 impl WindowArgs {
-    /// Steps to predict on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows.
+    /// Steps to predict on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows, and
+    /// how many drives are too short for it.
     pub fn horizon_on(&self, drives: &[Trajectory]) -> usize {
-        if let Some(asked) = self.horizon {
-            return asked;
-        }
-        let horizon = longest_horizon(drives);
-        if horizon < MAX_HORIZON {
-            note!(
-                "note: predicting {horizon} steps, as many as the longest drive allows ({MAX_HORIZON} where drives are longer); --horizon sets another number"
-            );
-        }
-        horizon
+        horizon_of(self.horizon, drives, "scored")
     }
 
     /// Refuses more steps than the model knows.
@@ -149,6 +141,38 @@ impl WindowArgs {
             _ => Ok(()),
         }
     }
+}
+
+/// Steps of a window on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows, and how
+/// many drives are too short to be `used`.
+pub fn horizon_of(asked: Option<usize>, drives: &[Trajectory], used: &str) -> usize {
+    let horizon = asked.unwrap_or_else(|| longest_horizon(drives));
+    if asked.is_none() && horizon < MAX_HORIZON {
+        note!(
+            "note: windows of {horizon} steps, as many as the longest drive allows ({MAX_HORIZON} where drives are longer); --horizon sets another number"
+        );
+    }
+    if let Some(told) = too_short(drives, horizon, used) {
+        note!("note: {told}");
+    }
+    horizon
+}
+
+/// Which drives have no window of this many steps; `None` where every drive or none has one.
+fn too_short(drives: &[Trajectory], horizon: usize, used: &str) -> Option<String> {
+    /// Names in full at most.
+    const LISTED: usize = 8;
+    let short: Vec<&str> = drives.iter().filter(|d| d.states.len() <= horizon).map(|d| d.id.as_str()).collect();
+    if short.is_empty() || short.len() == drives.len() {
+        return None;
+    }
+    let names = short.iter().take(LISTED).copied().collect::<Vec<_>>().join(", ");
+    let more = if short.len() > LISTED { format!(" and {} more", short.len() - LISTED) } else { String::new() };
+    Some(format!(
+        "{} of {} drives are too short for windows of {horizon} steps and are not {used} ({names}{more}); a smaller --horizon takes them in",
+        short.len(),
+        drives.len()
+    ))
 }
 
 /// As many steps as the model knows and the longest drive allows, at least one.
@@ -177,5 +201,43 @@ fn positive(text: &str) -> Result<usize, String> {
         Ok(0) => Err("must be at least 1".into()),
         Ok(n) => Ok(n),
         Err(_) => Err("not a whole number".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_physics::{Control, VehicleState};
+    use nesam_trajectories::MeasuredChannels;
+
+    use super::*;
+
+    fn drive(id: &str, samples: usize) -> Trajectory {
+        Trajectory {
+            id: id.into(),
+            set: String::new(),
+            world: None,
+            split: None,
+            dt_s: 0.1,
+            time_s: (0..samples).map(|k| 0.1 * k as f64).collect(),
+            states: vec![VehicleState::zero(); samples],
+            controls: vec![Control { speed_m_s: 1.0, second: 0.0 }; samples],
+            wheel_speed_rad_s: None,
+            road_wheel_angle_rad: None,
+            measured: MeasuredChannels::POSE_AND_TWIST,
+            truth: None,
+        }
+    }
+
+    #[test]
+    fn analytic_windows_are_as_long_as_the_longest_drive_allows() {
+        // Goal: logs of 2 s are used without an option, and drives too short for a window are said. Method: drives of 21, 20 and 40 samples.
+        let drives = [drive("a", 21), drive("b", 20), drive("c", 40)];
+        assert_eq!(horizon_of(None, &drives[..2], "trained on"), 20);
+        assert_eq!(horizon_of(None, &drives, "scored"), MAX_HORIZON);
+        assert_eq!(horizon_of(Some(5), &drives, "scored"), 5);
+        let told = too_short(&drives, 20, "scored").expect("b is too short");
+        assert!(told.starts_with("1 of 3 drives are too short for windows of 20 steps and are not scored (b);"), "{told}");
+        assert_eq!(too_short(&drives, 19, "scored"), None);
+        assert_eq!(too_short(&drives, 40, "scored"), None, "that no drive has a window is an error of its own");
     }
 }

@@ -38,7 +38,8 @@ impl Kinematic {
     pub fn fit(vehicle: &Vehicle, trajectories: &[Trajectory], horizon: usize) -> Result<Self, EvaluationError> {
         let samples = samples(trajectories, horizon);
         if samples.is_empty() {
-            return Err(EvaluationError::Fit { reason: format!("no window of {horizon} steps in {} training drives", trajectories.len()) });
+            let reason = format!("no window of {horizon} steps in {} training drives; use a shorter --horizon", trajectories.len());
+            return Err(EvaluationError::Fit { reason });
         }
         let loss = |p: &[f64; KINEMATIC_PARAMETERS]| loss_m(vehicle, &Self::from_array(*p), &samples);
         Ok(Self::from_array(hooke_jeeves(Self::ideal(vehicle).to_array(), loss)))

@@ -97,7 +97,13 @@ pub fn run(
     };
     let fitted = || {
         let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
-        calibrate_vehicle(damped(root.vehicle()), &training, recipe.dt_s, reporter)
+        let vehicle = root.vehicle_of(trajectories);
+        if vehicle.command_range != root.vehicle().command_range {
+            let [speed_m_s, second] = vehicle.command_range;
+            reporter
+                .line(&format!("the card states no range of commands; with that of the drives speed {speed_m_s:?} m/s, second {second:?}"));
+        }
+        calibrate_vehicle(damped(&vehicle), &training, recipe.dt_s, reporter)
     };
     let (vehicle, mut scales) = match &recipe.start {
         Some(bundle) if recipe.recalibrate => (fitted().0, bundle.normalization.clone()),

@@ -345,7 +345,10 @@ fn window_starts<'a>(set: &TrainingSet<'a>, plan: &TrainingPlan) -> std::result:
         starts.extend((first..n.saturating_sub(plan.horizon)).map(|start| (*drive, start)));
     }
     if starts.is_empty() {
-        return Err(TrainingError::Drives(format!("no drive is longer than the horizon of {} steps", plan.horizon)));
+        return Err(TrainingError::Drives(format!(
+            "no drive is longer than the horizon of {} steps; use a shorter --horizon",
+            plan.horizon
+        )));
     }
     Ok(starts)
 }

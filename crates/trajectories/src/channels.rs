@@ -75,3 +75,15 @@ fn second_command(table: &Table, second: SecondCommand) -> Result<Numbers, Traje
         }
     }
 }
+
+/// What the second command means where the name of its column alone says it, and that column; `cmd_steer` may be either kind of steering.
+pub(crate) fn implied_second(table: &Table) -> Option<(SecondCommand, &'static str)> {
+    let names = [
+        ("cmd_yaw_rate", SecondCommand::YawRateRadS),
+        ("cmd_road_wheel_angle", SecondCommand::RoadWheelAngleRad),
+        ("cmd_steer_angle", SecondCommand::RoadWheelAngleRad),
+    ];
+    let mut there = names.into_iter().filter(|(name, _)| table.has(name));
+    let (name, second) = there.next()?;
+    there.all(|(_, other)| other == second).then_some((second, name))
+}

@@ -4,15 +4,15 @@ use std::collections::{BTreeMap, BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use nesam_physics::Vehicle;
+use nesam_physics::{SecondCommand, Vehicle};
 use nesam_terrain::WorldMap;
 use sha2::{Digest, Sha256};
 
-use crate::channels::Channels;
-use crate::data_sheet::read_vehicle_card;
+use crate::channels::{Channels, implied_second};
+use crate::data_sheet::{CardReading, read_with_notes};
 use crate::drive;
 use crate::error::TrajectoryError;
-use crate::index::Index;
+use crate::index::{Entry, Index};
 use crate::table::Table;
 use crate::trajectory::{Split, Trajectory};
 
@@ -85,18 +85,22 @@ pub struct DataRoot {
     root: PathBuf,
     card: PathBuf,
     vehicle: Vehicle,
+    /// Which of the two command ranges the kind of drive implies and the card does not state.
+    implied_range: [bool; 2],
     worlds: Mutex<HashMap<String, Arc<WorldMap>>>,
     /// Relative path and SHA-256 of the set files read so far.
     hashes: Mutex<BTreeMap<String, String>>,
-    /// What the sets read so far lack, one sentence each.
+    /// What the card and the sets read so far lack, one sentence each.
     notes: Mutex<BTreeSet<String>>,
 }
 
 impl DataRoot {
-    /// Opens a root; the vehicle card is `vehicle`, else the one `vehicle_*.json` in the root.
+    /// Opens a root; the vehicle card is `vehicle`, else the one `vehicle_*.json` in the root. Where the card does not say what the second command means, the
+    /// columns of the first set that name it do.
     ///
     /// # Errors
-    /// `TrajectoryError::Layout` when the root is not a folder or has no card or several; the errors of [`read_vehicle_card`].
+    /// `TrajectoryError::Layout` when the root is not a folder or has no card or several; the errors of
+    /// [`read_vehicle_card`](crate::read_vehicle_card).
     pub fn open(root: &Path, vehicle: Option<&Path>) -> Result<Self, TrajectoryError> {
         let card = match vehicle {
             Some(path) => {
@@ -107,13 +111,31 @@ impl DataRoot {
             }
             None => find_card(root)?,
         };
-        let vehicle = read_vehicle_card(&card)?;
-        Ok(Self { root: root.into(), card, vehicle, worlds: Mutex::default(), hashes: Mutex::default(), notes: Mutex::default() })
+        let CardReading { vehicle, notes, implied_range } = read_with_notes(&card, &|| second_of_columns(root))?;
+        let notes = Mutex::new(notes.into_iter().collect());
+        Ok(Self { root: root.into(), card, vehicle, implied_range, worlds: Mutex::default(), hashes: Mutex::default(), notes })
     }
 
     /// The vehicle that drove.
     pub fn vehicle(&self) -> &Vehicle {
         &self.vehicle
+    }
+
+    /// The vehicle with room for the commands of these drives, where the card states no range of commands and its kind of drive implies one.
+    pub fn vehicle_of(&self, drives: &[Trajectory]) -> Vehicle {
+        let mut vehicle = self.vehicle.clone();
+        for control in drives.iter().flat_map(|drive| &drive.controls) {
+            for (axis, value) in [control.speed_m_s, control.second].into_iter().enumerate().filter(|(axis, _)| self.implied_range[*axis]) {
+                let [low, high] = vehicle.command_range[axis];
+                vehicle.command_range[axis] = [low.min(value), high.max(value)];
+            }
+        }
+        vehicle
+    }
+
+    /// Whether the ranges of the speed and of the second command are implied by the kind of drive, and not stated by the card.
+    pub fn implied_range(&self) -> [bool; 2] {
+        self.implied_range
     }
 
     /// File of its card.
@@ -164,7 +186,8 @@ impl DataRoot {
         Ok(map)
     }
 
-    /// What the sets loaded so far lack and is done without, one sentence each: maps that the index names and that are not there, channels of the pose.
+    /// What the card and the sets loaded so far lack and is done without, one sentence each: numbers of the card that are estimated, maps that the index names
+    /// and that are not there, channels of the pose, splits.
     pub fn notes(&self) -> Vec<String> {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
     }
@@ -186,7 +209,7 @@ impl DataRoot {
 
     /// Loads drives in the order of the samples file.
     ///
-    /// A drive without an index entry has neither split nor world. `world` is `None` where the root has no map of it, and where the drive does not measure its
+    /// A drive without an index entry has neither split nor world; one whose split is neither train nor test has no split, which [`DataRoot::notes`] says. `world` is `None` where the root has no map of it, and where the drive does not measure its
     /// whole pose; [`DataRoot::notes`] then says so, unless the root has no `worlds/` folder at all.
     ///
     /// # Errors
@@ -207,11 +230,15 @@ impl DataRoot {
         let mut loaded = Vec::with_capacity(wanted.len());
         for at in wanted {
             let (id, rows) = &drives[at];
-            let mut trajectory = drive::build(&channels, rows, &self.vehicle, table.path(), query.dt_s)?;
+            let built = drive::build(&channels, rows, &self.vehicle, table.path(), query.dt_s);
+            let mut trajectory = built.map_err(|error| error.in_drive(id))?;
             trajectory.id.clone_from(id);
             trajectory.set.clone_from(&query.set);
             if let Some(entry) = index.entries.get(id) {
                 trajectory.split = entry.split;
+                if let Some(name) = &entry.other_split {
+                    *lacking.splits.entry(name.clone()).or_default() += 1;
+                }
                 trajectory.world = entry.world.clone().filter(|_| has_worlds);
             }
             self.leave_off_map(&mut trajectory, &mut lacking);
@@ -276,6 +303,8 @@ struct Lacking {
     channels: BTreeMap<String, usize>,
     /// By what is wrong with the map.
     maps: BTreeMap<String, usize>,
+    /// By the name of a split that is neither train nor test.
+    splits: BTreeMap<String, usize>,
 }
 
 impl Lacking {
@@ -286,7 +315,10 @@ impl Lacking {
         let maps = self.maps.iter().map(|(what, count)| {
             format!("set `{set}`: {what}: {count} drives have no map, and are predicted on level ground of the default soil")
         });
-        channels.chain(maps).collect()
+        let splits = self.splits.iter().map(|(name, count)| {
+            format!("set `{set}`: split `{name}` of {count} drives is neither train nor test: only --split all reads them")
+        });
+        channels.chain(maps).chain(splits).collect()
     }
 }
 
@@ -319,6 +351,7 @@ fn wanted(query: &SetQuery, index: &Index, drives: &[DriveRows], samples: &Path)
     let refuse = |reason| Err(TrajectoryError::Query { set: query.set.clone(), reason });
     let has_samples: BTreeSet<&str> = drives.iter().map(|(id, _)| id.as_str()).collect();
     let split = |id: &str| index.entries.get(id).and_then(|entry| entry.split);
+    let split_name = |id: &str| index.entries.get(id).and_then(Entry::split_name);
     if let Some(ids) = &query.trajectories {
         for id in ids {
             if !has_samples.contains(id.as_str()) {
@@ -326,7 +359,7 @@ fn wanted(query: &SetQuery, index: &Index, drives: &[DriveRows], samples: &Path)
                 return refuse(format!("no trajectory `{id}`; present: {present}"));
             }
             if !query.split.admits(split(id)) {
-                let found = split(id).map_or("no split", Split::as_str);
+                let found = split_name(id).unwrap_or("no split");
                 return refuse(format!("trajectory `{id}` is in {found}, not in split {}", query.split.as_str()));
             }
         }
@@ -341,7 +374,7 @@ fn wanted(query: &SetQuery, index: &Index, drives: &[DriveRows], samples: &Path)
     let asked = |id: &String| query.trajectories.as_ref().is_none_or(|ids| ids.contains(id));
     let chosen: Vec<usize> = (0..drives.len()).filter(|at| asked(&drives[*at].0) && query.split.admits(split(&drives[*at].0))).collect();
     if chosen.is_empty() {
-        let splits: BTreeSet<&str> = drives.iter().filter_map(|(id, _)| split(id).map(Split::as_str)).collect();
+        let splits: BTreeSet<&str> = drives.iter().filter_map(|(id, _)| split_name(id)).collect();
         let present = listed(splits.into_iter().map(String::from).collect());
         let why = if index.exists() { "" } else { " (the set has no index)" };
         return refuse(format!("no drive in split {}; splits present: {present}{why}", query.split.as_str()));
@@ -365,6 +398,17 @@ fn find_card(root: &Path) -> Result<PathBuf, TrajectoryError> {
             Err(TrajectoryError::layout(root, reason))
         }
     }
+}
+
+/// What the second command means by the columns of the first set of a root that name it.
+fn second_of_columns(root: &Path) -> Option<(SecondCommand, String)> {
+    let mut sets = Vec::new();
+    collect_sets(root, "", SET_DEPTH, &mut sets);
+    sets.sort();
+    sets.iter().find_map(|set| {
+        let table = Table::open(&root.join(set).join(SAMPLES)).ok()?;
+        implied_second(&table).map(|(second, column)| (second, format!("column `{column}` of set `{set}`")))
+    })
 }
 
 /// Adds the sets below a folder, depth first; `worlds` holds maps, not sets.

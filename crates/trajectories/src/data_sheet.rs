@@ -3,6 +3,9 @@
 //! Names are harmonised here: each quantity is read under every name that a known card uses for it. A card in the schema of bundles
 //! (`"format": "nesam.vehicle/1"`) is accepted too. What a sheet leaves out is estimated by the rules below, all of them chosen:
 //!
+//! * Name: that of the file without `vehicle_`. Wheel width: 0.6 r. Wheelbase: the track of a skid-steer base, 1.8 tracks of a car. All three are said.
+//! * Meaning of the second command: `drive` in words of skid, differential or tracks means a yaw rate, of Ackermann or a car a road-wheel angle; where it says
+//!   neither, the columns of a data root that name it decide, and that is said.
 //! * Inertia: that of a solid box of wheelbase + 2 r by track + wheel width by 2.4 r, flagged in `inertia_estimated`.
 //! * Height of the reference point over the ground: 1.25 r (a low robot carries its battery between the axles).
 //! * Wheel centres: half wheelbase ahead and behind, half track to the sides.
@@ -31,21 +34,47 @@ const STIFF_DAMPING_RATIO: f64 = 0.7;
 const CAR_SPEED_RANGE_M_S: [f64; 2] = [-2.0, 12.0];
 /// Largest rim speed of a skid-steer card that gives none, m/s.
 const SKID_RIM_LIMIT_M_S: f64 = 3.0;
+/// Width of a wheel whose card gives none, in radii.
+const WIDTH_SHARE: f64 = 0.6;
+/// Wheelbase of a card that gives none, in tracks: of a skid-steer base and of a car.
+const WHEELBASE_SHARE: [f64; 2] = [1.0, 1.8];
 /// Rate limit where a card gives none: none in practice, 1/s.
 const UNLIMITED_RATE_PER_S: f64 = 1e3;
+
+/// What the second command means by the columns of recorded drives, and which column says so.
+pub(crate) type OfColumns<'a> = &'a dyn Fn() -> Option<(SecondCommand, String)>;
 
 /// Reads a vehicle card.
 ///
 /// # Errors
 /// `TrajectoryError` naming the file and the key that is missing, of the wrong type or out of range.
 pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
+    read_with_notes(path, &|| None).map(|card| card.vehicle)
+}
+
+/// A vehicle card that was read.
+pub(crate) struct CardReading {
+    pub(crate) vehicle: Vehicle,
+    /// What the card leaves out and is estimated, one sentence each.
+    pub(crate) notes: Vec<String>,
+    /// Which of the two command ranges no key of the card states.
+    pub(crate) implied_range: [bool; 2],
+}
+
+/// Reads a vehicle card with what it does not state. `of_columns` is asked only where the card does not say what the second command means.
+///
+/// # Errors
+/// As [`read_vehicle_card`].
+pub(crate) fn read_with_notes(path: &Path, of_columns: OfColumns<'_>) -> Result<CardReading, TrajectoryError> {
     let sheet = JsonFile::read(path)?;
+    let mut notes = Vec::new();
     if sheet.get("format").is_some() {
         return card_from_json(&sheet.root().to_string())
+            .map(|vehicle| CardReading { vehicle, notes, implied_range: [false; 2] })
             .map_err(|error| TrajectoryError::Card { path: path.into(), reason: error.to_string() });
     }
-    let wheels = Wheels::read(&sheet)?;
-    let second = second_command(&sheet)?;
+    let second = second_command(&sheet, of_columns, &mut notes)?;
+    let wheels = Wheels::read(&sheet, second, &mut notes)?;
     let mass_kg = sheet.required(&["mass_total", "mass_kg", "mass"])?;
     let gravity_m_s2 = sheet.positive(&["gravity", "gravity_m_s2"])?.unwrap_or(9.81);
     let (inertia_kg_m2, inertia_estimated) = inertia(&sheet, mass_kg, &wheels)?;
@@ -53,8 +82,9 @@ pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
     let steering = (second == SecondCommand::SteeringNormalised).then(|| steering_table(&sheet)).transpose()?;
     let track_m = sheet.positive(&["nominal_diff_drive_base_m"])?.filter(|_| second == SecondCommand::YawRateRadS);
     let track_m = track_m.unwrap_or(wheels.track_m);
-    Ok(Vehicle {
-        name: sheet.text("vehicle")?.or(sheet.text("name")?).ok_or_else(|| sheet.missing(&["vehicle", "name"]))?.into(),
+    let (command_range, implied_range) = command_range(&sheet, second, wheels.radius_m, track_m, steering.as_ref())?;
+    let vehicle = Vehicle {
+        name: name(&sheet, path, &mut notes)?,
         mass_kg,
         inertia_kg_m2,
         inertia_estimated,
@@ -64,7 +94,7 @@ pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
         suspension_n_m,
         suspension_n_s_m,
         second,
-        command_range: command_range(&sheet, second, wheels.radius_m, track_m, steering.as_ref())?,
+        command_range,
         steering,
         track_m,
         wheelbase_m: wheels.wheelbase_m,
@@ -73,7 +103,22 @@ pub fn read_vehicle_card(path: &Path) -> Result<Vehicle, TrajectoryError> {
         contact_law: Default::default(),
         soil_damping_pa_s_m: 0.0,
         effects: Default::default(),
-    })
+    };
+    Ok(CardReading { vehicle, notes, implied_range })
+}
+
+/// The name on the card, else that of its file.
+fn name(sheet: &JsonFile, path: &Path, notes: &mut Vec<String>) -> Result<String, TrajectoryError> {
+    if let Some(stated) = sheet.text("vehicle")?.or(sheet.text("name")?) {
+        return Ok(stated.into());
+    }
+    let stem = path.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    let name = stem.strip_prefix("vehicle_").unwrap_or(&stem);
+    if name.is_empty() {
+        return Err(sheet.missing(&["vehicle", "name"]));
+    }
+    notes.push(format!("vehicle card: no `vehicle` or `name`: called `{name}` as its file"));
+    Ok(name.into())
 }
 
 /// The vehicle as a card in the schema of bundles.
@@ -104,9 +149,13 @@ struct Wheels {
 }
 
 impl Wheels {
-    fn read(sheet: &JsonFile) -> Result<Self, TrajectoryError> {
+    fn read(sheet: &JsonFile, second: SecondCommand, notes: &mut Vec<String>) -> Result<Self, TrajectoryError> {
         let radius_m = sheet.required(&["tyre.radius", "wheel_radius_m", "wheel.radius"])?;
-        let width_m = sheet.required(&["tyre.width", "wheel_width_m", "wheel.width"])?;
+        let width_m = sheet.positive(&["tyre.width", "wheel_width_m", "wheel.width"])?.unwrap_or_else(|| {
+            let width_m = round(WIDTH_SHARE * radius_m);
+            notes.push(format!("vehicle card: no `wheel_width_m`: taken for {WIDTH_SHARE} of the radius, {width_m} m"));
+            width_m
+        });
         let centres = &["wheel_centres_rel_P_static", "wheel_centre_m"];
         if let Some((key, value)) = sheet.first(centres) {
             let centre_m: [[f64; 3]; WHEELS] = sheet.matrix(key, value)?;
@@ -120,7 +169,12 @@ impl Wheels {
         }
         let front = sheet.required(&["track_m", "track_front", "track_front_m"])?;
         let rear = sheet.positive(&["track_rear", "track_rear_m"])?.unwrap_or(front);
-        let wheelbase_m = sheet.required(&["wheelbase_m", "wheelbase"])?;
+        let wheelbase_m = sheet.positive(&["wheelbase_m", "wheelbase"])?.unwrap_or_else(|| {
+            let share = WHEELBASE_SHARE[usize::from(second != SecondCommand::YawRateRadS)];
+            let wheelbase_m = round(share * (front + rear) / 2.0);
+            notes.push(format!("vehicle card: no `wheelbase_m`: taken for {share} tracks, {wheelbase_m} m"));
+            wheelbase_m
+        });
         let height = &["cg_height_above_rigid_flat_ground_static_m", "cg_height_m"];
         let z = round(radius_m - sheet.positive(height)?.unwrap_or(1.25 * radius_m));
         let x = wheelbase_m / 2.0;
@@ -129,8 +183,8 @@ impl Wheels {
     }
 }
 
-/// What the second command means: stated, or implied by the kind of drive.
-fn second_command(sheet: &JsonFile) -> Result<SecondCommand, TrajectoryError> {
+/// What the second command means: stated, implied by the kind of drive, or told by the columns of the data.
+fn second_command(sheet: &JsonFile, of_columns: OfColumns<'_>, notes: &mut Vec<String>) -> Result<SecondCommand, TrajectoryError> {
     if let Some(stated) = sheet.text("second")? {
         return match stated {
             "steering_normalised" => Ok(SecondCommand::SteeringNormalised),
@@ -142,13 +196,41 @@ fn second_command(sheet: &JsonFile) -> Result<SecondCommand, TrajectoryError> {
             }
         };
     }
-    match sheet.text("drive")? {
-        Some("skid_steer" | "differential") => Ok(SecondCommand::YawRateRadS),
-        Some(other) if sheet.get("steering").is_none() => {
-            Err(sheet.wrong("drive", format!("`{other}`, expected skid_steer, or state `second` or `steering`")))
-        }
-        _ if sheet.get("steering.command_to_road_wheel_table").is_some() => Ok(SecondCommand::SteeringNormalised),
-        _ => Err(sheet.wrong("second", "missing, and neither `drive` nor a steering table implies it")),
+    let drive = sheet.text("drive")?;
+    if matches!(drive, Some("skid_steer" | "differential")) {
+        return Ok(SecondCommand::YawRateRadS);
+    }
+    if sheet.get("steering.command_to_road_wheel_table").is_some() {
+        return Ok(SecondCommand::SteeringNormalised);
+    }
+    if let Some(second) = drive.and_then(implied_by) {
+        return Ok(second);
+    }
+    if let Some((second, column)) = of_columns() {
+        let meaning = match second {
+            SecondCommand::YawRateRadS => "a yaw rate",
+            _ => "a road-wheel angle",
+        };
+        notes.push(format!("vehicle card: neither `second` nor `drive` says what the second command means; {column} says {meaning}"));
+        return Ok(second);
+    }
+    let words =
+        "state `second`, a steering table, or a `drive` with one of skid, diff, track (a yaw rate), ackermann, car (a road-wheel angle)";
+    match drive {
+        Some(other) => Err(sheet.wrong("drive", format!("`{other}` does not say what the second command means; {words}"))),
+        None => Err(sheet.wrong("second", format!("missing, and neither `drive` nor a steering table implies it; {words}"))),
+    }
+}
+
+/// What the second command of a vehicle of this kind means; `None` where the words name neither kind or both, as a car with a differential does.
+fn implied_by(drive: &str) -> Option<SecondCommand> {
+    let text = drive.to_lowercase();
+    let turns = ["skid", "diff", "track"].into_iter().any(|word| text.contains(word));
+    let steers = text.contains("ackermann") || text.split(|c: char| !c.is_alphabetic()).any(|word| word == "car");
+    match (turns, steers) {
+        (true, false) => Some(SecondCommand::YawRateRadS),
+        (false, true) => Some(SecondCommand::RoadWheelAngleRad),
+        _ => None,
     }
 }
 
@@ -215,24 +297,24 @@ fn steering_table(sheet: &JsonFile) -> Result<SteeringTable, TrajectoryError> {
     Ok(table)
 }
 
-/// Admissible commands: stated, else what the kind of drive implies.
+/// Admissible commands: stated, else what the kind of drive implies; and which of the two nothing on the card states.
 fn command_range(
     sheet: &JsonFile,
     second: SecondCommand,
     radius_m: f64,
     track_m: f64,
     steering: Option<&SteeringTable>,
-) -> Result<[[f64; 2]; 2], TrajectoryError> {
+) -> Result<([[f64; 2]; 2], [bool; 2]), TrajectoryError> {
     let rim_rad_s = sheet.positive(&["max_wheel_speed_rad_s"])?;
     let rim_m_s = rim_rad_s.map_or(SKID_RIM_LIMIT_M_S, |omega| round(omega * radius_m));
-    let implied = match second {
+    let (implied, mut is_implied) = match second {
         SecondCommand::YawRateRadS => {
             let turn = round(2.0 * rim_m_s / track_m);
-            [[-rim_m_s, rim_m_s], [-turn, turn]]
+            ([[-rim_m_s, rim_m_s], [-turn, turn]], [rim_rad_s.is_none(); 2])
         }
         SecondCommand::SteeringNormalised => {
             let ends = steering.map(|t| [t.command[0], t.command[t.command.len() - 1]]);
-            [CAR_SPEED_RANGE_M_S, ends.unwrap_or([-1.0, 1.0])]
+            ([CAR_SPEED_RANGE_M_S, ends.unwrap_or([-1.0, 1.0])], [true, false])
         }
         SecondCommand::RoadWheelAngleRad => {
             let stated = sheet.get("steering.max_road_wheel_angle_rad");
@@ -241,7 +323,7 @@ fn command_range(
                 Some(value) => sheet.finite("steering.max_road_wheel_angle_rad", value)?,
                 None => 0.7,
             };
-            [CAR_SPEED_RANGE_M_S, [-largest, largest]]
+            ([CAR_SPEED_RANGE_M_S, [-largest, largest]], [true, stated.is_none()])
         }
     };
     let stated = |key: &str, otherwise: [f64; 2]| {
@@ -249,7 +331,11 @@ fn command_range(
         let range: [f64; 2] = sheet.array(key, value)?;
         if range[0] < range[1] { Ok(range) } else { Err(sheet.wrong(key, "expected [min, max] with min < max")) }
     };
-    Ok([stated("command_range.speed_m_s", implied[0])?, stated("command_range.second", implied[1])?])
+    let keys = ["command_range.speed_m_s", "command_range.second"];
+    for (is_implied, key) in is_implied.iter_mut().zip(keys) {
+        *is_implied &= sheet.get(key).is_none();
+    }
+    Ok(([stated(keys[0], implied[0])?, stated(keys[1], implied[1])?], is_implied))
 }
 
 /// Actuators and drive line: stated values, else the defaults of the kind of drive.

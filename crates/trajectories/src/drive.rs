@@ -1,6 +1,7 @@
 //! One drive from its rows of the samples file.
 
-use nesam_physics::{Control, SecondCommand, Vehicle, VehicleState, WHEELS};
+use nesam_physics::driveline::rim_twist;
+use nesam_physics::{Control, RimServo, SecondCommand, Vehicle, VehicleState, WHEELS};
 
 use crate::channels::Channels;
 use crate::error::TrajectoryError;
@@ -49,7 +50,7 @@ pub(crate) fn build(
         velocity_m_s: velocity[k],
         angular_velocity_rad_s: angular[k],
     });
-    let controls = grid.held(&log.command).into_iter().map(|[speed_m_s, second]| Control { speed_m_s, second });
+    let controls = grid.averaged(&log.command).into_iter().map(|[speed_m_s, second]| Control { speed_m_s, second });
     let measured = MeasuredChannels {
         position: true,
         height: height_measured,
@@ -155,6 +156,22 @@ fn velocity(channels: &Channels, rows: &[usize], vehicle: &Vehicle, log: &Log) -
     Ok((estimate, VelocitySource::Positions))
 }
 
+/// Yaw rate of the vehicle per turning of its rims where nobody has fitted it, -. It lies between 0 and the 1 of wheels that do not slide, and half errs least
+/// at worst (chosen); a Husky has 0.38.
+const TURN_EFFICIENCY_UNKNOWN: f64 = 0.5;
+
+/// Yaw rate at the first sample of a drive without a measured one, rad/s.
+///
+/// The rims of a skid-steer vehicle tell it, their turning times the `turn_efficiency` of the card; the 1 of a card that was not fitted says nothing of
+/// the ground. The command tells nothing: the drive may begin before the vehicle obeys. Without wheel speeds, and for a car, whose wheels slip, it is zero.
+fn first_yaw_rate(vehicle: &Vehicle, log: &Log) -> f64 {
+    let skid = vehicle.second == SecondCommand::YawRateRadS;
+    let Some(wheels) = log.wheel_speed.as_ref().filter(|_| skid) else { return 0.0 };
+    let stated = vehicle.driveline.rims.turn_efficiency;
+    let efficiency = if stated == RimServo::default().turn_efficiency { TURN_EFFICIENCY_UNKNOWN } else { stated };
+    efficiency * rim_twist(vehicle, &wheels[0])[1]
+}
+
 /// Body angular velocity, axis by axis: measured, else estimated from attitudes.
 fn angular_velocity(
     channels: &Channels,
@@ -162,8 +179,7 @@ fn angular_velocity(
     vehicle: &Vehicle,
     log: &Log,
 ) -> Result<(Vec<[f64; 3]>, [bool; 3]), TrajectoryError> {
-    let yaw_rate = if vehicle.second == SecondCommand::YawRateRadS { log.command[0][1] } else { 0.0 };
-    let mut rates = from_attitudes(&log.time_s, &log.attitude, [0.0, 0.0, yaw_rate]);
+    let mut rates = from_attitudes(&log.time_s, &log.attitude, [0.0, 0.0, first_yaw_rate(vehicle, log)]);
     let mut measured = [false; 3];
     for (axis, column) in channels.angular_velocity.iter().enumerate() {
         let Some(values) = recorded(column.as_ref(), rows)? else { continue };

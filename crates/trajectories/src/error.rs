@@ -97,6 +97,18 @@ impl TrajectoryError {
         Self::Cell { path: path.into(), column: column.into(), row, reason: reason.into() }
     }
 
+    /// The same of a value of this drive, with what helps.
+    pub(crate) fn in_drive(self, id: &str) -> Self {
+        match self {
+            Self::Cell { path, column, row, reason } => {
+                let remedy =
+                    "name the others with --trajectories, or let `nesam import` leave out rows that lack a value and part drives at gaps";
+                Self::Cell { path, column, row, reason: format!("{reason} (in drive `{id}`; {remedy})") }
+            }
+            other => other,
+        }
+    }
+
     pub(crate) fn column(path: &Path, column: &str, reason: impl Into<String>) -> Self {
         Self::Column { path: path.into(), column: column.into(), reason: reason.into() }
     }

@@ -15,6 +15,8 @@ use crate::trajectory::Split;
 pub(crate) struct Entry {
     pub(crate) world: Option<String>,
     pub(crate) split: Option<Split>,
+    /// Name of a split that is neither train nor test.
+    pub(crate) other_split: Option<String>,
     /// Row in the index file, counting from 0.
     pub(crate) row: usize,
 }
@@ -27,6 +29,13 @@ pub(crate) struct Index {
     /// Trajectory ids in file order.
     pub(crate) order: Vec<String>,
     pub(crate) entries: HashMap<String, Entry>,
+}
+
+impl Entry {
+    /// The split by its name, whatever it is.
+    pub(crate) fn split_name(&self) -> Option<&str> {
+        self.split.map(Split::as_str).or(self.other_split.as_deref())
+    }
 }
 
 impl Index {
@@ -70,6 +79,7 @@ impl Index {
             let text = |key: &str| match entry.get(key) {
                 None | Some(Value::Null) => Ok(None),
                 Some(Value::String(s)) => Ok(Some(s.clone())),
+                Some(Value::Number(n)) if n.is_i64() || n.is_u64() => Ok(Some(n.to_string())),
                 Some(other) => Err(file.wrong(&format!("[{row}].{key}"), format!("expected text, found {other}"))),
             };
             index.push(path, row, text("trajectory")?, text("world")?, text("split")?)?;
@@ -87,13 +97,13 @@ impl Index {
     ) -> Result<(), TrajectoryError> {
         let wrong = |column: &str, reason: String| TrajectoryError::cell(path, column, row, reason);
         let id = id.ok_or_else(|| wrong("trajectory", "null, expected an id".into()))?;
-        let split = match split.as_deref() {
-            None => None,
-            Some("train") => Some(Split::Train),
-            Some("test") => Some(Split::Test),
-            Some(other) => return Err(wrong("split", format!("`{other}`, expected train or test"))),
+        let (split, other_split) = match split.as_deref() {
+            None => (None, None),
+            Some("train") => (Some(Split::Train), None),
+            Some("test") => (Some(Split::Test), None),
+            Some(other) => (None, Some(other.to_string())),
         };
-        if self.entries.insert(id.clone(), Entry { world, split, row }).is_some() {
+        if self.entries.insert(id.clone(), Entry { world, split, other_split, row }).is_some() {
             return Err(wrong("trajectory", format!("`{id}` appears a second time")));
         }
         self.order.push(id);

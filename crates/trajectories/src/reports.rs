@@ -64,6 +64,7 @@ fn drive(id: &str, reports: &[Report], dt_s: f64) -> Option<Trajectory> {
     let attitude = grid.angles(&all(&|r| r.state.attitude_rad));
     let velocity = grid.linear(&all(&|r| r.state.velocity_m_s));
     let angular = grid.linear(&all(&|r| r.state.angular_velocity_rad_s));
+    let commands = grid.averaged(&reports.iter().map(|r| [r.command.speed_m_s, r.command.second]).collect::<Vec<_>>());
     let wheels: Option<Vec<_>> = reports.iter().map(|r| r.wheel_speed_rad_s).collect();
     let angles: Option<Vec<_>> = reports.iter().map(|r| r.road_wheel_angle_rad).collect();
     let states = (0..position.len()).map(|k| VehicleState {
@@ -79,7 +80,7 @@ fn drive(id: &str, reports: &[Report], dt_s: f64) -> Option<Trajectory> {
         split: None,
         dt_s,
         states: states.collect(),
-        controls: grid.held(&reports.iter().map(|r| r.command).collect::<Vec<_>>()),
+        controls: commands.into_iter().map(|[speed_m_s, second]| Control { speed_m_s, second }).collect(),
         measured: MeasuredChannels {
             wheel_speed: wheels.is_some(),
             road_wheel_angle: angles.is_some(),

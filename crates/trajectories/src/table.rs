@@ -84,11 +84,7 @@ impl Table {
     /// A column of floats or integers, as f64.
     pub(crate) fn numbers(&self, name: &str) -> Result<Numbers, TrajectoryError> {
         let column = self.required(name)?;
-        let descriptor = self.reader.metadata().file_metadata().schema_descr().column(column);
-        let scaled = descriptor.logical_type_ref().is_some_and(|logical| {
-            matches!(logical, LogicalType::Decimal { .. } | LogicalType::Timestamp { .. } | LogicalType::Time { .. })
-        });
-        if scaled {
+        if self.is_scaled(column) {
             return Err(TrajectoryError::column(&self.path, name, "expected plain numbers, found decimal or time stamps"));
         }
         let (mut values, mut null) = (Vec::with_capacity(self.rows.min(RESERVED)), Vec::new());
@@ -110,28 +106,42 @@ impl Table {
         Ok(Numbers { path: self.path.clone(), name: name.into(), values, null })
     }
 
-    /// A column of texts (plain or dictionary); a column of only nulls may have any type.
+    /// Whether the numbers of a column mean something else than they say: decimals, instants, times of day.
+    fn is_scaled(&self, column: usize) -> bool {
+        let descriptor = self.reader.metadata().file_metadata().schema_descr().column(column);
+        descriptor.logical_type_ref().is_some_and(|logical| {
+            matches!(logical, LogicalType::Decimal { .. } | LogicalType::Timestamp { .. } | LogicalType::Time { .. })
+        })
+    }
+
+    /// A column of texts (plain or dictionary), or of whole numbers, which are read as text; a column of only nulls may have any type.
     pub(crate) fn texts(&self, name: &str) -> Result<Texts, TrajectoryError> {
         let column = self.required(name)?;
+        let (scaled, is_all_null) = (self.is_scaled(column), self.is_all_null(column));
         let mut texts: Texts = Vec::with_capacity(self.rows.min(RESERVED));
         self.each_group(column, name, |reader, max_level, rows| {
-            let ColumnReader::ByteArrayColumnReader(reader) = reader else {
-                let group_is_null = self.is_all_null(column);
-                texts.resize(texts.len() + rows, None);
-                return if group_is_null { Ok(()) } else { Err("expected text, found another type".into()) };
-            };
-            let mut raw = Vec::with_capacity(rows.min(RESERVED));
-            append(reader, max_level, rows, &mut raw, |v| Some(v.clone()), None)?;
-            for value in raw {
-                let Some(value) = value else {
-                    texts.push(None);
-                    continue;
-                };
-                let text = std::str::from_utf8(value.data()).map_err(|_| format!("row {}: not utf-8", texts.len()))?;
-                match texts.last() {
-                    Some(Some(last)) if **last == *text => texts.push(Some(Arc::clone(last))),
-                    _ => texts.push(Some(text.into())),
+            let mut whole: Vec<Option<i64>> = Vec::new();
+            match reader {
+                ColumnReader::ByteArrayColumnReader(r) => {
+                    let mut raw = Vec::with_capacity(rows.min(RESERVED));
+                    append(r, max_level, rows, &mut raw, |v| Some(v.clone()), None)?;
+                    for value in raw {
+                        let text = value.as_ref().map(|v| std::str::from_utf8(v.data())).transpose();
+                        let text = text.map_err(|_| format!("row {}: not utf-8", texts.len()))?;
+                        push_text(&mut texts, text);
+                    }
+                    return Ok(());
                 }
+                _ if is_all_null => {
+                    texts.resize(texts.len() + rows, None);
+                    return Ok(());
+                }
+                ColumnReader::Int32ColumnReader(r) if !scaled => append(r, max_level, rows, &mut whole, |v| Some(i64::from(*v)), None)?,
+                ColumnReader::Int64ColumnReader(r) if !scaled => append(r, max_level, rows, &mut whole, |v| Some(*v), None)?,
+                _ => return Err("expected text or whole numbers, found another type".into()),
+            };
+            for value in whole {
+                push_text(&mut texts, value.map(|v| v.to_string()).as_deref());
             }
             Ok(())
         })?;
@@ -198,6 +208,15 @@ impl Numbers {
     pub(crate) fn is_absent(&self, rows: &[usize]) -> bool {
         rows.iter().all(|row| self.null.get(*row) == Some(&true))
     }
+}
+
+/// Appends a text, shared with an equal one before it.
+fn push_text(texts: &mut Texts, text: Option<&str>) {
+    let shared = match (text, texts.last()) {
+        (Some(text), Some(Some(last))) if **last == *text => Some(Arc::clone(last)),
+        (text, _) => text.map(Arc::from),
+    };
+    texts.push(shared);
 }
 
 /// Appends one row group, nulls as `missing`; gives the null mask where there is a null.

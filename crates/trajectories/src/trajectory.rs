@@ -99,7 +99,7 @@ pub struct Trajectory {
     pub time_s: Vec<f64>,
     /// Measured states, noise included; see `measured` for what is estimated.
     pub states: Vec<VehicleState<f64>>,
-    /// Commands, each valid from its sample to the next.
+    /// Commands, each valid from its sample to the next; of a log that is finer than the step the mean of what was commanded between them.
     pub controls: Vec<Control<f64>>,
     /// Measured wheel speeds FL, FR, RL, RR, rad/s; a skid-steer vehicle repeats left and right.
     pub wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,

@@ -3,8 +3,9 @@
 
 mod common;
 
-use common::{Column, Columns, circle_columns, column, root_of, set, without, write_index, write_parquet};
-use nesam_trajectories::{DataRoot, SetQuery, Split, SplitFilter, Trajectory, TrajectoryError, VelocitySource};
+use common::{Column, Columns, SKID_CARD, circle_columns, column, root_of, set, without, write_index, write_parquet};
+use nesam_physics::SecondCommand;
+use nesam_trajectories::{DataRoot, SetQuery, Split, SplitFilter, Trajectory, TrajectoryError, VelocitySource, card_to_json};
 use parquet::basic::Compression;
 use tempfile::TempDir;
 
@@ -31,8 +32,8 @@ fn analytic_circle_without_index_worlds_and_velocity() {
     assert!((t.states[0].velocity_m_s[0] - 1.0).abs() < 1e-9);
     assert!(t.states.iter().all(|s| (s.velocity_m_s[0] - 1.0).abs() < 1e-3 && s.velocity_m_s[1].abs() < 0.01));
     assert!(t.states.iter().all(|s| s.angular_velocity_rad_s == [0.0, 0.0, 0.3]));
-    // Commands are held: sample k of 10 Hz takes the command of row 2 k.
-    assert!(t.controls.iter().enumerate().all(|(k, u)| (u.speed_m_s - 1.0 - 0.001 * k as f64).abs() < 1e-12));
+    // Commands are held: step k of 10 Hz takes the mean of the commands of rows 2 k and 2 k + 1, and what stays keeps every bit.
+    assert!(t.controls.iter().enumerate().all(|(k, u)| (u.speed_m_s - 1.000_25 - 0.001 * k as f64).abs() < 1e-12 && u.second == 0.3));
     assert_eq!(t.wheel_speed_rad_s.as_ref().unwrap()[3][0], t.wheel_speed_rad_s.as_ref().unwrap()[3][2]);
     // Without encoders the first sample takes the commanded speed.
     let blind = without(&without(&two_drives(), "om_l"), "om_r");
@@ -45,7 +46,8 @@ fn property_later_rows_do_not_change_earlier_samples() {
     let whole = load(&root_of(&circle_columns(&["a"], 40))).unwrap();
     let part = load(&root_of(&circle_columns(&["a"], 21))).unwrap();
     assert_eq!(part[0].states, whole[0].states[..11]);
-    assert_eq!(part[0].controls, whole[0].controls[..11]);
+    // The last command of the shorter log holds on; in the longer one it changes within the step that begins there.
+    assert_eq!(part[0].controls[..10], whole[0].controls[..10]);
 }
 
 #[test]
@@ -139,6 +141,7 @@ fn regress_bad_values_name_column_and_row() {
         set(&mut columns, name, 57, value);
         let error = refusal(&columns);
         assert!(error.contains(&format!("column `{name}`, row 57")) && error.contains(says), "{error}");
+        assert!(error.contains("drive `b`") && error.contains("--trajectories") && error.contains("nesam import"), "{error}");
         // The other drive is not affected, and neither is its reading.
         let root = root_of(&columns);
         let only_a = SetQuery { trajectories: Some(vec!["a".into()]), ..SetQuery::all("drive") };
@@ -149,7 +152,7 @@ fn regress_bad_values_name_column_and_row() {
     let error = refusal(&columns);
     assert!(error.contains("column `z`") && error.contains("expected numbers"), "{error}");
     let mut columns = two_drives();
-    *column(&mut columns, "trajectory") = Column::Int(vec![1; 80]);
+    *column(&mut columns, "trajectory") = Column::Float(vec![1.0; 80]);
     assert!(refusal(&columns).contains("column `trajectory`: expected text"));
     let mut columns = two_drives();
     if let Column::Text(ids) = column(&mut columns, "trajectory") {
@@ -265,14 +268,115 @@ fn analytic_index_gives_split_and_world_from_parquet_or_json() {
     for (json, says) in [
         ("{}", "expected an array"),
         ("[{\"world\":\"w1\"}]", "row 0: null"),
-        ("[{\"trajectory\":7}]", "[0].trajectory"),
+        ("[{\"trajectory\":7.5}]", "[0].trajectory"),
         ("[{\"trajectory\":\"a\"", "not valid json"),
-        ("[{\"trajectory\":\"a\",\"split\":\"val\"}]", "column `split`, row 0"),
+        ("[{\"trajectory\":\"a\",\"split\":7.5}]", "[0].split"),
         ("[{\"trajectory\":\"a\"},{\"trajectory\":\"a\"}]", "row 1: `a` appears a second time"),
     ] {
         std::fs::write(root.path().join("drive/index.json"), json).unwrap();
         let error = load(&root).unwrap_err().to_string();
         assert!(error.contains("index.json") && error.contains(says), "{json}: {error}");
+    }
+}
+
+#[test]
+fn regress_whole_numbers_are_ids() {
+    // Goal: ids that count are ids. Method: the circle with ids 7 and 8 as numbers, in the samples and in either index; one is asked for by its number.
+    let mut columns = two_drives();
+    *column(&mut columns, "trajectory") = Column::Int([vec![7; 40], vec![8; 40]].concat());
+    let root = root_of(&columns);
+    assert_eq!(load(&root).unwrap().iter().map(|t| t.id.as_str()).collect::<Vec<_>>(), ["7", "8"]);
+    let splits = Column::Text(vec![Some("test".into()), Some("train".into())]);
+    let index: Columns = vec![("trajectory".into(), Column::Int(vec![7, 8])), ("split".into(), splits)];
+    write_parquet(&root.path().join("drive/index.parquet"), &index, 2, Compression::UNCOMPRESSED);
+    assert_eq!(load(&root).unwrap()[1].split, Some(Split::Train));
+    std::fs::remove_file(root.path().join("drive/index.parquet")).unwrap();
+    std::fs::write(root.path().join("drive/index.json"), r#"[{"trajectory":7,"split":"train"},{"trajectory":8,"split":"test"}]"#).unwrap();
+    let only_8 = SetQuery { trajectories: Some(vec!["8".into()]), split: SplitFilter::Test, ..SetQuery::all("drive") };
+    assert_eq!(DataRoot::open(root.path(), None).unwrap().load_set(&only_8).unwrap()[0].id, "8");
+}
+
+#[test]
+fn regress_splits_of_other_names_are_neither_train_nor_test() {
+    // Goal: a set with a validation split is readable. Method: one drive in `train`, one in `val`; all are read and noted, `test` is refused by names.
+    let root = root_of(&two_drives());
+    write_index(&root.path().join("drive/index.parquet"), &[("a", None, Some("train")), ("b", None, Some("val"))]);
+    let opened = DataRoot::open(root.path(), None).unwrap();
+    let ids = |split| {
+        let drives = opened.load_set(&SetQuery { split, ..SetQuery::all("drive") }).unwrap();
+        drives.into_iter().map(|t| (t.id, t.split)).collect::<Vec<_>>()
+    };
+    assert_eq!(ids(SplitFilter::Train), [("a".to_string(), Some(Split::Train))]);
+    assert_eq!(opened.notes(), Vec::<String>::new());
+    assert_eq!(ids(SplitFilter::All), [("a".to_string(), Some(Split::Train)), ("b".to_string(), None)]);
+    assert_eq!(opened.notes(), ["set `drive`: split `val` of 1 drives is neither train nor test: only --split all reads them"]);
+    let test = SetQuery { split: SplitFilter::Test, ..SetQuery::all("drive") };
+    let error = opened.load_set(&test).unwrap_err().to_string();
+    assert!(error.contains("no drive in split test; splits present: train, val"), "{error}");
+    let of_val = SetQuery { trajectories: Some(vec!["b".into()]), ..test };
+    assert!(opened.load_set(&of_val).unwrap_err().to_string().contains("trajectory `b` is in val, not in split test"));
+}
+
+#[test]
+fn analytic_a_drive_begins_with_the_turning_of_its_rims() {
+    // Goal: without a measured yaw rate the first sample knows what the rims do, not what is commanded. Method: rims that turn with 0.075 m/s to each side of
+    // the base of 0.55 m while 3 rad/s are commanded; a card that nobody fitted, a fitted one, and no wheel speeds.
+    let mut columns = without(&two_drives(), "wz");
+    *column(&mut columns, "cmd_yaw_rate") = Column::Double(vec![Some(3.0); 80]);
+    let root = root_of(&columns);
+    let first = |root: &TempDir| load(root).unwrap()[0].states[0].angular_velocity_rad_s;
+    let turning = 0.15 / 0.55;
+    assert!((first(&root)[2] - 0.5 * turning).abs() < 1e-9, "{:?}", first(&root));
+    let mut fitted = DataRoot::open(root.path(), None).unwrap().vehicle().clone();
+    fitted.driveline.rims.turn_efficiency = 0.4;
+    std::fs::write(root.path().join("vehicle_test.json"), card_to_json(&fitted)).unwrap();
+    assert!((first(&root)[2] - 0.4 * turning).abs() < 1e-9, "{:?}", first(&root));
+    let blind = root_of(&without(&without(&columns, "om_l"), "om_r"));
+    assert_eq!(first(&blind), [0.0; 3]);
+}
+
+#[test]
+fn analytic_implied_ranges_make_room_for_the_commands_of_drives() {
+    // Goal: what was driven is admitted where the card does not forbid it. Method: 3.4 m/s under the bare card, which implies 3 m/s, under one that states the
+    // range, and under one that states how fast the wheels turn.
+    let mut columns = two_drives();
+    *column(&mut columns, "cmd_speed") = Column::Double(vec![Some(3.4); 80]);
+    let root = root_of(&columns);
+    let range = |card: &str| {
+        std::fs::write(root.path().join("vehicle_test.json"), card).unwrap();
+        let opened = DataRoot::open(root.path(), None).unwrap();
+        let seen = opened.vehicle_of(&opened.load_set(&SetQuery::all("drive")).unwrap());
+        assert_eq!(seen.command_range[1], opened.vehicle().command_range[1], "the turning stays within what is implied");
+        (opened.implied_range(), seen.command_range[0])
+    };
+    assert_eq!(range(SKID_CARD), ([true; 2], [-3.0, 3.4]));
+    let stated = SKID_CARD.replacen('{', r#"{"command_range": {"speed_m_s": [-1.0, 2.0]}, "#, 1);
+    assert_eq!(range(&stated), ([false, true], [-1.0, 2.0]));
+    let limited = SKID_CARD.replace("\"max_wheel_speed_rad_s\": null", "\"max_wheel_speed_rad_s\": 10");
+    assert_eq!(range(&limited), ([false; 2], [-1.6, 1.6]));
+}
+
+#[test]
+fn regress_columns_say_what_a_card_does_not() {
+    // Goal: a card of an unknown kind of drive is enough where the data say what is commanded. Method: the circle under a card of a `hover` drive, with its column of
+    // yaw rates, with one of angles, with both and with one that may be either.
+    let root = root_of(&two_drives());
+    std::fs::write(root.path().join("vehicle_test.json"), SKID_CARD.replace("skid_steer", "hover")).unwrap();
+    let open = |names: &[&str]| {
+        let mut columns = without(&two_drives(), "cmd_yaw_rate");
+        columns.extend(names.iter().map(|name| (name.to_string(), Column::Double(vec![Some(0.3); 80]))));
+        write_parquet(&root.path().join("drive/samples.parquet"), &columns, usize::MAX / 2, Compression::UNCOMPRESSED);
+        DataRoot::open(root.path(), None)
+    };
+    for (name, second) in [("cmd_yaw_rate", SecondCommand::YawRateRadS), ("cmd_steer_angle", SecondCommand::RoadWheelAngleRad)] {
+        let opened = open(&[name]).unwrap();
+        assert_eq!(opened.vehicle().second, second, "{name}");
+        assert!(opened.notes()[0].contains(&format!("column `{name}` of set `drive`")), "{:?}", opened.notes());
+        assert_eq!(opened.load_set(&SetQuery::all("drive")).unwrap()[0].controls[3].second, 0.3);
+    }
+    for names in [&["cmd_yaw_rate", "cmd_steer_angle"][..], &["cmd_steer"]] {
+        let error = open(names).unwrap_err().to_string();
+        assert!(error.contains("`hover`") && error.contains("ackermann"), "{error}");
     }
 }
 

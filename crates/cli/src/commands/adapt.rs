@@ -10,8 +10,8 @@ use clap::Args;
 use nesam_adaptation::{CalibratedFilter, FilterConfig, FilterSettings};
 use nesam_evaluation::report::{Short, adaptation_page};
 use nesam_evaluation::{
-    Adaptation, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, KnownSoil, ModelName, Resamples, Row, Truth,
-    WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, score, write_predictions,
+    Adaptation, Consistency, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, KnownSoil, ModelName, Resamples, Row,
+    Truth, WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, score, write_predictions,
 };
 use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
@@ -351,17 +351,7 @@ fn print_table(a: &Adaptation<'_>) {
         say!("\nonly {}", part.trajectories.join(", "));
         print_errors("mean over the horizon", &rows, false);
     }
-    let c = a.consistency();
-    let number = |v: Option<f64>| v.map_or("–".into(), |v| format!("{v:.2}"));
-    say!(
-        "\n{} updates, {} rejected, {} given up; NIS/dof mean {} median {}; inside 95 %: {}",
-        c.updates,
-        c.rejected,
-        c.failed,
-        number(c.nis_mean_over_dof),
-        number(c.nis_median_over_dof),
-        number(c.inside_95)
-    );
+    say!("\n{}", updates_line(&a.consistency(), a.maps.iter().any(Option::is_some)));
     if let Some(known) = a.known_soil {
         say!("{}", known.sentence());
         say!("{:<22}{}", "", SOIL_NAMES.map(|n| format!("{n:>11}")).concat());
@@ -370,6 +360,23 @@ fn print_table(a: &Adaptation<'_>) {
         }
     }
     print_soil(a);
+}
+
+/// What the filter did; `mapped`: whether any drive has a map.
+fn updates_line(c: &Consistency, mapped: bool) -> String {
+    if c.updates + c.rejected + c.failed == 0 && !mapped {
+        return "0 updates: no map, and without one the soil is not learned".into();
+    }
+    let number = |v: Option<f64>| v.map_or("–".into(), |v| format!("{v:.2}"));
+    format!(
+        "{} updates, {} rejected, {} given up; NIS/dof mean {} median {}; inside 95 %: {}",
+        c.updates,
+        c.rejected,
+        c.failed,
+        number(c.nis_mean_over_dof),
+        number(c.nis_median_over_dof),
+        number(c.inside_95)
+    )
 }
 
 /// A predictor, its errors and their intervals.
@@ -402,4 +409,18 @@ fn print_soil(a: &Adaptation<'_>) {
         }
     }
     say!("(· = not learned: the drive did not tell)");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn regress_no_updates_without_a_map_are_explained() {
+        // Goal: who has no map reads why nothing was learned. Method: nothing without and with a map, and one update.
+        let nothing = Consistency::default();
+        assert!(updates_line(&nothing, false).starts_with("0 updates: no map"));
+        assert!(updates_line(&nothing, true).starts_with("0 updates, 0 rejected"));
+        assert!(updates_line(&Consistency { updates: 1, ..nothing }, false).starts_with("1 updates, 0 rejected"));
+    }
 }

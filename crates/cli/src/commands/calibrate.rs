@@ -96,7 +96,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
         let needed_s = (HORIZON + 1) as f64 * args.data.dt;
         return Err(Failure::input(format!("no drive of set `{}` is of {needed_s:.1} s or more, so nothing can be predicted", drives.set)));
     }
-    let (vehicle, scales) = calibrate_vehicle(card.clone(), &usable, args.data.dt, &Console::default());
+    let (vehicle, scales) = calibrate_vehicle(drives.root.vehicle_of(&drives.drives), &usable, args.data.dt, &Console::default());
     let scored = if usable.len() > 1 { held_out(card, &usable, &scales) } else { scored(card, &vehicle, &usable, &scales) };
     let changes = changes(card, &vehicle);
     let path = out.join(CARD);

@@ -170,7 +170,8 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     }
     let refused: Vec<String> = drives.iter().filter_map(|d| out_of_range(root, d)).collect();
     if let Some(first) = refused.first() {
-        findings.note(format!("set {set}: {} drives command beyond the card's range, first {first}", refused.len()));
+        let implied = if root.implied_range().contains(&true) { ", which the card does not state in full" } else { "" };
+        findings.note(format!("set {set}: {} drives command beyond the card's range{implied}, first {first}", refused.len()));
     }
 }
 

@@ -88,8 +88,10 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
     }
     if let Some(bad) = controls.iter().position(|c| !drives.root.vehicle().admits(c)) {
         let [speed, second] = drives.root.vehicle().command_range;
+        let [of_speed, of_second] = drives.root.implied_range().map(|implied| if implied { " (implied, not stated)" } else { "" });
         return Err(Failure::input(format!(
-            "command {bad} (speed {} m/s, second {}) is outside the card's range: speed {speed:?} m/s, second {second:?}",
+            "command {bad} (speed {} m/s, second {}) is outside the card's range: speed {speed:?} m/s{of_speed}, second {second:?}{of_second}; \
+             `command_range` of a card states it, and `nesam calibrate` widens an implied one to the commands of the drives",
             controls[bad].speed_m_s, controls[bad].second
         )));
     }

@@ -11,7 +11,7 @@ use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
 use nesam_model::reference::ComputeDevice;
 use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 
-use crate::args::{DataArgs, SplitArg};
+use crate::args::{DataArgs, SplitArg, horizon_of};
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, out_place};
@@ -48,9 +48,9 @@ pub struct TrainArgs {
     /// Windows per batch
     #[arg(long, default_value_t = 32)]
     batch_size: usize,
-    /// Steps of each training rollout, at most 32
-    #[arg(long, value_name = "STEPS", default_value_t = 32)]
-    horizon: usize,
+    /// Steps of each training rollout, at most 32 [default: 32, fewer where every drive is shorter]
+    #[arg(long, value_name = "STEPS")]
+    horizon: Option<usize>,
     /// Peak learning rate
     #[arg(long, default_value_t = 5e-4)]
     lr: f64,
@@ -158,8 +158,8 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if args.batches * args.batch_size * shards == 0 || (args.epochs == 0 && args.from.is_none()) {
         return Err(Failure::input("--batches, --batch-size and --threads must be at least 1, and so must --epochs without --from"));
     }
-    if !(1..=MAX_HORIZON).contains(&args.horizon) {
-        return Err(Failure::input(format!("--horizon {} is not 1 to {MAX_HORIZON}", args.horizon)));
+    if let Some(horizon) = args.horizon.filter(|horizon| !(1..=MAX_HORIZON).contains(horizon)) {
+        return Err(Failure::input(format!("--horizon {horizon} is not 1 to {MAX_HORIZON}")));
     }
     if !(0.0..0.9).contains(&args.dropout) {
         return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
@@ -196,7 +196,8 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         }
     }
     let hash = drives.root.hash();
-    let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, args.horizon).or_input()?;
+    let horizon = horizon_of(args.horizon, &drives.drives, "trained on");
+    let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, horizon).or_input()?;
     let form = if variant == Variant::Full { String::new() } else { format!("-{}", variant.as_str().replace('_', "-")) };
     let out = out_place(args.out.as_deref(), "train", &format!("{}{form}", drives.set))?;
     let name = args.name.clone().unwrap_or_else(|| {
@@ -215,7 +216,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             steps: args.epochs * args.batches,
             batch: args.batch_size,
             rate: args.lr,
-            horizon: args.horizon,
+            horizon,
             seed: args.seed,
             epoch: args.batches,
             device: args.device,
