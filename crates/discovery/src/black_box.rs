@@ -58,7 +58,7 @@ impl BlackBox {
                         difference(rows, &changed.deviations(&case.bench, &[], &SoilCorrection::NONE), 1.0)
                     })
                     .collect();
-                profiled(&metric, rows, &columns, &prepared.signatures.soil)
+                profiled(&metric, rows, &columns, &prepared.signatures.soil, &prepared.signatures.uncounted)
             })
             .collect();
         Some(Self { mean, directions, parts: Parts::of(drives) })

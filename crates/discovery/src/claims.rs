@@ -167,6 +167,7 @@ impl Case<'_> {
         settled: &[Option<Settled>],
     ) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
+        let changes = self.changes(yardstick, fit, &selection.chosen);
         (0..selection.chosen.len())
             .map(|i| {
                 let hypothesis = selection.chosen[i];
@@ -187,7 +188,8 @@ impl Case<'_> {
                     refused: None,
                     refused_for_size: false,
                 };
-                if let Some((why, for_size)) = refusal(&group, &finding, fit, i) {
+                let changes = || changes[i].map(|change| (change.to_string(), false));
+                if let Some((why, for_size)) = refusal(&group, &finding, fit, i).or_else(changes) {
                     (finding.refused, finding.refused_for_size) = (Some(why), for_size);
                 }
                 finding

@@ -31,6 +31,8 @@ pub struct Signatures {
     pub columns: Vec<Vec<Row>>,
     /// One prior standard deviation of each soil parameter.
     pub soil: Vec<Vec<Row>>,
+    /// Segments that do not count, because a chosen effect may begin within them ([`straddling`](crate::onset)); empty where none does.
+    pub uncounted: Vec<usize>,
 }
 
 /// Score and information of a drive, soil profiled out.
@@ -159,7 +161,7 @@ pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Bes
             difference(&side(-0.25), &side(0.25), 2.0)
         })
         .collect();
-    Signatures { columns, soil }
+    Signatures { columns, soil, uncounted: Vec::new() }
 }
 
 /// (less - more) · factor, row by row: what the deviations look like when the effect is there and the prediction lacks it.
@@ -188,7 +190,7 @@ pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Conde
     }
     let named = columns.len();
     columns.extend(whitened(metric, &signatures.soil));
-    profile_soil(&products(metric, rows, &columns).sum(metric), named)
+    profile_soil(&products(metric, rows, &columns, &signatures.uncounted).sum(metric), named)
 }
 
 /// Columns as shifts in the metric, segment by segment.
@@ -196,10 +198,10 @@ fn whitened(metric: &Metric, columns: &[Vec<Row>]) -> Vec<Vec<DVector<f64>>> {
     columns.iter().map(|column| column.iter().map(|row| metric.shift(row)).collect()).collect()
 }
 
-/// Condenses a drive over any columns, without levels.
-pub fn profiled(metric: &Metric, rows: &[Row], columns: &[Vec<Row>], soil: &[Vec<Row>]) -> Condensed {
+/// Condenses a drive over any columns, without levels; `uncounted` segments have no say.
+pub fn profiled(metric: &Metric, rows: &[Row], columns: &[Vec<Row>], soil: &[Vec<Row>], uncounted: &[usize]) -> Condensed {
     let shifts: Vec<Vec<DVector<f64>>> = [columns, soil].into_iter().flat_map(|c| whitened(metric, c)).collect();
-    profile_soil(&products(metric, rows, &shifts).sum(metric), columns.len())
+    profile_soil(&products(metric, rows, &shifts, uncounted).sum(metric), columns.len())
 }
 
 /// Weighted products of residual and columns, (1 + columns) square each: variations within the drive, and its level. The residual comes first.
@@ -214,11 +216,11 @@ impl Products {
     }
 }
 
-fn products(metric: &Metric, rows: &[Row], columns: &[Vec<DVector<f64>>]) -> Products {
+fn products(metric: &Metric, rows: &[Row], columns: &[Vec<DVector<f64>>], uncounted: &[usize]) -> Products {
     let size = metric.channels.len();
     let residuals: Vec<DVector<f64>> = rows.iter().map(|row| metric.residual(row)).collect();
-    let weights = weights(&residuals);
-    let total: f64 = weights.iter().sum();
+    let weights = weights(&residuals, uncounted);
+    let total = weights.iter().sum::<f64>().max(1e-9);
     // One matrix of all segments: rows are segment-channels, columns the residual and the columns.
     let mut stacked = DMatrix::zeros(size * rows.len(), 1 + columns.len());
     let mut mean = DMatrix::zeros(size, 1 + columns.len());
@@ -244,7 +246,7 @@ fn products(metric: &Metric, rows: &[Row], columns: &[Vec<DVector<f64>>]) -> Pro
 pub fn believed_within<'a>(metric: &Metric, drives: impl Iterator<Item = (&'a [Row], &'a Signatures)>) -> f64 {
     let scores: Vec<Vec<(f64, f64)>> = drives
         .map(|(rows, signatures)| {
-            let within = products(metric, rows, &whitened(metric, &signatures.columns)).within;
+            let within = products(metric, rows, &whitened(metric, &signatures.columns), &signatures.uncounted).within;
             (1..within.ncols()).map(|j| (within[(0, j)], within[(j, j)])).collect()
         })
         .collect();
@@ -264,13 +266,14 @@ pub fn believed_within<'a>(metric: &Metric, drives: impl Iterator<Item = (&'a [R
     1.0 / quantile_sorted(&excesses, FACTOR_QUANTILE).max(1.0)
 }
 
-/// Weight of each segment: below 1 where it is far from the middle of its drive.
-fn weights(residuals: &[DVector<f64>]) -> Vec<f64> {
+/// Weight of each segment: below 1 where it is far from the middle of its drive, 0 where it does not count.
+fn weights(residuals: &[DVector<f64>], uncounted: &[usize]) -> Vec<f64> {
     let Some(first) = residuals.first() else { return Vec::new() };
     let size = first.len();
     let middle = DVector::from_fn(size, |c, _| median(&residuals.iter().map(|r| r[c]).collect::<Vec<_>>()));
     let bound = CUT_OFF * (size as f64).sqrt();
-    residuals.iter().map(|r| (bound / (r - &middle).norm().max(1e-9)).min(1.0)).collect()
+    let weight = |r: &DVector<f64>| (bound / (r - &middle).norm().max(1e-9)).min(1.0);
+    residuals.iter().enumerate().map(|(k, r)| if uncounted.contains(&k) { 0.0 } else { weight(r) }).collect()
 }
 
 fn profile_soil(gram: &DMatrix<f64>, named: usize) -> Condensed {
@@ -329,7 +332,7 @@ mod tests {
             .collect();
         let one = DMatrix::identity(9, 9);
         let metric = Metric::new((0..9).collect(), DVector::zeros(9), one.clone(), one).unwrap();
-        (metric, rows, Signatures { columns: vec![(0..40).map(|k| row(answer(k))).collect()], soil: Vec::new() })
+        (metric, rows, Signatures { columns: vec![(0..40).map(|k| row(answer(k))).collect()], soil: Vec::new(), uncounted: Vec::new() })
     }
 
     #[test]
@@ -342,5 +345,24 @@ mod tests {
         // Variance of the score over its information: 1 + sd² · information, of 40 segments at 0.5² each.
         let want = 1.0 / (1.0 + 0.25 * 10.0);
         assert!((believed(0.5) / want - 1.0).abs() < 0.2, "{} {want}", believed(0.5));
+    }
+
+    /// Goal: a segment in which an effect begins says nothing. Method: a drive in small noise that jumps by three in one segment or not, with and without that segment;
+    /// and one of which no segment counts.
+    #[test]
+    fn analytic_a_segment_that_does_not_count_has_no_say() {
+        let (metric, rows, signatures) = drives(0.0);
+        let small: Vec<Row> = rows[0].iter().map(|row| row.map(|v| 0.1 * v)).collect();
+        let mut jumps = small.clone();
+        jumps[17][0] += 3.0;
+        let score = |rows: &[Row], uncounted: &[usize]| {
+            let soil = vec![vec![[0.0; CHANNELS]; rows.len()]];
+            condense(&metric, rows, &Signatures { columns: signatures.columns.clone(), soil, uncounted: uncounted.to_vec() }).score
+        };
+        assert!((score(&jumps, &[]) - score(&small, &[])).norm() > 1.0, "a jump is seen");
+        let apart = (score(&jumps, &[17]) - score(&small, &[17])).norm();
+        assert!(apart < 1e-9, "{apart}");
+        let every: Vec<usize> = (0..40).collect();
+        assert!(score(&jumps, &every).norm() < 1e-9);
     }
 }

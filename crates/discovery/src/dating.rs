@@ -19,8 +19,6 @@ use crate::select::{DECISIVE, Selection, Yardstick, without};
 const LOOKS: usize = 3;
 /// Strongest hypotheses that are dated at first, chosen or not.
 const STRONGEST: usize = 3;
-/// Prior standard deviation of the share of an effect beside which another is dated (chosen): loose, it is whatever the drives say.
-const BESIDE_SD: f64 = 10.0;
 
 /// Hypotheses with the time from which each acts, s; `None` = from the start.
 type Acting = Vec<(usize, Option<f64>)>;
@@ -41,6 +39,11 @@ impl Dating {
         Self { onsets: vec![None; hypotheses], beside: vec![None; hypotheses], whole: vec![BTreeMap::new(); drives] }
     }
 
+    /// Onsets of those of some hypotheses that have one.
+    fn begins(&self, hypotheses: &[usize]) -> Vec<Onset> {
+        hypotheses.iter().filter_map(|h| self.onsets[*h]).collect()
+    }
+
     fn acting(&self, hypotheses: &[usize]) -> Acting {
         hypotheses.iter().map(|h| (*h, self.onsets[*h].map(|o| o.at_s))).collect()
     }
@@ -53,7 +56,8 @@ impl Case<'_> {
     }
 
     /// Selects effects, dates them with their close rivals, lets the columns begin there where an onset is sure, and selects again, until no onset changes. What
-    /// was dated by an earlier call is dated again where other effects are chosen beside it.
+    /// was dated by an earlier call is dated again where other effects are chosen beside it. Segments within which a chosen effect may begin count for its onset and that
+    /// of others, so that one that begins in them is dated too, and for nothing else.
     pub fn select(&mut self, yardstick: &Yardstick) -> (Selection, Vec<Option<Onset>>) {
         let mut group = yardstick.group(self.condensed());
         let mut selection = yardstick.select(&group);
@@ -78,6 +82,7 @@ impl Case<'_> {
                     moved = true;
                 }
             }
+            moved |= self.pass_over(&dating.begins(&selection.chosen));
             if !moved {
                 break;
             }
@@ -104,12 +109,13 @@ impl Case<'_> {
                 let signatures = &prepared.signatures;
                 let own: Vec<&Vec<Row>> = columns.iter().map(|c| whole.get(c).unwrap_or(&signatures.columns[*c])).collect();
                 let shift = |k: usize, c: usize| -> f64 { own.iter().zip(&shares).map(|(column, share)| share * column[k][c]).sum() };
-                let loose = others.iter().map(|c| scaled(&signatures.columns[*c], BESIDE_SD));
+                let loose = others.iter().map(|c| onset::loose(&signatures.columns[*c]));
                 Course {
                     times_s: prepared.drive.times_s(dt_s),
                     rows,
                     shift: (0..rows.len()).map(|k| core::array::from_fn(|c| shift(k, c))).collect(),
                     beside: signatures.soil.iter().cloned().chain(loose).collect(),
+                    uncounted: &[],
                 }
             })
             .collect();
@@ -125,6 +131,18 @@ impl Case<'_> {
                 begin(whole, &mut prepared.signatures, column, &times_s, at_s);
             }
         }
+    }
+
+    /// Lets segments that straddle these onsets no longer count, and all others; whether that is a change.
+    fn pass_over(&mut self, onsets: &[Onset]) -> bool {
+        let dt_s = self.bench.stepping.dt_s;
+        let mut changed = false;
+        for prepared in &mut self.prepared {
+            let uncounted = onset::straddling(&prepared.drive.times_s(dt_s), dt_s, onsets);
+            changed |= uncounted != prepared.signatures.uncounted;
+            prepared.signatures.uncounted = uncounted;
+        }
+        changed
     }
 
     fn condense_again(&mut self) {
@@ -183,12 +201,8 @@ fn strongest(yardstick: &Yardstick, group: &Group) -> Vec<usize> {
 }
 
 /// How much more the scores of a hypothesis scatter than the metric says.
-fn dispersion(yardstick: &Yardstick, hypothesis: usize) -> f64 {
+pub(crate) fn dispersion(yardstick: &Yardstick, hypothesis: usize) -> f64 {
     yardstick.catalogue[hypothesis].columns().into_iter().map(|c| yardstick.nulls.dispersion(c)).fold(DISPERSION_MIN, f64::max)
-}
-
-fn scaled(column: &[Row], factor: f64) -> Vec<Row> {
-    column.iter().map(|row| row.map(|v| v * factor)).collect()
 }
 
 #[cfg(test)]
@@ -210,6 +224,7 @@ mod tests {
             alone: Vec::new(),
             rivals: rivals.iter().copied().map(of).collect(),
             remaining: (0.0, String::new()),
+            remaining_level: (0.0, String::new()),
         }
     }
 
@@ -229,7 +244,7 @@ mod tests {
     fn analytic_a_column_that_begins_earlier_after_all_is_whole_again() {
         let times_s: Vec<f64> = (0..10).map(f64::from).collect();
         let column: Vec<Row> = times_s.iter().map(|t| [1.0 + t; CHANNELS]).collect();
-        let mut signatures = Signatures { columns: vec![column.clone()], soil: Vec::new() };
+        let mut signatures = Signatures { columns: vec![column.clone()], soil: Vec::new(), uncounted: Vec::new() };
         let mut whole = BTreeMap::new();
         for at_s in [8.0, 3.0] {
             begin(&mut whole, &mut signatures, 0, &times_s, Some(at_s));

@@ -147,7 +147,7 @@ fn linearised(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &
         .map(|prepared| {
             let rows = prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
             let columns = parameter_columns(bench, prepared, terms, values);
-            profiled(metric, &rows, &columns, &prepared.signatures.soil)
+            profiled(metric, &rows, &columns, &prepared.signatures.soil, &prepared.signatures.uncounted)
         })
         .collect()
 }

@@ -60,7 +60,7 @@ impl Leftover {
                 if let Some(fit) = fit {
                     columns.extend(parameter_columns(&case.bench, prepared, &fit.terms, &fit.values));
                 }
-                profiled(&metric, &rows, &columns, &prepared.signatures.soil)
+                profiled(&metric, &rows, &columns, &prepared.signatures.soil, &prepared.signatures.uncounted)
             })
             .collect();
         Self { region, units, parts: Parts::of(drives) }

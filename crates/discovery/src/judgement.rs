@@ -4,7 +4,7 @@ use crate::candidates::Candidate;
 use crate::claims::{Case, Finding};
 use crate::fit::Fit;
 use crate::onset::Onset;
-use crate::select::{DECISIVE, Selection, Yardstick, without};
+use crate::select::{DECISIVE, FURTHER, Selection, Yardstick, without};
 use crate::settled::{Settled, onset_in_place};
 
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
@@ -175,9 +175,17 @@ fn nothing_chosen(selection: &Selection) -> (Verdict, String) {
     (Verdict::None, "nothing stands out from drives without an effect".into())
 }
 
-/// Whether the drives differ from the reference beyond doubt, so that it must be said even when no cause can be named.
+/// Whether the drives differ from the reference beyond doubt, so that it must be said even when no cause can be named: before or after what was tried, which may show what
+/// it does not explain.
 fn surely_differs(selection: &Selection) -> bool {
-    selection.largest() >= UNEXPLAINED_MARGIN * selection.threshold
+    selection.largest().max(selection.remaining.0) >= UNEXPLAINED_MARGIN * selection.threshold
+}
+
+/// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence.
+fn left_over(selection: &Selection, share_max: f64) -> Option<&(f64, String)> {
+    let needed = |times: f64| (times * selection.threshold).max(share_max * selection.largest());
+    let all = [(&selection.remaining, needed(FURTHER)), (&selection.remaining_level, needed(1.0))];
+    all.into_iter().find(|(left, needed)| left.0 >= *needed).map(|(left, _)| left)
 }
 
 fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool) -> (Verdict, String) {
@@ -195,10 +203,9 @@ fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool
             format!("the drives differ from the reference, but {} cannot be claimed: {refused}", first.candidate.label()),
         );
     }
-    let (left, what) = &selection.remaining;
-    let share = left / selection.largest().max(1e-9);
     let force = findings.iter().any(|f| f.candidate.through_contact());
-    if !model_on_trial && *left >= selection.threshold && share > if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY } {
+    let left = left_over(selection, if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY });
+    if let Some((left, what)) = left.filter(|_| !model_on_trial) {
         return (
             Verdict::Unexplained,
             format!(
@@ -248,6 +255,7 @@ mod tests {
                 alone: Vec::new(),
                 rivals: vec![rivals; chosen.len()],
                 remaining: (0.0, String::new()),
+                remaining_level: (0.0, String::new()),
             };
             closest_of_another_id(&selection, &catalogue)
         };
@@ -255,6 +263,39 @@ mod tests {
         assert_eq!(stands_in(&["wheel_drag FR"], &close), Some(at("tow")));
         assert_eq!(stands_in(&["wheel_drag FR"], &[("wheel_drag RR", 0.5), ("tow", 6.1)]), None);
         assert_eq!(stands_in(&["wheel_drag FR", "gyro_bias"], &close), None, "the other one can be claimed");
+    }
+
+    /// A selection of this largest evidence, of which these are left: of anything, and of levels.
+    fn leaving(largest: f64, [any, level]: [f64; 2]) -> Selection {
+        Selection {
+            z: vec![Some(largest)],
+            levels: Vec::new(),
+            threshold: 4.0,
+            probability: None,
+            chosen: Vec::new(),
+            alone: Vec::new(),
+            rivals: Vec::new(),
+            remaining: (any, "anything".into()),
+            remaining_level: (level, "a level".into()),
+        }
+    }
+
+    /// Goal: what is left counts as a difference too. Method: evidence before and after what was tried, either side of one and a half thresholds of 4.
+    #[test]
+    fn analytic_more_left_than_there_was_is_a_difference() {
+        assert!(surely_differs(&leaving(5.3, [7.8, 7.8])));
+        assert!(surely_differs(&leaving(6.1, [2.0, 2.0])));
+        assert!(!surely_differs(&leaving(5.7, [5.6, 5.6])));
+    }
+
+    /// Goal: a hypothesis that could not be chosen besides refuses nothing, a level beyond chance does. Method: what is left of an evidence of 14, on a threshold of 4.
+    #[test]
+    fn analytic_what_could_not_be_chosen_refuses_no_claim() {
+        let refused_by = |left: [f64; 2]| left_over(&leaving(14.0, left), 0.2).map(|(_, what)| what.clone());
+        assert_eq!(refused_by([4.7, 3.0]), None);
+        assert_eq!(refused_by([5.1, 3.0]).as_deref(), Some("anything"));
+        assert_eq!(refused_by([4.7, 4.2]).as_deref(), Some("a level"));
+        assert!(left_over(&leaving(30.0, [5.1, 5.1]), 0.2).is_none(), "less than a fifth");
     }
 
     /// Goal: a reason does not say that nothing stands out where something was refused. Method: two findings that earlier looks refused, with nothing chosen and with
@@ -289,6 +330,7 @@ mod tests {
                 alone: Vec::new(),
                 rivals: Vec::new(),
                 remaining: (146.1, "a level".into()),
+                remaining_level: (146.1, "a level".into()),
             };
             let reason = nothing_chosen(&selection).1;
             let judgement =

@@ -9,7 +9,7 @@
 //! 3. [`Reference`] is what such scores usually are, measured on drives that training never saw, with null groups for honest thresholds;
 //! 4. [`evidence`] holds the scores of a group of drives against their scatter over null drives, for one hypothesis or after others were fitted;
 //! 5. [`select`] chooses up to three effects with the rivals that the drives cannot tell from them; `dating` lets each begin at its [`onset`];
-//! 6. [`fit`] estimates sizes by Gauss-Newton; [`claims`] gives intervals and refuses what lies at a bound, is unstable or explains too little;
+//! 6. [`fit`] estimates sizes by Gauss-Newton; [`claims`] gives intervals and refuses what lies at a bound, is unstable, changes its size or explains too little;
 //! 7. [`held_out`] predicts drives that were not fitted before, with the best soil alone, and with the effects;
 //! 8. [`controls`] predicts the same drives with what else might explain them: rivals, a black box, a free form of what is left;
 //! 9. [`diagnose`] does all of it, [`report`] writes JSON and HTML; [`bench`] measures how often it is right.
@@ -27,6 +27,7 @@ pub mod channels;
 pub mod claims;
 pub mod condense;
 mod consistency;
+mod constancy;
 pub mod controls;
 mod dating;
 mod diagnose;

@@ -1,5 +1,7 @@
 //! When an effect began: the profile of the generalised likelihood ratio over the start of the segments (Basseville and Nikiforov 1993, ch. 2.4).
 
+use std::fmt;
+
 use rayon::prelude::*;
 
 use crate::channels::{CHANNELS, Row, SEGMENT_STEPS};
@@ -16,6 +18,10 @@ pub(crate) const DISPERSION_MIN: f64 = 0.05;
 const INTERVAL: f64 = 3.84;
 /// Segments that must lie before and after an onset, on average by drive.
 const SEGMENTS_MIN: usize = 3;
+/// Prior standard deviation of the share of an effect beside which another is dated (chosen): loose, it is whatever the drives say.
+const BESIDE_SD: f64 = 10.0;
+/// Overlap below which segments only touch, s: sums of steps are not exact.
+const TOUCHING_S: f64 = 1e-6;
 
 /// An onset with its interval.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -26,6 +32,21 @@ pub struct Onset {
     pub ci95_s: [f64; 2],
     /// Gain over an effect that was always there, in the metric.
     pub gain: f64,
+}
+
+/// A change of the size of an effect that is already there.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Change {
+    /// When, s since the start of the drives.
+    pub at_s: f64,
+    /// By how much, as a share of the effect as fitted.
+    pub share: f64,
+}
+
+impl fmt::Display for Change {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "its size is not the same throughout: it changes by about {:.0} % at {:.1} s", 100.0 * self.share, self.at_s)
+    }
 }
 
 /// A drive in which an onset is looked for; one row per segment.
@@ -39,6 +60,16 @@ pub struct Course<'a> {
     pub shift: Vec<Row>,
     /// How what is fitted beside it shifts them, such as the soil, by one prior standard deviation of each.
     pub beside: Vec<Vec<Row>>,
+    /// Segments that do not count.
+    pub uncounted: &'a [usize],
+}
+
+impl Course<'_> {
+    /// Start of each segment that counts and in which the effect shows, s.
+    fn shown_s(&self) -> Vec<f64> {
+        let shows = |k: usize| !self.uncounted.contains(&k) && self.shift[k].iter().any(|v| *v != 0.0);
+        self.times_s.iter().enumerate().filter(|(k, _)| shows(*k)).map(|(_, time)| *time).collect()
+    }
 }
 
 /// The onset of an effect; `None` when it was there from the start as far as the drives tell.
@@ -46,21 +77,54 @@ pub struct Course<'a> {
 /// `dispersion` is how much more scores scatter than the metric says (a ratio of variances).
 pub fn find(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion: f64) -> Option<Onset> {
     let starts = starts(drives);
+    let gain: Vec<f64> = profile(metric, drives, &starts, false)
+        .into_iter()
+        .map(|(score, information)| score.max(0.0).powi(2) / information.max(1e-12))
+        .collect();
+    dated(&starts, &gain, dispersion, SEGMENT_STEPS as f64 * dt_s)
+}
+
+/// The change of size that speaks most against an effect that is the same as long as it is there; `None` where it brings less than an onset must.
+///
+/// The rows are what the fitted effect leaves, the shift is its answer where it acts, and each drive may have it in a size of its own. `share_min` is the share
+/// of what the effect explains that a change must bring.
+pub(crate) fn change(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion: f64, share_min: f64) -> Option<Change> {
+    let shown_s: Vec<f64> = drives.iter().flat_map(Course::shown_s).collect();
+    let starts = midway(&shown_s, drives.len());
+    // The whole effect has a share of one.
+    let explained: f64 = profile(metric, drives, &[f64::NEG_INFINITY], false).into_iter().map(|(_, information)| information).sum();
+    let gain = |(score, information): (f64, f64)| score.powi(2) / information.max(1e-12);
+    let steps = profile(metric, drives, &starts, true).into_iter().zip(&starts);
+    let (best, start) = steps.max_by(|a, b| gain(a.0).total_cmp(&gain(b.0)))?;
+    let least = (DECISIVE * dispersion.max(DISPERSION_MIN)).max(share_min * explained);
+    let at_s = start - 0.5 * SEGMENT_STEPS as f64 * dt_s;
+    (gain(best) >= least).then(|| Change { at_s, share: best.0 / best.1.max(1e-12) })
+}
+
+/// Score and information over all drives of an effect from each of some starts on, for itself or beside one that is `always` there in any size.
+fn profile(metric: &Metric, drives: &[Course<'_>], starts: &[f64], always: bool) -> Vec<(f64, f64)> {
     let condensed: Vec<Condensed> = drives
         .par_iter()
         .map(|drive| {
             let masked: Vec<Vec<Row>> = starts.iter().map(|from| begun(&drive.shift, &drive.times_s, *from)).collect();
-            profiled(metric, drive.rows, &masked, &drive.beside)
+            let beside: Vec<Vec<Row>> = drive.beside.iter().cloned().chain(always.then(|| loose(&drive.shift))).collect();
+            profiled(metric, drive.rows, &masked, &beside, drive.uncounted)
         })
         .collect();
-    let gain: Vec<f64> = (0..starts.len())
-        .map(|i| {
-            let score: f64 = condensed.iter().map(|c| c.score[i]).sum();
-            let information: f64 = condensed.iter().map(|c| c.information[(i, i)]).sum();
-            score.max(0.0).powi(2) / information.max(1e-12)
-        })
-        .collect();
-    dated(&starts, &gain, dispersion, SEGMENT_STEPS as f64 * dt_s)
+    let sum = |of: &dyn Fn(&Condensed) -> f64| condensed.iter().map(of).sum::<f64>();
+    (0..starts.len()).map(|i| (sum(&|c| c.score[i]), sum(&|c| c.information[(i, i)]))).collect()
+}
+
+/// A column beside which an effect is dated, by one prior standard deviation of its share.
+pub(crate) fn loose(column: &[Row]) -> Vec<Row> {
+    column.iter().map(|row| row.map(|v| v * BESIDE_SD)).collect()
+}
+
+/// Segments that overlap the interval of one of some onsets: an effect that begins within a segment shows in a part of it, and if it moves positions, with a jump.
+pub(crate) fn straddling(times_s: &[f64], dt_s: f64, onsets: &[Onset]) -> Vec<usize> {
+    let segment_s = SEGMENT_STEPS as f64 * dt_s;
+    let overlaps = |start_s: f64, [low, high]: [f64; 2]| start_s.max(low) + TOUCHING_S < (start_s + segment_s).min(high);
+    (0..times_s.len()).filter(|k| onsets.iter().any(|o| overlaps(times_s[*k], o.ci95_s))).collect()
 }
 
 /// A column that is there from a time on (s).
@@ -70,13 +134,21 @@ pub(crate) fn begun(column: &[Row], times_s: &[f64], at_s: f64) -> Vec<Row> {
 
 /// When an effect may have begun, s: always, which comes first, or at a segment with enough of them before and after.
 fn starts(drives: &[Course<'_>]) -> Vec<f64> {
-    let every = || drives.iter().flat_map(|d| d.times_s.iter().copied());
-    let mut times: Vec<f64> = every().collect();
+    let every: Vec<f64> = drives.iter().flat_map(|d| d.times_s.iter().copied()).collect();
+    std::iter::once(f64::NEG_INFINITY).chain(midway(&every, drives.len())).collect()
+}
+
+/// Those of the starts of segments of all drives, s, with enough of them before and after.
+fn midway(every: &[f64], drives: usize) -> Vec<f64> {
+    let mut times = every.to_vec();
     times.sort_by(f64::total_cmp);
     times.dedup();
-    let least = SEGMENTS_MIN * drives.len();
-    let enough = |time: &f64| every().filter(|t| t < time).count() >= least && every().filter(|t| t >= time).count() >= least;
-    std::iter::once(f64::NEG_INFINITY).chain(times.into_iter().filter(enough)).collect()
+    let least = SEGMENTS_MIN * drives;
+    times.retain(|time| {
+        let before = every.iter().filter(|t| *t < time).count();
+        before >= least && every.len() - before >= least
+    });
+    times
 }
 
 /// The onset that a profile of the gain over starts speaks for; the first start is always.
@@ -111,14 +183,18 @@ mod tests {
         (0..SEGMENTS).map(|k| core::array::from_fn(|c| if c == 0 && k >= segment { value } else { 0.0 })).collect()
     }
 
+    fn metric() -> Metric {
+        let one = DMatrix::identity(9, 9);
+        Metric::new((0..9).collect(), DVector::zeros(9), one.clone(), one).unwrap().believing(0.1)
+    }
+
     /// Onset of an effect that shifts the first channel by one, in five drives of the same deviations without noise.
     fn found(rows: &[Row], beside: &[Vec<Row>], dispersion: f64) -> Option<Onset> {
-        let one = DMatrix::identity(9, 9);
-        let metric = Metric::new((0..9).collect(), DVector::zeros(9), one.clone(), one).unwrap().believing(0.1);
         let still = from(0, 0.0);
-        let drive = || Course { times_s: times_s(), rows, shift: from(0, 1.0), beside: beside.iter().chain([&still]).cloned().collect() };
+        let beside: Vec<Vec<Row>> = beside.iter().chain([&still]).cloned().collect();
+        let drive = || Course { times_s: times_s(), rows, shift: from(0, 1.0), beside: beside.clone(), uncounted: &[] };
         let drives: Vec<Course<'_>> = (0..5).map(|_| drive()).collect();
-        find(&metric, &drives, 0.1, dispersion)
+        find(&metric(), &drives, 0.1, dispersion)
     }
 
     fn begins(onset: Option<Onset>, segment: usize) -> bool {
@@ -157,5 +233,41 @@ mod tests {
         let both = sum(&other, &from(9, 2.0));
         assert!(begins(found(&both, &[], 0.1), 18), "{:?}", found(&both, &[], 0.1));
         assert!(begins(found(&both, &loose, 0.1), 9), "{:?}", found(&both, &loose, 0.1));
+    }
+
+    /// Change of the size of an effect that is there from segment 6 on, in fifty drives of the same deviations; the segment before does not count.
+    fn changed(left: &[Row], share_min: f64) -> Option<Change> {
+        let drive = || Course { times_s: times_s(), rows: left, shift: from(6, 1.0), beside: vec![from(0, 0.0)], uncounted: &[5] };
+        let drives: Vec<Course<'_>> = (0..50).map(|_| drive()).collect();
+        change(&metric(), &drives, 0.1, 0.05, share_min)
+    }
+
+    /// Goal: an effect that ends or grows is seen not to be the same, a step is. Method: what a fit from segment 6 on leaves of an effect that is there from 6 to 17 (half
+    /// too large before and half too small after), of one that grows steadily, of one that was sized a little wrong, and of one that jumps where it begins.
+    #[test]
+    fn analytic_an_effect_that_ends_or_grows_is_not_the_same_throughout() {
+        let of = |left: &dyn Fn(usize) -> f64| -> Vec<Row> {
+            (0..SEGMENTS).map(|k| core::array::from_fn(|c| if c == 0 && k >= 5 { left(k) } else { 0.0 })).collect()
+        };
+        let ends = changed(&of(&|k| if k < 18 { 0.5 } else { -0.5 }), 0.02).unwrap();
+        assert!((ends.at_s - (times_s()[18] - 0.4)).abs() < 1e-9 && (ends.share + 1.0).abs() < 0.05, "{ends:?}");
+        assert!(changed(&of(&|k| (k as f64 - 17.5) / 24.0), 0.02).is_some_and(|grows| grows.share > 0.3));
+        assert_eq!(changed(&of(&|k| if k < 6 { 0.0 } else { 0.2 }), 0.02), None, "another size is no change of it");
+        assert_eq!(changed(&of(&|k| if k == 5 { 3.0 } else { 0.0 }), 0.02), None, "a jump does not count");
+        let said = "its size is not the same throughout: it changes by about -100 % at 14.0 s";
+        assert_eq!(Change { share: -1.0, ..ends }.to_string(), said);
+        let smaller = of(&|k| if k < 18 { 0.2 } else { -0.2 });
+        assert!(changed(&smaller, 0.02).is_some() && changed(&smaller, 0.12).is_none(), "answers of forces are not exact");
+    }
+
+    /// Goal: the segment in which an effect begins is known. Method: an onset whose first whole segment is the fifteenth, and two that are known worse.
+    #[test]
+    fn analytic_segments_within_the_interval_of_an_onset_straddle_it() {
+        let onset = |low: f64, high: f64| Onset { at_s: 0.5 * (low + high), ci95_s: [low, high], gain: 20.0 };
+        let first = times_s()[15];
+        let sure = onset(first - 0.8, first + 0.4);
+        assert_eq!(straddling(&times_s(), 0.1, &[sure]), [14, 15]);
+        assert_eq!(straddling(&times_s(), 0.1, &[onset(0.9, 2.3), sure]), [1, 2, 14, 15]);
+        assert!(straddling(&times_s(), 0.1, &[]).is_empty());
     }
 }

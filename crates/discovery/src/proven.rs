@@ -237,6 +237,7 @@ mod tests {
             alone: findings.iter().map(|f| f.alone).collect(),
             rivals: vec![Vec::new(); findings.len()],
             remaining: (1.0, String::new()),
+            remaining_level: (1.0, String::new()),
         };
         Judgement {
             selection,

@@ -99,6 +99,8 @@ pub struct Selection {
     pub rivals: Vec<Vec<Rival>>,
     /// Largest evidence that is left after the chosen ones, and what it is for.
     pub remaining: (f64, String),
+    /// The same of the levels of channels alone.
+    pub remaining_level: (f64, String),
 }
 
 impl Selection {
@@ -190,7 +192,8 @@ impl Yardstick {
             all_evidence(group, &self.catalogue, &self.channels).into_iter().enumerate().map(|(e, z)| z / self.spread(e)).collect();
         let z: Vec<Option<f64>> = (0..count).map(|e| self.considered[e].then_some(evidence[e])).collect();
         let levels = evidence[count..].to_vec();
-        let largest = z.iter().flatten().chain(&levels).copied().fold(0.0, f64::max);
+        let largest_level = levels.iter().copied().fold(0.0, f64::max);
+        let largest = z.iter().flatten().copied().fold(largest_level, f64::max);
         let mut selection = Selection {
             z,
             levels,
@@ -200,6 +203,7 @@ impl Yardstick {
             alone: Vec::new(),
             rivals: Vec::new(),
             remaining: (largest, String::new()),
+            remaining_level: (largest_level, String::new()),
         };
         if largest < selection.threshold {
             selection.remaining.1 = self.named(&selection, largest);
@@ -229,6 +233,7 @@ impl Yardstick {
         selection.alone = (0..chosen.len()).map(|i| self.after(group, &others(i), chosen[i]).0).collect();
         selection.rivals = (0..chosen.len()).map(|i| self.rivals(group, &others(i), chosen[i], &chosen)).collect();
         selection.remaining = self.remaining(group, &chosen);
+        selection.remaining_level = self.level_after_fit(group, group, &chosen);
     }
 
     /// The hypothesis that is best added to those chosen.
@@ -292,13 +297,19 @@ impl Yardstick {
     }
 
     /// The same where `left` are the scores after the fit went through the physics.
+    pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
+        let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
+        let level = self.level_after_fit(left, before, chosen);
+        hypotheses.chain([level]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
+    }
+
+    /// The same of the levels of channels alone.
     ///
     /// What a force or a soil does to the rims follows from the slope of traction, which is known worst (and without torque not at all, ADR 0003), so their
     /// levels do not speak against one.
-    pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
+    pub fn level_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
         let columns = self.columns(chosen);
         let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
-        let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
         let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
         let told = |c: &usize| !(force && (RIM_AT..PATH_AT).contains(c));
         let levels = self.channels.iter().enumerate().filter(|(_, c)| told(c)).map(|(i, c)| {
@@ -306,7 +317,7 @@ impl Yardstick {
                 / self.spread(self.catalogue.len() + i);
             (z, level_name(*c))
         });
-        hypotheses.chain(levels).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
+        levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
     }
 }
 

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, options, plough, rover, world};
+use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, drive_from, options, plough, rover, world};
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Stepping, Verdict, observe, observe_all};
@@ -108,6 +108,31 @@ fn property_an_effect_that_begins_midway_is_dated() {
         let onset = onset.unwrap_or_else(|| panic!("against {against:?}: {}", found.reason));
         let dated = (onset.at_s - 10.0).abs() <= 1.0 && onset.ci95_s[0] <= 10.0 && onset.ci95_s[1] >= 10.0;
         assert!(dated, "against {against:?}: {onset:?}");
+    }
+}
+
+/// Goal: the segment in which an effect begins is left out, of that set alone. Method: a steering offset from 10 s on, which the segment from 9.6 s straddles, and one that
+/// is always there.
+#[test]
+fn property_the_segment_in_which_an_effect_begins_does_not_count() {
+    let bundle = bundle();
+    let judge_by = Judge::of(&bundle).unwrap();
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
+    for onset_s in [10.0, 0.0] {
+        let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.1 })];
+        let drives: Vec<_> = (0..8).map(|i| drive_from(&format!("d{i}"), 510 + i, &effects, onset_s, &bundle.default_soil)).collect();
+        let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
+        let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &judge_by.catalogue };
+        let mut case = judge_by.case(bench, observed, &|_, _, _| {}).unwrap();
+        let yardstick = judge_by.yardstick(&case.metric.channels, drives.len(), &[]).unwrap();
+        case.select(&yardstick);
+        for prepared in &case.prepared {
+            let times_s = prepared.drive.times_s(0.1);
+            let left_out: Vec<f64> = prepared.signatures.uncounted.iter().map(|k| times_s[*k]).collect();
+            let straddled = left_out.iter().any(|from| *from < 10.0 && from + 0.8 > 10.0);
+            assert_eq!(straddled, onset_s > 0.0, "{left_out:?}");
+            assert!(left_out.len() < 6 && left_out.is_empty() == (onset_s == 0.0), "{left_out:?}");
+        }
     }
 }
 

@@ -34,7 +34,8 @@ which were measured with the old card: make them again with `nesam adapt --calib
 `nesam diagnose --make-reference`.
 
 What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
-rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds.
+rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel \
+speeds or, without any, from the motion.
 
 Examples:
   nesam calibrate --data mine --set first --out mine-calibrated
@@ -103,7 +104,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     let seconds = HORIZON as f64 * args.data.dt;
     summary(&scored, &changes, usable.len() > 1, seconds);
     if card.second == SecondCommand::YawRateRadS && usable.iter().all(|d| d.wheel_speed_rad_s.is_none()) {
-        say!("the servo of the rims stays as the card has it: wheel speeds would tell it, and no drive has them");
+        say!("no drive has wheel speeds: the servo of the rims was fitted to the motion, together with what the ground makes of it");
     }
     write_file(&path, (card_to_json(&vehicle) + "\n").as_bytes())?;
     say!("wrote {}", path.display());
