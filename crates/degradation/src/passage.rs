@@ -174,7 +174,7 @@ impl Ride<'_> {
             return None;
         }
         let prediction = self.predict(asked_s, self.commands(start_s, steps)).ok()?;
-        let poses = (0..steps).map(|k| pose_of(&prediction.rollout.state(0, k).map(f64::from))).collect();
+        let poses = (0..steps).map(|k| pose_of(&prediction.rollout.state_f64(0, k))).collect();
         Some(Asked {
             sample,
             start: self.true_pose(start_s),

@@ -10,7 +10,7 @@ use nesam_physics::{STATE_DIM, SoilCorrection};
 use rayon::prelude::*;
 
 use crate::claims::Case;
-use crate::condense::{Condensed, Parts, difference, profiled};
+use crate::condense::{Condensed, Parts, difference};
 use crate::ridge;
 
 /// Principal directions of the hidden layer that the head may change along (chosen: most of what a few drives vary).
@@ -58,7 +58,7 @@ impl BlackBox {
                         difference(rows, &changed.deviations(&case.bench, &[], &SoilCorrection::NONE), 1.0)
                     })
                     .collect();
-                profiled(&metric, rows, &columns, &prepared.signatures.soil, &prepared.signatures.uncounted)
+                prepared.signatures.profiled(&metric, rows, &columns)
             })
             .collect();
         Some(Self { mean, directions, parts: Parts::of(drives) })

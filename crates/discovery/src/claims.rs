@@ -188,8 +188,8 @@ impl Case<'_> {
                     refused: None,
                     refused_for_size: false,
                 };
-                let changes = || changes[i].map(|change| (change.to_string(), false));
-                if let Some((why, for_size)) = refusal(&group, &finding, fit, i).or_else(changes) {
+                let changed = changes[i].map(|change| (change.to_string(), false));
+                if let Some((why, for_size)) = refusal(&group, &finding, fit, i).or(changed) {
                     (finding.refused, finding.refused_for_size) = (Some(why), for_size);
                 }
                 finding

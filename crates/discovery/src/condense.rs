@@ -31,7 +31,7 @@ pub struct Signatures {
     pub columns: Vec<Vec<Row>>,
     /// One prior standard deviation of each soil parameter.
     pub soil: Vec<Vec<Row>>,
-    /// Segments that do not count, because a chosen effect may begin within them ([`straddling`](crate::onset)); empty where none does.
+    /// Segments that do not count, because an effect that was chosen last may begin within them ([`straddling`](crate::onset)); empty where none does.
     pub uncounted: Vec<usize>,
 }
 
@@ -198,7 +198,14 @@ fn whitened(metric: &Metric, columns: &[Vec<Row>]) -> Vec<Vec<DVector<f64>>> {
     columns.iter().map(|column| column.iter().map(|row| metric.shift(row)).collect()).collect()
 }
 
-/// Condenses a drive over any columns, without levels; `uncounted` segments have no say.
+impl Signatures {
+    /// Condenses their drive over any columns, without levels.
+    pub fn profiled(&self, metric: &Metric, rows: &[Row], columns: &[Vec<Row>]) -> Condensed {
+        profiled(metric, rows, columns, &self.soil, &self.uncounted)
+    }
+}
+
+/// Condenses a drive over any columns, without levels; `uncounted` segments have no weight.
 pub fn profiled(metric: &Metric, rows: &[Row], columns: &[Vec<Row>], soil: &[Vec<Row>], uncounted: &[usize]) -> Condensed {
     let shifts: Vec<Vec<DVector<f64>>> = [columns, soil].into_iter().flat_map(|c| whitened(metric, c)).collect();
     profile_soil(&products(metric, rows, &shifts, uncounted).sum(metric), columns.len())

@@ -7,7 +7,7 @@ use nesam_physics::{CONTRADICTIONS, Vehicle, VehicleState, contradiction};
 use nesam_trajectories::Trajectory;
 
 use crate::channels::{PATH_AT, Row, SEGMENT_STEPS, available};
-use crate::proof::RISE_MIN;
+use crate::proof::{RISE_MIN, sure_fall};
 
 /// Change of a contradiction that is none, m and rad.
 const UNCHANGED: f64 = 1e-9;
@@ -68,7 +68,7 @@ impl Contradictions {
             (size, resamples.mean_interval(&falls, &self.drive))
         };
         let changes: Vec<(f64, Option<[f64; 2]>)> = (0..CONTRADICTIONS).filter(|i| self.compared[*i]).map(change).collect();
-        let falls = |(size, interval): &(f64, Option<[f64; 2]>)| interval.is_some_and(|[low, _]| low > 0.0 && low >= gain * size);
+        let falls = |(size, interval): &(f64, Option<[f64; 2]>)| sure_fall(*interval, *size, gain);
         let rises = |(size, interval): &(f64, Option<[f64; 2]>)| interval.is_some_and(|[_, high]| high < -RISE_MIN * size);
         changes.iter().any(falls) && !changes.iter().any(rises)
     }

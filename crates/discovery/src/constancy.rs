@@ -1,4 +1,4 @@
-//! Whether a fitted effect is as large all the time that it is there: an offset that ends, comes and goes or grows is fitted well on average and is none of its kind.
+//! Whether a fitted effect is as large all the time that it is there: an offset that ends, or comes and goes, is fitted well on average and is none of its kind.
 //!
 //! What the fit leaves is searched for a further onset of the effect's own answer, as when effects are dated. An onset must bring a share of what its effect explains,
 //! because answers are not exact; a change of what is sized already must bring what answers of its layer are doubted by, so that forces, which depend on how the
@@ -14,7 +14,7 @@ use crate::condense::difference;
 use crate::dating::dispersion;
 use crate::fit::Fit;
 use crate::onset::{Change, Course, change, loose};
-use crate::select::{Yardstick, mismatch};
+use crate::select::{Yardstick, mismatch, without};
 
 /// What fitted effects leave of a drive.
 struct Left {
@@ -33,10 +33,15 @@ impl Case<'_> {
         let left: Vec<Left> = self
             .prepared
             .par_iter()
-            .map(|prepared| {
+            .zip(&self.rows)
+            .map(|(prepared, plain)| {
                 let with = |effects: &[ScheduledEffect]| prepared.drive.deviations(&self.bench, effects, &SoilCorrection::NONE);
                 let rows = with(&effects);
-                let answers = (0..effects.len()).map(|i| difference(&with(&lacking(&effects, i)), &rows, 1.0)).collect();
+                let answer = |i: usize| match without(&effects, i) {
+                    others if others.is_empty() => difference(plain, &rows, 1.0),
+                    others => difference(&with(&others), &rows, 1.0),
+                };
+                let answers = (0..effects.len()).map(answer).collect();
                 Left { rows, answers }
             })
             .collect();
@@ -64,9 +69,4 @@ impl Case<'_> {
         let share_min = mismatch(yardstick.catalogue[hypothesis].layer());
         change(&self.metric, &drives, dt_s, dispersion(yardstick, hypothesis), share_min)
     }
-}
-
-/// The effects but for the `i`-th.
-fn lacking(effects: &[ScheduledEffect], i: usize) -> Vec<ScheduledEffect> {
-    effects.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, effect)| *effect).collect()
 }

@@ -215,17 +215,7 @@ mod tests {
         let of = |rivals: &[(usize, f64)]| -> Vec<Rival> {
             rivals.iter().map(|&(hypothesis, difference)| Rival { hypothesis, difference }).collect()
         };
-        Selection {
-            z: Vec::new(),
-            levels: Vec::new(),
-            threshold: 4.0,
-            probability: None,
-            chosen: chosen.to_vec(),
-            alone: Vec::new(),
-            rivals: rivals.iter().copied().map(of).collect(),
-            remaining: (0.0, String::new()),
-            remaining_level: (0.0, String::new()),
-        }
+        Selection { chosen: chosen.to_vec(), rivals: rivals.iter().copied().map(of).collect(), ..Selection::empty(4.0) }
     }
 
     /// Goal: every chosen effect is dated beside the others, and its close rivals in its place. Method: two chosen ones, a close rival of each, one of both, a far one

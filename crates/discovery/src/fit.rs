@@ -7,7 +7,7 @@ use rayon::prelude::*;
 
 use crate::candidates::Candidate;
 use crate::channels::Row;
-use crate::condense::{Condensed, Signatures, difference, profiled};
+use crate::condense::{Condensed, Signatures, difference};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
 use nesam_physics::effects::ScheduledEffect;
@@ -147,7 +147,7 @@ fn linearised(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &
         .map(|prepared| {
             let rows = prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
             let columns = parameter_columns(bench, prepared, terms, values);
-            profiled(metric, &rows, &columns, &prepared.signatures.soil, &prepared.signatures.uncounted)
+            prepared.signatures.profiled(metric, &rows, &columns)
         })
         .collect()
 }

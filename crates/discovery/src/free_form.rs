@@ -9,7 +9,7 @@ use nesam_physics::effects::{Effect, FREE_FORM_AXES, FREE_FORM_FEATURES, FreeFor
 use rayon::prelude::*;
 
 use crate::claims::Case;
-use crate::condense::{Condensed, Parts, difference, profiled};
+use crate::condense::{Condensed, Parts, difference};
 use crate::fit::{Fit, parameter_columns};
 use crate::ridge;
 
@@ -60,7 +60,7 @@ impl Leftover {
                 if let Some(fit) = fit {
                     columns.extend(parameter_columns(&case.bench, prepared, &fit.terms, &fit.values));
                 }
-                profiled(&metric, &rows, &columns, &prepared.signatures.soil, &prepared.signatures.uncounted)
+                prepared.signatures.profiled(&metric, &rows, &columns)
             })
             .collect();
         Self { region, units, parts: Parts::of(drives) }

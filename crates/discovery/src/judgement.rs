@@ -74,13 +74,12 @@ impl Judgement {
 
     /// The same with what earlier looks refused, which is named where nothing else stands out.
     pub(crate) fn with_refused(mut self, refused: Vec<Finding>) -> Self {
-        let strongest = refused.iter().filter(|f| f.z >= self.selection.threshold).max_by(|a, b| a.z.total_cmp(&b.z));
-        let why = strongest.and_then(|f| Some((f, f.refused.as_ref()?)));
-        if let Some((finding, why)) = why.filter(|_| self.verdict == Verdict::Unexplained && self.selection.chosen.is_empty()) {
-            let ((z, what), label) = (&self.selection.remaining, finding.candidate.label());
+        let nothing_else = self.verdict == Verdict::Unexplained && self.selection.chosen.is_empty();
+        let standing_out = refused.iter().filter(|f| nothing_else && f.z >= self.selection.threshold);
+        if let Some(Finding { candidate, z, refused: Some(why), .. }) = standing_out.max_by(|a, b| a.z.total_cmp(&b.z)) {
+            let ((most, what), label) = (&self.selection.remaining, candidate.label());
             self.reason = format!(
-                "the drives differ from the reference, most in {what} (z = {z:.1}); {label} stands out (z = {:.1}) but was refused: {why}",
-                finding.z
+                "the drives differ from the reference, most in {what} (z = {most:.1}); {label} stands out (z = {z:.1}) but was refused: {why}"
             );
         }
         self.findings.extend(refused);
@@ -247,15 +246,9 @@ mod tests {
             let rivals: Vec<Rival> =
                 rivals.iter().map(|(label, difference)| Rival { hypothesis: at(label), difference: *difference }).collect();
             let selection = Selection {
-                z: Vec::new(),
-                levels: Vec::new(),
-                threshold: 4.0,
-                probability: None,
                 chosen: chosen.iter().map(|label| at(label)).collect(),
-                alone: Vec::new(),
                 rivals: vec![rivals; chosen.len()],
-                remaining: (0.0, String::new()),
-                remaining_level: (0.0, String::new()),
+                ..Selection::empty(4.0)
             };
             closest_of_another_id(&selection, &catalogue)
         };
@@ -269,14 +262,9 @@ mod tests {
     fn leaving(largest: f64, [any, level]: [f64; 2]) -> Selection {
         Selection {
             z: vec![Some(largest)],
-            levels: Vec::new(),
-            threshold: 4.0,
-            probability: None,
-            chosen: Vec::new(),
-            alone: Vec::new(),
-            rivals: Vec::new(),
             remaining: (any, "anything".into()),
             remaining_level: (level, "a level".into()),
+            ..Selection::empty(4.0)
         }
     }
 

@@ -84,15 +84,15 @@ pub fn find(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion: f64) 
     dated(&starts, &gain, dispersion, SEGMENT_STEPS as f64 * dt_s)
 }
 
-/// The change of size that speaks most against an effect that is the same as long as it is there; `None` where it brings less than an onset must.
+/// The change of size that speaks most against an effect that is the same as long as it is there; `None` where it brings less than an onset must, or less than `share_min` of what the
+/// effect explains.
 ///
-/// The rows are what the fitted effect leaves, the shift is its answer where it acts, and each drive may have it in a size of its own. `share_min` is the share
-/// of what the effect explains that a change must bring.
+/// The rows are what the fitted effect leaves, the shift is its answer where it acts, and each drive may have it in a size of its own.
 pub(crate) fn change(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion: f64, share_min: f64) -> Option<Change> {
     let shown_s: Vec<f64> = drives.iter().flat_map(Course::shown_s).collect();
     let starts = midway(&shown_s, drives.len());
     // The whole effect has a share of one.
-    let explained: f64 = profile(metric, drives, &[f64::NEG_INFINITY], false).into_iter().map(|(_, information)| information).sum();
+    let (_, explained) = profile(metric, drives, &[f64::NEG_INFINITY], false)[0];
     let gain = |(score, information): (f64, f64)| score.powi(2) / information.max(1e-12);
     let steps = profile(metric, drives, &starts, true).into_iter().zip(&starts);
     let (best, start) = steps.max_by(|a, b| gain(a.0).total_cmp(&gain(b.0)))?;
@@ -107,8 +107,8 @@ fn profile(metric: &Metric, drives: &[Course<'_>], starts: &[f64], always: bool)
         .par_iter()
         .map(|drive| {
             let masked: Vec<Vec<Row>> = starts.iter().map(|from| begun(&drive.shift, &drive.times_s, *from)).collect();
-            let beside: Vec<Vec<Row>> = drive.beside.iter().cloned().chain(always.then(|| loose(&drive.shift))).collect();
-            profiled(metric, drive.rows, &masked, &beside, drive.uncounted)
+            let with_whole = always.then(|| drive.beside.iter().cloned().chain([loose(&drive.shift)]).collect::<Vec<_>>());
+            profiled(metric, drive.rows, &masked, with_whole.as_ref().unwrap_or(&drive.beside), drive.uncounted)
         })
         .collect();
     let sum = |of: &dyn Fn(&Condensed) -> f64| condensed.iter().map(of).sum::<f64>();

@@ -1,4 +1,4 @@
-//! When predictions count as better: by errors of full rollouts, paired by drive, with intervals.
+//! When predictions count as better: by errors of full rollouts, paired by drive, with intervals; and when measurements contradict one another less.
 
 use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, EvaluationError, ModelScore, POSE_DIM, Resamples, Window, paired_difference};
 use nesam_model::Predictor;
@@ -53,9 +53,18 @@ pub(crate) fn several_scored(scores: &HeldOut) -> bool {
 /// Whether an error that counts surely falls by at least a share of itself.
 pub(crate) fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, counted: Counted, resamples: &Resamples) -> bool {
     let (_, interval) = paired_difference(&before.errors, &after.errors, resamples);
-    let falls = |(i, b): (Option<[f64; 2]>, Option<f64>)| matches!((i, b), (Some([low, _]), Some(b)) if low > 0.0 && low >= gain * b);
-    let rows = interval.row(false).into_iter().zip(before.summary.tree.row(false));
-    rows.zip(counted).filter_map(|(row, counts)| counts.then_some(row)).any(falls)
+    let falls = |(interval, error): (Option<[f64; 2]>, Option<f64>)| error.is_some_and(|error| sure_fall(interval, error, gain));
+    counting(interval.row(false).into_iter().zip(before.summary.tree.row(false)), counted).any(falls)
+}
+
+/// Whether a fall with this interval is sure, and at least this share of what falls.
+pub(crate) fn sure_fall(interval: Option<[f64; 2]>, of: f64, gain: f64) -> bool {
+    interval.is_some_and(|[low, _]| low > 0.0 && low >= gain * of)
+}
+
+/// The errors that count.
+fn counting<T>(errors: impl Iterator<Item = T>, counted: Counted) -> impl Iterator<Item = T> {
+    errors.zip(counted).filter_map(|(error, counts)| counts.then_some(error))
 }
 
 /// The first error that counts and surely rises, and by more than is negligible: its name, where from, by how much.
@@ -63,7 +72,7 @@ fn rises_surely(before: &ModelScore, after: &ModelScore, counted: Counted, resam
     let (difference, interval) = paired_difference(&after.errors, &before.errors, resamples);
     let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
     let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(before.summary.tree.row(false));
-    rows.zip(names).zip(counted).filter_map(|(row, counts)| counts.then_some(row)).find_map(|(((d, i), b), name)| match (d, i, b) {
+    counting(rows.zip(names), counted).find_map(|(((d, i), b), name)| match (d, i, b) {
         (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > RISE_MIN * b => Some([(*name).into(), format!("{b:.4}"), format!("{d:.4}")]),
         _ => None,
     })
@@ -126,13 +135,13 @@ impl Trial<'_> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use nesam_evaluation::{ModelName, StepError, WindowErrors, summarise};
 
     use super::*;
 
     /// Scores of six drives of one window with these errors.
-    fn score(absolute: [f64; POSE_DIM]) -> ModelScore {
+    pub(crate) fn score(absolute: [f64; POSE_DIM]) -> ModelScore {
         let drives = 6;
         let errors = WindowErrors {
             horizon: 1,

@@ -70,7 +70,7 @@ pub(crate) fn prove(
             None => None,
         };
         let Some(i) = needless else {
-            let agree = yardstick.model_on_trial && scores.as_ref().is_some_and(|scores| held.sensors_agree(&learned, scores));
+            let agree = || scores.as_ref().is_some_and(|scores| held.sensors_agree(&learned, scores));
             let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial, agree);
             return Ok(Proven { judgement, learned, scores, verdict, reason });
         };
@@ -158,7 +158,12 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
 }
 
 /// Verdict after the proof on held-out drives. `sensors_agree` says whether their measurements surely contradict one another less with what is claimed.
-fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool, sensors_agree: bool) -> (Verdict, String) {
+fn proven(
+    judgement: &Judgement,
+    scores: Option<&HeldOut>,
+    model_on_trial: bool,
+    sensors_agree: impl FnOnce() -> bool,
+) -> (Verdict, String) {
     let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
     let (verdict, reason) = (judgement.verdict, judgement.reason.clone());
     let Some(first) = claimed.first() else { return (verdict, reason) };
@@ -168,16 +173,18 @@ fn proven(judgement: &Judgement, scores: Option<&HeldOut>, model_on_trial: bool,
         return if stands { (verdict, reason) } else { refused("no drive is left to prove it on".into()) };
     };
     // Predictions hardly hang on a sensor that measurements speak against: a gyro's bias is gone from them after the first step.
-    let told = model_on_trial && sensors_agree && claimed.iter().all(|f| f.candidate.layer() == Layer::Sensor);
+    let told = model_on_trial && claimed.iter().all(|f| f.candidate.layer() == Layer::Sensor) && sensors_agree();
     let must_help = model_on_trial && !told || claimed.iter().any(|f| acts(f));
     let least_gain = must_help.then_some(if model_on_trial { GAIN_ON_TRIAL } else { 0.0 });
     if let Some(why) = not_proven(scores, least_gain, claimed.len() > 1 && !model_on_trial) {
         return refused(why);
     }
-    let helps = match (must_help, told) {
-        (true, _) => "; it helps on drives that were not fitted",
-        (_, true) => "; with it the measurements of drives that were not fitted contradict one another less",
-        _ => "",
+    let helps = if must_help {
+        "; it helps on drives that were not fitted"
+    } else if told {
+        "; with it the measurements of drives that were not fitted contradict one another less"
+    } else {
+        ""
     };
     let more = if model_on_trial { format!(", and {}", left(judgement)) } else { String::new() };
     (verdict, format!("{reason}{helps}{more}"))
@@ -201,7 +208,7 @@ fn left(judgement: &Judgement) -> String {
 
 #[cfg(test)]
 mod tests {
-    use nesam_evaluation::{ModelName, POSE_DIM, StepError, WindowErrors, summarise};
+    use nesam_evaluation::POSE_DIM;
 
     use super::*;
     use crate::candidates::catalogue;
@@ -229,15 +236,12 @@ mod tests {
         };
         let findings: Vec<Finding> = claims.iter().map(finding).collect();
         let selection = Selection {
-            z: Vec::new(),
-            levels: Vec::new(),
-            threshold: 4.0,
-            probability: None,
             chosen: findings.iter().map(|f| f.hypothesis).collect(),
             alone: findings.iter().map(|f| f.alone).collect(),
             rivals: vec![Vec::new(); findings.len()],
             remaining: (1.0, String::new()),
             remaining_level: (1.0, String::new()),
+            ..Selection::empty(4.0)
         };
         Judgement {
             selection,
@@ -253,7 +257,7 @@ mod tests {
     /// Goal: nothing weak or ambiguous is claimed of drives that prove nothing. Method: judgements without scores; 2.5 thresholds of 4 are 10.
     #[test]
     fn analytic_without_a_drive_to_prove_it_on_only_what_stands_far_out_is_claimed() {
-        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), None, on_trial, false);
+        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), None, on_trial, || false);
         let explained = (Verdict::Explained, "they explain it".to_string());
         assert_eq!(said(&[("steering_offset", 10.0)], false), explained);
         assert_eq!(said(&[("steering_offset", 12.0), ("gyro_bias", 11.0)], false), explained);
@@ -267,17 +271,7 @@ mod tests {
 
     /// Scores of six drives of one window in which every error is this large.
     fn score(error: f64) -> ModelScore {
-        let drives = 6;
-        let errors = WindowErrors {
-            horizon: 1,
-            scored: [true; POSE_DIM],
-            trajectory: (0..drives).collect(),
-            path_m: vec![5.0; drives],
-            steps: vec![StepError { absolute: [error; POSE_DIM], position_m: error }; drives],
-            not_finite: 0,
-        };
-        let summary = summarise(&errors, &Resamples::draw(drives, 50, 1));
-        ModelScore { name: ModelName::Nesam, parameters: 0, summary, errors, curves: core::array::from_fn(|_| None) }
+        crate::proof::tests::score([error; POSE_DIM])
     }
 
     /// Scores before, with the best soil, after.
@@ -303,10 +297,10 @@ mod tests {
         let cancelling = held_out([0.10, 0.12, 0.10]);
         assert_eq!(needless(&["steering_offset", "tow"], &cancelling, &[("steering_offset", 0.2), ("tow", 0.3)]), None);
         let two = judgement(&[("steering_offset", 12.0), ("tow", 12.0)]);
-        assert_eq!(proven(&two, Some(&cancelling), false, false).0, Verdict::Explained);
-        assert_eq!(proven(&two, Some(&cancelling), true, false).0, Verdict::Unexplained, "a model on trial has to get better");
+        assert_eq!(proven(&two, Some(&cancelling), false, || false).0, Verdict::Explained);
+        assert_eq!(proven(&two, Some(&cancelling), true, || false).0, Verdict::Unexplained, "a model on trial has to get better");
         let one = judgement(&[("tow", 12.0)]);
-        assert_eq!(proven(&one, Some(&cancelling), false, false).0, Verdict::Unexplained);
+        assert_eq!(proven(&one, Some(&cancelling), false, || false).0, Verdict::Unexplained);
         let riding = held_out([0.20, 0.18, 0.10]);
         assert_eq!(needless(&["steering_offset", "tow"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(1));
         assert_eq!(needless(&["tow", "steering_offset"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(0));
@@ -319,7 +313,7 @@ mod tests {
     #[test]
     fn analytic_a_sensor_of_a_model_on_trial_is_proven_by_what_measurements_contradict() {
         let (same, worse) = (held_out([0.1, 0.1, 0.1]), held_out([0.1, 0.1, 0.11]));
-        let verdict = |claims: &[(&str, f64)], scores: &HeldOut, agree: bool| proven(&judgement(claims), Some(scores), true, agree).0;
+        let verdict = |claims: &[(&str, f64)], scores: &HeldOut, agree: bool| proven(&judgement(claims), Some(scores), true, || agree).0;
         let (bias, tow) = (("gyro_bias", 12.0), ("tow", 12.0));
         assert_eq!(verdict(&[bias], &same, true), Verdict::Explained);
         assert_eq!(verdict(&[bias], &same, false), Verdict::Unexplained);
@@ -327,7 +321,7 @@ mod tests {
         for acting in [&[tow][..], &[bias, tow], &[("map_offset", 12.0)]] {
             assert_eq!(verdict(acting, &same, true), Verdict::Unexplained, "{acting:?} must help");
         }
-        let (_, reason) = proven(&judgement(&[bias]), Some(&same), true, true);
+        let (_, reason) = proven(&judgement(&[bias]), Some(&same), true, || true);
         assert!(reason.contains("contradict one another less") && !reason.contains("it helps"), "{reason}");
     }
 }

@@ -63,20 +63,23 @@ pub(crate) fn pursue(
         case.settle(&yardstick, &mut selection, &mut onsets, &[]);
         selection.chosen = needed(case, &yardstick, &group, &selection.chosen, &onsets);
         let Some(fit) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
-        let (fitted, why) = match found(&fit) {
-            Found::Fitted(fitted) => match not_better(case, &yardstick, &group, &selection.chosen, &onsets, &fit, trial)? {
-                Some(why) => (None, Some(why)),
-                None => (Some(fitted), None),
-            },
+        let helpful = match found(&fit) {
+            Found::Fitted(fitted) => {
+                let why = not_better(case, &yardstick, &group, &selection.chosen, &onsets, &fit, trial)?;
+                why.map_or(Ok(fitted), |why| Err(Some(why)))
+            }
             // Its finding is refused for its size; without it others may stand out.
-            Found::AtItsEnd => (None, None),
+            Found::AtItsEnd => Err(None),
             Found::Nothing => break,
         };
-        let Some(fitted) = fitted else {
-            let finding = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
-            refused.extend(finding.map(|own| Finding { refused: why.or_else(|| own.refused.clone()), ..own }));
-            yardstick.refused.push(selection.chosen[0]);
-            continue;
+        let fitted = match helpful {
+            Ok(fitted) => fitted,
+            Err(why) => {
+                let finding = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
+                refused.extend(finding.map(|own| Finding { refused: why.or_else(|| own.refused.clone()), ..own }));
+                yardstick.refused.push(selection.chosen[0]);
+                continue;
+            }
         };
         known.retain(|k| selection.chosen.contains(&k.hypothesis));
         known.push(Known { hypothesis: selection.chosen[0], rivals: selection.rivals.swap_remove(0) });
@@ -149,14 +152,14 @@ fn not_better(
     let (without, with) = (case.size(yardstick, group, &chosen[1..], onsets).effects(), fit.effects());
     let sensors_tell = yardstick.catalogue[chosen[0]].layer() == Layer::Sensor && {
         let own = trial.agreeing(&without, &with);
-        !own.is_empty() && settled(yardstick, &yardstick.group(case.left(fit).iter()), &own)
+        !own.is_empty() && none_stands_out(yardstick, &yardstick.group(case.left(fit).iter()), &own)
     };
     trial.no_better(&without, &with, sensors_tell)
 }
 
 /// Whether the level of none of these channels stands out in what a fit left.
-fn settled(yardstick: &Yardstick, left: &Group, channels: &[usize]) -> bool {
-    channels.iter().all(|channel| yardstick.level(left, *channel) < yardstick.threshold())
+fn none_stands_out(yardstick: &Yardstick, left: &Group, channels: &[usize]) -> bool {
+    yardstick.levels_after_fit(left, left, &[]).all(|(channel, z)| !channels.contains(&channel) || z < yardstick.threshold())
 }
 
 /// Measures scatter and signatures of every drive beside fitted effects; returns what these leave of each drive.
@@ -234,8 +237,8 @@ mod tests {
         let nulls = Nulls::about_zero(&nulls.each_ref()).unwrap();
         let yardstick = Yardstick::new(nulls, None, &catalogue, &[roll, yaw], &[]);
         let left = |score: f64| yardstick.group([drive(score)].iter());
-        assert!(settled(&yardstick, &left(5.0), &[roll, yaw]));
-        assert!(!settled(&yardstick, &left(100.0), &[roll, yaw]));
-        assert!(settled(&yardstick, &left(100.0), &[roll]), "another's");
+        assert!(none_stands_out(&yardstick, &left(5.0), &[roll, yaw]));
+        assert!(!none_stands_out(&yardstick, &left(100.0), &[roll, yaw]));
+        assert!(none_stands_out(&yardstick, &left(100.0), &[roll]), "another's");
     }
 }

@@ -307,7 +307,7 @@ mod tests {
     use rand_distr::{Distribution, StandardNormal};
 
     /// Goal: a set of more drives than half of the reference has a family-wise threshold and a probability. Method: thirty null drives of one level with scores of
-    /// unit scatter; groups of 15 and 27. What is drawn for 27 is what is drawn for 15, its spread wider by the root of 1 + 12 / 30.
+    /// unit scatter; groups of 5, 15 and 27. What is drawn for 27 is what is drawn for 15, its spread wider by the root of 1 + 12 / 30.
     #[test]
     fn analytic_large_groups_have_a_null_distribution_too() {
         let mut rng = ChaCha8Rng::seed_from_u64(4);
@@ -320,8 +320,8 @@ mod tests {
         };
         let nulls: Vec<Condensed> = (0..30).map(|_| drive()).collect();
         let of = |n: usize| NullGroups::draw(&nulls, &[], &[0], n).unwrap();
-        let (half, most) = (of(15), of(27));
-        assert!(most.threshold < 6.2, "{}", most.threshold);
+        let (few, half, most) = (of(5), of(15), of(27));
+        assert!(few.threshold < 6.2 && most.threshold < 6.2, "{} {}", few.threshold, most.threshold);
         assert_eq!((most.threshold, &most.largest), (half.threshold, &half.largest));
         assert!((most.spread[0] / half.spread[0] - 1.4f64.sqrt()).abs() < 1e-12, "{} {}", most.spread[0], half.spread[0]);
         assert!(NullGroups::draw(&nulls[..1], &[], &[0], 1).is_none());

@@ -416,17 +416,6 @@ mod tests {
     /// Goal: readers find every key of the errors where no drive was held out. Method: a diagnosis without scores.
     #[test]
     fn property_errors_without_held_out_drives_have_keys_and_no_numbers() {
-        let selection = Selection {
-            z: Vec::new(),
-            levels: Vec::new(),
-            threshold: 4.0,
-            probability: None,
-            chosen: Vec::new(),
-            alone: Vec::new(),
-            rivals: Vec::new(),
-            remaining: (0.0, String::new()),
-            remaining_level: (0.0, String::new()),
-        };
         let diagnosis = Diagnosis {
             verdict: Verdict::None,
             reason: "nothing stands out".into(),
@@ -437,7 +426,7 @@ mod tests {
             controls: Vec::new(),
             free_form: None,
             null_drives: None,
-            selection,
+            selection: Selection::empty(4.0),
             findings: Vec::new(),
             estimates: Vec::new(),
             claimed: Vec::new(),

@@ -104,6 +104,22 @@ pub struct Selection {
 }
 
 impl Selection {
+    /// A selection in which nothing was looked at and nothing is chosen, with this threshold.
+    #[cfg(test)]
+    pub(crate) fn empty(threshold: f64) -> Self {
+        Self {
+            z: Vec::new(),
+            levels: Vec::new(),
+            threshold,
+            probability: None,
+            chosen: Vec::new(),
+            alone: Vec::new(),
+            rivals: Vec::new(),
+            remaining: (0.0, String::new()),
+            remaining_level: (0.0, String::new()),
+        }
+    }
+
     /// Largest evidence of anything before fits.
     pub fn largest(&self) -> f64 {
         self.z.iter().flatten().chain(&self.levels).copied().fold(0.0, f64::max)
@@ -179,12 +195,6 @@ impl Yardstick {
         self.after(group, &with(k), j).0.powi(2) - self.after(group, &with(j), k).0.powi(2)
     }
 
-    /// Evidence that the level of a channel is unusual in the scores of a group; zero for one that is not compared.
-    pub(crate) fn level(&self, group: &Group, channel: usize) -> f64 {
-        let Some(i) = self.channels.iter().position(|c| *c == channel) else { return 0.0 };
-        group.remainder(&[], &[level_column(&self.catalogue, channel)], 0.0).z / self.spread(self.catalogue.len() + i)
-    }
-
     /// Judges a group of drives.
     pub fn select(&self, group: &Group) -> Selection {
         let count = self.catalogue.len();
@@ -213,7 +223,7 @@ impl Yardstick {
             let Some(next) = self.next(group, &selection.chosen) else { break };
             selection.chosen.push(next);
             self.exchange(group, &mut selection.chosen);
-            selection.remaining = self.remaining(group, &selection.chosen);
+            self.leave(group, group, &mut selection);
         }
         self.describe(group, &mut selection);
         selection
@@ -232,8 +242,7 @@ impl Yardstick {
         let others = |i: usize| without(&chosen, i);
         selection.alone = (0..chosen.len()).map(|i| self.after(group, &others(i), chosen[i]).0).collect();
         selection.rivals = (0..chosen.len()).map(|i| self.rivals(group, &others(i), chosen[i], &chosen)).collect();
-        selection.remaining = self.remaining(group, &chosen);
-        selection.remaining_level = self.level_after_fit(group, group, &chosen);
+        self.leave(group, group, selection);
     }
 
     /// The hypothesis that is best added to those chosen.
@@ -291,33 +300,29 @@ impl Yardstick {
         rivals
     }
 
-    /// Largest evidence after the chosen ones, of hypotheses and of channels.
-    fn remaining(&self, group: &Group, chosen: &[usize]) -> (f64, String) {
-        self.remaining_after_fit(group, group, chosen)
-    }
-
-    /// The same where `left` are the scores after the fit went through the physics.
-    pub fn remaining_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
+    /// Says of a selection what its chosen ones leave, where `left` are the scores after the fit went through the physics.
+    pub(crate) fn leave(&self, left: &Group, before: &Group, selection: &mut Selection) {
+        let chosen = &selection.chosen;
+        let levels = self.levels_after_fit(left, before, chosen).map(|(channel, z)| (z, level_name(channel)));
+        let level = levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
-        let level = self.level_after_fit(left, before, chosen);
-        hypotheses.chain([level]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
+        let most = hypotheses.chain([level.clone()]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
+        (selection.remaining, selection.remaining_level) = (most, level);
     }
 
-    /// The same of the levels of channels alone.
+    /// Evidence that the level of a channel is unusual in what the chosen ones leave, for every compared channel that may speak against them.
     ///
     /// What a force or a soil does to the rims follows from the slope of traction, which is known worst (and without torque not at all, ADR 0003), so their
     /// levels do not speak against one.
-    pub fn level_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> (f64, String) {
+    pub(crate) fn levels_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
         let columns = self.columns(chosen);
         let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
         let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
-        let told = |c: &usize| !(force && (RIM_AT..PATH_AT).contains(c));
-        let levels = self.channels.iter().enumerate().filter(|(_, c)| told(c)).map(|(i, c)| {
-            let z = left.remainder_since(before, &columns, &[level_column(&self.catalogue, *c)], worst).z
-                / self.spread(self.catalogue.len() + i);
-            (z, level_name(*c))
-        });
-        levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or((0.0, String::new()))
+        let told = move |channel: usize| !(force && (RIM_AT..PATH_AT).contains(&channel));
+        self.channels.iter().copied().enumerate().filter(move |(_, channel)| told(*channel)).map(move |(i, channel)| {
+            let found = left.remainder_since(before, &columns, &[level_column(&self.catalogue, channel)], worst);
+            (channel, found.z / self.spread(self.catalogue.len() + i))
+        })
     }
 }
 
@@ -325,7 +330,7 @@ fn level_name(channel: usize) -> String {
     format!("the level of {}", crate::channels::name(channel))
 }
 
-/// The chosen hypotheses but for the `i`-th.
-pub fn without(chosen: &[usize], i: usize) -> Vec<usize> {
-    chosen.iter().enumerate().filter(|(at, _)| *at != i).map(|(_, h)| *h).collect()
+/// All but the `i`-th.
+pub fn without<T: Copy>(all: &[T], i: usize) -> Vec<T> {
+    all.iter().enumerate().filter(|(at, _)| *at != i).map(|(_, item)| *item).collect()
 }

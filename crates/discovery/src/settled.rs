@@ -109,8 +109,7 @@ impl Case<'_> {
             let member = own.members.iter().position(|h| *h == selection.chosen[i]);
             if let Some(member) = member.filter(|_| own.others == without(&selection.chosen, i)) {
                 let left = own.group(yardstick, member, |_| true);
-                selection.remaining = yardstick.remaining_after_fit(&left, &before, &selection.chosen);
-                selection.remaining_level = yardstick.level_after_fit(&left, &before, &selection.chosen);
+                yardstick.leave(&left, &before, selection);
             }
         }
         settled

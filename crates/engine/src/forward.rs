@@ -141,7 +141,7 @@ impl RollForward {
     /// Takes the steps off a rollout again, and gives the state after them: every sample has the same, since it had the same commands.
     pub fn split(&self, rollout: Rollout) -> (Option<VehicleState<f64>>, Rollout) {
         let Some(last) = self.steps().checked_sub(1) else { return (None, rollout) };
-        let start = VehicleState::from_array(rollout.state(0, last).to_array().map(f64::from));
+        let start = rollout.state_f64(0, last);
         let (states, sinkage_m) =
             (self.tail(&rollout.states, rollout.horizon, STATE_DIM), self.tail(&rollout.sinkage_m, rollout.horizon, WHEELS));
         (Some(start), Rollout { states, position_m: Vec::new(), sinkage_m, horizon: rollout.horizon - self.steps(), ..rollout })

@@ -6,7 +6,7 @@ use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
 use crate::drives::Drive;
 use crate::recipe::Reporter;
-use crate::rims::{fit_rims, fit_rims_to_motion};
+use crate::rims::{self, fit_rims, fit_rims_to_motion};
 use crate::scales::measure;
 use crate::suspension::{TURNS, calibrate_suspension};
 use crate::symbolic::{HORIZON, descend, symbolic_error};
@@ -109,7 +109,7 @@ pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, repor
         let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
         let name = format!("{law:?}, {drive:?}");
-        reporter.stage(&format!("drive line, {name}"), 3 * knobs(&candidate).len());
+        reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS.len() } else { knobs(&candidate).len() });
         let mut done = 0;
         let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, |name, value, error| {
             done += 1;
@@ -158,11 +158,8 @@ pub fn calibrate_driveline(
             vehicle.driveline.rims = servo;
             progress("rims", servo.speed_gain, servo.turn_efficiency);
         } else {
-            let mut turn = 0.0;
-            vehicle.driveline.rims = fit_rims_to_motion(vehicle, drives, scales, |error| {
-                turn += 1.0;
-                progress("rims, from the motion", turn, error);
-            });
+            vehicle.driveline.rims =
+                fit_rims_to_motion(vehicle, drives, scales, |value, error| progress("rims, from the motion", value, error));
         }
         return [before, symbolic_error(vehicle, drives, scales).position_m];
     }

@@ -3,7 +3,7 @@
 
 use nesam_model::Normalization;
 use nesam_physics::driveline::{DrivelineState, rim_twist};
-use nesam_physics::{Control, RimServo, Vehicle};
+use nesam_physics::{RimServo, Vehicle};
 
 use crate::drives::Drive;
 use crate::symbolic::{descend, symbolic_error};
@@ -11,7 +11,7 @@ use crate::symbolic::{descend, symbolic_error};
 /// A number of the servo that is fitted, with its range.
 type Knob = (fn(&mut RimServo) -> &mut f64, [f64; 2]);
 
-const KNOBS: [Knob; 6] = [
+pub(crate) const KNOBS: [Knob; 6] = [
     (|s| &mut s.speed_gain, [0.1, 5.0]),
     (|s| &mut s.yaw_gain, [0.1, 5.0]),
     (|s| &mut s.yaw_limit_rad_s, [0.1, 20.0]),
@@ -41,6 +41,14 @@ fn servo_error(vehicle: &Vehicle, measured: &[(&Drive, Vec<[f64; 2]>)], dt_s: f6
     sum / count.max(1) as f64
 }
 
+/// Where a search begins: limits at the largest of these twists (m/s, rad/s) and lags of 0.2 s, the rest as it is.
+fn begun(servo: RimServo, track_m: f64, twists: impl Iterator<Item = [f64; 2]>) -> RimServo {
+    let limits = twists.fold([0.1f64; 2], |[turning, rim], [speed_m_s, turning_rad_s]| {
+        [turning.max(turning_rad_s.abs()), rim.max(speed_m_s.abs() + 0.5 * track_m * turning_rad_s.abs())]
+    });
+    RimServo { yaw_limit_rad_s: limits[0], rim_limit_m_s: limits[1], speed_lag_s: 0.2, yaw_lag_s: 0.2, ..servo }
+}
+
 /// The servo that follows the measured wheel speeds best, by coordinate search; `None` where no drive has wheel speeds.
 pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimServo> {
     let measured: Vec<(&Drive, Vec<[f64; 2]>)> =
@@ -48,16 +56,9 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
     if measured.is_empty() {
         return None;
     }
-    // Limits show as the largest values that were measured: a search that begins there does not take a limit for a small gain.
-    let largest = |of: &dyn Fn(&[f64; 2]) -> f64| measured.iter().flat_map(|(_, t)| t).map(of).fold(0.1, f64::max);
     let mut best = vehicle.clone();
-    best.driveline.rims = RimServo {
-        yaw_limit_rad_s: largest(&|t| t[1].abs()),
-        rim_limit_m_s: largest(&|t| t[0].abs() + 0.5 * vehicle.track_m * t[1].abs()),
-        speed_lag_s: 0.2,
-        yaw_lag_s: 0.2,
-        ..RimServo::default()
-    };
+    // Limits show as the largest values that were measured: a search that begins there does not take a limit for a small gain.
+    best.driveline.rims = begun(RimServo::default(), vehicle.track_m, measured.iter().flat_map(|(_, twists)| twists).copied());
     let mut error = servo_error(&best, &measured, dt_s);
     for round in 0..16 {
         for (knob, [low, high]) in KNOBS {
@@ -87,25 +88,19 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
 }
 
 /// The servo with which the symbolic model follows the measured motion best, for a base whose wheel speeds nobody measured. The error, m, is that of the position
-/// with what the error of the heading moves a wheel by, half of the track away. The servo stays as it is where none that is found is better; `progress` is told the
-/// error after each turn of a number.
-pub fn fit_rims_to_motion(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, mut progress: impl FnMut(f64)) -> RimServo {
+/// with what the error of the heading moves a wheel by, half of the track away. The servo stays as it is where none that is found is better; `progress` is told a
+/// number and the error after each of its turns.
+pub fn fit_rims_to_motion(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, mut progress: impl FnMut(f64, f64)) -> RimServo {
     let error = |vehicle: &Vehicle| {
         let of = symbolic_error(vehicle, drives, scales);
         of.position_m + 0.5 * vehicle.track_m * of.yaw_rad
     };
     let before = error(vehicle);
-    let mut begun = vehicle.clone();
+    let mut found = vehicle.clone();
     // Limits begin where the commands do not reach them: from there a search sees them.
-    let largest = |of: &dyn Fn(&Control<f64>) -> f64| drives.iter().flat_map(|d| &d.controls).map(of).fold(0.1, f64::max);
-    begun.driveline.rims = RimServo {
-        yaw_limit_rad_s: largest(&|c| c.second.abs()),
-        rim_limit_m_s: largest(&|c| c.speed_m_s.abs() + 0.5 * vehicle.track_m * c.second.abs()),
-        speed_lag_s: 0.2,
-        yaw_lag_s: 0.2,
-        ..begun.driveline.rims
-    };
-    let mut best = error(&begun);
+    let commands = drives.iter().flat_map(|d| &d.controls).map(|c| [c.speed_m_s, c.second]);
+    found.driveline.rims = begun(vehicle.driveline.rims, vehicle.track_m, commands);
+    let mut best = error(&found);
     for reach in [0.5, 0.2, 0.1] {
         for (knob, [low, high]) in KNOBS {
             let trials = |vehicle: &Vehicle, reach: f64| {
@@ -116,11 +111,11 @@ pub fn fit_rims_to_motion(vehicle: &Vehicle, drives: &[&Drive], scales: &Normali
                     trial
                 })
             };
-            best = descend(&mut begun, best, reach, trials, error);
-            progress(best);
+            best = descend(&mut found, best, reach, trials, error);
+            progress(*knob(&mut found.driveline.rims), best);
         }
     }
-    if best < before { begun.driveline.rims } else { vehicle.driveline.rims }
+    if best < before { found.driveline.rims } else { vehicle.driveline.rims }
 }
 
 /// Yaw rate of the vehicle per turning of its rims, by least squares; `None` if the rims never turn or the vehicle does not follow them.

@@ -66,14 +66,14 @@ fn analytic_a_servo_is_found_from_the_motion_alone() {
             wheels: None,
         };
         let rollout = truth.rollout(&query).unwrap();
-        let driven = (0..25).map(|k| VehicleState::from_array(rollout.state(0, k).to_array().map(f64::from)));
+        let driven = (0..25).map(|k| rollout.state_f64(0, k));
         Drive::new("made".into(), None, std::iter::once(start).chain(driven).collect(), vec![control; 26])
     };
     let drives: Vec<Drive> = (0..8).map(|i| made(f64::from(i))).collect();
     let drives: Vec<&Drive> = drives.iter().collect();
     vehicle.driveline.rims = told;
     let before = symbolic_error(&vehicle, &drives, &scales);
-    vehicle.driveline.rims = fit_rims_to_motion(&vehicle, &drives, &scales, |_| ());
+    vehicle.driveline.rims = fit_rims_to_motion(&vehicle, &drives, &scales, |_, _| ());
     let after = symbolic_error(&vehicle, &drives, &scales);
     let found = vehicle.driveline.rims;
     assert!(after.position_m < 0.2 * before.position_m && after.yaw_rad < before.yaw_rad, "{before:?} {after:?} {found:?}");

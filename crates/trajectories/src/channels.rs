@@ -60,13 +60,18 @@ fn group<const N: usize>(table: &Table, names: [&str; N]) -> Result<Option<[Numb
     if names.iter().all(|name| table.has(name)) { all(table, names).map(Some) } else { Ok(None) }
 }
 
-/// The column of the second command under the names that data roots use for its meaning.
-fn second_command(table: &Table, second: SecondCommand) -> Result<Numbers, TrajectoryError> {
-    let (names, meaning): (&[&str], _) = match second {
+/// The second command: names that data roots use for its column, and what it means.
+pub(crate) fn names_of(second: SecondCommand) -> (&'static [&'static str], &'static str) {
+    match second {
         SecondCommand::SteeringNormalised => (&["cmd_steer"], "normalised steering"),
         SecondCommand::RoadWheelAngleRad => (&["cmd_road_wheel_angle", "cmd_steer_angle", "cmd_steer"], "a road-wheel angle"),
         SecondCommand::YawRateRadS => (&["cmd_yaw_rate"], "a yaw rate"),
-    };
+    }
+}
+
+/// The column of the second command under one of its names.
+fn second_command(table: &Table, second: SecondCommand) -> Result<Numbers, TrajectoryError> {
+    let (names, meaning) = names_of(second);
     match names.iter().find(|name| table.has(name)) {
         Some(name) => table.numbers(name),
         None => {
@@ -78,12 +83,8 @@ fn second_command(table: &Table, second: SecondCommand) -> Result<Numbers, Traje
 
 /// What the second command means where the name of its column alone says it, and that column; `cmd_steer` may be either kind of steering.
 pub(crate) fn implied_second(table: &Table) -> Option<(SecondCommand, &'static str)> {
-    let names = [
-        ("cmd_yaw_rate", SecondCommand::YawRateRadS),
-        ("cmd_road_wheel_angle", SecondCommand::RoadWheelAngleRad),
-        ("cmd_steer_angle", SecondCommand::RoadWheelAngleRad),
-    ];
-    let mut there = names.into_iter().filter(|(name, _)| table.has(name));
+    let of = |second| names_of(second).0.iter().filter(|name| **name != "cmd_steer").map(move |name| (*name, second));
+    let mut there = of(SecondCommand::YawRateRadS).chain(of(SecondCommand::RoadWheelAngleRad)).filter(|(name, _)| table.has(name));
     let (name, second) = there.next()?;
     there.all(|(_, other)| other == second).then_some((second, name))
 }

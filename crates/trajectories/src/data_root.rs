@@ -79,7 +79,8 @@ impl SetQuery {
 
 /// An opened data root.
 ///
-/// Only the vehicle card is read on opening; sets and worlds are read when asked for, and worlds are kept.
+/// Only the vehicle card is read on opening, and where it does not say what the second command means, the sets until one tells it; sets and worlds are read
+/// when asked for, and worlds are kept.
 #[derive(Debug)]
 pub struct DataRoot {
     root: PathBuf,
@@ -150,10 +151,7 @@ impl DataRoot {
 
     /// Names of the sets, sorted; slashes separate folders.
     pub fn sets(&self) -> Vec<String> {
-        let mut sets = Vec::new();
-        collect_sets(&self.root, "", SET_DEPTH, &mut sets);
-        sets.sort();
-        sets
+        sets_of(&self.root)
     }
 
     /// Ids of the worlds that have a folder, sorted; empty for a root without maps.
@@ -209,8 +207,9 @@ impl DataRoot {
 
     /// Loads drives in the order of the samples file.
     ///
-    /// A drive without an index entry has neither split nor world; one whose split is neither train nor test has no split, which [`DataRoot::notes`] says. `world` is `None` where the root has no map of it, and where the drive does not measure its
-    /// whole pose; [`DataRoot::notes`] then says so, unless the root has no `worlds/` folder at all.
+    /// A drive without an index entry has neither split nor world; one whose split is neither train nor test has no split, which [`DataRoot::notes`] says.
+    /// `world` is `None` where the root has no map of it, and where the drive does not measure its whole pose; [`DataRoot::notes`] then says so, unless the
+    /// root has no `worlds/` folder at all.
     ///
     /// # Errors
     /// `TrajectoryError` naming file, column and row of the first value that is not usable among the drives asked for, the sets
@@ -235,8 +234,8 @@ impl DataRoot {
             trajectory.id.clone_from(id);
             trajectory.set.clone_from(&query.set);
             if let Some(entry) = index.entries.get(id) {
-                trajectory.split = entry.split;
-                if let Some(name) = &entry.other_split {
+                trajectory.split = entry.split();
+                if let Some(name) = entry.split_name.as_ref().filter(|_| trajectory.split.is_none()) {
                     *lacking.splits.entry(name.clone()).or_default() += 1;
                 }
                 trajectory.world = entry.world.clone().filter(|_| has_worlds);
@@ -268,8 +267,9 @@ impl DataRoot {
 
     /// Takes the world from a drive that cannot be put on its map, and counts why.
     fn leave_off_map(&self, drive: &mut Trajectory, lacking: &mut Lacking) {
-        let poses = [("z", drive.measured.height), ("roll", drive.measured.attitude[0]), ("pitch", drive.measured.attitude[1])];
-        let assumed: Vec<&str> = poses.into_iter().filter(|(_, measured)| !measured).map(|(name, _)| name).collect();
+        let names = ["x", "y", "z", "roll", "pitch", "yaw"];
+        let assumed: Vec<&str> =
+            names.into_iter().zip(drive.measured.pose()).filter(|(_, measured)| !measured).map(|(name, _)| name).collect();
         if !assumed.is_empty() {
             *lacking.channels.entry(assumed.join(", ")).or_default() += 1;
         }
@@ -350,8 +350,8 @@ fn rows_by_trajectory(table: &Table) -> Result<Vec<DriveRows>, TrajectoryError> 
 fn wanted(query: &SetQuery, index: &Index, drives: &[DriveRows], samples: &Path) -> Result<Vec<usize>, TrajectoryError> {
     let refuse = |reason| Err(TrajectoryError::Query { set: query.set.clone(), reason });
     let has_samples: BTreeSet<&str> = drives.iter().map(|(id, _)| id.as_str()).collect();
-    let split = |id: &str| index.entries.get(id).and_then(|entry| entry.split);
-    let split_name = |id: &str| index.entries.get(id).and_then(Entry::split_name);
+    let split = |id: &str| index.entries.get(id).and_then(Entry::split);
+    let split_name = |id: &str| index.entries.get(id).and_then(|entry| entry.split_name.as_deref());
     if let Some(ids) = &query.trajectories {
         for id in ids {
             if !has_samples.contains(id.as_str()) {
@@ -402,13 +402,18 @@ fn find_card(root: &Path) -> Result<PathBuf, TrajectoryError> {
 
 /// What the second command means by the columns of the first set of a root that name it.
 fn second_of_columns(root: &Path) -> Option<(SecondCommand, String)> {
-    let mut sets = Vec::new();
-    collect_sets(root, "", SET_DEPTH, &mut sets);
-    sets.sort();
-    sets.iter().find_map(|set| {
+    sets_of(root).iter().find_map(|set| {
         let table = Table::open(&root.join(set).join(SAMPLES)).ok()?;
         implied_second(&table).map(|(second, column)| (second, format!("column `{column}` of set `{set}`")))
     })
+}
+
+/// Names of the sets of a root, sorted.
+fn sets_of(root: &Path) -> Vec<String> {
+    let mut sets = Vec::new();
+    collect_sets(root, "", SET_DEPTH, &mut sets);
+    sets.sort();
+    sets
 }
 
 /// Adds the sets below a folder, depth first; `worlds` holds maps, not sets.

@@ -19,6 +19,7 @@ use std::path::Path;
 use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
 use serde_json::Value;
 
+use crate::channels::names_of;
 use crate::error::TrajectoryError;
 use crate::json::JsonFile;
 
@@ -170,7 +171,8 @@ impl Wheels {
         let front = sheet.required(&["track_m", "track_front", "track_front_m"])?;
         let rear = sheet.positive(&["track_rear", "track_rear_m"])?.unwrap_or(front);
         let wheelbase_m = sheet.positive(&["wheelbase_m", "wheelbase"])?.unwrap_or_else(|| {
-            let share = WHEELBASE_SHARE[usize::from(second != SecondCommand::YawRateRadS)];
+            let [of_skid, of_car] = WHEELBASE_SHARE;
+            let share = if second == SecondCommand::YawRateRadS { of_skid } else { of_car };
             let wheelbase_m = round(share * (front + rear) / 2.0);
             notes.push(format!("vehicle card: no `wheelbase_m`: taken for {share} tracks, {wheelbase_m} m"));
             wheelbase_m
@@ -207,10 +209,7 @@ fn second_command(sheet: &JsonFile, of_columns: OfColumns<'_>, notes: &mut Vec<S
         return Ok(second);
     }
     if let Some((second, column)) = of_columns() {
-        let meaning = match second {
-            SecondCommand::YawRateRadS => "a yaw rate",
-            _ => "a road-wheel angle",
-        };
+        let (_, meaning) = names_of(second);
         notes.push(format!("vehicle card: neither `second` nor `drive` says what the second command means; {column} says {meaning}"));
         return Ok(second);
     }
@@ -307,7 +306,7 @@ fn command_range(
 ) -> Result<([[f64; 2]; 2], [bool; 2]), TrajectoryError> {
     let rim_rad_s = sheet.positive(&["max_wheel_speed_rad_s"])?;
     let rim_m_s = rim_rad_s.map_or(SKID_RIM_LIMIT_M_S, |omega| round(omega * radius_m));
-    let (implied, mut is_implied) = match second {
+    let (implied, is_implied) = match second {
         SecondCommand::YawRateRadS => {
             let turn = round(2.0 * rim_m_s / track_m);
             ([[-rim_m_s, rim_m_s], [-turn, turn]], [rim_rad_s.is_none(); 2])
@@ -326,16 +325,16 @@ fn command_range(
             ([CAR_SPEED_RANGE_M_S, [-largest, largest]], [true, stated.is_none()])
         }
     };
-    let stated = |key: &str, otherwise: [f64; 2]| {
-        let Some(value) = sheet.get(key) else { return Ok(otherwise) };
+    let stated = |key: &str| {
+        let Some(value) = sheet.get(key) else { return Ok(None) };
         let range: [f64; 2] = sheet.array(key, value)?;
-        if range[0] < range[1] { Ok(range) } else { Err(sheet.wrong(key, "expected [min, max] with min < max")) }
+        if range[0] < range[1] { Ok(Some(range)) } else { Err(sheet.wrong(key, "expected [min, max] with min < max")) }
     };
-    let keys = ["command_range.speed_m_s", "command_range.second"];
-    for (is_implied, key) in is_implied.iter_mut().zip(keys) {
-        *is_implied &= sheet.get(key).is_none();
-    }
-    Ok(([stated(keys[0], implied[0])?, stated(keys[1], implied[1])?], is_implied))
+    let stated = [stated("command_range.speed_m_s")?, stated("command_range.second")?];
+    Ok((
+        core::array::from_fn(|axis| stated[axis].unwrap_or(implied[axis])),
+        core::array::from_fn(|axis| is_implied[axis] && stated[axis].is_none()),
+    ))
 }
 
 /// Actuators and drive line: stated values, else the defaults of the kind of drive.

@@ -98,15 +98,13 @@ impl TrajectoryError {
     }
 
     /// The same of a value of this drive, with what helps.
-    pub(crate) fn in_drive(self, id: &str) -> Self {
-        match self {
-            Self::Cell { path, column, row, reason } => {
-                let remedy =
-                    "name the others with --trajectories, or let `nesam import` leave out rows that lack a value and part drives at gaps";
-                Self::Cell { path, column, row, reason: format!("{reason} (in drive `{id}`; {remedy})") }
-            }
-            other => other,
+    pub(crate) fn in_drive(mut self, id: &str) -> Self {
+        const REMEDY: &str =
+            "name the others with --trajectories, or let `nesam import` leave out rows that lack a value and part drives at gaps";
+        if let Self::Cell { reason, .. } = &mut self {
+            *reason = format!("{reason} (in drive `{id}`; {REMEDY})");
         }
+        self
     }
 
     pub(crate) fn column(path: &Path, column: &str, reason: impl Into<String>) -> Self {

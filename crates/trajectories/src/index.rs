@@ -14,9 +14,8 @@ use crate::trajectory::Split;
 #[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Entry {
     pub(crate) world: Option<String>,
-    pub(crate) split: Option<Split>,
-    /// Name of a split that is neither train nor test.
-    pub(crate) other_split: Option<String>,
+    /// Name of its split, whatever it is.
+    pub(crate) split_name: Option<String>,
     /// Row in the index file, counting from 0.
     pub(crate) row: usize,
 }
@@ -32,9 +31,13 @@ pub(crate) struct Index {
 }
 
 impl Entry {
-    /// The split by its name, whatever it is.
-    pub(crate) fn split_name(&self) -> Option<&str> {
-        self.split.map(Split::as_str).or(self.other_split.as_deref())
+    /// The split; `None` too where its name is neither train nor test.
+    pub(crate) fn split(&self) -> Option<Split> {
+        match self.split_name.as_deref()? {
+            "train" => Some(Split::Train),
+            "test" => Some(Split::Test),
+            _ => None,
+        }
     }
 }
 
@@ -80,7 +83,7 @@ impl Index {
                 None | Some(Value::Null) => Ok(None),
                 Some(Value::String(s)) => Ok(Some(s.clone())),
                 Some(Value::Number(n)) if n.is_i64() || n.is_u64() => Ok(Some(n.to_string())),
-                Some(other) => Err(file.wrong(&format!("[{row}].{key}"), format!("expected text, found {other}"))),
+                Some(other) => Err(file.wrong(&format!("[{row}].{key}"), format!("expected text or a whole number, found {other}"))),
             };
             index.push(path, row, text("trajectory")?, text("world")?, text("split")?)?;
         }
@@ -93,17 +96,11 @@ impl Index {
         row: usize,
         id: Option<String>,
         world: Option<String>,
-        split: Option<String>,
+        split_name: Option<String>,
     ) -> Result<(), TrajectoryError> {
         let wrong = |column: &str, reason: String| TrajectoryError::cell(path, column, row, reason);
         let id = id.ok_or_else(|| wrong("trajectory", "null, expected an id".into()))?;
-        let (split, other_split) = match split.as_deref() {
-            None => (None, None),
-            Some("train") => (Some(Split::Train), None),
-            Some("test") => (Some(Split::Test), None),
-            Some(other) => (None, Some(other.to_string())),
-        };
-        if self.entries.insert(id.clone(), Entry { world, split, other_split, row }).is_some() {
+        if self.entries.insert(id.clone(), Entry { world, split_name, row }).is_some() {
             return Err(wrong("trajectory", format!("`{id}` appears a second time")));
         }
         self.order.push(id);

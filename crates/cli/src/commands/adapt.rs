@@ -242,7 +242,7 @@ pub(super) fn filter_in_force(given: &FilterSettings, literal: bool, bundle: &Mo
     match &bundle.soil_filter_json {
         None => {
             note!(
-                "note: bundle {} carries no noise of the soil filter for `{}`; defaults stand in (see `nesam adapt --calibrate`)",
+                "note: bundle {} carries no noise of the soil filter for `{}`; defaults stand in (see `nesam adapt --calibrate`, with a bundle of that vehicle)",
                 bundle.name,
                 bundle.vehicle.name
             );

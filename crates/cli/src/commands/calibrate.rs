@@ -34,8 +34,8 @@ which were measured with the old card: make them again with `nesam adapt --calib
 `nesam diagnose --make-reference`.
 
 What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
-rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel \
-speeds or, without any, from the motion.
+rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds or, \
+without any, from the motion. A range of commands that the card does not state is widened to the commands of the drives.
 
 Examples:
   nesam calibrate --data mine --set first --out mine-calibrated
@@ -247,7 +247,7 @@ fn with_bundle(mut document: Value, bundle: Option<&Path>, provenance: nesam_eva
 
 /// Writes a bundle with another card; what was measured with the old one is left out.
 fn save_bundle(base: &ModelBundle, vehicle: &Vehicle, data_hash: &str, to: &Path) -> Result<PathBuf, Failure> {
-    let same_vehicle = base.vehicle.name == vehicle.name;
+    let same_vehicle = base.is_of(vehicle);
     let mut bundle = ModelBundle {
         vehicle: vehicle.clone(),
         baselines_json: base.baselines_json.clone().filter(|_| same_vehicle),

@@ -150,11 +150,9 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     };
     let samples: usize = drives.iter().map(|d| d.states.len()).sum();
     findings.note(format!("set {set}: {} drives, {samples} samples at {} s", drives.len(), args.dt));
-    doubts(&drives, root.vehicle()).iter().for_each(|doubt| findings.doubt(&format!("set {set}"), doubt));
     let positions = drives.iter().flat_map(|d| &d.states).map(|s| s.position_m);
-    if let Some(doubt) = far_from_origin(positions) {
-        findings.doubt(&format!("set {set}"), &doubt);
-    }
+    let all = doubts(&drives, root.vehicle()).into_iter().chain(far_from_origin(positions));
+    all.for_each(|doubt| findings.doubt(&format!("set {set}"), &doubt));
     let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();
     worlds.sort_unstable();
     worlds.dedup();

@@ -171,7 +171,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
 /// influence on any prediction.
 fn take_coupling(bundle: &mut ModelBundle, sheet: &Vehicle) {
     let coupling = sheet.driveline.side_coupling_n_m_s;
-    if bundle.vehicle.name == sheet.name && bundle.vehicle.driveline.side_coupling_n_m_s == 0.0 && coupling > 0.0 {
+    if bundle.vehicle.driveline.side_coupling_n_m_s == 0.0 && coupling > 0.0 {
         bundle.vehicle.driveline.side_coupling_n_m_s = coupling;
         say!("the card of the bundle now has the coupling of the data sheet, {coupling} N m s/rad between the wheels of an axle");
     }
@@ -204,7 +204,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     if args.reference.is_none() && reference == ReferenceArg::Physics {
         output::note!(
             "note: bundle {} carries no reference for `{}`, so the model itself is tested, as with --reference physics; --make-reference \
-             measures one",
+             measures one, with a bundle of that vehicle",
             predictor.bundle().name,
             predictor.bundle().vehicle.name
         );

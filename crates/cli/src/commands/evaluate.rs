@@ -297,7 +297,7 @@ fn trained_baselines(args: &EvaluateArgs, names: &[ModelName], drives: &Drives) 
     let mut predictors = Vec::new();
     for folder in folders {
         let bundle = load_bundle(Some(&folder))?;
-        if bundle.vehicle.name == drives.root.vehicle().name {
+        if bundle.is_of(drives.root.vehicle()) {
             predictors.push(rounded(predictor_for(bundle, &drives.root)?, args.bf16, "--bf16")?);
         }
     }
@@ -316,7 +316,7 @@ fn kinematic(
         Some(p) => p.bundle().baselines_json.clone(),
         None => load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)
             .ok()
-            .filter(|b| b.vehicle.name == drives.root.vehicle().name)
+            .filter(|b| b.is_of(drives.root.vehicle()))
             .and_then(|b| b.baselines_json),
     };
     if let Some(json) = bundled {

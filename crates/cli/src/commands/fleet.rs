@@ -166,7 +166,7 @@ fn predict(engine: &mut Engine, now_ns: u64, drive: &Trajectory, sample: usize, 
         cost: None,
     };
     match engine.execute(now_ns, &Command::Predict(query)).or_failed()? {
-        Reply::Predicted(prediction) => Ok((0..horizon).map(|k| pose_of(&prediction.rollout.state(0, k).map(f64::from))).collect()),
+        Reply::Predicted(prediction) => Ok((0..horizon).map(|k| pose_of(&prediction.rollout.state_f64(0, k))).collect()),
         _ => Err(Failure::Failed("the engine answered a prediction with another reply; this is a bug".into())),
     }
 }

@@ -200,8 +200,9 @@ fn put_card(args: &ImportArgs, card: &Path) -> Result<(), Failure> {
 /// Reads the set as every other command will, says what does not fit together, and draws what was driven.
 fn judge(args: &ImportArgs, card: Option<&Path>, html: &Path) -> Result<(), Failure> {
     let root = DataRoot::open(&args.to, card).or_input()?;
+    let of_card = root.notes();
     let drives: Vec<Trajectory> = root.load_set(&SetQuery::all(&args.set)).or_input()?;
-    for note in root.notes().iter().filter(|_| args.world.is_some()) {
+    for note in root.notes().iter().filter(|note| args.world.is_some() || of_card.contains(note)) {
         say!("  note: {note}");
     }
     for doubt in doubts(&drives, root.vehicle()) {

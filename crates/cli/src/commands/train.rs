@@ -189,11 +189,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     restart_with(&[("CANDLE_NUM_THREADS", "1"), ("RAYON_NUM_THREADS", &threads), (PURGE_DELAY, "-1")])?;
     args.device.open().or_input()?;
     let drives = read_drives(&DataArgs { split: SplitArg::Train, ..args.data.clone() }, false)?;
-    if let (Some(bundle), given) = (&start, drives.root.vehicle()) {
-        let own = &bundle.vehicle;
-        if own.second != given.second || own.name != given.name {
-            return Err(Failure::input(format!("--from: bundle {} is of `{}`, the data of `{}`", bundle.name, own.name, given.name)));
-        }
+    if let Some(bundle) = start.as_ref().filter(|bundle| !bundle.is_of(drives.root.vehicle())) {
+        let (own, given) = (&bundle.vehicle.name, &drives.root.vehicle().name);
+        return Err(Failure::input(format!("--from: bundle {} is of `{own}`, the data of `{given}`", bundle.name)));
     }
     let hash = drives.root.hash();
     let horizon = horizon_of(args.horizon, &drives.drives, "trained on");

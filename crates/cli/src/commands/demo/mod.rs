@@ -81,7 +81,7 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
     let drives = read_drives(&data, false)?;
     let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?;
     let stage = stage_of(args, &drives)?;
-    if bundle.vehicle.name != drives.root.vehicle().name {
+    if !bundle.is_of(drives.root.vehicle()) {
         return Err(Failure::input(format!(
             "bundle {} was trained for `{}`, the drive is of `{}`",
             bundle.name,

@@ -36,8 +36,8 @@ pub struct RecordingArgs {
     /// Last stamp of the window, ns of the vehicle's clock [default: the last]
     #[arg(long, value_name = "NS", requires = "recording", allow_negative_numbers = true, default_value_t = i64::MAX, hide_default_value = true)]
     to_ns: i64,
-    /// Pieces that stand for drives. They share ground and driver, so the evidence is weaker than that of as many drives [default: 5; 10 with --reference
-    /// physics, which needs eight]
+    /// Pieces that stand for drives. They share ground and driver, so the evidence is weaker than that of as many drives [default: 5; 10 where the
+    /// model itself is tested, which needs eight]
     #[arg(long, value_name = "N", requires = "recording")]
     pieces: Option<usize>,
 }

@@ -29,7 +29,7 @@ impl SensorTerms {
     }
 
     /// The true states behind a series of measured ones, `dt_s` apart: [`SensorTerms::to_true`] with the turn and the way within a latency d summed from the
-    /// velocities that were measured then, ∫ from t - d to t, linear from sample to sample. Where the series does not reach, or is not finite, the nearest sample counts.
+    /// velocities that were measured then, ∫ from t - d to t, linear from sample to sample. Where the series does not reach, or is not finite, the last sample on the way there counts.
     pub fn to_true_along(&self, measured: &[VehicleState<f64>], dt_s: f64) -> Vec<VehicleState<f64>> {
         let (pose, position) = (self.pose_latency_s / dt_s, (self.position_latency_s + self.pose_latency_s) / dt_s);
         if pose == 0.0 && position == 0.0 {
@@ -174,7 +174,7 @@ fn turn_rate<T: Real>(truth: &VehicleState<T>) -> T {
 }
 
 /// Integral of a series that is linear from sample to sample, over the `steps` before sample `k` (those after it where negative, with a minus), in units of a
-/// step. Beyond the ends, and from what is not finite on, the last value holds.
+/// step. Beyond the ends, and over what is not finite, the last value on the way there holds.
 fn summed_before<const N: usize>(series: &[[f64; N]], k: usize, steps: f64) -> [f64; N] {
     let mut sum = [0.0; N];
     let (mut at, mut here, mut left) = (k, series[k], steps.abs());
