@@ -167,7 +167,7 @@ impl Case<'_> {
         settled: &[Option<Settled>],
     ) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
-        let changes = self.changes(yardstick, fit, &selection.chosen);
+        let mut changes = self.changes(yardstick, fit, &selection.chosen);
         (0..selection.chosen.len())
             .map(|i| {
                 let hypothesis = selection.chosen[i];
@@ -188,7 +188,7 @@ impl Case<'_> {
                     refused: None,
                     refused_for_size: false,
                 };
-                let changed = changes[i].map(|change| (change.to_string(), false));
+                let changed = changes[i].take().map(|change| (change, false));
                 if let Some((why, for_size)) = refusal(&group, &finding, fit, i).or(changed) {
                     (finding.refused, finding.refused_for_size) = (Some(why), for_size);
                 }

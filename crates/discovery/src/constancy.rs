@@ -2,7 +2,8 @@
 //!
 //! What the fit leaves is searched for a further onset of the effect's own answer, as when effects are dated. An onset must bring a share of what its effect explains,
 //! because answers are not exact; a change of what is sized already must bring what answers of its layer are doubted by, so that forces, which depend on how the
-//! vehicle is driven, are not refused for that.
+//! vehicle is driven, are not refused for that. What has no edge, such as a bias that grows, leaves sensors that go on from segment to segment
+//! ([`whiteness`](crate::whiteness)).
 
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
@@ -13,8 +14,10 @@ use crate::claims::Case;
 use crate::condense::difference;
 use crate::dating::dispersion;
 use crate::fit::Fit;
+use crate::judgement::UNEXPLAINED_MARGIN;
 use crate::onset::{Change, Course, change, loose};
 use crate::select::{Yardstick, mismatch, without};
+use crate::whiteness::{Succession, Unrest};
 
 /// What fitted effects leave of a drive.
 struct Left {
@@ -24,8 +27,9 @@ struct Left {
 }
 
 impl Case<'_> {
-    /// The change of the size of each of the chosen effects, which were fitted in this order. A model on trial lacks more than them, so that none is looked for there.
-    pub(crate) fn changes(&self, yardstick: &Yardstick, fit: &Fit, chosen: &[usize]) -> Vec<Option<Change>> {
+    /// Why the size of each of the chosen effects, which were fitted in this order, is not the same throughout; `None` where it is. A model on trial lacks more than them, so
+    /// that no change is looked for there.
+    pub(crate) fn changes(&self, yardstick: &Yardstick, fit: &Fit, chosen: &[usize]) -> Vec<Option<String>> {
         if yardstick.model_on_trial {
             return vec![None; chosen.len()];
         }
@@ -45,7 +49,34 @@ impl Case<'_> {
                 Left { rows, answers }
             })
             .collect();
-        (0..chosen.len()).map(|i| self.changes_of(yardstick, &left, i, chosen[i])).collect()
+        let changes = (0..chosen.len()).map(|i| {
+            let step = self.changes_of(yardstick, &left, i, chosen[i]).map(|change| change.to_string());
+            step.or_else(|| self.goes_on(yardstick, &left, i, chosen[i]).map(|unrest| format!("with it {unrest}")))
+        });
+        changes.map(|change| change.map(|what| format!("its size is not the same throughout: {what}"))).collect()
+    }
+
+    /// What sensors do within drives that they do not do without an effect.
+    pub(crate) fn unrest(&self, yardstick: &Yardstick) -> Option<Unrest> {
+        let of = |channel| self.successions(self.rows.iter().map(Vec::as_slice), channel);
+        let whiteness = &yardstick.whiteness;
+        whiteness.lasting(UNEXPLAINED_MARGIN * yardstick.threshold(), |_| true, of).or_else(|| whiteness.jump(of))
+    }
+
+    /// How a channel goes on in each drive.
+    fn successions<'r>(&self, rows: impl Iterator<Item = &'r [Row]>, channel: usize) -> Vec<Succession> {
+        self.prepared.iter().zip(rows).map(|(p, rows)| Succession::of(&p.drive, &p.signatures.uncounted, rows, channel)).collect()
+    }
+
+    /// What goes on from segment to segment of that which the `i`-th of fitted effects leaves, in a channel that it changes: more than its answer there is doubted by.
+    fn goes_on(&self, yardstick: &Yardstick, left: &[Left], i: usize, hypothesis: usize) -> Option<Unrest> {
+        let of = |channel| self.successions(left.iter().map(|left| left.rows.as_slice()), channel);
+        let doubted = mismatch(yardstick.catalogue[hypothesis].layer());
+        let more = |channel: usize| {
+            let answered: f64 = left.iter().flat_map(|left| &left.answers[i]).map(|row| row[channel].powi(2)).sum();
+            answered > 0.0 && of(channel).iter().map(|s| s.lagged).sum::<f64>() > doubted * answered
+        };
+        yardstick.whiteness.lasting(UNEXPLAINED_MARGIN * yardstick.threshold(), more, of)
     }
 
     /// The change of the size of the `i`-th of fitted effects, beside the others in whatever size each drive has them.

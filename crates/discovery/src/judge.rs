@@ -70,7 +70,8 @@ impl Judge {
         let nulls = Nulls::new(&self.nulls.iter().collect::<Vec<_>>())
             .ok_or_else(|| DiscoveryError::Reference { reason: "has too few drives".into() })?;
         let groups = NullGroups::draw(&self.nulls, &self.catalogue, channels, drives);
-        Ok(Yardstick::new(nulls, groups, &self.catalogue, channels, without))
+        let yardstick = Yardstick::new(nulls, groups, &self.catalogue, channels, without);
+        Ok(Yardstick { whiteness: self.reference.whiteness(), ..yardstick })
     }
 
     /// Compares observed drives with the reference.

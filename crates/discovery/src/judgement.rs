@@ -12,7 +12,7 @@ use crate::settled::{Settled, onset_in_place};
 const LEFT_MAX: f64 = 0.4;
 /// How far beyond the family-wise threshold the largest evidence must be before drives count as different without a known cause (chosen, as in ADR 0008):
 /// one set in twenty without an effect is beyond the threshold itself.
-const UNEXPLAINED_MARGIN: f64 = 1.5;
+pub(crate) const UNEXPLAINED_MARGIN: f64 = 1.5;
 /// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
 const LEFT_MAX_GEOMETRY: f64 = 0.2;
 
@@ -101,7 +101,18 @@ impl Judgement {
 pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     let (selection, onsets) = case.select(yardstick);
     let judgement = concluded(case, yardstick, selection, onsets, &[], Vec::new());
-    rival_instead(case, yardstick, judgement)
+    unless_unrest(case, yardstick, rival_instead(case, yardstick, judgement))
+}
+
+/// That nothing differs is said where sensors do not wander or jump either.
+fn unless_unrest(case: &Case<'_>, yardstick: &Yardstick, judgement: Judgement) -> Judgement {
+    match case.unrest(yardstick) {
+        Some(unrest) if judgement.verdict == Verdict::None => {
+            let reason = format!("{unrest}, which no effect of the catalogue explains");
+            Judgement { verdict: Verdict::Unexplained, reason, ..judgement }
+        }
+        _ => judgement,
+    }
 }
 
 /// Settles, sizes and doubts what is chosen until nothing is refused, or only the first is left. What is `passed_over` takes no place; `left_out` was refused before.

@@ -52,6 +52,7 @@ mod ridge;
 pub mod select;
 pub mod settled;
 mod tail;
+mod whiteness;
 
 pub use candidates::{Candidate, catalogue};
 pub use claims::Estimate;

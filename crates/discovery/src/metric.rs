@@ -114,15 +114,20 @@ impl Metric {
     }
 }
 
+/// Median of some values, and how far from it one has no further say.
+pub(crate) fn usual_range(values: &[f64]) -> (f64, f64) {
+    let middle = median(values);
+    let spread = NORMAL_PER_MEDIAN * median(&values.iter().map(|v| (v - middle).abs()).collect::<Vec<_>>());
+    (middle, CUT_OFF * spread)
+}
+
 /// Rows of a drive with every channel held within some robust standard deviations of its median.
 fn clip(rows: &[Row], channels: &[usize]) -> Vec<DVector<f64>> {
     let bounds: Vec<[f64; 2]> = channels
         .iter()
         .map(|c| {
-            let values: Vec<f64> = rows.iter().map(|r| r[*c]).collect();
-            let middle = median(&values);
-            let spread = NORMAL_PER_MEDIAN * median(&values.iter().map(|v| (v - middle).abs()).collect::<Vec<_>>());
-            [middle - CUT_OFF * spread, middle + CUT_OFF * spread]
+            let (middle, bound) = usual_range(&rows.iter().map(|r| r[*c]).collect::<Vec<_>>());
+            [middle - bound, middle + bound]
         })
         .collect();
     rows.iter()

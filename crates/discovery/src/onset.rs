@@ -45,7 +45,7 @@ pub(crate) struct Change {
 
 impl fmt::Display for Change {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "its size is not the same throughout: it changes by about {:.0} % at {:.1} s", 100.0 * self.share, self.at_s)
+        write!(f, "it changes by about {:.0} % at {:.1} s", 100.0 * self.share, self.at_s)
     }
 }
 
@@ -254,7 +254,7 @@ mod tests {
         assert!(changed(&of(&|k| (k as f64 - 17.5) / 24.0), 0.02).is_some_and(|grows| grows.share > 0.3));
         assert_eq!(changed(&of(&|k| if k < 6 { 0.0 } else { 0.2 }), 0.02), None, "another size is no change of it");
         assert_eq!(changed(&of(&|k| if k == 5 { 3.0 } else { 0.0 }), 0.02), None, "a jump does not count");
-        let said = "its size is not the same throughout: it changes by about -100 % at 14.0 s";
+        let said = "it changes by about -100 % at 14.0 s";
         assert_eq!(Change { share: -1.0, ..ends }.to_string(), said);
         let smaller = of(&|k| if k < 18 { 0.2 } else { -0.2 });
         assert!(changed(&smaller, 0.02).is_some() && changed(&smaller, 0.12).is_none(), "answers of forces are not exact");

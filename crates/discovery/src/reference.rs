@@ -21,8 +21,9 @@ use crate::error::DiscoveryError;
 use crate::evidence::{Group, Nulls};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
+use crate::whiteness::{Succession, Whiteness, asked};
 
-const SCHEMA: &str = "nesam.reference/5";
+const SCHEMA: &str = "nesam.reference/6";
 /// Random groups of null drives.
 const NULL_GROUPS: usize = 1000;
 /// Fewest drives of a reference.
@@ -43,13 +44,15 @@ pub struct NullDrive {
     pub score: Vec<f32>,
     /// Information matrix of the columns, lower half by rows.
     pub information: Vec<f32>,
+    /// How each compared channel that is asked for whiteness goes on from segment to segment.
+    pub successions: Vec<Succession>,
 }
 
 /// The reference of a bundle.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reference {
-    /// Always `nesam.reference/5`.
+    /// Always `nesam.reference/6`.
     pub schema: String,
     /// Hash of the data behind it.
     pub data_hash: String,
@@ -123,6 +126,7 @@ impl Reference {
                     trajectory: drive.id.clone(),
                     score: condensed.score.iter().map(|v| *v as f32).collect(),
                     information: lower(&condensed.information).into_iter().map(|v| v as f32).collect(),
+                    successions: asked_of(&metric.channels).map(|c| Succession::of(drive, &[], rows, c)).collect(),
                 }
             })
             .collect();
@@ -159,7 +163,8 @@ impl Reference {
         let sized = read.centre.len() == channels
             && read.within.len() == half(channels)
             && read.between.len() == half(channels)
-            && read.drives.iter().all(|d| d.score.len() == columns && d.information.len() == half(columns));
+            && read.drives.iter().all(|d| d.score.len() == columns && d.information.len() == half(columns))
+            && read.compared().is_some_and(|compared| read.drives.iter().all(|d| d.successions.len() == asked_of(&compared).count()));
         if !sized || read.drives.len() < DRIVES_MIN {
             return Err(fail("has arrays of another size; run `nesam diagnose --make-reference`".into()));
         }
@@ -189,18 +194,28 @@ impl Reference {
     /// `DiscoveryError::Reference` when a channel is unknown or a covariance is not definite; `Drives` when a drive lacks a compared channel.
     pub fn metric(&self, available: &[bool; CHANNELS]) -> Result<Metric, DiscoveryError> {
         let fail = |reason: &str| DiscoveryError::Reference { reason: reason.into() };
-        let known: Vec<String> = (0..CHANNELS).map(channels::name).collect();
-        let at =
-            |name: &String| known.iter().position(|k| k == name).ok_or_else(|| fail("names a channel that this program does not know"));
-        let channels = self.channels.iter().map(at).collect::<Result<Vec<_>, _>>()?;
+        let channels = self.compared().ok_or_else(|| fail("names a channel that this program does not know"))?;
         if let Some(missing) = channels.iter().find(|c| !available[**c]) {
-            let reason = format!("the reference compares {}, which a drive of this set does not measure", known[*missing]);
+            let reason = format!("the reference compares {}, which a drive of this set does not measure", channels::name(*missing));
             return Err(DiscoveryError::Drives { reason });
         }
         let size = channels.len();
         Metric::new(channels, DVector::from_column_slice(&self.centre), symmetric(&self.within, size), symmetric(&self.between, size))
             .map(|metric| metric.believing(self.within_believed))
             .ok_or_else(|| fail("has a covariance that is not definite"))
+    }
+
+    /// How channels go on from segment to segment in the null drives.
+    pub(crate) fn whiteness(&self) -> Whiteness {
+        let asked: Vec<usize> = asked_of(&self.compared().unwrap_or_default()).collect();
+        let drives: Vec<Vec<(usize, Succession)>> =
+            self.drives.iter().map(|d| asked.iter().copied().zip(d.successions.iter().copied()).collect()).collect();
+        Whiteness::of(drives.iter().map(Vec::as_slice))
+    }
+
+    /// Channels that are compared; `None` where one is not known.
+    fn compared(&self) -> Option<Vec<usize>> {
+        self.channels.iter().map(|name| (0..CHANNELS).find(|c| channels::name(*c) == *name)).collect()
     }
 
     /// Scores of the null drives.
@@ -276,6 +291,11 @@ impl NullGroups {
     pub fn attainable(&self) -> f64 {
         1.0 / (self.largest.len() + 1) as f64
     }
+}
+
+/// Those of some channels that are asked for whiteness.
+fn asked_of(channels: &[usize]) -> impl Iterator<Item = usize> {
+    channels.iter().copied().filter(|channel| asked(*channel))
 }
 
 /// What is written beside the catalogue.

@@ -10,6 +10,7 @@ use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, level_column};
 use crate::evidence::{Group, Nulls};
 use crate::reference::{NullGroups, all_evidence};
+use crate::whiteness::Whiteness;
 
 /// Difference of the criterion that decides between two hypotheses.
 pub const DECISIVE: f64 = 6.0;
@@ -43,6 +44,8 @@ pub struct Yardstick {
     pub known: Vec<Known>,
     /// What stood out and was refused by an earlier look; not chosen.
     pub refused: Vec<usize>,
+    /// How channels go on from segment to segment in drives without an effect; empty where the model is on trial.
+    pub whiteness: Whiteness,
 }
 
 /// A hypothesis that an earlier look found, with the rivals that it had then.
@@ -67,6 +70,7 @@ impl Yardstick {
             model_on_trial: false,
             known: Vec::new(),
             refused: Vec::new(),
+            whiteness: Whiteness::default(),
         }
     }
 }

@@ -4,7 +4,7 @@
 
 mod common;
 
-use common::{bundle, diagnose_from, diagnose_rover, diagnose_twin, drive, drive_from, options, plough, rover, world};
+use common::{bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_twin, drive, drive_from, options, plough, rover, world};
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Stepping, Verdict, observe, observe_all};
@@ -65,6 +65,30 @@ fn property_nothing_is_claimed_without_an_effect() {
         let found = diagnose_twin(&[], seed, &options());
         assert_eq!(found.verdict, Verdict::None, "{}; z {:?}", found.reason, found.selection.z);
         assert!(found.learned.iter().all(|l| l.effects.is_empty()));
+    }
+}
+
+/// Goal: a fault that leaves nothing on average is not called none, and one that grows is not called one size. Method: eight drives of 20 s without an effect whose gyro wanders
+/// in a sine, whose positions jump by half a metre twice, and whose gyro's bias grows.
+#[test]
+fn property_sensors_that_wander_jump_or_drift_are_told() {
+    let changed = |change: fn(usize, &mut nesam_physics::VehicleState<f64>)| {
+        let soil = bundle().default_soil;
+        let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 800 + i, &[], &soil)).collect();
+        for drive in &mut drives {
+            drive.states.iter_mut().enumerate().for_each(|(k, state)| change(k, state));
+        }
+        diagnose_drives(&drives, &options())
+    };
+    let wandering = changed(|k, state| state.angular_velocity_rad_s[2] += 0.03 * (std::f64::consts::TAU * k as f64 / 100.0).sin());
+    let jumping = changed(|k, state| state.position_m[0] += 0.5 * (f64::from(k >= 60) + f64::from(k >= 141)));
+    let growing = changed(|k, state| state.angular_velocity_rad_s[2] += 0.06 * k as f64 / 200.0);
+    for (found, said) in [
+        (&wandering, "turn_minus_gyro_yaw_rad goes on from segment to segment"),
+        (&jumping, "jumps by"),
+        (&growing, "gyro_bias cannot be claimed: its size is not the same throughout"),
+    ] {
+        assert!(found.verdict == Verdict::Unexplained && found.reason.contains(said), "{:?}: {}", found.verdict, found.reason);
     }
 }
 

@@ -192,10 +192,15 @@ pub fn diagnose_twin(effects: &[Effect], seed: u64, options: &Options) -> Diagno
 
 /// The same with effects that begin `onset_s` after the start.
 pub fn diagnose_from(effects: &[Effect], onset_s: f64, seed: u64, options: &Options) -> Diagnosis {
-    let bundle = bundle();
-    let drives: Vec<Trajectory> = (0..8).map(|i| drive_from(&format!("d{i}"), seed + i, effects, onset_s, &bundle.default_soil)).collect();
-    let predictor = Predictor::new(Arc::new(bundle)).unwrap();
-    diagnose(&predictor, &drives, &vec![Some(world()); drives.len()], options, &|_, _, _| {}).unwrap()
+    let soil = bundle().default_soil;
+    let drives: Vec<Trajectory> = (0..8).map(|i| drive_from(&format!("d{i}"), seed + i, effects, onset_s, &soil)).collect();
+    diagnose_drives(&drives, options)
+}
+
+/// Diagnoses drives of the twin.
+pub fn diagnose_drives(drives: &[Trajectory], options: &Options) -> Diagnosis {
+    let predictor = Predictor::new(Arc::new(bundle())).unwrap();
+    diagnose(&predictor, drives, &vec![Some(world()); drives.len()], options, &|_, _, _| {}).unwrap()
 }
 
 /// A skid-steer base of the same size, its rims servoed.
