@@ -70,7 +70,7 @@ pub struct GrpcConfig {
     pub measurements_in_flight_max: usize,
     /// Interval of keep-alive pings, s; a peer that has gone is noticed after about twice this.
     pub keepalive_s: f64,
-    /// Longest wait for running requests at shutdown, s.
+    /// Longest wait at shutdown for running requests, and for clients that still read their answers, s.
     pub drain_s: f64,
 }
 

@@ -11,7 +11,7 @@ use nesam_proto::v1 as pb;
 use tokio::net::TcpListener;
 use tokio::sync::{broadcast, watch};
 use tokio::task::JoinHandle;
-use tonic::transport::server::{Router, TcpIncoming};
+use tonic::transport::server::Router;
 use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
@@ -20,16 +20,17 @@ use crate::call::EngineClient;
 use crate::clock::{MonotonicClock, unix_ns};
 use crate::cluster::{Cluster, Etcd};
 use crate::config::{Config, GrpcConfig};
+use crate::connection::Closing;
 use crate::convert::SoilTeller;
 use crate::diagnosis::Diagnoses;
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
-use crate::grpc::{self, Edge, stopped};
+use crate::grpc::{self, Edge, UntilStopped, stopped};
 use crate::http::{self, HttpState};
+use crate::listener::{accept, accept_tls};
 use crate::recording::{Recorder, RecordingHeader};
 use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
-use crate::tls_listener;
 use crate::web::{Feed, Live, Raised};
 use crate::zenoh::{Presence, RenewedBus};
 
@@ -113,6 +114,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
+    let begins_within = Duration::from_secs_f64(config.tls.handshake_s);
     let diagnoses = Some(Arc::new(Diagnoses::new(&config, recorder.clone(), live.clone())));
     let edge = Edge {
         diagnoses,
@@ -152,7 +154,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         (false, Some(_)) => "TLS, clients unknown",
         (false, None) => "none",
     };
-    let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, stopping);
+    let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, Closing { begins_within, reads_within: drain, stopping });
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
     Ok(RunningServer {
         grpc_addr,
@@ -261,14 +263,19 @@ async fn open_store(
     Ok(Some(cluster))
 }
 
-/// Commits what is left, then lets the sessions go: others may have them from now on.
-async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) {
-    if let Some(keeper) = keeper {
-        let _ = tokio::task::spawn_blocking(move || keeper.finish()).await;
+/// Commits what is left, then lets the sessions go: others may have them from now on. Gives how much the store did not take.
+async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) -> usize {
+    let lost = match keeper {
+        Some(keeper) => tokio::task::spawn_blocking(move || keeper.finish()).await.unwrap_or_default(),
+        None => 0,
+    };
+    if lost > 0 {
+        tracing::error!(lost, "the store did not take the last changes of so many sessions, maps and cells of the soil map");
     }
     if let Some(cluster) = cluster {
         cluster.stop().await;
     }
+    lost
 }
 
 async fn open_folder(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle) -> Result<(), StoreError> {
@@ -326,7 +333,12 @@ pub(crate) fn router(edge: &Edge, health: &HealthReporter) -> Router {
     let reflection = described().build_v1().expect("the committed descriptor set decodes; this is a bug");
     // For clients that know no other, as that of Python does.
     let reflection_v1alpha = described().build_v1alpha().expect("the committed descriptor set decodes; this is a bug");
-    builder(&edge.config).add_routes(grpc::routes(edge).add_service(health).add_service(reflection).add_service(reflection_v1alpha))
+    let stopping = || edge.stopping.clone();
+    let routes = grpc::routes(edge)
+        .add_service(UntilStopped { service: health, stopping: stopping() })
+        .add_service(UntilStopped { service: reflection, stopping: stopping() })
+        .add_service(UntilStopped { service: reflection_v1alpha, stopping: stopping() });
+    builder(&edge.config).add_routes(routes)
 }
 
 fn spawn_grpc(
@@ -334,16 +346,15 @@ fn spawn_grpc(
     credentials: Option<Credentials>,
     edge: &Edge,
     health: &HealthReporter,
-    stopping: watch::Receiver<bool>,
+    closing: Closing,
 ) -> JoinHandle<()> {
-    let router = router(edge, health);
-    let incoming = TcpIncoming::from(listener).with_nodelay(Some(true));
+    let (router, stop) = (router(edge, health), stopped(closing.stopping.clone()));
     let Some(credentials) = credentials else {
-        return tokio::spawn(ended(router.serve_with_incoming_shutdown(incoming, stopped(stopping))));
+        return tokio::spawn(ended(router.serve_with_incoming_shutdown(accept(listener, closing), stop)));
     };
-    let connections = tls_listener::accept(incoming, credentials.tls(), credentials.handshake(), stopping.clone());
-    tokio::spawn(credentials.follow(edge.engine.metrics().clone(), stopping.clone()));
-    tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stopped(stopping))))
+    let connections = accept_tls(listener, credentials.tls(), closing.clone());
+    tokio::spawn(credentials.follow(edge.engine.metrics().clone(), closing.stopping));
+    tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stop)))
 }
 
 pub(crate) async fn ended(serving: impl Future<Output = Result<(), tonic::transport::Error>>) {
@@ -374,8 +385,9 @@ impl RunningServer {
     }
 
     /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements, the
-    /// recording is written to its end. Sessions of a store are committed before the engine stops.
-    pub async fn shutdown(mut self) {
+    /// recording is written to its end. Sessions of a store are committed before the engine stops. Gives how many sessions, maps and cells of the soil map have
+    /// changes that the store did not take, which are lost.
+    pub async fn shutdown(mut self) -> usize {
         report(&self.health, ServingStatus::NotServing).await;
         if let Some(bus) = self.bus.take() {
             bus.stop().await;
@@ -384,11 +396,11 @@ impl RunningServer {
         self.live.stop();
         for mut task in [Some(self.grpc), self.http.take()].into_iter().flatten() {
             if tokio::time::timeout(self.drain, &mut task).await.is_err() {
-                tracing::warn!("requests still ran after the drain time and were cut off");
+                tracing::warn!("requests still ran, or answers were still read, after the drain time and were cut off");
                 task.abort();
             }
         }
-        end_store(self.keeper, self.cluster).await;
+        let lost = end_store(self.keeper, self.cluster).await;
         let (handle, recorder) = (self.handle, self.recorder);
         let _ = tokio::task::spawn_blocking(move || {
             handle.stop();
@@ -400,34 +412,13 @@ impl RunningServer {
         })
         .await;
         tracing::info!("stopped");
+        lost
     }
 
-    /// Serves until `signal` resolves, then shuts down.
-    pub async fn run_until(self, signal: impl Future<Output = ()>) {
+    /// Serves until `signal` resolves, then shuts down; gives what [`RunningServer::shutdown`] does.
+    pub async fn run_until(self, signal: impl Future<Output = ()>) -> usize {
         signal.await;
         tracing::info!("stopping");
-        self.shutdown().await;
-    }
-}
-
-/// Resolves on ctrl-c or SIGTERM.
-pub async fn termination() {
-    let interrupt = async {
-        if tokio::signal::ctrl_c().await.is_err() {
-            std::future::pending::<()>().await;
-        }
-    };
-    #[cfg(unix)]
-    let terminate = async {
-        match tokio::signal::unix::signal(tokio::signal::unix::SignalKind::terminate()) {
-            Ok(mut signal) => signal.recv().await,
-            Err(_) => std::future::pending().await,
-        }
-    };
-    #[cfg(not(unix))]
-    let terminate = std::future::pending::<Option<()>>();
-    tokio::select! {
-        () = interrupt => {}
-        _ = terminate => {}
+        self.shutdown().await
     }
 }

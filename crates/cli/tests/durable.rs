@@ -69,6 +69,18 @@ impl Drive {
     }
 }
 
+/// Asks a server to stop; its exit code.
+fn stop(mut server: Child) -> Option<i32> {
+    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+    server.wait().unwrap().code()
+}
+
+/// Largest size of the files that a server writes, bytes or `unlimited`: writes beyond it fail as on a full disk.
+fn limit_files(server: &Child, bytes: &str) {
+    let limit = Command::new("prlimit").args(["--pid", &server.id().to_string(), &format!("--fsize={bytes}:")]).status();
+    assert!(limit.unwrap().success());
+}
+
 /// Sends what the outbox holds until `stop` answers have come, with some measurements always on their way; gives the last durable place.
 async fn send(client: &mut Client, outbox: &mut Outbox, stop: usize) -> u64 {
     let mut stream = client.measure().await.unwrap();
@@ -148,12 +160,11 @@ async fn service_a_killed_server_goes_on_bit_for_bit() {
     assert!(resent > 0, "every kill came when everything was durable: the test shows nothing");
 
     // All of it is there once more, and a gentle stop changes nothing.
-    let (mut server, address) = serve(here.path(), &["--store", "store"]).unwrap();
+    let (server, address) = serve(here.path(), &["--store", "store"]).unwrap();
     let mut client = Client::connect(&address).await.unwrap();
     assert_eq!(recorded.end(&mut client).await, expected);
     client.close_session("truck").await.unwrap();
-    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
-    assert_eq!(server.wait().unwrap().code(), Some(0));
+    assert_eq!(stop(server), Some(0));
     let (server, address) = serve(here.path(), &["--store", "store"]).unwrap();
     let mut client = Client::connect(&address).await.unwrap();
     assert!(client.list_sessions().await.unwrap().is_empty(), "a closed session stays closed");
@@ -173,4 +184,49 @@ async fn service_a_killed_server_goes_on_bit_for_bit() {
     let words = String::from_utf8_lossy(&refused.stderr).into_owned();
     assert_eq!(refused.status.code(), Some(2), "{words}");
     assert!(words.contains("session `truck`") && words.contains("bundle"), "{words}");
+}
+
+/// Goal: a disk that is full costs what was changed meanwhile and nothing after it, and whoever stops the server meanwhile is told. Method: a limit on the size of
+/// files, which the store reaches with a map of 9 MB.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_full_disk_is_told_and_survived() {
+    let here = tempfile::tempdir().unwrap();
+    std::fs::write(here.path().join("nesam.toml"), "[grpc]\ndeadline_s = 2.0\n").unwrap();
+    let options = ["--store", "store", "--config", "nesam.toml"];
+    let recorded = recorded();
+    let side = 1500;
+    let big = MapLayers {
+        id: "big".into(),
+        width: side,
+        height: side,
+        elevation_m: vec![0.0; side * side],
+        semantic_rgb: None,
+        ..recorded.map.clone()
+    };
+    let refused = async |server: &Child, client: &mut Client| {
+        let size = std::fs::metadata(here.path().join("store/sessions.redb")).unwrap().len();
+        limit_files(server, &size.to_string());
+        let words = client.upload_map(&big).await.unwrap_err().to_string();
+        assert!(words.contains("not durable yet"), "{words}");
+    };
+
+    let (server, address) = serve(here.path(), &options).unwrap();
+    let mut client = Client::connect(&address).await.unwrap();
+    recorded.open(&mut client).await;
+    refused(&server, &mut client).await;
+    assert_eq!(stop(server), Some(1), "what was not written is told");
+
+    let (server, address) = serve(here.path(), &options).unwrap();
+    let mut client = Client::connect(&address).await.unwrap();
+    assert_eq!((client.list_sessions().await.unwrap().len(), client.list_maps().await.unwrap().len()), (1, 1), "the map was not durable");
+    refused(&server, &mut client).await;
+    limit_files(&server, "unlimited");
+    let late = v1::OpenSessionRequest { vehicle_id: "late".into(), ..Default::default() };
+    client.open_session(late).await.expect("there is room again");
+    assert_eq!(stop(server), Some(0));
+
+    let (server, address) = serve(here.path(), &options).unwrap();
+    let mut client = Client::connect(&address).await.unwrap();
+    assert_eq!((client.list_sessions().await.unwrap().len(), client.list_maps().await.unwrap().len()), (2, 2));
+    kill(server);
 }

@@ -55,11 +55,6 @@ impl Credentials {
         self.tls.subscribe()
     }
 
-    /// Longest handshake of a new connection.
-    pub fn handshake(&self) -> Duration {
-        Duration::from_secs_f64(self.config.handshake_s)
-    }
-
     /// The rights of the fleet, where clients have identities.
     pub(super) fn rights(&self) -> Option<watch::Receiver<Arc<FleetFile>>> {
         self.rights.as_ref().map(watch::Sender::subscribe)

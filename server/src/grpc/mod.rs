@@ -8,6 +8,7 @@ mod prediction;
 mod sessions;
 mod soil;
 mod terrain;
+mod until_stopped;
 mod used;
 
 use std::pin::Pin;
@@ -33,6 +34,7 @@ use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
 
 pub(crate) use prediction::predict;
+pub(crate) use until_stopped::UntilStopped;
 
 /// A stream of replies.
 pub(crate) type ReplyStream<T> = Pin<Box<dyn Stream<Item = Result<T, Status>> + Send>>;

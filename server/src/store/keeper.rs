@@ -283,14 +283,16 @@ impl Keeper {
         Ok(())
     }
 
-    /// Commits what is left and ends the thread. The engine must still run.
-    pub fn finish(&self) {
+    /// Commits what is left and ends the thread. The engine must still run. Gives how many sessions, maps and cells of the soil map have changes that the store
+    /// did not take.
+    pub fn finish(&self) -> usize {
         self.lock().stopping = true;
         self.changed.notify_all();
         let thread = self.thread.lock().ok().and_then(|mut thread| thread.take());
         if thread.is_some_and(|thread| thread.join().is_err()) {
             tracing::error!("the store's thread panicked; what was not durable is lost; this is a bug");
         }
+        self.lock().dirty.len()
     }
 
     /// What is due now, everything once the server stops: each with its latest change.

@@ -20,13 +20,31 @@ const FILE: &str = "sessions.redb";
 const CACHE_BYTES: usize = 16 << 20;
 
 /// A `redb` database. A commit writes copies of the changed pages, then the root, and syncs the file; the checksums tell a torn commit from a whole one.
-#[derive(Debug)]
+///
+/// After an error of the disk, which may be full, a database refuses everything until it is opened anew: the next commit does that.
 pub struct RedbStore {
-    database: Database,
+    /// `None` = closed after a commit that failed.
+    database: Option<Database>,
+    /// Opens the same database once more, and makes none.
+    reopen: Box<dyn Fn() -> Result<Database, StoreError> + Send>,
+}
+
+impl core::fmt::Debug for RedbStore {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("RedbStore").field("database", &self.database).finish_non_exhaustive()
+    }
 }
 
 fn failed(error: impl core::fmt::Display) -> StoreError {
     StoreError::Database { reason: error.to_string() }
+}
+
+/// The same for a file that was opened.
+fn of_file(path: &Path, opened: Result<Database, DatabaseError>) -> Result<Database, StoreError> {
+    opened.map_err(|error| match error {
+        DatabaseError::DatabaseAlreadyOpen => StoreError::InUse { path: path.into() },
+        other => StoreError::Database { reason: format!("{}: {other}", path.display()) },
+    })
 }
 
 impl RedbStore {
@@ -41,25 +59,24 @@ impl RedbStore {
         };
         std::fs::create_dir_all(folder).map_err(at(folder))?;
         let path = folder.join(FILE);
-        let database = Database::builder().set_cache_size(CACHE_BYTES).create(&path).map_err(|error| match error {
-            DatabaseError::DatabaseAlreadyOpen => StoreError::InUse { path: path.clone() },
-            other => StoreError::Database { reason: format!("{}: {other}", path.display()) },
-        })?;
+        let database = of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).create(&path))?;
         // A new file is there after a power cut only when its folder is on the disk too.
         std::fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(at(folder))?;
-        Self::prepared(database)
+        // A file that has gone is no empty store: what was durable in it would be missing from the new one.
+        Self::prepared(database, move || of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).open(&path)))
     }
 
     /// The same on another backend, for tests of crashes.
     ///
     /// # Errors
     /// As [`RedbStore::open`].
-    pub fn with_backend(backend: impl StorageBackend) -> Result<Self, StoreError> {
-        Self::prepared(Database::builder().set_cache_size(CACHE_BYTES).create_with_backend(backend).map_err(failed)?)
+    pub fn with_backend(backend: impl StorageBackend + Clone) -> Result<Self, StoreError> {
+        let open = move || Database::builder().set_cache_size(CACHE_BYTES).create_with_backend(backend.clone()).map_err(failed);
+        Self::prepared(open()?, open)
     }
 
     /// Makes the tables, or refuses a database of another format.
-    fn prepared(database: Database) -> Result<Self, StoreError> {
+    fn prepared(database: Database, reopen: impl Fn() -> Result<Database, StoreError> + Send + 'static) -> Result<Self, StoreError> {
         let transaction = database.begin_write().map_err(failed)?;
         {
             let mut facts = transaction.open_table(FACTS).map_err(failed)?;
@@ -76,13 +93,38 @@ impl RedbStore {
             transaction.open_table(SOIL).map_err(failed)?;
         }
         transaction.commit().map_err(failed)?;
-        Ok(Self { database })
+        Ok(Self { database: Some(database), reopen: Box::new(reopen) })
     }
+}
+
+/// Writes the changes in one transaction.
+fn write(database: &Database, changes: &[Change]) -> Result<(), StoreError> {
+    let mut transaction = database.begin_write().map_err(failed)?;
+    transaction.set_durability(Durability::Immediate).map_err(failed)?;
+    {
+        let mut sessions = transaction.open_table(SESSIONS).map_err(failed)?;
+        let mut maps = transaction.open_table(MAPS).map_err(failed)?;
+        let mut soil = transaction.open_table(SOIL).map_err(failed)?;
+        for change in changes {
+            match change {
+                Change::PutSession(s) => {
+                    drop(sessions.insert(s.name.as_str(), (s.saved_unix_ns, s.image.as_slice())).map_err(failed)?);
+                }
+                Change::RemoveSession(name) => drop(sessions.remove(name.as_str()).map_err(failed)?),
+                Change::PutMap(id, bytes) => drop(maps.insert(id.as_str(), bytes.as_slice()).map_err(failed)?),
+                Change::RemoveMap(id) => drop(maps.remove(id.as_str()).map_err(failed)?),
+                Change::PutSoil(s) => drop(soil.insert(s.key.as_str(), (s.saved_unix_ns, s.share.as_slice())).map_err(failed)?),
+                Change::RemoveSoil(key) => drop(soil.remove(key.as_str()).map_err(failed)?),
+            }
+        }
+    }
+    transaction.commit().map_err(failed)
 }
 
 impl SessionStore for RedbStore {
     fn load(&self) -> Result<Contents, StoreError> {
-        let transaction = self.database.begin_read().map_err(failed)?;
+        let database = self.database.as_ref().ok_or_else(|| failed("is closed, as the last commit failed"))?;
+        let transaction = database.begin_read().map_err(failed)?;
         let mut contents = Contents::default();
         for entry in transaction.open_table(SESSIONS).map_err(failed)?.iter().map_err(failed)? {
             let (name, value) = entry.map_err(failed)?;
@@ -102,26 +144,12 @@ impl SessionStore for RedbStore {
     }
 
     fn commit(&mut self, changes: &[Change]) -> Result<Vec<String>, StoreError> {
-        let mut transaction = self.database.begin_write().map_err(failed)?;
-        transaction.set_durability(Durability::Immediate).map_err(failed)?;
-        {
-            let mut sessions = transaction.open_table(SESSIONS).map_err(failed)?;
-            let mut maps = transaction.open_table(MAPS).map_err(failed)?;
-            let mut soil = transaction.open_table(SOIL).map_err(failed)?;
-            for change in changes {
-                match change {
-                    Change::PutSession(s) => {
-                        drop(sessions.insert(s.name.as_str(), (s.saved_unix_ns, s.image.as_slice())).map_err(failed)?);
-                    }
-                    Change::RemoveSession(name) => drop(sessions.remove(name.as_str()).map_err(failed)?),
-                    Change::PutMap(id, bytes) => drop(maps.insert(id.as_str(), bytes.as_slice()).map_err(failed)?),
-                    Change::RemoveMap(id) => drop(maps.remove(id.as_str()).map_err(failed)?),
-                    Change::PutSoil(s) => drop(soil.insert(s.key.as_str(), (s.saved_unix_ns, s.share.as_slice())).map_err(failed)?),
-                    Change::RemoveSoil(key) => drop(soil.remove(key.as_str()).map_err(failed)?),
-                }
-            }
-        }
-        transaction.commit().map_err(failed)?;
+        let database = match self.database.take() {
+            Some(database) => database,
+            None => (self.reopen)()?,
+        };
+        write(&database, changes)?;
+        self.database = Some(database);
         Ok(Vec::new())
     }
 }

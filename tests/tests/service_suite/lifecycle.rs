@@ -116,15 +116,47 @@ async fn service_shutdown_ends_streams_and_frees_the_ports() {
     let mut watch = client.watch_soil("s").await.unwrap();
     let first = watch.message().await.unwrap().unwrap();
     assert_eq!((first.soil_epoch, first.correction.unwrap().delta), (0, Some(v1::SoilVector::default())));
+    // Streams of the standard services, which their clients leave open.
+    let mut health = HealthClient::new(client.channel()).watch(HealthCheckRequest::default()).await.unwrap().into_inner();
+    assert_eq!(health.message().await.unwrap().unwrap().status(), ServingStatus::Serving);
+    let asked = tokio_stream::pending::<ServerReflectionRequest>();
+    let mut reflection = ServerReflectionClient::new(client.channel()).server_reflection_info(asked).await.unwrap().into_inner();
     let started = Instant::now();
     server.shutdown().await;
     assert!(started.elapsed() < Duration::from_secs(4), "shutdown took {:?}", started.elapsed());
     assert_eq!(stream.answer().await.unwrap_err().code(), Some(tonic::Code::Unavailable));
     assert_eq!(watch.message().await.unwrap_err().code(), tonic::Code::Unavailable);
+    assert_eq!(health.message().await.unwrap().unwrap().status(), ServingStatus::NotServing);
+    assert_eq!(health.message().await.unwrap_err().code(), tonic::Code::Unavailable);
+    assert_eq!(reflection.message().await.unwrap_err().code(), tonic::Code::Unavailable);
     // Both ports can be taken again at once.
     let mut config = Config::ephemeral();
     (config.grpc.listen, config.http.listen) = (grpc, http);
     serve(config, predictor()).await.unwrap().shutdown().await;
+}
+
+/// Without TLS; `service_strangers_do_not_get_in` has it with TLS.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_connections_that_say_nothing_are_closed() {
+    let (server, _client) = start_with(|config| config.tls.handshake_s = 1.0).await;
+    let connect = || tokio::net::TcpStream::connect(server.grpc_addr);
+    let (mut silent, mut slow) = (connect().await.unwrap(), connect().await.unwrap());
+    slow.write_all(b"PRI * HTTP/2.0\r\n").await.unwrap();
+    for socket in [&mut silent, &mut slow] {
+        let mut rest = Vec::new();
+        let closed = tokio::time::timeout(Duration::from_secs(20), socket.read_to_end(&mut rest)).await;
+        assert!(closed.is_ok(), "still open");
+    }
+    server.shutdown().await;
+
+    // They hold up no stop either.
+    let change = |config: &mut Config| (config.tls.handshake_s, config.grpc.drain_s) = (300.0, 300.0);
+    let (server, _client) = start_with(change).await;
+    let _silent = tokio::net::TcpStream::connect(server.grpc_addr).await.unwrap();
+    // It is taken before the one after it, which answers.
+    let mut later = Client::connect(&format!("http://{}", server.grpc_addr)).await.unwrap();
+    later.list_sessions().await.unwrap();
+    tokio::time::timeout(Duration::from_secs(60), server.shutdown()).await.expect("it waits for nobody who has said nothing");
 }
 
 #[tokio::test(flavor = "multi_thread")]

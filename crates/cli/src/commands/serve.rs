@@ -4,10 +4,11 @@ use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use clap::Args;
 use nesam_model::{ModelBundle, Predictor};
-use nesam_server::{Config, RunningServer, ZenohConfig, access, serve, start_workers, termination};
+use nesam_server::{Config, RunningServer, ZenohConfig, access, outlive_file_limit, second_interrupt, serve, start_workers, termination};
 use tracing_subscriber::EnvFilter;
 
 use crate::args::BundleArgs;
@@ -16,6 +17,9 @@ use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::sources::{load_bundle, rounded};
+
+/// Time that tasks get to end once the server has stopped.
+const LEFT_BEHIND_AFTER: Duration = Duration::from_millis(200);
 
 /// Options of `nesam serve`. They override the configuration file, which overrides the defaults.
 #[derive(Args, Debug)]
@@ -87,24 +91,48 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
         return checked(&config, bundle);
     }
     start_workers(&config.workers).or_failed()?;
-    let (zenoh, kept, soil) = (config.zenoh.clone(), kept(&config), fleet_soil(&config));
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
-    runtime.block_on(async {
-        // The signals are caught before the addresses are printed, so that whoever waits for them can stop the server at once.
-        let signal = tokio::spawn(termination());
-        let (server, bundle) = start(config, bundle).await?;
-        announce(&server, &bundle, &zenoh);
-        say!("store {kept}");
-        soil.iter().for_each(|soil| say!("soil  {soil}"));
-        say!("ready; ctrl-c stops");
-        server
-            .run_until(async {
-                let _ = signal.await;
-            })
-            .await;
-        say!("stopped");
-        Ok(())
-    })
+    let ended = runtime.block_on(serve_until_stopped(config, bundle));
+    // A start that was broken off, or what a second ctrl-c did not wait for, is left behind.
+    runtime.shutdown_timeout(LEFT_BEHIND_AFTER);
+    ended
+}
+
+/// Serves until a signal comes. A second ctrl-c ends it without waiting for anything.
+async fn serve_until_stopped(config: Config, bundle: ModelBundle) -> Result<(), Failure> {
+    outlive_file_limit().or_failed()?;
+    // The signals are caught before anything is started, so that a server can be stopped at once.
+    let mut signal = tokio::spawn(termination());
+    let again = tokio::spawn(second_interrupt());
+    let (zenoh, kept, soil) = (config.zenoh.clone(), kept(&config), fleet_soil(&config));
+    let (server, bundle) = tokio::select! {
+        started = start(config, bundle) => started?,
+        _ = &mut signal => {
+            say!("stopped before it had started");
+            return Ok(());
+        }
+    };
+    announce(&server, &bundle, &zenoh);
+    say!("store {kept}");
+    soil.iter().for_each(|soil| say!("soil  {soil}"));
+    say!("ready; ctrl-c stops");
+    let stop = async {
+        let _ = signal.await;
+    };
+    let lost = tokio::select! {
+        lost = server.run_until(stop) => lost,
+        _ = again => {
+            let cost = "running requests were cut off, and what was not durable is lost";
+            return Err(Failure::Failed(format!("ended at once by a second ctrl-c: {cost}")));
+        }
+    };
+    if lost > 0 {
+        return Err(Failure::Failed(format!(
+            "the store did not take the last changes of {lost} sessions, maps and cells of the soil map: they are lost"
+        )));
+    }
+    say!("stopped");
+    Ok(())
 }
 
 /// Starts a server on a bundle.

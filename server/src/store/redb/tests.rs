@@ -202,6 +202,50 @@ fn property_a_power_cut_loses_no_commit_that_returned() {
     assert!(cuts > 100 && unfinished > 0, "{cuts} cuts, {unfinished} with the commit that had not returned");
 }
 
+/// Goal: a disk that is full for a moment costs no more than the commits of that moment. Method: the disk refuses everything from one of the writes and syncs
+/// of a commit on, then has room again; the same store takes the commit and those after it.
+#[test]
+fn regress_a_disk_that_was_full_is_written_to_again() {
+    let begun = Disk::default();
+    assert_eq!(run(&begun, 0, 3), Some(3));
+    let begun = begun.0.lock().unwrap().synced.clone();
+    let room = |disk: &Disk, left| disk.0.lock().unwrap().left = left;
+    let mut refused = 0;
+    loop {
+        let disk = Disk::holding(begun.clone());
+        let mut store = RedbStore::with_backend(disk.clone()).unwrap();
+        room(&disk, Some(refused));
+        if store.commit(&changes(4)).is_ok() {
+            break;
+        }
+        // Still full: the store is not opened either, or takes nothing.
+        room(&disk, Some(0));
+        assert!(store.commit(&changes(4)).is_err(), "full from operation {refused} on");
+        room(&disk, None);
+        for n in 4..=6 {
+            store.commit(&changes(n)).unwrap_or_else(|e| panic!("full from operation {refused} on, commit {n}: {e}"));
+        }
+        assert_eq!(store.load().unwrap(), expected(6), "full from operation {refused} on");
+        let synced = disk.0.lock().unwrap().synced.clone();
+        drop(store);
+        assert_eq!(RedbStore::with_backend(Disk::holding(synced)).unwrap().load().unwrap(), expected(6), "what a power cut leaves");
+        refused += 1;
+    }
+    assert!(refused > 2, "a commit of {refused} operations shows nothing");
+}
+
+/// A store whose folder has gone while its disk failed must not begin anew where the folder was.
+#[test]
+fn regress_a_file_that_has_gone_is_not_made_anew() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut store = RedbStore::open(folder.path()).unwrap();
+    store.commit(&changes(1)).unwrap();
+    store.database = None;
+    std::fs::remove_file(folder.path().join(FILE)).unwrap();
+    let message = store.commit(&changes(2)).unwrap_err().to_string();
+    assert!(message.contains(FILE) && !folder.path().join(FILE).exists(), "{message}");
+}
+
 #[test]
 fn service_damaged_foreign_and_shared_stores_are_refused() {
     let folder = tempfile::tempdir().unwrap();

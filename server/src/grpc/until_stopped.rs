@@ -1,0 +1,77 @@
+//! Services of libraries whose streams would go on for ever: health and reflection.
+
+use std::convert::Infallible;
+use std::pin::Pin;
+use std::task::{Context, Poll, ready};
+
+use bytes::Bytes;
+use http_body::{Body as _, Frame};
+use nesam_engine::EngineError;
+use tokio::sync::watch;
+use tonic::Status;
+use tonic::body::Body;
+use tonic::codegen::{BoxFuture, Service, http};
+use tonic::server::NamedService;
+
+use super::stopped;
+
+/// A service whose replies end with UNAVAILABLE when the server stops. Not for work that should be finished.
+#[derive(Clone)]
+pub(crate) struct UntilStopped<S> {
+    pub service: S,
+    pub stopping: watch::Receiver<bool>,
+}
+
+impl<S: NamedService> NamedService for UntilStopped<S> {
+    const NAME: &'static str = S::NAME;
+}
+
+impl<S> Service<http::Request<Body>> for UntilStopped<S>
+where
+    S: Service<http::Request<Body>, Response = http::Response<Body>, Error = Infallible>,
+    S::Future: Send + 'static,
+{
+    type Response = http::Response<Body>;
+    type Error = Infallible;
+    type Future = BoxFuture<http::Response<Body>, Infallible>;
+
+    fn poll_ready(&mut self, context: &mut Context<'_>) -> Poll<Result<(), Infallible>> {
+        self.service.poll_ready(context)
+    }
+
+    fn call(&mut self, request: http::Request<Body>) -> Self::Future {
+        let (reply, stop) = (self.service.call(request), Box::pin(stopped(self.stopping.clone())));
+        Box::pin(async move { Ok(reply.await?.map(|body| Body::new(Reply { body, stop, is_over: false }))) })
+    }
+}
+
+/// What is sent until the server stops.
+struct Reply {
+    body: Body,
+    stop: Pin<Box<dyn Future<Output = ()> + Send>>,
+    is_over: bool,
+}
+
+impl http_body::Body for Reply {
+    type Data = Bytes;
+    type Error = Status;
+
+    fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
+        if self.is_over {
+            return Poll::Ready(None);
+        }
+        // First what there is to say: a watch of health hears that nothing is served any more.
+        if let Poll::Ready(frame) = Pin::new(&mut self.body).poll_frame(context) {
+            return Poll::Ready(frame);
+        }
+        ready!(self.stop.as_mut().poll(context));
+        self.is_over = true;
+        let mut trailers = http::HeaderMap::new();
+        let ended = Status::unavailable(EngineError::Stopped.to_string()).add_header(&mut trailers);
+        Poll::Ready(Some(ended.map(|()| Frame::trailers(trailers))))
+    }
+
+    fn is_end_stream(&self) -> bool {
+        self.is_over || self.body.is_end_stream()
+    }
+}
