@@ -4,19 +4,21 @@ mod cluster;
 mod diagnosis;
 mod store;
 mod tls;
+mod zenoh;
 
-use std::net::{Ipv4Addr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
-use nesam_engine::{FleetSoilSettings, Limits, check_name};
+use nesam_engine::{FleetSoilSettings, Limits};
 use serde::{Deserialize, Serialize};
 
 pub use self::cluster::ClusterConfig;
 pub use self::diagnosis::DiagnosisConfig;
 pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
+pub use self::zenoh::{ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint};
 use crate::error::ServerError;
 
 /// Most worker threads: more than processors of any one machine, and few enough to start.
@@ -88,41 +90,6 @@ pub struct HttpConfig {
     pub watchers_max: usize,
     /// Folder with reports of `nesam diagnose --json` that the live page shows; empty = none.
     pub reports: PathBuf,
-}
-
-/// Role in a Zenoh network.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum ZenohMode {
-    /// Listens and connects.
-    Peer,
-    /// Connects to a router; the server does not start without one.
-    Client,
-    /// Routes for others too.
-    Router,
-}
-
-/// Zenoh.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct ZenohConfig {
-    /// Whether to take part in a Zenoh network.
-    pub enabled: bool,
-    /// Role.
-    pub mode: ZenohMode,
-    /// Endpoints to listen on, e.g. `tcp/127.0.0.1:7447`; `tls/0.0.0.0:7447` uses the files of `[tls]` and gives everybody the keys that the fleet file
-    /// says.
-    pub listen: Vec<String>,
-    /// Endpoints to connect to, e.g. `tcp/router:7447` or `tls/router:7447`; a peer keeps trying.
-    pub connect: Vec<String>,
-    /// Fleet in the keys `nesam/v1/<fleet>/<vehicle>/...`.
-    pub fleet: String,
-    /// Name of this server in the keys `nesam/v1/<fleet>/server/<name>/...`; empty = its Zenoh id.
-    pub name: String,
-    /// Interval at which the status of this server is published, s.
-    pub status_interval_s: f64,
-    /// Whether large messages to and from processes of the same host go through shared memory where the other side can; never together with `tls/...`.
-    pub shared_memory: bool,
 }
 
 /// Threads that compute predictions. They belong to the process: `nesam serve` starts them, see [`crate::start_workers`].
@@ -247,21 +214,6 @@ impl Default for HttpConfig {
     }
 }
 
-impl Default for ZenohConfig {
-    fn default() -> Self {
-        Self {
-            enabled: true,
-            mode: ZenohMode::Peer,
-            listen: vec!["tcp/127.0.0.1:7447".into()],
-            connect: Vec::new(),
-            fleet: "default".into(),
-            name: String::new(),
-            status_interval_s: 1.0,
-            shared_memory: true,
-        }
-    }
-}
-
 impl Default for FleetSoilConfig {
     fn default() -> Self {
         let s = FleetSoilSettings::default();
@@ -370,23 +322,6 @@ impl HttpConfig {
     }
 }
 
-impl ZenohConfig {
-    /// Whether an endpoint needs certificates.
-    pub fn uses_tls(&self) -> bool {
-        self.enabled && self.listen.iter().chain(&self.connect).any(|endpoint| is_tls_endpoint(endpoint))
-    }
-
-    /// Whether somebody can connect to this server with a certificate.
-    pub fn listens_with_tls(&self) -> bool {
-        self.listen.iter().any(|endpoint| is_tls_endpoint(endpoint))
-    }
-}
-
-/// Whether a Zenoh endpoint shows who connects.
-pub fn is_tls_endpoint(endpoint: &str) -> bool {
-    endpoint.starts_with("tls/")
-}
-
 fn loopback(port: u16) -> SocketAddr {
     (Ipv4Addr::LOCALHOST, port).into()
 }
@@ -465,8 +400,9 @@ impl Config {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
         }
-        self.http.health_address()?;
+        self.check_ports()?;
         self.tls.check()?;
+        self.zenoh.check()?;
         self.cluster.check()?;
         self.diagnosis.check()?;
         if self.cluster.enabled() && self.store.enabled {
@@ -489,11 +425,36 @@ impl Config {
         if !(0.0..=1.0).contains(&window_s) {
             return Err(ServerError::Value { key: "limits.reorder_window_s", reason: format!("is {window_s}, allowed is 0 to 1 s") });
         }
-        if !self.zenoh.name.is_empty() {
-            check_name("zenoh.name", &self.zenoh.name)
-                .map_err(|error| ServerError::Value { key: "zenoh.name", reason: error.to_string() })?;
+        Ok(())
+    }
+
+    /// Addresses that the server listens on itself, with their keys.
+    ///
+    /// # Errors
+    /// `ServerError::Value` as [`HttpConfig::health_address`].
+    pub fn addresses(&self) -> Result<Vec<(&'static str, SocketAddr)>, ServerError> {
+        let http = self.http.enabled.then_some(("http.listen", self.http.listen));
+        let health = self.http.health_address()?.map(|address| ("http.health", address));
+        let zenoh = self.zenoh.listen.iter().filter(|_| self.zenoh.enabled).filter_map(|endpoint| zenoh::socket(endpoint));
+        let zenoh = zenoh.map(|address| ("zenoh.listen", address));
+        Ok([("grpc.listen", self.grpc.listen)].into_iter().chain(http).chain(health).chain(zenoh).collect())
+    }
+
+    /// No two listeners may want the same port.
+    fn check_ports(&self) -> Result<(), ServerError> {
+        // All addresses of IPv6 are those of IPv4 too.
+        let covers = |a: IpAddr, b: IpAddr| a == b || (a.is_unspecified() && (a.is_ipv6() || b.is_ipv4()));
+        let addresses = self.addresses()?;
+        for (i, (key, address)) in addresses.iter().enumerate().filter(|(_, (_, address))| address.port() != 0) {
+            let same = |other: &SocketAddr| {
+                other.port() == address.port() && (covers(other.ip(), address.ip()) || covers(address.ip(), other.ip()))
+            };
+            if let Some((taken_by, _)) = addresses[..i].iter().find(|(_, other)| same(other)) {
+                let reason = format!("is {address}, whose port `{taken_by}` has already");
+                return Err(ServerError::Value { key: *key, reason });
+            }
         }
-        check_name("zenoh.fleet", &self.zenoh.fleet).map_err(|error| ServerError::Value { key: "zenoh.fleet", reason: error.to_string() })
+        Ok(())
     }
 
     /// Where clients have to say who they are, nothing else that knows no identities may be open to the network.
@@ -505,12 +466,8 @@ impl Config {
             let reason = "is open to the network and knows no identities; with `tls.client_ca` only loopback is allowed".into();
             return Err(ServerError::Value { key: "http.listen", reason });
         }
-        let inside = |endpoint: &String| {
-            let address = endpoint.split_once('/').map_or("", |(_, address)| address);
-            address.parse::<SocketAddr>().is_ok_and(|address| address.ip().is_loopback())
-        };
         if self.zenoh.enabled
-            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !inside(endpoint) && !is_tls_endpoint(endpoint))
+            && let Some(endpoint) = self.zenoh.listen.iter().find(|endpoint| !is_loopback_endpoint(endpoint) && !is_tls_endpoint(endpoint))
         {
             let reason = format!(
                 "`{endpoint}` is open to the network and knows no identities; with `tls.client_ca` listen on `tls/...`, or on loopback only \
@@ -572,6 +529,12 @@ mod tests {
                 "zenoh.listen",
             ),
             ("[http]\nhealth = \"everywhere\"\n", "http.health"),
+            ("[http]\nlisten = \"127.0.0.1:50051\"\n", "`grpc.listen` has already"),
+            ("[http]\nhealth = \"0.0.0.0:50080\"\n", "`http.listen` has already"),
+            ("[zenoh]\nlisten = [\"tcp/[::]:50051\"]\n", "zenoh.listen"),
+            ("[zenoh]\nlisten = [\"garbage\"]\n", "zenoh.listen"),
+            ("[zenoh]\nlisten = [\"tcp/0.0.0.0\"]\n", "zenoh.listen"),
+            ("[zenoh]\nconnect = [\"ftp/router:7447\"]\n", "zenoh.connect"),
             ("[diagnosis]\nlimit_s = 0.0\n", "diagnosis.limit_s"),
             ("[diagnosis]\nthreads = 0\n", "diagnosis.threads"),
             ("[diagnosis]\nat_once = 5000\n", "diagnosis.at_once"),

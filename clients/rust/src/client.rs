@@ -142,7 +142,7 @@ impl Client {
         Ok(self.sessions().get(v1::GetSessionRequest { session_id: session.into() }).await?.into_inner())
     }
 
-    /// Lists the open sessions.
+    /// Lists the open sessions of the server that answers: of servers that share sessions each lists those that it owns.
     pub async fn list_sessions(&mut self) -> Result<Vec<v1::Session>, ClientError> {
         Ok(self.sessions().list(v1::ListSessionsRequest {}).await?.into_inner().sessions)
     }
@@ -215,7 +215,7 @@ impl Client {
         Ok(self.terrain().get(v1::GetMapRequest { map_id: map.into() }).await?.into_inner())
     }
 
-    /// Lists the maps.
+    /// Lists the maps of the server that answers: of servers that share sessions each lists those that it holds.
     pub async fn list_maps(&mut self) -> Result<Vec<v1::MapDescription>, ClientError> {
         Ok(self.terrain().list(v1::ListMapsRequest {}).await?.into_inner().maps)
     }

@@ -94,8 +94,22 @@ impl From<tonic::Status> for ClientError {
             (false, true) => tonic::Code::Unavailable,
             (false, false) => status.code(),
         };
-        Self::Refused { code, field, message: status.message().into(), retry_after }
+        Self::Refused { code, field, message: with_causes(&status), retry_after }
     }
+}
+
+/// What a status says and, where the transport failed, what that came from: a certificate that was refused, for instance.
+fn with_causes(status: &tonic::Status) -> String {
+    let mut text = status.message().to_string();
+    let mut cause = status.source();
+    while let Some(error) = cause {
+        let said = error.to_string();
+        if !text.contains(&said) {
+            text = format!("{text}: {said}");
+        }
+        cause = error.source();
+    }
+    text
 }
 
 #[cfg(test)]
@@ -117,5 +131,17 @@ mod tests {
         assert_eq!(broken.code(), tonic::Code::Unknown);
         assert_eq!(ClientError::from(broken).code(), Some(tonic::Code::Unavailable));
         assert_eq!(ClientError::from(tonic::Status::unknown("said by the service")).code(), Some(tonic::Code::Unknown));
+    }
+
+    #[test]
+    fn regress_a_refused_certificate_is_told() {
+        #[derive(Debug, thiserror::Error)]
+        #[error("transport error")]
+        struct Transport {
+            source: std::io::Error,
+        }
+        let error = Transport { source: std::io::Error::other("received fatal alert: CertificateRequired") };
+        let told = ClientError::from(tonic::Status::from_error(Box::new(error))).to_string();
+        assert!(told.ends_with("transport error: received fatal alert: CertificateRequired"), "{told}");
     }
 }

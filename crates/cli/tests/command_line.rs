@@ -485,12 +485,54 @@ fn service_a_configuration_is_checked_without_serving() {
     let text = stdout(&output);
     assert_eq!(output.status.code(), Some(0), "{text}{}", stderr(&output));
     assert!(text.contains("no TLS") && text.contains("durable") && text.ends_with("sound\n"), "{text}");
-    assert!(!here.path().join("durable").exists(), "a check makes nothing");
+    assert_eq!(std::fs::read_dir(here.path()).unwrap().count(), 0, "a check makes nothing");
+    for (options, part) in [
+        (&["--http", "0.0.0.0:50080"][..], "http   0.0.0.0:50080, no TLS: everybody on the way reads"),
+        (&["--zenoh-connect", "tcp/router:7447"], "zenoh  tcp/router:7447, no TLS: everybody on the way feeds"),
+        (&[], "zenoh  tcp/127.0.0.1:7447, no TLS: whoever has an account on this machine feeds"),
+        (&["--no-zenoh"], "zenoh  off"),
+    ] {
+        let text = stdout(&nesam(&[&["serve", "--check"][..], options].concat(), here.path()));
+        assert!(text.contains(part) && text.ends_with("sound\n"), "{options:?}: {text}");
+    }
+    let asked = |value: &str| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_nesam"));
+        stderr(&command.args(["serve", "--check"]).env("RUST_LOG", value).current_dir(here.path()).output().unwrap())
+    };
+    assert!(asked("nesam=loud").contains("RUST_LOG=nesam=loud") && !asked("nesam=warn").contains("RUST_LOG"));
+    assert!(stdout(&nesam(&["serve", "--help"], here.path())).contains("RUST_LOG"));
+    // What cannot start.
+    std::fs::write(here.path().join("file"), "").unwrap();
+    for (options, words) in [
+        (["--zenoh-listen", "garbage"], ["zenoh.listen", "garbage"]),
+        (["--store", "file"], ["store.directory", "file"]),
+        (["--store", "file/below"], ["store.directory", "file/below"]),
+        (["--record", "file"], ["recording.directory", "file"]),
+        (["--http", "127.0.0.1:50051"], ["http.listen", "grpc.listen"]),
+        (["--grpc", "192.0.2.1:50051"], ["grpc.listen", "192.0.2.1"]),
+    ] {
+        refused(&[&["serve", "--check"][..], &options].concat(), here.path(), &words);
+    }
+    std::fs::write(here.path().join("store.toml"), "[store]\nenabled = true\ndirectory = \"file\"\n").unwrap();
+    let check = nesam(&["check", "store.toml"], here.path());
+    assert!(check.status.code() == Some(2) && stdout(&check).contains("store.directory"), "{}", stdout(&check));
     std::fs::write(here.path().join("half.toml"), "[tls]\ncertificate = \"server.pem\"\n").unwrap();
     refused(&["serve", "--check", "--config", "half.toml"], here.path(), &["tls.certificate", "tls.key"]);
     std::fs::write(here.path().join("absent.toml"), "[tls]\ncertificate = \"server.pem\"\nkey = \"server.key\"\n").unwrap();
     refused(&["serve", "--check", "--config", "absent.toml"], here.path(), &["tls.certificate", "server.pem"]);
     refused(&["serve", "--check", "--config", "nowhere.toml"], here.path(), &["nowhere.toml"]);
+}
+
+/// Goal: a connection that fails says why. Method: a port that nobody has any more.
+#[test]
+fn service_effects_say_why_a_server_is_not_reached() {
+    let here = tempfile::tempdir().unwrap();
+    let silent = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = format!("http://{}", silent.local_addr().unwrap());
+    drop(silent);
+    let output = nesam(&["effects", "list", "--server", &address], here.path());
+    let said = stderr(&output);
+    assert!(output.status.code() == Some(1) && said.contains("cannot reach") && said.to_lowercase().contains("refused"), "{said}");
 }
 
 /// The bundle itself in the place of one with effects: the same laps, so what differs in other laps is the effects.

@@ -43,6 +43,18 @@ fn service_rules_and_dashboard_name_metrics_that_exist() {
     }
 }
 
+/// Goal: relative paths, such as that of diagnoses, are where the sandboxed service may write. Method: its folder is its state directory, and that of its store.
+#[test]
+fn regress_the_unit_runs_in_the_folder_that_it_may_write() {
+    let unit = std::fs::read_to_string(common::repository().join("deploy/systemd/nesam.service")).unwrap();
+    let value = |key: &str| unit.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix('=')).unwrap();
+    let state = format!("/var/lib/{}", value("StateDirectory"));
+    assert_eq!(value("WorkingDirectory"), state);
+    for command in ["ExecStartPre", "ExecStart"] {
+        assert!(value(command).ends_with(&format!("--store {state}")), "{command}");
+    }
+}
+
 /// Three workers over the processors that this process may use: each stays on one, and none has more than its share.
 #[test]
 #[cfg(target_os = "linux")]

@@ -172,11 +172,12 @@ pub(crate) fn outside_card(vehicle: &Vehicle, control: &Control<f64>) -> Option<
 /// `EngineError::Invalid` naming `field`.
 pub fn check_name(field: &str, name: &str) -> Result<(), EngineError> {
     let allowed = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
-    if name.is_empty() || name.len() > NAME_LENGTH_MAX || !name.chars().all(allowed) {
-        let reason = format!("must be 1 to {NAME_LENGTH_MAX} of A-Z a-z 0-9 _ . - and is {} bytes long", name.len());
-        return Err(EngineError::invalid(field, reason));
-    }
-    Ok(())
+    let wrong = match name.chars().find(|c| !allowed(*c)) {
+        Some(other) => format!("has {other:?}"),
+        None if name.is_empty() || name.len() > NAME_LENGTH_MAX => format!("is {} characters long", name.len()),
+        None => return Ok(()),
+    };
+    Err(EngineError::invalid(field, format!("must be 1 to {NAME_LENGTH_MAX} of A-Z a-z 0-9 _ . - and {wrong}")))
 }
 
 #[cfg(test)]
@@ -199,6 +200,10 @@ mod tests {
         assert!(check_name("a", "truck_1.x-y").is_ok() && check_name("a", &"x".repeat(64)).is_ok());
         for name in ["", "a/b", "a b", "*", "é", &"x".repeat(65)] {
             assert!(check_name("a", name).is_err(), "{name}");
+        }
+        for (name, wrong) in [("a/b*", "has '/'"), ("", "is 0 characters long"), ("x".repeat(65).as_str(), "is 65 characters long")] {
+            let told = check_name("a", name).unwrap_err().to_string();
+            assert!(told.ends_with(wrong), "{told}");
         }
     }
 }

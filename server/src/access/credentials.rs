@@ -7,10 +7,11 @@ use std::time::Duration;
 use tokio::sync::watch;
 use tokio_rustls::rustls::crypto::ring;
 use tokio_rustls::rustls::pki_types::pem::PemObject as _;
-use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer};
+use tokio_rustls::rustls::pki_types::{CertificateDer, PrivateKeyDer, UnixTime};
 use tokio_rustls::rustls::server::WebPkiClientVerifier;
 use tokio_rustls::rustls::{Error, RootCertStore, ServerConfig};
 
+use super::certificate;
 use super::fleet_file::FleetFile;
 use crate::config::TlsConfig;
 use crate::error::ServerError;
@@ -30,6 +31,8 @@ struct Files {
 pub struct Credentials {
     config: TlsConfig,
     files: Files,
+    /// When the certificate expires, s since 1970.
+    expires_s: u64,
     tls: watch::Sender<Arc<ServerConfig>>,
     /// `None` = clients show no certificates.
     rights: Option<watch::Sender<Arc<FleetFile>>>,
@@ -43,11 +46,12 @@ impl Credentials {
     pub fn read(config: &TlsConfig) -> Result<Self, ServerError> {
         let files = Files::read(config)?;
         let tls = watch::channel(Arc::new(files.server_config()?)).0;
+        let expires_s = files.expiry_s(&config.certificate)?;
         let rights = match config.restricts() {
             true => Some(watch::channel(Arc::new(files.rights(&config.fleet)?)).0),
             false => None,
         };
-        Ok(Self { config: config.clone(), files, tls, rights })
+        Ok(Self { config: config.clone(), files, expires_s, tls, rights })
     }
 
     /// The configuration that new connections get.
@@ -70,16 +74,34 @@ impl Credentials {
             return Ok(false);
         }
         let tls = files.server_config()?;
+        // One that expired while it was in force is no reason to keep rights that were withdrawn.
+        let expires_s = match files.certificate == self.files.certificate {
+            true => self.expires_s,
+            false => files.expiry_s(&self.config.certificate)?,
+        };
         if let Some(rights) = &self.rights {
             rights.send_replace(Arc::new(files.rights(&self.config.fleet)?));
         }
         self.tls.send_replace(Arc::new(tls));
-        self.files = files;
+        (self.files, self.expires_s) = (files, expires_s);
         Ok(true)
+    }
+
+    /// What is readable and may be a mistake.
+    pub fn doubts(&self) -> Vec<String> {
+        let of_rights = self.rights.as_ref().map_or_else(Vec::new, |rights| rights.borrow().doubts());
+        self.files.foreign_certificate().into_iter().chain(of_rights).collect()
+    }
+
+    /// Says what is in force: when the certificate expires as a metric, what may be a mistake in the log.
+    fn in_force(&self, metrics: &Metrics) {
+        metrics.certificate_expires(self.expires_s);
+        self.doubts().iter().for_each(|doubt| tracing::warn!(target: "nesam::audit", doubt, "certificates or rights may be wrong"));
     }
 
     /// Follows the files until the server stops. What cannot be used is logged once and counted, and changes nothing.
     pub async fn follow(mut self, metrics: Arc<Metrics>, stopping: watch::Receiver<bool>) {
+        self.in_force(&metrics);
         let stop = stopped(stopping);
         tokio::pin!(stop);
         let mut tick = tokio::time::interval(Duration::from_secs_f64(self.config.reload_s));
@@ -103,6 +125,7 @@ impl Credentials {
                     said.clear();
                     metrics.reloaded(true);
                     tracing::info!(target: "nesam::audit", "certificates and rights were read anew");
+                    self.in_force(&metrics);
                 }
                 Err(error) if error.to_string() == said => {}
                 Err(error) => {
@@ -145,17 +168,38 @@ impl Files {
         let builder = if self.client_ca.is_empty() {
             builder.with_no_client_auth()
         } else {
-            let mut roots = RootCertStore::empty();
-            for certificate in certificates("tls.client_ca", &self.client_ca)? {
-                roots.add(certificate).map_err(|error| unusable("tls.client_ca", error.to_string()))?;
-            }
-            let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider).build();
+            let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(self.authorities()?), provider).build();
             builder.with_client_cert_verifier(verifier.map_err(|error| unusable("tls.client_ca", error.to_string()))?)
         };
         let key = PrivateKeyDer::from_pem_slice(&self.key).map_err(|_| unusable("tls.key", "the file holds no private key in PEM"))?;
         let mut config = builder.with_single_cert(certificates("tls.certificate", &self.certificate)?, key).map_err(failed)?;
         config.alpn_protocols.push(b"h2".to_vec());
         Ok(config)
+    }
+
+    /// The authorities of the clients' certificates.
+    fn authorities(&self) -> Result<RootCertStore, ServerError> {
+        let mut roots = RootCertStore::empty();
+        for certificate in certificates("tls.client_ca", &self.client_ca)? {
+            roots.add(certificate).map_err(|error| unusable("tls.client_ca", error.to_string()))?;
+        }
+        Ok(roots)
+    }
+
+    /// When the certificate expires, s since 1970; an error where no client would accept it.
+    fn expiry_s(&self, path: &Path) -> Result<u64, ServerError> {
+        let chain = certificates("tls.certificate", &self.certificate)?;
+        certificate::expiry_s(&chain[0], UnixTime::now())
+            .map_err(|reason| unusable("tls.certificate", format!("the certificate in {} {reason}", path.display())))
+    }
+
+    /// Why members of the fleet may not accept the certificate, where it is of another authority than theirs.
+    fn foreign_certificate(&self) -> Option<String> {
+        let (chain, authorities) = (certificates("tls.certificate", &self.certificate).ok()?, self.authorities().ok()?);
+        let error = certificate::verify(&chain[0], &chain[1..], &authorities.roots, UnixTime::now()).err()?;
+        Some(format!(
+            "no authority in `tls.client_ca` has signed the certificate in `tls.certificate`: who trusts them alone refuses this server ({error})"
+        ))
     }
 
     fn rights(&self, path: &Path) -> Result<FleetFile, ServerError> {

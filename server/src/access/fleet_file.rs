@@ -67,12 +67,17 @@ impl FleetFile {
         for name in names {
             check_name("name", name).map_err(|error| format!("`{name}`: {error}"))?;
         }
-        for (planner, entry) in &self.planners {
-            if let Some(unknown) = entry.vehicles.iter().find(|v| *v != ALL && !self.vehicles.contains_key(*v)) {
-                return Err(format!("planner `{planner}` has vehicle `{unknown}`, which is not in the file"));
-            }
-        }
         Ok(())
+    }
+
+    /// What is readable and may be a mistake: vehicles of planners that are not in the file, after a vehicle was revoked or for want of a letter.
+    pub fn doubts(&self) -> Vec<String> {
+        let unknown = |vehicle: &&String| *vehicle != ALL && !self.vehicles.contains_key(*vehicle);
+        let of_planner = |(planner, entry): (&String, &PlannerEntry)| {
+            let unknown: Vec<&str> = entry.vehicles.iter().filter(unknown).map(String::as_str).collect();
+            (!unknown.is_empty()).then(|| format!("planner `{planner}` has vehicles that are not in the file: {}", unknown.join(", ")))
+        };
+        self.planners.iter().filter_map(of_planner).collect()
     }
 
     /// Whether the identity is in the file.
@@ -185,10 +190,20 @@ maps = ["quarry"]
         assert!(!file.knows(&Identity::Operator("truck-7".into())) && !file.may_read(&Identity::Operator("x".into()), "truck-7"));
     }
 
+    /// A vehicle is revoked by its own line alone, although planners still name it.
+    #[test]
+    fn regress_a_revoked_vehicle_that_a_planner_names_has_no_rights() {
+        let file = FleetFile::parse(&FILE.replace("[vehicles.truck-7]\nmaps = [\"truck-7-local\"]\n", "")).unwrap();
+        let seven = Identity::Vehicle("truck-7".into());
+        assert!(!file.knows(&seven) && !file.may_read(&seven, "truck-7") && !file.may_change(&seven, "truck-7"));
+        assert_eq!(file.doubts(), ["planner `mission` has vehicles that are not in the file: truck-7"]);
+        assert!(FleetFile::parse(FILE).unwrap().doubts().is_empty(), "`*` and known vehicles are no mistake");
+    }
+
     #[test]
     fn regress_wrong_files_are_refused_with_the_entry() {
         for (text, part) in [
-            ("[planners.p]\nvehicles = [\"ghost\"]", "ghost"),
+            ("[planners.p]\nvehicles = 3", "vehicles"),
             ("[vehicles.\"a/b\"]", "a/b"),
             ("operator = [\"x\"]", "operator"),
             ("[vehicles.a]\nmap = [\"m\"]", "map"),

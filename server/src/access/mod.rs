@@ -4,6 +4,7 @@
 //! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused is
 //! logged under the target `nesam::audit` with who asked for what. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
 
+mod certificate;
 mod credentials;
 mod directory;
 mod fleet_file;

@@ -40,6 +40,8 @@ pub struct Metrics {
     requests: Pairs,
     /// Changes of certificates and rights that were not usable, and that were.
     reloads: [AtomicU64; 2],
+    /// When the certificate of the server expires, s since 1970; 0 = it has none.
+    certificate_expires_s: AtomicU64,
     events: Mutex<BTreeMap<&'static str, u64>>,
     alarms: AlarmCounts,
     queue: Histogram,
@@ -95,6 +97,11 @@ impl Metrics {
         self.reloads[usize::from(usable)].fetch_add(1, Ordering::Relaxed);
     }
 
+    /// Notes when the certificate that is in force expires, s since 1970.
+    pub fn certificate_expires(&self, at_s: u64) {
+        self.certificate_expires_s.store(at_s, Ordering::Relaxed);
+    }
+
     /// Counts something that happened to a session.
     pub fn event(&self, event: &Event) {
         if let Ok(mut events) = self.events.lock() {
@@ -141,6 +148,15 @@ impl Metrics {
         for (result, count) in ["failed", "ok"].iter().zip(&self.reloads) {
             let _ = writeln!(out, "{name}{{result=\"{result}\"}} {}", count.load(Ordering::Relaxed));
         }
+        let name = "nesam_certificate_expires_seconds";
+        let _ = writeln!(
+            out,
+            "# HELP {name} When the certificate of the server expires, since 1970; without TLS there is none.\n# TYPE {name} gauge"
+        );
+        let expires_s = self.certificate_expires_s.load(Ordering::Relaxed);
+        if expires_s > 0 {
+            let _ = writeln!(out, "{name} {expires_s}");
+        }
         self.alarms.render(&mut out);
         self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
         self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
@@ -170,6 +186,8 @@ mod tests {
         metrics.measurement(Transport::Zenoh, "applied");
         metrics.event(&Event::MapChanged { map: "m".into() });
         metrics.reloaded(false);
+        assert!(!metrics.render(0, 0).contains("nesam_certificate_expires_seconds 0"), "no certificate");
+        metrics.certificate_expires(1_800_000_000);
         let text = metrics.render(3, 4);
         for line in [
             "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
@@ -183,6 +201,7 @@ mod tests {
             "nesam_credentials_reloads_total{result=\"failed\"} 1",
             "nesam_credentials_reloads_total{result=\"ok\"} 0",
             "nesam_alarms_total{kind=\"sensor_jump\"} 0",
+            "nesam_certificate_expires_seconds 1800000000",
             "nesam_alarms_active 0",
             "nesam_waiting_predictions 4",
         ] {

@@ -28,8 +28,9 @@ async fn service_rights_and_certificates_change_without_a_restart() {
         watches.push((soil, client.clone().watch_alarms(session).await.unwrap()));
     }
 
-    // Taken out of the fleet file: the next request on an open connection is refused; nobody else notices.
-    stage.replace("fleet.toml", FLEET.replace("[vehicles.other]\n", "").as_bytes());
+    // Taken out of the fleet file, in which a planner still names it: the next request on an open connection is refused; nobody else notices.
+    let revoked = FLEET.replace("[vehicles.other]\n", "").replace("vehicles = [\"truck\"]", "vehicles = [\"truck\", \"other\"]");
+    stage.replace("fleet.toml", revoked.as_bytes());
     eventually(NOTICED, "revoked", || async {
         other.clone().list_sessions().await.is_err_and(|error| error.code() == Some(Code::PermissionDenied))
     })
@@ -48,6 +49,20 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     })
     .await;
     stage.client("nesam:vehicle:truck").await.list_sessions().await.unwrap();
+
+    // Nor does a certificate that has expired, which nobody would accept.
+    let expires =
+        || stage.server.metrics().render(0, 0).lines().find(|line| line.starts_with("nesam_certificate_expires")).map(str::to_string);
+    let expires_before = expires();
+    let (certificate, key) = stage.authority.sign(&[dns("localhost"), uri("nesam:server:alpha")], true);
+    stage.replace("server.pem", &certificate);
+    stage.replace("server.key", &key);
+    eventually(NOTICED, "expired", || async {
+        stage.server.metrics().render(0, 0).contains("nesam_credentials_reloads_total{result=\"failed\"} 2")
+    })
+    .await;
+    stage.client("nesam:vehicle:truck").await.list_sessions().await.unwrap();
+    assert!(expires_before.is_some() && expires() == expires_before, "{expires_before:?}, {:?}", expires());
 
     // A certificate and an authority that have nothing to do with those before.
     let successor = Authority::new();

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use nesam_client::{Client, ClientError, Tls, outcome_label, v1};
-use nesam_server::{Config, serve};
+use nesam_server::{Config, access, serve};
 use prost::bytes::Bytes;
 use rcgen::SanType;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -212,10 +212,16 @@ async fn service_bad_security_files_are_told_at_the_start() {
     write("server.pem", &certificate);
     write("server.key", &key);
     write("other.key", &authority.sign(&[dns("localhost")], false).1);
+    for (name, names, expired) in [("expired", [dns("localhost")], true), ("vehicle", [uri("nesam:vehicle:truck")], false)] {
+        let (certificate, key) = authority.sign(&names, expired);
+        write(&format!("{name}.pem"), &certificate);
+        write(&format!("{name}.key"), &key);
+    }
     write("ca.pem", authority.pem.as_bytes());
+    write("foreign.pem", Authority::new().pem.as_bytes());
     write("fleet.toml", crate::authority::FLEET.as_bytes());
     write("text", b"not PEM");
-    write("ghost.toml", b"[planners.p]\nvehicles = [\"ghost\"]");
+    write("king.toml", b"kings = [\"ghost\"]");
     let at = |name: &str| if name.is_empty() { Default::default() } else { files.path().join(name) };
     let started = |certificate: &str, key: &str, client_ca: &str, fleet: &str| {
         let mut config = Config::ephemeral();
@@ -230,8 +236,10 @@ async fn service_bad_security_files_are_told_at_the_start() {
         (["text", "server.key", "", ""], "tls"),
         (["server.pem", "text", "", ""], "tls"),
         (["server.pem", "other.key", "", ""], "does not belong"),
+        (["expired.pem", "expired.key", "", ""], "days ago"),
+        (["vehicle.pem", "vehicle.key", "", ""], "vehicle `truck`, not of a server"),
         (["server.pem", "server.key", "ca.pem", ""], "tls.fleet"),
-        (["server.pem", "server.key", "ca.pem", "ghost.toml"], "ghost"),
+        (["server.pem", "server.key", "ca.pem", "king.toml"], "kings"),
         (["server.pem", "server.key", "ca.pem", "absent"], "tls.fleet"),
         (["server.pem", "server.key", "text", "fleet.toml"], "tls"),
     ] {
@@ -239,6 +247,14 @@ async fn service_bad_security_files_are_told_at_the_start() {
         let message = started(certificate, key, client_ca, fleet).await.expect_err(part).to_string();
         assert!(message.contains(part), "{files:?}: {message}");
         assert!(!message.contains("BEGIN") && !message.contains("not PEM"), "no content of a file: {message}");
+    }
+    // A certificate of another authority than the clients' may be meant so.
+    for (client_ca, doubts) in [("ca.pem", 0), ("foreign.pem", 1)] {
+        let mut config = Config::ephemeral();
+        (config.tls.certificate, config.tls.key) = (at("server.pem"), at("server.key"));
+        (config.tls.client_ca, config.tls.fleet) = (at(client_ca), at("fleet.toml"));
+        let (credentials, _) = access::load(&config.tls).unwrap();
+        assert_eq!(credentials.unwrap().doubts().len(), doubts, "{client_ca}");
     }
     // TLS without client certificates: the way is private, everybody may do everything.
     let server = started("server.pem", "server.key", "", "").await.unwrap();

@@ -119,8 +119,9 @@ fn bundle(path: &Path, findings: &mut Findings) {
 }
 
 fn configuration(path: &Path, findings: &mut Findings) {
-    if let Err(text) = super::serve::check_configuration(path) {
-        findings.error(text);
+    match super::serve::check_configuration(path) {
+        Ok(doubts) => findings.doubts.extend(doubts),
+        Err(failure) => findings.error(failure.to_string()),
     }
 }
 

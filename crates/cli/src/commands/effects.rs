@@ -9,7 +9,7 @@ use nesam_client::{Client, ClientError, Tls, v1};
 use nesam_model::ModelBundle;
 use nesam_physics::effects::Effect;
 
-use crate::failure::{Failure, OrFail};
+use crate::failure::{Failure, OrFail, chain};
 use crate::output::say;
 
 /// Options of `nesam effects`.
@@ -33,7 +33,7 @@ enum OnSession {
     Apply(ApplyArgs),
     /// Take the applied effects away; the soil begins again from its prior
     Revert(ServerArgs),
-    /// Say which effects act in the sessions of a server, and which alarms are active
+    /// Say which effects act in the sessions that a server has, and which alarms are active; of servers that share sessions each lists its own
     List(ServerArgs),
 }
 
@@ -106,7 +106,7 @@ async fn connect(args: &ServerArgs) -> Result<Client, Failure> {
 }
 
 fn refused(error: ClientError) -> Failure {
-    if error.code().is_some() { Failure::Input(error.to_string()) } else { Failure::Failed(error.to_string()) }
+    if error.code().is_some() { Failure::Input(error.to_string()) } else { Failure::Failed(chain(&error)) }
 }
 
 /// Where the effects come from, and the effects.

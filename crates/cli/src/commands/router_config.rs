@@ -7,7 +7,7 @@ use nesam_server::access::FleetFile;
 use nesam_server::{LinkFiles, is_tls_endpoint, router_config};
 
 use crate::failure::{Failure, OrFail};
-use crate::output::say;
+use crate::output::{note, say};
 
 /// Options of `nesam router-config`. Paths of certificates are written as they are given: the router reads them.
 #[derive(Args, Debug)]
@@ -42,6 +42,7 @@ pub fn run(args: &RouterConfigArgs) -> Result<(), Failure> {
     let named = |reason: &dyn std::fmt::Display| Failure::input(format!("{}: {reason}", args.members.display()));
     let text = std::fs::read_to_string(&args.members).map_err(|error| named(&error))?;
     let members = FleetFile::parse(&text).map_err(|reason| named(&reason))?;
+    members.doubts().iter().for_each(|doubt| note!("{}: {doubt}", args.members.display()));
     nesam_engine::check_name("fleet", &args.fleet).or_input()?;
     if let Some(open) = args.listen.iter().find(|endpoint| !is_tls_endpoint(endpoint)) {
         return Err(Failure::input(format!("--listen {open}: only tls/... shows who connects")));

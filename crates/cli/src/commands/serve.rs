@@ -1,21 +1,24 @@
 //! `nesam serve`: the service until interrupted.
 
+mod checked;
+
 use std::io::IsTerminal;
 use std::net::SocketAddr;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
 use clap::Args;
 use nesam_model::{ModelBundle, Predictor};
-use nesam_server::{Config, RunningServer, ZenohConfig, access, outlive_file_limit, second_interrupt, serve, start_workers, termination};
+use nesam_server::{Config, RunningServer, ZenohConfig, outlive_file_limit, second_interrupt, serve, start_workers, termination};
 use tracing_subscriber::EnvFilter;
 
+pub use self::checked::check_configuration;
 use crate::args::BundleArgs;
 use crate::bundle_path::bundle_dir;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
-use crate::output::say;
+use crate::output::{note, say};
 use crate::sources::{load_bundle, rounded};
 
 /// Time that tasks get to end once the server has stopped.
@@ -23,6 +26,10 @@ const LEFT_BEHIND_AFTER: Duration = Duration::from_millis(200);
 
 /// Options of `nesam serve`. They override the configuration file, which overrides the defaults.
 #[derive(Args, Debug)]
+#[command(
+    after_help = "Environment:\n  RUST_LOG  What is logged on standard error: a level (error, warn, info, debug), or one for each\n            \
+                        part of the program, as in info,zenoh=warn (the default) or warn,nesam_server=debug. The target nesam::audit is who was refused what."
+)]
 pub struct ServeArgs {
     #[command(flatten)]
     bundle: BundleArgs,
@@ -72,7 +79,8 @@ pub struct ServeArgs {
     /// Round the network's products in rollouts to bf16, for processors with AMX or AVX-512 BF16; sums, physics and the soil filter stay in f32
     #[arg(long)]
     bf16: bool,
-    /// Check configuration, certificates, fleet file and bundle, say what is wrong, and serve nothing
+    /// Check configuration, certificates, fleet file, folders, addresses and bundle, say what is wrong and to whom the service would be open, and serve
+    /// nothing
     #[arg(long)]
     check: bool,
 }
@@ -88,7 +96,7 @@ pub fn run(args: &ServeArgs) -> Result<(), Failure> {
         config.diagnosis.bundle = std::path::absolute(&served).or_failed()?;
     }
     if args.check {
-        return checked(&config, bundle);
+        return checked::checked(&config, bundle);
     }
     start_workers(&config.workers).or_failed()?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
@@ -221,41 +229,23 @@ fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     }
 }
 
-/// Structured logs on standard error; `RUST_LOG` changes what is shown. A line that standard error does not take is lost: the subscriber would print of its own
-/// failure there, and panic in the call that logged.
+/// Structured logs on standard error; `RUST_LOG` changes what is shown, and a value that is not understood is told and changes nothing. A line that standard
+/// error does not take is lost: the subscriber would print of its own failure there, and panic in the call that logged.
 pub fn log_to_stderr(default: &str) {
-    let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(format!("{default},zenoh=warn")));
+    let usual = format!("{default},zenoh=warn");
+    let asked = std::env::var("RUST_LOG").ok().filter(|text| !text.is_empty());
+    let filter = asked.and_then(|text| match EnvFilter::try_new(&text) {
+        Ok(filter) => Some(filter),
+        Err(error) => {
+            note!("RUST_LOG={text}: {error}; `{usual}` is logged");
+            None
+        }
+    });
+    let filter = filter.unwrap_or_else(|| EnvFilter::new(&usual));
     let _ = tracing_subscriber::fmt()
         .with_env_filter(filter)
         .log_internal_errors(false)
         .with_writer(std::io::stderr)
         .with_ansi(std::io::stderr().is_terminal())
         .try_init();
-}
-
-/// Says what would be served. Ports are not tried, and a store is not opened: it may be in use by the server that this configuration is meant for.
-fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
-    let (tls, access) = access::load(&config.tls).or_input()?;
-    say!("bundle {} {}", bundle.name, bundle.hash);
-    let predictor = rounded(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?), config.workers.bf16, "workers.bf16")?;
-    say!("path   {}", predictor.path().as_str());
-    say!(
-        "grpc   {}, {}",
-        config.grpc.listen,
-        match (tls.is_some(), access.is_restricted()) {
-            (false, _) => "no TLS: everybody on the way reads and changes everything",
-            (true, false) => "TLS; whoever reaches the port may do everything",
-            (true, true) => "mutual TLS; clients have the rights of the fleet file",
-        }
-    );
-    say!("store  {}", kept(config));
-    fleet_soil(config).iter().for_each(|soil| say!("soil   {soil}"));
-    say!("sound");
-    Ok(())
-}
-
-/// Reads a configuration file and the files that it names, and says what is wrong with them.
-pub fn check_configuration(path: &Path) -> Result<(), String> {
-    let config = Config::load(path).map_err(|e| crate::failure::chain(&e))?;
-    access::load(&config.tls).map(|_| ()).map_err(|e| crate::failure::chain(&e))
 }
