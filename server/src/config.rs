@@ -148,6 +148,8 @@ pub struct RecordingConfig {
 pub struct LimitsConfig {
     /// Open sessions.
     pub sessions_max: usize,
+    /// Open sessions of one vehicle.
+    pub sessions_per_vehicle_max: usize,
     /// Candidate sequences of one prediction.
     pub samples_max: usize,
     /// Steps of one prediction, at most 32.
@@ -254,6 +256,7 @@ impl Default for LimitsConfig {
         let l = Limits::default();
         Self {
             sessions_max: l.sessions_max,
+            sessions_per_vehicle_max: l.sessions_per_vehicle_max,
             samples_max: l.samples_max,
             horizon_max: l.horizon_max,
             sample_steps_max: l.sample_steps_max,
@@ -283,6 +286,7 @@ impl From<&LimitsConfig> for Limits {
     fn from(c: &LimitsConfig) -> Self {
         Self {
             sessions_max: c.sessions_max,
+            sessions_per_vehicle_max: c.sessions_per_vehicle_max,
             samples_max: c.samples_max,
             horizon_max: c.horizon_max,
             sample_steps_max: c.sample_steps_max,
@@ -384,6 +388,7 @@ impl Config {
             ("grpc.streams_per_connection_max", self.grpc.streams_per_connection_max as usize),
             ("http.watchers_max", self.http.watchers_max),
             ("limits.sessions_max", self.limits.sessions_max),
+            ("limits.sessions_per_vehicle_max", self.limits.sessions_per_vehicle_max),
             ("limits.samples_max", self.limits.samples_max),
             ("limits.horizon_max", self.limits.horizon_max),
             ("limits.sample_steps_max", self.limits.sample_steps_max),

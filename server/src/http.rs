@@ -10,6 +10,7 @@ use axum::routing::get;
 use axum::{Json, Router};
 use serde_json::json;
 
+use crate::access::Refusals;
 use crate::clock::MonotonicClock;
 use crate::cluster::{Cluster, ClusterCounts};
 use crate::grpc::Edge;
@@ -60,12 +61,15 @@ async fn metrics(State(state): State<HttpState>) -> Response {
         ] {
             text += &metric(&format!("nesam_recording_{name}_total"), "counter", help, value);
         }
+        let help = "1 when nothing is recorded any more: the disk failed or a limit is reached.";
+        text += &metric("nesam_recording_ended", "gauge", help, u8::from(counts.ended));
     }
     if let Some(keeper) = &state.edge.keeper {
         text += &store_metrics(&keeper.counts());
     }
+    text += &refusal_metrics(&state.edge.access.refusals);
     // A server that is alone owns whatever it has.
-    let alone = ClusterCounts { leased: true, ..Default::default() };
+    let alone = ClusterCounts { leased: true, held: state.edge.engine.metrics().sessions() as usize, ..Default::default() };
     text += &cluster_metrics(&state.edge.cluster.as_ref().map_or(alone, Cluster::counts));
     if let Some(presence) = &state.edge.presence {
         text += &metric("nesam_vehicles_alive", "gauge", "Vehicles whose Zenoh liveliness token is there.", presence.count());
@@ -84,6 +88,13 @@ fn store_metrics(counts: &StoreCounts) -> String {
     ]
     .map(|(name, kind, help, value)| metric(&format!("nesam_store_{name}"), kind, help, value))
     .concat()
+}
+
+/// Each from the start, so that the first one is an increase.
+fn refusal_metrics(refusals: &Refusals) -> String {
+    let name = "nesam_refusals_total";
+    let lines = refusals.counts().map(|(reason, count)| format!("{name}{{reason=\"{reason}\"}} {count}\n")).concat();
+    format!("# HELP {name} What was refused for want of a certificate, an identity or a right.\n# TYPE {name} counter\n{lines}")
 }
 
 /// One metric without labels, as Prometheus reads it.

@@ -1,5 +1,6 @@
 //! Connections of gRPC as they come, with TLS or without. Handshakes run beside one another, each with the certificates that are in force when it begins.
 
+use std::io::ErrorKind;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
@@ -15,6 +16,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt as _};
 use tonic::transport::server::TcpIncoming;
 
+use crate::access::{Refusal, Refusals};
 use crate::connection::{Closing, Connection};
 use crate::grpc::stopped;
 
@@ -28,10 +30,11 @@ pub(crate) fn accept(listener: TcpListener, closing: Closing) -> impl Stream<Ite
     Sockets::of(listener).map(move |socket| Ok(Connection::new(socket, &closing)))
 }
 
-/// Connections whose handshake has succeeded in the time that they have to begin; the others are closed.
+/// Connections whose handshake has succeeded in the time that they have to begin; the others are closed and counted.
 pub(crate) fn accept_tls(
     listener: TcpListener,
     tls: watch::Receiver<Arc<ServerConfig>>,
+    refusals: Refusals,
     closing: Closing,
 ) -> ReceiverStream<std::io::Result<Connection<TlsStream<TcpStream>>>> {
     let (sender, receiver) = mpsc::channel(WAITING);
@@ -46,13 +49,18 @@ pub(crate) fn accept_tls(
             };
             let Some(socket) = socket else { return };
             let acceptor = TlsAcceptor::from(tls.borrow().clone());
-            let (sender, closing) = (sender.clone(), closing.clone());
+            let (sender, refusals, closing) = (sender.clone(), refusals.clone(), closing.clone());
             tokio::spawn(async move {
-                match tokio::time::timeout(closing.begins_within, acceptor.accept(socket)).await {
-                    Ok(Ok(connection)) => drop(sender.send(Ok(Connection::new(connection, &closing))).await),
-                    Ok(Err(error)) => tracing::debug!(%error, "handshake failed"),
-                    Err(_) => tracing::debug!("handshake took too long"),
-                }
+                let peer = socket.peer_addr().map(|address| address.to_string()).unwrap_or_default();
+                let reason = match tokio::time::timeout(closing.begins_within, acceptor.accept(socket)).await {
+                    Ok(Ok(connection)) => return drop(sender.send(Ok(Connection::new(connection, &closing))).await),
+                    // A proxy that looks whether the port is open.
+                    Ok(Err(error)) if error.kind() == ErrorKind::UnexpectedEof => return,
+                    Ok(Err(error)) => error.to_string(),
+                    Err(_) => "it took too long".into(),
+                };
+                refusals.count(Refusal::Handshake);
+                tracing::info!(target: "nesam::audit", peer, reason, "refused: no handshake");
             });
         }
     });

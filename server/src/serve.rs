@@ -352,7 +352,7 @@ fn spawn_grpc(
     let Some(credentials) = credentials else {
         return tokio::spawn(ended(router.serve_with_incoming_shutdown(accept(listener, closing), stop)));
     };
-    let connections = accept_tls(listener, credentials.tls(), closing.clone());
+    let connections = accept_tls(listener, credentials.tls(), edge.access.refusals.clone(), closing.clone());
     tokio::spawn(credentials.follow(edge.engine.metrics().clone(), closing.stopping));
     tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stop)))
 }

@@ -30,12 +30,16 @@ fn serve(folder: &Path, more: &[&str]) -> (Child, String) {
 
 /// A short drive straight on.
 async fn drive(address: &str) {
+    drive_as("truck", address).await;
+}
+
+async fn drive_as(vehicle: &str, address: &str) {
     let mut client = Client::connect(address).await.unwrap();
-    client.open_session(v1::OpenSessionRequest { vehicle_id: "truck".into(), ..Default::default() }).await.unwrap();
+    client.open_session(v1::OpenSessionRequest { vehicle_id: vehicle.into(), ..Default::default() }).await.unwrap();
     let state = |i: i64| [0.2 * i as f64, 0.0, 0.6, 0.0, 0.02, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0];
-    let measurements = (0..20).map(|i| measurement("truck", i * 100_000_000, state(i), [2.0, 0.0])).collect();
+    let measurements = (0..20).map(|i| measurement(vehicle, i * 100_000_000, state(i), [2.0, 0.0])).collect();
     assert_eq!(client.feed(measurements).await.unwrap().len(), 20);
-    client.predict(Candidates::new("truck", 1, 4, vec![2.0, 0.1, 2.0, 0.1, 2.0, 0.1, 2.0, 0.1])).await.unwrap();
+    client.predict(Candidates::new(vehicle, 1, 4, vec![2.0, 0.1, 2.0, 0.1, 2.0, 0.1, 2.0, 0.1])).await.unwrap();
 }
 
 fn recording(folder: &Path) -> PathBuf {
@@ -83,6 +87,36 @@ async fn service_a_stopped_server_leaves_a_recording_that_replays() {
         let output = nesam(&args, here.path());
         assert_eq!(output.status.code(), Some(2), "{}", said(&output));
         assert!(said(&output).contains(words) && !said(&output).contains("panicked"), "{}", said(&output));
+    }
+}
+
+/// A server that is started again records into the same folder: all of it is replayed, and a diagnosis finds the run that has the session.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_recordings_of_one_folder_are_read_one_after_the_other() {
+    let here = tempfile::tempdir().unwrap();
+    for vehicle in ["truck", "other"] {
+        let (mut server, address) = serve(here.path(), &[]);
+        drive_as(vehicle, &address).await;
+        assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+        assert_eq!(server.wait().unwrap().code(), Some(0));
+    }
+    let output = nesam(&["replay", "run", "--json", "out.json"], here.path());
+    assert_eq!(output.status.code(), Some(0), "{}", said(&output));
+    let json: Value = serde_json::from_str(&std::fs::read_to_string(here.path().join("out.json")).unwrap()).unwrap();
+    assert_eq!((json["schema"].as_str(), json["all_equal"].as_bool()), (Some("nesam.replays/1"), Some(true)));
+    let runs = json["runs"].as_array().unwrap();
+    let measured: Vec<_> = runs.iter().map(|run| run["kinds"]["measure"]["equal"].as_u64()).collect();
+    assert_eq!(measured, [Some(20); 2], "{json}");
+
+    // Two seconds are too few for a diagnosis, of whichever run.
+    for (session, words) in
+        [("truck", vec!["is diagnosed", "no 4 s"]), ("other", vec!["is diagnosed", "no 4 s"]), ("nobody", vec!["not in it"])]
+    {
+        let output = nesam(&["diagnose", "--recording", "run", "--session", session], here.path());
+        let said = said(&output);
+        assert!(output.status.code() == Some(2) && words.iter().all(|word| said.contains(word)), "{session}: {said}");
+        let run = runs[usize::from(session == "other")]["run"].as_str().unwrap();
+        assert!(session == "nobody" || said.contains(&format!("note: {run} is diagnosed")), "{session}: {said}");
     }
 }
 

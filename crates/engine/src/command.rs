@@ -330,6 +330,8 @@ pub enum Event {
     MapChanged {
         /// Id of the map.
         map: String,
+        /// Maps that are held now.
+        held: usize,
     },
     /// A session was closed.
     SessionClosed {

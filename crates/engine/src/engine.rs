@@ -150,7 +150,7 @@ impl Engine {
             Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
-                self.emit(Event::MapChanged { map: map.id().into() });
+                self.emit(Event::MapChanged { map: map.id().into(), held: self.maps.count() });
                 Ok(Reply::Map(map.clone()))
             }
             Command::GetMap { map } => self.maps.get(map).cloned().map(Reply::Map),
@@ -176,7 +176,7 @@ impl Engine {
         if let Some(map) = map {
             self.maps.get(map)?;
         }
-        self.check_room("session_id", id)?;
+        self.check_room("session_id", id, &open.vehicle)?;
         let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
         if self.watches() {
             session.begin_watch();
@@ -218,13 +218,18 @@ impl Engine {
         self.sessions.values().any(|session| session.vehicle() == vehicle && session.brings())
     }
 
-    /// Whether one more session of this name may be open.
-    fn check_room(&self, field: &'static str, id: &str) -> Result<(), EngineError> {
+    /// Whether one more session of this name and this vehicle may be open.
+    fn check_room(&self, field: &'static str, id: &str, vehicle: &str) -> Result<(), EngineError> {
         if self.sessions.contains_key(id) {
             return Err(EngineError::SessionExists { session: id.into(), field });
         }
         if self.sessions.len() >= self.limits.sessions_max {
             let reason = format!("{} sessions are open, the limit; close one", self.sessions.len());
+            return Err(EngineError::Exhausted { field: field.into(), reason });
+        }
+        let own = self.sessions.values().filter(|session| session.vehicle() == vehicle).count();
+        if own >= self.limits.sessions_per_vehicle_max {
+            let reason = format!("{own} sessions of vehicle `{vehicle}` are open, the limit for one vehicle; close one");
             return Err(EngineError::Exhausted { field: field.into(), reason });
         }
         Ok(())
@@ -233,7 +238,7 @@ impl Engine {
     fn fork(&mut self, now_ns: u64, id: &str, copy: &str) -> Result<Reply, EngineError> {
         let session = self.session(id)?;
         check_name("new_session_id", copy)?;
-        self.check_room("new_session_id", copy)?;
+        self.check_room("new_session_id", copy, session.vehicle())?;
         let session = session.fork(copy, now_ns);
         Ok(self.insert(session))
     }
@@ -280,7 +285,7 @@ impl Engine {
                 return Err(EngineError::NotReady { field: "image".into(), reason });
             }
         }
-        self.check_room("session_id", id)?;
+        self.check_room("session_id", id, &image.vehicle)?;
         let rules = Rules { step_ns: self.step_ns, vehicle: &bundle.vehicle, limits: &self.limits };
         let acting = Acting::new(&self.predictor, &image.effects).map_err(|error| refused(error.to_string()))?;
         let mut session = Session::from_image(id, image, self.filter.clone(), acting, now_ns, rules)?;
@@ -429,6 +434,12 @@ impl Engine {
         })
     }
 
+    /// Nodes of terrain that have been encoded on the map of a session.
+    pub(crate) fn encoded_nodes(&self, session: &str) -> u64 {
+        let map = self.sessions.get(session).and_then(Session::map).and_then(|id| self.maps.get(id).ok());
+        map.map_or(0, |map| self.predictor.terrain_cache(map).encoded)
+    }
+
     fn fleet(&self) -> Result<&Fleet, EngineError> {
         self.fleet.as_ref().ok_or_else(|| EngineError::NotReady {
             field: "map_id".into(),
@@ -457,7 +468,7 @@ impl Engine {
         if let Some(fleet) = &mut self.fleet {
             fleet.forget_colours(id);
         }
-        self.emit(Event::MapChanged { map: id.into() });
+        self.emit(Event::MapChanged { map: id.into(), held: self.maps.count() });
         Ok(Reply::Done)
     }
 

@@ -78,11 +78,11 @@ pub enum EngineError {
         reason: String,
     },
     /// Too many commands wait, or so many that the deadline would pass.
-    #[error("overloaded: {waiting} {kind} wait; ask again in {:.0} ms or ask for less", *retry_after_ns as f64 * 1e-6)]
+    #[error("overloaded: {waiting} {kind} come first; ask again in {:.0} ms or ask for less", *retry_after_ns as f64 * 1e-6)]
     Overloaded {
-        /// What waits: predictions or commands.
+        /// What comes first: predictions or commands.
         kind: &'static str,
-        /// How many.
+        /// How many wait, with the prediction that is computed.
         waiting: usize,
         /// Pause after which there may be room, ns.
         retry_after_ns: u64,

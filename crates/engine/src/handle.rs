@@ -12,7 +12,7 @@ use crate::engine::Engine;
 use crate::error::EngineError;
 use crate::limits::Limits;
 use crate::queue::{Queue, Turn};
-use crate::service_time::work;
+use crate::service_time::{encoding_work, work};
 use crate::sync::thread::{self, JoinHandle};
 use crate::sync::{Mutex, mpsc};
 
@@ -246,15 +246,19 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap
 fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, tap: &mut Option<Tap>) -> bool {
     match turn {
         Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
-            answer(engine, submission, Ok(()), clock, tap, |_| ());
+            answer(engine, submission, Ok(()), clock, tap, |_, _| ());
         }),
         Turn::Prediction(mut submission) => {
             if let Command::Predict(query) = &mut submission.command {
                 // Of one that is asked wrongly fewer samples may be within the limits: it stays whole, to be refused for what is wrong with it.
                 let right = query.samples_min == 0 || query.check(engine.limits(), engine.vehicle()).is_ok();
                 let fits = if right { queue.fit(query, submission.deadline_ns, clock.now_ns()) } else { Ok(()) };
-                let work = work(query, query.samples);
-                answer(engine, *submission, fits, clock, tap, |took_ns| queue.done(work, took_ns, clock.now_ns()));
+                let (work, session) = (work(query, query.samples), query.session.clone());
+                let before = engine.encoded_nodes(&session);
+                answer(engine, *submission, fits, clock, tap, |engine, took_ns| {
+                    let encoded = engine.encoded_nodes(&session).saturating_sub(before);
+                    queue.done(work + encoding_work(encoded), took_ns, clock.now_ns());
+                });
             }
         }
         Turn::End => return false,
@@ -279,7 +283,7 @@ fn answer(
     fits: Result<(), EngineError>,
     clock: &dyn Clock,
     tap: &mut Option<Tap>,
-    done: impl FnOnce(Option<u64>),
+    done: impl FnOnce(&Engine, Option<u64>),
 ) {
     let Submission { command, deadline_ns, abandoned, reply, submitted_ns, share: _ } = submission;
     let now_ns = clock.now_ns();
@@ -293,7 +297,7 @@ fn answer(
     };
     let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
     let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil)).map(|_| result.clone());
-    done(result.is_ok().then_some(busy_ns));
+    done(engine, result.is_ok().then_some(busy_ns));
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {
         tap(Executed { now_ns, command, result, queued_ns, busy_ns });

@@ -29,6 +29,8 @@ const STATE_FIELDS: [&str; STATE_DIM] = [
 pub struct Limits {
     /// Open sessions.
     pub sessions_max: usize,
+    /// Open sessions of one vehicle.
+    pub sessions_per_vehicle_max: usize,
     /// Candidate sequences N of one prediction.
     pub samples_max: usize,
     /// Steps K of one prediction; never above the positions of the model.
@@ -80,6 +82,7 @@ impl Default for Limits {
     fn default() -> Self {
         Self {
             sessions_max: 1024,
+            sessions_per_vehicle_max: 32,
             samples_max: 4096,
             horizon_max: MAX_HORIZON,
             sample_steps_max: 65_536,

@@ -28,6 +28,11 @@ impl MapRegistry {
         self.maps.values().cloned().collect()
     }
 
+    /// Number of maps.
+    pub fn count(&self) -> usize {
+        self.maps.len()
+    }
+
     /// Takes a new map, or a new version of one.
     ///
     /// `base` = version that the new one was made from, for a patched map; the held one must still be that.

@@ -17,8 +17,9 @@ use crate::sync::{Condvar, Mutex, MutexGuard};
 const WAY_BACK_NS: u64 = 2_000_000;
 /// Share of the time before its deadline that a prediction of fewer samples makes use of.
 const USED: f64 = 0.9;
-/// Shortest pause that a refused asker is told, ns.
+/// Shortest and longest pause that a refused asker is told, ns. What is expected may be far from the truth, and is soon corrected where others ask.
 const RETRY_MIN_NS: u64 = 1_000_000;
+const RETRY_MAX_NS: u64 = 5_000_000_000;
 
 /// Commands that wait. Predictions have a lane of their own, so that a flood of them neither delays nor displaces measurements.
 #[derive(Debug, Default)]
@@ -126,12 +127,16 @@ impl Queue {
         lanes.correct(expected_ns, now_ns);
         let waiting = lanes.predictions.len();
         if waiting > 0 && deadline_ns.is_some_and(|deadline_ns| now_ns + expected_ns > deadline_ns) {
-            return Err(EngineError::Overloaded { kind: "predictions", waiting, retry_after_ns: expected_ns.max(RETRY_MIN_NS) });
+            return Err(EngineError::Overloaded {
+                kind: "predictions",
+                waiting,
+                retry_after_ns: expected_ns.clamp(RETRY_MIN_NS, RETRY_MAX_NS),
+            });
         }
         Ok(())
     }
 
-    /// The prediction whose turn it was is done: learns how long it took if it was computed. Said before its answer leaves, so that whoever asks again at once
+    /// The prediction whose turn it was is done: learns how long this work took if it was computed. Said before its answer leaves, so that whoever asks again at once
     /// finds the engine idle.
     pub fn done(&self, work: f64, took_ns: Option<u64>, now_ns: u64) {
         let mut lanes = self.lock();
@@ -181,17 +186,17 @@ impl Lanes {
         let refused = |kind, waiting, retry_after_ns: u64| EngineError::Overloaded {
             kind,
             waiting,
-            retry_after_ns: retry_after_ns.max(RETRY_MIN_NS),
+            retry_after_ns: retry_after_ns.clamp(RETRY_MIN_NS, RETRY_MAX_NS),
         };
         let (waiting, own) = (self.predictions.len(), self.predictions.len_of(share));
         // Whoever comes while nothing else is to be done is let in whatever is expected: so the estimate stays true.
-        let idle = waiting == 0 && self.running.is_none();
+        let first = waiting + usize::from(self.running.is_some());
         if waiting >= limits.waiting_predictions_max {
-            Err(refused("predictions", waiting, admitted.place.wait_ns))
+            Err(refused("predictions", first, admitted.place.wait_ns))
         } else if own >= limits.waiting_predictions_per_vehicle_max {
             Err(refused("predictions of this vehicle", own, admitted.place.wait_ns))
-        } else if late_ns > 0 && !idle {
-            Err(refused("predictions", waiting, late_ns.max(self.demand.recovers_ns(share))))
+        } else if late_ns > 0 && first > 0 {
+            Err(refused("predictions", first, late_ns.max(self.demand.recovers_ns(share))))
         } else {
             self.demand.give(share, admitted.expected_ns as f64, now_ns);
             Ok(admitted)
@@ -357,5 +362,16 @@ mod tests {
         let [answers, samples] = [|one: &Tally| one.in_time, |one: &Tally| one.samples].map(|of| sum(&fewer, of) / sum(&all, of));
         assert!(answers > 1.8, "{answers} times as many answers, {fewer:?}");
         assert!(samples > 0.5, "with {samples} times the samples in all, {fewer:?}");
+    }
+
+    #[test]
+    fn analytic_who_is_refused_hears_of_the_one_that_is_computed_and_may_come_back_soon() {
+        let (queue, limits) = (Queue::default(), Limits::default());
+        // A quarter of an hour for a unit of work, which nobody would wait for.
+        queue.done(1.0, Some(900_000 * MS), 0);
+        assert!(queue.push(question(0, 0, 0), &limits).is_ok(), "nothing else is to be done");
+        assert!(matches!(queue.next(|| 0), Turn::Prediction(_)));
+        let (refused, _) = *queue.push(question(1, 0, 0), &limits).unwrap_err();
+        assert!(matches!(refused, EngineError::Overloaded { waiting: 1, retry_after_ns: RETRY_MAX_NS, .. }), "{refused}");
     }
 }

@@ -10,8 +10,8 @@ const JACOBIAN_WORK: f64 = 100.0;
 const COVARIANCE_WORK: f64 = 33.0;
 /// Work of a sample-step whose terrain is encoded for it alone (16 samples of 32 steps: 0.25 s, and 5 ms on the pose grid with the fixed work in it).
 const EXACT_WORK: f64 = 70.0;
-/// Shares of a new time in the estimate, when it is shorter and when it is longer than expected: terrain that is new is encoded once, and that says
-/// nothing of the next prediction.
+/// Shares of a new time in the estimate, when it is shorter and when it is longer than expected: what happens once, such as another program's turn, says nothing
+/// of the next prediction.
 const SHORTER: f64 = 0.5;
 const LONGER: f64 = 0.1;
 /// A longer time counts as this many times the expected one at most.
@@ -51,6 +51,12 @@ fn fixed_work(query: &PredictQuery) -> f64 {
     FIXED_WORK + if query.extras.interpolation_deviation { EXACT_WORK * query.horizon as f64 } else { 0.0 }
 }
 
+/// Work of encoding nodes of terrain that nobody had asked for before, in sample-steps. It is done once, so nothing is expected of it: it only keeps the time
+/// that it took out of that of the samples.
+pub(crate) fn encoding_work(nodes: u64) -> f64 {
+    EXACT_WORK * nodes as f64
+}
+
 impl ServiceTime {
     /// Expected time, ns; 0 while nothing is known.
     pub fn expected_ns(&self, work: f64) -> u64 {
@@ -83,20 +89,24 @@ mod tests {
     use super::*;
     use crate::candidates::Candidates;
 
-    #[test]
-    fn analytic_as_many_samples_as_there_is_time_for() {
-        let query = |samples_min| PredictQuery {
+    fn of_shape(samples: usize, horizon: usize) -> PredictQuery {
+        PredictQuery {
             session: "s".into(),
             start: None,
             instant: None,
             use_history: true,
-            samples: 1000,
-            samples_min,
-            horizon: 10,
-            controls: Candidates::Given(vec![0.0; 20_000]),
+            samples,
+            samples_min: 0,
+            horizon,
+            controls: Candidates::Given(vec![0.0; 2 * samples * horizon]),
             cost: None,
             extras: Default::default(),
-        };
+        }
+    }
+
+    #[test]
+    fn analytic_as_many_samples_as_there_is_time_for() {
+        let query = |samples_min| PredictQuery { samples_min, ..of_shape(1000, 10) };
         let mut time = ServiceTime::default();
         assert_eq!(time.affordable(&query(1), 1), 1000, "nothing is known yet");
         time.learn(1.0, 1000);
@@ -114,7 +124,7 @@ mod tests {
     fn analytic_the_estimate_follows_the_machine_and_forgets_the_cold_start() {
         let mut time = ServiceTime::default();
         assert_eq!(time.expected_ns(1e4), 0);
-        // The first prediction encodes terrain: twenty times as long.
+        // The first prediction touches memory for the first time: twenty times as long.
         time.learn(1e4, 20_000_000);
         for _ in 0..10 {
             time.learn(1e4, 1_000_000);
@@ -127,5 +137,16 @@ mod tests {
             time.learn(2e4, 4_000_000);
         }
         assert!((1_950_000..2_050_000).contains(&time.expected_ns(1e4)), "{}", time.expected_ns(1e4));
+    }
+
+    /// Found from outside: three samples on a new map take a second or two on two processors, nearly all of it for some hundred nodes of terrain; 2000 samples were then
+    /// expected to take minutes.
+    #[test]
+    fn regress_a_small_question_about_new_terrain_does_not_make_large_ones_look_slow() {
+        let (small, large) = (of_shape(3, 32), of_shape(2000, 32));
+        let mut time = ServiceTime::default();
+        time.learn(work(&small, 3) + encoding_work(800), 1_700_000_000);
+        let expected_ns = time.expected_ns(work(&large, 2000));
+        assert!(expected_ns < 3_000_000_000, "{expected_ns}");
     }
 }

@@ -9,6 +9,7 @@ mod credentials;
 mod directory;
 mod fleet_file;
 mod identity;
+mod refusals;
 
 use std::sync::Arc;
 
@@ -20,6 +21,7 @@ pub use self::credentials::Credentials;
 pub use self::directory::Directory;
 pub use self::fleet_file::FleetFile;
 pub use self::identity::Identity;
+pub use self::refusals::{Refusal, Refusals};
 use crate::config::TlsConfig;
 use crate::error::ServerError;
 
@@ -55,6 +57,8 @@ pub struct Access {
     fleet: Option<watch::Receiver<Arc<FleetFile>>>,
     /// Whose session is whose.
     pub directory: Directory,
+    /// What was refused.
+    pub refusals: Refusals,
 }
 
 /// Whoever sent a request.
@@ -111,9 +115,10 @@ impl Access {
             None => Err("the client shows no certificate".into()),
         };
         let peer = || request.remote_addr().map(|address| address.to_string()).unwrap_or_default();
-        let mut identity = member(&fleet, shown, peer)?;
+        let refused = |_: &Status| self.refusals.count(Refusal::Identity);
+        let mut identity = member(&fleet, shown, peer).inspect_err(refused)?;
         if let Identity::Proxy(_) = identity {
-            identity = member(&fleet, behind(&identity, request.metadata()), peer)?;
+            identity = member(&fleet, behind(&identity, request.metadata()), peer).inspect_err(refused)?;
         }
         Ok(Caller { access: self.clone(), identity: Some(identity) })
     }
@@ -152,7 +157,7 @@ impl Caller {
     pub fn may(&self, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
         // Without identities the engine says what is not there.
         let Some((fleet, identity)) = self.known() else { return Ok(None) };
-        decide(&fleet, identity, wish, self.vehicle_of(wish))
+        self.decide(&fleet, identity, wish, self.vehicle_of(wish))
     }
 
     /// The same for a session of this vehicle that is not open here.
@@ -161,7 +166,7 @@ impl Caller {
     /// PERMISSION_DENIED.
     pub fn may_with(&self, wish: Wish<'_>, vehicle: &str) -> Result<(), Status> {
         let Some((fleet, identity)) = self.known() else { return Ok(()) };
-        decide(&fleet, identity, wish, Some(vehicle.into())).map(drop)
+        self.decide(&fleet, identity, wish, Some(vehicle.into())).map(drop)
     }
 
     /// Resolves when the caller, who had it, has lost a right; never where there are no identities.
@@ -191,6 +196,21 @@ impl Caller {
 
     fn vehicle_of(&self, wish: Wish<'_>) -> Option<Arc<str>> {
         wish.session().and_then(|session| self.access.directory.vehicle(session))
+    }
+
+    /// Decides; a right that is missing is counted.
+    fn decide(
+        &self,
+        fleet: &FleetFile,
+        identity: &Identity,
+        wish: Wish<'_>,
+        vehicle: Option<Arc<str>>,
+    ) -> Result<Option<Arc<str>>, Status> {
+        decide(fleet, identity, wish, vehicle).inspect_err(|status| {
+            if status.code() == tonic::Code::PermissionDenied {
+                self.access.refusals.count(Refusal::Right);
+            }
+        })
     }
 }
 

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 
 use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, Ranking, SentCommand, StartInstant};
+use nesam_model::MAX_HORIZON;
 use nesam_physics::{STATE_DIM, WHEELS};
 use nesam_proto::packed::lend;
 use nesam_proto::v1 as pb;
@@ -26,6 +27,15 @@ pub struct OutputSelection {
 }
 
 const ALL_CHANNELS: u32 = (1 << STATE_DIM) - 1;
+
+/// Largest part of a request that is not candidates, bytes.
+const BESIDE_CANDIDATES: usize = 64 << 10;
+
+/// Largest request, bytes: whatever N and K are allowed each by itself, so that a product that is not is refused with its field.
+pub fn predict_bytes_max(limits: &Limits) -> usize {
+    let candidates = limits.samples_max.saturating_mul(limits.horizon_max.min(MAX_HORIZON)).saturating_mul(8);
+    candidates.saturating_add(BESIDE_CANDIDATES)
+}
 
 /// A query and what its reply shall carry. Shape and lengths are checked before anything is copied.
 ///

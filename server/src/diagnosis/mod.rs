@@ -24,7 +24,7 @@ use tonic::{Code, Status};
 
 use crate::config::{Config, DiagnosisConfig};
 use crate::convert::{refused, to_status};
-use crate::recording::Recorder;
+use crate::recording::{Recorder, utc};
 use crate::web::Live;
 
 pub(crate) use work::Told;
@@ -109,6 +109,15 @@ impl Diagnoses {
         let now = self.recorder.as_ref().map(|recorder| recorder.parts()).unwrap_or_default();
         let run = now.first().and_then(|part| run_of(part));
         if let Some(run) = run.filter(|run| named.is_empty() || named == *run) {
+            let ended = self.recorder.as_ref().and_then(|recorder| recorder.ended_unix_ns());
+            if let Some(ended_unix_ns) = ended.filter(|_| named.is_empty()) {
+                let at = utc(ended_unix_ns.unsigned_abs() / 1_000_000_000);
+                let reason = format!(
+                    "this server records nothing since {at}: its disk failed or `recording.bytes_max` is reached; name `{run}` to diagnose what was measured \
+                     before, or restart the server"
+                );
+                return Err(refused(Code::FailedPrecondition, "recording", reason));
+            }
             return Ok(Source { run: run.into(), files: now.clone(), live: true });
         }
         if named.is_empty() {

@@ -35,6 +35,7 @@ impl pb::measurements_server::Measurements for Service {
 
     async fn stream(&self, request: Request<Streaming<pb::Measurement>>) -> Result<Response<Self::StreamStream>, Status> {
         let edge = self.0.clone();
+        edge.engine.metrics().request(Transport::Grpc, "stream_measurements");
         let caller = edge.access.caller(&request)?;
         let (sender, receiver) = mpsc::channel(edge.config.measurements_in_flight_max);
         tokio::spawn(submit_all(edge.clone(), caller, request.into_inner(), sender));

@@ -28,7 +28,7 @@ use crate::call::EngineClient;
 use crate::clock::unix_ns;
 use crate::cluster::{Brought, Cluster, moved};
 use crate::config::GrpcConfig;
-use crate::convert::to_status;
+use crate::convert::{predict_bytes_max, to_status};
 use crate::diagnosis::Diagnoses;
 use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
@@ -223,10 +223,10 @@ pub(crate) async fn stopped(mut stopping: watch::Receiver<bool>) {
 
 /// All services behind one router, with their message limits.
 pub(crate) fn routes(edge: &Edge) -> Routes {
-    let controls = 8 * edge.engine.handle().limits().sample_steps_max + SMALL_MESSAGE;
+    let queries = predict_bytes_max(edge.engine.handle().limits());
     let tiles = edge.config.tile_bytes_max;
     Routes::new(pb::sessions_server::SessionsServer::new(sessions::Service(edge.clone())).max_decoding_message_size(IMAGE_BYTES_MAX))
-        .add_service(pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(controls))
+        .add_service(pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(queries))
         .add_service(
             pb::measurements_server::MeasurementsServer::new(measurements::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE),
         )

@@ -33,6 +33,14 @@ pub enum RecordingError {
         /// What is missing or does not fit.
         reason: String,
     },
+    /// No session of that name was open in the recorded run.
+    #[error("{run}: session `{session}` is not in it")]
+    NoSession {
+        /// Name of the run.
+        run: String,
+        /// Session that was asked for.
+        session: String,
+    },
     /// The recording was made with another bundle.
     #[error("the recording was made with bundle {recorded_name} {recorded}, this is {given_name} {given}; its answers would differ")]
     Bundle {

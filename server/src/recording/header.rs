@@ -122,7 +122,12 @@ impl RecordingHeader {
             metadata.get(key).cloned().ok_or_else(missing)
         };
         let wrong = |key: &str| RecordingError::unusable(path, format!("`{key}` in the description of the run is not readable"));
-        let limits: LimitsConfig = serde_json::from_str(&text("limits")?).map_err(|_| wrong("limits"))?;
+        let limits_text = text("limits")?;
+        let mut limits: LimitsConfig = serde_json::from_str(&limits_text).map_err(|_| wrong("limits"))?;
+        // Recordings from before there was a limit for one vehicle had none.
+        if !limits_text.contains("\"sessions_per_vehicle_max\"") {
+            limits.sessions_per_vehicle_max = limits.sessions_max;
+        }
         let fleet_soil: FleetSoilConfig = serde_json::from_str(&text("fleet_soil")?).map_err(|_| wrong("fleet_soil"))?;
         let header = Self {
             program: text("program")?,
@@ -147,7 +152,7 @@ impl RecordingHeader {
 }
 
 /// Seconds since 1970 as `20261121T193512Z` (proleptic Gregorian calendar, no leap seconds).
-fn utc(unix_s: u64) -> String {
+pub(crate) fn utc(unix_s: u64) -> String {
     let leap = |year: u64| year.is_multiple_of(4) && (!year.is_multiple_of(100) || year.is_multiple_of(400));
     let (mut days, second) = (unix_s / 86_400, unix_s % 86_400);
     let mut year = 1970;
@@ -207,6 +212,9 @@ mod tests {
         let mut older = metadata.clone();
         older.remove("precision");
         assert_eq!(RecordingHeader::of_metadata(path, &older).unwrap().0.precision, Precision::F32);
+        let limits = older["limits"].replace("\"sessions_per_vehicle_max\":32,", "");
+        older.insert("limits".into(), limits);
+        assert_eq!(RecordingHeader::of_metadata(path, &older).unwrap().0.limits.sessions_per_vehicle_max, 1024);
         older.insert("precision".into(), "f16".into());
         assert!(RecordingHeader::of_metadata(path, &older).unwrap_err().to_string().contains("precision"));
         let mut newer = metadata.clone();

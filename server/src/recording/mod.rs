@@ -33,6 +33,7 @@ mod window;
 pub use difference::FieldDifference;
 pub use error::RecordingError;
 pub use header::RecordingHeader;
+pub(crate) use header::utc;
 pub use reader::{Ending, RecordedCommand, Recording};
 pub(crate) use recorder::FLUSH_EVERY;
 pub use recorder::{Recorder, RecorderCounts};

@@ -52,6 +52,9 @@ pub enum Ending {
     },
 }
 
+/// Parts by their number.
+type Parts = BTreeMap<u32, (PathBuf, RecordingHeader)>;
+
 /// The parts of a recording.
 #[derive(Debug)]
 pub struct Recording {
@@ -67,31 +70,44 @@ impl Recording {
     /// Opens the parts of a recording: files, or a folder with the parts of one recording.
     ///
     /// # Errors
-    /// `RecordingError` naming the file that is no recording or was written by a program of another layout, or the part that is missing.
+    /// As [`Recording::open_all`], and `RecordingError::Parts` where there are two recordings.
     pub fn open(paths: &[PathBuf]) -> Result<Self, RecordingError> {
-        let files = files(paths)?;
-        let mut parts: BTreeMap<u32, (PathBuf, RecordingHeader)> = BTreeMap::new();
-        for path in files {
-            let (header, number) = OpenPart::open(&path)?.description()?;
-            if let Some((other, of_other)) = parts.values().next()
-                && of_other.run != header.run
-            {
-                let reason = format!("{} and {} are of two recordings; give one at a time", other.display(), path.display());
-                return Err(RecordingError::Parts { reason });
+        let mut recordings = Self::open_all(paths)?;
+        match (recordings.pop(), recordings.last()) {
+            (Some(recording), None) => Ok(recording),
+            (Some(last), Some(before)) => {
+                let reason = format!("{} and {} are two recordings; give one at a time", before.header.run, last.header.run);
+                Err(RecordingError::Parts { reason })
             }
-            parts.insert(number, (path, header));
+            (None, _) => Err(RecordingError::Parts { reason: "no file was given".into() }),
         }
+    }
+
+    /// Opens all recordings whose parts are among the files and in the folders: each time a server starts it begins another one. The oldest comes first.
+    ///
+    /// # Errors
+    /// `RecordingError` naming the file that is no recording or was written by a program of another layout, or the part that is missing.
+    pub fn open_all(paths: &[PathBuf]) -> Result<Vec<Self>, RecordingError> {
+        let mut runs: BTreeMap<(u64, String), Parts> = BTreeMap::new();
+        for path in files(paths)? {
+            let (header, number) = OpenPart::open(&path)?.description()?;
+            let run = (header.clock_zero_unix_ns, header.run.clone());
+            runs.entry(run).or_default().insert(number, (path, header));
+        }
+        runs.into_values().filter_map(|parts| Self::of_parts(parts).transpose()).collect()
+    }
+
+    /// The recording of these parts; `None` of none.
+    fn of_parts(parts: Parts) -> Result<Option<Self>, RecordingError> {
         let missing = (1..).zip(parts.keys()).find(|(expected, number)| expected != *number).map(|(expected, _)| expected);
-        let Some((first, header)) = parts.values().next().cloned() else {
-            return Err(RecordingError::Parts { reason: "no file was given".into() });
-        };
+        let Some((first, header)) = parts.values().next().cloned() else { return Ok(None) };
         if let Some(missing) = missing {
             let reason =
                 format!("part {missing} of recording {} is missing beside {}; a replay begins with part 1", header.run, first.display());
             return Err(RecordingError::Parts { reason });
         }
         let parts = parts.into_values().map(|(path, _)| path).collect();
-        Ok(Self { header, parts, open: None, next_index: 1, ending: None })
+        Ok(Some(Self { header, parts, open: None, next_index: 1, ending: None }))
     }
 
     /// What ran.

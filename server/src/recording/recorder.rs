@@ -1,9 +1,9 @@
 //! The recording side of a running server: a tap on the engine's thread, a bounded queue, a thread that writes.
 
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -17,6 +17,7 @@ use super::header::RecordingHeader;
 use super::part::Part;
 use super::schema::Descriptors;
 use crate::call::Timing;
+use crate::clock::unix_ns;
 use crate::config::RecordingConfig;
 
 /// Commands that may wait for the disk, besides the limit on their bytes.
@@ -41,8 +42,8 @@ struct Shared {
     dropped: AtomicU64,
     bytes: AtomicU64,
     waiting_bytes: AtomicU64,
-    /// Nothing is written any more: the disk failed or a limit is reached.
-    ended: AtomicBool,
+    /// Since when nothing is written any more, Unix time, ns: the disk failed or a limit is reached.
+    ended: OnceLock<i64>,
     parts: Mutex<Vec<PathBuf>>,
 }
 
@@ -105,8 +106,13 @@ impl Recorder {
             recorded: shared.recorded.load(Ordering::Relaxed),
             dropped: shared.dropped.load(Ordering::Relaxed),
             bytes: shared.bytes.load(Ordering::Relaxed),
-            ended: shared.ended.load(Ordering::Relaxed),
+            ended: shared.ended.get().is_some(),
         }
+    }
+
+    /// Since when nothing is written any more, Unix time, ns; `None` while it goes on.
+    pub fn ended_unix_ns(&self) -> Option<i64> {
+        self.shared.ended.get().copied()
     }
 
     /// Files so far, the first part first.
@@ -155,7 +161,7 @@ fn tap(sender: SyncSender<Item>, shared: Arc<Shared>, queue_bytes_max: u64) -> T
         let weight = weight(&executed);
         let waiting = shared.waiting_bytes.load(Ordering::Relaxed);
         let room = waiting == 0 || waiting.saturating_add(weight) <= queue_bytes_max;
-        if room && !shared.ended.load(Ordering::Relaxed) {
+        if room && shared.ended.get().is_none() {
             shared.waiting_bytes.fetch_add(weight, Ordering::Relaxed);
             if sender.try_send(Item { index, weight, executed: executed.into() }).is_ok() {
                 return;
@@ -199,7 +205,7 @@ impl Work {
             self.shared.waiting_bytes.fetch_sub(weight, Ordering::Relaxed);
             part = result.unwrap_or_else(|error| {
                 tracing::error!(%error, "recording ended; what was written until now can be replayed");
-                self.shared.ended.store(true, Ordering::Relaxed);
+                self.end();
                 None
             });
         }
@@ -208,6 +214,11 @@ impl Work {
         {
             tracing::error!(%error, "recording not finished; it can be replayed as far as it goes");
         }
+    }
+
+    /// Nothing is written any more.
+    fn end(&self) {
+        let _ = self.shared.ended.set(unix_ns());
     }
 
     fn dropped(&self) -> u64 {
@@ -233,7 +244,7 @@ impl Work {
         if self.finished_bytes + part.bytes() >= self.bytes_max {
             part.finish("recording.bytes_max is reached", self.dropped())?;
             tracing::error!(bytes_max = self.bytes_max, "recording ended: `recording.bytes_max` is reached");
-            self.shared.ended.store(true, Ordering::Relaxed);
+            self.end();
             return Ok(None);
         }
         if part.bytes() >= self.part_bytes_max {
@@ -293,7 +304,7 @@ mod tests {
             shared.waiting_bytes.fetch_sub(items.iter().map(|item| item.weight).sum(), Ordering::Relaxed);
             tap(executed());
             assert_eq!(receiver.try_iter().map(|item| item.index).collect::<Vec<_>>(), [11], "numbers have no holes of their own");
-            shared.ended.store(true, Ordering::Relaxed);
+            shared.ended.set(1).unwrap();
             tap(executed());
             assert_eq!((receiver.try_iter().count(), shared.dropped.load(Ordering::Relaxed)), (0, 11 - fits));
         }

@@ -35,7 +35,7 @@ struct Line {
 /// Sessions that were imported into the recorded run are known by their name, their map by the name that they came with.
 ///
 /// # Errors
-/// `RecordingError::Unusable` for a command that cannot be read or a session that is not in the recording, and the errors of
+/// `RecordingError::Unusable` for a command that cannot be read, `NoSession` for a session that is not in the recording, and the errors of
 /// [`Recording::next_command`].
 pub fn window(recording: &mut Recording, session: &str, from_ns: i64, to_ns: i64) -> Result<RecordedWindow, RecordingError> {
     let (run, limits) = (recording.header().run.clone(), Limits::from(&recording.header().limits));
@@ -89,7 +89,7 @@ pub fn window(recording: &mut Recording, session: &str, from_ns: i64, to_ns: i64
         }
     }
     let Some(last_map) = map_of.remove(session) else {
-        return Err(RecordingError::unusable(run.as_ref(), format!("session `{session}` is not in it")));
+        return Err(RecordingError::NoSession { run, session: session.into() });
     };
     let map_id = lines.iter().rfind(|line| !line.measurements.is_empty()).map_or(last_map, |line| line.map.clone());
     lines.retain(|line| line.map == map_id);

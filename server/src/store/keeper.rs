@@ -147,7 +147,7 @@ impl Keeper {
             Event::MeasurementAccepted { session, buffer_ended } => {
                 (Key::Session(session.clone()), if *buffer_ended { Duration::ZERO } else { self.interval })
             }
-            Event::MapChanged { map } => (Key::Map(map.clone()), Duration::ZERO),
+            Event::MapChanged { map, .. } => (Key::Map(map.clone()), Duration::ZERO),
             Event::FleetSoilChanged { own, .. } if self.soil_of.is_some() => (Key::Soil(own.key.clone()), self.interval),
             Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } => return,
         };

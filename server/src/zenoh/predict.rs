@@ -5,7 +5,7 @@ use nesam_proto::v1 as pb;
 
 use super::{decode, encode, keys};
 use crate::cluster::{Brought, Standing};
-use crate::convert::predict_error;
+use crate::convert::{predict_bytes_max, predict_error};
 use crate::grpc::Edge;
 use crate::grpc::predict as answer;
 use crate::telemetry::Transport;
@@ -52,11 +52,10 @@ async fn absent(edge: &Edge, session: &str, vehicle: &str) -> Option<Absent> {
 
 async fn reply(edge: Edge, query: ::zenoh::query::Query) {
     let key = query.key_expr().clone();
-    let limits = edge.engine.handle().limits();
     let decoded = {
         // Read where it lies: in shared memory that is the planner's own buffer.
         let payload = query.payload().map(|p| p.to_bytes()).unwrap_or_default();
-        decode::<pb::PredictRequest>("nesam.v1.PredictRequest", &payload, 8 * limits.sample_steps_max + (64 << 10))
+        decode::<pb::PredictRequest>("nesam.v1.PredictRequest", &payload, predict_bytes_max(edge.engine.handle().limits()))
     };
     let result = match decoded {
         Ok(mut request) => {

@@ -16,7 +16,8 @@ use tonic_reflection::pb::v1alpha;
 
 use crate::stage::*;
 
-async fn http_get(address: SocketAddr, path: &str) -> (u16, String) {
+/// Status and body of what HTTP answers.
+pub async fn http_get(address: SocketAddr, path: &str) -> (u16, String) {
     let mut socket = tokio::net::TcpStream::connect(address).await.unwrap();
     socket.write_all(format!("GET {path} HTTP/1.1\r\nhost: x\r\nconnection: close\r\n\r\n").as_bytes()).await.unwrap();
     let mut text = String::new();
@@ -73,6 +74,11 @@ async fn service_health_reflection_metrics_and_status() {
     assert_eq!(code, 200);
     for line in [
         "nesam_measurements_total{transport=\"grpc\",outcome=\"applied\"} 10",
+        "nesam_requests_total{transport=\"grpc\",method=\"stream_measurements\"} 1",
+        "nesam_sessions 1",
+        "nesam_maps 0",
+        "nesam_cluster_sessions 1",
+        "nesam_refusals_total{reason=\"handshake\"} 0",
         "nesam_commands_total{command=\"predict\",result=\"ok\"} 1",
         "nesam_commands_total{command=\"get\",result=\"not_found\"} 1",
         "nesam_prediction_compute_seconds_count 1",

@@ -5,7 +5,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use nesam_client::{outcome_label, v1};
-use nesam_engine::{Clock, Command, Engine, EngineHandle, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Submission};
+use nesam_engine::{
+    Clock, Command, Engine, EngineHandle, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply, Submission,
+};
 use tonic::Code;
 
 use crate::stage::*;
@@ -104,6 +106,30 @@ fn service_a_limit_holds_whatever_the_load() {
         let refused = receiver.recv().unwrap().expect_err("too many samples");
         assert_eq!(refused.field(), "extras.jacobians", "{refused}");
     }
+}
+
+/// The first question about new terrain has it encoded, and that says nothing of the next one. Each takes a tick by the clock; if the tick of the three samples on
+/// new terrain were that of samples alone, 48 of the next 128 would be expected to be done in time.
+#[test]
+fn service_terrain_that_was_new_does_not_count_as_time_of_samples() {
+    let recorded = recorded();
+    let engine = Engine::new(Arc::new(fresh_predictor()), Limits::default()).unwrap();
+    let handle = EngineHandle::unthreaded(engine, Arc::new(Ticking::default()), None);
+    let map = recorded.world.id().to_string();
+    handle.call(Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();
+    handle.call(Command::Open(OpenSession { vehicle: "s".into(), map, ..Default::default() })).unwrap();
+    for i in 0..3 {
+        let measurement = engine_sample(&recorded.drive, i);
+        handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+    }
+    handle.call(Command::Predict(engine_query("s", &recorded.drive, 2, 3, 32))).unwrap();
+    let query = PredictQuery { samples_min: 1, ..engine_query("s", &recorded.drive, 2, 128, 32) };
+    let (sender, receiver) = std::sync::mpsc::channel();
+    let mut asked = Submission::new(Command::Predict(query), move |answer| sender.send(answer.result).unwrap());
+    asked.deadline_ns = Some(handle.now_ns() + 10 * TICK_NS);
+    handle.submit(asked);
+    let Reply::Predicted(prediction) = receiver.recv().unwrap().unwrap() else { panic!("a prediction was asked for") };
+    assert_eq!(prediction.candidates(), 128);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -85,8 +85,14 @@ async fn service_given_start_history_use_and_selection() {
 async fn service_stream_of_requests_equals_single_requests_and_survives_bad_ones() {
     let (server, mut client, recorded) = driven("s", 40).await;
     let good = |tag| v1::PredictRequest { tag, ..candidates("s", &recorded.drive, 40, 2, 4).to_message() };
-    let requests =
-        vec![good(1), v1::PredictRequest { horizon: 33, ..good(2) }, v1::PredictRequest { session_id: "x".into(), ..good(3) }, good(4)];
+    let requests = vec![
+        good(1),
+        v1::PredictRequest { horizon: 33, ..good(2) },
+        v1::PredictRequest { session_id: "x".into(), ..good(3) },
+        // Each number is allowed, their product is not.
+        v1::PredictRequest { samples: 4096, horizon: 32, controls: vec![0; 8 * 4096 * 32].into(), ..good(5) },
+        good(4),
+    ];
     let single = client.predict_message(good(9)).await.unwrap();
     let replies = client.predict_stream(requests).await.unwrap();
     let mut seen = Vec::new();
@@ -99,7 +105,8 @@ async fn service_stream_of_requests_equals_single_requests_and_survives_bad_ones
             v1::predict_stream_reply::Outcome::Error(error) => seen.push((error.tag, error.code, error.field)),
         }
     }
-    assert_eq!(seen, [(1, 0, String::new()), (2, 3, "horizon".into()), (3, 5, "session_id".into()), (4, 0, String::new())]);
+    let expected: [(u64, i32, &str); 5] = [(1, 0, ""), (2, 3, "horizon"), (3, 5, "session_id"), (5, 3, "samples"), (4, 0, "")];
+    assert_eq!(seen, expected.map(|(tag, code, field)| (tag, code, String::from(field))));
     server.shutdown().await;
 }
 

@@ -4,6 +4,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::time::Duration;
 
 use nesam_client::{outcome_label, v1};
 use nesam_mcap::{Reader, Record, Writer};
@@ -203,6 +204,11 @@ async fn service_the_limit_ends_the_recording_and_nothing_else() {
     open(&mut client, "s", "").await;
     let answers = client.feed(samples("s", &recorded.drive, 80)).await.unwrap();
     assert_eq!(answers.len(), 81);
+    // What is not recorded any more is not diagnosed as if it were.
+    let recorder = server.recorder().unwrap();
+    eventually(Duration::from_secs(10), "the recording ends", async || recorder.counts().ended).await;
+    let asked = v1::StartDiagnosisRequest { session_id: "s".into(), ..Default::default() };
+    assert_refused("an ended recording", client.diagnose(asked).await, Code::FailedPrecondition, "recording");
     server.shutdown().await;
     let report = replayed(&[folder.path().into()]);
     assert!(report.all_equal() && (1..81).contains(&report.kinds["measure"].equal), "{report:?}");

@@ -1,6 +1,7 @@
 //! Goal: who may do nothing gets nothing, is told so by a typed status, and leaves no trace; the service goes on. Method: a server with mutual TLS, an
 //! authority and certificates made here, one client for each kind of stranger.
 
+use std::net::SocketAddr;
 use std::path::Path;
 use std::time::Duration;
 
@@ -12,6 +13,7 @@ use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
 use tonic::Code;
 
 use crate::authority::{Authority, dns, secured, uri, written};
+use crate::lifecycle::http_get;
 use crate::stage::*;
 
 fn open_request(vehicle: &str, session: &str) -> v1::OpenSessionRequest {
@@ -138,6 +140,13 @@ async fn service_a_proxy_is_believed_for_whom_it_calls_and_nobody_else_is() {
     stage.server.shutdown().await;
 }
 
+/// How many refusals of a reason `/metrics` tells.
+async fn refusals(http: SocketAddr, reason: &str) -> u64 {
+    let (_, metrics) = http_get(http, "/metrics").await;
+    let line = format!("nesam_refusals_total{{reason=\"{reason}\"}} ");
+    metrics.lines().find_map(|told| told.strip_prefix(&line)).unwrap().parse().unwrap()
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn service_strangers_do_not_get_in() {
     let recorded = recorded();
@@ -193,6 +202,10 @@ async fn service_strangers_do_not_get_in() {
         let closed = tokio::time::timeout(Duration::from_secs(5), socket.read_to_end(&mut rest)).await;
         assert!(closed.is_ok(), "a silent connection is closed after tls.handshake_s");
     }
+    // Three with the wrong certificate, one without TLS, one that trusts another authority, 64 that were silent or talked nonsense; and four that are nobody.
+    let http = stage.server.http_addr.unwrap();
+    eventually(Duration::from_secs(5), "handshakes that failed are counted", async || refusals(http, "handshake").await >= 69).await;
+    assert_eq!((refusals(http, "identity").await, refusals(http, "right").await), (4, 0));
     // Oversize and malformed messages of somebody who may ask.
     let huge = v1::OpenSessionRequest { vehicle_id: "x".repeat(1 << 20), ..Default::default() };
     let error = truck.open_session(huge).await.unwrap_err();

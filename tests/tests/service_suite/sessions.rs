@@ -88,3 +88,22 @@ async fn service_a_fork_has_everything_and_leaves_the_original_alone() {
     assert_same(&prediction, &offline(&recorded, 80, &query, 31, learned(&recorded, 80).0));
     server.shutdown().await;
 }
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_one_vehicle_does_not_take_all_sessions() {
+    let recorded = recorded();
+    let (server, mut client) = start_with(|config| config.limits.sessions_per_vehicle_max = 2).await;
+    open(&mut client, "a", "").await;
+    client.feed(samples("a", &recorded.drive, 3)).await.unwrap();
+    open(&mut client, "b", "").await;
+    let request = |vehicle: &str| v1::OpenSessionRequest { vehicle_id: vehicle.into(), session_id: "c".into(), ..Default::default() };
+    assert_refused("a third one", client.open_session(request("truck")).await, Code::ResourceExhausted, "session_id");
+    assert_refused("a copy", client.fork_session("a", "c").await, Code::ResourceExhausted, "new_session_id");
+    let image = client.export_session("a").await.unwrap();
+    assert_refused("an imported one", client.import_session(image.clone(), "c").await, Code::ResourceExhausted, "session_id");
+    // Another vehicle has room, and so has this one when it closes a session.
+    client.open_session(request("other")).await.unwrap();
+    client.close_session("b").await.unwrap();
+    client.import_session(image, "b").await.unwrap();
+    server.shutdown().await;
+}

@@ -6,7 +6,7 @@ use clap::Args;
 use nesam_engine::Measurement;
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_server::recording::{Recording, RecordingHeader, window};
+use nesam_server::recording::{RecordedWindow, Recording, RecordingError, RecordingHeader, window};
 use nesam_trajectories::{Report, drives_of_reports};
 
 use super::{Input, ReferenceArg, reference};
@@ -23,8 +23,8 @@ const PIECES_OF_THE_MODEL: usize = 10;
 /// Options that take the drives from a recording.
 #[derive(Args, Debug)]
 pub struct RecordingArgs {
-    /// Diagnose what a server recorded of a session instead of a set: files of one recording, or its folder. Without --bundle it is the recorded bundle, found
-    /// by its hash in deploy/bundles
+    /// Diagnose what a server recorded of a session instead of a set: files of recordings, or their folder; of several it is the newest that has the
+    /// session in the window. Without --bundle it is the recorded bundle, found by its hash in deploy/bundles
     #[arg(long, value_name = "PATH", num_args = 1.., requires = "session", conflicts_with_all = ["data", "set", "trajectories", "vehicle"])]
     pub recording: Vec<PathBuf>,
     /// Session to diagnose
@@ -46,13 +46,13 @@ impl RecordingArgs {
     /// The pieces of the window with the map of the session.
     pub fn input(&self, bundle: &BundleArgs, dt_s: f64, asked: Option<ReferenceArg>) -> Result<Input, Failure> {
         let session = self.session.as_deref().unwrap_or_default();
-        let mut recording = Recording::open(&self.recording).or_input()?;
-        let bundle = recorded_bundle(bundle, recording.header())?;
+        let recordings = Recording::open_all(&self.recording).or_input()?;
+        let (header, window) = self.newest_with(session, recordings)?;
+        let bundle = recorded_bundle(bundle, &header)?;
         let pieces = self.pieces.unwrap_or(match reference(asked, &bundle) {
             ReferenceArg::Bundle => PIECES,
             ReferenceArg::Physics => PIECES_OF_THE_MODEL,
         });
-        let window = window(&mut recording, session, self.from_ns, self.to_ns).or_input()?;
         let reports: Vec<Report> = window.measurements.iter().map(report).collect();
         let drives = drives_of_reports(session, &reports, dt_s, pieces);
         if drives.is_empty() {
@@ -71,6 +71,27 @@ impl RecordingArgs {
         let provenance = output::provenance_of(Some(&bundle), &data_hash, &maps_hash(&maps));
         let predictor = std::sync::Arc::new(nesam_model::Predictor::new(std::sync::Arc::new(bundle)).or_input()?);
         Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance })
+    }
+
+    /// What a session measured in the newest recording that has something of it in the window; where none has, what the newest says.
+    fn newest_with(&self, session: &str, recordings: Vec<Recording>) -> Result<(RecordingHeader, RecordedWindow), Failure> {
+        let count = recordings.len();
+        let mut otherwise = None;
+        for mut recording in recordings.into_iter().rev() {
+            let header = recording.header().clone();
+            match window(&mut recording, session, self.from_ns, self.to_ns) {
+                Ok(window) if !window.measurements.is_empty() => {
+                    if count > 1 {
+                        note!("note: {} is diagnosed, the newest of {count} recordings with this session in the window", header.run);
+                    }
+                    return Ok((header, window));
+                }
+                Ok(window) => otherwise = otherwise.or(Some(Ok((header, window)))),
+                Err(error @ RecordingError::NoSession { .. }) => otherwise = otherwise.or(Some(Err(error))),
+                Err(error) => return Err(error).or_input(),
+            }
+        }
+        otherwise.unwrap_or_else(|| Err(RecordingError::Parts { reason: "no file was given".into() })).or_input()
     }
 }
 

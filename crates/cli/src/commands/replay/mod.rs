@@ -14,7 +14,7 @@ use crate::failure::Failure;
 #[derive(Args, Debug)]
 #[command(after_help = EXAMPLES)]
 pub struct ReplayArgs {
-    /// Recording: its .mcap files, or the folder that holds the parts of one recording
+    /// Recordings: their .mcap files, or folders that hold them; each start of a server began one
     #[arg(value_name = "FILE.mcap|DIR", conflicts_with = "degrade")]
     recording: Vec<PathBuf>,
     #[command(flatten)]
@@ -62,7 +62,7 @@ SPEC of --degrade: `all` (also without SPEC), `none`, or keys with or without a 
 `all` is jitter, loss, reorder, clock-step and imu. The same seed gives the same messages.
 
 Examples:
-  nesam replay recordings                     all parts of the recording in this folder
+  nesam replay recordings                     all recordings in this folder, one after the other
   nesam replay run.0001.mcap --json out.json
   nesam replay --data ROOT --set NAME --degrade
   nesam replay --data ROOT --set NAME --degrade loss=0.05 --degrade imu,loss=0.05

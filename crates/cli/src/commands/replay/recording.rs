@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use nesam_model::{ModelBundle, Predictor};
 use nesam_server::recording::{Ending, KindCount, Recording, RecordingError, RecordingHeader, ReplayReport, replay};
-use serde_json::json;
+use serde_json::{Value, json};
 
 use super::ReplayArgs;
 use crate::failure::{Failure, OrFail};
@@ -17,10 +17,26 @@ use crate::sources::load_recorded_bundle;
 /// Time between two lines of progress.
 const SAY_EVERY: Duration = Duration::from_secs(10);
 
-/// Runs the command on recordings.
+/// Runs the command on recordings: all of them, whatever comes out of one.
 pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("the replay was not finished");
-    let mut recording = Recording::open(&args.recording).or_input()?;
+    let recordings = Recording::open_all(&args.recording).or_input()?;
+    let several = recordings.len() > 1;
+    let (mut documents, mut wrong) = (Vec::new(), Vec::new());
+    for recording in recordings {
+        let run = recording.header().run.clone();
+        let (document, failed) = replay_one(args, recording)?;
+        documents.push(document);
+        wrong.extend(failed.map(|reason| if several { format!("{run}: {reason}") } else { reason }));
+    }
+    if let Some(file) = &args.json {
+        output::write_file(file, to_json(documents, wrong.is_empty()).as_bytes())?;
+    }
+    if wrong.is_empty() { Ok(()) } else { Err(Failure::Failed(wrong.join("; "))) }
+}
+
+/// Replays one recording and prints what came out; gives that as JSON, and what is wrong.
+fn replay_one(args: &ReplayArgs, mut recording: Recording) -> Result<(Value, Option<String>), Failure> {
     let header = recording.header().clone();
     let bundle = Arc::new(load_recorded_bundle(args.bundle.bundle.as_deref(), &header)?);
     let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?.in_precision(header.precision));
@@ -38,17 +54,12 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
         Failure::Input(format!("{error}{hint}"))
     })?;
     print(&header, &report);
-    if let Some(file) = &args.json {
-        output::write_file(file, to_json(&header, &bundle, &report, &args.recording).as_bytes())?;
-    }
     let total = report.total();
-    if !report.all_equal() {
-        return Err(Failure::Failed(match total.different {
-            0 => "the recording is damaged".into(),
-            different => format!("{different} of {} answers differ", total.commands - total.not_executed),
-        }));
-    }
-    Ok(())
+    let wrong = (!report.all_equal()).then(|| match total.different {
+        0 => "the recording is damaged".to_string(),
+        different => format!("{different} of {} answers differ", total.commands - total.not_executed),
+    });
+    Ok((document(&header, &bundle, &report, &args.recording), wrong))
 }
 
 fn print(header: &RecordingHeader, report: &ReplayReport) {
@@ -91,8 +102,17 @@ fn here_and_there(header: &RecordingHeader) -> [(&'static str, String, String); 
     ]
 }
 
-fn to_json(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport, files: &[PathBuf]) -> String {
-    let document = json!({
+/// One recording as it is; several under `runs`.
+fn to_json(mut documents: Vec<Value>, all_equal: bool) -> String {
+    let document = match documents.len() {
+        1 => documents.remove(0),
+        _ => json!({"schema": "nesam.replays/1", "all_equal": all_equal, "runs": documents}),
+    };
+    serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+}
+
+fn document(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport, files: &[PathBuf]) -> Value {
+    json!({
         "schema": "nesam.replay/1",
         "run": header.run,
         "files": files,
@@ -110,6 +130,5 @@ fn to_json(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport
             "program": RecordingHeader::this_program(), "machine": RecordingHeader::this_machine(),
             "bundle": bundle.name, "bundle_hash": bundle.hash,
         },
-    });
-    serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+    })
 }
