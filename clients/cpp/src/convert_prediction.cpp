@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <chrono>
 #include <cstdint>
 #include <limits>
 #include <optional>
@@ -185,6 +186,7 @@ Result<v1::PredictRequest> to_message(const std::string& session_id, const Predi
   message.mutable_output()->set_precision(request.half ? v1::PRECISION_F16 : v1::PRECISION_F32);
   message.set_tag(request.tag);
   message.set_samples_min(request.samples_min);
+  if (request.budget) message.set_budget_s(std::chrono::duration<double>(*request.budget).count());
   return message;
 }
 

@@ -24,6 +24,7 @@ class Validity(enum.IntFlag):
     OVERTURNED = 64
     SOIL_NOT_LEARNED = 128
     ALARM_ACTIVE = 256
+    START_OFF_GROUND = 512
 
 
 @dataclass(frozen=True)

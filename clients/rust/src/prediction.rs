@@ -1,5 +1,7 @@
 //! Candidates and predictions.
 
+use std::time::Duration;
+
 use nesam_proto::packed::pack;
 use nesam_proto::v1;
 
@@ -24,6 +26,8 @@ pub struct Candidates {
     pub samples: usize,
     /// Fewest of them that are of use when time is short, 0 = all or nothing; [`Prediction::samples`] says how many were computed.
     pub samples_min: usize,
+    /// Time after which the answer is of no use, for streams and Zenoh; [`Client::predict_within`](crate::Client::predict_within) has a deadline of its own.
+    pub budget: Option<Duration>,
     /// K.
     pub horizon: usize,
     /// Row-major (samples, horizon, 2): speed in m/s, second command in the unit of the vehicle card; empty where they are drawn.
@@ -57,6 +61,7 @@ impl Candidates {
             use_history: true,
             samples,
             samples_min: 0,
+            budget: None,
             horizon,
             controls,
             drawing: None,
@@ -107,6 +112,7 @@ impl Candidates {
             drawing: self.drawing.clone(),
             cost: self.cost.clone(),
             samples_min: u32::try_from(self.samples_min).unwrap_or(u32::MAX),
+            budget_s: self.budget.map(|budget| budget.as_secs_f64()),
         }
     }
 }

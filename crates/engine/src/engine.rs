@@ -4,6 +4,7 @@ mod effects;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
@@ -58,6 +59,7 @@ impl Engine {
     /// # Errors
     /// `AdaptationError` when the settings or the noise that the bundle carries are not readable or not usable.
     pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Result<Self, AdaptationError> {
+        predictor.keep_maps(limits.maps_max);
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
         let filter = SoilFilter::new(CalibratedFilter::config_of(predictor.bundle().soil_filter_json.as_deref())?)?;
         let unreadable = |error: ModelError| AdaptationError::Settings { reason: error.to_string() };
@@ -126,12 +128,24 @@ impl Engine {
     /// # Errors
     /// Any [`EngineError`] that names why the command was refused.
     pub fn execute(&mut self, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
+        self.execute_unless(now_ns, command, None)
+    }
+
+    /// The same until `abandoned` is raised: a prediction is then given up, and leaves no trace.
+    pub(crate) fn execute_unless(&mut self, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
         if let Some(log) = &mut self.log {
             log.push((now_ns, command.clone()));
         }
-        if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
+        let result = self.answer(now_ns, command, abandoned);
+        if !matches!(result, Err(EngineError::Abandoned))
+            && let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id))
+        {
             session.touch(now_ns);
         }
+        result
+    }
+
+    fn answer(&mut self, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
         match command {
             Command::Open(open) => self.open(now_ns, open),
             Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
@@ -147,7 +161,7 @@ impl Engine {
             Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
             Command::TellFleetSoil => self.fleet().map(|fleet| Reply::FleetShares(fleet.cell_m(), fleet.shares(now_ns))),
             Command::HearFleetSoil { cell_m, shares } => self.hear_fleet_soil(now_ns, *cell_m, shares),
-            Command::Predict(query) => self.predict(now_ns, query).map(|p| Reply::Predicted(Arc::new(p))),
+            Command::Predict(query) => self.predict(now_ns, query, abandoned).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
                 self.emit(Event::MapChanged { map: map.id().into(), held: self.maps.count() });
@@ -358,7 +372,7 @@ impl Engine {
         Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, provenance, accepted, soil })))
     }
 
-    fn predict(&self, now_ns: u64, query: &PredictQuery) -> Result<Prediction, EngineError> {
+    fn predict(&self, now_ns: u64, query: &PredictQuery, abandoned: Option<&AtomicBool>) -> Result<Prediction, EngineError> {
         let session = self.session(&query.session)?;
         let predictor = session.predictor().unwrap_or(&self.predictor);
         query.check(&self.limits, self.vehicle())?;
@@ -391,7 +405,7 @@ impl Engine {
             wheels: None,
         };
         let learned = session.soil_field(map);
-        let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false };
+        let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false, abandoned };
         let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
         let looked_at = query.extras.interpolation_deviation && map.is_some();
         let deviation_m = looked_at.then(|| predictor.interpolation_deviation_m(&asked, &asked_extras, &rollout)).transpose()?;
@@ -402,9 +416,12 @@ impl Engine {
             ..Default::default()
         };
         if query.extras.derived() {
-            let linearisations = predictor.linearise(&asked)?;
+            let linearisations = predictor.linearise_unless(&asked, abandoned)?;
             (extras.jacobians, extras.covariance) =
                 query.extras.derive(&linearisations, forward.steps(), session.soil(), self.noise.as_ref())?;
+            if abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
+                return Err(EngineError::Abandoned);
+            }
         }
         let (rolled, mut rollout) = forward.split(rollout);
         let of_session = session.flags();

@@ -87,8 +87,8 @@ pub enum EngineError {
         /// Pause after which there may be room, ns.
         retry_after_ns: u64,
     },
-    /// The deadline passed before the computation began.
-    #[error("the deadline passed before the prediction was started; ask for fewer samples or allow more time")]
+    /// The deadline passed, or would surely pass, before the answer is there.
+    #[error("the deadline does not leave the time that the answer takes; ask for less or allow more time")]
     Expired,
     /// A measurement was refused, and its session stays as it is.
     #[error("{cause}")]
@@ -152,6 +152,7 @@ impl From<ModelError> for EngineError {
     fn from(error: ModelError) -> Self {
         match error {
             ModelError::Query { field, reason } => Self::Invalid { field: field.into(), reason },
+            ModelError::Abandoned => Self::Abandoned,
             other => Self::Internal { reason: other.to_string() },
         }
     }

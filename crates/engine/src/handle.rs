@@ -11,7 +11,7 @@ use crate::command::{Command, Reply};
 use crate::engine::Engine;
 use crate::error::EngineError;
 use crate::limits::Limits;
-use crate::queue::{Queue, Turn};
+use crate::queue::{Queue, Took, Turn};
 use crate::service_time::{encoding_work, work};
 use crate::sync::thread::{self, JoinHandle};
 use crate::sync::{Mutex, mpsc};
@@ -20,9 +20,9 @@ use crate::sync::{Mutex, mpsc};
 pub struct Submission {
     /// What is asked.
     pub command: Command,
-    /// Instant of the engine's clock after which a prediction need not be started any more, ns.
+    /// Instant of the engine's clock after which a prediction is of no use, ns: it is not started any more. Whoever submits raises `abandoned` then.
     pub deadline_ns: Option<u64>,
-    /// Raised when nobody waits for the answer any more; a prediction is then skipped.
+    /// Raised when nobody waits for the answer any more; a prediction is then skipped or given up.
     pub abandoned: Option<Arc<AtomicBool>>,
     /// Called once with the answer, on the engine's thread or on the submitter's; it must not wait.
     pub reply: Box<dyn FnOnce(Answer) + Send>,
@@ -94,7 +94,7 @@ pub struct Executed {
     pub now_ns: u64,
     /// The command.
     pub command: Command,
-    /// Reply or refusal. `Abandoned` and `Expired` say that the prediction was not computed at all.
+    /// Reply or refusal. `Abandoned` and `Expired` say that the prediction was not computed, or not to the end; it has left no trace.
     pub result: Result<Reply, EngineError>,
     /// Time in the queue, ns.
     pub queued_ns: u64,
@@ -255,9 +255,9 @@ fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, 
                 let fits = if right { queue.fit(query, submission.deadline_ns, clock.now_ns()) } else { Ok(()) };
                 let (work, session) = (work(query, query.samples), query.session.clone());
                 let before = engine.encoded_nodes(&session);
-                answer(engine, *submission, fits, clock, tap, |engine, took_ns| {
+                answer(engine, *submission, fits, clock, tap, |engine, took| {
                     let encoded = engine.encoded_nodes(&session).saturating_sub(before);
-                    queue.done(work + encoding_work(encoded), took_ns, clock.now_ns());
+                    queue.done(work + encoding_work(encoded), took, clock.now_ns());
                 });
             }
         }
@@ -271,11 +271,15 @@ fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, 
 /// # Errors
 /// Any [`EngineError`]; `Internal` after a panic.
 pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
-    catch_unwind(AssertUnwindSafe(|| engine.execute(now_ns, command)))
+    guarded(engine, now_ns, command, None)
+}
+
+fn guarded(engine: &mut Engine, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
+    catch_unwind(AssertUnwindSafe(|| engine.execute_unless(now_ns, command, abandoned)))
         .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
 }
 
-/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. `done` is told the time that it took, ns, if it was
+/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. `done` is told the time that it took, if it was
 /// not refused, before the answer leaves.
 fn answer(
     engine: &mut Engine,
@@ -283,21 +287,34 @@ fn answer(
     fits: Result<(), EngineError>,
     clock: &dyn Clock,
     tap: &mut Option<Tap>,
-    done: impl FnOnce(&Engine, Option<u64>),
+    done: impl FnOnce(&Engine, Option<Took>),
 ) {
     let Submission { command, deadline_ns, abandoned, reply, submitted_ns, share: _ } = submission;
     let now_ns = clock.now_ns();
     let is_prediction = matches!(command, Command::Predict(_));
-    let result = if is_prediction && abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
+    let abandoned = abandoned.as_deref().filter(|_| is_prediction);
+    let is_past = |now_ns: u64| is_prediction && deadline_ns.is_some_and(|deadline_ns| now_ns > deadline_ns);
+    let begun = if abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
         Err(EngineError::Abandoned)
-    } else if is_prediction && deadline_ns.is_some_and(|deadline| now_ns > deadline) {
+    } else if is_past(now_ns) {
         Err(EngineError::Expired)
     } else {
-        fits.and_then(|()| execute_guarded(engine, now_ns, &command))
+        fits
     };
+    let is_begun = begun.is_ok();
+    let result = begun.and_then(|()| match guarded(engine, now_ns, &command, abandoned) {
+        // Nobody waits any more since it is too late.
+        Err(EngineError::Abandoned) if is_past(clock.now_ns()) => Err(EngineError::Expired),
+        result => result,
+    });
     let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
+    let took = match &result {
+        Ok(_) => Some(Took::All(busy_ns)),
+        Err(EngineError::Abandoned | EngineError::Expired) if is_begun => Some(Took::AtLeast(busy_ns)),
+        Err(_) => None,
+    };
     let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil)).map(|_| result.clone());
-    done(engine, result.is_ok().then_some(busy_ns));
+    done(engine, took);
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {
         tap(Executed { now_ns, command, result, queued_ns, busy_ns });

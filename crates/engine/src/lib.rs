@@ -8,7 +8,7 @@
 //! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own. Measurements overtake predictions there: a planner that
 //! asks for much never delays what a vehicle reports by more than the prediction that is being computed. A full queue is an
 //! [`EngineError::Overloaded`], never a wait and never a panic, and so is a prediction that would not be done before its deadline; one whose asker has
-//! gone or whose deadline has passed is skipped. Vehicles share the time for predictions evenly.
+//! gone or whose deadline has passed is skipped or given up. Vehicles share the time for predictions evenly.
 //!
 //! ```text
 //! server ── Command ──► EngineHandle ──► queue ──► Engine::execute ──► Session, Predictor

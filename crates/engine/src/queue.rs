@@ -17,6 +17,12 @@ use crate::sync::{Condvar, Mutex, MutexGuard};
 const WAY_BACK_NS: u64 = 2_000_000;
 /// Share of the time before its deadline that a prediction of fewer samples makes use of.
 const USED: f64 = 0.9;
+/// A prediction that is expected to take this many times as long as there is time would be computed in vain (chosen).
+const HOPELESS: u64 = 2;
+/// Times as long as it took that a prediction would have taken which was given up later than it was expected to end (chosen): how much was left is not known.
+const WHOLE_OF_GIVEN_UP: u64 = 2;
+/// Time for which an estimate is relied on that the last prediction bore out, ns (chosen).
+const RELIED_ON_NS: u64 = 1_000_000_000;
 /// Shortest and longest pause that a refused asker is told, ns. What is expected may be far from the truth, and is soon corrected where others ask.
 const RETRY_MIN_NS: u64 = 1_000_000;
 const RETRY_MAX_NS: u64 = 5_000_000_000;
@@ -37,6 +43,8 @@ struct Lanes {
     demand: Demand,
     running: Option<Running>,
     service_time: ServiceTime,
+    /// Instant until which the expected times are relied on, ns.
+    relied_on_until_ns: u64,
     stopped: bool,
 }
 
@@ -46,6 +54,23 @@ struct Running {
     share: Arc<str>,
     since_ns: u64,
     expected_ns: u64,
+    deadline_ns: Option<u64>,
+}
+
+impl Running {
+    /// Time for which it still runs: it is given up at its deadline.
+    fn left_ns(&self, now_ns: u64) -> u64 {
+        (self.since_ns + self.expected_ns).min(self.deadline_ns.unwrap_or(u64::MAX)).saturating_sub(now_ns)
+    }
+}
+
+/// Time that a prediction took, ns.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Took {
+    /// It was computed.
+    All(u64),
+    /// It was given up.
+    AtLeast(u64),
 }
 
 /// How a prediction is let in.
@@ -105,7 +130,8 @@ impl Queue {
                 return Turn::End;
             }
             if let Some(next) = lanes.predictions.pop() {
-                lanes.running = Some(Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns });
+                let deadline_ns = next.item.deadline_ns;
+                lanes.running = Some(Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns, deadline_ns });
                 return Turn::Prediction(Box::new(next.item));
             }
             lanes = self.filled.wait(lanes).expect("no holder of the queue panics; this is a bug");
@@ -136,12 +162,23 @@ impl Queue {
         Ok(())
     }
 
-    /// The prediction whose turn it was is done: learns how long this work took if it was computed. Said before its answer leaves, so that whoever asks again at once
-    /// finds the engine idle.
-    pub fn done(&self, work: f64, took_ns: Option<u64>, now_ns: u64) {
+    /// The prediction whose turn it was is done: learns how long it took if it was computed, or that it takes longer if it was given up later than expected.
+    /// Said before its answer leaves, so that whoever asks again at once finds the engine idle.
+    pub fn done(&self, work: f64, took: Option<Took>, now_ns: u64) {
         let mut lanes = self.lock();
-        match took_ns {
-            Some(took_ns) => lanes.service_time.learn(work, took_ns),
+        let expected_ns = lanes.service_time.expected_ns(work);
+        match took {
+            Some(Took::All(took_ns)) => {
+                let bears_out = took_ns / HOPELESS <= expected_ns && expected_ns / HOPELESS <= took_ns;
+                lanes.relied_on_until_ns = if bears_out { now_ns + RELIED_ON_NS } else { 0 };
+                lanes.service_time.learn(work, took_ns);
+            }
+            Some(Took::AtLeast(took_ns)) => {
+                if (1..took_ns).contains(&expected_ns) {
+                    lanes.service_time.learn(work, WHOLE_OF_GIVEN_UP * took_ns);
+                }
+                lanes.correct(took_ns, now_ns);
+            }
             None => lanes.correct(0, now_ns),
         }
         lanes.running = None;
@@ -173,7 +210,7 @@ impl Lanes {
     fn admit(&mut self, share: &Arc<str>, submission: &Submission, query: &PredictQuery, limits: &Limits) -> Result<Admitted, EngineError> {
         let now_ns = submission.submitted_ns();
         self.demand.ask(share, self.service_time.expected_ns(work(query, query.samples)), now_ns);
-        let running_ns = self.running.as_ref().map_or(0, |running| (running.since_ns + running.expected_ns).saturating_sub(now_ns));
+        let running_ns = self.running.as_ref().map_or(0, |running| running.left_ns(now_ns));
         let due_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS));
         let room_ns = (self.demand.room(share) * due_ns.saturating_sub(now_ns) as f64) as u64;
         let of = |samples| {
@@ -189,14 +226,17 @@ impl Lanes {
             retry_after_ns: retry_after_ns.clamp(RETRY_MIN_NS, RETRY_MAX_NS),
         };
         let (waiting, own) = (self.predictions.len(), self.predictions.len_of(share));
-        // Whoever comes while nothing else is to be done is let in whatever is expected: so the estimate stays true.
+        // Whoever comes while nothing else is to be done is let in though it may be late, so that the estimate stays true; not in vain while the estimate is.
         let first = waiting + usize::from(self.running.is_some());
+        let is_hopeless = now_ns < self.relied_on_until_ns && admitted.expected_ns / HOPELESS > due_ns.saturating_sub(now_ns);
         if waiting >= limits.waiting_predictions_max {
             Err(refused("predictions", first, admitted.place.wait_ns))
         } else if own >= limits.waiting_predictions_per_vehicle_max {
             Err(refused("predictions of this vehicle", own, admitted.place.wait_ns))
         } else if late_ns > 0 && first > 0 {
             Err(refused("predictions", first, late_ns.max(self.demand.recovers_ns(share))))
+        } else if is_hopeless {
+            Err(EngineError::Expired)
         } else {
             self.demand.give(share, admitted.expected_ns as f64, now_ns);
             Ok(admitted)
@@ -283,7 +323,7 @@ mod tests {
     /// Vehicles that ask at random instants, at these rates in multiples of what the engine can do, an engine that takes 0.85 to 1.15 of what is expected.
     fn simulate(rates: &[f64], samples_min: usize) -> Vec<Tally> {
         let (queue, limits, mut random) = (Queue::default(), Limits::default(), random(11));
-        queue.done(1.0, Some(NS_PER_WORK as u64), 0);
+        queue.done(1.0, Some(Took::All(NS_PER_WORK as u64)), 0);
         let mut tallies = vec![Tally::default(); rates.len()];
         let mut asks_ns: Vec<f64> = rates.iter().map(|rate| -random().ln() * TAKES_NS / rate).collect();
         // Whose prediction runs, its work, its begin and end.
@@ -292,7 +332,7 @@ mod tests {
             let (vehicle, ask_ns) = asks_ns.iter().copied().enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
             let mut now_ns = ask_ns as u64;
             if let Some((_, work, begin_ns, end_ns)) = running.filter(|(.., end_ns)| *end_ns <= now_ns) {
-                queue.done(work, Some(end_ns - begin_ns), end_ns);
+                queue.done(work, Some(Took::All(end_ns - begin_ns)), end_ns);
                 (running, now_ns) = (None, end_ns);
             } else if now_ns > ENDS_NS {
                 return tallies;
@@ -368,10 +408,42 @@ mod tests {
     fn analytic_who_is_refused_hears_of_the_one_that_is_computed_and_may_come_back_soon() {
         let (queue, limits) = (Queue::default(), Limits::default());
         // A quarter of an hour for a unit of work, which nobody would wait for.
-        queue.done(1.0, Some(900_000 * MS), 0);
+        queue.done(1.0, Some(Took::All(900_000 * MS)), 0);
         assert!(queue.push(question(0, 0, 0), &limits).is_ok(), "nothing else is to be done");
         assert!(matches!(queue.next(|| 0), Turn::Prediction(_)));
         let (refused, _) = *queue.push(question(1, 0, 0), &limits).unwrap_err();
         assert!(matches!(refused, EngineError::Overloaded { waiting: 1, retry_after_ns: RETRY_MAX_NS, .. }), "{refused}");
+    }
+
+    /// A question of 16 ms on an idle engine with 4 ms, of which an answer needs two for its way back: let in until a prediction has borne the estimate out.
+    #[test]
+    fn analytic_what_cannot_be_in_time_is_not_begun_while_the_estimate_is_relied_on() {
+        let (queue, limits) = (Queue::default(), Limits::default());
+        let (of_one, takes_ns) = (TAKES_NS / NS_PER_WORK, TAKES_NS as u64);
+        let ask = |vehicle, now_ns: u64, within_ns: u64| {
+            let mut asked = question(vehicle, 0, now_ns);
+            asked.deadline_ns = Some(now_ns + within_ns);
+            queue.push(asked, &limits).map_err(|refused| {
+                let (error, _) = *refused;
+                error
+            })
+        };
+        let begin = |now_ns: u64| assert!(matches!(queue.next(|| now_ns), Turn::Prediction(_)));
+        queue.done(of_one, Some(Took::All(takes_ns)), 0);
+        assert_eq!(ask(0, 0, 4 * MS), Ok(()));
+        begin(0);
+        // It will be given up after 4 ms: another one is in time behind it.
+        assert_eq!(ask(1, 0, 30 * MS), Ok(()));
+        queue.done(of_one, Some(Took::AtLeast(4 * MS)), 4 * MS);
+        assert_eq!(queue.lock().service_time.expected_ns(of_one), takes_ns, "it says nothing of how long it would have taken");
+        begin(4 * MS);
+        queue.done(of_one, Some(Took::All(takes_ns)), 20 * MS);
+        assert_eq!(ask(0, 20 * MS, 4 * MS), Err(EngineError::Expired));
+        assert_eq!(ask(0, 20 * MS, 12 * MS), Ok(()), "it may be in time");
+        begin(20 * MS);
+        // Given up later than it was expected to end: such a question takes longer.
+        queue.done(of_one, Some(Took::AtLeast(40 * MS)), 60 * MS);
+        assert!(queue.lock().service_time.expected_ns(of_one) > takes_ns);
+        assert_eq!(ask(0, 20 * MS + RELIED_ON_NS, 4 * MS), Ok(()), "the machine may have become faster since");
     }
 }

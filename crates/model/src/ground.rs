@@ -22,13 +22,14 @@ impl<'a> GroundSource<'a> {
     pub fn new(map: Option<&'a WorldMap>, model: &StepModel, start: &VehicleState<f64>) -> Self {
         match map {
             Some(map) => Self::Map(map),
-            None => {
-                let [roll, pitch, _] = start.attitude_rad;
-                let offsets = model.wheel_offsets_heading(roll, pitch);
-                let mean = offsets.iter().map(|o| o[2]).sum::<f64>() / WHEELS as f64;
-                Self::Level(start.position_m[2] + mean - model.vehicle().wheel_radius_m)
-            }
+            None => Self::Level(level_m(model, start)),
         }
+    }
+
+    /// Height of a state above the ground on which it would stand at static ride height, mean over the wheels, m.
+    pub(crate) fn clearance_m(&self, model: &StepModel, state: &VehicleState<f64>) -> f64 {
+        let (ground, _) = self.under_wheels(model, state, 0.0);
+        level_m(model, state) - ground.iter().map(|under| under.height_m).sum::<f64>() / WHEELS as f64
     }
 
     /// Ground at a point: height (m), slope along x and y of World, and whether the point is known. Effects say how the ground differs from the map.
@@ -57,6 +58,14 @@ impl<'a> GroundSource<'a> {
         });
         (ground, known)
     }
+}
+
+/// Level ground on which a state would stand at static ride height, m.
+fn level_m(model: &StepModel, state: &VehicleState<f64>) -> f64 {
+    let [roll, pitch, _] = state.attitude_rad;
+    let offsets = model.wheel_offsets_heading(roll, pitch);
+    let mean = offsets.iter().map(|o| o[2]).sum::<f64>() / WHEELS as f64;
+    state.position_m[2] + mean - model.vehicle().wheel_radius_m
 }
 
 /// Ground of a height and a slope in World (∂z/∂x, ∂z/∂y), seen from a heading of the given sine and cosine.

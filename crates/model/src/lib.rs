@@ -70,6 +70,9 @@ pub enum ModelError {
         /// What was wrong and the limit.
         reason: String,
     },
+    /// Nobody waits for the answer any more ([`RolloutExtras::abandoned`]).
+    #[error("nobody waits for the rollout any more")]
+    Abandoned,
     /// What a bundle says of its own errors cannot be used.
     #[error("rollout_noise.json: {reason}")]
     RolloutNoise {

@@ -1,6 +1,6 @@
 //! The predictor: a bundle ready to answer rollouts (paper Eq. 1 and 2, applied K times).
 
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 
 use nesam_physics::driveline::DrivelineState;
 use nesam_physics::effects::{Phases, ScheduledEffect};
@@ -19,7 +19,7 @@ use crate::rollout::{HistoryStep, Rollout, RolloutExtras, RolloutQuery, Variant,
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
 use crate::soil_prior::SoilPrior;
-use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, VALUES};
+use crate::terrain_tokens::{CacheCounts, TerrainProjection, TerrainToken, TerrainTokens, TokensOfMaps, VALUES};
 use crate::token::{TokenScale, token_entries};
 
 mod block;
@@ -38,12 +38,14 @@ use self::rollout::BlockCaches;
 pub use self::transitions::Transition;
 pub(crate) use self::validate::validate;
 
-/// Maps whose terrain tokens are kept.
-const MAPS_MAX: usize = 16;
 /// Sinkage log-ratio that suppresses the sinkage (ablation "Sinkage = 0").
 pub(crate) const NO_SINKAGE: f32 = -12.0;
 /// |roll| or |pitch| beyond which a vehicle counts as overturned, rad.
 const OVERTURNED_RAD: f64 = 60.0 * core::f64::consts::PI / 180.0;
+/// Speed beyond the trained commands that counts as trained, as a share of the fastest of them: vehicles overshoot and roll downhill (chosen).
+const OVERSHOOT: f64 = 0.25;
+/// Height above or below the ground of a map at which a start cannot be meant, m: more than springs and sinkage take up (chosen).
+const OFF_GROUND_M: f64 = 0.5;
 
 /// How terrain tokens are obtained.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,9 +55,6 @@ enum TerrainMode {
     /// Encoded at every pose: slow, for checking the grid.
     Exact,
 }
-
-/// Hash of a map and its encoded terrain.
-type TokensOfMap = (String, Arc<TerrainTokens>);
 
 /// A loaded bundle that answers rollout queries. `Send + Sync`; a clone shares all that is large.
 #[derive(Clone, Debug)]
@@ -70,7 +69,7 @@ pub struct Predictor {
     projection: Arc<TerrainProjection>,
     token_scale: TokenScale,
     mode: TerrainMode,
-    maps: Arc<Mutex<Vec<TokensOfMap>>>,
+    maps: Arc<Mutex<TokensOfMaps>>,
     caches: Arc<BlockCaches>,
 }
 
@@ -263,6 +262,11 @@ impl Predictor {
         self.terrain(tokens.as_deref(), poses)
     }
 
+    /// Keeps the encoded terrain of so many maps, and of no fewer than before.
+    pub fn keep_maps(&self, maps: usize) {
+        self.maps().keep(maps);
+    }
+
     /// What was asked of the terrain cache of a map so far; nothing when there is none.
     pub fn terrain_cache(&self, map: &Arc<WorldMap>) -> CacheCounts {
         self.held_tokens(map).map_or_else(CacheCounts::default, |tokens| tokens.counts())
@@ -270,22 +274,16 @@ impl Predictor {
 
     /// The cache of a map, if somebody has asked for it.
     fn held_tokens(&self, map: &WorldMap) -> Option<Arc<TerrainTokens>> {
-        let maps = self.maps.lock().expect("no holder panics; this is a bug");
-        maps.iter().find(|(hash, _)| hash == map.hash()).map(|(_, tokens)| tokens.clone())
+        self.maps().get(map).cloned()
     }
 
-    /// The cache of a map, made on first use; the least recently made one goes when there are too many.
+    /// The cache of a map, made on first use.
     fn tokens_of(&self, map: &Arc<WorldMap>) -> Arc<TerrainTokens> {
-        let mut maps = self.maps.lock().expect("no holder panics; this is a bug");
-        if let Some((_, tokens)) = maps.iter().find(|(hash, _)| hash == map.hash()) {
-            return tokens.clone();
-        }
-        if maps.len() == MAPS_MAX {
-            maps.remove(0);
-        }
-        let tokens = Arc::new(TerrainTokens::new(map.clone()));
-        maps.push((map.hash().to_string(), tokens.clone()));
-        tokens
+        self.maps().used(map)
+    }
+
+    fn maps(&self) -> MutexGuard<'_, TokensOfMaps> {
+        self.maps.lock().expect("no holder panics; this is a bug")
     }
 
     /// Terrain tokens at poses; where there is no map or no semantics, the default soil.
@@ -362,6 +360,8 @@ impl Predictor {
         raise(tilt > OVERTURNED_RAD, flag::OVERTURNED);
         raise(tilt > scales.trained_tilt_rad, flag::SLOPE_UNTRAINED);
         raise(outside(control.speed_m_s, scales.trained_speed_m_s), flag::SPEED_UNTRAINED);
+        let driven = driven_m_s(scales.trained_speed_m_s);
+        raise(outside(before.velocity_m_s[0], driven) || outside(next[6], driven), flag::SPEED_UNTRAINED);
         raise(outside(control.second, scales.trained_second), flag::STEERING_UNTRAINED);
         if next.iter().all(|v| v.is_finite()) {
             sample.state = VehicleState::from_array(next);
@@ -371,6 +371,12 @@ impl Predictor {
         sample.previous = Some(before);
         sample.actuators = actuators;
     }
+}
+
+/// Speeds of a vehicle that was told these speeds, beginning and ending at rest, m/s.
+fn driven_m_s([slowest, fastest]: [f64; 2]) -> [f64; 2] {
+    let overshoot = OVERSHOOT * slowest.abs().max(fastest.abs());
+    [slowest.min(0.0) - overshoot, fastest.max(0.0) + overshoot]
 }
 
 /// The physics of a bundle in each phase between the onsets of its effects.

@@ -2,6 +2,7 @@
 
 use std::ops::Range;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::dims::{CONTEXT, FEATURES, HISTORY};
 use crate::soil_field::SoilField;
@@ -163,6 +164,13 @@ pub struct RolloutExtras<'a> {
     pub risk: bool,
     /// Whether to keep [`Rollout::position_m`], for scores far from the origin.
     pub unrounded: bool,
+    /// Raised when nobody waits for the answer any more: the rollout is then given up within a step.
+    pub abandoned: Option<&'a AtomicBool>,
+}
+
+/// Whether the flag of a rollout was raised.
+pub(crate) fn is_raised(abandoned: Option<&AtomicBool>) -> bool {
+    abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed))
 }
 
 /// How near each step is to a limit, row-major (samples, horizon) or (samples, horizon, 4) with the wheels FL, FR, RL, RR.
@@ -186,7 +194,7 @@ pub mod flag {
     pub const OFF_MAP: u32 = 2;
     /// No map was given.
     pub const NO_MAP: u32 = 4;
-    /// Speed command outside the trained range.
+    /// Speed command outside the trained range, or start or predicted speed beyond it by more than a quarter of its fastest.
     pub const SPEED_UNTRAINED: u32 = 8;
     /// Second command outside the trained range.
     pub const STEERING_UNTRAINED: u32 = 16;
@@ -194,6 +202,8 @@ pub mod flag {
     pub const SLOPE_UNTRAINED: u32 = 32;
     /// The vehicle lies on its side or roof (|roll| or |pitch| over 60 degrees).
     pub const OVERTURNED: u32 = 64;
+    /// The start lies more than half a metre above or below the ground of the map.
+    pub const START_OFF_GROUND: u32 = 512;
 }
 
 /// Predicted states.

@@ -4,6 +4,7 @@
 //! a grid in position and heading and interpolated trilinearly between them. Nodes depend on nothing but the map, so a
 //! prediction does not depend on what was asked before it. The cache belongs to one map version and one bundle.
 
+mod of_maps;
 mod store;
 
 use std::cell::RefCell;
@@ -18,6 +19,7 @@ use crate::dims::{CONTEXT, FEATURES, HIDDEN};
 use crate::encoder::{EncoderScratch, TerrainEncoders};
 use crate::fused::{After, Kernel, LANES, Lane, PANEL, Packed, Path, Row, Vector, linear};
 use crate::soil_prior::SoilPrior;
+pub use of_maps::TokensOfMaps;
 use store::NodeStore;
 
 /// Spacing of the pose grid: 0.25 m and 5 degrees (interpolation error 4 % of the token's spread on trained encoders).
@@ -177,6 +179,11 @@ impl TerrainTokens {
     /// The map.
     pub fn map(&self) -> &Arc<WorldMap> {
         &self.map
+    }
+
+    /// Nodes that it holds.
+    pub fn nodes(&self) -> usize {
+        self.nodes.read().count()
     }
 
     /// What was asked of the cache so far.

@@ -1316,10 +1316,14 @@ pub struct PredictRequest {
     /// `extras`.
     #[prost(message, optional, tag = "13")]
     pub cost: ::core::option::Option<PathCost>,
-    /// Fewest samples that are of use, at most N; 0 = all or nothing. Where all N would not be done before the deadline of the call, the service computes as
+    /// Fewest samples that are of use, at most N; 0 = all or nothing. Where all N would not be done before the deadline, the service computes as
     /// many of the first ones as will be, at least this many, and says so by `PredictReply.samples`. A row is the same in any number of rows.
     #[prost(uint32, tag = "14")]
     pub samples_min: u32,
+    /// Time after which the answer is of no use, s, above 0: from when the service has read the request until the answer leaves. The shorter of it and the deadline of the
+    /// call counts; in a stream and over Zenoh, where requests have no deadline of their own, of it and the deadline of the service. Absent = that one.
+    #[prost(double, optional, tag = "15")]
+    pub budget_s: ::core::option::Option<f64>,
 }
 /// Candidates as MPPI draws them: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the vehicle card.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -1656,7 +1660,7 @@ pub enum Validity {
     OffMap = 2,
     /// The session has no map: flat ground and the default soil were used.
     NoMap = 4,
-    /// A speed command lies outside the trained range.
+    /// A speed command lies outside the trained range, or the speed at the start or a predicted one beyond it by more than a quarter of its fastest.
     SpeedUntrained = 8,
     /// A second command lies outside the trained range.
     SteeringUntrained = 16,
@@ -1668,6 +1672,8 @@ pub enum Validity {
     SoilNotLearned = 128,
     /// An alarm of the session is active (`Session.alarm`): its measurements disagree with its predictions for longer than chance and soil explain.
     AlarmActive = 256,
+    /// The start lies more than half a metre above or below where the map would carry it.
+    StartOffGround = 512,
 }
 impl Validity {
     /// String value of the enum field names used in the ProtoBuf definition.
@@ -1686,6 +1692,7 @@ impl Validity {
             Self::Overturned => "VALIDITY_OVERTURNED",
             Self::SoilNotLearned => "VALIDITY_SOIL_NOT_LEARNED",
             Self::AlarmActive => "VALIDITY_ALARM_ACTIVE",
+            Self::StartOffGround => "VALIDITY_START_OFF_GROUND",
         }
     }
     /// Creates an enum from field names used in the ProtoBuf definition.
@@ -1701,6 +1708,7 @@ impl Validity {
             "VALIDITY_OVERTURNED" => Some(Self::Overturned),
             "VALIDITY_SOIL_NOT_LEARNED" => Some(Self::SoilNotLearned),
             "VALIDITY_ALARM_ACTIVE" => Some(Self::AlarmActive),
+            "VALIDITY_START_OFF_GROUND" => Some(Self::StartOffGround),
             _ => None,
         }
     }
@@ -1788,7 +1796,7 @@ pub mod prediction_client {
         }
         /// Rolls N candidate command sequences K steps of 0.1 s ahead.
         /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: unknown session. FAILED_PRECONDITION: no start state and no measurement yet, or the
-        /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not started in time.
+        /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not done in time.
         pub async fn predict(
             &mut self,
             request: impl tonic::IntoRequest<super::PredictRequest>,
@@ -1810,7 +1818,7 @@ pub mod prediction_client {
                 .insert(GrpcMethod::new("nesam.v1.Prediction", "Predict"));
             self.inner.unary(req, path, codec).await
         }
-        /// The same for planners with a fixed rate: replies come in the order of the requests. A request that fails is answered by
+        /// The same for planners with a fixed rate: replies come in the order of the requests, each of which may have a `budget_s`. A request that fails is answered by
         /// `PredictStreamReply.error` and does not end the stream.
         pub async fn predict_stream(
             &mut self,
@@ -1853,7 +1861,7 @@ pub mod prediction_server {
     pub trait Prediction: std::marker::Send + std::marker::Sync + 'static {
         /// Rolls N candidate command sequences K steps of 0.1 s ahead.
         /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: unknown session. FAILED_PRECONDITION: no start state and no measurement yet, or the
-        /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not started in time.
+        /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not done in time.
         async fn predict(
             &self,
             request: tonic::Request<super::PredictRequest>,
@@ -1864,7 +1872,7 @@ pub mod prediction_server {
             >
             + std::marker::Send
             + 'static;
-        /// The same for planners with a fixed rate: replies come in the order of the requests. A request that fails is answered by
+        /// The same for planners with a fixed rate: replies come in the order of the requests, each of which may have a `budget_s`. A request that fails is answered by
         /// `PredictStreamReply.error` and does not end the stream.
         async fn predict_stream(
             &self,

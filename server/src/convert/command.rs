@@ -59,6 +59,7 @@ pub fn predict_message(query: &PredictQuery) -> pb::PredictRequest {
         drawing,
         cost: cost.as_ref().map(path_cost_message),
         samples_min: u32::try_from(*samples_min).unwrap_or(u32::MAX),
+        budget_s: None,
     }
 }
 

@@ -17,10 +17,10 @@ use crate::telemetry::Transport;
 /// Answers planners.
 pub struct Service(pub Edge);
 
-/// One request, the same for the unary method, the stream and Zenoh.
-pub(crate) async fn predict(edge: &Edge, request: &pb::PredictRequest, budget: Duration) -> Result<pb::PredictReply, EngineError> {
+/// One request, the same for the unary method, the stream and Zenoh. It may take as long as it says itself, `longest` at most.
+pub(crate) async fn predict(edge: &Edge, request: &pb::PredictRequest, longest: Duration) -> Result<pb::PredictReply, EngineError> {
     let (query, output) = predict_query(request, edge.engine.handle().limits())?;
-    let (prediction, timing) = edge.engine.predict(query, budget).await?;
+    let (prediction, timing) = edge.engine.predict(query, budget(request, longest)?).await?;
     tracing::debug!(
         session = request.session_id,
         samples = request.samples,
@@ -29,6 +29,16 @@ pub(crate) async fn predict(edge: &Edge, request: &pb::PredictRequest, budget: D
         "predicted"
     );
     Ok(predict_reply(request.tag, &prediction, output, timing))
+}
+
+/// Time that a request may take.
+fn budget(request: &pb::PredictRequest, longest: Duration) -> Result<Duration, EngineError> {
+    match request.budget_s {
+        None => Ok(longest),
+        // What no duration holds is longer than any deadline.
+        Some(budget_s) if budget_s > 0.0 => Ok(Duration::try_from_secs_f64(budget_s).map_or(longest, |asked| asked.min(longest))),
+        Some(budget_s) => Err(EngineError::invalid("budget_s", format!("is {budget_s}, a number above 0 is needed"))),
+    }
 }
 
 #[tonic::async_trait]
@@ -60,7 +70,11 @@ impl pb::prediction_server::Prediction for Service {
                 };
                 let reply = match item {
                     Some(Ok(request)) => match used.enter(&edge, &caller, Wish::ReadSession(&request.session_id)).await {
-                        Ok(_) => Ok(answer(&edge, &request).await),
+                        Ok(_) => tokio::select! {
+                            reply = answer(&edge, &request) => Ok(reply),
+                            // Nobody waits for it any more.
+                            () = sender.closed() => return,
+                        },
                         // The session has moved, and the planner is to come after it.
                         Err(status) if status.code() == Code::Unavailable => Err(status),
                         Err(status) => Ok(refused(request.tag, &status)),

@@ -27,7 +27,7 @@ pub struct KindCount {
     pub equal: u64,
     /// Answers that did not.
     pub different: u64,
-    /// Predictions that the server did not compute, because the asker had gone or the deadline had passed.
+    /// Predictions that the server did not compute, or not to the end, because the asker had gone or the deadline had passed.
     pub not_executed: u64,
 }
 

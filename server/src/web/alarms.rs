@@ -182,6 +182,13 @@ fn candidates(session: &SessionNotes, now_s: f64) -> Vec<Alarm> {
         (flag::NOT_FINITE, Level::Alarm, "not_finite_state", "end in numbers that are not finite", "discard them; report the query"),
         (flag::OVERTURNED, Level::Alarm, "overturned", "overturn the vehicle", "discard them"),
         (flag::OFF_MAP, Level::Warning, "off_map", "leave the map", "upload more of the map, or keep the plan inside"),
+        (
+            flag::START_OFF_GROUND,
+            Level::Warning,
+            "start_off_ground",
+            "start above or below the ground of the map",
+            "check that map and measurements count heights from the same level",
+        ),
         (flag::SPEED_UNTRAINED, Level::Warning, "speed_untrained", "are faster or slower than what was trained", "trust them less"),
         (flag::STEERING_UNTRAINED, Level::Warning, "steering_untrained", "steer harder than what was trained", "trust them less"),
         (flag::SLOPE_UNTRAINED, Level::Warning, "slope_untrained", "tilt the vehicle more than what was trained", "trust them less"),

@@ -19,8 +19,8 @@ const FAN_POINTS: usize = 16;
 const REGIONS: usize = 8;
 /// Half width of a two-sided 95 % interval in standard deviations.
 const TWO_SIDED_95: f64 = 1.96;
-/// Flags that speak of the session and not of the candidate.
-const OF_SESSION: u32 = flag::NO_MAP | SOIL_NOT_LEARNED | ALARM_ACTIVE;
+/// Flags that speak of session and start and not of the candidate.
+const OF_SESSION: u32 = flag::NO_MAP | flag::START_OFF_GROUND | SOIL_NOT_LEARNED | ALARM_ACTIVE;
 /// Units in the order of `SOIL_NAMES`.
 const SOIL_UNITS: [&str; SOIL_DIM] = ["N/m^(n+2)", "N/m^(n+1)", "-", "Pa", "rad", "m"];
 

@@ -83,6 +83,8 @@ async fn service_bad_predictions_are_refused() {
         ("start too fast", from(with_entry(start, 6, 200.0)), InvalidArgument, "start.velocity_m_s.x"),
         ("start upside down twice", from(with_entry(start, 3, 7.0)), InvalidArgument, "start.attitude_rad.x"),
         ("history use 7", v1::PredictRequest { history_use: 7, ..good.clone() }, InvalidArgument, "history_use"),
+        ("no time", v1::PredictRequest { budget_s: Some(0.0), ..good.clone() }, InvalidArgument, "budget_s"),
+        ("NaN seconds", v1::PredictRequest { budget_s: Some(f64::NAN), ..good.clone() }, InvalidArgument, "budget_s"),
         ("channel 12", output(1 << 12, 1), InvalidArgument, "output.channels"),
         ("stride above K", output(0, 4), InvalidArgument, "output.stride"),
     ];

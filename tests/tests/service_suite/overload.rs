@@ -1,12 +1,12 @@
 //! Goal: too much is refused at once and typed, measurements still get through, and the server lives on.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use nesam_client::{outcome_label, v1};
 use nesam_engine::{
-    Clock, Command, Engine, EngineHandle, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply, Submission,
+    Clock, Command, Engine, EngineError, EngineHandle, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply, Submission,
 };
 use tonic::Code;
 
@@ -159,6 +159,62 @@ async fn service_deadlines_are_honoured_and_abandoned_requests_are_skipped() {
     // None of the late ones was computed.
     client.predict(candidates("s", &recorded.drive, 40, 1, 1)).await.unwrap();
     assert_eq!(server.metrics().predictions(), 2);
+    server.shutdown().await;
+}
+
+/// Goal: what nobody waits for any more costs the others nothing. Method: predictions of seconds whose flag is raised after they have begun; one with covariance
+/// spends its time in derivatives.
+#[test]
+fn service_a_prediction_that_nobody_waits_for_is_given_up() {
+    let recorded = recorded();
+    let handle = EngineHandle::spawn(Engine::new(predictor(), Limits::default()).unwrap(), Arc::new(ManualClock::default()));
+    handle.call(Command::Open(OpenSession { vehicle: "s".into(), ..Default::default() })).unwrap();
+    for i in 0..3 {
+        let measurement = engine_sample(&recorded.drive, i);
+        handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+    }
+    let jacobians = PredictExtras { jacobians: true, ..Default::default() };
+    for (samples, extras) in [(2048, PredictExtras::default()), (8, jacobians)] {
+        let query = PredictQuery { extras, ..engine_query("s", &recorded.drive, 2, samples, 32) };
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let mut asked = Submission::new(Command::Predict(query), move |answer| sender.send(answer.result).unwrap());
+        let abandoned = Arc::new(AtomicBool::new(false));
+        asked.abandoned = Some(abandoned.clone());
+        handle.submit(asked);
+        while handle.waiting().1 > 0 {
+            std::thread::yield_now();
+        }
+        std::thread::sleep(Duration::from_millis(5));
+        abandoned.store(true, Ordering::Relaxed);
+        assert!(matches!(receiver.recv().unwrap(), Err(EngineError::Abandoned)), "{samples} samples");
+    }
+    handle.call(Command::Predict(engine_query("s", &recorded.drive, 2, 1, 1))).unwrap();
+    handle.stop();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_prediction_ends_at_its_deadline() {
+    let (server, mut client, recorded) = driven("s", 40).await;
+    let heavy = candidates("s", &recorded.drive, 40, 2048, 32);
+    client.predict(heavy.clone()).await.unwrap();
+    let begun = Instant::now();
+    client.predict(heavy.clone()).await.unwrap();
+    let takes = begun.elapsed();
+    // After a pause the server does not rely on what it expects, and lets one in while nothing else is to be done.
+    tokio::time::sleep(Duration::from_millis(1100)).await;
+    client.predict_within(heavy, Some(takes / 4)).await.expect_err("it takes longer");
+    client.predict(candidates("s", &recorded.drive, 40, 1, 1)).await.unwrap();
+    assert_eq!(server.metrics().predictions(), 3, "the late one was not computed to its end");
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_prediction_of_a_stream_ends_with_its_planner() {
+    let (server, mut client, recorded) = driven("s", 40).await;
+    let heavy = candidates("s", &recorded.drive, 40, 2048, 32).to_message();
+    tokio::time::timeout(Duration::from_millis(20), client.predict_stream(vec![heavy])).await.expect_err("it takes longer");
+    client.predict(candidates("s", &recorded.drive, 40, 1, 1)).await.unwrap();
+    assert_eq!(server.metrics().predictions(), 1, "that of the stream was not computed to its end");
     server.shutdown().await;
 }
 

@@ -1,6 +1,6 @@
 //! Goal: a prediction through the service is the offline rollout, whatever else happens around it.
 
-use nesam_client::v1;
+use nesam_client::{Candidates, v1};
 use nesam_physics::SoilCorrection;
 
 use crate::stage::*;
@@ -107,6 +107,43 @@ async fn service_stream_of_requests_equals_single_requests_and_survives_bad_ones
     }
     let expected: [(u64, i32, &str); 5] = [(1, 0, ""), (2, 3, "horizon"), (3, 5, "session_id"), (5, 3, "samples"), (4, 0, "")];
     assert_eq!(seen, expected.map(|(tag, code, field)| (tag, code, String::from(field))));
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn service_each_request_of_a_stream_has_a_deadline() {
+    let (server, mut client, recorded) = driven("s", 40).await;
+    let within = |samples: usize, budget_s: f64| v1::PredictRequest {
+        budget_s: Some(budget_s),
+        ..candidates("s", &recorded.drive, 40, samples, 32).to_message()
+    };
+    // 2048 candidates take longer than a millisecond everywhere; an answer that comes later than the service waits for any is none.
+    let replies = client.predict_stream(vec![within(2048, 1e-3), within(1, 60.0), within(1, f64::INFINITY)]).await.unwrap();
+    let code = |reply: &v1::PredictStreamReply| match &reply.outcome {
+        Some(v1::predict_stream_reply::Outcome::Error(error)) => error.code,
+        _ => 0,
+    };
+    let codes: Vec<i32> = replies.iter().map(code).collect();
+    assert_eq!(codes, [4, 0, 0], "DEADLINE_EXCEEDED, and two answers");
+    server.shutdown().await;
+}
+
+/// Found from outside: starts at 20 m/s and 3 m below the ground carried no flag.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_start_far_from_what_was_trained_says_so() {
+    let (server, mut client, recorded) = driven("s", 40).await;
+    let from = |start: [f64; 12]| Candidates { start: Some(start), ..Candidates::new("s", 1, 8, [2.0, 0.0].repeat(8)) };
+    let measured = recorded.drive.states[40].to_array();
+    let (mut fast, mut below) = (measured, measured);
+    fast[6] += 15.0;
+    below[2] -= 3.0;
+    let [speed, ground] = [v1::Validity::SpeedUntrained, v1::Validity::StartOffGround].map(|flag| flag as u32);
+    for (start, flag, raised) in
+        [(measured, speed, false), (measured, ground, false), (fast, speed, true), (fast, ground, false), (below, ground, true)]
+    {
+        let validity = client.predict(from(start)).await.unwrap().validity[0];
+        assert_eq!(validity & flag != 0, raised, "{validity} of {start:?}");
+    }
     server.shutdown().await;
 }
 

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <chrono>
 #include <cstdint>
 #include <optional>
 #include <vector>
@@ -26,12 +27,13 @@ enum Validity : std::uint32_t {
   validity_not_finite = 1,          ///< A state of this sample is not finite; the other samples are unaffected.
   validity_off_map = 2,             ///< The sample left the known map.
   validity_no_map = 4,              ///< The session has no map: flat ground and the default soil were used.
-  validity_speed_untrained = 8,     ///< A speed command lies outside the trained range.
+  validity_speed_untrained = 8,     ///< A speed command lies outside the trained range, or a speed of the vehicle far beyond it.
   validity_steering_untrained = 16, ///< A second command lies outside the trained range.
   validity_slope_untrained = 32,    ///< Roll or pitch lies outside the trained range.
   validity_overturned = 64,         ///< |roll| or |pitch| over 60 degrees.
   validity_soil_not_learned = 128,  ///< The drive has not updated the soil yet: the prior alone speaks.
   validity_alarm_active = 256,      ///< An alarm of the session is active (`SessionStatus::alarm`): its measurements disagree with its predictions.
+  validity_start_off_ground = 512,  ///< The start lies more than half a metre above or below where the map would carry it.
 };
 
 /// Whether the measured history of the session may speak for the start state.
@@ -108,6 +110,8 @@ struct PredictRequest {
   std::uint64_t tag = 0;
   /// Fewest samples that are of use when the timeout is near, 0 = all or nothing; `Prediction::samples` says how many were computed.
   std::uint32_t samples_min = 0;
+  /// Time after which the answer is of no use, above 0: what a timeout is to a call, for each request of a stream. Absent = the deadline of the server.
+  std::optional<std::chrono::nanoseconds> budget;
   /// Lets the service draw the candidates: 8 K bytes on the wire instead of 8 N K.
   std::optional<CandidateDrawing> drawing;
   /// Lets the service say what each candidate is worth and return the best only: 4 N bytes and 48 K for each of them instead of 48 N K.

@@ -216,6 +216,7 @@ fn flag_names(word: u32) -> Vec<&'static str> {
         (flag::STEERING_UNTRAINED, "steering_untrained"),
         (flag::SLOPE_UNTRAINED, "slope_untrained"),
         (flag::OVERTURNED, "overturned"),
+        (flag::START_OFF_GROUND, "start_off_ground"),
     ];
     names.into_iter().filter(|(bit, _)| word & bit != 0).map(|(_, name)| name).collect()
 }

@@ -42,11 +42,11 @@ pub(super) struct Block<'a, const H: usize> {
 }
 
 impl Predictor {
-    /// Takes a block to the end of the horizon, or to the first step whose terrain is not encoded yet.
+    /// Takes a block to the end of the horizon, or to the first step whose terrain is not encoded yet, or to where it is given up.
     pub(super) fn advance_block<const H: usize>(&self, scene: &Scene<'_>, caches: &Caches<H>, block: &mut Block<'_, H>) {
         let mut cache = block.cache.take().unwrap_or_else(|| caches.take(scene.query.horizon, scene.variant.remembers()));
         let mut terrain = [[[0.0; VALUES]; LANES]; H];
-        while block.done < scene.query.horizon {
+        while block.done < scene.query.horizon && !scene.is_abandoned() {
             let mut watch = Watch::start(scene.clocks);
             if !self.block_terrain(scene, block, &mut terrain) {
                 block.cache = Some(cache);

@@ -1,6 +1,7 @@
 //! Linearisations of rollouts.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use nesam_physics::VehicleState;
 use rayon::prelude::*;
@@ -19,6 +20,18 @@ impl Predictor {
     /// # Errors
     /// As [`Predictor::rollout`].
     pub fn linearise<'a>(&'a self, query: &RolloutQuery<'a>) -> Result<Vec<Linearisation<'a>>, ModelError> {
+        self.linearise_unless(query, None)
+    }
+
+    /// The same until `abandoned` is raised, when nobody waits for the answer any more: rollouts and their derivatives then end within a step and are of no use.
+    ///
+    /// # Errors
+    /// As [`Predictor::linearise`].
+    pub fn linearise_unless<'a>(
+        &'a self,
+        query: &RolloutQuery<'a>,
+        abandoned: Option<&'a AtomicBool>,
+    ) -> Result<Vec<Linearisation<'a>>, ModelError> {
         validate(query)?;
         let scales = &self.bundle.normalization;
         let tokens = query.map.map(|map| self.tokens_of(map));
@@ -41,6 +54,7 @@ impl Predictor {
             prefix: self.prefix(variant, history, &ground, tokens.as_deref(), clock),
             coordinates: query.soil_correction.coordinates,
             wheels: query.wheels,
+            abandoned,
             previous: history.last().map(|step| step.state),
             observed_share: self.observed_share(history, clock),
             actuators: (!history.is_empty()).then(|| self.actuators(history, &start, &first, clock)),

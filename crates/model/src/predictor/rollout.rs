@@ -4,6 +4,7 @@
 //! block that meets terrain which is not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they
 //! go on. Which block waits for what changes nothing in the results: a node of the terrain is a function of its pose alone.
 
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, WHEELS};
@@ -13,12 +14,12 @@ use super::block::Block;
 use super::parts::PartClocks;
 use super::risk::RiskRow;
 use super::validate::{validate, validate_extras};
-use super::{LogClock, Predictor, Sample, control, pose, raw_soil, under};
+use super::{LogClock, OFF_GROUND_M, Predictor, Sample, control, pose, raw_soil, under};
 use crate::ModelError;
 use crate::fused::{BlockCache, LANES, Prefix};
 use crate::ground::GroundSource;
 use crate::precision::Precision;
-use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag};
+use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
 use crate::terrain_tokens::{Node, TerrainToken, TerrainTokens};
@@ -33,6 +34,7 @@ pub(super) struct Scene<'a> {
     pub(super) variant: Variant,
     pub(super) risk: bool,
     pub(super) unrounded: bool,
+    pub(super) abandoned: Option<&'a AtomicBool>,
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
     pub(super) clocks: Option<&'a PartClocks>,
@@ -42,6 +44,11 @@ impl Scene<'_> {
     /// Command of a row in step `k`: every group of samples has the same.
     pub(super) fn control(&self, row: usize, k: usize) -> Control<f64> {
         control(self.query, row % self.query.samples, k)
+    }
+
+    /// Whether nobody waits for the answer any more.
+    pub(super) fn is_abandoned(&self) -> bool {
+        is_raised(self.abandoned)
     }
 }
 
@@ -92,7 +99,8 @@ impl Predictor {
     /// that equals the query's correction gives the rollout of the query, both bit for bit.
     ///
     /// # Errors
-    /// As [`Predictor::rollout`]; also naming `soils` when a correction is not finite, and `risk` when the form has no soil.
+    /// As [`Predictor::rollout`]; also naming `soils` when a correction is not finite, and `risk` when the form has no soil; `ModelError::Abandoned` when it was
+    /// given up.
     pub fn rollout_with(&self, query: &RolloutQuery<'_>, extras: &RolloutExtras<'_>) -> Result<(Rollout, Option<RiskOutputs>), ModelError> {
         self.rollout_timed(query, extras, None)
     }
@@ -125,17 +133,20 @@ impl Predictor {
             variant,
             risk: extras.risk,
             unrounded: extras.unrounded,
+            abandoned: extras.abandoned,
             clock,
             tokens: tokens.as_deref(),
             clocks,
         };
         let rows = extras.soils.len().max(1) * query.samples;
+        let off_ground = scene.ground.clearance_m(self.physics.at(clock.start_s), &start_state).abs() > OFF_GROUND_M;
+        let of_start = if off_ground { flag::START_OFF_GROUND } else { 0 } | if query.map.is_none() { flag::NO_MAP } else { 0 };
         // Without a history the actuators begin as a row's own first command says, so rows stay independent.
         let start = |row: usize| Sample {
             state: start_state,
             previous: history.last().map(|step| step.state),
             actuators: self.actuators(history, &start_state, &scene.control(row, 0), clock),
-            flags: if query.map.is_none() { flag::NO_MAP } else { 0 },
+            flags: of_start,
         };
         let shared = start(0);
         let under_start = self.terrain(scene.tokens, &[pose(&start_state)])[0];
@@ -159,6 +170,9 @@ impl Predictor {
             true => self.roll_blocks(&scene, &self.caches.wide, &mut samples, &mut rollout),
             false => self.roll_blocks(&scene, &self.caches.narrow, &mut samples, &mut rollout),
         };
+        if scene.is_abandoned() {
+            return Err(ModelError::Abandoned);
+        }
         rollout.flags = samples.iter().map(|s| s.flags).collect();
         Ok((rollout, risk))
     }

@@ -1,6 +1,7 @@
 //! A rollout in f64 with its terrain held, and its derivatives.
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use nesam_physics::driveline::{DrivelineState, differentiable_wheels, measured_wheels};
 use nesam_physics::effects::Phases;
@@ -13,7 +14,7 @@ use crate::dims::CONTROL_DIM;
 use crate::fused::Prefix;
 use crate::normalization::Normalization;
 use crate::predictor::LogClock;
-use crate::rollout::{MeasuredWheels, Variant};
+use crate::rollout::{MeasuredWheels, Variant, is_raised};
 use crate::symbolic::symbolic_step;
 use crate::tangent::transformer::{ExactCache, ExactTransformer};
 use crate::tangent::{Number, Scenery};
@@ -37,6 +38,8 @@ pub struct TangentRollout<'a> {
     pub prefix: Prefix,
     pub coordinates: SoilCoordinates,
     pub wheels: Option<&'a [MeasuredWheels]>,
+    /// Raised when nobody waits for the answer any more.
+    pub abandoned: Option<&'a AtomicBool>,
     /// Last measured state before the start.
     pub previous: Option<VehicleState<f64>>,
     /// Actuators after the history; `None` without a history, where they begin as start and first command say.
@@ -176,7 +179,7 @@ pub struct Linearisation<'a> {
 }
 
 impl<'a> Linearisation<'a> {
-    /// Rolls out, asking for the terrain of each step at the state that was reached. Ends early at a state that is not finite.
+    /// Rolls out, asking for the terrain of each step at the state that was reached. Ends early at a state that is not finite, and where it is given up.
     pub(crate) fn roll_out(
         shared: Arc<TangentRollout<'a>>,
         start: &VehicleState<f64>,
@@ -195,7 +198,7 @@ impl<'a> Linearisation<'a> {
             }
             let motion = motions[k];
             let next = shared.step(k, &motion, control, &delta, &seen, &mut cache);
-            if !next.state.to_array().iter().all(|v| v.is_finite()) {
+            if is_raised(shared.abandoned) || !next.state.to_array().iter().all(|v| v.is_finite()) {
                 break;
             }
             scenery.push(seen);
@@ -242,6 +245,7 @@ impl<'a> Linearisation<'a> {
             motion = self.shared.on_soil(motion, delta, under_start);
         }
         (from..self.scenery.len())
+            .take_while(|_| !is_raised(self.shared.abandoned))
             .map(|k| {
                 motion = self.shared.step(k, &motion, &control(k), delta, &self.scenery[k], cache);
                 self.shared.reported(k + 1, &motion.state)

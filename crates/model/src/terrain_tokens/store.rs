@@ -7,7 +7,7 @@ use std::sync::{PoisonError, RwLock, RwLockReadGuard};
 use super::{Node, TerrainToken};
 
 /// Nodes after which the store forgets all it has (0.5 kB each).
-const NODES_MAX: usize = 400_000;
+pub(super) const NODES_MAX: usize = 400_000;
 /// Nodes along each side of a tile, as a power of two.
 const SIDE_BITS: u32 = 3;
 const SIDE: usize = 1 << SIDE_BITS;
@@ -78,6 +78,11 @@ impl NodeStore {
 }
 
 impl Reader<'_> {
+    /// Number of nodes.
+    pub fn count(&self) -> usize {
+        self.0.nodes
+    }
+
     /// The token of a node, if it is there.
     #[inline]
     pub fn get(&self, node: Node) -> Option<&TerrainToken> {
