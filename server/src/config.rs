@@ -58,7 +58,7 @@ pub struct Config {
 pub struct GrpcConfig {
     /// Address to listen on; port 0 takes a free one. Beyond loopback anybody who reaches the port can feed sessions.
     pub listen: SocketAddr,
-    /// Longest wait of a unary request that brings no deadline of its own, s.
+    /// Longest wait of a request, s; a shorter deadline of its own counts, a longer one does not.
     pub deadline_s: f64,
     /// Longest duration of a map upload, s.
     pub upload_deadline_s: f64,

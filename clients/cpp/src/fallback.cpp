@@ -1,7 +1,6 @@
 #include <nesam/fallback.hpp>
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -25,6 +24,59 @@ double wrapped(double angle_rad) noexcept {
   return pi - below_pi_rad;
 }
 
+/// The state one step after another at a speed and a yaw rate.
+VehicleState stepped(const VehicleState& from, double speed_m_s, double rate_rad_s, double dt_s) noexcept {
+  const double half_turn_rad = 0.5 * rate_rad_s * dt_s;
+  // Exact for an arc: the chord is speed dt sin(h) / h with h = half of the turned angle.
+  const double chord_m = speed_m_s * dt_s * (half_turn_rad == 0.0 ? 1.0 : std::sin(half_turn_rad) / half_turn_rad);
+  const double yaw_rad = from.attitude_rad[2];
+  VehicleState state = from;
+  state.position_m[0] += chord_m * std::cos(yaw_rad + half_turn_rad);
+  state.position_m[1] += chord_m * std::sin(yaw_rad + half_turn_rad);
+  state.attitude_rad[2] = wrapped(yaw_rad + rate_rad_s * dt_s);
+  state.velocity_m_s = {speed_m_s, 0.0, 0.0};
+  state.angular_velocity_rad_s = {0.0, 0.0, rate_rad_s};
+  return state;
+}
+
+/// Where a fallback begins, and the steps that a known state was rolled forward to it.
+struct Start {
+  detail::KnownState at;
+  std::uint32_t rolled_forward_steps = 0;
+};
+
+/// A known state rolled forward to an instant, rounded to the nearest step; absent where it is too old for that, and itself where it is later. Each step uses the
+/// command that is in effect at its middle; before the first of them the vehicle goes on as it moves.
+std::optional<Start> rolled_forward(const KinematicFallback& fallback, const detail::KnownState& known, std::int64_t until_ns, Span<const SentCommand> sent) {
+  if (!known.stamp_ns) return Start{known};
+  const std::int64_t known_ns = *known.stamp_ns;
+  const double step_ns = fallback.dt_s * 1e9;
+  const auto steps_since = [&](std::int64_t stamp_ns) { return (static_cast<double>(stamp_ns) - static_cast<double>(known_ns)) / step_ns; };
+  const double steps = std::max(0.0, std::floor(steps_since(until_ns) + 0.5));
+  if (!(steps <= horizon_max)) return std::nullopt;
+  Start start{known, static_cast<std::uint32_t>(steps)};
+  for (std::uint32_t k = 0; k < start.rolled_forward_steps; ++k) {
+    VehicleState& state = start.at.state;
+    double speed_m_s = state.velocity_m_s[0], rate_rad_s = state.angular_velocity_rad_s[2];
+    for (const SentCommand& command : sent) {
+      if (steps_since(command.stamp_ns) > k + 0.5) break;
+      speed_m_s = command.command.speed_m_s;
+      rate_rad_s = fallback.yaw_rate_rad_s(speed_m_s, command.command.second);
+    }
+    state = stepped(state, speed_m_s, rate_rad_s, fallback.dt_s);
+  }
+  start.at.stamp_ns = known_ns + static_cast<std::int64_t>(std::llround(steps * step_ns));
+  return start;
+}
+
+/// Where the fallback of a request begins.
+std::optional<Start> start_of(const PredictRequest& request, const std::optional<detail::KnownState>& known) {
+  if (request.start) return Start{{*request.start, std::nullopt}};
+  if (!known) return std::nullopt;
+  if (!request.start_stamp_ns) return Start{*known};
+  return rolled_forward(*request.fallback, *known, *request.start_stamp_ns, request.sent);
+}
+
 /// What a fallback may answer instead of.
 bool late(const Error& error) noexcept {
   return error.retryable() || error.code() == Code::deadline_exceeded;
@@ -42,19 +94,13 @@ std::vector<float> KinematicFallback::rollout(const VehicleState& start, View3<c
   std::vector<float> states;
   states.reserve(controls.samples() * controls.steps() * state_size);
   for (std::size_t n = 0; n < controls.samples(); ++n) {
-    double x_m = start.position_m[0], y_m = start.position_m[1], yaw_rad = start.attitude_rad[2];
+    VehicleState state = start;
     for (std::size_t k = 0; k < controls.steps(); ++k) {
       const double speed_m_s = controls(n, k, 0);
-      const double rate_rad_s = yaw_rate_rad_s(speed_m_s, controls(n, k, 1));
-      const double half_turn_rad = 0.5 * rate_rad_s * dt_s;
-      // Exact for an arc: the chord is speed dt sin(h) / h with h = half of the turned angle.
-      const double chord_m = speed_m_s * dt_s * (half_turn_rad == 0.0 ? 1.0 : std::sin(half_turn_rad) / half_turn_rad);
-      x_m += chord_m * std::cos(yaw_rad + half_turn_rad);
-      y_m += chord_m * std::sin(yaw_rad + half_turn_rad);
-      yaw_rad += rate_rad_s * dt_s;
-      const std::array<double, state_size> state = {x_m, y_m, start.position_m[2], start.attitude_rad[0], start.attitude_rad[1], wrapped(yaw_rad),
-                                                    speed_m_s, 0.0, 0.0, 0.0, 0.0, rate_rad_s};
-      for (const double value : state) states.push_back(static_cast<float>(value));
+      state = stepped(state, speed_m_s, yaw_rate_rad_s(speed_m_s, controls(n, k, 1)), dt_s);
+      for (const auto* part : {&state.position_m, &state.attitude_rad, &state.velocity_m_s, &state.angular_velocity_rad_s}) {
+        for (const double value : *part) states.push_back(static_cast<float>(value));
+      }
     }
   }
   return states;
@@ -62,9 +108,10 @@ std::vector<float> KinematicFallback::rollout(const VehicleState& start, View3<c
 
 namespace detail {
 
-std::optional<Prediction> fallback_prediction(const PredictRequest& request, const std::optional<VehicleState>& known, const Error& reason) {
-  const std::optional<VehicleState>& start = request.start ? request.start : known;
-  if (!request.fallback || !start || !late(reason)) return std::nullopt;
+std::optional<Prediction> fallback_prediction(const PredictRequest& request, const std::optional<KnownState>& known, const Error& reason) {
+  if (!request.fallback || !late(reason)) return std::nullopt;
+  const std::optional<Start> start = start_of(request, known);
+  if (!start) return std::nullopt;
   View3<const float> controls = request.controls;
   if (request.drawing) controls = {request.drawing->nominal, 1, request.drawing->nominal.size() / 2, 2};
   const std::uint32_t channels = request.channels == 0 ? all_channels : request.channels & all_channels;
@@ -76,12 +123,15 @@ std::optional<Prediction> fallback_prediction(const PredictRequest& request, con
   prediction.steps = controls.steps() / stride;
   prediction.channels = channels;
   prediction.validity.assign(prediction.samples, 0);
-  prediction.start = *start;
+  prediction.start = start->at.state;
+  prediction.start_stamp_ns = start->at.stamp_ns;
+  prediction.rolled_forward_steps = start->rolled_forward_steps;
+  if (request.drawing) prediction.drawn_storage.assign(request.drawing->nominal.begin(), request.drawing->nominal.end());
   constexpr double unknown = std::numeric_limits<double>::quiet_NaN();
   prediction.soil = {unknown, unknown, unknown, unknown, unknown, unknown};
   prediction.computed_by = ComputedBy::kinematic_fallback;
   prediction.fallback_reason = reason;
-  const std::vector<float> all = request.fallback->rollout(*start, controls);
+  const std::vector<float> all = request.fallback->rollout(prediction.start, controls);
   prediction.states_storage.reserve(prediction.samples * prediction.steps * prediction.channel_count());
   for (std::size_t n = 0; n < prediction.samples; ++n) {
     for (std::size_t k = stride - 1; k < controls.steps(); k += stride) {

@@ -1,5 +1,6 @@
 #pragma once
 
+#include <cstdint>
 #include <mutex>
 #include <optional>
 #include <string>
@@ -10,6 +11,12 @@
 
 namespace nesam::detail {
 
+/// A state of a session and its instant, ns of the vehicle's clock; absent for a start that was given.
+struct KnownState {
+  VehicleState state;
+  std::optional<std::int64_t> stamp_ns;
+};
+
 /// The newest state that a client knows of each session; a fallback without a given start begins there. Safe from several threads at once.
 class KnownStates {
  public:
@@ -17,16 +24,16 @@ class KnownStates {
   void measured(const Measurement& measurement, const MeasurementAnswer& answer) {
     // One that is buffered is no step of the history yet.
     if (!answer.accepted() || answer.is<Buffered>() || answer.reordered) return;
-    note(answer.session_id, measurement.state);
+    note(answer.session_id, {measurement.state, measurement.stamp_ns});
   }
 
-  /// Notes where a prediction from the newest measured state began.
+  /// Notes where a prediction of the session began that was not given its start.
   void predicted(const std::string& session_id, const PredictRequest& request, const Prediction& prediction) {
-    if (!request.start && !request.start_stamp_ns) note(session_id, prediction.start);
+    if (!request.start) note(session_id, {prediction.start, prediction.start_stamp_ns});
   }
 
   /// The newest known state of a session.
-  std::optional<VehicleState> of(const std::string& session_id) const {
+  std::optional<KnownState> of(const std::string& session_id) const {
     const std::lock_guard lock(mutex_);
     const auto known = states_.find(session_id);
     if (known == states_.end()) return std::nullopt;
@@ -40,13 +47,13 @@ class KnownStates {
   }
 
  private:
-  void note(const std::string& session_id, const VehicleState& state) {
+  void note(const std::string& session_id, const KnownState& newest) {
     const std::lock_guard lock(mutex_);
-    states_[session_id] = state;
+    states_[session_id] = newest;
   }
 
   mutable std::mutex mutex_;
-  std::unordered_map<std::string, VehicleState> states_;
+  std::unordered_map<std::string, KnownState> states_;
 };
 
 }  // namespace nesam::detail

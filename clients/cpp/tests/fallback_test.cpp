@@ -115,6 +115,26 @@ void service_a_late_answer_falls_back_and_says_so(const nesam::Session& session,
   drawn.fallback = request.fallback;
   const auto nominal = session.predict(drawn, 0ns);
   check(nominal.ok() && nominal->rows() == 1 && equal_bits(nominal->states().values(), whole->states().sample(0)), "the nominal sequence of a drawing");
+  check(nominal.ok() && equal_bits(nominal->drawn_controls().values(), drawn.drawing->nominal), "and which that is");
+
+  // A session that this client has not measured is known by where its predictions from now began, and is rolled forward from there.
+  const nesam::Session copy = std::move(session.fork(unique("copy")).value());
+  const nesam::Measurement newest = cruise(4, session.vehicle());
+  const nesam::SentCommand sent[] = {{newest.stamp_ns, newest.command}, {newest.stamp_ns + 2 * grid_ns, {0.5, 0.0}}};
+  nesam::PredictRequest ahead = request_of(controls, 3, 8);
+  ahead.sent = sent;
+  ahead.start_stamp_ns = newest.stamp_ns + 2 * grid_ns;
+  const auto first = predicted(copy, ahead);
+  ahead.start_stamp_ns = newest.stamp_ns + 3 * grid_ns;
+  ahead.fallback = request.fallback;
+  const auto next = copy.predict(ahead, 0ns);
+  if (!check_ok(first, "from now") || !check_ok(next, "from now, late")) return;
+  check(first->rolled_forward_steps == 2 && next->rolled_forward_steps == 1 && next->start_stamp_ns == ahead.start_stamp_ns, "from when");
+  const std::vector<float> slower = {0.5F, 0.0F};
+  const auto stepped = request.fallback->rollout(first->start, {nesam::Span<const float>(slower), 1, 1, 2});
+  check(marked(*next) && std::abs(next->start.position_m[0] - stepped[0]) < 1e-5 && next->start.velocity_m_s[0] == 0.5, "with what was sent");
+  ahead.start_stamp_ns = newest.stamp_ns + 35 * grid_ns;
+  check_error(copy.predict(ahead, 0ns), nesam::Code::deadline_exceeded, "", "what is known is too old");
 
   // In time the service answers, and to a wrong question it says what is wrong.
   nesam::PredictRequest right = request_of(controls, 3, 8);

@@ -1,6 +1,6 @@
 """Every unary call: which method of which service, with what, and what the reply means. The clients differ only in how they wait."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
@@ -10,7 +10,7 @@ from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
 from ._extras import Extras
-from ._fallback import KinematicFallback
+from ._fallback import KinematicFallback, KnownState
 from .v1 import effects_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2, types_pb2
 
 LATE = (DeadlineExceeded, Overloaded, Unavailable)
@@ -188,30 +188,37 @@ class Question:
         )
         return Call("prediction", "Predict", request, lambda reply: m.prediction(reply, self.stride, horizon, self.extras))
 
-    def fall_back(self, error: NesamError, known: Optional[np.ndarray]) -> t.Prediction:
-        """What the fallback answers from `start` or the newest known state; raises the error again without one of them."""
-        start = known if self.start is None else self.start
-        if self.fallback is None or start is None:
+    def fall_back(self, error: NesamError, known: Optional[KnownState]) -> t.Prediction:
+        """What the fallback answers from `start` or the newest known state, rolled forward to `start_stamp_ns`; raises the error again without one of them."""
+        if self.fallback is None:
             raise error
-        names = m.channel_names(self.channels)
-        return m.fallback_prediction(self.fallback, t.array(start, (12,), "start"), self.commands(), names, self.stride, error)
+        if self.start is not None:
+            known = KnownState(t.array(self.start, (12,), "start"))
+        elif known is not None and self.start_stamp_ns is not None:
+            known = self.fallback.rolled_forward(known, self.start_stamp_ns, self.sent)
+        if known is None:
+            raise error
+        names, controls = m.channel_names(self.channels), self.commands()
+        answered = m.fallback_prediction(self.fallback, known, controls, names, self.stride, error)
+        return replace(answered, controls=controls) if isinstance(self.controls, Drawing) else answered
 
 
 class KnownStates:
     """The newest state that a client knows of each session; a fallback without a given start begins there."""
 
     def __init__(self) -> None:
-        self._states: Dict[str, np.ndarray] = {}
+        self._states: Dict[str, KnownState] = {}
 
     def measured(self, measurement: t.Measurement, answer: t.Answer) -> None:
         """Notes a measured state that is now the newest of its session."""
         if answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered:
-            self._states[measurement.session_id] = np.asarray(measurement.state, dtype=np.float64)
+            state = np.asarray(measurement.state, dtype=np.float64)
+            self._states[measurement.session_id] = KnownState(state, measurement.stamp_ns)
 
     def predicted(self, question: Question, prediction: t.Prediction) -> t.Prediction:
-        """Notes where a prediction from the newest measured state began, and gives it back."""
-        if question.start is None and question.start_stamp_ns is None:
-            self._states[question.session_id] = prediction.start
+        """Notes where a prediction of the session began that was not given its start, and gives it back."""
+        if question.start is None:
+            self._states[question.session_id] = KnownState(prediction.start, prediction.start_stamp_ns)
         return prediction
 
     def fall_back(self, question: Question, error: NesamError) -> t.Prediction:

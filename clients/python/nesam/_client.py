@@ -263,8 +263,9 @@ class Client:
         service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so.
         start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session forward to it with the commands `sent`,
         pairs (stamp_ns, (speed, second)) by ascending stamp. half: lets the reply travel as 16-bit numbers; positions are rounded by at most
-        4 mm within 16 m of the start. A fallback does not roll forward and predicts the nominal sequence of a drawing alone. extras: Jacobians, covariance, risk and what-if soils; the answer is in
-        `Prediction.extras`, a fallback has none.
+        4 mm within 16 m of the start. extras: Jacobians, covariance, risk and what-if soils; the answer is in `Prediction.extras`.
+        A fallback rolls a known state forward by its own kinematics, no further than 32 steps, predicts the nominal sequence of a drawing alone, and has
+        no extras and no `ranking` (None).
 
         Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, or it lies off the map), Overloaded, DeadlineExceeded,
         Unavailable; ValueError for arrays of a wrong shape.

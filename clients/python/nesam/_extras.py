@@ -56,10 +56,10 @@ class ExtraOutputs:
     State entries are x y z roll pitch yaw vx vy vz wx wy wz (World, velocities in Body) whatever `channels` says. jacobian_start: (samples, steps, 12, 12)
     in the measured or given state. jacobian_controls: (samples, steps, 12, horizon, 2). jacobian_soil: (samples, steps, 12, 6) in the session's
     correction. covariance: (samples, steps, 12, 12) of what would be measured. region_90_planar: 90 % of the measured (x, y) lie where d' P^-1 d is at most
-    this, P the 2 x 2 block; region_90_single: (6,), the same for x y z roll pitch yaw alone. wheel_load_n, N, and wheel_slip, -1 to 1: (..., steps, 4)
+    this, P the 2 x 2 block; region_90_single: (6,), the same for x y z roll pitch yaw alone; not without a map or off it. wheel_load_n, N, and wheel_slip, -1 to 1: (..., steps, 4)
     with the wheels front left, front right, rear left, rear right. load_transfer_ratio: (..., steps), 0 even to 1 one side carries nothing.
-    traction_reserve: (..., steps), drawbar pull that is left over the weight; below 0 the vehicle gets stuck. `...` is (samples,), or (soils, samples) with
-    what-if soils. interpolation_deviation_m: mean over the horizon of the horizontal distance between the first candidate and the same one with the terrain
+    traction_reserve: (..., steps), drawbar pull that is left over the weight in the direction of the speed command; below 0 the vehicle gets stuck, or does
+    not start. `...` is (samples,), or (soils, samples) with what-if soils. interpolation_deviation_m: mean over the horizon of the horizontal distance between the first candidate and the same one with the terrain
     encoded at every pose.
     """
 

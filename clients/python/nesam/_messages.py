@@ -8,7 +8,7 @@ from . import _types as t
 from ._candidates import ranking
 from ._errors import NesamError
 from ._extras import Extras, extra_outputs
-from ._fallback import KinematicFallback
+from ._fallback import KinematicFallback, KnownState
 from .v1 import alarms_pb2, effects_pb2, measurements_pb2, prediction_pb2, sessions_pb2, terrain_pb2, types_pb2
 
 CHANNELS: Tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "wx", "wy", "wz")
@@ -249,17 +249,17 @@ def prediction(reply: prediction_pb2.PredictReply, stride: int, horizon: int, ex
 
 
 def fallback_prediction(
-    fallback: KinematicFallback, start: np.ndarray, controls: np.ndarray, names: Tuple[str, ...], stride: int, reason: NesamError
+    fallback: KinematicFallback, start: KnownState, controls: np.ndarray, names: Tuple[str, ...], stride: int, reason: NesamError
 ) -> t.Prediction:
     """What a fallback answers instead of the service, and why."""
     stride = max(1, stride)
-    states = fallback.rollout(start, controls)[:, stride - 1 :: stride][:, :, [CHANNELS.index(name) for name in names]]
+    states = fallback.rollout(start.state, controls)[:, stride - 1 :: stride][:, :, [CHANNELS.index(name) for name in names]]
     return t.Prediction(
         states=states,
         channels=names,
         steps_s=steps_s(states.shape[1], stride),
         validity=np.zeros(len(states), dtype=np.uint32),
-        start=start,
+        start=start.state,
         sinkage_m=None,
         history_steps=0,
         soil=None,
@@ -270,4 +270,6 @@ def fallback_prediction(
         compute_s=0.0,
         computed_by="kinematic_fallback",
         fallback_reason=reason,
+        start_stamp_ns=start.stamp_ns,
+        rolled_forward_steps=start.rolled_forward_steps,
     )

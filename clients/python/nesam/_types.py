@@ -339,8 +339,8 @@ class Prediction:
     soil_correction: what the session knew of the soil. extras: what `Extras` asked for; with what-if soils, states, sinkage_m and validity have a first
     dimension more, one group for each soil. controls: (samples, horizon, 2) float32 of candidates that the service drew, None of those that were sent.
     ranking: with a `PathCost`, the costs of all candidates; states, validity, sinkage_m and controls then have the rows of `ranking.best`.
-    computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance and
-    sinkage_m are None, validity is 0 and `fallback_reason` is the service's error.
+    computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance,
+    sinkage_m, extras and ranking are None, validity is 0, controls of a drawing are its nominal sequence alone, and `fallback_reason` is the service's error.
     """
 
     states: np.ndarray

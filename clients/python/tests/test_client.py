@@ -10,6 +10,7 @@ import pytest
 
 import nesam
 from conftest import straight
+from nesam._fallback import KnownState
 from nesam.v1 import prediction_pb2
 
 
@@ -278,6 +279,49 @@ def test_service_fallback_is_declared(driven):
     # A wrong question is not answered by the fallback.
     with pytest.raises(nesam.InvalidArgument):
         driven.predict("truck", fan(2, 33), fallback=fallback)
+
+
+def test_service_fallback_of_a_planner_that_only_asks(server_address, driven):
+    fallback = nesam.KinematicFallback(driven.session("truck").vehicle)
+    newest_ns = driven.session("truck").last_stamp_ns
+    asked_ns = newest_ns + 200_000_000
+    # Somebody else feeds the session; this planner knows it from its predictions from now alone.
+    with nesam.Client(server_address, timeout_s=60.0) as planner:
+        known = planner.predict("truck", fan(2, 8), start_stamp_ns=asked_ns, sent=[(newest_ns, (2.0, 0.0))], fallback=fallback)
+        assert (known.computed_by, known.rolled_forward_steps, known.start_stamp_ns) == ("service", 2, asked_ns)
+        sent = [(newest_ns, (2.0, 0.0)), (asked_ns, (1.5, 0.1))]
+        question = dict(start_stamp_ns=asked_ns + 100_000_000, sent=sent, timeout_s=0.0, fallback=fallback)
+        late = planner.predict("truck", fan(3, 24), **question)
+        assert late.computed_by == "kinematic_fallback" and late.states.shape == (3, 24, 12)
+        assert (late.rolled_forward_steps, late.start_stamp_ns) == (1, asked_ns + 100_000_000)
+        np.testing.assert_allclose(late.start, fallback.rollout(known.start, np.float32([[[1.5, 0.1]]]))[0, 0], rtol=1e-6, atol=1e-6)
+        # The fallback ranks nothing, and says which commands it predicts.
+        drawing = nesam.Drawing(fan(1, 24)[0], samples=64, sd=(0.5, 0.1), seed=1)
+        cost = nesam.PathCost(np.float32([[0, 0], [9, 0]]), 2.0, temperature=1.0)
+        drawn = planner.predict("truck", drawing, cost=cost, **question)
+        assert drawn.computed_by == "kinematic_fallback" and drawn.ranking is None
+        np.testing.assert_array_equal(drawn.controls, fan(1, 24))
+        # What it knows is too old to be carried on from.
+        with pytest.raises(nesam.DeadlineExceeded):
+            planner.predict("truck", fan(3, 24), **{**question, "start_stamp_ns": asked_ns + 3_300_000_000})
+
+
+def test_analytic_a_known_state_is_rolled_forward_with_what_was_sent():
+    fallback = nesam.KinematicFallback(nesam.VehicleCard("cart", "yaw_rate_rad_s", (-5.0, 5.0), (-1.0, 1.0), 1.0, 0.0))
+    state = np.zeros(12)
+    state[6], state[11] = 3.0, 0.5
+    known = KnownState(state, 1_000_000_000)
+    # One step as it moves, two steps straight on: the second command is in effect from the middle of the second step on.
+    ahead = fallback.rolled_forward(known, 1_290_000_000, [(1_150_000_000, (2.0, 0.0))])
+    assert (ahead.stamp_ns, ahead.rolled_forward_steps) == (1_300_000_000, 3)
+    np.testing.assert_allclose(ahead.state[[0, 1, 5]], [6 * np.sin(0.05) + 0.4 * np.cos(0.05), 6 * (1 - np.cos(0.05)) + 0.4 * np.sin(0.05), 0.05])
+    assert (ahead.state[6], ahead.state[11]) == (2.0, 0.0)
+    # Nearer than half a step, or earlier, it is itself; 32 steps are rolled forward and no more.
+    for until_ns in (1_049_000_000, 1_000_000_000, 0):
+        same = fallback.rolled_forward(known, until_ns, [])
+        assert (same.stamp_ns, same.rolled_forward_steps) == (known.stamp_ns, 0) and (same.state == state).all()
+    assert fallback.rolled_forward(known, 4_200_000_000, []).rolled_forward_steps == 32
+    assert fallback.rolled_forward(known, 4_300_000_000, []) is None
 
 
 def test_service_away_is_unavailable_or_fallback():

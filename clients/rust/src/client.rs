@@ -258,7 +258,8 @@ impl Client {
     /// time, is overloaded or away, and [`Prediction::computed_by`] says so.
     ///
     /// # Errors
-    /// `ClientError::Refused` with the service's reason. A fallback leaves it where neither a start is given nor a state of the session is known.
+    /// `ClientError::Refused` with the service's reason. A fallback leaves it where neither a start is given nor a state of the session is known, or
+    /// the known one is too old.
     pub async fn predict_within(&mut self, candidates: Candidates, deadline: Option<Duration>) -> Result<Prediction, ClientError> {
         let mut request = tonic::Request::new(candidates.to_message());
         if let Some(deadline) = deadline {

@@ -8,10 +8,14 @@ use nesam_proto::v1;
 use tonic::Code;
 
 use crate::error::ClientError;
+use crate::known_states::KnownState;
 use crate::prediction::{Candidates, ComputedBy, ExtraOutputs, FallbackReason, Prediction};
 
 /// Entries of a state.
 const STATE: usize = 12;
+
+/// Steps that a known state is rolled forward at most, as in the service.
+const ROLLED_FORWARD_STEPS_MAX: usize = 32;
 
 /// What a fallback may answer instead of.
 const LATE: [Code; 3] = [Code::DeadlineExceeded, Code::ResourceExhausted, Code::Unavailable];
@@ -50,33 +54,61 @@ impl KinematicFallback {
         let mut states = Vec::with_capacity(controls.len() / 2 * STATE);
         for sample in controls.chunks_exact((2 * horizon).max(1)) {
             let mut state = *start;
-            let mut yaw = start[5];
             for command in sample.chunks_exact(2) {
                 let (speed, second) = (f64::from(command[0]), f64::from(command[1]));
-                let rate = self.yaw_rate_rad_s(speed, second);
-                let half_turn = 0.5 * rate * self.dt_s;
-                // Exact for an arc: the chord is speed dt sin(h) / h with h = half of the turned angle.
-                let chord = speed * self.dt_s * if half_turn == 0.0 { 1.0 } else { half_turn.sin() / half_turn };
-                let (sin_middle, cos_middle) = (yaw + half_turn).sin_cos();
-                yaw += rate * self.dt_s;
-                state[0] += chord * cos_middle;
-                state[1] += chord * sin_middle;
-                state[5] = PI - (PI - yaw).rem_euclid(TAU);
-                state[6..].copy_from_slice(&[speed, 0.0, 0.0, 0.0, 0.0, rate]);
+                self.step(&mut state, speed, self.yaw_rate_rad_s(speed, second));
                 states.extend(state.iter().map(|value| *value as f32));
             }
         }
         states
     }
 
-    /// What it answers instead of the service, and why. `None` where the error is no lateness, where there is neither a start nor a known state, or where
-    /// the candidates contradict themselves.
-    pub(crate) fn answer(&self, candidates: &Candidates, known: Option<[f64; STATE]>, error: &ClientError) -> Option<Prediction> {
+    /// Moves a state by one step at a speed and a yaw rate.
+    fn step(&self, state: &mut [f64; STATE], speed_m_s: f64, rate_rad_s: f64) {
+        let half_turn = 0.5 * rate_rad_s * self.dt_s;
+        // Exact for an arc: the chord is speed dt sin(h) / h with h = half of the turned angle.
+        let chord = speed_m_s * self.dt_s * if half_turn == 0.0 { 1.0 } else { half_turn.sin() / half_turn };
+        let (sin_middle, cos_middle) = (state[5] + half_turn).sin_cos();
+        state[0] += chord * cos_middle;
+        state[1] += chord * sin_middle;
+        state[5] = PI - (PI - (state[5] + rate_rad_s * self.dt_s)).rem_euclid(TAU);
+        state[6..].copy_from_slice(&[speed_m_s, 0.0, 0.0, 0.0, 0.0, rate_rad_s]);
+    }
+
+    /// A known state rolled forward to an instant, rounded to the nearest step, and the steps; `None` where it is too old for that, and itself where it is
+    /// later. Each step uses the command that is in effect at its middle; before the first of them the vehicle goes on as it moves.
+    fn rolled_forward(&self, known: KnownState, until_ns: i64, sent: &[(i64, [f64; 2])]) -> Option<(KnownState, usize)> {
+        let step_ns = ((self.dt_s * 1e9).round() as i64).max(1);
+        let since_ns = |stamp_ns: i64| i128::from(stamp_ns) - i128::from(known.stamp_ns);
+        let steps = (2 * since_ns(until_ns) + i128::from(step_ns)).div_euclid(2 * i128::from(step_ns)).max(0);
+        let steps = usize::try_from(steps).ok().filter(|steps| *steps <= ROLLED_FORWARD_STEPS_MAX)?;
+        let mut state = known.state;
+        for step in 0..steps as i128 {
+            let in_effect = sent.iter().take_while(|(stamp_ns, _)| 2 * since_ns(*stamp_ns) <= (2 * step + 1) * i128::from(step_ns)).last();
+            let (speed, rate) = match in_effect {
+                Some((_, [speed, second])) => (*speed, self.yaw_rate_rad_s(*speed, *second)),
+                None => (state[6], state[11]),
+            };
+            self.step(&mut state, speed, rate);
+        }
+        Some((KnownState { state, stamp_ns: known.stamp_ns.saturating_add(steps as i64 * step_ns) }, steps))
+    }
+
+    /// What it answers instead of the service, and why. `None` where the error is no lateness, where there is neither a start nor a known state that is new
+    /// enough, or where the candidates contradict themselves.
+    pub(crate) fn answer(&self, candidates: &Candidates, known: Option<KnownState>, error: &ClientError) -> Option<Prediction> {
         let reason = match error {
             ClientError::Refused { code, message, .. } if LATE.contains(code) => FallbackReason { code: *code, message: message.clone() },
             _ => return None,
         };
-        let start = candidates.start.or(known)?;
+        let (start, start_stamp_ns, rolled_forward_steps) = match (candidates.start, candidates.start_stamp_ns) {
+            (Some(start), _) => (start, None, 0),
+            (None, None) => known.map(|known| (known.state, Some(known.stamp_ns), 0))?,
+            (None, Some(until_ns)) => {
+                let (ahead, steps) = self.rolled_forward(known?, until_ns, &candidates.sent)?;
+                (ahead.state, Some(ahead.stamp_ns), steps)
+            }
+        };
         let (samples, controls) = match &candidates.drawing {
             Some(drawing) => (1, Cow::Owned(unpack(&drawing.nominal))),
             None => (candidates.samples, Cow::Borrowed(candidates.controls.as_slice())),
@@ -103,8 +135,8 @@ impl KinematicFallback {
             sinkage_m: Vec::new(),
             validity: vec![0; samples],
             start,
-            start_stamp_ns: None,
-            rolled_forward_steps: 0,
+            start_stamp_ns,
+            rolled_forward_steps,
             history_steps: 0,
             soil: [f64::NAN; 6],
             soil_variance: None,
@@ -115,7 +147,7 @@ impl KinematicFallback {
             compute_s: 0.0,
             soil_groups: 1,
             extras: ExtraOutputs::default(),
-            drawn_controls: Vec::new(),
+            drawn_controls: if candidates.drawing.is_some() { controls.into_owned() } else { Vec::new() },
             costs: Vec::new(),
             best: Vec::new(),
             mean_controls: Vec::new(),
@@ -136,6 +168,10 @@ mod tests {
 
     fn late() -> ClientError {
         tonic::Status::deadline_exceeded("no answer came in time").into()
+    }
+
+    fn known(state: [f64; STATE], stamp_ns: i64) -> Option<KnownState> {
+        Some(KnownState { state, stamp_ns })
     }
 
     /// Goal: the fallback is the one of the Python client. Method: x, y, yaw, vx, wz that `nesam.KinematicFallback` gives for the same start, commands and
@@ -210,7 +246,7 @@ mod tests {
         let start = [3.0; STATE];
         let mut asked = Candidates::new("s", 2, 5, vec![1.0; 20]);
         (asked.output.channels, asked.output.stride, asked.tag) = ((1 << 1) | (1 << 6), 2, 9);
-        let answered = fallback.answer(&asked, Some(start), &late()).unwrap();
+        let answered = fallback.answer(&asked, known(start, 7), &late()).unwrap();
         let whole = fallback.rollout(&start, &asked.controls, 5);
         assert_eq!((answered.computed_by, answered.tag, answered.samples, answered.steps), (ComputedBy::KinematicFallback, 9, 2, 2));
         assert_eq!(answered.state(1, 1), [whole[STATE * 8 + 1], whole[STATE * 8 + 6]]);
@@ -220,8 +256,36 @@ mod tests {
             answered.soil.iter().all(|value| value.is_nan()) && answered.provenance.bundle_hash.is_empty() && answered.sinkage_m.is_empty()
         );
         let drawn = Candidates::drawn("s", 64, &[1.0, 0.1, 1.0, 0.2], v1::CandidateDrawing::default());
-        let nominal = fallback.answer(&drawn, Some(start), &late()).unwrap();
+        let nominal = fallback.answer(&drawn, known(start, 7), &late()).unwrap();
         assert_eq!((nominal.samples, nominal.states), (1, fallback.rollout(&start, &[1.0, 0.1, 1.0, 0.2], 2)));
+        assert_eq!((nominal.drawn_controls, nominal.start_stamp_ns), (vec![1.0, 0.1, 1.0, 0.2], Some(7)));
+    }
+
+    /// Goal: a planner that asks from now gets the kinematics from then. Method: a state that turns, one command that comes into effect in the middle of the
+    /// second step; instants on both sides of half a step and of the longest way. Tolerance: rounding of f64.
+    #[test]
+    fn analytic_a_known_state_is_rolled_forward_with_what_was_sent() {
+        let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
+        let mut state = [0.0; STATE];
+        (state[6], state[11]) = (3.0, 0.5);
+        let begin = known(state, 1_000_000_000);
+        let from = |instant_ns: i64| {
+            let asked = Candidates::new("s", 1, 1, vec![1.0, 0.0]).starting_at(instant_ns, vec![(1_150_000_000, [2.0, 0.0])]);
+            fallback.answer(&asked, begin, &late())
+        };
+        let ahead = from(1_290_000_000).unwrap();
+        assert_eq!((ahead.start_stamp_ns, ahead.rolled_forward_steps), (Some(1_300_000_000), 3));
+        let (sin, cos) = 0.05_f64.sin_cos();
+        // An arc of radius 6 m for one step, then straight on for two.
+        for (entry, value) in [(0, 6.0 * sin + 0.4 * cos), (1, 6.0 * (1.0 - cos) + 0.4 * sin), (5, 0.05), (6, 2.0), (11, 0.0)] {
+            assert!((ahead.start[entry] - value).abs() < 1e-12, "{entry}: {} for {value}", ahead.start[entry]);
+        }
+        for instant_ns in [1_049_000_000, 1_000_000_000, i64::MIN] {
+            let same = from(instant_ns).unwrap();
+            assert_eq!((same.start, same.start_stamp_ns, same.rolled_forward_steps), (state, Some(1_000_000_000), 0));
+        }
+        assert_eq!(from(4_200_000_000).unwrap().rolled_forward_steps, 32);
+        assert!(from(4_300_000_000).is_none() && from(i64::MAX).is_none(), "what is known is too old");
     }
 
     /// Goal: nothing but lateness is answered, and nothing is made up. Method: other errors, no state, controls without their shape.
@@ -229,7 +293,7 @@ mod tests {
     fn analytic_a_fallback_keeps_out_of_everything_else() {
         let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
         let asked = Candidates::new("s", 1, 1, vec![1.0, 0.0]);
-        let known = Some([0.0; STATE]);
+        let known = known([0.0; STATE], 0);
         for status in [tonic::Status::resource_exhausted(""), tonic::Status::unavailable("")] {
             assert!(fallback.answer(&asked, known, &status.into()).is_some());
         }
@@ -238,7 +302,7 @@ mod tests {
         }
         assert!(fallback.answer(&asked, known, &ClientError::protocol("a part is missing")).is_none());
         assert!(fallback.answer(&asked, None, &late()).is_none());
-        let given = Candidates { start: known, ..asked.clone() };
+        let given = Candidates { start: Some([0.0; STATE]), ..asked.clone() };
         assert!(fallback.answer(&given, None, &late()).is_some());
         for (samples, horizon) in [(2, 1), (1, 2), (usize::MAX, 2), (0, 1)] {
             assert!(fallback.answer(&Candidates { samples, horizon, ..asked.clone() }, known, &late()).is_none(), "{samples} x {horizon}");

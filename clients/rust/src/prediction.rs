@@ -43,8 +43,8 @@ pub struct Candidates {
     /// Copied to the prediction.
     pub tag: u64,
     /// Answers [`Client::predict`](crate::Client::predict) and [`Client::predict_within`](crate::Client::predict_within) when the service is late, overloaded
-    /// or away, from `start` or the newest state that the client knows; `None` = nothing does. It does not roll forward and has no extras, costs or
-    /// what-if soils; of a drawing it predicts the nominal sequence alone.
+    /// or away, from `start` or the newest state that the client knows, which it rolls forward to `start_stamp_ns` by its own kinematics, no further than 32
+    /// steps; `None` = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone.
     pub fallback: Option<KinematicFallback>,
 }
 
@@ -141,7 +141,7 @@ pub struct FallbackReason {
 }
 
 /// Predicted trajectories. With [`ComputedBy::KinematicFallback`], `soil` is not a number, `validity` is 0 and everything else that only the service
-/// knows is empty: provenance, sinkage, soil correction, extras, costs.
+/// knows is empty: provenance, sinkage, soil correction, extras, `costs`, `best` and `mean_controls`.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Prediction {
     /// Copied from the candidates.
@@ -209,7 +209,7 @@ pub struct ExtraOutputs {
     pub jacobian_soil: Vec<f32>,
     /// (samples, steps, 12, 12).
     pub covariance: Vec<f32>,
-    /// Squared Mahalanobis radius that holds 90 % of the measured (x, y).
+    /// Squared Mahalanobis radius that holds 90 % of the measured (x, y), on a map.
     pub region_90_planar: f64,
     /// The same of x, y, z, roll, pitch, yaw alone.
     pub region_90_single: Vec<f64>,

@@ -8,7 +8,7 @@ use crate::vehicle::WHEELS;
 
 /// Slip at which the traction that is left is counted (chosen: beyond it a wheel digs more than it pulls).
 pub const RESERVE_SLIP: f64 = 0.8;
-/// Speed around which the direction of travel changes its sign, m/s (chosen, as for slip).
+/// Speed command below which the motion tells the direction of travel, and speed around which it changes its sign then, m/s (chosen, as for slip).
 const DIRECTION_SPEED_M_S: f64 = 0.05;
 
 /// Lateral load-transfer ratio |ΣF_left - ΣF_right| / ΣF of the wheel loads FL, FR, RL, RR in N: 0 = even, 1 = one side carries nothing.
@@ -23,13 +23,15 @@ pub fn load_transfer_ratio<T: Real>(load_n: &[T; WHEELS]) -> T {
 
 impl StepModel {
     /// Traction reserve ρ = Σ DP_i(s*) / (M g) - d sin γ: drawbar pull that all wheels could give at their present loads, less what the slope asks
-    /// for, over the weight. Below 0 the vehicle cannot hold its speed at any slip: it slows down until it is stuck (an immobilisation margin).
+    /// for, over the weight. Below 0 the vehicle cannot go where it is told to at any slip: it slows down until it is stuck, or does not start (an
+    /// immobilisation margin).
     ///
     /// DP_i(s*) = thrust - compaction resistance of wheel i (Wong, *Theory of Ground Vehicles*, ch. 2) at slip s* = [`RESERVE_SLIP`], at the sinkage that
-    /// carries the wheel's load with this slip, times the learned ratio; γ is the climb of the body's x axis, d in (-1, 1) the direction of travel (0 at
-    /// rest). Drawbar pull over weight equals the tangent of the steepest slope that a vehicle climbs, hence the unit. Effects act on wheel, soil and pull as in
-    /// a step, and a force that they put on the body counts like the slope. Neglects side forces, the torque limit of the drive, friction at hubs (which
-    /// torque overcomes) and obstacles. `contacts` are those of the step with this input.
+    /// carries the wheel's load with this slip, times the learned ratio; γ is the climb of the body's x axis, d the direction of travel: that of
+    /// the speed command, 1 or -1, or of the motion in (-1, 1) where none is told. Drawbar pull over weight equals the tangent of the steepest slope that
+    /// a vehicle climbs, hence the unit. Effects act on wheel, soil and pull as in a step, and a force that they put on the body counts like the slope.
+    /// Neglects side forces, the torque limit of the drive, friction at hubs (which torque overcomes) and obstacles. `contacts` are those of the step
+    /// with this input.
     pub fn traction_reserve<T: Real>(&self, input: &StepInput<T>, contacts: &[WheelContact<T>; WHEELS]) -> T {
         let motion = ContactMotion::<T>::from_slip(RESERVE_SLIP, 0.0);
         let mut pull_n = T::lit(0.0);
@@ -49,7 +51,10 @@ impl StepModel {
             pull_n = pull_n + pulled;
         }
         let speed = input.state.velocity_m_s[0];
-        let direction = speed / speed.abs_smooth(DIRECTION_SPEED_M_S);
+        let of_motion = speed / speed.abs_smooth(DIRECTION_SPEED_M_S);
+        let (told, threshold) = (input.wheels.speed_m_s, T::lit(DIRECTION_SPEED_M_S));
+        let backwards_or_none = T::select_ge0(-told - threshold, T::lit(-1.0), of_motion);
+        let direction = T::select_ge0(told - threshold, T::lit(1.0), backwards_or_none);
         // Pitch is positive nose down, so the body climbs by -pitch.
         let climb = -input.state.attitude_rad[1].sin_cos().0;
         let weight_n = T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2);

@@ -1515,10 +1515,12 @@ pub struct PredictReply {
     /// model that were calibrated for the bundle.
     #[prost(bytes = "bytes", tag = "24")]
     pub covariance: ::prost::bytes::Bytes,
-    /// 90 % of the measured (x, y) lie where d' P^-1 d is at most this, d their distance from the predicted ones, P the 2 x 2 block of `covariance`.
+    /// 90 % of the measured (x, y) lie where d' P^-1 d is at most this, d their distance from the predicted ones, P the 2 x 2 block of `covariance`. It holds on
+    /// a map and on ground as in the drives that the bundle was calibrated on. Without a map, or off it (VALIDITY_NO_MAP, VALIDITY_OFF_MAP), it does not: the
+    /// covariance knows nothing of ground that nobody has told.
     #[prost(double, tag = "25")]
     pub region_90_planar: f64,
-    /// The same for x, y, z, roll, pitch and yaw alone: d^2 / variance is at most this.
+    /// The same for x, y, z, roll, pitch and yaw alone: d^2 / variance is at most this. Without a map or off it least of all those of z, roll and pitch hold.
     #[prost(double, repeated, tag = "26")]
     pub region_90_single: ::prost::alloc::vec::Vec<f64>,
     /// Loads of the four wheels, N, packed f32, shape (S N, steps, 4).
@@ -1530,8 +1532,8 @@ pub struct PredictReply {
     /// |left - right| over the sum of the wheel loads, 0 even, 1 one side carries nothing; packed f32, shape (S N, steps).
     #[prost(bytes = "bytes", tag = "29")]
     pub load_transfer_ratio: ::prost::bytes::Bytes,
-    /// Drawbar pull that the wheels could give at a slip of 0.8 less what the slope asks for, over the weight: below 0 the vehicle gets stuck. Packed f32,
-    /// shape (S N, steps).
+    /// Drawbar pull that the wheels could give at a slip of 0.8 less what the slope asks for in the direction of the speed command (of the motion where none
+    /// is given), over the weight: below 0 the vehicle gets stuck, or does not start. Packed f32, shape (S N, steps).
     #[prost(bytes = "bytes", tag = "30")]
     pub traction_reserve: ::prost::bytes::Bytes,
     /// Candidates that were drawn, packed f32, shape (N, horizon, 2), or (best, horizon, 2) with `cost`. Empty for candidates that were sent.
@@ -1624,7 +1626,7 @@ pub enum Precision {
     Unspecified = 0,
     F32 = 1,
     /// IEEE 754 binary16: half of the bytes, eleven significant bits. So that these suffice, x, y and z are then offsets from
-    /// `PredictReply.start.position_m`: rounded by at most 4 mm within 16 m.
+    /// `PredictReply.start.position_m`: rounded by at most 4 mm within 16 m, 16 mm within 64 m.
     F16 = 2,
 }
 impl Precision {
@@ -1797,6 +1799,8 @@ pub mod prediction_client {
         /// Rolls N candidate command sequences K steps of 0.1 s ahead.
         /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: unknown session. FAILED_PRECONDITION: no start state and no measurement yet, or the
         /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not done in time.
+        /// Without Jacobians and covariance a reply has up to 112 N K bytes: 2048 samples of 32 steps with all channels and the sinkage 4.2 MB, with risk too
+        /// 6.8 MB. gRPC libraries refuse replies over 4 MiB unless their limit is raised, and with the same RESOURCE_EXHAUSTED.
         pub async fn predict(
             &mut self,
             request: impl tonic::IntoRequest<super::PredictRequest>,
@@ -1862,6 +1866,8 @@ pub mod prediction_server {
         /// Rolls N candidate command sequences K steps of 0.1 s ahead.
         /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: unknown session. FAILED_PRECONDITION: no start state and no measurement yet, or the
         /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not done in time.
+        /// Without Jacobians and covariance a reply has up to 112 N K bytes: 2048 samples of 32 steps with all channels and the sinkage 4.2 MB, with risk too
+        /// 6.8 MB. gRPC libraries refuse replies over 4 MiB unless their limit is raised, and with the same RESOURCE_EXHAUSTED.
         async fn predict(
             &self,
             request: tonic::Request<super::PredictRequest>,
@@ -2370,7 +2376,7 @@ pub struct OpenSessionRequest {
     /// Uploaded map to drive on; empty = no map: flat ground and the default soil, and every prediction says so.
     #[prost(string, tag = "4")]
     pub map_id: ::prost::alloc::string::String,
-    /// First measurement, if there is one already. Its `session_id` may be empty.
+    /// First measurement, if there is one already. Its `session_id` is that of the session, or empty.
     #[prost(message, optional, tag = "5")]
     pub initial: ::core::option::Option<Measurement>,
 }
@@ -2757,7 +2763,7 @@ pub mod sessions_client {
             self.inner.unary(req, path, codec).await
         }
         /// Puts physical effects on a session; needs the rights of an operator. INVALID_ARGUMENT naming the effect: none or too many, an unknown id, an unknown,
-        /// missing or repeated parameter, a value outside its physical range. NOT_FOUND: unknown session.
+        /// missing or repeated parameter, a value outside its physical range, an effect of skid-steer bases on another vehicle. NOT_FOUND: unknown session.
         pub async fn apply_effects(
             &mut self,
             request: impl tonic::IntoRequest<super::ApplyEffectsRequest>,
@@ -2891,7 +2897,7 @@ pub mod sessions_server {
             tonic::Status,
         >;
         /// Puts physical effects on a session; needs the rights of an operator. INVALID_ARGUMENT naming the effect: none or too many, an unknown id, an unknown,
-        /// missing or repeated parameter, a value outside its physical range. NOT_FOUND: unknown session.
+        /// missing or repeated parameter, a value outside its physical range, an effect of skid-steer bases on another vehicle. NOT_FOUND: unknown session.
         async fn apply_effects(
             &self,
             request: tonic::Request<super::ApplyEffectsRequest>,

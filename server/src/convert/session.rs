@@ -10,8 +10,13 @@ use super::{alarm_message, control_message, effect_messages, measurement, vehicl
 /// A session to open.
 ///
 /// # Errors
-/// `Invalid` naming the field of the initial measurement at fault.
+/// `Invalid` naming the field of the initial measurement at fault, its session where it is of another one.
 pub fn open_session(message: &pb::OpenSessionRequest) -> Result<OpenSession, EngineError> {
+    let session = if message.session_id.is_empty() { &message.vehicle_id } else { &message.session_id };
+    if let Some(initial) = message.initial.as_ref().filter(|initial| !initial.session_id.is_empty() && initial.session_id != *session) {
+        let reason = format!("is `{}`, the session to open is `{session}`", initial.session_id);
+        return Err(EngineError::invalid("initial.session_id", reason));
+    }
     let below = |error| match error {
         EngineError::Invalid { field, reason } => EngineError::Invalid { field: format!("initial.{field}"), reason },
         other => other,

@@ -73,8 +73,14 @@ impl MapBuilder {
             return Err(EngineError::invalid("header.width", reason));
         }
         let geometry = GridGeometry { origin_m: [header.origin_x_m, header.origin_y_m], resolution_m: header.resolution_m, width, height };
-        if !(geometry.resolution_m.is_finite() && geometry.origin_m.iter().all(|v| v.is_finite())) {
-            return Err(EngineError::invalid("header.resolution_m", "resolution and origin must be finite"));
+        for (field, value) in [
+            ("header.origin_x_m", header.origin_x_m),
+            ("header.origin_y_m", header.origin_y_m),
+            ("header.resolution_m", header.resolution_m),
+        ] {
+            if !value.is_finite() {
+                return Err(EngineError::invalid(field, format!("is {value}, a finite number is needed")));
+            }
         }
         if header.frame.len() > FRAME_LENGTH_MAX {
             let reason = format!("has {} bytes, at most {FRAME_LENGTH_MAX} are allowed", header.frame.len());

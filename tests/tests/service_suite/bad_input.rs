@@ -178,6 +178,7 @@ async fn service_bad_sessions_are_refused() {
     let too_fast = v1::Measurement { state: first().state.map(|state| with_entry(state, 7, -101.0)), ..first() };
     let wheels = v1::Measurement { wheels: Some(v1::WheelMeasurement { speed_rad_s: vec![1.0; 5], ..Default::default() }), ..first() };
     let incomplete = v1::Measurement { state: None, ..sample("", &recorded.drive, 0) };
+    let of_another = sample("s", &recorded.drive, 0);
     use Code::{AlreadyExists, InvalidArgument, NotFound};
     for (what, request, code, field) in [
         ("no vehicle", v1::OpenSessionRequest::default(), InvalidArgument, "vehicle_id"),
@@ -191,6 +192,7 @@ async fn service_bad_sessions_are_refused() {
         ("initial not finite", v1::OpenSessionRequest { initial: Some(not_finite), ..good() }, InvalidArgument, "initial.command.second"),
         ("initial too fast", v1::OpenSessionRequest { initial: Some(too_fast), ..good() }, InvalidArgument, "initial.state.velocity_m_s.y"),
         ("initial wheels", v1::OpenSessionRequest { initial: Some(wheels), ..good() }, InvalidArgument, "initial.wheels.speed_rad_s"),
+        ("initial of another", v1::OpenSessionRequest { initial: Some(of_another), ..good() }, InvalidArgument, "initial.session_id"),
         ("initial incomplete", v1::OpenSessionRequest { initial: Some(incomplete), ..good() }, InvalidArgument, "initial.state"),
     ] {
         assert_refused(what, client.open_session(request).await, code, field);
@@ -243,7 +245,8 @@ async fn service_bad_maps_are_refused() {
         ("overflowing size", with_header(v1::MapHeader { width: u32::MAX, height: u32::MAX, ..header() }), InvalidArgument, "header.width"),
         ("NaN resolution", with_header(v1::MapHeader { resolution_m: f64::NAN, ..header() }), InvalidArgument, "header.resolution_m"),
         ("resolution 0", with_header(v1::MapHeader { resolution_m: 0.0, ..header() }), InvalidArgument, "header.resolution_m"),
-        ("infinite origin", with_header(v1::MapHeader { origin_x_m: f64::INFINITY, ..header() }), InvalidArgument, "header.resolution_m"),
+        ("infinite origin", with_header(v1::MapHeader { origin_x_m: f64::INFINITY, ..header() }), InvalidArgument, "header.origin_x_m"),
+        ("NaN origin", with_header(v1::MapHeader { origin_y_m: f64::NAN, ..header() }), InvalidArgument, "header.origin_y_m"),
         ("long frame", with_header(v1::MapHeader { frame: "x".repeat(65), ..header() }), InvalidArgument, "header.frame"),
         ("tile too high", with_tile(v1::MapTile { row: 1, ..tile() }), InvalidArgument, "tile.rows"),
         ("tile far right", with_tile(v1::MapTile { column: u32::MAX, ..tile() }), InvalidArgument, "tile.columns"),

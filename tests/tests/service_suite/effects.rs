@@ -104,6 +104,7 @@ async fn service_effects_outside_the_catalogue_are_refused() {
         ("negative sd", offset(&[("second", 0.1, -1.0)]), "effects[0]"),
         ("wide sd", offset(&[("second", 0.1, 1e3)]), "effects[0]"),
         ("the second one", [both(), offset(&[])].concat(), "effects[2]"),
+        ("not on a car", [both(), vec![effect("skid_steer_track", &[("metres", 0.3, 0.0)])]].concat(), "effects[2]"),
         ("too many", vec![both()[1].clone(); 17], "effects"),
         ("none", vec![], "effects"),
     ];

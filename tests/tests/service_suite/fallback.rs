@@ -86,6 +86,30 @@ async fn service_a_server_that_is_gone_falls_back_to_the_newest_known_state() {
     assert_fallback(client.predict(Candidates { start: Some([1.0; 12]), ..strange }).await, [1.0; 12]);
 }
 
+/// A planner that only asks from now knows the session by where its predictions began.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_planner_that_only_asks_from_now_falls_back() {
+    let (server, mut vehicle, recorded) = driven("s", 40).await;
+    let fallback = fallback_of(&mut vehicle, "s").await;
+    let newest_ns = vehicle.session("s").await.unwrap().last_stamp_ns.unwrap();
+    let mut planner = Client::connect(&format!("http://{}", server.grpc_addr)).await.unwrap();
+    let (asked_ns, step_ns) = (newest_ns + 200_000_000, 100_000_000);
+    let command = recorded.drive.controls[40];
+    let sent = vec![(newest_ns, [command.speed_m_s, command.second])];
+    let first = planner.predict(candidates("s", &recorded.drive, 40, 2, 8).starting_at(asked_ns, sent.clone())).await.unwrap();
+    assert_eq!((first.rolled_forward_steps, first.start_stamp_ns), (2, Some(asked_ns)));
+    server.shutdown().await;
+    let next = candidates("s", &recorded.drive, 40, 3, 5).starting_at(asked_ns + step_ns, sent);
+    let expected = fallback.rollout(&first.start, &[command.speed_m_s as f32, command.second as f32], 1);
+    let answered = planner.predict(next.or_fall_back(fallback)).await.unwrap();
+    assert_eq!((answered.computed_by, answered.rolled_forward_steps), (ComputedBy::KinematicFallback, 1));
+    assert_eq!(answered.start_stamp_ns, Some(asked_ns + step_ns));
+    // Single precision of positions and commands.
+    for (start, expected) in answered.start.iter().zip(&expected) {
+        assert!((start - f64::from(*expected)).abs() < 1e-4, "{start} for {expected}");
+    }
+}
+
 /// A connection that is being made, to a machine that does not answer, must not take longer than the deadline.
 #[tokio::test(flavor = "multi_thread")]
 async fn service_a_deadline_holds_without_a_connection() {

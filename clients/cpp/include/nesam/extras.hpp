@@ -50,6 +50,7 @@ struct ExtraOutputs {
   /// of the model that were calibrated for the bundle.
   Array<float, 4> covariance;
   /// 90 % of the measured (x, y) lie where d' P^-1 d is at most this: d their distance from the predicted ones, P the 2 x 2 block of `covariance`.
+  /// Not without a map or off it (`validity_no_map`, `validity_off_map`).
   std::optional<double> region_90_planar;
   /// The same for x, y, z, roll, pitch and yaw alone: d^2 / variance is at most this.
   std::optional<std::array<double, 6>> region_90_single;
@@ -59,7 +60,8 @@ struct ExtraOutputs {
   Array<float, 3> wheel_slip;
   /// |left - right| over the sum of the wheel loads, 0 even, 1 one side carries nothing: shape (rows, steps).
   Array<float, 2> load_transfer_ratio;
-  /// Drawbar pull that the wheels could give at a slip of 0.8 less what the slope asks for, over the weight: below 0 the vehicle gets stuck. Shape (rows, steps).
+  /// Drawbar pull that the wheels could give at a slip of 0.8 less what the slope asks for in the direction of the speed command, over the weight: below 0 the
+  /// vehicle gets stuck, or does not start. Shape (rows, steps).
   Array<float, 2> traction_reserve;
   /// Horizontal distance between the first candidate and the same one with the terrain encoded at every pose, mean over the horizon, m. Absent also without a
   /// map, where nothing is interpolated.

@@ -118,8 +118,9 @@ struct PredictRequest {
   std::optional<PathCost> cost;
   /// What to compute beyond the states.
   Extras extras;
-  /// Answers `Session::predict` when the service is late, overloaded or away, from `start` or the newest state that this client knows; absent = nothing does. It
-  /// does not roll forward and has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone. Streams leave it unread.
+  /// Answers `Session::predict` when the service is late, overloaded or away, from `start` or the newest state that this client knows, which it rolls forward to
+  /// `start_stamp_ns` by its own kinematics, no further than 32 steps; absent = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the
+  /// nominal sequence alone. Streams leave it unread.
   std::optional<KinematicFallback> fallback;
 };
 
@@ -130,7 +131,7 @@ enum class ComputedBy {
 };
 
 /// The predicted states and what they were computed from. With `ComputedBy::kinematic_fallback`, `soil` is not a number, `validity` is 0 and everything else that only
-/// the service knows is empty: provenance, sinkage, soil correction, extras, costs.
+/// the service knows is empty: provenance, sinkage, soil correction, extras, `costs`, `best` and `mean_controls`.
 class Prediction {
  public:
   /// Shape (rows, floor(K / stride), C) with C = number of channels asked for, in the order of `Channel`; yaw in (-pi, pi]. Step k (from 0) is the state

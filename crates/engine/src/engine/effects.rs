@@ -1,5 +1,8 @@
 //! Effects on sessions, and what their watches tell.
 
+use nesam_physics::SecondCommand;
+use nesam_physics::effects::Effect;
+
 use super::Engine;
 use crate::command::{Event, Reply};
 use crate::error::EngineError;
@@ -10,6 +13,7 @@ impl Engine {
     pub(super) fn set_effects(&mut self, id: &str, effects: &AppliedEffects) -> Result<Reply, EngineError> {
         self.session(id)?;
         let acting = Acting::new(&self.predictor, effects)?;
+        self.check_effects_fit(effects)?;
         let filter = self.filter.clone();
         let session = self.sessions.get_mut(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })?;
         let before = session.applied();
@@ -25,6 +29,21 @@ impl Engine {
             }
         }
         Ok(Reply::Session(Box::new(self.view(self.session(id)?))))
+    }
+
+    /// Refuses effects that change nothing on this vehicle. Those that a session brings with its image stay.
+    fn check_effects_fit(&self, effects: &AppliedEffects) -> Result<(), EngineError> {
+        let vehicle = self.vehicle();
+        if vehicle.second == SecondCommand::YawRateRadS {
+            return Ok(());
+        }
+        match effects.effects.iter().position(|effect| Effect::example(&effect.id).is_some_and(|effect| effect.is_of_skid_steer())) {
+            None => Ok(()),
+            Some(i) => {
+                let reason = format!("is `{}`, which changes nothing on `{}`: it does not skid-steer", effects.effects[i].id, vehicle.name);
+                Err(EngineError::invalid(format!("effects[{i}]"), reason))
+            }
+        }
     }
 
     /// Tells what a watch has raised or cleared.

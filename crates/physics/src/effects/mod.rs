@@ -166,6 +166,11 @@ impl Effect {
         Self::examples().into_iter().find(|effect| effect.id() == id)
     }
 
+    /// Whether the effect is one of the drive of skid-steer bases; it changes nothing on another vehicle.
+    pub fn is_of_skid_steer(&self) -> bool {
+        matches!(self, Self::SkidSteerTrack(_) | Self::TurnLimit(_))
+    }
+
     /// What somebody wrote down; `None` for an effect of the catalogue.
     pub fn written(&self) -> Option<Written> {
         if let Self::Written(written) = self { Some(*written) } else { None }
