@@ -57,7 +57,8 @@ class Soil:
     """What a session knows of the soil: a correction of the prior in the order k_phi k_c n c phi k_shear.
 
     coordinates: "logarithmic" (natural logarithm of the factor; differences for n and phi) or "physical" (SI). delta: (6,). covariance: (6, 6) or
-    None while no filter runs. learned: (6,) bool, whether the drive has told something of each.
+    None while no filter runs. learned: (6,) bool, whether the drive has at least halved the prior variance of each, with a correction that is more likely
+    right than the prior alone.
     """
 
     coordinates: str

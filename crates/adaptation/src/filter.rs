@@ -18,6 +18,8 @@ pub use snapshot::{ClassBelief, FilterSnapshot, JointSnapshot};
 
 /// Share of the prior variance below which a parameter counts as learned.
 const LEARNED_SHARE: f64 = 0.5;
+/// Weight of the correction above which what was learned counts as such: it is more likely right than the prior alone.
+const LEARNED_TRUST: f64 = 0.5;
 /// Share of the prior standard deviation below which another linearisation would change nothing: each move is about a tenth of the one before, so what is left
 /// is a thousandth.
 const CONVERGED_SHARE: f64 = 1e-2;
@@ -29,8 +31,9 @@ pub struct SoilPosterior {
     pub correction: SoilCorrection,
     /// P⁺, in the coordinates of the correction.
     pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
-    /// Whether the drive has told something of each parameter: its variance is below half of the prior one. Where it is false, a consumer
-    /// should say "not learned" instead of a number; k_phi and k_c for instance act through one sum on a vehicle of one wheel width.
+    /// Whether the drive has told much of each parameter: its variance is below half of the prior one, and the correction is trusted more than the prior
+    /// alone. Where it is false, a consumer should say "not learned" instead of a number; k_phi and k_c for instance act through one sum on a vehicle of
+    /// one wheel width. A correction can be right all the same: where the ground may change unannounced, variances seldom stay so small.
     pub learned: [bool; SOIL_DIM],
 }
 
@@ -134,7 +137,7 @@ impl SoilFilter {
         SoilPosterior {
             correction,
             covariance: core::array::from_fn(|r| core::array::from_fn(|c| p[(r, c)])),
-            learned: core::array::from_fn(|i| p[(i, i)] < LEARNED_SHARE * self.config.prior_sd[i].powi(2)),
+            learned: core::array::from_fn(|i| weight > LEARNED_TRUST && p[(i, i)] < LEARNED_SHARE * self.config.prior_sd[i].powi(2)),
         }
     }
 

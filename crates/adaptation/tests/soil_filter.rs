@@ -309,6 +309,8 @@ fn property_a_correction_is_used_where_it_helps_and_not_where_the_prior_is_right
         let (soft, loam) = (last(SOFT), last(LOAM));
         assert!(soft.trust > 0.95, "seed {seed}: {}", soft.trust);
         assert!(loam.trust < 0.3, "seed {seed}: {}", loam.trust);
+        let learned = [soft, loam].map(|update| update.posterior.learned);
+        assert!(learned[0].contains(&true) && !learned[1].contains(&true), "seed {seed}: {learned:?}");
     }
 }
 

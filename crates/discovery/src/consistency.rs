@@ -14,7 +14,7 @@ const UNCHANGED: f64 = 1e-9;
 
 /// Adds Δp - ∫ R v dt (heading frame of the first sample, m) and Δη - ∫ E ω dt (rad) over consecutive samples, by the trapezoidal rule.
 pub fn add_consistency(states: &[VehicleState<f64>], dt_s: f64, row: &mut Row) {
-    let found = contradiction(states, dt_s);
+    let found = contradiction(states, |_| dt_s);
     row[PATH_AT..PATH_AT + found.len()].copy_from_slice(&found);
 }
 
@@ -55,7 +55,7 @@ impl Contradictions {
                 states = vehicle.with_effects(&on).effects.sensor.to_true_along(&drive.states, drive.dt_s);
             }
             self.drive.push(d);
-            self.rows.push(contradiction(&states[start..=start + SEGMENT_STEPS], drive.dt_s));
+            self.rows.push(contradiction(&states[start..=start + SEGMENT_STEPS], |_| drive.dt_s));
         }
     }
 

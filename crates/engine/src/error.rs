@@ -54,9 +54,9 @@ pub enum EngineError {
         session: String,
     },
     /// A value is not acceptable.
-    #[error("`{field}`: {reason}")]
+    #[error("{}{reason}", at(field))]
     Invalid {
-        /// Path of the field at fault.
+        /// Path of the field at fault, empty when none is.
         field: String,
         /// What was wrong and what is allowed.
         reason: String,
@@ -146,6 +146,11 @@ impl EngineError {
             Self::Overloaded { .. } | Self::Expired | Self::Abandoned | Self::Stopped | Self::Internal { .. } => "",
         }
     }
+}
+
+/// What a message about a field begins with.
+fn at(field: &str) -> String {
+    if field.is_empty() { String::new() } else { format!("`{field}`: ") }
 }
 
 impl From<ModelError> for EngineError {

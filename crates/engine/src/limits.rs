@@ -4,6 +4,7 @@ use nesam_model::MAX_HORIZON;
 use nesam_physics::{Control, STATE_DIM, Vehicle, VehicleState};
 
 use crate::error::EngineError;
+use crate::measurement::WheelMeasurement;
 
 /// Longest name of a session, a vehicle or a map, bytes.
 pub const NAME_LENGTH_MAX: usize = 64;
@@ -61,7 +62,7 @@ pub struct Limits {
     pub waiting_measurements_per_vehicle_max: usize,
     /// |position| along each axis, m.
     pub position_max_m: f64,
-    /// |velocity| along each axis, m/s.
+    /// |velocity| along each axis and of the rim of each wheel, m/s.
     pub speed_max_m_s: f64,
     /// |angular velocity| about each axis, rad/s.
     pub angular_speed_max_rad_s: f64,
@@ -149,6 +150,24 @@ impl Limits {
             if !value.is_finite() || value.abs() > limit {
                 let reason = format!("is {value}, allowed is a finite number of magnitude up to {limit}");
                 return Err(EngineError::invalid(format!("{path}.{}", STATE_FIELDS[i]), reason));
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks the plausibility of finite measurements of wheels of this radius.
+    ///
+    /// # Errors
+    /// `EngineError::Invalid` naming the entry and its limit.
+    pub fn check_wheels(&self, wheels: &WheelMeasurement, wheel_radius_m: f64) -> Result<(), EngineError> {
+        let speeds = wheels.speed_rad_s.as_ref().map(|speeds| &speeds[..]).unwrap_or_default();
+        let angles = wheels.road_wheel_angle_rad.as_ref().map(|angles| &angles[..]).unwrap_or_default();
+        let entries =
+            [("speed_rad_s", speeds, self.speed_max_m_s / wheel_radius_m), ("road_wheel_angle_rad", angles, core::f64::consts::FRAC_PI_2)];
+        for (name, values, limit) in entries {
+            if let Some(i) = values.iter().position(|value| value.abs() > limit) {
+                let reason = format!("is {}, allowed is a magnitude up to {limit}", values[i]);
+                return Err(EngineError::invalid(format!("wheels.{name}[{i}]"), reason));
             }
         }
         Ok(())

@@ -26,7 +26,7 @@ pub(crate) use self::image::refused;
 pub use self::image::{SessionImage, TrackImage, WatchImage};
 use self::order::{Order, Verdict};
 pub use self::soil::{BufferTest, SoilState};
-use self::soil::{Judged, Models, SoilLearner};
+use self::soil::{Judged, Learned, Models, SoilLearner};
 use self::track::{Stamped, Taken, Track};
 use self::watch::{Watch, WatchedBuffer};
 use crate::error::EngineError;
@@ -181,6 +181,7 @@ impl Session {
             return refused(Outcome::NotFinite { field });
         }
         rules.limits.check_state("state", &measurement.state)?;
+        rules.limits.check_wheels(&measurement.wheels, rules.vehicle.wheel_radius_m)?;
         if let Some((entry, reason)) = outside_card(rules.vehicle, &measurement.command) {
             return Err(EngineError::invalid(format!("command.{entry}"), reason));
         }
@@ -293,7 +294,7 @@ impl Session {
                 }
             };
             for step in [Some(first), second].into_iter().flatten() {
-                if let Some(nis) = self.learn_step(step, step_ns, models, map) {
+                if let Some(nis) = self.learn_step(step, models, map) {
                     outcome = Outcome::Gated { nis };
                 }
                 self.check_forecast(models.usual, noise, map);
@@ -327,14 +328,15 @@ impl Session {
     }
 
     /// Lets the filter learn from one final step; NIS of the buffer that it ended if that was refused.
-    fn learn_step(&mut self, (end_ns, step): Stamped, step_ns: i64, models: Models<'_>, map: Option<&Arc<WorldMap>>) -> Option<f64> {
-        self.settled.push(step);
-        let (newest, before) = self.settled.history.make_contiguous().split_last()?;
-        let Judged { update, brought, contradiction, standing } = self.learner.step(models, before, newest, map)?;
+    fn learn_step(&mut self, newest: Stamped, models: Models<'_>, map: Option<&Arc<WorldMap>>) -> Option<f64> {
+        self.settled.push(newest.1);
+        let (_, before) = self.settled.history.make_contiguous().split_last()?;
+        let Judged { stamps_ns, learned, contradiction, standing } = self.learner.step(models, before, newest, map)?;
         if let Some(watch) = self.watch.as_mut().filter(|_| !standing) {
-            let begin_ns = watch.begin_ns(end_ns.saturating_sub(step_ns * self.learner.buffer() as i64), step_ns);
-            self.told.extend(watch.feed(WatchedBuffer::new([begin_ns, end_ns], &update.agreement, contradiction)));
+            let agreement = learned.as_ref().map(|learned| &learned.update.agreement);
+            self.told.extend(watch.feed(WatchedBuffer::new(stamps_ns, agreement, contradiction)));
         }
+        let Learned { update, brought } = learned?;
         self.fleet.brought.extend(brought.filter(|_| self.fleet.brings));
         let judged = self.soil.state.last_buffer.map_or(0, |last| last.judged) + 1;
         let last_buffer = Some(BufferTest { judged, nis: update.nis, dof: update.dof, rejected: update.rejected });
@@ -342,7 +344,7 @@ impl Session {
             self.soil.state.last_buffer = last_buffer;
             return Some(update.nis);
         }
-        let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, Some(end_ns)) };
+        let state = SoilState { last_buffer, ..self.learner.state(self.soil.state.epoch + 1, Some(stamps_ns[1])) };
         self.soil = SoilEstimate { state, covariance: update.posterior.covariance, noise_scale: update.noise_scale, ..self.soil };
         None
     }
@@ -398,7 +400,7 @@ impl Session {
     pub(crate) fn begin_from(&mut self, fleet: Option<&mut Fleet>, map: Option<&Arc<WorldMap>>, now_ns: u64) {
         let Some([x, y, _]) = self.newest().filter(|_| self.fleet.asks).map(|step| step.state.position_m) else { return };
         self.fleet.asks = false;
-        let (filter, _, _) = self.learner.parts();
+        let (filter, ..) = self.learner.parts();
         let prior = fleet.zip(map).and_then(|(fleet, map)| fleet.prior(map, [x, y], filter.config(), now_ns));
         if prior.is_some_and(|prior| self.learner.begin_from(&prior)) {
             let state = self.learner.state(self.soil.state.epoch + 1, None);

@@ -678,7 +678,8 @@ pub struct SoilCorrection {
     /// Diagonal of the covariance of `delta`, in these coordinates; absent while no filter runs.
     #[prost(message, optional, tag = "3")]
     pub variance: ::core::option::Option<SoilVector>,
-    /// Whether the drive has told something of each parameter, in the order of SoilVector; a parameter that is not learned has no number to show.
+    /// Whether the drive has at least halved the prior variance of each parameter, in the order of SoilVector, with a correction that is more likely right than
+    /// the prior alone. A parameter that is not learned has no number to show; predictions use its correction all the same.
     #[prost(bool, repeated, tag = "4")]
     pub learned: ::prost::alloc::vec::Vec<bool>,
     /// Covariance of `delta`, shape (6, 6), row-major in the order of SoilVector, in these coordinates; empty while no filter runs.
@@ -810,7 +811,8 @@ pub struct Measurement {
     #[prost(uint64, tag = "8")]
     pub run: u64,
 }
-/// Optional measurements of the wheels.
+/// Optional measurements of the wheels. They go into recordings and diagnoses alone: predictions and the soil filter do without them. REJECTED are angles
+/// beyond a right angle and speeds whose rim exceeds `limits.speed_max_m_s`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct WheelMeasurement {
     /// Speeds of the four wheels about their axles, rad/s, positive forward; empty or 4 values.
@@ -912,7 +914,7 @@ pub struct Buffered {
     #[prost(double, tag = "1")]
     pub next_step_in_s: f64,
 }
-/// This stamp or sequence number was accepted before. Nothing changed.
+/// This sequence number was accepted before, or this stamp and no higher number comes with it. Nothing changed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Duplicate {}
 /// The stamp lies behind the reorder window (`limits.reorder_window_s` before the newest accepted one), the sequence number contradicts the order of
@@ -2232,6 +2234,9 @@ pub struct SessionContent {
     /// What it learns does not go into that map, as that of a copy; false where an older service wrote it.
     #[prost(bool, tag = "35")]
     pub brings_nothing: bool,
+    /// Stamps of the steps of the open buffer, ns; none where an older service wrote it, and the buffer begins anew then.
+    #[prost(sint64, repeated, tag = "36")]
+    pub filter_stamps_ns: ::prost::alloc::vec::Vec<i64>,
 }
 /// A prediction that waits for what comes true.
 #[derive(Clone, PartialEq, ::prost::Message)]

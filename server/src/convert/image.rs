@@ -72,6 +72,7 @@ fn content(image: &SessionImage) -> pb::SessionContent {
         history_epoch: image.history_epoch,
         filter_steps: image.filter_steps.iter().map(step).collect(),
         filter_first: image.filter_first as u32,
+        filter_stamps_ns: image.filter_stamps_ns.clone(),
         filter: Some(pb::FilterImage {
             mean: image.filter.state.mean.clone(),
             covariance: image.filter.state.covariance.clone(),
@@ -140,6 +141,9 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
     let soil = from_soil(content)?;
     let numbers = content.recent_sequence.iter().map(|number| numbered(*number));
     let age = |age: u64| i64::try_from(age).unwrap_or(i64::MAX);
+    // As an older service wrote it, steps have no stamps: the next buffer begins anew.
+    let stamped = !content.filter_stamps_ns.is_empty();
+    let filter_steps = content.filter_steps.iter().filter(|_| stamped).map(from_step).collect::<Result<_, _>>()?;
     Ok(SessionImage {
         session: content.session_id.clone(),
         vehicle: content.vehicle_id.clone(),
@@ -158,8 +162,9 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
         step_age_ns: content.step_age_ns.map(age),
         history_epoch: content.history_epoch,
         accepted: content.accepted,
-        filter_steps: content.filter_steps.iter().map(from_step).collect::<Result<_, _>>()?,
-        filter_first: content.filter_first as usize,
+        filter_steps,
+        filter_first: if stamped { content.filter_first as usize } else { 0 },
+        filter_stamps_ns: content.filter_stamps_ns.clone(),
         filter: FilterSnapshot {
             state: JointSnapshot { mean: filter.mean.clone(), covariance: filter.covariance.clone() },
             plain: JointSnapshot { mean: filter.plain_mean.clone(), covariance: filter.plain_covariance.clone() },

@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use ::zenoh::sample::{Sample, SampleKind};
 use nesam_engine::{Command, EngineError, MeasureAnswer};
 use nesam_proto::v1 as pb;
 use tokio::sync::mpsc;
@@ -35,10 +36,13 @@ pub async fn declare(session: &::zenoh::Session, fleet: &str, edge: Edge, sender
 }
 
 /// Runs on a thread of Zenoh, so it only hands over.
-fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &::zenoh::sample::Sample) {
+fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &Sample) {
     edge.engine.metrics().request(Transport::Zenoh, "measurement");
     let vehicle = keys::vehicle(sample.key_expr().as_str());
-    let decoded = decode::<pb::Measurement>("nesam.v1.Measurement", &sample.payload().to_bytes(), MEASUREMENT_BYTES_MAX);
+    let decoded = match sample.kind() {
+        SampleKind::Put => decode::<pb::Measurement>("nesam.v1.Measurement", &sample.payload().to_bytes(), MEASUREMENT_BYTES_MAX),
+        SampleKind::Delete => Err(EngineError::invalid("", "a key that is deleted carries no measurement; put one")),
+    };
     let (message, undecodable) = decoded.map_or_else(|error| (pb::Measurement::default(), Some(error)), |message| (message, None));
     let session = if message.session_id.is_empty() { vehicle.to_string() } else { message.session_id.clone() };
     let path = ReturnPath {

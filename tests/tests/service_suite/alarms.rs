@@ -11,7 +11,8 @@ use std::time::Duration;
 use nesam_client::{Client, measurement, v1};
 use nesam_discovery::bench::{Change, apply};
 use nesam_discovery::{Options, Scoring, Verdict, diagnose};
-use nesam_engine::{AlarmKind, Command, Engine, Limits, OpenSession, Reply, WatchImage};
+use nesam_engine::{AlarmKind, Command, Engine, Limits, OpenSession, Reply, WatchImage, WheelMeasurement};
+use nesam_physics::{Control, VehicleState};
 use nesam_server::recording::{Recording, window};
 use nesam_terrain::WorldMap;
 use nesam_tests::sample_root;
@@ -245,12 +246,57 @@ fn property_stamps_that_jitter_raise_the_alarm_of_exact_ones() {
     });
     // Which buffers follow the one before them.
     let follow = |watch: &WatchImage| watch.stamps_ns.windows(2).map(|pair| pair[0][1] == pair[1][0]).collect::<Vec<_>>();
-    assert!(follow(&exact).contains(&true) && exact.values == jittered.values);
+    // Stamps are off by a microsecond at most, and what is integrated over them by its speed.
+    let off = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(follow(&exact).contains(&true) && off(exact.values.as_flattened(), jittered.values.as_flattened()) < 1e-5);
     assert_eq!(follow(&exact), follow(&jittered));
     let [exact, jittered] = [exact, jittered].map(|watch| watch.active.expect("the bias is told"));
     assert_eq!((exact.kind, exact.channel_name()), (AlarmKind::SensorJump, "turn_minus_gyro_yaw_rad_s"));
-    assert_eq!((jittered.kind, jittered.channel, jittered.statistic), (exact.kind, exact.channel, exact.statistic));
+    assert_eq!((jittered.kind, jittered.channel), (exact.kind, exact.channel));
+    assert!((jittered.statistic - exact.statistic).abs() < 1e-2, "{jittered:?} {exact:?}");
     assert!((jittered.stamp_ns - exact.stamp_ns).abs() < 1000, "{jittered:?} {exact:?}");
+}
+
+/// What the watch remembers after 40 s on a circle, 3 m/s and 0.3 rad/s, measured exactly at this rate with velocities that are this many times too large; on
+/// this map, but far outside of it.
+fn circled(world: &Arc<WorldMap>, map: &str, rate_hz: f64, velocity: f64) -> WatchImage {
+    let mut engine = Engine::new(predictor(), Limits::default()).unwrap();
+    engine.execute(0, &Command::PutMap { map: world.clone(), base: None }).unwrap();
+    engine.execute(0, &Command::Open(OpenSession { vehicle: "s".into(), map: map.into(), ..Default::default() })).unwrap();
+    let (speed_m_s, turn_rad_s) = (3.0, 0.3);
+    for k in 0..(40.0 * rate_hz) as u64 {
+        let time_s = k as f64 / rate_hz;
+        let mut state = VehicleState::zero();
+        let (sin, cos) = (turn_rad_s * time_s).sin_cos();
+        state.position_m = [5000.0 + speed_m_s / turn_rad_s * sin, speed_m_s / turn_rad_s * (1.0 - cos), 0.0];
+        state.attitude_rad[2] = turn_rad_s * time_s;
+        state.velocity_m_s[0] = velocity * speed_m_s;
+        state.angular_velocity_rad_s[2] = turn_rad_s;
+        let (sequence, stamp_ns) = (Some(k + 1), (time_s * 1e9).round() as i64);
+        let (command, wheels) = (Control { speed_m_s: 2.0, second: 0.1 }, WheelMeasurement::default());
+        measure(&mut engine, nesam_engine::Measurement { sequence, boot: None, stamp_ns, state, command, wheels });
+    }
+    watched(&mut engine)
+}
+
+#[test]
+fn property_a_rate_that_is_slightly_off_contradicts_nothing() {
+    let world = recorded().world;
+    for rate_hz in [9.8, 9.9, 10.0, 10.1, 19.8, 20.2] {
+        let watch = circled(&world, "", rate_hz, 1.0);
+        assert!(watch.stamps_ns.len() > 10 && watch.episodes == 0, "{rate_hz} Hz: {:?}", watch.active);
+    }
+}
+
+#[test]
+fn property_sensors_are_watched_without_a_map_and_outside_of_it() {
+    let world = recorded().world;
+    for map in ["", world.id()] {
+        assert_eq!(circled(&world, map, 10.0, 1.0).episodes, 0, "map `{map}`");
+        let alarm = circled(&world, map, 10.0, 1.1).active.expect("velocities are told");
+        assert_eq!((alarm.kind, alarm.channel_name()), (AlarmKind::SensorJump, "path_minus_velocity_ahead_m_s"), "map `{map}`");
+        assert!((alarm.size + 0.3).abs() < 0.05, "{alarm:?}");
+    }
 }
 
 #[test]

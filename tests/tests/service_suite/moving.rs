@@ -73,7 +73,7 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
     };
     let newer = v1::SessionImage { version: 4, ..outer }.encode_to_vec();
     type Change<'a> = &'a dyn Fn(&mut v1::SessionContent);
-    let changes: [(&str, Change<'_>); 16] = [
+    let changes: [(&str, Change<'_>); 18] = [
         ("bundle", &|c| c.bundle_hash = "0".repeat(64)),
         ("filter", &|c| c.filter_settings.push('x')),
         ("NaN state", &|c| c.live.as_mut().unwrap().history[3].state[1] = f64::NAN),
@@ -84,6 +84,8 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
         ("numbers", &|c| c.recent_sequence.truncate(3)),
         ("grid", &|c| c.settled.as_mut().unwrap().grid_ns[0] = 0),
         ("buffer", &|c| c.filter_first = 1 << 30),
+        ("buffer without a stamp", &|c| c.filter_stamps_ns.truncate(1)),
+        ("stamps of the buffer", &|c| c.filter_stamps_ns.reverse()),
         ("no soil", &|c| c.soil = None),
         ("forecast", &|c| c.forecast.as_mut().unwrap().steps.truncate(31)),
         ("half a correction", &|c| c.forecast.as_mut().unwrap().corrections.truncate(5)),
@@ -101,8 +103,11 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
     assert_refused("unknown map", client.import_session(no_map, "t").await, Code::NotFound, "map_id");
     assert_eq!(client.list_sessions().await.unwrap(), before);
     client.import_session(sealed(&|_| ()), "t").await.unwrap();
-    // As a service wrote it that held no prediction against what came.
-    let older = sealed(&|c| (c.forecast, c.forecasts) = (None, Vec::new()));
+    // As a service wrote it that held no prediction against what came and kept no stamps of the open buffer; which begins anew.
+    let older = sealed(&|c| (c.forecast, c.forecasts, c.filter_stamps_ns) = (None, Vec::new(), Vec::new()));
     client.import_session(older, "older").await.unwrap();
+    let again = v1::SessionImage::decode(client.export_session("older").await.unwrap().as_slice()).unwrap();
+    let again = v1::SessionContent::decode(again.content).unwrap();
+    assert!(content.filter_stamps_ns.len() > 1 && again.filter_stamps_ns.is_empty() && again.filter_steps.is_empty());
     server.shutdown().await;
 }

@@ -91,6 +91,9 @@ async fn service_clock_jumps_gaps_and_late_stamps_are_told_apart() {
             at(11, 20),       // the clock was set back
             at(12, 21),
             at(13, 22),
+            at(14, 21), // and again, onto stamps that are known
+            at(15, 22),
+            at(16, 23),
         ],
     )
     .await;
@@ -107,6 +110,9 @@ async fn service_clock_jumps_gaps_and_late_stamps_are_told_apart() {
         "APPLIED",
         "DUPLICATE",
         "TOO_OLD",
+        "TOO_OLD",
+        "CLOCK_JUMP",
+        "APPLIED",
         "TOO_OLD",
         "CLOCK_JUMP",
         "APPLIED",

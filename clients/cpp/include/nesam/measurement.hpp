@@ -40,7 +40,7 @@ struct Applied {
 struct Buffered {
   double next_step_in_s = 0.0;
 };
-/// This stamp or sequence number was accepted before. Nothing changed.
+/// This sequence number was accepted before, or this stamp and no higher number comes with it. Nothing changed.
 struct Duplicate {};
 /// Behind the reorder window, numbered against the order of the stamps, or of a former start of the vehicle. Nothing changed.
 struct TooOld {

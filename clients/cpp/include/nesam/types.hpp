@@ -87,7 +87,8 @@ struct SoilCorrection {
   SoilVector delta;
   /// Diagonal of the covariance of `delta`, in these coordinates; absent while no filter runs.
   std::optional<SoilVector> variance;
-  /// Whether the drive has told something of each parameter, in the order of `SoilVector`; a parameter that is not learned has no number to show.
+  /// Whether the drive has at least halved the prior variance of each parameter, in the order of `SoilVector`, with a correction that is more likely right
+  /// than the prior alone. A parameter that is not learned has no number to show; predictions use its correction all the same.
   std::array<bool, 6> learned{};
   /// Covariance of `delta`, in these coordinates and in the order of `SoilVector`; absent while no filter runs.
   std::optional<std::array<std::array<double, 6>, 6>> covariance;

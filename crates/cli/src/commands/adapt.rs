@@ -408,7 +408,7 @@ fn print_soil(a: &Adaptation<'_>) {
             say!("{:<22}{}", "  prior there", cells(&|i| Short(last.prior[i]).to_string()));
         }
     }
-    say!("(· = not learned: the drive did not tell)");
+    say!("(· = not learned: the drive did not halve the variance of the prior, or the prior fits as well)");
 }
 
 #[cfg(test)]

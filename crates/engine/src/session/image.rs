@@ -57,6 +57,8 @@ pub struct SessionImage {
     pub filter_steps: Vec<HistoryStep>,
     /// Where its open buffer begins among them.
     pub filter_first: usize,
+    /// Stamps of the steps from there on, ns.
+    pub filter_stamps_ns: Vec<i64>,
     /// What the soil filter has learned.
     pub filter: FilterSnapshot,
     /// What the session gives out of it.
@@ -129,7 +131,7 @@ impl Session {
     pub(crate) fn image(&self, now_ns: u64, bundle_hash: &str, map: Option<(String, String)>) -> SessionImage {
         let Order { recent, last_sequence, boot, ended_boots, newest_arrival_ns, final_ns, suspect: _ } = &self.order;
         let age = |arrived_ns: i64| (now_ns as i64).saturating_sub(arrived_ns);
-        let (filter, filter_steps, filter_first) = self.learner.parts();
+        let (filter, filter_steps, filter_first, filter_stamps_ns) = self.learner.parts();
         SessionImage {
             session: self.id.clone(),
             vehicle: self.vehicle.clone(),
@@ -150,6 +152,7 @@ impl Session {
             accepted: self.accepted,
             filter_steps: filter_steps.to_vec(),
             filter_first,
+            filter_stamps_ns: filter_stamps_ns.to_vec(),
             filter: filter.snapshot(),
             soil: self.soil,
             forecast: self.forecast.clone(),
@@ -199,7 +202,7 @@ impl Session {
             used_ns: now_ns,
             history_epoch: image.history_epoch,
             accepted: image.accepted,
-            learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first),
+            learner: SoilLearner::from_parts(filter, image.filter_steps.clone(), image.filter_first, image.filter_stamps_ns.clone()),
             soil: image.soil,
             forecast: image.forecast.clone(),
             fleet: FleetPart { asks: image.asks_fleet, brings: !image.brings_nothing, brought: Vec::new() },
@@ -228,6 +231,8 @@ impl SessionImage {
             ("an impossible buffer", self.filter_steps.is_empty() || self.filter_first < HISTORY),
             ("an impossible buffer", self.filter_steps.is_empty() || self.filter_steps.len() > self.filter_first),
             ("an impossible buffer", self.filter_steps.len() <= self.filter_first + buffer),
+            ("an impossible buffer", self.filter_steps.len().saturating_sub(self.filter_first) == self.filter_stamps_ns.len()),
+            ("stamps that do not ascend", ascending(&mut self.filter_stamps_ns.iter().copied())),
             ("too many starts", self.ended_boots.len() <= super::order::ENDED_BOOTS_MAX),
             ("a soil that is not finite", self.soil.covariance.as_flattened().iter().all(|v| v.is_finite())),
             ("a noise scale that is not positive", self.soil.noise_scale > 0.0 && self.soil.noise_scale.is_finite()),

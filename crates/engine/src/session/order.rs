@@ -32,7 +32,7 @@ pub(super) type Numbered = (i64, Option<u64>);
 /// Why a measurement does not continue the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum OffLine {
-    /// Behind the window.
+    /// Behind the window, or behind older ones by its number.
     Late,
     /// Further ahead than time has passed.
     Ahead,
@@ -91,16 +91,20 @@ impl Order {
         }
         let Some(newest_ns) = self.newest_ns() else { return Ok(Verdict::Accept) };
         let resent = measurement.sequence.is_some() && measurement.sequence == self.last_sequence;
+        let fresh = self.is_fresh(measurement.sequence);
         let place = self.recent.partition_point(|(recent_ns, _)| *recent_ns < stamp_ns);
-        if resent || self.recent.get(place).is_some_and(|(recent_ns, _)| *recent_ns == stamp_ns) {
+        // A fresh number on the stamp of an older one is no copy: the clock was set back by whole intervals.
+        let known = self.recent.get(place).filter(|(recent_ns, _)| *recent_ns == stamp_ns);
+        if resent || known.is_some_and(|(_, number)| number.is_none() || !fresh) {
             return Ok(Verdict::Refuse(Outcome::Duplicate));
         }
         let ahead_s = seconds(stamp_ns.saturating_sub(newest_ns));
         let silent_s = seconds((now_ns as i64).saturating_sub(self.newest_arrival_ns).max(0));
         let edge_ns = newest_ns.saturating_sub(limits.reorder_window_ns()).max(self.final_ns.unwrap_or(i64::MIN));
-        let off = if stamp_ns <= edge_ns {
+        let against = self.numbered_against(place, measurement.sequence);
+        let off = if stamp_ns <= edge_ns || against && fresh {
             OffLine::Late
-        } else if self.numbered_against(place, measurement.sequence) {
+        } else if against {
             OffLine::Renumbered
         } else if ahead_s - silent_s > limits.clock_ahead_max_s {
             OffLine::Ahead
@@ -118,6 +122,11 @@ impl Order {
             OffLine::Late | OffLine::Renumbered => Verdict::Refuse(Outcome::TooOld { behind_s }),
             OffLine::Ahead => Verdict::Refuse(Outcome::Future { ahead_s: ahead_s - silent_s }),
         })
+    }
+
+    /// Whether a number is higher than all before.
+    fn is_fresh(&self, sequence: Option<u64>) -> bool {
+        matches!((sequence, self.last_sequence), (Some(number), Some(last)) if number > last)
     }
 
     /// Whether a number at this place contradicts its neighbours.
@@ -148,8 +157,7 @@ impl Order {
             _ => Suspect { kind, first_stamp_ns: here.0, first_arrival_ns: now_ns, last: here, count: 1 },
         };
         self.suspect = Some(suspect);
-        let fresh = matches!((measurement.sequence, self.last_sequence), (Some(number), Some(last)) if number > last);
-        if kind != OffLine::Late || fresh {
+        if kind != OffLine::Late || self.is_fresh(measurement.sequence) {
             return suspect.count >= PROOF_COUNT;
         }
         let elapsed_s = now_ns.saturating_sub(suspect.first_arrival_ns) as f64 * 1e-9;

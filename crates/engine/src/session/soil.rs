@@ -8,6 +8,8 @@ use nesam_model::{HISTORY, HistoryStep, Predictor, SoilByClass, SoilField};
 use nesam_physics::{CONTRADICTIONS, SOIL_DIM, SoilCorrection, contradiction};
 use nesam_terrain::WorldMap;
 
+use super::seconds;
+use super::track::Stamped;
 use crate::fleet::Brought;
 
 /// What the fleet may say at most on whether the correction helps, log odds: from odds of e⁻⁴ before any evidence to e, so that a vehicle that finds it wrong
@@ -28,7 +30,7 @@ pub struct SoilState {
     pub correction: SoilCorrection,
     /// Variance of the correction in its coordinates; `None` while no filter runs.
     pub variance: Option<[f64; SOIL_DIM]>,
-    /// Whether the drive has told something of each parameter.
+    /// Whether the drive has told much of each parameter, see [`nesam_adaptation::SoilPosterior::learned`].
     pub learned: [bool; SOIL_DIM],
     /// How well the last full buffer agreed with the prediction, whether it was taken or refused; `None` before the first.
     pub last_buffer: Option<BufferTest>,
@@ -69,15 +71,23 @@ pub(super) struct Models<'a> {
     pub shifted: &'a [Predictor],
 }
 
-/// A full buffer that the filter has judged.
+/// A full buffer.
 pub(super) struct Judged {
-    pub update: SoilUpdate,
-    /// What it knows more than its prior, where it was not refused.
-    pub brought: Option<Brought>,
+    /// Its first and last stamp, ns of the vehicle's clock.
+    pub stamps_ns: [i64; 2],
+    /// What the filter made of it; `None` where the ground under a wheel is not known.
+    pub learned: Option<Learned>,
     /// How its sensors contradict each other, see [`contradiction`].
     pub contradiction: [f64; CONTRADICTIONS],
     /// The vehicle stood and was told to: nothing moves, so nothing can disagree.
     pub standing: bool,
+}
+
+/// What the filter made of a full buffer.
+pub(super) struct Learned {
+    pub update: SoilUpdate,
+    /// What it knows more than its prior, where it was not refused.
+    pub brought: Option<Brought>,
 }
 
 /// The soil filter of one session. What a step says of the soil is known when the next one is measured.
@@ -88,67 +98,73 @@ pub(super) struct SoilLearner {
     steps: Vec<HistoryStep>,
     /// Place in `steps` where the buffer begins.
     first: usize,
+    /// Stamps of the steps from there on, ns: a vehicle whose rate is slightly off makes steps that are slightly longer or shorter than those of the model.
+    stamps_ns: Vec<i64>,
 }
 
 impl SoilLearner {
     pub(super) fn new(filter: SoilFilter) -> Self {
-        Self { filter, steps: Vec::new(), first: 0 }
+        Self { filter, steps: Vec::new(), first: 0, stamps_ns: Vec::new() }
     }
 
-    /// The filter, the steps that it holds, and where its open buffer begins among them.
-    pub(super) fn parts(&self) -> (&SoilFilter, &[HistoryStep], usize) {
-        (&self.filter, &self.steps, if self.steps.is_empty() { 0 } else { self.first })
-    }
-
-    /// Transitions of a full buffer.
-    pub(super) fn buffer(&self) -> usize {
-        self.filter.config().buffer
+    /// The filter, the steps that it holds, where its open buffer begins among them, and the stamps from there on.
+    pub(super) fn parts(&self) -> (&SoilFilter, &[HistoryStep], usize, &[i64]) {
+        (&self.filter, &self.steps, if self.steps.is_empty() { 0 } else { self.first }, &self.stamps_ns)
     }
 
     /// The inverse of [`SoilLearner::parts`].
-    pub(super) fn from_parts(filter: SoilFilter, steps: Vec<HistoryStep>, first: usize) -> Self {
-        Self { filter, steps, first }
+    pub(super) fn from_parts(filter: SoilFilter, steps: Vec<HistoryStep>, first: usize, stamps_ns: Vec<i64>) -> Self {
+        Self { filter, steps, first, stamps_ns }
     }
 
     /// The next step does not follow the last one.
     pub(super) fn forget_open(&mut self) {
         self.steps.clear();
+        self.stamps_ns.clear();
         self.filter.clear_buffer();
     }
 
-    /// Takes the newest step with the steps before it. Numbers that are not finite end in an empty buffer and nothing else.
+    /// Takes the newest step with the steps before it. From numbers that are not finite nothing is learned.
     ///
-    /// Without a map nothing is learned: where the slope of the ground is a guess, its error would be taken for soil. For the same reason a buffer
-    /// with a wheel off the map is left out.
+    /// Nor without a map: where the slope of the ground is a guess, its error would be taken for soil. For the same reason a buffer with a wheel off the map
+    /// is left out. Whether sensors contradict each other is told of any buffer.
     pub(super) fn step(
         &mut self,
         models: Models<'_>,
         before: &[HistoryStep],
-        newest: &HistoryStep,
+        (stamp_ns, newest): Stamped,
         map: Option<&Arc<WorldMap>>,
     ) -> Option<Judged> {
-        let Some(map) = map else {
-            self.forget_open();
-            return None;
-        };
         if self.steps.is_empty() {
             self.steps.extend_from_slice(&before[before.len().saturating_sub(HISTORY - 1)..]);
             self.first = self.steps.len();
         }
-        self.steps.push(*newest);
+        self.steps.push(newest);
+        self.stamps_ns.push(stamp_ns);
         if self.steps.len() <= self.first + self.filter.config().buffer {
             return None;
         }
-        let update = self.learn_from_buffer(models, map);
+        let learned = map.and_then(|map| self.learn_from_buffer(models, map));
         self.filter.clear_buffer();
+        let judged = self.judged(models.usual, learned);
         // The end of this buffer is the start of the next.
         self.steps.drain(..self.steps.len().saturating_sub(HISTORY));
         self.first = self.steps.len() - 1;
-        update
+        self.stamps_ns.drain(..self.stamps_ns.len().saturating_sub(1));
+        Some(judged)
+    }
+
+    /// The full buffer with what was learned from it.
+    fn judged(&self, predictor: &Predictor, learned: Option<Learned>) -> Judged {
+        let (first, last) = (self.first, self.steps.len() - 1);
+        let states: Vec<_> = self.steps[first..=last].iter().map(|step| predictor.true_state(&step.state)).collect();
+        let contradiction = contradiction(&states, |k| seconds(self.stamps_ns[k + 1].saturating_sub(self.stamps_ns[k])));
+        let stamps_ns = [self.stamps_ns[0], self.stamps_ns[last - first]];
+        Judged { stamps_ns, learned, contradiction, standing: self.stands(first, last) }
     }
 
     /// What the filter makes of the full buffer.
-    fn learn_from_buffer(&mut self, models: Models<'_>, map: &Arc<WorldMap>) -> Option<Judged> {
+    fn learn_from_buffer(&mut self, models: Models<'_>, map: &Arc<WorldMap>) -> Option<Learned> {
         let (first, last) = (self.first, self.steps.len() - 1);
         let buffer = self.transitions(models.usual, map)?;
         let shifted = models.shifted.iter().map(|model| self.transitions(model, map).map(|buffer| (model.step_model(), buffer)));
@@ -165,9 +181,7 @@ impl SoilLearner {
         let told = update.excited && !update.rejected;
         let increment = if told { self.increment(&update.before, log_odds) } else { None };
         let brought = increment.map(|increment| Brought { position_m: [x, y], increment });
-        let states: Vec<_> = self.steps[first..=last].iter().map(|step| models.usual.true_state(&step.state)).collect();
-        let contradiction = contradiction(&states, models.usual.bundle().normalization.dt_s);
-        Some(Judged { update, brought, contradiction, standing: self.stands(first, last) })
+        Some(Learned { update, brought })
     }
 
     /// Whether the vehicle stood over these steps and was told to. One that is told to drive and does not is no such case.

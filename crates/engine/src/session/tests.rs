@@ -165,6 +165,15 @@ fn analytic_clocks_that_jump_are_believed_the_second_time() {
     }
     assert_eq!(observe(&mut session, &numbered(100 * STEP_NS, 6)).map(|o| o.label()), Ok("too_old"));
     assert_eq!(observe(&mut session, &numbered(101 * STEP_NS, 7)), Ok(Outcome::ClockJump { jump_s: seconds(-803 * STEP_NS) }));
+    // Back by whole intervals, numbered on: the same, although the stamps are known.
+    for back in [2, 3, 20] {
+        let mut session = driven(0);
+        let sent: Vec<_> = (0..60).map(|i| numbered(i * STEP_NS, i as u64 + 1)).collect();
+        sent.iter().for_each(|m| assert_eq!(observe(&mut session, m), Ok(Outcome::Applied)));
+        assert_eq!(observe(&mut session, &sent[60 - back]), Ok(Outcome::Duplicate), "resent");
+        let jumped = (60..63).map(|i| observe(&mut session, &numbered((i - back as i64) * STEP_NS, i as u64 + 1)).unwrap().label());
+        assert_eq!(jumped.collect::<Vec<_>>(), ["too_old", "clock_jump", "applied"], "{back} intervals");
+    }
     // Back, without numbers: the stamps have to keep pace with the arrivals, as those of a burst do not.
     let mut session = driven(1);
     observe(&mut session, &at(100 * STEP_NS)).unwrap();
@@ -205,7 +214,12 @@ fn property_no_bad_number_gets_in() {
         wheels.wheels.speed_rad_s = Some([0.0, 0.0, bad, 0.0]);
         assert_eq!(observe(&mut session, &wheels), Ok(Outcome::NotFinite { field: "wheels.speed_rad_s[2]".into() }));
     }
+    // The cart's wheels have a radius of 0.2 m.
+    let spinning = WheelMeasurement { speed_rad_s: Some([0.0, 500.0, -500.1, 0.0]), road_wheel_angle_rad: None };
+    let in_degrees = WheelMeasurement { speed_rad_s: None, road_wheel_angle_rad: Some([1.5, 30.0]) };
     for (measurement, field) in [
+        (Measurement { wheels: spinning, ..at(3 * STEP_NS) }, "wheels.speed_rad_s[2]"),
+        (Measurement { wheels: in_degrees, ..at(3 * STEP_NS) }, "wheels.road_wheel_angle_rad[1]"),
         (Measurement { command: Control { speed_m_s: 3.01, second: 0.0 }, ..at(3 * STEP_NS) }, "command.speed_m_s"),
         (Measurement { command: Control { speed_m_s: 3.0, second: -0.51 }, ..at(3 * STEP_NS) }, "command.second"),
         (Measurement { state: VehicleState { position_m: [1e7, 0.0, 0.0], ..at(0).state }, ..at(3 * STEP_NS) }, "state.position_m.x"),

@@ -14,6 +14,9 @@
 //! 12.5 minutes (`nesam bench alarms --split train`). They are multiples of what the bundle's own R_B expects, so they move with the bundle; those of the
 //! sensors are the noise of the simulated sensors and a drift. A bundle without a calibrated filter is not watched.
 //!
+//! Without a map, or with a wheel off it, nothing is predicted: then the test of the sensors alone goes on, and a buffer counts as expected in the others.
+//! Their alarms stay active as long. What only sensors can do is told also while another alarm is active.
+//!
 //! A vehicle that stands because it was told to is not judged: nothing moves, and the NIS would be too small for no reason.
 //!
 //! No clock, no random numbers: the same buffers give the same alarms.
@@ -70,9 +73,19 @@ pub(crate) struct WatchedBuffer {
 }
 
 impl WatchedBuffer {
-    pub fn new(stamps_ns: [i64; 2], agreement: &Agreement, contradiction: [f64; CONTRADICTIONS]) -> Self {
+    /// `agreement` is that of the motion with its prediction, where there was one.
+    pub fn new(stamps_ns: [i64; 2], agreement: Option<&Agreement>, contradiction: [f64; CONTRADICTIONS]) -> Self {
+        let Some(agreement) = agreement else {
+            let expected = [0.0; VELOCITY_DIM];
+            return Self { stamps_ns, nis: 1.0, normalised: expected, mean: expected, contradiction, weighed: [0.0; 2] };
+        };
         let Agreement { nis, dof, mean, normalised, weighed, beyond_soil } = *agreement;
         Self { stamps_ns, nis: nis / dof.max(1) as f64, normalised, mean, contradiction, weighed: [weighed, beyond_soil] }
+    }
+
+    /// Whether its motion was predicted: no measured motion agrees to the bit.
+    fn was_predicted(&self) -> bool {
+        self.weighed[0] > 0.0
     }
 
     /// Its numbers in one row.
@@ -129,17 +142,10 @@ impl Reading {
 }
 
 impl Watch {
-    /// First stamp of a buffer that began about then: the last one of the buffer before, where that is less than half a step away, as after a gap it is not. The stamps
-    /// of a vehicle are no exact multiples of the step.
-    pub fn begin_ns(&self, about_ns: i64, step_ns: i64) -> i64 {
-        let before_ns = self.window.back().map(|b| b.stamps_ns[1]);
-        before_ns.filter(|end_ns| end_ns.abs_diff(about_ns) < step_ns.unsigned_abs() / 2).unwrap_or(about_ns)
-    }
-
-    /// Takes the next buffer; the alarm that it raises or clears. A buffer with a number that is not finite is left out.
-    pub fn feed(&mut self, buffer: WatchedBuffer) -> Option<Alarm> {
+    /// Takes the next buffer; the alarms that it clears and raises, in this order. A buffer with a number that is not finite is left out.
+    pub fn feed(&mut self, buffer: WatchedBuffer) -> Vec<Alarm> {
         if !buffer.to_values().iter().all(|v| v.is_finite()) {
-            return None;
+            return Vec::new();
         }
         if self.window.len() == WINDOW {
             self.window.pop_front();
@@ -147,17 +153,28 @@ impl Watch {
         self.window.push_back(buffer);
         let readings = self.readings();
         // The most telling test first: what only sensors can do is not told as motion.
-        let worst = readings.iter().map(Reading::share).fold(0.0, f64::max);
-        if self.active.is_some() {
-            self.calm = if worst < CALM_SHARE { self.calm + 1 } else { 0 };
-            return if self.calm >= CALM_BUFFERS { self.clear() } else { None };
+        let raised = readings.iter().find(|r| r.share() > 1.0);
+        let active = self.active.map(|alarm| alarm.kind);
+        if active.is_none_or(|kind| kind != AlarmKind::SensorJump && raised.is_some_and(|r| r.kind == AlarmKind::SensorJump)) {
+            let cleared = self.clear();
+            return cleared.into_iter().chain(raised.map(|reading| self.raise(reading))).collect();
         }
-        let raised = readings.into_iter().find(|r| r.share() > 1.0)?;
+        let worst = readings.iter().map(Reading::share).fold(0.0, f64::max);
+        if worst >= CALM_SHARE {
+            self.calm = 0;
+        } else if buffer.was_predicted() || active == Some(AlarmKind::SensorJump) {
+            self.calm += 1;
+        }
+        if self.calm >= CALM_BUFFERS { self.clear().into_iter().collect() } else { Vec::new() }
+    }
+
+    /// Begins an episode.
+    fn raise(&mut self, reading: &Reading) -> Alarm {
         self.episodes += 1;
         self.calm = 0;
-        let alarm = self.alarm(&raised);
+        let alarm = self.alarm(reading);
         self.active = Some(alarm);
-        Some(alarm)
+        alarm
     }
 
     /// The vehicle is taken for another one from now on: ends the present episode and forgets the window.

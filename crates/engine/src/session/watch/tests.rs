@@ -42,7 +42,7 @@ fn usual(k: i64, noise: &mut Noise) -> WatchedBuffer {
 fn property_usual_buffers_raise_nothing() {
     for seed in 0..20 {
         let (mut watch, mut noise) = (Watch::default(), Noise::of(seed));
-        let told: Vec<Alarm> = (0..200).filter_map(|k| watch.feed(usual(k, &mut noise))).collect();
+        let told: Vec<Alarm> = (0..200).flat_map(|k| watch.feed(usual(k, &mut noise))).collect();
         assert_eq!(told, [], "seed {seed}");
     }
 }
@@ -87,28 +87,49 @@ fn analytic_each_change_is_told_once_by_its_test_and_dated() {
 fn analytic_the_same_error_again_and_again_is_correlated() {
     // Each channel errs by ±1.3 standard deviations, the sign changing from channel to channel and never in time: 1.3 √12 = 4.5 is no jump.
     let mut watch = Watch::default();
-    let told = (0..12).find_map(|k| {
+    let mut told = (0..12).flat_map(|k| {
         let normalised = core::array::from_fn(|c| if c % 2 == 0 { 1.3 } else { -1.3 });
         watch.feed(WatchedBuffer { normalised, nis: 1.0, contradiction: [0.0; CONTRADICTIONS], ..usual(k, &mut Noise::of(1)) })
     });
+    let told = told.next();
     assert!(told.is_some_and(|alarm| alarm.kind == AlarmKind::Correlated && alarm.statistic > 0.99), "{told:?}");
 }
 
 #[test]
-fn property_stamps_that_jitter_do_not_part_buffers() {
-    const STEP_NS: i64 = SECOND_NS / 10;
-    let (mut exact, mut jittered, mut noise) = (Watch::default(), Watch::default(), Noise::of(9));
-    for k in 0..12 {
-        let buffer = usual(k, &mut noise);
-        let end_ns = buffer.stamps_ns[1] + k * 7919 % 1000;
-        let begin_ns = jittered.begin_ns(end_ns - SECOND_NS, STEP_NS);
-        jittered.feed(WatchedBuffer { stamps_ns: [begin_ns, end_ns], ..buffer });
-        exact.feed(buffer);
-        assert_eq!(jittered.sensor_jump().unwrap().statistic, exact.sensor_jump().unwrap().statistic, "buffer {k}");
+fn analytic_sensors_are_told_of_while_another_alarm_is_active() {
+    // From buffer 30 on another soil, from 45 on a gyro that errs by 0.02 rad/s; both end at 60.
+    let (mut watch, mut noise) = (Watch::default(), Noise::of(11));
+    let mut told = Vec::new();
+    for k in 0..120 {
+        let mut buffer = usual(k, &mut noise);
+        buffer.nis = if (30..60).contains(&k) { 8.0 } else { buffer.nis };
+        buffer.contradiction[5] -= if (45..60).contains(&k) { 0.02 } else { 0.0 };
+        told.extend(watch.feed(buffer));
     }
-    // The shortest gap is no jitter.
-    let after_ns = jittered.window[11].stamps_ns[1] + STEP_NS / 2 * 3;
-    assert_eq!(jittered.begin_ns(after_ns, STEP_NS), after_ns);
+    let told_of: Vec<_> = told.iter().map(|alarm| (alarm.kind, alarm.episode, alarm.active)).collect();
+    let [soil, sensor] = [AlarmKind::NisLarge, AlarmKind::SensorJump];
+    assert_eq!(told_of, [(soil, 1, true), (soil, 1, false), (sensor, 2, true), (sensor, 2, false)]);
+    assert!((46..=48).contains(&(told[2].stamp_ns / SECOND_NS)) && told[1].stamp_ns == told[2].stamp_ns, "{told:?}");
+}
+
+#[test]
+fn analytic_without_a_prediction_sensors_alone_are_judged() {
+    let unpredicted = |k: i64, noise: &mut Noise, off: f64| {
+        let mut contradiction = noise.contradiction();
+        contradiction[0] -= off;
+        WatchedBuffer::new([k * SECOND_NS, (k + 1) * SECOND_NS], None, contradiction)
+    };
+    let (mut watch, mut noise) = (Watch::default(), Noise::of(13));
+    let usual_ones: Vec<Alarm> = (0..60).flat_map(|k| watch.feed(unpredicted(k, &mut noise, 0.0))).collect();
+    assert_eq!(usual_ones, []);
+    let raised: Vec<Alarm> = (60..80).flat_map(|k| watch.feed(unpredicted(k, &mut noise, 0.2))).collect();
+    assert!(matches!(raised[..], [Alarm { kind: AlarmKind::SensorJump, active: true, .. }]), "{raised:?}");
+    // An alarm of motion is not over because the map ends.
+    let mut watch = Watch::default();
+    let begun: Vec<Alarm> = (0..6).flat_map(|k| watch.feed(WatchedBuffer { nis: 8.0, ..usual(k, &mut noise) })).collect();
+    assert!(matches!(begun[..], [Alarm { kind: AlarmKind::NisLarge, active: true, .. }]), "{begun:?}");
+    let ended: Vec<Alarm> = (6..40).flat_map(|k| watch.feed(unpredicted(k, &mut noise, 0.0))).collect();
+    assert_eq!((ended, watch.active), (Vec::new(), Some(begun[0])));
 }
 
 #[test]
@@ -131,7 +152,7 @@ fn property_numbers_that_are_not_finite_leave_no_trace_and_values_round_trip() {
         watch.feed(usual(k, &mut noise));
     }
     let before = watch.clone();
-    assert_eq!(watch.feed(WatchedBuffer { nis: f64::NAN, ..usual(9, &mut noise) }), None);
+    assert_eq!(watch.feed(WatchedBuffer { nis: f64::NAN, ..usual(9, &mut noise) }), []);
     assert_eq!(watch, before);
     for buffer in &watch.window {
         assert_eq!(WatchedBuffer::from_values(buffer.stamps_ns, &buffer.to_values()), *buffer);
