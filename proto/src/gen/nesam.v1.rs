@@ -2659,7 +2659,7 @@ pub mod sessions_client {
             req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Sessions", "Get"));
             self.inner.unary(req, path, codec).await
         }
-        /// Lists the open sessions, by session id.
+        /// Lists the open sessions of the server that answers, by session id. Of servers that share sessions each lists those that it owns: ask all of them.
         pub async fn list(
             &mut self,
             request: impl tonic::IntoRequest<super::ListSessionsRequest>,
@@ -2863,7 +2863,7 @@ pub mod sessions_server {
             &self,
             request: tonic::Request<super::GetSessionRequest>,
         ) -> std::result::Result<tonic::Response<super::Session>, tonic::Status>;
-        /// Lists the open sessions, by session id.
+        /// Lists the open sessions of the server that answers, by session id. Of servers that share sessions each lists those that it owns: ask all of them.
         async fn list(
             &self,
             request: tonic::Request<super::ListSessionsRequest>,
@@ -4299,6 +4299,7 @@ pub mod terrain_client {
             req.extensions_mut().insert(GrpcMethod::new("nesam.v1.Terrain", "Get"));
             self.inner.unary(req, path, codec).await
         }
+        /// Lists the maps of the server that answers. Of servers that share sessions each holds those of its own sessions and those uploaded to it.
         pub async fn list(
             &mut self,
             request: impl tonic::IntoRequest<super::ListMapsRequest>,
@@ -4366,6 +4367,7 @@ pub mod terrain_server {
             &self,
             request: tonic::Request<super::GetMapRequest>,
         ) -> std::result::Result<tonic::Response<super::MapDescription>, tonic::Status>;
+        /// Lists the maps of the server that answers. Of servers that share sessions each holds those of its own sessions and those uploaded to it.
         async fn list(
             &self,
             request: tonic::Request<super::ListMapsRequest>,
