@@ -212,9 +212,11 @@ impl Candidate {
         self.line.effect.layer()
     }
 
-    /// Whether the answer to the effect goes through the contact of the wheels, which is known roughly: forces, soils, and what changes the drive.
+    /// Whether the answer to the effect goes through the contact of the wheels, which is known roughly: forces, soils, maps, and what changes the drive.
     pub fn through_contact(&self) -> bool {
-        self.layer().is_force() || ["torque_limit", "speed_lag", "speed_delay", "speed_gain", "locked_differential"].contains(&self.id())
+        self.layer().is_force()
+            || self.layer() == Layer::Map
+            || ["torque_limit", "speed_lag", "speed_delay", "speed_gain", "locked_differential"].contains(&self.id())
     }
 
     /// The effect with given values of the free parameters.

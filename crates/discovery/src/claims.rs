@@ -24,6 +24,8 @@ use crate::settled::Settled;
 const MAGNITUDE_HALF_MAX: f64 = 0.7;
 /// The same from which it is no longer told in percent: a size near zero has any share.
 const MAGNITUDE_HALF_UNKNOWN: f64 = 100.0;
+/// Most drives whose own sizes are told.
+const BY_DRIVE_MAX: usize = 12;
 /// Share of half-samples of the drives that must choose a claimed effect or one of its rivals.
 const STABILITY_MIN: f64 = 0.6;
 /// Parts of neighbouring drives of which all half-samples are looked at; every drive is a part where there are fewer.
@@ -190,11 +192,21 @@ impl Case<'_> {
                 };
                 let changed = changes[i].take().map(|change| (change, false));
                 if let Some((why, for_size)) = refusal(&group, &finding, fit, i).or(changed) {
-                    (finding.refused, finding.refused_for_size) = (Some(why), for_size);
+                    let by_drive = if for_size { self.by_drive(candidate) } else { String::new() };
+                    (finding.refused, finding.refused_for_size) = (Some(format!("{why}{by_drive}")), for_size);
                 }
                 finding
             })
             .collect()
+    }
+
+    /// What each drive alone makes of the size of an effect of one column, by the slope of its answer; empty for others and for more drives than a line holds.
+    fn by_drive(&self, candidate: Candidate) -> String {
+        let Some(unit) = candidate.unit().filter(|_| (2..=BY_DRIVE_MAX).contains(&self.prepared.len())) else { return String::new() };
+        let column = candidate.columns()[0];
+        let size = |own: &Condensed| unit * own.score[column] / own.information[(column, column)].max(1e-12);
+        let each: Vec<String> = self.prepared.iter().map(|p| format!("{} {}", p.drive.id, Short(size(&p.condensed)))).collect();
+        format!(" (by drive: {})", each.join(", "))
     }
 
     /// Share of half-samples of the drives that choose a hypothesis, one of its rivals, or something that they cannot tell from it.

@@ -160,9 +160,12 @@ pub fn diagnose(
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
     let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options };
-    let Proven { judgement, learned, mut scores, verdict, reason } =
+    let Proven { mut judgement, learned, mut scores, verdict, reason } =
         prove(&case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &held_drives)?;
     let any = verdict.claims();
+    for i in judgement.claimed().into_iter().filter(|_| !any) {
+        judgement.findings[i].refused = Some(reason.clone());
+    }
     let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
     let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: any, predictor, held_out: &places };
     let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {

@@ -227,11 +227,21 @@ fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool
     }
     let named: Vec<String> = findings.iter().map(|f| f.candidate.label()).collect();
     let rivals: Vec<String> = findings.iter().flat_map(|f| &f.rivals).map(|m| m.candidate.label()).collect();
+    let more = if model_on_trial { String::new() } else { more_left(selection) };
     if rivals.is_empty() {
-        (Verdict::Explained, format!("{} explains it", together(&named)))
+        (Verdict::Explained, format!("{} explains it{more}", together(&named)))
     } else {
-        (Verdict::Ambiguous, format!("{} explains it, but {} would do about as well", together(&named), rivals.join(" or ")))
+        (Verdict::Ambiguous, format!("{} explains it, but {} would do about as well{more}", together(&named), rivals.join(" or ")))
     }
+}
+
+/// What is left beyond doubt beside claimed effects, and what to do: a share of what loud effects explain may be much.
+fn more_left(selection: &Selection) -> String {
+    let (z, what) = &selection.remaining;
+    if *z < UNEXPLAINED_MARGIN * selection.threshold {
+        return String::new();
+    }
+    format!("; more is left, most in {what} (z = {z:.1}): diagnose once more with the bundle that has them")
 }
 
 fn together(named: &[String]) -> String {

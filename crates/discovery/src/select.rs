@@ -147,6 +147,11 @@ pub fn mismatch(layer: Layer) -> f64 {
     if layer.is_force() { 0.12 } else { 0.02 }
 }
 
+/// The same of what it leaves: a map has a height that geometry tells, and lets wheels sink by forces.
+fn mismatch_left(layer: Layer) -> f64 {
+    if layer == Layer::Map { mismatch(Layer::Force) } else { mismatch(layer) }
+}
+
 impl Yardstick {
     /// What an earlier look said of a hypothesis that it found.
     pub fn known(&self, hypothesis: usize) -> Option<&Known> {
@@ -180,7 +185,7 @@ impl Yardstick {
     /// The same where `left` are the scores after the fit of `fitted` went through the physics.
     pub fn after_fit(&self, left: &Group, before: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
         let candidate = &self.catalogue[hypothesis];
-        let worst = fitted.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
+        let worst = fitted.iter().map(|h| mismatch_left(self.catalogue[*h].layer())).fold(0.0, f64::max);
         let found = left.remainder_since(before, &self.columns(fitted), &candidate.columns(), worst);
         if candidate.positive() && found.shares[0] <= 0.0 {
             return (0.0, 0.0);
@@ -320,7 +325,7 @@ impl Yardstick {
     /// levels do not speak against one.
     pub(crate) fn levels_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
         let columns = self.columns(chosen);
-        let worst = chosen.iter().map(|h| mismatch(self.catalogue[*h].layer())).fold(0.0, f64::max);
+        let worst = chosen.iter().map(|h| mismatch_left(self.catalogue[*h].layer())).fold(0.0, f64::max);
         let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
         let told = move |channel: usize| !(force && (RIM_AT..PATH_AT).contains(&channel));
         self.channels.iter().copied().enumerate().filter(move |(_, channel)| told(*channel)).map(move |(i, channel)| {

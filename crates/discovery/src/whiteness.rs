@@ -2,7 +2,7 @@
 //!
 //! Asked of contradictions between sensors, into which neither forces nor soils nor commands enter: what else deviates goes on as ground and driver do. A level tells of what is
 //! there on average; this tells of what comes and goes within a drive, such as a gyro that wanders to both sides. White errors of poses give a lag-one correlation of −1/2, as
-//! segments share their ends.
+//! segments share their ends, and white errors of velocities none: more of the latter alone raises it to zero and no further.
 
 use std::fmt;
 
@@ -15,6 +15,8 @@ use crate::observe::ObservedDrive;
 
 /// How many times the largest deviation of drives without an effect a jump is (chosen: impacts on rough ground were within twice).
 const JUMP: f64 = 3.0;
+/// Standard deviations above zero from which a correlation is surely positive.
+const POSITIVE: f64 = 3.0;
 /// Channels in which a jump is looked for: impacts shake height, roll and pitch.
 const JUMPING: [usize; 3] = [PATH_AT, PATH_AT + 1, TURN_AT + 2];
 
@@ -145,11 +147,11 @@ impl Whiteness {
         Self { usual: usual.collect() }
     }
 
-    /// What goes on most from segment to segment, of channels of drives; `None` where none does with this evidence.
+    /// What goes on most from segment to segment, of channels of drives; `None` where none does with this evidence and a correlation above zero.
     pub(crate) fn lasting(&self, evidence: f64, channels: impl Fn(usize) -> bool, of: impl Fn(usize) -> Vec<Succession>) -> Option<Unrest> {
         let own = self.usual.iter().filter(|usual| channels(usual.channel)).filter_map(|usual| {
-            let (lag_one, z) = usual.evidence(&of(usual.channel))?;
-            Some((usual, lag_one, z))
+            let (lag_one, sd) = usual.lag_one_of(&of(usual.channel))?;
+            (lag_one >= POSITIVE * sd).then_some((usual, lag_one, (lag_one - usual.lag_one) / sd))
         });
         let (usual, lag_one, z) = own.max_by(|a, b| a.2.total_cmp(&b.2)).filter(|(_, _, z)| *z >= evidence)?;
         Some(Unrest::Lasting { channel: usual.channel, lag_one, usual: usual.lag_one, z })
@@ -165,8 +167,8 @@ impl Whiteness {
 }
 
 impl Usual {
-    /// Lag-one correlation of drives together, and the evidence that it is larger than without an effect. A loud drive says more, and stands for fewer.
-    fn evidence(&self, drives: &[Succession]) -> Option<(f64, f64)> {
+    /// Lag-one correlation of drives together, with its standard deviation against that without an effect. A loud drive says more, and stands for fewer.
+    fn lag_one_of(&self, drives: &[Succession]) -> Option<(f64, f64)> {
         let drives: Vec<&Succession> = drives.iter().filter(|s| s.pairs > 0).collect();
         let square: f64 = drives.iter().map(|s| s.square).sum();
         if square <= 0.0 {
@@ -174,7 +176,7 @@ impl Usual {
         }
         let lag_one = drives.iter().map(|s| s.lagged).sum::<f64>() / square;
         let own: f64 = drives.iter().map(|s| (s.square / square).powi(2) / s.pairs as f64).sum();
-        Some((lag_one, (lag_one - self.lag_one) / (self.variance * (own + 1.0 / self.pairs)).sqrt()))
+        Some((lag_one, (self.variance * (own + 1.0 / self.pairs)).sqrt()))
     }
 }
 
@@ -189,7 +191,7 @@ mod tests {
     const CHANNEL: usize = TURN_AT + 2;
 
     /// Differences of white errors, one segment after the other, and `more` of each.
-    fn drive(rng: &mut ChaCha8Rng, segments: usize, more: impl Fn(usize) -> f64) -> Succession {
+    fn drive(rng: &mut ChaCha8Rng, segments: usize, mut more: impl FnMut(usize) -> f64) -> Succession {
         let pose: Vec<f64> = (0..=segments).map(|_| StandardNormal.sample(rng)).collect();
         let values: Vec<f64> = (0..segments).map(|k| pose[k + 1] - pose[k] + more(k)).collect();
         let starts: Vec<usize> = (0..segments).map(|k| k * SEGMENT_STEPS).collect();
@@ -214,6 +216,11 @@ mod tests {
             let level = group(|_| 7.0);
             assert_eq!(whiteness.lasting(5.0, |_| true, |_| level.clone()), None);
         }
+        let mut rates = ChaCha8Rng::seed_from_u64(5);
+        let mut rate = || -> f64 { StandardNormal.sample(&mut rates) };
+        let louder: Vec<Succession> = (0..5).map(|_| drive(&mut rng, 28, |_| 4.0 * rate())).collect();
+        assert_eq!(whiteness.lasting(5.0, |_| true, |_| louder.clone()), None, "rates that are noisier");
+        let mut group = |more: fn(usize) -> f64| (0..5).map(|_| drive(&mut rng, 28, more)).collect::<Vec<_>>();
         let sine = group(|k| 2.0 * (k as f64 * 0.8 / 25.0 * std::f64::consts::TAU).sin());
         let found = whiteness.lasting(9.0, |_| true, |_| sine.clone());
         assert!(matches!(found, Some(Unrest::Lasting { channel: CHANNEL, lag_one, .. }) if lag_one > 0.0), "{found:?}");

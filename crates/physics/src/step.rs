@@ -13,7 +13,7 @@ use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
 use crate::terramechanics::{ContactLaw, Support, WheelGeometry, WheelMotion, WheelWrench};
-use crate::torque_drive::{Driven, carried_on_n, shear_slope_n_s_m};
+use crate::torque_drive::{Driven, carried_on_n};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -84,9 +84,6 @@ pub struct StepModel {
 
 /// Speed around which the friction of a dragging wheel changes its sign, m/s (chosen).
 const DRAG_SPEED_M_S: f64 = 0.07;
-
-/// Speed of a wheel over the ground below which next to nothing is sheared, m/s (chosen: a tenth of what strains loose soil at walking pace).
-const UNSHEARED_M_S: f64 = 0.005;
 
 /// Speed around which the contact of a wheel passes from one side of the axle to the other, m/s (chosen: creep of a parked vehicle).
 const LEAD_SPEED_M_S: f64 = 0.05;
@@ -385,7 +382,7 @@ impl StepModel {
         let sinkage = balanced * ratio;
         let load = (preload_n - rate * sinkage).relu_smooth(1.0);
         let share = load / wrench.normal_n.relu_smooth(1.0);
-        let (mut drag, mut contact) = self.traction(i, &wrench, share, load, roll, input, sinkage);
+        let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
         if let Some(driven) = driven {
             let taken = wrench.torque_n_m * share * direction * T::lit(1.0 / wheel.radius_m);
             let more = carried_on_n(wheel, (sinkage, load), &soil, driven.at_rim_n, taken, wrench.thrust_n * share * direction);
@@ -427,27 +424,24 @@ impl StepModel {
         wrench: &WheelWrench<T>,
         share: T,
         load: T,
-        roll: &Roll<T>,
+        direction: T,
+        wheel_motion: &WheelMotion<T>,
         input: &StepInput<T>,
         sinkage_m: T,
+        slip: T,
     ) -> ([T; 2], WheelContact<T>) {
-        let Roll { motion: wheel_motion, direction, contact: Rolling { motion, soil, .. } } = roll;
-        let (direction, slip) = (*direction, motion.slip);
         let drag_n = self.drag_at_tread(wheel, wrench.thrust_n * share, load, wheel_motion, &input.soil);
         let opposing = wheel_motion.forward_m_s / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
         let forward_n = wrench.drawbar_n() * share * direction - drag_n * opposing;
         let left_n = wrench.side_n * share;
-        // Secant slopes bound the tangents of the concave shear law, so the implicit step never under-damps. Where next to nothing is sheared there is no force to divide, and
-        // the secant goes over into the slope of the law at none, the steepest: a slow vehicle would chatter, and its Jacobian grow.
+        // Secant slopes bound the tangents of the concave shear law, so the implicit step never under-damps.
+        let floor = 0.02;
         let overspeed_m_s = wheel_motion.rim_speed_m_s - wheel_motion.forward_m_s;
-        let unsheared_n =
-            shear_slope_n_s_m(self.wheel_at(wheel), wheel_motion.rim_speed_m_s, sinkage_m, load, soil) * T::lit(UNSHEARED_M_S);
-        let secant = |force_n: T, speed_m_s: T| (force_n.sqr() + unsheared_n.sqr()).sqrt() / speed_m_s.abs_smooth(UNSHEARED_M_S);
+        let over = overspeed_m_s.abs_smooth(floor);
+        let thrust = (wrench.thrust_n * share).abs_smooth(1.0);
+        let side = left_n.abs_smooth(1.0) / wheel_motion.left_m_s.abs_smooth(floor);
         let friction = drag_n / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
-        let drag = [
-            input.wheels.slip_feedback() * secant(wrench.thrust_n * share, overspeed_m_s) + friction.max(T::lit(0.0)),
-            secant(left_n, wheel_motion.left_m_s),
-        ];
+        let drag = [input.wheels.slip_feedback() * (thrust / over) + friction.max(T::lit(0.0)), side];
         (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip, overspeed_m_s })
     }
 }

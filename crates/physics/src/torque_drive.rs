@@ -142,14 +142,6 @@ impl<T: Real> Grip<T> {
     }
 }
 
-/// Slope of the shear force over the speed of a wheel over the ground where nothing is sheared, N s/m: Janosi's law over a contact of linearly growing
-/// displacement, S L / (2 K |v|) with the strength S and the speed v of the rim.
-#[inline(always)]
-pub(crate) fn shear_slope_n_s_m<T: Real>(wheel: &WheelGeometry, rim_speed_m_s: T, sinkage_m: T, load_n: T, soil: &Soil<T>) -> T {
-    let (length_m, limit_n) = held(wheel, sinkage_m, load_n, soil);
-    limit_n * length_m / (soil.k_shear * T::lit(2.0) * rim_speed_m_s.abs_smooth(SPEED_FLOOR_M_S))
-}
-
 /// Length of a contact, m, and the largest shear force that it holds, N.
 #[inline(always)]
 fn held<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, soil: &Soil<T>) -> (T, T) {

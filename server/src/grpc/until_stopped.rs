@@ -40,19 +40,33 @@ where
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        let (reply, stop) = (self.service.call(request), Box::pin(stopped(self.stopping.clone())));
-        Box::pin(async move { Ok(reply.await?.map(|body| Body::new(Reply { body, stop, is_over: false }))) })
+        let until_stopped = |body, then| UntilThen { body, stop: Box::pin(stopped(self.stopping.clone())), then, is_over: false };
+        // A service that waits for more to be asked would hold the stream.
+        let asked = request.map(|body| Body::new(until_stopped(body, Then::End)));
+        let told = until_stopped(Body::empty(), Then::Unavailable);
+        let reply = self.service.call(asked);
+        Box::pin(async move { Ok(reply.await?.map(|body| Body::new(UntilThen { body, ..told }))) })
     }
 }
 
 /// What is sent until the server stops.
-struct Reply {
+struct UntilThen {
     body: Body,
     stop: Pin<Box<dyn Future<Output = ()> + Send>>,
+    then: Then,
     is_over: bool,
 }
 
-impl http_body::Body for Reply {
+/// How a body ends when the server stops.
+#[derive(Clone, Copy)]
+enum Then {
+    /// Nothing more comes.
+    End,
+    /// With the status UNAVAILABLE.
+    Unavailable,
+}
+
+impl http_body::Body for UntilThen {
     type Data = Bytes;
     type Error = Status;
 
@@ -66,6 +80,9 @@ impl http_body::Body for Reply {
         }
         ready!(self.stop.as_mut().poll(context));
         self.is_over = true;
+        if let Then::End = self.then {
+            return Poll::Ready(None);
+        }
         let mut trailers = http::HeaderMap::new();
         let ended = Status::unavailable(EngineError::Stopped.to_string()).add_header(&mut trailers);
         Poll::Ready(Some(ended.map(|()| Frame::trailers(trailers))))

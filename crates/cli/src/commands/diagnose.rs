@@ -8,7 +8,7 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex};
 
 use clap::Args;
-use nesam_discovery::channels::CHANNELS;
+use nesam_discovery::channels::{self, CHANNELS};
 use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, catalogue, diagnose, observe_all};
 use nesam_evaluation::report::Short;
@@ -31,6 +31,8 @@ use crate::{interrupt, output};
 
 /// Hypotheses in the printed table.
 const SHOWN: usize = 12;
+/// Channels whose levels stand out that are printed, loudest first.
+const SHOWN_LEVELS: usize = 3;
 
 /// Options of `nesam diagnose`.
 #[derive(Args, Debug)]
@@ -272,6 +274,12 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
     order.sort_by(|a, b| s.z[*b].unwrap_or(0.0).total_cmp(&s.z[*a].unwrap_or(0.0)));
     for e in order.into_iter().take(SHOWN) {
         say!("  {:<24} z {:7.1}", found.catalogue[e].label(), s.z[e].unwrap_or(0.0));
+    }
+    let mut levels: Vec<(f64, usize)> =
+        s.levels.iter().copied().zip(found.channels.iter().copied()).filter(|(z, _)| *z >= s.threshold).collect();
+    levels.sort_by(|a, b| b.0.total_cmp(&a.0));
+    for (z, channel) in levels.into_iter().take(SHOWN_LEVELS) {
+        say!("  {:<24} z {z:7.1}  (level)", channels::name(channel));
     }
     for f in &found.findings {
         let rivals: Vec<String> = f.rivals.iter().map(|r| format!("{} ({:.2})", r.candidate.label(), r.weight)).collect();
