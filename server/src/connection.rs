@@ -65,13 +65,17 @@ impl<IO: AsyncRead + Unpin> Connection<IO> {
     /// dropped: unread bytes make the system reset the connection, and what is on its way to the client would be lost.
     fn poll_read_by_client(&mut self, context: &mut Context<'_>) -> Poll<()> {
         let Some(read_by) = &mut self.read_by else { return Poll::Ready(()) };
+        // First: reads that never pend use up the task's budget, and a timer does not tell without it.
+        if read_by.as_mut().poll(context).is_ready() {
+            return Poll::Ready(());
+        }
         let mut dropped = [0; 4096];
         loop {
             let mut buffer = ReadBuf::new(&mut dropped);
             match Pin::new(&mut self.io).poll_read(context, &mut buffer) {
                 Poll::Ready(Ok(())) if !buffer.filled().is_empty() => {}
                 Poll::Ready(_) => return Poll::Ready(()),
-                Poll::Pending => return read_by.as_mut().poll(context),
+                Poll::Pending => return Poll::Pending,
             }
         }
     }

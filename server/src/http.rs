@@ -68,8 +68,10 @@ async fn metrics(State(state): State<HttpState>) -> Response {
         text += &store_metrics(&keeper.counts());
     }
     text += &refusal_metrics(&state.edge.access.refusals);
+    let sessions = state.edge.access.directory.count();
+    text += &metric("nesam_sessions", "gauge", "Open sessions.", sessions);
     // A server that is alone owns whatever it has.
-    let alone = ClusterCounts { leased: true, held: state.edge.engine.metrics().sessions() as usize, ..Default::default() };
+    let alone = ClusterCounts { leased: true, held: sessions, ..Default::default() };
     text += &cluster_metrics(&state.edge.cluster.as_ref().map_or(alone, Cluster::counts));
     if let Some(presence) = &state.edge.presence {
         text += &metric("nesam_vehicles_alive", "gauge", "Vehicles whose Zenoh liveliness token is there.", presence.count());

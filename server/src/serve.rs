@@ -266,7 +266,8 @@ async fn open_store(
 /// Commits what is left, then lets the sessions go: others may have them from now on. Gives how much the store did not take.
 async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) -> usize {
     let lost = match keeper {
-        Some(keeper) => tokio::task::spawn_blocking(move || keeper.finish()).await.unwrap_or_default(),
+        // A panic there leaves nobody who could count: something was lost.
+        Some(keeper) => tokio::task::spawn_blocking(move || keeper.finish()).await.unwrap_or(1),
         None => 0,
     };
     if lost > 0 {

@@ -51,7 +51,13 @@ std::optional<Start> rolled_forward(const KinematicFallback& fallback, const det
   if (!known.stamp_ns) return Start{known};
   const std::int64_t known_ns = *known.stamp_ns;
   const double step_ns = fallback.dt_s * 1e9;
-  const auto steps_since = [&](std::int64_t stamp_ns) { return (static_cast<double>(stamp_ns) - static_cast<double>(known_ns)) / step_ns; };
+  // Whole seconds apart from the rest: a double does not hold the nanoseconds since 1970.
+  const auto steps_since = [&](std::int64_t stamp_ns) {
+    constexpr std::int64_t second_ns = 1'000'000'000;
+    const double apart_s = static_cast<double>(stamp_ns / second_ns - known_ns / second_ns);
+    const double apart_ns = apart_s * 1e9 + static_cast<double>(stamp_ns % second_ns - known_ns % second_ns);
+    return apart_ns / step_ns;
+  };
   const double steps = std::max(0.0, std::floor(steps_since(until_ns) + 0.5));
   if (!(steps <= horizon_max)) return std::nullopt;
   Start start{known, static_cast<std::uint32_t>(steps)};

@@ -513,6 +513,11 @@ fn service_a_configuration_is_checked_without_serving() {
     ] {
         refused(&[&["serve", "--check"][..], &options].concat(), here.path(), &words);
     }
+    // A port that the file has twice and a flag mends.
+    std::fs::write(here.path().join("ports.toml"), "[grpc]\nlisten = \"127.0.0.1:50080\"\n").unwrap();
+    refused(&["serve", "--check", "--config", "ports.toml"], here.path(), &["http.listen", "50080"]);
+    let mended = nesam(&["serve", "--check", "--config", "ports.toml", "--http", "127.0.0.1:50090"], here.path());
+    assert!(mended.status.success(), "{}", stderr(&mended));
     std::fs::write(here.path().join("store.toml"), "[store]\nenabled = true\ndirectory = \"file\"\n").unwrap();
     let check = nesam(&["check", "store.toml"], here.path());
     assert!(check.status.code() == Some(2) && stdout(&check).contains("store.directory"), "{}", stdout(&check));

@@ -14,7 +14,6 @@ use crate::claims::Case;
 use crate::condense::difference;
 use crate::dating::dispersion;
 use crate::fit::Fit;
-use crate::judgement::UNEXPLAINED_MARGIN;
 use crate::onset::{Change, Course, change, loose};
 use crate::select::{Yardstick, mismatch, without};
 use crate::whiteness::{Succession, Unrest};
@@ -60,7 +59,7 @@ impl Case<'_> {
     pub(crate) fn unrest(&self, yardstick: &Yardstick) -> Option<Unrest> {
         let of = |channel| self.successions(self.rows.iter().map(Vec::as_slice), channel);
         let whiteness = &yardstick.whiteness;
-        whiteness.lasting(UNEXPLAINED_MARGIN * yardstick.threshold(), |_| true, of).or_else(|| whiteness.jump(of))
+        whiteness.lasting(yardstick.beyond_doubt(), |_| true, of).or_else(|| whiteness.jump(of))
     }
 
     /// How a channel goes on in each drive.
@@ -76,7 +75,7 @@ impl Case<'_> {
             let answered: f64 = left.iter().flat_map(|left| &left.answers[i]).map(|row| row[channel].powi(2)).sum();
             answered > 0.0 && of(channel).iter().map(|s| s.lagged).sum::<f64>() > doubted * answered
         };
-        yardstick.whiteness.lasting(UNEXPLAINED_MARGIN * yardstick.threshold(), more, of)
+        yardstick.whiteness.lasting(yardstick.beyond_doubt(), more, of)
     }
 
     /// The change of the size of the `i`-th of fitted effects, beside the others in whatever size each drive has them.

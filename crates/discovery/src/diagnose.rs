@@ -163,8 +163,10 @@ pub fn diagnose(
     let Proven { mut judgement, learned, mut scores, verdict, reason } =
         prove(&case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &held_drives)?;
     let any = verdict.claims();
-    for i in judgement.claimed().into_iter().filter(|_| !any) {
-        judgement.findings[i].refused = Some(reason.clone());
+    if !any {
+        for i in judgement.claimed() {
+            judgement.findings[i].refused = Some(reason.clone());
+        }
     }
     let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
     let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: any, predictor, held_out: &places };

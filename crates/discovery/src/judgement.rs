@@ -10,9 +10,6 @@ use crate::settled::{Settled, onset_in_place};
 /// Share of the largest evidence that may be left after the claimed effects, when it is beyond chance (chosen): the model's answer to an effect is not
 /// exact, but most of what is different must be explained before anything is claimed.
 const LEFT_MAX: f64 = 0.4;
-/// How far beyond the family-wise threshold the largest evidence must be before drives count as different without a known cause (chosen, as in ADR 0008):
-/// one set in twenty without an effect is beyond the threshold itself.
-pub(crate) const UNEXPLAINED_MARGIN: f64 = 1.5;
 /// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
 const LEFT_MAX_GEOMETRY: f64 = 0.2;
 
@@ -106,13 +103,12 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
 
 /// That nothing differs is said where sensors do not wander or jump either.
 fn unless_unrest(case: &Case<'_>, yardstick: &Yardstick, judgement: Judgement) -> Judgement {
-    match case.unrest(yardstick) {
-        Some(unrest) if judgement.verdict == Verdict::None => {
-            let reason = format!("{unrest}, which no effect of the catalogue explains");
-            Judgement { verdict: Verdict::Unexplained, reason, ..judgement }
-        }
-        _ => judgement,
+    if judgement.verdict != Verdict::None {
+        return judgement;
     }
+    let Some(unrest) = case.unrest(yardstick) else { return judgement };
+    let reason = format!("{unrest}, which no effect of the catalogue explains");
+    Judgement { verdict: Verdict::Unexplained, reason, ..judgement }
 }
 
 /// Settles, sizes and doubts what is chosen until nothing is refused, or only the first is left. What is `passed_over` takes no place; `left_out` was refused before.
@@ -188,7 +184,7 @@ fn nothing_chosen(selection: &Selection) -> (Verdict, String) {
 /// Whether the drives differ from the reference beyond doubt, so that it must be said even when no cause can be named: before or after what was tried, which may show what
 /// it does not explain.
 fn surely_differs(selection: &Selection) -> bool {
-    selection.largest().max(selection.remaining.0) >= UNEXPLAINED_MARGIN * selection.threshold
+    selection.largest().max(selection.remaining.0) >= selection.beyond_doubt()
 }
 
 /// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence.
@@ -238,7 +234,7 @@ fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool
 /// What is left beyond doubt beside claimed effects, and what to do: a share of what loud effects explain may be much.
 fn more_left(selection: &Selection) -> String {
     let (z, what) = &selection.remaining;
-    if *z < UNEXPLAINED_MARGIN * selection.threshold {
+    if *z < selection.beyond_doubt() {
         return String::new();
     }
     format!("; more is left, most in {what} (z = {z:.1}): diagnose once more with the bundle that has them")

@@ -207,10 +207,8 @@ impl Reference {
 
     /// How channels go on from segment to segment in the null drives.
     pub(crate) fn whiteness(&self) -> Whiteness {
-        let asked: Vec<usize> = asked_of(&self.compared().unwrap_or_default()).collect();
-        let drives: Vec<Vec<(usize, Succession)>> =
-            self.drives.iter().map(|d| asked.iter().copied().zip(d.successions.iter().copied()).collect()).collect();
-        Whiteness::of(drives.iter().map(Vec::as_slice))
+        let drives: Vec<&[Succession]> = self.drives.iter().map(|d| d.successions.as_slice()).collect();
+        Whiteness::of(asked_of(&self.compared().unwrap_or_default()), &drives)
     }
 
     /// Channels that are compared; `None` where one is not known.

@@ -20,6 +20,9 @@ pub const EFFECTS_MAX: usize = 3;
 pub const RIVALS_MAX: usize = 2;
 /// Threshold without null groups: twice that of 28 candidates at 5 % family-wise.
 const THRESHOLD_ALONE: f64 = 6.2;
+/// How far beyond the family-wise threshold the largest evidence must be before drives count as different without a known cause (chosen, as in ADR 0008):
+/// one set in twenty without an effect is beyond the threshold itself.
+const UNEXPLAINED_MARGIN: f64 = 1.5;
 /// Share of the strongest gain below which a hypothesis does not compete.
 const COMPETING: f64 = 0.3;
 /// Evidence that a second or third effect needs, as a multiple of the threshold (chosen): the model's answer to the first is not exact.
@@ -135,6 +138,11 @@ impl Selection {
         yardstick.describe(group, self);
     }
 
+    /// Evidence from which drives differ beyond doubt, so that it must be said even when no cause can be named.
+    pub(crate) fn beyond_doubt(&self) -> f64 {
+        UNEXPLAINED_MARGIN * self.threshold
+    }
+
     /// Whether the drives differ from the reference, known cause or not.
     pub fn differs(&self) -> bool {
         self.largest() >= self.threshold
@@ -161,6 +169,11 @@ impl Yardstick {
     /// Family-wise threshold.
     pub fn threshold(&self) -> f64 {
         self.groups.as_ref().map_or(THRESHOLD_ALONE, |n| n.threshold)
+    }
+
+    /// As [`Selection::beyond_doubt`].
+    pub(crate) fn beyond_doubt(&self) -> f64 {
+        UNEXPLAINED_MARGIN * self.threshold()
     }
 
     fn spread(&self, e: usize) -> f64 {

@@ -133,11 +133,10 @@ impl fmt::Display for Unrest {
 }
 
 impl Whiteness {
-    /// From drives without an effect, each with the channels that are asked and how they go on.
-    pub(crate) fn of<'a>(drives: impl Iterator<Item = &'a [(usize, Succession)]> + Clone) -> Self {
-        let channels: Vec<usize> = drives.clone().next().into_iter().flatten().map(|(channel, _)| *channel).collect();
-        let usual = channels.into_iter().enumerate().filter_map(|(at, channel)| {
-            let own: Vec<Succession> = drives.clone().map(|drive| drive[at].1).filter(|s| s.pairs > 0 && s.square > 0.0).collect();
+    /// From drives without an effect: how each of these channels goes on in each.
+    pub(crate) fn of(channels: impl Iterator<Item = usize>, drives: &[&[Succession]]) -> Self {
+        let usual = channels.enumerate().filter_map(|(at, channel)| {
+            let own: Vec<Succession> = drives.iter().map(|drive| drive[at]).filter(|s| s.pairs > 0 && s.square > 0.0).collect();
             let pairs = own.iter().map(|s| s.pairs as f64).sum::<f64>();
             let lag_one = own.iter().map(|s| s.pairs as f64 * s.lag_one()).sum::<f64>() / pairs;
             let variance = own.iter().map(|s| s.pairs as f64 * (s.lag_one() - lag_one).powi(2)).sum::<f64>() / (own.len() as f64 - 1.0);
@@ -199,8 +198,8 @@ mod tests {
     }
 
     fn usual(rng: &mut ChaCha8Rng) -> Whiteness {
-        let drives: Vec<[(usize, Succession); 1]> = (0..30).map(|_| [(CHANNEL, drive(rng, 28, |_| 0.0))]).collect();
-        Whiteness::of(drives.iter().map(|drive| &drive[..]))
+        let drives: Vec<[Succession; 1]> = (0..30).map(|_| [drive(rng, 28, |_| 0.0)]).collect();
+        Whiteness::of([CHANNEL].into_iter(), &drives.iter().map(|drive| &drive[..]).collect::<Vec<_>>())
     }
 
     /// Goal: what comes and goes within drives is told, what is always there and what is noise is not. Method: thirty drives of the noise of poses alone; 400 groups of five

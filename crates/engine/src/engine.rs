@@ -4,11 +4,11 @@ mod effects;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
-use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant};
+use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant, is_raised};
 use nesam_physics::{Vehicle, VehicleState};
 use nesam_terrain::WorldMap;
 
@@ -133,13 +133,14 @@ impl Engine {
 
     /// The same until `abandoned` is raised: a prediction is then given up, and leaves no trace.
     pub(crate) fn execute_unless(&mut self, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
+        let result = self.answer(now_ns, command, abandoned);
+        if matches!(result, Err(EngineError::Abandoned)) {
+            return result;
+        }
         if let Some(log) = &mut self.log {
             log.push((now_ns, command.clone()));
         }
-        let result = self.answer(now_ns, command, abandoned);
-        if !matches!(result, Err(EngineError::Abandoned))
-            && let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id))
-        {
+        if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
             session.touch(now_ns);
         }
         result
@@ -419,7 +420,7 @@ impl Engine {
             let linearisations = predictor.linearise_unless(&asked, abandoned)?;
             (extras.jacobians, extras.covariance) =
                 query.extras.derive(&linearisations, forward.steps(), session.soil(), self.noise.as_ref())?;
-            if abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
+            if is_raised(abandoned) {
                 return Err(EngineError::Abandoned);
             }
         }

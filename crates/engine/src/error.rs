@@ -82,7 +82,7 @@ pub enum EngineError {
     Overloaded {
         /// What comes first: predictions or commands.
         kind: &'static str,
-        /// How many wait, with the prediction that is computed.
+        /// How many; of all predictions, with the one that is computed.
         waiting: usize,
         /// Pause after which there may be room, ns.
         retry_after_ns: u64,

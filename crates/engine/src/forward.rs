@@ -2,7 +2,7 @@
 
 use std::borrow::Cow;
 
-use nesam_model::{MAX_HORIZON, RiskOutputs, Rollout};
+use nesam_model::{RiskOutputs, Rollout};
 use nesam_physics::{Control, STATE_DIM, Vehicle, VehicleState, WHEELS};
 
 use crate::error::EngineError;
@@ -91,7 +91,7 @@ impl RollForward {
             let reason = format!("lies {} s before the newest measured step; allowed is half a step of {} s", -seconds, step as f64 * 1e-9);
             return Err(EngineError::invalid("start_stamp_ns", reason));
         }
-        let steps_max = limits.horizon_max.min(MAX_HORIZON).saturating_sub(horizon);
+        let steps_max = limits.steps_max().saturating_sub(horizon);
         let Some(steps) = usize::try_from(steps).ok().filter(|steps| *steps <= steps_max) else {
             let reason = format!(
                 "lies {seconds} s = {steps} steps after the newest measured step; with horizon {horizon} at most {steps_max} are allowed"

@@ -2,8 +2,9 @@
 
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
+use nesam_model::is_raised;
 use nesam_physics::Vehicle;
 
 use crate::clock::Clock;
@@ -294,7 +295,7 @@ fn answer(
     let is_prediction = matches!(command, Command::Predict(_));
     let abandoned = abandoned.as_deref().filter(|_| is_prediction);
     let is_past = |now_ns: u64| is_prediction && deadline_ns.is_some_and(|deadline_ns| now_ns > deadline_ns);
-    let begun = if abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed)) {
+    let begun = if is_raised(abandoned) {
         Err(EngineError::Abandoned)
     } else if is_past(now_ns) {
         Err(EngineError::Expired)

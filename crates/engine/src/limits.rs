@@ -115,13 +115,17 @@ impl Limits {
         (self.reorder_window_s.clamp(0.0, 1.0) * 1e9).round() as i64
     }
 
+    /// Largest K: never above the positions of the model.
+    pub fn steps_max(&self) -> usize {
+        self.horizon_max.min(MAX_HORIZON)
+    }
+
     /// Checks N, K and N K.
     ///
     /// # Errors
     /// `EngineError::Invalid` naming `samples` or `horizon` and the limit.
     pub fn check_shape(&self, samples: usize, horizon: usize) -> Result<(), EngineError> {
-        let horizon_max = self.horizon_max.min(MAX_HORIZON);
-        for (field, value, limit) in [("samples", samples, self.samples_max), ("horizon", horizon, horizon_max)] {
+        for (field, value, limit) in [("samples", samples, self.samples_max), ("horizon", horizon, self.steps_max())] {
             if value == 0 || value > limit {
                 return Err(EngineError::invalid(field, format!("is {value}, allowed are 1 to {limit}")));
             }
@@ -160,8 +164,7 @@ impl Limits {
     /// # Errors
     /// `EngineError::Invalid` naming the entry and its limit.
     pub fn check_wheels(&self, wheels: &WheelMeasurement, wheel_radius_m: f64) -> Result<(), EngineError> {
-        let speeds = wheels.speed_rad_s.as_ref().map(|speeds| &speeds[..]).unwrap_or_default();
-        let angles = wheels.road_wheel_angle_rad.as_ref().map(|angles| &angles[..]).unwrap_or_default();
+        let (speeds, angles) = (wheels.speed_rad_s.as_slice().as_flattened(), wheels.road_wheel_angle_rad.as_slice().as_flattened());
         let entries =
             [("speed_rad_s", speeds, self.speed_max_m_s / wheel_radius_m), ("road_wheel_angle_rad", angles, core::f64::consts::FRAC_PI_2)];
         for (name, values, limit) in entries {

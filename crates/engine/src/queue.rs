@@ -153,11 +153,7 @@ impl Queue {
         lanes.correct(expected_ns, now_ns);
         let waiting = lanes.predictions.len();
         if waiting > 0 && deadline_ns.is_some_and(|deadline_ns| now_ns + expected_ns > deadline_ns) {
-            return Err(EngineError::Overloaded {
-                kind: "predictions",
-                waiting,
-                retry_after_ns: expected_ns.clamp(RETRY_MIN_NS, RETRY_MAX_NS),
-            });
+            return Err(overloaded("predictions", waiting, expected_ns));
         }
         Ok(())
     }
@@ -220,21 +216,16 @@ impl Lanes {
             (Admitted { place, expected_ns, due_ns }, late_ns)
         };
         let (admitted, late_ns) = Some(of(query.samples)).filter(|(_, late_ns)| *late_ns == 0).unwrap_or_else(|| of(query.least()));
-        let refused = |kind, waiting, retry_after_ns: u64| EngineError::Overloaded {
-            kind,
-            waiting,
-            retry_after_ns: retry_after_ns.clamp(RETRY_MIN_NS, RETRY_MAX_NS),
-        };
         let (waiting, own) = (self.predictions.len(), self.predictions.len_of(share));
         // Whoever comes while nothing else is to be done is let in though it may be late, so that the estimate stays true; not in vain while the estimate is.
         let first = waiting + usize::from(self.running.is_some());
         let is_hopeless = now_ns < self.relied_on_until_ns && admitted.expected_ns / HOPELESS > due_ns.saturating_sub(now_ns);
         if waiting >= limits.waiting_predictions_max {
-            Err(refused("predictions", first, admitted.place.wait_ns))
+            Err(overloaded("predictions", first, admitted.place.wait_ns))
         } else if own >= limits.waiting_predictions_per_vehicle_max {
-            Err(refused("predictions of this vehicle", own, admitted.place.wait_ns))
+            Err(overloaded("predictions of this vehicle", own, admitted.place.wait_ns))
         } else if late_ns > 0 && first > 0 {
-            Err(refused("predictions", first, late_ns.max(self.demand.recovers_ns(share))))
+            Err(overloaded("predictions", first, late_ns.max(self.demand.recovers_ns(share))))
         } else if is_hopeless {
             Err(EngineError::Expired)
         } else {
@@ -253,19 +244,23 @@ impl Lanes {
 
     /// Lets another command in, unless too many wait.
     fn take(&mut self, submission: &Submission, limits: &Limits) -> Result<(), EngineError> {
-        let refused = |kind, waiting| EngineError::Overloaded { kind, waiting, retry_after_ns: RETRY_MIN_NS };
         if self.commands.len() >= limits.waiting_commands_max {
-            return Err(refused("commands", self.commands.len()));
+            return Err(overloaded("commands", self.commands.len(), 0));
         }
         if let Command::Measure { .. } = submission.command {
             let own = self.commands_of.entry(submission.share()).or_default();
             if *own >= limits.waiting_measurements_per_vehicle_max {
-                return Err(refused("measurements of this vehicle", *own));
+                return Err(overloaded("measurements of this vehicle", *own, 0));
             }
             *own += 1;
         }
         Ok(())
     }
+}
+
+/// A refusal with a pause within the bounds.
+fn overloaded(kind: &'static str, waiting: usize, retry_after_ns: u64) -> EngineError {
+    EngineError::Overloaded { kind, waiting, retry_after_ns: retry_after_ns.clamp(RETRY_MIN_NS, RETRY_MAX_NS) }
 }
 
 #[cfg(test)]

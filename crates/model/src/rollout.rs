@@ -169,7 +169,7 @@ pub struct RolloutExtras<'a> {
 }
 
 /// Whether the flag of a rollout was raised.
-pub(crate) fn is_raised(abandoned: Option<&AtomicBool>) -> bool {
+pub fn is_raised(abandoned: Option<&AtomicBool>) -> bool {
     abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed))
 }
 

@@ -43,6 +43,7 @@ fn jacobian(drive: &Drive, control: &Control<f64>) -> [[f64; N]; N] {
     core::array::from_fn(|r| core::array::from_fn(|k| inc[index[r]].eps[k] + if r == k { 1.0 } else { 0.0 }))
 }
 
+/// Goal: errors of a state die out. Method: eigenvalues of the step's Jacobian along drives at 1.5 m/s; at walking pace they do not (ADR 0003).
 #[test]
 fn property_a_step_does_not_amplify_small_changes() {
     for vehicle in [truck(), torque_truck(), robot()] {
@@ -64,9 +65,7 @@ fn property_a_step_does_not_amplify_small_changes() {
                 growth = norm / v.iter().map(|x| x * x).sum::<f64>().sqrt();
                 v = n.map(|x| x / norm);
             }
-            if k % 10 == 0 {
-                println!("{} k {k}: {growth} {v:.2?}", drive.model.vehicle().name);
-            }
+            assert!(growth < 1.0, "{} step {k}: {growth} along {v:.2?}", drive.model.vehicle().name);
             drive.step(control.speed_m_s, control.second);
         }
     }

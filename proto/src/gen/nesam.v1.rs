@@ -1801,7 +1801,7 @@ pub mod prediction_client {
         /// Rolls N candidate command sequences K steps of 0.1 s ahead.
         /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: unknown session. FAILED_PRECONDITION: no start state and no measurement yet, or the
         /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not done in time.
-        /// Without Jacobians and covariance a reply has up to 112 N K bytes: 2048 samples of 32 steps with all channels and the sinkage 4.2 MB, with risk too
+        /// Without Jacobians and covariance a reply has up to 112 N K bytes (for each what-if soil): 2048 samples of 32 steps with all channels and the sinkage 4.2 MB, with risk too
         /// 6.8 MB. gRPC libraries refuse replies over 4 MiB unless their limit is raised, and with the same RESOURCE_EXHAUSTED.
         pub async fn predict(
             &mut self,
@@ -1868,7 +1868,7 @@ pub mod prediction_server {
         /// Rolls N candidate command sequences K steps of 0.1 s ahead.
         /// INVALID_ARGUMENT: names the field and the limit. NOT_FOUND: unknown session. FAILED_PRECONDITION: no start state and no measurement yet, or the
         /// measured position lies outside the session's map. RESOURCE_EXHAUSTED: overloaded, ask again. DEADLINE_EXCEEDED: not done in time.
-        /// Without Jacobians and covariance a reply has up to 112 N K bytes: 2048 samples of 32 steps with all channels and the sinkage 4.2 MB, with risk too
+        /// Without Jacobians and covariance a reply has up to 112 N K bytes (for each what-if soil): 2048 samples of 32 steps with all channels and the sinkage 4.2 MB, with risk too
         /// 6.8 MB. gRPC libraries refuse replies over 4 MiB unless their limit is raised, and with the same RESOURCE_EXHAUSTED.
         async fn predict(
             &self,

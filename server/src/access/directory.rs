@@ -20,6 +20,11 @@ impl Directory {
         }
     }
 
+    /// Number of open sessions.
+    pub fn count(&self) -> usize {
+        self.0.read().map_or(0, |sessions| sessions.len())
+    }
+
     /// Vehicle of an open session.
     pub fn vehicle(&self, session: &str) -> Option<Arc<str>> {
         self.0.read().ok()?.get(session).cloned()

@@ -198,7 +198,7 @@ impl Caller {
         wish.session().and_then(|session| self.access.directory.vehicle(session))
     }
 
-    /// Decides; a right that is missing is counted.
+    /// Whether somebody may, with a session of this vehicle; what is refused is logged and counted.
     fn decide(
         &self,
         fleet: &FleetFile,
@@ -206,34 +206,26 @@ impl Caller {
         wish: Wish<'_>,
         vehicle: Option<Arc<str>>,
     ) -> Result<Option<Arc<str>>, Status> {
-        decide(fleet, identity, wish, vehicle).inspect_err(|status| {
-            if status.code() == tonic::Code::PermissionDenied {
-                self.access.refusals.count(Refusal::Right);
+        let allowed = match (wish, &vehicle) {
+            (Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session), None) => {
+                return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
             }
-        })
-    }
-}
-
-/// Whether somebody may, with a session of this vehicle; what is refused is logged.
-fn decide(fleet: &FleetFile, identity: &Identity, wish: Wish<'_>, vehicle: Option<Arc<str>>) -> Result<Option<Arc<str>>, Status> {
-    let allowed = match (wish, &vehicle) {
-        (Wish::ReadSession(session) | Wish::ChangeSession(session) | Wish::ApplyEffects(session), None) => {
-            return Err(crate::convert::to_status(nesam_engine::EngineError::UnknownSession { session: session.into() }));
+            (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
+            (Wish::ApplyEffects(_), Some(_)) | (Wish::Diagnose(_), _) => fleet.may_operate(identity),
+            (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
+            (Wish::OpenSession { vehicle, session }, _) => {
+                let name = if session.is_empty() { vehicle } else { session };
+                fleet.may_change(identity, vehicle) && fleet.may_name(identity, name)
+            }
+            (Wish::ChangeMap(map), _) => fleet.may_change_map(identity, map),
+        };
+        if allowed {
+            return Ok(vehicle);
         }
-        (Wish::ReadSession(_), Some(vehicle)) => fleet.may_read(identity, vehicle),
-        (Wish::ApplyEffects(_), Some(_)) | (Wish::Diagnose(_), _) => fleet.may_operate(identity),
-        (Wish::ChangeSession(_), Some(vehicle)) => fleet.may_change(identity, vehicle),
-        (Wish::OpenSession { vehicle, session }, _) => {
-            let name = if session.is_empty() { vehicle } else { session };
-            fleet.may_change(identity, vehicle) && fleet.may_name(identity, name)
-        }
-        (Wish::ChangeMap(map), _) => fleet.may_change_map(identity, map),
-    };
-    if allowed {
-        return Ok(vehicle);
+        tracing::warn!(target: "nesam::audit", %identity, ?wish, "refused: no right");
+        self.access.refusals.count(Refusal::Right);
+        Err(Status::permission_denied(format!("{identity} has no right to {wish}; the fleet file of the server gives rights")))
     }
-    tracing::warn!(target: "nesam::audit", %identity, ?wish, "refused: no right");
-    Err(Status::permission_denied(format!("{identity} has no right to {wish}; the fleet file of the server gives rights")))
 }
 
 impl core::fmt::Display for Wish<'_> {

@@ -3,7 +3,6 @@
 use std::sync::Arc;
 
 use nesam_engine::{EngineError, Limits, PredictQuery, Prediction, Ranking, SentCommand, StartInstant};
-use nesam_model::MAX_HORIZON;
 use nesam_physics::{STATE_DIM, WHEELS};
 use nesam_proto::packed::lend;
 use nesam_proto::v1 as pb;
@@ -33,7 +32,7 @@ const BESIDE_CANDIDATES: usize = 64 << 10;
 
 /// Largest request, bytes: whatever N and K are allowed each by itself, so that a product that is not is refused with its field.
 pub fn predict_bytes_max(limits: &Limits) -> usize {
-    let candidates = limits.samples_max.saturating_mul(limits.horizon_max.min(MAX_HORIZON)).saturating_mul(8);
+    let candidates = limits.samples_max.saturating_mul(limits.steps_max()).saturating_mul(8);
     candidates.saturating_add(BESIDE_CANDIDATES)
 }
 

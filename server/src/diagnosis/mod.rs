@@ -118,7 +118,7 @@ impl Diagnoses {
                 );
                 return Err(refused(Code::FailedPrecondition, "recording", reason));
             }
-            return Ok(Source { run: run.into(), files: now.clone(), live: true });
+            return Ok(Source { run: run.into(), files: now.clone(), live: ended.is_none() });
         }
         if named.is_empty() {
             let reason =

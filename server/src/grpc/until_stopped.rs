@@ -7,7 +7,7 @@ use std::task::{Context, Poll, ready};
 use bytes::Bytes;
 use http_body::Frame;
 use nesam_engine::EngineError;
-use tokio::sync::watch;
+use tokio::sync::{oneshot, watch};
 use tonic::Status;
 use tonic::body::Body;
 use tonic::codegen::{BoxFuture, Service, http};
@@ -40,12 +40,19 @@ where
     }
 
     fn call(&mut self, request: http::Request<Body>) -> Self::Future {
-        let until_stopped = |body, then| UntilThen { body, stop: Box::pin(stopped(self.stopping.clone())), then, is_over: false };
-        // A service that waits for more to be asked would hold the stream.
-        let asked = request.map(|body| Body::new(until_stopped(body, Then::End)));
-        let told = until_stopped(Body::empty(), Then::Unavailable);
+        // A service that waits for more to be asked would hold the stream. It hears of the end after the reply has ended: else it would end that itself, with OK.
+        let (held, ended) = oneshot::channel::<()>();
+        let ended = Box::pin(async move {
+            let _ = ended.await;
+        });
+        let stopping = self.stopping.clone();
+        let stop = Box::pin(async move {
+            stopped(stopping).await;
+            drop(held);
+        });
+        let asked = request.map(|body| Body::new(UntilThen { body, stop: ended, then: Then::End, is_over: false }));
         let reply = self.service.call(asked);
-        Box::pin(async move { Ok(reply.await?.map(|body| Body::new(UntilThen { body, ..told }))) })
+        Box::pin(async move { Ok(reply.await?.map(|body| Body::new(UntilThen { body, stop, then: Then::Unavailable, is_over: false }))) })
     }
 }
 

@@ -73,17 +73,15 @@ impl Recording {
     /// As [`Recording::open_all`], and `RecordingError::Parts` where there are two recordings.
     pub fn open(paths: &[PathBuf]) -> Result<Self, RecordingError> {
         let mut recordings = Self::open_all(paths)?;
-        match (recordings.pop(), recordings.last()) {
-            (Some(recording), None) => Ok(recording),
-            (Some(last), Some(before)) => {
-                let reason = format!("{} and {} are two recordings; give one at a time", before.header.run, last.header.run);
-                Err(RecordingError::Parts { reason })
-            }
-            (None, _) => Err(RecordingError::Parts { reason: "no file was given".into() }),
+        if let [.., before, last] = &recordings[..] {
+            let reason = format!("{} and {} are two recordings; give one at a time", before.header.run, last.header.run);
+            return Err(RecordingError::Parts { reason });
         }
+        Ok(recordings.pop().expect("there is at least one recording; this is a bug"))
     }
 
-    /// Opens all recordings whose parts are among the files and in the folders: each time a server starts it begins another one. The oldest comes first.
+    /// Opens all recordings whose parts are among the files and in the folders, at least one: each time a server starts it begins another one. The oldest comes
+    /// first.
     ///
     /// # Errors
     /// `RecordingError` naming the file that is no recording or was written by a program of another layout, or the part that is missing.
@@ -94,25 +92,33 @@ impl Recording {
             let run = (header.clock_zero_unix_ns, header.run.clone());
             runs.entry(run).or_default().insert(number, (path, header));
         }
-        runs.into_values().filter_map(|parts| Self::of_parts(parts).transpose()).collect()
+        if runs.is_empty() {
+            return Err(RecordingError::Parts { reason: "no file was given".into() });
+        }
+        runs.into_values().map(Self::of_parts).collect()
     }
 
-    /// The recording of these parts; `None` of none.
-    fn of_parts(parts: Parts) -> Result<Option<Self>, RecordingError> {
+    /// The recording of these parts, of which there is one.
+    fn of_parts(parts: Parts) -> Result<Self, RecordingError> {
         let missing = (1..).zip(parts.keys()).find(|(expected, number)| expected != *number).map(|(expected, _)| expected);
-        let Some((first, header)) = parts.values().next().cloned() else { return Ok(None) };
+        let (first, header) = parts.values().next().cloned().expect("a run is known by a part of it; this is a bug");
         if let Some(missing) = missing {
             let reason =
                 format!("part {missing} of recording {} is missing beside {}; a replay begins with part 1", header.run, first.display());
             return Err(RecordingError::Parts { reason });
         }
         let parts = parts.into_values().map(|(path, _)| path).collect();
-        Ok(Some(Self { header, parts, open: None, next_index: 1, ending: None }))
+        Ok(Self { header, parts, open: None, next_index: 1, ending: None })
     }
 
     /// What ran.
     pub fn header(&self) -> &RecordingHeader {
         &self.header
+    }
+
+    /// Its files that are not read yet, the first part first.
+    pub fn files(&self) -> Vec<PathBuf> {
+        self.parts.iter().cloned().collect()
     }
 
     /// How the recording ends; known when no command is left.

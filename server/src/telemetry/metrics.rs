@@ -43,8 +43,7 @@ pub struct Metrics {
     /// When the certificate of the server expires, s since 1970; 0 = it has none.
     certificate_expires_s: AtomicU64,
     events: Mutex<BTreeMap<&'static str, u64>>,
-    /// Open sessions and held maps.
-    sessions: AtomicU64,
+    /// Held maps.
     maps: AtomicU64,
     alarms: AlarmCounts,
     queue: Histogram,
@@ -110,22 +109,10 @@ impl Metrics {
         if let Ok(mut events) = self.events.lock() {
             *events.entry(event.label()).or_default() += 1;
         }
-        match event {
-            Event::SessionOpened { .. } => {
-                self.sessions.fetch_add(1, Ordering::Relaxed);
-            }
-            Event::SessionClosed { .. } => {
-                self.sessions.fetch_sub(1, Ordering::Relaxed);
-            }
-            Event::MapChanged { held, .. } => self.maps.store(*held as u64, Ordering::Relaxed),
-            _ => {}
+        if let Event::MapChanged { held, .. } = event {
+            self.maps.store(*held as u64, Ordering::Relaxed);
         }
         self.alarms.note(event);
-    }
-
-    /// Open sessions.
-    pub fn sessions(&self) -> u64 {
-        self.sessions.load(Ordering::Relaxed)
     }
 
     /// Number of predictions answered.
@@ -160,10 +147,8 @@ impl Metrics {
                 let _ = writeln!(out, "nesam_events_total{{event=\"{event}\"}} {value}");
             }
         }
-        for (name, help, value) in [("nesam_sessions", "Open sessions.", &self.sessions), ("nesam_maps", "Maps that are held.", &self.maps)]
-        {
-            let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} gauge\n{name} {}", value.load(Ordering::Relaxed));
-        }
+        let (name, maps) = ("nesam_maps", self.maps.load(Ordering::Relaxed));
+        let _ = writeln!(out, "# HELP {name} Maps that are held.\n# TYPE {name} gauge\n{name} {maps}");
         // Both from the start, so that the first failure is an increase.
         let name = "nesam_credentials_reloads_total";
         let _ = writeln!(out, "# HELP {name} Changes of certificates and rights, by whether they were usable.\n# TYPE {name} counter");
@@ -207,10 +192,6 @@ mod tests {
         metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
         metrics.measurement(Transport::Zenoh, "applied");
         metrics.event(&Event::MapChanged { map: "m".into(), held: 3 });
-        for session in ["a", "b"] {
-            metrics.event(&Event::SessionOpened { session: session.into(), vehicle: "v".into() });
-        }
-        metrics.event(&Event::SessionClosed { session: "a".into(), expired: true });
         metrics.reloaded(false);
         assert!(!metrics.render(0, 0).contains("nesam_certificate_expires_seconds 0"), "no certificate");
         metrics.certificate_expires(1_800_000_000);
@@ -224,7 +205,6 @@ mod tests {
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
             "nesam_events_total{event=\"map_changed\"} 1",
-            "nesam_sessions 1",
             "nesam_maps 3",
             "nesam_credentials_reloads_total{result=\"failed\"} 1",
             "nesam_credentials_reloads_total{result=\"ok\"} 0",

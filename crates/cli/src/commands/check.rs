@@ -39,13 +39,18 @@ struct Findings {
     notes: Vec<String>,
 }
 
+/// What so many errors and doubts come to.
+pub(in crate::commands) fn verdict(errors: usize, doubts: usize) -> String {
+    match (errors, doubts) {
+        (0, 0) => "sound".into(),
+        (0, doubts) => format!("readable; doubts: {doubts}"),
+        (errors, _) => format!("errors: {errors}"),
+    }
+}
+
 impl Findings {
     fn verdict(&self) -> String {
-        match (self.errors.len(), self.doubts.len()) {
-            (0, 0) => "sound".into(),
-            (0, doubts) => format!("readable; doubts: {doubts}"),
-            (errors, _) => format!("errors: {errors}"),
-        }
+        verdict(self.errors.len(), self.doubts.len())
     }
 
     fn error(&mut self, text: impl Into<String>) {

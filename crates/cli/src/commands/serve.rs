@@ -153,7 +153,7 @@ pub async fn start(config: Config, bundle: ModelBundle) -> Result<(RunningServer
 
 fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
     let mut config = match &args.config {
-        Some(file) => Config::load(file).or_input()?,
+        Some(file) => Config::read(file).or_input()?,
         None => Config::default(),
     };
     config.grpc.listen = args.grpc.unwrap_or(config.grpc.listen);

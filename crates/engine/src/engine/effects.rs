@@ -31,7 +31,7 @@ impl Engine {
         Ok(Reply::Session(Box::new(self.view(self.session(id)?))))
     }
 
-    /// Refuses effects that change nothing on this vehicle. Those that a session brings with its image stay.
+    /// Refuses effects of skid-steer drives on another vehicle, where they change nothing. Those that a session brings with its image stay.
     fn check_effects_fit(&self, effects: &AppliedEffects) -> Result<(), EngineError> {
         let vehicle = self.vehicle();
         if vehicle.second == SecondCommand::YawRateRadS {

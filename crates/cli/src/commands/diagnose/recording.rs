@@ -91,7 +91,7 @@ impl RecordingArgs {
                 Err(error) => return Err(error).or_input(),
             }
         }
-        otherwise.unwrap_or_else(|| Err(RecordingError::Parts { reason: "no file was given".into() })).or_input()
+        otherwise.expect("there is at least one recording; this is a bug").or_input()
     }
 }
 

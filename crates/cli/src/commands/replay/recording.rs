@@ -25,19 +25,25 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     let (mut documents, mut wrong) = (Vec::new(), Vec::new());
     for recording in recordings {
         let run = recording.header().run.clone();
-        let (document, failed) = replay_one(args, recording)?;
-        documents.push(document);
+        let failed = match replay_one(args, recording) {
+            Ok((document, failed)) => {
+                documents.push(document);
+                failed
+            }
+            Err(failure) if several => Some(failure.to_string()),
+            Err(failure) => return Err(failure),
+        };
         wrong.extend(failed.map(|reason| if several { format!("{run}: {reason}") } else { reason }));
     }
     if let Some(file) = &args.json {
-        output::write_file(file, to_json(documents, wrong.is_empty()).as_bytes())?;
+        output::write_file(file, to_json(documents, several, wrong.is_empty()).as_bytes())?;
     }
     if wrong.is_empty() { Ok(()) } else { Err(Failure::Failed(wrong.join("; "))) }
 }
 
 /// Replays one recording and prints what came out; gives that as JSON, and what is wrong.
 fn replay_one(args: &ReplayArgs, mut recording: Recording) -> Result<(Value, Option<String>), Failure> {
-    let header = recording.header().clone();
+    let (header, files) = (recording.header().clone(), recording.files());
     let bundle = Arc::new(load_recorded_bundle(args.bundle.bundle.as_deref(), &header)?);
     let predictor = Arc::new(Predictor::new(Arc::clone(&bundle)).or_input()?.in_precision(header.precision));
     let started = Instant::now();
@@ -59,7 +65,7 @@ fn replay_one(args: &ReplayArgs, mut recording: Recording) -> Result<(Value, Opt
         0 => "the recording is damaged".to_string(),
         different => format!("{different} of {} answers differ", total.commands - total.not_executed),
     });
-    Ok((document(&header, &bundle, &report, &args.recording), wrong))
+    Ok((document(&header, &bundle, &report, &files), wrong))
 }
 
 fn print(header: &RecordingHeader, report: &ReplayReport) {
@@ -103,10 +109,13 @@ fn here_and_there(header: &RecordingHeader) -> [(&'static str, String, String); 
 }
 
 /// One recording as it is; several under `runs`.
-fn to_json(mut documents: Vec<Value>, all_equal: bool) -> String {
-    let document = match documents.len() {
-        1 => documents.remove(0),
-        _ => json!({"schema": "nesam.replays/1", "all_equal": all_equal, "runs": documents}),
+fn to_json(mut documents: Vec<Value>, several: bool, all_equal: bool) -> String {
+    let document = match documents.pop() {
+        Some(only) if !several => only,
+        last => {
+            documents.extend(last);
+            json!({"schema": "nesam.replays/1", "all_equal": all_equal, "runs": documents})
+        }
     };
     serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
 }

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_server::{Config, ServerError, access, is_loopback_endpoint, is_tls_endpoint};
 
+use super::super::check::verdict;
 use super::{fleet_soil, kept};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
@@ -32,10 +33,7 @@ pub fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
     say!("store  {}", kept(config));
     fleet_soil(config).iter().for_each(|soil| say!("soil   {soil}"));
     doubts.iter().for_each(|doubt| say!("doubt  {doubt}"));
-    match doubts.len() {
-        0 => say!("sound"),
-        count => say!("readable; doubts: {count}"),
-    }
+    say!("{}", verdict(0, doubts.len()));
     Ok(())
 }
 
@@ -51,7 +49,9 @@ fn doubts(config: &Config) -> Result<Vec<String>, Failure> {
     let (tls, _) = access::load(&config.tls).or_input()?;
     for (key, address) in config.addresses().or_input()? {
         // Any port tells whether the address is one of this machine.
-        TcpListener::bind((address.ip(), 0)).map_err(|source| ServerError::Listen { address, key, source }).or_input()?;
+        let mut any_port = address;
+        any_port.set_port(0);
+        TcpListener::bind(any_port).map_err(|source| ServerError::Listen { address, key, source }).or_input()?;
     }
     let folders = [
         ("store.directory", config.store.enabled, &config.store.directory),
