@@ -12,8 +12,8 @@ use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
-use crate::terramechanics::{ContactLaw, Support, WheelGeometry, WheelMotion, WheelWrench};
-use crate::torque_drive::{Driven, carried_on_n};
+use crate::terramechanics::{ContactLaw, SLIP_SPEED_FLOOR_M_S, Support, WheelGeometry, WheelMotion, WheelWrench};
+use crate::torque_drive::{Driven, carried_on_n, held_per_speed};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -84,6 +84,10 @@ pub struct StepModel {
 
 /// Speed around which the friction of a dragging wheel changes its sign, m/s (chosen).
 const DRAG_SPEED_M_S: f64 = 0.07;
+/// Over-speed of a rim below which the secant of its thrust is held, m/s (chosen).
+const SECANT_FLOOR_M_S: f64 = 0.02;
+/// Speed of a wheel to its side below which the slope of the shear law counts instead of the secant, m/s (chosen: well below what a turning vehicle slides).
+const SHEARED_M_S: f64 = 0.005;
 
 /// Speed around which the contact of a wheel passes from one side of the axle to the other, m/s (chosen: creep of a parked vehicle).
 const LEAD_SPEED_M_S: f64 = 0.05;
@@ -382,7 +386,7 @@ impl StepModel {
         let sinkage = balanced * ratio;
         let load = (preload_n - rate * sinkage).relu_smooth(1.0);
         let share = load / wrench.normal_n.relu_smooth(1.0);
-        let (mut drag, mut contact) = self.traction(i, &wrench, share, load, direction, &wheel_motion, input, sinkage, motion.slip);
+        let (mut drag, mut contact) = self.traction(i, &wrench, share, (sinkage, load), roll, input);
         if let Some(driven) = driven {
             let taken = wrench.torque_n_m * share * direction * T::lit(1.0 / wheel.radius_m);
             let more = carried_on_n(wheel, (sinkage, load), &soil, driven.at_rim_n, taken, wrench.thrust_n * share * direction);
@@ -415,38 +419,49 @@ impl StepModel {
         (travelled[2] + offset[2] - ground) / slope.sqrt()
     }
 
-    /// Tractive forces at the load actually carried, and their secant damping coefficients.
+    /// Tractive forces at the load actually carried, and how they fall with the velocity of the wheel: by secants, which bound the tangents of the concave shear law,
+    /// so that the implicit step never under-damps.
     #[inline(always)]
-    #[allow(clippy::too_many_arguments)]
     fn traction<T: Real>(
         &self,
-        wheel: usize,
+        i: usize,
         wrench: &WheelWrench<T>,
         share: T,
-        load: T,
-        direction: T,
-        wheel_motion: &WheelMotion<T>,
+        (sinkage_m, load): (T, T),
+        roll: &Roll<T>,
         input: &StepInput<T>,
-        sinkage_m: T,
-        slip: T,
     ) -> ([T; 2], WheelContact<T>) {
-        let drag_n = self.drag_at_tread(wheel, wrench.thrust_n * share, load, wheel_motion, &input.soil);
-        let opposing = wheel_motion.forward_m_s / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
+        let Roll { motion, direction, contact: Rolling { motion: contact, soil, .. } } = *roll;
+        let drag_n = self.drag_at_tread(i, wrench.thrust_n * share, load, &motion, &input.soil);
+        let opposing = motion.forward_m_s / motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
         let forward_n = wrench.drawbar_n() * share * direction - drag_n * opposing;
         let left_n = wrench.side_n * share;
-        // Secant slopes bound the tangents of the concave shear law, so the implicit step never under-damps.
-        let floor = 0.02;
-        let overspeed_m_s = wheel_motion.rim_speed_m_s - wheel_motion.forward_m_s;
-        let over = overspeed_m_s.abs_smooth(floor);
-        let thrust = (wrench.thrust_n * share).abs_smooth(1.0);
-        let side = left_n.abs_smooth(1.0) / wheel_motion.left_m_s.abs_smooth(floor);
-        let friction = drag_n / wheel_motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
-        let drag = [input.wheels.slip_feedback() * (thrust / over) + friction.max(T::lit(0.0)), side];
-        (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip, overspeed_m_s })
+
+        let overspeed_m_s = motion.rim_speed_m_s - motion.forward_m_s;
+        let thrust = (wrench.thrust_n * share).abs_smooth(1.0) / overspeed_m_s.abs_smooth(SECANT_FLOOR_M_S);
+        let friction = drag_n / motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
+        // Where next to nothing is sheared sideways the secant has no value, and the tangent of the law takes its place.
+        let sheared = T::lit(SHEARED_M_S);
+        let held_n = held_per_speed(self.wheel_at(i), sinkage_m, load, motion.rim_speed_m_s, &soil) * sheared;
+        let side = ((left_n.sqr() + held_n.sqr()) / (motion.left_m_s.sqr() + sheared.sqr())).sqrt();
+        let stopping = self.stopping((wrench.resistance_n * share).relu_smooth(1.0), load, &motion, input);
+        let drag = [input.wheels.slip_feedback() * thrust + stopping + friction.max(T::lit(0.0)), side];
+        (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip: contact.slip, overspeed_m_s })
     }
 }
 
 impl StepModel {
+    /// How a resistance R falls with the forward speed v of its wheel, N s/m. It turns around with u, the sum of the speeds of rim and ground; so near u = 0 its
+    /// secant R / |u| du/dv stops the wheel without turning it back. That fades out above twice what R changes u by in a sub-step, where it would only brake late.
+    #[inline(always)]
+    fn stopping<T: Real>(&self, resistance_n: T, load_n: T, motion: &WheelMotion<T>, input: &StepInput<T>) -> T {
+        let sum_2 = (motion.rim_speed_m_s + motion.forward_m_s).sqr();
+        let per_forward = (T::lit(2.0) - input.wheels.slip_feedback()).max(T::lit(0.0));
+        let in_substep = T::lit(2.0 * self.vehicle.gravity_m_s2 * self.dt_s / self.substeps as f64);
+        let fades_2 = (per_forward * in_substep * resistance_n / (load_n + T::lit(1.0)) + T::lit(0.01)).sqr();
+        per_forward * resistance_n * fades_2 / ((sum_2 + fades_2) * (sum_2 + T::lit(SLIP_SPEED_FLOOR_M_S * SLIP_SPEED_FLOOR_M_S)).sqrt())
+    }
+
     /// Force that friction at the wheels of an axle takes from the tread of one of them, N ([`Vehicle::drag_at_tread_n_m`]).
     ///
     /// The slope of traction is the tangent of the exponential shear law at the mobilised share u of its limit: thrust / over-speed · (1 - u) (-ln(1 - u)) / u.

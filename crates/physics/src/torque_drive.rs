@@ -151,6 +151,14 @@ fn held<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, soil: &Soil<T>)
     (length_m, (load_n * soil.phi.tan() + soil.c * length_m * T::lit(wheel.width_m)).relu_smooth(1.0))
 }
 
+/// How fast the shear force of a contact grows with the speed at which its wheel slides, N s/m, where it does not slide yet: S L / (2 K |v|) of strength S, length L,
+/// shear modulus K and rim speed v, the slope of Janosi's law over a contact of linearly growing displacement.
+#[inline(always)]
+pub(crate) fn held_per_speed<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, rim_speed_m_s: T, soil: &Soil<T>) -> T {
+    let (length_m, limit_n) = held(wheel, sinkage_m, load_n, soil);
+    limit_n * length_m / (soil.k_shear * T::lit(2.0) * rim_speed_m_s.abs_smooth(SPEED_FLOOR_M_S))
+}
+
 /// √λ for the share λ of a sinkage by which soil springs back behind the wheel: the pressure at the bottom of Bekker's wheel, 3 W / ((3 - n) b √(D z)), over the
 /// elastic stiffness.
 #[inline(always)]

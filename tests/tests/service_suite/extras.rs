@@ -148,6 +148,21 @@ async fn service_risk_is_plausible_and_picked_by_stride() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn service_covariance_of_candidates_that_slow_down_stays_small() {
+    let (server, mut client, recorded) = driven("s", 40).await;
+    // To walking pace and to a stop, straight on and in a turn.
+    let mut asked = candidates("s", &recorded.drive, 40, 8, 32);
+    asked.controls = (0..8).flat_map(|row| vec![[[0.0, 0.3, 0.6, 1.0][row % 4], [0.0, 0.4][row / 4]]; 32]).flatten().collect();
+    asked.extras = Some(v1::PredictExtras { covariance: true, ..Default::default() });
+    let covariance = client.predict(asked).await.unwrap().extras.covariance;
+    for (row, covariance) in covariance.chunks_exact(32 * 144).enumerate() {
+        let sd_m = [0, 1].map(|i| covariance[31 * 144 + 13 * i].sqrt());
+        assert!(sd_m.iter().all(|sd_m| (0.01..1.5).contains(sd_m)), "candidate {row}: {sd_m:?} m after 3.2 s");
+    }
+    server.shutdown().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn service_covariance_of_an_exact_start_is_smaller() {
     let (server, mut client, recorded) = driven("s", 60).await;
     let ask = |start_covariance| {

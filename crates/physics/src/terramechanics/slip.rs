@@ -3,7 +3,7 @@
 use crate::scalar::Real;
 
 /// Speed below which slip ratios are regularised, m/s (chosen: creep of a parked vehicle).
-pub const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
+pub(crate) const SLIP_SPEED_FLOOR_M_S: f64 = 0.05;
 
 /// Motion of the wheel centre against the ground in the wheel's contact frame.
 #[derive(Clone, Copy, Debug)]
