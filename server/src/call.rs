@@ -13,10 +13,14 @@ use nesam_engine::{
 };
 use nesam_terrain::WorldMap;
 use tokio::sync::oneshot;
+use tokio::time::Sleep;
 
 use crate::access::Directory;
 use crate::telemetry::Metrics;
 use crate::web::Feed;
+
+/// Share of the time before its deadline after which an answer of fewer samples is due (chosen: the rest is for its way back).
+const USED: f64 = 0.9;
 
 /// Awaits the engine; one for all handlers, clones share it.
 #[derive(Clone, Debug)]
@@ -36,17 +40,28 @@ pub struct Timing {
     pub compute_s: f64,
 }
 
-/// An answer that is on its way. Dropping it tells the engine that nobody waits any more.
+/// An answer that is on its way. Awaiting it tells the engine when it is due, dropping it that nobody waits any more.
 #[derive(Debug)]
 pub struct Pending {
     answer: oneshot::Receiver<Answer>,
     abandoned: Arc<AtomicBool>,
+    due: Option<Due>,
+}
+
+/// When an answer of fewer samples is due, and the flag that is raised then.
+#[derive(Debug)]
+struct Due {
+    at: Pin<Box<Sleep>>,
+    flag: Arc<AtomicBool>,
 }
 
 impl Future for Pending {
     type Output = Answer;
 
     fn poll(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Answer> {
+        if self.due.as_mut().is_some_and(|due| due.at.as_mut().poll(context).is_ready()) {
+            self.due.take().into_iter().for_each(|due| due.flag.store(true, Ordering::Relaxed));
+        }
         let stopped = |_| Answer { result: Err(EngineError::Stopped), queued_ns: 0, busy_ns: 0 };
         Pin::new(&mut self.answer).poll(context).map(|answer| answer.unwrap_or_else(stopped))
     }
@@ -106,9 +121,14 @@ impl EngineClient {
             Command::Measure { session, .. } => self.directory.vehicle(session),
             _ => None,
         };
+        let due = matches!(&submission.command, Command::Predict(query) if query.samples_min > 0).then(|| {
+            let flag = Arc::new(AtomicBool::new(false));
+            submission.due = Some(flag.clone());
+            Due { at: Box::pin(tokio::time::sleep(budget.mul_f64(USED))), flag }
+        });
         submission.deadline_ns = Some(self.handle.now_ns().saturating_add(u64::try_from(budget.as_nanos()).unwrap_or(u64::MAX)));
         self.handle.submit(submission);
-        Pending { answer, abandoned }
+        Pending { answer, abandoned, due }
     }
 
     /// Submits and awaits, at most as long as `budget`.

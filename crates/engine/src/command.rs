@@ -2,10 +2,12 @@
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 
 use nesam_model::HistoryStep;
 use nesam_terrain::WorldMap;
 
+use crate::error::EngineError;
 use crate::fleet::{FleetCell, FleetShare};
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
@@ -111,7 +113,26 @@ pub enum Command {
     },
 }
 
+/// When to end a prediction before it is complete. The default is never.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct Until<'a> {
+    /// Raised when nobody waits for the answer any more: it is given up.
+    pub abandoned: Option<&'a AtomicBool>,
+    /// Raised when the answer is due: it ends with the samples that are done, where fewer are of use.
+    pub due: Option<&'a AtomicBool>,
+}
+
 impl Command {
+    /// What of a command that ended so was answered: of a prediction the samples that were computed.
+    pub(crate) fn as_answered(mut self, result: &Result<Reply, EngineError>) -> Self {
+        if let (Self::Predict(query), Ok(Reply::Predicted(prediction))) = (&mut self, result)
+            && prediction.candidates() < query.samples
+        {
+            query.keep_first(prediction.candidates());
+        }
+        self
+    }
+
     /// The names of all commands: counters of what seldom happens are there before it does.
     pub const LABELS: [&str; 19] = [
         "open",

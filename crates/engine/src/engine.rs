@@ -4,16 +4,15 @@ mod effects;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
-use nesam_model::{HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant, is_raised};
+use nesam_model::{Due, HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant, is_raised};
 use nesam_physics::{Vehicle, VehicleState};
 use nesam_terrain::WorldMap;
 
 use crate::candidates::Candidates;
-use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
+use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot, Until};
 use crate::error::EngineError;
 use crate::extras::ExtraOutputs;
 use crate::fleet::{Fleet, FleetCell, FleetShare};
@@ -128,17 +127,17 @@ impl Engine {
     /// # Errors
     /// Any [`EngineError`] that names why the command was refused.
     pub fn execute(&mut self, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
-        self.execute_unless(now_ns, command, None)
+        self.execute_until(now_ns, command, Until::default())
     }
 
-    /// The same until `abandoned` is raised: a prediction is then given up, and leaves no trace.
-    pub(crate) fn execute_unless(&mut self, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
-        let result = self.answer(now_ns, command, abandoned);
+    /// The same, as far as it goes until then. A prediction that is given up leaves no trace, one of fewer samples that of a command for these.
+    pub(crate) fn execute_until(&mut self, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
+        let result = self.answer(now_ns, command, until);
         if matches!(result, Err(EngineError::Abandoned)) {
             return result;
         }
         if let Some(log) = &mut self.log {
-            log.push((now_ns, command.clone()));
+            log.push((now_ns, command.clone().as_answered(&result)));
         }
         if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
             session.touch(now_ns);
@@ -146,7 +145,7 @@ impl Engine {
         result
     }
 
-    fn answer(&mut self, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
+    fn answer(&mut self, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
         match command {
             Command::Open(open) => self.open(now_ns, open),
             Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
@@ -162,7 +161,7 @@ impl Engine {
             Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
             Command::TellFleetSoil => self.fleet().map(|fleet| Reply::FleetShares(fleet.cell_m(), fleet.shares(now_ns))),
             Command::HearFleetSoil { cell_m, shares } => self.hear_fleet_soil(now_ns, *cell_m, shares),
-            Command::Predict(query) => self.predict(now_ns, query, abandoned).map(|p| Reply::Predicted(Arc::new(p))),
+            Command::Predict(query) => self.predict(now_ns, query, until).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
                 self.emit(Event::MapChanged { map: map.id().into(), held: self.maps.count() });
@@ -373,7 +372,7 @@ impl Engine {
         Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, provenance, accepted, soil })))
     }
 
-    fn predict(&self, now_ns: u64, query: &PredictQuery, abandoned: Option<&AtomicBool>) -> Result<Prediction, EngineError> {
+    fn predict(&self, now_ns: u64, query: &PredictQuery, until: Until<'_>) -> Result<Prediction, EngineError> {
         let session = self.session(&query.session)?;
         let predictor = session.predictor().unwrap_or(&self.predictor);
         query.check(&self.limits, self.vehicle())?;
@@ -406,8 +405,13 @@ impl Engine {
             wheels: None,
         };
         let learned = session.soil_field(map);
-        let asked_extras = RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false, abandoned };
+        let due = until.due.filter(|_| query.takes_fewer()).map(|flag| Due { flag, least: query.least() });
+        let Until { abandoned, .. } = until;
+        let asked_extras =
+            RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false, abandoned, due };
         let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
+        let samples = if due.is_some() { rollout.samples } else { query.samples };
+        let taken = &commands[..samples * query.horizon * 2];
         let looked_at = query.extras.interpolation_deviation && map.is_some();
         let deviation_m = looked_at.then(|| predictor.interpolation_deviation_m(&asked, &asked_extras, &rollout)).transpose()?;
         let mut extras = ExtraOutputs {
@@ -427,14 +431,14 @@ impl Engine {
         let (rolled, mut rollout) = forward.split(rollout);
         let of_session = session.flags();
         rollout.flags.iter_mut().for_each(|flags| *flags |= of_session);
-        let ranking = query.cost.as_ref().map(|cost| cost.rank(&rollout, &commands));
+        let ranking = query.cost.as_ref().map(|cost| cost.rank(&rollout, taken));
         if let Some(ranking) = &ranking {
             rollout = ranking.best_of(&rollout);
         }
         let drawn_controls = match (&query.controls, &ranking) {
             (Candidates::Given(_), _) => Vec::new(),
-            (Candidates::Drawn(_), None) => commands.into_owned(),
-            (Candidates::Drawn(_), Some(ranking)) => ranking.rows_of_best(&commands, 2 * query.horizon),
+            (Candidates::Drawn(_), None) => taken.to_vec(),
+            (Candidates::Drawn(_), Some(ranking)) => ranking.rows_of_best(taken, 2 * query.horizon),
         };
         Ok(Prediction {
             soil_variance: session.soil().state.variance_at(&rollout.soil),

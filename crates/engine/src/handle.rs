@@ -8,7 +8,7 @@ use nesam_model::is_raised;
 use nesam_physics::Vehicle;
 
 use crate::clock::Clock;
-use crate::command::{Command, Reply};
+use crate::command::{Command, Reply, Until};
 use crate::engine::Engine;
 use crate::error::EngineError;
 use crate::limits::Limits;
@@ -25,6 +25,8 @@ pub struct Submission {
     pub deadline_ns: Option<u64>,
     /// Raised when nobody waits for the answer any more; a prediction is then skipped or given up.
     pub abandoned: Option<Arc<AtomicBool>>,
+    /// Raised when the answer is due: a prediction of which fewer samples are of use then ends with those that are done.
+    pub due: Option<Arc<AtomicBool>>,
     /// Called once with the answer, on the engine's thread or on the submitter's; it must not wait.
     pub reply: Box<dyn FnOnce(Answer) + Send>,
     /// Vehicle that the command counts for when vehicles compete; `None` = its session stands for it.
@@ -41,7 +43,7 @@ impl core::fmt::Debug for Submission {
 impl Submission {
     /// A command without a deadline.
     pub fn new(command: Command, reply: impl FnOnce(Answer) + Send + 'static) -> Self {
-        Self { command, deadline_ns: None, abandoned: None, reply: Box::new(reply), share: None, submitted_ns: 0 }
+        Self { command, deadline_ns: None, abandoned: None, due: None, reply: Box::new(reply), share: None, submitted_ns: 0 }
     }
 
     /// Whom the command counts for.
@@ -247,18 +249,18 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap
 fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, tap: &mut Option<Tap>) -> bool {
     match turn {
         Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
-            answer(engine, submission, Ok(()), clock, tap, |_, _| ());
+            answer(engine, submission, Ok(()), clock, tap, |_, _, _| ());
         }),
         Turn::Prediction(mut submission) => {
             if let Command::Predict(query) = &mut submission.command {
                 // Of one that is asked wrongly fewer samples may be within the limits: it stays whole, to be refused for what is wrong with it.
                 let right = query.samples_min == 0 || query.check(engine.limits(), engine.vehicle()).is_ok();
                 let fits = if right { queue.fit(query, submission.deadline_ns, clock.now_ns()) } else { Ok(()) };
-                let (work, session) = (work(query, query.samples), query.session.clone());
-                let before = engine.encoded_nodes(&session);
-                answer(engine, *submission, fits, clock, tap, |engine, took| {
-                    let encoded = engine.encoded_nodes(&session).saturating_sub(before);
-                    queue.done(work + encoding_work(encoded), took, clock.now_ns());
+                let before = engine.encoded_nodes(&query.session);
+                answer(engine, *submission, fits, clock, tap, |engine, command, took| {
+                    let Command::Predict(query) = command else { return };
+                    let encoded = engine.encoded_nodes(&query.session).saturating_sub(before);
+                    queue.done(work(query, query.samples) + encoding_work(encoded), took, clock.now_ns());
                 });
             }
         }
@@ -272,25 +274,25 @@ fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, 
 /// # Errors
 /// Any [`EngineError`]; `Internal` after a panic.
 pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
-    guarded(engine, now_ns, command, None)
+    guarded(engine, now_ns, command, Until::default())
 }
 
-fn guarded(engine: &mut Engine, now_ns: u64, command: &Command, abandoned: Option<&AtomicBool>) -> Result<Reply, EngineError> {
-    catch_unwind(AssertUnwindSafe(|| engine.execute_unless(now_ns, command, abandoned)))
+fn guarded(engine: &mut Engine, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
+    catch_unwind(AssertUnwindSafe(|| engine.execute_until(now_ns, command, until)))
         .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
 }
 
-/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. `done` is told the time that it took, if it was
-/// not refused, before the answer leaves.
+/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. `done` is told what of it was
+/// answered and the time that it took, if it was not refused, before the answer leaves.
 fn answer(
     engine: &mut Engine,
     submission: Submission,
     fits: Result<(), EngineError>,
     clock: &dyn Clock,
     tap: &mut Option<Tap>,
-    done: impl FnOnce(&Engine, Option<Took>),
+    done: impl FnOnce(&Engine, &Command, Option<Took>),
 ) {
-    let Submission { command, deadline_ns, abandoned, reply, submitted_ns, share: _ } = submission;
+    let Submission { command, deadline_ns, abandoned, due, reply, submitted_ns, share: _ } = submission;
     let now_ns = clock.now_ns();
     let is_prediction = matches!(command, Command::Predict(_));
     let abandoned = abandoned.as_deref().filter(|_| is_prediction);
@@ -303,7 +305,7 @@ fn answer(
         fits
     };
     let is_begun = begun.is_ok();
-    let result = begun.and_then(|()| match guarded(engine, now_ns, &command, abandoned) {
+    let result = begun.and_then(|()| match guarded(engine, now_ns, &command, Until { abandoned, due: due.as_deref() }) {
         // Nobody waits any more since it is too late.
         Err(EngineError::Abandoned) if is_past(clock.now_ns()) => Err(EngineError::Expired),
         result => result,
@@ -315,7 +317,8 @@ fn answer(
         Err(_) => None,
     };
     let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil)).map(|_| result.clone());
-    done(engine, took);
+    let command = command.as_answered(&result);
+    done(engine, &command, took);
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {
         tap(Executed { now_ns, command, result, queued_ns, busy_ns });

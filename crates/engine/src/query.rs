@@ -108,6 +108,12 @@ impl PredictQuery {
         if self.samples_min == 0 { self.samples } else { self.samples_min.min(self.samples) }
     }
 
+    /// Whether its first samples are an answer when they are done and it is due: nothing is asked for that is worked out after all of them.
+    pub(crate) fn takes_fewer(&self) -> bool {
+        let extras = PredictExtras { risk: false, exact_terrain: false, ..self.extras.clone() };
+        self.least() < self.samples && extras == PredictExtras::default()
+    }
+
     /// Leaves the first samples only, of a query that was checked.
     pub(crate) fn keep_first(&mut self, samples: usize) {
         self.samples = samples;

@@ -36,7 +36,7 @@ pub use ground::{GroundSource, history_actuators};
 pub use normalization::Normalization;
 pub use precision::Precision;
 pub use predictor::{PartTimes, Predictor, Transition};
-pub use rollout::{HistoryStep, MeasuredWheels, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};
+pub use rollout::{Due, HistoryStep, MeasuredWheels, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};
 pub use rollout_noise::RolloutNoise;
 pub use soil_field::{SoilByClass, SoilField};
 pub use tangent::{Linearisation, StateJacobian};

@@ -166,6 +166,17 @@ pub struct RolloutExtras<'a> {
     pub unrounded: bool,
     /// Raised when nobody waits for the answer any more: the rollout is then given up within a step.
     pub abandoned: Option<&'a AtomicBool>,
+    /// When an answer of fewer samples is due; then the rollout has the first of them. Without what-if soils.
+    pub due: Option<Due<'a>>,
+}
+
+/// When the first samples of a rollout are answer enough.
+#[derive(Clone, Copy, Debug)]
+pub struct Due<'a> {
+    /// Raised when the answer is due.
+    pub flag: &'a AtomicBool,
+    /// Fewest samples that are of use: as many are computed however late it is.
+    pub least: usize,
 }
 
 /// Whether the flag of a rollout was raised.

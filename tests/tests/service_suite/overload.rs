@@ -1,12 +1,13 @@
 //! Goal: too much is refused at once and typed, measurements still get through, and the server lives on.
 
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use nesam_client::{outcome_label, v1};
 use nesam_engine::{
-    Clock, Command, Engine, EngineError, EngineHandle, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply, Submission,
+    Clock, Command, Engine, EngineError, EngineHandle, Executed, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply,
+    Submission,
 };
 use tonic::Code;
 
@@ -190,6 +191,57 @@ fn service_a_prediction_that_nobody_waits_for_is_given_up() {
     }
     handle.call(Command::Predict(engine_query("s", &recorded.drive, 2, 1, 1))).unwrap();
     handle.stop();
+}
+
+/// Goal: an answer that is due has what is done, is the beginning of the whole, and replays. Method: the flag is raised before a prediction begins, so that it ends
+/// as soon as enough is done; the whole of it, and what a recording hears of.
+#[test]
+fn service_an_answer_that_is_due_has_what_is_done() {
+    let recorded = recorded();
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let tap = {
+        let heard = heard.clone();
+        Box::new(move |executed: Executed| heard.lock().unwrap().push(executed))
+    };
+    let engine = Engine::new(predictor(), Limits::default()).unwrap();
+    let handle = EngineHandle::unthreaded(engine, Arc::new(ManualClock::default()), Some(tap));
+    let map = recorded.world.id().to_string();
+    handle.call(Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();
+    handle.call(Command::Open(OpenSession { vehicle: "s".into(), map, ..Default::default() })).unwrap();
+    for i in 0..3 {
+        let measurement = engine_sample(&recorded.drive, i);
+        handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+    }
+    let ask = |query: PredictQuery, due: bool| {
+        let (sender, receiver) = std::sync::mpsc::channel();
+        let mut asked = Submission::new(Command::Predict(query), move |answer| sender.send(answer.result).unwrap());
+        asked.due = Some(Arc::new(AtomicBool::new(due)));
+        handle.submit(asked);
+        let Reply::Predicted(prediction) = receiver.recv().unwrap().unwrap() else { panic!("a prediction was asked for") };
+        prediction
+    };
+    let risk = PredictExtras { risk: true, ..Default::default() };
+    let asked = PredictQuery { samples_min: 70, extras: risk, ..engine_query("s", &recorded.drive, 2, 1024, 32) };
+    let [whole, first] = [false, true].map(|due| ask(asked.clone(), due));
+    assert_eq!(whole.candidates(), 1024);
+    let first_rows = first.candidates();
+    assert!((70..1024).contains(&first_rows), "{first_rows} candidates");
+    let beginning = |whole: &[f32], first: &[f32]| whole.iter().zip(first).all(|(a, b)| a.to_bits() == b.to_bits());
+    for (whole, first, width) in [
+        (&whole.rollout.states, &first.rollout.states, 12),
+        (&whole.rollout.sinkage_m, &first.rollout.sinkage_m, 4),
+        (&whole.extras.risk.as_ref().unwrap().wheel_load_n, &first.extras.risk.as_ref().unwrap().wheel_load_n, 4),
+    ] {
+        assert!(first.len() == first_rows * 32 * width && beginning(whole, first), "{width} numbers a step");
+    }
+    assert_eq!(first.rollout.flags.len(), first_rows);
+    // Who needs all of them waits for all of them.
+    assert_eq!(ask(PredictQuery { samples_min: 0, ..asked.clone() }, true).candidates(), 1024);
+    // What a recording hears of gives the same answer again.
+    let executed = heard.lock().unwrap().iter().rev().nth(1).cloned().unwrap();
+    let Command::Predict(recorded) = &executed.command else { panic!("a prediction was recorded") };
+    assert_eq!(recorded.samples, first_rows);
+    assert_eq!(ask(recorded.clone(), false).rollout, first.rollout);
 }
 
 #[tokio::test(flavor = "multi_thread")]

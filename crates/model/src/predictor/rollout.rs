@@ -4,7 +4,7 @@
 //! block that meets terrain which is not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they
 //! go on. Which block waits for what changes nothing in the results: a node of the terrain is a function of its pose alone.
 
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, WHEELS};
@@ -19,7 +19,7 @@ use crate::ModelError;
 use crate::fused::{BlockCache, LANES, Prefix};
 use crate::ground::GroundSource;
 use crate::precision::Precision;
-use crate::rollout::{RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};
+use crate::rollout::{Due, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};
 use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
 use crate::terrain_tokens::{Node, TerrainToken, TerrainTokens};
@@ -35,6 +35,9 @@ pub(super) struct Scene<'a> {
     pub(super) risk: bool,
     pub(super) unrounded: bool,
     pub(super) abandoned: Option<&'a AtomicBool>,
+    pub(super) due: Option<Due<'a>>,
+    /// Whether as many samples are done as are of use when the answer is due.
+    pub(super) enough: AtomicBool,
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
     pub(super) clocks: Option<&'a PartClocks>,
@@ -49,6 +52,11 @@ impl Scene<'_> {
     /// Whether nobody waits for the answer any more.
     pub(super) fn is_abandoned(&self) -> bool {
         is_raised(self.abandoned)
+    }
+
+    /// Whether nothing more is to be computed: nobody waits, or the answer is due and there is one.
+    pub(super) fn is_over(&self) -> bool {
+        self.is_abandoned() || (is_raised(self.due.map(|due| due.flag)) && is_raised(Some(&self.enough)))
     }
 }
 
@@ -134,6 +142,8 @@ impl Predictor {
             risk: extras.risk,
             unrounded: extras.unrounded,
             abandoned: extras.abandoned,
+            due: extras.due.filter(|_| extras.soils.is_empty()),
+            enough: AtomicBool::new(false),
             clock,
             tokens: tokens.as_deref(),
             clocks,
@@ -173,7 +183,7 @@ impl Predictor {
         if scene.is_abandoned() {
             return Err(ModelError::Abandoned);
         }
-        rollout.flags = samples.iter().map(|s| s.flags).collect();
+        rollout.flags = samples[..rollout.samples].iter().map(|s| s.flags).collect();
         Ok((rollout, risk))
     }
 
@@ -213,7 +223,7 @@ impl Predictor {
         samples: &mut [Sample],
         rollout: &mut Rollout,
     ) -> Option<RiskOutputs> {
-        let (rows, horizon) = (samples.len(), rollout.horizon);
+        let horizon = rollout.horizon;
         let size = H * LANES;
         let mut blocks: Vec<Block<'_, H>> = samples
             .chunks_mut(size)
@@ -232,17 +242,20 @@ impl Predictor {
                 missing: Vec::new(),
             })
             .collect();
-        loop {
-            blocks.par_iter_mut().filter(|block| block.done < horizon).for_each(|block| self.advance_block(scene, caches, block));
-            let missing: Vec<Node> = blocks.iter_mut().flat_map(|block| block.missing.drain(..)).collect();
-            match scene.tokens {
-                Some(tokens) if !missing.is_empty() => tokens.encode(&self.projection, missing),
-                _ => break,
+        // Where fewer samples are of use the first ones come first, as many blocks at once as there are threads.
+        let at_once = if scene.due.is_some() { rayon::current_num_threads() } else { blocks.len() };
+        let mut done = 0;
+        for together in blocks.chunks_mut(at_once) {
+            self.advance_blocks(scene, caches, together);
+            done += together.iter().take_while(|block| block.done == horizon).map(|block| block.samples.len()).sum::<usize>();
+            scene.enough.store(scene.due.is_some_and(|due| done >= due.least), Ordering::Relaxed);
+            if scene.is_over() {
+                break;
             }
         }
         let risk = scene.risk.then(|| {
-            let mut risk = RiskOutputs::zero(rows * horizon);
-            for block in &blocks {
+            let mut risk = RiskOutputs::zero(done * horizon);
+            for block in blocks.iter().take_while(|block| block.first < done) {
                 for (row, values) in block.risk.iter().enumerate() {
                     risk.put(block.first * horizon + row, values);
                 }
@@ -250,6 +263,23 @@ impl Predictor {
             risk
         });
         rollout.position_m = blocks.into_iter().flat_map(|block| block.position_m).collect();
+        rollout.position_m.truncate(done * horizon);
+        rollout.states.truncate(done * horizon * STATE_DIM);
+        rollout.sinkage_m.truncate(done * horizon * WHEELS);
+        rollout.samples = done;
         risk
+    }
+
+    /// Takes blocks to the end of the horizon, or to where they are given up; what they lack of the terrain is encoded for all of them at once.
+    fn advance_blocks<const H: usize>(&self, scene: &Scene<'_>, caches: &Caches<H>, blocks: &mut [Block<'_, H>]) {
+        loop {
+            let behind = blocks.par_iter_mut().filter(|block| block.done < scene.query.horizon);
+            behind.for_each(|block| self.advance_block(scene, caches, block));
+            let missing: Vec<Node> = blocks.iter_mut().flat_map(|block| block.missing.drain(..)).collect();
+            match scene.tokens {
+                Some(tokens) if !missing.is_empty() && !scene.is_over() => tokens.encode(&self.projection, missing),
+                _ => return,
+            }
+        }
     }
 }
