@@ -464,7 +464,7 @@ impl Config {
             };
             if let Some((taken_by, _)) = addresses[..i].iter().find(|(_, other)| same(other)) {
                 let reason = format!("is {address}, whose port `{taken_by}` has already");
-                return Err(ServerError::Value { key: *key, reason });
+                return Err(ServerError::Value { key, reason });
             }
         }
         Ok(())

@@ -124,7 +124,7 @@ pub(crate) struct Until<'a> {
 
 impl Command {
     /// What of a command that ended so was answered: of a prediction the samples that were computed.
-    pub(crate) fn as_answered(mut self, result: &Result<Reply, EngineError>) -> Self {
+    pub(crate) fn answered(mut self, result: &Result<Reply, EngineError>) -> Self {
         if let (Self::Predict(query), Ok(Reply::Predicted(prediction))) = (&mut self, result)
             && prediction.candidates() < query.samples
         {

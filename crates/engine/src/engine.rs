@@ -137,7 +137,7 @@ impl Engine {
             return result;
         }
         if let Some(log) = &mut self.log {
-            log.push((now_ns, command.clone().as_answered(&result)));
+            log.push((now_ns, command.clone().answered(&result)));
         }
         if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
             session.touch(now_ns);

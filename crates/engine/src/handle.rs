@@ -317,7 +317,7 @@ fn answer(
         Err(_) => None,
     };
     let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil)).map(|_| result.clone());
-    let command = command.as_answered(&result);
+    let command = command.answered(&result);
     done(engine, &command, took);
     reply(Answer { result, queued_ns, busy_ns });
     if let (Some(tap), Some(result)) = (tap, heard) {
