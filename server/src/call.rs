@@ -8,7 +8,7 @@ use std::task::{Context, Poll};
 use std::time::Duration;
 
 use nesam_engine::{
-    Answer, AppliedEffects, Command, EngineError, EngineHandle, FleetCell, FleetShare, MeasureAnswer, OpenSession, PredictQuery,
+    Answer, AppliedEffects, Command, DUE_AFTER, EngineError, EngineHandle, FleetCell, FleetShare, MeasureAnswer, OpenSession, PredictQuery,
     Prediction, Reply, SessionImage, SessionView, Submission,
 };
 use nesam_terrain::WorldMap;
@@ -18,9 +18,6 @@ use tokio::time::Sleep;
 use crate::access::Directory;
 use crate::telemetry::Metrics;
 use crate::web::Feed;
-
-/// Share of the time before its deadline after which an answer of fewer samples is due (chosen: the rest is for its way back).
-const USED: f64 = 0.9;
 
 /// Awaits the engine; one for all handlers, clones share it.
 #[derive(Clone, Debug)]
@@ -124,7 +121,7 @@ impl EngineClient {
         let due = matches!(&submission.command, Command::Predict(query) if query.samples_min > 0).then(|| {
             let flag = Arc::new(AtomicBool::new(false));
             submission.due = Some(flag.clone());
-            Due { at: Box::pin(tokio::time::sleep(budget.mul_f64(USED))), flag }
+            Due { at: Box::pin(tokio::time::sleep(budget.mul_f64(DUE_AFTER))), flag }
         });
         submission.deadline_ns = Some(self.handle.now_ns().saturating_add(u64::try_from(budget.as_nanos()).unwrap_or(u64::MAX)));
         self.handle.submit(submission);

@@ -405,8 +405,8 @@ impl Engine {
             wheels: None,
         };
         let learned = session.soil_field(map);
-        let due = until.due.filter(|_| query.takes_fewer()).map(|flag| Due { flag, least: query.least() });
-        let Until { abandoned, .. } = until;
+        let Until { abandoned, due } = until;
+        let due = due.filter(|_| query.takes_fewer()).map(|flag| Due { flag, least: query.least() });
         let asked_extras =
             RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false, abandoned, due };
         let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;

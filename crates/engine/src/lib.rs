@@ -54,6 +54,7 @@ pub use measurement::{Measurement, Outcome, WheelMeasurement};
 pub use nesam_adaptation::{FORECAST_AHEAD, FilterSnapshot, ForecastCheck, JointSnapshot};
 pub use nesam_fleet_soil::{CellEvidence, CellKey, EvidenceParts, FleetSoilError, FleetSoilSettings};
 pub use query::{ALARM_ACTIVE, PredictQuery, Prediction, Provenance, SOIL_NOT_LEARNED};
+pub use queue::DUE_AFTER;
 pub use ranking::{CostWeights, PathCost, Ranking};
 pub use session::{
     Alarm, AlarmKind, AppliedEffect, AppliedEffects, AppliedParameter, BufferTest, Observed, OpenForecast, Session, SessionImage,

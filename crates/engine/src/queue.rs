@@ -15,8 +15,8 @@ use crate::sync::{Condvar, Mutex, MutexGuard};
 
 /// What an answer still needs after the engine: its way back, ns.
 const WAY_BACK_NS: u64 = 2_000_000;
-/// Share of the time before its deadline that a prediction of fewer samples makes use of.
-const USED: f64 = 0.9;
+/// Share of the time before its deadline after which an answer of fewer samples is due (chosen: the rest is for its way back).
+pub const DUE_AFTER: f64 = 0.9;
 /// A prediction that is expected to take this many times as long as there is time would be computed in vain (chosen).
 const HOPELESS: u64 = 2;
 /// Times as long as it took that a prediction would have taken which was given up later than it was expected to end (chosen): how much was left is not known.
@@ -145,7 +145,7 @@ impl Queue {
     pub fn fit(&self, query: &mut PredictQuery, deadline_ns: Option<u64>, now_ns: u64) -> Result<(), EngineError> {
         let mut lanes = self.lock();
         if query.least() < query.samples {
-            let own_ns = deadline_ns.map_or(u64::MAX, |deadline_ns| (USED * deadline_ns.saturating_sub(now_ns) as f64) as u64);
+            let own_ns = deadline_ns.map_or(u64::MAX, |deadline_ns| (DUE_AFTER * deadline_ns.saturating_sub(now_ns) as f64) as u64);
             let affordable = lanes.service_time.affordable(query, own_ns.min(lanes.predictions.spare_ns(now_ns)));
             query.keep_first(affordable);
         }

@@ -180,8 +180,8 @@ pub struct Due<'a> {
 }
 
 /// Whether the flag of a rollout was raised.
-pub fn is_raised(abandoned: Option<&AtomicBool>) -> bool {
-    abandoned.is_some_and(|flag| flag.load(Ordering::Relaxed))
+pub fn is_raised(flag: Option<&AtomicBool>) -> bool {
+    flag.is_some_and(|flag| flag.load(Ordering::Relaxed))
 }
 
 /// How near each step is to a limit, row-major (samples, horizon) or (samples, horizon, 4) with the wheels FL, FR, RL, RR.

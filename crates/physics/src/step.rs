@@ -471,7 +471,7 @@ impl StepModel {
         if torque_takes_it || self.vehicle.effects.force.wheel_drag_n_m.iter().all(|drag| *drag == 0.0) {
             return T::lit(0.0);
         }
-        let over = (motion.rim_speed_m_s - motion.forward_m_s).abs_smooth(0.02);
+        let over = (motion.rim_speed_m_s - motion.forward_m_s).abs_smooth(SECANT_FLOOR_M_S);
         let (sin, cos) = soil.phi.sin_cos();
         let thrust = thrust_n.abs_smooth(1.0);
         let mobilised = (thrust / (load_n * sin / cos).relu_smooth(1.0)).min(T::lit(0.95)).max(T::lit(0.05));

@@ -46,7 +46,7 @@ impl Predictor {
     pub(super) fn advance_block<const H: usize>(&self, scene: &Scene<'_>, caches: &Caches<H>, block: &mut Block<'_, H>) {
         let mut cache = block.cache.take().unwrap_or_else(|| caches.take(scene.query.horizon, scene.variant.remembers()));
         let mut terrain = [[[0.0; VALUES]; LANES]; H];
-        while block.done < scene.query.horizon && !scene.is_over() {
+        while block.done < scene.query.horizon && !scene.is_over(block.first) {
             let mut watch = Watch::start(scene.clocks);
             if !self.block_terrain(scene, block, &mut terrain) {
                 block.cache = Some(cache);

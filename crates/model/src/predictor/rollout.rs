@@ -4,7 +4,7 @@
 //! block that meets terrain which is not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they
 //! go on. Which block waits for what changes nothing in the results: a node of the terrain is a function of its pose alone.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, WHEELS};
@@ -36,8 +36,6 @@ pub(super) struct Scene<'a> {
     pub(super) unrounded: bool,
     pub(super) abandoned: Option<&'a AtomicBool>,
     pub(super) due: Option<Due<'a>>,
-    /// Whether as many samples are done as are of use when the answer is due.
-    pub(super) enough: AtomicBool,
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
     pub(super) clocks: Option<&'a PartClocks>,
@@ -54,9 +52,9 @@ impl Scene<'_> {
         is_raised(self.abandoned)
     }
 
-    /// Whether nothing more is to be computed: nobody waits, or the answer is due and there is one.
-    pub(super) fn is_over(&self) -> bool {
-        self.is_abandoned() || (is_raised(self.due.map(|due| due.flag)) && is_raised(Some(&self.enough)))
+    /// Whether nothing more is to be computed of a block that begins with this row: nobody waits, or the answer is due and has enough without it.
+    pub(super) fn is_over(&self, first: usize) -> bool {
+        self.is_abandoned() || self.due.is_some_and(|due| first >= due.least && is_raised(Some(due.flag)))
     }
 }
 
@@ -143,7 +141,6 @@ impl Predictor {
             unrounded: extras.unrounded,
             abandoned: extras.abandoned,
             due: extras.due.filter(|_| extras.soils.is_empty()),
-            enough: AtomicBool::new(false),
             clock,
             tokens: tokens.as_deref(),
             clocks,
@@ -247,9 +244,9 @@ impl Predictor {
         let mut done = 0;
         for together in blocks.chunks_mut(at_once) {
             self.advance_blocks(scene, caches, together);
-            done += together.iter().take_while(|block| block.done == horizon).map(|block| block.samples.len()).sum::<usize>();
-            scene.enough.store(scene.due.is_some_and(|due| done >= due.least), Ordering::Relaxed);
-            if scene.is_over() {
+            let whole = together.iter().take_while(|block| block.done == horizon);
+            done += whole.map(|block| block.samples.len()).sum::<usize>();
+            if together.iter().any(|block| block.done < horizon) {
                 break;
             }
         }
@@ -275,9 +272,10 @@ impl Predictor {
         loop {
             let behind = blocks.par_iter_mut().filter(|block| block.done < scene.query.horizon);
             behind.for_each(|block| self.advance_block(scene, caches, block));
-            let missing: Vec<Node> = blocks.iter_mut().flat_map(|block| block.missing.drain(..)).collect();
+            let aside = blocks.iter_mut().filter(|block| !scene.is_over(block.first));
+            let missing: Vec<Node> = aside.flat_map(|block| block.missing.drain(..)).collect();
             match scene.tokens {
-                Some(tokens) if !missing.is_empty() && !scene.is_over() => tokens.encode(&self.projection, missing),
+                Some(tokens) if !missing.is_empty() => tokens.encode(&self.projection, missing),
                 _ => return,
             }
         }
