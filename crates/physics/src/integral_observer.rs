@@ -11,10 +11,10 @@ use crate::step::StepModel;
 use crate::terramechanics::Support;
 use crate::torque_drive::Grip;
 use crate::vec3::Tilt;
-use crate::vehicle::WHEELS;
+use crate::vehicle::{Vehicle, WHEELS};
 
 /// Slowest motion that says something of the drive, m/s (chosen: below it a climb per way is noise).
-const SLOWEST_M_S: f64 = 0.3;
+pub(crate) const SLOWEST_M_S: f64 = 0.3;
 /// Share of the largest demand up to which a torque says what was demanded (chosen: beyond it the limit hides it).
 const UNSATURATED: f64 = 0.9;
 /// Integral gain below which the integral says nothing, 1/s.
@@ -22,6 +22,13 @@ const SMALLEST_GAIN_PER_S: f64 = 0.02;
 /// Power of the weight with which compaction resists: (2 n + 2) / (2 n + 1) of a rigid wheel (Bekker 1969; Wong, *Theory of Ground Vehicles*, ch. 2), for the
 /// n = 0.7 of a sandy loam (Wong's table); 1.35 to 1.5 over all but the stiffest of its soils.
 const COMPACTION_POWER: f64 = 1.42;
+
+/// What the integral of the speed error, m, amounts to where it holds the usual resistance of a car under torque; 0 where there is no torque or no integral.
+pub(crate) fn held_by_integral_m(vehicle: &Vehicle) -> f64 {
+    let line = &vehicle.driveline;
+    let torque = line.torque.as_ref().filter(|_| line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S);
+    torque.map_or(0.0, |torque| (torque.holding_demand_m_s / line.speed_integral_gain_per_s).min(line.speed_integral_limit_m))
+}
 
 impl StepModel {
     /// Actuators after a measured step from `before` to `after`, of which `advanced` is what commands and speeds made: the integral of the speed error is
@@ -51,7 +58,8 @@ impl StepModel {
         let share = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let limit = line.overspeed_limit_m_s;
         let heavier = (self.body.mass_kg / self.vehicle().mass_kg).powf(COMPACTION_POWER);
-        let usual_n_m = torque.torque_n_m(limited(torque.holding_demand_m_s, limit), speed, share) * heavier;
+        let usual = torque.torques(limited(torque.holding_demand_m_s, limit), speed, speed, share);
+        let usual_n_m = (usual.driving_n_m - usual.braking_n_m) * heavier;
         let Some(brought) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
         let demand = unlimited(brought.clamp(-UNSATURATED * limit, UNSATURATED * limit), limit);
         let told = advanced.told_speed_m_s(self.vehicle(), control);

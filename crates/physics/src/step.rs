@@ -12,8 +12,8 @@ use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step_effects::Altered;
-use crate::terramechanics::{ContactLaw, SLIP_SPEED_FLOOR_M_S, Support, WheelGeometry, WheelMotion, WheelWrench};
-use crate::torque_drive::{Driven, carried_on_n, held_per_speed};
+use crate::terramechanics::{ContactLaw, Support, TRAVEL_SPEED_FLOOR_M_S, WheelGeometry, WheelMotion, WheelWrench, travel_direction};
+use crate::torque_drive::{Driven, carried_on_n, sheared_sideways};
 use crate::vec3::{Tilt, Vec3, add, cross, dot, normalise, scale};
 use crate::vehicle::{Vehicle, WHEELS};
 
@@ -388,10 +388,17 @@ impl StepModel {
         let share = load / wrench.normal_n.relu_smooth(1.0);
         let (mut drag, mut contact) = self.traction(i, &wrench, share, (sinkage, load), roll, input);
         if let Some(driven) = driven {
-            let taken = wrench.torque_n_m * share * direction * T::lit(1.0 / wheel.radius_m);
-            let more = carried_on_n(wheel, (sinkage, load), &soil, driven.at_rim_n, taken, wrench.thrust_n * share * direction);
+            let thrust_n = wrench.thrust_n * share;
+            let other_n = wrench.torque_n_m * share * T::lit(1.0 / wheel.radius_m) - thrust_n;
+            // Beside its thrust the torque of a wheel is shear that follows the rim, or the moment of the pressure ahead of its axle.
+            let (turned_n, resisting_n) = match wheel.law {
+                ContactLaw::WongReece => (other_n * direction, wrench.resistance_n * share),
+                ContactLaw::SoilContactModel => (other_n * travel_direction(wheel_motion.forward_m_s), other_n),
+            };
+            let more = carried_on_n(wheel, (sinkage, load), &soil, driven.at_rim_n, thrust_n * direction + turned_n, thrust_n * direction);
             contact.forward_n = contact.forward_n + input.wheels.rim_follow * more;
-            drag[0] = drag[0] + input.wheels.rim_follow * (driven.damping_n_s_m - drag[0]);
+            let stopping = self.stopping(resisting_n.relu_smooth(1.0) + driven.braked_n, contact.forward_n, load, &wheel_motion);
+            drag[0] = drag[0] + input.wheels.rim_follow * (driven.damping_n_s_m + stopping - drag[0]);
         }
         if self.altered.on_wheels {
             self.alter_traction(i, &wheel_motion, &motion, &soil, share, &mut drag, &mut contact);
@@ -434,32 +441,35 @@ impl StepModel {
         let Roll { motion, direction, contact: Rolling { motion: contact, soil, .. } } = *roll;
         let drag_n = self.drag_at_tread(i, wrench.thrust_n * share, load, &motion, &input.soil);
         let opposing = motion.forward_m_s / motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
-        let forward_n = wrench.drawbar_n() * share * direction - drag_n * opposing;
+        let resistance_n = wrench.resistance_n * share;
+        let forward_n = wrench.thrust_n * share * direction - resistance_n * travel_direction(motion.forward_m_s) - drag_n * opposing;
         let left_n = wrench.side_n * share;
 
         let overspeed_m_s = motion.rim_speed_m_s - motion.forward_m_s;
         let thrust = (wrench.thrust_n * share).abs_smooth(1.0) / overspeed_m_s.abs_smooth(SECANT_FLOOR_M_S);
         let friction = drag_n / motion.forward_m_s.abs_smooth(DRAG_SPEED_M_S);
         // Where next to nothing is sheared sideways the secant has no value, and the tangent of the law takes its place.
-        let sheared = T::lit(SHEARED_M_S);
-        let held_n = held_per_speed(self.wheel_at(i), sinkage_m, load, motion.rim_speed_m_s, &soil) * sheared;
+        let (limit_n, sliding_m_s) = sheared_sideways(self.wheel_at(i), sinkage_m, load, &motion, &soil);
+        let sheared = sliding_m_s.min(T::lit(SHEARED_M_S));
+        let held_n = limit_n / sliding_m_s * sheared;
         let side = ((left_n.sqr() + held_n.sqr()) / (motion.left_m_s.sqr() + sheared.sqr())).sqrt();
-        let stopping = self.stopping((wrench.resistance_n * share).relu_smooth(1.0), load, &motion, input);
+        let stopping = self.stopping(resistance_n.relu_smooth(1.0), forward_n, load, &motion);
         let drag = [input.wheels.slip_feedback() * thrust + stopping + friction.max(T::lit(0.0)), side];
         (drag, WheelContact { sinkage_m, normal_n: load, forward_n, left_n, slip: contact.slip, overspeed_m_s })
     }
 }
 
 impl StepModel {
-    /// How a resistance R falls with the forward speed v of its wheel, N s/m. It turns around with u, the sum of the speeds of rim and ground; so near u = 0 its
-    /// secant R / |u| du/dv stops the wheel without turning it back. That fades out above twice what R changes u by in a sub-step, where it would only brake late.
+    /// How a motion resistance R falls with the forward speed v of its wheel, N s/m. It turns around with v; so near v = 0 its secant R / |v| stops the wheel without
+    /// turning it back. That fades out above twice what R changes v by in a sub-step, where it would only brake late. Where the force on the wheel, N, drives it on, the
+    /// secant is that at the speed it comes to: a vehicle that sets off does not turn around.
     #[inline(always)]
-    fn stopping<T: Real>(&self, resistance_n: T, load_n: T, motion: &WheelMotion<T>, input: &StepInput<T>) -> T {
-        let sum_2 = (motion.rim_speed_m_s + motion.forward_m_s).sqr();
-        let per_forward = (T::lit(2.0) - input.wheels.slip_feedback()).max(T::lit(0.0));
-        let in_substep = T::lit(2.0 * self.vehicle.gravity_m_s2 * self.dt_s / self.substeps as f64);
-        let fades_2 = (per_forward * in_substep * resistance_n / (load_n + T::lit(1.0)) + T::lit(0.01)).sqr();
-        per_forward * resistance_n * fades_2 / ((sum_2 + fades_2) * (sum_2 + T::lit(SLIP_SPEED_FLOOR_M_S * SLIP_SPEED_FLOOR_M_S)).sqrt())
+    fn stopping<T: Real>(&self, resistance_n: T, forward_n: T, load_n: T, motion: &WheelMotion<T>) -> T {
+        let per_load = T::lit(self.vehicle.gravity_m_s2 * self.dt_s / self.substeps as f64) / (load_n + T::lit(1.0));
+        let gained_m_s = (travel_direction(motion.forward_m_s) * forward_n * per_load).max(T::lit(0.0));
+        let speed_m_s = motion.forward_m_s.abs_smooth(TRAVEL_SPEED_FLOOR_M_S) + gained_m_s;
+        let fades_2 = (T::lit(2.0) * resistance_n * per_load + T::lit(0.01)).sqr();
+        resistance_n * fades_2 / ((speed_m_s.sqr() + fades_2) * speed_m_s)
     }
 
     /// Force that friction at the wheels of an axle takes from the tread of one of them, N ([`Vehicle::drag_at_tread_n_m`]).

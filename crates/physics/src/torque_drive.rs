@@ -8,7 +8,7 @@ use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step::{StepInput, StepModel, fresh_share};
-use crate::terramechanics::{ContactLaw, Support, WheelGeometry, bekker_sinkage, viscous_rate_n_m};
+use crate::terramechanics::{ContactLaw, Support, WheelGeometry, WheelMotion, bekker_sinkage, travel_direction, viscous_rate_n_m};
 use crate::vehicle::WHEELS;
 
 /// Largest share of the shear strength that the guess mobilises (chosen: beyond it the wheel spins and traction control works).
@@ -151,12 +151,15 @@ fn held<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, soil: &Soil<T>)
     (length_m, (load_n * soil.phi.tan() + soil.c * length_m * T::lit(wheel.width_m)).relu_smooth(1.0))
 }
 
-/// How fast the shear force of a contact grows with the speed at which its wheel slides, N s/m, where it does not slide yet: S L / (2 K |v|) of strength S, length L,
-/// shear modulus K and rim speed v, the slope of Janosi's law over a contact of linearly growing displacement.
+/// Largest shear force S of a contact, N, and the sideways speed, m/s, at which its slope where the wheel does not slide to that side yet would reach it. The slope is
+/// that of Janosi's law over a contact of linearly growing displacement, S L / (2 K |v|) of length L, shear modulus K and rim speed v; where the wheel slides ahead at a
+/// speed o that shears the soil whole, S / |o|, as the force points against the sliding.
 #[inline(always)]
-pub(crate) fn held_per_speed<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, rim_speed_m_s: T, soil: &Soil<T>) -> T {
+pub(crate) fn sheared_sideways<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, motion: &WheelMotion<T>, soil: &Soil<T>) -> (T, T) {
     let (length_m, limit_n) = held(wheel, sinkage_m, load_n, soil);
-    limit_n * length_m / (soil.k_shear * T::lit(2.0) * rim_speed_m_s.abs_smooth(SPEED_FLOOR_M_S))
+    let rolling = soil.k_shear * T::lit(2.0) * motion.rim_speed_m_s.abs_smooth(SPEED_FLOOR_M_S) / length_m;
+    let over = motion.rim_speed_m_s - motion.forward_m_s;
+    (limit_n, (rolling.sqr() + over.sqr()).sqrt())
 }
 
 /// √λ for the share λ of a sinkage by which soil springs back behind the wheel: the pressure at the bottom of Bekker's wheel, 3 W / ((3 - n) b √(D z)), over the
@@ -213,7 +216,9 @@ fn lock_n_m_s(share: f64) -> f64 {
 pub(crate) struct Driven<T> {
     /// Torque of the hub over the radius, N.
     pub(crate) at_rim_n: T,
-    /// How fast it falls with the speed of the wheel, N s/m.
+    /// What brakes and the friction of the wheel itself take of it against the travel, N.
+    pub(crate) braked_n: T,
+    /// How fast what drives falls with the speed of the wheel, N s/m.
     pub(crate) damping_n_s_m: T,
     /// Speed of the rim over that of the ground, m/s.
     pub(crate) overspeed_m_s: T,
@@ -221,8 +226,8 @@ pub(crate) struct Driven<T> {
 
 impl StepModel {
     /// What drives the wheels, which pass over the ground at `forward_m_s` and have these grips, if torque drives this vehicle: a quarter each of
-    /// what the speed control asks for through open differentials, less the friction of the wheel itself, and what couplings hand from faster wheels to
-    /// slower ones, sides and axles alike.
+    /// what the speed control asks for through open differentials, less what brakes and the friction of the wheel itself hold against its travel, and what
+    /// couplings hand from faster wheels to slower ones, sides and axles alike.
     #[inline(always)]
     pub(crate) fn driven<T: Real>(
         &self,
@@ -236,11 +241,13 @@ impl StepModel {
         let actuator = &self.vehicle.effects.actuator;
         let speed = state.velocity_m_s[0];
         let each: [T; WHEELS] = core::array::from_fn(|i| T::lit(1.0 / (WHEELS as f64 * self.wheel_at(i).radius_m)));
-        let alone_n: [T; WHEELS] = core::array::from_fn(|i| {
-            let driven_n = drive.torque_n_m(input.wheels.demand_m_s(i, speed), speed, 1.0 - actuator.torque_lost) * each[i];
-            let braked_n = self.vehicle.effects.force.wheel_drag_n_m[i] / self.wheel_at(i).radius_m;
-            driven_n - forward_m_s[i] / forward_m_s[i].abs_smooth(SPEED_FLOOR_M_S) * T::lit(braked_n)
-        });
+        let (mut alone_n, mut braked_n) = ([T::lit(0.0); WHEELS], [T::lit(0.0); WHEELS]);
+        for i in 0..WHEELS {
+            let demand = input.wheels.demand_m_s(i, speed);
+            let hubs = drive.torques(demand, input.wheels.speed_m_s, speed, 1.0 - actuator.torque_lost);
+            braked_n[i] = hubs.braking_n_m * each[i] + T::lit(self.vehicle.effects.force.wheel_drag_n_m[i] / self.wheel_at(i).radius_m);
+            alone_n[i] = hubs.driving_n_m * each[i] - travel_direction(forward_m_s[i]) * braked_n[i];
+        }
         let coupling_n_m_s = 2.0 * line.side_coupling_n_m_s + lock_n_m_s(actuator.lock);
         let coupling_n_s_m = coupling_n_m_s / (self.wheel.radius_m * self.wheel.radius_m);
         let mut at_rim_n = alone_n;
@@ -252,6 +259,7 @@ impl StepModel {
         Some(core::array::from_fn(|i| Driven {
             at_rim_n: at_rim_n[i],
             damping_n_s_m: input.wheels.rim_gain * each[i] * T::lit(drive.per_demand_n_m_s_m),
+            braked_n: braked_n[i],
             overspeed_m_s: grips[i].rim(at_rim_n[i], forward_m_s[i], MOBILISED_MAX, &input.soil).overspeed_m_s,
         }))
     }

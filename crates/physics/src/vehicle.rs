@@ -79,15 +79,26 @@ pub struct TorqueDrive {
     pub curve: [f64; TORQUE_KNOTS],
 }
 
+/// Torques at all wheels together, N m.
+#[derive(Clone, Copy, Debug)]
+pub struct HubTorques<T> {
+    /// What the engine gives, backwards below zero.
+    pub driving_n_m: T,
+    /// What brakes hold against the travel, zero or above.
+    pub braking_n_m: T,
+}
+
 impl TorqueDrive {
-    /// Torque at all wheels together for a demand (m/s) at a speed (m/s), of an engine that gives `share` of what it should, N m.
+    /// Torques for a demand at a speed (m/s both) under a speed command (m/s), of an engine that gives `share` of what it should. A negative demand brakes; of a car that
+    /// is told to go backwards it drives.
     #[inline(always)]
-    pub fn torque_n_m<T: Real>(&self, demand_m_s: T, speed_m_s: T, share: f64) -> T {
-        let factor = self.factor(speed_m_s);
-        let (driving, braking) = (demand_m_s.max(T::lit(0.0)), demand_m_s.min(T::lit(0.0)));
-        let direction = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S);
-        (driving * factor * T::lit(share) + braking * T::lit(self.brake_ratio)) * T::lit(self.per_demand_n_m_s_m)
-            - direction * T::lit(self.closed_n_m)
+    pub fn torques<T: Real>(&self, demand_m_s: T, told_m_s: T, speed_m_s: T, share: f64) -> HubTorques<T> {
+        let (zero, one) = (T::lit(0.0), T::lit(1.0));
+        let ahead = self.driving_n_m_s_m(speed_m_s, share) * demand_m_s.max(zero);
+        let other = demand_m_s.min(zero) * T::lit(self.brake_ratio * self.per_demand_n_m_s_m);
+        let closed = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S) * T::lit(self.closed_n_m);
+        let backwards = (told_m_s * T::lit(-1.0 / HOLDING_SPEED_M_S)).max(zero).min(one);
+        HubTorques { driving_n_m: ahead + backwards * other - closed, braking_n_m: (backwards - one) * other }
     }
 
     /// Demand that holds the usual resistance under a speed command (m/s), m/s.
@@ -123,7 +134,7 @@ impl TorqueDrive {
 
 /// Speed around which the drag of the engine turns its direction, m/s (chosen).
 const CLOSED_SPEED_M_S: f64 = 0.1;
-/// Speed command around which the held demand turns its direction, m/s (chosen: a command of zero holds nothing).
+/// Speed command around which the held demand turns its direction, and backwards from which a car drives backwards, m/s (chosen: a command of zero does neither).
 const HOLDING_SPEED_M_S: f64 = 0.1;
 
 /// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then two equal lags in series, for the mean rim speed and for

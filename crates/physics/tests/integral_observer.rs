@@ -4,7 +4,7 @@
 mod common;
 
 use common::{Drive, loam};
-use nesam_physics::driveline::DrivelineState;
+use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::effects::{Effect, LinearDrag, Payload, WheelDrag};
 use nesam_physics::step::StepModel;
 use nesam_physics::{Control, DT_S, Soil, TorqueDrive, Vehicle, VehicleState};
@@ -166,4 +166,20 @@ fn analytic_nothing_is_made_up_for_where_nothing_was_observed_or_the_soil_is_the
     let blind = StepModel::new(&observed(0.0), DT_S, 2);
     assert_eq!(blind.observed_share(31), 0.0);
     assert_eq!(blind.compaction_made_up_for_m(&loam(), &softer, SPEED_M_S, blind.observed_share(31)), 0.0);
+}
+
+#[test]
+fn analytic_a_car_that_stands_begins_with_an_empty_integral() {
+    let car = observed(RATE_PER_S);
+    let torque = car.driveline.torque.expect("this car's hubs are under torque");
+    let told = Control { speed_m_s: SPEED_M_S, second: 0.0 };
+    // What is demanded at a speed beyond the gain times its error.
+    let held = |speed_m_s: f64| {
+        let moving = VehicleState { velocity_m_s: [speed_m_s, 0.0, 0.0], ..VehicleState::zero() };
+        let actuators = DrivelineState::starting(&car, &moving, &Control { speed_m_s: 0.0, second: 0.0 });
+        command_wheels::<f64>(&car, &actuators, &actuators, &told).demand_m_s(0, speed_m_s)
+            - car.driveline.speed_gain * (SPEED_M_S - speed_m_s)
+    };
+    assert!(held(0.0).abs() < 1e-3, "{}", held(0.0));
+    assert!((held(SPEED_M_S) - torque.holding_demand_m_s).abs() < 1e-3, "{}", held(SPEED_M_S));
 }

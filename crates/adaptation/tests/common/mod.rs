@@ -26,8 +26,7 @@ pub fn twin(model: &StepModel, true_soil: [f64; SOIL_DIM], prior: [f64; SOIL_DIM
         let t = k as f64 * DT_S;
         let control = Control { speed_m_s: 2.5 + 1.2 * (1.1 * t).sin(), second: 0.8 * (0.7 * t + seed as f64).sin() };
         let after = actuators.advance(model.vehicle(), &control, state.velocity_m_s[0], DT_S);
-        // As steep as the truck climbs on soft soil: where it gets stuck and rolls back, an estimate from afar is not linear.
-        let slope = 0.03 * (0.25 * t).sin();
+        let slope = 0.12 * (0.25 * t).sin();
         let input = StepInput {
             state,
             wheels: command_wheels(model.vehicle(), &actuators, &after, &control),

@@ -17,7 +17,7 @@ pub use gauss::GaussRule;
 pub use load_balance::{Support, balance_sinkage};
 pub use pressure_sinkage::{bekker_sinkage, normal_stress};
 pub use shear::{mobilised_share, mohr_coulomb};
-pub(crate) use slip::SLIP_SPEED_FLOOR_M_S;
 pub use slip::{ContactMotion, WheelMotion};
+pub(crate) use slip::{TRAVEL_SPEED_FLOOR_M_S, travel_direction};
 pub(crate) use wheel::viscous_rate_n_m;
 pub use wheel::{ContactLaw, WheelGeometry, WheelWrench, wheel_wrench};

@@ -83,3 +83,13 @@ impl<T: Real> WheelMotion<T> {
         (direction, motion)
     }
 }
+
+/// Speed around which the direction of travel turns, m/s: half that of [`SLIP_SPEED_FLOOR_M_S`], which counts rim and ground.
+pub(crate) const TRAVEL_SPEED_FLOOR_M_S: f64 = 0.5 * SLIP_SPEED_FLOOR_M_S;
+
+/// Direction in which a wheel travels over its ground, in (-1, 1), smooth through standstill: motion resistance points against it. Chosen, as Wong and Reece give the
+/// resistance of a wheel that travels; neglects what one that spins on the spot digs.
+#[inline(always)]
+pub(crate) fn travel_direction<T: Real>(forward_m_s: T) -> T {
+    forward_m_s / forward_m_s.abs_smooth(TRAVEL_SPEED_FLOOR_M_S)
+}

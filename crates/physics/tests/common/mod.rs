@@ -10,6 +10,11 @@ pub fn loam() -> Soil<f64> {
     Soil { k_phi: 1515.04e3, k_c: 5.27e3, n: 0.7, c: 1.72e3, phi: 29f64.to_radians(), k_shear: 0.025 }
 }
 
+/// Mud in which the wheels of a car of 2.5 tonnes sink by most of their radius.
+pub fn mud() -> Soil<f64> {
+    Soil { k_phi: 1.3e5, k_c: 700.0, n: 0.8, c: 1700.0, phi: 8f64.to_radians(), k_shear: 0.043 }
+}
+
 /// Ground that is a plane of the given slopes in World, seen from a pose with its reference point at (x, y).
 pub fn plane(model: &StepModel, state: &VehicleState<f64>, slope_x: f64, slope_y: f64) -> [Ground<f64>; 4] {
     let [roll, pitch, yaw] = state.attitude_rad;
