@@ -99,12 +99,14 @@ fn chosen(args: &DiscoveryBench, groups: usize) -> Result<Vec<(Hidden, usize)>, 
         return Err(Failure::input(format!("--sets {unknown}: no such set of the benchmark")));
     }
     let wanted = |h: &Hidden| args.sets.is_empty() || args.sets.iter().any(|s| s == h.set);
-    let (nulls, effects): (Vec<Hidden>, Vec<Hidden>) = plan.into_iter().filter(wanted).partition(|h| h.set.starts_with("null"));
-    let effects = effects.into_iter().step_by(args.every_hidden).enumerate();
+    // Its place in the whole plan chooses the drives of an effect, so that the choice of sets does not.
+    let (nulls, effects): (Vec<_>, Vec<_>) =
+        plan.into_iter().enumerate().filter(|(_, h)| wanted(h)).partition(|(_, h)| h.set.starts_with("null"));
+    let effects = effects.into_iter().step_by(args.every_hidden);
     let mut runs: Vec<(Hidden, usize)> =
         effects.flat_map(|(i, h)| (0..args.groups.min(groups)).map(move |g| (h.clone(), (i + g) % groups))).collect();
     let count = if args.nulls == 0 { groups } else { args.nulls };
-    runs.extend(nulls.into_iter().flat_map(|h| (0..count).map(move |g| (h.clone(), g))));
+    runs.extend(nulls.into_iter().flat_map(|(_, h)| (0..count).map(move |g| (h.clone(), g))));
     Ok(runs)
 }
 
