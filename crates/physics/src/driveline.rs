@@ -58,12 +58,11 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
     }
 
     /// Actuators where the drive begins: a skid-steer vehicle's rims turn as its measured motion tells, a car's have settled on the command. The integral of a car under
-    /// torque that stands is empty: what holds the usual resistance comes as it drives.
+    /// torque holds what a weak engine asks for beyond the usual resistance, and of one that stands nothing: what holds the resistance comes as it drives.
     pub fn starting(vehicle: &Vehicle, state: &VehicleState<T>, control: &Control<T>) -> Self {
         if vehicle.second != SecondCommand::YawRateRadS {
             let stands = state.velocity_m_s[0].value().abs() < SLOWEST_M_S;
-            let emptied_m = if stands { held_by_integral_m(vehicle) } else { 0.0 };
-            return Self { speed_error_integral_m: T::lit(-emptied_m), ..Self::settled(control) };
+            return Self { speed_error_integral_m: T::lit(held_by_integral_m(vehicle, stands)), ..Self::settled(control) };
         }
         let servo = &vehicle.limited_rims();
         let measured = state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency);

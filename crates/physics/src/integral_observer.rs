@@ -23,12 +23,19 @@ const SMALLEST_GAIN_PER_S: f64 = 0.02;
 /// n = 0.7 of a sandy loam (Wong's table); 1.35 to 1.5 over all but the stiffest of its soils.
 const COMPACTION_POWER: f64 = 1.42;
 
-/// What the integral of the speed error, m, amounts to where it holds the usual resistance of a car under torque; 0 where there is no torque or no integral.
-pub(crate) fn held_by_integral_m(vehicle: &Vehicle) -> f64 {
+/// What the integral of the speed error, m, amounts to beyond what holds the usual resistance of a sound car under torque: all of it is missing in a car that stands,
+/// a weak engine asks for more. 0 where there is no torque or no integral.
+pub(crate) fn held_by_integral_m(vehicle: &Vehicle, stands: bool) -> f64 {
     let line = &vehicle.driveline;
-    let torque = line.torque.as_ref().filter(|_| line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S);
-    torque.map_or(0.0, |torque| (torque.holding_demand_m_s / line.speed_integral_gain_per_s).min(line.speed_integral_limit_m))
+    let Some(torque) = line.torque.as_ref().filter(|_| line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S) else { return 0.0 };
+    let share = (1.0 - vehicle.effects.actuator.torque_lost).max(SMALLEST_SHARE);
+    let more = if stands { -1.0 } else { 1.0 / share - 1.0 };
+    let limit = line.speed_integral_limit_m;
+    (more * torque.holding_demand_m_s / line.speed_integral_gain_per_s).clamp(-limit, limit)
 }
+
+/// Smallest share of its torque that an engine is taken to give where its integral is told.
+const SMALLEST_SHARE: f64 = 0.05;
 
 impl StepModel {
     /// Actuators after a measured step from `before` to `after`, of which `advanced` is what commands and speeds made: the integral of the speed error is
@@ -58,7 +65,8 @@ impl StepModel {
         let share = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let limit = line.overspeed_limit_m_s;
         let heavier = (self.body.mass_kg / self.vehicle().mass_kg).powf(COMPACTION_POWER);
-        let usual = torque.torques(limited(torque.holding_demand_m_s, limit), speed, speed, share);
+        // The ground resists a weak engine as it does a sound one.
+        let usual = torque.torques(limited(torque.holding_demand_m_s, limit), speed, speed, 1.0);
         let usual_n_m = (usual.driving_n_m - usual.braking_n_m) * heavier;
         let Some(brought) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
         let demand = unlimited(brought.clamp(-UNSATURATED * limit, UNSATURATED * limit), limit);

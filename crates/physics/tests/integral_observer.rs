@@ -5,7 +5,7 @@ mod common;
 
 use common::{Drive, loam};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
-use nesam_physics::effects::{Effect, LinearDrag, Payload, WheelDrag};
+use nesam_physics::effects::{Effect, LinearDrag, Payload, TorqueLimit, WheelDrag};
 use nesam_physics::step::StepModel;
 use nesam_physics::{Control, DT_S, Soil, TorqueDrive, Vehicle, VehicleState};
 use nesam_test_vehicles::torque_truck;
@@ -182,4 +182,21 @@ fn analytic_a_car_that_stands_begins_with_an_empty_integral() {
     };
     assert!(held(0.0).abs() < 1e-3, "{}", held(0.0));
     assert!((held(SPEED_M_S) - torque.holding_demand_m_s).abs() < 1e-3, "{}", held(SPEED_M_S));
+}
+
+#[test]
+fn analytic_a_weak_engine_is_asked_for_more_by_its_integral() {
+    let sound = observed(RATE_PER_S);
+    let hold = sound.driveline.torque.expect("this car's hubs are under torque").holding_demand_m_s;
+    for fraction in [1.0, 0.8, 0.5] {
+        let weak = sound.with_effects(&[Effect::TorqueLimit(TorqueLimit { fraction })]);
+        // At a steady speed on the level the same torque takes 1 / fraction of the demand.
+        let want = (hold / fraction - hold) / sound.driveline.speed_integral_gain_per_s;
+        let got = settled(&weak, 0.0, 0.0);
+        assert!((got - want).abs() < 1e-3 * (1.0 + want), "{fraction}: {got} m, not {want} m");
+        // And does so where its drive begins.
+        let moving = VehicleState { velocity_m_s: [SPEED_M_S, 0.0, 0.0], ..VehicleState::zero() };
+        let begun = DrivelineState::starting(&weak, &moving, &Control { speed_m_s: SPEED_M_S, second: 0.0 }).speed_error_integral_m;
+        assert!((begun - want).abs() < 1e-9, "{fraction}: {begun} m, not {want} m");
+    }
 }
