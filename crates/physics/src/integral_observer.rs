@@ -22,6 +22,8 @@ const SMALLEST_GAIN_PER_S: f64 = 0.02;
 /// Power of the weight with which compaction resists: (2 n + 2) / (2 n + 1) of a rigid wheel (Bekker 1969; Wong, *Theory of Ground Vehicles*, ch. 2), for the
 /// n = 0.7 of a sandy loam (Wong's table); 1.35 to 1.5 over all but the stiffest of its soils.
 const COMPACTION_POWER: f64 = 1.42;
+/// Smallest share of its torque that an engine is taken to give where its integral is told.
+const SMALLEST_SHARE: f64 = 0.05;
 
 /// What the integral of the speed error, m, amounts to beyond what holds the usual resistance of a sound car under torque: all of it is missing in a car that stands,
 /// a weak engine asks for more. 0 where there is no torque or no integral.
@@ -33,9 +35,6 @@ pub(crate) fn held_by_integral_m(vehicle: &Vehicle, stands: bool) -> f64 {
     let limit = line.speed_integral_limit_m;
     (more * torque.holding_demand_m_s / line.speed_integral_gain_per_s).clamp(-limit, limit)
 }
-
-/// Smallest share of its torque that an engine is taken to give where its integral is told.
-const SMALLEST_SHARE: f64 = 0.05;
 
 impl StepModel {
     /// Actuators after a measured step from `before` to `after`, of which `advanced` is what commands and speeds made: the integral of the speed error is

@@ -11,6 +11,11 @@ use nesam_test_vehicles::{robot, torque_truck, truck};
 
 const N: usize = 9;
 
+/// Soil softer than loam.
+const SOFT: Soil<f64> = Soil { k_phi: 4e5, k_c: 3000.0, n: 0.9, c: 2000.0, phi: 0.3, k_shear: 0.025 };
+/// Soil harder than it.
+const FIRM: Soil<f64> = Soil { k_phi: 8e6, k_c: 60e3, n: 1.1, c: 10e3, phi: 33f64.to_radians(), k_shear: 0.01 };
+
 /// z, roll, pitch, velocities after a step as duals of the same before it.
 fn jacobian(drive: &Drive, control: &Control<f64>) -> [[f64; N]; N] {
     let (input, _) = drive.input(control);
@@ -50,8 +55,7 @@ fn jacobian(drive: &Drive, control: &Control<f64>) -> [[f64; N]; N] {
 fn property_steps_do_not_amplify_small_changes() {
     const PLANAR: [usize; 3] = [3, 4, 8];
     let clay = Soil { k_phi: 692.15e3, k_c: 13.19e3, n: 0.5, c: 4.14e3, phi: 13f64.to_radians(), k_shear: 0.006 };
-    let firm = Soil { k_phi: 8e6, k_c: 60e3, n: 1.1, c: 10e3, phi: 33f64.to_radians(), k_shear: 0.01 };
-    for (vehicle, soil) in [truck(), torque_truck(), robot()].iter().flat_map(|v| [loam(), clay, firm, mud()].map(|soil| (v, soil))) {
+    for (vehicle, soil) in [truck(), torque_truck(), robot()].iter().flat_map(|v| [loam(), clay, FIRM, mud()].map(|soil| (v, soil))) {
         for (slope, speed_m_s) in [0.0, 0.1].into_iter().flat_map(|slope| [0.0, 0.1, 0.3, 0.6, 0.9, 1.2, 1.5, 2.0, 3.0].map(|v| (slope, v)))
         {
             let mut drive = Drive::new(vehicle.clone(), speed_m_s + 0.5);
@@ -82,14 +86,12 @@ fn property_steps_do_not_amplify_small_changes() {
 /// wheels that drag, on damped soil and under the other law of contact among them.
 #[test]
 fn property_a_vehicle_that_stops_does_not_go_to_and_fro() {
-    let soft = Soil { k_phi: 4e5, k_c: 3000.0, n: 0.9, c: 2000.0, phi: 0.3, k_shear: 0.025 };
-    let firm = Soil { k_phi: 8e6, k_c: 60e3, n: 1.1, c: 10e3, phi: 33f64.to_radians(), k_shear: 0.01 };
     let mut dragging = torque_truck();
     dragging.effects.force.wheel_drag_n_m = [900.0; 4];
     let damped = Vehicle { soil_damping_pa_s_m: 2e4, ..torque_truck() };
     let other_law = Vehicle { contact_law: ContactLaw::WongReece, ..torque_truck() };
     for (at, vehicle) in [truck(), torque_truck(), dragging, damped, other_law, robot()].into_iter().enumerate() {
-        for (soil, slope) in [mud(), soft, loam(), firm].into_iter().flat_map(|soil| [0.0, 0.1, 0.2, 0.3].map(|slope| (soil, slope))) {
+        for (soil, slope) in [mud(), SOFT, loam(), FIRM].into_iter().flat_map(|soil| [0.0, 0.1, 0.2, 0.3].map(|slope| (soil, slope))) {
             for (speed_m_s, across) in [0.0, 0.3, 1.0].into_iter().flat_map(|v| [0.0, 0.5].map(|across| (v, across))) {
                 let mut drive = Drive::new(vehicle.clone(), 0.8);
                 drive.soil = soil;
@@ -121,8 +123,7 @@ fn property_a_vehicle_that_stops_does_not_go_to_and_fro() {
 /// Goal: what resists the rolling of a wheel does not push a vehicle that is stuck. Method: forward speed after ten seconds under a command ahead, on flat ground.
 #[test]
 fn property_wheels_that_spin_on_the_spot_push_nobody_back() {
-    let soft = Soil { k_phi: 4e5, k_c: 3000.0, n: 0.9, c: 2000.0, phi: 0.3, k_shear: 0.025 };
-    for (vehicle, soil) in [truck(), torque_truck(), robot()].iter().flat_map(|v| [mud(), soft, loam()].map(|soil| (v, soil))) {
+    for (vehicle, soil) in [truck(), torque_truck(), robot()].iter().flat_map(|v| [mud(), SOFT, loam()].map(|soil| (v, soil))) {
         for speed_m_s in [0.3, 1.0, 2.0] {
             let mut drive = Drive::new(vehicle.clone(), 0.5);
             drive.soil = soil;
