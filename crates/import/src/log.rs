@@ -29,9 +29,17 @@ impl Log {
         texts.or_else(|| Some(self.column(name)?.iter().map(|v| v.map_or(String::new(), |v| v.to_string())).collect()))
     }
 
+    /// Whether it has a column of this name, of numbers or not.
+    pub fn holds(&self, name: &str) -> bool {
+        self.all_names().any(|held| held == name)
+    }
+
     /// Names of all columns, for errors.
     pub fn names(&self) -> String {
-        let names: Vec<&str> = self.numbers.iter().map(|(n, _)| n.as_str()).chain(self.texts.iter().map(|(n, _)| n.as_str())).collect();
-        names.join(", ")
+        self.all_names().collect::<Vec<_>>().join(", ")
+    }
+
+    fn all_names(&self) -> impl Iterator<Item = &str> {
+        self.numbers.iter().map(|(n, _)| n.as_str()).chain(self.texts.iter().map(|(n, _)| n.as_str()))
     }
 }

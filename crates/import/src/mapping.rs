@@ -105,11 +105,11 @@ impl Mapping {
         Ok(Self { entries })
     }
 
-    /// Numbers of a target in SI and radians; `None` when the log has no such column.
+    /// Numbers of a target in SI and radians; `None` when the log has no such column. A column that holds something else is refused, mapped or not.
     pub(crate) fn numbers(&self, log: &Log, target: &str) -> Result<Option<Vec<Option<f64>>>, ImportError> {
         let (source, factor) = match self.entries.iter().find(|entry| entry.target == target) {
             Some(entry) => (entry.source.as_str(), entry.factor),
-            None if log.column(target).is_some() => (target, 1.0),
+            None if log.holds(target) => (target, 1.0),
             None => return Ok(None),
         };
         let Some(values) = log.column(source) else {
@@ -169,7 +169,7 @@ mod tests {
             path: "log.csv".into(),
             rows: 1,
             numbers: vec![("heading".into(), vec![Some(90.0)]), ("a:b".into(), vec![Some(36.0)]), ("t".into(), vec![Some(2.0)])],
-            texts: vec![("run".into(), vec!["one".into()])],
+            texts: vec![("run".into(), vec!["one".into()]), ("x".into(), vec!["n/a".into()])],
             places: vec![2],
         };
         let mapping = Mapping::parse(["# comment", "", "yaw = -heading:deg", "cmd_speed=a:b:km/h", "trajectory=run"]).expect("valid");
@@ -178,6 +178,7 @@ mod tests {
         assert_eq!(value("cmd_speed").expect("there"), Some(10.0));
         assert_eq!(value("t").expect("there"), Some(2.0));
         assert_eq!(value("wz").expect("absent"), None);
+        assert!(value("x").expect_err("no number").to_string().contains("column `x` (for `x`) holds `n/a`, expected numbers"));
         assert_eq!(mapping.texts(&log, "trajectory"), Some(vec!["one".to_string()]));
     }
 
