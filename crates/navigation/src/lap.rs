@@ -107,6 +107,29 @@ pub struct Lap {
     pub velocity_mismatch_m_s: Option<f64>,
     /// x, y driven, every 0.2 s, m.
     pub path: Vec<[f64; 2]>,
+    /// How the vehicle leant, every 0.1 s; empty in laps that were kept by an earlier program.
+    #[serde(default)]
+    pub lean: Vec<Lean>,
+}
+
+/// How the vehicle leans at a place.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Lean {
+    /// Share of the lap driven.
+    pub progress: f64,
+    /// |roll|, degrees.
+    pub roll_deg: f64,
+    /// |pitch|, degrees.
+    pub pitch_deg: f64,
+}
+
+impl Lap {
+    /// Mean of an angle over the first part of the lap, from its beginning to where the vehicle first came to `progress`: what two laps, of which one ends
+    /// earlier, are compared by, since ground that one never came to says nothing of how the other drives. `None` where the lap does not tell how it leant.
+    pub fn mean_lean_until(&self, progress: f64, of: fn(&Lean) -> f64) -> Option<f64> {
+        let steps = self.lean.iter().position(|lean| lean.progress >= progress).map_or(self.lean.len(), |first| first + 1);
+        (steps > 0).then(|| self.lean[..steps].iter().map(of).sum::<f64>() / steps as f64)
+    }
 }
 
 /// Drives a lap.
@@ -234,8 +257,7 @@ struct Track {
     positions: Vec<[f64; 2]>,
     off_path_m: f64,
     off_path_sum_m: f64,
-    roll_sum: f64,
-    pitch_sum: f64,
+    lean: Vec<Lean>,
     local: Vec<[f64; 2]>,
     scored: Scored,
     velocity: VelocityCheck,
@@ -253,8 +275,7 @@ impl Track {
             positions: vec![[x, y]],
             off_path_m: 0.0,
             off_path_sum_m: 0.0,
-            roll_sum: 0.0,
-            pitch_sum: 0.0,
+            lean: Vec::new(),
             local: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
             scored: Scored::Truth,
             velocity: VelocityCheck::default(),
@@ -283,8 +304,7 @@ impl Track {
         self.positions.push([x, y]);
         self.off_path_m = distance_to_line([x, y], &self.local);
         self.off_path_sum_m += self.off_path_m;
-        self.roll_sum += roll.abs();
-        self.pitch_sum += pitch.abs();
+        self.lean.push(Lean { progress: self.progress(plan), roll_deg: roll.abs().to_degrees(), pitch_deg: pitch.abs().to_degrees() });
         self.note(reading);
     }
 
@@ -322,13 +342,14 @@ impl Track {
             progress: self.progress(plan).clamp(0.0, 1.0),
             hausdorff_m: hausdorff_m(&self.positions, &part),
             off_path_mean_m: self.off_path_sum_m / steps,
-            roll_deg: (self.roll_sum / steps).to_degrees(),
-            pitch_deg: (self.pitch_sum / steps).to_degrees(),
+            roll_deg: self.lean.iter().map(|lean| lean.roll_deg).sum::<f64>() / steps,
+            pitch_deg: self.lean.iter().map(|lean| lean.pitch_deg).sum::<f64>() / steps,
             measurements: BTreeMap::new(),
             soil_delta: None,
             scored: self.scored,
             velocity_mismatch_m_s: self.velocity.mismatch_m_s(),
             path: self.positions.iter().step_by(2).copied().collect(),
+            lean: self.lean.clone(),
         }
     }
 }

@@ -26,7 +26,7 @@ mod trial;
 pub use caution::{Caution, CautionSettings};
 pub use error::NavigationError;
 pub use forecast::{Forecaster, KinematicForecaster, Situation};
-pub use lap::{Lap, LapPlan, Scored, run_lap};
+pub use lap::{Lap, LapPlan, Lean, Scored, run_lap};
 pub use link::{Answer, BuiltInPlant, PlantLink, Reading, Start};
 pub use map_layers::map_layers;
 pub use mppi::{Decision, Mppi, MppiSettings};

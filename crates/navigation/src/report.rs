@@ -42,13 +42,21 @@ impl SoilKind {
 
 /// The configuration that others are compared with.
 const BASE: &str = "fixed";
-/// Quantities that are compared.
-const COMPARED: [(&str, fn(&Lap) -> f64); 4] = [
-    ("hausdorff_m", |lap| lap.hausdorff_m),
-    ("off_path_m", |lap| lap.off_path_mean_m),
-    ("roll_deg", |lap| lap.roll_deg),
-    ("pitch_deg", |lap| lap.pitch_deg),
+/// Quantities that are compared: distances over the part that each drove, angles over the part that both drove.
+const COMPARED: [(&str, fn(&Lap, f64) -> f64); 4] = [
+    ("hausdorff_m", |lap, _| lap.hausdorff_m),
+    ("off_path_m", |lap, _| lap.off_path_mean_m),
+    ("roll_deg", roll_deg),
+    ("pitch_deg", pitch_deg),
 ];
+
+fn roll_deg(lap: &Lap, progress: f64) -> f64 {
+    lap.mean_lean_until(progress, |lean| lean.roll_deg).unwrap_or(lap.roll_deg)
+}
+
+fn pitch_deg(lap: &Lap, progress: f64) -> f64 {
+    lap.mean_lean_until(progress, |lean| lean.pitch_deg).unwrap_or(lap.pitch_deg)
+}
 
 /// All runs of a command.
 #[derive(Clone, Debug)]
@@ -80,8 +88,10 @@ impl NavigationReport {
         let provenance: Map<String, Value> = self.provenance.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
         let each = self.runs.iter().map(|run| {
             let mut value = json!(run);
-            // The driven paths are in the HTML and in the files of the runs.
-            value["lap"].as_object_mut().map(|lap| lap.remove("path"));
+            // Step by step they are in the files of the runs; the HTML draws the paths.
+            if let Some(lap) = value["lap"].as_object_mut() {
+                lap.retain(|key, _| key != "path" && key != "lean");
+            }
             value
         });
         json!({
@@ -108,17 +118,19 @@ impl NavigationReport {
         Value::Object(object)
     }
 
-    /// The table as rows of texts: soil, configuration, runs, completion, time, Hausdorff, mean distance, roll, pitch, Hausdorff over fixed.
-    pub fn rows(&self) -> Vec<[String; 10]> {
+    /// The table as rows of texts: soil, configuration, runs, completion, time, Hausdorff, mean distance, roll, pitch, and the last but the second over those of
+    /// `fixed`.
+    pub fn rows(&self) -> Vec<[String; 12]> {
         let kinds: Vec<Option<SoilKind>> = std::iter::once(None).chain(SoilKind::ALL.map(Some)).collect();
         let mut rows = Vec::new();
         for kind in kinds {
             for name in configuration_names(&self.runs) {
                 let Some(s) = summarise(&self.runs, &name, kind) else { continue };
-                let against = ratio(&self.runs, &name, BASE, kind, |lap| lap.hausdorff_m).filter(|_| name != BASE);
+                let over_fixed =
+                    |of| ratio(&self.runs, &name, BASE, kind, of).filter(|_| name != BASE).map_or("–".into(), |r| ratio_text(&r));
                 rows.push([
                     kind.map_or("all", SoilKind::as_str).to_string(),
-                    name,
+                    name.clone(),
                     s.runs.to_string(),
                     format!("{:.0} % [{:.0}, {:.0}]", 100.0 * s.completion, 100.0 * s.completion_ci95[0], 100.0 * s.completion_ci95[1]),
                     mean_sd(&s.time_s, 1),
@@ -126,7 +138,9 @@ impl NavigationReport {
                     mean_sd(&s.off_path_m, 2),
                     mean_sd(&s.roll_deg, 2),
                     mean_sd(&s.pitch_deg, 2),
-                    against.map_or("–".into(), |r| ratio_text(&r)),
+                    over_fixed(|lap, _| lap.hausdorff_m),
+                    over_fixed(roll_deg),
+                    over_fixed(pitch_deg),
                 ]);
             }
         }
@@ -134,8 +148,20 @@ impl NavigationReport {
     }
 
     /// Heads of the columns of [`NavigationReport::rows`].
-    pub const HEAD: [&'static str; 10] =
-        ["soil", "model", "runs", "completed", "time s", "Hausdorff m", "off path m", "|roll| °", "|pitch| °", "Hausdorff / fixed"];
+    pub const HEAD: [&'static str; 12] = [
+        "soil",
+        "model",
+        "runs",
+        "completed",
+        "time s",
+        "Hausdorff m",
+        "off path m",
+        "|roll| °",
+        "|pitch| °",
+        "Hausdorff / fixed",
+        "|roll| / fixed",
+        "|pitch| / fixed",
+    ];
 
     /// The HTML page.
     pub fn page(&self) -> Page {
@@ -147,8 +173,10 @@ impl NavigationReport {
             names.join(", ")
         );
         let mut page = Page::new("Closed-loop driving", &lead);
-        let mut table =
-            Table::new("Completed = the whole lap in time, never more than 5 m off. Time over completed laps only.", &Self::HEAD);
+        let mut table = Table::new(
+            "Completed = the whole lap in time, never more than 5 m off. Time over completed laps only; |roll| and |pitch| over fixed on the part that both laps of a pair drove.",
+            &Self::HEAD,
+        );
         for row in self.rows() {
             table.row(row.into_iter().map(Into::into).collect());
         }

@@ -112,13 +112,18 @@ pub fn summarise(runs: &[Run], configuration: &str, soil: Option<SoilKind>) -> O
     })
 }
 
-/// Ratio of a quantity between two configurations, over runs of the same world, start and seed.
-pub fn ratio(runs: &[Run], over: &str, under: &str, soil: Option<SoilKind>, of: fn(&Lap) -> f64) -> Option<Ratio> {
+/// Ratio of a quantity between two configurations, over runs of the same world, start and seed. `of` gives the quantity of a lap over its first part, up to the
+/// share of the lap that both came to.
+pub fn ratio(runs: &[Run], over: &str, under: &str, soil: Option<SoilKind>, of: fn(&Lap, f64) -> f64) -> Option<Ratio> {
     let same = |a: &Run, b: &Run| a.place() == b.place() && a.seed == b.seed;
     let is = |r: &Run, name: &str| r.configuration == name && soil.is_none_or(|soil| r.soil == soil);
     let pairs: Vec<(&Run, &Run)> =
         runs.iter().filter(|r| is(r, over)).filter_map(|a| runs.iter().find(|b| is(b, under) && same(a, b)).map(|b| (a, b))).collect();
-    let (above, below): (Vec<f64>, Vec<f64>) = pairs.iter().map(|(a, b)| (of(&a.lap), of(&b.lap))).unzip();
+    let both = |(a, b): &(&Run, &Run)| {
+        let progress = a.lap.progress.min(b.lap.progress);
+        (of(&a.lap, progress), of(&b.lap, progress))
+    };
+    let (above, below): (Vec<f64>, Vec<f64>) = pairs.iter().map(both).unzip();
     let total: f64 = below.iter().sum();
     if pairs.is_empty() || total <= 0.0 {
         return None;
@@ -165,7 +170,7 @@ fn wilson(share: f64, count: usize) -> [f64; 2] {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::lap::Scored;
+    use crate::lap::{Lean, Scored};
 
     pub(crate) fn run(configuration: &str, world: &str, start: usize, seed: u64, hausdorff_m: f64, completed: bool) -> Run {
         let lap = Lap {
@@ -182,6 +187,7 @@ pub(crate) mod tests {
             scored: Scored::Truth,
             velocity_mismatch_m_s: None,
             path: vec![[23.5, 0.0], [23.0, 2.0]],
+            lean: Vec::new(),
         };
         Run { configuration: configuration.into(), world: world.into(), soil: SoilKind::Soft, start, seed, lap }
     }
@@ -197,11 +203,26 @@ pub(crate) mod tests {
         }
         let fixed = summarise(&runs, "fixed", None).unwrap();
         assert!((fixed.hausdorff_m.mean - 3.0).abs() < 1e-12 && (fixed.completion - 4.0 / 6.0).abs() < 1e-12 && fixed.places == 2);
-        let against = ratio(&runs, "adapted", "fixed", Some(SoilKind::Soft), |lap| lap.hausdorff_m).unwrap();
+        let against = ratio(&runs, "adapted", "fixed", Some(SoilKind::Soft), |lap, _| lap.hausdorff_m).unwrap();
         // Every pair has the ratio one half, so every resample has it.
         assert!(against.pairs == 6 && (against.ratio - 0.5).abs() < 1e-12);
         assert!(against.ci95.unwrap().iter().all(|v| (v - 0.5).abs() < 1e-12));
         assert!(summarise(&runs, "fixed", Some(SoilKind::Firm)).is_none() && configuration_names(&runs) == ["fixed", "adapted"]);
+    }
+
+    /// Goal: a lap that ends before the steep part is not told to lean less. Method: 2° up to the middle and 8° after it; the other lap ends in the middle.
+    #[test]
+    fn analytic_laps_are_compared_where_both_drove() {
+        let lean = |progress: f64| Lean { progress, roll_deg: if progress > 0.5 { 8.0 } else { 2.0 }, pitch_deg: 1.0 };
+        let lap = |configuration: &str, steps: usize| {
+            let mut run = run(configuration, "a", 0, 1, 1.0, steps == 10);
+            run.lap = Lap { progress: 0.1 * steps as f64, lean: (1..=steps).map(|k| lean(0.1 * k as f64)).collect(), ..run.lap };
+            run
+        };
+        let runs = vec![lap("fixed", 5), lap("adapted", 10)];
+        let roll = |lap: &Lap, progress: f64| lap.mean_lean_until(progress, |lean| lean.roll_deg).unwrap();
+        assert!((roll(&runs[1].lap, 1.0) - 5.0).abs() < 1e-12);
+        assert!((ratio(&runs, "adapted", "fixed", None, roll).unwrap().ratio - 1.0).abs() < 1e-12);
     }
 
     /// Wilson (1927), as tabulated for 0 of 10: 0 to 0.2775; for 5 of 10: 0.2366 to 0.7634.

@@ -388,7 +388,7 @@ fn steering_guess(vehicle: &Vehicle, path: &ReferencePath, speed_m_s: f64) -> f6
 }
 
 fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> {
-    let widths = [8, 10, 5, 16, 13, 27, 13, 14, 13, 20];
+    let widths = [8, 10, 5, 16, 13, 27, 13, 14, 13, 20, 20, 20];
     let line = |cells: Vec<&str>| {
         let padded = cells.iter().zip(widths).enumerate().map(|(i, (c, w))| if i < 2 { format!("{c:<w$}") } else { format!("{c:>w$}") });
         say!("{}", padded.collect::<String>());
