@@ -209,14 +209,18 @@ impl Case<'_> {
         format!(" (by drive: {})", each.join(", "))
     }
 
-    /// Share of half-samples of the drives that choose a hypothesis, one of its rivals, or something that they cannot tell from it.
+    /// Share of half-samples of the drives that choose a hypothesis, one of its rivals, or something that they cannot tell from it. Halves of drives in none of which it
+    /// shows, as all end before it begins, are not asked.
     ///
     /// What was compared through the physics on all drives is compared in the same way on the half ([`Settled::stands`]).
     fn stability(&self, yardstick: &Yardstick, own: Candidate, rivals: &[Member], settled: Option<&Settled>) -> f64 {
         let drives = self.prepared.len();
         let n = drives.min(STABILITY_PARTS);
         let half = n.div_ceil(2);
-        let subsets: Vec<u32> = (0u32..1 << n).filter(|s| s.count_ones() as usize == half).collect();
+        let holds = |subset: u32, i: usize| subset & (1 << part_of(i, drives, STABILITY_PARTS)) != 0;
+        let answers = |i: usize| own.columns().into_iter().any(|c| self.prepared[i].condensed.information[(c, c)] > 0.0);
+        let subsets: Vec<u32> =
+            (0u32..1 << n).filter(|s| s.count_ones() as usize == half && (0..drives).any(|i| holds(*s, i) && answers(i))).collect();
         let in_class = |h: usize| {
             let id = yardstick.catalogue[h].id();
             id == own.id() || rivals.iter().any(|r| r.candidate.id() == id)
@@ -224,7 +228,7 @@ impl Case<'_> {
         let hits = subsets
             .par_iter()
             .filter(|subset| {
-                let inside = |i: usize| **subset & (1 << part_of(i, drives, STABILITY_PARTS)) != 0;
+                let inside = |i: usize| holds(**subset, i);
                 let part = yardstick.group((0..drives).filter(|i| inside(*i)).map(|i| &self.prepared[i].condensed));
                 let chosen = yardstick.select(&part).chosen;
                 chosen.iter().any(|h| in_class(*h)) || settled.is_some_and(|s| s.stands(yardstick, &chosen, &part, inside, in_class))

@@ -164,8 +164,8 @@ pub fn diagnose(
         prove(&case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &held_drives)?;
     let any = verdict.claims();
     if !any {
-        for i in judgement.claimed() {
-            judgement.findings[i].refused = Some(reason.clone());
+        for finding in judgement.findings.iter_mut().filter(|f| f.refused.is_none()) {
+            finding.refused = Some(reason.clone());
         }
     }
     let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();

@@ -43,6 +43,8 @@ pub struct HeldOut {
     pub resamples: Resamples,
     /// Errors that prove or refute something.
     pub counted: Counted,
+    /// Whether what was learned for a drive begins before its last window ends; true where nothing was learned.
+    pub shows: Vec<bool>,
 }
 
 /// How the rollouts are cut and scored.
@@ -107,6 +109,7 @@ pub fn score_held_out(
         before_onset: (!early.is_empty()).then(|| [of(0, &early), of(2, &early)]),
         resamples,
         counted: counted(maps),
+        shows: shows(&windows, drives.len(), |d| learned[d].effects.iter().map(|e| e.onset_s).collect()),
     })
 }
 
@@ -129,8 +132,21 @@ pub fn score_models(
     Ok(score(&ModelPaths { name: ModelName::Nesam, parameters, paths }, windows, Truth::Measured, resamples))
 }
 
+/// Whether each of some drives has a window that ends after an effect of it has begun, or no effect at all.
+pub(crate) fn shows(windows: &[Window<'_>], drives: usize, onsets_s: impl Fn(usize) -> Vec<f64>) -> Vec<bool> {
+    let of = |d: usize| {
+        let first_s = onsets_s(d).into_iter().min_by(f64::total_cmp);
+        first_s.is_none_or(|first_s| windows.iter().any(|w| w.drive == d && end_s(w) >= first_s))
+    };
+    (0..drives).map(of).collect()
+}
+
+/// When a window ends, s since the start of the log.
+fn end_s(window: &Window<'_>) -> f64 {
+    window.since_log_start_s() + window.horizon as f64 * window.trajectory.dt_s
+}
+
 /// Whether a window ends before any of the learned effects begins.
 fn ends_before_onset(window: &Window<'_>, learned: &Learned) -> bool {
-    let end_s = window.since_log_start_s() + window.horizon as f64 * window.trajectory.dt_s;
-    !learned.effects.is_empty() && learned.effects.iter().all(|e| e.onset_s > end_s)
+    !learned.effects.is_empty() && learned.effects.iter().all(|e| e.onset_s > end_s(window))
 }

@@ -90,7 +90,7 @@ impl Judgement {
         let others = without(&self.selection.chosen, i);
         self.selection.choose(yardstick, &yardstick.group(case.condensed()), others);
         let left_out = self.findings.into_iter().filter(|f| f.refused.is_some()).collect();
-        concluded(case, yardstick, self.selection, self.onsets, &[dropped], left_out)
+        unless_unrest(case, yardstick, concluded(case, yardstick, self.selection, self.onsets, &[dropped], left_out))
     }
 }
 

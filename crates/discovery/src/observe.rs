@@ -244,7 +244,7 @@ impl ObservedDrive {
         let readings: Vec<Reading> = sets
             .iter()
             .map(|set| {
-                let on: Vec<Effect> = effects.iter().enumerate().filter(|(i, _)| set & (1 << i) != 0).map(|(_, e)| e.effect).collect();
+                let on: Vec<ScheduledEffect> = effects.iter().enumerate().filter(|(i, _)| set & (1 << i) != 0).map(|(_, e)| *e).collect();
                 self.reading(bench, &on)
             })
             .collect();
@@ -293,17 +293,30 @@ impl ObservedDrive {
         })
     }
 
-    fn reading(&self, bench: &Bench<'_>, effects: &[Effect]) -> Reading {
-        let vehicle = bench.vehicle.with_effects(effects);
-        let states = vehicle.effects.sensor.to_true_along(&self.states, bench.stepping.dt_s);
-        let model = bench.stepping.model(&vehicle);
-        let mut now = self.first_actuators(&vehicle, &states[0]);
+    /// What the drive says to a model with all of these effects. Actuators remember: before an effect begins they are those of a vehicle without it.
+    fn reading(&self, bench: &Bench<'_>, effects: &[ScheduledEffect]) -> Reading {
+        let mut onsets_s: Vec<f64> = effects.iter().map(|e| e.onset_s).filter(|onset_s| *onset_s > 0.0).collect();
+        onsets_s.sort_by(f64::total_cmp);
+        onsets_s.dedup();
+        let vehicle_at = |time_s: f64| {
+            let begun: Vec<Effect> = effects.iter().filter(|e| e.onset_s <= time_s).map(|e| e.effect).collect();
+            bench.vehicle.with_effects(&begun)
+        };
+        // Phases of the drive from the first on, each with its model.
+        let phases: Vec<StepModel> =
+            std::iter::once(0.0).chain(onsets_s.iter().copied()).map(|from_s| bench.stepping.model(&vehicle_at(from_s))).collect();
+        let model = phases.last().expect("there is a first phase; this is a bug").clone();
+        let states = model.vehicle().effects.sensor.to_true_along(&self.states, bench.stepping.dt_s);
+        let mut now = self.first_actuators(phases[0].vehicle(), &states[0]);
         let actuators = self
             .transitions
             .iter()
             .zip(states.windows(2))
-            .map(|(transition, states)| {
-                let after = now.advance(&vehicle, &transition.control, states[0].velocity_m_s[0], model.dt_s());
+            .enumerate()
+            .map(|(k, (transition, states))| {
+                let begun = onsets_s.iter().filter(|onset_s| **onset_s <= k as f64 * bench.stepping.dt_s).count();
+                let model = &phases[begun];
+                let after = now.advance(model.vehicle(), &transition.control, states[0].velocity_m_s[0], model.dt_s());
                 let pair = [now, after];
                 now = model.observed_actuators(&after, &transition.control, &states[0], &states[1], model.dt_s());
                 pair

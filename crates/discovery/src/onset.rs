@@ -89,8 +89,7 @@ pub fn find(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion: f64) 
 ///
 /// The rows are what the fitted effect leaves, the shift is its answer where it acts, and each drive may have it in a size of its own.
 pub(crate) fn change(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion: f64, share_min: f64) -> Option<Change> {
-    let shown_s: Vec<f64> = drives.iter().flat_map(Course::shown_s).collect();
-    let starts = midway(&shown_s, drives.len());
+    let starts = midway(&drives.iter().map(Course::shown_s).collect::<Vec<_>>());
     // The whole effect has a share of one.
     let (_, explained) = profile(metric, drives, &[f64::NEG_INFINITY], false)[0];
     let gain = |(score, information): (f64, f64)| score.powi(2) / information.max(1e-12);
@@ -134,20 +133,19 @@ pub(crate) fn begun(column: &[Row], times_s: &[f64], at_s: f64) -> Vec<Row> {
 
 /// When an effect may have begun, s: always, which comes first, or at a segment with enough of them before and after.
 fn starts(drives: &[Course<'_>]) -> Vec<f64> {
-    let every: Vec<f64> = drives.iter().flat_map(|d| d.times_s.iter().copied()).collect();
-    std::iter::once(f64::NEG_INFINITY).chain(midway(&every, drives.len())).collect()
+    std::iter::once(f64::NEG_INFINITY).chain(midway(&drives.iter().map(|d| d.times_s.clone()).collect::<Vec<_>>())).collect()
 }
 
-/// Those of the starts of segments of all drives, s, with enough of them before and after.
-fn midway(every: &[f64], drives: usize) -> Vec<f64> {
-    let mut times = every.to_vec();
+/// Those of the starts of segments of each drive, s, with enough of them before and after: so many on average of the drives that have any there.
+fn midway(each: &[Vec<f64>]) -> Vec<f64> {
+    let mut times = each.concat();
     times.sort_by(f64::total_cmp);
     times.dedup();
-    let least = SEGMENTS_MIN * drives;
-    times.retain(|time| {
-        let before = every.iter().filter(|t| *t < time).count();
-        before >= least && every.len() - before >= least
-    });
+    let enough = |side: &dyn Fn(&f64) -> bool| {
+        let counts = || each.iter().map(|times| times.iter().filter(|t| side(t)).count()).filter(|count| *count > 0);
+        counts().sum::<usize>() >= SEGMENTS_MIN * counts().count().max(1)
+    };
+    times.retain(|time| enough(&|t| t < time) && enough(&|t| t >= time));
     times
 }
 
@@ -220,6 +218,18 @@ mod tests {
         assert_eq!(of(1.0, 1.6, 0.0), None);
         assert!(of(1.0, 1.8, 0.0).is_some());
         assert!(of(100.0, 113.0, 1.0).is_none() && of(100.0, 115.0, 1.0).is_some());
+    }
+
+    /// Goal: drives that have ended do not keep the onset of the others from being named. Method: one drive of 24 s beside four of 8 s; three segments of it are enough after
+    /// those have ended, and before that as many of each.
+    #[test]
+    fn analytic_drives_that_ended_are_not_asked_for_what_came_after() {
+        let short: Vec<f64> = times_s().into_iter().take(10).collect();
+        let whole = midway(&vec![times_s(); 5]);
+        let starts = midway(&[vec![times_s()], vec![short; 4]].concat());
+        let last = |starts: &[f64]| starts.last().copied().unwrap();
+        assert!(last(&whole) == times_s()[SEGMENTS - SEGMENTS_MIN] && last(&starts) == last(&whole), "{starts:?}");
+        assert_eq!(starts[0], whole[0]);
     }
 
     /// Goal: what another effect leaves is no onset. Method: that effect shows from segment 18 on only, whatever its onset, and ours always or from segment 9 on; both

@@ -1,13 +1,17 @@
 //! When predictions count as better: by errors of full rollouts, paired by drive, with intervals; and when measurements contradict one another less.
 
-use nesam_evaluation::{DIMENSION_KEYS, DriveMaps, EvaluationError, ModelScore, POSE_DIM, Resamples, Window, paired_difference};
+use std::borrow::Cow;
+
+use nesam_evaluation::{
+    DIMENSION_KEYS, DriveMaps, EvaluationError, ModelScore, POSE_DIM, Resamples, Window, WindowErrors, paired_difference, values,
+};
 use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_trajectories::Trajectory;
 
 use crate::consistency::Contradictions;
-use crate::held_out::{HeldOut, Scoring, score_models};
+use crate::held_out::{HeldOut, Scoring, score_models, shows};
 
 /// Most windows of a trial.
 const WINDOWS_MAX: usize = 1000;
@@ -30,31 +34,60 @@ pub fn counted(maps: &DriveMaps) -> Counted {
 pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Option<String> {
     const WHERE: &str = "on drives that were not fitted";
     let [before, soil, after] = &scores.scores;
-    if least_gain.is_some() && !several_scored(scores) {
+    if least_gain.is_some() && !several_scored(&after.errors) {
         return Some("only one drive that was left out can be scored, which proves nothing: leave out two or more".into());
+    }
+    if least_gain.is_some() && !several_scored(&telling(&after.errors, &scores.shows)) {
+        return Some(
+            "what was found shows in one of the drives that were left out alone, which proves nothing: leave out two in which it shows"
+                .into(),
+        );
     }
     let against = [soil, before].into_iter().take(if each { 1 } else { 2 });
     for (against, gain) in against.filter_map(|score| Some((score, least_gain?))) {
-        if !falls_surely(against, after, gain, scores.counted, &scores.resamples) {
+        if !falls_surely(against, after, gain, scores.counted, &scores.resamples, &scores.shows) {
             let share = if gain > 0.0 { format!(" by {:.0} %", 100.0 * gain) } else { String::new() };
             return Some(format!("no error falls surely{share} {WHERE}"));
         }
     }
-    rises_surely(before, after, scores.counted, &scores.resamples)
+    rises_surely(before, after, scores.counted, &scores.resamples, &scores.shows)
         .map(|[name, from, by]| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
 }
 
-/// Whether more than one held-out drive has windows.
-pub(crate) fn several_scored(scores: &HeldOut) -> bool {
-    let scored = &scores.scores[2].errors.trajectory;
+/// Whether more than one drive has windows.
+pub(crate) fn several_scored(errors: &WindowErrors) -> bool {
+    let scored = &errors.trajectory;
     scored.iter().any(|d| Some(d) != scored.first())
 }
 
-/// Whether an error that counts surely falls by at least a share of itself.
-pub(crate) fn falls_surely(before: &ModelScore, after: &ModelScore, gain: f64, counted: Counted, resamples: &Resamples) -> bool {
-    let (_, interval) = paired_difference(&before.errors, &after.errors, resamples);
+/// The errors on drives in which what was learned shows. One that ends before every effect begins is predicted alike to the bit with them and without: it says nothing,
+/// and drawn often enough it would keep any fall from being sure.
+fn telling<'a>(errors: &'a WindowErrors, shows: &[bool]) -> Cow<'a, WindowErrors> {
+    if errors.trajectory.iter().all(|d| shows[*d]) {
+        return Cow::Borrowed(errors);
+    }
+    let mut kept = WindowErrors { scored: errors.scored, not_finite: errors.not_finite, ..WindowErrors::empty(errors.horizon) };
+    for w in (0..errors.windows()).filter(|w| shows[errors.trajectory[*w]]) {
+        kept.trajectory.push(errors.trajectory[w]);
+        kept.path_m.push(errors.path_m[w]);
+        kept.steps.extend_from_slice(&errors.steps[w * errors.horizon..(w + 1) * errors.horizon]);
+    }
+    Cow::Owned(kept)
+}
+
+/// Whether an error that counts surely falls by at least a share of itself, on the drives in which it could.
+pub(crate) fn falls_surely(
+    before: &ModelScore,
+    after: &ModelScore,
+    gain: f64,
+    counted: Counted,
+    resamples: &Resamples,
+    shows: &[bool],
+) -> bool {
+    let [before, after] = [before, after].map(|score| telling(&score.errors, shows));
+    let (_, interval) = paired_difference(&before, &after, resamples);
     let falls = |(interval, error): (Option<[f64; 2]>, Option<f64>)| error.is_some_and(|error| sure_fall(interval, error, gain));
-    counting(interval.row(false).into_iter().zip(before.summary.tree.row(false)), counted).any(falls)
+    counting(interval.row(false).into_iter().zip(values(&before).row(false)), counted).any(falls)
 }
 
 /// Whether a fall with this interval is sure, and at least this share of what falls.
@@ -68,10 +101,11 @@ fn counting<T>(errors: impl Iterator<Item = T>, counted: Counted) -> impl Iterat
 }
 
 /// The first error that counts and surely rises, and by more than is negligible: its name, where from, by how much.
-fn rises_surely(before: &ModelScore, after: &ModelScore, counted: Counted, resamples: &Resamples) -> Option<[String; 3]> {
-    let (difference, interval) = paired_difference(&after.errors, &before.errors, resamples);
+fn rises_surely(before: &ModelScore, after: &ModelScore, counted: Counted, resamples: &Resamples, shows: &[bool]) -> Option<[String; 3]> {
+    let [before, after] = [before, after].map(|score| telling(&score.errors, shows));
+    let (difference, interval) = paired_difference(&after, &before, resamples);
     let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
-    let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(before.summary.tree.row(false));
+    let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(values(&before).row(false));
     counting(rows.zip(names), counted).find_map(|(((d, i), b), name)| match (d, i, b) {
         (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > RISE_MIN * b => Some([(*name).into(), format!("{b:.4}"), format!("{d:.4}")]),
         _ => None,
@@ -113,13 +147,14 @@ impl Trial<'_> {
             score_models(&windows, self.maps, &models, 0, &resamples)
         };
         let (before, after) = (scored(without)?, scored(with)?);
-        if !sensors_tell && !falls_surely(&before, &after, 0.0, counted, &resamples) {
+        let shows = shows(&windows, self.drives.len(), |_| with.iter().map(|e| e.onset_s).collect());
+        if !sensors_tell && !falls_surely(&before, &after, 0.0, counted, &resamples, &shows) {
             return Ok(Some("no error of predictions of the fitted drives falls surely with it".into()));
         }
         let told = |[name, from, by]: [String; 3]| {
             format!("the error of {name} of predictions of the fitted drives rises surely with it, from {from} by {by}")
         };
-        Ok(rises_surely(&before, &after, counted, &resamples).map(told))
+        Ok(rises_surely(&before, &after, counted, &resamples, &shows).map(told))
     }
 
     /// Channels in which measurements contradict one another otherwise with the second effects than with the first, if they surely do less; else none.
@@ -136,7 +171,7 @@ impl Trial<'_> {
 
 #[cfg(test)]
 pub(crate) mod tests {
-    use nesam_evaluation::{ModelName, StepError, WindowErrors, summarise};
+    use nesam_evaluation::{ModelName, StepError, summarise};
 
     use super::*;
 
@@ -168,6 +203,7 @@ pub(crate) mod tests {
                 before_onset: None,
                 resamples: Resamples::draw(6, 50, 1),
                 counted,
+                shows: vec![true; 6],
             };
             not_proven(&scores, Some(0.1), false)
         };
@@ -179,5 +215,26 @@ pub(crate) mod tests {
         let tilt = [0.1, 0.1, 0.1, 0.8, 0.4, 20.0];
         assert!(proof(tilt, flat).is_some_and(|why| why.contains("no error falls surely")));
         assert_eq!(proof(tilt, all), None);
+    }
+
+    /// Goal: drives that end before an effect begins do not keep its proof from being sure. Method: six drives, of which yaw falls in two and nothing in four, which no
+    /// interval over all six takes for sure; then those four are known to end before.
+    #[test]
+    fn analytic_drives_in_which_nothing_has_begun_prove_nothing() {
+        let before = [0.1, 0.1, 0.1, 0.8, 0.8, 20.0];
+        let mut after = score(before);
+        for step in &mut after.errors.steps[..2] {
+            step.absolute[5] = 10.0;
+        }
+        let proof = |shows: Vec<bool>| {
+            let (scores, counted) = ([score(before), score(before), after.clone()], counted(&[]));
+            let resamples = Resamples::draw(6, 500, 1);
+            not_proven(&HeldOut { scores, controls: Vec::new(), before_onset: None, resamples, counted, shows }, Some(0.0), false)
+        };
+        let two = [[true; 2].to_vec(), vec![false; 4]].concat();
+        assert!(proof(vec![true; 6]).is_some_and(|why| why.contains("no error falls surely")));
+        assert_eq!(proof(two), None);
+        let one = [vec![true], vec![false; 5]].concat();
+        assert!(proof(one).is_some_and(|why| why.contains("in one of the drives")));
     }
 }

@@ -10,7 +10,7 @@ use crate::claims::{Case, Finding};
 use crate::condense::best_soil;
 use crate::consistency::Contradictions;
 use crate::diagnose::Options;
-use crate::held_out::{HeldOut, Learned, score_held_out, score_models};
+use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::judgement::{Judgement, Verdict};
 use crate::proof::{falls_surely, not_proven, several_scored};
 use crate::select::Yardstick;
@@ -66,7 +66,12 @@ pub(crate) fn prove(
         let learned = learn(fewer, case, &judgement, options, drives.len());
         let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
         let needless = match &scores {
-            Some(scores) => last_needless(&judgement, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
+            Some(scores) => {
+                let without = |hypothesis| -> Result<_, EvaluationError> {
+                    Ok((held.without(hypothesis, &learned, scores)?, held.shows(hypothesis, &learned)?))
+                };
+                last_needless(&judgement, scores, without)?
+            }
             None => None,
         };
         let Some(i) = needless else {
@@ -95,6 +100,14 @@ impl HeldDrives<'_> {
         before.fall_surely(&after, GAIN_ON_TRIAL, &scores.resamples)
     }
 
+    /// Whether a hypothesis shows in each of the drives, as far as it was learned for it.
+    fn shows(&self, hypothesis: usize, learned: &[Learned]) -> Result<Vec<bool>, EvaluationError> {
+        let windows = self.options.scoring.windows(self.drives)?;
+        let onset_s =
+            |l: &Learned| l.effects.iter().zip(&l.hypotheses).filter(|(_, h)| **h == hypothesis).map(|(e, _)| e.onset_s).collect();
+        Ok(shows(&windows, self.drives.len(), |d| onset_s(&learned[d])))
+    }
+
     /// Score of the drives with what was learned but for a hypothesis.
     fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<ModelScore, EvaluationError> {
         let predictors: Vec<Predictor> = learned.iter().map(|l| self.predictor.with_effects(&l.without(hypothesis))).collect();
@@ -102,14 +115,20 @@ impl HeldDrives<'_> {
     }
 }
 
-/// Position of the last of several claims that changes how the vehicle moves and without which no error is surely larger; `without` scores the drives with all others.
-fn last_needless<E>(judgement: &Judgement, scores: &HeldOut, without: impl Fn(usize) -> Result<ModelScore, E>) -> Result<Option<usize>, E> {
+/// Position of the last of several claims that changes how the vehicle moves and without which no error is surely larger; `without` scores the drives with all others,
+/// and says in which it shows.
+fn last_needless<E>(
+    judgement: &Judgement,
+    scores: &HeldOut,
+    without: impl Fn(usize) -> Result<(ModelScore, Vec<bool>), E>,
+) -> Result<Option<usize>, E> {
     let claimed = judgement.claimed();
-    if claimed.len() < 2 || !several_scored(scores) {
+    if claimed.len() < 2 || !several_scored(&scores.scores[2].errors) {
         return Ok(None);
     }
     for i in claimed.into_iter().rev().filter(|i| acts(&judgement.findings[*i])) {
-        if !falls_surely(&without(judgement.findings[i].hypothesis)?, &scores.scores[2], 0.0, scores.counted, &scores.resamples) {
+        let (without, shows) = without(judgement.findings[i].hypothesis)?;
+        if !falls_surely(&without, &scores.scores[2], 0.0, scores.counted, &scores.resamples, &shows) {
             return Ok(Some(i));
         }
     }
@@ -277,7 +296,7 @@ mod tests {
     /// Scores before, with the best soil, after.
     fn held_out(errors: [f64; 3]) -> HeldOut {
         let (resamples, counted) = (Resamples::draw(6, 50, 1), [true; POSE_DIM + 1]);
-        HeldOut { scores: errors.map(score), controls: Vec::new(), before_onset: None, resamples, counted }
+        HeldOut { scores: errors.map(score), controls: Vec::new(), before_onset: None, resamples, counted, shows: vec![true; 6] }
     }
 
     /// The claim that is needless where the drives have this error without each of some hypotheses, and `after` with all.
@@ -285,7 +304,7 @@ mod tests {
         let judged = judgement(&claims.iter().map(|id| (*id, 12.0)).collect::<Vec<_>>());
         let of = |hypothesis: usize| {
             let id = judged.findings.iter().find(|f| f.hypothesis == hypothesis).unwrap().candidate.id();
-            without.iter().find(|w| w.0 == id).map(|w| score(w.1)).ok_or(id)
+            without.iter().find(|w| w.0 == id).map(|w| (score(w.1), vec![true; 6])).ok_or(id)
         };
         last_needless(&judged, scores, of).unwrap()
     }

@@ -266,6 +266,26 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
     assert!(turned < -0.01, "a drag on the right turns to the right, by {turned}");
 }
 
+/// Goal: actuators remember a vehicle that did not have an effect yet. Method: a steering lag from the eleventh segment on and one from the start. Segments before it are
+/// as without it, the first one after it begins with wheels that followed at once, and later ones cannot tell.
+#[test]
+fn property_before_an_effect_begins_actuators_are_those_without_it() {
+    let bundle = bundle();
+    let recorded = drive("lag", 42, &[], &bundle.default_soil);
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
+    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &[] };
+    let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
+    let times_s = observed.times_s(bench.stepping.dt_s);
+    let lag = Effect::SteeringLag(SteeringLag { seconds: 0.3 });
+    let rows = |effects: &[ScheduledEffect]| observed.deviations(&bench, effects, &nesam_physics::SoilCorrection::NONE);
+    let from = |onset_s: f64| rows(&[ScheduledEffect { effect: lag, onset_s }]);
+    let (never, always, midway) = (rows(&[]), from(0.0), from(times_s[10]));
+    let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!((0..10).all(|k| apart(&midway[k], &never[k]) == 0.0));
+    assert!(apart(&midway[10], &always[10]) > 1e-4, "{}", apart(&midway[10], &always[10]));
+    assert!((15..times_s.len()).all(|k| apart(&midway[k], &always[k]) < 1e-6));
+}
+
 #[test]
 fn property_controls_stand_beside_a_named_effect() {
     let options = nesam_discovery::Options { controls: true, ..options() };
