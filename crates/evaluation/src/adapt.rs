@@ -176,7 +176,7 @@ pub fn check_forecasts(
 /// Runs the filter over one drive from its first sample, as a session that receives the samples one by one.
 ///
 /// A buffer with a wheel off the map is left out, and a drive without a map teaches nothing: where the slope of the ground is a guess,
-/// its error would be taken for soil.
+/// its error would be taken for soil. No buffer holds a step in which the vehicle sets off ([`Predictor::sets_off`]).
 ///
 /// # Errors
 /// As [`adapt_all`].
@@ -192,6 +192,11 @@ pub fn adapt_drive(
     let steps = history_steps(drive);
     let mut start = 0;
     while start + config.buffer < steps.len() {
+        let sets_off = |k: &usize| predictor.sets_off(&steps[..*k], &steps[*k]);
+        if let Some(last) = (start..=start + config.buffer).rev().find(sets_off) {
+            start = last + 1;
+            continue;
+        }
         let soil = SoilByClass::new(Some(map), filter.estimates());
         let buffer = buffer_at(predictor, &steps, start, config, map, &soil);
         start += config.buffer;

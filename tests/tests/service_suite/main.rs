@@ -33,6 +33,7 @@ mod simulation;
 mod slides;
 mod soil;
 mod stage;
+mod starts;
 mod streams;
 mod zenoh_network;
 mod zenoh_presence;

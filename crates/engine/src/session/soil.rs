@@ -127,7 +127,7 @@ impl SoilLearner {
     /// Takes the newest step with the steps before it. From numbers that are not finite nothing is learned.
     ///
     /// Nor without a map: where the slope of the ground is a guess, its error would be taken for soil. For the same reason a buffer with a wheel off the map
-    /// is left out. Whether sensors contradict each other is told of any buffer.
+    /// is left out. Whether sensors contradict each other is told of any buffer. No buffer holds a step in which the vehicle sets off ([`Predictor::sets_off`]).
     pub(super) fn step(
         &mut self,
         models: Models<'_>,
@@ -135,6 +135,10 @@ impl SoilLearner {
         (stamp_ns, newest): Stamped,
         map: Option<&Arc<WorldMap>>,
     ) -> Option<Judged> {
+        if models.usual.sets_off(before, &newest) {
+            self.forget_open();
+            return None;
+        }
         if self.steps.is_empty() {
             self.steps.extend_from_slice(&before[before.len().saturating_sub(HISTORY - 1)..]);
             self.first = self.steps.len();

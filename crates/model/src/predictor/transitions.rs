@@ -17,6 +17,11 @@ use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
 use crate::terrain_tokens::TerrainToken;
 
+/// Speeds of vehicle and command below which a vehicle is parked, m/s.
+const PARKED_M_S: f64 = 0.3;
+/// Steps within which a vehicle that was parked counts as setting off: one second.
+const SETTING_OFF_STEPS: usize = 10;
+
 /// A measured transition, ready for the physics.
 #[derive(Clone, Copy, Debug)]
 pub struct Transition {
@@ -105,6 +110,20 @@ impl Predictor {
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
         }
         transitions
+    }
+
+    /// Whether a car under torque sets off in `newest`: it was parked within the second before, or these steps begin with it at rest, and it is slower than any speed
+    /// at which its card knows the engine. How hard it pulls there is a guess, whose error would be taken for soil. One that is stuck for longer is no such case.
+    pub fn sets_off(&self, before: &[HistoryStep], newest: &HistoryStep) -> bool {
+        let Some(torque) = &self.step_model().vehicle().driveline.torque else { return false };
+        let speed = |step: &HistoryStep| step.state.velocity_m_s[0].abs();
+        let parked = |step: &HistoryStep| speed(step) < PARKED_M_S && step.control.speed_m_s.abs() < PARKED_M_S;
+        if speed(newest) >= torque.curve_speed_m_s[0] || parked(newest) {
+            return false;
+        }
+        let recent = &before[before.len().saturating_sub(SETTING_OFF_STEPS)..];
+        let begins_at_rest = before.len() < SETTING_OFF_STEPS && speed(before.first().unwrap_or(newest)) < PARKED_M_S;
+        begins_at_rest || recent.iter().any(parked)
     }
 
     /// The transitions that start at `steps[range]`, as the soil filter takes them into one buffer: along one rollout on the soil `along`, or each
