@@ -42,8 +42,8 @@ struct ServerArgs {
     /// Address of the server
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:50051")]
     server: String,
-    /// Session; `list` without it lists all
-    #[arg(long, value_name = "ID", default_value = "")]
+    /// Session; `list` alone goes without: it lists all then
+    #[arg(long, value_name = "ID", default_value = "", hide_default_value = true)]
     session: String,
     /// CA of the server, PEM; with it the connection is TLS
     #[arg(long, value_name = "FILE")]

@@ -35,7 +35,7 @@ pub(super) struct DiscoveryBench {
     #[arg(long, value_name = "N", default_value_t = 1)]
     every_hidden: usize,
     /// Groups without an effect for each null set; the first are disjoint, further ones are drawn at random and overlap [default: the disjoint ones]
-    #[arg(long, value_name = "N", default_value_t = 0)]
+    #[arg(long, value_name = "N", default_value_t = 0, hide_default_value = true)]
     nulls: usize,
     /// Let other methods try too: the refitted true effect, soil alone, ridge and STLSQ over the whole catalogue, a black box, a free form
     #[arg(long)]

@@ -35,7 +35,7 @@ pub(super) struct ServeBench {
     #[arg(long, value_name = "FACTOR", default_value_t = 1)]
     greedy: usize,
     /// Fewest of them that are of use: the server then answers with fewer when time is short [default: all or nothing]
-    #[arg(long, value_name = "SAMPLES", default_value_t = 0)]
+    #[arg(long, value_name = "SAMPLES", default_value_t = 0, hide_default_value = true)]
     samples_min: usize,
     /// Steps per rollout
     #[arg(long, value_name = "STEPS", default_value_t = 32)]
