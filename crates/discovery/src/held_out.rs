@@ -24,9 +24,13 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// The effects but for that of a hypothesis.
-    pub fn without(&self, hypothesis: usize) -> Vec<ScheduledEffect> {
-        self.effects.iter().zip(&self.hypotheses).filter(|(_, h)| **h != hypothesis).map(|(effect, _)| *effect).collect()
+    /// The effects but for that of a hypothesis, and that one, if it was learned.
+    pub fn apart(&self, hypothesis: usize) -> [Vec<ScheduledEffect>; 2] {
+        let of = |own: bool| {
+            let effects = self.effects.iter().zip(&self.hypotheses);
+            effects.filter(|(_, h)| (**h == hypothesis) == own).map(|(effect, _)| *effect).collect()
+        };
+        [of(false), of(true)]
     }
 }
 
@@ -102,14 +106,14 @@ pub fn score_held_out(
         score(&model, &windows, Truth::Measured, &resamples)
     };
     let all: Vec<usize> = (0..windows.len()).collect();
-    let early: Vec<usize> = all.iter().copied().filter(|w| ends_before_onset(&windows[*w], &learned[windows[*w].drive])).collect();
+    let early: Vec<usize> = all.iter().copied().filter(|w| ends_before_onset(&windows[*w], &learned[windows[*w].drive].effects)).collect();
     Ok(HeldOut {
         scores: core::array::from_fn(|m| of(m, &all)),
         controls: Vec::new(),
         before_onset: (!early.is_empty()).then(|| [of(0, &early), of(2, &early)]),
         resamples,
         counted: counted(maps),
-        shows: shows(&windows, drives.len(), |d| learned[d].effects.iter().map(|e| e.onset_s).collect()),
+        shows: shows(&windows, drives.len(), |d| &learned[d].effects),
     })
 }
 
@@ -132,21 +136,13 @@ pub fn score_models(
     Ok(score(&ModelPaths { name: ModelName::Nesam, parameters, paths }, windows, Truth::Measured, resamples))
 }
 
-/// Whether each of some drives has a window that ends after an effect of it has begun, or no effect at all.
-pub(crate) fn shows(windows: &[Window<'_>], drives: usize, onsets_s: impl Fn(usize) -> Vec<f64>) -> Vec<bool> {
-    let of = |d: usize| {
-        let first_s = onsets_s(d).into_iter().min_by(f64::total_cmp);
-        first_s.is_none_or(|first_s| windows.iter().any(|w| w.drive == d && end_s(w) >= first_s))
-    };
-    (0..drives).map(of).collect()
+/// Whether each of some drives has a window that does not end before all effects learned for it begin.
+pub(crate) fn shows<'a>(windows: &[Window<'_>], drives: usize, effects: impl Fn(usize) -> &'a [ScheduledEffect]) -> Vec<bool> {
+    (0..drives).map(|d| windows.iter().any(|w| w.drive == d && !ends_before_onset(w, effects(d)))).collect()
 }
 
-/// When a window ends, s since the start of the log.
-fn end_s(window: &Window<'_>) -> f64 {
-    window.since_log_start_s() + window.horizon as f64 * window.trajectory.dt_s
-}
-
-/// Whether a window ends before any of the learned effects begins.
-fn ends_before_onset(window: &Window<'_>, learned: &Learned) -> bool {
-    !learned.effects.is_empty() && learned.effects.iter().all(|e| e.onset_s > end_s(window))
+/// Whether a window ends before any of some effects begins.
+fn ends_before_onset(window: &Window<'_>, effects: &[ScheduledEffect]) -> bool {
+    let end_s = window.since_log_start_s() + window.horizon as f64 * window.trajectory.dt_s;
+    !effects.is_empty() && effects.iter().all(|e| e.onset_s > end_s)
 }

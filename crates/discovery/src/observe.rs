@@ -9,7 +9,7 @@ use std::sync::Arc;
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Transition};
 use nesam_physics::driveline::{DrivelineState, command_wheels, rim_twist};
-use nesam_physics::effects::{Effect, ScheduledEffect};
+use nesam_physics::effects::{Phases, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel, StepOutput};
 use nesam_physics::{Ride, SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, UsualRide, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
@@ -69,6 +69,13 @@ pub struct Bench<'a> {
     pub stepping: Stepping,
     /// All hypotheses.
     pub catalogue: &'a [Candidate],
+}
+
+impl Bench<'_> {
+    /// Physics of the vehicle in each phase of a drive in which effects begin.
+    fn phases(&self, effects: &[ScheduledEffect]) -> Phases<StepModel> {
+        Phases::of(effects, |begun| self.stepping.model(&self.vehicle.with_effects(begun)))
+    }
 }
 
 /// A measured drive, prepared: nothing of it depends on an effect or a soil correction.
@@ -295,27 +302,17 @@ impl ObservedDrive {
 
     /// What the drive says to a model with all of these effects. Actuators remember: before an effect begins they are those of a vehicle without it.
     fn reading(&self, bench: &Bench<'_>, effects: &[ScheduledEffect]) -> Reading {
-        let mut onsets_s: Vec<f64> = effects.iter().map(|e| e.onset_s).filter(|onset_s| *onset_s > 0.0).collect();
-        onsets_s.sort_by(f64::total_cmp);
-        onsets_s.dedup();
-        let vehicle_at = |time_s: f64| {
-            let begun: Vec<Effect> = effects.iter().filter(|e| e.onset_s <= time_s).map(|e| e.effect).collect();
-            bench.vehicle.with_effects(&begun)
-        };
-        // Phases of the drive from the first on, each with its model.
-        let phases: Vec<StepModel> =
-            std::iter::once(0.0).chain(onsets_s.iter().copied()).map(|from_s| bench.stepping.model(&vehicle_at(from_s))).collect();
-        let model = phases.last().expect("there is a first phase; this is a bug").clone();
+        let phases = bench.phases(effects);
+        let model = phases.last().clone();
         let states = model.vehicle().effects.sensor.to_true_along(&self.states, bench.stepping.dt_s);
-        let mut now = self.first_actuators(phases[0].vehicle(), &states[0]);
+        let mut now = self.first_actuators(phases.at(Some(0.0)).vehicle(), &states[0]);
         let actuators = self
             .transitions
             .iter()
             .zip(states.windows(2))
             .enumerate()
             .map(|(k, (transition, states))| {
-                let begun = onsets_s.iter().filter(|onset_s| **onset_s <= k as f64 * bench.stepping.dt_s).count();
-                let model = &phases[begun];
+                let model = phases.at(Some(k as f64 * bench.stepping.dt_s));
                 let after = now.advance(model.vehicle(), &transition.control, states[0].velocity_m_s[0], model.dt_s());
                 let pair = [now, after];
                 now = model.observed_actuators(&after, &transition.control, &states[0], &states[1], model.dt_s());
@@ -343,14 +340,11 @@ impl ObservedDrive {
     pub fn driven_again(&self, bench: &Bench<'_>, effects: &[ScheduledEffect], drive: &mut Trajectory) {
         let dt_s = bench.stepping.dt_s;
         let plain = self.reading(bench, &[]);
-        let on: Vec<Effect> = effects.iter().map(|e| e.effect).collect();
-        let onset_s = effects.iter().map(|e| e.onset_s).fold(0.0, f64::max);
-        let vehicle = bench.vehicle.with_effects(&on);
-        let changed = bench.stepping.model(&vehicle);
+        let phases = bench.phases(effects);
         let mut actuators = plain.actuators[0][0];
         let mut state = self.states[0];
         for (k, transition) in self.transitions.iter().enumerate() {
-            let model = if k as f64 * dt_s >= onset_s { &changed } else { &plain.model };
+            let model = phases.at(Some(k as f64 * dt_s));
             let recorded = self.stepped(&plain.model, k, dt_s, &self.states[k], &plain.actuators[k]);
             let after = actuators.advance(model.vehicle(), &transition.control, state.velocity_m_s[0], dt_s);
             let driven = self.stepped(model, k, dt_s, &state, &[actuators, after]);

@@ -147,7 +147,7 @@ impl Trial<'_> {
             score_models(&windows, self.maps, &models, 0, &resamples)
         };
         let (before, after) = (scored(without)?, scored(with)?);
-        let shows = shows(&windows, self.drives.len(), |_| with.iter().map(|e| e.onset_s).collect());
+        let shows = shows(&windows, self.drives.len(), |_| with);
         if !sensors_tell && !falls_surely(&before, &after, 0.0, counted, &resamples, &shows) {
             return Ok(Some("no error of predictions of the fitted drives falls surely with it".into()));
         }

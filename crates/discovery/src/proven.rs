@@ -66,12 +66,7 @@ pub(crate) fn prove(
         let learned = learn(fewer, case, &judgement, options, drives.len());
         let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
         let needless = match &scores {
-            Some(scores) => {
-                let without = |hypothesis| -> Result<_, EvaluationError> {
-                    Ok((held.without(hypothesis, &learned, scores)?, held.shows(hypothesis, &learned)?))
-                };
-                last_needless(&judgement, scores, without)?
-            }
+            Some(scores) => last_needless(&judgement, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
             None => None,
         };
         let Some(i) = needless else {
@@ -100,18 +95,13 @@ impl HeldDrives<'_> {
         before.fall_surely(&after, GAIN_ON_TRIAL, &scores.resamples)
     }
 
-    /// Whether a hypothesis shows in each of the drives, as far as it was learned for it.
-    fn shows(&self, hypothesis: usize, learned: &[Learned]) -> Result<Vec<bool>, EvaluationError> {
+    /// Score of the drives with what was learned but for a hypothesis, and in which of them that one shows.
+    fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<(ModelScore, Vec<bool>), EvaluationError> {
+        let apart: Vec<_> = learned.iter().map(|l| l.apart(hypothesis)).collect();
+        let predictors: Vec<Predictor> = apart.iter().map(|[others, _]| self.predictor.with_effects(others)).collect();
+        let score = self.score(&predictors, scores.scores[2].parameters, &scores.resamples)?;
         let windows = self.options.scoring.windows(self.drives)?;
-        let onset_s =
-            |l: &Learned| l.effects.iter().zip(&l.hypotheses).filter(|(_, h)| **h == hypothesis).map(|(e, _)| e.onset_s).collect();
-        Ok(shows(&windows, self.drives.len(), |d| onset_s(&learned[d])))
-    }
-
-    /// Score of the drives with what was learned but for a hypothesis.
-    fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<ModelScore, EvaluationError> {
-        let predictors: Vec<Predictor> = learned.iter().map(|l| self.predictor.with_effects(&l.without(hypothesis))).collect();
-        self.score(&predictors, scores.scores[2].parameters, &scores.resamples)
+        Ok((score, shows(&windows, self.drives.len(), |d| &apart[d][1])))
     }
 }
 

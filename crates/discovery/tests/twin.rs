@@ -7,9 +7,10 @@ mod common;
 use common::{bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_twin, drive, drive_from, options, plough, rover, world};
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
-use nesam_discovery::{Against, Bench, Diagnosis, Judge, Stepping, Verdict, observe, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Judge, ObservedDrive, Stepping, Verdict, observe, observe_all};
 use nesam_model::ModelBundle;
 use nesam_physics::effects::*;
+use nesam_trajectories::Trajectory;
 
 fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
     let e = found.estimates.iter().find(|e| e.name == name).unwrap();
@@ -245,13 +246,19 @@ fn property_one_drive_left_out_proves_nothing_and_the_reason_says_so() {
     assert_ne!(json["after"], json["before"], "the effect that was not proven was tried");
 }
 
+/// A drive without an effect, prepared, with its bundle.
+fn observed_drive(id: &str) -> (ModelBundle, Trajectory, ObservedDrive) {
+    let bundle = bundle();
+    let recorded = drive(id, 42, &[], &bundle.default_soil);
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
+    let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
+    (bundle, recorded, observed)
+}
+
 #[test]
 fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
-    let bundle = bundle();
-    let recorded = drive("again", 42, &[], &bundle.default_soil);
-    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
+    let (bundle, recorded, observed) = observed_drive("again");
     let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &[] };
-    let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
     let mut again = recorded.clone();
     observed.driven_again(&bench, &[], &mut again);
     for (a, b) in recorded.states.iter().zip(&again.states) {
@@ -270,11 +277,8 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
 /// as without it, the first one after it begins with wheels that followed at once, and later ones cannot tell.
 #[test]
 fn property_before_an_effect_begins_actuators_are_those_without_it() {
-    let bundle = bundle();
-    let recorded = drive("lag", 42, &[], &bundle.default_soil);
-    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
+    let (bundle, _, observed) = observed_drive("lag");
     let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &[] };
-    let observed = observe(&predictor, &recorded, Some(&world())).unwrap();
     let times_s = observed.times_s(bench.stepping.dt_s);
     let lag = Effect::SteeringLag(SteeringLag { seconds: 0.3 });
     let rows = |effects: &[ScheduledEffect]| observed.deviations(&bench, effects, &nesam_physics::SoilCorrection::NONE);

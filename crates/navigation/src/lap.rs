@@ -107,8 +107,7 @@ pub struct Lap {
     pub velocity_mismatch_m_s: Option<f64>,
     /// x, y driven, every 0.2 s, m.
     pub path: Vec<[f64; 2]>,
-    /// How the vehicle leant, every 0.1 s; empty in laps that were kept by an earlier program.
-    #[serde(default)]
+    /// How the vehicle leant, every 0.1 s.
     pub lean: Vec<Lean>,
 }
 
@@ -125,11 +124,16 @@ pub struct Lean {
 
 impl Lap {
     /// Mean of an angle over the first part of the lap, from its beginning to where the vehicle first came to `progress`: what two laps, of which one ends
-    /// earlier, are compared by, since ground that one never came to says nothing of how the other drives. `None` where the lap does not tell how it leant.
-    pub fn mean_lean_until(&self, progress: f64, of: fn(&Lean) -> f64) -> Option<f64> {
+    /// earlier, are compared by, since ground that one never came to says nothing of how the other drives.
+    pub fn mean_lean_until(&self, progress: f64, of: fn(&Lean) -> f64) -> f64 {
         let steps = self.lean.iter().position(|lean| lean.progress >= progress).map_or(self.lean.len(), |first| first + 1);
-        (steps > 0).then(|| self.lean[..steps].iter().map(of).sum::<f64>() / steps as f64)
+        mean_lean(&self.lean[..steps], of)
     }
+}
+
+/// Mean of an angle; 0 of no step.
+fn mean_lean(lean: &[Lean], of: fn(&Lean) -> f64) -> f64 {
+    lean.iter().map(of).sum::<f64>() / lean.len().max(1) as f64
 }
 
 /// Drives a lap.
@@ -342,8 +346,8 @@ impl Track {
             progress: self.progress(plan).clamp(0.0, 1.0),
             hausdorff_m: hausdorff_m(&self.positions, &part),
             off_path_mean_m: self.off_path_sum_m / steps,
-            roll_deg: self.lean.iter().map(|lean| lean.roll_deg).sum::<f64>() / steps,
-            pitch_deg: self.lean.iter().map(|lean| lean.pitch_deg).sum::<f64>() / steps,
+            roll_deg: mean_lean(&self.lean, |lean| lean.roll_deg),
+            pitch_deg: mean_lean(&self.lean, |lean| lean.pitch_deg),
             measurements: BTreeMap::new(),
             soil_delta: None,
             scored: self.scored,

@@ -51,11 +51,11 @@ const COMPARED: [(&str, fn(&Lap, f64) -> f64); 4] = [
 ];
 
 fn roll_deg(lap: &Lap, progress: f64) -> f64 {
-    lap.mean_lean_until(progress, |lean| lean.roll_deg).unwrap_or(lap.roll_deg)
+    lap.mean_lean_until(progress, |lean| lean.roll_deg)
 }
 
 fn pitch_deg(lap: &Lap, progress: f64) -> f64 {
-    lap.mean_lean_until(progress, |lean| lean.pitch_deg).unwrap_or(lap.pitch_deg)
+    lap.mean_lean_until(progress, |lean| lean.pitch_deg)
 }
 
 /// All runs of a command.

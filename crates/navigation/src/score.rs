@@ -220,7 +220,7 @@ pub(crate) mod tests {
             run
         };
         let runs = vec![lap("fixed", 5), lap("adapted", 10)];
-        let roll = |lap: &Lap, progress: f64| lap.mean_lean_until(progress, |lean| lean.roll_deg).unwrap();
+        let roll = |lap: &Lap, progress: f64| lap.mean_lean_until(progress, |lean| lean.roll_deg);
         assert!((roll(&runs[1].lap, 1.0) - 5.0).abs() < 1e-12);
         assert!((ratio(&runs, "adapted", "fixed", None, roll).unwrap().ratio - 1.0).abs() < 1e-12);
     }

@@ -28,17 +28,22 @@ pub struct Phases<M> {
 impl<M> Phases<M> {
     /// Prepares each phase of a vehicle. `vehicle` has all effects begun; where every effect acts always, it is taken as it is.
     pub fn new(vehicle: &Vehicle, effects: &[ScheduledEffect], prepare: impl Fn(&Vehicle) -> M) -> Self {
-        let mut onsets: Vec<f64> = effects.iter().map(|e| e.onset_s).filter(|onset| *onset > 0.0).collect();
-        if onsets.is_empty() {
+        if effects.iter().all(|e| e.onset_s <= 0.0) {
             return Self { phases: vec![(0.0, prepare(vehicle))] };
         }
+        let bare = Vehicle { effects: Default::default(), ..vehicle.clone() };
+        Self::of(effects, |begun| prepare(&bare.with_effects(begun)))
+    }
+
+    /// Prepares each phase from the effects that have begun in it.
+    pub fn of(effects: &[ScheduledEffect], prepare: impl Fn(&[Effect]) -> M) -> Self {
+        let mut onsets: Vec<f64> = effects.iter().map(|e| e.onset_s).filter(|onset| *onset > 0.0).collect();
         onsets.push(0.0);
         onsets.sort_by(f64::total_cmp);
         onsets.dedup();
-        let bare = Vehicle { effects: Default::default(), ..vehicle.clone() };
         let phase = |from: f64| {
             let begun: Vec<Effect> = effects.iter().filter(|e| e.onset_s <= from).map(|e| e.effect).collect();
-            (from, prepare(&bare.with_effects(&begun)))
+            (from, prepare(&begun))
         };
         Self { phases: onsets.into_iter().map(phase).collect() }
     }
