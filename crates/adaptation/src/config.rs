@@ -83,6 +83,9 @@ pub struct FilterConfig {
     /// Beyond Algorithm 1: probability, before a buffer is looked at, that the ground has changed since the last one to something that nothing learned tells of; 0 =
     /// never. A buffer that fits P₀ better than P⁻ then moves P⁻ towards P₀, as far as it is likely that the ground has changed.
     pub change_probability: f64,
+    /// Beyond Algorithm 1: how much the ground varies about the prior where it is what it looks like, as a share of the filter's own variance, above 0 and at most 1. The
+    /// covariance that goes out is the average of that and of the filter's own, each with its probability; 1 = the filter's own. Smaller: narrower bands on usual ground.
+    pub looks_share: f64,
     /// A buffer whose NIS would be exceeded with less than this probability is rejected. 0 accepts everything.
     pub gate_tail_probability: f64,
     /// Beyond Algorithm 1: times that one buffer is linearised at most, 1 to 10 (Gauss-Newton on the same posterior; 1 = once, at Δθ⁻). Soil acts
@@ -119,6 +122,7 @@ impl Default for FilterConfig {
             trust_memory: 10.0,
             trust_log_odds: -3.0,
             change_probability: 0.0,
+            looks_share: 1.0,
             gate_tail_probability: 1e-9,
             linearisations: 4,
             bounded: true,
@@ -189,6 +193,9 @@ impl FilterConfig {
             if !(memory == 0.0 || memory.is_finite() && memory >= 1.0) {
                 return fail(setting, format!("is {memory}, it must be 0 (off) or at least 1 buffer"));
             }
+        }
+        if !(self.looks_share > 0.0 && self.looks_share <= 1.0) {
+            return fail("looks_share", format!("is {}, it must lie in (0, 1]", self.looks_share));
         }
         if !self.trust_log_odds.is_finite() {
             return fail("trust_log_odds", format!("is {}, it must be finite", self.trust_log_odds));

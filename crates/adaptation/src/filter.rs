@@ -20,6 +20,8 @@ pub use snapshot::{ClassBelief, FilterSnapshot, JointSnapshot};
 const LEARNED_SHARE: f64 = 0.5;
 /// Weight of the correction above which what was learned counts as such: it is more likely right than the prior alone.
 const LEARNED_TRUST: f64 = 0.5;
+/// Most that the covariance that goes out is widened by for errors of the model: twice the standard deviation (chosen, ADR 0068).
+const WIDENED_MAX: f64 = 4.0;
 /// Share of the prior standard deviation below which another linearisation would change nothing: each move is about a tenth of the one before, so what is left
 /// is a thousandth.
 const CONVERGED_SHARE: f64 = 1e-2;
@@ -29,9 +31,9 @@ const CONVERGED_SHARE: f64 = 1e-2;
 pub struct SoilPosterior {
     /// Δθ⁺.
     pub correction: SoilCorrection,
-    /// P⁺, in the coordinates of the correction.
+    /// How sure it is, in the coordinates of the correction: see [`SoilFilter::posterior`].
     pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
-    /// Whether the drive has told much of each parameter: its variance is below half of the prior one, and the correction is trusted more than the prior
+    /// Whether the drive has told much of each parameter: the filter's own variance is below half of the prior one, and the correction is trusted more than the prior
     /// alone. Where it is false, a consumer should say "not learned" instead of a number; k_phi and k_c for instance act through one sum on a vehicle of
     /// one wheel width. A correction can be right all the same: where the ground may change unannounced, variances seldom stay so small.
     pub learned: [bool; SOIL_DIM],
@@ -121,7 +123,9 @@ impl SoilFilter {
     }
 
     /// The present estimate of the ground under the newest transition as it should be used: the average over "the ground is what it looks like" and "it is what
-    /// was learned", each with its probability, and the covariance of that mixture. Without trust ([`FilterConfig::trust_memory`] = 0) it is Δθ⁺ and P⁺.
+    /// was learned", each with its probability, and the covariance of that mixture, wider by the factor on R_B of this drive as far as that is above 1: where the model
+    /// errs more than R_B says, the one correction that it learns says less of the ground under the vehicle. Without trust and scale
+    /// ([`FilterConfig::trust_memory`] = [`FilterConfig::scale_memory`] = 0) it is Δθ⁺ and P⁺.
     pub fn posterior(&self) -> SoilPosterior {
         self.posterior_of(self.here)
     }
@@ -132,11 +136,14 @@ impl SoilFilter {
         let weight = self.trust.weight();
         let mut correction = correction_of(&self.state.soils(), class, &self.config);
         let delta = SVector::<f64, SOIL_DIM>::from(correction.delta);
-        let p = self.state.soil_covariance(class) + delta * delta.transpose() * (weight * (1.0 - weight));
+        let (own, between) = (self.state.soil_covariance(class), delta * delta.transpose() * (weight * (1.0 - weight)));
+        let p = own + between;
+        let within = weight + (1.0 - weight) * self.config.looks_share;
+        let told = own * (within * self.scale.value().clamp(1.0, WIDENED_MAX)) + between;
         correction.delta = correction.delta.map(|d| weight * d);
         SoilPosterior {
             correction,
-            covariance: core::array::from_fn(|r| core::array::from_fn(|c| p[(r, c)])),
+            covariance: core::array::from_fn(|r| core::array::from_fn(|c| told[(r, c)])),
             learned: core::array::from_fn(|i| weight > LEARNED_TRUST && p[(i, i)] < LEARNED_SHARE * self.config.prior_sd[i].powi(2)),
         }
     }

@@ -78,6 +78,9 @@ pub struct FilterSettings {
     /// Probability, before a buffer, that the ground has changed.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub change_probability: Option<f64>,
+    /// Variance where the ground is what it looks like, as a share of the filter's own.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub looks_share: Option<f64>,
     /// Tail probability below which a buffer is rejected.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub gate_tail_probability: Option<f64>,
@@ -140,6 +143,7 @@ impl FilterSettings {
             trust_log_odds: Some(config.trust_log_odds),
             noise,
             change_probability: Some(config.change_probability),
+            looks_share: Some(config.looks_share),
             gate_tail_probability: Some(config.gate_tail_probability),
             linearisations: Some(config.linearisations),
             bounded: Some(config.bounded),
@@ -190,6 +194,7 @@ impl FilterSettings {
             trust_memory: self.trust_memory.unwrap_or(base.trust_memory),
             trust_log_odds: self.trust_log_odds.unwrap_or(base.trust_log_odds),
             change_probability: self.change_probability.unwrap_or(base.change_probability),
+            looks_share: self.looks_share.unwrap_or(base.looks_share),
             gate_tail_probability: self.gate_tail_probability.unwrap_or(base.gate_tail_probability),
             linearisations: self.linearisations.unwrap_or(base.linearisations),
             bounded: self.bounded.unwrap_or(base.bounded),

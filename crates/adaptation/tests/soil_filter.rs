@@ -245,6 +245,8 @@ fn property_unusable_settings_are_refused_by_name() {
     assert_eq!(refused(FilterConfig { process_sd: [f64::NAN; 6], ..base() }), "process_sd");
     assert_eq!(refused(FilterConfig { gate_tail_probability: 1.0, ..base() }), "gate_tail_probability");
     assert_eq!(refused(FilterConfig { change_probability: 1.0, ..base() }), "change_probability");
+    assert_eq!(refused(FilterConfig { looks_share: 0.0, ..base() }), "looks_share");
+    assert_eq!(refused(FilterConfig { looks_share: 1.5, ..base() }), "looks_share");
     assert_eq!(refused(FilterConfig { block: 3, ..base() }), "block");
     assert_eq!(refused(FilterConfig { shared_buffers: 0.5, ..base() }), "shared_buffers");
     assert_eq!(refused(FilterConfig { caution: [1.0, 1.0, 0.5, 1.0, 1.0, 1.0], ..base() }), "caution");
@@ -311,6 +313,36 @@ fn property_a_correction_is_used_where_it_helps_and_not_where_the_prior_is_right
         assert!(loam.trust < 0.3, "seed {seed}: {}", loam.trust);
         let learned = [soft, loam].map(|update| update.posterior.learned);
         assert!(learned[0].contains(&true) && !learned[1].contains(&true), "seed {seed}: {learned:?}");
+    }
+}
+
+/// Goal: the covariance that goes out is that of the mixture, wider where the model errs more than it should. Method: a filter before any drive, and after one whose noise is
+/// five times what it was told, against its own covariance, trust and scale.
+#[test]
+fn analytic_the_band_that_goes_out_follows_trust_and_scale() {
+    let model = model();
+    let told = VelocityNoise::white(0.2 * NOISE[0], 0.2 * NOISE[1]).into();
+    let config = FilterConfig {
+        noise: told,
+        scale_memory: 5.0,
+        trust_memory: 10.0,
+        trust_log_odds: -4.0,
+        looks_share: 0.65,
+        ..config(SoilCoordinates::Logarithmic)
+    };
+    let fresh = SoilFilter::new(config.clone()).unwrap();
+    let weight = 1.0 / (1.0 + 4.0_f64.exp());
+    let (own, out) = (fresh.covariance(), fresh.posterior().covariance);
+    for i in 0..6 {
+        assert!((out[i][i] / own[(i, i)] - (weight + (1.0 - weight) * 0.65)).abs() < 1e-12);
+    }
+    let (filter, updates) = run(config, &model, &twin(&model, LOAM, LOAM, 200, 1));
+    let (own, posterior, weight) = (filter.covariance(), filter.posterior(), updates.last().unwrap().trust);
+    assert!(filter.snapshot().noise_scale > 4.0, "widened by four at most");
+    for i in 0..6 {
+        let between = weight * (1.0 - weight) * filter.estimate().delta[i].powi(2);
+        let expected = 4.0 * (weight + (1.0 - weight) * 0.65) * own[(i, i)] + between;
+        assert!((posterior.covariance[i][i] / expected - 1.0).abs() < 1e-12, "{i}");
     }
 }
 

@@ -94,6 +94,8 @@ const CAUTION: [f64; 6] = [1.0, 1.0, 3.0, 3.0, 3.0, 1.0];
 
 /// How likely it thinks that the ground has changed before each buffer of a second: one change in ten seconds (chosen on the same and on twins, ADR 0059).
 const CHANGE_PROBABILITY: f64 = 0.1;
+/// How much the ground varies about the prior where it is what it looks like, of what the filter allows for (chosen on the same, ADR 0068).
+const LOOKS_SHARE: f64 = 0.65;
 /// Buffers over which it scales R_B to the drive, and its log odds that a correction helps before any evidence (chosen with that).
 const SCALE_MEMORY: f64 = 3.0;
 const TRUST_LOG_ODDS: f64 = -4.0;
@@ -285,6 +287,7 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     given.process_sd.get_or_insert(FilterConfig::process_sd_of(&prior_sd));
     given.caution.get_or_insert(CAUTION);
     given.change_probability.get_or_insert(CHANGE_PROBABILITY);
+    given.looks_share.get_or_insert(LOOKS_SHARE);
     given.scale_memory.get_or_insert(SCALE_MEMORY);
     given.trust_log_odds.get_or_insert(TRUST_LOG_ODDS);
     if !args.follow_errors {
