@@ -15,7 +15,7 @@ use crate::evidence::Group;
 use crate::fit::{Fit, Prepared, Start, Term, fit};
 use crate::metric::Metric;
 use crate::observe::Bench;
-use crate::onset::Onset;
+use crate::onset::{Onset, PossibleOnset};
 use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick, mismatch};
 use crate::settled::Settled;
 
@@ -79,12 +79,27 @@ pub struct Finding {
     pub estimates: Vec<Estimate>,
     /// When it began; `None` = there from the start.
     pub onset: Option<Onset>,
+    /// When it may have begun, s, where drives speak for an onset and do not decide; the interval of its size allows for that.
+    pub may_have_begun_s: Option<f64>,
     /// Rivals within the criterion, closest first.
     pub rivals: Vec<Member>,
     /// Why it is not claimed.
     pub refused: Option<String>,
     /// Whether that is for its size, which lies at the end of its range or is hardly known.
     pub refused_for_size: bool,
+}
+
+impl Finding {
+    /// Lets the interval of a size hold what it would be with an onset that is possible; of an effect of several parameters, which have no common factor, it says only
+    /// when.
+    fn allow_for(&mut self, possible: PossibleOnset) {
+        self.may_have_begun_s = Some(possible.at_s);
+        let (candidate, [least, most]) = (self.candidate, possible.factor);
+        let Some(parameter) = candidate.free().first().map(|f| f.parameter).filter(|_| candidate.unit().is_some()) else { return };
+        let Some([low, high]) = self.estimates.get_mut(parameter).and_then(|e| e.ci95.as_mut()) else { return };
+        let with = [*low * least, *low * most, *high * least, *high * most];
+        (*low, *high) = with.iter().fold((*low, *high), |(low, high), v| (low.min(*v), high.max(*v)));
+    }
 }
 
 /// Course of a channel over the drives.
@@ -99,7 +114,7 @@ pub struct Trace {
 }
 
 /// A set of drives, ready to be judged.
-#[derive(Debug)]
+#[derive(Clone, Debug)]
 pub struct Case<'a> {
     /// Reference.
     pub bench: Bench<'a>,
@@ -186,6 +201,7 @@ impl Case<'_> {
                     stability: self.stability(yardstick, candidate, &rivals, settled.get(i).and_then(Option::as_ref)),
                     estimates: estimates(&group, fit, i),
                     onset: onsets[hypothesis],
+                    may_have_begun_s: None,
                     rivals,
                     refused: None,
                     refused_for_size: false,
@@ -194,6 +210,9 @@ impl Case<'_> {
                 if let Some((why, for_size)) = refusal(&group, &finding, fit, i).or(changed) {
                     let by_drive = if for_size { self.by_drive(candidate) } else { String::new() };
                     (finding.refused, finding.refused_for_size) = (Some(format!("{why}{by_drive}")), for_size);
+                }
+                if let Some(possible) = self.possible_onset(hypothesis).filter(|_| finding.onset.is_none()) {
+                    finding.allow_for(possible);
                 }
                 finding
             })
@@ -383,11 +402,38 @@ mod tests {
             stability: 1.0,
             estimates: vec![Estimate { name: "fraction", unit: "-", value: 0.95, ci95: Some([0.95 - half, 0.95 + half]) }],
             onset: None,
+            may_have_begun_s: None,
             rivals: Vec::new(),
             refused: None,
             refused_for_size: false,
         };
         refusal(&group, &finding, &fit, 0)
+    }
+
+    /// Goal: the interval of a size holds what it would be with an onset that is possible. Method: a gain of 0.05 [0.02, 0.08] that is 1.5 to 1.8 times as large if it began midway.
+    #[test]
+    fn analytic_an_interval_allows_for_an_onset_that_is_possible() {
+        let catalogue = catalogue(&[]);
+        let hypothesis = catalogue.iter().position(|c| c.id() == "speed_gain").unwrap();
+        let mut finding = Finding {
+            hypothesis,
+            candidate: catalogue[hypothesis],
+            weight: 1.0,
+            z: 9.0,
+            alone: 9.0,
+            delta_bic: 81.0,
+            stability: 1.0,
+            estimates: vec![Estimate { name: "relative", unit: "-", value: 0.05, ci95: Some([0.02, 0.08]) }],
+            onset: None,
+            may_have_begun_s: None,
+            rivals: Vec::new(),
+            refused: None,
+            refused_for_size: false,
+        };
+        finding.allow_for(PossibleOnset { at_s: 8.8, factor: [1.5, 1.8] });
+        let [low, high] = finding.estimates[0].ci95.unwrap();
+        assert!((low - 0.02).abs() < 1e-12 && (high - 0.144).abs() < 1e-12);
+        assert_eq!(finding.may_have_begun_s, Some(8.8));
     }
 
     /// A torque that is whole is a fraction of 1: 0.95 takes 0.05 of it away, and 0.5 is ten times that.

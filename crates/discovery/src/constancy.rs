@@ -96,7 +96,8 @@ impl Case<'_> {
                 }
             })
             .collect();
-        let share_min = mismatch(yardstick.catalogue[hypothesis].layer());
-        change(&self.metric, &drives, dt_s, dispersion(yardstick, hypothesis), share_min)
+        // What of an answer may be wrong is a share of what it explains, which goes with the square of its size.
+        let share_min = mismatch(yardstick.catalogue[hypothesis].layer()).sqrt();
+        change(&self.metric, &drives, dispersion(yardstick, hypothesis), share_min)
     }
 }

@@ -12,7 +12,7 @@ use crate::channels::Row;
 use crate::claims::Case;
 use crate::condense::{Signatures, condense};
 use crate::evidence::Group;
-use crate::onset::{self, Course, DISPERSION_MIN, Onset};
+use crate::onset::{self, Course, DISPERSION_MIN, Dated, Onset, PossibleOnset};
 use crate::select::{DECISIVE, Selection, Yardstick, without};
 
 /// Most times that effects are dated and chosen again (chosen).
@@ -28,6 +28,8 @@ type Acting = Vec<(usize, Option<f64>)>;
 pub(crate) struct Dating {
     /// Onset of each hypothesis, from which on its columns are there.
     onsets: Vec<Option<Onset>>,
+    /// Onset of each hypothesis that may have one, which its columns do not have.
+    possible: Vec<Option<PossibleOnset>>,
     /// What each hypothesis was last dated beside; `None` = it was not dated.
     beside: Vec<Option<Acting>>,
     /// The whole of each column that begins midway, by drive.
@@ -36,7 +38,12 @@ pub(crate) struct Dating {
 
 impl Dating {
     fn none(hypotheses: usize, drives: usize) -> Self {
-        Self { onsets: vec![None; hypotheses], beside: vec![None; hypotheses], whole: vec![BTreeMap::new(); drives] }
+        Self {
+            onsets: vec![None; hypotheses],
+            possible: vec![None; hypotheses],
+            beside: vec![None; hypotheses],
+            whole: vec![BTreeMap::new(); drives],
+        }
     }
 
     /// Onsets of those of some hypotheses that have one.
@@ -74,8 +81,10 @@ impl Case<'_> {
                 if dating.beside[hypothesis].as_ref() == Some(&acting) {
                     continue;
                 }
-                let onset = self.date(yardstick, &group, &dating, hypothesis, &beside);
+                let dated = self.date(yardstick, &group, &dating, hypothesis, &beside);
+                let onset = dated.onset();
                 dating.beside[hypothesis] = Some(acting);
+                dating.possible[hypothesis] = dated.possible();
                 let before = std::mem::replace(&mut dating.onsets[hypothesis], onset);
                 if before.map(|o| o.at_s) != onset.map(|o| o.at_s) {
                     self.begin(yardstick, &mut dating, hypothesis);
@@ -95,11 +104,16 @@ impl Case<'_> {
         (selection, onsets)
     }
 
-    /// Onset of a hypothesis that acts beside others, each from its own onset on.
-    fn date(&self, yardstick: &Yardstick, group: &Group, dating: &Dating, hypothesis: usize, beside: &[usize]) -> Option<Onset> {
+    /// When a hypothesis may have begun as far as that was looked for and is not decided.
+    pub(crate) fn possible_onset(&self, hypothesis: usize) -> Option<PossibleOnset> {
+        self.dating.as_ref().and_then(|dating| dating.possible[hypothesis])
+    }
+
+    /// When a hypothesis began that acts beside others, each from its own onset on.
+    fn date(&self, yardstick: &Yardstick, group: &Group, dating: &Dating, hypothesis: usize, beside: &[usize]) -> Dated {
         let dt_s = self.bench.stepping.dt_s;
         let (columns, others) = (yardstick.catalogue[hypothesis].columns(), yardstick.columns(beside));
-        let shares = group.remainder(&others, &columns, 0.0).shares;
+        let shares = group.remainder(&others, &columns).shares;
         let drives: Vec<Course<'_>> = self
             .prepared
             .iter()

@@ -11,13 +11,13 @@ use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::Condensed;
 use crate::controls::{Kind, NullDrives, Setting};
 use crate::error::DiscoveryError;
-use crate::held_out::{HeldOut, Learned, Scoring};
+use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
 use crate::judge::{Judge, case_of, own_yardstick};
 use crate::judgement::{Verdict, judge};
 use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
 use crate::own_reference;
 use crate::proof::Trial;
-use crate::proven::{HeldDrives, Proven, keep, prove};
+use crate::proven::{HeldDrives, Proven, keep, learned_by_all, prove, said_by_others};
 use crate::pursuit::{Pursued, pursue};
 use crate::select::{EFFECTS_MAX, Selection};
 
@@ -146,22 +146,36 @@ pub fn diagnose(
     progress("hypotheses", 0, 1);
     let judgement = judge(&mut case, &yardstick).with_refused(refused);
     let fewer = match &judge_by {
-        Some(judge_by) if options.fit_on.is_none() && total > 1 => {
-            Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?)
-        }
+        Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
         _ => None,
     };
+    // What is claimed by a reference follows from the fitted drives alone, others only say what comes of it. A model on trial is proven on others where there are some.
     let held_at: Vec<usize> = match options.fit_on {
         Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
-        None if total > 1 => (0..drives.len()).collect(),
+        None if total > 1 => fit_at.clone(),
         None => Vec::new(),
     };
     let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
     let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
     progress("held-out windows", 0, held.len());
-    let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options };
-    let Proven { mut judgement, learned, mut scores, verdict, reason } =
-        prove(&case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &held_drives)?;
+    let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
+    let apart = options.fit_on.is_some() && judge_by.is_some();
+    let proving = if apart && total > 1 {
+        HeldDrives { drives: &fit_drives, maps: &fit_maps, fitted: true, ..held_drives }
+    } else if apart {
+        HeldDrives { drives: &[], ..held_drives }
+    } else {
+        held_drives
+    };
+    let Proven { mut judgement, mut learned, mut scores, verdict, mut reason } =
+        prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
+    if apart {
+        learned = vec![learned_by_all(&case, &judgement); held.len()];
+        scores = if held.is_empty() { None } else { Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?) };
+        if let Some(scores) = scores.as_ref().filter(|_| verdict.claims()) {
+            reason += &said_by_others(&judgement, scores);
+        }
+    }
     let any = verdict.claims();
     if !any {
         for finding in judgement.findings.iter_mut().filter(|f| f.refused.is_none()) {

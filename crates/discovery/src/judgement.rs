@@ -320,6 +320,7 @@ mod tests {
                 stability: 1.0,
                 estimates: Vec::new(),
                 onset: None,
+                may_have_begun_s: None,
                 rivals: Vec::new(),
                 refused: Some(format!("{id} does not help")),
                 refused_for_size: false,

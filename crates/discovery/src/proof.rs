@@ -101,7 +101,13 @@ fn counting<T>(errors: impl Iterator<Item = T>, counted: Counted) -> impl Iterat
 }
 
 /// The first error that counts and surely rises, and by more than is negligible: its name, where from, by how much.
-fn rises_surely(before: &ModelScore, after: &ModelScore, counted: Counted, resamples: &Resamples, shows: &[bool]) -> Option<[String; 3]> {
+pub(crate) fn rises_surely(
+    before: &ModelScore,
+    after: &ModelScore,
+    counted: Counted,
+    resamples: &Resamples,
+    shows: &[bool],
+) -> Option<[String; 3]> {
     let [before, after] = [before, after].map(|score| telling(&score.errors, shows));
     let (difference, interval) = paired_difference(&after, &before, resamples);
     let names = DIMENSION_KEYS.iter().chain(&["position_m"]);

@@ -11,8 +11,8 @@ use crate::condense::best_soil;
 use crate::consistency::Contradictions;
 use crate::diagnose::Options;
 use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
-use crate::judgement::{Judgement, Verdict};
-use crate::proof::{falls_surely, not_proven, several_scored};
+use crate::judgement::{Judgement, Verdict, judge};
+use crate::proof::{falls_surely, not_proven, rises_surely, several_scored};
 use crate::select::Yardstick;
 
 /// Share by which an error on held-out drives must surely fall where the model itself is on trial (chosen). A model of a new vehicle is wrong in many ways at
@@ -20,6 +20,9 @@ use crate::select::Yardstick;
 const GAIN_ON_TRIAL: f64 = 0.1;
 /// Evidence, in thresholds, from which an effect is claimed where no drive is left to prove it on (chosen).
 const WITHOUT_PROOF: f64 = 2.5;
+
+/// Most effects that a proof may refute one after the other (chosen): those that resemble a sensor that is mounted askew are five.
+const REFUTED_MAX: usize = 5;
 
 /// Drives that are predicted to prove a judgement.
 #[derive(Clone, Copy, Debug)]
@@ -32,6 +35,8 @@ pub(crate) struct HeldDrives<'a> {
     pub maps: &'a DriveMaps,
     /// What the command line says.
     pub options: &'a Options,
+    /// Whether they are those that were fitted: each is predicted with what the others teach.
+    pub fitted: bool,
 }
 
 /// A judgement with what held-out drives say of it.
@@ -49,21 +54,79 @@ pub(crate) struct Proven {
     pub reason: String,
 }
 
-/// Predicts held-out drives with what is claimed. Of several claims, one that the others do as well without is dropped; they are sized again and have to prove
-/// themselves again. `fewer` judges one drive less than were fitted.
+/// Predicts held-out drives with what is claimed. Where an error surely rises by one of the claims, the drives are judged again without that effect: what resembles the
+/// true one may explain as much of them and predicts worse. What then proves itself stands if it leaves no more. `fewer` judges one drive less than were fitted. The case is
+/// that of the judgement that comes out.
 ///
 /// # Errors
 /// Those of the model.
 pub(crate) fn prove(
+    case: &mut Case<'_>,
+    yardstick: &Yardstick,
+    fewer: &Yardstick,
+    judgement: Judgement,
+    held: &HeldDrives<'_>,
+) -> Result<Proven, EvaluationError> {
+    let first = tried(case, yardstick, fewer, judgement, held)?;
+    let mut worse = if yardstick.model_on_trial { None } else { worsening(&first, held)? };
+    if worse.is_none() {
+        return Ok(first);
+    }
+    let mut refuted: Vec<Finding> = Vec::new();
+    let (mut again, mut yardstick, mut fewer) = (case.clone(), yardstick.clone(), fewer.clone());
+    while let Some(finding) = worse.filter(|_| refuted.len() < REFUTED_MAX) {
+        for judging in [&mut yardstick, &mut fewer] {
+            judging.refused.push(finding.hypothesis);
+        }
+        refuted.push(finding);
+        let judgement = judge(&mut again, &yardstick);
+        let mut next = tried(&again, &yardstick, &fewer, judgement, held)?;
+        if next.verdict.claims() && next.judgement.selection.remaining.0 <= first.judgement.selection.remaining.0 {
+            next.judgement.findings.extend(refuted);
+            *case = again;
+            return Ok(next);
+        }
+        worse = worsening(&next, held)?;
+    }
+    Ok(first)
+}
+
+/// The claim by which an error of a judgement that is not proven surely rises, refused for that: the only one, or the last of several without which that error is surely
+/// smaller. `None` where no error rises, or that of none of them.
+fn worsening(proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, EvaluationError> {
+    let (judgement, claimed) = (&proven.judgement, proven.judgement.claimed());
+    let Some(scores) = proven.scores.as_ref().filter(|_| !proven.verdict.claims() && !claimed.is_empty()) else { return Ok(None) };
+    let [before, _, after] = &scores.scores;
+    let rises = |without: &ModelScore, shows: &[bool]| rises_surely(without, after, scores.counted, &scores.resamples, shows);
+    let Some(risen) = rises(before, &scores.shows) else { return Ok(None) };
+    let refuted = |i: usize, [name, from, by]: [String; 3]| {
+        let refused = Some(format!("the error of {name} rises surely with it on drives that were not fitted, from {from} by {by}"));
+        Finding { refused, ..judgement.findings[i].clone() }
+    };
+    if let [only] = claimed[..] {
+        return Ok(Some(refuted(only, risen)));
+    }
+    for i in claimed.into_iter().rev() {
+        let (without, shows) = held.without(judgement.findings[i].hypothesis, &proven.learned, scores)?;
+        if let Some(risen) = rises(&without, &shows) {
+            return Ok(Some(refuted(i, risen)));
+        }
+    }
+    Ok(None)
+}
+
+/// Predicts held-out drives with what a judgement claims. Of several claims, one that the others do as well without is dropped; they are sized again and have to prove
+/// themselves again.
+fn tried(
     case: &Case<'_>,
     yardstick: &Yardstick,
     fewer: &Yardstick,
     mut judgement: Judgement,
     held: &HeldDrives<'_>,
 ) -> Result<Proven, EvaluationError> {
-    let HeldDrives { predictor, drives, maps, options } = *held;
+    let HeldDrives { predictor, drives, maps, options, .. } = *held;
     loop {
-        let learned = learn(fewer, case, &judgement, options, drives.len());
+        let learned = learn(fewer, case, &judgement, held);
         let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
         let needless = match &scores {
             Some(scores) => last_needless(&judgement, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
@@ -125,17 +188,20 @@ fn last_needless<E>(
     Ok(None)
 }
 
-/// What each of `held_out` drives is predicted with; `fewer` judges one drive less than were fitted.
-fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, options: &Options, held_out: usize) -> Vec<Learned> {
-    match options.fit_on {
-        Some(_) => {
-            let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
-            let hypotheses = keep(judgement, judgement.selection.chosen.clone());
-            vec![Learned { soil: best_soil(case.condensed()), effects, hypotheses }; held_out]
-        }
-        None if held_out > 0 => leave_each_out(fewer, case, judgement),
-        None => Vec::new(),
+/// What each held-out drive is predicted with; `fewer` judges one drive less than were fitted.
+fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, held: &HeldDrives<'_>) -> Vec<Learned> {
+    match held.drives.len() {
+        count if !held.fitted => vec![learned_by_all(case, judgement); count],
+        0 => Vec::new(),
+        _ => leave_each_out(fewer, case, judgement),
     }
+}
+
+/// What all fitted drives teach together.
+pub(crate) fn learned_by_all(case: &Case<'_>, judgement: &Judgement) -> Learned {
+    let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
+    let hypotheses = keep(judgement, judgement.selection.chosen.clone());
+    Learned { soil: best_soil(case.condensed()), effects, hypotheses }
 }
 
 /// The fitted effects that are claimed.
@@ -199,6 +265,16 @@ fn proven(
     (verdict, format!("{reason}{helps}{more}"))
 }
 
+/// What drives beside those that were fitted say of a proven judgement.
+pub(crate) fn said_by_others(judgement: &Judgement, scores: &HeldOut) -> String {
+    let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
+    let least_gain = claimed.iter().any(|f| acts(f)).then_some(0.0);
+    match not_proven(scores, least_gain, claimed.len() > 1) {
+        Some(why) => format!("; of the other drives: {why}"),
+        None => "; the other drives agree".into(),
+    }
+}
+
 /// Whether an effect changes how the vehicle moves. A wrong sensor shows in the sensors; whether predictions from it get better is another question, unless the model
 /// itself is on trial and nothing that is measured twice speaks for it.
 fn acts(finding: &Finding) -> bool {
@@ -238,6 +314,7 @@ mod tests {
                 stability: 1.0,
                 estimates: Vec::new(),
                 onset: None,
+                may_have_begun_s: None,
                 rivals: Vec::new(),
                 refused: None,
                 refused_for_size: false,

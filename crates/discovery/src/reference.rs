@@ -235,10 +235,10 @@ impl Reference {
 /// Evidence of every hypothesis, then of the level of every compared channel, with nothing fitted.
 pub fn all_evidence(group: &Group, catalogue: &[Candidate], channels: &[usize]) -> Vec<f64> {
     let hypotheses = catalogue.iter().map(|c| {
-        let found = group.remainder(&[], &c.columns(), 0.0);
+        let found = group.remainder(&[], &c.columns());
         if c.positive() && found.shares[0] <= 0.0 { 0.0 } else { found.z }
     });
-    hypotheses.chain(channels.iter().map(|c| group.remainder(&[], &[level_column(catalogue, *c)], 0.0).z)).collect()
+    hypotheses.chain(channels.iter().map(|c| group.remainder(&[], &[level_column(catalogue, *c)]).z)).collect()
 }
 
 impl NullGroups {

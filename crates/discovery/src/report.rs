@@ -382,7 +382,11 @@ fn trace_plot(trace: &Trace) -> LinePlot {
 /// An effect in words.
 pub fn describe(finding: &Finding) -> String {
     let parameters: Vec<String> = finding.estimates.iter().map(|p| format!("{} {}", p.name, Short(p.value))).collect();
-    let onset = finding.onset.map_or(String::new(), |o| format!(" from {:.1} s on", o.at_s));
+    let onset = match (finding.onset, finding.may_have_begun_s) {
+        (Some(onset), _) => format!(" from {:.1} s on", onset.at_s),
+        (None, Some(at_s)) => format!(" (it may have begun at about {at_s:.1} s, and be another size then)"),
+        (None, None) => String::new(),
+    };
     parameters.join(", ") + &onset
 }
 
@@ -397,6 +401,7 @@ fn effect_json(finding: &Finding) -> Value {
         "parameters": parameters,
         "onset_s": finding.onset.map(|o| o.at_s),
         "onset_ci95": finding.onset.map(|o| o.ci95_s),
+        "onset_possible_s": finding.may_have_begun_s,
         "evidence": {"z": finding.z, "z_after_others": finding.alone, "delta_bic": finding.delta_bic, "stability": finding.stability},
         "rivals": rivals,
         "separating_manoeuvre": manoeuvre::separating(finding),

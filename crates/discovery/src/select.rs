@@ -8,7 +8,7 @@ use nesam_physics::effects::Layer;
 use crate::candidates::Candidate;
 use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, level_column};
-use crate::evidence::{Group, Nulls};
+use crate::evidence::{Fitted, Group, Nulls};
 use crate::reference::{NullGroups, all_evidence};
 use crate::whiteness::Whiteness;
 
@@ -190,6 +190,15 @@ impl Yardstick {
         hypotheses.iter().flat_map(|h| self.catalogue[*h].columns()).collect()
     }
 
+    /// Fitted hypotheses, each with how far what it leaves is believed.
+    fn believed(&self, fitted: &[usize]) -> Vec<Fitted> {
+        let of = |h: &usize| {
+            let candidate = &self.catalogue[*h];
+            Fitted { columns: candidate.columns(), mismatch: mismatch_left(candidate.layer()) }
+        };
+        fitted.iter().map(of).collect()
+    }
+
     /// Evidence of a hypothesis after others, in units of its null spread; zero for one that has the wrong sign.
     pub fn after(&self, group: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
         self.after_fit(group, group, fitted, hypothesis)
@@ -198,8 +207,7 @@ impl Yardstick {
     /// The same where `left` are the scores after the fit of `fitted` went through the physics.
     pub fn after_fit(&self, left: &Group, before: &Group, fitted: &[usize], hypothesis: usize) -> (f64, f64) {
         let candidate = &self.catalogue[hypothesis];
-        let worst = fitted.iter().map(|h| mismatch_left(self.catalogue[*h].layer())).fold(0.0, f64::max);
-        let found = left.remainder_since(before, &self.columns(fitted), &candidate.columns(), worst);
+        let found = left.remainder_since(before, &self.believed(fitted), &candidate.columns());
         if candidate.positive() && found.shares[0] <= 0.0 {
             return (0.0, 0.0);
         }
@@ -208,7 +216,7 @@ impl Yardstick {
 
     /// Evidence of a hypothesis in what `fitted` left when they were sized through the physics without it, in units of its null spread.
     pub fn refitted(&self, left: &Group, fitted: &[usize], hypothesis: usize) -> f64 {
-        left.remainder(&self.columns(fitted), &self.catalogue[hypothesis].columns(), 0.0).z / self.spread(hypothesis)
+        left.remainder(&self.columns(fitted), &self.catalogue[hypothesis].columns()).z / self.spread(hypothesis)
     }
 
     /// Criterion of hypothesis j against k when `others` are fitted too; positive = j is better.
@@ -337,12 +345,11 @@ impl Yardstick {
     /// What a force or a soil does to the rims follows from the slope of traction, which is known worst (and without torque not at all, ADR 0003), so their
     /// levels do not speak against one.
     pub(crate) fn levels_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
-        let columns = self.columns(chosen);
-        let worst = chosen.iter().map(|h| mismatch_left(self.catalogue[*h].layer())).fold(0.0, f64::max);
+        let believed = self.believed(chosen);
         let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
         let told = move |channel: usize| !(force && (RIM_AT..PATH_AT).contains(&channel));
         self.channels.iter().copied().enumerate().filter(move |(_, channel)| told(*channel)).map(move |(i, channel)| {
-            let found = left.remainder_since(before, &columns, &[level_column(&self.catalogue, channel)], worst);
+            let found = left.remainder_since(before, &believed, &[level_column(&self.catalogue, channel)]);
             (channel, found.z / self.spread(self.catalogue.len() + i))
         })
     }
