@@ -572,6 +572,7 @@ fn service_a_configuration_is_checked_without_serving() {
         (["--store", "file"], ["store.directory", "file"]),
         (["--store", "file/below"], ["store.directory", "file/below"]),
         (["--record", "file"], ["recording.directory", "file"]),
+        (["--reports", "file"], ["http.reports", "file is not a folder"]),
         (["--http", "127.0.0.1:50051"], ["http.listen", "grpc.listen"]),
         (["--grpc", "192.0.2.1:50051"], ["grpc.listen", "192.0.2.1"]),
     ] {
@@ -585,6 +586,8 @@ fn service_a_configuration_is_checked_without_serving() {
     std::fs::write(here.path().join("store.toml"), "[store]\nenabled = true\ndirectory = \"file\"\n").unwrap();
     let check = nesam(&["check", "store.toml"], here.path());
     assert!(check.status.code() == Some(2) && stdout(&check).contains("store.directory"), "{}", stdout(&check));
+    let check = nesam(&["check", "file"], here.path());
+    assert!(check.status.success() && stdout(&check).contains("doubt: is empty"), "{}", stdout(&check));
     std::fs::write(here.path().join("half.toml"), "[tls]\ncertificate = \"server.pem\"\n").unwrap();
     refused(&["serve", "--check", "--config", "half.toml"], here.path(), &["tls.certificate", "tls.key"]);
     std::fs::write(here.path().join("absent.toml"), "[tls]\ncertificate = \"server.pem\"\nkey = \"server.key\"\n").unwrap();

@@ -124,10 +124,18 @@ fn bundle(path: &Path, findings: &mut Findings) {
 }
 
 fn configuration(path: &Path, findings: &mut Findings) {
+    if std::fs::read_to_string(path).is_ok_and(|text| says_nothing(&text)) {
+        findings.doubts.push("is empty: every key would have its default; is it the right file?".into());
+    }
     match super::serve::check_configuration(path) {
         Ok(doubts) => findings.doubts.extend(doubts),
         Err(failure) => findings.error(failure.to_string()),
     }
+}
+
+/// Whether a text is white space and comments.
+fn says_nothing(text: &str) -> bool {
+    text.lines().map(str::trim).all(|line| line.is_empty() || line.starts_with('#'))
 }
 
 fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
