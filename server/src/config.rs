@@ -12,6 +12,7 @@ use std::path::{Path, PathBuf};
 use figment::Figment;
 use figment::providers::{Format, Serialized, Toml};
 use nesam_engine::{FleetSoilSettings, Limits};
+use nesam_model::MAX_HORIZON;
 use serde::{Deserialize, Serialize};
 
 pub use self::cluster::ClusterConfig;
@@ -413,6 +414,15 @@ impl Config {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
             }
         }
+        if self.limits.horizon_max > MAX_HORIZON {
+            let reason = format!("is {}, the model predicts {MAX_HORIZON} steps at most", self.limits.horizon_max);
+            return Err(ServerError::Value { key: "limits.horizon_max", reason });
+        }
+        let reports = &self.http.reports;
+        if self.http.enabled && reports.exists() && !reports.is_dir() {
+            let reason = format!("{} is not a folder; give the one that `nesam diagnose` writes its reports to", reports.display());
+            return Err(ServerError::Value { key: "http.reports", reason });
+        }
         self.check_ports()?;
         self.tls.check()?;
         self.zenoh.check()?;
@@ -524,7 +534,9 @@ mod tests {
             ("[grpc]\nlisten = 3\n", "listen"),
             ("[grpc]\nport = 3\n", "port"),
             ("[limits]\nsessions_max = 0\n", "limits.sessions_max"),
-            ("[zenoh]\nfleet = \"a/b\"\n", "zenoh.fleet"),
+            ("[limits]\nhorizon_max = 33\n", "`limits.horizon_max`: is 33, the model predicts 32 steps at most"),
+            ("[http]\nreports = \"/dev/null\"\n", "`http.reports`: /dev/null is not a folder"),
+            ("[zenoh]\nfleet = \"a/b\"\n", "configuration key `zenoh.fleet`: must be"),
             ("[zenoh]\nname = \"a/b\"\n", "zenoh.name"),
             ("[limits]\nreorder_window_s = 1.5\n", "limits.reorder_window_s"),
             ("[fleet_soil]\nreach_m = -1.0\n", "reach_m"),

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 use nesam_evaluation::Inputs;
-use nesam_model::MAX_HORIZON;
+use nesam_model::{HISTORY, MAX_HORIZON};
 use nesam_trajectories::Trajectory;
 
 use crate::failure::Failure;
@@ -24,7 +24,7 @@ pub struct DataArgs {
     #[arg(long, value_enum, default_value_t = SplitArg::All)]
     pub split: SplitArg,
     /// Only these drives
-    #[arg(long, value_name = "ID,…", value_delimiter = ',')]
+    #[arg(long, value_name = "ID,…", value_delimiter = ',', value_parser = name)]
     pub trajectories: Option<Vec<String>>,
     /// Vehicle card, when the data root has none of its own
     #[arg(long, value_name = "FILE")]
@@ -117,8 +117,8 @@ pub struct WindowArgs {
     /// Steps to predict [default: 32, fewer where every drive is shorter]
     #[arg(long, value_name = "STEPS", value_parser = positive)]
     pub horizon: Option<usize>,
-    /// Steps of measured history that the model may see, the start included
-    #[arg(long, value_name = "STEPS", default_value_t = 32, value_parser = positive)]
+    /// Steps of measured history that the model may see, the start included; it sees 32 at most
+    #[arg(long, value_name = "STEPS", default_value_t = HISTORY, value_parser = history)]
     pub history: usize,
 }
 
@@ -200,8 +200,21 @@ fn positive(text: &str) -> Result<usize, String> {
     match text.parse::<usize>() {
         Ok(0) => Err("must be at least 1".into()),
         Ok(n) => Ok(n),
-        Err(_) => Err("not a whole number".into()),
+        Err(_) => Err("not a whole number of at least 1".into()),
     }
+}
+
+/// Steps of history that the model has places for.
+fn history(text: &str) -> Result<usize, String> {
+    match positive(text)? {
+        steps if steps > HISTORY => Err(format!("the model sees {HISTORY} steps at most")),
+        steps => Ok(steps),
+    }
+}
+
+/// One of the names of a list.
+fn name(text: &str) -> Result<String, String> {
+    if text.is_empty() { Err("empty name in --trajectories".into()) } else { Ok(text.into()) }
 }
 
 #[cfg(test)]

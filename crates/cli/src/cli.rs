@@ -1,6 +1,6 @@
 //! The command line: names, one-line purposes, examples.
 
-use clap::{CommandFactory, Parser, Subcommand};
+use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::bundle_path::{MANIFEST, default_bundle};
 use crate::commands;
@@ -83,13 +83,25 @@ enum Command {
 
 /// Parses the arguments and runs the command, whose results must have been printed whole.
 pub fn run() -> Result<(), Failure> {
-    let cli = Cli::parse();
+    let cli = Cli::from_arg_matches(&arguments().get_matches()).unwrap_or_else(|error| error.exit());
     if cli.version {
         say!("{}", version());
     } else {
         command(cli.command)?;
     }
     check_printed()
+}
+
+/// The command line. A negative number behind an option is its value, so that who refuses it can name the option.
+fn arguments() -> clap::Command {
+    fn take_negative_numbers(command: clap::Command) -> clap::Command {
+        let taking = |arg: clap::Arg| {
+            let is_option = arg.get_long().is_some() && arg.get_action().takes_values();
+            if is_option { arg.allow_negative_numbers(true) } else { arg }
+        };
+        command.mut_args(taking).mut_subcommands(take_negative_numbers)
+    }
+    take_negative_numbers(Cli::command())
 }
 
 fn command(command: Option<Command>) -> Result<(), Failure> {
@@ -127,4 +139,33 @@ fn version() -> String {
         Some(format!("bundle {name} {}", nesam_model::bundle::sha256_hex(&manifest)))
     });
     format!("nesam {}\n{}", env!("CARGO_PKG_VERSION"), bundle.unwrap_or_else(|| "no bundle found".into()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: a wrong number is refused by the name of its option. Method: negative numbers, too much history and a name too few, with a space and with `=`.
+    #[test]
+    fn regress_wrong_values_are_refused_by_the_name_of_their_option() {
+        arguments().debug_assert();
+        let refused = |words: &[&str]| {
+            let words = [&["nesam"], words].concat();
+            let parsed = arguments().try_get_matches_from(words).and_then(|matches| Cli::from_arg_matches(&matches));
+            parsed.expect_err("a wrong value").to_string()
+        };
+        for (words, told) in [
+            (&["evaluate", "--horizon", "-1"][..], ["'--horizon <STEPS>'", "at least 1"]),
+            (&["evaluate", "--horizon=-1"], ["'--horizon <STEPS>'", "at least 1"]),
+            (&["evaluate", "--history", "33"], ["'--history <STEPS>'", "32 steps at most"]),
+            (&["evaluate", "--trajectories", "n0005,"], ["'--trajectories <ID,…>'", "empty name in --trajectories"]),
+            (&["navigate", "--runs", "-3"], ["'--runs <RUNS>'", "invalid"]),
+            (&["bench", "predict", "--queries", "-3"], ["'--queries <QUERIES>'", "invalid"]),
+        ] {
+            let said = refused(words);
+            assert!(told.iter().all(|part| said.contains(part)), "{words:?}: {said}");
+        }
+        let at = arguments().try_get_matches_from(["nesam", "predict", "--at", "-1"]);
+        assert!(at.is_ok(), "the drive says whether it has such an instant");
+    }
 }

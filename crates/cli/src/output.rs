@@ -84,35 +84,65 @@ pub fn result_files<const N: usize>(
     Ok(files)
 }
 
-/// Refuses a file that no command may write: one in a bundle, one that is a folder, one below a file.
+/// Links followed from one to the next at most, as Linux does.
+const LINKS_MAX: usize = 40;
+
+/// Refuses a file that no command may write: one in a bundle, one that is a folder, one below a file. What links lead to counts.
 pub fn check_file(path: &Path) -> Result<(), Failure> {
     let refused = |why: &str| Err(Failure::input(format!("{} {why}", path.display())));
-    if inside_bundle(path.parent().unwrap_or(Path::new("."))) {
-        return refused("lies in a bundle, which no command may change");
-    }
     if path.is_dir() {
         return refused("is a folder; give a file");
     }
-    match path.ancestors().skip(1).find(|above| above.exists()) {
+    let file = match replaceable(path) {
+        Err(error) => return refused(&format!("cannot be written: {error}")),
+        Ok(file) => file.unwrap_or_else(|| path.to_path_buf()),
+    };
+    if inside_bundle(file.parent().unwrap_or(Path::new("."))) {
+        return refused("lies in a bundle, which no command may change");
+    }
+    match file.ancestors().skip(1).find(|above| above.exists()) {
         Some(above) if !above.is_dir() => refused(&format!("cannot be written: {} is not a folder", above.display())),
         _ => Ok(()),
     }
 }
 
-/// Writes a whole file or none: a neighbour first, then a rename. Folders above it are made.
+/// The file behind the links of a path, whose place a whole new one can take; `None` for what is written as it is: a device, a pipe, a file that is open
+/// already and named by its number.
+fn replaceable(path: &Path) -> std::io::Result<Option<PathBuf>> {
+    if std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
+        return Ok(None);
+    }
+    let mut file = path.to_path_buf();
+    for _ in 0..LINKS_MAX {
+        if file.starts_with("/proc") || file.starts_with("/dev/fd") {
+            return Ok(None);
+        }
+        let Ok(behind) = std::fs::read_link(&file) else { return Ok(Some(file)) };
+        file = file.parent().unwrap_or(Path::new("")).join(behind);
+    }
+    Err(std::io::Error::other(format!("more than {LINKS_MAX} links lead on from it")))
+}
+
+/// Writes a whole file or none: a neighbour first, then a rename. Folders above it are made. Devices and pipes are written as they are.
 pub fn write_file(path: &Path, text: &[u8]) -> Result<(), Failure> {
+    if path == Path::new("/dev/stdout") {
+        // Opened anew it would begin at the start of a file that holds the printed lines.
+        let mut stdout = std::io::stdout().lock();
+        return stdout.write_all(text).and_then(|()| stdout.flush()).map_err(|e| cannot_write(path, &e));
+    }
     write_with(path, |draft| std::fs::write(draft, text).map_err(|e| cannot_write(path, &e)))
 }
 
-/// The same for what is written by a function that is told the neighbour.
+/// The same for what is written by a function that is told the neighbour, or the device or pipe itself.
 pub fn write_with(path: &Path, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
     check_file(path)?;
-    if let Some(folder) = path.parent().filter(|p| !p.as_os_str().is_empty()) {
+    let Some(file) = replaceable(path).map_err(|e| cannot_write(path, &e))? else { return write(path) };
+    if let Some(folder) = file.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).map_err(|e| cannot_write(path, &e))?;
     }
-    let name = path.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
-    let draft = path.with_file_name(format!(".{name}.part"));
-    let written = write(&draft).and_then(|()| std::fs::rename(&draft, path).map_err(|e| cannot_write(path, &e)));
+    let name = file.file_name().map_or_else(|| "out".into(), |n| n.to_string_lossy().into_owned());
+    let draft = file.with_file_name(format!(".{name}.part"));
+    let written = write(&draft).and_then(|()| std::fs::rename(&draft, &file).map_err(|e| cannot_write(path, &e)));
     if written.is_err() {
         let _ = std::fs::remove_file(&draft);
     }
@@ -144,5 +174,53 @@ pub fn provenance_of(bundle: Option<&ModelBundle>, data_hash: &str, maps_hash: &
         bundle_hash: bundle.map_or_else(String::new, |b| b.hash.clone()),
         data_hash: data_hash.into(),
         maps_hash: maps_hash.into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: a link stays one, and what it leads to is replaced whole. Method: a link to a file, one to that link, one to a file that is not there yet, one to
+    /// itself.
+    #[test]
+    fn property_a_link_stays_and_the_file_behind_it_is_written() {
+        let here = tempfile::tempdir().unwrap();
+        let at = |name: &str| here.path().join(name);
+        std::fs::write(at("file"), "old").unwrap();
+        for (to, from) in [("file", "link"), ("link", "second"), ("folder/new", "dangling"), ("loop", "loop")] {
+            std::os::unix::fs::symlink(to, at(from)).unwrap();
+        }
+        for (link, file) in [("link", "file"), ("second", "file"), ("dangling", "folder/new")] {
+            write_file(&at(link), link.as_bytes()).unwrap();
+            assert!(at(link).is_symlink(), "{link}");
+            assert_eq!(std::fs::read_to_string(at(file)).unwrap(), link);
+        }
+        assert!(check_file(&at("loop")).unwrap_err().to_string().contains("links"));
+        std::fs::create_dir(at("kept")).unwrap();
+        std::fs::write(at("kept/manifest.toml"), "").unwrap();
+        std::os::unix::fs::symlink("kept/new", at("into")).unwrap();
+        assert!(check_file(&at("into")).unwrap_err().to_string().contains("lies in a bundle"));
+        assert!(!here.path().read_dir().unwrap().flatten().any(|e| e.file_name().to_string_lossy().ends_with(".part")));
+    }
+
+    /// Goal: what is no file stays what it is, and what it does not take is a failure. Method: a named pipe with a reader, `/dev/full` behind a link.
+    #[test]
+    fn property_pipes_and_devices_are_written_as_they_are() {
+        use std::os::unix::fs::FileTypeExt;
+        let here = tempfile::tempdir().unwrap();
+        let (pipe, full) = (here.path().join("pipe"), here.path().join("full"));
+        assert!(std::process::Command::new("mkfifo").arg(&pipe).status().unwrap().success());
+        let reader = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || std::fs::read_to_string(pipe).unwrap()
+        });
+        write_file(&pipe, b"whole").unwrap();
+        assert_eq!(reader.join().unwrap(), "whole");
+        assert!(std::fs::metadata(&pipe).unwrap().file_type().is_fifo());
+        std::os::unix::fs::symlink("/dev/full", &full).unwrap();
+        check_file(&full).unwrap();
+        assert!(matches!(write_file(&full, b"lost").unwrap_err(), Failure::Failed(why) if why.contains("cannot write")));
+        assert!(full.is_symlink());
     }
 }

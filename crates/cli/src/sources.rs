@@ -9,7 +9,7 @@ use nesam_model::{ModelBundle, Precision, Predictor};
 use nesam_physics::{DT_S, Vehicle};
 use nesam_server::recording::RecordingHeader;
 use nesam_terrain::WorldMap;
-use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, Trajectory};
+use nesam_trajectories::{BeyondRange, DataRoot, SetQuery, SplitFilter, Trajectory};
 
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::{bundle_dir, bundle_of_hash, bundle_of_vehicle, sample_root};
@@ -67,11 +67,36 @@ pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failur
     if drives.is_empty() {
         return Err(Failure::input(format!("set `{set}` has no drive in split `{}`", args.split.as_str())));
     }
-    for note in root.notes() {
+    for note in root.contradictions().iter().chain(&root.notes()) {
         crate::output::note!("note: {note}");
     }
+    check_commands(&root, &set, &drives)?;
     let maps = maps_of(&root, &drives)?;
     Ok(Drives { root, set, drives, maps })
+}
+
+/// Refuses commands beyond a range that the card states, and tells of those beyond one that it only implies.
+fn check_commands(root: &DataRoot, set: &str, drives: &[Trajectory]) -> Result<(), Failure> {
+    for beyond in root.beyond_range(drives) {
+        if !beyond.implied {
+            return Err(Failure::input(format!(
+                "set `{set}`: {beyond}; mend its units, leave the drive out (such drives: {}), or let `command_range` of {} admit it",
+                beyond.drives,
+                root.card().display()
+            )));
+        }
+        note!("note: set `{set}`: {}", beyond_implied(&beyond));
+    }
+    Ok(())
+}
+
+/// What commands beyond a range that no card states come to.
+pub fn beyond_implied(beyond: &BeyondRange) -> String {
+    format!(
+        "{} drives command beyond a range that the card does not state, and no service would take that: {beyond}; `command_range` of a card states it, and \
+         `nesam calibrate` and `nesam train` widen it to the commands of the drives",
+        beyond.drives
+    )
 }
 
 /// The drives that training left for validation, for `option`, which does `what` with them; only the train split has any.

@@ -188,6 +188,70 @@ fn chrono_the_sample_is_sound() {
     assert!(stdout(&inspect).contains("mass_kg"));
 }
 
+/// Goal: commands that no service would take are not scored. Method: the sample under a card that states a narrower range of steering, then under one that
+/// leaves the range of the speed to its kind of drive, which the drives exceed by their unit.
+#[test]
+fn service_commands_beyond_the_range_of_the_card_are_refused() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), root.path());
+    let card = root.path().join("vehicle_hmmwv.json");
+    let text = std::fs::read_to_string(&card).unwrap();
+    std::fs::write(&card, text.replacen('{', r#"{"command_range": {"second": [-0.2, 0.2]},"#, 1)).unwrap();
+    let data = root.path().display().to_string();
+    let args = ["evaluate", "--data", &data, "--set", "nominal", "--models", "constant_velocity"];
+    refused(
+        &args,
+        root.path(),
+        &["drive `n0001`, row", "second command", "is outside the range of its card, -0.2 to 0.2", "command_range"],
+    );
+    let check = nesam(&["check", &data], root.path());
+    assert!(
+        check.status.code() == Some(2) && stdout(&check).contains("set nominal: 6 drives command beyond the range"),
+        "{}",
+        stdout(&check)
+    );
+    let mut log = String::from("t,x,y,z,roll,pitch,yaw,cmd_speed,cmd_steer\n");
+    (0..100).for_each(|i| log += &format!("{:.1},{:.2},0,0.6,0,0,0,13.0,0\n", 0.1 * f64::from(i), 1.3 * f64::from(i)));
+    std::fs::write(root.path().join("fast.csv"), log).unwrap();
+    let plain = sample().join("vehicle_hmmwv.json").display().to_string();
+    assert!(nesam(&["import", "fast.csv", "--to", "mine", "--set", "fast", "--vehicle", &plain], root.path()).status.success());
+    let scored = nesam(&["evaluate", "--data", "mine", "--models", "constant_velocity"], root.path());
+    assert!(scored.status.success(), "{}", stderr(&scored));
+    assert!(
+        stderr(&scored).contains("note: set `fast`: 1 drives command beyond a range that the card does not state"),
+        "{}",
+        stderr(&scored)
+    );
+    let check = nesam(&["check", "mine"], root.path());
+    assert!(check.status.success() && stdout(&check).contains("doubt: set fast: 1 drives command beyond"), "{}", stdout(&check));
+}
+
+/// Goal: a root that lost its maps says so, wherever it is read. Method: the sample without `worlds/`, and one row less in an index.
+#[test]
+fn service_a_root_that_lost_its_maps_says_so() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), root.path());
+    std::fs::remove_dir_all(root.path().join("worlds")).unwrap();
+    let index = root.path().join("nominal/index.json");
+    let mut rows: Vec<Value> = serde_json::from_str(&std::fs::read_to_string(&index).unwrap()).unwrap();
+    rows.remove(0);
+    // The Parquet index would count before this one.
+    std::fs::remove_file(root.path().join("nominal/index.parquet")).unwrap();
+    std::fs::write(&index, Value::Array(rows).to_string()).unwrap();
+    let data = root.path().display().to_string();
+    let scored = nesam(&["evaluate", "--data", &data, "--set", "nominal", "--models", "constant_velocity"], root.path());
+    assert!(scored.status.success(), "{}", stderr(&scored));
+    for told in
+        ["note: set `nominal`: the data root has no world `w", "note: set `nominal`: 1 drives are not in the index: no map, no split"]
+    {
+        assert!(stderr(&scored).contains(told), "{told}: {}", stderr(&scored));
+    }
+    let check = nesam(&["check", &data], root.path());
+    for told in ["doubt: set `nominal`: the data root has no world `w", "doubt: set `nominal`: 1 drives are not in the index"] {
+        assert!(check.status.success() && stdout(&check).contains(told), "{told}: {}", stdout(&check));
+    }
+}
+
 #[test]
 fn service_a_root_without_samples_says_what_makes_a_set() {
     let here = tempfile::tempdir().unwrap();
@@ -508,6 +572,7 @@ fn service_a_configuration_is_checked_without_serving() {
         (["--store", "file"], ["store.directory", "file"]),
         (["--store", "file/below"], ["store.directory", "file/below"]),
         (["--record", "file"], ["recording.directory", "file"]),
+        (["--reports", "file"], ["http.reports", "file is not a folder"]),
         (["--http", "127.0.0.1:50051"], ["http.listen", "grpc.listen"]),
         (["--grpc", "192.0.2.1:50051"], ["grpc.listen", "192.0.2.1"]),
     ] {
@@ -521,6 +586,8 @@ fn service_a_configuration_is_checked_without_serving() {
     std::fs::write(here.path().join("store.toml"), "[store]\nenabled = true\ndirectory = \"file\"\n").unwrap();
     let check = nesam(&["check", "store.toml"], here.path());
     assert!(check.status.code() == Some(2) && stdout(&check).contains("store.directory"), "{}", stdout(&check));
+    let check = nesam(&["check", "file"], here.path());
+    assert!(check.status.success() && stdout(&check).contains("doubt: is empty"), "{}", stdout(&check));
     std::fs::write(here.path().join("half.toml"), "[tls]\ncertificate = \"server.pem\"\n").unwrap();
     refused(&["serve", "--check", "--config", "half.toml"], here.path(), &["tls.certificate", "tls.key"]);
     std::fs::write(here.path().join("absent.toml"), "[tls]\ncertificate = \"server.pem\"\nkey = \"server.key\"\n").unwrap();

@@ -111,22 +111,26 @@ fn service_an_interrupted_bench_says_that_nothing_was_written() {
     assert_eq!(bench.wait().unwrap().code(), Some(1));
 }
 
-/// Goal: Ctrl-C during pre-training loses no encoders, and what is said of --resume is true. Method: Ctrl-C while the drive line is fitted, which comes before;
-/// then the same command with --resume.
+/// Goal: the first Ctrl-C ends what comes before the first step, finished encoders are kept, and what is said of --resume is true. Method: Ctrl-C while the drive
+/// line is fitted and once both encoders are; then the same command with --resume.
 #[test]
-fn service_an_interrupted_training_keeps_its_encoders() {
+fn service_an_interrupted_training_stops_and_keeps_finished_encoders() {
     let here = tempfile::tempdir().unwrap();
     let root = sample();
     let tiny = ["--epochs", "1", "--batches", "2", "--encoder-steps", "3", "--batch-size", "4"];
     let args = [&["train", "--data", &root, "--set", "nominal"][..], &tiny].concat();
-    let mut training = nesam(&args, here.path()).stderr(Stdio::piped()).spawn().unwrap();
-    let mut said = BufReader::new(training.stderr.take().unwrap());
-    lines_until(&mut said.by_ref().lines(), "symbolic model alone");
-    send("-INT", &training);
-    let mut rest = String::new();
-    said.read_to_string(&mut rest).unwrap();
-    assert_eq!(training.wait().unwrap().code(), Some(1), "{rest}");
-    assert!(rest.contains("interrupted after step 0; the same command with --resume goes on"), "{rest}");
+    for (after, interrupted) in [("symbolic model alone", "while the vehicle's card was calibrated"), ("semantic encoder:", "interrupted")]
+    {
+        let mut training = nesam(&args, here.path()).stderr(Stdio::piped()).spawn().unwrap();
+        let mut said = BufReader::new(training.stderr.take().unwrap());
+        lines_until(&mut said.by_ref().lines(), after);
+        send("-INT", &training);
+        let mut rest = String::new();
+        said.read_to_string(&mut rest).unwrap();
+        assert_eq!(training.wait().unwrap().code(), Some(1), "{rest}");
+        assert!(rest.contains(interrupted) && rest.contains("the same command with --resume"), "{rest}");
+        assert!(!rest.contains("NaN"), "{rest}");
+    }
     let output = nesam(&[&args[..], &["--resume"]].concat(), here.path()).output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success() && said.contains("encoders taken from"), "{said}");

@@ -129,7 +129,12 @@ impl PredictExtras {
             check_covariance(start).map_err(|reason| EngineError::invalid("extras.start_covariance", reason))?;
         }
         if groups * samples > limits.samples_max {
-            return fail("soil_deltas", format!("makes {groups} x {samples} trajectories, allowed are {}", limits.samples_max));
+            let field = if self.soils == WhatIfSoils::SigmaPoints { "soil_sigma_points" } else { "soil_deltas" };
+            let (most, samples_max) = (limits.samples_max, limits.samples_max / groups);
+            return fail(
+                field,
+                format!("makes {groups} x {samples} trajectories, allowed are {most}: with {groups} soils up to {samples_max} samples"),
+            );
         }
         Ok(())
     }
@@ -324,5 +329,22 @@ mod tests {
         assert!(check_covariance(&p).unwrap_err().contains("symmetric"));
         p[1][1] = -1.0;
         assert!(check_covariance(&p).is_err());
+    }
+
+    /// Goal: too many trajectories are told by the field that makes them, with the most that is admitted. Method: one sample more than that for sigma points
+    /// and for two soils.
+    #[test]
+    fn regress_too_many_trajectories_name_what_makes_them() {
+        let limits = Limits::default();
+        for (soils, field, groups) in [
+            (WhatIfSoils::SigmaPoints, "extras.soil_sigma_points", SIGMA_POINTS),
+            (WhatIfSoils::Added(vec![[0.0; SOIL_DIM]; 2]), "extras.soil_deltas", 2),
+        ] {
+            let extras = PredictExtras { soils, ..Default::default() };
+            let most = limits.samples_max / groups;
+            assert!(extras.check(&limits, most).is_ok());
+            let error = extras.check(&limits, most + 1).unwrap_err().to_string();
+            assert!(error.contains(field) && error.contains(&format!("up to {most} samples")), "{error}");
+        }
     }
 }

@@ -35,8 +35,9 @@ pub struct PretrainPlan {
 pub struct Pretrained {
     /// Arrays `encoder.<name>.*`.
     pub weights: Weights,
-    /// Mean squared error as a share of the variance of the patches, over the last tenth of the steps.
-    pub unexplained: f64,
+    /// Mean squared error as a share of the variance of the patches, over the last tenth of the steps; `None` where so few were made that none is in it, or
+    /// where the patches do not vary.
+    pub unexplained: Option<f64>,
 }
 
 struct Autoencoder {
@@ -100,7 +101,8 @@ impl Autoencoder {
     }
 }
 
-/// Trains one encoder (`name` is `elevation` or `semantic`) on a device; `progress(step, loss)` is called after each step.
+/// Trains one encoder (`name` is `elevation` or `semantic`) on a device; `progress(step, loss)` is called after each step. `None` where it was interrupted, which
+/// is asked before each step.
 ///
 /// # Errors
 /// A candle error.
@@ -111,14 +113,18 @@ pub fn pretrain(
     plan: &PretrainPlan,
     device: &Device,
     mut progress: impl FnMut(usize, f32),
-) -> Result<Pretrained> {
+    interrupted: &dyn Fn() -> bool,
+) -> Result<Option<Pretrained>> {
     let channels = if name == "elevation" { 1 } else { 3 };
     let mut rng = ChaCha8Rng::seed_from_u64(plan.seed);
     let autoencoder = Autoencoder::new(name, channels, device, &mut rng)?;
     let mut adam = Adam::default();
     let mut patch = Patch::new();
-    let (mut squared_error, mut variance, mut counted) = (0.0, 0.0, 0);
+    let (mut squared_error, mut variance) = (0.0, 0.0);
     for step in 0..plan.steps {
+        if interrupted() {
+            return Ok(None);
+        }
         let mut pixels = Vec::with_capacity(plan.batch * PATCH_PX * PATCH_PX * channels);
         for _ in 0..plan.batch {
             let (map, x, y) = &places[rng.random_range(0..places.len())];
@@ -144,7 +150,6 @@ pub fn pretrain(
             let mean = images.mean_all()?;
             variance += f64::from(images.broadcast_sub(&mean)?.sqr()?.mean_all()?.to_scalar::<f32>()?);
             squared_error += f64::from(loss);
-            counted += 1;
         }
         progress(step + 1, loss);
     }
@@ -152,6 +157,33 @@ pub fn pretrain(
     for (name, var) in autoencoder.variables.iter().filter(|(name, _)| name.starts_with("encoder.")) {
         weights.insert(name.clone(), var.dims(), var.flatten_all()?.to_vec1()?);
     }
-    let unexplained = if counted > 0 { squared_error / variance } else { f64::NAN };
-    Ok(Pretrained { weights, unexplained })
+    let unexplained = (variance > 0.0).then(|| squared_error / variance);
+    Ok(Some(Pretrained { weights, unexplained }))
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_terrain::GridGeometry;
+
+    use super::*;
+
+    /// Goal: pre-training stops before the next step when it is told to, and says of its errors what it measured. Method: two patches of ground that rises
+    /// along x, told to stop after one of three steps; then one step alone, of which none is in the last tenth, and ten.
+    #[test]
+    fn property_pre_training_stops_when_told_and_gives_no_number_that_it_did_not_measure() {
+        let geometry = GridGeometry { origin_m: [0.0; 2], resolution_m: 0.5, width: 40, height: 40 };
+        let heights = (0..1600).map(|i| (i % 40) as f32 * 0.1).collect();
+        let places = vec![(Arc::new(WorldMap::from_layers("slope", 1, geometry, heights, None).unwrap()), 10.0, 10.0)];
+        let pretrained = |steps: usize, stop_after: usize| {
+            let plan = PretrainPlan { steps, batch: 2, rate: 1e-3, seed: 1 };
+            let done = core::cell::Cell::new(0);
+            let stop = || done.get() >= stop_after;
+            let of = pretrain("elevation", &places, &PatchScale::default(), &plan, &Device::Cpu, |step, _| done.set(step), &stop);
+            (of.unwrap(), done.get())
+        };
+        let (stopped, done) = pretrained(3, 1);
+        assert!(stopped.is_none() && done == 1);
+        assert_eq!(pretrained(1, 9).0.unwrap().unexplained, None);
+        assert!(pretrained(10, 99).0.unwrap().unexplained.unwrap().is_finite());
+    }
 }

@@ -94,8 +94,14 @@ impl DriveLaw {
 }
 
 /// The vehicle with its drive line fitted on drives under each contact law and drive, the best pair kept, its suspension fitted with that where drives have a
-/// map, and the scales of the drives.
-pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
+/// map, and the scales of the drives; `None` where it was interrupted, which is asked before each number.
+pub fn calibrate_vehicle(
+    vehicle: Vehicle,
+    training: &[&Drive],
+    dt_s: f64,
+    reporter: &dyn Reporter,
+    interrupted: &dyn Fn() -> bool,
+) -> Option<(Vehicle, Normalization)> {
     let scales = measure(training, &vehicle, dt_s);
     let seconds = HORIZON as f64 * dt_s;
     let samples: usize = training.iter().map(|d| d.states.len()).sum();
@@ -111,10 +117,14 @@ pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, repor
         let name = format!("{law:?}, {drive:?}");
         reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS.len() } else { knobs(&candidate).len() });
         let mut done = 0;
-        let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, |name, value, error| {
+        let progress = |name: &str, value: f64, error: f64| {
             done += 1;
             reporter.progress(done, &format!("{name} = {value:.4}, {error:.3} m"));
-        });
+        };
+        let [before, after] = calibrate_driveline(&mut candidate, &few, &scales, progress, interrupted);
+        if interrupted() {
+            return None;
+        }
         reporter
             .line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s; {:?}", candidate.driveline));
         if best.as_ref().is_none_or(|(error, _)| after < *error) {
@@ -123,21 +133,25 @@ pub fn calibrate_vehicle(vehicle: Vehicle, training: &[&Drive], dt_s: f64, repor
     }
     let mut chosen = best.map_or(vehicle, |(_, chosen)| chosen);
     if training.iter().all(|drive| drive.map.is_none()) {
-        return (chosen, scales);
+        return Some((chosen, scales));
     }
     reporter.stage("suspension", TURNS);
     let mut done = 0;
-    let [before, after] = calibrate_suspension(&mut chosen, training, &scales, |name, value, error| {
+    let progress = |name: &str, value: f64, error: f64| {
         done += 1;
         reporter.progress(done, &format!("{name} = {value:.0}, {:.3}°", error.to_degrees()));
-    });
+    };
+    let [before, after] = calibrate_suspension(&mut chosen, training, &scales, progress, interrupted);
+    if interrupted() {
+        return None;
+    }
     let (rates, dampings) = (chosen.suspension_n_m, chosen.suspension_n_s_m);
     reporter.line(&format!(
         "suspension, symbolic model alone {:.3}° -> {:.3}° of roll and pitch over {seconds:.1} s; {rates:.0?} N/m, {dampings:.0?} N s/m",
         before.to_degrees(),
         after.to_degrees()
     ));
-    (chosen, scales)
+    Some((chosen, scales))
 }
 
 /// Numbers that are calibrated on a car.
@@ -145,12 +159,14 @@ pub fn knobs(vehicle: &Vehicle) -> &'static [Knob] {
     if vehicle.driveline.torque.is_some() { &TORQUE } else { &OVERSPEED }
 }
 
-/// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error before and after, m.
+/// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error before and after, m. Where it is interrupted, which is
+/// asked before each number, the vehicle is as fitted by then.
 pub fn calibrate_driveline(
     vehicle: &mut Vehicle,
     drives: &[&Drive],
     scales: &Normalization,
     mut progress: impl FnMut(&str, f64, f64),
+    interrupted: &dyn Fn() -> bool,
 ) -> [f64; 2] {
     let before = symbolic_error(vehicle, drives, scales).position_m;
     if vehicle.second == SecondCommand::YawRateRadS {
@@ -158,14 +174,17 @@ pub fn calibrate_driveline(
             vehicle.driveline.rims = servo;
             progress("rims", servo.speed_gain, servo.turn_efficiency);
         } else {
-            vehicle.driveline.rims =
-                fit_rims_to_motion(vehicle, drives, scales, |value, error| progress("rims, from the motion", value, error));
+            let told = |value: f64, error: f64| progress("rims, from the motion", value, error);
+            vehicle.driveline.rims = fit_rims_to_motion(vehicle, drives, scales, told, interrupted);
         }
         return [before, symbolic_error(vehicle, drives, scales).position_m];
     }
     let mut best = before;
     for round in 0..3 {
         for &(name, knob, [low, high]) in knobs(vehicle) {
+            if interrupted() {
+                return [before, best];
+            }
             let reach = if round == 0 { 0.5 } else { 0.5 / f64::from(2 << round) };
             let trials = |vehicle: &Vehicle, reach: f64| {
                 [(-1.0, 1e-3), (1.0, 0.05)].map(|(sign, of_range)| {

@@ -135,11 +135,12 @@ pub fn encode_drives(
     scale: &PatchScale,
     pooling: &Pooling,
     progress: impl Fn(usize) + Sync,
+    interrupted: &(dyn Fn() -> bool + Sync),
 ) {
     drives.par_iter_mut().for_each_init(
         || (Patch::new(), EncoderScratch::default(), vec![0f32; CONTEXT]),
         |(patch, scratch, context), drive| {
-            let Some(map) = drive.map.clone() else { return };
+            let Some(map) = drive.map.clone().filter(|_| !interrupted()) else { return };
             let samples = drive.states.len();
             // Contexts that are not pooled hold the semantic features already.
             let apart = if pooling.width() == CONTEXT { 0 } else { FEATURES };

@@ -84,7 +84,7 @@ pub fn run(
     recipe: &Recipe,
     baselines_json: Option<String>,
     reporter: &dyn Reporter,
-    interrupted: &dyn Fn() -> bool,
+    interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<ModelBundle, TrainingError> {
     let mut drives = load_drives(root, trajectories)?;
     let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
@@ -103,12 +103,13 @@ pub fn run(
             reporter
                 .line(&format!("the card states no range of commands; with that of the drives speed {speed_m_s:?} m/s, second {second:?}"));
         }
-        calibrate_vehicle(damped(&vehicle), &training, recipe.dt_s, reporter)
+        calibrate_vehicle(damped(&vehicle), &training, recipe.dt_s, reporter, interrupted)
+            .ok_or(TrainingError::Unprepared("the vehicle's card was calibrated"))
     };
     let (vehicle, mut scales) = match &recipe.start {
-        Some(bundle) if recipe.recalibrate => (fitted().0, bundle.normalization.clone()),
+        Some(bundle) if recipe.recalibrate => (fitted()?.0, bundle.normalization.clone()),
         Some(bundle) => (damped(&bundle.vehicle), bundle.normalization.clone()),
-        None => fitted(),
+        None => fitted()?,
     };
     scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);
 
@@ -136,9 +137,12 @@ pub fn run(
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
-        encode_drives(&mut drives, &TerrainEncoders::new(&weights)?, &scales.patch_scale(), &recipe.pooling, |n| {
-            reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
-        });
+        let told = |n| reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
+        let encoders = TerrainEncoders::new(&weights)?;
+        encode_drives(&mut drives, &encoders, &scales.patch_scale(), &recipe.pooling, told, interrupted);
+    }
+    if interrupted() {
+        return Err(TrainingError::Unprepared("the terrain contexts were computed"));
     }
 
     let set = TrainingSet {
@@ -266,14 +270,14 @@ fn encoders_file(plan: &PretrainPlan, pixels: &PatchScale, places: &Places) -> S
     format!("encoders-{}.safetensors", &key[..12])
 }
 
-/// Pre-trained encoders, from the output folder if this run was made before.
+/// Pre-trained encoders, from the output folder if this run was made before. Only both whole are kept.
 fn encoders(
     drives: &[Drive],
     train_at: &[usize],
     scales: &Normalization,
     recipe: &Recipe,
     reporter: &dyn Reporter,
-    interrupted: &dyn Fn() -> bool,
+    interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<Weights, TrainingError> {
     let plan = PretrainPlan { steps: recipe.encoder_steps, batch: recipe.encoder_batch, rate: recipe.encoder_rate, seed: recipe.plan.seed };
     let places: Places = train_at
@@ -297,9 +301,10 @@ fn encoders(
                 scope.spawn(move || {
                     let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().expect("a thread can be started; this is a bug");
                     pool.install(|| {
-                        pretrain(name, places, &scales.patch_scale(), plan, device, |_, loss| {
+                        let told = |_, loss| {
                             reporter.progress(done.fetch_add(1, Ordering::Relaxed) + 1, &format!("{name} loss {loss:.5}"));
-                        })
+                        };
+                        pretrain(name, places, &scales.patch_scale(), plan, device, told, interrupted)
                     })
                 })
             })
@@ -308,15 +313,15 @@ fn encoders(
     });
     let mut weights = Weights::default();
     for ((name, _), result) in ENCODERS.iter().zip(results) {
-        let pretrained = result?;
-        reporter.line(&format!("{name} encoder: {:.1} % of the variance is lost in the features", 100.0 * pretrained.unexplained));
+        let pretrained = result?.ok_or(TrainingError::Unprepared("the encoders were pre-trained"))?;
+        let lost = pretrained.unexplained.map_or("not measured".into(), |share| format!("{:.1} %", 100.0 * share));
+        reporter.line(&format!("{name} encoder: variance that is lost in the features: {lost}"));
         for (array_name, array) in pretrained.weights.iter() {
             weights.insert(array_name, &array.shape, array.values.clone());
         }
     }
     write(&path, &weights.to_bytes())?;
-    // Asked for meanwhile: pre-training runs to its end, and what it made is kept for the run that resumes this one.
-    if interrupted() { Err(TrainingError::Interrupted(0)) } else { Ok(weights) }
+    Ok(weights)
 }
 
 fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {

@@ -90,7 +90,13 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
 /// The servo with which the symbolic model follows the measured motion best, for a base whose wheel speeds nobody measured. The error, m, is that of the position
 /// with what the error of the heading moves a wheel by, half of the track away. The servo stays as it is where none that is found is better; `progress` is told a
 /// number and the error after each of its turns.
-pub fn fit_rims_to_motion(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalization, mut progress: impl FnMut(f64, f64)) -> RimServo {
+pub fn fit_rims_to_motion(
+    vehicle: &Vehicle,
+    drives: &[&Drive],
+    scales: &Normalization,
+    mut progress: impl FnMut(f64, f64),
+    interrupted: &dyn Fn() -> bool,
+) -> RimServo {
     let error = |vehicle: &Vehicle| {
         let of = symbolic_error(vehicle, drives, scales);
         of.position_m + 0.5 * vehicle.track_m * of.yaw_rad
@@ -111,6 +117,9 @@ pub fn fit_rims_to_motion(vehicle: &Vehicle, drives: &[&Drive], scales: &Normali
                     trial
                 })
             };
+            if interrupted() {
+                break;
+            }
             best = descend(&mut found, best, reach, trials, error);
             progress(*knob(&mut found.driveline.rims), best);
         }

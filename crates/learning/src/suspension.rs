@@ -25,12 +25,13 @@ const MOST: f64 = 3.0;
 pub const TURNS: usize = NUMBERS.len() * FIRST_REACH.len();
 
 /// Fits rates and dampings to the roll and pitch of drives over a map, and returns the error before and after, rad. Drives without a map tell nothing of
-/// what tilts a body: without any the vehicle stays as it is.
+/// what tilts a body: without any the vehicle stays as it is. Where it is interrupted, which is asked before each number, the vehicle is as fitted by then.
 pub fn calibrate_suspension(
     vehicle: &mut Vehicle,
     drives: &[&Drive],
     scales: &Normalization,
     mut progress: impl FnMut(&str, f64, f64),
+    interrupted: &dyn Fn() -> bool,
 ) -> [f64; 2] {
     let mapped: Vec<&Drive> = drives.iter().copied().filter(|drive| drive.map.is_some()).collect();
     let before = symbolic_error(vehicle, &mapped, scales).tilt_rad;
@@ -40,6 +41,9 @@ pub fn calibrate_suspension(
     }
     for reach in FIRST_REACH {
         for (name, number, wheels) in NUMBERS {
+            if interrupted() {
+                return [before, best];
+            }
             let of_card = *number(&mut card);
             let trials = |vehicle: &Vehicle, reach: f64| {
                 [1.0 + reach, 1.0 / (1.0 + reach)].map(|factor| {

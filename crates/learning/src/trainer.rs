@@ -128,6 +128,12 @@ pub enum TrainingError {
     /// The data cannot be trained on.
     #[error("training data: {0}")]
     Drives(String),
+    /// Stopped on request before the first step, while something was prepared that a run does each time.
+    #[error(
+        "training was interrupted before its first step, while {0}: that part is not kept, checkpoints and finished encoders are; the same command with \
+         --resume does it again and goes on"
+    )]
+    Unprepared(&'static str),
     /// Stopped on request; the last checkpoint resumes the run.
     #[error("training was interrupted after step {0}; the same command with --resume goes on")]
     Interrupted(usize),

@@ -73,7 +73,7 @@ fn analytic_a_servo_is_found_from_the_motion_alone() {
     let drives: Vec<&Drive> = drives.iter().collect();
     vehicle.driveline.rims = told;
     let before = symbolic_error(&vehicle, &drives, &scales);
-    vehicle.driveline.rims = fit_rims_to_motion(&vehicle, &drives, &scales, |_, _| ());
+    vehicle.driveline.rims = fit_rims_to_motion(&vehicle, &drives, &scales, |_, _| (), &|| false);
     let after = symbolic_error(&vehicle, &drives, &scales);
     let found = vehicle.driveline.rims;
     assert!(after.position_m < 0.2 * before.position_m && after.yaw_rad < before.yaw_rad, "{before:?} {after:?} {found:?}");

@@ -30,7 +30,7 @@ fn analytic_springs_and_dampers_are_found() {
     let mut scales = measured_scales(&drives[0]);
     scales.default_soil_raw = to_raw(&[1.5e6, 5e3, 0.7, 1.7e3, 0.5, 0.02]);
     let mut found = mistaken();
-    let [before, after] = calibrate_suspension(&mut found, &drives.iter().collect::<Vec<_>>(), &scales, |_, _, _| ());
+    let [before, after] = calibrate_suspension(&mut found, &drives.iter().collect::<Vec<_>>(), &scales, |_, _, _| (), &|| false);
     assert!(after < 0.3 * before, "{before} -> {after} rad");
     for wheel in [0, 2] {
         let rate = found.suspension_n_m[wheel] / truck().suspension_n_m[wheel];
@@ -45,6 +45,6 @@ fn analytic_springs_and_dampers_are_found() {
 fn analytic_drives_without_a_map_change_nothing() {
     let sample = drive(None, 60);
     let mut found = mistaken();
-    calibrate_suspension(&mut found, &[&sample], &measured_scales(&sample), |_, _, _| ());
+    calibrate_suspension(&mut found, &[&sample], &measured_scales(&sample), |_, _, _| (), &|| false);
     assert_eq!(found, mistaken());
 }

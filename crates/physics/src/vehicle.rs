@@ -275,7 +275,17 @@ impl Vehicle {
 
     /// Whether the command lies in the range of the card. Compared in f32, as the service does, so that the ends of the range are admitted in both precisions.
     pub fn admits(&self, control: &Control<f64>) -> bool {
-        let inside = |v: f64, r: [f64; 2]| v as f32 >= r[0] as f32 && v as f32 <= r[1] as f32;
-        inside(control.speed_m_s, self.command_range[0]) && inside(control.second, self.command_range[1])
+        self.admitted(control) == [true; 2]
+    }
+
+    /// The same of the speed and of the second command alone.
+    pub fn admitted(&self, control: &Control<f64>) -> [bool; 2] {
+        [self.admits_on(0, control.speed_m_s), self.admits_on(1, control.second)]
+    }
+
+    /// The same of one of the two, by its place in `command_range`.
+    pub fn admits_on(&self, axis: usize, value: f64) -> bool {
+        let [low, high] = self.command_range[axis];
+        value as f32 >= low as f32 && value as f32 <= high as f32
     }
 }

@@ -29,6 +29,9 @@ pub struct GridGeometry {
 /// Most cells of one map: 4096 x 4096, i.e. 410 m at 0.1 m. A larger map would take more than 270 MB in memory; it is refused.
 pub const MAX_CELLS: usize = 4096 * 4096;
 
+/// Farthest origin of a map from that of World, along x and y, m; beyond it positions lose the digits that a cell needs.
+pub const ORIGIN_MAX_M: f64 = 1e7;
+
 impl GridGeometry {
     /// Number of cells.
     pub fn cells(&self) -> usize {
@@ -59,8 +62,8 @@ impl GridGeometry {
 
     /// Checks the geometry; the first wrong field and the reason otherwise.
     pub(crate) fn check(&self) -> Result<(), (&'static str, String)> {
-        if !self.origin_m.iter().all(|o| o.is_finite() && o.abs() <= 1e7) {
-            return Err(("origin_m", format!("{:?} is not finite or beyond 1e7 m", self.origin_m)));
+        if !self.origin_m.iter().all(|o| o.is_finite() && o.abs() <= ORIGIN_MAX_M) {
+            return Err(("origin_m", format!("{:?} is not finite or beyond {ORIGIN_MAX_M:e} m", self.origin_m)));
         }
         if !(self.resolution_m.is_finite() && self.resolution_m >= 1e-3 && self.resolution_m <= 1e3) {
             return Err(("resolution_m", format!("{} is outside 0.001..=1000 m", self.resolution_m)));

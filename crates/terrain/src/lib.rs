@@ -18,7 +18,7 @@ mod world_map;
 
 pub use disguise::Disguise;
 pub use error::TerrainError;
-pub use geometry::{GridGeometry, MAX_CELLS, Pose2};
+pub use geometry::{GridGeometry, MAX_CELLS, ORIGIN_MAX_M, Pose2};
 pub use image::read_gray8;
 pub use patch::{PATCH_PX, PATCH_RESOLUTION_M, Patch, PatchScale, sample_patch};
 pub use world_map::{Ground, MapSource, SoilClassRange, WorldMap};

@@ -123,7 +123,7 @@ impl WorldMap {
     ///
     /// # Errors
     /// `TerrainError::Layers` naming the field when the tile is empty or leaves the map, a layer has the wrong number of cells,
-    /// the tile has semantics but the map has none, or the patched map is not valid.
+    /// the tile has semantics but the map has none, there is no next version, or the patched map is not valid.
     pub fn with_tile(
         &self,
         column0: usize,
@@ -153,6 +153,12 @@ impl WorldMap {
                 return Err(wrong("tile semantic_rgb", reason));
             }
         }
+        let Some(version) = self.version.checked_add(1) else {
+            return Err(wrong(
+                "version",
+                format!("{} is the last, no patch can follow; upload the map anew under another id", self.version),
+            ));
+        };
         let mut elevation = self.elevation_m();
         let mut semantic = self.semantic_rgb();
         for row in 0..height {
@@ -163,7 +169,7 @@ impl WorldMap {
                 map[to..to + width].copy_from_slice(&tile[from]);
             }
         }
-        let patched = Self::from_layers(&self.id, self.version + 1, self.geometry, elevation, semantic)?;
+        let patched = Self::from_layers(&self.id, version, self.geometry, elevation, semantic)?;
         Ok(patched.with_soil_classes(self.soil_classes.clone()).with_source(self.source.clone()))
     }
 

@@ -215,6 +215,8 @@ fn analytic_bad_layers_and_tiles_are_refused() {
     assert_eq!(field(flat.with_tile(0, 0, 2, 2, &[0.0; 3], None)), "tile elevation_m");
     assert_eq!(field(flat.with_tile(0, 0, 1, 1, &[0.0], Some(&[[0, 0, 0]]))), "tile semantic_rgb");
     assert_eq!(field(flat.with_tile(0, 0, 1, 1, &[f32::INFINITY], None)), "elevation_m");
+    let last = WorldMap::from_layers("a", u64::MAX, grid(), heights(|_, _| 0.0), None).unwrap();
+    assert_eq!(field(last.with_tile(0, 0, 1, 1, &[0.0], None)), "version");
     assert_eq!(field(WorldMap::from_layers("a", 1, grid(), vec![0.0; 5], None)), "elevation_m");
     assert_eq!(field(WorldMap::from_layers("a", 1, grid(), heights(|_, _| 0.0), Some(vec![[0; 3]; 4]))), "semantic_rgb");
     let nan_origin = GridGeometry { origin_m: [0.0, f64::NAN], ..grid() };

@@ -13,11 +13,12 @@ use crate::data_sheet::{CardReading, read_with_notes};
 use crate::drive;
 use crate::error::TrajectoryError;
 use crate::index::{Entry, Index};
+use crate::lacking::Lacking;
 use crate::table::Table;
 use crate::trajectory::{Split, Trajectory};
 
 /// File that makes a folder a set.
-const SAMPLES: &str = "samples.parquet";
+pub(crate) const SAMPLES: &str = "samples.parquet";
 
 /// Depth to which sets are searched (`effect_open/payload` is at 2).
 const SET_DEPTH: usize = 4;
@@ -93,6 +94,8 @@ pub struct DataRoot {
     hashes: Mutex<BTreeMap<String, String>>,
     /// What the card and the sets read so far lack, one sentence each.
     notes: Mutex<BTreeSet<String>>,
+    /// Where index, samples and worlds of the sets read so far do not belong together, one sentence each.
+    contradictions: Mutex<BTreeSet<String>>,
 }
 
 impl DataRoot {
@@ -114,7 +117,16 @@ impl DataRoot {
         };
         let CardReading { vehicle, notes, implied_range } = read_with_notes(&card, &|| second_of_columns(root))?;
         let notes = Mutex::new(notes.into_iter().collect());
-        Ok(Self { root: root.into(), card, vehicle, implied_range, worlds: Mutex::default(), hashes: Mutex::default(), notes })
+        Ok(Self {
+            root: root.into(),
+            card,
+            vehicle,
+            implied_range,
+            worlds: Mutex::default(),
+            hashes: Mutex::default(),
+            notes,
+            contradictions: Mutex::default(),
+        })
     }
 
     /// The vehicle that drove.
@@ -184,10 +196,16 @@ impl DataRoot {
         Ok(map)
     }
 
-    /// What the card and the sets loaded so far lack and is done without, one sentence each: numbers of the card that are estimated, maps that the index names
-    /// and that are not there, channels of the pose, splits.
+    /// What the card and the sets loaded so far lack and is done without, one sentence each: numbers of the card that are estimated, elevation images, channels
+    /// of the pose, splits.
     pub fn notes(&self) -> Vec<String> {
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
+    }
+
+    /// Where index, samples and worlds of the sets loaded so far do not belong together, one sentence each: worlds that an index names and that are not there,
+    /// drives that are not in it. They are loaded without a map all the same.
+    pub fn contradictions(&self) -> Vec<String> {
+        self.contradictions.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect()
     }
 
     /// SHA-256 (hex) over all set files read so far: samples and indices, by relative path.
@@ -208,8 +226,8 @@ impl DataRoot {
     /// Loads drives in the order of the samples file.
     ///
     /// A drive without an index entry has neither split nor world; one whose split is neither train nor test has no split, which [`DataRoot::notes`] says.
-    /// `world` is `None` where the root has no map of it, and where the drive does not measure its whole pose; [`DataRoot::notes`] then says so, unless the
-    /// root has no `worlds/` folder at all.
+    /// `world` is `None` where the root has no map of it, and where the drive does not measure its whole pose; [`DataRoot::contradictions`] and
+    /// [`DataRoot::notes`] then say so.
     ///
     /// # Errors
     /// `TrajectoryError` naming file, column and row of the first value that is not usable among the drives asked for, the sets
@@ -224,7 +242,6 @@ impl DataRoot {
         let drives = rows_by_trajectory(&table)?;
         let wanted = wanted(query, &index, &drives, table.path())?;
         let channels = Channels::read(&table, self.vehicle.second, query.ground_truth)?;
-        let has_worlds = !self.world_ids().is_empty();
         let mut lacking = Lacking::default();
         let mut loaded = Vec::with_capacity(wanted.len());
         for at in wanted {
@@ -238,12 +255,15 @@ impl DataRoot {
                 if let Some(name) = entry.split_name.as_ref().filter(|_| trajectory.split.is_none()) {
                     *lacking.splits.entry(name.clone()).or_default() += 1;
                 }
-                trajectory.world = entry.world.clone().filter(|_| has_worlds);
+                trajectory.world.clone_from(&entry.world);
+            } else if index.exists() {
+                lacking.not_in_index += 1;
             }
             self.leave_off_map(&mut trajectory, &mut lacking);
             loaded.push(trajectory);
         }
         self.notes.lock().unwrap_or_else(PoisonError::into_inner).extend(lacking.sentences(&query.set));
+        self.contradictions.lock().unwrap_or_else(PoisonError::into_inner).extend(lacking.contradictions(&query.set));
         Ok(loaded)
     }
 
@@ -276,9 +296,9 @@ impl DataRoot {
         let Some(world) = drive.world.take() else { return };
         let dir = self.world_dir(&world);
         if !is_plain_name(&world) || !dir.is_dir() {
-            *lacking.maps.entry(format!("the data root has no world `{world}`")).or_default() += 1;
+            *lacking.worlds.entry(world).or_default() += 1;
         } else if !WorldMap::has_elevation(&dir) {
-            *lacking.maps.entry(format!("world `{world}` has no elevation image")).or_default() += 1;
+            *lacking.elevations.entry(world).or_default() += 1;
         } else if drive.measured.whole_pose() {
             drive.world = Some(world);
         }
@@ -296,37 +316,11 @@ impl DataRoot {
     }
 }
 
-/// What the drives of a set lack and are loaded without: how many of them, by what it is.
-#[derive(Default)]
-struct Lacking {
-    /// By channels of the pose that are taken for zero.
-    channels: BTreeMap<String, usize>,
-    /// By what is wrong with the map.
-    maps: BTreeMap<String, usize>,
-    /// By the name of a split that is neither train nor test.
-    splits: BTreeMap<String, usize>,
-}
-
-impl Lacking {
-    fn sentences(&self, set: &str) -> Vec<String> {
-        let channels = self.channels.iter().map(|(names, count)| {
-            format!("set `{set}`: {names} not measured in {count} drives: taken for zero, on level ground without a map, and not scored")
-        });
-        let maps = self.maps.iter().map(|(what, count)| {
-            format!("set `{set}`: {what}: {count} drives have no map, and are predicted on level ground of the default soil")
-        });
-        let splits = self.splits.iter().map(|(name, count)| {
-            format!("set `{set}`: split `{name}` of {count} drives is neither train nor test: only --split all reads them")
-        });
-        channels.chain(maps).chain(splits).collect()
-    }
-}
-
 /// A drive's id and its rows, in file order.
-type DriveRows = (String, Vec<usize>);
+pub(crate) type DriveRows = (String, Vec<usize>);
 
 /// Groups the rows of the samples by trajectory, in order of first appearance.
-fn rows_by_trajectory(table: &Table) -> Result<Vec<DriveRows>, TrajectoryError> {
+pub(crate) fn rows_by_trajectory(table: &Table) -> Result<Vec<DriveRows>, TrajectoryError> {
     let ids = table.texts("trajectory")?;
     let mut drives: Vec<DriveRows> = Vec::new();
     let mut places: HashMap<Arc<str>, usize> = HashMap::new();

@@ -9,6 +9,7 @@
 #![forbid(unsafe_code)]
 
 mod channels;
+mod command_range;
 mod data_root;
 mod data_sheet;
 mod drive;
@@ -16,6 +17,7 @@ mod error;
 mod ground_truth;
 mod index;
 mod json;
+mod lacking;
 mod reports;
 mod resample;
 mod soil_truth;
@@ -24,6 +26,7 @@ mod trajectory;
 mod velocity;
 mod windows;
 
+pub use command_range::BeyondRange;
 pub use data_root::{DataRoot, SetQuery, SplitFilter};
 pub use data_sheet::{card_from_json, card_to_json, read_vehicle_card};
 pub use error::TrajectoryError;

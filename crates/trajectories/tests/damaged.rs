@@ -113,7 +113,7 @@ fn regress_drives_without_a_map_of_their_own_are_loaded_without_one() {
     let opened = DataRoot::open(root.path(), None).unwrap();
     let drives = opened.load_set(&SetQuery::all("drive")).unwrap();
     assert_eq!(drives.iter().map(|d| d.world.as_deref()).collect::<Vec<_>>(), [Some("w1"), None, None, None]);
-    let notes = opened.notes().join("\n");
+    let notes = [opened.contradictions(), opened.notes()].concat().join("\n");
     for said in ["no world `../w2`: 1 drives have no map", "world `w3` has no elevation image", "world `w4` has no elevation image"] {
         assert!(notes.contains(said), "{said}: {notes}");
     }
@@ -124,6 +124,57 @@ fn regress_drives_without_a_map_of_their_own_are_loaded_without_one() {
     write_parquet(&root.path().join("drive/samples.parquet"), &flat, usize::MAX / 2, Compression::UNCOMPRESSED);
     write_index(&index, &[("a", Some("w1"), None)]);
     assert_eq!(load(&root).unwrap()[0].world, None, "at height zero it would stand in the ground or in the air");
+}
+
+#[test]
+fn regress_a_root_that_lost_all_its_maps_says_so_like_one_that_lost_one() {
+    // Goal: what index, samples and worlds say otherwise of each other is told, however much of it. Method: an index that names a world of a root without
+    // `worlds/`, then with an empty one, then six such worlds; and drives that the index does not know.
+    let root = root_of(&circle_columns(&["a", "b", "c", "d", "e", "f", "g"], 40));
+    let index = root.path().join("drive/index.parquet");
+    let told = |rows: &[(&str, Option<&str>, Option<&str>)]| {
+        write_index(&index, rows);
+        let opened = DataRoot::open(root.path(), None).unwrap();
+        assert!(opened.load_set(&SetQuery::all("drive")).unwrap().iter().all(|drive| drive.world.is_none()));
+        assert_eq!(opened.notes(), Vec::<String>::new());
+        opened.contradictions()
+    };
+    let known = [("a", Some("w1"), None), ("b", Some("w1"), None), ("c", None, None)];
+    for _ in 0..2 {
+        let said = told(&known);
+        assert_eq!(said.len(), 2, "{said:?}");
+        assert!(said[0].contains("4 drives are not in the index: no map, no split"), "{said:?}");
+        assert!(said[1].contains("the data root has no world `w1`: 2 drives have no map"), "{said:?}");
+        std::fs::create_dir_all(root.path().join("worlds")).unwrap();
+    }
+    let names = ["w1", "w2", "w3", "w4", "w5", "w6"];
+    let each: Vec<_> = ["a", "b", "c", "d", "e", "f"].into_iter().zip(names).map(|(id, world)| (id, Some(world), None)).collect();
+    let said = told(&[&each[..], &[("g", None, None)]].concat());
+    assert!(said.len() == 1 && said[0].contains("no world `w1`, `w2`, `w3`, `w4` and 2 more: 6 drives have no map"), "{said:?}");
+}
+
+#[test]
+fn regress_commands_beyond_the_range_name_drive_row_and_limits() {
+    // Goal: whoever mends a log knows where. Method: 3.4 m/s in three rows of the second drive, under a card that implies 3 m/s and one that states 3.2 m/s.
+    let mut columns = two_drives();
+    [70, 71, 72].into_iter().for_each(|row| set(&mut columns, "cmd_speed", row, Some(3.4)));
+    let root = root_of(&columns);
+    let beyond = |card: &str| {
+        std::fs::write(root.path().join("vehicle_test.json"), card).unwrap();
+        let opened = DataRoot::open(root.path(), None).unwrap();
+        let drives = opened.load_set(&SetQuery::all("drive")).unwrap();
+        assert_eq!(opened.beyond_range(&drives[..1]), []);
+        opened.beyond_range(&drives)
+    };
+    let [implied] = &beyond(SKID_CARD)[..] else { panic!("one of the two commands") };
+    assert_eq!((implied.axis, implied.drives, implied.trajectory.as_str(), implied.row), (0, 1, "b", Some(70)));
+    assert!(implied.implied && implied.range == [-3.0, 3.0]);
+    let [stated] = &beyond(&SKID_CARD.replacen('{', r#"{"command_range": {"speed_m_s": [-1.0, 3.2]}, "#, 1))[..] else { panic!("one") };
+    let said = stated.to_string();
+    assert!(
+        !stated.implied && said.contains("drive `b`, row 70 of samples.parquet: speed 3.4 is outside the range of its card, -1.0 to 3.2"),
+        "{said}"
+    );
 }
 
 #[test]

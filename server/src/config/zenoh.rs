@@ -3,7 +3,7 @@
 use std::net::SocketAddr;
 
 use ::zenoh::config::EndPoint;
-use nesam_engine::check_name;
+use nesam_engine::{EngineError, check_name};
 use serde::{Deserialize, Serialize};
 
 use crate::error::ServerError;
@@ -83,8 +83,12 @@ impl ZenohConfig {
                 return Err(ServerError::Value { key, reason });
             }
         }
-        let name =
-            |key: &'static str, name: &str| check_name(key, name).map_err(|error| ServerError::Value { key, reason: error.to_string() });
+        let name = |key: &'static str, name: &str| {
+            check_name(key, name).map_err(|error| match error {
+                EngineError::Invalid { reason, .. } => ServerError::Value { key, reason },
+                other => ServerError::Value { key, reason: other.to_string() },
+            })
+        };
         if !self.name.is_empty() {
             name("zenoh.name", &self.name)?;
         }

@@ -31,8 +31,11 @@ pub fn image_bytes(image: &SessionImage) -> Vec<u8> {
 /// The session in such bytes.
 ///
 /// # Errors
-/// `Invalid` naming `image`: no export, another version, damaged, or not of the shape of a session.
+/// `Invalid` naming `image`: empty, no export, another version, damaged, or not of the shape of a session.
 pub fn session_image(bytes: &[u8]) -> Result<SessionImage, EngineError> {
+    if bytes.is_empty() {
+        return Err(refused("is empty; give what an export has answered"));
+    }
     let no_export = |error: prost::DecodeError| refused(format!("is no exported session: {error}"));
     let outer = pb::SessionImage::decode(bytes).map_err(no_export)?;
     if outer.version != VERSION {

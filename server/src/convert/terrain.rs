@@ -2,7 +2,7 @@
 
 use nesam_engine::{EngineError, Limits, check_name};
 use nesam_proto::v1 as pb;
-use nesam_terrain::{GridGeometry, MapSource, TerrainError, WorldMap};
+use nesam_terrain::{GridGeometry, MapSource, ORIGIN_MAX_M, TerrainError, WorldMap};
 
 use super::decode_f32;
 
@@ -81,6 +81,9 @@ impl MapBuilder {
             if !value.is_finite() {
                 return Err(EngineError::invalid(field, format!("is {value}, a finite number is needed")));
             }
+            if value.abs() > ORIGIN_MAX_M {
+                return Err(EngineError::invalid(field, format!("is {value}, allowed are up to {ORIGIN_MAX_M:e} m")));
+            }
         }
         if header.frame.len() > FRAME_LENGTH_MAX {
             let reason = format!("has {} bytes, at most {FRAME_LENGTH_MAX} are allowed", header.frame.len());
@@ -119,7 +122,7 @@ impl MapBuilder {
     /// `Invalid` naming what is wrong with the layers.
     pub fn finish(self) -> Result<WorldMap, EngineError> {
         let map = WorldMap::from_layers(&self.id, self.version, self.geometry, self.elevation_m, self.semantic_rgb);
-        map.map(|map| map.with_source(self.source)).map_err(|e| layers("header", e))
+        map.map(|map| map.with_source(self.source)).map_err(layers)
     }
 }
 
@@ -130,16 +133,18 @@ impl MapBuilder {
 pub fn patched(map: &WorldMap, message: &pb::MapTile) -> Result<WorldMap, EngineError> {
     let with_colours = map.has_semantics() && !message.semantic_rgb.is_empty();
     let tile = tile(message, map.geometry(), with_colours)?;
-    map.with_tile(tile.column, tile.row, tile.columns, tile.rows, &tile.elevation_m, tile.semantic_rgb.as_deref())
-        .map_err(|e| layers("tile", e))
+    map.with_tile(tile.column, tile.row, tile.columns, tile.rows, &tile.elevation_m, tile.semantic_rgb.as_deref()).map_err(layers)
 }
 
-fn layers(parent: &str, error: TerrainError) -> EngineError {
+/// An error of a map by the field of the request that it is about: layers come in tiles, all else in the header.
+fn layers(error: TerrainError) -> EngineError {
     match error {
-        TerrainError::Layers { field, reason, .. } => {
-            EngineError::invalid(format!("{parent}.{}", field.trim_start_matches("tile ")), reason)
-        }
-        other => EngineError::invalid(parent, other.to_string()),
+        TerrainError::Layers { field: "version", reason, .. } => EngineError::invalid("base_version", reason),
+        TerrainError::Layers { field, reason, .. } => match field.trim_start_matches("tile ") {
+            layer @ ("elevation_m" | "semantic_rgb") => EngineError::invalid(format!("tile.{layer}"), reason),
+            side => EngineError::invalid(format!("header.{side}"), reason),
+        },
+        other => EngineError::invalid("header", other.to_string()),
     }
 }
 

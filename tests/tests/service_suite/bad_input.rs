@@ -247,6 +247,7 @@ async fn service_bad_maps_are_refused() {
         ("resolution 0", with_header(v1::MapHeader { resolution_m: 0.0, ..header() }), InvalidArgument, "header.resolution_m"),
         ("infinite origin", with_header(v1::MapHeader { origin_x_m: f64::INFINITY, ..header() }), InvalidArgument, "header.origin_x_m"),
         ("NaN origin", with_header(v1::MapHeader { origin_y_m: f64::NAN, ..header() }), InvalidArgument, "header.origin_y_m"),
+        ("far origin", with_header(v1::MapHeader { origin_y_m: -1.1e7, ..header() }), InvalidArgument, "header.origin_y_m"),
         ("long frame", with_header(v1::MapHeader { frame: "x".repeat(65), ..header() }), InvalidArgument, "header.frame"),
         ("tile too high", with_tile(v1::MapTile { row: 1, ..tile() }), InvalidArgument, "tile.rows"),
         ("tile far right", with_tile(v1::MapTile { column: u32::MAX, ..tile() }), InvalidArgument, "tile.columns"),
@@ -254,8 +255,8 @@ async fn service_bad_maps_are_refused() {
         ("short elevation", with_tile(v1::MapTile { elevation_m: vec![0; 47].into(), ..tile() }), InvalidArgument, "tile.elevation_m"),
         ("missing colours", with_tile(v1::MapTile { semantic_rgb: Default::default(), ..tile() }), InvalidArgument, "tile.semantic_rgb"),
         ("colours not announced", with_header(v1::MapHeader { semantic: false, ..header() }), InvalidArgument, "tile.semantic_rgb"),
-        ("all holes", with_tile(filled(f32::NAN)), InvalidArgument, "header.elevation_m"),
-        ("infinite elevation", with_tile(filled(f32::INFINITY)), InvalidArgument, "header.elevation_m"),
+        ("all holes", with_tile(filled(f32::NAN)), InvalidArgument, "tile.elevation_m"),
+        ("infinite elevation", with_tile(filled(f32::INFINITY)), InvalidArgument, "tile.elevation_m"),
         ("version held", with_header(v1::MapHeader { map_id: world.map_id.clone(), ..header() }), AlreadyExists, "map_id"),
     ] {
         assert_refused(what, client.upload_messages(messages).await, code, field);
@@ -289,6 +290,12 @@ async fn service_bad_maps_are_refused() {
     assert_ne!(patched.hash, world.hash);
     let prediction = client.predict(candidates("s", &recorded.drive, 39, 1, 1)).await.unwrap();
     assert_eq!((prediction.provenance.map_version, &prediction.provenance.map_hash), (2, &patched.hash));
+
+    // The last version there is takes no patch, and says so.
+    let last = v1::MapHeader { map_id: "last".into(), version: u64::MAX, ..header() };
+    client.upload_messages(with_header(last)).await.unwrap();
+    assert_refused("patch of the last", client.patch_tile(patch("last", u64::MAX, Some(tile()))).await, InvalidArgument, "base_version");
+    client.delete_map("last").await.unwrap();
 
     // Stamp and frame are carried, past a patch too, and are no part of the hash.
     let plain = client.upload_messages(with_header(header())).await.unwrap();

@@ -212,6 +212,7 @@ async fn service_bad_extras_are_refused() {
         ("17 soils", ask(1, soils(&[0.0; 102])), "extras.soil_deltas"),
         ("infinite soil", ask(1, soils(&[f32::INFINITY; 6])), "extras.soil_deltas"),
         ("16 x 300 rows", ask(300, soils(&[0.0; 96])), "extras.soil_deltas"),
+        ("13 x 316 rows", ask(316, v1::PredictExtras { soil_sigma_points: true, ..Default::default() }), "extras.soil_sigma_points"),
         ("both soils", ask(1, v1::PredictExtras { soil_sigma_points: true, ..soils(&[0.0; 6]) }), "extras.soil_sigma_points"),
     ] {
         assert_refused(what, client.predict_message(request).await, Code::InvalidArgument, field);

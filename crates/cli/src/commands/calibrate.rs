@@ -97,7 +97,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
         let needed_s = (HORIZON + 1) as f64 * args.data.dt;
         return Err(Failure::input(format!("no drive of set `{}` is of {needed_s:.1} s or more, so nothing can be predicted", drives.set)));
     }
-    let (vehicle, scales) = calibrate_vehicle(drives.root.vehicle_of(&drives.drives), &usable, args.data.dt, &Console::default());
+    let (vehicle, scales) = calibrated(drives.root.vehicle_of(&drives.drives), &usable, args.data.dt, &Console::default());
     let scored = if usable.len() > 1 { held_out(card, &usable, &scales) } else { scored(card, &vehicle, &usable, &scales) };
     let changes = changes(card, &vehicle);
     let path = out.join(CARD);
@@ -115,6 +115,11 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     write_file(&file, (serde_json::to_string_pretty(&document).expect("numbers and text serialise; this is a bug") + "\n").as_bytes())?;
     say!("wrote {}", file.display());
     Ok(())
+}
+
+/// Calibrates to the end: Ctrl-C ends this command as a whole.
+fn calibrated(card: Vehicle, drives: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
+    calibrate_vehicle(card, drives, dt_s, reporter, &|| false).expect("nothing interrupts it; this is a bug")
 }
 
 /// The bundle whose card is replaced; the effects of one that has some were found beside its old card.
@@ -138,7 +143,7 @@ fn held_out(card: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Sc
         let part = |held: bool| -> Vec<&Drive> {
             drives.iter().enumerate().filter(|(i, _)| (i % folds == fold) == held).map(|(_, drive)| *drive).collect()
         };
-        let fitted = calibrate_vehicle(card.clone(), &part(false), scales.dt_s, &Silent).0;
+        let fitted = calibrated(card.clone(), &part(false), scales.dt_s, &Silent).0;
         all.extend(scored(card, &fitted, &part(true), scales));
         progress.set(fold + 1);
     }

@@ -13,7 +13,7 @@ use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
 use crate::output::say;
-use crate::sources::query;
+use crate::sources::{beyond_implied, query};
 
 /// Heights of a vehicle that follows its map spread less than this about their mean, m (chosen; the simulated drives have 0.03).
 const HEIGHT_SPREAD_M: f64 = 0.5;
@@ -124,10 +124,18 @@ fn bundle(path: &Path, findings: &mut Findings) {
 }
 
 fn configuration(path: &Path, findings: &mut Findings) {
+    if std::fs::read_to_string(path).is_ok_and(|text| says_nothing(&text)) {
+        findings.doubts.push("is empty: every key would have its default; is it the right file?".into());
+    }
     match super::serve::check_configuration(path) {
         Ok(doubts) => findings.doubts.extend(doubts),
         Err(failure) => findings.error(failure.to_string()),
     }
+}
+
+/// Whether a text is white space and comments.
+fn says_nothing(text: &str) -> bool {
+    text.lines().map(str::trim).all(|line| line.is_empty() || line.starts_with('#'))
 }
 
 fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
@@ -145,6 +153,7 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     for set in root.sets() {
         check_set(&root, &set, findings);
     }
+    findings.doubts.extend(root.contradictions());
     root.notes().into_iter().for_each(|note| findings.note(note));
 }
 
@@ -172,10 +181,12 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     if without > 0 {
         findings.note(format!("set {set}: {without} drives have no map: flat ground and the default soil will be used"));
     }
-    let refused: Vec<String> = drives.iter().filter_map(|d| out_of_range(root, d)).collect();
-    if let Some(first) = refused.first() {
-        let implied = if root.implied_range().contains(&true) { ", which the card does not state in full" } else { "" };
-        findings.note(format!("set {set}: {} drives command beyond the card's range{implied}, first {first}", refused.len()));
+    for beyond in root.beyond_range(&drives) {
+        if beyond.implied {
+            findings.doubts.push(format!("set {set}: {}", beyond_implied(&beyond)));
+        } else {
+            findings.error(format!("set {set}: {} drives command beyond the range of the card: {beyond}", beyond.drives));
+        }
     }
 }
 
@@ -220,12 +231,6 @@ fn heights(drives: &[Trajectory], world: &str, map: &WorldMap, set: &str, findin
             "set {set}: heights do not follow map {world}: {mean:.2} ± {spread:.2} m above it; is it of this place, in this frame?"
         ));
     }
-}
-
-/// Where a drive's commands leave the range of the card.
-fn out_of_range(root: &DataRoot, drive: &Trajectory) -> Option<String> {
-    let at = drive.controls.iter().position(|c| !root.vehicle().admits(c))?;
-    Some(format!("{} at {:.1} s", drive.id, drive.time_s[at]))
 }
 
 #[cfg(test)]

@@ -208,9 +208,9 @@ fn judge(args: &ImportArgs, card: Option<&Path>, html: &Path) -> Result<(), Fail
     for doubt in doubts(&drives, root.vehicle()) {
         say!("  doubt: {}; {}", doubt.what, doubt.advice);
     }
-    let refused = drives.iter().filter(|drive| drive.controls.iter().any(|c| !root.vehicle().admits(c))).count();
-    if refused > 0 {
-        say!("  doubt: {refused} drives command beyond the range of the card; see the units of the commands");
+    for beyond in root.beyond_range(&drives) {
+        let cost = if beyond.implied { "" } else { ", and will not be read so" };
+        say!("  doubt: {} drives command beyond the range of the card{cost}: {beyond}; see the units of the commands", beyond.drives);
     }
     write_file(html, page::page(&args.set, &drives, root.vehicle()).as_bytes())?;
     say!("wrote {}", html.display());

@@ -9,7 +9,8 @@ use serde_json::{Map, Value, json};
 
 use crate::args::{BundleArgs, DataArgs};
 use crate::failure::Failure;
-use crate::output::{provenance, say, write_file};
+use crate::interrupt::exit_on_ctrl_c;
+use crate::output::{check_file, provenance, say, write_file};
 use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
 
 /// Options of `nesam inside`.
@@ -29,6 +30,8 @@ const STATE_NAMES: [&str; 12] = ["x", "y", "z", "roll", "pitch", "yaw", "vx", "v
 /// Runs the command.
 pub fn run(args: &InsideArgs) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
+    args.json.iter().try_for_each(|file| check_file(file))?;
+    exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, true)?;
     if drives.drives.iter().all(|d| d.truth.is_none()) {
         return Err(Failure::input(format!("set `{}` has no gt_ columns: there is nothing to compare the physics with", drives.set)));

@@ -131,17 +131,17 @@ impl Reporter for Console {
 
 static INTERRUPTED: AtomicBool = AtomicBool::new(false);
 
-/// The first Ctrl-C asks for a checkpoint after the step in work, or for the encoders in work; the second ends the program at once.
+/// The first Ctrl-C asks for a checkpoint after the step in work, or before the first step for an end after what is in work; the second ends the program at once.
 fn stop_on_ctrl_c() {
     std::thread::spawn(|| {
         let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
         runtime.block_on(async {
             while tokio::signal::ctrl_c().await.is_ok() {
                 if INTERRUPTED.swap(true, Ordering::SeqCst) {
-                    note!("\nstopped at once: what was done since the last checkpoint is lost, and encoders that are not finished");
+                    note!("\nstopped at once: what was done since the last checkpoint is lost");
                     std::process::exit(1);
                 }
-                note!("\nstopping after this step, or when the encoders are finished; Ctrl-C again to stop at once");
+                note!("\nstopping after this step; Ctrl-C again to stop at once");
             }
         });
     });

@@ -129,7 +129,7 @@ pub fn single_cells() -> Pooling {
 /// The drive with its contexts.
 pub fn encoded(mut drive: Drive, weights: &Weights, scales: &Normalization) -> Drive {
     let encoders = TerrainEncoders::new(weights).expect("all arrays are there");
-    encode_drives(core::slice::from_mut(&mut drive), &encoders, &scales.patch_scale(), &single_cells(), |_| {});
+    encode_drives(core::slice::from_mut(&mut drive), &encoders, &scales.patch_scale(), &single_cells(), |_| {}, &|| false);
     drive
 }
 

@@ -16,7 +16,8 @@ use serde_json::{Value, json};
 
 use crate::args::{BundleArgs, DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
-use crate::output::{provenance, say, write_file};
+use crate::interrupt::exit_on_ctrl_c;
+use crate::output::{check_file, provenance, say, write_file};
 use crate::sources::{check_model_step, load_bundle_for, predictor_for, read_drives, validation_drives};
 
 /// Options of `nesam bench alarms`.
@@ -55,6 +56,8 @@ const HIDDEN: [(&str, Change); 14] = [
 /// Runs the command.
 pub(super) fn run(args: &AlarmBench) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
+    args.json.iter().try_for_each(|file| check_file(file))?;
+    exit_on_ctrl_c("nothing was written");
     let drives = match args.data.split {
         SplitArg::Train => validation_drives(&args.data, "bench alarms", "alarms are counted")?,
         _ => read_drives(&args.data, false)?,

@@ -11,7 +11,8 @@ use serde_json::json;
 
 use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
-use crate::output::{provenance, say, write_file};
+use crate::interrupt::exit_on_ctrl_c;
+use crate::output::{check_file, provenance, say, write_file};
 use crate::progress::Progress;
 use crate::sources::{check_model_step, load_bundle_for, predictor_for, validation_drives};
 
@@ -48,6 +49,8 @@ pub(super) struct DiscoveryBench {
 /// Runs the command.
 pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
     check_model_step(args.data.dt)?;
+    args.json.iter().try_for_each(|file| check_file(file))?;
+    exit_on_ctrl_c("nothing was written");
     let drives = validation_drives(&args.data, "bench discovery", "effects are hidden")?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
     let judge = Judge::of(predictor.bundle()).or_input()?;

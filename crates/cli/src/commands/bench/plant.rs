@@ -16,6 +16,7 @@ use serde_json::json;
 use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::commands::plant::write::{Asked, copy_vehicle_and_worlds, write_drives};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{self, say, write_file};
 use crate::progress::Progress;
 use crate::sources::{load_bundle_for, open_root, predictor_for, read_drives};
@@ -106,6 +107,7 @@ struct Run {
 pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
     let doses = chosen(args)?;
     let labels = drawn(args, &doses)?;
+    exit_on_ctrl_c("drives that were written are in the folder, figures were not");
     let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &root)?, &root)?;
     let out = output::out_dir(args.out.as_deref(), "bench", "plant")?;

@@ -17,6 +17,7 @@ use crate::args::BundleArgs;
 use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{command_line, say, write_file};
 use crate::sources::load_bundle;
 
@@ -85,6 +86,7 @@ pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
         return Err(Failure::input(format!("{name} must be positive and finite, not {value}")));
     }
     restart_with(&OF_A_SERVER)?;
+    exit_on_ctrl_c("nothing was written");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(measure(args, bundle))

@@ -14,6 +14,7 @@ use crate::args::{BundleArgs, check_count};
 use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{command_line, say, write_file};
 use crate::progress::Progress;
 use crate::sources::load_bundle;
@@ -63,6 +64,7 @@ pub(super) fn run(args: &WireBench) -> Result<(), Failure> {
     check_count("--samples", args.samples, 1..=limits.samples_max.min(limits.sample_steps_max / args.horizon))?;
     check_count("--queries", args.queries, 1..=usize::MAX)?;
     restart_with(&OF_A_SERVER)?;
+    exit_on_ctrl_c("nothing was written");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     runtime.block_on(measure(args, bundle))

@@ -18,6 +18,7 @@ use serde_json::{Value, json};
 
 use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
+use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{self, say};
 use crate::sources::{load_bundle_for, on_vehicle_of, open_root};
 
@@ -164,6 +165,12 @@ impl Task {
 pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     check(args)?;
     args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
+    exit_on_ctrl_c(match args.plant {
+        None => "laps that were driven to their end are kept, and the same command goes on after them",
+        Some(_) => {
+            "laps that were driven to their end are kept, and the same command goes on after them, with --resume if the plant does not say which it is"
+        }
+    });
     let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
     let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
     let load = |dir: Option<&Path>| load_bundle_for(dir, &root).map(|bundle| on_vehicle_of(bundle, &root));

@@ -15,7 +15,8 @@ use serde_json::{Value, json};
 
 use crate::args::DataArgs;
 use crate::failure::{Failure, OrFail};
-use crate::output::{say, write_file};
+use crate::interrupt::exit_on_ctrl_c;
+use crate::output::{check_file, say, write_file};
 use crate::progress::Progress;
 use crate::sources::{open_root, read_drives};
 
@@ -55,6 +56,8 @@ struct Compared {
 
 /// Runs the command.
 pub fn run(args: &CheckArgs) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| check_file(file))?;
+    exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, true)?;
     let (_, root) = open_root(&args.data)?;
     let vehicle = Arc::new(PlantVehicle::of_root(&root).or_input()?);

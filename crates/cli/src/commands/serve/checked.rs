@@ -61,6 +61,10 @@ fn doubts(config: &Config) -> Result<Vec<String>, Failure> {
         writable(folder).map_err(|error| Failure::input(format!("`{key}` {}: {error}", folder.display())))?;
     }
     let mut doubts = tls.map_or_else(Vec::new, |tls| tls.doubts());
+    let reports = &config.http.reports;
+    if config.http.enabled && !reports.as_os_str().is_empty() && !reports.exists() {
+        doubts.push(format!("`http.reports` {}: does not exist; the page shows its reports once it does", reports.display()));
+    }
     // Diagnoses are made of recordings.
     let folder = &config.diagnosis.directory;
     if config.recording.enabled
