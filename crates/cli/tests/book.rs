@@ -4,6 +4,8 @@
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use nesam_adaptation::FilterSettings;
+
 fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
 }
@@ -63,5 +65,18 @@ fn property_links_of_the_book_lead_to_files() {
     for page in pages() {
         let name = page.strip_prefix(&docs).unwrap().display().to_string();
         assert!(name == "SUMMARY.md" || summary.contains(&format!("({name})")), "{name} is not in the book");
+    }
+}
+
+/// Goal: every setting of the soil filter is explained. Method: the keys that a settings file may have, as the filter refuses all others.
+#[test]
+fn property_every_setting_of_the_soil_filter_is_in_the_book() {
+    let page = std::fs::read_to_string(repository().join("docs/soil-filter.md")).unwrap();
+    let refused = FilterSettings::from_json(r#"{"no_such_setting": 1}"#).unwrap_err().to_string();
+    let (_, expected) = refused.split_once("expected one of ").unwrap();
+    let keys: Vec<&str> = expected.split('`').skip(1).step_by(2).collect();
+    assert!(keys.len() > 20, "{refused}");
+    for key in keys {
+        assert!(page.contains(&format!("`{key}`")), "{key}");
     }
 }

@@ -104,6 +104,18 @@ impl Case<'_> {
         (selection, onsets)
     }
 
+    /// Forgets all onsets: columns are whole and every segment counts again.
+    pub(crate) fn forget_onsets(&mut self) {
+        let Some(dating) = self.dating.take() else { return };
+        for (prepared, whole) in self.prepared.iter_mut().zip(dating.whole) {
+            for (column, rows) in whole {
+                prepared.signatures.columns[column] = rows;
+            }
+            prepared.signatures.uncounted.clear();
+        }
+        self.condense_again();
+    }
+
     /// When a hypothesis may have begun as far as that was looked for and is not decided.
     pub(crate) fn possible_onset(&self, hypothesis: usize) -> Option<PossibleOnset> {
         self.dating.as_ref().and_then(|dating| dating.possible[hypothesis])
@@ -209,7 +221,7 @@ fn places(selection: &Selection, more: &[usize]) -> Vec<(usize, Vec<usize>)> {
 /// The hypotheses that explain most for how their scores scatter.
 fn strongest(yardstick: &Yardstick, group: &Group) -> Vec<usize> {
     let gain = |h: usize| yardstick.after(group, &[], h).1 / dispersion(yardstick, h);
-    let mut gains: Vec<(usize, f64)> = (0..yardstick.catalogue.len()).filter(|h| yardstick.considered[*h]).map(|h| (h, gain(h))).collect();
+    let mut gains: Vec<(usize, f64)> = (0..yardstick.catalogue.len()).filter(|h| yardstick.may_choose(*h)).map(|h| (h, gain(h))).collect();
     gains.sort_by(|a, b| b.1.total_cmp(&a.1));
     gains.into_iter().take(STRONGEST).filter(|(_, gain)| *gain > 0.0).map(|(h, _)| h).collect()
 }

@@ -160,7 +160,8 @@ pub fn diagnose(
     progress("held-out windows", 0, held.len());
     let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
     let apart = options.fit_on.is_some() && judge_by.is_some();
-    let proving = if apart && total > 1 {
+    // Pieces of a few seconds may hold no window.
+    let proving = if apart && total > 1 && options.scoring.windows(&fit_drives).is_ok() {
         HeldDrives { drives: &fit_drives, maps: &fit_maps, fitted: true, ..held_drives }
     } else if apart {
         HeldDrives { drives: &[], ..held_drives }
@@ -171,7 +172,11 @@ pub fn diagnose(
         prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
     if apart {
         learned = vec![learned_by_all(&case, &judgement); held.len()];
-        scores = if held.is_empty() { None } else { Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?) };
+        scores = if options.scoring.windows(&held).is_ok() {
+            Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?)
+        } else {
+            None
+        };
         if let Some(scores) = scores.as_ref().filter(|_| verdict.claims()) {
             reason += &said_by_others(&judgement, scores);
         }

@@ -4,7 +4,7 @@
 //! combination of columns it is the scatter of that combination over the null drives, so no large covariance has to be inverted. A drive that says more
 //! than the usual one about a column (it is faster, or rougher) is also allowed to scatter more.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn};
 
 use crate::candidates::SHARE_SD;
 use crate::condense::Condensed;
@@ -134,7 +134,7 @@ impl Group {
         let pull = self.projection(&fitted, block);
         let fitted_score = self.score.select_rows(&fitted);
         let score = self.score.select_rows(block) - &pull * &fitted_score;
-        let doubted = doubted(&pull, &before.score.select_rows(&fitted), effects);
+        let doubted = self.doubted(before, &fitted, effects, block);
         let mut information = own.select_columns(block);
         if !fitted.is_empty() {
             information -= &pull * self.information.select_rows(&fitted).select_columns(block);
@@ -168,15 +168,32 @@ impl Group {
 
     /// A_BE (A_EE + prior)⁻¹: what a fit of `fitted` takes from the scores of `block`.
     fn projection(&self, fitted: &[usize], block: &[usize]) -> DMatrix<f64> {
-        if fitted.is_empty() {
-            return DMatrix::zeros(block.len(), 0);
-        }
+        let cross = self.information.select_rows(fitted).select_columns(block);
+        self.fitting(fitted).map_or_else(|| DMatrix::zeros(block.len(), fitted.len()), |c| c.solve(&cross).transpose())
+    }
+
+    /// A_EE + prior of fitted columns; `None` where there are none.
+    fn fitting(&self, fitted: &[usize]) -> Option<Cholesky<f64, Dyn>> {
         let mut own = self.information.select_rows(fitted).select_columns(fitted);
         for i in 0..fitted.len() {
             own[(i, i)] += SHARE_SD.powi(-2) + 1e-9;
         }
-        let cross = self.information.select_rows(fitted).select_columns(block);
-        own.cholesky().map_or_else(|| DMatrix::zeros(block.len(), fitted.len()), |c| c.solve(&cross).transpose())
+        own.cholesky().filter(|_| !fitted.is_empty())
+    }
+
+    /// Variance of the scores of a block for what fitted effects may be wrong by: each by its share of what it explains there, with the size that it has in the fit of all.
+    fn doubted(&self, before: &Group, fitted: &[usize], effects: &[Fitted], block: &[usize]) -> DVector<f64> {
+        let mut variance = DVector::zeros(block.len());
+        let Some(fitting) = self.fitting(fitted) else { return variance };
+        let shares = fitting.solve(&before.score.select_rows(fitted));
+        let mut from = 0;
+        for effect in effects {
+            let own = shares.rows(from, effect.columns.len());
+            from += effect.columns.len();
+            let explained = self.information.select_rows(block).select_columns(&effect.columns) * own;
+            variance += (explained * effect.mismatch).map(|v| v * v);
+        }
+        variance
     }
 
     /// Fall of the squared distance by a set of columns together, in the metric.
@@ -188,19 +205,6 @@ impl Group {
     pub fn joint_shares(&self, columns: &[usize]) -> Vec<f64> {
         self.remainder(&[], columns).shares
     }
-}
-
-/// Variance of the scores of a block for what fitted effects may be wrong by: the share of each of what it explains there, which errs for itself.
-fn doubted(pull: &DMatrix<f64>, score: &DVector<f64>, effects: &[Fitted]) -> DVector<f64> {
-    let mut variance = DVector::zeros(pull.nrows());
-    let mut from = 0;
-    for effect in effects {
-        let count = effect.columns.len();
-        let explained = pull.columns(from, count) * score.rows(from, count);
-        variance += (explained * effect.mismatch).map(|v| v * v);
-        from += count;
-    }
-    variance
 }
 
 #[cfg(test)]
@@ -259,16 +263,24 @@ mod tests {
         assert!(doubted < group.remainder(&[1], &[0]).z, "a response that is believed less leaves less evidence");
     }
 
-    /// Goal: an effect that is known roughly makes the answer of another one no worse. Method: a third column that each of two fitted ones explains alike, of scores 60 and 80.
+    /// Goal: an effect that is known roughly makes the answer of another one no worse, however alike the two are. Method: two fitted columns at a cosine of 0.8, one with a share of 3
+    /// and one with none, before a block that both resemble; doubted is what the first explains there, 3 · 60.
     #[test]
     fn analytic_each_fitted_effect_is_doubted_by_its_own_share() {
-        let (pull, score) = (DMatrix::from_row_slice(1, 2, &[1.0, 1.0]), DVector::from_row_slice(&[60.0, 80.0]));
+        let information = DMatrix::from_row_slice(3, 3, &[100.0, 80.0, 60.0, 80.0, 100.0, 80.0, 60.0, 80.0, 100.0]);
+        let group = Group { score: information.column(0) * 3.0, information, covariance: DMatrix::zeros(3, 3) };
         let of = |first: f64, second: f64| {
             let effects = [(0, first), (1, second)].map(|(column, mismatch)| Fitted { columns: vec![column], mismatch });
-            doubted(&pull, &score, &effects)[0]
+            group.doubted(&group, &[0, 1], &effects, &[2])[0].sqrt()
         };
-        assert!((of(0.1, 0.0) - 36.0).abs() < 1e-9 && (of(0.1, 0.1) - 100.0).abs() < 1e-9);
+        // The prior of a share takes a little of it.
+        assert!((of(0.12, 0.02) / (0.12 * 180.0) - 1.0).abs() < 0.02, "{}", of(0.12, 0.02));
+        assert!(of(0.0, 0.12) < 0.02 * 180.0, "{}", of(0.0, 0.12));
         let together = [Fitted { columns: vec![0, 1], mismatch: 0.1 }];
-        assert!((doubted(&pull, &score, &together)[0] - 196.0).abs() < 1e-9, "columns of one effect err together");
+        assert!(
+            (group.doubted(&group, &[0, 1], &together, &[2])[0].sqrt() / 18.0 - 1.0).abs() < 0.02,
+            "columns of one effect err together"
+        );
+        assert_eq!(group.doubted(&group, &[], &[], &[2])[0], 0.0);
     }
 }

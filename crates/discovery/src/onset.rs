@@ -12,6 +12,8 @@ use crate::metric::Metric;
 const DECISIVE: f64 = 14.0;
 /// The same from which an onset is possible, so that the size may be another (chosen).
 const POSSIBLE: f64 = 6.6;
+/// Most by which an onset that is possible makes a size larger (chosen): what is there for a quarter of the drives.
+const FACTOR_MAX: f64 = 4.0;
 /// Least share of the gain that an onset must bring (chosen): the answer to a strong effect that was always there is not exact, and fits a part of the time best.
 const SHARE_MIN: f64 = 0.01;
 /// Least dispersion that is believed (chosen): some thirty null drives tell of no smaller one.
@@ -122,11 +124,11 @@ pub(crate) fn find(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion
 pub(crate) fn change(metric: &Metric, drives: &[Course<'_>], dispersion: f64, share_min: f64) -> Option<Change> {
     let starts = midway(&drives.iter().map(Course::shown_s).collect::<Vec<_>>());
     let gain = |(score, information): (f64, f64)| score.powi(2) / information.max(1e-12);
+    let share = |(score, information): (f64, f64)| score / information.max(1e-12);
     let steps = profile(metric, drives, &starts, true).into_iter().zip(&starts);
-    let (best, start) = steps.max_by(|a, b| gain(a.0).total_cmp(&gain(b.0)))?;
-    let least = DECISIVE * dispersion.max(DISPERSION_MIN);
-    let share = best.0 / best.1.max(1e-12);
-    (gain(best) >= least && share.abs() >= share_min).then_some(Change { at_s: *start, share })
+    let large = steps.filter(|(step, _)| share(*step).abs() >= share_min);
+    let (best, at_s) = large.max_by(|a, b| gain(a.0).total_cmp(&gain(b.0)))?;
+    (gain(best) >= DECISIVE * dispersion.max(DISPERSION_MIN)).then(|| Change { at_s: *at_s, share: share(best) })
 }
 
 /// Score and information over all drives of an effect from each of some starts on, for itself or beside one that is `always` there in any size.
@@ -193,8 +195,8 @@ fn dated(starts: &[f64], profile: &[(f64, f64)], dispersion: f64, segment_s: f64
         let [low, high] = range(&|i| starts[i]);
         return Dated::From(Onset { at_s: starts[best], ci95_s: [low - 0.5 * segment_s, high + 0.5 * segment_s], gain: over });
     }
-    if over >= POSSIBLE * dispersion && share(0) > 0.0 {
-        return Dated::Possibly(PossibleOnset { at_s: starts[best], factor: range(&|i| share(i) / share(0)) });
+    if over >= (POSSIBLE * dispersion).max(SHARE_MIN * gain[best]) && share(0) > 0.0 {
+        return Dated::Possibly(PossibleOnset { at_s: starts[best], factor: range(&|i| (share(i) / share(0)).min(FACTOR_MAX)) });
     }
     Dated::Always
 }
@@ -250,13 +252,14 @@ mod tests {
         let of = |always: f64, best: f64, dispersion: f64| {
             // Scores whose squares over an information of one are these gains.
             let profile = [always, 0.5 * always, best, 0.5 * always].map(|gain| (gain.sqrt(), 1.0));
-            dated(&starts, &profile, dispersion, 0.8).onset()
+            dated(&starts, &profile, dispersion, 0.8)
         };
-        assert_eq!(of(1000.0, 1010.0, 0.1), None);
-        assert!(of(1000.0, 1040.0, 0.1).is_some_and(|o| o.at_s == 4.8 && (o.gain - 40.0).abs() < 1e-9));
-        assert_eq!(of(1.0, 1.6, 0.0), None);
-        assert!(of(1.0, 1.8, 0.0).is_some());
-        assert!(of(100.0, 113.0, 1.0).is_none() && of(100.0, 115.0, 1.0).is_some());
+        let is = |dated: Dated| dated.onset().is_some();
+        assert_eq!(of(1000.0, 1010.0, 0.1), Dated::Always);
+        assert!(of(1000.0, 1040.0, 0.1).onset().is_some_and(|o| o.at_s == 4.8 && (o.gain - 40.0).abs() < 1e-9));
+        assert!(!is(of(1.0, 1.6, 0.0)));
+        assert!(is(of(1.0, 1.8, 0.0)));
+        assert!(!is(of(100.0, 113.0, 1.0)) && is(of(100.0, 115.0, 1.0)));
     }
 
     /// Goal: an onset that is not decided makes another size possible. Method: half of the information, and so half of the score, lies after the start that is best; an onset there
@@ -327,7 +330,7 @@ mod tests {
     fn analytic_segments_within_the_interval_of_an_onset_straddle_it() {
         let onset = |low: f64, high: f64| Onset { at_s: 0.5 * (low + high), ci95_s: [low, high], gain: 20.0 };
         let first = times_s()[15];
-        let sure = onset(first - 0.8, first + 0.4);
+        let sure = onset(first - 0.4, first + 0.4);
         assert_eq!(straddling(&times_s(), 0.1, &[sure]), [14, 15]);
         assert_eq!(straddling(&times_s(), 0.1, &[onset(0.9, 2.3), sure]), [1, 2, 14, 15]);
         assert!(straddling(&times_s(), 0.1, &[]).is_empty());

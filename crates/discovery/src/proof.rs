@@ -37,7 +37,7 @@ pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Opti
     if least_gain.is_some() && !several_scored(&after.errors) {
         return Some("only one drive that was left out can be scored, which proves nothing: leave out two or more".into());
     }
-    if least_gain.is_some() && !several_scored(&telling(&after.errors, &scores.shows)) {
+    if least_gain.is_some() && !several_show(scores) {
         return Some(
             "what was found shows in one of the drives that were left out alone, which proves nothing: leave out two in which it shows"
                 .into(),
@@ -51,13 +51,18 @@ pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Opti
         }
     }
     rises_surely(before, after, scores.counted, &scores.resamples, &scores.shows)
-        .map(|[name, from, by]| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
+        .map(|Rise { name, from, by, .. }| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
 }
 
 /// Whether more than one drive has windows.
 pub(crate) fn several_scored(errors: &WindowErrors) -> bool {
     let scored = &errors.trajectory;
     scored.iter().any(|d| Some(d) != scored.first())
+}
+
+/// Whether what was learned shows in more than one drive that has windows.
+pub(crate) fn several_show(scores: &HeldOut) -> bool {
+    several_scored(&telling(&scores.scores[2].errors, &scores.shows))
 }
 
 /// The errors on drives in which what was learned shows. One that ends before every effect begins is predicted alike to the bit with them and without: it says nothing,
@@ -100,20 +105,35 @@ fn counting<T>(errors: impl Iterator<Item = T>, counted: Counted) -> impl Iterat
     errors.zip(counted).filter_map(|(error, counts)| counts.then_some(error))
 }
 
-/// The first error that counts and surely rises, and by more than is negligible: its name, where from, by how much.
+/// An error that surely rises.
+#[derive(Clone, Debug)]
+pub(crate) struct Rise {
+    /// Its place among the errors.
+    pub dimension: usize,
+    /// Its name.
+    pub name: &'static str,
+    /// Where it rises from.
+    pub from: String,
+    /// By how much.
+    pub by: String,
+}
+
+/// The first error that counts and surely rises, and by more than is negligible.
 pub(crate) fn rises_surely(
     before: &ModelScore,
     after: &ModelScore,
     counted: Counted,
     resamples: &Resamples,
     shows: &[bool],
-) -> Option<[String; 3]> {
+) -> Option<Rise> {
     let [before, after] = [before, after].map(|score| telling(&score.errors, shows));
     let (difference, interval) = paired_difference(&after, &before, resamples);
-    let names = DIMENSION_KEYS.iter().chain(&["position_m"]);
+    let names = DIMENSION_KEYS.iter().copied().chain(["position_m"]).enumerate();
     let rows = difference.row(false).into_iter().zip(interval.row(false)).zip(values(&before).row(false));
-    counting(rows.zip(names), counted).find_map(|(((d, i), b), name)| match (d, i, b) {
-        (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > RISE_MIN * b => Some([(*name).into(), format!("{b:.4}"), format!("{d:.4}")]),
+    counting(rows.zip(names), counted).find_map(|(((d, i), b), (dimension, name))| match (d, i, b) {
+        (Some(d), Some([low, _]), Some(b)) if low > 0.0 && d > RISE_MIN * b => {
+            Some(Rise { dimension, name, from: format!("{b:.4}"), by: format!("{d:.4}") })
+        }
         _ => None,
     })
 }
@@ -157,7 +177,7 @@ impl Trial<'_> {
         if !sensors_tell && !falls_surely(&before, &after, 0.0, counted, &resamples, &shows) {
             return Ok(Some("no error of predictions of the fitted drives falls surely with it".into()));
         }
-        let told = |[name, from, by]: [String; 3]| {
+        let told = |Rise { name, from, by, .. }: Rise| {
             format!("the error of {name} of predictions of the fitted drives rises surely with it, from {from} by {by}")
         };
         Ok(rises_surely(&before, &after, counted, &resamples, &shows).map(told))

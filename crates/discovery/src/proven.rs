@@ -12,7 +12,7 @@ use crate::consistency::Contradictions;
 use crate::diagnose::Options;
 use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::judgement::{Judgement, Verdict, judge};
-use crate::proof::{falls_surely, not_proven, rises_surely, several_scored};
+use crate::proof::{Counted, Rise, falls_surely, not_proven, rises_surely, several_scored, several_show};
 use crate::select::Yardstick;
 
 /// Share by which an error on held-out drives must surely fall where the model itself is on trial (chosen). A model of a new vehicle is wrong in many ways at
@@ -67,49 +67,58 @@ pub(crate) fn prove(
     judgement: Judgement,
     held: &HeldDrives<'_>,
 ) -> Result<Proven, EvaluationError> {
-    let first = tried(case, yardstick, fewer, judgement, held)?;
+    let mut first = tried(case, yardstick, fewer, judgement, held)?;
     let mut worse = if yardstick.model_on_trial { None } else { worsening(&first, held)? };
     if worse.is_none() {
         return Ok(first);
     }
     let mut refuted: Vec<Finding> = Vec::new();
     let (mut again, mut yardstick, mut fewer) = (case.clone(), yardstick.clone(), fewer.clone());
+    let admitted = first.judgement.selection.remaining.0.max(yardstick.threshold());
     while let Some(finding) = worse.filter(|_| refuted.len() < REFUTED_MAX) {
         for judging in [&mut yardstick, &mut fewer] {
-            judging.refused.push(finding.hypothesis);
+            judging.withheld.push(finding.hypothesis);
         }
         refuted.push(finding);
+        again.forget_onsets();
         let judgement = judge(&mut again, &yardstick);
         let mut next = tried(&again, &yardstick, &fewer, judgement, held)?;
-        if next.verdict.claims() && next.judgement.selection.remaining.0 <= first.judgement.selection.remaining.0 {
+        if next.verdict.claims() && next.judgement.selection.remaining.0 <= admitted {
             next.judgement.findings.extend(refuted);
             *case = again;
             return Ok(next);
         }
         worse = worsening(&next, held)?;
     }
+    // What was refuted first is among the claims of the first judgement, which says so for each of them.
+    if let Some(own) = refuted.first() {
+        first.judgement.findings.iter_mut().filter(|f| f.hypothesis == own.hypothesis).for_each(|f| f.refused.clone_from(&own.refused));
+    }
     Ok(first)
 }
 
 /// The claim by which an error of a judgement that is not proven surely rises, refused for that: the only one, or the last of several without which that error is surely
-/// smaller. `None` where no error rises, or that of none of them.
+/// smaller and surely rises no more. `None` where no error rises, or that of none of them.
 fn worsening(proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, EvaluationError> {
     let (judgement, claimed) = (&proven.judgement, proven.judgement.claimed());
     let Some(scores) = proven.scores.as_ref().filter(|_| !proven.verdict.claims() && !claimed.is_empty()) else { return Ok(None) };
     let [before, _, after] = &scores.scores;
-    let rises = |without: &ModelScore, shows: &[bool]| rises_surely(without, after, scores.counted, &scores.resamples, shows);
-    let Some(risen) = rises(before, &scores.shows) else { return Ok(None) };
-    let refuted = |i: usize, [name, from, by]: [String; 3]| {
+    let rises =
+        |from: &ModelScore, to: &ModelScore, counted: Counted, shows: &[bool]| rises_surely(from, to, counted, &scores.resamples, shows);
+    let Some(risen) = rises(before, after, scores.counted, &scores.shows) else { return Ok(None) };
+    let refuted = |i: usize| {
+        let Rise { name, from, by, .. } = &risen;
         let refused = Some(format!("the error of {name} rises surely with it on drives that were not fitted, from {from} by {by}"));
         Finding { refused, ..judgement.findings[i].clone() }
     };
     if let [only] = claimed[..] {
-        return Ok(Some(refuted(only, risen)));
+        return Ok(Some(refuted(only)));
     }
+    let same = core::array::from_fn(|dimension| dimension == risen.dimension);
     for i in claimed.into_iter().rev() {
         let (without, shows) = held.without(judgement.findings[i].hypothesis, &proven.learned, scores)?;
-        if let Some(risen) = rises(&without, &shows) {
-            return Ok(Some(refuted(i, risen)));
+        if rises(&without, after, same, &shows).is_some() && rises(before, &without, same, &scores.shows).is_none() {
+            return Ok(Some(refuted(i)));
         }
     }
     Ok(None)
@@ -268,10 +277,14 @@ fn proven(
 /// What drives beside those that were fitted say of a proven judgement.
 pub(crate) fn said_by_others(judgement: &Judgement, scores: &HeldOut) -> String {
     let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
+    if !several_show(scores) {
+        return "; the other drives are too few to say".into();
+    }
     let least_gain = claimed.iter().any(|f| acts(f)).then_some(0.0);
     match not_proven(scores, least_gain, claimed.len() > 1) {
-        Some(why) => format!("; of the other drives: {why}"),
-        None => "; the other drives agree".into(),
+        Some(why) => format!("; the other drives do not bear it out: {why}"),
+        None if least_gain.is_some() => "; so it does on the other drives".into(),
+        None => "; no error of the other drives surely rises".into(),
     }
 }
 

@@ -47,6 +47,8 @@ pub struct Yardstick {
     pub known: Vec<Known>,
     /// What stood out and was refused by an earlier look; not chosen.
     pub refused: Vec<usize>,
+    /// What the proof of an earlier judgement refuted; not chosen and no rival, but it counts in what is left.
+    pub withheld: Vec<usize>,
     /// How channels go on from segment to segment in drives without an effect; empty where the model is on trial.
     pub whiteness: Whiteness,
 }
@@ -73,6 +75,7 @@ impl Yardstick {
             model_on_trial: false,
             known: Vec::new(),
             refused: Vec::new(),
+            withheld: Vec::new(),
             whiteness: Whiteness::default(),
         }
     }
@@ -313,8 +316,19 @@ impl Yardstick {
         }
     }
 
+    /// Hypotheses that may be chosen beside others.
     fn open<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
+        self.looked_at(chosen).filter(|k| !self.withheld.contains(k))
+    }
+
+    /// Hypotheses that may show in what others leave.
+    fn looked_at<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
         (0..self.catalogue.len()).filter(|k| self.considered[*k] && !chosen.contains(k) && !self.refused.contains(k))
+    }
+
+    /// Whether a hypothesis may be chosen.
+    pub(crate) fn may_choose(&self, hypothesis: usize) -> bool {
+        self.open(&[]).any(|k| k == hypothesis)
     }
 
     fn rivals(&self, group: &Group, others: &[usize], j: usize, chosen: &[usize]) -> Vec<Rival> {
@@ -335,7 +349,7 @@ impl Yardstick {
         let chosen = &selection.chosen;
         let levels = self.levels_after_fit(left, before, chosen).map(|(channel, z)| (z, level_name(channel)));
         let level = levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
-        let hypotheses = self.open(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
+        let hypotheses = self.looked_at(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
         let most = hypotheses.chain([level.clone()]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         (selection.remaining, selection.remaining_level) = (most, level);
     }

@@ -229,21 +229,31 @@ fn property_a_drive_is_fitted_once_however_often_it_is_named() {
     assert_eq!(again.selection.z, once.selection.z);
 }
 
+/// Goal: what is claimed with `--fit-on` hangs on the fitted drives, and one other drive says too little. Method: seven of eight drives with a steering offset.
 #[test]
-fn property_one_drive_left_out_proves_nothing_and_the_reason_says_so() {
+fn property_one_drive_beside_those_that_are_fitted_says_too_little() {
     let fit_on = Some((0..7).map(|i| format!("d{i}")).collect());
-    let options = nesam_discovery::Options { fit_on, controls: true, ..options() };
+    let options = nesam_discovery::Options { fit_on, ..options() };
+    let found = diagnose_twin(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })], 500, &options);
+    assert_eq!(found.verdict, Verdict::Explained, "{}", found.reason);
+    assert!(found.reason.contains("the other drives are too few to say"), "{}", found.reason);
+    assert_eq!((found.held_out.as_slice(), found.learned.len()), (&["d7".to_string()][..], 1));
+}
+
+/// Goal: without a claim the free form is fitted to everything by which the drives differ, and is held against the model as it is. Method: a steering offset whose id is
+/// withheld.
+#[test]
+fn property_without_a_claim_the_free_form_stands_against_the_model_as_it_is() {
+    let without = vec!["steering_offset".into()];
+    let options = nesam_discovery::Options { without, controls: true, ..options() };
     let found = diagnose_twin(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })], 500, &options);
     assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.reason);
-    assert!(found.reason.contains("proves nothing: leave out two or more"), "{}", found.reason);
-    // Without a claim the free form is fitted to everything by which the drives differ, and is held against the model as it is.
     let provenance = nesam_evaluation::Provenance::default();
     let against = Against::Bundle;
     let report =
         Report { set: "twin", diagnosis: &found, bundle: None, free_form_bundle: None, provenance: &provenance, dt_s: 0.1, against };
     let json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
     assert_eq!(json["controls"]["free_form"]["before"], json["before"]);
-    assert_ne!(json["after"], json["before"], "the effect that was not proven was tried");
 }
 
 /// A drive without an effect, prepared, with its bundle.

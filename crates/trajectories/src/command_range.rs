@@ -47,12 +47,13 @@ impl DataRoot {
             let outside = |drive: &Trajectory| drive.controls.iter().find(|control| !vehicle.admitted(control)[axis]).copied();
             let mut found = drives.iter().filter_map(|drive| outside(drive).map(|control| (drive, control)));
             let (drive, control) = found.next()?;
+            let recorded = self.row_beyond(drive, vehicle, axis);
             Some(BeyondRange {
                 axis,
                 drives: 1 + found.count(),
                 trajectory: drive.id.clone(),
-                row: self.row_beyond(drive, vehicle, axis),
-                value: [control.speed_m_s, control.second][axis],
+                row: recorded.map(|(row, _)| row),
+                value: recorded.map_or([control.speed_m_s, control.second][axis], |(_, value)| value),
                 range: vehicle.command_range[axis],
                 implied: self.implied_range()[axis],
             })
@@ -60,13 +61,13 @@ impl DataRoot {
         (0..NAMES.len()).filter_map(of_axis).collect()
     }
 
-    /// The first row of a drive whose command the card does not admit.
-    fn row_beyond(&self, drive: &Trajectory, vehicle: &Vehicle, axis: usize) -> Option<usize> {
+    /// The first row of a drive whose command the card does not admit, with that command.
+    fn row_beyond(&self, drive: &Trajectory, vehicle: &Vehicle, axis: usize) -> Option<(usize, f64)> {
         let table = Table::open(&self.path().join(&drive.set).join(SAMPLES)).ok()?;
         let command = Channels::read(&table, vehicle.second, false).ok()?.command;
         let (_, rows) = rows_by_trajectory(&table).ok()?.into_iter().find(|(id, _)| *id == drive.id)?;
         let values = command[axis].finite(&rows).ok()?;
         let at = values.iter().position(|value| !vehicle.admits_on(axis, *value))?;
-        Some(rows[at])
+        Some((rows[at], values[at]))
     }
 }

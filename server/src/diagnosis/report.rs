@@ -81,9 +81,9 @@ fn effect(claimed: &Value) -> Option<pb::Effect> {
 
 fn parameter(claimed: &Value) -> Option<pb::EffectParameter> {
     let (name, value) = (claimed["name"].as_str()?, claimed["value"].as_f64()?);
-    // The upper end of an interval may be cut off where the parameter ends; the lower one is not. A choice, such as the wheel, has none.
-    let low = claimed["ci95"][0].as_f64().unwrap_or(value);
-    Some(pb::EffectParameter { name: name.into(), value, sd: ((value - low) / HALF_WIDTH).max(0.0) })
+    // The upper end of an interval may be cut off where the parameter ends, and either may lie further out where an onset is possible. A choice, such as the wheel, has none.
+    let end = |i: usize| claimed["ci95"][i].as_f64().unwrap_or(value);
+    Some(pb::EffectParameter { name: name.into(), value, sd: ((value - end(0)).max(end(1) - value) / HALF_WIDTH).max(0.0) })
 }
 
 #[cfg(test)]

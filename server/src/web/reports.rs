@@ -106,7 +106,7 @@ fn summary(report: &Value, file: Option<&Path>) -> Option<Value> {
             || json!({"mae_mean": tree["mae_mean"], "position_m": tree["position_m"]["mean"], "ci95": tree["ci95"]["position_m"]["mean"]}),
         )
     };
-    let effect = |e: &Value| json!({"id": e["id"], "weight": e["weight"], "parameters": e["parameters"], "onset_s": e["onset_s"], "z": e["evidence"]["z"], "rivals": e["rivals"]});
+    let effect = |e: &Value| json!({"id": e["id"], "weight": e["weight"], "parameters": e["parameters"], "onset_s": e["onset_s"], "onset_possible_s": e["onset_possible_s"], "z": e["evidence"]["z"], "rivals": e["rivals"]});
     Some(json!({
         "set": report["set"],
         "verdict": report["verdict"],

@@ -137,7 +137,7 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     let maps = vec![recorded.map.clone(); pieces.len()];
     assert!(pieces.len() >= 4 && recorded.map.is_some(), "{} pieces", pieces.len());
     let options = Options {
-        // All pieces are fitted; the proof is what follows in the drive.
+        // All pieces are fitted and prove one another; what follows in the drive is apart.
         fit_on: Some(pieces.iter().map(|p| p.id.clone()).collect()),
         ..Options::of(Scoring { horizon: HORIZON, history: 32, resamples: 100, seed: 1 })
     };

@@ -42,7 +42,7 @@ pub struct AdaptArgs {
     window: WindowArgs,
     #[command(flatten)]
     inputs: CommandsArgs,
-    /// Settings of the soil filter, JSON as in the `filter` block of a report; what is absent stays as by default
+    /// Settings of the soil filter, JSON as in the `filter` block of a report; what is absent stays as the bundle has it (docs/soil-filter.md)
     #[arg(long, value_name = "FILE.json")]
     filter: Option<PathBuf>,
     /// Algorithm 1 of the paper to the letter: physical units, one linearisation, nothing held at a bound

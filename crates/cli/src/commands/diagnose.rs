@@ -47,8 +47,8 @@ pub struct DiagnoseArgs {
     inputs: CommandsArgs,
     #[command(flatten)]
     recording: RecordingArgs,
-    /// Fit on these drives only and score on the others, of which one alone proves nothing; `train` stands for those of the train split [default: leave each
-    /// drive out once]
+    /// Find, prove and claim by these drives only, each left out once, and score the others; a model on trial (--reference physics) is proven on the others. `train`
+    /// stands for those of the train split [default: leave each drive out once]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     fit_on: Option<Vec<String>>,
     /// Effects that are not considered
@@ -211,13 +211,16 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
             predictor.bundle().vehicle.name
         );
     }
+    let fit_on = args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?;
+    // What is claimed does not hang on other drives, nor does how far they are predicted.
+    let fitted: Vec<Trajectory> = drives.drives.iter().filter(|d| fit_on.as_ref().is_none_or(|ids| ids.contains(&d.id))).cloned().collect();
     let options = Options {
-        fit_on: args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?,
+        fit_on,
         without: args.without.clone(),
         hypotheses,
         against: reference.into(),
         scoring: Scoring {
-            horizon: args.window.horizon_on(&drives.drives),
+            horizon: args.window.horizon_on(&fitted),
             history: args.window.history,
             resamples: DEFAULT_RESAMPLES,
             seed: args.seed,

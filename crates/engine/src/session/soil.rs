@@ -227,7 +227,7 @@ impl SoilLearner {
         self.filter.begun_from(&belief, log_odds).map(|filter| self.filter = filter).is_some()
     }
 
-    /// P⁺ as the filter gives it out.
+    /// Covariance as the filter gives it out, its own with trust and scale.
     pub(super) fn covariance(&self) -> [[f64; SOIL_DIM]; SOIL_DIM] {
         self.filter.posterior().covariance
     }

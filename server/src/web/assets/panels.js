@@ -95,7 +95,8 @@ function parameter(p) {
 function report(r) {
   const effects = (r.effects ?? []).map((e) => {
     const rivals = (e.rivals ?? []).map((v) => v.id).filter((id) => id !== e.id);
-    const begun = e.onset_s ? `, from ${significant(e.onset_s)} s` : "";
+    const perhaps = e.onset_possible_s ? `, perhaps from ${significant(e.onset_possible_s)} s, and another size then` : "";
+    const begun = e.onset_s ? `, from ${significant(e.onset_s)} s` : perhaps;
     return `<p class="effect"><strong>${esc(e.id)}</strong> ${(e.parameters ?? []).map(parameter).join(", ")}${begun}${rivals.length ? ` <span class="soft">not told from ${rivals.map(esc).join(", ")}</span>` : ""}</p>`;
   });
   const stages = [["before", "before", r.before], ["soil alone", "soil", r.soil_only], ["with effect", "after", r.after]].filter(([, , e]) => e?.position_m != null);
