@@ -117,7 +117,7 @@ fn service_an_interrupted_bench_says_that_nothing_was_written() {
 fn service_an_interrupted_training_stops_and_keeps_finished_encoders() {
     let here = tempfile::tempdir().unwrap();
     let root = sample();
-    let tiny = ["--epochs", "1", "--batches", "2", "--encoder-steps", "3", "--batch-size", "4"];
+    let tiny = ["--epochs", "1", "--batches", "20", "--encoder-steps", "3", "--batch-size", "4"];
     let args = [&["train", "--data", &root, "--set", "nominal"][..], &tiny].concat();
     for (after, interrupted) in [("symbolic model alone", "while the vehicle's card was calibrated"), ("semantic encoder:", "interrupted")]
     {
