@@ -122,7 +122,7 @@ pub(crate) fn find(metric: &Metric, drives: &[Course<'_>], dt_s: f64, dispersion
 ///
 /// The rows are what the fitted effect leaves, the shift is its answer where it acts, and each drive may have it in a size of its own.
 pub(crate) fn change(metric: &Metric, drives: &[Course<'_>], dispersion: f64, share_min: f64) -> Option<Change> {
-    let starts = midway(&drives.iter().map(Course::shown_s).collect::<Vec<_>>());
+    let starts = within(&drives.iter().map(Course::shown_s).collect::<Vec<_>>());
     let gain = |(score, information): (f64, f64)| score.powi(2) / information.max(1e-12);
     let share = |(score, information): (f64, f64)| score / information.max(1e-12);
     let steps = profile(metric, drives, &starts, true).into_iter().zip(&starts);
@@ -178,6 +178,15 @@ fn midway(each: &[Vec<f64>]) -> Vec<f64> {
     };
     times.retain(|time| enough(&|t| t < time) && enough(&|t| t >= time));
     times
+}
+
+/// Those of the starts of segments of each drive, s, with enough of them before and after, and with a quarter of all on each side: a few segments at an end may be off by much for
+/// what else is wrong there.
+fn within(each: &[Vec<f64>]) -> Vec<f64> {
+    let all = each.concat();
+    let quarter = |count: usize| 4 * count >= all.len();
+    let before = |time: f64| all.iter().filter(|t| **t < time).count();
+    midway(each).into_iter().filter(|time| quarter(before(*time)) && quarter(all.len() - before(*time))).collect()
 }
 
 /// What a profile of scores and information over starts says; the first start is always.
