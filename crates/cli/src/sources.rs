@@ -70,31 +70,19 @@ pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failur
     for note in root.contradictions().iter().chain(&root.notes()) {
         crate::output::note!("note: {note}");
     }
-    check_commands(&root, &set, &drives)?;
+    for beyond in root.beyond_range(&drives) {
+        crate::output::note!("note: set `{set}`: {}", beyond_range(&beyond));
+    }
     let maps = maps_of(&root, &drives)?;
     Ok(Drives { root, set, drives, maps })
 }
 
-/// Refuses commands beyond a range that the card states, and tells of those beyond one that it only implies.
-fn check_commands(root: &DataRoot, set: &str, drives: &[Trajectory]) -> Result<(), Failure> {
-    for beyond in root.beyond_range(drives) {
-        if !beyond.implied {
-            return Err(Failure::input(format!(
-                "set `{set}`: {beyond}; mend its units, leave the drive out (such drives: {}), or let `command_range` of {} admit it",
-                beyond.drives,
-                root.card().display()
-            )));
-        }
-        note!("note: set `{set}`: {}", beyond_implied(&beyond));
-    }
-    Ok(())
-}
-
-/// What commands beyond a range that no card states come to.
-pub fn beyond_implied(beyond: &BeyondRange) -> String {
+/// What commands beyond the range of a card come to: they were recorded, so that the drives are read, and no service would take them.
+pub fn beyond_range(beyond: &BeyondRange) -> String {
+    let of = if beyond.implied { "a range that the card does not state" } else { "the range that the card states" };
     format!(
-        "{} drives command beyond a range that the card does not state, and no service would take that: {beyond}; `command_range` of a card states it, and \
-         `nesam calibrate` and `nesam train` widen it to the commands of the drives",
+        "{} drives command beyond {of}, and no service would take that: {beyond}; if its units are right, let `command_range` of the card admit it (`nesam calibrate` and \
+         `nesam train` widen a range that is not stated)",
         beyond.drives
     )
 }
