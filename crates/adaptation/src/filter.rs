@@ -33,8 +33,8 @@ pub struct SoilPosterior {
     pub correction: SoilCorrection,
     /// How sure it is, in the coordinates of the correction: see [`SoilFilter::posterior`].
     pub covariance: [[f64; SOIL_DIM]; SOIL_DIM],
-    /// Whether the drive has told much of each parameter: its variance, as it is before trust and scale narrow or widen what goes out, is below half of the prior one, and the correction is trusted more than the prior
-    /// alone. Where it is false, a consumer should say "not learned" instead of a number; k_phi and k_c for instance act through one sum on a vehicle of
+    /// Whether the drive has told much of each parameter: its variance, as it is before trust and scale narrow or widen what goes out, is below half of the prior
+    /// one, and the correction is trusted more than the prior alone. Where it is false, a consumer should say "not learned" instead of a number; k_phi and k_c for instance act through one sum on a vehicle of
     /// one wheel width. A correction can be right all the same: where the ground may change unannounced, variances seldom stay so small.
     pub learned: [bool; SOIL_DIM],
 }

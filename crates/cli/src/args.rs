@@ -1,5 +1,6 @@
 //! Options that several commands share.
 
+use std::borrow::Borrow;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
@@ -125,7 +126,7 @@ pub struct WindowArgs {
 impl WindowArgs {
     /// Steps to predict on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows, and
     /// how many drives are too short for it.
-    pub fn horizon_on(&self, drives: &[Trajectory]) -> usize {
+    pub fn horizon_on(&self, drives: &[impl Borrow<Trajectory>]) -> usize {
         horizon_of(self.horizon, drives, "scored")
     }
 
@@ -145,7 +146,7 @@ impl WindowArgs {
 
 /// Steps of a window on these drives: what was asked for, else as many as the longest drive allows. Says so where that is less than the model knows, and how
 /// many drives are too short to be `used`.
-pub fn horizon_of(asked: Option<usize>, drives: &[Trajectory], used: &str) -> usize {
+pub fn horizon_of(asked: Option<usize>, drives: &[impl Borrow<Trajectory>], used: &str) -> usize {
     let horizon = asked.unwrap_or_else(|| longest_horizon(drives));
     if asked.is_none() && horizon < MAX_HORIZON {
         note!(
@@ -159,10 +160,11 @@ pub fn horizon_of(asked: Option<usize>, drives: &[Trajectory], used: &str) -> us
 }
 
 /// Which drives have no window of this many steps; `None` where every drive or none has one.
-fn too_short(drives: &[Trajectory], horizon: usize, used: &str) -> Option<String> {
+fn too_short(drives: &[impl Borrow<Trajectory>], horizon: usize, used: &str) -> Option<String> {
     /// Names in full at most.
     const LISTED: usize = 8;
-    let short: Vec<&str> = drives.iter().filter(|d| d.states.len() <= horizon).map(|d| d.id.as_str()).collect();
+    let short: Vec<&str> =
+        drives.iter().map(Borrow::borrow).filter(|d: &&Trajectory| d.states.len() <= horizon).map(|d| d.id.as_str()).collect();
     if short.is_empty() || short.len() == drives.len() {
         return None;
     }
@@ -176,8 +178,8 @@ fn too_short(drives: &[Trajectory], horizon: usize, used: &str) -> Option<String
 }
 
 /// As many steps as the model knows and the longest drive allows, at least one.
-pub fn longest_horizon(drives: &[Trajectory]) -> usize {
-    let longest = drives.iter().map(|d| d.states.len()).max().unwrap_or(0);
+pub fn longest_horizon(drives: &[impl Borrow<Trajectory>]) -> usize {
+    let longest = drives.iter().map(|d| d.borrow().states.len()).max().unwrap_or(0);
     MAX_HORIZON.min(longest.saturating_sub(1)).max(1)
 }
 

@@ -71,14 +71,14 @@ pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failur
         crate::output::note!("note: {note}");
     }
     for beyond in root.beyond_range(&drives) {
-        crate::output::note!("note: set `{set}`: {}", beyond_range(&beyond));
+        crate::output::note!("note: set `{set}`: {}", beyond_range_note(&beyond));
     }
     let maps = maps_of(&root, &drives)?;
     Ok(Drives { root, set, drives, maps })
 }
 
 /// What commands beyond the range of a card come to: they were recorded, so that the drives are read, and no service would take them.
-pub fn beyond_range(beyond: &BeyondRange) -> String {
+pub fn beyond_range_note(beyond: &BeyondRange) -> String {
     let of = if beyond.implied { "a range that the card does not state" } else { "the range that the card states" };
     format!(
         "{} drives command beyond {of}, and no service would take that: {beyond}; if its units are right, let `command_range` of the card admit it (`nesam calibrate` and \

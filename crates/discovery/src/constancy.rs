@@ -2,8 +2,7 @@
 //!
 //! What the fit leaves is searched for a further onset of the effect's own answer, as when effects are dated. An onset must bring a share of what its effect explains,
 //! because answers are not exact; a change of what is sized already must bring what answers of its layer are doubted by, or be as large as that is in the middle of the
-//! drives (28 % of the size, of forces and soils 69 %), so that forces,
-//! which depend on how the vehicle is driven, are not refused for that. What has no edge, such as a bias that grows, leaves sensors that go on from segment to segment
+//! drives (28 % of the size, of forces and soils 69 %), so that forces, which depend on how the vehicle is driven, are not refused for that. What has no edge, such as a bias that grows, leaves sensors that go on from segment to segment
 //! ([`whiteness`](crate::whiteness)).
 
 use nesam_physics::SoilCorrection;

@@ -221,7 +221,7 @@ fn places(selection: &Selection, more: &[usize]) -> Vec<(usize, Vec<usize>)> {
 /// The hypotheses that explain most for how their scores scatter.
 fn strongest(yardstick: &Yardstick, group: &Group) -> Vec<usize> {
     let gain = |h: usize| yardstick.after(group, &[], h).1 / dispersion(yardstick, h);
-    let mut gains: Vec<(usize, f64)> = (0..yardstick.catalogue.len()).filter(|h| yardstick.may_choose(*h)).map(|h| (h, gain(h))).collect();
+    let mut gains: Vec<(usize, f64)> = yardstick.open(&[]).map(|h| (h, gain(h))).collect();
     gains.sort_by(|a, b| b.1.total_cmp(&a.1));
     gains.into_iter().take(STRONGEST).filter(|(_, gain)| *gain > 0.0).map(|(h, _)| h).collect()
 }

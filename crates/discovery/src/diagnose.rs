@@ -160,14 +160,7 @@ pub fn diagnose(
     progress("held-out windows", 0, held.len());
     let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
     let apart = options.fit_on.is_some() && judge_by.is_some();
-    // Pieces of a few seconds may hold no window.
-    let proving = if apart && total > 1 && options.scoring.windows(&fit_drives).is_ok() {
-        HeldDrives { drives: &fit_drives, maps: &fit_maps, fitted: true, ..held_drives }
-    } else if apart {
-        HeldDrives { drives: &[], ..held_drives }
-    } else {
-        held_drives
-    };
+    let proving = if apart { held_drives.among_fitted(&fit_drives, &fit_maps) } else { held_drives };
     let Proven { mut judgement, mut learned, mut scores, verdict, mut reason } =
         prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
     if apart {

@@ -131,13 +131,19 @@ impl Group {
     pub fn remainder_since(&self, before: &Group, effects: &[Fitted], block: &[usize]) -> Remainder {
         let fitted: Vec<usize> = effects.iter().flat_map(|e| e.columns.iter().copied()).collect();
         let own = self.information.select_rows(block);
-        let pull = self.projection(&fitted, block);
+        let fitting = self.fitting(&fitted);
+        // A_BE (A_EE + prior)⁻¹: what the fit takes from the scores of the block.
+        let cross = self.information.select_rows(&fitted).select_columns(block);
+        let pull = fitting.as_ref().map_or_else(|| DMatrix::zeros(block.len(), fitted.len()), |c| c.solve(&cross).transpose());
         let fitted_score = self.score.select_rows(&fitted);
         let score = self.score.select_rows(block) - &pull * &fitted_score;
-        let doubted = self.doubted(before, &fitted, effects, block);
+        let doubted = match fitting {
+            Some(fitting) => self.doubted(&fitting.solve(&before.score.select_rows(&fitted)), effects, block),
+            None => DVector::zeros(block.len()),
+        };
         let mut information = own.select_columns(block);
         if !fitted.is_empty() {
-            information -= &pull * self.information.select_rows(&fitted).select_columns(block);
+            information -= &pull * cross;
         }
         // Score covariance of T t with T = [-pull, 1].
         let all: Vec<usize> = fitted.iter().chain(block).copied().collect();
@@ -166,12 +172,6 @@ impl Group {
         }
     }
 
-    /// A_BE (A_EE + prior)⁻¹: what a fit of `fitted` takes from the scores of `block`.
-    fn projection(&self, fitted: &[usize], block: &[usize]) -> DMatrix<f64> {
-        let cross = self.information.select_rows(fitted).select_columns(block);
-        self.fitting(fitted).map_or_else(|| DMatrix::zeros(block.len(), fitted.len()), |c| c.solve(&cross).transpose())
-    }
-
     /// A_EE + prior of fitted columns; `None` where there are none.
     fn fitting(&self, fitted: &[usize]) -> Option<Cholesky<f64, Dyn>> {
         let mut own = self.information.select_rows(fitted).select_columns(fitted);
@@ -181,11 +181,10 @@ impl Group {
         own.cholesky().filter(|_| !fitted.is_empty())
     }
 
-    /// Variance of the scores of a block for what fitted effects may be wrong by: each by its share of what it explains there, with the size that it has in the fit of all.
-    fn doubted(&self, before: &Group, fitted: &[usize], effects: &[Fitted], block: &[usize]) -> DVector<f64> {
+    /// Variance of the scores of a block for what fitted effects may be wrong by: each by its share of what it explains there, with the size that it has in the fit of all, whose
+    /// `shares` are those of the columns of all effects.
+    fn doubted(&self, shares: &DVector<f64>, effects: &[Fitted], block: &[usize]) -> DVector<f64> {
         let mut variance = DVector::zeros(block.len());
-        let Some(fitting) = self.fitting(fitted) else { return variance };
-        let shares = fitting.solve(&before.score.select_rows(fitted));
         let mut from = 0;
         for effect in effects {
             let own = shares.rows(from, effect.columns.len());
@@ -269,18 +268,19 @@ mod tests {
     fn analytic_each_fitted_effect_is_doubted_by_its_own_share() {
         let information = DMatrix::from_row_slice(3, 3, &[100.0, 80.0, 60.0, 80.0, 100.0, 80.0, 60.0, 80.0, 100.0]);
         let group = Group { score: information.column(0) * 3.0, information, covariance: DMatrix::zeros(3, 3) };
+        let doubted = |effects: &[Fitted]| {
+            let fitted: Vec<usize> = effects.iter().flat_map(|e| e.columns.clone()).collect();
+            group.doubted(&group.fitting(&fitted).unwrap().solve(&group.score.select_rows(&fitted)), effects, &[2])[0]
+        };
         let of = |first: f64, second: f64| {
             let effects = [(0, first), (1, second)].map(|(column, mismatch)| Fitted { columns: vec![column], mismatch });
-            group.doubted(&group, &[0, 1], &effects, &[2])[0].sqrt()
+            doubted(&effects).sqrt()
         };
         // The prior of a share takes a little of it.
         assert!((of(0.12, 0.02) / (0.12 * 180.0) - 1.0).abs() < 0.02, "{}", of(0.12, 0.02));
         assert!(of(0.0, 0.12) < 0.02 * 180.0, "{}", of(0.0, 0.12));
         let together = [Fitted { columns: vec![0, 1], mismatch: 0.1 }];
-        assert!(
-            (group.doubted(&group, &[0, 1], &together, &[2])[0].sqrt() / 18.0 - 1.0).abs() < 0.02,
-            "columns of one effect err together"
-        );
-        assert_eq!(group.doubted(&group, &[], &[], &[2])[0], 0.0);
+        assert!((doubted(&together).sqrt() / 18.0 - 1.0).abs() < 0.02, "columns of one effect err together");
+        assert!(group.fitting(&[]).is_none(), "nothing is fitted, so nothing is doubted");
     }
 }

@@ -309,22 +309,8 @@ mod tests {
     fn analytic_what_was_refused_is_named_where_nothing_else_stands_out() {
         let catalogue = catalogue(&[]);
         let finding = |id: &str, z: f64| {
-            let hypothesis = catalogue.iter().position(|c| c.id() == id).unwrap();
-            Finding {
-                hypothesis,
-                candidate: catalogue[hypothesis],
-                weight: 1.0,
-                z,
-                alone: z,
-                delta_bic: 50.0,
-                stability: 1.0,
-                estimates: Vec::new(),
-                onset: None,
-                may_have_begun_s: None,
-                rivals: Vec::new(),
-                refused: Some(format!("{id} does not help")),
-                refused_for_size: false,
-            }
+            let refused = Some(format!("{id} does not help"));
+            Finding { refused, ..Finding::of(&catalogue, id, z, Vec::new()) }
         };
         let judged = |verdict: Verdict, refused: Vec<Finding>| {
             let selection = Selection {

@@ -262,5 +262,10 @@ pub(crate) mod tests {
         assert_eq!(proof(two), None);
         let one = [vec![true], vec![false; 5]].concat();
         assert!(proof(one).is_some_and(|why| why.contains("in one of the drives")));
+        after.errors.trajectory.fill(0);
+        let (scores, counted) = ([score(before), score(before), after.clone()], counted(&[]));
+        let resamples = Resamples::draw(6, 50, 1);
+        let alone = HeldOut { scores, controls: Vec::new(), before_onset: None, resamples, counted, shows: vec![true; 6] };
+        assert!(not_proven(&alone, Some(0.0), false).is_some_and(|why| why.contains("proves nothing: leave out two or more")));
     }
 }

@@ -151,7 +151,14 @@ fn tried(
     }
 }
 
-impl HeldDrives<'_> {
+impl<'a> HeldDrives<'a> {
+    /// The fitted drives in the place of others, each predicted with what the others teach; none of them where one is alone or none holds a window, as pieces of a few
+    /// seconds.
+    pub(crate) fn among_fitted(self, drives: &'a [Trajectory], maps: &'a DriveMaps) -> Self {
+        let usable = drives.len() > 1 && self.options.scoring.windows(drives).is_ok();
+        Self { drives: if usable { drives } else { &[] }, maps, fitted: true, ..self }
+    }
+
     /// Score of the drives with a model for each.
     pub(crate) fn score(&self, predictors: &[Predictor], parameters: usize, resamples: &Resamples) -> Result<ModelScore, EvaluationError> {
         let windows = self.options.scoring.windows(self.drives)?;
@@ -315,24 +322,7 @@ mod tests {
     /// A judgement that claims effects of this evidence after the others, held against a threshold of 4.
     fn judgement(claims: &[(&str, f64)]) -> Judgement {
         let catalogue = catalogue(&[]);
-        let finding = |&(id, alone): &(&str, f64)| {
-            let hypothesis = catalogue.iter().position(|c| c.id() == id).unwrap();
-            Finding {
-                hypothesis,
-                candidate: catalogue[hypothesis],
-                weight: 1.0,
-                z: alone,
-                alone,
-                delta_bic: 50.0,
-                stability: 1.0,
-                estimates: Vec::new(),
-                onset: None,
-                may_have_begun_s: None,
-                rivals: Vec::new(),
-                refused: None,
-                refused_for_size: false,
-            }
-        };
+        let finding = |&(id, alone): &(&str, f64)| Finding::of(&catalogue, id, alone, Vec::new());
         let findings: Vec<Finding> = claims.iter().map(finding).collect();
         let selection = Selection {
             chosen: findings.iter().map(|f| f.hypothesis).collect(),

@@ -317,18 +317,13 @@ impl Yardstick {
     }
 
     /// Hypotheses that may be chosen beside others.
-    fn open<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
+    pub(crate) fn open<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
         self.looked_at(chosen).filter(|k| !self.withheld.contains(k))
     }
 
     /// Hypotheses that may show in what others leave.
     fn looked_at<'a>(&'a self, chosen: &'a [usize]) -> impl Iterator<Item = usize> + 'a {
         (0..self.catalogue.len()).filter(|k| self.considered[*k] && !chosen.contains(k) && !self.refused.contains(k))
-    }
-
-    /// Whether a hypothesis may be chosen.
-    pub(crate) fn may_choose(&self, hypothesis: usize) -> bool {
-        self.open(&[]).any(|k| k == hypothesis)
     }
 
     fn rivals(&self, group: &Group, others: &[usize], j: usize, chosen: &[usize]) -> Vec<Rival> {

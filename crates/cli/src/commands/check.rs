@@ -13,7 +13,7 @@ use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
 use crate::output::say;
-use crate::sources::{beyond_range, query};
+use crate::sources::{beyond_range_note, query};
 
 /// Heights of a vehicle that follows its map spread less than this about their mean, m (chosen; the simulated drives have 0.03).
 const HEIGHT_SPREAD_M: f64 = 0.5;
@@ -182,7 +182,7 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
         findings.note(format!("set {set}: {without} drives have no map: flat ground and the default soil will be used"));
     }
     for beyond in root.beyond_range(&drives) {
-        findings.doubts.push(format!("set {set}: {}", beyond_range(&beyond)));
+        findings.doubts.push(format!("set {set}: {}", beyond_range_note(&beyond)));
     }
 }
 

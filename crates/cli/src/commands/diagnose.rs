@@ -213,7 +213,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     }
     let fit_on = args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?;
     // What is claimed does not hang on other drives, nor does how far they are predicted.
-    let fitted: Vec<Trajectory> = drives.drives.iter().filter(|d| fit_on.as_ref().is_none_or(|ids| ids.contains(&d.id))).cloned().collect();
+    let fitted: Vec<&Trajectory> = drives.drives.iter().filter(|d| fit_on.as_ref().is_none_or(|ids| ids.contains(&d.id))).collect();
     let options = Options {
         fit_on,
         without: args.without.clone(),
