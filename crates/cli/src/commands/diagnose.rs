@@ -213,7 +213,11 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     }
     let fit_on = args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?;
     // What is claimed does not hang on other drives, nor does how far they are predicted.
-    let fitted: Vec<&Trajectory> = drives.drives.iter().filter(|d| fit_on.as_ref().is_none_or(|ids| ids.contains(&d.id))).collect();
+    let mut fitted: Vec<&Trajectory> = drives.drives.iter().filter(|d| fit_on.as_ref().is_none_or(|ids| ids.contains(&d.id))).collect();
+    if fitted.is_empty() {
+        // Nothing is of that name, which the diagnosis refuses.
+        fitted.extend(&drives.drives);
+    }
     let options = Options {
         fit_on,
         without: args.without.clone(),
