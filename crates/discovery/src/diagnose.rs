@@ -17,7 +17,7 @@ use crate::judgement::{Verdict, judge};
 use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
 use crate::own_reference;
 use crate::proof::Trial;
-use crate::proven::{HeldDrives, Proven, keep, learned_by_all, prove, said_by_others};
+use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others};
 use crate::pursuit::{Pursued, pursue};
 use crate::select::{EFFECTS_MAX, Selection};
 
@@ -161,10 +161,10 @@ pub fn diagnose(
     let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
     let apart = options.fit_on.is_some() && judge_by.is_some();
     let proving = if apart { held_drives.among_fitted(&fit_drives, &fit_maps) } else { held_drives };
-    let Proven { mut judgement, mut learned, mut scores, verdict, mut reason } =
+    let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
         prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
     if apart {
-        learned = vec![learned_by_all(&case, &judgement); held.len()];
+        learned = vec![taught; held.len()];
         scores = if options.scoring.windows(&held).is_ok() {
             Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?)
         } else {

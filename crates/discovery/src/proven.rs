@@ -46,6 +46,8 @@ pub(crate) struct Proven {
     pub judgement: Judgement,
     /// What each held-out drive was predicted with.
     pub learned: Vec<Learned>,
+    /// What all fitted drives teach together, proven or not.
+    pub taught: Learned,
     /// Scores; `None` when no drive is held out.
     pub scores: Option<HeldOut>,
     /// Verdict after the proof.
@@ -144,7 +146,8 @@ fn tried(
         let Some(i) = needless else {
             let agree = || scores.as_ref().is_some_and(|scores| held.sensors_agree(&learned, scores));
             let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial, agree);
-            return Ok(Proven { judgement, learned, scores, verdict, reason });
+            let taught = learned_by_all(case, &judgement);
+            return Ok(Proven { judgement, learned, taught, scores, verdict, reason });
         };
         let why = "no error falls surely with it beside the others on drives that were not fitted";
         judgement = judgement.dropping(case, yardstick, i, why.into());
@@ -214,7 +217,7 @@ fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, held: &HeldD
 }
 
 /// What all fitted drives teach together.
-pub(crate) fn learned_by_all(case: &Case<'_>, judgement: &Judgement) -> Learned {
+fn learned_by_all(case: &Case<'_>, judgement: &Judgement) -> Learned {
     let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
     let hypotheses = keep(judgement, judgement.selection.chosen.clone());
     Learned { soil: best_soil(case.condensed()), effects, hypotheses }
