@@ -10,6 +10,7 @@ use nesam_evaluation::{median, quantile_sorted};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
 
+use crate::bend::{self, Commands};
 use crate::candidates::{Candidate, column_count};
 use crate::channels::{CHANNELS, Row};
 use crate::metric::Metric;
@@ -31,6 +32,8 @@ pub struct Signatures {
     pub columns: Vec<Vec<Row>>,
     /// One prior standard deviation of each soil parameter.
     pub soil: Vec<Vec<Row>>,
+    /// What each segment was commanded.
+    pub commands: Vec<Commands>,
     /// Segments that do not count, because an effect that was chosen last may begin within them ([`straddling`](crate::onset)); empty where none does.
     pub uncounted: Vec<usize>,
 }
@@ -161,7 +164,7 @@ pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Bes
             difference(&side(-0.25), &side(0.25), 2.0)
         })
         .collect();
-    Signatures { columns, soil, uncounted: Vec::new() }
+    Signatures { columns, soil, commands: drive.commands(), uncounted: Vec::new() }
 }
 
 /// (less - more) · factor, row by row: what the deviations look like when the effect is there and the prediction lacks it.
@@ -169,10 +172,11 @@ pub fn difference(less: &[Row], more: &[Row], factor: f64) -> Vec<Row> {
     less.iter().zip(more).map(|(l, m)| core::array::from_fn(|c| (l[c] - m[c]) * factor)).collect()
 }
 
-/// Names of all columns: those of the catalogue, then the level of each channel.
+/// Names of all columns: those of the catalogue, then the level of each channel, then the bend of each of an actuator.
 pub fn column_names(catalogue: &[Candidate]) -> Vec<String> {
     let effects = catalogue.iter().flat_map(|c| c.columns().into_iter().map(|j| format!("{} {j}", c.label())).collect::<Vec<_>>());
-    effects.chain((0..CHANNELS).map(|c| format!("level of {}", crate::channels::name(c)))).collect()
+    let named = |what: &'static str| move |c: usize| format!("{what} of {}", crate::channels::name(c));
+    effects.chain((0..CHANNELS).map(named("level"))).chain(bend::ASKED.map(named("bend"))).collect()
 }
 
 /// Column of the level of a channel, after those of all hypotheses.
@@ -180,14 +184,20 @@ pub fn level_column(catalogue: &[Candidate], channel: usize) -> usize {
     column_count(catalogue) + channel
 }
 
-/// Condenses a drive: the catalogue's columns and, after them, the level of every channel as a column of its own, which names no cause.
+/// Column of the bend of a channel of an actuator, after those of all levels.
+pub fn bend_column(catalogue: &[Candidate], channel: usize) -> usize {
+    column_count(catalogue) + CHANNELS + channel - bend::ASKED.start
+}
+
+/// Condenses a drive: the catalogue's columns and, after them, the level of every channel and the bend of every one of an actuator as columns of their own, which name no
+/// cause.
 pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Condensed {
     let mut columns = whitened(metric, &signatures.columns);
-    for c in 0..CHANNELS {
-        let unit =
-            metric.channels.iter().position(|own| *own == c).map_or_else(|| DVector::zeros(metric.channels.len()), |at| metric.unit(at));
-        columns.push(vec![unit; rows.len()]);
-    }
+    let unit = |c: usize| {
+        metric.channels.iter().position(|own| *own == c).map_or_else(|| DVector::zeros(metric.channels.len()), |at| metric.unit(at))
+    };
+    columns.extend((0..CHANNELS).map(|c| vec![unit(c); rows.len()]));
+    columns.extend(bend::ASKED.map(|c| bend::shape(&signatures.commands, c).into_iter().map(|share| unit(c) * share).collect()));
     let named = columns.len();
     columns.extend(whitened(metric, &signatures.soil));
     profile_soil(&products(metric, rows, &columns, &signatures.uncounted).sum(metric), named)
@@ -339,7 +349,16 @@ mod tests {
             .collect();
         let one = DMatrix::identity(9, 9);
         let metric = Metric::new((0..9).collect(), DVector::zeros(9), one.clone(), one).unwrap();
-        (metric, rows, Signatures { columns: vec![(0..40).map(|k| row(answer(k))).collect()], soil: Vec::new(), uncounted: Vec::new() })
+        (
+            metric,
+            rows,
+            Signatures {
+                columns: vec![(0..40).map(|k| row(answer(k))).collect()],
+                soil: Vec::new(),
+                commands: Vec::new(),
+                uncounted: Vec::new(),
+            },
+        )
     }
 
     #[test]
@@ -364,7 +383,9 @@ mod tests {
         jumps[17][0] += 3.0;
         let score = |rows: &[Row], uncounted: &[usize]| {
             let soil = vec![vec![[0.0; CHANNELS]; rows.len()]];
-            condense(&metric, rows, &Signatures { columns: signatures.columns.clone(), soil, uncounted: uncounted.to_vec() }).score
+            let commands = vec![[0.0; 2]; rows.len()];
+            condense(&metric, rows, &Signatures { columns: signatures.columns.clone(), soil, commands, uncounted: uncounted.to_vec() })
+                .score
         };
         assert!((score(&jumps, &[]) - score(&small, &[])).norm() > 1.0, "a jump is seen");
         let apart = (score(&jumps, &[17]) - score(&small, &[17])).norm();

@@ -19,6 +19,7 @@ use crate::own_reference;
 use crate::proof::Trial;
 use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others};
 use crate::pursuit::{Pursued, pursue};
+use crate::reference::bending;
 use crate::select::{EFFECTS_MAX, Selection};
 
 /// What drives are held against.
@@ -100,6 +101,16 @@ impl Diagnosis {
     pub fn claims(&self) -> impl Iterator<Item = &Finding> {
         let any = self.verdict.claims();
         self.findings.iter().filter(move |f| any && f.refused.is_none())
+    }
+
+    /// How unusual the level of each compared channel is, with the channel.
+    pub fn levels_seen(&self) -> Vec<(f64, usize)> {
+        self.selection.levels.iter().copied().zip(self.channels.iter().copied()).collect()
+    }
+
+    /// How unusually each channel of an actuator bends as it is commanded, with the channel; empty where the model is on trial.
+    pub fn bends_seen(&self) -> Vec<(f64, usize)> {
+        self.selection.bends.iter().copied().zip(bending(&self.channels)).collect()
     }
 }
 

@@ -187,10 +187,15 @@ fn surely_differs(selection: &Selection) -> bool {
     selection.largest().max(selection.remaining.0) >= selection.beyond_doubt()
 }
 
-/// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence.
+/// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence; or
+/// a bend beyond chance, of which straight answers leave none whatever their size.
 fn left_over(selection: &Selection, share_max: f64) -> Option<&(f64, String)> {
     let needed = |times: f64| (times * selection.threshold).max(share_max * selection.largest());
-    let all = [(&selection.remaining, needed(FURTHER)), (&selection.remaining_level, needed(1.0))];
+    let all = [
+        (&selection.remaining, needed(FURTHER)),
+        (&selection.remaining_level, needed(1.0)),
+        (&selection.remaining_bend, selection.threshold),
+    ];
     all.into_iter().find(|(left, needed)| left.0 >= *needed).map(|(left, _)| left)
 }
 
@@ -313,17 +318,8 @@ mod tests {
             Finding { refused, ..Finding::of(&catalogue, id, z, Vec::new()) }
         };
         let judged = |verdict: Verdict, refused: Vec<Finding>| {
-            let selection = Selection {
-                z: Vec::new(),
-                levels: vec![146.1],
-                threshold: 4.0,
-                probability: None,
-                chosen: Vec::new(),
-                alone: Vec::new(),
-                rivals: Vec::new(),
-                remaining: (146.1, "a level".into()),
-                remaining_level: (146.1, "a level".into()),
-            };
+            let left = (146.1, "a level".to_string());
+            let selection = Selection { levels: vec![146.1], remaining: left.clone(), remaining_level: left, ..Selection::empty(4.0) };
             let reason = nothing_chosen(&selection).1;
             let judgement =
                 Judgement { selection, findings: Vec::new(), onsets: Vec::new(), settled: Vec::new(), fit: None, verdict, reason };

@@ -21,6 +21,7 @@
 #![forbid(unsafe_code)]
 
 pub mod bench;
+mod bend;
 mod black_box;
 mod candidates;
 pub mod channels;

@@ -16,6 +16,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
+use crate::bend::Commands;
 use crate::candidates::Candidate;
 use crate::channels::{BINS, CHANNELS, RIM_AT, Row, SEGMENT_STEPS, STATE_CHANNELS, STEERING_AT, available};
 use crate::consistency::add_consistency;
@@ -408,6 +409,16 @@ impl ObservedDrive {
                 speeds[k][i] += SEGMENT_STEPS as f64 * (before[RIM_AT + i] - after[RIM_AT + i]) / from.0.vehicle().wheel_radius_m;
             }
         }
+    }
+
+    /// Mean commands of each segment.
+    pub fn commands(&self) -> Vec<Commands> {
+        let of = |start: &usize| {
+            let steps = &self.transitions[*start..*start + SEGMENT_STEPS];
+            let mean = |command: fn(&Transition) -> f64| steps.iter().map(command).sum::<f64>() / SEGMENT_STEPS as f64;
+            [mean(|t| t.control.speed_m_s), mean(|t| t.control.second)]
+        };
+        self.starts.iter().map(of).collect()
     }
 
     fn segment(&self, bench: &Bench<'_>, reading: &Reading, soil: &SoilCorrection, start: usize) -> Row {

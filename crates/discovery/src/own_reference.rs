@@ -66,7 +66,7 @@ pub fn sign_flips(drives: &[Condensed], catalogue: &[Candidate], channels: &[usi
             let flipped: Vec<Condensed> =
                 drives.iter().zip(signs).map(|(d, sign)| Condensed { score: &d.score * *sign, ..d.clone() }).collect();
             let group = Nulls::about_zero(&flipped.iter().collect::<Vec<_>>())?.group(flipped.iter());
-            Some(all_evidence(&group, catalogue, channels))
+            Some(all_evidence(&group, catalogue, channels, &[]))
         })
         .collect::<Option<_>>()?;
     Some(NullGroups::of(groups))

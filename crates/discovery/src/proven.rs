@@ -333,6 +333,7 @@ mod tests {
             rivals: vec![Vec::new(); findings.len()],
             remaining: (1.0, String::new()),
             remaining_level: (1.0, String::new()),
+            remaining_bend: (0.0, String::new()),
             ..Selection::empty(4.0)
         };
         Judgement {

@@ -14,16 +14,17 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
+use crate::bend;
 use crate::candidates::{Candidate, catalogue};
 use crate::channels::{self, CHANNELS, Row};
-use crate::condense::{Condensed, Signatures, believed_within, column_names, condense, level_column, signatures};
+use crate::condense::{Condensed, Signatures, believed_within, bend_column, column_names, condense, level_column, signatures};
 use crate::error::DiscoveryError;
 use crate::evidence::{Group, Nulls};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
 use crate::whiteness::{Succession, Whiteness, asked};
 
-const SCHEMA: &str = "nesam.reference/6";
+const SCHEMA: &str = "nesam.reference/7";
 /// Random groups of null drives.
 const NULL_GROUPS: usize = 1000;
 /// Fewest drives of a reference.
@@ -52,7 +53,7 @@ pub struct NullDrive {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Reference {
-    /// Always `nesam.reference/6`.
+    /// Always `nesam.reference/7`.
     pub schema: String,
     /// Hash of the data behind it.
     pub data_hash: String,
@@ -61,7 +62,7 @@ pub struct Reference {
     /// Hypotheses beside the catalogue: written effects, as the text of an `effects.toml`; empty without any.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub hypotheses: String,
-    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel.
+    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel and the bend of each of an actuator.
     pub columns: Vec<String>,
     /// Usual level of each compared channel.
     pub centre: Vec<f64>,
@@ -78,7 +79,7 @@ pub struct Reference {
 /// Null distribution of the evidence of groups of n drives.
 #[derive(Clone, Debug)]
 pub struct NullGroups {
-    /// Factor by which the null evidence of each hypothesis, then of each channel's level, exceeds a standard normal deviate (at least 1).
+    /// Factor by which the null evidence of each hypothesis, then of each channel's level and bend, exceeds a standard normal deviate (at least 1).
     pub spread: Vec<f64>,
     /// Largest spread-corrected evidence of each group, ascending.
     pub largest: Vec<f64>,
@@ -232,13 +233,14 @@ impl Reference {
     }
 }
 
-/// Evidence of every hypothesis, then of the level of every compared channel, with nothing fitted.
-pub fn all_evidence(group: &Group, catalogue: &[Candidate], channels: &[usize]) -> Vec<f64> {
+/// Evidence of every hypothesis, then of the level of every compared channel and of the bend of each of `bending`, with nothing fitted.
+pub fn all_evidence(group: &Group, catalogue: &[Candidate], channels: &[usize], bending: &[usize]) -> Vec<f64> {
     let hypotheses = catalogue.iter().map(|c| {
         let found = group.remainder(&[], &c.columns());
         if c.positive() && found.shares[0] <= 0.0 { 0.0 } else { found.z }
     });
-    hypotheses.chain(channels.iter().map(|c| group.remainder(&[], &[level_column(catalogue, *c)]).z)).collect()
+    let nameless = channels.iter().map(|c| level_column(catalogue, *c)).chain(bending.iter().map(|c| bend_column(catalogue, *c)));
+    hypotheses.chain(nameless.map(|column| group.remainder(&[], &[column]).z)).collect()
 }
 
 impl NullGroups {
@@ -259,7 +261,7 @@ impl NullGroups {
             .map(|inside| {
                 let others: Vec<&Condensed> = (0..total).filter(|d| !inside.contains(d)).map(|d| &nulls[d]).collect();
                 let group = Nulls::new(&others)?.group(inside.iter().map(|d| &nulls[*d]));
-                Some(all_evidence(&group, catalogue, channels))
+                Some(all_evidence(&group, catalogue, channels, &bending(channels)))
             })
             .collect::<Option<_>>()?;
         let mut drawn = Self::of(groups);
@@ -289,6 +291,11 @@ impl NullGroups {
     pub fn attainable(&self) -> f64 {
         1.0 / (self.largest.len() + 1) as f64
     }
+}
+
+/// Those of some channels of which it is asked whether they bend.
+pub fn bending(channels: &[usize]) -> Vec<usize> {
+    channels.iter().copied().filter(|channel| bend::ASKED.contains(channel)).collect()
 }
 
 /// Those of some channels that are asked for whiteness.

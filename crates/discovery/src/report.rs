@@ -13,7 +13,7 @@ use crate::diagnose::{Against, Diagnosis};
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
-pub const STOP_RULE: &str = "9: what a proof refutes is withheld and the rest judged again; each fitted effect doubted by its own share; up to three effects, each dated beside the others and held against its rivals; of several each force, soil and actuator proven by itself, without a proof 2.5 thresholds; sensors of a model on trial proven by what measurements contradict; height, roll and pitch count on a map only; segments in which an effect begins do not count, and each has one size; sensors that wander or jump are a difference; a map answers through the ground; pairwise criterion 6; at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree; a factor known by its distance from 1";
+pub const STOP_RULE: &str = "10: an actuator that bends as it is commanded beside what is claimed is a difference; what a proof refutes is withheld and the rest judged again; each fitted effect doubted by its own share; up to three effects, each dated beside the others and held against its rivals; of several each force, soil and actuator proven by itself, without a proof 2.5 thresholds; sensors of a model on trial proven by what measurements contradict; height, roll and pitch count on a map only; segments in which an effect begins do not count, and each has one size; sensors that wander or jump are a difference; a map answers through the ground; pairwise criterion 6; at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree; a factor known by its distance from 1";
 const STAGES: [&str; 3] = ["before", "soil only", "after"];
 
 /// What a report is made from.
@@ -70,6 +70,7 @@ impl Report<'_> {
         });
         let map = document.as_object_mut().expect("an object was built; this is a bug");
         map.insert("levels".into(), self.levels());
+        map.insert("bends".into(), self.bends());
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
     }
 
@@ -132,6 +133,13 @@ impl Report<'_> {
         (0..d.channels.len()).map(of).collect()
     }
 
+    /// How unusually each channel of an actuator bends as it is commanded.
+    fn bends(&self) -> Value {
+        let d = self.diagnosis;
+        let of = |(z, c): (f64, usize)| json!({"channel": channels::name(c), "layer": channels::layer(c), "z": z});
+        d.bends_seen().into_iter().map(of).collect()
+    }
+
     /// The claimed effects, each with its rivals: an equivalence class of at most three, weights of which sum to 1.
     fn effects(&self) -> Vec<Value> {
         self.diagnosis.claims().map(effect_json).collect()
@@ -176,7 +184,8 @@ impl Report<'_> {
         let mut page = Page::new(&format!("nesam diagnose: {}", self.set), &lead);
         page.section("What was seen")
             .text("Mean deviation of every channel from the frozen reference, by residual layer; z is against groups of drives without an effect.")
-            .table(&self.level_table());
+            .table(&self.level_table())
+            .table(&self.bend_table());
         let traces: Vec<LinePlot> = d.traces.iter().map(trace_plot).collect();
         page.section("The most unusual channel of each layer").plots(
             &traces,
@@ -259,6 +268,14 @@ impl Report<'_> {
                 format!("{:+.4}", d.levels[i]).into(),
                 format!("{:.1}", d.selection.levels[i]).into(),
             ]);
+        }
+        table
+    }
+
+    fn bend_table(&self) -> Table {
+        let mut table = Table::new("Whether actuators bend as they are commanded", &["channel", "layer", "z"]);
+        for (z, c) in self.diagnosis.bends_seen() {
+            table.row(vec![channels::name(c).into(), channels::layer(c).into(), format!("{z:.1}").into()]);
         }
         table
     }

@@ -7,9 +7,9 @@ use nesam_physics::effects::Layer;
 
 use crate::candidates::Candidate;
 use crate::channels::{PATH_AT, RIM_AT};
-use crate::condense::{Condensed, level_column};
+use crate::condense::{Condensed, bend_column, level_column};
 use crate::evidence::{Fitted, Group, Nulls};
-use crate::reference::{NullGroups, all_evidence};
+use crate::reference::{NullGroups, all_evidence, bending};
 use crate::whiteness::Whiteness;
 
 /// Difference of the criterion that decides between two hypotheses.
@@ -97,6 +97,8 @@ pub struct Selection {
     pub z: Vec<Option<f64>>,
     /// Evidence that the level of each compared channel is unusual.
     pub levels: Vec<f64>,
+    /// Evidence that each of those of an actuator bends as it is commanded; empty where the model is on trial.
+    pub bends: Vec<f64>,
     /// Family-wise threshold.
     pub threshold: f64,
     /// Family-wise probability of the largest evidence, and the smallest that could be shown.
@@ -111,6 +113,8 @@ pub struct Selection {
     pub remaining: (f64, String),
     /// The same of the levels of channels alone.
     pub remaining_level: (f64, String),
+    /// The same of the bends of actuators alone.
+    pub remaining_bend: (f64, String),
 }
 
 impl Selection {
@@ -120,6 +124,7 @@ impl Selection {
         Self {
             z: Vec::new(),
             levels: Vec::new(),
+            bends: Vec::new(),
             threshold,
             probability: None,
             chosen: Vec::new(),
@@ -127,12 +132,13 @@ impl Selection {
             rivals: Vec::new(),
             remaining: (0.0, String::new()),
             remaining_level: (0.0, String::new()),
+            remaining_bend: (0.0, String::new()),
         }
     }
 
     /// Largest evidence of anything before fits.
     pub fn largest(&self) -> f64 {
-        self.z.iter().flatten().chain(&self.levels).copied().fold(0.0, f64::max)
+        self.z.iter().flatten().chain(&self.levels).chain(&self.bends).copied().fold(0.0, f64::max)
     }
 
     /// Chooses these hypotheses, in this order.
@@ -231,22 +237,24 @@ impl Yardstick {
     /// Judges a group of drives.
     pub fn select(&self, group: &Group) -> Selection {
         let count = self.catalogue.len();
-        let evidence: Vec<f64> =
-            all_evidence(group, &self.catalogue, &self.channels).into_iter().enumerate().map(|(e, z)| z / self.spread(e)).collect();
+        let evidence = all_evidence(group, &self.catalogue, &self.channels, &self.bending());
+        let evidence: Vec<f64> = evidence.into_iter().enumerate().map(|(e, z)| z / self.spread(e)).collect();
         let z: Vec<Option<f64>> = (0..count).map(|e| self.considered[e].then_some(evidence[e])).collect();
-        let levels = evidence[count..].to_vec();
-        let largest_level = levels.iter().copied().fold(0.0, f64::max);
-        let largest = z.iter().flatten().copied().fold(largest_level, f64::max);
+        let (levels, bends) = evidence[count..].split_at(self.channels.len());
+        let most = |evidence: &[f64]| evidence.iter().copied().fold(0.0, f64::max);
+        let largest = z.iter().flatten().copied().fold(most(levels).max(most(bends)), f64::max);
         let mut selection = Selection {
             z,
-            levels,
+            levels: levels.to_vec(),
+            bends: bends.to_vec(),
             threshold: self.threshold(),
             probability: self.groups.as_ref().map(|n| [n.probability(largest), n.attainable()]),
             chosen: Vec::new(),
             alone: Vec::new(),
             rivals: Vec::new(),
             remaining: (largest, String::new()),
-            remaining_level: (largest_level, String::new()),
+            remaining_level: (most(levels), String::new()),
+            remaining_bend: (most(bends), String::new()),
         };
         if largest < selection.threshold {
             selection.remaining.1 = self.named(&selection, largest);
@@ -266,7 +274,8 @@ impl Yardstick {
     fn named(&self, selection: &Selection, evidence: f64) -> String {
         let hypothesis = selection.z.iter().position(|z| *z == Some(evidence)).map(|e| self.catalogue[e].label());
         let level = || selection.levels.iter().position(|z| *z == evidence).map(|i| level_name(self.channels[i]));
-        hypothesis.or_else(level).unwrap_or_default()
+        let bend = || selection.bends.iter().position(|z| *z == evidence).map(|i| bend_name(self.bending()[i]));
+        hypothesis.or_else(level).or_else(bend).unwrap_or_default()
     }
 
     /// What speaks for each chosen hypothesis, its rivals, and what is left.
@@ -344,9 +353,26 @@ impl Yardstick {
         let chosen = &selection.chosen;
         let levels = self.levels_after_fit(left, before, chosen).map(|(channel, z)| (z, level_name(channel)));
         let level = levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
+        let bends = self.bends_after_fit(left, before, chosen).map(|(channel, z)| (z, bend_name(channel)));
+        let bend = bends.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         let hypotheses = self.looked_at(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
-        let most = hypotheses.chain([level.clone()]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
-        (selection.remaining, selection.remaining_level) = (most, level);
+        let most = hypotheses.chain([level.clone(), bend.clone()]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
+        (selection.remaining, selection.remaining_level, selection.remaining_bend) = (most, level, bend);
+    }
+
+    /// Channels of which it is asked whether they bend: those of actuators, but for a model on trial, which lacks more.
+    fn bending(&self) -> Vec<usize> {
+        if self.model_on_trial { Vec::new() } else { bending(&self.channels) }
+    }
+
+    /// Evidence that each channel of an actuator bends as it is commanded in what the chosen ones leave.
+    fn bends_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
+        let believed = self.believed(chosen);
+        let first = self.catalogue.len() + self.channels.len();
+        self.bending().into_iter().enumerate().map(move |(i, channel)| {
+            let found = left.remainder_since(before, &believed, &[bend_column(&self.catalogue, channel)]);
+            (channel, found.z / self.spread(first + i))
+        })
     }
 
     /// Evidence that the level of a channel is unusual in what the chosen ones leave, for every compared channel that may speak against them.
@@ -362,6 +388,10 @@ impl Yardstick {
             (channel, found.z / self.spread(self.catalogue.len() + i))
         })
     }
+}
+
+fn bend_name(channel: usize) -> String {
+    format!("the bend of {}", crate::channels::name(channel))
 }
 
 fn level_name(channel: usize) -> String {

@@ -93,6 +93,20 @@ fn property_sensors_that_wander_jump_or_drift_are_told() {
     }
 }
 
+/// Goal: a steering that turns further to one side is neither an offset nor a ratio, nor both. Method: eight drives of 20 s whose commands to the left are recorded as less than
+/// they were, by a fifth.
+#[test]
+fn property_a_steering_that_turns_further_to_the_left_is_no_offset() {
+    let soil = bundle().default_soil;
+    let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 860 + i, &[], &soil)).collect();
+    for control in drives.iter_mut().flat_map(|drive| &mut drive.controls) {
+        control.second /= if control.second > 0.0 { 1.2 } else { 1.0 };
+    }
+    let found = diagnose_drives(&drives, &options());
+    assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.reason);
+    assert!(found.reason.contains("the bend of") && found.reason.contains("road_wheel_angle_rad"), "{}", found.reason);
+}
+
 /// What is said of drives with the plough at one and a half of its size.
 fn ploughed(options: &nesam_discovery::Options) -> Diagnosis {
     diagnose_twin(&[Effect::Written(plough().at(1.5))], 1100, options)

@@ -282,11 +282,11 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
     for e in order.into_iter().take(SHOWN) {
         say!("  {:<24} z {:7.1}", found.catalogue[e].label(), s.z[e].unwrap_or(0.0));
     }
-    let mut levels: Vec<(f64, usize)> =
-        s.levels.iter().copied().zip(found.channels.iter().copied()).filter(|(z, _)| *z >= s.threshold).collect();
-    levels.sort_by(|a, b| b.0.total_cmp(&a.0));
-    for (z, channel) in levels.into_iter().take(SHOWN_LEVELS) {
-        say!("  {:<24} z {z:7.1}  (level)", channels::name(channel));
+    for (what, mut evidence) in [("level", found.levels_seen()), ("bend", found.bends_seen())] {
+        evidence.sort_by(|a, b| b.0.total_cmp(&a.0));
+        for (z, channel) in evidence.into_iter().take_while(|(z, _)| *z >= s.threshold).take(SHOWN_LEVELS) {
+            say!("  {:<24} z {z:7.1}  ({what})", channels::name(channel));
+        }
     }
     for f in &found.findings {
         let rivals: Vec<String> = f.rivals.iter().map(|r| format!("{} ({:.2})", r.candidate.label(), r.weight)).collect();

@@ -53,6 +53,8 @@ pub enum Change {
     GyroCross(f64),
     /// Outside of the catalogue: steering that sticks near the middle and overshoots outside, u + size sin(2 π u).
     SteeringWarp(f64),
+    /// Outside of the catalogue: a steering that turns further to the left, by this share of it.
+    SteeringLeft(f64),
     /// Outside of the catalogue: speed over ground that breathes with time, size sin(2 π t / 4 s).
     VelocityRipple(f64),
     /// Noise of every state channel as large again as it is, `size` times (a trap: not an effect).
@@ -119,6 +121,7 @@ pub fn apply(change: Change, onset_s: f64, drive: &mut Trajectory, map: Option<A
             }
             Change::GyroCross(size) => s.angular_velocity_rad_s[2] += size * s.attitude_rad[0],
             Change::SteeringWarp(size) => c.second -= size * (core::f64::consts::TAU * c.second).sin(),
+            Change::SteeringLeft(size) => c.second /= 1.0 + if c.second > 0.0 { size } else { 0.0 },
             Change::VelocityRipple(size) => s.velocity_m_s[0] += size * (core::f64::consts::TAU * time * drive.dt_s / 4.0).sin(),
             Change::Noise(size) => {
                 // The sensors' own deviations, moved elsewhere in the drive, so that their distribution is right without a model of it.
