@@ -191,7 +191,11 @@ impl SoilFilter {
             return Ok(None);
         }
         let buffer = core::mem::take(&mut self.buffer);
+        let before = (self.scale, self.trust.clone(), self.plain.clone());
         let outcome = self.update(model, &buffer);
+        if outcome.is_err() {
+            (self.scale, self.trust, self.plain) = before;
+        }
         self.buffer = buffer;
         self.buffer.clear();
         outcome.map(Some)
@@ -260,7 +264,7 @@ impl SoilFilter {
         let rejected = chi_square_tail(dof, gated) < self.config.gate_tail_probability;
         let excited = excitation >= self.config.excitation_min;
         if !rejected && excited {
-            self.judge(model, buffer, unit, &judged)?;
+            self.judge(model, buffer, unit, &judged, &rest, &cautious)?;
             let tail = if self.config.tail_dof > 0.0 { (self.config.tail_dof + nis) / (self.config.tail_dof + dof as f64) } else { 1.0 };
             let noise = cautious * (self.config.shared_buffers * tail.max(1.0));
             let mut linear = first;
@@ -323,8 +327,16 @@ impl SoilFilter {
 
     /// Lets a buffer say whether what was learned predicts it better than the prior alone. Both start from the same transitions: what the network says
     /// along the rollout stays as it is. Where errors carry on, both follow them and their predictive likelihoods are compared; else an earlier
-    /// correction is compared with none.
-    fn judge(&mut self, model: &StepModel, buffer: &[BufferedTransition], unit: f64, judged: &KalmanStep) -> Result<(), AdaptationError> {
+    /// correction is compared with none. `rest` is the noise that was not shared, with what is considered, and `cautious` the same with caution.
+    fn judge(
+        &mut self,
+        model: &StepModel,
+        buffer: &[BufferedTransition],
+        unit: f64,
+        judged: &KalmanStep,
+        rest: &DMatrix<f64>,
+        cautious: &DMatrix<f64>,
+    ) -> Result<(), AdaptationError> {
         if self.config.trust_memory == 0.0 {
             return Ok(());
         }
@@ -334,14 +346,14 @@ impl SoilFilter {
             let innovation = innovation(&self.config, model, buffer, &none)?;
             let at_prior = Linearisation { jacobian: DMatrix::zeros(innovation.len(), none.len()), innovation }.scaled(unit);
             let ahead = self.plain.predicted_without_soil(&self.config);
-            let step = ahead.step(&at_prior, &none, &self.rest)?;
+            let step = ahead.step(&at_prior, &none, rest)?;
             self.trust.vote(0.5 * (step.nis + step.log_det - judged.nis - judged.log_det));
-            self.plain = ahead.after(&step, &at_prior, &self.rest, &none);
+            self.plain = ahead.after(&step, &at_prior, rest, &none);
             return Ok(());
         }
         let Some(candidate) = self.trust.candidate() else { return Ok(()) };
         let rows = self.noise.nrows();
-        let factor = self.config.with_caution(&self.noise).cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
+        let factor = cautious.clone().cholesky().ok_or(AdaptationError::SingularInnovation { rows })?;
         let squared = |correction: &DVector<f64>| -> Result<f64, AdaptationError> {
             let innovation = innovation(&self.config, model, buffer, correction)? * unit;
             Ok(innovation.dot(&factor.solve(&innovation)))

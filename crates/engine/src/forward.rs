@@ -138,7 +138,8 @@ impl RollForward {
         }
     }
 
-    /// Takes the steps off a rollout again, and gives the state after them: every sample has the same, since it had the same commands.
+    /// Takes the steps off a rollout again, and gives the state after them: every sample on the same soil has the same, since it had the same commands. Of several soils it is
+    /// that of the first.
     pub fn split(&self, rollout: Rollout) -> (Option<VehicleState<f64>>, Rollout) {
         let Some(last) = self.steps().checked_sub(1) else { return (None, rollout) };
         let start = rollout.state_f64(0, last);

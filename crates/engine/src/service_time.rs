@@ -32,7 +32,7 @@ fn sample_work(query: &PredictQuery) -> f64 {
     let extras = &query.extras;
     let soils = match &extras.soils {
         WhatIfSoils::Estimate => 1,
-        WhatIfSoils::Added(soils) => 1 + soils.len(),
+        WhatIfSoils::Added(soils) => soils.len(),
         WhatIfSoils::SigmaPoints => SIGMA_POINTS,
     };
     let exact = if extras.exact_terrain { EXACT_WORK } else { 0.0 };

@@ -294,7 +294,9 @@ impl Session {
                 }
             };
             for step in [Some(first), second].into_iter().flatten() {
-                if let Some(nis) = self.learn_step(step, models, map) {
+                // A new line or a gap is said before the refusal of a buffer that it ended.
+                let usual = matches!(outcome, Outcome::Applied | Outcome::Buffered { .. } | Outcome::Gated { .. });
+                if let Some(nis) = self.learn_step(step, models, map).filter(|_| usual) {
                     outcome = Outcome::Gated { nis };
                 }
                 self.check_forecast(models.usual, noise, map);

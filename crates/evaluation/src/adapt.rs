@@ -163,7 +163,8 @@ pub fn check_forecasts(
             .step_by(FORECAST_AHEAD)
             .map(|start| {
                 let soil = adapted.soil_at(start, Some(map));
-                let errors = predictor.forecast_errors(&steps, start, FORECAST_STEPS, &soil, map);
+                let stands = Predictor::stands(&steps[start..=start + FORECAST_AHEAD]);
+                let errors = if stands { None } else { predictor.forecast_errors(&steps, start, FORECAST_STEPS, &soil, map) };
                 if let (Some(errors), Some(expected)) = (errors, noise.of_position(FORECAST_STEPS, adapted.filter_scale_at(start))) {
                     check.observe(&errors, &expected);
                 }
@@ -176,7 +177,7 @@ pub fn check_forecasts(
 /// Runs the filter over one drive from its first sample, as a session that receives the samples one by one.
 ///
 /// A buffer with a wheel off the map is left out, and a drive without a map teaches nothing: where the slope of the ground is a guess,
-/// its error would be taken for soil. No buffer holds a step in which the vehicle sets off ([`Predictor::sets_off`]).
+/// its error would be taken for soil. No buffer holds a step in which the vehicle sets off ([`Predictor::sets_off`]), and one over which it stands teaches nothing.
 ///
 /// # Errors
 /// As [`adapt_all`].
@@ -220,7 +221,7 @@ pub fn adapt_drive(
     Ok(out)
 }
 
-/// The transitions from sample `start` to `start + B`; `None` when one leaves the known map.
+/// The transitions from sample `start` to `start + B`; `None` when one leaves the known map or the vehicle stands.
 fn buffer_at(
     predictor: &Predictor,
     steps: &[HistoryStep],
@@ -229,6 +230,9 @@ fn buffer_at(
     map: &Arc<WorldMap>,
     soil: &dyn SoilField,
 ) -> Option<Vec<BufferedTransition>> {
+    if Predictor::stands(&steps[start..=start + config.buffer]) {
+        return None;
+    }
     let along = (config.innovation == Innovation::Rollout).then_some(soil);
     let transitions = predictor.measured_transitions(steps, start..start + config.buffer, along, map)?;
     let both = transitions.into_iter().zip(&steps[start + 1..]);

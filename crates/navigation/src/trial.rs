@@ -37,9 +37,8 @@ impl Surroundings {
             [[x, y, yaw], [measured[0], measured[1], measured[5]]].map(|[x, y, yaw]| ground_pose(&self.vehicle, &self.map, x, y, yaw));
         let ([ground_m, roll, pitch], [below_m, ..]) = (there?, here?);
         let z = ground_m + measured[2] - below_m;
-        let (sin, cos) = yaw.sin_cos();
-        let rate = speed_m_s * curvature_of(path, arc_m);
-        Some([x, y, z, roll, pitch, yaw, speed_m_s * cos, speed_m_s * sin, -speed_m_s * pitch.tan(), 0.0, 0.0, rate])
+        // Velocities are in Body: along the vehicle, which lies on the ground.
+        Some([x, y, z, roll, pitch, yaw, speed_m_s, 0.0, 0.0, 0.0, 0.0, speed_m_s * curvature_of(path, arc_m)])
     }
 
     /// What to steer from there: as the path asks on ground that does not give, half as much again and more, and fully inside.
@@ -73,7 +72,7 @@ mod tests {
 
     use super::*;
 
-    /// On a plane that rises by a tenth to the east: height, pitch and climb of a vehicle that is driven there, and steering that a bicycle would turn by.
+    /// On a plane that rises by a tenth to the east: height, lean and velocity of a vehicle that drives along the path there, and steering that a bicycle would turn by.
     #[test]
     fn analytic_a_trial_begins_on_the_path_and_along_the_ground() {
         let geometry = GridGeometry { origin_m: [-40.0; 2], resolution_m: 1.0, width: 81, height: 81 };
@@ -89,7 +88,9 @@ mod tests {
         let phi = path.phi_at(arc_m);
         assert_eq!([state[0], state[1]], path.point(phi));
         assert!((state[2] - map.height_m(state[0], state[1]).unwrap() - 0.7).abs() < 0.02, "{state:?}");
-        assert!((state[8] - 0.1 * state[6]).abs() < 1e-3 && (state[6].hypot(state[7]) - 2.0).abs() < 1e-12, "{state:?}");
+        let yaw = path.heading(phi);
+        assert!((yaw.cos().abs() < 0.95) && state[5] == yaw && state[6..9] == [2.0, 0.0, 0.0], "{state:?}");
+        assert!((state[4] + 0.1 * yaw.cos()).abs() < 0.01 && (state[3].abs() - (0.1 * yaw.sin()).abs()).abs() < 0.01, "{state:?}");
         let [guess, more, full] = around.steerings(&path, arc_m, 2.0);
         assert!((curvature_1_m(&vehicle, guess) - curvature_of(&path, arc_m + AIM_M)).abs() < 1e-6 && more > guess && full >= more);
         assert!(around.on_path(&path, arc_m, 2.0, &[1e3; 12]).is_none(), "beyond the map");

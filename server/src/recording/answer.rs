@@ -61,9 +61,9 @@ fn reply_entry(command: &Command, reply: &Reply, vehicle: &Vehicle, timing: Timi
     }
 }
 
-/// Whether the recorded answer says that the command was not executed, or given up: its asker had gone, or its deadline had passed.
+/// Whether the recorded answer says that the command was not executed, or given up: its asker had gone, its deadline had passed, or too many came before it.
 pub(crate) fn not_executed((topic, data): &Entry) -> bool {
-    let skipped = [tonic::Code::Cancelled, tonic::Code::DeadlineExceeded].map(i32::from);
+    let skipped = [tonic::Code::Cancelled, tonic::Code::DeadlineExceeded, tonic::Code::ResourceExhausted].map(i32::from);
     *topic == Topic::PredictionError && pb::PredictError::decode(data.as_slice()).is_ok_and(|error| skipped.contains(&error.code))
 }
 

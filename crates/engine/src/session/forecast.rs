@@ -34,8 +34,11 @@ impl OpenForecast {
         self.steps.len() == FORECAST_HELD
     }
 
-    /// Holds it against what was measured. Of one that leaves the map nothing is said.
+    /// Holds it against what was measured. Of one that leaves the map nothing is said, nor of a vehicle that stands.
     pub(super) fn compare(&self, predictor: &Predictor, noise: &RolloutNoise, map: &Arc<WorldMap>, check: &mut ForecastCheck) {
+        if Predictor::stands(&self.steps[HISTORY - 1..]) {
+            return;
+        }
         let soil = SoilByClass::new(Some(map), self.corrections.clone());
         let errors = predictor.forecast_errors(&self.steps, HISTORY - 1, FORECAST_STEPS, &soil, map);
         if let (Some(errors), Some(expected)) = (errors, noise.of_position(FORECAST_STEPS, self.noise_scale)) {

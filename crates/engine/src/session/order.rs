@@ -38,6 +38,8 @@ pub(super) enum OffLine {
     Ahead,
     /// Numbered against the order of the stamps.
     Renumbered,
+    /// Of another start of the vehicle's software, which had ended before or not.
+    OtherBoot { boot: u64, ended: bool },
 }
 
 /// Measurements off the line that follow each other: one of them is an error, several are a clock that was set or a vehicle that was restarted.
@@ -81,13 +83,12 @@ impl Order {
     pub(super) fn judge(&mut self, measurement: &Measurement, now_ns: u64, step_ns: i64, limits: &Limits) -> Result<Verdict, EngineError> {
         let stamp_ns = measurement.stamp_ns;
         let behind_s = self.newest_ns().map_or(0.0, |newest| seconds(newest.saturating_sub(stamp_ns)).max(0.0));
-        if let Some(boot) = measurement.boot {
-            if self.ended_boots.contains(&boot) {
-                return Ok(Verdict::Refuse(Outcome::TooOld { behind_s }));
-            }
-            if self.boot.is_some_and(|present| present != boot) {
-                return Ok(Verdict::Begin(Outcome::Restarted));
-            }
+        if let Some(boot) = measurement.boot.filter(|boot| self.boot.is_some_and(|present| present != *boot)) {
+            let ended = self.ended_boots.contains(&boot);
+            // One that was delayed or is sent once more is no restart, and would end the present one for good.
+            let restarted = !ended && self.newest_ns().is_none_or(|newest| stamp_ns > newest)
+                || self.suspects(OffLine::OtherBoot { boot, ended }, measurement, now_ns, step_ns);
+            return Ok(if restarted { Verdict::Begin(Outcome::Restarted) } else { Verdict::Refuse(Outcome::TooOld { behind_s }) });
         }
         let Some(newest_ns) = self.newest_ns() else { return Ok(Verdict::Accept) };
         let resent = measurement.sequence.is_some() && measurement.sequence == self.last_sequence;
@@ -119,7 +120,7 @@ impl Order {
         Ok(match off {
             _ if renewed && (off == OffLine::Renumbered || self.numbered_again(measurement)) => Verdict::Begin(Outcome::Restarted),
             _ if renewed => Verdict::Begin(Outcome::ClockJump { jump_s: ahead_s - silent_s }),
-            OffLine::Late | OffLine::Renumbered => Verdict::Refuse(Outcome::TooOld { behind_s }),
+            OffLine::Late | OffLine::Renumbered | OffLine::OtherBoot { .. } => Verdict::Refuse(Outcome::TooOld { behind_s }),
             OffLine::Ahead => Verdict::Refuse(Outcome::Future { ahead_s: ahead_s - silent_s }),
         })
     }
@@ -144,8 +145,8 @@ impl Order {
 
     /// Notes a measurement off the line and says whether enough of them agree on a new one.
     ///
-    /// Two in a row do, if they lie ahead, or if their numbers are fresh or contradict the stamps: late ones of the old line are never so. Otherwise
-    /// the stamps have to keep pace with the arrivals, as no burst of resent measurements does.
+    /// Two in a row do, if they lie ahead, if their numbers are fresh or contradict the stamps, or if they are of a start that is new: late ones of the old line are never
+    /// so. Otherwise the stamps have to keep pace with the arrivals, as no burst of resent measurements does.
     fn suspects(&mut self, kind: OffLine, measurement: &Measurement, now_ns: u64, step_ns: i64) -> bool {
         let here: Numbered = (measurement.stamp_ns, measurement.sequence);
         let follows = |last: Numbered| {
@@ -157,7 +158,12 @@ impl Order {
             _ => Suspect { kind, first_stamp_ns: here.0, first_arrival_ns: now_ns, last: here, count: 1 },
         };
         self.suspect = Some(suspect);
-        if kind != OffLine::Late || self.is_fresh(measurement.sequence) {
+        let by_count = match kind {
+            OffLine::Late => self.is_fresh(measurement.sequence),
+            OffLine::OtherBoot { ended, .. } => !ended,
+            OffLine::Ahead | OffLine::Renumbered => true,
+        };
+        if by_count {
             return suspect.count >= PROOF_COUNT;
         }
         let elapsed_s = now_ns.saturating_sub(suspect.first_arrival_ns) as f64 * 1e-9;
@@ -186,6 +192,7 @@ impl Order {
     /// Forgets the line: the next measurement begins another one.
     pub(super) fn begin(&mut self, boot: Option<u64>) {
         let mut ended_boots = core::mem::take(&mut self.ended_boots);
+        ended_boots.retain(|ended| Some(*ended) != boot);
         if let Some(ended) = self.boot.filter(|present| boot.is_some_and(|boot| boot != *present)) {
             ended_boots.push_back(ended);
             if ended_boots.len() > ENDED_BOOTS_MAX {

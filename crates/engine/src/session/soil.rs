@@ -16,9 +16,6 @@ use crate::fleet::Brought;
 /// unlearns it within a few buffers. Chosen.
 const VOTES_MAX: f64 = 5.0;
 
-/// Distance in a buffer, m, and commanded speed, m/s, below which a vehicle stands. Chosen.
-const STANDING: [f64; 2] = [0.5, 0.5];
-
 /// What was learned of the soil in this session.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct SoilState {
@@ -124,7 +121,7 @@ impl SoilLearner {
         self.filter.clear_buffer();
     }
 
-    /// Takes the newest step with the steps before it. From numbers that are not finite nothing is learned.
+    /// Takes the newest step with the steps before it. From numbers that are not finite nothing is learned, nor from a vehicle that stands ([`Predictor::stands`]).
     ///
     /// Nor without a map: where the slope of the ground is a guess, its error would be taken for soil. For the same reason a buffer with a wheel off the map
     /// is left out. Whether sensors contradict each other is told of any buffer. No buffer holds a step in which the vehicle sets off ([`Predictor::sets_off`]).
@@ -148,9 +145,10 @@ impl SoilLearner {
         if self.steps.len() <= self.first + self.filter.config().buffer {
             return None;
         }
-        let learned = map.and_then(|map| self.learn_from_buffer(models, map));
+        let standing = Predictor::stands(&self.steps[self.first..]);
+        let learned = map.filter(|_| !standing).and_then(|map| self.learn_from_buffer(models, map));
         self.filter.clear_buffer();
-        let judged = self.judged(models.usual, learned);
+        let judged = self.judged(models.usual, learned, standing);
         // The end of this buffer is the start of the next.
         self.steps.drain(..self.steps.len().saturating_sub(HISTORY));
         self.first = self.steps.len() - 1;
@@ -159,12 +157,12 @@ impl SoilLearner {
     }
 
     /// The full buffer with what was learned from it.
-    fn judged(&self, predictor: &Predictor, learned: Option<Learned>) -> Judged {
+    fn judged(&self, predictor: &Predictor, learned: Option<Learned>, standing: bool) -> Judged {
         let (first, last) = (self.first, self.steps.len() - 1);
         let states: Vec<_> = self.steps[first..=last].iter().map(|step| predictor.true_state(&step.state)).collect();
         let contradiction = contradiction(&states, |k| seconds(self.stamps_ns[k + 1].saturating_sub(self.stamps_ns[k])));
         let stamps_ns = [self.stamps_ns[0], self.stamps_ns[last - first]];
-        Judged { stamps_ns, learned, contradiction, standing: self.stands(first, last) }
+        Judged { stamps_ns, learned, contradiction, standing }
     }
 
     /// What the filter makes of the full buffer.
@@ -186,13 +184,6 @@ impl SoilLearner {
         let increment = if told { self.increment(&update.before, log_odds) } else { None };
         let brought = increment.map(|increment| Brought { position_m: [x, y], increment });
         Some(Learned { update, brought })
-    }
-
-    /// Whether the vehicle stood over these steps and was told to. One that is told to drive and does not is no such case.
-    fn stands(&self, first: usize, last: usize) -> bool {
-        let ([x0, y0, _], [x1, y1, _]) = (self.steps[first].state.position_m, self.steps[last].state.position_m);
-        let told = self.steps[first..last].iter().fold(0.0, |most: f64, step| most.max(step.control.speed_m_s.abs()));
-        (x1 - x0).hypot(y1 - y0) < STANDING[0] && told < STANDING[1]
     }
 
     /// The transitions of the full buffer as a predictor sees them.

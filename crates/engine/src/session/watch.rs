@@ -279,7 +279,7 @@ impl Watch {
             return None;
         }
         let dot = |a: &WatchedBuffer, b: &WatchedBuffer| (0..VELOCITY_DIM).map(|c| a.normalised[c] * b.normalised[c]).sum::<f64>();
-        let pairs = self.window.iter().zip(self.window.iter().skip(1));
+        let pairs = self.window.iter().zip(self.window.iter().skip(1)).filter(|(a, b)| a.stamps_ns[1] == b.stamps_ns[0]);
         let (products, squares) = pairs.fold((0.0, 0.0), |(p, s), (a, b)| (p + dot(a, b), s + 0.5 * (dot(a, a) + dot(b, b))));
         let statistic = if squares > 0.0 { products / squares } else { 0.0 };
         Some(Reading { kind: AlarmKind::Correlated, channel: None, statistic, threshold: CORRELATED, onset: 0 })

@@ -17,6 +17,8 @@ use crate::soil_coordinates::from_raw;
 use crate::soil_field::SoilField;
 use crate::terrain_tokens::TerrainToken;
 
+/// Distance, m, and commanded speed, m/s, below which a vehicle stands over a buffer or a forecast. Chosen.
+const STANDING: [f64; 2] = [0.5, 0.5];
 /// Speeds of vehicle and command below which a vehicle is parked, m/s.
 const PARKED_M_S: f64 = 0.3;
 /// Steps within which a vehicle that was parked counts as setting off: one second.
@@ -110,6 +112,15 @@ impl Predictor {
             self.advance(&mut sample, &total, transition.actuators[1], transition.ground_known, control);
         }
         transitions
+    }
+
+    /// Whether a vehicle stands over these steps and is told to: nothing moves, so nothing is told of soil or of the model's errors. One that is told to drive and does not is
+    /// no such case.
+    pub fn stands(steps: &[HistoryStep]) -> bool {
+        let [first, .., last] = steps else { return false };
+        let ([x0, y0, _], [x1, y1, _]) = (first.state.position_m, last.state.position_m);
+        let told = steps[..steps.len() - 1].iter().fold(0.0, |most: f64, step| most.max(step.control.speed_m_s.abs()));
+        (x1 - x0).hypot(y1 - y0) < STANDING[0] && told < STANDING[1]
     }
 
     /// Whether a car under torque sets off in `newest`: it was parked within the second before, or these steps begin with it at rest, and it is slower than any speed
