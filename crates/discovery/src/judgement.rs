@@ -194,7 +194,7 @@ fn left_over(selection: &Selection, share_max: f64) -> Option<&(f64, String)> {
     let all = [
         (&selection.remaining, needed(FURTHER)),
         (&selection.remaining_level, needed(1.0)),
-        (&selection.remaining_bend, selection.threshold),
+        (&selection.remaining_bend, FURTHER * selection.threshold),
     ];
     all.into_iter().find(|(left, needed)| left.0 >= *needed).map(|(left, _)| left)
 }

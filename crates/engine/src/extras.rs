@@ -263,12 +263,12 @@ fn cholesky<const N: usize>(a: &[[f64; N]; N]) -> [[f64; N]; N] {
 }
 
 /// Refuses what is no covariance.
-fn check_covariance(p: &StateCovariance) -> Result<(), String> {
+pub(crate) fn check_covariance<const N: usize>(p: &[[f64; N]; N]) -> Result<(), String> {
     if !p.as_flattened().iter().all(|v| v.is_finite()) {
         return Err("holds a number that is not finite".into());
     }
     let scale = |r: usize, c: usize| (p[r][r] * p[c][c]).max(0.0).sqrt();
-    for r in 0..STATE_DIM {
+    for r in 0..N {
         if p[r][r] < 0.0 {
             return Err(format!("has the variance {} at [{r}, {r}], at least 0 is needed", p[r][r]));
         }
@@ -279,11 +279,10 @@ fn check_covariance(p: &StateCovariance) -> Result<(), String> {
         }
     }
     // P + a little of its own diagonal has a Cholesky factor, or P has a negative eigenvalue.
-    let lifted: StateCovariance = core::array::from_fn(|r| core::array::from_fn(|c| p[r][c] * if r == c { 1.0 + SYMMETRY } else { 1.0 }));
+    let lifted: [[f64; N]; N] = core::array::from_fn(|r| core::array::from_fn(|c| p[r][c] * if r == c { 1.0 + SYMMETRY } else { 1.0 }));
     let l = cholesky(&lifted);
-    let rebuilt = |r: usize, c: usize| -> f64 { (0..STATE_DIM).map(|k| l[r][k] * l[c][k]).sum() };
-    let positive =
-        (0..STATE_DIM).all(|r| (0..=r).all(|c| (rebuilt(r, c) - lifted[r][c]).abs() <= 1e-6 * scale(r, c).max(f64::MIN_POSITIVE)));
+    let rebuilt = |r: usize, c: usize| -> f64 { (0..N).map(|k| l[r][k] * l[c][k]).sum() };
+    let positive = (0..N).all(|r| (0..=r).all(|c| (rebuilt(r, c) - lifted[r][c]).abs() <= 1e-6 * scale(r, c).max(f64::MIN_POSITIVE)));
     if positive { Ok(()) } else { Err("is not positive semi-definite".into()) }
 }
 

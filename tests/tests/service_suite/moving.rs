@@ -73,12 +73,14 @@ async fn service_damaged_foreign_and_old_exports_are_refused() {
     };
     let newer = v1::SessionImage { version: 4, ..outer }.encode_to_vec();
     type Change<'a> = &'a dyn Fn(&mut v1::SessionContent);
-    let changes: [(&str, Change<'_>); 18] = [
+    let changes: [(&str, Change<'_>); 20] = [
         ("bundle", &|c| c.bundle_hash = "0".repeat(64)),
         ("filter", &|c| c.filter_settings.push('x')),
         ("NaN state", &|c| c.live.as_mut().unwrap().history[3].state[1] = f64::NAN),
         ("short state", &|c| c.open[0].step.as_mut().unwrap().state.truncate(11)),
         ("NaN covariance", &|c| c.filter.as_mut().unwrap().covariance[7] = f64::NAN),
+        ("negative variance", &|c| c.filter.as_mut().unwrap().covariance[0] = -1.0),
+        ("no covariance", &|c| c.filter.as_mut().unwrap().covariance[1] = 1e300),
         ("command", &|c| c.filter_steps[0].command[0] = 1e3),
         ("stamps", &|c| c.recent_stamp_ns.reverse()),
         ("numbers", &|c| c.recent_sequence.truncate(3)),

@@ -89,7 +89,8 @@ impl SoilFilter {
     /// A filter with these settings that goes on, bit for bit, where the one of the snapshot stood. The buffer is empty.
     ///
     /// # Errors
-    /// `AdaptationError::NotFinite` when a number of the snapshot is not, `Settings` when it is that of a filter with other classes or another shared error.
+    /// `AdaptationError::NotFinite` when a number of the snapshot is not, `Settings` when it is that of a filter with other classes or another shared error, or a covariance in it
+    /// is none.
     pub fn restored(mut self, snapshot: &FilterSnapshot) -> Result<Self, AdaptationError> {
         let FilterSnapshot { state, plain, noise_scale, trust_log_odds, trust_corrections, ground_class } = snapshot;
         let joint = [state, plain].into_iter().flat_map(|s| s.mean.iter().chain(&s.covariance));
@@ -97,8 +98,10 @@ impl SoilFilter {
             return Err(AdaptationError::NotFinite { what: "snapshot", index: 0 });
         }
         let soils = SOIL_DIM * self.config.classes;
-        let other =
-            || AdaptationError::Settings { reason: "the snapshot is that of a filter with other classes or another shared error".into() };
+        let other = || AdaptationError::Settings {
+            reason: "the snapshot is that of a filter with other classes or another shared error, or holds a covariance that is none"
+                .into(),
+        };
         if !trust_corrections.len().is_multiple_of(soils) {
             return Err(other());
         }

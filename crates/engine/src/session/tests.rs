@@ -133,9 +133,12 @@ fn analytic_a_restarted_vehicle_begins_anew_and_its_former_life_is_over() {
     for i in 100..120 {
         assert_eq!(observe(&mut session, &boot(77, i)), Ok(Outcome::Applied));
     }
-    assert_eq!(observe(&mut session, &boot(5, 0)), Ok(Outcome::Restarted));
-    assert_eq!((session.history().len(), session.last_stamp_ns(), session.last_sequence(), session.boot()), (1, Some(0), Some(1), Some(5)));
-    assert_eq!(observe(&mut session, &boot(5, 1)), Ok(Outcome::Applied));
+    // Stamps that begin again are believed the second time.
+    assert!(matches!(observe(&mut session, &boot(5, 0)), Ok(Outcome::TooOld { .. })));
+    assert_eq!(observe(&mut session, &boot(5, 1)), Ok(Outcome::Restarted));
+    let begun = (session.history().len(), session.last_stamp_ns(), session.last_sequence(), session.boot());
+    assert_eq!(begun, (1, Some(STEP_NS), Some(2), Some(5)));
+    assert_eq!(observe(&mut session, &boot(5, 2)), Ok(Outcome::Applied));
     let before = trace(&session);
     assert!(matches!(observe(&mut session, &boot(77, 120)), Ok(Outcome::TooOld { .. })));
     assert_eq!(trace(&session), before);
@@ -145,6 +148,33 @@ fn analytic_a_restarted_vehicle_begins_anew_and_its_former_life_is_over() {
     assert_eq!(observe(&mut session, &numbered(10 * STEP_NS, 2)), Ok(Outcome::Restarted));
     assert_eq!(observe(&mut session, &numbered(11 * STEP_NS, 3)), Ok(Outcome::Applied));
     assert_eq!(session.history().len(), 2);
+}
+
+/// Goal: what was delayed or is sent once more ends no life of the vehicle, and a life that was taken for over can go on. Method: strays of another boot, new or over, among
+/// measurements of the present one; a boot with later stamps; then the former one alone, in a burst and at its pace.
+#[test]
+fn analytic_strays_of_another_boot_end_nothing() {
+    let boot = |boot: u64, i: i64| Measurement { boot: Some(boot), ..numbered(i * STEP_NS, i as u64 + 1) };
+    let mut session = driven(0);
+    for i in 100..110 {
+        assert_eq!(observe(&mut session, &boot(77, i)), Ok(Outcome::Applied));
+        assert!(matches!(observe(&mut session, &boot(5, i - 60)), Ok(Outcome::TooOld { .. })));
+    }
+    assert_eq!((session.history().len(), session.boot()), (10, Some(77)));
+    assert_eq!(observe(&mut session, &boot(78, 111)), Ok(Outcome::Restarted), "stamps that go on are believed at once");
+    for i in 112..120 {
+        assert_eq!(observe(&mut session, &boot(78, i)), Ok(Outcome::Applied));
+        assert!(matches!(observe(&mut session, &boot(77, i - 50)), Ok(Outcome::TooOld { .. })));
+    }
+    for i in 60..80 {
+        assert!(matches!(observe(&mut session, &boot(77, i)), Ok(Outcome::TooOld { .. })), "a burst is no proof");
+    }
+    assert_eq!(observe(&mut session, &boot(78, 120)), Ok(Outcome::Applied));
+    let rules = Rules { step_ns: STEP_NS, vehicle: &cart(), limits: &Limits::default() };
+    let outcomes: Vec<&str> =
+        (0..7).map(|i| session.observe(&boot(77, 121 + i), (i * STEP_NS) as u64, rules).unwrap().outcome.label()).collect();
+    assert_eq!(outcomes, ["too_old", "too_old", "too_old", "too_old", "too_old", "restarted", "applied"]);
+    assert_eq!(session.boot(), Some(77));
 }
 
 #[test]

@@ -211,3 +211,24 @@ impl Predictor {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use nesam_physics::{Control, VehicleState};
+
+    use super::*;
+
+    /// Eleven steps at this speed, m/s, told this speed.
+    fn steps(speed_m_s: f64, told_m_s: f64) -> Vec<HistoryStep> {
+        let at = |k: usize| VehicleState { position_m: [0.1 * speed_m_s * k as f64, 0.0, 0.0], ..VehicleState::zero() };
+        (0..11).map(|k| HistoryStep { state: at(k), control: Control { speed_m_s: told_m_s, second: 0.0 } }).collect()
+    }
+
+    #[test]
+    fn analytic_who_is_told_to_drive_does_not_stand() {
+        assert!(Predictor::stands(&steps(0.0, 0.0)) && Predictor::stands(&steps(0.1, 0.0)));
+        assert!(!Predictor::stands(&steps(0.0, 2.0)), "stuck");
+        assert!(!Predictor::stands(&steps(1.0, 0.0)), "rolling");
+        assert!(!Predictor::stands(&steps(0.0, 0.0)[..1]), "no way");
+    }
+}
