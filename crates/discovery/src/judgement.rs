@@ -188,7 +188,7 @@ fn surely_differs(selection: &Selection) -> bool {
 }
 
 /// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence; or
-/// a bend beyond chance, of which straight answers leave none whatever their size.
+/// such a bend, of which straight answers leave none whatever their size.
 fn left_over(selection: &Selection, share_max: f64) -> Option<&(f64, String)> {
     let needed = |times: f64| (times * selection.threshold).max(share_max * selection.largest());
     let all = [

@@ -173,9 +173,9 @@ pub fn plan() -> Vec<Hidden> {
         plan.push(Hidden { changes: vec![first.2, second.2], truth, ..recorded("two", first.0, first.1, first.2) });
     }
     plan.extend([nothing("null"), Hidden { changes: vec![C::Noise(1.0)], ..nothing("null_noise") }]);
+    plan.extend([0.08, -0.12].map(|size| recorded("map_large", "map_offset", size, C::MapOffset(size))));
     // Last, as the drives of a group follow from its place.
     plan.push(outside(C::SteeringLeft(0.12)));
-    plan.extend([0.08, -0.12].map(|size| recorded("map_large", "map_offset", size, C::MapOffset(size))));
     plan
 }
 
