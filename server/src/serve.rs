@@ -258,8 +258,10 @@ async fn open_store(
     let etcd = Etcd::new(&config.cluster)?;
     let cluster = Cluster::start(etcd, &config.cluster, grpc_addr.to_string(), engine.clone(), keeper.clone()).await?;
     let store = EtcdStore::new(cluster.clone(), tokio::runtime::Handle::current());
-    let started = keeper.start(Box::new(store), engine.handle().clone(), Restored::default());
-    started.map_err(|source| ServerError::Store { source })?;
+    if let Err(source) = keeper.start(Box::new(store), engine.handle().clone(), Restored::default()) {
+        cluster.stop().await;
+        return Err(ServerError::Store { source });
+    }
     Ok(Some(cluster))
 }
 
@@ -395,11 +397,15 @@ impl RunningServer {
         }
         let _ = self.stop.send(true);
         self.live.stop();
-        for mut task in [Some(self.grpc), self.http.take()].into_iter().flatten() {
-            if tokio::time::timeout(self.drain, &mut task).await.is_err() {
-                tracing::warn!("requests still ran, or answers were still read, after the drain time and were cut off");
-                task.abort();
+        let mut serving: Vec<JoinHandle<()>> = [Some(self.grpc), self.http.take()].into_iter().flatten().collect();
+        let ended = async {
+            for task in &mut serving {
+                let _ = task.await;
             }
+        };
+        if tokio::time::timeout(self.drain, ended).await.is_err() {
+            tracing::warn!("requests still ran, or answers were still read, after the drain time and were cut off");
+            serving.iter().for_each(JoinHandle::abort);
         }
         let lost = end_store(self.keeper, self.cluster).await;
         let (handle, recorder) = (self.handle, self.recorder);

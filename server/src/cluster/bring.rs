@@ -5,12 +5,13 @@ use std::time::Duration;
 
 use nesam_engine::{EngineError, SessionImage};
 use nesam_proto::etcd::KeyValue;
+use tokio::runtime::Handle;
 use tokio::sync::OwnedMutexGuard;
 use tokio::time::Instant;
 use tonic::Status;
 
 use super::record::{Server, json, of_json, session_of};
-use super::{Cluster, Held, Stage, again, created, delete, get, moved, put, written};
+use super::{Claim, Cluster, Held, Stage, again, created, delete, get, moved, put, written};
 use crate::convert::to_status;
 use crate::store::{StoredSession, resumed};
 
@@ -62,6 +63,39 @@ struct Seen {
     stored: Option<StoredSession>,
 }
 
+/// A wish that an owner was told in etcd. Dropped, on whichever way out and when whoever asks gives up, it is taken back.
+struct Asked {
+    cluster: Cluster,
+    session: String,
+    /// Of the owner that was asked.
+    epoch: i64,
+    /// At which it was told; `None` = etcd does not hold it any more.
+    revision: Option<i64>,
+    runtime: Handle,
+}
+
+impl Asked {
+    /// Tells the owner of this epoch. To its end, also when whoever asks gives up: else nobody would know what to take back.
+    async fn tell(cluster: &Cluster, session: &str, epoch: i64) -> Result<Self, Status> {
+        let lease = cluster.0.lease.id().ok_or_else(|| moved(session))?;
+        let (cluster, session, runtime) = (cluster.clone(), session.to_owned(), Handle::current());
+        let telling = tokio::spawn(async move {
+            let told = cluster.0.etcd.all(vec![put(&cluster.0.keys.want(&session), json(&cluster.0.me), lease)]).await?;
+            Ok(Self { cluster, session, epoch, revision: Some(told.revision), runtime })
+        });
+        telling.await.map_err(|error| Status::internal(format!("asking for a session: {error}")))?
+    }
+}
+
+impl Drop for Asked {
+    fn drop(&mut self) {
+        let Some(revision) = self.revision else { return };
+        let want = self.cluster.0.keys.want(&self.session);
+        // Unless another one has asked since then.
+        self.runtime.spawn(self.cluster.clone().insist(vec![written(&want, revision)], vec![delete(&want)]));
+    }
+}
+
 impl Cluster {
     /// Brings a session here, wherever it is. `permit` hears the vehicle that it belongs to before anything is done.
     ///
@@ -77,16 +111,11 @@ impl Cluster {
     ///
     /// # Errors
     /// ALREADY_EXISTS for `field` when a session of this name is stored; else as [`Cluster::bring`].
-    pub async fn claim(&self, session: &str, field: &'static str, budget: Duration) -> Result<(), Status> {
+    pub async fn claim(&self, session: &str, field: &'static str, budget: Duration) -> Result<Claim, Status> {
+        // Before anything is taken: whoever asks may give up at any time.
+        let claim = Claim::new(self, session);
         let taken = |_: &str| Err(to_status(EngineError::SessionExists { session: session.into(), field }));
-        self.have(session, Zeal::Create, budget, taken).await.map(drop)
-    }
-
-    /// Lets a claimed name go if no session has begun under it.
-    pub async fn unclaim(&self, session: &str) {
-        if self.0.engine.get(session, WAIT_MAX).await.is_err() {
-            self.let_go(session).await;
-        }
+        self.have(session, Zeal::Create, budget, taken).await.map(|_| claim)
     }
 
     /// Where a session is, for a bus that tells every server of it.
@@ -129,11 +158,25 @@ impl Cluster {
         if self.is_here(session)? {
             return Ok(Brought::Here);
         }
-        let turn = self.lock().turns.entry(session.into()).or_default().clone();
-        let turn = turn.lock_owned().await;
+        let turn = self.turn(session).await;
         let result = self.have_in_turn(session, zeal, until, permit, turn).await;
-        self.lock().turns.retain(|_, turn| Arc::strong_count(turn) > 1);
+        self.tidy_turns();
         result
+    }
+
+    /// Waits for the turn of a session: who takes it, or lets go what was begun for nobody, does so one after the other.
+    pub(super) async fn turn(&self, session: &str) -> OwnedMutexGuard<()> {
+        let turn = self.lock().turns.entry(session.into()).or_default().clone();
+        turn.lock_owned().await
+    }
+
+    pub(super) fn end_turn(&self, turn: OwnedMutexGuard<()>) {
+        drop(turn);
+        self.tidy_turns();
+    }
+
+    fn tidy_turns(&self) {
+        self.lock().turns.retain(|_, turn| Arc::strong_count(turn) > 1);
     }
 
     async fn have_in_turn(
@@ -145,8 +188,8 @@ impl Cluster {
         mut turn: OwnedMutexGuard<()>,
     ) -> Result<Brought, Status> {
         let mut changes = self.0.changes.subscribe();
-        // Epoch of the owner that was asked, and the revision at which; one that took the session since then has not heard.
-        let mut asked: Option<(i64, i64)> = None;
+        // One that took the session since then has not heard.
+        let mut asked: Option<Asked> = None;
         loop {
             if self.is_here(session)? {
                 return Ok(Brought::Here);
@@ -167,6 +210,8 @@ impl Cluster {
                 let (taken, back) = taking.await.map_err(|error| Status::internal(format!("taking session `{session}`: {error}")))?;
                 turn = back;
                 if taken? {
+                    // With the wish.
+                    asked.iter_mut().for_each(|asked| asked.revision = None);
                     return Ok(Brought::Here);
                 }
                 continue;
@@ -178,18 +223,11 @@ impl Cluster {
             }
             let left = until.saturating_duration_since(Instant::now());
             if left.is_zero() || zeal == Zeal::IfFree {
-                if let Some((_, revision)) = asked {
-                    let want = self.0.keys.want(session);
-                    // Unless another one has asked since then.
-                    let _ = self.0.etcd.transaction(vec![written(&want, revision)], vec![delete(&want)]).await;
-                }
                 let reason = format!("session `{session}` is with server `{}` ({}), which has not let go of it", owner.name, owner.address);
                 return Err(again(&reason, self.0.lease.length() / 4));
             }
-            if asked.is_none_or(|(of, _)| of != epoch) {
-                let lease = self.0.lease.id().ok_or_else(|| moved(session))?;
-                let done = self.0.etcd.all(vec![put(&self.0.keys.want(session), json(&self.0.me), lease)]).await?;
-                asked = Some((epoch, done.revision));
+            if asked.as_ref().is_none_or(|asked| asked.epoch != epoch) {
+                asked = Some(Asked::tell(self, session, epoch).await?);
             }
             let _ = tokio::time::timeout(left.min(LOOK_AGAIN), changes.changed()).await;
         }
@@ -241,7 +279,7 @@ impl Cluster {
                 Ok(true)
             }
             Err(status) => {
-                self.let_go(session).await;
+                self.let_go(session, epoch).await;
                 Err(status)
             }
         }

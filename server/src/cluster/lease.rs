@@ -44,6 +44,11 @@ impl Lease {
         (Instant::now() < term.until).then_some(term.id)
     }
 
+    /// Number of the lease until it is known to have ended: what stands under it in etcd may be there as long.
+    pub fn number(&self) -> Option<i64> {
+        self.held().map(|term| term.id)
+    }
+
     /// Length of a lease.
     pub fn length(&self) -> Duration {
         self.length

@@ -3,6 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use nesam_proto::etcd as pb;
+use pb::request_op::Request;
 use tonic::Status;
 
 use super::{Cluster, Held, Stage, created, delete};
@@ -14,14 +16,37 @@ const STAY: Duration = Duration::from_millis(500);
 const LAST_COMMIT: Duration = Duration::from_secs(2);
 /// Longest wait for the engine.
 const CLOSE: Duration = Duration::from_secs(10);
+/// Pause before etcd is asked again to take something back.
+const INSIST_AGAIN: Duration = Duration::from_millis(100);
 
 impl Cluster {
-    /// Hands a session over if it is here and another server wants it: to be looked at when either begins.
+    /// Hands a session over if it is here and another server wants it: to be looked at when either begins. A wanted one that is not here although its key is
+    /// ours is let go as well.
     pub(super) fn heed(&self, session: &str) {
-        let wanted = self.lock().wanted(session);
+        let lease = self.0.lease.number();
+        let (wanted, stray) = {
+            let state = self.lock();
+            (state.wanted(session), state.stray(session, lease))
+        };
         if let Some(held) = wanted {
             tokio::spawn(self.clone().hand_over(session.into(), held));
         }
+        if stray.is_some() {
+            tokio::spawn(self.clone().free_stray(session.into()));
+        }
+    }
+
+    /// Gives the key of a session back under which there is none here.
+    async fn free_stray(self, session: String) {
+        // One that is being taken is here in a moment.
+        let turn = self.turn(&session).await;
+        let lease = self.0.lease.number();
+        let stray = self.lock().stray(&session, lease);
+        if let Some(epoch) = stray {
+            tracing::warn!(session, epoch, "owner's key without a session given back");
+            self.release(&session, epoch).await;
+        }
+        self.end_turn(turn);
     }
 
     /// Writes what there is of a session and lets it go.
@@ -39,17 +64,22 @@ impl Cluster {
         if !self.0.keeper.settled(&Key::Session(session.clone()), LAST_COMMIT).await {
             tracing::warn!(session, "the store is slow; the session moves with what is durable of it");
         }
-        self.let_go(&session).await;
+        self.let_go(&session, held.epoch).await;
         tracing::info!(session, epoch = held.epoch, "session handed over");
     }
 
-    /// Lets one session go: from the engine, then from etcd.
-    pub(super) async fn let_go(&self, session: &str) {
-        let Some(held) = self.lock().held.remove(session) else { return };
-        self.forget(session).await;
-        if let Err(status) = self.release_key(session, held.epoch).await {
-            tracing::warn!(session, reason = status.message(), "owner's key not removed; it goes with the lease");
+    /// Lets one session go: from the engine, then from etcd. In tasks that nobody gives up: a session half left would be nobody's.
+    pub(super) async fn let_go(&self, session: &str, epoch: i64) {
+        let left = self.lock().leave(session, epoch);
+        if left {
+            self.gone(session, epoch).await;
         }
+    }
+
+    /// Takes a session that is not held any more out of the engine, then gives its key back.
+    pub(super) async fn gone(&self, session: &str, epoch: i64) {
+        self.forget(session).await;
+        self.release(session, epoch).await;
     }
 
     /// Forgets all sessions: the lease has ended.
@@ -62,20 +92,19 @@ impl Cluster {
         self.lock().counts.lost += lost.len() as u64;
     }
 
-    /// Forgets a session that belongs to another server now.
-    pub(crate) async fn lose(&self, session: &str) {
-        let Some(held) = self.lock().held.remove(session) else { return };
-        tracing::warn!(session, epoch = held.epoch, "session lost: another server has it");
-        self.forget(session).await;
-        self.lock().counts.lost += 1;
+    /// Forgets a session that belongs to another server now, unless it has come back since this epoch.
+    pub(crate) async fn lose(&self, session: &str, epoch: i64) {
+        let left = self.lock().leave(session, epoch);
+        if left {
+            tracing::warn!(session, epoch, "session lost: another server has it");
+            self.forget(session).await;
+            self.lock().counts.lost += 1;
+        }
     }
 
     /// A session was closed, and etcd knows it.
     pub(crate) fn closed(&self, session: &str, epoch: i64) {
-        let mut state = self.lock();
-        if state.held.get(session).is_some_and(|held| held.epoch == epoch) {
-            state.held.remove(session);
-        }
+        self.lock().leave(session, epoch);
     }
 
     /// Takes a session out of the engine. It is not held any more, so nothing that the store does from now on changes what is stored of it.
@@ -87,8 +116,28 @@ impl Cluster {
         let _ = self.0.left.send(Arc::from(session));
     }
 
+    /// Gives the key of one epoch back, at the latest when etcd answers again: while this server lives nobody else would.
+    async fn release(&self, session: &str, epoch: i64) {
+        let Err(status) = self.release_key(session, epoch).await else { return };
+        tracing::warn!(session, epoch, reason = status.message(), "owner's key not removed yet; etcd is asked again while the lease lasts");
+        let owner = self.0.keys.owner(session);
+        tokio::spawn(self.clone().insist(vec![created(&owner, epoch)], vec![delete(&owner)]));
+    }
+
     pub(super) async fn release_key(&self, session: &str, epoch: i64) -> Result<(), Status> {
         let owner = self.0.keys.owner(session);
         self.0.etcd.transaction(vec![created(&owner, epoch)], vec![delete(&owner)]).await.map(drop)
+    }
+
+    /// Takes something of ours back that goes with the lease at the latest: asks until etcd has done it or the lease has ended. The conditions must see to it
+    /// that a repetition does nothing.
+    pub(super) async fn insist(self, conditions: Vec<pb::Compare>, then: Vec<Request>) {
+        let lease = self.0.lease.number();
+        while lease.is_some() && self.0.lease.number() == lease {
+            if self.0.etcd.transaction(conditions.clone(), then.clone()).await.is_ok() {
+                return;
+            }
+            tokio::time::sleep(INSIST_AGAIN).await;
+        }
     }
 }

@@ -12,6 +12,7 @@
 //! ```
 
 mod bring;
+mod claim;
 mod etcd;
 mod keys;
 mod lease;
@@ -32,6 +33,7 @@ use tonic::Status;
 use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use self::bring::{Brought, Standing};
+pub(crate) use self::claim::Claim;
 pub use self::etcd::etcd_endpoint;
 pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, get_keys, put, written};
 pub(crate) use self::keys::Keys;
@@ -64,6 +66,13 @@ struct Held {
     stage: Stage,
 }
 
+/// Who has a session, as the watch tells.
+#[derive(Clone, Copy, Debug)]
+struct Owner {
+    epoch: i64,
+    lease: i64,
+}
+
 /// Counters of a server among others.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct ClusterCounts {
@@ -80,12 +89,14 @@ pub(crate) struct ClusterCounts {
 #[derive(Debug, Default)]
 struct State {
     held: BTreeMap<String, Held>,
-    /// Lease of the owner of each session of the fleet, as the watch tells.
-    owners: BTreeMap<String, i64>,
+    /// Owner of each session of the fleet, as the watch tells.
+    owners: BTreeMap<String, Owner>,
     /// Revision at which another server asked for a session, as the watch tells.
     wants: BTreeMap<String, i64>,
     /// Sessions that are being brought here: one at a time each.
     turns: BTreeMap<String, Arc<tokio::sync::Mutex<()>>>,
+    /// How many requests are about to begin a session under a name.
+    claims: BTreeMap<String, usize>,
     /// When a session was last looked for on behalf of a bus that sends to everybody.
     looked: BTreeMap<String, Instant>,
     /// SHA-256 of each map that is in etcd, as it was last read or written.
@@ -98,6 +109,33 @@ impl State {
     fn wanted(&self, session: &str) -> Option<Held> {
         let held = self.held.get(session).filter(|held| held.stage == Stage::Here)?;
         self.wants.get(session).is_some_and(|asked| *asked > held.epoch).then_some(*held)
+    }
+
+    /// Epoch of a session that another server has asked for and whose key stands under this lease, ours, although it is not here: etcd did not say that it was
+    /// taken, or nobody could let it go. It may be on its way, unless whoever asks has its turn.
+    fn stray(&self, session: &str, lease: Option<i64>) -> Option<i64> {
+        let owner = self.owners.get(session).filter(|owner| Some(owner.lease) == lease && !self.held.contains_key(session))?;
+        self.wants.get(session).is_some_and(|asked| *asked > owner.epoch).then_some(owner.epoch)
+    }
+
+    /// Notes that a session is not here any more; false when that was noted before, or when it has come back since then under another epoch.
+    fn leave(&mut self, session: &str, epoch: i64) -> bool {
+        let here = self.held.get(session).is_some_and(|held| held.epoch == epoch);
+        if here {
+            self.held.remove(session);
+        }
+        here
+    }
+
+    /// Notes that one of the requests that claimed a name is done with it; whether it was the last one.
+    fn unclaim(&mut self, session: &str) -> bool {
+        let Some(claims) = self.claims.get_mut(session) else { return true };
+        *claims -= 1;
+        let last = *claims == 0;
+        if last {
+            self.claims.remove(session);
+        }
+        last
     }
 }
 
@@ -215,7 +253,7 @@ impl Cluster {
     /// Whether another server has the session, as far as this one knows.
     fn is_elsewhere(&self, session: &str) -> bool {
         let state = self.lock();
-        !state.held.contains_key(session) && state.owners.get(session).is_some_and(|lease| Some(*lease) != self.0.lease.id())
+        !state.held.contains_key(session) && state.owners.get(session).is_some_and(|owner| Some(owner.lease) != self.0.lease.id())
     }
 
     /// Epoch of a session whose owner this server is.
@@ -277,5 +315,41 @@ mod tests {
         assert!(state.wanted("s").is_none(), "a wish that the taking has fulfilled, of which the watch has not told yet");
         state.wants.clear();
         assert!(state.wanted("s").is_none());
+    }
+
+    /// Goal: what ends an earlier stay of a session ends no later one. Method: a session that went and came back under another epoch.
+    #[test]
+    fn analytic_an_earlier_epoch_ends_no_later_one() {
+        let mut state = State::default();
+        state.held.insert("s".into(), Held { epoch: 9, since: Instant::now(), stage: Stage::Here });
+        assert!(!state.leave("s", 7) && state.held.contains_key("s"), "of an earlier stay");
+        assert!(!state.leave("t", 9), "never here");
+        assert!(state.leave("s", 9) && state.held.is_empty());
+        assert!(!state.leave("s", 9), "once");
+    }
+
+    /// Goal: a key of this server under which it has no session is found when somebody wants the session, and no other one is.
+    #[test]
+    fn analytic_a_key_without_a_session_is_stray_when_it_is_wanted() {
+        let (mut state, ours) = (State::default(), Some(3));
+        assert_eq!(state.stray("s", ours), None, "nobody's");
+        state.owners.insert("s".into(), Owner { epoch: 7, lease: 3 });
+        assert_eq!(state.stray("s", ours), None, "nobody asks");
+        state.wants.insert("s".into(), 6);
+        assert_eq!(state.stray("s", ours), None, "somebody asked an earlier owner");
+        state.wants.insert("s".into(), 8);
+        assert_eq!(state.stray("s", ours), Some(7));
+        assert_eq!((state.stray("s", Some(4)), state.stray("s", None)), (None, None), "another server's, or of an earlier lease");
+        state.held.insert("s".into(), Held { epoch: 7, since: Instant::now(), stage: Stage::Arriving });
+        assert_eq!(state.stray("s", ours), None, "it is here");
+    }
+
+    /// Goal: the last of those who claimed a name sees to it.
+    #[test]
+    fn analytic_the_last_claim_is_told() {
+        let mut state = State::default();
+        state.claims.insert("s".into(), 2);
+        assert!(!state.unclaim("s") && state.unclaim("s"));
+        assert!(state.claims.is_empty());
     }
 }

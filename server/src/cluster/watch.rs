@@ -7,7 +7,7 @@ use tonic::Status;
 
 use super::keys::Topic;
 use super::record::{MapHead, Server, of_json};
-use super::{Cluster, get_all};
+use super::{Cluster, Owner, get_all};
 
 /// Time for which etcd remembers old contents, at least.
 const COMPACT_EVERY: Duration = Duration::from_secs(30);
@@ -76,13 +76,15 @@ impl Cluster {
     async fn apply(&self, found: &pb::KeyValue, there: bool) {
         match (self.0.keys.topic(&found.key), there) {
             (Some(Topic::Owner(session)), true) => {
-                let foreign = {
+                let before = {
                     let mut state = self.lock();
-                    state.owners.insert(session.into(), found.lease);
-                    state.held.get(session).is_some_and(|held| held.epoch < found.create_revision)
+                    state.owners.insert(session.into(), Owner { epoch: found.create_revision, lease: found.lease });
+                    state.held.get(session).map(|held| held.epoch).filter(|epoch| *epoch < found.create_revision)
                 };
-                if foreign && Some(found.lease) != self.0.lease.id() {
-                    self.lose(session).await;
+                if let Some(epoch) = before
+                    && Some(found.lease) != self.0.lease.id()
+                {
+                    self.lose(session, epoch).await;
                 }
             }
             (Some(Topic::Owner(session)), false) => {

@@ -157,11 +157,15 @@ impl Edge {
             // One of this name may have been closed a moment ago: the name goes with the commit of that, and so would what begins under it before.
             keeper.settled(&Key::Session(name.into()), budget).await;
         }
-        cluster.claim(name, field, budget).await?;
+        // The client may give up at any of these waits.
+        let claim = cluster.claim(name, field, budget).await?;
         match begin.await {
-            Ok(view) => Ok(view),
+            Ok(view) => {
+                claim.begun();
+                Ok(view)
+            }
             Err(error) => {
-                cluster.unclaim(name).await;
+                claim.give_back().await;
                 Err(self.status(error))
             }
         }

@@ -108,6 +108,12 @@ impl pb::sessions_server::Sessions for Service {
         let image = session_image(&image).map_err(to_status)?;
         let name = if session_id.is_empty() { &image.session } else { &session_id };
         caller.may(Wish::OpenSession { vehicle: &image.vehicle, session: name })?;
+        if image.effects != AppliedEffects::default() {
+            // Anybody can write an image: its checksum tells damage, not who made it.
+            let refused =
+                |status: Status| Status::new(status.code(), format!("the image says which effects the vehicle has: {}", status.message()));
+            caller.may_with(Wish::ApplyEffects(name), &image.vehicle).map_err(refused)?;
+        }
         if let Some((map, _)) = &image.map {
             self.0.bring_map(map, budget).await?;
         }

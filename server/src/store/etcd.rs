@@ -76,7 +76,7 @@ impl EtcdStore {
             // One of them has gone to another server; the others must not wait for it.
             for alone in group {
                 if !self.write(std::slice::from_ref(alone)).await? {
-                    self.cluster.lose(alone.name).await;
+                    self.cluster.lose(alone.name, alone.epoch).await;
                     foreign.push(alone.name.into());
                 }
             }

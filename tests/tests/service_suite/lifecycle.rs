@@ -141,6 +141,33 @@ async fn service_shutdown_ends_streams_and_frees_the_ports() {
     serve(config, predictor()).await.unwrap().shutdown().await;
 }
 
+/// Goal: requests of gRPC and of HTTP that do not end have the drain time together. Method: half a request of HTTP, first alone, which shows that it holds up the
+/// stop, then with half a request of gRPC.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_grpc_and_http_have_one_drain_time() {
+    let drain = Duration::from_secs(3);
+    for with_grpc in [false, true] {
+        let (server, _client) = start_with(|config| config.grpc.drain_s = drain.as_secs_f64()).await;
+        let http = server.http_addr.unwrap();
+        let mut page = tokio::net::TcpStream::connect(http).await.unwrap();
+        page.write_all(b"GET /health HTTP/1.1\r\n").await.unwrap();
+        let socket = tokio::net::TcpStream::connect(server.grpc_addr).await.unwrap();
+        let (caller, connection) = h2::client::handshake(socket).await.unwrap();
+        tokio::spawn(async move { drop(connection.await) });
+        let request = http::Request::post("http://localhost/nesam.v1.Sessions/List");
+        let request = request.header("content-type", "application/grpc").header("te", "trailers").body(()).unwrap();
+        // Headers whose message never comes.
+        let mut caller = caller.ready().await.unwrap();
+        let _half = with_grpc.then(|| caller.send_request(request, false).unwrap());
+        // Both are read.
+        tokio::time::sleep(Duration::from_millis(500)).await;
+        let started = Instant::now();
+        server.shutdown().await;
+        let took = started.elapsed();
+        assert!((drain..drain * 9 / 5).contains(&took), "with half a request of gRPC: {with_grpc}; {took:?}");
+    }
+}
+
 /// Without TLS; `service_strangers_do_not_get_in` has it with TLS.
 #[tokio::test(flavor = "multi_thread")]
 async fn service_connections_that_say_nothing_are_closed() {

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use nesam_client::{Client, ClientError, Tls, outcome_label, v1};
 use nesam_server::{Config, access, serve};
+use prost::Message as _;
 use prost::bytes::Bytes;
 use rcgen::SanType;
 use tokio::io::{AsyncReadExt as _, AsyncWriteExt as _};
@@ -102,6 +103,50 @@ async fn service_each_client_reaches_its_own_vehicles_only() {
 
     // What a vehicle is taken to be is for operators.
     assert_eq!(operator.apply_effects("truck", "", offset()).await.unwrap().effects, offset());
+    stage.server.shutdown().await;
+}
+
+/// An image with other effects and another word on where they come from, and a checksum that fits: what whoever has an image can write.
+fn rewritten(image: &[u8], effects: Vec<v1::Effect>, source: &str) -> Vec<u8> {
+    let outer = v1::SessionImage::decode(image).unwrap();
+    let content = v1::SessionContent::decode(outer.content.clone()).unwrap();
+    let content = v1::SessionContent { effects, effects_source: source.into(), ..content }.encode_to_vec();
+    let checksum = <sha2::Sha256 as sha2::Digest>::digest(&content).to_vec();
+    v1::SessionImage { checksum: checksum.into(), content: content.into(), ..outer }.encode_to_vec()
+}
+
+/// Goal: whoever may not put effects on a session does not bring them in with an image. Method: images with effects of an operator, with effects and with a
+/// source that were written into them; what a vehicle may do all the same is written down in docs/security.md.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_an_image_brings_effects_for_operators_alone() {
+    let recorded = recorded();
+    let stage = secured().await;
+    let (mut truck, mut operator) = (stage.client("nesam:vehicle:truck").await, stage.client("nesam:operator:control").await);
+    truck.open_session(open_request("truck", "")).await.unwrap();
+    truck.feed(samples("truck", &recorded.drive, 40)).await.unwrap();
+    let bare = truck.export_session("truck").await.unwrap();
+    operator.apply_effects("truck", "a report", offset()).await.unwrap();
+    let applied = truck.export_session("truck").await.unwrap();
+    let before = operator.list_sessions().await.unwrap();
+    for (what, image) in [
+        ("an operator's effects", applied.clone()),
+        ("an operator's effects under another source", rewritten(&applied, offset(), "a better report")),
+        ("effects of its own", rewritten(&bare, offset(), "")),
+        ("a source alone", rewritten(&bare, Vec::new(), "a report")),
+    ] {
+        let refused = truck.import_session(image, "copy").await;
+        assert!(refused.as_ref().is_err_and(|error| error.to_string().contains("effects")), "{what}: {refused:?}");
+        denied(what, refused, "vehicle `truck`");
+    }
+    assert_eq!(operator.list_sessions().await.unwrap(), before, "nothing of that has left a trace");
+
+    // An image without effects is its own business, also one that they were taken out of.
+    for (name, image) in [("bare", bare.clone()), ("stripped", rewritten(&applied, Vec::new(), ""))] {
+        let session = truck.import_session(image, name).await.unwrap();
+        assert_eq!((session.effects, session.effects_source.as_str()), (Vec::new(), ""), "{name}");
+    }
+    let copy = operator.import_session(applied, "copy").await.unwrap();
+    assert_eq!((copy.effects, copy.effects_source.as_str()), (offset(), "a report"));
     stage.server.shutdown().await;
 }
 

@@ -1,9 +1,11 @@
 //! Goal: servers that share sessions answer as one would, also while sessions move and etcd is slow or refuses. Method: two servers over real sockets on the
 //! stand-in for etcd; `simulation` and `tests/fleet` have what dies.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use nesam_client::{Client, MapLayers, v1};
+use nesam_proto::etcd::event::EventType;
 use nesam_server::RunningServer;
 use tokio_stream::wrappers::TcpListenerStream;
 use tonic::Code;
@@ -34,6 +36,12 @@ async fn two_servers() -> (Etcd, Shared, Shared) {
     };
     let (one, two) = (server("one").await, server("two").await);
     (etcd, one, two)
+}
+
+/// How often a key of etcd was written.
+fn writes(etcd: &Etcd, key: &str) -> usize {
+    let written = |event: &nesam_proto::etcd::Event| event.r#type() == EventType::Put && event.kv.as_ref().is_some_and(|kv| kv.key == key);
+    etcd.history().iter().filter(|(_, event)| written(event)).count()
 }
 
 async fn shut_down(servers: [Shared; 2]) {
@@ -149,7 +157,7 @@ async fn service_whoever_watches_a_session_that_moves_is_told_to_ask_again() {
 async fn service_what_is_opened_while_its_name_is_given_back_stays() {
     let (etcd, mut one, two) = two_servers().await;
     open(&mut one.client, "s", "").await;
-    etcd.trouble(Trouble { delay: Duration::from_millis(300), refusal: None });
+    etcd.trouble(Trouble { delay: Duration::from_millis(300), ..Trouble::default() });
     let mut client = one.client.clone();
     let closing = tokio::spawn(async move { client.close_session("s").await });
     // The engine has closed it by now, and etcd does not know yet.
@@ -159,5 +167,88 @@ async fn service_what_is_opened_while_its_name_is_given_back_stays() {
     etcd.trouble(Trouble::default());
     one.client.session("s").await.unwrap();
     assert!(etcd.get("nesam/session/s").is_some() && etcd.get("nesam/live/owner/s").is_some());
+    shut_down([one, two]).await;
+}
+
+/// Goal: a session is not its former owner's for ever because etcd failed once. Method: etcd removes no key of an owner until the owner has tried.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_session_that_could_not_be_given_back_at_once_comes_all_the_same() {
+    let (etcd, mut one, two) = two_servers().await;
+    let run = open(&mut one.client, "s", "").await.run;
+    etcd.trouble(Trouble { keeps: Some("nesam/live/owner/"), ..Trouble::default() });
+    let mut client = two.client.clone();
+    let asking = tokio::spawn(async move { client.session("s").await });
+    eventually(PATIENCE, "the owner has tried to give it back", async || etcd.kept() > 0).await;
+    assert_eq!(etcd.get("nesam/live/owner/s").unwrap().create_revision.unsigned_abs(), run, "in vain");
+    etcd.trouble(Trouble::default());
+    assert!(asking.await.unwrap().unwrap().run > run);
+    shut_down([one, two]).await;
+}
+
+/// Goal: a key of a server under which it has no session keeps nobody out. Method: such a key as it stays behind when etcd has written it and could not say so.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_key_without_a_session_is_given_back_to_whoever_asks() {
+    let (etcd, mut one, mut two) = two_servers().await;
+    open(&mut one.client, "other", "").await;
+    let owner = etcd.get("nesam/live/owner/other").unwrap();
+    etcd.put("nesam/live/owner/s", owner.value, owner.lease);
+    open(&mut two.client, "s", "").await;
+    assert_ne!(etcd.get("nesam/live/owner/s").unwrap().lease, owner.lease);
+    one.client.session("other").await.unwrap();
+    shut_down([one, two]).await;
+}
+
+/// Goal: whoever does not wait until a session is open leaves no name behind under which there is none. Method: a slow etcd and clients that give up one after the
+/// other, some of them while the name is being taken.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_whoever_gives_up_opening_leaves_no_name_without_a_session() {
+    let (etcd, one, mut two) = two_servers().await;
+    // To look who has a name and to take it is a quarter of a second each: clients give up before, while and after their names are taken.
+    etcd.trouble(Trouble { delay: Duration::from_millis(250), ..Trouble::default() });
+    let names: Vec<String> = (0..24).map(|i| format!("s{i}")).collect();
+    let owner = |name: &str| format!("nesam/live/owner/{name}");
+    let opening = names.iter().zip(0..).map(|(name, i)| {
+        let request = v1::OpenSessionRequest { vehicle_id: name.clone(), ..Default::default() };
+        let mut client = one.client.clone();
+        tokio::spawn(async move { drop(tokio::time::timeout(Duration::from_millis(30 * i), client.open_session(request)).await) })
+    });
+    for gives_up in opening.collect::<Vec<_>>() {
+        gives_up.await.unwrap();
+    }
+    // What was begun for somebody comes to its end.
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    etcd.trouble(Trouble::default());
+    let client = one.client.clone();
+    let sessions = async || -> BTreeSet<String> {
+        client.clone().list_sessions().await.unwrap().into_iter().map(|session| session.session_id).collect()
+    };
+    let fits = async || {
+        let sessions = sessions().await;
+        names.iter().all(|name| etcd.get(&owner(name)).is_some() == sessions.contains(name))
+    };
+    eventually(PATIENCE, "whatever name is taken has a session", fits).await;
+    let (begun, taken) = (sessions().await, names.iter().filter(|name| writes(&etcd, &owner(name)) > 0).count());
+    assert!(taken > begun.len(), "{taken} names taken for {} sessions: nobody gave up in between", begun.len());
+    for name in names.iter().filter(|name| !begun.contains(*name)) {
+        open(&mut two.client, name, "").await;
+    }
+    shut_down([one, two]).await;
+}
+
+/// Goal: a wish does not outlive whoever has it. Method: a client that gives up as soon as its server has asked the owner.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_whoever_gives_up_asking_leaves_no_wish() {
+    let (etcd, mut one, two) = two_servers().await;
+    open(&mut one.client, "s", "").await;
+    // Slow enough that the session is on its way meanwhile.
+    etcd.trouble(Trouble { delay: Duration::from_millis(250), ..Trouble::default() });
+    let mut client = two.client.clone();
+    let asking = tokio::spawn(async move { client.session("s").await });
+    eventually(PATIENCE, "the owner is asked", async || writes(&etcd, "nesam/live/want/s") > 0).await;
+    asking.abort();
+    etcd.trouble(Trouble::default());
+    eventually(PATIENCE, "the wish is taken back", async || etcd.get("nesam/live/want/s").is_none()).await;
+    let client = one.client.clone();
+    eventually(PATIENCE, "the session is there", async || client.clone().session("s").await.is_ok()).await;
     shut_down([one, two]).await;
 }

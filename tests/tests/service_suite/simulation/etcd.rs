@@ -5,6 +5,7 @@
 use std::collections::BTreeMap;
 use std::ops::Bound;
 use std::pin::Pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
@@ -12,6 +13,7 @@ use nesam_proto::etcd as pb;
 use pb::event::EventType;
 use pb::request_op::Request as Asked;
 use pb::response_op::Response as Told;
+use prost::bytes::Bytes;
 use tokio::sync::{mpsc, watch};
 use tokio_stream::wrappers::ReceiverStream;
 use tokio_stream::{Stream, StreamExt as _};
@@ -48,6 +50,8 @@ pub struct Trouble {
     pub delay: Duration,
     /// None is done, and all are answered with this code.
     pub refusal: Option<Code>,
+    /// None that removes a single key which begins so is done; they are answered with UNAVAILABLE.
+    pub keeps: Option<&'static str>,
 }
 
 /// What etcd holds; clones share it, and it outlives the host that serves it as a disk does.
@@ -55,6 +59,8 @@ pub struct Trouble {
 pub struct Etcd {
     held: Arc<Mutex<Held>>,
     trouble: Arc<Mutex<Trouble>>,
+    /// Transactions that were refused for what they would remove.
+    kept: Arc<AtomicUsize>,
     /// The newest revision.
     changed: watch::Sender<i64>,
 }
@@ -64,7 +70,7 @@ impl Default for Etcd {
     fn default() -> Self {
         let (keys, leases, history) = (BTreeMap::new(), BTreeMap::new(), Vec::new());
         let held = Held { revision: 1, keys, leases, granted: 0, now: Duration::ZERO, compacted: 0, history };
-        Self { held: Arc::new(Mutex::new(held)), trouble: Arc::default(), changed: watch::channel(1).0 }
+        Self { held: Arc::new(Mutex::new(held)), trouble: Arc::default(), kept: Arc::default(), changed: watch::channel(1).0 }
     }
 }
 
@@ -176,6 +182,18 @@ impl Etcd {
         *self.trouble.lock().unwrap() = trouble;
     }
 
+    /// How many transactions were refused for what they would remove.
+    pub fn kept(&self) -> usize {
+        self.kept.load(Ordering::Relaxed)
+    }
+
+    /// Writes a key under a lease that lasts, as the server with that lease would.
+    pub fn put(&self, key: &str, value: Bytes, lease: i64) {
+        let put = pb::PutRequest { key: Bytes::copy_from_slice(key.as_bytes()), value, lease };
+        let success = vec![pb::RequestOp { request: Some(Asked::RequestPut(put)) }];
+        self.with(|held| held.transaction(pb::TxnRequest { compare: Vec::new(), success })).unwrap();
+    }
+
     /// A key as it is now.
     pub fn get(&self, key: &str) -> Option<pb::KeyValue> {
         self.lock().keys.get(key.as_bytes()).cloned()
@@ -264,14 +282,23 @@ impl Etcd {
 #[tonic::async_trait]
 impl pb::kv_server::Kv for Etcd {
     async fn txn(&self, request: Request<pb::TxnRequest>) -> Result<Response<pb::TxnResponse>, Status> {
-        let Trouble { delay, refusal } = *self.trouble.lock().unwrap();
+        let Trouble { delay, refusal, keeps } = *self.trouble.lock().unwrap();
         if !delay.is_zero() {
             tokio::time::sleep(delay).await;
         }
         if let Some(code) = refusal {
             return Err(Status::new(code, "simulated"));
         }
-        self.with(|held| held.transaction(request.into_inner())).map(Response::new)
+        let asked = request.into_inner();
+        let removes = |prefix: &str| {
+            let mut requests = asked.success.iter().filter_map(|op| op.request.as_ref());
+            requests.any(|request| matches!(request, Asked::RequestDeleteRange(range) if range.key.starts_with(prefix.as_bytes())))
+        };
+        if keeps.is_some_and(removes) {
+            self.kept.fetch_add(1, Ordering::Relaxed);
+            return Err(Status::unavailable("simulated"));
+        }
+        self.with(|held| held.transaction(asked)).map(Response::new)
     }
 
     async fn compact(&self, request: Request<pb::CompactionRequest>) -> Result<Response<pb::CompactionResponse>, Status> {
