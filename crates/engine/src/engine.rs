@@ -336,7 +336,8 @@ impl Engine {
             && vehicle != session.vehicle()
         {
             // Whose it is is not told: whoever asks may have no right to know.
-            let reason = format!("session `{id}` is of another vehicle than `{vehicle}`, which sent the measurement; open one for this vehicle");
+            let reason =
+                format!("session `{id}` is of another vehicle than `{vehicle}`, which sent the measurement; open one for this vehicle");
             return Err(EngineError::invalid("session_id", reason));
         }
         let before = (session.soil().state, session.accepted());

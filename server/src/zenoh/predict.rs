@@ -24,7 +24,8 @@ pub async fn declare(session: &::zenoh::Session, fleet: &str, edge: Edge) -> Res
 fn foreign(edge: &Edge, session: &str, vehicle: &str) -> Option<EngineError> {
     edge.access.directory.vehicle(session).filter(|owner| **owner != *vehicle)?;
     // Whose it is is not told: whoever asks may have no right to know.
-    let reason = format!("session `{session}` is of another vehicle than `{vehicle}`, through whose key it was asked; use the key of its vehicle");
+    let reason =
+        format!("session `{session}` is of another vehicle than `{vehicle}`, through whose key it was asked; use the key of its vehicle");
     Some(EngineError::invalid("session_id", reason))
 }
 

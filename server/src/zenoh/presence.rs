@@ -70,7 +70,14 @@ pub async fn declare(
 
 /// Publishes the status of this server at an interval and when a vehicle comes or goes, as long as there is a publisher: all of it for operators, and what names
 /// neither sessions nor vehicles for everybody.
-pub async fn publish_status(edge: Edge, presence: Presence, fleet: String, name: String, interval: Duration, sender: mpsc::Sender<Outgoing>) {
+pub async fn publish_status(
+    edge: Edge,
+    presence: Presence,
+    fleet: String,
+    name: String,
+    interval: Duration,
+    sender: mpsc::Sender<Outgoing>,
+) {
     let [about_key, status_key] = ["about", "status"].map(|topic| keys::of_server(&fleet, &name, topic));
     let started = Instant::now();
     let mut tick = tokio::time::interval(interval);
