@@ -105,6 +105,12 @@ impl EngineClient {
         })
     }
 
+    /// Whether what nobody counts may wait too: the look at the session of a measurement that never reaches the engine. Where as much waits as one vehicle may
+    /// have there the answer goes without: what is sent wrongly must not take the place of what is not.
+    pub(crate) fn has_room(&self) -> bool {
+        self.handle.waiting().0 < self.handle.limits().waiting_measurements_per_vehicle_max
+    }
+
     /// Puts a command in the queue now; commands submitted by one task are executed in that order.
     pub fn submit(&self, command: Command, budget: Duration) -> Pending {
         let (sender, answer) = oneshot::channel();

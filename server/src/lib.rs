@@ -17,6 +17,7 @@ mod error;
 mod expiry;
 mod grpc;
 mod http;
+mod http_connections;
 mod listener;
 mod one_thread;
 pub mod recording;

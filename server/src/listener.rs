@@ -1,4 +1,4 @@
-//! Connections of gRPC as they come, with TLS or without. Handshakes run beside one another, each with the certificates that are in force when it begins.
+//! Connections as they come, those of gRPC with TLS or without. Handshakes run beside one another, each with the certificates that are in force when it begins.
 
 use std::io::ErrorKind;
 use std::pin::Pin;
@@ -68,14 +68,15 @@ pub(crate) fn accept_tls(
 }
 
 /// The sockets of a listener. Where none can be had, it is tried again after a pause, and said once.
-struct Sockets {
+pub(crate) struct Sockets {
     incoming: TcpIncoming,
     pause: Option<Pin<Box<Sleep>>>,
     is_failing: bool,
 }
 
 impl Sockets {
-    fn of(listener: TcpListener) -> Self {
+    /// Of a listener.
+    pub fn of(listener: TcpListener) -> Self {
         Self { incoming: TcpIncoming::from(listener).with_nodelay(Some(true)), pause: None, is_failing: false }
     }
 }

@@ -27,6 +27,7 @@ use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, UntilStopped, stopped};
 use crate::http::{self, HttpState};
+use crate::http_connections::{self, HttpLimits};
 use crate::listener::{accept, accept_tls};
 use crate::recording::{Recorder, RecordingHeader};
 use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
@@ -36,6 +37,12 @@ use crate::zenoh::{Presence, RenewedBus};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
 pub(crate) const EVENTS_KEPT: usize = 1024;
+
+/// Connections of HTTP at a time, beside those of live pages (chosen: an orchestrator and a few proxies ask one at a time each). More would take the file
+/// descriptors of gRPC.
+const ASKERS_MAX: usize = 64;
+/// Connections that a browser opens to one server.
+const BROWSER_CONNECTIONS: usize = 6;
 
 /// Names under which health is reported; the empty one stands for the whole server.
 const HEALTH_NAMES: [&str; 7] =
@@ -140,11 +147,15 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let http = http_listener.map(|listener| {
         live.start(&edge, clock, recorder.clone(), passed);
         let state = HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() };
-        spawn_http(listener, http::router(state), stopping.clone())
+        // Prometheus, scripts and the pages, each with what a browser opens to one server.
+        let connections_max = ASKERS_MAX.saturating_add(config.http.watchers_max.saturating_mul(BROWSER_CONNECTIONS));
+        let limits = HttpLimits { asks_within: begins_within, connections_max };
+        tokio::spawn(http_connections::serve(listener, http::router(state), limits, stopping.clone()))
     });
     let health_addr = health_listener.as_ref().and_then(|listener| listener.local_addr().ok());
     if let Some(listener) = health_listener {
-        spawn_http(listener, http::health_router(edge.clone()), stopping.clone());
+        let limits = HttpLimits { asks_within: begins_within, connections_max: ASKERS_MAX };
+        tokio::spawn(http_connections::serve(listener, http::health_router(edge.clone()), limits, stopping.clone()));
     }
     tokio::spawn(expire_sessions(edge.clone()));
     let health = HealthReporter::new();
@@ -192,14 +203,6 @@ pub(crate) fn engine_of(config: &Config, predictor: &Arc<Predictor>, sink: Event
         false => Ok(engine),
     };
     Ok(engine.map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?.with_events(sink))
-}
-
-fn spawn_http(listener: TcpListener, router: axum::Router, stopping: watch::Receiver<bool>) -> JoinHandle<()> {
-    tokio::spawn(async move {
-        if let Err(error) = axum::serve(listener, router).with_graceful_shutdown(stopped(stopping)).await {
-            tracing::error!(%error, "http ended");
-        }
-    })
 }
 
 /// The recording that the configuration asks for, and the tap that feeds it.

@@ -67,11 +67,10 @@ fn service_nohup_keeps_a_server_running() {
 fn service_a_second_ctrl_c_does_not_wait() {
     let here = tempfile::tempdir().unwrap();
     std::fs::write(here.path().join("nesam.toml"), "[grpc]\ndrain_s = 300.0\n").unwrap();
-    let (server, lines) = start(here.path(), &["--http", "127.0.0.1:0", "--config", "nesam.toml"]);
-    let address = told(&lines, "http").unwrap().trim_start_matches("http://").trim_end_matches('/');
-    // A request that never comes to its end: a server that stops waits for it.
-    let mut socket = TcpStream::connect(address).unwrap();
-    socket.write_all(b"GET /status HTTP/1.1\r\n").unwrap();
+    let (server, lines) = start(here.path(), &["--no-http", "--config", "nesam.toml"]);
+    // A client that begins HTTP/2 with no settings and says no more: a server that stops waits for it to hear so, for as long as keep-alive lets it.
+    let mut socket = TcpStream::connect(told(&lines, "grpc").unwrap()).unwrap();
+    socket.write_all(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n\0\0\0\x04\0\0\0\0\0").unwrap();
     std::thread::sleep(Duration::from_millis(300));
     assert_eq!(end(server, "-INT", true), Some(1));
 }

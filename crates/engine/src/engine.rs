@@ -335,7 +335,9 @@ impl Engine {
         if let Some(vehicle) = vehicle
             && vehicle != session.vehicle()
         {
-            let reason = format!("session `{id}` belongs to vehicle `{}`, the measurement comes from `{vehicle}`", session.vehicle());
+            // Whose it is is not told: whoever asks may have no right to know.
+            let reason =
+                format!("session `{id}` is of another vehicle than `{vehicle}`, which sent the measurement; open one for this vehicle");
             return Err(EngineError::invalid("session_id", reason));
         }
         let before = (session.soil().state, session.accepted());

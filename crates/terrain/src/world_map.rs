@@ -238,13 +238,31 @@ impl WorldMap {
 
     /// Elevation layer as given, row-major, row 0 in the south, NaN = hole, m.
     pub fn elevation_m(&self) -> Vec<f32> {
-        let known = |i: usize| self.surface.known.as_ref().is_none_or(|k| k[i]);
-        self.surface.height_m.iter().enumerate().map(|(i, z)| if known(i) { *z } else { f32::NAN }).collect()
+        (0..self.surface.height_m.len()).map(|cell| self.cell_elevation_m(cell)).collect()
+    }
+
+    /// The same of one cell, by its index in that layer, m; NaN = hole. For whoever needs some cells of a large map.
+    ///
+    /// # Panics
+    /// When the map has no such cell.
+    #[inline]
+    pub fn cell_elevation_m(&self, cell: usize) -> f32 {
+        let known = self.surface.known.as_ref().is_none_or(|known| known[cell]);
+        if known { self.surface.height_m[cell] } else { f32::NAN }
     }
 
     /// Semantic layer as given, row-major, row 0 in the south.
     pub fn semantic_rgb(&self) -> Option<Vec<[u8; 3]>> {
         self.colour.as_ref().map(|c| c.iter().map(|p| unpack(*p)).collect())
+    }
+
+    /// The same of one cell, by its index in that layer; `None` without semantics.
+    ///
+    /// # Panics
+    /// When the map has no such cell.
+    #[inline]
+    pub fn cell_rgb(&self, cell: usize) -> Option<[u8; 3]> {
+        self.colour.as_ref().map(|colour| unpack(colour[cell]))
     }
 
     /// Whether the point lies on the map (holes included).

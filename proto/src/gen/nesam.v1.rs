@@ -3974,8 +3974,8 @@ pub struct FleetSoilHeard {
     #[prost(uint64, tag = "1")]
     pub cells: u64,
 }
-/// What a server publishes about itself over Zenoh on nesam/v1/<fleet>/server/<name>/status, at an interval and when a vehicle comes or goes. While it is
-/// there it also holds the liveliness token nesam/v1/<fleet>/server/<name>/alive; vehicles hold nesam/v1/<fleet>/<vehicle>/alive.
+/// What a server publishes about itself over Zenoh: for operators on nesam/v1/<fleet>/server/<name>/status, at an interval and when a vehicle comes or goes;
+/// for everybody on .../about, without what it says of sessions and vehicles. It also holds the token .../alive; vehicles hold nesam/v1/<fleet>/<vehicle>/alive.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ServerStatus {
     /// Name of the server in the keys.

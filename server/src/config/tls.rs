@@ -18,7 +18,7 @@ pub struct TlsConfig {
     pub client_ca: PathBuf,
     /// Fleet file: what each client may do; needed with `client_ca`.
     pub fleet: PathBuf,
-    /// Longest handshake, s; a connection that says nothing for longer is closed, also without TLS.
+    /// Longest handshake, s; a connection that says nothing for longer is closed, also without TLS, and one of HTTP on which nothing is asked for longer.
     pub handshake_s: f64,
     /// Interval at which the files are read again, s. What has changed and is sound holds for new connections, rights at once.
     pub reload_s: f64,

@@ -23,8 +23,8 @@ type InFlight = (pb::Measurement, Result<Pending, Refused>);
 
 /// Why a measurement did not reach the engine.
 enum Refused {
-    /// By what it says; the session is read in its place, so that the answer tells where it stands.
-    Invalid(EngineError, Pending),
+    /// By what it says; where there is room the session is read in its place, so that the answer tells where it stands.
+    Invalid(EngineError, Option<Pending>),
     /// By the rights, or by where the session is.
     Status(Status),
 }
@@ -87,14 +87,18 @@ async fn submit(edge: &Edge, caller: &Caller, used: &mut Used, message: &pb::Mea
     let checked = measurement(message).and_then(|measurement| edge.check_run(&session, message.run).map(|()| measurement));
     match checked {
         Ok(measurement) => Ok(edge.engine.submit(Command::Measure { session, vehicle, measurement }, edge.stream_budget())),
-        Err(error) => Err(Refused::Invalid(error, edge.engine.submit(Command::Get { session }, edge.stream_budget()))),
+        Err(error) => {
+            let look = || edge.engine.submit(Command::Get { session }, edge.stream_budget());
+            Err(Refused::Invalid(error, edge.engine.has_room().then(look)))
+        }
     }
 }
 
 async fn answer(edge: &Edge, (message, pending): InFlight) -> Result<pb::MeasurementAnswer, Status> {
     let result = match pending {
         Ok(pending) => measured(pending.await),
-        Err(Refused::Invalid(error, session)) => Err(unmeasured(error, None, session.await)),
+        Err(Refused::Invalid(error, Some(session))) => Err(unmeasured(error, None, session.await)),
+        Err(Refused::Invalid(error, None)) => Err(error),
         Err(Refused::Status(status)) => {
             edge.engine.metrics().measurement(Transport::Grpc, "rejected");
             let rejected = pb::Rejected { code: status.code().into(), field: "session_id".into(), message: status.message().into() };

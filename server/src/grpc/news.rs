@@ -4,7 +4,7 @@ use nesam_engine::{EngineError, Event, SessionView};
 use tokio::sync::broadcast::error::RecvError;
 use tokio::sync::{broadcast, mpsc};
 use tokio_stream::wrappers::ReceiverStream;
-use tonic::{Request, Response, Status};
+use tonic::{Code, Request, Response, Status};
 
 use super::{Edge, ReplyStream, stopped};
 use crate::access::{Caller, Wish};
@@ -33,7 +33,7 @@ pub(super) async fn tell<T, M: Send + 'static>(
     edge.allow_caller(&caller, Wish::ReadSession(&session), edge.budget(request)).await?;
     // Listening starts before reading, so that nothing falls between the two.
     let events = edge.events.subscribe();
-    let view = edge.engine.get(&session, edge.stream_budget()).await.map_err(|error| edge.status(error))?;
+    let view = read(&edge, &caller, &session).await?;
     let (sender, receiver) = mpsc::channel(WAITING);
     if let Some(message) = (news.of_session)(&session, &view) {
         let _ = sender.try_send(Ok(message));
@@ -86,10 +86,10 @@ async fn follow<M: Send + 'static>(
             }
             Ok(event) => (news.of_event)(session, event),
             // Too slow a watcher misses what has passed, never what holds.
-            Err(RecvError::Lagged(_)) => match edge.engine.get(session, edge.stream_budget()).await {
+            Err(RecvError::Lagged(_)) => match read(edge, caller, session).await {
                 Ok(view) => (news.of_session)(session, &view),
-                Err(EngineError::UnknownSession { .. }) if edge.cluster.is_none() => return Ok(()),
-                Err(error) => return Err(edge.status(error)),
+                Err(status) if status.code() == Code::NotFound => return Ok(()),
+                Err(status) => return Err(status),
             },
             Err(RecvError::Closed) => return Ok(()),
         };
@@ -99,4 +99,15 @@ async fn follow<M: Send + 'static>(
             return Ok(());
         }
     }
+}
+
+/// The session as it stands, if its vehicle is one that the watcher may read: between two looks a session may have been closed and one of another vehicle opened
+/// under its name.
+///
+/// # Errors
+/// PERMISSION_DENIED; what keeps the engine from answering, NOT_FOUND included.
+async fn read(edge: &Edge, caller: &Caller, session: &str) -> Result<SessionView, Status> {
+    let view = edge.engine.get(session, edge.stream_budget()).await.map_err(|error| edge.status(error))?;
+    caller.may_with(Wish::ReadSession(session), &view.vehicle)?;
+    Ok(view)
 }

@@ -19,6 +19,7 @@ use tokio_stream::wrappers::ReceiverStream;
 use super::feed::{Feed, Note};
 use super::painter::{Desk, Painter, Update};
 use super::reports::Reports;
+use super::terrain::Pictures;
 use crate::clock::MonotonicClock;
 use crate::config::HttpConfig;
 use crate::grpc::{Edge, stopped};
@@ -35,6 +36,8 @@ pub(crate) struct Live {
     pub feed: Feed,
     /// Diagnoses that the page shows.
     pub reports: Reports,
+    /// Maps as the page shows them.
+    pub pictures: Pictures,
     desk: Arc<Desk>,
     watchers_max: usize,
 }
@@ -53,7 +56,7 @@ impl Live {
     pub fn new(config: &HttpConfig) -> (Self, mpsc::Receiver<Note>) {
         let (feed, passed) = Feed::new();
         let reports = Reports::new(&config.reports);
-        (Self { feed, reports, desk: Arc::new(Desk::new()), watchers_max: config.watchers_max }, passed)
+        (Self { feed, reports, pictures: Pictures::default(), desk: Arc::new(Desk::new()), watchers_max: config.watchers_max }, passed)
     }
 
     /// Starts the thread that makes the updates. Where the system refuses one, the page stays without them.

@@ -123,7 +123,7 @@ fn server(member: &mut Member<'_>, fleet: &str, name: &str) {
     member.hears(vec![of_all("measurement")]);
     member.allow(&["ingress"], &["declare_queryable", "reply"], vec![of_all("predict")]);
     member.allow(&["egress"], &["query"], vec![of_all("predict")]);
-    let own = [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, name, "status")];
+    let own = [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, name, "about"), keys::of_server(fleet, name, "status")];
     member.allow(&["ingress"], &["put"], TOLD.map(of_all).into_iter().chain(own).collect());
     member.allow(&["ingress"], &["liveliness_token"], vec![keys::of_server(fleet, name, "alive")]);
     member.watches(vec![of_all("alive")]);
@@ -140,9 +140,9 @@ fn shares_soil(member: &mut Member<'_>, fleet: &str, name: &str) {
     member.allow(&["ingress", "egress"], &["query"], all);
 }
 
-/// What everybody may hear of servers.
+/// What everybody may hear of servers. Their `status` names all sessions and vehicles and is for operators.
 fn of_servers(fleet: &str) -> [String; 2] {
-    [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, "*", "status")]
+    [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, "*", "about")]
 }
 
 /// Certificate, key and authority of one end of a connection.
@@ -184,6 +184,9 @@ pub fn router_config(members: &FleetFile, fleet: &str, listen: &[String], files:
 mod tests {
     use super::*;
 
+    /// Keys outside of `a/` that vehicle `a` and the planner of `a` may use: they tell of no vehicle.
+    const OF_NOBODY: [&str; 3] = ["nesam/v1/f/soil_map", "nesam/v1/f/server/*/about", "nesam/v1/f/server/*/alive"];
+
     #[test]
     fn property_nobody_but_operators_and_servers_has_keys_of_all_vehicles() {
         let text = "operators = [\"c\"]\nservers = [\"s\"]\n[vehicles.a]\n[vehicles.b]\n[planners.p]\nvehicles = [\"a\"]\n[planners.idle]";
@@ -195,12 +198,18 @@ mod tests {
                 rule["messages"].as_array().unwrap().iter().all(|message| message.as_str().unwrap().starts_with("declare_"));
             for key in rule["key_exprs"].as_array().unwrap().iter().map(|key| key.as_str().unwrap()) {
                 assert!(key.starts_with("nesam/v1/f/"), "{who}: {key}");
-                let narrow = key.starts_with("nesam/v1/f/a/") || key.starts_with("nesam/v1/f/server/") || key == "nesam/v1/f/soil_map";
+                let narrow = key.starts_with("nesam/v1/f/a/") || OF_NOBODY.contains(&key);
                 match who.split(':').nth(1).unwrap() {
-                    "vehicle" if who.contains(":b ") => assert!(!key.contains("/a/"), "{who}: {key}"),
+                    "vehicle" if who.contains(":b ") => {
+                        let own = key.starts_with("nesam/v1/f/b/") || OF_NOBODY.contains(&key);
+                        assert!(own || only_declared, "{who}: {key}");
+                    }
                     "vehicle" | "planner" => assert!(narrow || only_declared, "{who}: {key}"),
                     _ => {}
                 }
+                // Where all sessions and vehicles are told: to operators, by the server.
+                let of_status = key.ends_with("/status") && key.contains("/server/");
+                assert!(!of_status || who.contains(":server:"), "{who}: {key}");
             }
         }
     }

@@ -55,25 +55,28 @@ fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &S
     };
     let measurement = match undecodable.map_or_else(|| measurement(&path.message), Err) {
         Ok(_) if !path.is_ours() => return,
+        // The run of another vehicle's session is not told either: the engine refuses that one.
+        Ok(measurement) if path.is_foreign() => Ok(measurement),
         decoded => decoded.and_then(|measurement| edge.check_run(&session, path.message.run).map(|()| measurement)),
     };
     match measurement {
         Ok(measurement) => {
             let command = Command::Measure { session, vehicle: Some(vehicle.into()), measurement };
-            edge.engine.handle().submit(edge.engine.submission(command, move |answer| path.answer(measured(answer))));
+            let mut submission = edge.engine.submission(command, move |answer| path.answer(measured(answer)));
+            // The vehicle of the key, which rights are given by: the session is whatever the sender says.
+            submission.share = Some(vehicle.into());
+            edge.engine.handle().submit(submission);
         }
         Err(error) => refuse(edge, session, path, error),
     }
 }
 
-/// Answers a measurement that never reaches the engine; the session is read in its place, so that the answer tells where it stands. Where much waits the answer
-/// goes without: what is sent wrongly must not take the place of what is not.
+/// Answers a measurement that never reaches the engine; where there is room the session is read in its place, so that the answer tells where it stands.
 fn refuse(edge: &Edge, session: String, path: ReturnPath, error: EngineError) {
-    let handle = edge.engine.handle();
-    if handle.waiting().0 >= handle.limits().waiting_measurements_per_vehicle_max {
+    if !edge.engine.has_room() {
         return path.answer(Err(error));
     }
-    handle.submit(edge.engine.submission(Command::Get { session }, move |answer| {
+    edge.engine.handle().submit(edge.engine.submission(Command::Get { session }, move |answer| {
         let error = unmeasured(error, Some(&path.vehicle), answer);
         path.answer(Err(error));
     }));
@@ -97,10 +100,15 @@ impl ReturnPath {
         standing == Standing::Here
     }
 
+    /// Whether the session is open and of another vehicle, which is told nothing of it.
+    fn is_foreign(&self) -> bool {
+        self.edge.access.directory.vehicle(&self.session).is_some_and(|owner| *owner != *self.vehicle)
+    }
+
     /// Counts and publishes the answer.
     fn answer(self, result: Result<MeasureAnswer, EngineError>) {
         self.edge.engine.metrics().measurement(Transport::Zenoh, result.as_ref().map_or("rejected", |m| m.outcome.label()));
-        let (run, durable_place) = self.edge.durable_place(&self.session);
+        let (run, durable_place) = if self.is_foreign() { (0, 0) } else { self.edge.durable_place(&self.session) };
         let answer = pb::MeasurementAnswer { run, durable_place, ..measurement_answer(&self.message, &self.session, result) };
         if self.sender.try_send((self.status_key, encode(&answer))).is_err() {
             self.edge.engine.metrics().measurement(Transport::Zenoh, "answer_dropped");

@@ -56,11 +56,11 @@ impl Bus {
         let name = if config.name.is_empty() { session.zid().to_string() } else { config.name.clone() };
         let shares = fleet_soil.enabled && fleet_soil.exchange_s > 0.0;
         let sharing = shares.then(|| Sharing::new(edge, &config.fleet, &name));
-        let soil = tokio::spawn(soil::publish_changes(edge.events.subscribe(), config.fleet.clone(), sharing.clone(), sender.clone()));
-        let sharing = match sharing {
+        let events = edge.events.subscribe();
+        let asking = match &sharing {
             Some(sharing) => {
                 let every = Duration::from_secs_f64(fleet_soil.exchange_s);
-                Some(tokio::spawn(sharing.declare(&session, &config.fleet, every).await.map_err(failed)?))
+                Some(sharing.declare(&session, &config.fleet, every).await.map_err(failed)?)
             }
             None => None,
         };
@@ -68,9 +68,11 @@ impl Bus {
         predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
         let presence = edge.presence.clone().unwrap_or_default();
         let token = presence::declare(&session, &config.fleet, &name, presence.clone()).await.map_err(failed)?;
-        let key = keys::of_server(&config.fleet, &name, "status");
+        // Tasks begin when nothing can fail any more: one that holds the session would keep it, and its port, open.
+        let soil = tokio::spawn(soil::publish_changes(events, config.fleet.clone(), sharing, sender.clone()));
+        let sharing = asking.map(tokio::spawn);
         let interval = Duration::from_secs_f64(config.status_interval_s);
-        let status = tokio::spawn(presence::publish_status(edge.clone(), presence, key, name, interval, sender));
+        let status = tokio::spawn(presence::publish_status(edge.clone(), presence, config.fleet.clone(), name, interval, sender));
         let publisher = tokio::spawn(publish(session.clone(), receiver));
         tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
         Ok(Self { session, publisher, soil, sharing, status, _token: token })

@@ -68,8 +68,17 @@ pub async fn declare(
     session.liveliness().declare_token(keys::of_server(fleet, name, "alive")).await
 }
 
-/// Publishes the status of this server at an interval and when a vehicle comes or goes, as long as there is a publisher.
-pub async fn publish_status(edge: Edge, presence: Presence, key: String, name: String, interval: Duration, sender: mpsc::Sender<Outgoing>) {
+/// Publishes the status of this server at an interval and when a vehicle comes or goes, as long as there is a publisher: all of it for operators, and what names
+/// neither sessions nor vehicles for everybody.
+pub async fn publish_status(
+    edge: Edge,
+    presence: Presence,
+    fleet: String,
+    name: String,
+    interval: Duration,
+    sender: mpsc::Sender<Outgoing>,
+) {
+    let [about_key, status_key] = ["about", "status"].map(|topic| keys::of_server(&fleet, &name, topic));
     let started = Instant::now();
     let mut tick = tokio::time::interval(interval);
     tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
@@ -77,6 +86,17 @@ pub async fn publish_status(edge: Edge, presence: Presence, key: String, name: S
         tokio::select! {
             _ = tick.tick() => {}
             () = presence.changed.notified() => {}
+        }
+        let bundle = edge.predictor.bundle();
+        let about = pb::ServerStatus {
+            name: name.clone(),
+            uptime_s: started.elapsed().as_secs_f64(),
+            bundle_name: bundle.name.clone(),
+            bundle_hash: bundle.hash.clone(),
+            ..Default::default()
+        };
+        if sender.send((about_key.clone(), encode(&about))).await.is_err() {
+            return;
         }
         // An engine that is too busy to list its sessions says nothing this time.
         let Ok(views) = edge.engine.list(edge.stream_budget()).await else { continue };
@@ -90,16 +110,8 @@ pub async fn publish_status(edge: Edge, presence: Presence, key: String, name: S
             effects: effect_messages(&view.effects),
             alarm: view.alarm.as_ref().map(|alarm| alarm_message(&view.session, &view.vehicle, alarm)),
         });
-        let bundle = edge.predictor.bundle();
-        let status = pb::ServerStatus {
-            name: name.clone(),
-            uptime_s: started.elapsed().as_secs_f64(),
-            bundle_name: bundle.name.clone(),
-            bundle_hash: bundle.hash.clone(),
-            sessions: sessions.collect(),
-            vehicles_alive: presence.vehicles(),
-        };
-        if sender.send((key.clone(), encode(&status))).await.is_err() {
+        let status = pb::ServerStatus { sessions: sessions.collect(), vehicles_alive: presence.vehicles(), ..about };
+        if sender.send((status_key.clone(), encode(&status))).await.is_err() {
             return;
         }
     }

@@ -171,14 +171,24 @@ async fn service_grpc_and_http_have_one_drain_time() {
 /// Without TLS; `service_strangers_do_not_get_in` has it with TLS.
 #[tokio::test(flavor = "multi_thread")]
 async fn service_connections_that_say_nothing_are_closed() {
-    let (server, _client) = start_with(|config| config.tls.handshake_s = 1.0).await;
-    let connect = || tokio::net::TcpStream::connect(server.grpc_addr);
-    let (mut silent, mut slow) = (connect().await.unwrap(), connect().await.unwrap());
-    slow.write_all(b"PRI * HTTP/2.0\r\n").await.unwrap();
-    for socket in [&mut silent, &mut slow] {
+    let (server, _client) = start_with(|config| (config.tls.handshake_s, config.http.health) = (1.0, "127.0.0.1:0".into())).await;
+    let http = [("http.listen", server.http_addr.unwrap()), ("http.health", server.health_addr.unwrap())];
+    let mut open = Vec::new();
+    for (what, address) in [("grpc", server.grpc_addr)].into_iter().chain(http) {
+        let half: &[u8] = if what == "grpc" { b"PRI * HTTP/2.0\r\n" } else { b"GET /health HTTP/1.1\r\nhost: x\r\n" };
+        for said in [&half[..0], half] {
+            let mut socket = tokio::net::TcpStream::connect(address).await.unwrap();
+            socket.write_all(said).await.unwrap();
+            open.push((what, said.len(), socket));
+        }
+    }
+    for (what, said, mut socket) in open {
         let mut rest = Vec::new();
         let closed = tokio::time::timeout(Duration::from_secs(20), socket.read_to_end(&mut rest)).await;
-        assert!(closed.is_ok(), "still open");
+        assert!(closed.is_ok(), "{what}: still open after {said} bytes");
+    }
+    for (what, address) in http {
+        assert_eq!(http_get(address, "/health").await.0, 200, "{what}");
     }
     server.shutdown().await;
 
@@ -186,6 +196,9 @@ async fn service_connections_that_say_nothing_are_closed() {
     let change = |config: &mut Config| (config.tls.handshake_s, config.grpc.drain_s) = (300.0, 300.0);
     let (server, _client) = start_with(change).await;
     let _silent = tokio::net::TcpStream::connect(server.grpc_addr).await.unwrap();
+    let mut half = tokio::net::TcpStream::connect(server.http_addr.unwrap()).await.unwrap();
+    half.write_all(b"GET /status HTTP/1.1\r\n").await.unwrap();
+    assert_eq!(http_get(server.http_addr.unwrap(), "/health").await.0, 200);
     // It is taken before the one after it, which answers.
     let mut later = Client::connect(&format!("http://{}", server.grpc_addr)).await.unwrap();
     later.list_sessions().await.unwrap();

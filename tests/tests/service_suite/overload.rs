@@ -1,10 +1,11 @@
 //! Goal: too much is refused at once and typed, measurements still get through, and the server lives on.
 
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, channel};
+use std::sync::mpsc::{Receiver, Sender, channel};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{outcome_label, v1};
 use nesam_engine::{
     Clock, Command, Engine, EngineError, EngineHandle, Executed, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply,
@@ -13,6 +14,7 @@ use nesam_engine::{
 use tonic::Code;
 
 use crate::stage::*;
+use crate::zenoh_network::{PATIENCE, behind, router};
 
 #[tokio::test(flavor = "multi_thread")]
 async fn service_overload_is_resource_exhausted_and_measurements_get_through() {
@@ -46,6 +48,97 @@ async fn service_overload_is_resource_exhausted_and_measurements_get_through() {
     let after = client.predict(candidates("s", &recorded.drive, 59, 2, 4)).await.unwrap();
     assert_eq!(after.provenance.history_epoch, 60);
     server.shutdown().await;
+}
+
+/// Holds the thread of an engine until what this gives is dropped.
+async fn hold(engine: &EngineHandle) -> Sender<()> {
+    let (release, released) = channel();
+    let (held, holds) = tokio::sync::oneshot::channel();
+    engine.submit(Submission::new(Command::List, move |_| {
+        let _ = held.send(());
+        let _ = released.recv();
+    }));
+    holds.await.unwrap();
+    release
+}
+
+/// Goal: who sends what is refused takes the places of nobody. Method: while the engine is held, four streams send more measurements without a state than commands
+/// may wait; then another vehicle reports.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_measurements_that_are_invalid_leave_room_for_others() {
+    let recorded = recorded();
+    let (server, mut client) = start_with(|config| {
+        config.limits.waiting_commands_max = 64;
+        config.limits.waiting_measurements_per_vehicle_max = 8;
+    })
+    .await;
+    for vehicle in ["noisy", "quiet"] {
+        client.open_session(v1::OpenSessionRequest { vehicle_id: vehicle.into(), ..Default::default() }).await.unwrap();
+    }
+    let release = hold(server.engine()).await;
+    let noisy: Vec<_> = (0..4)
+        .map(|_| {
+            let mut client = client.clone();
+            let invalid = (0..40).map(|i| v1::Measurement { state: None, ..sample("noisy", &recorded.drive, i) }).collect();
+            tokio::spawn(async move { client.feed(invalid).await })
+        })
+        .collect();
+    eventually(PATIENCE, "the first of them look at their session", async || server.engine().waiting().0 >= 8).await;
+    // The others come meanwhile.
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    // One more for each stream that looks for room at the same time, and what the server asks itself.
+    let waiting = server.engine().waiting().0;
+    assert!(waiting < 32, "{waiting} commands wait");
+    let quiet = tokio::spawn({
+        let (mut client, first) = (client.clone(), sample("quiet", &recorded.drive, 0));
+        async move { client.feed(vec![first]).await }
+    });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    drop(release);
+    let answers = quiet.await.unwrap().unwrap();
+    assert_eq!(answers.iter().map(outcome_label).collect::<Vec<_>>(), ["APPLIED"]);
+    for stream in noisy {
+        let answers = stream.await.unwrap().unwrap();
+        assert_eq!(answers.len(), 40);
+        for answer in answers {
+            let Some(v1::measurement_answer::Outcome::Rejected(rejected)) = answer.outcome else { panic!("{answer:?}") };
+            assert_eq!((rejected.code, rejected.field.as_str()), (3, "state"), "{}", rejected.message);
+        }
+    }
+    server.shutdown().await;
+}
+
+/// Goal: over Zenoh a vehicle has one share, whatever it says that its sessions are called. Method: while the engine is held a vehicle sends under more names than
+/// measurements of one vehicle may wait.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_invented_names_over_zenoh_take_one_share() {
+    let recorded = recorded();
+    let (router, endpoint) = router().await;
+    let (server, _client) = start_with(|config| {
+        behind(config, &endpoint);
+        config.limits.waiting_measurements_per_vehicle_max = 4;
+    })
+    .await;
+    let vehicle = ZenohVehicle::connect(&endpoint, "test", "truck").await.unwrap();
+    vehicle.wait_for_service(PATIENCE).await.unwrap();
+    let code = async || match vehicle.answer(PATIENCE).await.unwrap().expect("an answer on the status key").outcome {
+        Some(v1::measurement_answer::Outcome::Rejected(rejected)) => rejected.code,
+        other => panic!("{other:?}"),
+    };
+    let release = hold(server.engine()).await;
+    for i in 0..24 {
+        vehicle.publish(&sample(&format!("invented-{i}"), &recorded.drive, i)).await.unwrap();
+    }
+    for i in 0..20 {
+        assert_eq!(code().await, Code::ResourceExhausted as i32, "answer {i}");
+    }
+    drop(release);
+    for i in 0..4 {
+        assert_eq!(code().await, Code::NotFound as i32, "answer {i} of those that waited");
+    }
+    vehicle.close().await.unwrap();
+    server.shutdown().await;
+    router.close().await.unwrap();
 }
 
 /// Whoever asks again as soon as its answer is there finds nobody before it, however long the engine's thread takes to look for its next turn.

@@ -167,7 +167,6 @@ async fn refuses_bad_payloads(vehicle: &ZenohVehicle, recorded: &Recorded, clien
     let mut not_finite = sample("", &recorded.drive, 51);
     not_finite.state.as_mut().unwrap().position_m.as_mut().unwrap().z = f64::NAN;
     let missing = v1::Measurement { command: None, ..sample("", &recorded.drive, 51) };
-    let spoofed = v1::Measurement { session_id: "grpc".into(), ..sample("", &recorded.drive, 51) };
     let nobody = v1::Measurement { session_id: "nobody".into(), ..sample("", &recorded.drive, 51) };
     for (what, payload, label, field, code) in [
         ("garbage", vec![0xff; 40], "REJECTED", "", 3),
@@ -186,13 +185,7 @@ async fn refuses_bad_payloads(vehicle: &ZenohVehicle, recorded: &Recorded, clien
             assert!(!rejected.message.starts_with("``"), "{what}: {}", rejected.message);
         }
     }
-    // The session of another vehicle cannot be fed through this vehicle's key. ("grpc" belongs to a vehicle of another name.)
-    let other = v1::OpenSessionRequest { vehicle_id: "other".into(), ..Default::default() };
-    client.open_session(other).await.unwrap();
-    vehicle.publish(&v1::Measurement { session_id: "other".into(), ..spoofed }).await.unwrap();
-    let answer = vehicle.answer(PATIENCE).await.unwrap().unwrap();
-    assert!(matches!(answer.outcome, Some(v1::measurement_answer::Outcome::Rejected(r)) if r.field == "session_id" && r.code == 3));
-    assert_eq!(client.session("other").await.unwrap().history_steps, 0);
+    refuses_sessions_of_others(vehicle, recorded, client).await;
 
     let refused = vehicle.predict(&candidates("nobody", &recorded.drive, 50, 1, 1)).await;
     assert_refused("query of an unknown session", refused, tonic::Code::NotFound, "session_id");
@@ -206,5 +199,33 @@ async fn refuses_bad_payloads(vehicle: &ZenohVehicle, recorded: &Recorded, clien
     let mut newer = sample("", &recorded.drive, 51).encode_to_vec();
     newer.extend([0xc0, 0x3e, 0x01]);
     vehicle.publish_bytes(newer).await.unwrap();
-    assert_eq!(outcome_label(&vehicle.answer(PATIENCE).await.unwrap().unwrap()), "APPLIED");
+    let answer = vehicle.answer(PATIENCE).await.unwrap().unwrap();
+    assert_eq!(outcome_label(&answer), "APPLIED");
+    assert_ne!(answer.run, 0, "of its own session a vehicle is told the run");
+}
+
+/// The session of another vehicle is neither fed nor asked through this vehicle's key, and what is answered says neither whose it is nor where it stands.
+async fn refuses_sessions_of_others(vehicle: &ZenohVehicle, recorded: &Recorded, client: &mut nesam_client::Client) {
+    let other = v1::OpenSessionRequest { vehicle_id: "neighbour".into(), session_id: "theirs".into(), ..Default::default() };
+    client.open_session(other).await.unwrap();
+    client.feed(samples("theirs", &recorded.drive, 2)).await.unwrap();
+    let before = client.session("theirs").await.unwrap();
+    let valid = sample("theirs", &recorded.drive, 51);
+    for (what, measurement, field) in [
+        ("valid", valid.clone(), "session_id"),
+        ("meant for another run", v1::Measurement { run: 1, ..valid.clone() }, "session_id"),
+        ("without a state", v1::Measurement { state: None, ..valid }, "state"),
+    ] {
+        vehicle.publish(&measurement).await.unwrap();
+        let answer = vehicle.answer(PATIENCE).await.unwrap().expect(what);
+        assert_eq!((answer.run, answer.durable_place, answer.history_epoch, answer.map_version), (0, 0, 0, 0), "{what}");
+        let Some(v1::measurement_answer::Outcome::Rejected(rejected)) = answer.outcome else { panic!("{what}: {answer:?}") };
+        assert_eq!((rejected.field.as_str(), rejected.code), (field, 3), "{what}: {}", rejected.message);
+        assert!(!rejected.message.contains("neighbour"), "{what}: {}", rejected.message);
+    }
+    let asked = vehicle.predict(&candidates("theirs", &recorded.drive, 2, 1, 1)).await;
+    let message = asked.as_ref().err().map(ToString::to_string).unwrap_or_default();
+    assert!(!message.contains("neighbour"), "{message}");
+    assert_refused("query of another vehicle's session", asked, tonic::Code::InvalidArgument, "session_id");
+    assert_eq!(client.session("theirs").await.unwrap(), before);
 }

@@ -20,6 +20,7 @@ async fn service_liveliness_and_status_follow_vehicles_and_servers() {
     let (router, endpoint) = router().await;
     let tokens = router.liveliness().declare_subscriber("nesam/v1/test/server/*/alive").history(true).await.unwrap();
     let status = router.declare_subscriber("nesam/v1/test/server/alpha/status").await.unwrap();
+    let about = router.declare_subscriber("nesam/v1/test/server/alpha/about").await.unwrap();
     // A vehicle that was there before the server is seen too.
     let early = ZenohVehicle::connect(&endpoint, "test", "early").await.unwrap();
     let (server, mut client) = start_with(|config| {
@@ -49,6 +50,15 @@ async fn service_liveliness_and_status_follow_vehicles_and_servers() {
     assert_eq!((published.name.as_str(), published.vehicles_alive.as_slice()), ("alpha", &["early".to_string(), "truck".into()][..]));
     assert_eq!((published.sessions[0].session_id.as_str(), published.sessions[0].last_stamp_ns), ("truck", Some(2 * STEP_NS)));
     assert_eq!(published.bundle_hash, predictor().bundle().hash);
+    // What everybody hears is the same without sessions and vehicles, since long before there were any.
+    for _ in 0..about.len().max(1) {
+        let sample = tokio::time::timeout(PATIENCE, about.recv_async()).await.expect("in time").unwrap();
+        let told = v1::ServerStatus::decode(sample.payload().to_bytes().as_ref()).unwrap();
+        assert!((0.0..=published.uptime_s + 60.0).contains(&told.uptime_s), "{told:?}");
+        let known = v1::ServerStatus { sessions: Vec::new(), vehicles_alive: Vec::new(), uptime_s: told.uptime_s, ..published.clone() };
+        assert_eq!(told, known);
+    }
+    about.undeclare().await.unwrap();
 
     vehicle.close().await.unwrap();
     until_alive(&client, false).await;

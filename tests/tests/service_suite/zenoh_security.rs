@@ -15,6 +15,8 @@ use crate::stage::*;
 use crate::zenoh_network::{PATIENCE, behind};
 use crate::zenoh_presence::until_alive;
 
+type Subscriber = zenoh::pubsub::Subscriber<zenoh::handlers::FifoChannelHandler<zenoh::sample::Sample>>;
+
 /// Time in which something that is allowed would long have happened.
 const SILENCE: Duration = Duration::from_millis(1500);
 
@@ -138,6 +140,24 @@ async fn service_a_router_with_the_written_configuration_guards_the_fleet() {
     of_truck.put("nesam/v1/test/server/beta/soil_map", forged.encode_to_vec()).await.unwrap();
     tokio::time::sleep(SILENCE).await;
     assert!(told(&stage.server).await && told(&beta).await, "a vehicle is no server");
+    // What a vehicle hears of a server names nobody; what names sessions and vehicles is for operators.
+    let about = of_truck.declare_subscriber("nesam/v1/test/server/alpha/about").await.unwrap();
+    let status = of_truck.declare_subscriber("nesam/v1/test/server/*/status").await.unwrap();
+    let (certificate, key) = stage.authority.sign(&[uri("nesam:operator:control")], false);
+    let (certificate, key) = (write("operator.pem", &certificate), write("operator.key", &key));
+    let of_operator = zenoh::open(zenoh::Config::from_json5(&joining(&endpoint, &certificate, &key, &ca)).unwrap()).await.unwrap();
+    let whole = of_operator.declare_subscriber("nesam/v1/test/server/alpha/status").await.unwrap();
+    let heard = async |subscriber: &Subscriber| {
+        let sample = tokio::time::timeout(PATIENCE, subscriber.recv_async()).await.expect("in time").unwrap();
+        v1::ServerStatus::decode(sample.payload().to_bytes().as_ref()).unwrap()
+    };
+    // Each round is one of the server's, which tells both.
+    for _ in 0..2 {
+        let (told, whole) = (heard(&about).await, heard(&whole).await);
+        assert_eq!((told.name.as_str(), told.sessions.len(), told.vehicles_alive.len()), ("alpha", 0, 0));
+        assert!(whole.sessions.iter().any(|session| session.vehicle_id == "other"), "{whole:?}");
+    }
+    assert!(status.try_recv().unwrap().is_none(), "a vehicle hears of other vehicles");
     // A server that comes late asks.
     beta.shutdown().await;
     let beta = server(&stage.authority, "beta").await.server;
