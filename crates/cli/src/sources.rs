@@ -4,7 +4,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nesam_learning::recipe::is_validation;
+use nesam_learning::recipe::{VALIDATED_FROM, is_validation};
 use nesam_model::{ModelBundle, Precision, Predictor};
 use nesam_physics::Vehicle;
 use nesam_server::recording::RecordingHeader;
@@ -95,7 +95,15 @@ pub fn validation_drives(args: &DataArgs, option: &str, what: &str) -> Result<Dr
     let mut all = read_drives(args, false)?;
     let mut sorted: Vec<(Trajectory, Option<Arc<WorldMap>>)> = all.drives.into_iter().zip(all.maps).collect();
     sorted.sort_by(|(a, _), (b, _)| a.id.cmp(&b.id));
-    (all.drives, all.maps) = sorted.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, drive)| drive).unzip();
+    let count = sorted.len();
+    (all.drives, all.maps) = sorted.into_iter().enumerate().filter(|(i, _)| is_validation(*i, count)).map(|(_, drive)| drive).unzip();
+    if all.drives.is_empty() {
+        return Err(Failure::input(format!(
+            "{option}: training leaves every tenth drive for validation where there are {VALIDATED_FROM} or more; with the {count} of set `{}` all train, and \
+             {what} on drives that no weight has seen: record more, or leave out --trajectories",
+            all.set
+        )));
+    }
     Ok(all)
 }
 
@@ -270,6 +278,18 @@ mod tests {
         let root = DataRoot::open(&repository.join("tests/data/chrono_sample"), None).expect("the shipped sample");
         assert!(check_own_vehicle(&bundle("hmmwv-nominal"), &root, "--make-reference").is_ok());
         assert!(check_own_vehicle(&bundle("clearpath-husky"), &root, "--make-reference").is_err());
+    }
+
+    /// Goal: nothing is calibrated on drives that a model was trained on. Method: the shipped sample, of which training leaves none out.
+    #[test]
+    fn regress_few_drives_leave_none_for_validation() {
+        let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample");
+        let args = DataArgs { set: Some("nominal".into()), split: SplitArg::Train, ..DataArgs::of(Some(sample)) };
+        let count = read_drives(&args, false).expect("the shipped sample").drives.len();
+        assert!(count > 0 && count < VALIDATED_FROM, "{count} drives");
+        let failure = validation_drives(&args, "--calibrate", "the noise is estimated").err().map(|failure| failure.to_string());
+        let failure = failure.unwrap_or_default();
+        assert!(failure.contains("--calibrate") && failure.contains(&format!("the {count} of set `nominal`")), "{failure}");
     }
 
     /// Goal: drives are read in the step of the bundle that predicts them, whatever that is. Method: the shipped bundle, as it is and as one of 0.05 s.
