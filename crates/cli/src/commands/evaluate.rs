@@ -356,7 +356,7 @@ fn print_table(e: &Evaluation<'_>) {
             say!("{:<22}{cells}{interval}", model.name.as_str());
         }
     }
-    for model in e.models.iter().filter(|m| m.errors.not_finite > 0) {
-        say!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite);
+    for model in e.models.iter().filter(|m| m.errors.not_finite() > 0) {
+        say!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite());
     }
 }
