@@ -4,9 +4,9 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nesam_learning::recipe::is_validation;
+use nesam_learning::recipe::{VALIDATED_FROM, is_validation};
 use nesam_model::{ModelBundle, Precision, Predictor};
-use nesam_physics::{DT_S, Vehicle};
+use nesam_physics::Vehicle;
 use nesam_server::recording::RecordingHeader;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{BeyondRange, DataRoot, SetQuery, SplitFilter, Trajectory};
@@ -95,7 +95,15 @@ pub fn validation_drives(args: &DataArgs, option: &str, what: &str) -> Result<Dr
     let mut all = read_drives(args, false)?;
     let mut sorted: Vec<(Trajectory, Option<Arc<WorldMap>>)> = all.drives.into_iter().zip(all.maps).collect();
     sorted.sort_by(|(a, _), (b, _)| a.id.cmp(&b.id));
-    (all.drives, all.maps) = sorted.into_iter().enumerate().filter(|(i, _)| is_validation(*i)).map(|(_, drive)| drive).unzip();
+    let count = sorted.len();
+    (all.drives, all.maps) = sorted.into_iter().enumerate().filter(|(i, _)| is_validation(*i, count)).map(|(_, drive)| drive).unzip();
+    if all.drives.is_empty() {
+        return Err(Failure::input(format!(
+            "{option}: training leaves every tenth drive for validation where there are {VALIDATED_FROM} or more; with the {count} of set `{}` all train, and \
+             {what} on drives that no weight has seen: record more, or leave out --trajectories",
+            all.set
+        )));
+    }
     Ok(all)
 }
 
@@ -157,8 +165,9 @@ pub fn load_recorded_bundle(given: Option<&Path>, header: &RecordingHeader) -> R
     load_bundle(given.or(found.as_deref()))
 }
 
-/// The bundle as a predictor of the vehicle of a data root, see [`on_vehicle_of`].
-pub fn predictor_for(bundle: ModelBundle, root: &DataRoot) -> Result<Arc<Predictor>, Failure> {
+/// The bundle as a predictor of the vehicle of a data root, see [`on_vehicle_of`], for drives in steps of `dt_s` seconds.
+pub fn predictor_for(bundle: ModelBundle, root: &DataRoot, dt_s: f64) -> Result<Arc<Predictor>, Failure> {
+    check_model_step(&bundle, dt_s)?;
     Ok(Arc::new(Predictor::new(Arc::new(on_vehicle_of(bundle, root))).or_input()?))
 }
 
@@ -244,13 +253,16 @@ fn check_step(dt_s: f64) -> Result<(), Failure> {
     Err(Failure::input(format!("--dt {dt_s} is outside 0.01…1 s")))
 }
 
-/// Refuses a step that the learned model does not know.
-pub fn check_model_step(dt_s: f64) -> Result<(), Failure> {
-    if (dt_s - DT_S).abs() < 1e-9 {
+/// Refuses drives in another step than the one that the bundle was trained with: its network would take them for drives at another speed.
+pub fn check_model_step(bundle: &ModelBundle, dt_s: f64) -> Result<(), Failure> {
+    let own_s = bundle.normalization.dt_s;
+    if (dt_s - own_s).abs() < 1e-9 {
         return Ok(());
     }
     Err(Failure::input(format!(
-        "the model predicts in steps of {DT_S} s; --dt {dt_s} works with --models kinematic,constant_velocity only"
+        "bundle {} predicts in steps of {own_s} s, the drives are read in steps of {dt_s} s (--dt {dt_s}); without a bundle, `nesam evaluate --models \
+         kinematic,constant_velocity` takes any step",
+        bundle.name
     )))
 }
 
@@ -266,5 +278,31 @@ mod tests {
         let root = DataRoot::open(&repository.join("tests/data/chrono_sample"), None).expect("the shipped sample");
         assert!(check_own_vehicle(&bundle("hmmwv-nominal"), &root, "--make-reference").is_ok());
         assert!(check_own_vehicle(&bundle("clearpath-husky"), &root, "--make-reference").is_err());
+    }
+
+    /// Goal: nothing is calibrated on drives that a model was trained on. Method: the shipped sample, of which training leaves none out.
+    #[test]
+    fn regress_few_drives_leave_none_for_validation() {
+        let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample");
+        let args = DataArgs { set: Some("nominal".into()), split: SplitArg::Train, ..DataArgs::of(Some(sample)) };
+        let count = read_drives(&args, false).expect("the shipped sample").drives.len();
+        assert!(count > 0 && count < VALIDATED_FROM, "{count} drives");
+        let failure = validation_drives(&args, "--calibrate", "the noise is estimated").err().map(|failure| failure.to_string());
+        let failure = failure.unwrap_or_default();
+        assert!(failure.contains("--calibrate") && failure.contains(&format!("the {count} of set `nominal`")), "{failure}");
+    }
+
+    /// Goal: drives are read in the step of the bundle that predicts them, whatever that is. Method: the shipped bundle, as it is and as one of 0.05 s.
+    #[test]
+    fn regress_drives_in_another_step_than_the_bundle_are_refused() {
+        let repository = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
+        let mut bundle = ModelBundle::load(&repository.join("deploy/bundles/hmmwv-nominal")).expect("a shipped bundle");
+        let root = DataRoot::open(&repository.join("tests/data/chrono_sample"), None).expect("the shipped sample");
+        for (own_s, other_s) in [(0.1, 0.05), (0.05, 0.1)] {
+            bundle.normalization.dt_s = own_s;
+            assert!(predictor_for(bundle.clone(), &root, own_s).is_ok(), "{own_s}");
+            let failure = predictor_for(bundle.clone(), &root, other_s).err().map(|failure| failure.to_string()).unwrap_or_default();
+            assert!(failure.contains(&format!("steps of {own_s} s")) && failure.contains(&format!("--dt {other_s}")), "{own_s}: {failure}");
+        }
     }
 }

@@ -444,6 +444,22 @@ fn chrono_a_bundle_made_in_seconds_predicts_and_a_damaged_one_is_refused() {
     assert!(check.status.code() == Some(2) && stdout(&check).contains("weights.safetensors"), "{}", stdout(&check));
 }
 
+/// Goal: a bundle of another step predicts drives in its own step and in no other. Method: the bundle of two training steps, told that it steps by 0.05 s.
+#[test]
+fn chrono_a_bundle_of_another_step_reads_drives_in_its_own() {
+    let here = tempfile::tempdir().unwrap();
+    let root = sample().display().to_string();
+    let mut bundle = nesam_model::ModelBundle::load(tiny_bundle()).unwrap();
+    bundle.normalization.dt_s = 0.05;
+    bundle.save(&here.path().join("finer")).unwrap();
+    let start = ["predict", "--data", &root, "--set", "nominal", "--bundle", "finer", "--horizon", "5", "--out", "p.json"];
+    refused(&start, here.path(), &["steps of 0.05 s", "--dt 0.1"]);
+    let scored = ["evaluate", "--data", &root, "--set", "nominal", "--bundle", "finer", "--horizon", "5"];
+    refused(&scored, here.path(), &["steps of 0.05 s", "--dt 0.1"]);
+    let predicted = nesam(&[&start[..], &["--dt", "0.05"]].concat(), here.path());
+    assert_eq!(predicted.status.code(), Some(0), "{}", stderr(&predicted));
+}
+
 /// Goal: on drives of an external simulator the shipped bundle names the steering offset they have, sizes it, writes a bundle that has it, and
 /// finds nothing in drives without an effect. Method: the command on two drives of each; the truth is 0.12.
 #[test]

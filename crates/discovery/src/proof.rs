@@ -71,13 +71,7 @@ fn telling<'a>(errors: &'a WindowErrors, shows: &[bool]) -> Cow<'a, WindowErrors
     if errors.trajectory.iter().all(|d| shows[*d]) {
         return Cow::Borrowed(errors);
     }
-    let mut kept = WindowErrors { scored: errors.scored, not_finite: errors.not_finite, ..WindowErrors::empty(errors.horizon) };
-    for w in (0..errors.windows()).filter(|w| shows[errors.trajectory[*w]]) {
-        kept.trajectory.push(errors.trajectory[w]);
-        kept.path_m.push(errors.path_m[w]);
-        kept.steps.extend_from_slice(&errors.steps[w * errors.horizon..(w + 1) * errors.horizon]);
-    }
-    Cow::Owned(kept)
+    Cow::Owned(errors.filter(|w| shows[errors.trajectory[w]]))
 }
 
 /// Whether an error that counts surely falls by at least a share of itself, on the drives in which it could.
@@ -210,7 +204,7 @@ pub(crate) mod tests {
             trajectory: (0..drives).collect(),
             path_m: vec![5.0; drives],
             steps: vec![StepError { absolute, position_m: absolute[0] }; drives],
-            not_finite: 0,
+            broken: vec![false; drives],
         };
         let summary = summarise(&errors, &Resamples::draw(drives, 50, 1));
         ModelScore { name: ModelName::Nesam, parameters: 0, summary, errors, curves: core::array::from_fn(|_| None) }

@@ -33,14 +33,19 @@ pub struct WindowErrors {
     pub path_m: Vec<f64>,
     /// Row-major (windows, K).
     pub steps: Vec<StepError>,
-    /// Windows in which the model gave a number that is not finite.
-    pub not_finite: usize,
+    /// Of each window, whether the model gave a number in it that is not finite.
+    pub broken: Vec<bool>,
 }
 
 impl WindowErrors {
     /// No windows yet.
     pub fn empty(horizon: usize) -> Self {
-        Self { horizon, scored: [true; POSE_DIM], trajectory: Vec::new(), path_m: Vec::new(), steps: Vec::new(), not_finite: 0 }
+        Self { horizon, scored: [true; POSE_DIM], trajectory: Vec::new(), path_m: Vec::new(), steps: Vec::new(), broken: Vec::new() }
+    }
+
+    /// Number of windows in which the model gave a number that is not finite.
+    pub fn not_finite(&self) -> usize {
+        self.broken.iter().filter(|broken| **broken).count()
     }
 
     /// Number of windows.
@@ -55,8 +60,8 @@ impl WindowErrors {
 
     /// Adds a window: `start` is the measured pose the prediction began from, `truth` the poses after steps 1…K.
     ///
-    /// A step that is not finite is scored as if the vehicle had stayed at the last finite pose, and the window is counted in
-    /// `not_finite`: leaving it out would flatter the model, and a NaN would hide every other window.
+    /// A step that is not finite is scored as if the vehicle had stayed at the last finite pose, and the window is counted by
+    /// [`WindowErrors::not_finite`]: leaving it out would flatter the model, and a NaN would hide every other window.
     pub fn push(&mut self, trajectory: usize, start: &Pose, path: &PosePath, truth: &[Pose], measured: [bool; POSE_DIM]) {
         assert_eq!(path.poses.len(), self.horizon, "a prediction has one pose per step; this is a bug");
         assert_eq!(truth.len(), self.horizon, "a window has one true pose per step; this is a bug");
@@ -69,7 +74,7 @@ impl WindowErrors {
             }
             self.steps.push(StepError { absolute: absolute_error(&last, true_pose), position_m: horizontal_distance(&last, true_pose) });
         }
-        self.not_finite += usize::from(broken);
+        self.broken.push(broken);
         for (scored, (predicted, measured)) in self.scored.iter_mut().zip(path.predicts.into_iter().zip(measured)) {
             *scored &= predicted && measured;
         }
@@ -84,6 +89,7 @@ impl WindowErrors {
             out.trajectory.push(self.trajectory[w]);
             out.path_m.push(self.path_m[w]);
             out.steps.extend_from_slice(self.window(w));
+            out.broken.push(self.broken[w]);
         }
         out
     }
@@ -132,6 +138,21 @@ mod tests {
         let path = PosePath { poses: vec![along_x(1.0), along_x(f64::NAN)], predicts: [true; 6] };
         e.push(0, &along_x(0.0), &path, &[along_x(1.0), along_x(2.0)], [true; 6]);
         assert_eq!(e.column(1, 0), [1.0]);
-        assert_eq!(e.not_finite, 1);
+        assert_eq!(e.not_finite(), 1);
+    }
+
+    /// Goal: a part of the windows counts those of its own that are not finite. Method: three windows, the second broken, every part of two.
+    #[test]
+    fn regress_windows_that_are_kept_keep_whether_they_are_finite() {
+        let mut e = WindowErrors::empty(1);
+        for (drive, x) in [1.0, f64::NAN, 1.0].into_iter().enumerate() {
+            e.push(drive, &along_x(0.0), &PosePath { poses: vec![along_x(x)], predicts: [true; 6] }, &[along_x(1.0)], [true; 6]);
+        }
+        for (left_out, not_finite) in [(0, 1), (1, 0), (2, 1)] {
+            let kept = e.filter(|w| w != left_out);
+            assert_eq!((kept.windows(), kept.not_finite()), (2, not_finite), "without {left_out}");
+            assert_eq!(kept.filter(|_| true), kept);
+        }
+        assert_eq!((e.not_finite(), e.filter(|_| false).not_finite()), (1, 0));
     }
 }

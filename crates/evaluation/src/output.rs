@@ -177,7 +177,7 @@ fn model_json(model: &ModelScore) -> ModelJson<'_> {
     ModelJson {
         summary: &model.summary,
         parameters: model.parameters,
-        not_finite_windows: model.errors.not_finite,
+        not_finite_windows: model.errors.not_finite(),
         by_step: ByName(by_step.collect()),
     }
 }

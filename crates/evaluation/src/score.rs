@@ -181,7 +181,7 @@ mod tests {
             trajectory: vec![0, 1],
             path_m: vec![4.0, 10.0],
             steps: vec![step(1.0, 2.0), step(3.0, 4.0), step(0.0, 0.0), step(1.0, 6.0)],
-            not_finite: 0,
+            broken: vec![false; 2],
         }
     }
 

@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector, SMatrix};
 use nesam_adaptation::{AdaptationError, BufferedTransition, FilterConfig, SoilFilter, SoilPosterior, conditions};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{Ground, StepInput, StepModel};
-use nesam_physics::{Control, DT_S, SOIL_BOUNDS, SOIL_DIM, SecondCommand, Soil, SoilCorrection, VehicleState};
+use nesam_physics::{Control, SOIL_BOUNDS, SOIL_DIM, SecondCommand, Soil, SoilCorrection, VehicleState};
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::{ChiSquared, Distribution, StandardNormal};
@@ -244,7 +244,7 @@ impl<'a> Twin<'a> {
 
     /// One step on the true soil: its transition as the filter sees it, without noise.
     fn transition(&mut self) -> BufferedTransition {
-        let t = self.step as f64 * DT_S;
+        let t = self.step as f64 * self.model.dt_s();
         let wave = |[frequency, phase]: [f64; 2]| (frequency * t + phase).sin();
         let card = self.model.vehicle();
         let [_, second] = card.command_range;
@@ -253,7 +253,7 @@ impl<'a> Twin<'a> {
             _ => 0.8 * second[1] * wave(self.waves[1]),
         };
         let control = Control { speed_m_s: 2.5 + 1.2 * wave(self.waves[0]), second: turning };
-        let after = self.actuators.advance(card, &control, self.state.velocity_m_s[0], DT_S);
+        let after = self.actuators.advance(card, &control, self.state.velocity_m_s[0], self.model.dt_s());
         let (ahead, left) = (0.12 * wave(self.waves[2]), 0.08 * wave(self.waves[3]));
         let input = StepInput {
             state: self.state,

@@ -5,6 +5,7 @@ use std::ops::Range;
 
 use candle_core::backprop::GradStore;
 use candle_core::{DType, Device, Result, Tensor, Var};
+use half::f16;
 use nesam_model::dims::{CONTEXT, FEATURE_CHANNELS, FEATURE_PX, FEATURES, HIDDEN};
 use nesam_model::reference::{Network, PredictedStep, Row, TerrainProvider};
 use nesam_model::{GroundSource, Normalization, Variant, history_actuators};
@@ -168,19 +169,24 @@ pub struct PathTerrain<'a, 'w> {
     soil: Option<(Tensor, Var)>,
     /// First row of each window in the table ahead.
     first_row: Vec<u32>,
+    /// Whether any window has terrain features.
     has_map: bool,
+    /// 1 for a window with features, 0 for one without: (windows, 1); `None` where all or none have them.
+    seeing: Option<Tensor>,
     sight: Sight<'a>,
     device: Device,
 }
 
 impl<'a, 'w> PathTerrain<'a, 'w> {
-    /// Projects and reads the soil of every reachable sample: one large matrix product instead of one per step.
+    /// Projects and reads the soil of every reachable sample: one large matrix product instead of one per step. A window of a drive without features has
+    /// tokens of zero and the default soil, as alone, whatever the others have.
     ///
     /// # Errors
     /// A candle error.
     pub fn new(network: &Network, windows: &'w [Window<'a>], history: usize, horizon: usize, sight: Sight<'a>) -> Result<Self> {
         let (variant, width) = (sight.variant, sight.pooling.width());
-        let has_map = windows.iter().all(|w| w.drive.has_features());
+        let seeing: Vec<f32> = windows.iter().map(|w| if w.drive.has_features() { 1.0 } else { 0.0 }).collect();
+        let has_map = seeing.contains(&1.0);
         let each = |of: fn(&Window<'_>, usize) -> Range<usize>, steps: usize| -> Vec<At> {
             windows.iter().enumerate().flat_map(|(w, window)| of(window, steps).map(move |i| (w, i))).collect()
         };
@@ -190,26 +196,31 @@ impl<'a, 'w> PathTerrain<'a, 'w> {
         let device = network.device();
         let factors: Vec<Option<Vec<f32>>> = windows.iter().map(|w| sight.factors(w.dropout)).collect();
         let projection = if has_map { Some(sight.projection(network)?.t()?) } else { None };
+        let nothing = vec![f16::ZERO; width.max(FEATURES)];
         let project = |samples: &[At]| -> Result<Projected> {
             let Some(projection) = &projection else {
                 let tokens = Var::zeros((samples.len(), HIDDEN), DType::F32, device)?;
                 return Ok(Projected { context: Tensor::zeros((samples.len(), 1), DType::F32, device)?, tokens });
             };
-            let context = gather(samples, width, |(w, i)| windows[w].drive.context(i), &factors, device)?;
+            let of = |(w, i): At| if seeing[w] > 0.0 { windows[w].drive.context(i) } else { &nothing[..width] };
+            let context = gather(samples, width, of, &factors, device)?;
             let tokens = Var::from_tensor(&context.matmul(projection)?)?;
             Ok(Projected { context, tokens })
         };
         let soil = if has_map && variant.has_soil() {
-            let features = gather(&ahead, FEATURES, |(w, i)| windows[w].drive.semantic(i), &[], device)?;
+            let of = |(w, i): At| if seeing[w] > 0.0 { windows[w].drive.semantic(i) } else { &nothing[..FEATURES] };
+            let features = gather(&ahead, FEATURES, of, &[], device)?;
             let graph = network.soil.raw(&features.reshape((ahead.len(), FEATURE_PX, FEATURE_PX, FEATURE_CHANNELS))?)?;
             let leaf = Var::from_tensor(&graph.detach())?;
             Some((graph, leaf))
         } else {
             None
         };
+        let is_mixed = has_map && seeing.contains(&0.0);
         Ok(Self {
             windows,
             horizon,
+            seeing: if is_mixed { Some(Tensor::from_slice(&seeing, (windows.len(), 1), device)?) } else { None },
             past: if past.is_empty() { None } else { Some(project(&past)?) },
             ahead: project(&ahead)?,
             soil,
@@ -317,7 +328,13 @@ impl TerrainProvider for PathTerrain<'_, '_> {
         let places: Vec<Place> =
             self.windows.iter().zip(states).map(|(w, state)| w.drive.nearest_place(state, w.start, w.last(self.horizon))).collect();
         let soil = match &self.soil {
-            Some((_, leaf)) => self.interpolate(leaf, &places)?,
+            Some((_, leaf)) => {
+                let read = self.interpolate(leaf, &places)?;
+                match &self.seeing {
+                    Some(seeing) => (read.broadcast_mul(seeing)? + default_soil()?.broadcast_mul(&seeing.affine(-1.0, 1.0)?)?)?,
+                    None => read,
+                }
+            }
             None => default_soil()?,
         };
         Ok((self.interpolate(&self.ahead.tokens, &places)?, soil))

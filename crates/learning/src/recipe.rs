@@ -67,10 +67,13 @@ pub trait Reporter: Sync {
     fn line(&self, text: &str);
 }
 
-/// Every tenth drive of a list sorted by id validates; the rest trains. What is calibrated for a bundle afterwards uses the same drives, which no
-/// weight has seen.
-pub fn is_validation(index: usize) -> bool {
-    index % 10 == 7
+/// Drives that a training needs to leave some out; of fewer, all train.
+pub const VALIDATED_FROM: usize = 10;
+
+/// Every tenth of `count` drives sorted by id validates; the rest trains, and all do where there are fewer than [`VALIDATED_FROM`]. What is calibrated for a
+/// bundle afterwards uses the same drives, which no weight has seen.
+pub fn is_validation(index: usize, count: usize) -> bool {
+    count >= VALIDATED_FROM && index % 10 == 7
 }
 
 /// Trains a bundle on the drives of the train split and writes it to `out/bundle`.
@@ -88,7 +91,7 @@ pub fn run(
 ) -> Result<ModelBundle, TrainingError> {
     let mut drives = load_drives(root, trajectories)?;
     let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
-        (0..drives.len()).filter(|i| (is_validation(*i) && drives.len() >= 10) == validation).collect()
+        (0..drives.len()).filter(|i| is_validation(*i, drives.len()) == validation).collect()
     };
     let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
     let damped = |vehicle: &Vehicle| Vehicle {
@@ -127,13 +130,15 @@ pub fn run(
         scales.residual_scale = sd;
         weights.insert("residual.bias", &[STATE_DIM], mean.iter().zip(sd).map(|(m, s)| m / s).collect());
     }
-    let mapped = drives.iter().any(|d| d.map.is_some());
-    if mapped && recipe.start.is_none() {
+    let trained_on_maps = any_mapped(&drives, &train_at);
+    if trained_on_maps && recipe.start.is_none() {
         for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
             weights.insert(name, &array.shape, array.values.clone());
         }
     }
-    if mapped && recipe.plan.steps > 0 {
+    // Of encoders that were trained on nothing no drive is shown anything.
+    let has_encoders = trained_on_maps || recipe.start.is_some();
+    if has_encoders && drives.iter().any(|d| d.map.is_some()) && recipe.plan.steps > 0 {
         let samples = drives.iter().map(|d| d.states.len()).sum();
         reporter.stage("terrain contexts", samples);
         let done = AtomicUsize::new(0);
@@ -252,6 +257,11 @@ pub fn load_drives(root: &DataRoot, trajectories: &[Trajectory]) -> Result<Vec<D
         .collect()
 }
 
+/// Whether any of some drives has a map.
+fn any_mapped(drives: &[Drive], at: &[usize]) -> bool {
+    at.iter().any(|&i| drives[i].map.is_some())
+}
+
 /// Mirror images of some drives; drives over one map share its image.
 fn mirrored(drives: &[Drive], at: &[usize]) -> Vec<Drive> {
     let mut maps: HashMap<String, Arc<WorldMap>> = HashMap::new();
@@ -336,6 +346,25 @@ fn write(path: &Path, bytes: &[u8]) -> Result<(), TrainingError> {
 mod tests {
     use super::*;
     use nesam_terrain::GridGeometry;
+
+    /// Goal: encoders are trained where there is something to train them on. Method: of two drives the one that validates has a map, the other has none.
+    #[test]
+    fn regress_maps_of_validation_drives_alone_train_no_encoder() {
+        let geometry = GridGeometry { origin_m: [0.0; 2], resolution_m: 0.1, width: 2, height: 2 };
+        let map = Arc::new(WorldMap::from_layers("plain", 1, geometry, vec![0.0; 4], None).unwrap());
+        let drives = [None, Some(map)].map(|map| Drive::new("made".into(), map, Vec::new(), Vec::new()));
+        assert!(!any_mapped(&drives, &[0]) && any_mapped(&drives, &[1]) && any_mapped(&drives, &[0, 1]));
+    }
+
+    #[test]
+    fn regress_few_drives_all_train_and_none_of_them_validates() {
+        for count in [0, 1, 8, 9] {
+            assert!((0..count).all(|index| !is_validation(index, count)), "{count}");
+        }
+        for (count, held_out) in [(10, vec![7]), (17, vec![7]), (18, vec![7, 17]), (300, (0..30).map(|tenth| 10 * tenth + 7).collect())] {
+            assert_eq!((0..count).filter(|index| is_validation(*index, count)).collect::<Vec<_>>(), held_out, "{count}");
+        }
+    }
 
     #[test]
     fn property_encoders_are_taken_for_the_same_pixels_of_the_same_places_alone() {

@@ -265,9 +265,11 @@ fn steps_needed(variant: Variant, available: usize) -> usize {
 }
 
 /// Trains from `weights`; resumes from the folder's checkpoint if asked. `progress(step, loss, norm)` after each step, `report` after each epoch.
+/// A run that is interrupted and resumed gives the weights that it gives in one go: what is validated, and may so be chosen, depends on the plan alone.
 ///
 /// # Errors
-/// `TrainingError`; an interruption leaves a checkpoint.
+/// `TrainingError`; an interruption leaves a checkpoint, also before the first epoch: one that is resumed with a plan of no further steps gives the running
+/// mean where nothing was validated yet.
 pub fn train(
     set: &TrainingSet<'_>,
     weights: &Weights,
@@ -286,6 +288,7 @@ pub fn train(
         average: weights.clone(),
         adam: Adam::default(),
         curve: Vec::new(),
+        unreported: Unreported::default(),
     });
     let device = plan.device.open()?;
     let network = Network::from_weights(&checkpoint.latest, &device)?;
@@ -294,7 +297,7 @@ pub fn train(
             rayon::ThreadPoolBuilder::new().num_threads(plan.physics_threads()).build().expect("a thread can be started; this is a bug")
         })
         .collect();
-    let (mut losses, mut steps, mut since) = (Vec::new(), 0_u32, Instant::now());
+    let mut since = Instant::now();
     while checkpoint.step < plan.steps {
         let step = checkpoint.step;
         // Each step has its own random stream, so a resumed run draws the batches that an uninterrupted one would have drawn.
@@ -312,19 +315,22 @@ pub fn train(
         let norm = checkpoint.adam.update(&network.variables, &gradients, cosine(plan.rate, step, plan.steps), 1.0, plan.decay)?;
         checkpoint.step += 1;
         average_in(&mut checkpoint.average, &network.to_weights()?, checkpoint.step);
+        checkpoint.unreported.steps += 1;
         if loss.is_finite() {
-            losses.push(loss);
+            checkpoint.unreported.losses.push(f64::from(loss));
         }
-        steps += 1;
         progress(checkpoint.step, loss, norm);
         let stop = interrupted();
-        if checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps || stop {
-            let step_s = since.elapsed().as_secs_f64() / f64::from(steps);
+        let due = checkpoint.step % plan.epoch == 0 || checkpoint.step == plan.steps;
+        if due || stop {
+            checkpoint.unreported.seconds += since.elapsed().as_secs_f64();
+            checkpoint.latest = merged(weights, &network.to_weights()?);
+        }
+        if due {
             let averaged = Network::from_weights(&checkpoint.average, &device)?;
             let (validation, diverged) = set.validate(&averaged, plan.horizon, plan.objective.variant)?;
-            let loss = losses.iter().sum::<f32>() / losses.len() as f32;
+            let (loss, step_s) = std::mem::take(&mut checkpoint.unreported).means();
             let line = EpochReport { step: checkpoint.step, loss, validation, diverged, step_s };
-            checkpoint.latest = merged(weights, &network.to_weights()?);
             if score(&line) < checkpoint.best_score {
                 checkpoint.best_score = score(&line);
                 checkpoint.best = checkpoint.average.clone();
@@ -332,7 +338,9 @@ pub fn train(
             checkpoint.curve.push(line);
             checkpoint.save(&plan.folder)?;
             report(&line);
-            (losses, steps, since) = (Vec::new(), 0, Instant::now());
+            since = Instant::now();
+        } else if stop {
+            checkpoint.save(&plan.folder)?;
         }
         if stop {
             return Err(TrainingError::Interrupted(checkpoint.step));
@@ -413,6 +421,24 @@ fn merged(base: &Weights, trained: &Weights) -> Weights {
     weights
 }
 
+/// Steps since the last line of the curve.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct Unreported {
+    /// Finite losses.
+    losses: Vec<f64>,
+    steps: usize,
+    /// Time of the steps, over all the runs that took them.
+    seconds: f64,
+}
+
+impl Unreported {
+    /// Mean loss, NaN where none was finite, and seconds per step.
+    fn means(&self) -> (f32, f64) {
+        let sum = self.losses.iter().map(|loss| *loss as f32).sum::<f32>();
+        (sum / self.losses.len() as f32, self.seconds / self.steps as f64)
+    }
+}
+
 /// What an interrupted run needs.
 struct Checkpoint {
     step: usize,
@@ -422,6 +448,7 @@ struct Checkpoint {
     average: Weights,
     adam: Adam,
     curve: Vec<EpochReport>,
+    unreported: Unreported,
 }
 
 impl Checkpoint {
@@ -437,7 +464,13 @@ impl Checkpoint {
             ("adam.safetensors", moments.to_bytes()),
         ];
         let hashes: HashMap<&str, String> = arrays.iter().map(|(name, bytes)| (*name, sha256_hex(bytes))).collect();
-        let state = serde_json::json!({ "step": self.step, "best_score": self.best_score, "curve": self.curve, "hashes": hashes });
+        let state = serde_json::json!({
+            "step": self.step,
+            "best_score": self.best_score,
+            "curve": self.curve,
+            "unreported": self.unreported,
+            "hashes": hashes,
+        });
         // The state is renamed first: of a run that is killed in between, `load` finds the arrays of that state under either name.
         let files: Vec<(&str, Vec<u8>)> = std::iter::once(("state.json", state.to_string().into_bytes())).chain(arrays).collect();
         for (name, bytes) in &files {
@@ -475,6 +508,10 @@ impl Checkpoint {
             step: state["step"].as_u64().ok_or_else(|| missing("step"))? as usize,
             best_score: state["best_score"].as_f64().unwrap_or(f64::INFINITY),
             curve: serde_json::from_value(state["curve"].clone()).map_err(|e| fail(&state_path, e.to_string()))?,
+            // A checkpoint that says none was validated when it was written.
+            unreported: serde_json::from_value::<Option<Unreported>>(state["unreported"].clone())
+                .map_err(|e| fail(&state_path, e.to_string()))?
+                .unwrap_or_default(),
             best: arrays("best.safetensors")?,
             latest: arrays("latest.safetensors")?,
             average: arrays("average.safetensors")?,
@@ -498,6 +535,7 @@ mod tests {
             average: weights,
             adam: Adam::default(),
             curve: vec![line],
+            unreported: Unreported { losses: vec![0.5, 1.5], steps: 3, seconds: 0.25 },
         }
     }
 
@@ -509,6 +547,7 @@ mod tests {
         checkpoint(2, LINE).save(folder.path()).unwrap();
         let found = Checkpoint::load(folder.path()).unwrap().unwrap();
         assert_eq!((found.step, found.best_score, found.best.clone()), (2, f64::INFINITY, found.latest));
+        assert_eq!(found.unreported, checkpoint(2, LINE).unreported);
         let line = found.curve[0];
         assert!(line.loss.is_nan() && line.validation[0] == 0.5 && line.validation[1].is_nan() && line.diverged == 3, "{line:?}");
     }

@@ -136,7 +136,8 @@ impl ModelBundle {
     /// Loads and verifies a bundle folder.
     ///
     /// # Errors
-    /// `ModelError::Bundle` or `ModelError::Weights` naming the file or array and what was wrong (missing, wrong hash, wrong shape, unknown format).
+    /// `ModelError::Bundle` or `ModelError::Weights` naming the file or array and what was wrong (missing, wrong hash, wrong shape, unknown format,
+    /// a number that no model runs with).
     pub fn load(dir: &Path) -> Result<Self, ModelError> {
         let folder = Folder(dir);
         let manifest_bytes = folder.read(MANIFEST)?;
@@ -170,6 +171,7 @@ impl ModelBundle {
         let weights = Weights::from_bytes(&take(WEIGHTS).unwrap_or_default(), &dir.join(WEIGHTS))?;
         let normalization: Normalization =
             toml::from_str(&text_of(NORMALIZATION)?).map_err(|e| folder.fail(NORMALIZATION, format!("is not readable: {e}")))?;
+        normalization.check().map_err(|reason| folder.fail(NORMALIZATION, reason))?;
         let vehicle = nesam_vehicle_card::from_json(&text_of(VEHICLE)?).map_err(|e| folder.fail(VEHICLE, e.to_string()))?;
         let effects = effects_file::read(&text_of(EFFECTS)?).map_err(|reason| folder.fail(EFFECTS, reason))?;
         let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;

@@ -77,3 +77,37 @@ fn regress_every_damaged_file_of_a_bundle_is_named() {
         }
     }
 }
+
+/// Goal: a bundle whose files are whole and whose numbers are none is refused when it is loaded. Method: one line of the shipped `normalization.toml` is
+/// written anew, with a manifest that agrees.
+#[test]
+fn regress_a_bundle_that_no_model_runs_with_is_not_loaded() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for name in files().iter().map(String::as_str).chain(["manifest.toml"]) {
+        fs::copy(shipped().join(name), folder.path().join(name)).expect("the shipped bundle is complete");
+    }
+    let manifest = fs::read_to_string(shipped().join("manifest.toml")).expect("readable");
+    let whole = fs::read_to_string(shipped().join("normalization.toml")).expect("readable");
+    let with = |key: &str, value: &str| {
+        let line = |line: &str| if line.starts_with(&format!("{key} = ")) { format!("{key} = {value}\n") } else { format!("{line}\n") };
+        let changed: String = whole.lines().map(line).collect();
+        assert_ne!(changed.trim_end(), whole.trim_end(), "`{key}` is a line of the file");
+        let agreeing = manifest.replace(&sha256_hex(whole.as_bytes()), &sha256_hex(changed.as_bytes()));
+        fs::write(folder.path().join("normalization.toml"), changed).expect("writable");
+        fs::write(folder.path().join("manifest.toml"), agreeing).expect("writable");
+        ModelBundle::load(folder.path())
+    };
+    for (key, value, allowed) in [
+        ("substeps", "0", "1 to 64"),
+        ("substeps", "1000000000", "1 to 64"),
+        ("dt_s", "-0.1", "0.01 to 1 s"),
+        ("dt_s", "nan", "0.01 to 1 s"),
+        ("elevation_half_range_m", "0.0", "above 0"),
+        ("sinkage_log_ratio_max", "nan", "above 0"),
+    ] {
+        let message = with(key, value).expect_err(key).to_string();
+        assert!(message.contains("normalization.toml") && message.contains(&format!("`{key}`")), "{key} = {value}: {message}");
+        assert!(message.contains(allowed), "{key} = {value}: {message}");
+    }
+    with("substeps", "3").expect("a number of sub-steps that is allowed");
+}

@@ -39,6 +39,8 @@ const SKID_RIM_LIMIT_M_S: f64 = 3.0;
 const WIDTH_SHARE: f64 = 0.6;
 /// Wheelbase of a card that gives none, in tracks: of a skid-steer base and of a car.
 const WHEELBASE_SHARE: [f64; 2] = [1.0, 1.8];
+/// Largest road-wheel angle of a car-like card that gives none, rad.
+const ROAD_WHEEL_ANGLE_RAD: f64 = 0.7;
 /// Rate limit where a card gives none: none in practice, 1/s.
 const UNLIMITED_RATE_PER_S: f64 = 1e3;
 
@@ -316,12 +318,8 @@ fn command_range(
             ([CAR_SPEED_RANGE_M_S, ends.unwrap_or([-1.0, 1.0])], [true, false])
         }
         SecondCommand::RoadWheelAngleRad => {
-            let stated = sheet.get("steering.max_road_wheel_angle_rad");
-            let largest = match stated {
-                Some(Value::Array(angles)) => angles.iter().filter_map(Value::as_f64).fold(0.0, f64::max),
-                Some(value) => sheet.finite("steering.max_road_wheel_angle_rad", value)?,
-                None => 0.7,
-            };
+            let stated = largest_road_wheel_angle(sheet)?;
+            let largest = stated.unwrap_or(ROAD_WHEEL_ANGLE_RAD);
             ([CAR_SPEED_RANGE_M_S, [-largest, largest]], [true, stated.is_none()])
         }
     };
@@ -335,6 +333,25 @@ fn command_range(
         core::array::from_fn(|axis| stated[axis].unwrap_or(implied[axis])),
         core::array::from_fn(|axis| is_implied[axis] && stated[axis].is_none()),
     ))
+}
+
+/// The largest angle of a road wheel, rad, where the card gives one or one for each wheel: each above 0, for it is turned to both sides.
+fn largest_road_wheel_angle(sheet: &JsonFile) -> Result<Option<f64>, TrajectoryError> {
+    const KEY: &str = "steering.max_road_wheel_angle_rad";
+    let Some(Value::Array(angles)) = sheet.get(KEY) else { return sheet.positive(&[KEY]) };
+    if angles.is_empty() {
+        return Err(sheet.wrong(KEY, "expected an angle or one for each wheel, found none"));
+    }
+    let mut largest = 0.0_f64;
+    for (i, angle) in angles.iter().enumerate() {
+        let key = format!("{KEY}[{i}]");
+        let angle_rad = sheet.finite(&key, angle)?;
+        if angle_rad <= 0.0 {
+            return Err(sheet.wrong(&key, format!("{angle_rad} is not positive")));
+        }
+        largest = largest.max(angle_rad);
+    }
+    Ok(Some(largest))
 }
 
 /// Actuators and drive line: stated values, else the defaults of the kind of drive.

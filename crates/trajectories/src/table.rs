@@ -132,7 +132,9 @@ impl Table {
                     }
                     return Ok(());
                 }
-                _ if is_all_null => {
+                reader if is_all_null => {
+                    // Memory is taken for rows that the column has, whatever a damaged footer says.
+                    read_nulls(reader, max_level, rows)?;
                     texts.resize(texts.len() + rows, None);
                     return Ok(());
                 }
@@ -217,6 +219,25 @@ fn push_text(texts: &mut Texts, text: Option<&str>) {
         (text, _) => text.map(Arc::from),
     };
     texts.push(shared);
+}
+
+/// Reads a row group of nothing but nulls, of any type; an error where it has other rows than the footer says, or a value.
+fn read_nulls(reader: ColumnReader, max_level: i16, rows: usize) -> Result<(), String> {
+    let none = &mut Vec::new();
+    let nulls = match reader {
+        ColumnReader::BoolColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::Int32ColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::Int64ColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::Int96ColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::FloatColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::DoubleColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::ByteArrayColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+        ColumnReader::FixedLenByteArrayColumnReader(r) => append(r, max_level, rows, none, |_| (), ()),
+    }?;
+    if rows == 0 || nulls.is_some_and(|nulls| nulls.iter().all(|null| *null)) {
+        return Ok(());
+    }
+    Err("the footer says that every row is null, and one is not".into())
 }
 
 /// Appends one row group, nulls as `missing`; gives the null mask where there is a null.

@@ -184,6 +184,33 @@ fn analytic_a_card_may_say_that_soil_is_damped() {
     assert!(error.contains("`soil_damping_pa_s_m` is -1, must not be negative"), "{error}");
 }
 
+/// Goal: a range of road-wheel angles ascends. Method: a card commanded by the angle, with each form of the largest one.
+#[test]
+fn regress_a_largest_road_wheel_angle_is_positive_and_a_number() {
+    let with = |angle: Value| {
+        let mut card = hmmwv_json();
+        card["second"] = json!("road_wheel_angle_rad");
+        card["steering"]["max_road_wheel_angle_rad"] = angle;
+        read(&card.to_string())
+    };
+    for (angle, largest) in [(json!(0.5), 0.5), (json!([0.36, 0.38]), 0.38), (json!([0.4]), 0.4), (json!(null), 0.7)] {
+        assert_eq!(with(angle.clone()).unwrap().command_range[1], [-largest, largest], "{angle}");
+    }
+    let key = "steering.max_road_wheel_angle_rad";
+    for (angle, at, word) in [
+        (json!(-0.5), "", "-0.5 is not positive"),
+        (json!(0), "", "0 is not positive"),
+        (json!("wide"), "", "finite number"),
+        (json!([]), "", "found none"),
+        (json!([0.36, "wide"]), "[1]", "finite number"),
+        (json!([null, 0.36]), "[0]", "finite number"),
+        (json!([0.36, -0.36]), "[1]", "-0.36 is not positive"),
+    ] {
+        let error = with(angle.clone()).unwrap_err().to_string();
+        assert!(error.contains(&format!("`{key}{at}`")) && error.contains(word), "{angle}: {error}");
+    }
+}
+
 #[test]
 fn analytic_stated_ranges_win() {
     let mut card = hmmwv_json();

@@ -7,6 +7,9 @@ use common::{Column, Columns, SKID_CARD, circle_columns, column, root_of, set, w
 use nesam_physics::SecondCommand;
 use nesam_trajectories::{DataRoot, SetQuery, Split, SplitFilter, Trajectory, TrajectoryError, VelocitySource, card_to_json};
 use parquet::basic::Compression;
+use parquet::file::metadata::{FileMetaData, ParquetMetaData, ParquetMetaDataWriter};
+use parquet::file::reader::{FileReader, SerializedFileReader};
+use parquet::file::statistics::Statistics;
 use tempfile::TempDir;
 
 fn load(root: &TempDir) -> Result<Vec<Trajectory>, TrajectoryError> {
@@ -260,6 +263,36 @@ fn property_channels_that_were_not_recorded_may_be_null() {
     (40..80).for_each(|row| set(&mut columns, "om_l", row, None));
     let drives = load(&root_of(&columns)).unwrap();
     assert!(drives[0].measured.wheel_speed && !drives[1].measured.wheel_speed);
+}
+
+/// Goal: columns of nothing but nulls, which may have any type, are read for as many rows as they have. Method: an index whose worlds are null numbers; then
+/// one whose drives are, with a footer that speaks of fifty million of them.
+#[test]
+fn regress_nulls_are_as_many_as_the_file_has() {
+    const FORGED: i64 = 50_000_000;
+    let root = root_of(&two_drives());
+    let index = root.path().join("drive/index.parquet");
+    let nulls = || Column::Double(vec![None; 2]);
+    let ids = Column::Text(["a", "b"].map(|id| Some(id.to_string())).to_vec());
+    write_parquet(&index, &vec![("trajectory".to_string(), ids), ("world".to_string(), nulls())], 2, Compression::SNAPPY);
+    assert!(load(&root).unwrap().iter().all(|drive| drive.world.is_none()));
+
+    write_parquet(&index, &vec![("trajectory".to_string(), nulls())], 2, Compression::SNAPPY);
+    let honest = load(&root).unwrap_err().to_string();
+    assert!(honest.contains("null, expected an id"), "{honest}");
+    let metadata = SerializedFileReader::new(std::fs::File::open(&index).unwrap()).unwrap().metadata().clone();
+    let group = metadata.row_group(0).clone();
+    let all_null = Statistics::double(None, None, None, Some(FORGED as u64), false);
+    let column = group.column(0).clone().into_builder().set_statistics(all_null).build().unwrap();
+    let group = group.into_builder().set_column_metadata(vec![column]).set_num_rows(FORGED).build().unwrap();
+    let schema = metadata.file_metadata().schema_descr_ptr();
+    let forged = ParquetMetaData::new(FileMetaData::new(1, FORGED, None, None, schema, None), vec![group]);
+    // A footer after the footer: the last one counts.
+    let mut bytes = std::fs::read(&index).unwrap();
+    ParquetMetaDataWriter::new(&mut bytes, &forged).finish().unwrap();
+    std::fs::write(&index, bytes).unwrap();
+    let error = load(&root).unwrap_err().to_string();
+    assert!(error.contains("column `trajectory`") && error.contains(&format!("rows 0..{FORGED}")), "{error}");
 }
 
 #[test]

@@ -26,9 +26,7 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
 use crate::progress::Progress;
-use crate::sources::{
-    Drives, check_model_step, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives,
-};
+use crate::sources::{Drives, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Options of `nesam adapt`.
@@ -138,7 +136,6 @@ enum DisguiseArg {
 
 /// Runs the command.
 pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     args.window.check_horizon()?;
     args.inputs.check("what the soil is learned for is predictions under commands")?;
     if args.calibrate {
@@ -156,7 +153,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     args.predictions.iter().try_for_each(|file| output::check_file(file))?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let filter = filter_in_force(&settings_file(args.filter.as_deref())?, args.literal, predictor.bundle())?;
     warn_about_velocities(&drives);
 
@@ -280,7 +277,7 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let drives = validation_drives(&args.data, "--calibrate", "the noise is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
     check_own_vehicle(&bundle, &drives.root, "--calibrate")?;
-    let predictor = predictor_for(bundle.clone(), &drives.root)?;
+    let predictor = predictor_for(bundle.clone(), &drives.root, args.data.dt)?;
     let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);
     let prior_sd = *given.prior_sd.get_or_insert(PRIOR_SD);

@@ -30,7 +30,7 @@ use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{provenance, say, write_file};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 
 /// Options of `nesam bench`.
 #[derive(Args, Debug)]
@@ -119,7 +119,6 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
 }
 
 fn predict(args: &PredictBench) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     check_count("--samples", args.samples, 1..=usize::MAX)?;
     check_count("--queries", args.queries, 1..=usize::MAX)?;
     check_count("--horizon", args.horizon, 1..=MAX_HORIZON)?;
@@ -139,7 +138,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
     };
 
     // One replan after the other along the drive at the rate of the model, on a map that nobody has asked about yet.
-    let chosen = sweep::on_path(predictor_for(bundle.clone(), &drives.root)?, args.path.as_deref())?;
+    let chosen = sweep::on_path(predictor_for(bundle.clone(), &drives.root, args.data.dt)?, args.path.as_deref())?;
     let fresh: &Predictor = &chosen;
     let steady = (0..args.queries).map(|q| time(fresh, drive.along(q), args.seed + q as u64)).collect::<Result<Vec<_>, _>>()?;
     // Poses all over the drive whose surroundings have been asked about before, with other commands.

@@ -22,7 +22,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
     let [file] = output::result_files(args.out.as_deref(), "coverage", &drives.set, [(&args.json, "coverage.json")])?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let noise = noise_of(predictor.bundle())?;
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);
     let filter = CalibratedFilter::config_of(predictor.bundle().soil_filter_json.as_deref()).or_input()?;
@@ -66,7 +66,7 @@ pub fn calibrate(args: &EvaluateArgs) -> Result<(), Failure> {
     let drives = validation_drives(&args.data, "--calibrate-coverage", "the covariance is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
     check_own_vehicle(&bundle, &drives.root, "--calibrate-coverage")?;
-    let predictor = predictor_for(bundle.clone(), &drives.root)?;
+    let predictor = predictor_for(bundle.clone(), &drives.root, args.data.dt)?;
     let start = RolloutNoise::new(start_sd, &[]).start_covariance();
     let filter = CalibratedFilter::config_of(bundle.soil_filter_json.as_deref()).or_input()?;
     let mut filtered = adapt_all(&predictor, &drives.drives, &drives.maps, &filter, &|_| {}).or_input()?;

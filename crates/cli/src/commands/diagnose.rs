@@ -26,7 +26,7 @@ use crate::bundle_version::save_with_effects;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{check_model_step, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Hypotheses in the printed table.
@@ -116,7 +116,7 @@ struct Input {
 /// The drives of a set in a data root.
 fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
     let drives = read_drives(&args.data, false)?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let data_hash = drives.root.hash();
     Ok(Input { set: drives.set, drives: drives.drives, maps: drives.maps, data_hash, predictor, provenance })
@@ -124,7 +124,6 @@ fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
 
 /// Runs the command.
 pub fn run(args: &DiagnoseArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     args.window.check_horizon()?;
     args.inputs.check("what is diagnosed are predictions under commands")?;
     if args.make_reference { make_reference(args) } else { diagnose_set(args) }
@@ -138,7 +137,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let mut bundle = load_bundle(Some(&dir))?;
     check_own_vehicle(&bundle, &drives.root, "--make-reference")?;
     take_coupling(&mut bundle, drives.root.vehicle());
-    let predictor = predictor_for(bundle.clone(), &drives.root)?;
+    let predictor = predictor_for(bundle.clone(), &drives.root, args.data.dt)?;
     let progress = Progress::start("validation drives, as the model sees them", drives.drives.len());
     let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
@@ -194,11 +193,7 @@ fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure>
 fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
-    let drives = if args.recording.recording.is_empty() {
-        of_set(args)?
-    } else {
-        args.recording.input(&args.bundle, args.data.dt, args.reference)?
-    };
+    let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.reference)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
     args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
     let predictor = Arc::clone(&drives.predictor);
@@ -253,7 +248,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         bundle: shown.as_deref(),
         free_form_bundle: free_form_bundle.as_deref(),
         provenance: &drives.provenance,
-        dt_s: args.data.dt,
+        dt_s: predictor.bundle().normalization.dt_s,
         against: reference.into(),
     };
     summary(&report, &found);

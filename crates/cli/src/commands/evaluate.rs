@@ -17,9 +17,7 @@ use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
 use crate::progress::Progress;
-use crate::sources::{
-    Drives, check_model_step, load_bundle, load_bundle_for, predictor_for, read_drives, rounded, training_drives, worlds_of,
-};
+use crate::sources::{Drives, load_bundle, load_bundle_for, predictor_for, read_drives, rounded, training_drives, worlds_of};
 use crate::{interrupt, output};
 
 /// Options of `nesam evaluate`.
@@ -107,7 +105,6 @@ fn at_least_1000(text: &str) -> Result<usize, String> {
 /// Runs the command.
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     if args.coverage || args.calibrate_coverage {
-        check_model_step(args.data.dt)?;
         args.window.check_horizon()?;
         if args.inputs == InputsArg::Wheels {
             return Err(Failure::input("--inputs wheels: the covariance of a prediction is that of one under commands"));
@@ -232,9 +229,8 @@ impl Models {
         horizon: usize,
     ) -> Result<Self, Failure> {
         let predictor = if names.iter().any(|n| n.is_nesam()) {
-            check_model_step(args.data.dt)?;
             args.window.check_horizon()?;
-            let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+            let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
             Some(rounded(predictor, args.bf16, "--bf16")?)
         } else {
             None
@@ -298,7 +294,7 @@ fn trained_baselines(args: &EvaluateArgs, names: &[ModelName], drives: &Drives) 
     for folder in folders {
         let bundle = load_bundle(Some(&folder))?;
         if bundle.is_of(drives.root.vehicle()) {
-            predictors.push(rounded(predictor_for(bundle, &drives.root)?, args.bf16, "--bf16")?);
+            predictors.push(rounded(predictor_for(bundle, &drives.root, args.data.dt)?, args.bf16, "--bf16")?);
         }
     }
     Ok(predictors)
@@ -360,7 +356,7 @@ fn print_table(e: &Evaluation<'_>) {
             say!("{:<22}{cells}{interval}", model.name.as_str());
         }
     }
-    for model in e.models.iter().filter(|m| m.errors.not_finite > 0) {
-        say!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite);
+    for model in e.models.iter().filter(|m| m.errors.not_finite() > 0) {
+        say!("{}: {} windows gave a number that is not finite and count as standing still", model.name, model.errors.not_finite());
     }
 }

@@ -17,7 +17,7 @@ use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::say;
 use crate::progress::Progress;
-use crate::sources::{check_model_step, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{load_bundle_for, predictor_for, read_drives};
 
 /// Step of the model, ns.
 const STEP_NS: i64 = 100_000_000;
@@ -55,13 +55,12 @@ struct Pair<'a> {
 
 /// Runs the command.
 pub fn run(args: &FleetArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     if args.horizon == 0 || args.horizon > MAX_HORIZON {
         return Err(Failure::input(format!("--horizon {} is not 1 to {MAX_HORIZON}", args.horizon)));
     }
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let pairs = pairs_of(&drives.drives, &drives.maps);
     if pairs.is_empty() {
         return Err(Failure::input("no world of the set has two drives; a second vehicle needs one that drove before it"));

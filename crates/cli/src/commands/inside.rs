@@ -11,7 +11,7 @@ use crate::args::{BundleArgs, DataArgs};
 use crate::failure::Failure;
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{check_file, provenance, say, write_file};
-use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 
 /// Options of `nesam inside`.
 #[derive(Args, Debug)]
@@ -29,14 +29,13 @@ const STATE_NAMES: [&str; 12] = ["x", "y", "z", "roll", "pitch", "yaw", "vx", "v
 
 /// Runs the command.
 pub fn run(args: &InsideArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     args.json.iter().try_for_each(|file| check_file(file))?;
     exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, true)?;
     if drives.drives.iter().all(|d| d.truth.is_none()) {
         return Err(Failure::input(format!("set `{}` has no gt_ columns: there is nothing to compare the physics with", drives.set)));
     }
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let (comparison, residual) = look_inside(&predictor, &drives.drives, &drives.maps, &true_soils(&drives));
     say!("{:<28}{:>9}{:>12}{:>12}{:>12}{:>8}{:>8}", "quantity/class", "values", "true mean", "bias", "mean |err|", "corr.", "rank");
     let mut quantities = Map::new();

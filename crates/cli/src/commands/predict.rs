@@ -15,7 +15,7 @@ use crate::args::{BundleArgs, CommandsArgs, DataArgs, WindowArgs};
 use crate::failure::{Failure, OrFail};
 use crate::output;
 use crate::output::{note, say};
-use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives, rounded};
+use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives, rounded};
 
 /// Options of `nesam predict`.
 #[derive(Args, Debug)]
@@ -72,7 +72,6 @@ enum Format {
 
 /// Runs the command.
 pub fn run(args: &PredictArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     args.inputs.check("a prediction is made as the service makes it, under commands alone")?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
@@ -95,7 +94,7 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
             controls[bad].speed_m_s, controls[bad].second
         )));
     }
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let predictor = rounded(predictor, args.bf16, "--bf16")?;
     let map = drives.maps[0].as_ref();
     let rollout = rollout(args, &predictor, &window, &controls, map)?;

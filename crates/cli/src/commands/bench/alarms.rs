@@ -18,7 +18,7 @@ use crate::args::{BundleArgs, DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{check_file, provenance, say, write_file};
-use crate::sources::{check_model_step, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{load_bundle_for, predictor_for, read_drives, validation_drives};
 
 /// Options of `nesam bench alarms`.
 #[derive(Args, Debug)]
@@ -55,14 +55,13 @@ const HIDDEN: [(&str, Change); 14] = [
 
 /// Runs the command.
 pub(super) fn run(args: &AlarmBench) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     args.json.iter().try_for_each(|file| check_file(file))?;
     exit_on_ctrl_c("nothing was written");
     let drives = match args.data.split {
         SplitArg::Train => validation_drives(&args.data, "bench alarms", "alarms are counted")?,
         _ => read_drives(&args.data, false)?,
     };
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     if predictor.bundle().soil_filter_json.is_none() {
         return Err(Failure::input(
             "sessions of this bundle are not watched: it has no calibrated soil filter (`nesam adapt --calibrate`)",

@@ -14,7 +14,7 @@ use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{check_file, provenance, say, write_file};
 use crate::progress::Progress;
-use crate::sources::{check_model_step, load_bundle_for, predictor_for, validation_drives};
+use crate::sources::{load_bundle_for, predictor_for, validation_drives};
 
 /// Rollouts by which methods are compared.
 const SCORING: Scoring = Scoring { horizon: 32, history: 32, resamples: 10, seed: 1 };
@@ -48,11 +48,10 @@ pub(super) struct DiscoveryBench {
 
 /// Runs the command.
 pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     args.json.iter().try_for_each(|file| check_file(file))?;
     exit_on_ctrl_c("nothing was written");
     let drives = validation_drives(&args.data, "bench discovery", "effects are hidden")?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let judge = Judge::of(predictor.bundle()).or_input()?;
     let known = judge.drives();
     if drives.drives.iter().any(|d| !known.contains(&d.id)) || drives.drives.len() != known.len() {

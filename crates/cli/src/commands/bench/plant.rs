@@ -108,8 +108,9 @@ pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
     let doses = chosen(args)?;
     let labels = drawn(args, &doses)?;
     exit_on_ctrl_c("drives that were written are in the folder, figures were not");
-    let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &root)?, &root)?;
+    let data = DataArgs::of(args.data.clone());
+    let (root, path) = open_root(&data)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &root)?, &root, data.dt)?;
     let out = output::out_dir(args.out.as_deref(), "bench", "plant")?;
     copy_vehicle_and_worlds(&path, &out, &args.worlds)?;
     write_sets(args, &labels, &path, &out)?;

@@ -24,7 +24,7 @@ pub fn close_the_loop(bundle: &ModelBundle, played: &Drives, data: &DataArgs, sh
         return Ok(Vec::new());
     }
     say!("\ndoes the model lack an effect? each drive predicted with what the other drives of its set taught");
-    let predictor = predictor_for(bundle.clone(), &played.root)?;
+    let predictor = predictor_for(bundle.clone(), &played.root, data.dt)?;
     let root = Some(played.root.path().to_path_buf());
     let every = DataArgs { data: root, split: SplitArg::All, trajectories: None, ..data.clone() };
     sets.into_iter().map(|set| of_set(&predictor, DataArgs { set: Some(set), ..every.clone() }, show)).collect()

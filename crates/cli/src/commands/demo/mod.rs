@@ -73,13 +73,13 @@ fn positive_seconds(text: &str) -> Result<f64, String> {
 
 /// Runs the command.
 pub fn run(args: &DemoArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
         data.trajectories = Some(vec![id.clone()]);
     }
     let drives = read_drives(&data, false)?;
     let bundle = load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?;
+    check_model_step(&bundle, args.data.dt)?;
     let stage = stage_of(args, &drives)?;
     if !bundle.is_of(drives.root.vehicle()) {
         return Err(Failure::input(format!(

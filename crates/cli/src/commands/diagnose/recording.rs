@@ -25,7 +25,7 @@ const PIECES_OF_THE_MODEL: usize = 10;
 pub struct RecordingArgs {
     /// Diagnose what a server recorded of a session instead of a set: files of recordings, or their folder; of several it is the newest that has the
     /// session in the window. Without --bundle it is the recorded bundle, found by its hash in deploy/bundles
-    #[arg(long, value_name = "PATH", num_args = 1.., requires = "session", conflicts_with_all = ["data", "set", "trajectories", "vehicle"])]
+    #[arg(long, value_name = "PATH", num_args = 1.., requires = "session", conflicts_with_all = ["data", "set", "trajectories", "vehicle", "dt"])]
     pub recording: Vec<PathBuf>,
     /// Session to diagnose
     #[arg(long, value_name = "ID", requires = "recording")]
@@ -43,8 +43,8 @@ pub struct RecordingArgs {
 }
 
 impl RecordingArgs {
-    /// The pieces of the window with the map of the session.
-    pub fn input(&self, bundle: &BundleArgs, dt_s: f64, asked: Option<ReferenceArg>) -> Result<Input, Failure> {
+    /// The pieces of the window in steps of the model, with the map of the session.
+    pub fn input(&self, bundle: &BundleArgs, asked: Option<ReferenceArg>) -> Result<Input, Failure> {
         let session = self.session.as_deref().unwrap_or_default();
         let recordings = Recording::open_all(&self.recording).or_input()?;
         let (header, window) = self.newest_with(session, recordings)?;
@@ -54,7 +54,7 @@ impl RecordingArgs {
             ReferenceArg::Physics => PIECES_OF_THE_MODEL,
         });
         let reports: Vec<Report> = window.measurements.iter().map(report).collect();
-        let drives = drives_of_reports(session, &reports, dt_s, pieces);
+        let drives = drives_of_reports(session, &reports, bundle.normalization.dt_s, pieces);
         if drives.is_empty() {
             return Err(Failure::input(format!("session `{session}` has no 4 s of measurements without a pause in this window")));
         }

@@ -20,7 +20,7 @@ use crate::args::{BundleArgs, DataArgs};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{self, say};
-use crate::sources::{load_bundle_for, on_vehicle_of, open_root};
+use crate::sources::{check_model_step, load_bundle_for, on_vehicle_of, open_root};
 
 use laps::{Identity, Kept, drive_all};
 use stage::{Bundles, Stage, kinematic_of};
@@ -172,8 +172,13 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
         }
     });
     let effects = HiddenEffects::parse(args.effect.iter().map(String::as_str)).or_input()?;
-    let (root, path) = open_root(&DataArgs::of(args.data.clone()))?;
-    let load = |dir: Option<&Path>| load_bundle_for(dir, &root).map(|bundle| on_vehicle_of(bundle, &root));
+    let data = DataArgs::of(args.data.clone());
+    let (root, path) = open_root(&data)?;
+    let load = |dir: Option<&Path>| {
+        let bundle = load_bundle_for(dir, &root)?;
+        check_model_step(&bundle, data.dt)?;
+        Ok::<_, Failure>(on_vehicle_of(bundle, &root))
+    };
     let bundle = load(args.bundle.bundle.as_deref())?;
     let diagnosed = args.diagnosed.as_deref().map(|dir| load(Some(dir))).transpose()?;
     check_speed(args.speed, &bundle.vehicle)?;

@@ -16,11 +16,10 @@ use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::{self, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_model_step, load_bundle_for, predictor_for, read_drives};
+use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 
 /// Runs the command on recorded drives.
 pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
-    check_model_step(args.data.dt)?;
     let specs = args.degrade.iter().map(|text| Degradation::parse(text).or_input()).collect::<Result<Vec<_>, _>>()?;
     interrupt::exit_on_ctrl_c("nothing was written");
     let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
@@ -34,7 +33,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
             format!("--horizon {horizon} does not fit: the model knows {MAX_HORIZON} steps, the longest drive has {longest} samples");
         return Err(Failure::input(reason));
     }
-    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root)?;
+    let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let setup = Setup { predictor: Arc::clone(&predictor), horizon, truth };
     let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, 1);
     let clean = passages(&setup, &drives, &asked, &Degradation::default(), args.seed)?;

@@ -40,7 +40,7 @@ impl Dimension {
     /// Reads a unit such as `N s^2/m^2`, `kg/s` or `1/m`: factors separated by blanks or `*`; what follows a `/` up to the next one is divided by.
     ///
     /// # Errors
-    /// The part that is no unit, and the units that there are.
+    /// The part that is no unit, and the units that there are; or that the exponents of a long product are out of range.
     pub fn parse(unit: &str) -> Result<Self, String> {
         let mut sum = Self::NONE;
         for (i, part) in unit.split('/').enumerate() {
@@ -60,7 +60,8 @@ impl Dimension {
                     ));
                 };
                 for (total, e) in sum.0.iter_mut().zip(exponents) {
-                    *total += 2 * sign * exponent * e;
+                    let out_of_range = || format!("has the unit `{unit}`, which is out of range: its exponents go beyond 63");
+                    *total = total.checked_add(2 * sign * exponent * e).ok_or_else(out_of_range)?;
                 }
             }
         }
@@ -127,6 +128,18 @@ mod tests {
         assert_eq!(Dimension::parse("N m"), Ok(Dimension::MOMENT));
         assert_eq!(Dimension::parse("m/s").map(|d| d.power(2).root()), Ok(Some(Dimension::SPEED)));
         assert_eq!(Dimension::FORCE.to_string(), "m kg s^-2");
+    }
+
+    /// Sums of doubled exponents that a byte holds are taken, one more factor is an error. `W` has s^-3, in both signs.
+    #[test]
+    fn regress_units_whose_exponents_overflow_are_refused() {
+        let product = |factor: &str, n: usize| vec![factor; n].join(" ");
+        // 24 a factor: five make 120, six 144.
+        for (factor, sign) in [("W^4", ""), ("W^-4", ""), ("W^4", "1/"), ("W^-4", "1/")] {
+            assert!(Dimension::parse(&format!("{sign}{}", product(factor, 5))).is_ok(), "{sign}{factor}");
+            let error = Dimension::parse(&format!("{sign}{}", product(factor, 6))).unwrap_err();
+            assert!(error.contains("out of range"), "{sign}{factor}: {error}");
+        }
     }
 
     #[test]

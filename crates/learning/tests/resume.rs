@@ -1,0 +1,87 @@
+//! Goal: a training that was interrupted ends where it would have ended. Method: a few steps at a high rate, which soon makes
+//! the model worse, so that a validation between two epochs would choose other weights; in one go, and interrupted after each step and resumed.
+
+mod common;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use common::{drive, measured_scales, single_cells, truck};
+use nesam_learning::initial::initial_weights;
+use nesam_learning::{Objective, Trained, TrainingError, TrainingPlan, TrainingSet, train};
+use nesam_model::reference::ComputeDevice;
+use nesam_model::{Variant, Weights};
+use nesam_physics::step::StepModel;
+
+const HORIZON: usize = 4;
+/// Steps of the runs, with an epoch in the middle that ends after four.
+const STEPS: usize = 6;
+const EPOCH: usize = 4;
+
+/// `steps` steps with checkpoints in a folder, with the weights they began from; `stop` = interrupted after every step.
+fn run(folder: &Path, steps: usize, resume: bool, stop: bool) -> (Result<Trained, TrainingError>, Weights) {
+    let learned_from = drive(None, 60);
+    let scales = measured_scales(&learned_from);
+    let weights = initial_weights(7, &scales);
+    let set = TrainingSet {
+        train: vec![&learned_from],
+        validation: vec![&learned_from],
+        model: Arc::new(StepModel::new(&truck(), scales.dt_s, scales.substeps)),
+        scales: &scales,
+        pooling: single_cells(),
+    };
+    let plan = TrainingPlan {
+        steps,
+        batch: 2,
+        rate: 0.01,
+        horizon: HORIZON,
+        seed: 1,
+        epoch: EPOCH,
+        device: ComputeDevice::Cpu,
+        shards: 1,
+        dropout: 0.0,
+        decay: 0.0,
+        objective: Objective { variant: Variant::Full, sustained: 0.0, soil_prior: 0.0 },
+        folder: folder.into(),
+    };
+    (train(&set, &weights, &plan, resume, &|| stop, |_, _, _| {}, |_| {}), weights)
+}
+
+/// Runs to the end, interrupted after each of the steps.
+fn in_pieces(folder: &Path) -> Trained {
+    for step in 1..=STEPS {
+        match run(folder, STEPS, step > 1, true).0 {
+            Err(TrainingError::Interrupted(at)) => assert_eq!(at, step),
+            other => panic!("step {step} was to be interrupted: {:?}", other.map(|trained| trained.steps)),
+        }
+    }
+    run(folder, STEPS, true, false).0.expect("the run is complete")
+}
+
+#[test]
+fn regress_a_training_that_was_interrupted_gives_the_weights_of_one_that_was_not() {
+    let [folder, other] = [(); 2].map(|()| tempfile::tempdir().expect("a folder"));
+    let whole = run(folder.path(), STEPS, false, false).0.expect("a run in one go");
+    let resumed = in_pieces(other.path());
+    assert_eq!(whole.curve.iter().map(|line| line.step).collect::<Vec<_>>(), [EPOCH, STEPS]);
+    assert_eq!((resumed.steps, resumed.curve.len()), (whole.steps, whole.curve.len()));
+    for (a, b) in whole.curve.iter().zip(&resumed.curve) {
+        assert_eq!((a.step, a.loss.to_bits(), a.diverged), (b.step, b.loss.to_bits(), b.diverged), "{a:?} {b:?}");
+        // A number that went through JSON may lack its last bit.
+        for (a, b) in a.validation.iter().zip(b.validation) {
+            assert!((a - b).abs() <= 1e-12 * a.abs() || (a.is_nan() && b.is_nan()), "{a} {b}");
+        }
+        assert!(b.step_s.is_finite() && b.step_s > 0.0, "{b:?}");
+    }
+    assert!(resumed.weights == whole.weights, "the weights differ");
+}
+
+#[test]
+fn regress_an_interruption_before_the_first_epoch_leaves_what_was_trained() {
+    let folder = tempfile::tempdir().expect("a folder");
+    assert!(matches!(run(folder.path(), STEPS, false, true).0, Err(TrainingError::Interrupted(1))));
+    let (ended, weights) = run(folder.path(), 1, true, false);
+    let ended = ended.expect("a plan of no further steps");
+    assert_eq!((ended.steps, ended.curve.len()), (1, 0));
+    assert!(ended.weights != weights, "the running mean after the step");
+}
