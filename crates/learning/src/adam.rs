@@ -1,6 +1,6 @@
 //! Adam (Kingma & Ba 2015) with moments that can be saved, and a bound on the norm of the gradient.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 
 use candle_core::{Result, Tensor, Var};
 use nesam_model::Weights;
@@ -37,7 +37,9 @@ impl Adam {
         decay: f32,
     ) -> Result<f32> {
         self.steps += 1;
-        let norm = gradients.values().flatten().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt() as f32;
+        // In the order of the names: that of a hash map is another in every run, and so is the last bit of its sum.
+        let ordered: BTreeMap<&String, &Vec<f32>> = gradients.iter().collect();
+        let norm = ordered.into_values().flatten().map(|g| f64::from(*g).powi(2)).sum::<f64>().sqrt() as f32;
         if !norm.is_finite() {
             return Ok(norm); // a bad batch must not destroy the weights; the caller reports it
         }
