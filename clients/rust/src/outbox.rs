@@ -1,71 +1,138 @@
 //! Measurements that a vehicle keeps until the service has them on stable storage.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 
 use nesam_proto::v1;
+use v1::measurement_answer::Outcome;
 
-/// Where a measurement stands.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Progress {
-    /// Not sent, or sent over a connection that broke.
-    Unsent,
-    /// Sent, not answered; counted in the order of sending, which is that of the answers.
-    Sent(u64),
-    /// Answered: its place among those that the session has accepted.
-    Received(u64),
-}
+use crate::error::ClientError;
+
+/// Measurements that an outbox keeps at most, unless it is told otherwise; as in the other clients.
+const PENDING_MAX: usize = 65_536;
 
 /// Keeps the measurements of one session until they are durable, so that a crash of the server loses none.
 ///
 /// Send what [`Outbox::next_unsent`] gives over one stream at a time, hand every answer to [`Outbox::answered`] in order, and call [`Outbox::reconnected`]
 /// when a new stream is opened: it sends again what is not known to be durable, and the service drops what it has.
-#[derive(Clone, Debug, Default)]
+///
+/// Several measurements may be on their way at once. Where the service has no room for one of them (RESOURCE_EXHAUSTED, UNAVAILABLE), those that were sent
+/// after it may have been accepted before it is sent again, and further than the reorder window (`limits.reorder_window_s`) behind them it is not taken any
+/// more. So that no more overtake it, it is sent again first, and nothing after it before it is answered; pause before it is. One that comes too late all the
+/// same is given back by [`Outbox::answered`]. Who must lose none sends one measurement at a time: the next one after the answer to the one before.
+#[derive(Clone, Debug)]
 pub struct Outbox {
-    kept: VecDeque<(v1::Measurement, Progress)>,
-    /// How often a measurement was sent.
-    sent: u64,
+    pending_max: usize,
+    /// What is not known to be durable, by the order of [`Outbox::push`].
+    kept: BTreeMap<u64, v1::Measurement>,
+    /// Those of `kept` that were not sent, or sent over a connection that broke.
+    unsent: BTreeSet<u64>,
+    /// Those of `kept` that were sent and not answered, in the order of sending, which is that of the answers.
+    on_the_way: VecDeque<u64>,
+    /// Those of `kept` that were accepted: place in the session, number in `kept`.
+    received: BTreeSet<(u64, u64)>,
+    /// Those of `kept` that the service had no room for and has not answered otherwise since.
+    no_room: BTreeSet<u64>,
+    /// How many were pushed.
+    pushed: u64,
     /// Who counts the places.
     run: u64,
 }
 
+impl Default for Outbox {
+    /// Keeps 65 536 measurements at most. A store commits at least every second (`store.interval_s`), so this many are more than ten minutes at 100 Hz; without
+    /// a store nothing becomes durable, and they are all that can be sent.
+    fn default() -> Self {
+        Self::with_pending_max(PENDING_MAX)
+    }
+}
+
 impl Outbox {
-    /// Takes a new measurement.
-    pub fn push(&mut self, measurement: v1::Measurement) {
-        self.kept.push_back((measurement, Progress::Unsent));
+    /// Keeps `pending_max` measurements at most; [`Outbox::push`] refuses more.
+    pub fn with_pending_max(pending_max: usize) -> Self {
+        Self {
+            pending_max,
+            kept: BTreeMap::new(),
+            unsent: BTreeSet::new(),
+            on_the_way: VecDeque::new(),
+            received: BTreeSet::new(),
+            no_room: BTreeSet::new(),
+            pushed: 0,
+            run: 0,
+        }
     }
 
-    /// The next measurement to send; it counts as sent from now on.
+    /// Takes a new measurement.
+    ///
+    /// # Errors
+    /// `ClientError::Refused` with RESOURCE_EXHAUSTED of `pending_max` when as many are not known to be durable; this one is not kept. Hand over answers, or a
+    /// `durable_place` ([`Outbox::durable`]), first.
+    pub fn push(&mut self, measurement: v1::Measurement) -> Result<(), ClientError> {
+        if self.kept.len() >= self.pending_max {
+            return Err(ClientError::Refused {
+                code: tonic::Code::ResourceExhausted,
+                field: "pending_max".into(),
+                message: format!("{} measurements are not known to be durable; wait until some are", self.kept.len()),
+                retry_after: None,
+            });
+        }
+        self.pushed += 1;
+        self.kept.insert(self.pushed, measurement);
+        self.unsent.insert(self.pushed);
+        Ok(())
+    }
+
+    /// The next measurement to send, oldest first; it counts as sent from now on. `None` when everything is sent, and, while one is kept that the service had no
+    /// room for, until that one and those before it are answered.
     pub fn next_unsent(&mut self) -> Option<v1::Measurement> {
-        let (measurement, progress) = self.kept.iter_mut().find(|(_, progress)| *progress == Progress::Unsent)?;
-        self.sent += 1;
-        *progress = Progress::Sent(self.sent);
-        Some(measurement.clone())
+        let number = *self.unsent.first()?;
+        let awaited = |sent: &u64| *sent < number || self.no_room.contains(sent);
+        if !self.no_room.is_empty() && self.on_the_way.iter().any(awaited) {
+            return None;
+        }
+        self.unsent.remove(&number);
+        self.on_the_way.push_back(number);
+        self.kept.get(&number).cloned()
     }
 
     /// Takes the answer to the measurement that was sent first of those not answered. A refused measurement is not kept, but for one that the service had no
     /// room for: that is sent again.
-    pub fn answered(&mut self, answer: &v1::MeasurementAnswer) {
+    ///
+    /// Gives back a measurement that is lost: the service had no room for it, has accepted later ones since, and answers TOO_OLD now. `None` otherwise, also
+    /// for other refusals, which the answer tells.
+    pub fn answered(&mut self, answer: &v1::MeasurementAnswer) -> Option<v1::Measurement> {
         // A refusal need not tell who counts.
         if answer.place != 0 {
             self.counted_by(answer.run);
         }
-        let sent = self.kept.iter().enumerate().filter_map(|(at, (_, progress))| match progress {
-            Progress::Sent(number) => Some((*number, at)),
-            _ => None,
-        });
-        if let Some((_, at)) = sent.min() {
-            match &answer.outcome {
-                Some(v1::measurement_answer::Outcome::Rejected(rejected))
-                    if [tonic::Code::ResourceExhausted, tonic::Code::Unavailable].contains(&rejected.code.into()) =>
-                {
-                    self.kept[at].1 = Progress::Unsent;
-                }
-                _ if answer.place == 0 => drop(self.kept.remove(at)),
-                _ => self.kept[at].1 = Progress::Received(answer.place),
-            }
-        }
+        let lost = match self.on_the_way.pop_front() {
+            Some(number) => self.settle(number, answer),
+            None => None,
+        };
         if answer.run == self.run {
             self.durable(answer.run, answer.durable_place);
+        }
+        lost
+    }
+
+    /// Notes what a measurement was answered; gives it back where it is lost.
+    fn settle(&mut self, number: u64, answer: &v1::MeasurementAnswer) -> Option<v1::Measurement> {
+        match &answer.outcome {
+            Some(Outcome::Rejected(rejected))
+                if [tonic::Code::ResourceExhausted, tonic::Code::Unavailable].contains(&rejected.code.into()) =>
+            {
+                self.no_room.insert(number);
+                self.unsent.insert(number);
+                None
+            }
+            outcome if answer.place == 0 => {
+                let overtaken = self.no_room.remove(&number) && matches!(outcome, Some(Outcome::TooOld(_)));
+                self.kept.remove(&number).filter(|_| overtaken)
+            }
+            _ => {
+                self.no_room.remove(&number);
+                self.received.insert((answer.place, number));
+                None
+            }
         }
     }
 
@@ -73,20 +140,27 @@ impl Outbox {
     /// what it answered is sent again.
     pub fn durable(&mut self, run: u64, place: u64) {
         self.counted_by(run);
-        self.kept.retain(|(_, progress)| !matches!(progress, Progress::Received(received) if *received <= place));
+        while let Some((received, number)) = self.received.first().copied()
+            && received <= place
+        {
+            self.received.pop_first();
+            self.kept.remove(&number);
+        }
     }
 
     fn counted_by(&mut self, run: u64) {
         if run != self.run {
             self.run = run;
-            let received = self.kept.iter_mut().filter(|(_, progress)| matches!(progress, Progress::Received(_)));
-            received.for_each(|(_, progress)| *progress = Progress::Unsent);
+            let received = std::mem::take(&mut self.received);
+            self.unsent.extend(received.into_iter().map(|(_, number)| number));
         }
     }
 
     /// A new stream begins, to the same run of the server or another one: everything kept is sent again.
     pub fn reconnected(&mut self) {
-        self.kept.iter_mut().for_each(|(_, progress)| *progress = Progress::Unsent);
+        self.on_the_way.clear();
+        self.received.clear();
+        self.unsent = self.kept.keys().copied().collect();
     }
 
     /// Measurements that are not known to be durable.
@@ -111,13 +185,17 @@ mod tests {
 
     fn holding(measurements: u64) -> Outbox {
         let mut outbox = Outbox::default();
-        (1..=measurements).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }));
+        (1..=measurements).for_each(|sequence| outbox.push(v1::Measurement { sequence, ..Default::default() }).unwrap());
         outbox
     }
 
     fn no_room() -> v1::MeasurementAnswer {
         let rejected = v1::Rejected { code: tonic::Code::ResourceExhausted.into(), ..Default::default() };
-        v1::MeasurementAnswer { outcome: Some(v1::measurement_answer::Outcome::Rejected(rejected)), ..Default::default() }
+        v1::MeasurementAnswer { outcome: Some(Outcome::Rejected(rejected)), ..Default::default() }
+    }
+
+    fn too_old() -> v1::MeasurementAnswer {
+        v1::MeasurementAnswer { outcome: Some(Outcome::TooOld(v1::TooOld::default())), ..Default::default() }
     }
 
     fn sequences(outbox: &mut Outbox) -> Vec<u64> {
@@ -136,11 +214,12 @@ mod tests {
         outbox.answered(&no_room());
         assert_eq!(sequences(&mut outbox), [4]);
         outbox.reconnected();
-        assert_eq!(sequences(&mut outbox), [2, 4]);
+        assert_eq!(sequences(&mut outbox), [2], "4 had no room and waits for the answer to 2");
         // A number of another run of the server says nothing before the measurement is answered again.
         outbox.durable(0, 7);
         assert_eq!(outbox.len(), 2);
         outbox.answered(&answer(7, 7));
+        assert_eq!(sequences(&mut outbox), [4]);
         outbox.answered(&answer(8, 7));
         outbox.durable(0, 8);
         assert!(outbox.is_empty());
@@ -183,5 +262,67 @@ mod tests {
         assert!(sequences(&mut outbox).is_empty() && outbox.len() == 1, "1 has its place, 2 was refused for good");
         outbox.durable(5, 1);
         assert!(outbox.is_empty());
+    }
+
+    /// Goal: nothing overtakes a measurement that there was no room for, but what was on its way. Method: the service has no room for the first two of three,
+    /// new ones come meanwhile; what is sent is written down after every answer.
+    #[test]
+    fn analytic_what_had_no_room_goes_first_and_alone() {
+        let mut outbox = holding(3);
+        assert_eq!(sequences(&mut outbox), [1, 2, 3]);
+        outbox.answered(&no_room());
+        outbox.push(v1::Measurement { sequence: 4, ..Default::default() }).unwrap();
+        assert_eq!(sequences(&mut outbox), [1], "4 waits");
+        outbox.answered(&no_room());
+        assert!(sequences(&mut outbox).is_empty(), "2 waits for the answer to 1");
+        assert!(outbox.answered(&answer(1, 0)).is_none(), "3 is accepted");
+        assert!(sequences(&mut outbox).is_empty());
+        // Still no room for 1: once more, alone.
+        assert!(outbox.answered(&no_room()).is_none());
+        assert_eq!(sequences(&mut outbox), [1]);
+        assert!(outbox.answered(&answer(2, 0)).is_none(), "put in its place within the reorder window");
+        assert_eq!(sequences(&mut outbox), [2]);
+        assert!(outbox.answered(&answer(3, 0)).is_none());
+        outbox.push(v1::Measurement { sequence: 5, ..Default::default() }).unwrap();
+        assert_eq!(sequences(&mut outbox), [4, 5], "there is room again");
+        outbox.answered(&answer(4, 0));
+        outbox.answered(&answer(5, 5));
+        assert!(outbox.is_empty());
+    }
+
+    /// Goal: no measurement is lost without a word. Method: one that had no room is TOO_OLD after later ones were accepted, also over a new connection; one that
+    /// was never refused for room is TOO_OLD because the service has it.
+    #[test]
+    fn regress_a_measurement_that_was_overtaken_is_given_back() {
+        for reconnects in [false, true] {
+            let mut outbox = holding(2);
+            assert_eq!(sequences(&mut outbox), [1, 2]);
+            outbox.answered(&no_room());
+            assert!(outbox.answered(&answer(1, 1)).is_none());
+            if reconnects {
+                outbox.reconnected();
+            }
+            assert_eq!(sequences(&mut outbox), [1]);
+            assert_eq!(outbox.answered(&too_old()).map(|lost| lost.sequence), Some(1), "reconnects: {reconnects}");
+            assert!(outbox.is_empty());
+        }
+        let mut outbox = holding(1);
+        assert_eq!(sequences(&mut outbox), [1]);
+        assert!(outbox.answered(&too_old()).is_none() && outbox.is_empty());
+    }
+
+    /// Goal: a server that keeps no store does not fill the memory of the vehicle. Method: one more than is kept; one becomes durable.
+    #[test]
+    fn analytic_no_more_are_kept_than_the_limit() {
+        let mut outbox = Outbox::with_pending_max(2);
+        let push = |outbox: &mut Outbox, sequence: u64| outbox.push(v1::Measurement { sequence, ..Default::default() });
+        push(&mut outbox, 1).unwrap();
+        push(&mut outbox, 2).unwrap();
+        let refused = push(&mut outbox, 3).unwrap_err();
+        assert_eq!((refused.code(), refused.field()), (Some(tonic::Code::ResourceExhausted), "pending_max"));
+        assert_eq!(sequences(&mut outbox), [1, 2], "the refused one is not kept");
+        outbox.answered(&answer(1, 1));
+        push(&mut outbox, 3).unwrap();
+        assert_eq!((sequences(&mut outbox), outbox.len()), (vec![3], 2));
     }
 }

@@ -7,7 +7,7 @@ use bytes::Bytes;
 use nesam_proto::v1;
 use prost::Message as _;
 use zenoh::bytes::ZBytes;
-use zenoh::handlers::FifoChannelHandler;
+use zenoh::handlers::{RingChannel, RingChannelHandler};
 use zenoh::liveliness::LivelinessToken;
 use zenoh::pubsub::Subscriber;
 use zenoh::qos::CongestionControl;
@@ -17,13 +17,18 @@ use crate::error::ClientError;
 use crate::prediction::{Candidates, Prediction};
 use crate::tls::Tls;
 
+/// Answers that wait unread at most: more than five seconds at 200 Hz.
+const UNREAD_MAX: usize = 1024;
+
 /// A vehicle in a Zenoh network. Needs a multi-thread tokio runtime.
+///
+/// Answers to measurements need not be read. Where more than 1024 are unread, the oldest of them go: who has to count them reads them as they come.
 #[derive(Debug)]
 pub struct ZenohVehicle {
     session: zenoh::Session,
     measurement_key: String,
     predict_key: String,
-    answers: Subscriber<FifoChannelHandler<Sample>>,
+    answers: Subscriber<RingChannelHandler<Sample>>,
     /// Tells the network that this vehicle is there; goes with it.
     _alive: LivelinessToken,
 }
@@ -103,7 +108,8 @@ impl ZenohVehicle {
     async fn join(config: zenoh::Config, fleet: &str, vehicle: &str) -> Result<Self, ClientError> {
         let session = zenoh::open(config).await.map_err(failed)?;
         let key = |topic: &str| format!("nesam/v1/{fleet}/{vehicle}/{topic}");
-        let answers = session.declare_subscriber(key("status")).await.map_err(failed)?;
+        // A channel that makes Zenoh's thread wait for a reader would hold up the replies to predictions too.
+        let answers = session.declare_subscriber(key("status")).with(RingChannel::new(UNREAD_MAX)).await.map_err(failed)?;
         let alive = session.liveliness().declare_token(key("alive")).await.map_err(failed)?;
         Ok(Self { session, measurement_key: key("measurement"), predict_key: key("predict"), answers, _alive: alive })
     }
@@ -125,7 +131,8 @@ impl ZenohVehicle {
         put.await.map_err(failed)
     }
 
-    /// The next answer to a measurement of this vehicle; `None` after `timeout`.
+    /// The next answer to a measurement of this vehicle, the oldest of the last 1024 that are unread; `None` after `timeout`. An answer tells the `sequence` of
+    /// its measurement, by which a reader sees that some are missing.
     ///
     /// # Errors
     /// `ClientError::Protocol` when the payload is no answer.

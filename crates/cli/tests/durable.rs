@@ -99,7 +99,7 @@ async fn send(client: &mut Client, outbox: &mut Outbox, stop: usize) -> u64 {
         assert!(["APPLIED", "GATED", "DUPLICATE"].contains(&outcome_label(&answer)), "{answer:?}");
         assert!(answer.durable_place >= durable, "{answer:?}");
         durable = answer.durable_place;
-        outbox.answered(&answer);
+        assert_eq!(outbox.answered(&answer), None, "a measurement is lost");
         (answered, on_the_way) = (answered + 1, on_the_way - 1);
     }
     durable
@@ -146,7 +146,7 @@ async fn service_a_killed_server_goes_on_bit_for_bit() {
         outbox.reconnected();
         let again = outbox.len();
         resent += again;
-        (sent..until).for_each(|i| outbox.push(recorded.sample(i)));
+        (sent..until).for_each(|i| outbox.push(recorded.sample(i)).unwrap());
         // Without a pause before the kill, so that measurements are on their way and commits in the making.
         let last = until == SENT;
         durable = send(&mut client, &mut outbox, if last { usize::MAX } else { until - sent + again - IN_FLIGHT.min(until - sent) }).await;

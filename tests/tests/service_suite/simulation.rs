@@ -254,7 +254,7 @@ impl Vehicle {
         loop {
             let driven = self.begun.elapsed().as_nanos() as usize / STEP_NS as usize;
             while self.pushed <= driven.min(self.scene.last) {
-                self.outbox.push(sample(self.session, &self.scene.recorded.drive, self.pushed));
+                self.outbox.push(sample(self.session, &self.scene.recorded.drive, self.pushed))?;
                 self.pushed += 1;
             }
             let (mut sent, newest) = (0, self.owners.newest(self.session));
