@@ -8,6 +8,7 @@ from typing import Deque, List, Tuple
 import grpc
 
 from . import _calls as calls
+from . import _messages as m
 from . import _types as t
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
 
@@ -57,12 +58,14 @@ class DurableStream:
         """Sends one measurement and awaits its answer, over as many connections as it takes.
 
         Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises
-        Overloaded of `pending_max` when so many are kept: this one is not, `flush` first.
+        Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, which is not kept.
         """
         kept = self._kept()
         if kept >= self._pending_max:
             reason = f"{kept} measurements are not known to be durable; flush them first"
             raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
+        # One that cannot be sent would hold up all that come after it.
+        m.measurement_message(measurement)
         self._waiting.append(measurement)
         return self._deliver()
 

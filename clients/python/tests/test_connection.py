@@ -204,6 +204,14 @@ def test_service_a_session_at_another_run_is_sent_everything_over_a_new_stream()
         assert heard == [[1, 2], [1, 2]] and not stream.pending
 
 
+def test_service_what_cannot_be_sent_holds_up_nothing():
+    with counting([[(5, 1)]], (5, 1)) as (client, heard), client.durable_stream("truck") as stream:
+        with pytest.raises(ValueError, match="state"):
+            stream.send(nesam.Measurement("truck", 0, np.zeros(6), (1.0, 0.0)))
+        assert not stream.pending
+        assert stream.send(next(straight("truck", 1))).outcome == "APPLIED" and heard == [[1]]
+
+
 def test_service_a_slow_vehicle_is_not_a_silent_service():
     def slowly():
         for measurement in straight("truck", 4):
