@@ -121,6 +121,10 @@ class DurableStream:
                 if time.monotonic() >= until:
                     raise Unavailable(error.code, error.field, error.message) from error
                 time.sleep(self._pause_s)
+            except BaseException:
+                # Interrupted before its answer, which must not be taken for that of the next measurement.
+                self.close()
+                raise
 
     def _attempt(self, end: float) -> t.Answer:
         """The same over one connection, each measurement after the answer to the one before."""

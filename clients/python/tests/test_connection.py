@@ -2,6 +2,7 @@
 look at metadata, answer much, late or never."""
 
 import asyncio
+import signal
 import time
 from concurrent import futures
 from contextlib import contextmanager
@@ -210,6 +211,35 @@ def test_service_what_cannot_be_sent_holds_up_nothing():
             stream.send(nesam.Measurement("truck", 0, np.zeros(6), (1.0, 0.0)))
         assert not stream.pending
         assert stream.send(next(straight("truck", 1))).outcome == "APPLIED" and heard == [[1]]
+
+
+def test_service_an_interrupted_send_shifts_no_answers():
+    """Method: a signal whose handler raises, as Ctrl-C does, while the service takes its time with the first answer."""
+    heard = []
+
+    def slow_at_first(requests, _):
+        here = []
+        heard.append(here)
+        for place, request in enumerate(requests, 1):
+            here.append(request.sequence)
+            if len(heard) == 1:
+                time.sleep(0.5)
+            yield measurements_pb2.MeasurementAnswer(sequence=request.sequence, place=place, run=5, applied=measurements_pb2.Applied())
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    first, second = straight("truck", 2)
+    with listening(measurements(slow_at_first)) as address, nesam.Client(address) as client, client.durable_stream("truck") as stream:
+        before = signal.signal(signal.SIGALRM, interrupt)
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0.2)
+            with pytest.raises(KeyboardInterrupt):
+                stream.send(first)
+        finally:
+            signal.signal(signal.SIGALRM, before)
+        assert stream.pending == [first]
+        assert stream.send(second).sequence == 2 and heard == [[1], [1, 2]] and stream.pending == [first, second]
 
 
 def test_service_a_slow_vehicle_is_not_a_silent_service():
