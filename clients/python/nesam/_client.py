@@ -224,13 +224,14 @@ class Client:
         """An open stream for a vehicle that reports at its own pace; use it in a `with` block."""
         return MeasurementStream(self)
 
-    def durable_stream(self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2) -> DurableStream:
+    def durable_stream(self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2, pending_max: int = 65536) -> DurableStream:
         """A stream that keeps measurements until the service has them on stable storage, and sends them again after a crash of the server.
 
-        reconnect_s: longest time without the service before `send` gives up, s. pause_s: time between two attempts, s. The server needs a store
-        (`nesam serve --store DIR`).
+        reconnect_s: longest time without the service before `send` gives up, s. pause_s: time between two attempts, s. pending_max: measurements that are kept at
+        most; beyond it `send` raises Overloaded. A store commits at least every second (`store.interval_s`), so the default is more than ten minutes at 100 Hz.
+        The server needs a store (`nesam serve --store DIR`): without one nothing becomes durable, and `pending_max` measurements are all that can be sent.
         """
-        return DurableStream(self, session_id, reconnect_s, pause_s)
+        return DurableStream(self, session_id, reconnect_s, pause_s, pending_max)
 
     # Predictions
 

@@ -3,13 +3,14 @@
 import math
 import time
 from collections import deque
-from typing import Deque, List, Optional, Tuple
+from typing import Deque, List, Tuple
 
 import grpc
 
 from . import _calls as calls
+from . import _messages as m
 from . import _types as t
-from ._errors import DeadlineExceeded, NesamError, Unavailable
+from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
 
 _BROKEN = {
     grpc.StatusCode.UNAVAILABLE,
@@ -24,17 +25,21 @@ _BROKEN = {
 class DurableStream:
     """A stream of the measurements of one session that outlives crashes of the server; open it with `client.durable_stream`.
 
-    What is not known to be durable is kept and sent again over a new connection; the service drops what it has. Threads must not share it.
+    What is not known to be durable is kept, at most `pending_max` measurements, and sent again over a new connection; the service drops what it has.
+    Threads must not share it.
     """
 
-    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float):
+    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
         self._client = client
         self._session_id = session_id
         self._reconnect_s = reconnect_s
         self._pause_s = pause_s
+        self._pending_max = pending_max
         self._stream = None
-        # Each measurement with its place, None before it is answered by this run of the server.
-        self._kept: Deque[Tuple[t.Measurement, Optional[int]]] = deque()
+        # What is kept, oldest first: all that is answered is older than all that waits. Durable ones leave from the left, as places only rise.
+        self._answered: Deque[Tuple[t.Measurement, int]] = deque()
+        # Without an answer of this run of the server.
+        self._waiting: Deque[t.Measurement] = deque()
         # Who counts the places.
         self._run = 0
 
@@ -47,21 +52,28 @@ class DurableStream:
     @property
     def pending(self) -> List[t.Measurement]:
         """Measurements that are not known to be durable, oldest first."""
-        return [measurement for measurement, _ in self._kept]
+        return [measurement for measurement, _ in self._answered] + list(self._waiting)
 
     def send(self, measurement: t.Measurement) -> t.Answer:
         """Sends one measurement and awaits its answer, over as many connections as it takes.
 
-        Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it.
+        Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises
+        Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, which is not kept.
         """
-        self._kept.append((measurement, None))
-        return self._deliver()[-1]
+        kept = self._kept()
+        if kept >= self._pending_max:
+            reason = f"{kept} measurements are not known to be durable; flush them first"
+            raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
+        # One that cannot be sent would hold up all that come after it.
+        m.measurement_message(measurement)
+        self._waiting.append(measurement)
+        return self._deliver()
 
     def flush(self, timeout_s: float = 10.0) -> None:
         """Waits until everything is durable. Raises DeadlineExceeded after `timeout_s`, also where the server keeps no store, and Unavailable."""
         end = time.monotonic() + timeout_s
-        while self._kept:
-            if any(place is None for _, place in self._kept):
+        while self._kept():
+            if self._waiting:
                 try:
                     self._deliver(end)
                 except Unavailable:
@@ -70,67 +82,80 @@ class DurableStream:
             try:
                 left_s = max(0.0, min(end - time.monotonic(), self._client.timeout_s))
                 session = self._client._do(calls.session(self._session_id), left_s)
-                self._durable(session.run, session.durable_place)
+                if self._counted_by_another(session.run):
+                    self.close()
+                else:
+                    self._durable(session.run, session.durable_place)
             except NesamError as error:
                 if error.code not in _BROKEN:
                     raise
-                self._forget_places()
-            if self._kept and time.monotonic() >= end:
-                reason = f"{len(self._kept)} measurements are not durable after {timeout_s} s; is the server there, and does it keep a store?"
+                # Who is only late may have everything.
+                if error.code != grpc.StatusCode.DEADLINE_EXCEEDED:
+                    self._forget_places()
+            if self._kept() and time.monotonic() >= end:
+                reason = f"{self._kept()} measurements are not durable after {timeout_s} s; is the server there, and does it keep a store?"
                 raise DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", reason)
-            if self._kept:
+            if self._kept():
                 time.sleep(min(self._pause_s, 0.05))
 
     def close(self) -> None:
-        """Says that no more measurements come; what is not durable is in `pending`."""
+        """Ends the connection; what is not durable stays in `pending`, and a later `send` or `flush` sends it over another one."""
         if self._stream is not None:
             self._stream.close()
             self._stream = None
+        self._forget_places()
 
-    def _deliver(self, end: float = math.inf) -> List[t.Answer]:
-        """Sends what has no answer yet, oldest first, over as many connections as it takes until `end`."""
+    def _kept(self) -> int:
+        return len(self._answered) + len(self._waiting)
+
+    def _deliver(self, end: float = math.inf) -> t.Answer:
+        """Sends what has no answer yet, oldest first, over as many connections as it takes until `end`; the answer to the newest."""
         until = min(end, time.monotonic() + self._reconnect_s)
         while True:
             try:
                 return self._attempt(end)
             except NesamError as error:
                 self.close()
-                self._forget_places()
                 if error.code not in _BROKEN:
                     raise
                 if time.monotonic() >= until:
                     raise Unavailable(error.code, error.field, error.message) from error
                 time.sleep(self._pause_s)
+            except BaseException:
+                # Interrupted before its answer, which must not be taken for that of the next measurement.
+                self.close()
+                raise
 
-    def _attempt(self, end: float) -> List[t.Answer]:
+    def _attempt(self, end: float) -> t.Answer:
+        """The same over one connection, each measurement after the answer to the one before."""
         if self._stream is None:
             self._stream = self._client.measurement_stream()
-        answers = []
-        for i, (measurement, place) in enumerate(list(self._kept)):
-            if place is not None:
-                continue
-            answer = self._stream.send(measurement, max(0.0, min(self._reconnect_s, end - time.monotonic())))
+        while True:
+            answer = self._stream.send(self._waiting[0], max(0.0, min(self._reconnect_s, end - time.monotonic())))
             if answer.code in (grpc.StatusCode.RESOURCE_EXHAUSTED.value[0], grpc.StatusCode.UNAVAILABLE.value[0]):
                 raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", answer.message)
-            # A refusal need not tell who counts.
+            # A refused measurement has no place and is not kept; its answer need not tell who counts.
             if answer.place:
-                self._counted_by(answer.run)
-            self._kept[i] = (measurement, answer.place)
-            answers.append(answer)
-        # A place of 0 is that of a refused measurement, which nobody keeps.
-        if answers:
-            self._durable(self._run, answers[-1].durable_place if answers[-1].run == self._run else 0)
-        return answers
+                if self._counted_by_another(answer.run, answer.place):
+                    raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "another run of the server counts now")
+                self._run = answer.run
+                self._answered.append((self._waiting[0], answer.place))
+            self._waiting.popleft()
+            if answer.run == self._run:
+                self._durable(answer.run, answer.durable_place)
+            if not self._waiting:
+                return answer
+
+    def _counted_by_another(self, run: int, place: float = math.inf) -> bool:
+        """Whether the answers so far came from another run of the server, or from a session that began anew: then all is sent again, from the oldest on."""
+        return bool(self._answered) and (run != self._run or place < self._answered[-1][1])
 
     def _durable(self, run: int, durable_place: int) -> None:
-        self._counted_by(run)
-        self._kept = deque((m, place) for m, place in self._kept if place is None or place > durable_place)
-
-    def _counted_by(self, run: int) -> None:
-        if run != self._run:
-            self._run = run
-            self._forget_places()
+        self._run = run
+        while self._answered and self._answered[0][1] <= durable_place:
+            self._answered.popleft()
 
     def _forget_places(self) -> None:
         """Another run of the server may count otherwise."""
-        self._kept = deque((measurement, None) for measurement, _ in self._kept)
+        self._waiting.extendleft(measurement for measurement, _ in reversed(self._answered))
+        self._answered.clear()

@@ -30,7 +30,7 @@ class FailedPrecondition(NesamError):
 
 
 class Overloaded(NesamError):
-    """Too many requests wait, or a limit on sessions or maps is reached; ask again later."""
+    """Too many requests wait, or a limit on sessions, maps or what a durable stream keeps is reached; ask again later."""
 
 
 class DeadlineExceeded(NesamError):

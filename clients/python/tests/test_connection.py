@@ -2,6 +2,7 @@
 look at metadata, answer much, late or never."""
 
 import asyncio
+import signal
 import time
 from concurrent import futures
 from contextlib import contextmanager
@@ -158,6 +159,87 @@ def test_service_a_refusal_takes_no_place_away():
             assert stream.send(second).outcome == "REJECTED" and [m.sequence for m in stream.pending] == [1]
             stream.flush()
             assert heard == [1, 2] and not stream.pending
+
+
+@contextmanager
+def counting(answers, session):
+    """A client of a service whose n-th stream gives the n-th list of answers, (run, place), and whose session is at (run, durable place); and the sequence
+    numbers that each stream heard."""
+    heard = []
+
+    def stream(requests, _):
+        here = []
+        heard.append(here)
+        for (run, place), request in zip(answers[len(heard) - 1], requests):
+            here.append(request.sequence)
+            yield measurements_pb2.MeasurementAnswer(place=place, run=run, applied=measurements_pb2.Applied())
+
+    told = sessions_pb2.Session(session_id="truck", run=session[0], durable_place=session[1])
+    get = grpc.unary_unary_rpc_method_handler(lambda *_: told, None, sessions_pb2.Session.SerializeToString)
+    with listening(measurements(stream), ("nesam.v1.Sessions", "Get", get)) as address, nesam.Client(address) as client:
+        yield client, heard
+
+
+@pytest.mark.parametrize(
+    "answers, session",
+    [
+        pytest.param([[(5, 1), (5, 2), (6, 9), (6, 9)], [(6, 10), (6, 11), (6, 11), (6, 12)]], (6, 12), id="another run"),
+        pytest.param([[(5, 7), (5, 8), (5, 1), (5, 1)], [(5, 2), (5, 3), (5, 3), (5, 4)]], (5, 4), id="a session that began anew"),
+    ],
+)
+def test_service_who_counts_otherwise_midway_is_sent_everything_in_order(answers, session):
+    with counting(answers, session) as (client, heard), client.durable_stream("truck", pause_s=0.01) as stream:
+        for measurement in straight("truck", 4):
+            stream.send(measurement)
+        assert heard == [[1, 2, 3], [1, 2, 3, 4]] and [m.sequence for m in stream.pending] == [1, 2, 3, 4]
+        stream.flush()
+        assert not stream.pending and len(heard) == 2
+
+
+def test_service_a_session_at_another_run_is_sent_everything_over_a_new_stream():
+    answers = [[(5, 1), (5, 2), (5, 3)], [(6, 9), (6, 10)]]
+    with counting(answers, (6, 10)) as (client, heard), client.durable_stream("truck", pause_s=0.01) as stream:
+        for measurement in straight("truck", 2):
+            stream.send(measurement)
+        stream.flush()
+        assert heard == [[1, 2], [1, 2]] and not stream.pending
+
+
+def test_service_what_cannot_be_sent_holds_up_nothing():
+    with counting([[(5, 1)]], (5, 1)) as (client, heard), client.durable_stream("truck") as stream:
+        with pytest.raises(ValueError, match="state"):
+            stream.send(nesam.Measurement("truck", 0, np.zeros(6), (1.0, 0.0)))
+        assert not stream.pending
+        assert stream.send(next(straight("truck", 1))).outcome == "APPLIED" and heard == [[1]]
+
+
+def test_service_an_interrupted_send_shifts_no_answers():
+    """Method: a signal whose handler raises, as Ctrl-C does, while the service takes its time with the first answer."""
+    heard = []
+
+    def slow_at_first(requests, _):
+        here = []
+        heard.append(here)
+        for place, request in enumerate(requests, 1):
+            here.append(request.sequence)
+            if len(heard) == 1:
+                time.sleep(0.5)
+            yield measurements_pb2.MeasurementAnswer(sequence=request.sequence, place=place, run=5, applied=measurements_pb2.Applied())
+
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    first, second = straight("truck", 2)
+    with listening(measurements(slow_at_first)) as address, nesam.Client(address) as client, client.durable_stream("truck") as stream:
+        before = signal.signal(signal.SIGALRM, interrupt)
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0.2)
+            with pytest.raises(KeyboardInterrupt):
+                stream.send(first)
+        finally:
+            signal.signal(signal.SIGALRM, before)
+        assert stream.pending == [first]
+        assert stream.send(second).sequence == 2 and heard == [[1], [1, 2]] and stream.pending == [first, second]
 
 
 def test_service_a_slow_vehicle_is_not_a_silent_service():

@@ -1,11 +1,12 @@
-"""Goal: a vehicle that keeps what is not durable loses nothing when the server is killed or stands still, and does not wait for it for ever. Method: the real
-binary, SIGKILL and a restart on its store, SIGSTOP and SIGCONT."""
+"""Goal: a vehicle that keeps what is not durable loses nothing when the server is killed or stands still, and does not wait for it for ever; where nothing
+becomes durable it keeps so much and no more. Method: the real binary, SIGKILL and a restart on its store, SIGSTOP and SIGCONT, no store."""
 
 import os
 import signal
 import threading
 import time
 
+import grpc
 import numpy as np
 import pytest
 
@@ -89,3 +90,43 @@ def test_service_a_server_that_stands_still_is_given_up_and_loses_nothing(start,
         session = client.session("truck")
         assert session.accepted == session.durable_place == 30 and session.last_sequence == 30
         np.testing.assert_array_equal(session.state, drive[-1].state)
+
+
+def test_service_without_a_store_so_many_are_kept_and_no_more(client, hills):
+    drive = list(straight("truck", 12))
+    client.upload_map(hills)
+    client.open_session("truck", map_id="hills")
+    with client.durable_stream("truck", pending_max=10) as stream:
+        for measurement in drive[:10]:
+            assert stream.send(measurement).durable_place == 0
+        for measurement in drive[10:]:
+            with pytest.raises(nesam.Overloaded, match="10 measurements") as refused:
+                stream.send(measurement)
+            assert refused.value.code == grpc.StatusCode.RESOURCE_EXHAUSTED and refused.value.field == "pending_max"
+        with pytest.raises(nesam.DeadlineExceeded):
+            stream.flush(timeout_s=0.2)
+        assert stream.pending == drive[:10]
+    assert stream.pending == drive[:10] and client.session("truck").accepted == 10
+
+
+def test_service_what_is_durable_makes_room(start, hills):
+    drive = list(straight("truck", 30))
+    _, address = start()
+    with nesam.Client(address, timeout_s=60.0) as client:
+        client.upload_map(hills)
+        client.open_session("truck", map_id="hills")
+        with client.durable_stream("truck", pending_max=3) as stream:
+            refused = 0
+            for measurement in drive:
+                while True:
+                    try:
+                        assert stream.send(measurement).outcome in ("APPLIED", "GATED")
+                        break
+                    except nesam.Overloaded:
+                        refused += 1
+                        stream.flush()
+                assert len(stream.pending) <= 3
+            stream.flush()
+            assert not stream.pending and refused > 0
+        session = client.session("truck")
+        assert session.accepted == session.durable_place == 30 and session.last_sequence == 30
