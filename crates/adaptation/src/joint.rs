@@ -189,15 +189,17 @@ pub(crate) fn correction_of(soils: &DVector<f64>, class: usize, config: &FilterC
     let at = SOIL_DIM * if class < config.classes { class } else { 0 };
     SoilCorrection { coordinates: config.coordinates, delta: core::array::from_fn(|i| soils[at + i]) }
 }
+
 /// Whether a matrix is symmetric and has no negative eigenvalue, but for rounding; what has no variance may be in it.
 fn is_covariance(matrix: &DMatrix<f64>) -> bool {
     const ROUNDING: f64 = 1e-9;
     let sd = matrix.diagonal().map(|variance| variance.sqrt());
-    // Correlations, with one on the diagonal where there is no variance either; NaN from a negative one.
+    // Correlations, with one on the diagonal where there is no variance either, which covaries with nothing; NaN from a negative one.
     let correlation = DMatrix::from_fn(matrix.nrows(), matrix.ncols(), |r, c| match (r == c, sd[r] * sd[c]) {
         (true, _) => 1.0 + ROUNDING + 0.0 * sd[r],
         (false, scale) if scale > 0.0 => matrix[(r, c)] / scale,
-        (false, scale) => matrix[(r, c)] + scale,
+        (false, scale) if matrix[(r, c)] == 0.0 => scale,
+        _ => f64::INFINITY,
     });
     (&correlation - correlation.transpose()).amax() <= ROUNDING && correlation.cholesky().is_some()
 }

@@ -13,7 +13,8 @@ use crate::stage::{layers, predictor, start};
 const SLOPE_M: f64 = 88.0;
 const LEVEL_M: f64 = 20.0;
 
-/// Goal: soft ground on a slope is known to slide before the vehicle is there, by whoever knows the soil. Method: the soil of the map and the true one.
+/// Goal: soft ground on a slope is known to slide before the vehicle is there, by whoever knows the soil, and to leave less room than the rest of the path by whoever knows the
+/// map alone. Method: the soil of the map and the true one, tried where the path heads to the south-east and where it heads to the north-west.
 #[tokio::test(flavor = "multi_thread")]
 async fn service_a_soft_slope_ahead_slides_where_its_soil_is_known() {
     let folder = sample_root().join("worlds/w35");
@@ -35,7 +36,7 @@ async fn service_a_soft_slope_ahead_slides_where_its_soil_is_known() {
         }
     }
     let [level, slope, level_known, slope_known] = slides[..] else { panic!("four places") };
-    assert!(level < 0.0 && level_known < 0.0, "no slide where the ground is level: {slides:?}");
-    assert!(slope < 1.5 && slope_known > slope + 0.5 && slope_known > 1.5, "{slides:?}");
+    assert!(level < -1.0 && level_known < -1.0, "room where the ground is level: {slides:?}");
+    assert!((-0.8..0.0).contains(&slope) && slope_known > slope + 0.5 && slope_known > 0.3, "{slides:?}");
     server.shutdown().await;
 }
