@@ -105,7 +105,7 @@ def test_service_reordering_repetition_gap_and_restart_over_zenoh(network):
     assert exchange(later) == ("TOO_OLD", False)
     session = client.session("truck-8")
     assert (session.history_steps, session.last_sequence) == (2, 3)
-    np.testing.assert_allclose(session.state, example.measured(0.9)[0])
+    np.testing.assert_allclose(session.state, example.measured(1.0)[0])
     again.close()
 
 
