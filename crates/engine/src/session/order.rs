@@ -116,12 +116,13 @@ impl Order {
         } else {
             return Ok(Verdict::Accept);
         };
-        let renewed = self.suspects(off, measurement, now_ns, step_ns);
-        Ok(match off {
-            _ if renewed && (off == OffLine::Renumbered || self.numbered_again(measurement)) => Verdict::Begin(Outcome::Restarted),
-            _ if renewed => Verdict::Begin(Outcome::ClockJump { jump_s: ahead_s - silent_s }),
-            OffLine::Late | OffLine::Renumbered | OffLine::OtherBoot { .. } => Verdict::Refuse(Outcome::TooOld { behind_s }),
-            OffLine::Ahead => Verdict::Refuse(Outcome::Future { ahead_s: ahead_s - silent_s }),
+        let jump_s = ahead_s - silent_s;
+        Ok(match (off, self.suspects(off, measurement, now_ns, step_ns)) {
+            (OffLine::Ahead, false) => Verdict::Refuse(Outcome::Future { ahead_s: jump_s }),
+            (_, false) => Verdict::Refuse(Outcome::TooOld { behind_s }),
+            (OffLine::Renumbered, true) => Verdict::Begin(Outcome::Restarted),
+            (_, true) if self.numbered_again(measurement) => Verdict::Begin(Outcome::Restarted),
+            (_, true) => Verdict::Begin(Outcome::ClockJump { jump_s }),
         })
     }
 
