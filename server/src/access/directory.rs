@@ -29,4 +29,9 @@ impl Directory {
     pub fn vehicle(&self, session: &str) -> Option<Arc<str>> {
         self.0.read().ok()?.get(session).cloned()
     }
+
+    /// Whether a session is open and of another vehicle than this one, which is told nothing of it.
+    pub fn is_foreign(&self, session: &str, vehicle: &str) -> bool {
+        self.0.read().is_ok_and(|sessions| sessions.get(session).is_some_and(|owner| **owner != *vehicle))
+    }
 }

@@ -100,9 +100,9 @@ impl ReturnPath {
         standing == Standing::Here
     }
 
-    /// Whether the session is open and of another vehicle, which is told nothing of it.
+    /// See [`Directory::is_foreign`](crate::access::Directory::is_foreign).
     fn is_foreign(&self) -> bool {
-        self.edge.access.directory.vehicle(&self.session).is_some_and(|owner| *owner != *self.vehicle)
+        self.edge.access.directory.is_foreign(&self.session, &self.vehicle)
     }
 
     /// Counts and publishes the answer.

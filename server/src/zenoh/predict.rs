@@ -22,11 +22,13 @@ pub async fn declare(session: &::zenoh::Session, fleet: &str, edge: Edge) -> Res
 
 /// Why a session is not asked through the key of a vehicle: it belongs to another one. Routers give rights by key.
 fn foreign(edge: &Edge, session: &str, vehicle: &str) -> Option<EngineError> {
-    edge.access.directory.vehicle(session).filter(|owner| **owner != *vehicle)?;
     // Whose it is is not told: whoever asks may have no right to know.
-    let reason =
-        format!("session `{session}` is of another vehicle than `{vehicle}`, through whose key it was asked; use the key of its vehicle");
-    Some(EngineError::invalid("session_id", reason))
+    edge.access.directory.is_foreign(session, vehicle).then(|| {
+        let reason = format!(
+            "session `{session}` is of another vehicle than `{vehicle}`, through whose key it was asked; use the key of its vehicle"
+        );
+        EngineError::invalid("session_id", reason)
+    })
 }
 
 /// Why a session cannot be asked here.
