@@ -11,7 +11,7 @@ use tokio::time::Instant;
 use tonic::Status;
 
 use super::record::{Server, json, of_json, session_of};
-use super::{Claim, Cluster, Held, Stage, again, created, delete, get, moved, put, written};
+use super::{Claim, Cluster, ENGINE_WAIT, Held, NO_TURN, Stage, again, created, delete, get, moved, put, written};
 use crate::convert::to_status;
 use crate::store::{StoredSession, resumed};
 
@@ -23,8 +23,6 @@ const LOOK_AGAIN: Duration = Duration::from_millis(100);
 const LEASE_PAUSE: Duration = Duration::from_millis(20);
 /// Shortest pause between two searches for one session on behalf of a bus.
 const SEARCH_PAUSE: Duration = Duration::from_millis(200);
-/// Pause before a session is asked for again that the engine had no turn for.
-const NO_TURN: Duration = Duration::from_millis(100);
 
 /// What came of it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -307,7 +305,7 @@ impl Cluster {
                 "session `{session}` cannot go on on this server: {error}; its servers must have the same bundle and limits"
             )),
         };
-        self.0.engine.import(image, session, WAIT_MAX).await.map(drop).map_err(refused)
+        self.0.engine.import(image, session, ENGINE_WAIT).await.map(drop).map_err(refused)
     }
 }
 

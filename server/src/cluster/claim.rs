@@ -1,16 +1,9 @@
 //! Names under which sessions are about to begin.
 
-use std::time::Duration;
-
 use nesam_engine::EngineError;
 use tokio::runtime::Handle;
 
-use super::{Cluster, Stage};
-
-/// Longest wait for the engine.
-const WAIT_MAX: Duration = Duration::from_secs(10);
-/// Pause before the engine is asked again that had no turn.
-const NO_TURN: Duration = Duration::from_millis(100);
+use super::{Cluster, ENGINE_WAIT, NO_TURN, Stage};
 
 /// A name that a request has claimed, or is about to. The request may be given up at any time, also while the name is on its way: dropping this lets the name
 /// go, unless a session has begun under it.
@@ -79,7 +72,7 @@ impl Cluster {
                 return false;
             }
             // What was asked of the engine before is done before, also for a client that does not wait any longer.
-            match self.0.engine.get(session, WAIT_MAX).await {
+            match self.0.engine.get(session, ENGINE_WAIT).await {
                 Ok(_) | Err(EngineError::Stopped) => return false,
                 Err(EngineError::UnknownSession { .. }) => return true,
                 // It does not say: a session that runs must not go.

@@ -7,15 +7,13 @@ use nesam_proto::etcd as pb;
 use pb::request_op::Request;
 use tonic::Status;
 
-use super::{Cluster, Held, Stage, created, delete};
+use super::{Cluster, ENGINE_WAIT, Held, Stage, created, delete};
 use crate::store::Key;
 
 /// Time for which a session stays at least, so that two askers do not tear at it.
 const STAY: Duration = Duration::from_millis(500);
 /// Longest wait for what is not durable yet; what is left then is sent again by the clients.
 const LAST_COMMIT: Duration = Duration::from_secs(2);
-/// Longest wait for the engine.
-const CLOSE: Duration = Duration::from_secs(10);
 /// Pause before etcd is asked again to take something back.
 const INSIST_AGAIN: Duration = Duration::from_millis(100);
 
@@ -111,7 +109,7 @@ impl Cluster {
     pub(super) async fn forget(&self, session: &str) {
         self.0.keeper.forget(session);
         // A name that was only claimed is not in the engine.
-        let _ = self.0.engine.close(session, CLOSE).await;
+        let _ = self.0.engine.close(session, ENGINE_WAIT).await;
         self.0.keeper.forgotten(session);
         let _ = self.0.left.send(Arc::from(session));
     }
@@ -120,13 +118,20 @@ impl Cluster {
     async fn release(&self, session: &str, epoch: i64) {
         let Err(status) = self.release_key(session, epoch).await else { return };
         tracing::warn!(session, epoch, reason = status.message(), "owner's key not removed yet; etcd is asked again while the lease lasts");
-        let owner = self.0.keys.owner(session);
-        tokio::spawn(self.clone().insist(vec![created(&owner, epoch)], vec![delete(&owner)]));
+        let (conditions, then) = self.key_given_back(session, epoch);
+        tokio::spawn(self.clone().insist(conditions, then));
     }
 
+    /// The same once.
     pub(super) async fn release_key(&self, session: &str, epoch: i64) -> Result<(), Status> {
+        let (conditions, then) = self.key_given_back(session, epoch);
+        self.0.etcd.transaction(conditions, then).await.map(drop)
+    }
+
+    /// The transaction that gives the key of one epoch back; a repetition does nothing.
+    fn key_given_back(&self, session: &str, epoch: i64) -> (Vec<pb::Compare>, Vec<Request>) {
         let owner = self.0.keys.owner(session);
-        self.0.etcd.transaction(vec![created(&owner, epoch)], vec![delete(&owner)]).await.map(drop)
+        (vec![created(&owner, epoch)], vec![delete(&owner)])
     }
 
     /// Takes something of ours back that goes with the lease at the latest: asks until etcd has done it or the lease has ended. The conditions must see to it

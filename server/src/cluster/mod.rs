@@ -49,6 +49,10 @@ use crate::store::Keeper;
 const LEFT_KEPT: usize = 1024;
 /// Longest wait for the first lease.
 const FIRST_LEASE: Duration = Duration::from_secs(10);
+/// Longest wait for the engine.
+const ENGINE_WAIT: Duration = Duration::from_secs(10);
+/// Pause before the engine is asked again that had no turn.
+const NO_TURN: Duration = Duration::from_millis(100);
 
 /// How far a session has come.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
