@@ -3,9 +3,13 @@
 use nalgebra::{DMatrix, DVector, SMatrix};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 
+use crate::covariance::check_covariance;
 use crate::filter::JointSnapshot;
 use crate::noise::SharedError;
 use crate::{AdaptationError, FilterConfig, KalmanStep, kalman_update};
+
+/// What the correlations of a filter's own covariance may be off by.
+const ROUNDING: f64 = 1e-9;
 
 /// Covariance of the Δθ of one class.
 pub(crate) type SoilMatrix = SMatrix<f64, SOIL_DIM, SOIL_DIM>;
@@ -129,12 +133,11 @@ impl JointState {
     /// The state of a snapshot; `None` when it is not of this size, or its covariance is none: then every update would fail.
     pub(crate) fn restored(&self, snapshot: &JointSnapshot) -> Option<Self> {
         let n = self.mean.len();
-        if snapshot.mean.len() != n || snapshot.covariance.len() != n * n {
+        if snapshot.mean.len() != n || check_covariance(n, &snapshot.covariance, ROUNDING).is_err() {
             return None;
         }
         let covariance = DMatrix::from_row_slice(n, n, &snapshot.covariance);
-        let mean = DVector::from_column_slice(&snapshot.mean);
-        is_covariance(&covariance).then_some(Self { mean, covariance, soils: self.soils })
+        Some(Self { mean: DVector::from_column_slice(&snapshot.mean), covariance, soils: self.soils })
     }
 
     /// Covariance of the Δθ of one class.
@@ -188,31 +191,4 @@ fn with_shared(soils: DMatrix<f64>, shared: Option<&SharedError>, share: f64) ->
 pub(crate) fn correction_of(soils: &DVector<f64>, class: usize, config: &FilterConfig) -> SoilCorrection {
     let at = SOIL_DIM * if class < config.classes { class } else { 0 };
     SoilCorrection { coordinates: config.coordinates, delta: core::array::from_fn(|i| soils[at + i]) }
-}
-
-/// Whether a matrix is symmetric and has no negative eigenvalue, but for rounding; what has no variance may be in it.
-fn is_covariance(matrix: &DMatrix<f64>) -> bool {
-    const ROUNDING: f64 = 1e-9;
-    let sd = matrix.diagonal().map(|variance| variance.sqrt());
-    // Correlations, with one on the diagonal where there is no variance either, which covaries with nothing; NaN from a negative one.
-    let correlation = DMatrix::from_fn(matrix.nrows(), matrix.ncols(), |r, c| match (r == c, sd[r] * sd[c]) {
-        (true, _) => 1.0 + ROUNDING + 0.0 * sd[r],
-        (false, scale) if scale > 0.0 => matrix[(r, c)] / scale,
-        (false, scale) if matrix[(r, c)] == 0.0 => scale,
-        _ => f64::INFINITY,
-    });
-    (&correlation - correlation.transpose()).amax() <= ROUNDING && correlation.cholesky().is_some()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn analytic_covariances_are_told_from_other_matrices() {
-        let of = |entries: [f64; 4]| is_covariance(&DMatrix::from_row_slice(2, 2, &entries));
-        assert!(of([4.0, 1.0, 1.0, 1.0]) && of([4.0, 2.0, 2.0, 1.0]) && of([0.0, 0.0, 0.0, 1e-12]));
-        assert!(!of([-1.0, 0.0, 0.0, 1.0]) && !of([4.0, 2.1, 2.1, 1.0]) && !of([4.0, 1.0, 1e300, 1.0]) && !of([4.0, 1.0, 0.9, 1.0]));
-        assert!(!of([0.0, 1e-3, 1e-3, 1.0]) && !of([f64::NAN, 0.0, 0.0, 1.0]));
-    }
 }

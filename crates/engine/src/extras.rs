@@ -1,5 +1,6 @@
 //! What a prediction may compute beyond states: Jacobians, covariance, risk, what-if soils. What is not asked for costs nothing.
 
+use nesam_adaptation::check_covariance;
 use nesam_model::rollout_noise::{NoiseScale, POSE, RolloutNoise, SoilCovariance, StateCovariance};
 use nesam_model::{Linearisation, RiskOutputs};
 use nesam_physics::{SOIL_DIM, STATE_DIM, SoilCorrection};
@@ -11,8 +12,8 @@ use crate::session::SoilEstimate;
 
 /// Groups of trajectories that the sigma points of a soil posterior make: its mean and two for each parameter.
 pub const SIGMA_POINTS: usize = 2 * SOIL_DIM + 1;
-/// Relative tolerance of the symmetry of a given covariance, for numbers that travelled as f32.
-const SYMMETRY: f64 = 1e-4;
+/// What the correlations of a given covariance may be off by: its numbers travelled as f32.
+pub(crate) const COVARIANCE_ROUNDING: f64 = 1e-4;
 
 /// What to compute beyond the states.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -126,7 +127,8 @@ impl PredictExtras {
             }
         }
         if let Some(CovarianceQuery { start: Some(start) }) = &self.covariance {
-            check_covariance(start).map_err(|reason| EngineError::invalid("extras.start_covariance", reason))?;
+            check_covariance(STATE_DIM, start.as_flattened(), COVARIANCE_ROUNDING)
+                .map_err(|reason| EngineError::invalid("extras.start_covariance", reason))?;
         }
         if groups * samples > limits.samples_max {
             let field = if self.soils == WhatIfSoils::SigmaPoints { "soil_sigma_points" } else { "soil_deltas" };
@@ -262,30 +264,6 @@ fn cholesky<const N: usize>(a: &[[f64; N]; N]) -> [[f64; N]; N] {
     l
 }
 
-/// Refuses what is no covariance.
-pub(crate) fn check_covariance<const N: usize>(p: &[[f64; N]; N]) -> Result<(), String> {
-    if !p.as_flattened().iter().all(|v| v.is_finite()) {
-        return Err("holds a number that is not finite".into());
-    }
-    let scale = |r: usize, c: usize| (p[r][r] * p[c][c]).max(0.0).sqrt();
-    for r in 0..N {
-        if p[r][r] < 0.0 {
-            return Err(format!("has the variance {} at [{r}, {r}], at least 0 is needed", p[r][r]));
-        }
-        for c in 0..r {
-            if (p[r][c] - p[c][r]).abs() > SYMMETRY * scale(r, c).max(p[r][c].abs()) {
-                return Err(format!("is not symmetric at [{r}, {c}]: {} and {}", p[r][c], p[c][r]));
-            }
-        }
-    }
-    // P + a little of its own diagonal has a Cholesky factor, or P has a negative eigenvalue.
-    let lifted: [[f64; N]; N] = core::array::from_fn(|r| core::array::from_fn(|c| p[r][c] * if r == c { 1.0 + SYMMETRY } else { 1.0 }));
-    let l = cholesky(&lifted);
-    let rebuilt = |r: usize, c: usize| -> f64 { (0..N).map(|k| l[r][k] * l[c][k]).sum() };
-    let positive = (0..N).all(|r| (0..=r).all(|c| (rebuilt(r, c) - lifted[r][c]).abs() <= 1e-6 * scale(r, c).max(f64::MIN_POSITIVE)));
-    if positive { Ok(()) } else { Err("is not positive semi-definite".into()) }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -314,20 +292,6 @@ mod tests {
                 assert!((moment - soil.covariance[r][c]).abs() < 1e-12, "{r} {c}: {moment}");
             }
         }
-    }
-
-    #[test]
-    fn analytic_only_covariances_are_taken_for_covariances() {
-        let mut p = [[0.0; STATE_DIM]; STATE_DIM];
-        assert!(check_covariance(&p).is_ok(), "an exact start");
-        (p[0][0], p[1][1], p[0][1], p[1][0]) = (1.0, 1.0, 1.0, 1.0);
-        assert!(check_covariance(&p).is_ok(), "semi-definite");
-        (p[0][1], p[1][0]) = (1.5, 1.5);
-        assert!(check_covariance(&p).unwrap_err().contains("semi-definite"));
-        p[1][0] = 0.5;
-        assert!(check_covariance(&p).unwrap_err().contains("symmetric"));
-        p[1][1] = -1.0;
-        assert!(check_covariance(&p).is_err());
     }
 
     /// Goal: too many trajectories are told by the field that makes them, with the most that is admitted. Method: one sample more than that for sigma points

@@ -2,8 +2,9 @@
 
 use std::sync::Arc;
 
-use nesam_adaptation::{FilterSnapshot, SoilFilter};
+use nesam_adaptation::{FilterSnapshot, SoilFilter, check_covariance};
 use nesam_model::{HISTORY, HistoryStep};
+use nesam_physics::SOIL_DIM;
 
 use super::forecast::OpenForecast;
 use super::order::Order;
@@ -12,7 +13,7 @@ use super::track::Track;
 use super::watch::{VALUES, Watch, WatchedBuffer};
 use super::{Acting, Alarm, AppliedEffects, FleetPart, OPEN_MAX, Rules, Session, SoilEstimate};
 use crate::error::EngineError;
-use crate::extras::check_covariance;
+use crate::extras::COVARIANCE_ROUNDING;
 use crate::grid::StepGrid;
 use crate::limits::outside_card;
 use crate::measurement::Measurement;
@@ -235,7 +236,10 @@ impl SessionImage {
             ("an impossible buffer", self.filter_steps.len().saturating_sub(self.filter_first) == self.filter_stamps_ns.len()),
             ("stamps that do not ascend", ascending(&mut self.filter_stamps_ns.iter().copied())),
             ("too many starts", self.ended_boots.len() <= super::order::ENDED_BOOTS_MAX),
-            ("a soil covariance that is none", check_covariance(&self.soil.covariance).is_ok()),
+            (
+                "a soil covariance that is none",
+                check_covariance(SOIL_DIM, self.soil.covariance.as_flattened(), COVARIANCE_ROUNDING).is_ok(),
+            ),
             ("a soil variance that is none", self.soil.state.variance.is_none_or(|sd2| sd2.iter().all(|v| v.is_finite() && *v >= 0.0))),
             ("a noise scale that is not positive", self.soil.noise_scale > 0.0 && self.soil.noise_scale.is_finite()),
             ("an impossible forecast", self.forecast.as_ref().is_none_or(OpenForecast::is_possible)),
