@@ -333,6 +333,15 @@ pub enum Event {
         /// The alarm.
         alarm: Box<Alarm>,
     },
+    /// The soil filter of a session could not learn from a buffer, take over what the fleet knows or bring something to it. It goes on with what it knew.
+    SoilFilterFailed {
+        /// Name of the session.
+        session: String,
+        /// Vehicle that it belongs to.
+        vehicle: String,
+        /// What failed.
+        reason: String,
+    },
     /// Other effects act in a session from now on.
     EffectsChanged {
         /// Name of the session.
@@ -364,6 +373,9 @@ pub enum Event {
 }
 
 impl Event {
+    /// Label of [`Event::SoilFilterFailed`].
+    pub const SOIL_FILTER_FAILED: &str = "soil_filter_failed";
+
     /// Name for metrics.
     pub fn label(&self) -> &'static str {
         match self {
@@ -372,6 +384,7 @@ impl Event {
             Self::SessionOpened { .. } => "session_opened",
             Self::AlarmChanged { alarm, .. } if alarm.active => "alarm_raised",
             Self::AlarmChanged { .. } => "alarm_cleared",
+            Self::SoilFilterFailed { .. } => Self::SOIL_FILTER_FAILED,
             Self::EffectsChanged { .. } => "effects_changed",
             Self::MeasurementAccepted { .. } => "measurement_accepted",
             Self::MapChanged { .. } => "map_changed",

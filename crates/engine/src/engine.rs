@@ -353,6 +353,7 @@ impl Engine {
         session.begin_from(self.fleet.as_mut(), map.as_ref(), now_ns);
         let outcome = session.learn(&self.predictor, self.noise.as_ref(), map.as_ref(), self.step_ns, outcome);
         let (vehicle, brought, told) = (session.vehicle().to_string(), session.take_brought(), session.take_told());
+        let failures = session.take_soil_failures();
         let (soil, history_steps, accepted) = (*session.soil(), session.history().len(), session.accepted());
         let provenance = self.provenance(self.session(id)?);
         if let (Some(fleet), Some(map)) = (&mut self.fleet, &map) {
@@ -367,6 +368,9 @@ impl Engine {
             self.emit(Event::MeasurementAccepted { session: id.into(), buffer_ended });
         }
         self.emit_alarms(id, &vehicle, told);
+        for reason in failures {
+            self.emit(Event::SoilFilterFailed { session: id.into(), vehicle: vehicle.clone(), reason });
+        }
         if soil.state.epoch != before.0.epoch {
             let provenance = provenance.clone().into();
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into(), provenance });

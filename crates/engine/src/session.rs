@@ -388,6 +388,11 @@ impl Session {
         core::mem::take(&mut self.told)
     }
 
+    /// Why the soil filter learned less than it could have since the last time.
+    pub(crate) fn take_soil_failures(&mut self) -> Vec<String> {
+        self.learner.take_failures()
+    }
+
     /// The predictor of this session's vehicle, where effects were applied to it.
     pub(crate) fn predictor(&self) -> Option<&Predictor> {
         self.acting.as_ref().map(|acting| acting.predictor())

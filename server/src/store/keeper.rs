@@ -149,7 +149,9 @@ impl Keeper {
             }
             Event::MapChanged { map, .. } => (Key::Map(map.clone()), Duration::ZERO),
             Event::FleetSoilChanged { own, .. } if self.soil_of.is_some() => (Key::Soil(own.key.clone()), self.interval),
-            Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } => return,
+            Event::SoilChanged { .. } | Event::FleetSoilChanged { .. } | Event::AlarmChanged { .. } | Event::SoilFilterFailed { .. } => {
+                return;
+            }
         };
         let mut state = self.lock();
         if let Event::FleetSoilChanged { cell_m, own, .. } = event {

@@ -109,8 +109,10 @@ impl Metrics {
         if let Ok(mut events) = self.events.lock() {
             *events.entry(event.label()).or_default() += 1;
         }
-        if let Event::MapChanged { held, .. } = event {
-            self.maps.store(*held as u64, Ordering::Relaxed);
+        match event {
+            Event::MapChanged { held, .. } => self.maps.store(*held as u64, Ordering::Relaxed),
+            Event::SoilFilterFailed { session, vehicle, reason } => tracing::warn!(session, vehicle, reason, "the soil filter failed"),
+            _ => {}
         }
         self.alarms.note(event);
     }
@@ -142,7 +144,9 @@ impl Metrics {
             }
         }
         let _ = writeln!(out, "# HELP nesam_events_total What happened to sessions.\n# TYPE nesam_events_total counter");
-        if let Ok(events) = self.events.lock() {
+        if let Ok(mut events) = self.events.lock() {
+            // From the start, so that the first failure is an increase.
+            events.entry(Event::SOIL_FILTER_FAILED).or_default();
             for (event, value) in events.iter() {
                 let _ = writeln!(out, "nesam_events_total{{event=\"{event}\"}} {value}");
             }
@@ -192,6 +196,8 @@ mod tests {
         metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
         metrics.measurement(Transport::Zenoh, "applied");
         metrics.event(&Event::MapChanged { map: "m".into(), held: 3 });
+        assert!(metrics.render(0, 0).contains("nesam_events_total{event=\"soil_filter_failed\"} 0\n"));
+        metrics.event(&Event::SoilFilterFailed { session: "s".into(), vehicle: "v".into(), reason: "why".into() });
         metrics.reloaded(false);
         assert!(!metrics.render(0, 0).contains("nesam_certificate_expires_seconds 0"), "no certificate");
         metrics.certificate_expires(1_800_000_000);
@@ -205,6 +211,7 @@ mod tests {
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
             "nesam_events_total{event=\"map_changed\"} 1",
+            "nesam_events_total{event=\"soil_filter_failed\"} 1",
             "nesam_maps 3",
             "nesam_credentials_reloads_total{result=\"failed\"} 1",
             "nesam_credentials_reloads_total{result=\"ok\"} 0",

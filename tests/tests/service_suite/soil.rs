@@ -1,7 +1,10 @@
 //! Goal: every B transitions update the soil inside the session, and every reply says what is known of it.
 
+use std::sync::{Arc, Mutex};
+
 use nesam_adaptation::FilterConfig;
 use nesam_client::{outcome_label, v1};
+use nesam_engine::{Command, Engine, Event, Limits, OpenSession, Reply};
 
 use crate::stage::*;
 
@@ -57,4 +60,37 @@ async fn service_every_reply_carries_soil_and_covariance() {
     }
     assert_eq!(learned(&recorded, 5 * buffer + OPEN_STEPS).1, updates, "the filter of `nesam adapt` made as many");
     server.shutdown().await;
+}
+
+/// Goal: what the filter cannot compute is told, once for each buffer, and teaches nothing. Method: a prior so wide that its variance overflows, so that no innovation
+/// covariance has a Cholesky factor.
+#[test]
+fn analytic_a_filter_that_fails_says_so_and_learns_nothing() {
+    let recorded = recorded();
+    let told = Arc::new(Mutex::new(Vec::new()));
+    let sink = Arc::clone(&told);
+    let filter = FilterConfig { prior_sd: [1e200; 6], ..filter_config() };
+    let buffers = 3;
+    let last = buffers * filter.buffer + OPEN_STEPS;
+    let mut engine =
+        Engine::new(predictor(), Limits::default()).unwrap().with_filter(filter).unwrap().with_events(Box::new(move |event| {
+            if let Event::SoilFilterFailed { session, vehicle, reason } = event {
+                sink.lock().unwrap().push((session, vehicle, reason));
+            }
+        }));
+    engine.execute(0, &Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();
+    let open = OpenSession { session: "s".into(), vehicle: "truck".into(), map: recorded.world.id().into(), ..Default::default() };
+    engine.execute(0, &Command::Open(open)).unwrap();
+    for i in 0..=last {
+        let measurement = engine_sample(&recorded.drive, i);
+        let reply = engine.execute(0, &Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+        let Reply::Measured(answer) = reply else { panic!("another reply") };
+        assert_eq!((answer.outcome.label(), answer.soil.state.epoch), ("applied", 0), "sample {i}");
+    }
+    let told = told.lock().unwrap();
+    assert_eq!(told.len(), buffers, "{told:?}");
+    assert!(
+        told.iter().all(|(session, vehicle, reason)| session == "s" && vehicle == "truck" && reason.contains("innovation")),
+        "{told:?}"
+    );
 }

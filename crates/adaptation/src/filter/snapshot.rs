@@ -73,9 +73,12 @@ impl SoilFilter {
 
     /// The filter as if it had learned `belief` before, on log odds that it helps; the first buffer judges it already. `None` for a filter that keeps classes
     /// of ground apart or follows a shared error: a belief about one soil does not say what they are.
-    pub fn begun_from(&self, belief: &ClassBelief, log_odds: f64) -> Option<Self> {
+    ///
+    /// # Errors
+    /// As [`SoilFilter::restored`], for a belief that is none.
+    pub fn begun_from(&self, belief: &ClassBelief, log_odds: f64) -> Result<Option<Self>, AdaptationError> {
         if self.config.classes != 1 || self.config.shared_error.is_some() {
-            return None;
+            return Ok(None);
         }
         let snapshot = FilterSnapshot {
             state: JointSnapshot { mean: belief.delta.to_vec(), covariance: belief.covariance.as_flattened().to_vec() },
@@ -83,7 +86,7 @@ impl SoilFilter {
             trust_corrections: belief.delta.repeat(crate::trust::JUDGED),
             ..self.snapshot()
         };
-        self.clone().restored(&snapshot).ok()
+        self.clone().restored(&snapshot).map(Some)
     }
 
     /// A filter with these settings that goes on, bit for bit, where the one of the snapshot stood. The buffer is empty.

@@ -1,9 +1,10 @@
 //! What a session learns of the soil: the filter and the transition that waits for its end.
 
+use std::fmt::Display;
 use std::sync::Arc;
 
 use nesam_adaptation::{BufferedTransition, ClassBelief, Innovation, SoilFilter, SoilUpdate};
-use nesam_fleet_soil::{FleetPrior, Increment, SoilBelief};
+use nesam_fleet_soil::{FleetPrior, FleetSoilError, Increment, SoilBelief};
 use nesam_model::{HISTORY, HistoryStep, Predictor, SoilByClass, SoilField};
 use nesam_physics::{CONTRADICTIONS, SOIL_DIM, SoilCorrection, contradiction};
 use nesam_terrain::WorldMap;
@@ -72,7 +73,7 @@ pub(super) struct Models<'a> {
 pub(super) struct Judged {
     /// Its first and last stamp, ns of the vehicle's clock.
     pub stamps_ns: [i64; 2],
-    /// What the filter made of it; `None` where the ground under a wheel is not known.
+    /// What the filter made of it; `None` where the ground under a wheel is not known, and where the filter failed.
     pub learned: Option<Learned>,
     /// How its sensors contradict each other, see [`contradiction`].
     pub contradiction: [f64; CONTRADICTIONS],
@@ -97,11 +98,13 @@ pub(super) struct SoilLearner {
     first: usize,
     /// Stamps of the steps from there on, ns: a vehicle whose rate is slightly off makes steps that are slightly longer or shorter than those of the model.
     stamps_ns: Vec<i64>,
+    /// What failed since it was asked for last.
+    failures: Vec<String>,
 }
 
 impl SoilLearner {
     pub(super) fn new(filter: SoilFilter) -> Self {
-        Self { filter, steps: Vec::new(), first: 0, stamps_ns: Vec::new() }
+        Self::from_parts(filter, Vec::new(), 0, Vec::new())
     }
 
     /// The filter, the steps that it holds, where its open buffer begins among them, and the stamps from there on.
@@ -111,7 +114,17 @@ impl SoilLearner {
 
     /// The inverse of [`SoilLearner::parts`].
     pub(super) fn from_parts(filter: SoilFilter, steps: Vec<HistoryStep>, first: usize, stamps_ns: Vec<i64>) -> Self {
-        Self { filter, steps, first, stamps_ns }
+        Self { filter, steps, first, stamps_ns, failures: Vec::new() }
+    }
+
+    /// Why the filter learned less than it could have since the last time. It goes on with what it knew before.
+    pub(super) fn take_failures(&mut self) -> Vec<String> {
+        core::mem::take(&mut self.failures)
+    }
+
+    /// What came of a step of the filter; why nothing did is kept.
+    fn noted<T, E: Display>(&mut self, result: Result<T, E>) -> Option<T> {
+        result.map_err(|error| self.failures.push(error.to_string())).ok()
     }
 
     /// The next step does not follow the last one.
@@ -171,17 +184,19 @@ impl SoilLearner {
         let buffer = self.transitions(models.usual, map)?;
         let shifted = models.shifted.iter().map(|model| self.transitions(model, map).map(|buffer| (model.step_model(), buffer)));
         let shifted: Vec<_> = shifted.collect::<Option<_>>()?;
-        self.filter.consider(models.usual.step_model(), &buffer, &shifted).ok()?;
+        let considered = self.filter.consider(models.usual.step_model(), &buffer, &shifted);
+        self.noted(considered)?;
         let log_odds = self.filter.snapshot().trust_log_odds;
         let mut update = None;
         for buffered in buffer {
-            update = self.filter.push(models.usual.step_model(), buffered).ok()?;
+            let pushed = self.filter.push(models.usual.step_model(), buffered);
+            update = self.noted(pushed)?;
         }
         let update = update?;
         let [x, y, _] = self.steps[(first + last) / 2].state.position_m;
         // A buffer that told nothing left the estimate as it was: it brings nothing, and no vote.
         let told = update.excited && !update.rejected;
-        let increment = if told { self.increment(&update.before, log_odds) } else { None };
+        let increment = told.then(|| self.increment(&update.before, log_odds)).and_then(|increment| self.noted(increment));
         let brought = increment.map(|increment| Brought { position_m: [x, y], increment });
         Some(Learned { update, brought })
     }
@@ -203,19 +218,20 @@ impl SoilLearner {
     }
 
     /// What the last update knows more than was believed before it, and how it voted on whether the correction helps.
-    fn increment(&self, before: &ClassBelief, log_odds: f64) -> Option<Increment> {
+    fn increment(&self, before: &ClassBelief, log_odds: f64) -> Result<Increment, FleetSoilError> {
         let (after, config) = (self.filter.snapshot(), self.filter.config());
         let kept = 1.0 - 1.0 / config.trust_memory.max(1.0);
         let over = |log_odds: f64| log_odds - config.trust_log_odds;
         let vote = if config.trust_memory > 0.0 { over(after.trust_log_odds) - kept * over(log_odds) } else { 0.0 };
-        Increment::between(&soil_belief(before), &soil_belief(&self.filter.belief()), vote).ok()
+        Increment::between(&soil_belief(before), &soil_belief(&self.filter.belief()), vote)
     }
 
     /// Begins from what the fleet knows. Says whether it does.
     pub(super) fn begin_from(&mut self, prior: &FleetPrior) -> bool {
         let belief = ClassBelief { delta: prior.belief.delta, covariance: prior.belief.covariance };
         let log_odds = self.filter.config().trust_log_odds + prior.votes.clamp(-VOTES_MAX, VOTES_MAX);
-        self.filter.begun_from(&belief, log_odds).map(|filter| self.filter = filter).is_some()
+        let begun = self.filter.begun_from(&belief, log_odds);
+        self.noted(begun).flatten().map(|filter| self.filter = filter).is_some()
     }
 
     /// Covariance as the filter gives it out, its own with trust and scale.
