@@ -26,9 +26,6 @@ use crate::session::{Acting, Observed, Rules, Session, SessionImage, refused};
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
 pub type EventSink = Box<dyn FnMut(Event) + Send>;
 
-/// A recorded command and the instant at which it was executed, ns of the engine's clock.
-pub type Logged = (u64, Command);
-
 /// All state of the service.
 pub struct Engine {
     predictor: Arc<Predictor>,
@@ -43,7 +40,6 @@ pub struct Engine {
     /// Soil map of the fleet; `None` = every session begins from the prior alone.
     fleet: Option<Fleet>,
     events: Option<EventSink>,
-    log: Option<Vec<Logged>>,
 }
 
 impl core::fmt::Debug for Engine {
@@ -73,7 +69,6 @@ impl Engine {
             maps: MapRegistry::default(),
             fleet: None,
             events: None,
-            log: None,
         })
     }
 
@@ -101,16 +96,6 @@ impl Engine {
         self
     }
 
-    /// Keeps every command from now on, for a replay.
-    pub fn start_recording(&mut self) {
-        self.log = Some(Vec::new());
-    }
-
-    /// The recorded commands.
-    pub fn take_recording(&mut self) -> Vec<Logged> {
-        self.log.take().unwrap_or_default()
-    }
-
     /// Limits in force.
     pub fn limits(&self) -> &Limits {
         &self.limits
@@ -135,9 +120,6 @@ impl Engine {
         let result = self.answer(now_ns, command, until);
         if matches!(result, Err(EngineError::Abandoned)) {
             return result;
-        }
-        if let Some(log) = &mut self.log {
-            log.push((now_ns, command.clone().answered(&result)));
         }
         if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
             session.touch(now_ns);

@@ -41,7 +41,7 @@ pub mod sync;
 pub use candidates::{Candidates, Drawing};
 pub use clock::{Clock, ManualClock};
 pub use command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot};
-pub use engine::{Engine, EventSink, Logged};
+pub use engine::{Engine, EventSink};
 pub use error::EngineError;
 pub use extras::{CovarianceQuery, Covariances, ExtraOutputs, Jacobians, PredictExtras, SIGMA_POINTS, WhatIfSoils};
 pub use fleet::{FleetCell, FleetShare};

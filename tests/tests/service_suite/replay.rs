@@ -1,9 +1,9 @@
 //! Goal: the recorded commands of a run give the same answers when they are executed again.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 
 use nesam_engine::{
-    Candidates, Command, CostWeights, Drawing, Engine, EngineHandle, Limits, ManualClock, OpenSession, PathCost, PredictExtras,
+    Candidates, Command, CostWeights, Drawing, Engine, EngineHandle, Executed, Limits, ManualClock, OpenSession, PathCost, PredictExtras,
     PredictQuery,
 };
 
@@ -12,10 +12,12 @@ use crate::stage::*;
 #[test]
 fn property_replayed_commands_give_the_same_bytes() {
     let recorded = recorded();
-    let mut engine = Engine::new(predictor(), Limits::default()).unwrap();
-    engine.start_recording();
+    let engine = Engine::new(predictor(), Limits::default()).unwrap();
     let clock = Arc::new(ManualClock::default());
-    let handle = EngineHandle::spawn(engine, clock.clone());
+    let log = Arc::new(Mutex::new(Vec::new()));
+    let heard = Arc::clone(&log);
+    let tap = Box::new(move |executed: Executed| heard.lock().unwrap().push((executed.now_ns, executed.command)));
+    let handle = EngineHandle::spawn_tapped(engine, clock.clone(), Some(tap));
     let mut first = Vec::new();
     let mut call = |command: Command| {
         clock.advance_ns(7_000_000);
@@ -44,7 +46,8 @@ fn property_replayed_commands_give_the_same_bytes() {
     call(Command::List);
     call(Command::Close { session: "truck".into() });
 
-    let log = handle.stop().expect("the engine's thread ended well").take_recording();
+    handle.stop().expect("the engine's thread ended well");
+    let log = log.lock().unwrap();
     assert_eq!(log.len(), first.len());
     let mut again = Engine::new(Arc::new(fresh_predictor()), Limits::default()).unwrap();
     for ((now_ns, command), answer) in log.iter().zip(&first) {
