@@ -1,7 +1,5 @@
 //! What can go wrong in the filter.
 
-use crate::VELOCITY_DIM;
-
 /// Errors of this crate. After any of them the estimate is what it was before.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum AdaptationError {
@@ -40,13 +38,5 @@ pub enum AdaptationError {
     Settings {
         /// What was wrong.
         reason: String,
-    },
-    /// Too few differences to estimate the noise from.
-    #[error("{found} consecutive transitions are too few to estimate the noise of {VELOCITY_DIM} channels, at least {needed} are needed")]
-    TooFewTransitions {
-        /// Transitions given.
-        found: usize,
-        /// Transitions needed.
-        needed: usize,
     },
 }

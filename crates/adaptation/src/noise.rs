@@ -6,13 +6,6 @@ use serde::{Deserialize, Serialize};
 use crate::AdaptationError;
 use crate::prediction::VELOCITY_DIM;
 
-/// Lags over which the colour of the noise is fitted; a buffer is about as long.
-const LAGS: usize = 10;
-/// Consecutive transitions needed to estimate the noise.
-const TRANSITIONS_MIN: usize = 100;
-/// Share of the variance that counts as white at least, so that S stays well conditioned.
-const WHITE_SHARE_MIN: f64 = 0.2;
-
 /// Noise of one channel: white, plus a model error that forgets itself from step to step (first-order autoregressive).
 ///
 /// The coloured part is what keeps a buffer honest: ten predictions that share an error say less than ten that do not, and a filter that
@@ -115,12 +108,6 @@ pub struct VelocityNoise {
 }
 
 impl VelocityNoise {
-    /// The same white noise in the three linear and the three angular channels, nothing coloured.
-    pub fn white(velocity_m_s: f64, angular_velocity_rad_s: f64) -> Self {
-        let of = |white_sd| ChannelNoise { white_sd, coloured_sd: 0.0, correlation: 0.0 };
-        Self { channels: core::array::from_fn(|c| of(if c < 3 { velocity_m_s } else { angular_velocity_rad_s })) }
-    }
-
     /// R_B of a buffer of `steps` transitions, row 6 k + c for channel c of transition k.
     pub fn covariance(&self, steps: usize) -> DMatrix<f64> {
         DMatrix::from_fn(steps * VELOCITY_DIM, steps * VELOCITY_DIM, |row, column| {
@@ -132,25 +119,6 @@ impl VelocityNoise {
             let white = if k == j { noise.white_sd * noise.white_sd } else { 0.0 };
             white + noise.coloured_sd * noise.coloured_sd * noise.correlation.powi(k.abs_diff(j) as i32)
         })
-    }
-
-    /// Noise whose autocovariance fits that of differences y - ŷ, given as unbroken runs of consecutive transitions.
-    ///
-    /// For each correlation on a grid the coloured variance follows by least squares over lags 1…10; what lag 0 has more is white. The
-    /// mean counts as noise: a filter must not explain a constant error of the model by soil.
-    ///
-    /// # Errors
-    /// `AdaptationError::TooFewTransitions` with fewer than 100 transitions, `NotFinite` when a difference is not a number.
-    pub fn estimate(runs: &[Vec<[f64; VELOCITY_DIM]>]) -> Result<Self, AdaptationError> {
-        let found = runs.iter().map(Vec::len).sum();
-        if found < TRANSITIONS_MIN {
-            return Err(AdaptationError::TooFewTransitions { found, needed: TRANSITIONS_MIN });
-        }
-        if let Some(index) = runs.iter().flatten().position(|e| !e.iter().all(|v| v.is_finite())) {
-            return Err(AdaptationError::NotFinite { what: "difference", index });
-        }
-        let channels = core::array::from_fn(|c| fit(&core::array::from_fn(|lag| autocovariance(runs, c, lag))));
-        Ok(Self { channels })
     }
 
     /// Refuses what cannot make a covariance.
@@ -170,37 +138,4 @@ impl VelocityNoise {
             }
         }
     }
-}
-
-/// Mean over all pairs `lag` steps apart within a run.
-fn autocovariance(runs: &[Vec<[f64; VELOCITY_DIM]>], channel: usize, lag: usize) -> f64 {
-    let (mut sum, mut pairs) = (0.0, 0usize);
-    for run in runs {
-        for k in lag..run.len() {
-            sum += run[k][channel] * run[k - lag][channel];
-            pairs += 1;
-        }
-    }
-    sum / pairs.max(1) as f64
-}
-
-fn fit(autocovariance: &[f64; LAGS + 1]) -> ChannelNoise {
-    let total = autocovariance[0].max(f64::MIN_POSITIVE);
-    let mut best = (f64::INFINITY, 0.0, 0.0);
-    for step in 0..99 {
-        let correlation = f64::from(step) * 0.01;
-        let shape = |lag: usize| correlation.powi(lag as i32);
-        let (mut along, mut norm) = (0.0, 0.0);
-        for (lag, value) in autocovariance.iter().enumerate().skip(1) {
-            along += value * shape(lag);
-            norm += shape(lag) * shape(lag);
-        }
-        let variance = if norm > 0.0 { (along / norm).clamp(0.0, (1.0 - WHITE_SHARE_MIN) * total) } else { 0.0 };
-        let misfit: f64 = (1..=LAGS).map(|lag| (autocovariance[lag] - variance * shape(lag)).powi(2)).sum();
-        if misfit < best.0 {
-            best = (misfit, variance, correlation);
-        }
-    }
-    let (_, variance, correlation) = best;
-    ChannelNoise { white_sd: (total - variance).sqrt(), coloured_sd: variance.sqrt(), correlation }
 }

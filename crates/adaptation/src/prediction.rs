@@ -148,14 +148,6 @@ fn prediction_of(state: &[SoilDual; STATE_DIM]) -> VelocityPrediction {
     }
 }
 
-impl BufferedTransition {
-    /// y - ŷ at a correction.
-    pub fn innovation(&self, model: &StepModel, correction: &SoilCorrection) -> [f64; VELOCITY_DIM] {
-        let predicted = predict_velocity(model, self, correction).velocity;
-        core::array::from_fn(|c| self.measured_next[c] - predicted[c])
-    }
-}
-
 /// The input with another soil, in the scalar of that soil; everything else is constant.
 fn with_soil<T: Real>(input: &StepInput<f64>, soil: Soil<T>) -> StepInput<T> {
     let wheels = &input.wheels;

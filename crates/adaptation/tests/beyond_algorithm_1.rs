@@ -4,11 +4,9 @@
 
 mod common;
 
-use common::{LOAM, NOISE, SOFT, config, model, run, twin};
+use common::{LOAM, NOISE, SOFT, config, model, run, twin, white};
 use nalgebra::DMatrix;
-use nesam_adaptation::{
-    BufferedTransition, FilterConfig, Innovation, NoiseConditions, SharedError, SoilFilter, SoilUpdate, VelocityNoise, conditions,
-};
+use nesam_adaptation::{BufferedTransition, FilterConfig, Innovation, NoiseConditions, SharedError, SoilFilter, SoilUpdate, conditions};
 use nesam_physics::{SOIL_DIM, SoilCoordinates};
 
 fn plain() -> FilterConfig {
@@ -23,7 +21,7 @@ fn of_means() -> FilterConfig {
 #[test]
 fn property_nothing_is_learned_where_the_ground_is_not_excited() {
     // Sensors a thousand times worse than the soil could move anything: the information of a buffer is nil, although Q_B would widen P.
-    let deaf = FilterConfig { noise: VelocityNoise::white(1e3, 1e3).into(), process_sd: [0.05; 6], excitation_min: 1e-3, ..plain() };
+    let deaf = FilterConfig { noise: white(1e3, 1e3).into(), process_sd: [0.05; 6], excitation_min: 1e-3, ..plain() };
     let (filter, updates) = run(deaf.clone(), &model(), &twin(&model(), SOFT, LOAM, 50, 1));
     assert!(updates.iter().all(|u| !u.excited && !u.rejected && u.excitation < 1e-3), "{updates:?}");
     assert_eq!(filter.posterior(), SoilFilter::new(deaf).unwrap().posterior());
@@ -127,7 +125,7 @@ fn property_an_error_that_carries_on_is_foreseen() {
             shared[(r, c)] = 0.01;
         }
     }
-    let mut noise = VelocityNoise::white(NOISE[0], NOISE[1]).covariance(2);
+    let mut noise = white(NOISE[0], NOISE[1]).covariance(2);
     noise += &shared;
     let told = FilterConfig { noise: nesam_adaptation::BufferNoise::Sampled(noise), ..of_means() };
     let following = FilterConfig { shared_error: Some(SharedError { covariance: shared, correlation: 0.99 }), ..told.clone() };

@@ -4,11 +4,11 @@
 
 mod common;
 
-use common::{LOAM, NOISE, SOFT, config, model, run, twin};
+use common::{LOAM, NOISE, SOFT, config, model, run, twin, white};
 use nalgebra::{DMatrix, DVector};
 use nesam_adaptation::{
     AdaptationError, BufferNoise, BufferedTransition, FilterConfig, Innovation, SharedError, SoilFilter, UncorrectedBuffer, VELOCITY_DIM,
-    VelocityNoise, calibrate, chi_square_tail, predict_velocity,
+    calibrate, chi_square_tail, predict_velocity,
 };
 use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SoilCoordinates, SoilCorrection};
 use rand::SeedableRng;
@@ -212,28 +212,6 @@ fn regress_same_pushes_same_bytes() {
 }
 
 #[test]
-fn property_noise_is_found_again_in_its_own_samples() {
-    let mut rng = ChaCha8Rng::seed_from_u64(1);
-    let mut normal = || -> f64 { StandardNormal.sample(&mut rng) };
-    let (white, coloured, correlation) = (0.05, 0.08, 0.8_f64);
-    let mut carried = [0.0; VELOCITY_DIM];
-    let run: Vec<[f64; VELOCITY_DIM]> = (0..20_000)
-        .map(|_| {
-            core::array::from_fn(|c| {
-                carried[c] = correlation * carried[c] + (1.0 - correlation * correlation).sqrt() * coloured * normal();
-                carried[c] + white * normal()
-            })
-        })
-        .collect();
-    for channel in VelocityNoise::estimate(&[run]).unwrap().channels {
-        assert!((channel.white_sd - white).abs() < 0.01 && (channel.coloured_sd - coloured).abs() < 0.01, "{channel:?}");
-        assert!((channel.correlation - correlation).abs() < 0.05, "{channel:?}");
-    }
-    let few = VelocityNoise::estimate(&[vec![[0.0; 6]; 5]]);
-    assert_eq!(few, Err(AdaptationError::TooFewTransitions { found: 5, needed: 100 }));
-}
-
-#[test]
 fn property_unusable_settings_are_refused_by_name() {
     let refused = |config: FilterConfig| match SoilFilter::new(config) {
         Err(AdaptationError::Config { setting, .. }) => setting,
@@ -254,7 +232,7 @@ fn property_unusable_settings_are_refused_by_name() {
     assert_eq!(refused(FilterConfig { trust_memory: -1.0, ..base() }), "trust_memory");
     assert_eq!(refused(FilterConfig { trust_log_odds: f64::NAN, ..base() }), "trust_log_odds");
     assert_eq!(refused(FilterConfig { linearisations: 0, ..base() }), "linearisations");
-    assert_eq!(refused(FilterConfig { noise: VelocityNoise::white(0.0, 0.1).into(), ..base() }), "noise");
+    assert_eq!(refused(FilterConfig { noise: white(0.0, 0.1).into(), ..base() }), "noise");
     assert_eq!(refused(FilterConfig { classes: 0, ..base() }), "classes");
     assert_eq!(refused(FilterConfig { class_share: 1.5, ..base() }), "class_share");
     assert_eq!(refused(FilterConfig { tail_dof: -1.0, ..base() }), "tail_dof");
@@ -321,7 +299,7 @@ fn property_a_correction_is_used_where_it_helps_and_not_where_the_prior_is_right
 #[test]
 fn analytic_the_band_that_goes_out_follows_trust_and_scale() {
     let model = model();
-    let told = VelocityNoise::white(0.2 * NOISE[0], 0.2 * NOISE[1]).into();
+    let told = white(0.2 * NOISE[0], 0.2 * NOISE[1]).into();
     let config = FilterConfig {
         noise: told,
         scale_memory: 5.0,
@@ -350,7 +328,7 @@ fn analytic_the_band_that_goes_out_follows_trust_and_scale() {
 fn property_noise_that_is_larger_than_told_is_found_by_the_scale() {
     // Told a fifth of the noise that there is: without the scale NIS over its degrees of freedom is near 25.
     let model = model();
-    let told = VelocityNoise::white(0.2 * NOISE[0], 0.2 * NOISE[1]).into();
+    let told = white(0.2 * NOISE[0], 0.2 * NOISE[1]).into();
     let following = FilterConfig { noise: told, scale_memory: 5.0, ..config(SoilCoordinates::Logarithmic) };
     let of_drive = |seed: u64| {
         let (_, updates) = run(following.clone(), &model, &twin(&model, LOAM, LOAM, 400, seed));

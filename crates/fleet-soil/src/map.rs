@@ -105,11 +105,6 @@ impl CellEvidence {
         }
     }
 
-    /// Buffers that went in, aged to the last one.
-    pub fn buffers(&self) -> f64 {
-        self.buffers
-    }
-
     /// Instant of the last increment, s.
     pub fn stamp_s(&self) -> f64 {
         self.stamp_s
@@ -391,7 +386,7 @@ mod tests {
             assert!((prior.buffers - expected.buffers).abs() < 1e-12 && (prior.votes - expected.votes).abs() < 1e-12);
             for (key, evidence) in map.cells() {
                 let whole = one.cell(key).unwrap();
-                assert!((evidence.buffers() - whole.buffers()).abs() < 1e-9 && evidence.stamp_s() == whole.stamp_s());
+                assert!((evidence.buffers - whole.buffers).abs() < 1e-9 && evidence.stamp_s() == whole.stamp_s());
                 assert_eq!(map.cell(key), Some(evidence));
             }
         }

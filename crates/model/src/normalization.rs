@@ -32,7 +32,7 @@ pub struct Normalization {
     /// Whether the encoders see borders between colours smoothed (`PatchScale::smooth_semantics`); bundles before 0.1.0 do not say and see them hard.
     #[serde(default)]
     pub smooth_semantics: bool,
-    /// Mean of the state and control entries of a token, see `token::ENTRY_NAMES`.
+    /// Mean of the state and control entries of a token, see `token_entries`.
     pub token_mean: [f32; STATE_CONTROL],
     /// Scale of the same.
     pub token_scale: [f32; STATE_CONTROL],

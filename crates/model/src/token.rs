@@ -60,21 +60,4 @@ impl TokenScale {
     }
 }
 
-/// Names of the entries, for reports.
-pub const ENTRY_NAMES: [&str; STATE_CONTROL] = [
-    "height_m",
-    "roll_rad",
-    "pitch_rad",
-    "turned_rad",
-    "v_x_m_s",
-    "v_y_m_s",
-    "v_z_m_s",
-    "w_x_rad_s",
-    "w_y_rad_s",
-    "w_z_rad_s",
-    "ahead_m",
-    "left_m",
-    "speed_command_m_s",
-    "second_command",
-];
 const _: () = assert!(STATE_DIM + 2 == STATE_CONTROL);

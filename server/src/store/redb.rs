@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use ::redb::{Database, DatabaseError, Durability, ReadableDatabase as _, ReadableTable as _, StorageBackend, TableDefinition};
+use ::redb::{Database, DatabaseError, Durability, ReadableDatabase as _, ReadableTable as _, TableDefinition};
 
 use super::{Change, Contents, SessionStore, StoreError, StoredSession, StoredSoil};
 
@@ -64,15 +64,6 @@ impl RedbStore {
         std::fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(at(folder))?;
         // A file that has gone is no empty store: what was durable in it would be missing from the new one.
         Self::prepared(database, move || of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).open(&path)))
-    }
-
-    /// The same on another backend, for tests of crashes.
-    ///
-    /// # Errors
-    /// As [`RedbStore::open`].
-    pub fn with_backend(backend: impl StorageBackend + Clone) -> Result<Self, StoreError> {
-        let open = move || Database::builder().set_cache_size(CACHE_BYTES).create_with_backend(backend.clone()).map_err(failed);
-        Self::prepared(open()?, open)
     }
 
     /// Makes the tables, or refuses a database of another format.

@@ -150,7 +150,7 @@ impl Sharing {
     /// Buffers that were brought here.
     fn brought(&mut self) -> f64 {
         let Reply::FleetShares(_, shares) = self.ask(Command::TellFleetSoil) else { panic!("another reply") };
-        shares.iter().flat_map(|share| &share.cells).map(|cell| cell.evidence.buffers()).sum()
+        shares.iter().flat_map(|share| &share.cells).map(|cell| cell.evidence.parts().buffers).sum()
     }
 }
 

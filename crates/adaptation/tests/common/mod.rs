@@ -1,6 +1,6 @@
 //! A truck, twin drives, settings without the adaptive parts.
 
-use nesam_adaptation::{BufferedTransition, FilterConfig, Innovation, SoilFilter, SoilUpdate, VelocityNoise};
+use nesam_adaptation::{BufferedTransition, ChannelNoise, FilterConfig, Innovation, SoilFilter, SoilUpdate, VelocityNoise};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::step::{Ground, StepInput, StepModel};
 use nesam_physics::{Control, DT_S, SOIL_DIM, Soil, SoilCoordinates, VehicleState};
@@ -63,12 +63,18 @@ pub fn twin(model: &StepModel, true_soil: [f64; SOIL_DIM], prior: [f64; SOIL_DIM
     transitions
 }
 
+/// The same white noise in the three linear and the three angular channels, nothing coloured.
+pub fn white(velocity_m_s: f64, angular_velocity_rad_s: f64) -> VelocityNoise {
+    let of = |white_sd| ChannelNoise { white_sd, coloured_sd: 0.0, correlation: 0.0 };
+    VelocityNoise { channels: core::array::from_fn(|c| of(if c < 3 { velocity_m_s } else { angular_velocity_rad_s })) }
+}
+
 pub fn config(coordinates: SoilCoordinates) -> FilterConfig {
     let base = match coordinates {
         SoilCoordinates::Physical => FilterConfig::literal(),
         SoilCoordinates::Logarithmic => FilterConfig::default(),
     };
-    let noise = VelocityNoise::white(NOISE[0], NOISE[1]).into();
+    let noise = white(NOISE[0], NOISE[1]).into();
     let one_step = Innovation::OneStep;
     let plain = FilterConfig { scale_memory: 0.0, trust_memory: 0.0, shared_buffers: 1.0, classes: 1, class_share: 0.0, ..base };
     FilterConfig { noise, process_sd: [0.0; 6], gate_tail_probability: 0.0, innovation: one_step, block: 1, ..plain }

@@ -4,6 +4,8 @@
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex};
 
+use ::redb::StorageBackend;
+
 use super::*;
 
 /// Sector of the disk: what is written at once or not at all, bytes.
@@ -159,9 +161,15 @@ fn expected(n: u64) -> Contents {
     Contents { sessions: sessions.into_values().collect(), maps: maps.into_iter().collect(), soil: soil.into_values().collect() }
 }
 
+/// A store on such a disk.
+fn on(disk: Disk) -> Result<RedbStore, StoreError> {
+    let open = move || Database::builder().set_cache_size(CACHE_BYTES).create_with_backend(disk.clone()).map_err(failed);
+    RedbStore::prepared(open()?, open)
+}
+
 /// Commits until the power goes; the last commit that returned.
 fn run(disk: &Disk, from: u64, commits: u64) -> Option<u64> {
-    let mut store = RedbStore::with_backend(disk.clone()).ok()?;
+    let mut store = on(disk.clone()).ok()?;
     let mut returned = from;
     for n in from + 1..=from + commits {
         if store.commit(&changes(n)).is_err() {
@@ -190,7 +198,7 @@ fn property_a_power_cut_loses_no_commit_that_returned() {
             disk.0.lock().unwrap().left = Some(left);
             let returned = run(&disk, 0, COMMITS).unwrap_or(0);
             let left_over = disk.0.lock().unwrap().after_power_cut(&mut random);
-            let store = RedbStore::with_backend(Disk::holding(left_over)).unwrap_or_else(|e| panic!("cut at {left}, seed {seed}: {e}"));
+            let store = on(Disk::holding(left_over)).unwrap_or_else(|e| panic!("cut at {left}, seed {seed}: {e}"));
             let held = store.load().unwrap();
             let next = held == expected(returned + 1) && returned < COMMITS;
             assert!(held == expected(returned) || next, "cut at {left}, seed {seed}: {returned} commits had returned");
@@ -213,7 +221,7 @@ fn regress_a_disk_that_was_full_is_written_to_again() {
     let mut refused = 0;
     loop {
         let disk = Disk::holding(begun.clone());
-        let mut store = RedbStore::with_backend(disk.clone()).unwrap();
+        let mut store = on(disk.clone()).unwrap();
         room(&disk, Some(refused));
         if store.commit(&changes(4)).is_ok() {
             break;
@@ -228,7 +236,7 @@ fn regress_a_disk_that_was_full_is_written_to_again() {
         assert_eq!(store.load().unwrap(), expected(6), "full from operation {refused} on");
         let synced = disk.0.lock().unwrap().synced.clone();
         drop(store);
-        assert_eq!(RedbStore::with_backend(Disk::holding(synced)).unwrap().load().unwrap(), expected(6), "what a power cut leaves");
+        assert_eq!(on(Disk::holding(synced)).unwrap().load().unwrap(), expected(6), "what a power cut leaves");
         refused += 1;
     }
     assert!(refused > 2, "a commit of {refused} operations shows nothing");
