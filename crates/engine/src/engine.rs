@@ -395,13 +395,15 @@ impl Engine {
         let learned = session.soil_field(map);
         let Until { abandoned, due } = until;
         let due = due.filter(|_| query.takes_fewer()).map(|flag| Due { flag, least: query.least() });
+        let looked_at = query.extras.interpolation_deviation && map.is_some();
         let asked_extras =
-            RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: false, abandoned, due };
-        let (rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
+            RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: looked_at, abandoned, due };
+        let (mut rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
         let samples = if due.is_some() { rollout.samples } else { query.samples };
         let taken = &commands[..samples * query.horizon * 2];
-        let looked_at = query.extras.interpolation_deviation && map.is_some();
         let deviation_m = looked_at.then(|| predictor.interpolation_deviation_m(&asked, &asked_extras, &rollout)).transpose()?;
+        // An answer carries the states alone.
+        rollout.position_m = Vec::new();
         let mut extras = ExtraOutputs {
             soil_groups: soils.len().max(1),
             interpolation_deviation_m: deviation_m.filter(|deviation_m| deviation_m.is_finite()),

@@ -212,7 +212,8 @@ impl Predictor {
     }
 
     /// How far the first candidate of an answer lies from the same candidate with the terrain encoded at every pose: horizontal distance, mean over the
-    /// horizon, m. `answered` is what this predictor made of the query, whose first candidate is its first row.
+    /// horizon, m. `answered` is what this predictor made of the query, whose first candidate is its first row, with positions that are not rounded
+    /// ([`RolloutExtras::unrounded`]): at UTM coordinates the rounded ones lie further apart than any interpolation moves them.
     ///
     /// # Errors
     /// As [`Predictor::rollout`].
@@ -223,13 +224,13 @@ impl Predictor {
         answered: &Rollout,
     ) -> Result<f64, ModelError> {
         let first = RolloutQuery { samples: 1, controls: &query.controls[..2 * query.horizon], ..query.clone() };
-        let extras = RolloutExtras { soils: &extras.soils[..extras.soils.len().min(1)], risk: false, ..*extras };
+        let extras = RolloutExtras { soils: &extras.soils[..extras.soils.len().min(1)], risk: false, unrounded: true, ..*extras };
         let (exact, _) = self.exactly().rollout_with(&first, &extras)?;
-        let planar = |states: &[f32]| -> Vec<[f32; 2]> {
-            states.chunks_exact(STATE_DIM).take(query.horizon).map(|state| [state[0], state[1]]).collect()
+        let apart_m = |k: usize| {
+            let [a, b] = [answered, &exact].map(|rollout| rollout.state_f64(0, k).position_m);
+            (a[0] - b[0]).hypot(a[1] - b[1])
         };
-        let pairs = planar(&answered.states).into_iter().zip(planar(&exact.states));
-        Ok(pairs.map(|(a, b)| f64::from(a[0] - b[0]).hypot(f64::from(a[1] - b[1]))).sum::<f64>() / query.horizon as f64)
+        Ok((0..query.horizon).map(apart_m).sum::<f64>() / query.horizon as f64)
     }
 
     /// Form that a query asks for.
