@@ -15,6 +15,11 @@ pub const ASKED: Range<usize> = STEERING_AT..PATH_AT;
 /// The mean commands of a segment: speed, m/s, and the second command in its unit.
 pub type Commands = [f64; 2];
 
+/// Those of some channels of which it is asked.
+pub fn asked_of(channels: &[usize]) -> Vec<usize> {
+    channels.iter().copied().filter(|channel| ASKED.contains(channel)).collect()
+}
+
 /// How far an actuator channel would be off in each segment of a drive if it bent by one, in units of the command (speed: its square). Nothing where the commands hardly vary.
 pub fn shape(commands: &[Commands], channel: usize) -> Vec<f64> {
     let (command, bent): (Vec<f64>, Vec<f64>) = match channel {

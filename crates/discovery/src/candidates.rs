@@ -123,7 +123,7 @@ fn payload(effect: Effect) -> Line {
     }
 }
 
-/// Least mass from which the size of a payload is looked for, kg (chosen).
+/// Least mass from which the size of a payload is looked for on the car of the catalogue, kg (chosen).
 const PAYLOAD_START_KG: f64 = 200.0;
 
 /// One hypothesis: an effect of the catalogue, for a wheel drag at one wheel.
@@ -159,6 +159,16 @@ pub fn column_count(catalogue: &[Candidate]) -> usize {
     catalogue.iter().map(|c| c.line.columns.len()).sum()
 }
 
+/// Mass from which a vehicle answers to the loads, forces and torques of the catalogue as the car does for which they were chosen, kg (chosen).
+const CATALOGUE_MASS_KG: f64 = 2000.0;
+
+/// How far a vehicle is led by an effect in place of what leads the car of the catalogue as far: loads, forces and torques of a robot are smaller, lengths, times and ratios
+/// are not.
+fn lightness(unit: &str, mass_kg: f64) -> f64 {
+    let grows = ["kg", "N", "N m", "N s/m", "N s²/m²"].contains(&unit);
+    if grows { (mass_kg / CATALOGUE_MASS_KG).min(1.0) } else { 1.0 }
+}
+
 /// Standard deviation of the shares of a linear form.
 pub const SHARE_SD: f64 = 3.0;
 
@@ -190,6 +200,17 @@ impl Candidate {
     /// Parameters to estimate.
     pub fn free(&self) -> &'static [Free] {
         &self.line.free
+    }
+
+    /// Step of the finite differences of a free parameter on a vehicle of this mass (kg).
+    pub fn step(&self, i: usize, mass_kg: f64) -> f64 {
+        let free = &self.line.free[i];
+        free.step * lightness(self.line.effect.quantities()[free.parameter].unit, mass_kg)
+    }
+
+    /// Share by which its columns are differentiated on a vehicle of this mass (kg).
+    pub fn share_step(&self, mass_kg: f64) -> f64 {
+        lightness(self.line.effect.quantities()[self.line.free[0].parameter].unit, mass_kg)
     }
 
     /// Whether columns are differentiated forward from zero.
@@ -236,10 +257,10 @@ impl Candidate {
         }
     }
 
-    /// Where a refit begins: the shares of the linear form as physical parameters.
-    pub fn start(&self, shares: &[f64]) -> Vec<f64> {
+    /// Where a refit begins on a vehicle of this mass (kg): the shares of the linear form as physical parameters.
+    pub fn start(&self, shares: &[f64], mass_kg: f64) -> Vec<f64> {
         if self.id() == "payload" {
-            return payload_start(&self.line.columns, shares);
+            return payload_start(&self.line.columns, shares, PAYLOAD_START_KG * lightness("kg", mass_kg));
         }
         let of = |(i, f): (usize, &Free)| {
             let [low, high] = self.range(i);
@@ -287,7 +308,7 @@ impl Candidate {
     }
 }
 
-fn payload_start(columns: &[Vec<f64>], shares: &[f64]) -> Vec<f64> {
+fn payload_start(columns: &[Vec<f64>], shares: &[f64], least_kg: f64) -> Vec<f64> {
     let (mut mass, mut moment) = (0.0f64, [0.0; 3]);
     for (share, column) in shares.iter().zip(columns) {
         mass += share * column[0];
@@ -296,7 +317,7 @@ fn payload_start(columns: &[Vec<f64>], shares: &[f64]) -> Vec<f64> {
         }
     }
     // A load that was taken away would look the same on the other side; a payload is there.
-    let mass_kg = mass.max(PAYLOAD_START_KG);
+    let mass_kg = mass.max(least_kg);
     let at = |axis: usize, reach: f64| (moment[axis] / mass_kg).clamp(-reach, reach);
     vec![mass_kg, at(0, 2.0), at(1, 0.8), at(2, 1.2)]
 }

@@ -13,6 +13,7 @@ use crate::condense::{Condensed, condense, part_of};
 use crate::dating::Dating;
 use crate::evidence::Group;
 use crate::fit::{Fit, Prepared, Start, Term, fit};
+use crate::ground::Ground;
 use crate::metric::Metric;
 use crate::observe::Bench;
 use crate::onset::{Onset, PossibleOnset};
@@ -149,6 +150,8 @@ pub struct Case<'a> {
     pub rows: Vec<Vec<Row>>,
     /// From when on the columns of each hypothesis are there; `None` until onsets were looked for.
     pub(crate) dating: Option<Dating>,
+    /// The soil that explains the drives best without an effect, where a model on trial has no map to tell it.
+    pub(crate) ground_alone: Option<Ground>,
 }
 
 impl Case<'_> {
@@ -171,7 +174,7 @@ impl Case<'_> {
             .map(|term| {
                 let own = term.candidate.columns();
                 let rest = shares.split_off(own.len());
-                let start = term.candidate.start(&shares);
+                let start = term.candidate.start(&shares, self.bench.vehicle.mass_kg);
                 shares = rest;
                 match term.candidate.unit() {
                     Some(unit) => offset.push(unit * yardstick.nulls.share[own[0]]),

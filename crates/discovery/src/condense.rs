@@ -15,7 +15,7 @@ use crate::candidates::{Candidate, column_count};
 use crate::channels::{CHANNELS, Row};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
-use nesam_physics::effects::ScheduledEffect;
+use nesam_physics::effects::{Effect, ScheduledEffect};
 
 /// Prior standard deviation of a soil correction common to a drive, logarithmic coordinates: ln k_phi, ln k_c, n, ln c, phi (rad), ln k_shear.
 /// Twice the spread of Wong's published soils within a class of ground (chosen), because a claim must not rest on soil that is a little unusual.
@@ -128,25 +128,30 @@ pub struct Beside {
 
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.
 pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive) -> Signatures {
-    signatures_beside(bench, drive, &[])
+    signatures_beside(bench, drive, &[], |_| true)
 }
 
 /// The same beside effects that were fitted; their own columns are the secants, from without to with each, one after the other, so that the deviations without
-/// them are those with them plus the columns times their shares.
-pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Beside]) -> Signatures {
+/// them are those with them plus the columns times their shares. Columns of what is not `wanted` are zero.
+pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Beside], wanted: impl Fn(&Candidate) -> bool) -> Signatures {
     let beside: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
     let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| {
         let effects: Vec<ScheduledEffect> = beside.iter().copied().chain(effect).collect();
         drive.deviations(bench, &effects, soil)
     };
     let base = at(None, &SoilCorrection::NONE);
-    let forms: Vec<(nesam_physics::effects::Effect, bool)> =
-        bench.catalogue.iter().flat_map(|c| c.linear_form().into_iter().map(|e| (e, c.forward())).collect::<Vec<_>>()).collect();
+    let mass_kg = bench.vehicle.mass_kg;
+    let form = |c: &Candidate| {
+        let step = wanted(c).then(|| c.share_step(mass_kg));
+        c.linear_form().into_iter().map(|e| (e, c.forward(), step)).collect::<Vec<_>>()
+    };
+    let forms: Vec<(Effect, bool, Option<f64>)> = bench.catalogue.iter().flat_map(form).collect();
     let mut columns: Vec<Vec<Row>> = forms
         .par_iter()
-        .map(|(effect, forward)| {
+        .map(|(effect, forward, step)| {
+            let Some(step) = step else { return vec![[0.0; CHANNELS]; base.len()] };
             let side = |share: f64| at(Some(ScheduledEffect { effect: effect.scaled(share), onset_s: 0.0 }), &SoilCorrection::NONE);
-            if *forward { difference(&base, &side(1.0), 1.0) } else { difference(&side(-1.0), &side(1.0), 0.5) }
+            if *forward { difference(&base, &side(*step), 1.0 / step) } else { difference(&side(-step), &side(*step), 0.5 / step) }
         })
         .collect();
     for (i, own) in fitted.iter().enumerate() {
@@ -197,7 +202,10 @@ pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Conde
         metric.channels.iter().position(|own| *own == c).map_or_else(|| DVector::zeros(metric.channels.len()), |at| metric.unit(at))
     };
     columns.extend((0..CHANNELS).map(|c| vec![unit(c); rows.len()]));
-    columns.extend(bend::ASKED.map(|c| bend::shape(&signatures.commands, c).into_iter().map(|share| unit(c) * share).collect()));
+    columns.extend(bend::ASKED.map(|c| {
+        let unit = unit(c);
+        bend::shape(&signatures.commands, c).into_iter().map(|share| &unit * share).collect()
+    }));
     let named = columns.len();
     columns.extend(whitened(metric, &signatures.soil));
     profile_soil(&products(metric, rows, &columns, &signatures.uncounted).sum(metric), named)

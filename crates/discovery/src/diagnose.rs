@@ -6,21 +6,22 @@ use nesam_physics::effects::written::WRITTEN_MAX;
 use nesam_physics::effects::{Effect, Written};
 use nesam_trajectories::Trajectory;
 
+use crate::bend;
 use crate::candidates::{Candidate, catalogue};
 use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::Condensed;
 use crate::controls::{Kind, NullDrives, Setting};
 use crate::error::DiscoveryError;
+use crate::ground::{Ground, Soils};
 use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
 use crate::judge::{Judge, case_of, own_yardstick};
 use crate::judgement::{Verdict, judge};
-use crate::observe::{Bench, ObservedDrive, Stepping, observe_all};
+use crate::observe::{Bench, ObservedDrive, observe_all};
 use crate::own_reference;
 use crate::proof::Trial;
-use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others};
+use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
 use crate::pursuit::{Pursued, pursue};
-use crate::reference::bending;
-use crate::select::{EFFECTS_MAX, Selection};
+use crate::select::{EFFECTS_MAX, EFFECTS_ON_TRIAL_MAX, Selection};
 
 /// What drives are held against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -86,6 +87,8 @@ pub struct Diagnosis {
     pub estimates: Vec<Estimate>,
     /// The claimed effects; empty when nothing is claimed.
     pub claimed: Vec<nesam_physics::effects::ScheduledEffect>,
+    /// Soils under the drives, where a model on trial has no map to tell; else `None`.
+    pub soils: Option<Soils>,
     /// Ids of fitted drives.
     pub fit_on: Vec<String>,
     /// Ids of scored drives.
@@ -110,7 +113,7 @@ impl Diagnosis {
 
     /// How unusually each channel of an actuator bends as it is commanded, with the channel; empty where the model is on trial.
     pub fn bends_seen(&self) -> Vec<(f64, usize)> {
-        self.selection.bends.iter().copied().zip(bending(&self.channels)).collect()
+        self.selection.bends.iter().copied().zip(bend::asked_of(&self.channels)).collect()
     }
 }
 
@@ -151,7 +154,7 @@ pub fn diagnose(
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let total = fit_at.len();
     let observed = observe_all(predictor, seen, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(bundle), catalogue: &catalogue };
+    let bench = Bench::new(bundle, &catalogue);
     let trial = Trial { predictor, drives: &fit_drives, maps: &fit_maps, scoring: &options.scoring };
     let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
     progress("hypotheses", 0, 1);
@@ -175,7 +178,7 @@ pub fn diagnose(
     let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
         prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
     if apart {
-        learned = vec![taught; held.len()];
+        learned = vec![taught.clone(); held.len()];
         scores = if options.scoring.windows(&held).is_ok() {
             Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?)
         } else {
@@ -185,7 +188,14 @@ pub fn diagnose(
             reason += &said_by_others(&judgement, scores);
         }
     }
-    let any = verdict.claims();
+    let (any, beside) = (verdict.claims(), taught.beside);
+    let soils = case.ground_alone.as_ref().map(|ground| {
+        let assumed = bundle.normalization.default_soil();
+        Soils { assumed, alone: ground.correction().apply(&assumed), beside: beside.apply(&assumed) }
+    });
+    if let Some(scores) = scores.as_ref().filter(|_| soils.is_some()) {
+        reason += &said_of_ground(scores);
+    }
     if !any {
         for finding in judgement.findings.iter_mut().filter(|f| f.refused.is_none()) {
             finding.refused = Some(reason.clone());
@@ -221,6 +231,7 @@ pub fn diagnose(
         selection: judgement.selection,
         estimates,
         claimed,
+        soils,
         fit_on: fit_drives.iter().map(|d| d.id.clone()).collect(),
         held_out: held.iter().map(|d| d.id.clone()).collect(),
         learned,
@@ -240,7 +251,8 @@ fn hypotheses(bundle: &ModelBundle, judge_by: Option<&Judge>, options: &Options)
         return Err(DiscoveryError::Reference { reason });
     }
     let in_bundle = bundle.effects.iter().filter(|e| e.effect.written().is_some()).count();
-    if in_bundle + written.len().min(EFFECTS_MAX) > WRITTEN_MAX {
+    let at_once = if judge_by.is_some() { EFFECTS_MAX } else { EFFECTS_ON_TRIAL_MAX };
+    if in_bundle + written.len().min(at_once) > WRITTEN_MAX {
         let reason = format!(
             "bundle {} has {in_bundle} written effects; with these hypotheses more than {WRITTEN_MAX} could act at once",
             bundle.name
@@ -269,6 +281,9 @@ fn held_against<'a>(
     let total = observed.len();
     let Some(judge_by) = judge_by else {
         let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
+        if trial.maps.iter().all(Option::is_none) {
+            case.ground_alone = Some(Ground::beside(&case, &[]));
+        }
         let drives: Vec<Condensed> = case.condensed().cloned().collect();
         let first = own_yardstick(&case, &drives, &options.without)?;
         let pursued = pursue(&mut case, first, &options.without, trial, progress)?;
@@ -286,7 +301,8 @@ type Tried = (Vec<(Kind, usize)>, Option<Effect>);
 fn score_controls(setting: &Setting<'_>, scores: &mut HeldOut, held: &HeldDrives<'_>) -> Result<Tried, DiscoveryError> {
     let (made, free_form) = setting.controls()?;
     for control in &made {
-        let score = held.score(&control.predictors, control.parameters, &scores.resamples)?;
+        let on_ground: Vec<_> = control.predictors.iter().map(|p| (p, setting.case.bench.ground)).collect();
+        let score = held.score(&on_ground, control.parameters, &scores.resamples)?;
         scores.controls.push(score);
     }
     Ok((made.iter().map(|c| (c.kind, c.parameters)).collect(), free_form))

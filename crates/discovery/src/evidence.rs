@@ -130,10 +130,9 @@ impl Group {
     /// be explained.
     pub fn remainder_since(&self, before: &Group, effects: &[Fitted], block: &[usize]) -> Remainder {
         let fitted: Vec<usize> = effects.iter().flat_map(|e| e.columns.iter().copied()).collect();
-        let own = self.information.select_rows(block);
         let fitting = self.fitting(&fitted);
         // A_BE (A_EE + prior)⁻¹: what the fit takes from the scores of the block.
-        let cross = self.information.select_rows(&fitted).select_columns(block);
+        let cross = part(&self.information, &fitted, block);
         let pull = fitting.as_ref().map_or_else(|| DMatrix::zeros(block.len(), fitted.len()), |c| c.solve(&cross).transpose());
         let fitted_score = self.score.select_rows(&fitted);
         let score = self.score.select_rows(block) - &pull * &fitted_score;
@@ -141,7 +140,7 @@ impl Group {
             Some(fitting) => self.doubted(&fitting.solve(&before.score.select_rows(&fitted)), effects, block),
             None => DVector::zeros(block.len()),
         };
-        let mut information = own.select_columns(block);
+        let mut information = part(&self.information, block, block);
         if !fitted.is_empty() {
             information -= &pull * cross;
         }
@@ -150,7 +149,7 @@ impl Group {
         let mut transform = DMatrix::zeros(block.len(), all.len());
         transform.view_mut((0, 0), (block.len(), fitted.len())).copy_from(&-&pull);
         transform.view_mut((0, fitted.len()), (block.len(), block.len())).fill_with_identity();
-        let mut covariance = &transform * self.covariance.select_rows(&all).select_columns(&all) * transform.transpose();
+        let mut covariance = &transform * part(&self.covariance, &all, &all) * transform.transpose();
         for i in 0..block.len() {
             covariance[(i, i)] += doubted[i] + 1e-12 + 1e-6 * self.information[(block[i], block[i])];
             information[(i, i)] = information[(i, i)].max(1e-12);
@@ -174,7 +173,7 @@ impl Group {
 
     /// A_EE + prior of fitted columns; `None` where there are none.
     fn fitting(&self, fitted: &[usize]) -> Option<Cholesky<f64, Dyn>> {
-        let mut own = self.information.select_rows(fitted).select_columns(fitted);
+        let mut own = part(&self.information, fitted, fitted);
         for i in 0..fitted.len() {
             own[(i, i)] += SHARE_SD.powi(-2) + 1e-9;
         }
@@ -189,7 +188,7 @@ impl Group {
         for effect in effects {
             let own = shares.rows(from, effect.columns.len());
             from += effect.columns.len();
-            let explained = self.information.select_rows(block).select_columns(&effect.columns) * own;
+            let explained = part(&self.information, block, &effect.columns) * own;
             variance += (explained * effect.mismatch).map(|v| v * v);
         }
         variance
@@ -204,6 +203,11 @@ impl Group {
     pub fn joint_shares(&self, columns: &[usize]) -> Vec<f64> {
         self.remainder(&[], columns).shares
     }
+}
+
+/// Some rows and columns of a matrix.
+fn part(matrix: &DMatrix<f64>, rows: &[usize], columns: &[usize]) -> DMatrix<f64> {
+    DMatrix::from_fn(rows.len(), columns.len(), |i, j| matrix[(rows[i], columns[j])])
 }
 
 #[cfg(test)]

@@ -5,7 +5,7 @@ use nalgebra::{DMatrix, DVector};
 use nesam_physics::SoilCorrection;
 use rayon::prelude::*;
 
-use crate::candidates::Candidate;
+use crate::candidates::{Candidate, Free};
 use crate::channels::Row;
 use crate::condense::{Condensed, Signatures, difference};
 use crate::metric::Metric;
@@ -15,6 +15,10 @@ use nesam_physics::effects::ScheduledEffect;
 const ITERATIONS: usize = 5;
 /// Steps below this share of a standard deviation end the iteration.
 const CONVERGED: f64 = 0.05;
+/// How often a step that explains less is halved.
+const HALVINGS: usize = 4;
+/// Rise of the squared distance from which a step explains less.
+const RISE: f64 = 0.5;
 
 /// A drive with everything that does not depend on which drives it is judged with.
 #[derive(Clone, Debug)]
@@ -106,22 +110,34 @@ pub struct Start {
 pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], start: Start) -> Fit {
     let Start { mut values, offset, prior } = start;
     let mut held = clamp(terms, &mut values);
-    let mut at = linearised(bench, metric, drives, terms, &values);
     let all: Vec<usize> = (0..drives.len()).collect();
+    let rows_at = |values: &[Vec<f64>]| -> Vec<Vec<Row>> {
+        let effects = timed(terms, values);
+        drives.par_iter().map(|prepared| prepared.drive.deviations(bench, &effects, &SoilCorrection::NONE)).collect()
+    };
+    let mut at = linearised(bench, metric, drives, terms, &values, &rows_at(&values));
     let mut covariance = DMatrix::zeros(0, 0);
     for _ in 0..ITERATIONS {
-        let (moved, spread) = step(terms, &at, &all, &values, prior, &vec![0.0; offset.len()]);
+        let (mut moved, spread) = step(terms, &at, &all, &values, prior, &vec![0.0; offset.len()]);
         covariance = spread;
-        let before = flat(&values);
-        values = shaped(terms, &moved);
-        held = clamp(terms, &mut values);
+        let (before, most) = (flat(&values), at.iter().map(|d| d.square).sum::<f64>() + from_priors(terms, &values, prior) + RISE);
+        // Far from a tangent a step may lead past what is sought.
+        let next = (0..=HALVINGS).find_map(|_| {
+            let mut values = shaped(terms, &moved);
+            let held = clamp(terms, &mut values);
+            let rows = rows_at(&values);
+            moved = moved.iter().zip(&before).map(|(to, from)| 0.5 * (to + from)).collect();
+            (square(metric, drives, &rows) + from_priors(terms, &values, prior) <= most).then_some((values, held, rows))
+        });
+        let Some((to, ends, rows)) = next else { break };
+        (values, held) = (to, ends);
         let largest = flat(&values)
             .iter()
             .zip(&before)
             .enumerate()
             .map(|(i, (a, b))| (a - b).abs() / covariance[(i, i)].sqrt().max(1e-12))
             .fold(0.0, f64::max);
-        at = linearised(bench, metric, drives, terms, &values);
+        at = linearised(bench, metric, drives, terms, &values, &rows);
         if largest < CONVERGED {
             break;
         }
@@ -140,16 +156,26 @@ pub fn fit(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Te
     Fit { terms: terms.to_vec(), values, covariance, held, jackknife }
 }
 
-/// Score and information of each drive in the free parameters, soil profiled out.
-fn linearised(bench: &Bench<'_>, metric: &Metric, drives: &[&Prepared], terms: &[Term], values: &[Vec<f64>]) -> Vec<Condensed> {
-    drives
-        .par_iter()
-        .map(|prepared| {
-            let rows = prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
-            let columns = parameter_columns(bench, prepared, terms, values);
-            prepared.signatures.profiled(metric, &rows, &columns)
-        })
-        .collect()
+/// Score and information of each drive in the free parameters, soil profiled out, where its deviations are `rows`.
+fn linearised(
+    bench: &Bench<'_>,
+    metric: &Metric,
+    drives: &[&Prepared],
+    terms: &[Term],
+    values: &[Vec<f64>],
+    rows: &[Vec<Row>],
+) -> Vec<Condensed> {
+    let of = |(prepared, rows): (&&Prepared, &Vec<Row>)| {
+        let columns = parameter_columns(bench, prepared, terms, values);
+        prepared.signatures.profiled(metric, rows, &columns)
+    };
+    drives.par_iter().zip(rows).map(of).collect()
+}
+
+/// Squared distance of all drives in the metric, soil profiled out, where their deviations are `rows`.
+fn square(metric: &Metric, drives: &[&Prepared], rows: &[Vec<Row>]) -> f64 {
+    let of = |(prepared, rows): (&&Prepared, &Vec<Row>)| prepared.signatures.profiled(metric, rows, &[]).square;
+    drives.par_iter().zip(rows).map(of).collect::<Vec<f64>>().iter().sum()
 }
 
 /// How the deviations of a drive shift with each free parameter of the terms.
@@ -157,15 +183,16 @@ pub fn parameter_columns(bench: &Bench<'_>, prepared: &Prepared, terms: &[Term],
     let at = |values: &[Vec<f64>]| prepared.drive.deviations(bench, &timed(terms, values), &SoilCorrection::NONE);
     let mut columns = Vec::new();
     for (t, term) in terms.iter().enumerate() {
-        for (i, f) in term.candidate.free().iter().enumerate() {
+        for i in 0..term.candidate.free().len() {
+            let step = term.candidate.step(i, bench.vehicle.mass_kg);
             let side = |sign: f64| {
                 let mut moved = values.to_vec();
-                moved[t][i] += sign * f.step;
+                moved[t][i] += sign * step;
                 at(&moved)
             };
             // A parameter that cannot be negative, such as a delay, is differentiated forward at zero.
             let low = term.candidate.range(i)[0];
-            let (less, factor) = if values[t][i] - f.step < low { (at(values), 1.0 / f.step) } else { (side(-1.0), 0.5 / f.step) };
+            let (less, factor) = if values[t][i] - step < low { (at(values), 1.0 / step) } else { (side(-1.0), 0.5 / step) };
             columns.push(difference(&less, &side(1.0), factor));
         }
     }
@@ -188,6 +215,12 @@ fn step(terms: &[Term], at: &[Condensed], kept: &[usize], values: &[Vec<f64>], p
     let covariance = information.cholesky().map_or_else(|| DMatrix::zeros(size, size), |c| c.inverse());
     let moved = &covariance * score;
     (values.iter().zip(moved.iter()).zip(offset).map(|((v, m), o)| v + m - o).collect(), covariance)
+}
+
+/// Squared distance of values from priors of this weight.
+fn from_priors(terms: &[Term], values: &[Vec<f64>], prior: f64) -> f64 {
+    let of = |(f, value): (&Free, f64)| prior * ((value - f.mean) / f.sd).powi(2);
+    terms.iter().flat_map(|t| t.candidate.free()).zip(flat(values)).map(of).sum()
 }
 
 fn clamp(terms: &[Term], values: &mut [Vec<f64>]) -> Vec<Vec<bool>> {

@@ -17,6 +17,8 @@ use crate::proof::{Counted, counted};
 pub struct Learned {
     /// Best soil correction without an effect.
     pub soil: SoilCorrection,
+    /// Soil correction beside the effects; none where the ground is not on trial.
+    pub beside: SoilCorrection,
     /// Effects claimed; empty when nothing was.
     pub effects: Vec<ScheduledEffect>,
     /// Hypothesis of each of them, as its index in the catalogue.
@@ -94,7 +96,7 @@ pub fn score_held_out(
             let with = |predictor: &Predictor, soil| roll_out(predictor, Variant::Full, soil, w, None, map);
             let before = with(predictor, SoilCorrection::NONE)?;
             let soil = with(predictor, learned[w.drive].soil)?;
-            let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&after[w.drive], SoilCorrection::NONE)? };
+            let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&after[w.drive], learned[w.drive].beside)? };
             Ok([before, soil, after])
         })
         .collect::<Result<_, EvaluationError>>()?;

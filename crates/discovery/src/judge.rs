@@ -100,7 +100,7 @@ pub(crate) fn case_of<'a>(metric: Metric, bench: Bench<'a>, observed: Vec<Observ
             Prepared { drive, signatures, condensed }
         })
         .collect();
-    Case { bench, metric_without: metric.clone(), metric, prepared, rows, dating: None }
+    Case { bench, metric_without: metric.clone(), metric, prepared, rows, dating: None, ground_alone: None }
 }
 
 /// What drives are compared with that stand for themselves (`--reference physics`), whose scatter is that of `drives`.

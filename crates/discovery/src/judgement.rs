@@ -75,9 +75,8 @@ impl Judgement {
         let standing_out = refused.iter().filter(|f| nothing_else && f.z >= self.selection.threshold);
         if let Some(Finding { candidate, z, refused: Some(why), .. }) = standing_out.max_by(|a, b| a.z.total_cmp(&b.z)) {
             let ((most, what), label) = (&self.selection.remaining, candidate.label());
-            self.reason = format!(
-                "the drives differ from the reference, most in {what} (z = {most:.1}); {label} stands out (z = {z:.1}) but was refused: {why}"
-            );
+            self.reason =
+                format!("{DIFFER_FROM_MODEL}, most in {what} (z = {most:.1}); {label} stands out (z = {z:.1}) but was refused: {why}");
         }
         self.findings.extend(refused);
         self
@@ -124,7 +123,7 @@ fn concluded(
     loop {
         let settled = case.settle(yardstick, &mut selection, &mut onsets, passed_over);
         if selection.chosen.is_empty() {
-            let (verdict, reason) = nothing_chosen(&selection);
+            let (verdict, reason) = nothing_chosen(&selection, yardstick.model_on_trial);
             return Judgement { selection, findings: left_out, onsets, settled, fit: None, verdict, reason };
         }
         let fit = case.size(yardstick, &group, &selection.chosen, &onsets);
@@ -166,7 +165,14 @@ fn closest_of_another_id(selection: &Selection, catalogue: &[Candidate]) -> Opti
     close.map(|r| r.hypothesis).find(|h| catalogue[*h].id() != catalogue[only].id())
 }
 
-fn nothing_chosen(selection: &Selection) -> (Verdict, String) {
+/// That drives differ from a model on trial.
+const DIFFER_FROM_MODEL: &str = "the drives are not as the model predicts";
+
+fn differ(model_on_trial: bool) -> &'static str {
+    if model_on_trial { DIFFER_FROM_MODEL } else { "the drives differ from the reference" }
+}
+
+fn nothing_chosen(selection: &Selection, model_on_trial: bool) -> (Verdict, String) {
     if !surely_differs(selection) && selection.differs() {
         let z = selection.largest();
         return (Verdict::None, format!("the evidence that anything differs is weak (z = {z:.1}), and no effect may be claimed"));
@@ -175,10 +181,11 @@ fn nothing_chosen(selection: &Selection) -> (Verdict, String) {
         let (z, what) = &selection.remaining;
         return (
             Verdict::Unexplained,
-            format!("the drives differ from the reference, most in {what} (z = {z:.1}), but no effect of the catalogue stands out"),
+            format!("{}, most in {what} (z = {z:.1}), but no effect of the catalogue stands out", differ(model_on_trial)),
         );
     }
-    (Verdict::None, "nothing stands out from drives without an effect".into())
+    let nothing = if model_on_trial { "the model errs to no side on average" } else { "nothing stands out from drives without an effect" };
+    (Verdict::None, nothing.into())
 }
 
 /// Whether the drives differ from the reference beyond doubt, so that it must be said even when no cause can be named: before or after what was tried, which may show what
@@ -209,10 +216,7 @@ fn provisional(selection: &Selection, findings: &[Finding], model_on_trial: bool
         );
     }
     if let Some(refused) = &first.refused {
-        return (
-            Verdict::Unexplained,
-            format!("the drives differ from the reference, but {} cannot be claimed: {refused}", first.candidate.label()),
-        );
+        return (Verdict::Unexplained, format!("{}, but {} cannot be claimed: {refused}", differ(model_on_trial), first.candidate.label()));
     }
     let force = findings.iter().any(|f| f.candidate.through_contact());
     let left = left_over(selection, if force { LEFT_MAX } else { LEFT_MAX_GEOMETRY });
@@ -320,7 +324,7 @@ mod tests {
         let judged = |verdict: Verdict, refused: Vec<Finding>| {
             let left = (146.1, "a level".to_string());
             let selection = Selection { levels: vec![146.1], remaining: left.clone(), remaining_level: left, ..Selection::empty(4.0) };
-            let reason = nothing_chosen(&selection).1;
+            let reason = nothing_chosen(&selection, false).1;
             let judgement =
                 Judgement { selection, findings: Vec::new(), onsets: Vec::new(), settled: Vec::new(), fit: None, verdict, reason };
             judgement.with_refused(refused)

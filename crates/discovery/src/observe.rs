@@ -70,6 +70,15 @@ pub struct Bench<'a> {
     pub stepping: Stepping,
     /// All hypotheses.
     pub catalogue: &'a [Candidate],
+    /// What was found of the ground under all drives beside the effects found so far, where a model on trial has no map to tell it.
+    pub ground: SoilCorrection,
+}
+
+impl<'a> Bench<'a> {
+    /// With all of these hypotheses, on the ground as it is assumed.
+    pub fn new(bundle: &'a ModelBundle, catalogue: &'a [Candidate]) -> Self {
+        Self { vehicle: &bundle.vehicle, stepping: Stepping::of(bundle), catalogue, ground: SoilCorrection::NONE }
+    }
 }
 
 impl Bench<'_> {
@@ -217,7 +226,7 @@ pub(crate) fn available_in_all<'a>(drives: impl IntoIterator<Item = &'a Observed
 }
 
 /// Whether the rims turn as they are told, whatever the ground does.
-fn rims_servoed(vehicle: &Vehicle) -> bool {
+pub(crate) fn rims_servoed(vehicle: &Vehicle) -> bool {
     vehicle.second == SecondCommand::YawRateRadS
 }
 
@@ -378,16 +387,16 @@ impl ObservedDrive {
         let input = StepInput {
             state: *state,
             wheels: command_wheels(model.vehicle(), &actuators[0], &actuators[1], &transition.control),
-            soil: Soil::from_array(self.soil_at(model, &SoilCorrection::NONE, k, dt_s)),
+            soil: Soil::from_array(self.soil_at(model, [&SoilCorrection::NONE; 2], k, dt_s)),
             ground: ground.under_wheels(model, state, 0.0).0,
             ..transition.input
         };
         model.step(&input)
     }
 
-    /// Soil of a sample with a correction and what effects change of it in time.
-    fn soil_at(&self, model: &StepModel, soil: &SoilCorrection, k: usize, dt_s: f64) -> [f64; SOIL_DIM] {
-        let nominal = soil.apply(&self.transitions[k].input.soil.to_array());
+    /// Soil of a sample with corrections, one after the other, and what effects change of it in time.
+    fn soil_at(&self, model: &StepModel, [ground, soil]: [&SoilCorrection; 2], k: usize, dt_s: f64) -> [f64; SOIL_DIM] {
+        let nominal = soil.apply(&ground.apply(&self.transitions[k].input.soil.to_array()));
         model.vehicle().effects.soil.drifted(nominal, Some(k as f64 * dt_s))
     }
 
@@ -437,7 +446,7 @@ impl ObservedDrive {
                 state,
                 wheels: command_wheels(model.vehicle(), before, after, &transition.control),
                 sinkage_log_ratio,
-                soil: Soil::from_array(self.soil_at(model, soil, start + j, bench.stepping.dt_s)),
+                soil: Soil::from_array(self.soil_at(model, [&bench.ground, soil], start + j, bench.stepping.dt_s)),
                 ground: ground.under_wheels(model, &state, 0.0).0,
             };
             let StepOutput { increment, contacts } = model.step(&input);

@@ -146,28 +146,28 @@ pub struct Trial<'a> {
 }
 
 impl Trial<'_> {
-    /// Why predictions of these drives are not better with the second effects than with the first; `None` where they are. Where `sensors_tell` they must only not be
+    /// Why predictions of these drives are not better with the second effects, on the second ground, than with the first; `None` where they are. Where `sensors_tell` they must only not be
     /// surely worse.
     ///
     /// # Errors
     /// `EvaluationError::NoWindows` when no window fits; the first error of the model.
     pub fn no_better(
         &self,
-        without: &[ScheduledEffect],
-        with: &[ScheduledEffect],
+        without: (&[ScheduledEffect], &SoilCorrection),
+        with: (&[ScheduledEffect], &SoilCorrection),
         sensors_tell: bool,
     ) -> Result<Option<String>, EvaluationError> {
         let windows = self.scoring.windows(self.drives)?;
         let every = windows.len().div_ceil(WINDOWS_MAX);
         let windows: Vec<Window<'_>> = windows.into_iter().step_by(every).collect();
         let (resamples, counted) = (self.resamples(), counted(self.maps));
-        let scored = |effects: &[ScheduledEffect]| {
+        let scored = |(effects, ground): (&[ScheduledEffect], &SoilCorrection)| {
             let predictor = self.predictor.with_effects(effects);
-            let models = vec![(&predictor, SoilCorrection::NONE); self.drives.len()];
+            let models = vec![(&predictor, *ground); self.drives.len()];
             score_models(&windows, self.maps, &models, 0, &resamples)
         };
         let (before, after) = (scored(without)?, scored(with)?);
-        let shows = shows(&windows, self.drives.len(), |_| with);
+        let shows = shows(&windows, self.drives.len(), |_| with.0);
         if !sensors_tell && !falls_surely(&before, &after, 0.0, counted, &resamples, &shows) {
             return Ok(Some("no error of predictions of the fitted drives falls surely with it".into()));
         }

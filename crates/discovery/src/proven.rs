@@ -3,13 +3,14 @@
 use nesam_evaluation::{DriveMaps, EvaluationError, ModelScore, Resamples};
 use nesam_model::Predictor;
 use nesam_physics::SoilCorrection;
-use nesam_physics::effects::Layer;
+use nesam_physics::effects::{Layer, ScheduledEffect};
 use nesam_trajectories::Trajectory;
 
 use crate::claims::{Case, Finding};
 use crate::condense::best_soil;
 use crate::consistency::Contradictions;
 use crate::diagnose::Options;
+use crate::ground::Ground;
 use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::judgement::{Judgement, Verdict, judge};
 use crate::proof::{Counted, Rise, falls_surely, not_proven, rises_surely, several_scored, several_show};
@@ -137,7 +138,12 @@ fn tried(
 ) -> Result<Proven, EvaluationError> {
     let HeldDrives { predictor, drives, maps, options, .. } = *held;
     loop {
-        let learned = learn(fewer, case, &judgement, held);
+        let taught = learned_by_all(case, &judgement);
+        let learned = match drives.len() {
+            count if !held.fitted => vec![taught.clone(); count],
+            0 => Vec::new(),
+            _ => leave_each_out(fewer, case, &judgement),
+        };
         let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
         let needless = match &scores {
             Some(scores) => last_needless(&judgement, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
@@ -146,7 +152,6 @@ fn tried(
         let Some(i) = needless else {
             let agree = || scores.as_ref().is_some_and(|scores| held.sensors_agree(&learned, scores));
             let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial, agree);
-            let taught = learned_by_all(case, &judgement);
             return Ok(Proven { judgement, learned, taught, scores, verdict, reason });
         };
         let why = "no error falls surely with it beside the others on drives that were not fitted";
@@ -162,11 +167,20 @@ impl<'a> HeldDrives<'a> {
         Self { drives: if usable { drives } else { &[] }, maps, fitted: true, ..self }
     }
 
+    /// The ground beside effects, where the ground is on trial too and there are effects.
+    fn ground(case: &Case<'_>, effects: &[ScheduledEffect]) -> Option<Ground> {
+        (case.bench.ground != SoilCorrection::NONE && !effects.is_empty()).then(|| Ground::beside(case, effects))
+    }
+
     /// Score of the drives with a model for each.
-    pub(crate) fn score(&self, predictors: &[Predictor], parameters: usize, resamples: &Resamples) -> Result<ModelScore, EvaluationError> {
+    pub(crate) fn score(
+        &self,
+        models: &[(&Predictor, SoilCorrection)],
+        parameters: usize,
+        resamples: &Resamples,
+    ) -> Result<ModelScore, EvaluationError> {
         let windows = self.options.scoring.windows(self.drives)?;
-        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().map(|p| (p, SoilCorrection::NONE)).collect();
-        score_models(&windows, self.maps, &models, parameters, resamples)
+        score_models(&windows, self.maps, models, parameters, resamples)
     }
 
     /// Whether the measurements of the drives surely contradict one another less, by a share as errors of predictions must fall, with what was learned.
@@ -181,7 +195,8 @@ impl<'a> HeldDrives<'a> {
     fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<(ModelScore, Vec<bool>), EvaluationError> {
         let apart: Vec<_> = learned.iter().map(|l| l.apart(hypothesis)).collect();
         let predictors: Vec<Predictor> = apart.iter().map(|[others, _]| self.predictor.with_effects(others)).collect();
-        let score = self.score(&predictors, scores.scores[2].parameters, &scores.resamples)?;
+        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().zip(learned).map(|(p, l)| (p, l.beside)).collect();
+        let score = self.score(&models, scores.scores[2].parameters, &scores.resamples)?;
         let windows = self.options.scoring.windows(self.drives)?;
         Ok((score, shows(&windows, self.drives.len(), |d| &apart[d][1])))
     }
@@ -207,20 +222,13 @@ fn last_needless<E>(
     Ok(None)
 }
 
-/// What each held-out drive is predicted with; `fewer` judges one drive less than were fitted.
-fn learn(fewer: &Yardstick, case: &Case<'_>, judgement: &Judgement, held: &HeldDrives<'_>) -> Vec<Learned> {
-    match held.drives.len() {
-        count if !held.fitted => vec![learned_by_all(case, judgement); count],
-        0 => Vec::new(),
-        _ => leave_each_out(fewer, case, judgement),
-    }
-}
-
 /// What all fitted drives teach together.
 fn learned_by_all(case: &Case<'_>, judgement: &Judgement) -> Learned {
-    let effects = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
+    let effects: Vec<ScheduledEffect> = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
     let hypotheses = keep(judgement, judgement.selection.chosen.clone());
-    Learned { soil: best_soil(case.condensed()), effects, hypotheses }
+    let beside = HeldDrives::ground(case, &effects).map_or(SoilCorrection::NONE, |ground| ground.correction());
+    let soil = case.ground_alone.as_ref().map_or_else(|| best_soil(case.condensed()), Ground::correction);
+    Learned { soil, beside, effects, hypotheses }
 }
 
 /// The fitted effects that are claimed.
@@ -231,11 +239,13 @@ pub(crate) fn keep<T: Clone>(judgement: &Judgement, effects: Vec<T>) -> Vec<T> {
 /// What each drive is predicted with: learned without it. Detection and choice follow from the other drives alone, the size from one step of the whole fit.
 /// What was compared through the physics on all drives is compared in the same way on the others ([`Settled::stands`](crate::settled::Settled::stands)).
 fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement) -> Vec<Learned> {
+    let ground = HeldDrives::ground(case, &judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects())));
     (0..case.prepared.len())
         .map(|left_out| {
             let inside = |d: usize| d != left_out;
             let others = || (0..case.prepared.len()).filter(|d| inside(*d)).map(|d| &case.prepared[d].condensed);
-            let soil = best_soil(others());
+            let alone = case.ground_alone.as_ref().map(|ground| ground.correction_without(left_out));
+            let soil = alone.unwrap_or_else(|| best_soil(others()));
             let group = yardstick.group(others());
             let chosen = yardstick.select(&group).chosen;
             let stands = |i: usize| {
@@ -246,7 +256,8 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
             let without = judgement.fit.as_ref().map_or_else(Vec::new, |fit| fit.effects_without(left_out));
             let stood = judgement.claimed().into_iter().filter(|i| stands(*i));
             let (effects, hypotheses) = stood.filter_map(|i| Some((*without.get(i)?, judgement.findings[i].hypothesis))).unzip();
-            Learned { soil, effects, hypotheses }
+            let beside = ground.as_ref().map_or(SoilCorrection::NONE, |ground| ground.correction_without(left_out));
+            Learned { soil, beside, effects, hypotheses }
         })
         .collect()
 }
@@ -296,6 +307,19 @@ pub(crate) fn said_by_others(judgement: &Judgement, scores: &HeldOut) -> String 
         None if least_gain.is_some() => "; so it does on the other drives".into(),
         None => "; no error of the other drives surely rises".into(),
     }
+}
+
+/// What held-out drives say of the soil that was assumed under a model on trial.
+pub(crate) fn said_of_ground(scores: &HeldOut) -> String {
+    let [before, soil, _] = &scores.scores;
+    let shows = vec![true; scores.shows.len()];
+    if falls_surely(before, soil, GAIN_ON_TRIAL, scores.counted, &scores.resamples, &shows) {
+        return "; the ground is another than the bundle assumes, which alone makes predictions better".into();
+    }
+    if rises_surely(before, soil, scores.counted, &scores.resamples, &shows).is_some() {
+        return "; no other soil alone makes predictions better".into();
+    }
+    String::new()
 }
 
 /// Whether an effect changes how the vehicle moves. A wrong sensor shows in the sensors; whether predictions from it get better is another question, unless the model

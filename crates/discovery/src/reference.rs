@@ -261,7 +261,7 @@ impl NullGroups {
             .map(|inside| {
                 let others: Vec<&Condensed> = (0..total).filter(|d| !inside.contains(d)).map(|d| &nulls[d]).collect();
                 let group = Nulls::new(&others)?.group(inside.iter().map(|d| &nulls[*d]));
-                Some(all_evidence(&group, catalogue, channels, &bending(channels)))
+                Some(all_evidence(&group, catalogue, channels, &bend::asked_of(channels)))
             })
             .collect::<Option<_>>()?;
         let mut drawn = Self::of(groups);
@@ -291,11 +291,6 @@ impl NullGroups {
     pub fn attainable(&self) -> f64 {
         1.0 / (self.largest.len() + 1) as f64
     }
-}
-
-/// Those of some channels of which it is asked whether they bend.
-pub fn bending(channels: &[usize]) -> Vec<usize> {
-    channels.iter().copied().filter(|channel| bend::ASKED.contains(channel)).collect()
 }
 
 /// Those of some channels that are asked for whiteness.

@@ -5,17 +5,20 @@
 
 use nesam_physics::effects::Layer;
 
+use crate::bend;
 use crate::candidates::Candidate;
 use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, bend_column, level_column};
 use crate::evidence::{Fitted, Group, Nulls};
-use crate::reference::{NullGroups, all_evidence, bending};
+use crate::reference::{NullGroups, all_evidence};
 use crate::whiteness::Whiteness;
 
 /// Difference of the criterion that decides between two hypotheses.
 pub const DECISIVE: f64 = 6.0;
 /// Most effects that one diagnosis names.
 pub const EFFECTS_MAX: usize = 3;
+/// The same of a model on trial (chosen): a data sheet may leave out gain, limit and lag of speed and of turning.
+pub const EFFECTS_ON_TRIAL_MAX: usize = 6;
 /// Most rivals of an effect, so that a class has at most three members.
 pub const RIVALS_MAX: usize = 2;
 /// Threshold without null groups: twice that of 28 candidates at 5 % family-wise.
@@ -260,7 +263,7 @@ impl Yardstick {
             selection.remaining.1 = self.named(&selection, largest);
             return selection;
         }
-        while selection.chosen.len() < EFFECTS_MAX && selection.remaining.0 >= selection.threshold {
+        while selection.chosen.len() < self.effects_max() && selection.remaining.0 >= selection.threshold {
             let Some(next) = self.next(group, &selection.chosen) else { break };
             selection.chosen.push(next);
             self.exchange(group, &mut selection.chosen);
@@ -268,6 +271,11 @@ impl Yardstick {
         }
         self.describe(group, &mut selection);
         selection
+    }
+
+    /// Most effects that are named.
+    pub(crate) fn effects_max(&self) -> usize {
+        if self.model_on_trial { EFFECTS_ON_TRIAL_MAX } else { EFFECTS_MAX }
     }
 
     /// What has this evidence alone; empty where nothing has.
@@ -362,16 +370,29 @@ impl Yardstick {
 
     /// Channels of which it is asked whether they bend: those of actuators, but for a model on trial, which lacks more.
     fn bending(&self) -> Vec<usize> {
-        if self.model_on_trial { Vec::new() } else { bending(&self.channels) }
+        if self.model_on_trial { Vec::new() } else { bend::asked_of(&self.channels) }
     }
 
     /// Evidence that each channel of an actuator bends as it is commanded in what the chosen ones leave.
     fn bends_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
-        let believed = self.believed(chosen);
         let first = self.catalogue.len() + self.channels.len();
-        self.bending().into_iter().enumerate().map(move |(i, channel)| {
-            let found = left.remainder_since(before, &believed, &[bend_column(&self.catalogue, channel)]);
-            (channel, found.z / self.spread(first + i))
+        let asked = self.bending().into_iter().enumerate().map(move |(i, channel)| (channel, first + i));
+        self.nameless_after_fit(left, before, chosen, asked, bend_column)
+    }
+
+    /// Evidence of columns without a cause, each with its channel and its place among all evidence, in what the chosen ones leave.
+    fn nameless_after_fit(
+        &self,
+        left: &Group,
+        before: &Group,
+        chosen: &[usize],
+        asked: impl Iterator<Item = (usize, usize)>,
+        column: impl Fn(&[Candidate], usize) -> usize,
+    ) -> impl Iterator<Item = (usize, f64)> {
+        let believed = self.believed(chosen);
+        asked.map(move |(channel, place)| {
+            let found = left.remainder_since(before, &believed, &[column(&self.catalogue, channel)]);
+            (channel, found.z / self.spread(place))
         })
     }
 
@@ -380,13 +401,11 @@ impl Yardstick {
     /// What a force or a soil does to the rims follows from the slope of traction, which is known worst (and without torque not at all, ADR 0003), so their
     /// levels do not speak against one.
     pub(crate) fn levels_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
-        let believed = self.believed(chosen);
         let force = chosen.iter().any(|h| self.catalogue[*h].layer().is_force());
         let told = move |channel: usize| !(force && (RIM_AT..PATH_AT).contains(&channel));
-        self.channels.iter().copied().enumerate().filter(move |(_, channel)| told(*channel)).map(move |(i, channel)| {
-            let found = left.remainder_since(before, &believed, &[level_column(&self.catalogue, channel)]);
-            (channel, found.z / self.spread(self.catalogue.len() + i))
-        })
+        let first = self.catalogue.len();
+        let asked = self.channels.iter().copied().enumerate().filter(move |(_, channel)| told(*channel));
+        self.nameless_after_fit(left, before, chosen, asked.map(move |(i, channel)| (channel, first + i)), level_column)
     }
 }
 

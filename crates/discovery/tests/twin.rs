@@ -4,11 +4,15 @@
 
 mod common;
 
-use common::{bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_twin, drive, drive_from, options, plough, rover, world};
+use common::{
+    bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_rover_on, diagnose_twin, drive, drive_from, options, plough, rover,
+    world,
+};
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, ObservedDrive, Stepping, Verdict, observe, observe_all};
 use nesam_model::ModelBundle;
+use nesam_physics::SoilCorrection;
 use nesam_physics::effects::*;
 use nesam_trajectories::Trajectory;
 
@@ -161,7 +165,7 @@ fn property_the_segment_in_which_an_effect_begins_does_not_count() {
         let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.1 })];
         let drives: Vec<_> = (0..8).map(|i| drive_from(&format!("d{i}"), 510 + i, &effects, onset_s, &bundle.default_soil)).collect();
         let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
-        let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &judge_by.catalogue };
+        let bench = Bench::new(&bundle, &judge_by.catalogue);
         let mut case = judge_by.case(bench, observed, &|_, _, _| {}).unwrap();
         let yardstick = judge_by.yardstick(&case.metric.channels, drives.len(), &[]).unwrap();
         case.select(&yardstick);
@@ -193,7 +197,7 @@ fn property_what_takes_the_place_of_an_effect_brings_its_own_evidence() {
     let judge_by = Judge::of(&bundle).unwrap();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &judge_by.catalogue };
+    let bench = Bench::new(&bundle, &judge_by.catalogue);
     let mut case = judge_by.case(bench, observed, &|_, _, _| {}).unwrap();
     let yardstick = judge_by.yardstick(&case.metric.channels, drives.len(), &[]).unwrap();
     let at = |id: &str| yardstick.catalogue.iter().position(|c| c.id() == id).unwrap();
@@ -217,7 +221,7 @@ fn property_every_chosen_effect_is_held_against_its_rivals() {
     let judge_by = Judge::of(&bundle).unwrap();
     let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle.clone())).unwrap();
     let observed = observe_all(&predictor, &drives, &vec![Some(world()); drives.len()], &|_| {}).unwrap();
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &judge_by.catalogue };
+    let bench = Bench::new(&bundle, &judge_by.catalogue);
     let case = judge_by.case(bench, observed, &|_, _, _| {}).unwrap();
     let yardstick = judge_by.yardstick(&case.metric.channels, drives.len(), &[]).unwrap();
     let at = |id: &str| yardstick.catalogue.iter().position(|c| c.id() == id).unwrap();
@@ -282,7 +286,7 @@ fn observed_drive(id: &str) -> (ModelBundle, Trajectory, ObservedDrive) {
 #[test]
 fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
     let (bundle, recorded, observed) = observed_drive("again");
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &[] };
+    let bench = Bench::new(&bundle, &[]);
     let mut again = recorded.clone();
     observed.driven_again(&bench, &[], &mut again);
     for (a, b) in recorded.states.iter().zip(&again.states) {
@@ -302,7 +306,7 @@ fn property_without_an_effect_a_drive_driven_again_is_the_recording() {
 #[test]
 fn property_before_an_effect_begins_actuators_are_those_without_it() {
     let (bundle, _, observed) = observed_drive("lag");
-    let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &[] };
+    let bench = Bench::new(&bundle, &[]);
     let times_s = observed.times_s(bench.stepping.dt_s);
     let lag = Effect::SteeringLag(SteeringLag { seconds: 0.3 });
     let rows = |effects: &[ScheduledEffect]| observed.deviations(&bench, effects, &nesam_physics::SoilCorrection::NONE);
@@ -363,6 +367,11 @@ fn property_a_new_skid_steer_base_is_judged_by_short_logs_without_a_map() {
     assert!(explained_by(&found, "turn_limit"), "{}; z {:?}", found.reason, found.selection.z);
     let (rad_s, ci95) = value(&found, "rad_s");
     assert!((rad_s - 0.4).abs() < 0.06, "{rad_s} {ci95:?}");
+    // Ground that lets a base turn less than its contacts do.
+    let found = diagnose_rover(&[Effect::TurningResistance(TurningResistance { coefficient: 0.3 })]);
+    assert!(explained_by(&found, "turning_resistance"), "{}; z {:?}", found.reason, found.selection.z);
+    let (coefficient, ci95) = value(&found, "coefficient");
+    assert!((coefficient - 0.3).abs() < 0.06, "{coefficient} {ci95:?}");
     // Velocities that nobody measured are no evidence; a heading behind the gyro is.
     let found = diagnose_rover(&[Effect::PoseLatency(PoseLatency { seconds: 0.2 })]);
     let first = found.findings.first().map(|f| f.candidate.id());
@@ -376,6 +385,29 @@ fn property_a_gyro_of_a_new_base_is_told_by_what_measurements_contradict() {
     assert!(explained_by(&found, "gyro_bias"), "{}; z {:?}", found.reason, found.selection.z);
     let (rad_s, ci95) = value(&found, "rad_s");
     assert!((rad_s - 0.08).abs() < 0.008, "{rad_s} {ci95:?}");
+}
+
+/// Goal: ground that no map tells is fitted, and neither named as an effect nor in the way of one. Method: logs on firmer ground with more grip than the model assumes, of a
+/// base without an effect and of one that is faster than it is told.
+#[test]
+fn property_ground_that_no_map_tells_is_fitted_before_anything_is_named() {
+    let assumed = bundle().default_soil;
+    let firm = SoilCorrection { delta: [1.0, 0.0, 0.0, 0.5, 0.14, -0.9], ..SoilCorrection::NONE }.apply(&assumed);
+    let errors = |found: &nesam_discovery::Diagnosis| -> [f64; 3] {
+        let of = |score: &nesam_evaluation::ModelScore| score.summary.tree.mae_mean.yaw_deg.unwrap();
+        found.scores.as_ref().unwrap().scores.each_ref().map(of)
+    };
+    let found = diagnose_rover_on(&firm, &[]);
+    let [before, soil, _] = errors(&found);
+    eprintln!("{}; yaw {before:.2} -> {soil:.2}; {:?}", found.reason, found.soils);
+    assert!(found.claimed.is_empty(), "{}; z {:?}", found.reason, found.selection.z);
+    assert!(soil < 0.7 * before, "the ground alone: yaw {before} -> {soil}");
+    assert!(found.reason.contains("the ground is another"), "{}", found.reason);
+    let found = diagnose_rover_on(&firm, &[Effect::SpeedGain(SpeedGain { relative: 0.6 })]);
+    let (relative, ci95) = value(&found, "relative");
+    let [_, soil, after] = errors(&found);
+    eprintln!("{}; {relative} {ci95:?}; yaw {soil:.2} -> {after:.2}", found.reason);
+    assert!((relative / 0.6 - 1.0).abs() < 0.1, "{relative} {ci95:?}");
 }
 
 #[test]

@@ -115,7 +115,7 @@ pub fn calibrate_vehicle(
         let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
         let name = format!("{law:?}, {drive:?}");
-        reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS.len() } else { knobs(&candidate).len() });
+        reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS_OF_MOTION.len() } else { knobs(&candidate).len() });
         let mut done = 0;
         let progress = |name: &str, value: f64, error: f64| {
             done += 1;

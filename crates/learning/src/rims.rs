@@ -11,13 +11,18 @@ use crate::symbolic::{descend, symbolic_error};
 /// A number of the servo that is fitted, with its range.
 type Knob = (fn(&mut RimServo) -> &mut f64, [f64; 2]);
 
-pub(crate) const KNOBS: [Knob; 6] = [
+/// Those that the motion alone tells; the others are told by measured rims.
+pub(crate) const KNOBS_OF_MOTION: [Knob; 6] = [KNOBS[0], KNOBS[1], KNOBS[2], KNOBS[3], KNOBS[4], KNOBS[5]];
+
+const KNOBS: [Knob; 8] = [
     (|s| &mut s.speed_gain, [0.1, 5.0]),
     (|s| &mut s.yaw_gain, [0.1, 5.0]),
     (|s| &mut s.yaw_limit_rad_s, [0.1, 20.0]),
     (|s| &mut s.rim_limit_m_s, [0.1, 20.0]),
     (|s| &mut s.speed_lag_s, [0.01, 2.0]),
     (|s| &mut s.yaw_lag_s, [0.01, 2.0]),
+    (|s| &mut s.acceleration_limit[0], [0.05, RimServo::NO_LIMIT]),
+    (|s| &mut s.acceleration_limit[1], [0.05, RimServo::NO_LIMIT]),
 ];
 
 /// Mean rim speed (m/s) and turning of the rims (rad/s) over a drive.
@@ -56,10 +61,33 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
     if measured.is_empty() {
         return None;
     }
+    // Limits show as the largest values that were measured: a search that begins there does not take a limit for a small gain, nor a ramp for a lag.
+    let begin = begun(RimServo::default(), vehicle.track_m, measured.iter().flat_map(|(_, twists)| twists).copied());
+    let led = RimServo { acceleration_limit: fastest(&measured, dt_s), ..begin };
+    let found = [begin, led].map(|servo| searched(vehicle, servo, &measured, dt_s));
+    let [(mut servo, lagged), (ramp, led)] = found;
+    if led < lagged {
+        servo = ramp;
+    }
+    if let Some(share) = turn_efficiency(&measured) {
+        servo.turn_efficiency = share;
+    }
+    Some(servo)
+}
+
+/// Largest mean accelerations over half a second: of the mean rim speed, m/s², and of the turning of the rims, rad/s².
+fn fastest(measured: &[(&Drive, Vec<[f64; 2]>)], dt_s: f64) -> [f64; 2] {
+    let span = (0.5 / dt_s).round().max(1.0) as usize;
+    let rate = |a: &[f64; 2], b: &[f64; 2], i: usize| (b[i] - a[i]).abs() / (span as f64 * dt_s);
+    let pairs = || measured.iter().flat_map(|(_, twists)| twists.iter().zip(twists.iter().skip(span)));
+    core::array::from_fn(|i| pairs().map(|(a, b)| rate(a, b, i)).fold(0.1, f64::max))
+}
+
+/// The servo that a coordinate search from one leads to, and its error.
+fn searched(vehicle: &Vehicle, from: RimServo, measured: &[(&Drive, Vec<[f64; 2]>)], dt_s: f64) -> (RimServo, f64) {
     let mut best = vehicle.clone();
-    // Limits show as the largest values that were measured: a search that begins there does not take a limit for a small gain.
-    best.driveline.rims = begun(RimServo::default(), vehicle.track_m, measured.iter().flat_map(|(_, twists)| twists).copied());
-    let mut error = servo_error(&best, &measured, dt_s);
+    best.driveline.rims = from;
+    let mut error = servo_error(&best, measured, dt_s);
     for round in 0..16 {
         for (knob, [low, high]) in KNOBS {
             let mut reach = 0.5 / f64::from(1 << round.min(5));
@@ -69,7 +97,7 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
                 for trial in [current / (1.0 + reach), current * (1.0 + reach)] {
                     let mut candidate = best.clone();
                     *knob(&mut candidate.driveline.rims) = trial.clamp(low, high);
-                    let found = servo_error(&candidate, &measured, dt_s);
+                    let found = servo_error(&candidate, measured, dt_s);
                     if found < error {
                         (best, error, improved) = (candidate, found, true);
                     }
@@ -80,11 +108,7 @@ pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Option<RimSe
             }
         }
     }
-    let mut servo = best.driveline.rims;
-    if let Some(share) = turn_efficiency(&measured) {
-        servo.turn_efficiency = share;
-    }
-    Some(servo)
+    (best.driveline.rims, error)
 }
 
 /// The servo with which the symbolic model follows the measured motion best, for a base whose wheel speeds nobody measured. The error, m, is that of the position
@@ -108,7 +132,7 @@ pub fn fit_rims_to_motion(
     found.driveline.rims = begun(vehicle.driveline.rims, vehicle.track_m, commands);
     let mut best = error(&found);
     for reach in [0.5, 0.2, 0.1] {
-        for (knob, [low, high]) in KNOBS {
+        for (knob, [low, high]) in KNOBS_OF_MOTION {
             let trials = |vehicle: &Vehicle, reach: f64| {
                 [1.0 / (1.0 + reach), 1.0 + reach].map(|factor| {
                     let mut trial = vehicle.clone();

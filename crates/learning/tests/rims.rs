@@ -24,6 +24,7 @@ fn analytic_a_known_servo_is_found() {
         speed_lag_s: 0.3,
         yaw_lag_s: 0.4,
         turn_efficiency: 0.4,
+        ..RimServo::default()
     };
     let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, track_m: 0.55, ..truck() };
     vehicle.driveline.rims = truth;
@@ -35,6 +36,21 @@ fn analytic_a_known_servo_is_found() {
     assert!(close(found.yaw_limit_rad_s, truth.yaw_limit_rad_s) && close(found.rim_limit_m_s, truth.rim_limit_m_s), "{found:?}");
     assert!(close(found.speed_lag_s, truth.speed_lag_s) && close(found.yaw_lag_s, truth.yaw_lag_s), "{found:?}");
     assert!(close(found.turn_efficiency, truth.turn_efficiency), "{found:?}");
+}
+
+/// Goal: a ramp is not taken for a lag, and its limits are found. Method: the same drives from a base that leads its rims by ramps and hardly lags.
+#[test]
+fn analytic_rims_that_are_led_by_ramps_are_found() {
+    let truth =
+        RimServo { speed_lag_s: 0.05, yaw_lag_s: 0.05, acceleration_limit: [1.2, 2.0], turn_efficiency: 0.4, ..RimServo::default() };
+    let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, track_m: 0.55, ..truck() };
+    vehicle.driveline.rims = truth;
+    let drives: Vec<Drive> = (0..40).map(|i| made(&vehicle, f64::from(i))).collect();
+    vehicle.driveline.rims = RimServo::default();
+    let found = fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1).unwrap();
+    for i in 0..2 {
+        assert!((found.acceleration_limit[i] / truth.acceleration_limit[i] - 1.0).abs() < 0.05, "{found:?}");
+    }
 }
 
 /// Goal: a base whose wheel speeds nobody measured is calibrated, too. Method: eight drives from rest that the symbolic model makes with a known servo, without

@@ -13,6 +13,7 @@ use crate::ModelError;
 use crate::effects_file;
 use crate::normalization::Normalization;
 use crate::rollout::Variant;
+use crate::soil_coordinates;
 use crate::weights::Weights;
 
 /// Version of the layout; another version is refused.
@@ -220,6 +221,13 @@ impl ModelBundle {
             }
         }
         silent
+    }
+
+    /// The bundle with another soil where a map tells of none.
+    pub fn on_soil(&self, soil: &[f64; SOIL_DIM]) -> Self {
+        let mut on_soil = self.clone();
+        on_soil.normalization.default_soil_raw = soil_coordinates::to_raw(soil);
+        on_soil
     }
 
     /// Whether the network says anything of sinkage or of the next state.

@@ -10,7 +10,7 @@ use crate::command_path::CommandPath;
 use crate::integral_observer::{SLOWEST_M_S, held_by_integral_m};
 use crate::scalar::Real;
 use crate::state::{Control, VehicleState};
-use crate::vehicle::{SecondCommand, Vehicle, WHEELS};
+use crate::vehicle::{RimServo, SecondCommand, Vehicle, WHEELS};
 
 /// State of the actuators between steps, in floats or in duals over them.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -87,7 +87,14 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         let kept = |lag_s: f64| T::lit(if lag_s > 0.0 { (-dt_s / lag_s).exp() } else { 0.0 });
         let (speed, turning) = (kept(servo.speed_lag_s), kept(servo.yaw_lag_s));
         let target = servo.target(control.speed_m_s, control.second, vehicle.track_m);
-        let demand = [target[0] + speed * (self.rim_demand[0] - target[0]), target[1] + turning * (self.rim_demand[1] - target[1])];
+        let demand: [T; 2] = core::array::from_fn(|i| {
+            let lagged = target[i] + [speed, turning][i] * (self.rim_demand[i] - target[i]);
+            if servo.acceleration_limit[i] >= RimServo::NO_LIMIT {
+                return lagged;
+            }
+            let most = servo.acceleration_limit[i] * dt_s;
+            self.rim_demand[i] + clamp(lagged - self.rim_demand[i], -most, most)
+        });
         Self {
             steering: demand[1] + turning * (self.steering - demand[1]),
             speed_error_integral_m: T::lit(0.0),

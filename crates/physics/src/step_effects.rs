@@ -11,6 +11,7 @@ use crate::terramechanics::{
     ContactArc, ContactMotion, Support, WheelGeometry, WheelMotion, balance_sinkage, front_bulldozing, side_bulldozing,
 };
 use crate::vec3::{Tilt, Vec3, add, cross, dot, scale};
+use crate::vehicle::SecondCommand;
 
 /// Speed around which a resistance of a wheel changes its sign, m/s (chosen, as for wheel drag).
 const RESISTANCE_SPEED_M_S: f64 = 0.07;
@@ -97,6 +98,12 @@ impl StepModel {
             rhs[axis] = rhs[axis] + force[axis];
         }
         rhs[4] = rhs[4] + T::lit(terms.tow_moment_n_m);
+        if terms.turning_resistance != 0.0 && self.vehicle.second == SecondCommand::YawRateRadS {
+            let (weight, wheelbase) = (self.body.mass_kg * self.vehicle.gravity_m_s2, self.vehicle.wheelbase_m);
+            let sideways = state.angular_velocity_rad_s[2] * T::lit(0.5 * wheelbase);
+            let most = T::lit(0.25 * terms.turning_resistance * weight * wheelbase);
+            rhs[5] = rhs[5] - most * sideways / sideways.abs_smooth(RESISTANCE_SPEED_M_S);
+        }
         if terms.free_form.acts() {
             add_wrench(rhs, terms.free_form.at(v[0], angle, ahead, left).as_flattened());
         }

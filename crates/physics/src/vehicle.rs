@@ -137,8 +137,8 @@ const CLOSED_SPEED_M_S: f64 = 0.1;
 /// Speed command around which the held demand turns its direction, and backwards from which a car drives backwards, m/s (chosen: a command of zero does neither).
 const HOLDING_SPEED_M_S: f64 = 0.1;
 
-/// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then two equal lags in series, for the mean rim speed and for
-/// the turning of the rims (their difference over the track) apart.
+/// How a skid-steer base turns a commanded twist into rim speeds: gains, limits, then a lag, a limit of the acceleration and the same lag once more, for the mean rim
+/// speed and for the turning of the rims (their difference over the track) apart.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RimServo {
     /// Mean rim speed per commanded speed, -.
@@ -153,6 +153,8 @@ pub struct RimServo {
     pub speed_lag_s: f64,
     /// Time constant of each lag of the turning, s.
     pub yaw_lag_s: f64,
+    /// Largest acceleration of the mean rim speed, m/s², and of the turning of the rims, rad/s².
+    pub acceleration_limit: [f64; 2],
     /// Yaw rate of the vehicle per turning of the rims, -. Tells how the rims turn at the start of a rollout, when only the vehicle was measured.
     pub turn_efficiency: f64,
 }
@@ -160,7 +162,7 @@ pub struct RimServo {
 impl Default for RimServo {
     /// A base that does what it is told, within 0.1 s in turning, on ground where nothing slides.
     fn default() -> Self {
-        const NONE: f64 = 1e3;
+        const NONE: f64 = RimServo::NO_LIMIT;
         Self {
             speed_gain: 1.0,
             yaw_gain: 1.0,
@@ -168,12 +170,16 @@ impl Default for RimServo {
             rim_limit_m_s: NONE,
             speed_lag_s: 0.0,
             yaw_lag_s: 0.05,
+            acceleration_limit: [NONE; 2],
             turn_efficiency: 1.0,
         }
     }
 }
 
 impl RimServo {
+    /// A limit that nothing reaches.
+    pub const NO_LIMIT: f64 = 1e3;
+
     /// Where the rims settle under a commanded twist: (mean rim speed m/s, turning rad/s).
     pub fn target<T: Real>(&self, speed_m_s: T, yaw_rate_rad_s: T, track_m: f64) -> [T; 2] {
         let size = |x: T| T::select_ge0(x, x, -x);
@@ -269,6 +275,11 @@ impl Vehicle {
         }
         if lost.turn_limit_inverse_s_rad > 0.0 {
             rims.yaw_limit_rad_s = rims.yaw_limit_rad_s.min(1.0 / lost.turn_limit_inverse_s_rad);
+        }
+        for (limit, inverse) in rims.acceleration_limit.iter_mut().zip(lost.acceleration_limit_inverse) {
+            if inverse > 0.0 {
+                *limit = limit.min(1.0 / inverse);
+            }
         }
         rims
     }

@@ -17,8 +17,8 @@ pub(crate) struct Channels {
     /// Roll and pitch.
     pub(crate) tilt: [Option<Numbers>; 2],
     pub(crate) yaw: Numbers,
-    pub(crate) body_velocity: Option<[Numbers; 3]>,
-    pub(crate) world_velocity: Option<[Numbers; 3]>,
+    pub(crate) body_velocity: Option<Velocity>,
+    pub(crate) world_velocity: Option<Velocity>,
     pub(crate) angular_velocity: [Option<Numbers>; 3],
     pub(crate) command: [Numbers; 2],
     pub(crate) wheel_speed: Option<[Numbers; WHEELS]>,
@@ -27,18 +27,28 @@ pub(crate) struct Channels {
     pub(crate) truth: Option<TruthColumns>,
 }
 
+/// A velocity; a planar one says nothing of the third axis.
+pub(crate) struct Velocity {
+    pub(crate) planar: [Numbers; 2],
+    pub(crate) third: Option<Numbers>,
+}
+
 impl Channels {
     /// Reads the columns; horizontal position, yaw, time and the commands must be there, `gt_` columns only where ground truth is asked for.
     pub(crate) fn read(table: &Table, second: SecondCommand, ground_truth: bool) -> Result<Self, TrajectoryError> {
         let one = |name: &str| if table.has(name) { table.numbers(name).map(Some) } else { Ok(None) };
+        let velocity = |planar: [&str; 2], third: &str| -> Result<Option<Velocity>, TrajectoryError> {
+            let Some(planar) = group(table, planar)? else { return Ok(None) };
+            Ok(Some(Velocity { planar, third: one(third)? }))
+        };
         Ok(Self {
             time: table.numbers("t")?,
             position: all(table, ["x", "y"])?,
             height: one("z")?,
             tilt: [one("roll")?, one("pitch")?],
             yaw: table.numbers("yaw")?,
-            body_velocity: group(table, ["vbx", "vby", "vbz"])?,
-            world_velocity: group(table, ["vx", "vy", "vz"])?,
+            body_velocity: velocity(["vbx", "vby"], "vbz")?,
+            world_velocity: velocity(["vx", "vy"], "vz")?,
             angular_velocity: [one("wx")?, one("wy")?, one("wz")?],
             command: [table.numbers("cmd_speed")?, second_command(table, second)?],
             wheel_speed: group(table, ["om_fl", "om_fr", "om_rl", "om_rr"])?,

@@ -101,7 +101,7 @@ pub(crate) fn read_with_notes(path: &Path, of_columns: OfColumns<'_>) -> Result<
         steering,
         track_m,
         wheelbase_m: wheels.wheelbase_m,
-        driveline: driveline(&sheet, second)?,
+        driveline: driveline(&sheet, second, wheels.radius_m)?,
         gravity_m_s2,
         contact_law: Default::default(),
         soil_damping_pa_s_m: 0.0,
@@ -355,12 +355,13 @@ fn largest_road_wheel_angle(sheet: &JsonFile) -> Result<Option<f64>, TrajectoryE
 }
 
 /// Actuators and drive line: stated values, else the defaults of the kind of drive.
-fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, TrajectoryError> {
+fn driveline(sheet: &JsonFile, second: SecondCommand, radius_m: f64) -> Result<Driveline, TrajectoryError> {
     let skid = second == SecondCommand::YawRateRadS;
     let or = |keys: &[&str], default: f64| -> Result<f64, TrajectoryError> {
         let value = sheet.number(keys)?.unwrap_or(default);
         if value >= 0.0 { Ok(value) } else { Err(sheet.wrong(keys[0], format!("{value} is negative"))) }
     };
+    let rim_limit_m_s = sheet.positive(&["max_wheel_speed_rad_s"])?.map_or(RimServo::NO_LIMIT, |omega| round(omega * radius_m));
     let steering_lag_s = or(&["steering.actuator.time_constant_s", "driveline.steering_lag_s"], if skid { 0.1 } else { 0.0 })?;
     Ok(Driveline {
         steering_lag_s,
@@ -374,7 +375,7 @@ fn driveline(sheet: &JsonFile, second: SecondCommand) -> Result<Driveline, Traje
         speed_integral_limit_m: or(&["driveline.speed_integral_limit_m"], 2.0)?,
         overspeed_limit_m_s: sheet.positive(&["driveline.overspeed_limit_m_s"])?.unwrap_or(if skid { SKID_RIM_LIMIT_M_S } else { 0.8 }),
         // Two lags of half the time each.
-        rims: RimServo { yaw_lag_s: 0.5 * steering_lag_s, ..RimServo::default() },
+        rims: RimServo { yaw_lag_s: 0.5 * steering_lag_s, rim_limit_m_s, ..RimServo::default() },
         side_coupling_n_m_s: or(&["driveline.lsd_Nm_per_rad_s", "driveline.side_coupling_n_m_s"], 0.0)?,
         torque: None,
     })

@@ -3,7 +3,7 @@
 use nesam_physics::driveline::rim_twist;
 use nesam_physics::{Control, RimServo, SecondCommand, Vehicle, VehicleState, WHEELS};
 
-use crate::channels::Channels;
+use crate::channels::{Channels, Velocity};
 use crate::error::TrajectoryError;
 use crate::ground_truth::together;
 use crate::resample::Grid;
@@ -136,22 +136,35 @@ fn wheel_speeds(channels: &Channels, rows: &[usize]) -> Result<Option<Vec<[f64; 
     Ok(sides.map(|sides| sides.into_iter().map(|[left, right]| [left, right, left, right]).collect()))
 }
 
-/// Body velocity: measured in Body, else measured in World, else estimated from positions.
+/// A measured velocity; the third axis of a planar one, which tells nothing of it, is that of `estimated`.
+fn recorded_velocity(
+    columns: Option<&Velocity>,
+    rows: &[usize],
+    estimated: impl FnOnce() -> Vec<[f64; 3]>,
+) -> Result<Option<Vec<[f64; 3]>>, TrajectoryError> {
+    let Some(Velocity { planar, third }) = columns.filter(|v| !v.planar.iter().any(|c| c.is_absent(rows))) else { return Ok(None) };
+    let third = recorded(third.as_ref(), rows)?.unwrap_or_else(|| estimated().into_iter().map(|v| v[2]).collect());
+    Ok(Some(together(planar, rows)?.into_iter().zip(third).map(|([x, y], z)| [x, y, z]).collect()))
+}
+
+/// Body velocity: measured in Body, else measured in World, else estimated from positions. Of a planar one the third axis is estimated.
 ///
 /// The estimate begins with what is known at the first sample: the mean rim speed where wheel speeds are measured, else the commanded
 /// speed. The vehicle is as fast as its card or its fastest command says.
 fn velocity(channels: &Channels, rows: &[usize], vehicle: &Vehicle, log: &Log) -> Result<(Vec<[f64; 3]>, VelocitySource), TrajectoryError> {
-    if let Some(body) = optional(&channels.body_velocity, rows)? {
+    let commanded = log.command.iter().map(|command| command[0]);
+    let largest_m_s = vehicle.command_range[0].into_iter().chain(commanded).fold(0.0, |a: f64, b| a.max(b.abs()));
+    let level = vec![[0.0; 3]; rows.len()];
+    let estimated = |attitude: &[[f64; 3]]| from_positions(&log.time_s, &log.position, attitude, [0.0; 3], largest_m_s);
+    if let Some(body) = recorded_velocity(channels.body_velocity.as_ref(), rows, || estimated(&log.attitude))? {
         return Ok((body, VelocitySource::Body));
     }
-    if let Some(world) = optional(&channels.world_velocity, rows)? {
+    if let Some(world) = recorded_velocity(channels.world_velocity.as_ref(), rows, || estimated(&level))? {
         let body = world.into_iter().zip(&log.attitude).map(|(v, attitude)| to_body(*attitude, v)).collect();
         return Ok((body, VelocitySource::World));
     }
     let rim = log.wheel_speed.as_ref().map(|w| w[0].iter().sum::<f64>() / WHEELS as f64 * vehicle.wheel_radius_m);
     let forward = rim.unwrap_or(log.command[0][0]);
-    let commanded = log.command.iter().map(|command| command[0]);
-    let largest_m_s = vehicle.command_range[0].into_iter().chain(commanded).fold(0.0, |a: f64, b| a.max(b.abs()));
     let estimate = from_positions(&log.time_s, &log.position, &log.attitude, [forward, 0.0, 0.0], largest_m_s);
     Ok((estimate, VelocitySource::Positions))
 }

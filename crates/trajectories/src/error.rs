@@ -99,8 +99,7 @@ impl TrajectoryError {
 
     /// The same of a value of this drive, with what helps.
     pub(crate) fn in_drive(mut self, id: &str) -> Self {
-        const REMEDY: &str =
-            "name the others with --trajectories, or let `nesam import` leave out rows that lack a value and part drives at gaps";
+        const REMEDY: &str = "mend it there, name the other drives with --trajectories, or make the root again with `nesam import` from the bag or CSV, which leaves out rows that lack a value and parts drives at gaps";
         if let Self::Cell { reason, .. } = &mut self {
             *reason = format!("{reason} (in drive `{id}`; {REMEDY})");
         }

@@ -257,6 +257,25 @@ fn analytic_commands_say_how_fast_a_vehicle_is() {
     assert!((last.velocity_m_s[0] - 8.0).abs() < 0.1, "{last:?}");
 }
 
+/// Goal: a planar velocity is one. Method: the circle with velocities ahead and to the left, in Body and in World, and none upwards; its height rises by 0.1 m/s, which the
+/// positions tell.
+#[test]
+fn regress_a_planar_velocity_is_used() {
+    let planar = |names: [&str; 2], of: fn(f64) -> [f64; 2]| {
+        let mut columns = without(&circle_columns(&["a"], 60), "z");
+        let each = |f: &dyn Fn(f64) -> f64| Column::Double((0..60).map(|k| Some(f(0.05 * k as f64))).collect());
+        columns.push(("z".into(), each(&|t| 0.1 * t)));
+        columns.push((names[0].into(), each(&|t| of(t)[0])));
+        columns.push((names[1].into(), each(&|t| of(t)[1])));
+        load(&root_of(&columns)).unwrap().swap_remove(0)
+    };
+    for drive in [planar(["vbx", "vby"], |_| [1.0, 0.05]), planar(["vx", "vy"], |t| [(0.3 * t).cos(), (0.3 * t).sin()])] {
+        assert!(drive.measured.linear_velocity, "{:?}", drive.measured);
+        let [ahead, left, up] = drive.states[25].velocity_m_s;
+        assert!((ahead - 1.0).abs() < 1e-9 && left.abs() < 0.06 && (up - 0.1).abs() < 0.02, "{ahead} {left} {up}");
+    }
+}
+
 #[test]
 fn property_channels_that_were_not_recorded_may_be_null() {
     let mut columns = two_drives();

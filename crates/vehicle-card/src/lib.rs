@@ -134,7 +134,18 @@ struct Rims {
     rim_limit_m_s: f64,
     speed_lag_s: f64,
     yaw_lag_s: f64,
+    #[serde(default = "no_limits", skip_serializing_if = "are_no_limits")]
+    acceleration_limit: [f64; 2],
     turn_efficiency: f64,
+}
+
+fn no_limits() -> [f64; 2] {
+    RimServo::default().acceleration_limit
+}
+
+/// Limits that nothing reaches are left out, so that cards written before these were known keep their bytes.
+fn are_no_limits(limits: &[f64; 2]) -> bool {
+    *limits == no_limits()
 }
 
 /// How the soil acts on the wheels.

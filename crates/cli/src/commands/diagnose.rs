@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use clap::Args;
 use nesam_discovery::channels::{self, CHANNELS};
 use nesam_discovery::report::{Report, describe};
-use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, Stepping, catalogue, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, catalogue, diagnose, observe_all};
 use nesam_evaluation::report::Short;
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
 use nesam_model::{ModelBundle, Predictor};
@@ -142,7 +142,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
     let catalogue = catalogue(&hypotheses);
-    let bench = Bench { vehicle: &predictor.bundle().vehicle, stepping: Stepping::of(&bundle), catalogue: &catalogue };
+    let bench = Bench::new(predictor.bundle(), &catalogue);
     let progress = Progress::start("validation drives against every effect", observed.len());
     let reference = Reference::measure(&bench, &observed, &drives.root.hash(), &|done| progress.set(done)).or_input()?;
     progress.finish();
@@ -233,7 +233,11 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let data_hash = if args.fit_on.is_some() { fitted::hash(&drives.drives, &found.fit_on) } else { drives.data_hash.clone() };
     let bundle = match found.claimed.as_slice() {
         [] => None,
-        claimed => Some(save_with_effects(predictor.bundle(), claimed, &data_hash, &out.join("bundle"))?),
+        claimed => {
+            let bundle = predictor.bundle();
+            let on_soil = found.soils.map(|soils| bundle.on_soil(&soils.beside));
+            Some(save_with_effects(on_soil.as_ref().unwrap_or(bundle), claimed, &data_hash, &out.join("bundle"))?)
+        }
     };
     let with_free_form: Vec<ScheduledEffect> = found.claimed.iter().copied().chain(found.free_form.map(Into::into)).collect();
     // What silences the network finds is no addition to a network that speaks.

@@ -36,7 +36,7 @@ use crate::error::DiscoveryError;
 use crate::held_out::Scoring;
 use crate::judge::Judge;
 use crate::judgement::judge;
-use crate::observe::{Bench, Stepping, observe, observe_all};
+use crate::observe::{Bench, observe, observe_all};
 use rand::SeedableRng;
 use rand::seq::index::sample;
 use rand_chacha::ChaCha8Rng;
@@ -216,7 +216,7 @@ impl Stage<'_> {
     pub fn run(&self, hidden: &Hidden, group: usize, scoring: Option<&Scoring>) -> Result<Outcome, DiscoveryError> {
         let start = Instant::now();
         let bundle = self.predictor.bundle();
-        let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(bundle), catalogue: &self.judge.catalogue };
+        let bench = Bench::new(bundle, &self.judge.catalogue);
         let (mut drives, mut maps) = (Vec::new(), Vec::new());
         for m in self.members(group) {
             let (mut drive, mut map) = (self.drives[m].clone(), self.maps[m].clone());

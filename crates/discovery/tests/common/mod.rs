@@ -9,7 +9,7 @@ use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant, eff
 use nesam_physics::driveline::{DrivelineState, command_wheels};
 use nesam_physics::effects::{Effect, Written};
 use nesam_physics::step::{StepInput, StepModel};
-use nesam_physics::{Control, Driveline, RimServo, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState};
+use nesam_physics::{Control, Driveline, RimServo, SOIL_DIM, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
 use nesam_trajectories::{MeasuredChannels, Trajectory};
 use rand::SeedableRng;
@@ -172,7 +172,7 @@ pub fn bundle() -> ModelBundle {
             let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
             let catalogue = catalogue(&[plough()]);
-            let bench = Bench { vehicle: &bundle.vehicle, stepping: Stepping::of(&bundle), catalogue: &catalogue };
+            let bench = Bench::new(&bundle, &catalogue);
             let reference = Reference::measure(&bench, &observed, "twin", &|_| {}).unwrap();
             bundle.reference_json = Some(reference.to_json().into());
             bundle
@@ -219,17 +219,17 @@ pub fn rover() -> Vehicle {
 
 /// Logs of a rover with effects, as short ones of real robots are: two seconds after a step of the commands, on ground without a map, poses, wheel speeds and
 /// the yaw rate measured, velocities not (what stands for them is noise about the truth).
-pub fn rover_logs(count: u64, seed: u64, effects: &[Effect]) -> Vec<Trajectory> {
-    (0..count).map(|i| rover_log(&format!("r{i:02}"), seed + i, effects)).collect()
+pub fn rover_logs(count: u64, seed: u64, effects: &[Effect], soil: &[f64; SOIL_DIM]) -> Vec<Trajectory> {
+    (0..count).map(|i| rover_log(&format!("r{i:02}"), seed + i, effects, soil)).collect()
 }
 
-fn rover_log(id: &str, seed: u64, effects: &[Effect]) -> Trajectory {
+fn rover_log(id: &str, seed: u64, effects: &[Effect], soil: &[f64; SOIL_DIM]) -> Trajectory {
     const STEPS: usize = 21;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let mut normal = move || -> f64 { StandardNormal.sample(&mut rng) };
     let vehicle = rover().with_effects(effects);
     let model = StepModel::new(&vehicle, 0.1, 2);
-    let soil = Soil::from_array(bundle().default_soil);
+    let soil = Soil::from_array(*soil);
     let mut command = || Control { speed_m_s: (1.2 * normal()).clamp(-2.0, 2.0), second: (0.5 * normal()).clamp(-1.0, 1.0) };
     let told = [command(), command()];
     let mut state = VehicleState::from_array([0.0, 0.0, 0.6, 0.0, 0.0, 0.0, told[0].speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0]);
@@ -275,8 +275,13 @@ fn rover_log(id: &str, seed: u64, effects: &[Effect]) -> Trajectory {
 
 /// The model of a rover on trial by logs of one with effects.
 pub fn diagnose_rover(effects: &[Effect]) -> Diagnosis {
+    diagnose_rover_on(&bundle().default_soil, effects)
+}
+
+/// The same of one that drove on another soil than the model assumes.
+pub fn diagnose_rover_on(soil: &[f64; SOIL_DIM], effects: &[Effect]) -> Diagnosis {
     let bundle = ModelBundle { vehicle: rover(), reference_json: None, ..bundle() };
-    let logs = rover_logs(60, 300, effects);
+    let logs = rover_logs(60, 300, effects, soil);
     let options = Options { against: Against::Physics, scoring: Scoring { horizon: 19, history: 1, ..options().scoring }, ..options() };
     let predictor = Predictor::new(Arc::new(bundle)).unwrap();
     diagnose(&predictor, &logs, &vec![None; logs.len()], &options, &|_, _, _| {}).unwrap()

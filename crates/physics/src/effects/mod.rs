@@ -156,7 +156,7 @@ catalogue! {
     SlipSinkage MultiPass ElasticRecovery ThetaMShift Grousers FrontBulldozing SideBulldozing
     RollStiffness PitchStiffness MapTilt MapOffset SoilDrift
     GyroBias GyroScale VelocityScale PositionLatency LeverArm MountAngle ClockDrift FrictionCap SoilCrust
-    PoseLatency TurnLimit
+    PoseLatency TurnLimit TurningResistance AccelerationLimit TurnAccelerationLimit
     FreeForm
 }
 
@@ -168,7 +168,14 @@ impl Effect {
 
     /// Whether the effect is one of the drive of skid-steer bases; it changes nothing on another vehicle.
     pub fn is_of_skid_steer(&self) -> bool {
-        matches!(self, Self::SkidSteerTrack(_) | Self::TurnLimit(_))
+        matches!(
+            self,
+            Self::SkidSteerTrack(_)
+                | Self::TurnLimit(_)
+                | Self::TurningResistance(_)
+                | Self::AccelerationLimit(_)
+                | Self::TurnAccelerationLimit(_)
+        )
     }
 
     /// What somebody wrote down; `None` for an effect of the catalogue.

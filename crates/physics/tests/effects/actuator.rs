@@ -2,7 +2,7 @@
 
 use nesam_physics::driveline::{DrivelineState, WheelCommand, command_wheels};
 use nesam_physics::effects::*;
-use nesam_physics::{Control, DT_S, SecondCommand, Vehicle};
+use nesam_physics::{Control, DT_S, RimServo, SecondCommand, Vehicle};
 use nesam_test_vehicles::{robot, truck};
 
 use crate::common::Drive;
@@ -186,6 +186,29 @@ fn analytic_a_turn_limit_holds_the_rims_and_leaves_slower_turns() {
         assert!((turning(&limited, told) - 1.5 * told.signum()).abs() < 1e-9);
     }
     assert_eq!(turning(&limited, 1.2).to_bits(), turning(&robot(), 1.2).to_bits());
+}
+
+/// Goal: rims are led to a command by a ramp, and where they are led faster than they would go anyway by nothing. Method: a robot that obeys at once, told another speed and
+/// another turning; then a limit that its own lag stays below.
+#[test]
+fn analytic_acceleration_limits_lead_the_rims_by_a_ramp() {
+    let mut direct = robot();
+    direct.driveline.rims = RimServo { speed_lag_s: 0.0, yaw_lag_s: 0.0, ..RimServo::default() };
+    let (speed, turn) = (AccelerationLimit { m_s2: 2.0 }, TurnAccelerationLimit { rad_s2: 3.0 });
+    let limited = direct.with_effects(&[Effect::AccelerationLimit(speed), Effect::TurnAccelerationLimit(turn)]);
+    for (k, (state, _)) in follow(&limited, &[[1.5, -1.0]; 10]).into_iter().enumerate() {
+        let passed_s = DT_S * (k + 1) as f64;
+        assert!((state.rim_speed_m_s - (2.0 * passed_s).min(1.5)).abs() < 1e-12, "step {k}: {}", state.rim_speed_m_s);
+        assert!((state.steering + (3.0 * passed_s).min(1.0)).abs() < 1e-12, "step {k}: {}", state.steering);
+    }
+    let mut lagged = robot();
+    lagged.driveline.rims = RimServo { speed_lag_s: 0.5, yaw_lag_s: 0.5, ..RimServo::default() };
+    let loose = lagged.with_effects(&[Effect::AccelerationLimit(AccelerationLimit { m_s2: 3.0 })]);
+    let speeds =
+        |vehicle: &Vehicle| follow(vehicle, &[[1.5, 0.0]; 10]).into_iter().map(|(state, _)| state.rim_speed_m_s).collect::<Vec<_>>();
+    for (a, b) in speeds(&loose).into_iter().zip(speeds(&lagged)) {
+        assert!((a - b).abs() < 1e-12, "{a} {b}");
+    }
 }
 
 #[test]

@@ -86,6 +86,30 @@ fn analytic_tow_is_balanced_by_the_tread_and_pitches_by_its_moment() {
     assert!((pull / 800.0 - 1.0).abs() < 0.02, "drawbar pull {pull}");
 }
 
+/// Goal: a base that resists turning by Wong's moment, and only one that skid-steers. Method: a robot that spins in the air, where nothing else resists: C W L / 4 over its
+/// inertia in a fine step, either way round and with either sign; then a car.
+#[test]
+fn analytic_turning_resistance_slows_a_spinning_base_by_its_moment() {
+    let slowed = |vehicle: &Vehicle, coefficient: f64, spin: f64| {
+        let rate = |effects: &[Effect]| {
+            let mut drive = Drive::new(vehicle.with_effects(effects), 0.0);
+            drive.model = StepModel::new(&vehicle.with_effects(effects), 0.1, 40);
+            drive.state.position_m[2] += 50.0;
+            drive.state.angular_velocity_rad_s[2] = spin;
+            drive.step(0.0, 0.0);
+            drive.state.angular_velocity_rad_s[2]
+        };
+        rate(&[Effect::TurningResistance(TurningResistance { coefficient })]) - rate(&[])
+    };
+    // The tread's floor of damping acts in the air too.
+    let want = 0.1 * 50.0 * 9.81 * 0.512 / 4.0 / 3.6 * 0.1;
+    for (coefficient, spin, sign) in [(0.1, 2.0, -1.0), (0.1, -2.0, 1.0), (-0.1, 2.0, 1.0)] {
+        let found = slowed(&robot(), coefficient, spin);
+        assert!((found / (sign * want) - 1.0).abs() < 0.05, "{coefficient} {spin}: {found} {want}");
+    }
+    assert_eq!(slowed(&truck(), 0.1, 2.0), 0.0);
+}
+
 #[test]
 fn analytic_centre_of_mass_loads_axles_and_sides_by_the_lever_rule() {
     let weight = 2493.56 * 9.81;

@@ -1,5 +1,6 @@
 //! Effects between command and wheel: what the actuators make of what they are told.
 
+mod acceleration_limit;
 mod locked_differential;
 mod skid_steer_track;
 mod speed_delay;
@@ -12,8 +13,10 @@ mod steering_lag;
 mod steering_offset;
 mod steering_ratio;
 mod torque_limit;
+mod turn_acceleration_limit;
 mod turn_limit;
 
+pub use acceleration_limit::AccelerationLimit;
 pub use locked_differential::LockedDifferential;
 pub use skid_steer_track::SkidSteerTrack;
 pub use speed_delay::SpeedDelay;
@@ -26,6 +29,7 @@ pub use steering_lag::SteeringLag;
 pub use steering_offset::SteeringOffset;
 pub use steering_ratio::SteeringRatio;
 pub use torque_limit::TorqueLimit;
+pub use turn_acceleration_limit::TurnAccelerationLimit;
 pub use turn_limit::TurnLimit;
 
 /// What effects change between command and wheel; all zero by default. Pairs are (speed, second command).
@@ -51,6 +55,8 @@ pub struct ActuatorTerms {
     pub lock: f64,
     /// Inverse of the largest turning of the rims of a skid-steer base, s/rad.
     pub turn_limit_inverse_s_rad: f64,
+    /// Inverse of the largest accelerations of the rims of a skid-steer base: of their mean speed, s²/m, and of their turning, s²/rad.
+    pub acceleration_limit_inverse: [f64; 2],
     /// Added to the track of a differential drive, m.
     pub track_m: f64,
 }

@@ -12,6 +12,7 @@ mod quadratic_drag;
 mod roll_stiffness;
 mod rolling_resistance;
 mod tow;
+mod turning_resistance;
 mod tyre_radius_front;
 mod tyre_radius_rear;
 mod wheel_drag;
@@ -29,6 +30,7 @@ pub use quadratic_drag::QuadraticDrag;
 pub use roll_stiffness::RollStiffness;
 pub use rolling_resistance::RollingResistance;
 pub use tow::Tow;
+pub use turning_resistance::TurningResistance;
 pub use tyre_radius_front::TyreRadiusFront;
 pub use tyre_radius_rear::TyreRadiusRear;
 pub use wheel_drag::WheelDrag;
@@ -54,6 +56,8 @@ pub struct ForceTerms {
     pub tow_n: f64,
     /// Its moment about Body y at the reference point, N m.
     pub tow_moment_n_m: f64,
+    /// Moment against turning per quarter of weight times wheelbase, of a skid-steer base, -.
+    pub turning_resistance: f64,
     /// Force fixed in World (east, north), N.
     pub wind_n: [f64; 2],
     /// Rolling resistance per wheel load, -.
@@ -79,6 +83,7 @@ impl ForceTerms {
             || self.quadratic_drag_n_s2_m2 != 0.0
             || self.tow_n != 0.0
             || self.tow_moment_n_m != 0.0
+            || self.turning_resistance != 0.0
             || self.wind_n != [0.0; 2]
             || self.free_form.acts()
             || self.written[0].is_some()
