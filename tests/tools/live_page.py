@@ -160,7 +160,7 @@ def interactions(browser):
     browser.key("1")
     browser.click("#view-all")
     check(becomes(browser, "view-all"), "a button shows the whole map")
-    box = browser.value("(() => { const r = document.querySelector('#map').getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2] })()")
+    box = browser.middle("#map")
     browser.drag(box, [box[0] + 60, box[1] + 30])
     check(becomes(browser, "view-all", False) and becomes(browser, "view-follow", False), "dragging frees the map")
     check("x " in text(browser, "#cursor") and " z " in text(browser, "#cursor"), "the place under the pointer is read")
@@ -197,6 +197,10 @@ def with_a_drive(browser, nesam, shots):
         browser.wait("document.getElementById('forecast-text').textContent.includes('came true')", 240)
         check(re.search(r"[\d.]+ m off after 3.2 s, expected [\d.]+ m", text(browser, "#forecast-text")), "what predictions came to is told beside what was expected")
         check(re.search(r"median [\d.]+, 99 % [\d.]+", text(browser, "#latency-text")), "latency is told as quantiles")
+        for plot, reading in (("nis", "NIS"), ("latency", "ms in the queue")):
+            browser.hover(f"#{plot}-plot")
+            browser.wait(f"document.querySelector('#{plot}-plot .note')?.textContent.includes('{reading}')")
+        check(True, "what is under the pointer is read in both plots")
         check("%" in text(browser, "#service") and "m/s" in text(browser, "#vehicle"), "cache hits and the vehicle's motion have figures")
         check("at x" in browser.value("document.getElementById('map').getAttribute('aria-label')"), "the map says in words where the vehicle is")
         for name, (width, height) in SIZES.items():
