@@ -86,7 +86,7 @@ function empty() {
   } else if (!linked && !paused && !store.service) {
     html = "<strong>The service does not answer</strong><p>Start it with <code>nesam serve</code> and leave this page open: it connects by itself.</p>";
   } else if (!session) {
-    html = "<strong>No vehicle yet</strong><p>A vehicle appears here when a session is opened. See one drive with <code>nesam demo</code>, or open a session with a client: <code>Client().open_session(\"truck\")</code>.</p>";
+    html = "<strong>No vehicle yet</strong><p>A vehicle appears here when a session is opened. See one drive with <code>nesam demo</code>, or open a session with a client: <code>nesam.Client(\"HOST:PORT\").open_session(\"truck\")</code>.</p>";
   } else if (!session.newest && !session.trail.length) {
     html = `<strong>Session ${session.session.replace(/[&<>]/g, "")} is open</strong><p>It waits for its first measurement, over gRPC or Zenoh.</p>`;
   }
