@@ -90,6 +90,7 @@ finish_server() {
 }
 
 failed=no
+"$build/known_states_test" || failed=yes
 start_server "$@"
 for test in client_test extras_test fallback_test predictions_test sessions_test streams_test; do
   timeout 300 "$build/$test" "$address" || failed=yes

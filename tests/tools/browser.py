@@ -121,9 +121,18 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyDown", key=key, code="Space" if key == " " else "", text=text)
         self.call("Input.dispatchKeyEvent", type="keyUp", key=key)
 
+    def middle(self, selector):
+        """The middle of an element."""
+        return self.value(f"(() => {{ const r = document.querySelector({json.dumps(selector)}).getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2] }})()")
+
+    def hover(self, selector):
+        """Moves the mouse to the middle of an element."""
+        x, y = self.middle(selector)
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+
     def click(self, selector):
         """Clicks the middle of an element."""
-        x, y = self.value(f"(() => {{ const r = document.querySelector({json.dumps(selector)}).getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2] }})()")
+        x, y = self.middle(selector)
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 

@@ -54,6 +54,17 @@ BESIDE_A_HOLE = """(async () => {
   const { data } = ground.paint("elevation", false).getContext("2d").getImageData(0, 0, 5, 5);
   return [...new Set(Array.from({ length: 25 }, (_, i) => (data[4 * i + 3] ? data[4 * i] : "hole")))].length;
 })()"""
+CONTOURS = """(async () => {
+  const { Ground } = await import("/ground.js"), ground = new Ground("m", "a");
+  Object.assign(ground, { about: { origin_m: [10, 20], columns: 5, rows: 5, resolution_m: 1 }, contour_m: 0.5 });
+  const lines = (height, every) => {
+    ground.heights = Float32Array.from({ length: 25 }, (_, i) => height(i % 5, Math.floor(i / 5)));
+    const pieces = ground.contours([0, 0], [99, 99], every), points = Array.from({ length: pieces.length / 2 }, (_, i) => [pieces[2 * i] - 10, pieces[2 * i + 1] - 20]);
+    return [points.length / 2, points.every(([x, y]) => Math.abs(height(x, y) / 0.5 - Math.round(height(x, y) / 0.5)) < 1e-5)];
+  };
+  const slope = (x, y) => 0.3 * x + 1e-3 * y;
+  return [lines(slope, 1), lines(slope, 2), lines((x, y) => (x === 2 && y === 2 ? NaN : slope(x, y)), 1)[0], lines(() => 0.5, 1)[0]];
+})()"""
 LOADS = """(async () => {
   const { MapView } = await import("/map.js"), map = { id: "m", version: 1, hash: "a" };
   const view = Object.assign(Object.create(MapView.prototype), { store: { session: { map } }, grounds: new Map(), notBefore: new Map(), changed() {} });
@@ -124,6 +135,8 @@ def modules(browser):
     check((predictions, candidates) == (400, 25600), "400 predictions of 64 candidates a second are told as so many")
     check(300 <= kept <= 1200 and oldest_s > 29, "their times are thinned evenly")
     check(browser.value(BESIDE_A_HOLE) == 2, "level ground beside a hole looks like level ground")
+    contours = browser.value(CONTOURS)
+    check(contours == [[8, True], [4, True], 6, 0], f"contours run where the ground has their height, around holes, and not on level ground {contours}")
     loads = browser.value(LOADS)
     check(loads == [[1, None], [1, None], [3, "a"], [3, "a"], [5, "b"]], f"a map that did not come is asked for again, and one of another hash is another one {loads}")
 
@@ -142,6 +155,9 @@ def without_vehicles(browser, nesam, shots):
             check("steering_offset" in report and "0.200 m" in report and "gyro_bias" in report, "a diagnosis shows effect, rival, before and after")
             widths = browser.value("[...document.querySelectorAll('#reports i')].map((i) => i.getBoundingClientRect().width)")
             check(widths[0] > widths[1] > widths[2] > 0 and abs(widths[2] / widths[0] - 0.25) < 0.02, "its bars are as long as the errors")
+            pathlib.Path(folder, "nothing.json").write_text(json.dumps(REPORT | {"verdict": "none", "reason": "nothing stands out", "effects": []}))
+            browser.wait("document.querySelectorAll('#reports article').length === 2")
+            check(text(browser, "#reports").count("with effect") == 1, "one that names no effect has no errors with it")
             browser.screenshot(shots / "empty.png")
             modules(browser)
         finally:
@@ -160,7 +176,7 @@ def interactions(browser):
     browser.key("1")
     browser.click("#view-all")
     check(becomes(browser, "view-all"), "a button shows the whole map")
-    box = browser.value("(() => { const r = document.querySelector('#map').getBoundingClientRect(); return [r.x + r.width / 2, r.y + r.height / 2] })()")
+    box = browser.middle("#map")
     browser.drag(box, [box[0] + 60, box[1] + 30])
     check(becomes(browser, "view-all", False) and becomes(browser, "view-follow", False), "dragging frees the map")
     check("x " in text(browser, "#cursor") and " z " in text(browser, "#cursor"), "the place under the pointer is read")
@@ -197,6 +213,10 @@ def with_a_drive(browser, nesam, shots):
         browser.wait("document.getElementById('forecast-text').textContent.includes('came true')", 240)
         check(re.search(r"[\d.]+ m off after 3.2 s, expected [\d.]+ m", text(browser, "#forecast-text")), "what predictions came to is told beside what was expected")
         check(re.search(r"median [\d.]+, 99 % [\d.]+", text(browser, "#latency-text")), "latency is told as quantiles")
+        for plot, reading in (("nis", "NIS"), ("latency", "ms in the queue")):
+            browser.hover(f"#{plot}-plot")
+            browser.wait(f"document.querySelector('#{plot}-plot .note')?.textContent.includes('{reading}')")
+        check(True, "what is under the pointer is read in both plots")
         check("%" in text(browser, "#service") and "m/s" in text(browser, "#vehicle"), "cache hits and the vehicle's motion have figures")
         check("at x" in browser.value("document.getElementById('map').getAttribute('aria-label')"), "the map says in words where the vehicle is")
         for name, (width, height) in SIZES.items():

@@ -89,13 +89,14 @@ Result<std::string> Core::export_session(const std::string& id, Timeout timeout)
 Result<Prediction> Core::predict(const std::string& id, const PredictRequest& request, Timeout timeout) const {
   auto message = to_message(id, request);
   if (!message) return message.error();
+  const std::uint64_t asked = known_states.ask();
   auto reply = call(*prediction, &v1::Prediction::Stub::Predict, *message, timeout);
   if (!reply) {
     if (auto fallback = fallback_prediction(request, known_states.of(id), reply.error())) return *std::move(fallback);
     return reply.error();
   }
   auto predicted = from_message(*reply, Asked(request));
-  if (predicted) known_states.predicted(id, request, *predicted);
+  if (predicted) known_states.predicted(asked, id, request, *predicted);
   return predicted;
 }
 

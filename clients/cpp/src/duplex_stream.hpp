@@ -31,7 +31,7 @@ class DuplexStream {
   using Answer = typename Kind::Answer;
 
   /// Throws `std::system_error` where the machine has no thread for it.
-  DuplexStream(std::shared_ptr<Core> core, const std::string& id);
+  DuplexStream(std::shared_ptr<Core> shared, const std::string& id);
   ~DuplexStream();
 
   Result<void> send(Request message, Sent sent);
@@ -42,6 +42,9 @@ class DuplexStream {
 
   const std::string session_id;
 
+ protected:
+  const std::shared_ptr<Core> core;
+
  private:
   void write_all() noexcept;
   void read_all() noexcept;
@@ -51,7 +54,6 @@ class DuplexStream {
   /// What to say after the end. Only when `ended_`.
   Error ending() const;
 
-  const std::shared_ptr<Core> core_;
   grpc::ClientContext context_;
   std::unique_ptr<grpc::ClientReaderWriter<Request, Reply>> stream_;
 
@@ -71,9 +73,9 @@ class DuplexStream {
 };
 
 template <class Kind>
-DuplexStream<Kind>::DuplexStream(std::shared_ptr<Core> core, const std::string& id) : session_id(id), core_(std::move(core)) {
-  core_->introduce(context_);
-  stream_ = Kind::open(*core_, context_);
+DuplexStream<Kind>::DuplexStream(std::shared_ptr<Core> shared, const std::string& id) : session_id(id), core(std::move(shared)) {
+  core->introduce(context_);
+  stream_ = Kind::open(*core, context_);
   writer_ = std::thread([this] { write_all(); });
   try {
     reader_ = std::thread([this] { read_all(); });
@@ -197,7 +199,7 @@ bool DuplexStream<Kind>::take(const Reply& reply) {
     sent = &unanswered_.front();
   }
   // Only this thread takes requests off, and others that are added leave this one where it is: no lock is held while a large reply is unpacked.
-  Answer answer = Kind::answer(*core_, reply, *sent);
+  Answer answer = Kind::answer(*core, reply, *sent);
   {
     const std::lock_guard lock(mutex_);
     inbox_.push_back(std::move(answer));

@@ -1,6 +1,7 @@
 #include <nesam/durable_stream.hpp>
 
 #include <algorithm>
+#include <cstddef>
 #include <cstdint>
 #include <deque>
 #include <optional>
@@ -36,19 +37,19 @@ class DurableStreamImpl {
       : core_(std::move(core)), session_id_(session_id), options_(options) {}
 
   Result<MeasurementAnswer> send(const Measurement& measurement) {
-    if (kept_.size() >= options_.pending_max) {
-      return Error(Code::resource_exhausted, "pending_max", std::to_string(kept_.size()) + " measurements are not known to be durable; flush them first");
+    if (kept() >= options_.pending_max) {
+      return Error(Code::resource_exhausted, "pending_max", std::to_string(kept()) + " measurements are not known to be durable; flush them first");
     }
-    kept_.push_back({measurement, std::nullopt});
+    waiting_.push_back(measurement);
     // Which run counts is the matter of this object.
-    kept_.back().measurement.run = 0;
+    waiting_.back().run = 0;
     return deliver(SteadyTime::max());
   }
 
   Result<void> flush(std::chrono::nanoseconds timeout) {
     const SteadyTime end = std::chrono::steady_clock::now() + bounded(timeout);
-    while (!kept_.empty()) {
-      if (unanswered()) {
+    while (kept() != 0) {
+      if (!waiting_.empty()) {
         auto answer = deliver(end);
         if (!answer && (answer.error().code() != Code::unavailable || !over(end))) return answer.error();
       }
@@ -60,9 +61,9 @@ class DurableStreamImpl {
       } else if (status.error().code() != Code::deadline_exceeded) {
         return status.error();
       }
-      if (kept_.empty()) break;
+      if (kept() == 0) break;
       if (over(end)) {
-        return Error(Code::deadline_exceeded, "", std::to_string(kept_.size()) + " measurements are not durable in time; does the server keep a store?");
+        return Error(Code::deadline_exceeded, "", std::to_string(kept()) + " measurements are not durable in time; does the server keep a store?");
       }
       std::this_thread::sleep_for(std::min({bounded(options_.pause), left(end), std::chrono::nanoseconds(std::chrono::milliseconds(50))}));
     }
@@ -71,8 +72,9 @@ class DurableStreamImpl {
 
   std::vector<Measurement> pending() const {
     std::vector<Measurement> measurements;
-    measurements.reserve(kept_.size());
-    for (const Kept& kept : kept_) measurements.push_back(kept.measurement);
+    measurements.reserve(kept());
+    for (const Answered& answered : answered_) measurements.push_back(answered.measurement);
+    measurements.insert(measurements.end(), waiting_.begin(), waiting_.end());
     return measurements;
   }
 
@@ -83,10 +85,9 @@ class DurableStreamImpl {
   }
 
  private:
-  struct Kept {
+  struct Answered {
     Measurement measurement;
-    /// Absent before it is answered by this run of the server.
-    std::optional<std::uint64_t> place;
+    std::uint64_t place;
   };
 
   static std::chrono::nanoseconds left(SteadyTime end) { return bounded(end - std::chrono::steady_clock::now()); }
@@ -116,22 +117,21 @@ class DurableStreamImpl {
       stream_.emplace(std::move(*opened));
     }
     std::optional<MeasurementAnswer> newest;
-    for (Kept& kept : kept_) {
-      if (kept.place) continue;
-      auto answer = exchange(kept.measurement, std::min(left(end), bounded(options_.reconnect)));
+    while (!waiting_.empty()) {
+      auto answer = exchange(waiting_.front(), std::min(left(end), bounded(options_.reconnect)));
       if (!answer) return answer.error();
       if (no_room(*answer)) return Error(Code::unavailable, "", answer->is<Rejected>()->message);
-      // A refusal need not tell who counts.
+      // A refused measurement has no place and is not kept; its answer need not tell who counts.
       if (answer->place != 0) {
-        if (counted_by_another(answer->run)) return Error(Code::unavailable, "", "another run of the server counts now");
+        if (counted_by_another(answer->run, answer->place)) return Error(Code::unavailable, "", "another run of the server counts now");
         run_ = answer->run;
+        answered_.push_back({std::move(waiting_.front()), answer->place});
       }
-      kept.place = answer->place;
+      waiting_.pop_front();
+      if (answer->run == run_) durable(run_, answer->durable_place);
       newest = std::move(*answer);
     }
     if (!newest) return Error(Code::internal, "", "nothing to send; this is a bug");
-    // A place of 0 is that of a refused measurement, which nobody keeps.
-    durable(run_, newest->run == run_ ? newest->durable_place : 0);
     return *std::move(newest);
   }
 
@@ -143,32 +143,32 @@ class DurableStreamImpl {
     return answer;
   }
 
-  /// Whether answers so far came from another run: then everything kept is sent again, from the oldest on.
-  bool counted_by_another(std::uint64_t run) const {
-    return run != run_ && std::any_of(kept_.begin(), kept_.end(), [](const Kept& kept) { return kept.place.has_value(); });
+  /// Whether answers so far came from another run, or from a session that began anew: then everything kept is sent again, from the oldest on.
+  bool counted_by_another(std::uint64_t run, std::uint64_t place = UINT64_MAX) const {
+    return !answered_.empty() && (run != run_ || place < answered_.back().place);
   }
 
   void durable(std::uint64_t run, std::uint64_t durable_place) {
     if (counted_by_another(run)) return close();
     run_ = run;
-    const auto held = [durable_place](const Kept& kept) { return kept.place && *kept.place <= durable_place; };
-    kept_.erase(std::remove_if(kept_.begin(), kept_.end(), held), kept_.end());
+    while (!answered_.empty() && answered_.front().place <= durable_place) answered_.pop_front();
   }
 
-  bool unanswered() const {
-    return std::any_of(kept_.begin(), kept_.end(), [](const Kept& kept) { return !kept.place; });
-  }
+  std::size_t kept() const { return answered_.size() + waiting_.size(); }
 
+  /// Another run of the server may count otherwise.
   void forget_places() {
-    for (Kept& kept : kept_) kept.place.reset();
+    for (; !answered_.empty(); answered_.pop_back()) waiting_.push_front(std::move(answered_.back().measurement));
   }
 
   const std::shared_ptr<Core> core_;
   const std::string session_id_;
   const DurableOptions options_;
   std::optional<MeasurementStream> stream_;
-  /// Oldest first.
-  std::deque<Kept> kept_;
+  /// What is kept, oldest first: all that is answered is older than all that waits. Durable ones leave from the front, as places only rise.
+  std::deque<Answered> answered_;
+  /// Without an answer of this run of the server.
+  std::deque<Measurement> waiting_;
   /// Who counts the places.
   std::uint64_t run_ = 0;
 };

@@ -1,5 +1,6 @@
 #include <nesam/measurement_stream.hpp>
 
+#include <cstdint>
 #include <utility>
 
 #include "convert.hpp"
@@ -8,17 +9,23 @@
 namespace nesam {
 namespace detail {
 
+/// A measurement and its number among what the client has sent.
+struct Reported {
+  Measurement measurement;
+  std::uint64_t asked;
+};
+
 struct MeasurementExchange {
   using Request = v1::Measurement;
   using Reply = v1::MeasurementAnswer;
-  using Sent = Measurement;
+  using Sent = Reported;
   using Answer = MeasurementAnswer;
   static constexpr std::size_t pending_max = MeasurementStream::pending_max;
 
   static auto open(Core& core, grpc::ClientContext& context) { return core.measurements->Stream(&context); }
   static Answer answer(const Core& core, const Reply& reply, const Sent& sent) {
     Answer answer = from_message(reply);
-    core.known_states.measured(sent, answer);
+    core.known_states.measured(sent.asked, sent.measurement, answer);
     return answer;
   }
 };
@@ -26,6 +33,10 @@ struct MeasurementExchange {
 class MeasurementStreamImpl : public DuplexStream<MeasurementExchange> {
  public:
   using DuplexStream::DuplexStream;
+
+  Result<void> send(const Measurement& measurement) {
+    return DuplexStream::send(to_message(session_id, measurement), {measurement, core->known_states.ask()});
+  }
 };
 
 }  // namespace detail
@@ -37,10 +48,14 @@ MeasurementStream& MeasurementStream::operator=(MeasurementStream&&) noexcept = 
 MeasurementStream::~MeasurementStream() = default;
 
 Result<void> MeasurementStream::send(const Measurement& measurement) {
-  return impl_->send(detail::to_message(impl_->session_id, measurement), measurement);
+  return impl_->send(measurement);
 }
 Result<MeasurementAnswer> MeasurementStream::receive(std::chrono::nanoseconds timeout) { return impl_->receive(timeout); }
 Result<void> MeasurementStream::finish(std::chrono::nanoseconds timeout) { return impl_->finish(timeout); }
-std::vector<Measurement> MeasurementStream::unanswered() const { return impl_->unanswered(); }
+std::vector<Measurement> MeasurementStream::unanswered() const {
+  std::vector<Measurement> measurements;
+  for (detail::Reported& reported : impl_->unanswered()) measurements.push_back(std::move(reported.measurement));
+  return measurements;
+}
 
 }  // namespace nesam

@@ -231,8 +231,9 @@ class AsyncClient:
             cost=cost,
             samples_min=samples_min,
         )
+        asked = self._known_states.ask()
         try:
-            return self._known_states.predicted(question, await self._do(question.call(), timeout_s))
+            return self._known_states.predicted(asked, question, await self._do(question.call(), timeout_s))
         except calls.LATE as error:
             return self._known_states.fall_back(question, error)
 
@@ -256,6 +257,7 @@ class AsyncMeasurementStream:
         message = m.measurement_message(measurement)
         timeout_s = self._client.timeout_s if timeout_s is None else timeout_s
         async with self._turn:
+            asked = self._client._known_states.ask()
             try:
                 reply = await asyncio.wait_for(self._exchange(message), timeout_s)
             except asyncio.TimeoutError:
@@ -268,7 +270,7 @@ class AsyncMeasurementStream:
         if reply is grpc.aio.EOF:
             raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream")
         answer = m.answer(reply)
-        self._client._known_states.measured(measurement, answer)
+        self._client._known_states.measured(asked, measurement, answer)
         return answer
 
     async def _exchange(self, message: measurements_pb2.Measurement) -> measurements_pb2.MeasurementAnswer:

@@ -1,5 +1,7 @@
 """Every unary call: which method of which service, with what, and what the reply means. The clients differ only in how they wait."""
 
+import itertools
+import threading
 from dataclasses import dataclass, replace
 from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
 
@@ -203,28 +205,61 @@ class Question:
         return replace(answered, controls=controls) if isinstance(self.controls, Drawing) else answered
 
 
+@dataclass(frozen=True)
+class _Newest:
+    """A known state, the number of what it answered or of what was answered before, and of the measurement with which the vehicle's clock began anew."""
+
+    known: KnownState
+    asked: int
+    clock: int
+
+
 class KnownStates:
-    """The newest state that a client knows of each session; a fallback without a given start begins there."""
+    """The newest state that a client knows of each session; a fallback without a given start begins there.
+
+    What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only where
+    its stamp is larger and the vehicle's clock has not begun anew since.
+    """
 
     def __init__(self) -> None:
-        self._states: Dict[str, KnownState] = {}
+        self._numbers = itertools.count(1)
+        self._states: Dict[str, _Newest] = {}
+        self._lock = threading.Lock()
 
-    def measured(self, measurement: t.Measurement, answer: t.Answer) -> None:
+    def ask(self) -> int:
+        """Number of what is sent now."""
+        return next(self._numbers)
+
+    def measured(self, asked: int, measurement: t.Measurement, answer: t.Answer) -> None:
         """Notes a measured state that is now the newest of its session."""
-        if answer.outcome in ("APPLIED", "GAP", "GATED", "CLOCK_JUMP", "RESTARTED") and not answer.reordered:
+        begins_anew = answer.outcome in ("CLOCK_JUMP", "RESTARTED")
+        if (begins_anew or answer.outcome in ("APPLIED", "GAP", "GATED")) and not answer.reordered:
             state = np.asarray(measurement.state, dtype=np.float64)
-            self._states[measurement.session_id] = KnownState(state, measurement.stamp_ns)
+            self._note(measurement.session_id, KnownState(state, measurement.stamp_ns), asked, begins_anew)
 
-    def predicted(self, question: Question, prediction: t.Prediction) -> t.Prediction:
+    def predicted(self, asked: int, question: Question, prediction: t.Prediction) -> t.Prediction:
         """Notes where a prediction of the session began that was not given its start, and gives it back."""
         if question.start is None:
-            self._states[question.session_id] = KnownState(prediction.start, prediction.start_stamp_ns)
+            self._note(question.session_id, KnownState(prediction.start, prediction.start_stamp_ns), asked, False)
         return prediction
 
     def fall_back(self, question: Question, error: NesamError) -> t.Prediction:
         """What the fallback of a question answers; raises the error again without one or without a state."""
-        return question.fall_back(error, self._states.get(question.session_id))
+        newest = self._states.get(question.session_id)
+        return question.fall_back(error, None if newest is None else newest.known)
 
     def forget(self, session_id: str) -> None:
         """Forgets a closed session."""
         self._states.pop(session_id, None)
+
+    def _note(self, session_id: str, known: KnownState, asked: int, begins_anew: bool) -> None:
+        with self._lock:
+            newest = self._states.get(session_id)
+            if newest is None or begins_anew:
+                self._states[session_id] = _Newest(known, asked, asked if begins_anew else 0)
+            elif asked > newest.asked or (asked > newest.clock and _is_later(known, newest.known)):
+                self._states[session_id] = _Newest(known, max(asked, newest.asked), newest.clock)
+
+
+def _is_later(known: KnownState, other: KnownState) -> bool:
+    return known.stamp_ns is not None and other.stamp_ns is not None and known.stamp_ns > other.stamp_ns

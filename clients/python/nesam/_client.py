@@ -119,7 +119,8 @@ class Client:
     def import_session(self, image: bytes, session_id: str = "") -> t.Session:
         """Opens a session from an export; it answers as the original would, bit for bit. An empty name keeps that of the exported one.
 
-        Raises InvalidArgument (damaged, another version, another bundle), NotFound (map), FailedPrecondition (the map has other layers), AlreadyExists.
+        Raises InvalidArgument (damaged, another version, another bundle), NotFound (map), FailedPrecondition (the map has other layers), AlreadyExists,
+        PermissionDenied as NesamError (another's vehicle, or an image with effects without the rights of an operator).
         """
         return self._do(calls.import_session(image, session_id))
 
@@ -287,8 +288,9 @@ class Client:
             cost=cost,
             samples_min=samples_min,
         )
+        asked = self._known_states.ask()
         try:
-            return self._known_states.predicted(question, self._do(question.call(), timeout_s))
+            return self._known_states.predicted(asked, question, self._do(question.call(), timeout_s))
         except calls.LATE as error:
             return self._known_states.fall_back(question, error)
 
@@ -300,7 +302,7 @@ class MeasurementStream:
         self._client = client
         self._outgoing: "queue.SimpleQueue[Optional[measurements_pb2.Measurement]]" = queue.SimpleQueue()
         self._heard: "queue.SimpleQueue[Any]" = queue.SimpleQueue()
-        self._waiting: Deque[t.Measurement] = deque()
+        self._waiting: Deque[Tuple[int, t.Measurement]] = deque()
         # Since when the oldest of those that wait has been waited for.
         self._since = 0.0
         self._closed = False
@@ -342,7 +344,7 @@ class MeasurementStream:
         message = m.measurement_message(measurement)
         if not self._waiting:
             self._since = time.monotonic()
-        self._waiting.append(measurement)
+        self._waiting.append((self._client._known_states.ask(), measurement))
         self._outgoing.put(message)
 
     def _next(self, timeout_s: float) -> t.Answer:
@@ -356,7 +358,7 @@ class MeasurementStream:
             self.close()
             raise heard
         answer, self._since = m.answer(heard), time.monotonic()
-        self._client._known_states.measured(self._waiting.popleft(), answer)
+        self._client._known_states.measured(*self._waiting.popleft(), answer)
         return answer
 
 

@@ -3,6 +3,7 @@
 import math
 import time
 from collections import deque
+from dataclasses import replace
 from typing import Deque, List, Tuple
 
 import grpc
@@ -64,6 +65,8 @@ class DurableStream:
         if kept >= self._pending_max:
             reason = f"{kept} measurements are not known to be durable; flush them first"
             raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
+        # Which run counts is the matter of this object.
+        measurement = replace(measurement, run=0)
         # One that cannot be sent would hold up all that come after it.
         m.measurement_message(measurement)
         self._waiting.append(measurement)

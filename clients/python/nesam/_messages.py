@@ -41,6 +41,7 @@ def measurement_message(measurement: t.Measurement) -> measurements_pb2.Measurem
         sequence=measurement.sequence,
         stamp_ns=measurement.stamp_ns,
         boot_id=measurement.boot_id,
+        run=measurement.run,
         state=t.state_message(measurement.state),
         command=types_pb2.Control(speed_m_s=command[0], second=command[1]),
         wheels=wheels,

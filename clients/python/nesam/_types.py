@@ -250,7 +250,9 @@ class Measurement:
 
     state: (12,), pose in World, twist in Body. command: (speed m/s, second in the unit of the vehicle card), applied from this instant on.
     stamp_ns: the vehicle's clock. sequence: 0 = not numbered. boot_id: any number that differs from start to start of the vehicle's software, 0 = not
-    told; another one begins a new history and keeps the soil. wheel_speed_rad_s: (4,) FL FR RL RR; road_wheel_angle_rad: (2,) left, right.
+    told; another one begins a new history and keeps the soil. run: `Answer.run` of the answers so far, 0 = whatever it is; where the session is at another
+    run now it is REJECTED for `run`, and what is not durable is to be sent again (a `DurableStream` sees to that itself).
+    wheel_speed_rad_s: (4,) FL FR RL RR; road_wheel_angle_rad: (2,) left, right.
     """
 
     session_id: str
@@ -261,6 +263,7 @@ class Measurement:
     wheel_speed_rad_s: Optional[Sequence[float]] = None
     road_wheel_angle_rad: Optional[Sequence[float]] = None
     boot_id: int = 0
+    run: int = 0
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,17 @@
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import grpc
 import numpy as np
 import pytest
 
 import nesam
 from conftest import straight
+from nesam._calls import KnownStates, Question
 from nesam._fallback import KnownState
 from nesam.v1 import prediction_pb2
 
@@ -238,6 +242,17 @@ def test_wrong_shapes_are_refused_before_anything_is_sent(driven):
         driven.upload_map(nesam.WorldMap("m", np.zeros((4, 4)), 0.5, semantic_rgb=np.zeros((4, 3, 3))))
 
 
+def test_service_a_measurement_for_another_run_is_rejected(driven):
+    first, *_, last = straight("truck", 42)
+    run = driven.measure([first])[0].run
+    assert run and driven.session("truck").run == run
+    [applied] = driven.measure([replace(list(straight("truck", 41))[-1], run=run)])
+    assert applied.outcome in ("APPLIED", "GATED")
+    [rejected] = driven.measure([replace(last, run=run ^ 1)])
+    assert (rejected.outcome, rejected.field, rejected.code) == ("REJECTED", "run", grpc.StatusCode.FAILED_PRECONDITION.value[0])
+    assert driven.session("truck").last_sequence == 41
+
+
 def test_service_sessions_and_maps(client, hills):
     description = client.upload_map(hills)
     assert (description.width, description.height, description.version, description.semantic) == (161, 121, 1, True)
@@ -322,6 +337,37 @@ def test_analytic_a_known_state_is_rolled_forward_with_what_was_sent():
         assert (same.stamp_ns, same.rolled_forward_steps) == (known.stamp_ns, 0) and (same.state == state).all()
     assert fallback.rolled_forward(known, 4_200_000_000, []).rolled_forward_steps == 32
     assert fallback.rolled_forward(known, 4_300_000_000, []) is None
+
+
+def test_analytic_what_was_asked_for_earlier_replaces_only_what_is_older():
+    """Goal: an answer that comes late is not taken for newer than what is known. Method: questions and measurements, numbered as they are sent and heard in
+    another order."""
+    known = KnownStates()
+
+    def newest():
+        return known._states["s"].known.stamp_ns
+
+    def measured(asked, stamp_ns, outcome):
+        known.measured(asked, nesam.Measurement("s", stamp_ns, np.zeros(12), (0.0, 0.0)), SimpleNamespace(outcome=outcome, reordered=False))
+        return newest()
+
+    def predicted(asked, stamp_ns):
+        known.predicted(asked, Question("s", fan(1, 1)), SimpleNamespace(start=np.zeros(12), start_stamp_ns=stamp_ns))
+        return newest()
+
+    late, ahead = known.ask(), known.ask()
+    assert measured(known.ask(), 200, "APPLIED") == 200
+    assert predicted(late, 100) == 200, "it was asked for before the measurement and is older"
+    assert predicted(ahead, 300) == 300, "somebody else had measured more"
+    assert measured(known.ask(), 250, "APPLIED") == 250, "what was sent later tells what the session has now"
+    of_the_old_clock, jump, after = known.ask(), known.ask(), known.ask()
+    assert predicted(after, 260) == 260
+    assert measured(jump, 10, "CLOCK_JUMP") == 10, "stamps of before say nothing"
+    assert predicted(of_the_old_clock, 400) == 10, "the clock has begun anew since"
+    assert measured(known.ask(), 20, "APPLIED") == 20
+    assert measured(known.ask(), 5, "RESTARTED") == 5
+    assert predicted(after, 500) == 5, "the vehicle has been restarted since"
+    assert predicted(known.ask(), 7) == 7
 
 
 def test_service_away_is_unavailable_or_fallback():

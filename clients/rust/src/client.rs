@@ -237,7 +237,7 @@ impl Client {
     /// Sends measurements and collects their answers.
     pub async fn feed(&mut self, measurements: Vec<v1::Measurement>) -> Result<Vec<v1::MeasurementAnswer>, ClientError> {
         let mut client = v1::measurements_client::MeasurementsClient::new(self.routed());
-        let reported: Vec<Reported> = measurements.iter().map(Reported::new).collect();
+        let reported: Vec<Reported> = measurements.iter().map(|measurement| self.known.report(measurement)).collect();
         let mut inbound = client.stream(tokio_stream::iter(measurements)).await?.into_inner();
         let mut answers = Vec::with_capacity(reported.len());
         while let Some(answer) = inbound.message().await? {
@@ -265,9 +265,10 @@ impl Client {
         if let Some(deadline) = deadline {
             request.set_timeout(deadline);
         }
+        let asked = self.known.ask();
         match self.ask(request, deadline).await {
             Ok(prediction) => {
-                self.known.predicted(&candidates, &prediction);
+                self.known.predicted(asked, &candidates, &prediction);
                 Ok(prediction)
             }
             Err(error) => {

@@ -36,7 +36,7 @@ impl MeasurementStream {
         let place = self.sender.reserve().await.map_err(|_| ClientError::protocol("the measurement stream has ended"))?;
         // Under the lock, so that both queues have the same order.
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-        waiting.push_back(Reported::new(&measurement));
+        waiting.push_back(self.known.report(&measurement));
         place.send(measurement);
         Ok(())
     }

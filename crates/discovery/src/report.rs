@@ -222,7 +222,7 @@ impl Report<'_> {
             return;
         }
         let head: Vec<&str> =
-            ["control", "parameters"].into_iter().chain(DIMENSION_KEYS).chain(["position mean", "position at K"]).collect();
+            ["control", "parameters"].into_iter().chain(DIMENSION_KEYS).chain(["position mean [m]", "position at K [m]"]).collect();
         let mut table = Table::new("Mean absolute error over the horizon on held-out drives", &head);
         let named = self.stages().into_iter().filter(|(name, _)| *name != STAGES[1]).map(|(name, tree)| (name.to_string(), None, tree));
         let controls = rows.iter().map(|(kind, parameters, score)| (control_name(kind), Some(*parameters), &score.summary.tree));
@@ -315,7 +315,7 @@ impl Report<'_> {
     }
 
     fn error_table(&self) -> Table {
-        let head: Vec<&str> = std::iter::once("model").chain(DIMENSION_KEYS).chain(["position mean", "position at K"]).collect();
+        let head: Vec<&str> = std::iter::once("model").chain(DIMENSION_KEYS).chain(["position mean [m]", "position at K [m]"]).collect();
         let mut table = Table::new("Mean absolute error over the horizon on held-out drives", &head);
         for (name, tree) in self.stages() {
             let numbers = tree.mae_mean.to_array().into_iter().chain([tree.position_m.mean, tree.position_m.final_]);

@@ -60,7 +60,7 @@ pub fn adaptation_page(adaptation: &Adaptation<'_>) -> String {
     );
     page.section("Soil over time").plots(
         &soil_plots(adaptation),
-        "Soil under the vehicle: the dashed line is the prior, the band one standard deviation of the posterior. Moduli, cohesion and shear modulus as \
+        "Soil under the vehicle: the prior is that of the first drive, the band one standard deviation of the posterior. Moduli, cohesion and shear modulus as \
          log10. A flat band as wide as at the start means: not learned.",
     );
     let p = adaptation.provenance;

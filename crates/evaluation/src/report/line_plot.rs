@@ -46,7 +46,7 @@ pub struct LinePlot {
 
 const WIDTH: f64 = 380.0;
 const HEIGHT: f64 = 260.0;
-const LEFT: f64 = 52.0;
+const LEFT: f64 = 62.0;
 const RIGHT: f64 = 10.0;
 const TOP: f64 = 24.0;
 const BOTTOM: f64 = 38.0;

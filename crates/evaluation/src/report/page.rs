@@ -5,6 +5,9 @@ use std::fmt::Write;
 use super::line_plot::LinePlot;
 use super::table::Table;
 
+/// A value of the footer with more bytes than this is folded.
+const LONG: usize = 1000;
+
 /// Replaces the characters that HTML gives a meaning to.
 pub fn escape(text: &str) -> String {
     text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
@@ -68,7 +71,9 @@ impl Page {
         let title = escape(&self.title);
         let mut footer = String::new();
         for (name, value) in &self.footer {
-            let _ = writeln!(footer, "<dt>{}</dt><dd><code>{}</code></dd>", escape(name), escape(value));
+            let code = format!("<code>{}</code>", escape(value));
+            let shown = if value.len() > LONG { format!("<details><summary>show</summary>{code}</details>") } else { code };
+            let _ = writeln!(footer, "<dt>{}</dt><dd>{shown}</dd>", escape(name));
         }
         format!(
             "<!doctype html>\n<html lang=\"en\">\n<head>\n<meta charset=\"utf-8\">\n\
@@ -91,12 +96,12 @@ main { max-width: 1180px; margin: 0 auto; padding: 2rem 1.25rem 4rem; }
 h1 { font-size: 1.7rem; line-height: 1.2; margin: 0 0 .6rem; }
 h2 { font-size: 1.2rem; margin: 2.4rem 0 .6rem; }
 p { max-width: 75ch; } .lead { font-size: 1.08rem; color: var(--soft); }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; } .scroll + .scroll { margin-top: 1.4rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .9rem; }
 caption { text-align: left; color: var(--soft); padding: .3rem 0; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid var(--line); white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-tbody tr:nth-child(odd) { background: var(--row); } td.best { font-weight: 700; } td small { color: var(--soft); }
+th:first-child, td:first-child, .words { text-align: left; }
+tbody tr:nth-child(odd) { background: var(--row); } td.best { font-weight: 700; } td small { color: var(--soft); display: block; }
 button { font: inherit; font-size: .8rem; color: var(--soft); background: none; border: 1px solid var(--line);
   border-radius: 4px; padding: .1rem .5rem; cursor: pointer; margin: .4rem 0; }
 button:hover { color: var(--ink); }
@@ -116,14 +121,15 @@ svg .probe { stroke: var(--ink); stroke-opacity: .6; fill: none; pointer-events:
 #note { position: fixed; z-index: 2; background: var(--paper); border: 1px solid var(--line); border-radius: 4px; padding: .25rem .6rem;
   font-size: .8rem; font-variant-numeric: tabular-nums; pointer-events: none; box-shadow: 0 1px 6px #0003; }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); color: var(--soft); font-size: .85rem; }
-dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; } dd { margin: 0; overflow-wrap: anywhere; }
+dl { display: grid; grid-template-columns: max-content 1fr; gap: .15rem 1rem; } dd { margin: 0; overflow-wrap: anywhere; } summary { cursor: pointer; }
+@media (max-width: 900px) { table { font-size: .82rem; } th, td { padding: .25rem .35rem; } }
 @media print { button, #note { display: none; } }
 "#;
 
 const SCRIPT: &str = r#"
 document.querySelectorAll('button[data-copy]').forEach(b => b.addEventListener('click', async () => {
   const rows = [...b.nextElementSibling.querySelectorAll('tr')];
-  const text = rows.map(r => [...r.cells].map(c => c.innerText.trim()).join('\t')).join('\n');
+  const text = rows.map(r => [...r.cells].map(c => c.innerText.trim().replace(/\s+/g, ' ')).join('\t')).join('\n');
   const say = t => { b.textContent = t; setTimeout(() => b.textContent = 'copy table', 1500); };
   try { await navigator.clipboard.writeText(text); say('copied'); } catch {
     // A browser that gives no clipboard to files: the table is selected instead.
@@ -169,9 +175,10 @@ mod tests {
         let mut page = Page::new("a < b", "lead & more");
         let mut plot = LinePlot::new("error", "t [s]", "m");
         plot.series.push(Series::line("<model>", 1, vec![(0.0, 0.0), (1.0, 2.0)]));
-        page.section("one").plots(&[plot], "caption").footer("command", "nesam evaluate --set \"x\"");
+        page.section("one").plots(&[plot], "caption").footer("command", "nesam evaluate --set \"x\"").footer("filter", &"1,".repeat(LONG));
         let html = page.render();
         assert!(html.contains("a &lt; b") && html.contains("&lt;model&gt;") && html.contains("--set &quot;x&quot;"));
+        assert_eq!(html.matches("<details>").count(), 1, "what is long is folded, what is short is not");
         for outside in ["http://", "https://", "src=", "@import", "url("] {
             assert!(!html.contains(outside), "the page must not load `{outside}`");
         }

@@ -60,17 +60,29 @@ impl Table {
         out + "\n"
     }
 
+    /// Whether a column holds words, which begin on the left, and not numbers.
+    fn has_words(&self, column: usize) -> bool {
+        let mut told = self.rows.iter().filter_map(|row| row.get(column)).filter(|cell| !cell.text.is_empty()).peekable();
+        told.peek().is_some() && told.all(|cell| cell.text.starts_with(char::is_alphabetic))
+    }
+
     pub(super) fn to_html(&self) -> String {
         let mut html = String::from("<div class=\"scroll\">\n<button data-copy>copy table</button>\n<table>\n");
         let _ = writeln!(html, "<caption>{}</caption>\n<thead><tr>", escape(&self.caption));
-        for head in &self.head {
-            let _ = write!(html, "<th>{}</th>", escape(head));
+        let words: Vec<bool> = (0..self.head.len()).map(|column| self.has_words(column)).collect();
+        for (head, words) in self.head.iter().zip(&words) {
+            let class = if *words { " class=\"words\"" } else { "" };
+            let _ = write!(html, "<th{class}>{}</th>", escape(head));
         }
         html.push_str("</tr></thead>\n<tbody>\n");
         for row in &self.rows {
             html.push_str("<tr>");
-            for cell in row {
-                let class = if cell.best { " class=\"best\"" } else { "" };
+            for (column, cell) in row.iter().enumerate() {
+                let class = match (cell.best, words.get(column)) {
+                    (true, _) => " class=\"best\"",
+                    (false, Some(true)) => " class=\"words\"",
+                    _ => "",
+                };
                 let _ = write!(html, "<td{class}>{}", escape(&cell.text));
                 if !cell.small.is_empty() {
                     let _ = write!(html, " <small>{}</small>", escape(&cell.small));
@@ -81,5 +93,20 @@ impl Table {
         }
         html.push_str("</tbody>\n</table>\n</div>\n");
         html
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn property_words_begin_on_the_left_and_numbers_end_on_the_right() {
+        let mut table = Table::new("errors", &["model", "layer", "z [m]", "outcome"]);
+        table.row(["a", "soil", "0.1", ""].map(Cell::from).into()).row(["b", "map", "–", "chosen"].map(Cell::from).into());
+        let html = table.to_html();
+        let class = |cell: &str| html.contains(&format!("<td class=\"words\">{cell}</td>"));
+        assert!(class("soil") && class("map") && class("chosen") && html.contains("<th class=\"words\">layer</th>"), "{html}");
+        assert!(!class("0.1") && !class("–") && html.contains("<td>0.1</td>") && html.contains("<th>z [m]</th>"), "{html}");
     }
 }

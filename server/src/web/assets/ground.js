@@ -1,7 +1,10 @@
-// The ground as a picture: hillshade with contours, or semantic colours with the same shade.
+// The ground as a picture: hillshade, or semantic colours with the same shade; lines of equal height apart from it, as sharp as the screen.
 
 const HOLE = 65535;
 const STEPS = [0.1, 0.2, 0.25, 0.5, 1, 2, 2.5, 5, 10, 20, 50, 100];
+
+// A semantic colour as it is painted: less lively than what is drawn on it.
+export const painted = (value, dark) => Math.round(value * (dark ? 0.55 : 0.72) + (dark ? 8 : 66));
 
 export class Ground {
   // The map with this hash; empty until `load` is done.
@@ -24,7 +27,7 @@ export class Ground {
       return share === HOLE ? NaN : low + ((high - low) * share) / (HOLE - 1);
     });
     if (about.semantics) this.colours = new Uint8Array(await (await get(`${path}/semantics`)).arrayBuffer());
-    this.contour_m = STEPS.find((step) => (high - low) / step <= 12) ?? 200;
+    this.contour_m = STEPS.find((step) => (high - low) / step <= 12) ?? (high - low) / 12;
     this.about = about;
   }
 
@@ -64,6 +67,27 @@ export class Ground {
     return (0.5 * dx - 0.5 * dy + 0.7071) / Math.hypot(dx, dy, 1);
   }
 
+  // Lines of equal height between two corners of what is seen, as pieces of four numbers, x and y of both ends. Looks at every so many cells.
+  contours([x0, y0], [x1, y1], every) {
+    const { origin_m: [x, y], resolution_m: r, columns, rows } = this.about, { heights: z, contour_m: step } = this, pieces = [];
+    const first = (seen, start) => Math.max(Math.floor((seen - start) / r / every), 0) * every;
+    for (let row = first(y0, y); row + every < rows && y + row * r < y1; row += every) {
+      for (let column = first(x0, x); column + every < columns && x + column * r < x1; column += every) {
+        const at = row * columns + column, up = every * columns, around = [z[at], z[at + every], z[at + up + every], z[at + up]];
+        const high = Math.max(...around);
+        for (let n = Math.ceil(Math.min(...around) / step); n * step < high; n++) {
+          for (let i = 0; i < 4; i++) {
+            // Counter-clockwise from the south-west; of four crossings each two that follow are joined.
+            const [from, to] = [around[i], around[(i + 1) % 4]], share = (n * step - from) / (to - from);
+            if (from < n * step === to < n * step) continue;
+            pieces.push(x + r * (column + every * [share, 1, 1 - share, 0][i]), y + r * (row + every * [0, share, 1, 1 - share][i]));
+          }
+        }
+      }
+    }
+    return pieces;
+  }
+
   picture(layer, dark) {
     const key = `${layer}${dark}`;
     if (!this.pictures.has(key)) this.pictures.set(key, this.paint(layer === "semantics" && this.colours ? "semantics" : "elevation", dark));
@@ -76,19 +100,15 @@ export class Ground {
     [canvas.width, canvas.height] = [columns, rows];
     const context = canvas.getContext("2d"), image = context.createImageData(columns, rows), z = this.heights;
     const [from, to] = dark ? [[31, 39, 44], [72, 77, 74]] : [[203, 211, 207], [243, 240, 229]];
-    const line = dark ? 1.28 : 0.86;
     for (let row = 0; row < rows; row++) {
       for (let column = 0; column < columns; column++) {
         const cell = row * columns + column, pixel = 4 * ((rows - 1 - row) * columns + column), h = z[cell];
         if (Number.isNaN(h)) continue;
-        const around = this.around(row, column), [east, , north] = around;
-        const light = Math.min(Math.max(0.58 + 0.6 * this.shade(around), 0.4), 1.2);
-        const level = Math.floor(h / this.contour_m);
-        const contour = layer === "elevation" && (Math.floor(east / this.contour_m) !== level || Math.floor(north / this.contour_m) !== level) ? line : 1;
+        const light = Math.min(Math.max(0.58 + 0.6 * this.shade(this.around(row, column)), 0.4), 1.2);
         const share = (h - low) / (high - low || 1);
         for (let c = 0; c < 3; c++) {
-          const base = layer === "semantics" ? this.colours[3 * cell + c] * (dark ? 0.55 : 0.72) + (dark ? 8 : 66) : from[c] + share * (to[c] - from[c]);
-          image.data[pixel + c] = base * light * contour;
+          const base = layer === "semantics" ? painted(this.colours[3 * cell + c], dark) : from[c] + share * (to[c] - from[c]);
+          image.data[pixel + c] = base * light;
         }
         image.data[pixel + 3] = 255;
       }

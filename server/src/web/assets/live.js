@@ -1,11 +1,12 @@
 // The live page: takes updates from /live/events and draws them.
 
+import { painted } from "./ground.js";
 import { MapView } from "./map.js";
 import { LatencyPlot, NisPlot } from "./plots.js";
 import { Store } from "./store.js";
 import * as panels from "./panels.js";
 
-const SILENT_MS = 4000;
+const SILENT_MS = 4000, CLASSES_SHOWN = 8;
 const by = (id) => document.getElementById(id);
 const store = new Store();
 let paused = false, lastUpdate = 0, lostUpdates = 0, linked = false, dirty = false;
@@ -85,7 +86,7 @@ function empty() {
   } else if (!linked && !paused && !store.service) {
     html = "<strong>The service does not answer</strong><p>Start it with <code>nesam serve</code> and leave this page open: it connects by itself.</p>";
   } else if (!session) {
-    html = "<strong>No vehicle yet</strong><p>A vehicle appears here when a session is opened. See one drive with <code>nesam demo</code>, or open a session with a client: <code>Client().open_session(\"truck\")</code>.</p>";
+    html = "<strong>No vehicle yet</strong><p>A vehicle appears here when a session is opened. See one drive with <code>nesam demo</code>, or open a session with a client: <code>nesam.Client(\"HOST:PORT\").open_session(\"truck\")</code>.</p>";
   } else if (!session.newest && !session.trail.length) {
     html = `<strong>Session ${session.session.replace(/[&<>]/g, "")} is open</strong><p>It waits for its first measurement, over gRPC or Zenoh.</p>`;
   }
@@ -117,15 +118,24 @@ function clock(seconds) {
   return `up ${h}:${m}:${s}`;
 }
 
+const minus = (metres) => metres.toFixed(1).replace("-", "\u2212");
+
 function legend() {
   const session = store.session, sample = (colour, width, dash = "") => `<svg viewBox="0 0 24 10" aria-hidden="true"><path d="M1 5H23" fill="none" stroke="var(${colour})" stroke-width="${width}" stroke-dasharray="${dash}"/></svg>`;
-  const lines = [];
+  const lines = [], [low, high] = map.ground?.about.height_range_m ?? [];
   if (session?.trail.length) lines.push(`${sample("--ink", 2.5)}driven`);
   if (session?.fan) lines.push(`${sample("--blue", 1.5)}${session.fan.samples} candidates, ${session.fan.horizon_s.toFixed(1)} s`);
   if (session?.fan?.flagged.some(Boolean)) lines.push(`${sample("--vermilion", 1.5, "4 3")}outside what was trained or known`);
   if (session?.region) lines.push(`${sample("--orange", 2.5)}one of them, 90 % regions`);
-  if (map.ground && map.layer === "elevation") lines.push(`<span class="soft">contours every ${map.ground.contour_m} m</span>`);
+  if (map.ground && map.layer === "elevation") lines.push(`<span class="soft">contours every ${map.ground.contour_m} m; dark ${minus(low)} m, light ${minus(high)} m</span>`);
   if (map.ground && map.layer === "semantics" && !map.ground.colours) lines.push('<span class="soft">this map has no semantics</span>');
+  // Classes of the map in their colours, as far as it names some.
+  if (map.ground && map.layer === "semantics") {
+    const classes = map.ground.about.classes.filter((one) => one.colour);
+    const patch = (colour) => `<svg viewBox="0 0 24 10" aria-hidden="true"><path d="M1 0h22v10h-22z" fill="rgb(${colour.map((v) => painted(v, map.dark.matches))})"/></svg>`;
+    for (const { name, colour } of classes.slice(0, CLASSES_SHOWN)) lines.push(`${patch(colour)}${panels.esc(name.replaceAll("_", " "))}`);
+    if (classes.length > CLASSES_SHOWN) lines.push(`<span class="soft">and ${classes.length - CLASSES_SHOWN} more under the pointer</span>`);
+  }
   panels.put(by("legend"), lines.map((line) => `<li>${line}</li>`).join(""));
 }
 

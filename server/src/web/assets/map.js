@@ -1,9 +1,10 @@
 // The map: ground, driven paths, candidates, regions, vehicles.
 
 import { Ground } from "./ground.js";
+import { STALE_S } from "./store.js";
 
 const RETRY_MS = 2000;
-const FOLLOW_PX_PER_M = 24, PX_PER_M = [0.5, 150], GRID = [1, 2, 5, 10, 20, 50, 100, 200, 500];
+const FOLLOW_PX_PER_M = 24, CONTOUR_PX = 3, PX_PER_M = [0.5, 150], GRID = [1, 2, 5, 10, 20, 50, 100, 200, 500];
 const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 export class MapView {
@@ -160,9 +161,24 @@ export class MapView {
     const { x, y, width, height } = this.ground.extent, [left, top] = this.toScreen(x, y + height);
     c.imageSmoothingEnabled = this.scale * this.ground.about.resolution_m < 6;
     c.drawImage(this.ground.picture(this.layer, this.dark.matches), left, top, width * this.scale, height * this.scale);
+    if (this.layer === "elevation") this.drawContours(c);
     c.strokeStyle = css("--soft");
     c.lineWidth = 1;
     c.strokeRect(left, top, width * this.scale, height * this.scale);
+  }
+
+  drawContours(c) {
+    const { clientWidth: w, clientHeight: h } = this.canvas, every = Math.ceil(CONTOUR_PX / (this.scale * this.ground.about.resolution_m));
+    const pieces = this.ground.contours(this.toWorld(0, h), this.toWorld(w, 0), every);
+    c.beginPath();
+    for (let i = 0; i < pieces.length; i += 4) {
+      c.moveTo(...this.toScreen(pieces[i], pieces[i + 1]));
+      c.lineTo(...this.toScreen(pieces[i + 2], pieces[i + 3]));
+    }
+    c.lineCap = "round";
+    c.strokeStyle = css("--contour");
+    c.lineWidth = 1;
+    c.stroke();
   }
 
   // Where no map is, a grid tells distances.
@@ -214,8 +230,8 @@ export class MapView {
       const points = [fan.start];
       for (let i = 0; i < path.length && path[i] !== null; i += 2) points.push([path[i], path[i + 1]]);
       this.line(c, points);
-      c.globalAlpha = fan.flagged[n] ? 0.85 : 0.55;
-      this.stroke(c, fan.flagged[n] ? vermilion : blue, 1, 0, fan.flagged[n] ? [4, 3] : []);
+      c.globalAlpha = fan.flagged[n] ? 1 : 0.55;
+      this.stroke(c, fan.flagged[n] ? vermilion : blue, fan.flagged[n] ? 1.5 : 1, 0, fan.flagged[n] ? [4, 4] : []);
     });
     c.globalAlpha = 1;
   }
@@ -251,7 +267,8 @@ export class MapView {
     c.lineTo(length / 4, -width / 2);
     c.closePath();
     c.fillStyle = session === this.store.session ? css("--ink") : css("--soft");
-    c.globalAlpha = 0.85;
+    // Pale where the vehicle is silent.
+    c.globalAlpha = session.newest.age_s > STALE_S ? 0.3 : 0.85;
     c.fill();
     c.globalAlpha = 1;
     c.strokeStyle = css("--panel");
@@ -263,9 +280,10 @@ export class MapView {
       c.lineWidth = 3;
       c.lineJoin = "round";
       c.strokeStyle = css("--panel");
-      c.strokeText(session.session, x + 12, y - 12);
+      const beside = [x + 0.5 * length + 4, y - 0.5 * length + 4];
+      c.strokeText(session.session, ...beside);
       c.fillStyle = css("--ink");
-      c.fillText(session.session, x + 12, y - 12);
+      c.fillText(session.session, ...beside);
     }
   }
 

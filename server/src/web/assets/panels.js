@@ -1,6 +1,8 @@
 // Read-outs, soil, alarms, diagnoses.
 
-const esc = (text) => String(text ?? "").replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
+import { STALE_S } from "./store.js";
+
+export const esc = (text) => String(text ?? "").replace(/[&<>"]/g, (c) => `&#${c.charCodeAt(0)};`);
 const DEG = 180 / Math.PI;
 const fixed = (value, digits) => (Number.isFinite(value) ? value.toFixed(digits).replace("-", "\u2212") : "\u2013");
 
@@ -25,7 +27,7 @@ export function vehicle(elements, session, alive) {
   }
   const [x, y, z] = n.position_m, [roll, pitch, yaw] = n.attitude_rad.map((a) => a * DEG), speed = Math.hypot(...n.velocity_m_s.slice(0, 2));
   put(elements.list, [
-    reading("speed", fixed(speed, 2), "m/s"), reading("roll", fixed(roll, 1), "\u00b0", false, "left side up is positive"), reading("x", fixed(x, 2), "m"), reading("age", fixed(n.age_s, 1), "s", n.age_s > 1, "time since the newest measurement arrived"),
+    reading("speed", fixed(speed, 2), "m/s"), reading("roll", fixed(roll, 1), "\u00b0", false, "left side up is positive"), reading("x", fixed(x, 2), "m"), reading("age", fixed(n.age_s, 1), "s", n.age_s > STALE_S, "time since the newest measurement arrived"),
     reading("commanded", fixed(n.command.speed_m_s, 2), "m/s"), reading("pitch", fixed(pitch, 1), "\u00b0", false, "nose down is positive"), reading("y", fixed(y, 2), "m"), reading("history", session.history_steps, "of 32", false, "measured steps that the next prediction starts from"),
     reading("second cmd", fixed(n.command.second, 2), "", false, "steering in the unit of the vehicle card"), reading("yaw", fixed(yaw, 1), "\u00b0", false, "counter-clockwise from east"), reading("z", fixed(z, 2), "m"), reading("yaw rate", fixed(n.angular_velocity_rad_s[2] * DEG, 1), "\u00b0/s"),
   ].join(""));
@@ -80,7 +82,7 @@ export function service(element, store) {
   put(element, [
     reading("predictions", fixed(store.rate("predictions"), 1), "/s"), reading("candidates", fixed(store.rate("candidates"), 0), "/s"),
     reading("waiting", s.waiting.predictions + s.waiting.commands), reading("answered", s.predictions),
-    reading("cache, 10 s", percent(cache.recent_hit_rate), "%", false, "share of terrain lookups that needed no encoding, last ten seconds"), reading("cache, all", percent(cache.hit_rate), "%", false, `${cache.looked_up} lookups, ${cache.encoded} encoded`),
+    reading("cache hits, 10 s", percent(cache.recent_hit_rate), "%", false, "share of terrain lookups that needed no encoding, last ten seconds"), reading("cache hits, all", percent(cache.hit_rate), "%", false, `${cache.looked_up} lookups, ${cache.encoded} encoded`),
     reading("vehicles", s.vehicles_alive ? s.vehicles_alive.length : "\u2013", s.vehicles_alive ? "on Zenoh" : ""), reading("recording", s.recording ? fixed(s.recording.bytes / 1e6, 1) : "off", s.recording ? "MB" : ""),
   ].join(""));
 }
@@ -99,7 +101,7 @@ function report(r) {
     const begun = e.onset_s ? `, from ${significant(e.onset_s)} s` : perhaps;
     return `<p class="effect"><strong>${esc(e.id)}</strong> ${(e.parameters ?? []).map(parameter).join(", ")}${begun}${rivals.length ? ` <span class="soft">not told from ${rivals.map(esc).join(", ")}</span>` : ""}</p>`;
   });
-  const stages = [["before", "before", r.before], ["soil alone", "soil", r.soil_only], ["with effect", "after", r.after]].filter(([, , e]) => e?.position_m != null);
+  const stages = [["before", "before", r.before], ["soil alone", "soil", r.soil_only], ["with effect", "after", r.after]].filter(([, kind, e]) => e?.position_m != null && (kind !== "after" || effects.length));
   const most = Math.max(...stages.map(([, , e]) => e.position_m));
   const bars = stages.map(([name, kind, e]) => `<span>${name}</span><i class="${kind}" data-share="${(e.position_m / most).toFixed(4)}"></i><span>${fixed(e.position_m, 3)} m${e.ci95 ? ` <span class="soft">[${fixed(e.ci95[0], 3)}, ${fixed(e.ci95[1], 3)}]</span>` : ""}</span>`);
   const axes = ["x_m", "y_m", "z_m", "roll_deg", "pitch_deg", "yaw_deg"];

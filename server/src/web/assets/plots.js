@@ -45,7 +45,7 @@ export class NisPlot extends Plot {
     this.last = session;
     const tests = (session?.tests ?? []).slice(-SHOWN_TESTS);
     if (!tests.length) {
-      this.say(!session ? "no vehicle" : session.map ? "waiting for the first full buffer of the soil filter" : "no map: the soil is not learned", true);
+      this.say(!session ? "no vehicle" : session.map ? "no full buffer of the soil filter since this page was opened" : "no map: the soil is not learned", true);
       return "";
     }
     const f = this.frame(), ratios = tests.map((t) => t.nis / t.dof), [low, high] = chiSquareInterval(tests.at(-1).dof);
@@ -82,13 +82,13 @@ export class LatencyPlot extends Plot {
     this.last = store;
     const shown = store.timings;
     if (!shown.length) {
-      this.say(store.timed ? "no prediction was asked for within a minute" : "no prediction was asked for yet", true);
+      this.say(store.timed ? "no prediction was asked for within a minute" : "no prediction was asked for since this page was opened", true);
       return "";
     }
     const f = this.frame(), total = (t) => t[1] + t[2], sorted = shown.map(total).sort((a, b) => a - b);
     const top = Math.max(quantile(sorted, 0.995) * 1.25, 2);
     const x = (at) => f.right - ((store.now - at) / TIMINGS_S) * (f.right - f.left), y = (ms) => f.bottom - (Math.min(ms, top) / top) * (f.bottom - f.top);
-    const step = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((s) => top / s <= 4) ?? 5000;
+    const step = [0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000].find((s) => top / s <= 5) ?? 10000;
     let svg = "";
     for (let t = 0; t <= top; t += step) svg += `<path class="grid" d="M${f.left} ${y(t)}H${f.right}"/><text x="${f.left - 6}" y="${y(t) + 4}" text-anchor="end">${t}</text>`;
     // A dot where it was answered; below it, as a line, what of that it waited.
@@ -102,7 +102,7 @@ export class LatencyPlot extends Plot {
       const near = shown.reduce((a, b) => (Math.abs(x(b[0]) - this.hover) < Math.abs(x(a[0]) - this.hover) ? b : a));
       svg += `<path class="probe" d="M${x(near[0])} ${f.top}V${f.bottom}"/><text class="note" x="${f.right}" y="${f.top + 10}" text-anchor="end">${esc(`${near[3]} candidates: ${near[2].toFixed(1)} ms, ${near[1].toFixed(1)} ms in the queue`)}</text>`;
     }
-    const text = `ms, median ${quantile(sorted, 0.5).toFixed(1)}, 99 % ${quantile(sorted, 0.99).toFixed(1)}`;
+    const text = `ms in the service, median ${quantile(sorted, 0.5).toFixed(1)}, 99 % ${quantile(sorted, 0.99).toFixed(1)}`;
     this.say(text, false);
     this.svg.innerHTML = svg;
     return text;

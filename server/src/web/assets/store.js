@@ -2,6 +2,8 @@
 
 const TRAIL_MAX = 600, TESTS_MAX = 200, TIMINGS_MAX = 1200, RATES_S = 5;
 export const TIMINGS_S = 60;
+// A vehicle whose newest measurement is older than this is silent.
+export const STALE_S = 1;
 
 function keepLast(list, fresh, most) {
   list.push(...fresh);
