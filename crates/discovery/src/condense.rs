@@ -128,12 +128,12 @@ pub struct Beside {
 
 /// Signatures of every column of the catalogue and of the soil on one drive, by central differences.
 pub fn signatures(bench: &Bench<'_>, drive: &ObservedDrive) -> Signatures {
-    signatures_beside(bench, drive, &[], |_| true)
+    signatures_beside(bench, drive, &[])
 }
 
 /// The same beside effects that were fitted; their own columns are the secants, from without to with each, one after the other, so that the deviations without
-/// them are those with them plus the columns times their shares. Columns of what is not `wanted` are zero.
-pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Beside], wanted: impl Fn(&Candidate) -> bool) -> Signatures {
+/// them are those with them plus the columns times their shares.
+pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Beside]) -> Signatures {
     let beside: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
     let at = |effect: Option<ScheduledEffect>, soil: &SoilCorrection| {
         let effects: Vec<ScheduledEffect> = beside.iter().copied().chain(effect).collect();
@@ -141,15 +141,11 @@ pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Bes
     };
     let base = at(None, &SoilCorrection::NONE);
     let mass_kg = bench.vehicle.mass_kg;
-    let form = |c: &Candidate| {
-        let step = wanted(c).then(|| c.share_step(mass_kg));
-        c.linear_form().into_iter().map(|e| (e, c.forward(), step)).collect::<Vec<_>>()
-    };
-    let forms: Vec<(Effect, bool, Option<f64>)> = bench.catalogue.iter().flat_map(form).collect();
+    let form = |c: &Candidate| c.linear_form().into_iter().map(|e| (e, c.forward(), c.share_step(mass_kg))).collect::<Vec<_>>();
+    let forms: Vec<(Effect, bool, f64)> = bench.catalogue.iter().flat_map(form).collect();
     let mut columns: Vec<Vec<Row>> = forms
         .par_iter()
         .map(|(effect, forward, step)| {
-            let Some(step) = step else { return vec![[0.0; CHANNELS]; base.len()] };
             let side = |share: f64| at(Some(ScheduledEffect { effect: effect.scaled(share), onset_s: 0.0 }), &SoilCorrection::NONE);
             if *forward { difference(&base, &side(*step), 1.0 / step) } else { difference(&side(-step), &side(*step), 0.5 / step) }
         })

@@ -226,7 +226,7 @@ pub(crate) fn available_in_all<'a>(drives: impl IntoIterator<Item = &'a Observed
 }
 
 /// Whether the rims turn as they are told, whatever the ground does.
-pub(crate) fn rims_servoed(vehicle: &Vehicle) -> bool {
+fn rims_servoed(vehicle: &Vehicle) -> bool {
     vehicle.second == SecondCommand::YawRateRadS
 }
 

@@ -12,8 +12,7 @@ use nesam_physics::SoilCorrection;
 use nesam_physics::effects::{Layer, ScheduledEffect};
 use rayon::prelude::*;
 
-use crate::candidates::Candidate;
-use crate::channels::{CHANNELS, PATH_AT, RIM_AT, Row};
+use crate::channels::Row;
 use crate::claims::{Case, Finding};
 use crate::condense::{Beside, Condensed, condense, signatures_beside};
 use crate::diagnose::OnProgress;
@@ -22,7 +21,7 @@ use crate::evidence::Group;
 use crate::fit::{Fit, Term};
 use crate::ground::Ground;
 use crate::judge::own_yardstick;
-use crate::observe::{available_in_all, rims_servoed};
+use crate::observe::available_in_all;
 use crate::onset::Onset;
 use crate::own_reference;
 use crate::proof::Trial;
@@ -42,146 +41,75 @@ pub(crate) struct Pursued {
     pub refused: Vec<Finding>,
 }
 
-/// What a search found so far.
-#[derive(Default)]
-struct Search {
-    known: Vec<Known>,
-    /// The known effects as fitted.
-    fitted: Vec<Beside>,
-    /// Hypotheses that are not looked at again, with why.
-    passed_over: Vec<usize>,
-    refused: Vec<Finding>,
-}
-
-/// What a search asks.
-struct Asked {
-    channels: [bool; CHANNELS],
-    /// Whether only what moves the rims is sought, on the rims alone: what the ground makes of them neither proves nor refutes it.
-    of_rims: bool,
-    /// Most effects that are known at its end.
-    most: usize,
-}
-
-/// Where rims are servoed and measured, what they tell of the drive line is sought first, which no ground stands in front of. Then, where no map tells of the ground, one soil is
-/// fitted beside it; then everything else is sought, and the soil fitted again beside each effect that is found.
+/// Looks again beside the first effect that stands out and helps, then beside the first two, and so on. Where no map tells of the ground one soil is fitted first, and again beside
+/// each effect that is found.
 ///
 /// # Errors
 /// As [`own_yardstick`] and [`Trial::no_better`].
 pub(crate) fn pursue(
     case: &mut Case<'_>,
-    first: Yardstick,
+    mut yardstick: Yardstick,
     without: &[String],
     trial: &Trial<'_>,
     progress: OnProgress<'_>,
 ) -> Result<Pursued, DiscoveryError> {
-    let mut search = Search::default();
-    let available = available_in_all(case.prepared.iter().map(|p| &p.drive));
-    let rims = core::array::from_fn(|c| available[c] && (RIM_AT..PATH_AT).contains(&c));
-    let of_rims = Asked { channels: rims, of_rims: true, most: EFFECTS_ON_TRIAL_MAX - 2 };
-    if rims_servoed(case.bench.vehicle) && rims.contains(&true) {
-        let left = look_beside(case, &[], &of_rims, progress)?;
-        let yardstick = yardstick_of(case, &left, &search, &of_rims, without)?;
-        search.go_on(case, yardstick, &of_rims, without, trial, progress)?;
+    let (mut known, mut refused): (Vec<Known>, Vec<Finding>) = (Vec::new(), Vec::new());
+    if refit_ground(case, &[], trial)? {
+        let left = look_beside(case, &[], progress)?;
+        yardstick = own_yardstick(case, &left, without)?;
     }
-    refit_ground(case, &search.effects(), trial)?;
-    let all = Asked { channels: available, of_rims: false, most: EFFECTS_ON_TRIAL_MAX };
-    let yardstick = if search.fitted.is_empty() && case.bench.ground == SoilCorrection::NONE && !rims.contains(&true) {
-        first
-    } else {
-        let left = look_beside(case, &search.fitted, &all, progress)?;
-        yardstick_of(case, &left, &search, &all, without)?
-    };
-    let yardstick = search.go_on(case, yardstick, &all, without, trial, progress)?;
-    Ok(Pursued { yardstick, refused: search.refused })
-}
-
-impl Search {
-    fn effects(&self) -> Vec<ScheduledEffect> {
-        self.fitted.iter().map(|f| f.effect).collect()
-    }
-
-    /// Looks again beside each further effect that stands out and helps. Gives what the last look is judged by.
-    fn go_on(
-        &mut self,
-        case: &mut Case<'_>,
-        mut yardstick: Yardstick,
-        asked: &Asked,
-        without: &[String],
-        trial: &Trial<'_>,
-        progress: OnProgress<'_>,
-    ) -> Result<Yardstick, DiscoveryError> {
-        for _ in 0..LOOKS {
-            if self.known.len() >= asked.most {
-                break;
+    for _ in 0..LOOKS {
+        let (mut selection, mut onsets) = case.select(&yardstick);
+        let Some(first) = selection.chosen.get(..known.len() + 1) else { break };
+        let Some(&new) = first.iter().find(|h| yardstick.known(**h).is_none()) else { break };
+        // What was found last is held against its rivals through the physics.
+        let chosen = std::iter::once(new).chain(first.iter().copied().filter(|h| *h != new)).collect();
+        let group = yardstick.group(case.condensed());
+        selection.choose(&yardstick, &group, chosen);
+        case.settle(&yardstick, &mut selection, &mut onsets, &[]);
+        selection.chosen = needed(case, &yardstick, &group, &selection.chosen, &onsets);
+        let Some(fit) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
+        let helpful = match found(&fit) {
+            Found::Fitted(fitted) => {
+                let why = not_better(case, &yardstick, &group, &selection.chosen, &onsets, &fit, trial)?;
+                why.map_or(Ok(fitted), |why| Err(Some(why)))
             }
-            let (mut selection, mut onsets) = case.select(&yardstick);
-            let Some(first) = selection.chosen.get(..self.known.len() + 1) else { break };
-            let Some(&new) = first.iter().find(|h| yardstick.known(**h).is_none()) else { break };
-            // What was found last is held against its rivals through the physics.
-            let chosen = std::iter::once(new).chain(first.iter().copied().filter(|h| *h != new)).collect();
-            let group = yardstick.group(case.condensed());
-            selection.choose(&yardstick, &group, chosen);
-            case.settle(&yardstick, &mut selection, &mut onsets, &[]);
-            selection.chosen = needed(case, &yardstick, &group, &selection.chosen, &onsets);
-            let Some(fit) = sized(case, &yardstick, &group, &selection.chosen, &onsets) else { break };
-            let helpful = match found(&fit) {
-                Found::Fitted(fitted) if asked.of_rims => Ok(fitted),
-                Found::Fitted(fitted) => {
-                    let why = not_better(case, &yardstick, &group, &selection.chosen, &onsets, &fit, trial)?;
-                    why.map_or(Ok(fitted), |why| Err(Some(why)))
-                }
-                // Its finding is refused for its size; without it others may stand out.
-                Found::AtItsEnd => Err(None),
-                Found::Nothing => break,
-            };
-            match helpful {
-                Ok(fitted) => self.fitted = fitted,
-                Err(why) => {
-                    if !asked.of_rims {
-                        let finding = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
-                        self.refused.extend(finding.map(|own| Finding { refused: why.or_else(|| own.refused.clone()), ..own }));
-                        self.passed_over.push(selection.chosen[0]);
-                    }
-                    yardstick.refused.push(selection.chosen[0]);
-                    continue;
-                }
+            // Its finding is refused for its size; without it others may stand out.
+            Found::AtItsEnd => Err(None),
+            Found::Nothing => break,
+        };
+        let fitted = match helpful {
+            Ok(fitted) => fitted,
+            Err(why) => {
+                let finding = case.findings(&yardstick, &selection, &onsets, &fit, &[]).into_iter().next();
+                refused.extend(finding.map(|own| Finding { refused: why.or_else(|| own.refused.clone()), ..own }));
+                yardstick.refused.push(selection.chosen[0]);
+                continue;
             }
-            self.known.retain(|k| selection.chosen.contains(&k.hypothesis));
-            self.known.push(Known { hypothesis: selection.chosen[0], rivals: selection.rivals.swap_remove(0) });
-            if !asked.of_rims {
-                refit_ground(case, &self.effects(), trial)?;
-            }
-            let left = look_beside(case, &self.fitted, asked, progress)?;
-            yardstick = Yardstick { refused: yardstick.refused, ..yardstick_of(case, &left, self, asked, without)? };
+        };
+        known.retain(|k| selection.chosen.contains(&k.hypothesis));
+        known.push(Known { hypothesis: selection.chosen[0], rivals: selection.rivals.swap_remove(0) });
+        refit_ground(case, &fit.effects(), trial)?;
+        let left = look_beside(case, &fitted, progress)?;
+        yardstick = Yardstick { known: known.clone(), refused: yardstick.refused, ..own_yardstick(case, &left, without)? };
+        if known.len() == EFFECTS_ON_TRIAL_MAX {
+            break;
         }
-        Ok(yardstick)
     }
+    Ok(Pursued { yardstick, refused })
 }
 
-/// What drives are judged by beside what is known, where these are what it leaves of them.
-fn yardstick_of(
-    case: &Case<'_>,
-    left: &[Condensed],
-    search: &Search,
-    asked: &Asked,
-    without: &[String],
-) -> Result<Yardstick, DiscoveryError> {
-    let own = own_yardstick(case, left, without)?;
-    let moves_rims = |c: &Candidate| !asked.of_rims || c.layer() == Layer::Actuator;
-    let considered = own.considered.iter().zip(&own.catalogue).map(|(considered, c)| *considered && moves_rims(c)).collect();
-    Ok(Yardstick { known: search.known.clone(), refused: search.passed_over.clone(), considered, ..own })
-}
-
-/// Fits the ground once more beside effects, where no map tells of it, and takes it if predictions of the fitted drives are better on it.
-fn refit_ground(case: &mut Case<'_>, effects: &[ScheduledEffect], trial: &Trial<'_>) -> Result<(), EvaluationError> {
+/// Fits the ground once more beside effects, where no map tells of it, and takes it if predictions of the fitted drives are better on it; says whether it did.
+fn refit_ground(case: &mut Case<'_>, effects: &[ScheduledEffect], trial: &Trial<'_>) -> Result<bool, EvaluationError> {
     if trial.maps.iter().any(Option::is_some) {
-        return Ok(());
+        return Ok(false);
     }
     let (before, found) = (case.bench.ground, Ground::beside(case, effects).correction());
-    if trial.no_better((effects, &before), (effects, &found), false)?.is_none() {
+    let taken = trial.no_better((effects, &before), (effects, &found), false)?.is_none();
+    if taken {
         case.bench.ground = found;
     }
-    Ok(())
+    Ok(taken)
 }
 
 /// Those of the chosen hypotheses that drives ask for when the others are sized again without them: what was found early may have stood for what was found
@@ -255,19 +183,19 @@ fn none_stands_out(yardstick: &Yardstick, left: &Group, channels: &[usize]) -> b
     yardstick.levels_after_fit(left, left, &[]).all(|(channel, z)| !channels.contains(&channel) || z < yardstick.threshold())
 }
 
-/// Measures scatter and signatures of every drive beside fitted effects, of what is asked; returns what the effects leave of each drive.
-fn look_beside(case: &mut Case<'_>, fitted: &[Beside], asked: &Asked, progress: OnProgress<'_>) -> Result<Vec<Condensed>, DiscoveryError> {
+/// Measures scatter and signatures of every drive beside fitted effects; returns what these leave of each drive.
+fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>) -> Result<Vec<Condensed>, DiscoveryError> {
     let effects: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
     let bench = case.bench;
     let rows: Vec<Vec<Row>> = case.prepared.par_iter().map(|p| p.drive.deviations(&bench, &effects, &SoilCorrection::NONE)).collect();
-    case.metric = own_reference::metric_of(&rows, &asked.channels)?;
+    case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
     // Signatures that are measured again are whole.
     case.dating = None;
     let total = case.prepared.len();
     let mut left = Vec::with_capacity(total);
     for (done, (prepared, rows)) in case.prepared.iter_mut().zip(&rows).enumerate() {
         progress("drives held against every effect beside those found", done, total);
-        prepared.signatures = signatures_beside(&bench, &prepared.drive, fitted, |c| !asked.of_rims || c.layer() == Layer::Actuator);
+        prepared.signatures = signatures_beside(&bench, &prepared.drive, fitted);
         let after = condense(&case.metric, rows, &prepared.signatures);
         let before = fitted.iter().fold(after.clone(), |with, f| with.plus(f.candidate.columns()[0], f.share));
         // What soil alone would explain stays that of the first look.
@@ -283,7 +211,7 @@ mod tests {
     use nalgebra::{DMatrix, DVector};
 
     use super::*;
-    use crate::candidates::catalogue;
+    use crate::candidates::{Candidate, catalogue};
     use crate::channels::TURN_AT;
     use crate::condense::level_column;
     use crate::evidence::Nulls;

@@ -13,7 +13,7 @@ use crate::diagnose::{Against, Diagnosis};
 use crate::manoeuvre;
 
 /// Version of the rule by which a diagnosis stops.
-pub const STOP_RULE: &str = "11: of a model on trial the drive line is sought first where rims tell it, on ground that is fitted where no map tells it, up to six effects, each ranked by what it leaves of each drive; a step of a fit that leaves more is halved; an actuator that bends as it is commanded beside what is claimed is a difference; what a proof refutes is withheld and the rest judged again; each fitted effect doubted by its own share; up to three effects, each dated beside the others and held against its rivals; of several each force, soil and actuator proven by itself, without a proof 2.5 thresholds; sensors of a model on trial proven by what measurements contradict; height, roll and pitch count on a map only; segments in which an effect begins do not count, and each has one size; sensors that wander or jump are a difference; a map answers through the ground; pairwise criterion 6; at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree; a factor known by its distance from 1";
+pub const STOP_RULE: &str = "11: of a model on trial up to four effects, on ground that is fitted where no map tells it; a step of a fit that leaves more is halved; an actuator that bends as it is commanded beside what is claimed is a difference; what a proof refutes is withheld and the rest judged again; each fitted effect doubted by its own share; up to three effects, each dated beside the others and held against its rivals; of several each force, soil and actuator proven by itself, without a proof 2.5 thresholds; sensors of a model on trial proven by what measurements contradict; height, roll and pitch count on a map only; segments in which an effect begins do not count, and each has one size; sensors that wander or jump are a difference; a map answers through the ground; pairwise criterion 6; at most 40 % of the largest evidence left, 20 % for geometry; what varies within drives believed as far as they agree; a factor known by its distance from 1";
 const STAGES: [&str; 3] = ["before", "soil only", "after"];
 
 /// What a report is made from.
@@ -453,6 +453,7 @@ mod tests {
             findings: Vec::new(),
             estimates: Vec::new(),
             claimed: Vec::new(),
+            soils: None,
             fit_on: vec!["the only one".into()],
             held_out: Vec::new(),
             learned: Vec::new(),

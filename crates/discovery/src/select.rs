@@ -18,7 +18,7 @@ pub const DECISIVE: f64 = 6.0;
 /// Most effects that one diagnosis names.
 pub const EFFECTS_MAX: usize = 3;
 /// The same of a model on trial (chosen): a data sheet may leave out gain, limit and lag of speed and of turning.
-pub const EFFECTS_ON_TRIAL_MAX: usize = 6;
+pub const EFFECTS_ON_TRIAL_MAX: usize = 4;
 /// Most rivals of an effect, so that a class has at most three members.
 pub const RIVALS_MAX: usize = 2;
 /// Threshold without null groups: twice that of 28 candidates at 5 % family-wise.

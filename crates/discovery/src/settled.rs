@@ -43,25 +43,13 @@ impl Settled {
     ) -> (usize, Vec<Rival>) {
         let left: Vec<Group> = (0..self.members.len()).map(|m| self.group(yardstick, m, &inside)).collect();
         let z = |k: usize, j: usize| yardstick.after_fit(&left[j], before, &self.with(j), self.members[k]).0;
-        let difference = |j: usize, k: usize| {
-            if yardstick.model_on_trial { self.closer(j, k, &inside) } else { z(j, k).powi(2) - z(k, j).powi(2) }
-        };
+        let difference = |j: usize, k: usize| z(j, k).powi(2) - z(k, j).powi(2);
         let admitted = (0..self.members.len()).filter(|m| may(self.members[*m]));
         let best = admitted.reduce(|best, k| if difference(best, k) < 0.0 { k } else { best }).unwrap_or(0);
         let rival = |k: usize| Rival { hypothesis: self.members[k], difference: difference(best, k) };
         let mut rivals: Vec<Rival> = (0..self.members.len()).filter(|k| *k != best).map(rival).collect();
         rivals.sort_by(|a, b| a.difference.total_cmp(&b.difference));
         (best, rivals)
-    }
-
-    /// By how much a member leaves less than another: the squared deviate of the paired difference of what both leave of each drive (Vuong 1989, the drive being the unit of
-    /// replication), below zero where it leaves more. Evidence by the scatter of the judged drives, of which most columns of a model on trial have much, ranks no two of them.
-    fn closer(&self, j: usize, k: usize, inside: impl Fn(usize) -> bool) -> f64 {
-        let pairs = self.left[k].iter().zip(&self.left[j]).enumerate().filter(|(d, _)| inside(*d));
-        let differences: Vec<f64> = pairs.map(|(_, (k, j))| k.square - j.square).collect();
-        let (count, sum) = (differences.len() as f64, differences.iter().sum::<f64>());
-        let variance = differences.iter().map(|d| (d - sum / count).powi(2)).sum::<f64>() * count / (count - 1.0).max(1.0);
-        sum * sum.abs() / variance.max(1e-12)
     }
 
     /// Whether drives that chose `chosen` stand for a hypothesis that `counts`: they chose a member, and of the members one that counts is best on the drives for

@@ -10,7 +10,7 @@ use common::{
 };
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
-use nesam_discovery::{Against, Bench, Diagnosis, Judge, ObservedDrive, Stepping, Verdict, observe, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Judge, ObservedDrive, Verdict, observe, observe_all};
 use nesam_model::ModelBundle;
 use nesam_physics::SoilCorrection;
 use nesam_physics::effects::*;
@@ -309,7 +309,7 @@ fn property_before_an_effect_begins_actuators_are_those_without_it() {
     let bench = Bench::new(&bundle, &[]);
     let times_s = observed.times_s(bench.stepping.dt_s);
     let lag = Effect::SteeringLag(SteeringLag { seconds: 0.3 });
-    let rows = |effects: &[ScheduledEffect]| observed.deviations(&bench, effects, &nesam_physics::SoilCorrection::NONE);
+    let rows = |effects: &[ScheduledEffect]| observed.deviations(&bench, effects, &SoilCorrection::NONE);
     let from = |onset_s: f64| rows(&[ScheduledEffect { effect: lag, onset_s }]);
     let (never, always, midway) = (rows(&[]), from(0.0), from(times_s[10]));
     let apart = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
@@ -393,7 +393,7 @@ fn property_a_gyro_of_a_new_base_is_told_by_what_measurements_contradict() {
 fn property_ground_that_no_map_tells_is_fitted_before_anything_is_named() {
     let assumed = bundle().default_soil;
     let firm = SoilCorrection { delta: [1.0, 0.0, 0.0, 0.5, 0.14, -0.9], ..SoilCorrection::NONE }.apply(&assumed);
-    let errors = |found: &nesam_discovery::Diagnosis| -> [f64; 3] {
+    let errors = |found: &Diagnosis| -> [f64; 3] {
         let of = |score: &nesam_evaluation::ModelScore| score.summary.tree.mae_mean.yaw_deg.unwrap();
         found.scores.as_ref().unwrap().scores.each_ref().map(of)
     };

@@ -802,7 +802,8 @@ pub struct Measurement {
     #[prost(message, optional, tag = "6")]
     pub wheels: ::core::option::Option<WheelMeasurement>,
     /// Start of the vehicle's software that `sequence` and `stamp_ns` belong to: any number that differs from start to start, for example a random one;
-    /// 0 = not told. Another one than before begins a new history, keeps the soil, and ends the old start: its late measurements are TOO_OLD.
+    /// 0 = not told. Another one than before begins a new history, keeps the soil, and ends the old start: its late measurements are TOO_OLD. Where its
+    /// stamps do not go on from those before, its first measurement is TOO_OLD too, and the second begins the history.
     #[prost(uint64, tag = "7")]
     pub boot_id: u64,
     /// `MeasurementAnswer.run` of the answers so far; 0 = whatever it is. Where the session is at another run now, and so may lack what that one had not made
@@ -918,10 +919,11 @@ pub struct Buffered {
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Duplicate {}
 /// The stamp lies behind the reorder window (`limits.reorder_window_s` before the newest accepted one), the sequence number contradicts the order of
-/// the stamps, or the vehicle has been restarted since. Nothing changed.
+/// the stamps, or it is of another boot than the present one (`boot_id`): one that has ended, or a new one whose stamp does not go on, which is believed
+/// with the second measurement of it. Nothing changed.
 #[derive(Clone, Copy, PartialEq, ::prost::Message)]
 pub struct TooOld {
-    /// How far the stamp lies before the newest one, s (0 when only the sequence number is old).
+    /// How far the stamp lies before the newest one, s (0 when only the sequence number or the boot is old).
     #[prost(double, tag = "1")]
     pub behind_s: f64,
 }
@@ -2726,7 +2728,8 @@ pub mod sessions_client {
         }
         /// Opens a session from an export; from then on it answers as the original would, bit for bit. INVALID_ARGUMENT naming `image`: damaged or cut
         /// bytes, another version of the format, another bundle, other settings of the soil filter. INVALID_ARGUMENT: a bad name. NOT_FOUND: the map is not
-        /// uploaded. FAILED_PRECONDITION: the map has other layers. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as Open.
+        /// uploaded. FAILED_PRECONDITION: the map has other layers. PERMISSION_DENIED: the caller may not open sessions of the vehicle under this name, or the image
+        /// has effects and the caller has not the rights of an operator. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as Open.
         pub async fn import(
             &mut self,
             request: impl tonic::IntoRequest<super::ImportSessionRequest>,
@@ -2888,7 +2891,8 @@ pub mod sessions_server {
         >;
         /// Opens a session from an export; from then on it answers as the original would, bit for bit. INVALID_ARGUMENT naming `image`: damaged or cut
         /// bytes, another version of the format, another bundle, other settings of the soil filter. INVALID_ARGUMENT: a bad name. NOT_FOUND: the map is not
-        /// uploaded. FAILED_PRECONDITION: the map has other layers. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as Open.
+        /// uploaded. FAILED_PRECONDITION: the map has other layers. PERMISSION_DENIED: the caller may not open sessions of the vehicle under this name, or the image
+        /// has effects and the caller has not the rights of an operator. ALREADY_EXISTS, RESOURCE_EXHAUSTED: as Open.
         async fn import(
             &self,
             request: tonic::Request<super::ImportSessionRequest>,

@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, Stepping, catalogue, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, catalogue, diagnose, observe_all};
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant, effects_from_toml};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
