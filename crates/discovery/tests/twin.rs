@@ -367,11 +367,6 @@ fn property_a_new_skid_steer_base_is_judged_by_short_logs_without_a_map() {
     assert!(explained_by(&found, "turn_limit"), "{}; z {:?}", found.reason, found.selection.z);
     let (rad_s, ci95) = value(&found, "rad_s");
     assert!((rad_s - 0.4).abs() < 0.06, "{rad_s} {ci95:?}");
-    // Ground that lets a base turn less than its contacts do.
-    let found = diagnose_rover(&[Effect::TurningResistance(TurningResistance { coefficient: 0.3 })]);
-    assert!(explained_by(&found, "turning_resistance"), "{}; z {:?}", found.reason, found.selection.z);
-    let (coefficient, ci95) = value(&found, "coefficient");
-    assert!((coefficient - 0.3).abs() < 0.06, "{coefficient} {ci95:?}");
     // Velocities that nobody measured are no evidence; a heading behind the gyro is.
     let found = diagnose_rover(&[Effect::PoseLatency(PoseLatency { seconds: 0.2 })]);
     let first = found.findings.first().map(|f| f.candidate.id());
