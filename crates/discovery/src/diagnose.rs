@@ -191,7 +191,7 @@ pub fn diagnose(
     let (any, beside) = (verdict.claims(), taught.beside);
     let soils = case.ground_alone.as_ref().map(|ground| {
         let assumed = bundle.normalization.default_soil();
-        Soils { assumed, alone: ground.correction().apply(&assumed), beside: beside.apply(&assumed) }
+        Soils { assumed, alone: ground.correction().apply(&assumed), beside: if any { beside } else { case.bench.ground }.apply(&assumed) }
     });
     if let Some(scores) = scores.as_ref().filter(|_| soils.is_some()) {
         reason += &said_of_ground(scores);

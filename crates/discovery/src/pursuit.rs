@@ -54,7 +54,8 @@ pub(crate) fn pursue(
     progress: OnProgress<'_>,
 ) -> Result<Pursued, DiscoveryError> {
     let (mut known, mut refused): (Vec<Known>, Vec<Finding>) = (Vec::new(), Vec::new());
-    if refit_ground(case, &[], trial)? {
+    let alone = case.ground_alone.as_ref().map(Ground::correction);
+    if alone.map_or(Ok(false), |soil| take_ground(case, soil, &[], trial))? {
         let left = look_beside(case, &[], progress)?;
         yardstick = own_yardstick(case, &left, without)?;
     }
@@ -89,7 +90,10 @@ pub(crate) fn pursue(
         };
         known.retain(|k| selection.chosen.contains(&k.hypothesis));
         known.push(Known { hypothesis: selection.chosen[0], rivals: selection.rivals.swap_remove(0) });
-        refit_ground(case, &fit.effects(), trial)?;
+        if case.ground_alone.is_some() {
+            let soil = Ground::beside(case, &fit.effects()).correction();
+            take_ground(case, soil, &fit.effects(), trial)?;
+        }
         let left = look_beside(case, &fitted, progress)?;
         yardstick = Yardstick { known: known.clone(), refused: yardstick.refused, ..own_yardstick(case, &left, without)? };
         if known.len() == EFFECTS_ON_TRIAL_MAX {
@@ -99,15 +103,12 @@ pub(crate) fn pursue(
     Ok(Pursued { yardstick, refused })
 }
 
-/// Fits the ground once more beside effects, where no map tells of it, and takes it if predictions of the fitted drives are better on it; says whether it did.
-fn refit_ground(case: &mut Case<'_>, effects: &[ScheduledEffect], trial: &Trial<'_>) -> Result<bool, EvaluationError> {
-    if trial.maps.iter().any(Option::is_some) {
-        return Ok(false);
-    }
-    let (before, found) = (case.bench.ground, Ground::beside(case, effects).correction());
-    let taken = trial.no_better((effects, &before), (effects, &found), false)?.is_none();
+/// Takes a soil that was fitted beside effects if predictions of the fitted drives are better on it, which drives without a window cannot say; tells whether it did.
+fn take_ground(case: &mut Case<'_>, soil: SoilCorrection, effects: &[ScheduledEffect], trial: &Trial<'_>) -> Result<bool, EvaluationError> {
+    let before = case.bench.ground;
+    let taken = trial.scoring.windows(trial.drives).is_ok() && trial.no_better((effects, &before), (effects, &soil), false)?.is_none();
     if taken {
-        case.bench.ground = found;
+        case.bench.ground = soil;
     }
     Ok(taken)
 }
