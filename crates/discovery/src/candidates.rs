@@ -37,10 +37,30 @@ struct Line {
 }
 
 static LINES: LazyLock<Vec<Line>> = LazyLock::new(|| {
-    // The free form has no cause to be named. Segments of 0.8 s hardly tell a ramp of the rims from a lag or a limit (ADR 0072); a calibration on wheel speeds does.
-    let asked = |e: &&Effect| !matches!(e, Effect::FreeForm(_) | Effect::AccelerationLimit(_) | Effect::TurnAccelerationLimit(_));
+    // The free form has no cause to be named. Segments of 0.8 s hardly tell a ramp of the rims from a lag or a limit (ADR 0072); wheel speeds over time do (ADR 0073).
+    let asked = |e: &&Effect| !matches!(e, Effect::FreeForm(_)) && !OF_RIMS_ALONE.contains(&e.id());
     Effect::examples().iter().filter(asked).flat_map(lines_of).collect()
 });
+
+/// Effects of the drive line of a skid-steer base that are asked of wheel speeds over time alone.
+const OF_RIMS_ALONE: [&str; 4] = ["acceleration_limit", "turn_acceleration_limit", "wheel_speed_limit", "turn_efficiency"];
+/// Effects that wheel speeds of a skid-steer base tell over time beside those, so that nothing else is asked for them where these are measured.
+const OF_RIMS: [&str; 11] = [
+    "speed_gain",
+    "steering_ratio",
+    "turn_limit",
+    "speed_delay",
+    "steering_delay",
+    "speed_lag",
+    "steering_lag",
+    "steering_offset",
+    "steering_backlash",
+    "skid_steer_track",
+    "torque_limit",
+];
+
+static RIM_LINES: LazyLock<Vec<Line>> =
+    LazyLock::new(|| OF_RIMS.iter().chain(&OF_RIMS_ALONE).filter_map(|id| Effect::example(id)).map(|example| line_of(&example)).collect());
 
 /// Lines of written effects, each once: hypotheses are plain copies, so they stay, as what is written does.
 static WRITTEN: Mutex<Vec<&'static Line>> = Mutex::new(Vec::new());
@@ -143,16 +163,26 @@ impl PartialEq for Candidate {
 
 /// All hypotheses, in the order of their columns: the catalogue, then what is written.
 pub fn catalogue(written: &[Written]) -> Vec<Candidate> {
-    let mut first_column = 0;
-    LINES
-        .iter()
-        .chain(written.iter().map(written_line))
+    placed(LINES.iter().chain(written.iter().map(written_line)), 0)
+}
+
+/// Lines as hypotheses whose columns follow one another from one on.
+fn placed(lines: impl Iterator<Item = &'static Line>, mut first_column: usize) -> Vec<Candidate> {
+    lines
         .map(|line| {
             let candidate = Candidate { line, first_column };
             first_column += line.columns.len();
             candidate
         })
         .collect()
+}
+
+/// The same without what measured wheel speeds of a skid-steer base tell over time, and the hypotheses that are asked of these, in columns behind all others.
+pub(crate) fn beside_rims(written: &[Written]) -> (Vec<Candidate>, Vec<Candidate>) {
+    let lines = LINES.iter().filter(|line| !OF_RIMS.contains(&line.effect.id())).chain(written.iter().map(written_line));
+    let others = placed(lines, 0);
+    let of_rims = placed(RIM_LINES.iter(), column_count(&catalogue(written)));
+    (others, of_rims)
 }
 
 /// Number of columns of the linear form of all hypotheses.

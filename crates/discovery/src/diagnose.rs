@@ -7,10 +7,11 @@ use nesam_physics::effects::{Effect, Written};
 use nesam_trajectories::Trajectory;
 
 use crate::bend;
-use crate::candidates::{Candidate, catalogue};
+use crate::candidates::{Candidate, beside_rims, catalogue};
 use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::Condensed;
 use crate::controls::{Kind, NullDrives, Setting};
+use crate::drive_line::{self, DriveLine};
 use crate::error::DiscoveryError;
 use crate::ground::{Ground, Soils};
 use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
@@ -144,7 +145,7 @@ pub fn diagnose(
         Against::Bundle => Some(Judge::of(bundle)?),
         Against::Physics => None,
     };
-    let catalogue = hypotheses(bundle, judge_by.as_ref(), options)?;
+    let all = hypotheses(bundle, judge_by.as_ref(), options)?;
     let fit_at = fitted(drives, options)?;
     // The model itself is judged from the best that is known of each state; a bundle's network knows what the past tells, and is judged from that.
     let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
@@ -152,91 +153,163 @@ pub fn diagnose(
         (options.against == Against::Physics).then(|| fit_drives.iter().map(Trajectory::in_hindsight).collect());
     let seen = in_hindsight.as_ref().unwrap_or(&fit_drives);
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
-    let total = fit_at.len();
-    let observed = observe_all(predictor, seen, &fit_maps, &|done| progress("drives as the model sees them", done, total))?;
-    let bench = Bench::new(bundle, &catalogue);
-    let trial = Trial { predictor, drives: &fit_drives, maps: &fit_maps, scoring: &options.scoring };
-    let (mut case, Pursued { yardstick, refused }) = held_against(judge_by.as_ref(), bench, observed, options, &trial, progress)?;
-    progress("hypotheses", 0, 1);
-    let judgement = judge(&mut case, &yardstick).with_refused(refused);
-    let fewer = match &judge_by {
-        Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
-        _ => None,
+    let asked = Asked {
+        plain: predictor,
+        judge_by: judge_by.as_ref(),
+        drives,
+        maps,
+        fit_at: &fit_at,
+        fit_drives: &fit_drives,
+        seen,
+        fit_maps: &fit_maps,
+        options,
+        progress,
     };
-    // What is claimed by a reference follows from the fitted drives alone, others only say what comes of it. A model on trial is proven on others where there are some.
-    let held_at: Vec<usize> = match options.fit_on {
-        Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
-        None if total > 1 => fit_at.clone(),
-        None => Vec::new(),
-    };
-    let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
-    let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
-    progress("held-out windows", 0, held.len());
-    let held_drives = HeldDrives { predictor, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
-    let apart = options.fit_on.is_some() && judge_by.is_some();
-    let proving = if apart { held_drives.among_fitted(&fit_drives, &fit_maps) } else { held_drives };
-    let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
-        prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
-    if apart {
-        learned = vec![taught.clone(); held.len()];
-        scores = if options.scoring.windows(&held).is_ok() {
-            Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?)
+    if options.against == Against::Bundle || !drive_line::tells(&bundle.vehicle, seen) {
+        return asked.diagnosed(&DriveLine::default(), &all, Vec::new());
+    }
+    // Wheel speeds tell the drive line whatever the ground does; everything else is asked of a vehicle that has it.
+    let (others, of_rims) = beside_rims(&options.hypotheses);
+    progress("wheel speeds", 0, 1);
+    let told = DriveLine::told_by(&bundle.vehicle, seen, &of_rims, others.len(), &options.without);
+    let found = asked.diagnosed(&told, &others, of_rims)?;
+    if told.is_empty() || found.verdict.claims() {
+        return Ok(found);
+    }
+    // What is not proven with it may be without it.
+    let mut without = asked.diagnosed(&DriveLine::default(), &all, Vec::new())?;
+    without.reason += &format!("; {}, which makes no predictions better by a tenth", told.named());
+    Ok(without)
+}
+
+/// What a diagnosis is asked of.
+#[derive(Clone, Copy)]
+struct Asked<'a> {
+    /// The model without effects.
+    plain: &'a Predictor,
+    judge_by: Option<&'a Judge>,
+    drives: &'a [Trajectory],
+    maps: &'a DriveMaps,
+    fit_at: &'a [usize],
+    fit_drives: &'a [Trajectory],
+    /// The fitted drives as they are looked at.
+    seen: &'a [Trajectory],
+    fit_maps: &'a DriveMaps,
+    options: &'a Options,
+    progress: OnProgress<'a>,
+}
+
+impl Asked<'_> {
+    /// Asks with hypotheses of a vehicle with what wheel speeds told, which is of `of_rims`.
+    fn diagnosed(&self, told: &DriveLine, catalogue: &[Candidate], of_rims: Vec<Candidate>) -> Result<Diagnosis, DiscoveryError> {
+        let Self { plain, judge_by, drives, maps, fit_at, fit_drives, seen, fit_maps, options, progress } = *self;
+        let total = fit_at.len();
+        let driven;
+        let predictor = if told.is_empty() {
+            plain
         } else {
-            None
+            driven = plain.with_effects(&told.effects);
+            &driven
         };
-        if let Some(scores) = scores.as_ref().filter(|_| verdict.claims()) {
-            reason += &said_by_others(&judgement, scores);
+        let bundle = predictor.bundle();
+        let observed = observe_all(predictor, seen, fit_maps, &|done| progress("drives as the model sees them", done, total))?;
+        let bench = Bench::new(bundle, catalogue);
+        let trial = Trial { predictor, drives: fit_drives, maps: fit_maps, scoring: &options.scoring };
+        let (mut case, Pursued { yardstick, refused }) =
+            held_against(judge_by, bench, observed, options, (plain, &trial, !told.is_empty()), progress)?;
+        progress("hypotheses", 0, 1);
+        let judgement = judge(&mut case, &yardstick).with_refused(refused);
+        let fewer = match judge_by {
+            Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
+            _ => None,
+        };
+        // What is claimed by a reference follows from the fitted drives alone, others only say what comes of it. A model on trial is proven on others where there are some.
+        let held_at: Vec<usize> = match options.fit_on {
+            Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
+            None if total > 1 => fit_at.to_vec(),
+            None => Vec::new(),
+        };
+        let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
+        let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
+        progress("held-out windows", 0, held.len());
+        let held_drives = HeldDrives { predictor: plain, told, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
+        let apart = options.fit_on.is_some() && judge_by.is_some();
+        let proving = if apart { held_drives.among_fitted(fit_drives, fit_maps) } else { held_drives };
+        let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
+            prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
+        if apart {
+            learned = vec![taught.clone(); held.len()];
+            scores = if options.scoring.windows(&held).is_ok() {
+                Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?)
+            } else {
+                None
+            };
+            if let Some(scores) = scores.as_ref().filter(|_| verdict.claims()) {
+                reason += &said_by_others(&judgement, scores);
+            }
         }
-    }
-    let (any, beside) = (verdict.claims(), taught.beside);
-    let soils = case.ground_alone.as_ref().map(|ground| {
-        let assumed = bundle.normalization.default_soil();
-        Soils { assumed, alone: ground.correction().apply(&assumed), beside: if any { beside } else { case.bench.ground }.apply(&assumed) }
-    });
-    if let Some(scores) = scores.as_ref().filter(|_| soils.is_some()) {
-        reason += &said_of_ground(scores);
-    }
-    if !any {
-        for finding in judgement.findings.iter_mut().filter(|f| f.refused.is_none()) {
-            finding.refused = Some(reason.clone());
+        let (any, beside) = (verdict.claims(), taught.beside);
+        let soils = case.ground_alone.as_ref().map(|ground| {
+            let assumed = bundle.normalization.default_soil();
+            Soils {
+                assumed,
+                alone: ground.correction().apply(&assumed),
+                beside: if any { beside } else { case.bench.ground }.apply(&assumed),
+            }
+        });
+        if let Some(scores) = scores.as_ref().filter(|_| soils.is_some()) {
+            reason += &said_of_ground(scores);
         }
-    }
-    let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
-    let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: any, predictor, held_out: &places };
-    let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {
-        Some(scores) => {
-            progress("controls", 0, held.len());
-            score_controls(&setting, scores, &held_drives)?
+        let named = any && judgement.verdict.claims();
+        let mut of_rims_found = told.findings.clone();
+        let unproven = |findings: &mut [Finding]| {
+            findings.iter_mut().filter(|f| f.refused.is_none()).for_each(|f| f.refused = Some(reason.clone()));
+        };
+        if !named {
+            unproven(&mut judgement.findings);
         }
-        None => (Vec::new(), None),
-    };
-    let null_drives = judge_by.as_ref().and_then(|j| setting.on_null_drives(&j.nulls));
-    let claimed = if any { judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects())) } else { Vec::new() };
-    let estimates = if claimed.is_empty() {
-        Vec::new()
-    } else {
-        judgement.claimed().iter().flat_map(|i| judgement.findings[*i].estimates.clone()).collect()
-    };
-    Ok(Diagnosis {
-        verdict,
-        reason,
-        traces: case.traces(&judgement.selection, &claimed),
-        controls,
-        free_form,
-        null_drives,
-        levels: levels(&case),
-        catalogue: yardstick.catalogue,
-        channels: yardstick.channels,
-        findings: judgement.findings,
-        selection: judgement.selection,
-        estimates,
-        claimed,
-        soils,
-        fit_on: fit_drives.iter().map(|d| d.id.clone()).collect(),
-        held_out: held.iter().map(|d| d.id.clone()).collect(),
-        learned,
-        scores,
-    })
+        if !any {
+            unproven(&mut of_rims_found);
+        }
+        let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
+        let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: named, predictor, held_out: &places };
+        let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {
+            Some(scores) => {
+                progress("controls", 0, held.len());
+                score_controls(&setting, scores, &held_drives)?
+            }
+            None => (Vec::new(), None),
+        };
+        let null_drives = judge_by.and_then(|j| setting.on_null_drives(&j.nulls));
+        let claimed = if named { judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects())) } else { Vec::new() };
+        let traces = case.traces(&judgement.selection, &claimed);
+        let findings: Vec<Finding> = of_rims_found.into_iter().chain(judgement.findings).collect();
+        let claims = findings.iter().filter(|f| any && f.refused.is_none());
+        let estimates = claims.flat_map(|f| f.estimates.clone()).collect();
+        let claimed = if any { told.effects.iter().copied().chain(claimed).collect() } else { Vec::new() };
+        let mut selection = judgement.selection;
+        selection.z.extend(of_rims.iter().map(|c| told.findings.iter().find(|f| f.candidate == *c).map(|f| f.z)));
+        Ok(Diagnosis {
+            verdict,
+            reason,
+            traces,
+            controls,
+            free_form,
+            null_drives,
+            levels: levels(&case),
+            catalogue: yardstick.catalogue.into_iter().chain(of_rims).collect(),
+            channels: yardstick.channels,
+            findings,
+            selection,
+            estimates,
+            claimed,
+            soils,
+            fit_on: fit_drives.iter().map(|d| d.id.clone()).collect(),
+            held_out: held.iter().map(|d| d.id.clone()).collect(),
+            learned,
+            scores,
+        })
+    }
 }
 
 /// All hypotheses of a diagnosis.
@@ -275,18 +348,22 @@ fn held_against<'a>(
     bench: Bench<'a>,
     observed: Vec<ObservedDrive>,
     options: &Options,
-    trial: &Trial<'_>,
+    (plain, trial, told): (&Predictor, &Trial<'_>, bool),
     progress: OnProgress<'_>,
 ) -> Result<(Case<'a>, Pursued), DiscoveryError> {
     let total = observed.len();
     let Some(judge_by) = judge_by else {
-        let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
+        let mut ground_alone = None;
         if trial.maps.iter().all(Option::is_none) {
-            case.ground_alone = Some(Ground::beside(&case, &[]));
+            let plain = Bench { vehicle: &plain.bundle().vehicle, ..bench };
+            let drives: Vec<&ObservedDrive> = observed.iter().collect();
+            ground_alone = Some(Ground::fitted(&plain, &own_reference::metric(&plain, &observed)?, &drives, &[]));
         }
+        let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
+        case.ground_alone = ground_alone;
         let drives: Vec<Condensed> = case.condensed().cloned().collect();
         let first = own_yardstick(&case, &drives, &options.without)?;
-        let pursued = pursue(&mut case, first, &options.without, trial, progress)?;
+        let pursued = pursue(&mut case, first, &options.without, (trial, told), progress)?;
         return Ok((case, pursued));
     };
     let case = judge_by.case(bench, observed, progress)?;

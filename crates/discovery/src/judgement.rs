@@ -82,6 +82,14 @@ impl Judgement {
         self
     }
 
+    /// The same with all claims refused for this reason; `said` says so.
+    pub(crate) fn unproven(mut self, why: &str, said: String) -> Self {
+        for i in self.claimed() {
+            self.findings[i].refused = Some(why.into());
+        }
+        Self { verdict: Verdict::Unexplained, reason: said, ..self }
+    }
+
     /// The same without one of several claims, which is refused for this reason: the others are settled and sized again.
     pub(crate) fn dropping(mut self, case: &Case<'_>, yardstick: &Yardstick, i: usize, why: String) -> Self {
         let dropped = self.selection.chosen[i];
@@ -249,7 +257,7 @@ fn more_left(selection: &Selection) -> String {
     format!("; more is left, most in {what} (z = {z:.1}): diagnose once more with the bundle that has them")
 }
 
-fn together(named: &[String]) -> String {
+pub(crate) fn together(named: &[String]) -> String {
     match named {
         [first, others @ ..] if !others.is_empty() => format!("{first} with {}", others.join(" and ")),
         _ => named.concat(),

@@ -14,8 +14,8 @@
 //! 8. [`controls`] predicts the same drives with what else might explain them: rivals, a black box, a free form of what is left;
 //! 9. [`diagnose`] does all of it, [`report`] writes JSON and HTML; [`bench`] measures how often it is right.
 //!
-//! With [`Against::Physics`] the drives stand for themselves and the symbolic model itself is on trial; [`pursuit`] then
-//! looks for further effects beside those already found.
+//! With [`Against::Physics`] the drives stand for themselves and the symbolic model itself is on trial: wheel speeds tell the `drive_line`, the `ground` is
+//! fitted where no map tells it, and [`pursuit`] looks for further effects beside those already found.
 //!
 //! Ground truth is never read.
 #![forbid(unsafe_code)]
@@ -32,6 +32,7 @@ mod constancy;
 pub mod controls;
 mod dating;
 mod diagnose;
+mod drive_line;
 mod error;
 pub mod evidence;
 pub mod fit;

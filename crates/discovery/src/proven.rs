@@ -10,9 +10,10 @@ use crate::claims::{Case, Finding};
 use crate::condense::best_soil;
 use crate::consistency::Contradictions;
 use crate::diagnose::Options;
+use crate::drive_line::DriveLine;
 use crate::ground::Ground;
 use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
-use crate::judgement::{Judgement, Verdict, judge};
+use crate::judgement::{Judgement, Verdict, judge, together};
 use crate::proof::{Counted, Rise, falls_surely, not_proven, rises_surely, several_scored, several_show};
 use crate::select::Yardstick;
 
@@ -30,6 +31,8 @@ const REFUTED_MAX: usize = 5;
 pub(crate) struct HeldDrives<'a> {
     /// The model without effects.
     pub predictor: &'a Predictor,
+    /// What wheel speeds tell of the drive line: part of whatever is claimed.
+    pub told: &'a DriveLine,
     /// The drives.
     pub drives: &'a [Trajectory],
     /// Their maps.
@@ -71,7 +74,12 @@ pub(crate) fn prove(
     held: &HeldDrives<'_>,
 ) -> Result<Proven, EvaluationError> {
     let mut first = tried(case, yardstick, fewer, judgement, held)?;
-    let mut worse = if yardstick.model_on_trial { None } else { worsening(&first, held)? };
+    if yardstick.model_on_trial {
+        // What wheel speeds tell may be proven where what was found beside it is not.
+        let with_more = !held.told.is_empty() && !first.verdict.claims() && first.judgement.verdict.claims();
+        return if with_more { of_rims_alone(case, yardstick, fewer, first, held) } else { Ok(first) };
+    }
+    let mut worse = worsening(&first, held)?;
     if worse.is_none() {
         return Ok(first);
     }
@@ -98,6 +106,21 @@ pub(crate) fn prove(
         first.judgement.findings.iter_mut().filter(|f| f.hypothesis == own.hypothesis).for_each(|f| f.refused.clone_from(&own.refused));
     }
     Ok(first)
+}
+
+/// A judgement that is not proven without its claims, if what wheel speeds tell is proven by itself; else as it was.
+fn of_rims_alone(
+    case: &Case<'_>,
+    yardstick: &Yardstick,
+    fewer: &Yardstick,
+    first: Proven,
+    held: &HeldDrives<'_>,
+) -> Result<Proven, EvaluationError> {
+    let own: Vec<&Finding> = first.judgement.claimed().into_iter().map(|i| &first.judgement.findings[i]).collect();
+    let said = format!("{} would fit and is not proven", labels(&own));
+    let judgement = first.judgement.unproven(&first.reason, said);
+    let alone = tried(case, yardstick, fewer, judgement, held)?;
+    Ok(if alone.verdict.claims() { alone } else { Proven { judgement: alone.judgement, ..first } })
 }
 
 /// The claim by which an error of a judgement that is not proven surely rises, refused for that: the only one, or the last of several without which that error is surely
@@ -138,20 +161,20 @@ fn tried(
 ) -> Result<Proven, EvaluationError> {
     let HeldDrives { predictor, drives, maps, options, .. } = *held;
     loop {
-        let taught = learned_by_all(case, &judgement);
+        let taught = learned_by_all(case, &judgement, held.told);
         let learned = match drives.len() {
             count if !held.fitted => vec![taught.clone(); count],
             0 => Vec::new(),
-            _ => leave_each_out(fewer, case, &judgement),
+            _ => leave_each_out(fewer, case, &judgement, held.told),
         };
         let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
         let needless = match &scores {
-            Some(scores) => last_needless(&judgement, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
+            Some(scores) => last_needless(&judgement, held.told, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
             None => None,
         };
         let Some(i) = needless else {
             let agree = || scores.as_ref().is_some_and(|scores| held.sensors_agree(&learned, scores));
-            let (verdict, reason) = proven(&judgement, scores.as_ref(), yardstick.model_on_trial, agree);
+            let (verdict, reason) = proven(&judgement, held.told, scores.as_ref(), yardstick.model_on_trial, agree);
             return Ok(Proven { judgement, learned, taught, scores, verdict, reason });
         };
         let why = "no error falls surely with it beside the others on drives that were not fitted";
@@ -167,9 +190,10 @@ impl<'a> HeldDrives<'a> {
         Self { drives: if usable { drives } else { &[] }, maps, fitted: true, ..self }
     }
 
-    /// The ground beside effects, where the ground is on trial too and there are effects.
-    fn ground(case: &Case<'_>, effects: &[ScheduledEffect]) -> Option<Ground> {
-        (case.bench.ground != SoilCorrection::NONE && !effects.is_empty()).then(|| Ground::beside(case, effects))
+    /// The ground beside effects, where the ground is on trial too and there are effects, these or those of the drive line.
+    fn ground(case: &Case<'_>, effects: &[ScheduledEffect], told: &DriveLine) -> Option<Ground> {
+        let any = !effects.is_empty() || !told.is_empty();
+        (case.bench.ground != SoilCorrection::NONE && any).then(|| Ground::beside(case, effects))
     }
 
     /// Score of the drives with a model for each.
@@ -206,11 +230,12 @@ impl<'a> HeldDrives<'a> {
 /// and says in which it shows.
 fn last_needless<E>(
     judgement: &Judgement,
+    told: &DriveLine,
     scores: &HeldOut,
     without: impl Fn(usize) -> Result<(ModelScore, Vec<bool>), E>,
 ) -> Result<Option<usize>, E> {
     let claimed = judgement.claimed();
-    if claimed.len() < 2 || !several_scored(&scores.scores[2].errors) {
+    if claimed.len() + told.findings.len() < 2 || !several_scored(&scores.scores[2].errors) {
         return Ok(None);
     }
     for i in claimed.into_iter().rev().filter(|i| acts(&judgement.findings[*i])) {
@@ -223,10 +248,11 @@ fn last_needless<E>(
 }
 
 /// What all fitted drives teach together.
-fn learned_by_all(case: &Case<'_>, judgement: &Judgement) -> Learned {
-    let effects: Vec<ScheduledEffect> = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
-    let hypotheses = keep(judgement, judgement.selection.chosen.clone());
-    let beside = HeldDrives::ground(case, &effects).map_or(SoilCorrection::NONE, |ground| ground.correction());
+fn learned_by_all(case: &Case<'_>, judgement: &Judgement, told: &DriveLine) -> Learned {
+    let own: Vec<ScheduledEffect> = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
+    let beside = HeldDrives::ground(case, &own, told).map_or(SoilCorrection::NONE, |ground| ground.correction());
+    let effects = told.effects.iter().copied().chain(own).collect();
+    let hypotheses = told.hypotheses().into_iter().chain(keep(judgement, judgement.selection.chosen.clone())).collect();
     let soil = case.ground_alone.as_ref().map_or_else(|| best_soil(case.condensed()), Ground::correction);
     Learned { soil, beside, effects, hypotheses }
 }
@@ -238,8 +264,9 @@ pub(crate) fn keep<T: Clone>(judgement: &Judgement, effects: Vec<T>) -> Vec<T> {
 
 /// What each drive is predicted with: learned without it. Detection and choice follow from the other drives alone, the size from one step of the whole fit.
 /// What was compared through the physics on all drives is compared in the same way on the others ([`Settled::stands`](crate::settled::Settled::stands)).
-fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement) -> Vec<Learned> {
-    let ground = HeldDrives::ground(case, &judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects())));
+fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement, told: &DriveLine) -> Vec<Learned> {
+    let own = judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(judgement, f.effects()));
+    let ground = HeldDrives::ground(case, &own, told);
     (0..case.prepared.len())
         .map(|left_out| {
             let inside = |d: usize| d != left_out;
@@ -255,7 +282,9 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
             };
             let without = judgement.fit.as_ref().map_or_else(Vec::new, |fit| fit.effects_without(left_out));
             let stood = judgement.claimed().into_iter().filter(|i| stands(*i));
-            let (effects, hypotheses) = stood.filter_map(|i| Some((*without.get(i)?, judgement.findings[i].hypothesis))).unzip();
+            let of_rims = told.effects_without(left_out).into_iter().zip(told.hypotheses());
+            let own = stood.filter_map(|i| Some((*without.get(i)?, judgement.findings[i].hypothesis)));
+            let (effects, hypotheses) = of_rims.chain(own).unzip();
             let beside = ground.as_ref().map_or(SoilCorrection::NONE, |ground| ground.correction_without(left_out));
             Learned { soil, beside, effects, hypotheses }
         })
@@ -265,34 +294,47 @@ fn leave_each_out(yardstick: &Yardstick, case: &Case<'_>, judgement: &Judgement)
 /// Verdict after the proof on held-out drives. `sensors_agree` says whether their measurements surely contradict one another less with what is claimed.
 fn proven(
     judgement: &Judgement,
+    told: &DriveLine,
     scores: Option<&HeldOut>,
     model_on_trial: bool,
     sensors_agree: impl FnOnce() -> bool,
 ) -> (Verdict, String) {
-    let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
-    let (verdict, reason) = (judgement.verdict, judgement.reason.clone());
+    let own: Vec<&Finding> = judgement.claimed().into_iter().map(|i| &judgement.findings[i]).collect();
+    let claimed: Vec<&Finding> = told.findings.iter().chain(own.iter().copied()).collect();
+    let (verdict, reason) = told.said_with(judgement);
     let Some(first) = claimed.first() else { return (verdict, reason) };
-    let refused = |why: String| (Verdict::Unexplained, format!("{} fits, but {why}", first.candidate.label()));
+    let what = if told.is_empty() { first.candidate.label() } else { labels(&claimed) };
+    let refused = |why: String| (Verdict::Unexplained, format!("{what} fits, but {why}"));
     let Some(scores) = scores else {
         let stands = !model_on_trial && beyond_doubt(&claimed, judgement.selection.threshold);
         return if stands { (verdict, reason) } else { refused("no drive is left to prove it on".into()) };
     };
     // Predictions hardly hang on a sensor that measurements speak against: a gyro's bias is gone from them after the first step.
-    let told = model_on_trial && claimed.iter().all(|f| f.candidate.layer() == Layer::Sensor) && sensors_agree();
-    let must_help = model_on_trial && !told || claimed.iter().any(|f| acts(f));
+    let sensors = model_on_trial && !own.is_empty() && own.iter().all(|f| f.candidate.layer() == Layer::Sensor);
+    let agree = sensors && sensors_agree();
+    if sensors && !agree && !told.is_empty() {
+        return refused(format!("with {} measurements of drives that were not fitted contradict one another no less", labels(&own)));
+    }
+    let agree = agree && told.is_empty();
+    let must_help = model_on_trial && !agree || claimed.iter().any(|f| acts(f));
     let least_gain = must_help.then_some(if model_on_trial { GAIN_ON_TRIAL } else { 0.0 });
     if let Some(why) = not_proven(scores, least_gain, claimed.len() > 1 && !model_on_trial) {
         return refused(why);
     }
     let helps = if must_help {
         "; it helps on drives that were not fitted"
-    } else if told {
+    } else if agree {
         "; with it the measurements of drives that were not fitted contradict one another less"
     } else {
         ""
     };
-    let more = if model_on_trial { format!(", and {}", left(judgement)) } else { String::new() };
+    let more = if model_on_trial && judgement.verdict.claims() { format!(", and {}", left(judgement)) } else { String::new() };
     (verdict, format!("{reason}{helps}{more}"))
+}
+
+/// What findings are of, in words.
+fn labels(findings: &[&Finding]) -> String {
+    together(&findings.iter().map(|f| f.candidate.label()).collect::<Vec<_>>())
 }
 
 /// What drives beside those that were fitted say of a proven judgement.
@@ -374,7 +416,7 @@ mod tests {
     /// Goal: nothing weak or ambiguous is claimed of drives that prove nothing. Method: judgements without scores; 2.5 thresholds of 4 are 10.
     #[test]
     fn analytic_without_a_drive_to_prove_it_on_only_what_stands_far_out_is_claimed() {
-        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), None, on_trial, || false);
+        let said = |claims: &[(&str, f64)], on_trial: bool| proven(&judgement(claims), &DriveLine::default(), None, on_trial, || false);
         let explained = (Verdict::Explained, "they explain it".to_string());
         assert_eq!(said(&[("steering_offset", 10.0)], false), explained);
         assert_eq!(said(&[("steering_offset", 12.0), ("gyro_bias", 11.0)], false), explained);
@@ -404,7 +446,7 @@ mod tests {
             let id = judged.findings.iter().find(|f| f.hypothesis == hypothesis).unwrap().candidate.id();
             without.iter().find(|w| w.0 == id).map(|w| (score(w.1), vec![true; 6])).ok_or(id)
         };
-        last_needless(&judged, scores, of).unwrap()
+        last_needless(&judged, &DriveLine::default(), scores, of).unwrap()
     }
 
     /// Goal: each of several effects is proven by itself. Method: scores by hand. Two that cancel in part help only together; a second that rides on the first does not
@@ -414,10 +456,14 @@ mod tests {
         let cancelling = held_out([0.10, 0.12, 0.10]);
         assert_eq!(needless(&["steering_offset", "tow"], &cancelling, &[("steering_offset", 0.2), ("tow", 0.3)]), None);
         let two = judgement(&[("steering_offset", 12.0), ("tow", 12.0)]);
-        assert_eq!(proven(&two, Some(&cancelling), false, || false).0, Verdict::Explained);
-        assert_eq!(proven(&two, Some(&cancelling), true, || false).0, Verdict::Unexplained, "a model on trial has to get better");
+        assert_eq!(proven(&two, &DriveLine::default(), Some(&cancelling), false, || false).0, Verdict::Explained);
+        assert_eq!(
+            proven(&two, &DriveLine::default(), Some(&cancelling), true, || false).0,
+            Verdict::Unexplained,
+            "a model on trial has to get better"
+        );
         let one = judgement(&[("tow", 12.0)]);
-        assert_eq!(proven(&one, Some(&cancelling), false, || false).0, Verdict::Unexplained);
+        assert_eq!(proven(&one, &DriveLine::default(), Some(&cancelling), false, || false).0, Verdict::Unexplained);
         let riding = held_out([0.20, 0.18, 0.10]);
         assert_eq!(needless(&["steering_offset", "tow"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(1));
         assert_eq!(needless(&["tow", "steering_offset"], &riding, &[("steering_offset", 0.2), ("tow", 0.1)]), Some(0));
@@ -430,7 +476,9 @@ mod tests {
     #[test]
     fn analytic_a_sensor_of_a_model_on_trial_is_proven_by_what_measurements_contradict() {
         let (same, worse) = (held_out([0.1, 0.1, 0.1]), held_out([0.1, 0.1, 0.11]));
-        let verdict = |claims: &[(&str, f64)], scores: &HeldOut, agree: bool| proven(&judgement(claims), Some(scores), true, || agree).0;
+        let verdict = |claims: &[(&str, f64)], scores: &HeldOut, agree: bool| {
+            proven(&judgement(claims), &DriveLine::default(), Some(scores), true, || agree).0
+        };
         let (bias, tow) = (("gyro_bias", 12.0), ("tow", 12.0));
         assert_eq!(verdict(&[bias], &same, true), Verdict::Explained);
         assert_eq!(verdict(&[bias], &same, false), Verdict::Unexplained);
@@ -438,7 +486,7 @@ mod tests {
         for acting in [&[tow][..], &[bias, tow], &[("map_offset", 12.0)]] {
             assert_eq!(verdict(acting, &same, true), Verdict::Unexplained, "{acting:?} must help");
         }
-        let (_, reason) = proven(&judgement(&[bias]), Some(&same), true, || true);
+        let (_, reason) = proven(&judgement(&[bias]), &DriveLine::default(), Some(&same), true, || true);
         assert!(reason.contains("contradict one another less") && !reason.contains("it helps"), "{reason}");
     }
 }

@@ -42,7 +42,7 @@ pub(crate) struct Pursued {
 }
 
 /// Looks again beside the first effect that stands out and helps, then beside the first two, and so on. Where no map tells of the ground one soil is fitted first, and again beside
-/// each effect that is found.
+/// each effect that is found. `told` says that the vehicle has a drive line that wheel speeds told.
 ///
 /// # Errors
 /// As [`own_yardstick`] and [`Trial::no_better`].
@@ -50,12 +50,13 @@ pub(crate) fn pursue(
     case: &mut Case<'_>,
     mut yardstick: Yardstick,
     without: &[String],
-    trial: &Trial<'_>,
+    (trial, told): (&Trial<'_>, bool),
     progress: OnProgress<'_>,
 ) -> Result<Pursued, DiscoveryError> {
     let (mut known, mut refused): (Vec<Known>, Vec<Finding>) = (Vec::new(), Vec::new());
-    let alone = case.ground_alone.as_ref().map(Ground::correction);
-    if alone.map_or(Ok(false), |soil| take_ground(case, soil, &[], trial))? {
+    let alone = case.ground_alone.as_ref().filter(|_| !told).map(Ground::correction);
+    let first = alone.or_else(|| case.ground_alone.is_some().then(|| Ground::beside(case, &[]).correction()));
+    if first.map_or(Ok(false), |soil| take_ground(case, soil, &[], trial))? {
         let left = look_beside(case, &[], progress)?;
         yardstick = own_yardstick(case, &left, without)?;
     }

@@ -5,8 +5,8 @@
 mod common;
 
 use common::{
-    bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_rover_on, diagnose_twin, drive, drive_from, options, plough, rover,
-    world,
+    bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_rover_beside, diagnose_rover_on, diagnose_twin, drive, drive_from,
+    options, plough, rover, rover_logs, world,
 };
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
@@ -423,6 +423,29 @@ fn property_a_large_effect_hides_no_other() {
     }
     let [(seconds, _), (rad_s, _)] = ["seconds", "rad_s"].map(|name| value(&found, name));
     assert!((seconds / 0.5 - 1.0).abs() < 0.2 && (rad_s / 0.4 - 1.0).abs() < 0.1, "{seconds} {rad_s}");
+}
+
+/// Goal: what looks alike in the mean of a segment is told apart by wheel speeds over time, and told once. Method: a base that is late, led by a ramp and no faster than a
+/// limit, with sizes within a twentieth; then the same logs against a model that has what was found.
+#[test]
+fn property_a_ramp_a_delay_and_a_limit_of_the_rims_are_told_apart() {
+    let (delay, ramp, limit) = (SpeedDelay { seconds: 0.3 }, AccelerationLimit { m_s2: 1.0 }, WheelSpeedLimit { m_s: 1.5 });
+    let logs = rover_logs(
+        60,
+        300,
+        &[Effect::SpeedDelay(delay), Effect::AccelerationLimit(ramp), Effect::WheelSpeedLimit(limit)],
+        &bundle().default_soil,
+    );
+    let found = diagnose_rover_beside(&[], &logs);
+    for id in ["speed_delay", "acceleration_limit", "wheel_speed_limit"] {
+        assert!(explained_by(&found, id), "{id} is a rival only: {}", found.reason);
+    }
+    for (name, want) in [("seconds", 0.3), ("m_s2", 1.0), ("m_s", 1.5)] {
+        let (got, ci95) = value(&found, name);
+        assert!((got / want - 1.0).abs() < 0.05, "{name} {got} {ci95:?}, {want} is true");
+    }
+    let again = diagnose_rover_beside(&found.claimed, &logs);
+    assert!(again.claims().all(|f| f.candidate.layer() != Layer::Actuator), "{}", again.reason);
 }
 
 #[test]

@@ -159,10 +159,21 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         if vehicle.effects.actuator.alters_commands() { self.path.speed_over_step_m_s } else { control.speed_m_s }
     }
 
+    /// Speeds of the left and right rims of a skid-steer base at an instant, m/s: what its wheel encoders tell.
+    pub fn rim_speeds_m_s(&self, vehicle: &Vehicle) -> [T; 2] {
+        let half_turn =
+            T::lit(0.5 * (vehicle.track_m + vehicle.effects.actuator.track_m)) * behind_actuator(vehicle, self.position(vehicle));
+        [self.rim_speed_m_s - half_turn, self.rim_speed_m_s + half_turn]
+    }
+
+    /// Position of the steering behind its play.
+    fn position(&self, vehicle: &Vehicle) -> T {
+        if vehicle.effects.actuator.steering_play != 0.0 { self.path.play } else { self.steering }
+    }
+
     /// Road-wheel angles FL, FR, RL, RR at an instant, rad.
     pub fn road_wheel_angles(&self, vehicle: &Vehicle) -> [T; WHEELS] {
-        let position = if vehicle.effects.actuator.steering_play != 0.0 { self.path.play } else { self.steering };
-        road_wheel_angles(vehicle, behind_actuator(vehicle, position))
+        road_wheel_angles(vehicle, behind_actuator(vehicle, self.position(vehicle)))
     }
 }
 

@@ -276,6 +276,10 @@ impl Vehicle {
         if lost.turn_limit_inverse_s_rad > 0.0 {
             rims.yaw_limit_rad_s = rims.yaw_limit_rad_s.min(1.0 / lost.turn_limit_inverse_s_rad);
         }
+        if lost.rim_limit_inverse_s_m > 0.0 {
+            rims.rim_limit_m_s = rims.rim_limit_m_s.min(1.0 / lost.rim_limit_inverse_s_m);
+        }
+        rims.turn_efficiency *= 1.0 + lost.turn_efficiency;
         for (limit, inverse) in rims.acceleration_limit.iter_mut().zip(lost.acceleration_limit_inverse) {
             if inverse > 0.0 {
                 *limit = limit.min(1.0 / inverse);

@@ -11,7 +11,8 @@
 //! * Wheel centres: half wheelbase ahead and behind, half track to the sides.
 //! * Suspension: none means stiff, a static deflection of 10 mm and a damping ratio of 0.7. A sheet's spring and damper act at the
 //!   shock; with a motion ratio of about 0.8 the wheel sees 0.6 of the rate and 0.64 of the damping.
-//! * Drive line: a car-like vehicle holds 0.15 of its speed error as rim over-speed, at most 0.8 m/s; a skid-steer vehicle servoes its
+//! * Drive line: a car-like vehicle holds 0.15 of its speed error as rim over-speed, at most 0.8 m/s, and one whose wheels are smaller than 0.46 m as much more as their
+//!   contact is shorter: soil is sheared by slip times the length of the contact. A skid-steer vehicle servoes its
 //!   rims (gain 1) with an actuator lag of 0.1 s, up to 3 m/s of rim speed. [`Vehicle`] parameters that matter can be calibrated later.
 
 use std::path::Path;
@@ -41,6 +42,9 @@ const WIDTH_SHARE: f64 = 0.6;
 const WHEELBASE_SHARE: [f64; 2] = [1.0, 1.8];
 /// Largest road-wheel angle of a car-like card that gives none, rad.
 const ROAD_WHEEL_ANGLE_RAD: f64 = 0.7;
+/// Over-speed of the rims of a car-like vehicle per speed error, and the radius of its wheels, m, below which they need more.
+const CAR_SPEED_GAIN: f64 = 0.15;
+const LARGE_WHEEL_M: f64 = 0.46;
 /// Rate limit where a card gives none: none in practice, 1/s.
 const UNLIMITED_RATE_PER_S: f64 = 1e3;
 
@@ -369,7 +373,7 @@ fn driveline(sheet: &JsonFile, second: SecondCommand, radius_m: f64) -> Result<D
             &["steering.actuator.rate_limit_per_s", "driveline.steering_rate_limit_per_s"],
             UNLIMITED_RATE_PER_S,
         )?,
-        speed_gain: or(&["driveline.speed_gain"], if skid { 1.0 } else { 0.15 })?,
+        speed_gain: or(&["driveline.speed_gain"], if skid { 1.0 } else { round(CAR_SPEED_GAIN * (LARGE_WHEEL_M / radius_m).max(1.0)) })?,
         speed_integral_gain_per_s: or(&["driveline.speed_integral_gain_per_s"], 0.0)?,
         speed_integral_leak_s: sheet.positive(&["driveline.speed_integral_leak_s"])?.unwrap_or(2.0),
         speed_integral_limit_m: or(&["driveline.speed_integral_limit_m"], 2.0)?,

@@ -180,7 +180,7 @@ const TURN_EFFICIENCY_UNKNOWN: f64 = 0.5;
 fn first_yaw_rate(vehicle: &Vehicle, log: &Log) -> f64 {
     let skid = vehicle.second == SecondCommand::YawRateRadS;
     let Some(wheels) = log.wheel_speed.as_ref().filter(|_| skid) else { return 0.0 };
-    let stated = vehicle.driveline.rims.turn_efficiency;
+    let stated = vehicle.limited_rims().turn_efficiency;
     let efficiency = if stated == RimServo::default().turn_efficiency { TURN_EFFICIENCY_UNKNOWN } else { stated };
     efficiency * rim_twist(vehicle, &wheels[0])[1]
 }

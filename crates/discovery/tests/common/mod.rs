@@ -7,7 +7,7 @@ use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, ca
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant, effects_from_toml};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
-use nesam_physics::effects::{Effect, Written};
+use nesam_physics::effects::{Effect, ScheduledEffect, Written};
 use nesam_physics::step::{StepInput, StepModel};
 use nesam_physics::{Control, Driveline, RimServo, SOIL_DIM, SecondCommand, Soil, SoilCorrection, Vehicle, VehicleState};
 use nesam_terrain::{GridGeometry, WorldMap};
@@ -280,9 +280,13 @@ pub fn diagnose_rover(effects: &[Effect]) -> Diagnosis {
 
 /// The same of one that drove on another soil than the model assumes.
 pub fn diagnose_rover_on(soil: &[f64; SOIL_DIM], effects: &[Effect]) -> Diagnosis {
-    let bundle = ModelBundle { vehicle: rover(), reference_json: None, ..bundle() };
-    let logs = rover_logs(60, 300, effects, soil);
+    diagnose_rover_beside(&[], &rover_logs(60, 300, effects, soil))
+}
+
+/// Logs of a rover against a model that has some effects.
+pub fn diagnose_rover_beside(known: &[ScheduledEffect], logs: &[Trajectory]) -> Diagnosis {
+    let bundle = ModelBundle { vehicle: rover(), reference_json: None, ..bundle() }.with_effects(known);
     let options = Options { against: Against::Physics, scoring: Scoring { horizon: 19, history: 1, ..options().scoring }, ..options() };
     let predictor = Predictor::new(Arc::new(bundle)).unwrap();
-    diagnose(&predictor, &logs, &vec![None; logs.len()], &options, &|_, _, _| {}).unwrap()
+    diagnose(&predictor, logs, &vec![None; logs.len()], &options, &|_, _, _| {}).unwrap()
 }

@@ -156,7 +156,7 @@ catalogue! {
     SlipSinkage MultiPass ElasticRecovery ThetaMShift Grousers FrontBulldozing SideBulldozing
     RollStiffness PitchStiffness MapTilt MapOffset SoilDrift
     GyroBias GyroScale VelocityScale PositionLatency LeverArm MountAngle ClockDrift FrictionCap SoilCrust
-    PoseLatency TurnLimit TurningResistance AccelerationLimit TurnAccelerationLimit
+    PoseLatency TurnLimit TurningResistance AccelerationLimit TurnAccelerationLimit WheelSpeedLimit TurnEfficiency
     FreeForm
 }
 
@@ -175,6 +175,8 @@ impl Effect {
                 | Self::TurningResistance(_)
                 | Self::AccelerationLimit(_)
                 | Self::TurnAccelerationLimit(_)
+                | Self::WheelSpeedLimit(_)
+                | Self::TurnEfficiency(_)
         )
     }
 

@@ -188,6 +188,32 @@ fn analytic_a_turn_limit_holds_the_rims_and_leaves_slower_turns() {
     assert_eq!(turning(&limited, 1.2).to_bits(), turning(&robot(), 1.2).to_bits());
 }
 
+/// Goal: rims that end at a speed keep the curvature of what they are told, and slower commands are untouched. Method: v - ω B / 2 and v + ω B / 2 by hand.
+#[test]
+fn analytic_a_wheel_speed_limit_shrinks_both_rims_alike() {
+    let limited = robot().with_effects(&[Effect::WheelSpeedLimit(WheelSpeedLimit { m_s: 0.8 })]);
+    let settled = |vehicle: &Vehicle, told: [f64; 2]| follow(vehicle, &[told; 60])[59].0.rim_speeds_m_s(vehicle);
+    let half = 0.5 * robot().track_m;
+    let [left, right] = settled(&limited, [1.0, 1.2]);
+    let share = 0.8 / (1.0 + 1.2 * half);
+    assert!((right - 0.8).abs() < 1e-6 && (left - share * (1.0 - 1.2 * half)).abs() < 1e-6, "{left} {right}");
+    assert_eq!(settled(&limited, [0.3, -0.5]).map(f64::to_bits), settled(&robot(), [0.3, -0.5]).map(f64::to_bits));
+}
+
+/// Goal: a base that turns less than its rims begins with rims that turn the faster, and only that changes. Method: a start at a yaw rate that was measured.
+#[test]
+fn analytic_a_turn_efficiency_tells_the_rims_from_the_motion() {
+    let slides = robot().with_effects(&[Effect::TurnEfficiency(TurnEfficiency { factor: 0.4 })]);
+    let mut state = nesam_physics::VehicleState::from_array([0.0; 12]);
+    (state.velocity_m_s[0], state.angular_velocity_rad_s[2]) = (0.5, 0.3);
+    let begun = |vehicle: &Vehicle| DrivelineState::<f64>::starting(vehicle, &state, &Control { speed_m_s: 0.5, second: 0.3 });
+    assert!((begun(&slides).steering / begun(&robot()).steering - 1.0 / 0.4).abs() < 1e-12);
+    assert_eq!(begun(&slides).rim_speed_m_s.to_bits(), begun(&robot()).rim_speed_m_s.to_bits());
+    let told =
+        |vehicle: &Vehicle| begun(vehicle).advance(vehicle, &Control { speed_m_s: 0.5, second: 0.3 }, 0.5, 20.0).rim_speeds_m_s(vehicle);
+    assert!(told(&slides).iter().zip(told(&robot())).all(|(a, b)| (a - b).abs() < 1e-9), "where the rims settle is the same");
+}
+
 /// Goal: rims are led to a command by a ramp, and where they are led faster than they would go anyway by nothing. Method: a robot that obeys at once, told another speed and
 /// another turning; then a limit that its own lag stays below.
 #[test]

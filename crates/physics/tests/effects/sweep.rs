@@ -55,7 +55,7 @@ fn mirrored(effect: &Effect) -> Effect {
 
 #[test]
 fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
-    assert_eq!(Effect::IDS.len(), 51);
+    assert_eq!(Effect::IDS.len(), 53);
     for (i, effect) in Effect::examples().iter().enumerate() {
         assert_eq!(Effect::IDS[i], effect.id());
         assert_eq!(Effect::IDS.iter().filter(|id| **id == effect.id()).count(), 1);
@@ -177,7 +177,7 @@ fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
             wrong.push(format!("{id}: channel {channel} moved by {moved:+.2e}"));
         }
     }
-    for (id, sign) in [("skid_steer_track", 1.0), ("turn_limit", -1.0), ("turning_resistance", -1.0)] {
+    for (id, sign) in [("skid_steer_track", 1.0), ("turn_limit", -1.0), ("turning_resistance", -1.0), ("wheel_speed_limit", -1.0)] {
         let heading = |effects: &[Effect]| drive(&robot(), effects, 2.0, 30).attitude_rad[2];
         if (heading(&[Effect::example(id).unwrap()]) - heading(&[])) * sign < 1e-5 {
             wrong.push(id.into());

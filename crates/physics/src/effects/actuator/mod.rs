@@ -14,7 +14,9 @@ mod steering_offset;
 mod steering_ratio;
 mod torque_limit;
 mod turn_acceleration_limit;
+mod turn_efficiency;
 mod turn_limit;
+mod wheel_speed_limit;
 
 pub use acceleration_limit::AccelerationLimit;
 pub use locked_differential::LockedDifferential;
@@ -30,7 +32,9 @@ pub use steering_offset::SteeringOffset;
 pub use steering_ratio::SteeringRatio;
 pub use torque_limit::TorqueLimit;
 pub use turn_acceleration_limit::TurnAccelerationLimit;
+pub use turn_efficiency::TurnEfficiency;
 pub use turn_limit::TurnLimit;
+pub use wheel_speed_limit::WheelSpeedLimit;
 
 /// What effects change between command and wheel; all zero by default. Pairs are (speed, second command).
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -57,6 +61,10 @@ pub struct ActuatorTerms {
     pub turn_limit_inverse_s_rad: f64,
     /// Inverse of the largest accelerations of the rims of a skid-steer base: of their mean speed, s²/m, and of their turning, s²/rad.
     pub acceleration_limit_inverse: [f64; 2],
+    /// Inverse of the largest speed of a rim of a skid-steer base, s/m.
+    pub rim_limit_inverse_s_m: f64,
+    /// Relative change of the yaw rate of a skid-steer base per turning of its rims, -.
+    pub turn_efficiency: f64,
     /// Added to the track of a differential drive, m.
     pub track_m: f64,
 }
