@@ -22,7 +22,7 @@ use crate::settled::Settled;
 
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
 /// pass for this one on a drive, but seldom with the same size on all.
-const MAGNITUDE_HALF_MAX: f64 = 0.7;
+pub(crate) const MAGNITUDE_HALF_MAX: f64 = 0.7;
 /// The same from which it is no longer told in percent: a size near zero has any share.
 const MAGNITUDE_HALF_UNKNOWN: f64 = 100.0;
 /// Most drives whose own sizes are told.
@@ -30,7 +30,7 @@ const BY_DRIVE_MAX: usize = 12;
 /// Share of half-samples of the drives that must choose a claimed effect or one of its rivals.
 const STABILITY_MIN: f64 = 0.6;
 /// Parts of neighbouring drives of which all half-samples are looked at; every drive is a part where there are fewer.
-const STABILITY_PARTS: usize = 10;
+pub(crate) const STABILITY_PARTS: usize = 10;
 /// Weight of the priors of a fit where the model itself is on trial: they only keep in place what cannot be seen (chosen).
 const PRIOR_ON_TRIAL: f64 = 0.01;
 /// Student's t for the thirty drives behind a reference.

@@ -178,7 +178,7 @@ pub fn diagnose(
     }
     // What is not proven with it may be without it.
     let mut without = asked.diagnosed(&DriveLine::default(), &all, Vec::new())?;
-    without.reason += &format!("; {}, which makes no predictions better by a tenth", told.named());
+    without.reason += &format!("; {}, which is not proven", told.named());
     Ok(without)
 }
 

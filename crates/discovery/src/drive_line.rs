@@ -13,7 +13,7 @@ use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
 use crate::candidates::Candidate;
-use crate::claims::{Estimate, Finding, Member};
+use crate::claims::{Estimate, Finding, MAGNITUDE_HALF_MAX, Member, STABILITY_PARTS};
 use crate::condense::part_of;
 use crate::judgement::{Judgement, Verdict, together};
 use crate::reference::DRIVES_MIN;
@@ -51,12 +51,9 @@ const STEPS_MIN: usize = 20;
 const LARGE: f64 = 0.98;
 const AT_LIMIT: f64 = 0.95;
 const AWAY: f64 = 0.9;
-/// Half of the 95 % interval of a claimed size, as a share of its distance from none, at most.
-const HALF_MAX: f64 = 0.7;
-/// Parts of the drives in which an effect is held to explain something or not.
-const PARTS: usize = 10;
 /// Relative change of the turn efficiency from which it counts.
 const EFFICIENCY_MIN: f64 = 0.05;
+const EFFICIENCY: &str = "turn_efficiency";
 
 /// What wheel speeds tell.
 #[derive(Clone, Debug, Default)]
@@ -125,12 +122,8 @@ struct Rims<'a> {
 }
 
 impl DriveLine {
-    /// From drives of a vehicle; nothing is told where it is no skid-steer base, a drive has no wheel speeds, or there are too few. `family` begins at this place of the
-    /// catalogue; effects in `without` are not considered.
+    /// From drives of a vehicle that [tell](tells) it. `family` begins at this place of the catalogue; effects in `without` are not considered.
     pub fn told_by(vehicle: &Vehicle, drives: &[Trajectory], family: &[Candidate], first: usize, without: &[String]) -> Self {
-        if !tells(vehicle, drives) {
-            return Self::default();
-        }
         let considered = |c: &Candidate| !without.iter().any(|id| id == c.id());
         let rims = Rims::of(vehicle, drives, family.iter().copied().filter(|c| considered(c) && c.id() != EFFICIENCY).collect());
         let place = |candidate: Candidate| first + family.iter().position(|c| *c == candidate).expect("it is of the family; this is a bug");
@@ -195,8 +188,6 @@ impl DriveLine {
         self.findings.is_empty()
     }
 }
-
-const EFFICIENCY: &str = "turn_efficiency";
 
 /// Whether wheel speeds of these drives tell the drive line.
 pub(crate) fn tells(vehicle: &Vehicle, drives: &[Trajectory]) -> bool {
@@ -425,7 +416,7 @@ impl<'a> Rims<'a> {
             let spread = self.spread(&found);
             let share = |i: usize| 1.96 * spread.sd[i] / self.family[found.terms[i]].magnitude(0, found.values[i]).max(1e-12);
             let worst = (0..found.terms.len()).max_by(|a, b| share(*a).total_cmp(&share(*b)));
-            match worst.filter(|i| share(*i) > HALF_MAX) {
+            match worst.filter(|i| share(*i) > MAGNITUDE_HALF_MAX) {
                 Some(i) => found = self.dropped(&found, i),
                 None => return (found, spread),
             }
@@ -440,15 +431,15 @@ impl<'a> Rims<'a> {
         close.sort_by(|a, b| a.1.total_cmp(&b.1));
         let rivals = close.iter().filter(|(_, t)| *t < T_RIVAL).take(RIVALS_MAX);
         let rivals = rivals.map(|(term, t)| (self.family[*term], (-0.5 * t.max(0.0).powi(2)).exp())).collect();
-        let mut parts = [0.0; PARTS];
+        let mut parts = [0.0; STABILITY_PARTS];
         for (d, (without, with)) in doubt.without.by_drive.iter().zip(&found.by_drive).enumerate() {
-            parts[part_of(d, self.logs.len(), PARTS)] += without - with;
+            parts[part_of(d, self.logs.len(), STABILITY_PARTS)] += without - with;
         }
         let helped = parts.iter().filter(|gain| **gain > 0.0).count();
         let told = Told {
             z,
             difference: close.first().map_or(z * z, |(_, t)| t * t.abs()),
-            stability: helped as f64 / self.logs.len().min(PARTS) as f64,
+            stability: helped as f64 / self.logs.len().min(STABILITY_PARTS) as f64,
             sd,
             rivals,
         };
