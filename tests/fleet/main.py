@@ -30,8 +30,10 @@ IDLE_S = 20.0
 class Check:
     """One fault under load. `needs`: what this machine has to allow, CUTS or SLOW_DISKS; `members`: only with so many members of etcd."""
 
-    def __init__(self, name, what, fault, needs=None, takes_over=True, members=1):
+    def __init__(self, name, what, fault, needs=None, takes_over=True, members=1, moves=1):
         self.name, self.what, self.fault, self.needs, self.takes_over, self.members = name, what, fault, needs, takes_over, members
+        # How often a session may lose its owner, so how many calls of one planner may fail.
+        self.moves = moves
 
 
 def victim(fleet, run):
@@ -144,7 +146,7 @@ CHECKS = [
     Check("store-restart", "SIGKILL of etcd, of several members of the leader, and restart", store_restarts, takes_over=False),
     Check("store-leader", "SIGKILL of the leading member of etcd, restart after the drives", store_leader_dies, members=3),
     Check("router-restart", "SIGKILL of the Zenoh router and restart", router_restarts, takes_over=False),
-    Check("upgrade", "SIGTERM and restart of all replicas, one after the other", upgrade),
+    Check("upgrade", "SIGTERM and restart of all replicas, one after the other", upgrade, moves=len(REPLICAS)),
 ]
 
 
@@ -234,6 +236,9 @@ def perform(check, fleet, oracle, attempt):
         since = run.drive(check.fault)
         run.compare(oracle)
         owners = run.audit(since)
+        for planner in run.planners:
+            if planner.retried > check.moves:
+                run.violations.append(f"{planner.name}: {planner.retried} calls were repeated, {check.moves} may be")
     finally:
         traffic.close(run.vehicles, run.planners)
     silence_s = max(planner.silence_s for planner in run.planners)

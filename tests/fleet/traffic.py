@@ -230,6 +230,7 @@ class Planner(threading.Thread):
         self.client = nesam.Client(address, timeout_s=8.0, vehicle_id=session)
         self._session, self._every_s = session, every_s
         self._ending = threading.Event()
+        self._began = False
         self.answered, self.retried, self.violations, self.silence_s = 0, 0, [], 0.0
 
     def run(self):
@@ -238,11 +239,12 @@ class Planner(threading.Thread):
             for attempt in range(2):
                 try:
                     self.client.predict(self._session, CONTROLS)
-                    break
-                except nesam.FailedPrecondition:
-                    # The vehicle has not told its state yet.
+                    self._began = True
                     break
                 except nesam.NesamError as error:
+                    if isinstance(error, nesam.FailedPrecondition) and not self._began:
+                        # The vehicle has not told its state yet.
+                        break
                     if attempt == 1:
                         self.violations.append(f"{self.name}: two calls in a row failed: {type(error).__name__}: {error}")
                     else:

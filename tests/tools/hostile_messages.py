@@ -12,7 +12,7 @@ import numpy as np
 import nesam
 from nesam import _calls as calls
 from nesam import _messages as messages
-from nesam.v1 import sharing_pb2, soil_pb2, types_pb2
+from nesam.v1 import session_image_pb2, sharing_pb2, soil_pb2, types_pb2
 from serving import served
 
 CORPUS = Path(__file__).resolve().parents[1] / "hostile/corpus"
@@ -71,7 +71,9 @@ def of_a_server(binary, state, world):
             moved[:2] = 0.2 * i - 1.0, 0.0
             steps.append(nesam.Measurement("truck", i * 100_000_000, moved, (2.0, 0.0), sequence=i + 1))
         client.measure(steps)
-        keep("session_image", "valid.bin", client.export_session("truck"))
+        exported = client.export_session("truck")
+        keep("session_image", "valid.bin", exported)
+        keep("session_content", "valid.bin", session_image_pb2.SessionImage.FromString(exported).content)
         client.predict("truck", np.tile(np.float32([2.0, 0.1]), (2, 2, 1)))
     keep("recording", "valid.mcap", next(folder.glob("*.mcap")).read_bytes())
     shutil.rmtree(folder)

@@ -4,7 +4,11 @@
 #include <cstddef>
 #include <cstdint>
 #include <deque>
+#include <map>
+#include <mutex>
 #include <optional>
+#include <random>
+#include <string>
 #include <thread>
 #include <utility>
 
@@ -29,6 +33,19 @@ bool no_room(const MeasurementAnswer& answer) {
   return rejected && (rejected->code == Code::resource_exhausted || rejected->code == Code::unavailable);
 }
 
+/// A measurement without a number or a boot gets one of this program: by them the service knows what it has had, however long ago.
+void number(Measurement& measurement, const std::string& session_id) {
+  static const std::uint64_t boot_id = [] {
+    std::random_device random;
+    return (static_cast<std::uint64_t>(random()) << 32U) | random() | 1U;
+  }();
+  static std::mutex mutex;
+  static std::map<std::string, std::uint64_t> numbers;
+  const std::lock_guard<std::mutex> lock(mutex);
+  if (measurement.sequence == 0) measurement.sequence = ++numbers[session_id];
+  if (measurement.boot_id == 0) measurement.boot_id = boot_id;
+}
+
 }  // namespace
 
 class DurableStreamImpl {
@@ -43,6 +60,7 @@ class DurableStreamImpl {
     waiting_.push_back(measurement);
     // Which run counts is the matter of this object.
     waiting_.back().run = 0;
+    number(waiting_.back(), session_id_);
     return deliver(SteadyTime::max());
   }
 

@@ -1,10 +1,12 @@
 """Measurements that are kept until the service has them on stable storage."""
 
+import itertools
 import math
+import secrets
 import time
 from collections import deque
 from dataclasses import replace
-from typing import Deque, List, Tuple
+from typing import Deque, Dict, Iterator, List, Tuple
 
 import grpc
 
@@ -23,11 +25,21 @@ _BROKEN = {
 """How a connection looks that broke or fell silent, by itself or through a proxy. Everything else is a refusal."""
 
 
+_BOOT_ID = secrets.randbits(63) | 1
+_NUMBERS: Dict[str, Iterator[int]] = {}
+"""This start of the program, and by session the numbers of its measurements that have none of their own: by them the service knows what it has had, however long ago."""
+
+
+def _numbered(measurement: t.Measurement, session_id: str) -> t.Measurement:
+    number = measurement.sequence or next(_NUMBERS.setdefault(session_id, itertools.count(1)))
+    return replace(measurement, sequence=number, boot_id=measurement.boot_id or _BOOT_ID)
+
+
 class DurableStream:
     """A stream of the measurements of one session that outlives crashes of the server; open it with `client.durable_stream`.
 
     What is not known to be durable is kept, at most `pending_max` measurements, and sent again over a new connection; the service drops what it has.
-    Threads must not share it.
+    Measurements without a number or a boot get one of this program, so that nothing is taken for new that is sent again. Threads must not share it.
     """
 
     def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
@@ -66,7 +78,7 @@ class DurableStream:
             reason = f"{kept} measurements are not known to be durable; flush them first"
             raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
         # Which run counts is the matter of this object.
-        measurement = replace(measurement, run=0)
+        measurement = _numbered(replace(measurement, run=0), self._session_id)
         # One that cannot be sent would hold up all that come after it.
         m.measurement_message(measurement)
         self._waiting.append(measurement)

@@ -1,6 +1,8 @@
 //! Measurements that a vehicle keeps until the service has them on stable storage.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::hash::{BuildHasher, RandomState};
+use std::sync::{LazyLock, Mutex, PoisonError};
 
 use nesam_proto::v1;
 use v1::measurement_answer::Outcome;
@@ -9,6 +11,10 @@ use crate::error::ClientError;
 
 /// Measurements that an outbox keeps at most, unless it is told otherwise; as in the other clients.
 const PENDING_MAX: usize = 65_536;
+
+/// This start of the program, and by session the numbers of its measurements that have none of their own: by them the service knows what it has had, however long ago.
+static BOOT_ID: LazyLock<u64> = LazyLock::new(|| RandomState::new().hash_one(std::process::id()) | 1);
+static NUMBERS: Mutex<BTreeMap<String, u64>> = Mutex::new(BTreeMap::new());
 
 /// Keeps the measurements of one session until they are durable, so that a crash of the server loses none.
 ///
@@ -61,12 +67,12 @@ impl Outbox {
         }
     }
 
-    /// Takes a new measurement.
+    /// Takes a new measurement. One without a number or a boot gets one of this program, so that nothing is taken for new that is sent again.
     ///
     /// # Errors
     /// `ClientError::Refused` with RESOURCE_EXHAUSTED of `pending_max` when as many are not known to be durable; this one is not kept. Hand over answers, or a
     /// `durable_place` ([`Outbox::durable`]), first.
-    pub fn push(&mut self, measurement: v1::Measurement) -> Result<(), ClientError> {
+    pub fn push(&mut self, mut measurement: v1::Measurement) -> Result<(), ClientError> {
         if self.kept.len() >= self.pending_max {
             return Err(ClientError::Refused {
                 code: tonic::Code::ResourceExhausted,
@@ -74,6 +80,15 @@ impl Outbox {
                 message: format!("{} measurements are not known to be durable; wait until some are", self.kept.len()),
                 retry_after: None,
             });
+        }
+        if measurement.boot_id == 0 {
+            measurement.boot_id = *BOOT_ID;
+        }
+        if measurement.sequence == 0 {
+            let mut numbers = NUMBERS.lock().unwrap_or_else(PoisonError::into_inner);
+            let number = numbers.entry(measurement.session_id.clone()).or_default();
+            *number += 1;
+            measurement.sequence = *number;
         }
         self.pushed += 1;
         self.kept.insert(self.pushed, measurement);

@@ -48,17 +48,30 @@ fn service_commands_of_the_book_run() {
     assert!(ran >= 3, "{ran} blocks were run");
 }
 
+/// Files that a page links to.
+fn files_linked(page: &str) -> impl Iterator<Item = &str> {
+    let targets = page.split("](").skip(1).filter_map(|rest| rest.split(')').next()).filter_map(|link| link.split('#').next());
+    targets.filter(|target| !target.is_empty() && !target.contains("://") && !target.contains(' '))
+}
+
+#[test]
+fn property_links_of_the_first_pages_lead_to_files() {
+    for page in ["README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md"] {
+        let text = std::fs::read_to_string(repository().join(page)).unwrap();
+        for target in files_linked(&text) {
+            assert!(repository().join(target).exists(), "{page}: `{target}` leads nowhere");
+        }
+    }
+}
+
 #[test]
 fn property_links_of_the_book_lead_to_files() {
     let docs = repository().join("docs");
     for page in pages() {
         let text = std::fs::read_to_string(&page).unwrap();
-        for link in text.split("](").skip(1).filter_map(|rest| rest.split(')').next()) {
-            let target = link.split('#').next().unwrap_or_default();
-            if !target.is_empty() && !target.contains("://") && !target.contains(' ') {
-                let there = page.parent().unwrap().join(target).canonicalize();
-                assert!(there.is_ok_and(|path| path.starts_with(&docs)), "{}: `{link}` leads nowhere in the book", page.display());
-            }
+        for target in files_linked(&text) {
+            let there = page.parent().unwrap().join(target).canonicalize();
+            assert!(there.is_ok_and(|path| path.starts_with(&docs)), "{}: `{target}` leads nowhere in the book", page.display());
         }
     }
     let summary = std::fs::read_to_string(repository().join("docs/SUMMARY.md")).unwrap();

@@ -36,6 +36,13 @@ const PRIOR_ON_TRIAL: f64 = 0.01;
 /// Student's t for the thirty drives behind a reference.
 const T_NULLS: f64 = 2.05;
 const T_975: [f64; 10] = [12.71, 4.30, 3.18, 2.78, 2.57, 2.45, 2.36, 2.31, 2.26, 2.23];
+/// The same for more degrees of freedom (of 20).
+const T_975_MANY: f64 = 2.1;
+
+/// Student's t of a two-sided 95 % interval by so many drives.
+pub(crate) fn t_975(drives: usize) -> f64 {
+    T_975.get(drives.saturating_sub(2)).copied().unwrap_or(T_975_MANY)
+}
 
 /// A parameter of a claimed effect.
 #[derive(Clone, Debug)]
@@ -337,8 +344,7 @@ fn half_width(group: &Group, fit: &Fit, term: usize, derivatives: &[(usize, f64)
     let columns = fit.terms[term].candidate.columns();
     let dispersion = columns.iter().map(|c| group.covariance[(*c, *c)] / group.information[(*c, *c)].max(1e-12)).fold(1.0, f64::max);
     let posterior = T_NULLS * fit.sd(term, derivatives) * dispersion.sqrt();
-    let t = T_975.get(fit.jackknife.len().saturating_sub(2)).copied().unwrap_or(2.1);
-    fit.jackknife_sd(term, of).map_or(posterior, |sd| posterior.max(t * sd))
+    fit.jackknife_sd(term, of).map_or(posterior, |sd| posterior.max(t_975(fit.jackknife.len()) * sd))
 }
 
 fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {

@@ -141,7 +141,7 @@ impl Queue {
     /// Leaves of the prediction whose turn it is what is expected to be done by its deadline without making one that waits late, where fewer samples are of use.
     ///
     /// # Errors
-    /// `EngineError::Overloaded` where it would be late all the same and others wait, who may not be: others took longer than was expected of them.
+    /// `EngineError::Expired` where it would be late all the same and others wait, who may not be: it was let in, and others took longer than was expected of them.
     pub fn fit(&self, query: &mut PredictQuery, deadline_ns: Option<u64>, now_ns: u64) -> Result<(), EngineError> {
         let mut lanes = self.lock();
         if query.least() < query.samples {
@@ -153,7 +153,7 @@ impl Queue {
         lanes.correct(expected_ns, now_ns);
         let waiting = lanes.predictions.len();
         if waiting > 0 && deadline_ns.is_some_and(|deadline_ns| now_ns + expected_ns > deadline_ns) {
-            return Err(overloaded("predictions", waiting, expected_ns));
+            return Err(EngineError::Expired);
         }
         Ok(())
     }

@@ -13,6 +13,7 @@ mod alarm;
 mod effects;
 mod forecast;
 mod image;
+mod numbers;
 mod order;
 mod soil;
 mod track;

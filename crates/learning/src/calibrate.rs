@@ -170,14 +170,19 @@ pub fn calibrate_driveline(
 ) -> [f64; 2] {
     let before = symbolic_error(vehicle, drives, scales).position_m;
     if vehicle.second == SecondCommand::YawRateRadS {
-        if let Some(servo) = fit_rims(vehicle, drives, scales.dt_s) {
+        let with = |servo| {
+            let mut vehicle = vehicle.clone();
             vehicle.driveline.rims = servo;
-            progress("rims", servo.speed_gain, servo.turn_efficiency);
-        } else {
+            (symbolic_error(&vehicle, drives, scales).position_m, servo)
+        };
+        let fitted = fit_rims(vehicle, drives, scales.dt_s).into_iter().map(with).min_by(|a, b| a.0.total_cmp(&b.0));
+        let (after, servo) = fitted.unwrap_or_else(|| {
             let told = |value: f64, error: f64| progress("rims, from the motion", value, error);
-            vehicle.driveline.rims = fit_rims_to_motion(vehicle, drives, scales, told, interrupted);
-        }
-        return [before, symbolic_error(vehicle, drives, scales).position_m];
+            with(fit_rims_to_motion(vehicle, drives, scales, told, interrupted))
+        });
+        vehicle.driveline.rims = servo;
+        progress("rims", servo.speed_gain, after);
+        return [before, after];
     }
     let mut best = before;
     for round in 0..3 {

@@ -30,7 +30,7 @@ fn analytic_a_known_servo_is_found() {
     vehicle.driveline.rims = truth;
     let drives: Vec<Drive> = (0..40).map(|i| made(&vehicle, f64::from(i))).collect();
     vehicle.driveline.rims = RimServo::default();
-    let found = fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1).unwrap();
+    let found = fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1)[0];
     let close = |a: f64, b: f64| (a / b - 1.0).abs() < 0.05;
     assert!(close(found.speed_gain, truth.speed_gain) && close(found.yaw_gain, truth.yaw_gain), "{found:?}");
     assert!(close(found.yaw_limit_rad_s, truth.yaw_limit_rad_s) && close(found.rim_limit_m_s, truth.rim_limit_m_s), "{found:?}");
@@ -47,10 +47,28 @@ fn analytic_rims_that_are_led_by_ramps_are_found() {
     vehicle.driveline.rims = truth;
     let drives: Vec<Drive> = (0..40).map(|i| made(&vehicle, f64::from(i))).collect();
     vehicle.driveline.rims = RimServo::default();
-    let found = fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1).unwrap();
+    let found = fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1)[0];
     for i in 0..2 {
         assert!((found.acceleration_limit[i] / truth.acceleration_limit[i] - 1.0).abs() < 0.05, "{found:?}");
     }
+}
+
+/// Goal: a dead time is not taken for a lag, and is found; where there is none, none is. Method: the same drives from a base that hears its commands late.
+#[test]
+fn analytic_a_dead_time_is_found() {
+    let found_of = |dead_time_s: [f64; 2]| {
+        let mut vehicle = Vehicle { second: SecondCommand::YawRateRadS, track_m: 0.55, ..truck() };
+        vehicle.driveline.rims = RimServo { speed_lag_s: 0.1, yaw_lag_s: 0.1, dead_time_s, turn_efficiency: 0.4, ..RimServo::default() };
+        let drives: Vec<Drive> = (0..40).map(|i| made(&vehicle, f64::from(i))).collect();
+        vehicle.driveline.rims = RimServo::default();
+        fit_rims(&vehicle, &drives.iter().collect::<Vec<_>>(), 0.1)
+    };
+    let late = found_of([0.3, 0.25]);
+    let [_, late] = late[..] else { panic!("a dead time is asked for: {late:?}") };
+    assert!((late.dead_time_s[0] - 0.3).abs() < 0.02 && (late.dead_time_s[1] - 0.25).abs() < 0.02, "{late:?}");
+    assert!((late.speed_lag_s - 0.1).abs() < 0.02 && (late.yaw_lag_s - 0.1).abs() < 0.02, "{late:?}");
+    let at_once = found_of([0.0; 2]);
+    assert!(at_once.len() == 1 && at_once[0].dead_time_s == [0.0; 2], "{at_once:?}");
 }
 
 /// Goal: a base whose wheel speeds nobody measured is calibrated, too. Method: eight drives from rest that the symbolic model makes with a known servo, without

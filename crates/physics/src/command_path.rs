@@ -1,12 +1,12 @@
 //! The way of the commands to the actuators: late, lagged, enlarged.
 
-use crate::effects::ActuatorTerms;
 use crate::scalar::Real;
 use crate::state::Control;
+use crate::vehicle::{SecondCommand, Vehicle};
 
 /// Commands that are kept, so the longest delay in steps.
 const SENT: usize = 8;
-/// Pieces of a step in which lags and a car's steering advance (chosen: 10 ms of 0.1 s; a held mean within a piece errs in its square).
+/// Pieces of a step in which lags and a steering actuator advance (chosen: 10 ms of 0.1 s; a held mean within a piece errs in its square).
 const PIECES: usize = 10;
 
 /// Commands between sender and actuators. Pairs are (speed m/s, second command in its unit).
@@ -43,18 +43,21 @@ impl<T: Real> CommandPath<T> {
 
     /// Advances by a step of `dt_s` under a command and returns the mean of what arrives; `each` is told the second command and the duration of each
     /// piece, s.
-    pub(crate) fn advance(&mut self, terms: &ActuatorTerms, control: &Control<T>, dt_s: f64, mut each: impl FnMut(T, f64)) -> Control<T> {
+    pub(crate) fn advance(&mut self, vehicle: &Vehicle, control: &Control<T>, dt_s: f64, mut each: impl FnMut(T, f64)) -> Control<T> {
+        let (terms, delay_s) = (&vehicle.effects.actuator, vehicle.command_delay_s());
         let now = [control.speed_m_s, control.second];
-        let piece_s = dt_s / PIECES as f64;
+        // Without a lag, and where no steering follows on the way, the mean over the whole step is all that is asked for.
+        let pieces = if vehicle.second == SecondCommand::YawRateRadS && terms.lag_s == [0.0; 2] { 1 } else { PIECES };
+        let piece_s = dt_s / pieces as f64;
         let mut mean = [T::lit(0.0); 2];
-        for piece in 0..PIECES {
+        for piece in 0..pieces {
             let from_s = piece as f64 * piece_s;
             let arrived: [T; 2] = core::array::from_fn(|c| {
-                let delayed = self.mean_between(c, now[c], from_s - terms.delay_s[c], piece_s, dt_s);
+                let delayed = self.mean_between(c, now[c], from_s - delay_s[c], piece_s, dt_s);
                 self.lag(c, delayed, terms.lag_s[c], piece_s)
             });
             each(arrived[1], piece_s);
-            mean = core::array::from_fn(|c| mean[c] + arrived[c] * T::lit(1.0 / PIECES as f64));
+            mean = core::array::from_fn(|c| mean[c] + arrived[c] * T::lit(1.0 / pieces as f64));
         }
         self.sent.copy_within(0..SENT - 1, 1);
         self.sent[0] = now;

@@ -23,7 +23,7 @@ pub struct DrivelineState<T = f64> {
     pub rim_speed_m_s: T,
     /// What the rims of a skid-steer vehicle are asked for between the two lags: (mean speed m/s, turning rad/s).
     pub rim_demand: [T; 2],
-    /// Commands between sender and actuators; followed only where an effect alters them.
+    /// Commands between sender and actuators; followed only where a dead time or an effect alters them.
     pub path: CommandPath<T>,
 }
 
@@ -108,7 +108,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
     ///
     /// Exact first-order lag for a held command, limited in rate; the integral of the speed error leaks with the card's time constant.
     pub fn advance(&self, vehicle: &Vehicle, control: &Control<T>, forward_m_s: T, dt_s: f64) -> Self {
-        if vehicle.effects.actuator.alters_commands() {
+        if vehicle.alters_commands() {
             return self.advance_altered(vehicle, control, forward_m_s, dt_s);
         }
         if vehicle.second == SecondCommand::YawRateRadS {
@@ -129,7 +129,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         let skid = vehicle.second == SecondCommand::YawRateRadS;
         let mut path = self.path;
         let mut steering = self.steering;
-        let arrived = path.advance(&vehicle.effects.actuator, control, dt_s, |second, piece_s| {
+        let arrived = path.advance(vehicle, control, dt_s, |second, piece_s| {
             if !skid {
                 steering = steered(vehicle, steering, second, piece_s);
             }
@@ -156,7 +156,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
 
     /// Speed that the drive is told over the step that led to these actuators, m/s: what arrives of the command where effects alter it.
     pub(crate) fn told_speed_m_s(&self, vehicle: &Vehicle, control: &Control<T>) -> T {
-        if vehicle.effects.actuator.alters_commands() { self.path.speed_over_step_m_s } else { control.speed_m_s }
+        if vehicle.alters_commands() { self.path.speed_over_step_m_s } else { control.speed_m_s }
     }
 
     /// Speeds of the left and right rims of a skid-steer base at an instant, m/s: what its wheel encoders tell.
@@ -177,13 +177,32 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
     }
 }
 
+/// Speeds of the left and right rims of a skid-steer base whose wheels turn so (FL, FR, RL, RR, rad/s), m/s.
+pub fn rim_speeds_m_s(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHEELS]) -> [f64; 2] {
+    core::array::from_fn(|side| 0.5 * (wheel_speed_rad_s[side] + wheel_speed_rad_s[side + 2]) * vehicle.wheel_radius_m)
+}
+
 /// Mean speed (m/s) and turning (rad/s, positive left) that the servo of a skid-steer base holds where its wheels turn so (FL, FR, RL, RR, rad/s): the way
 /// back from wheels to actuators, through what effects change between them.
 pub fn rim_twist(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHEELS]) -> [f64; 2] {
-    let side = |i: usize| 0.5 * (wheel_speed_rad_s[i] + wheel_speed_rad_s[i + 2]) * vehicle.wheel_radius_m;
+    let [left, right] = rim_speeds_m_s(vehicle, wheel_speed_rad_s);
     let terms = &vehicle.effects.actuator;
-    let turning = (side(1) - side(0)) / (vehicle.track_m + terms.track_m);
-    [0.5 * (side(0) + side(1)), (turning - terms.steering_offset) / (1.0 + terms.steering_ratio)]
+    let turning = (right - left) / (vehicle.track_m + terms.track_m);
+    [0.5 * (left + right), (turning - terms.steering_offset) / (1.0 + terms.steering_ratio)]
+}
+
+/// The rims of a skid-steer base run freely from commands: its actuators at every sample after the first, at which its wheels turn so (FL, FR, RL, RR, rad/s).
+pub fn free_run<'a>(
+    vehicle: &'a Vehicle,
+    first_rad_s: &[f64; WHEELS],
+    controls: &'a [Control<f64>],
+    dt_s: f64,
+) -> impl Iterator<Item = DrivelineState> + use<'a> {
+    let begun = DrivelineState::turning(vehicle, rim_twist(vehicle, first_rad_s));
+    controls.iter().scan(begun, move |state, control| {
+        *state = state.advance(vehicle, control, 0.0, dt_s);
+        Some(*state)
+    })
 }
 
 /// Position of a car's steering actuator after `dt_s` under a command.

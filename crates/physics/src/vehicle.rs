@@ -145,6 +145,8 @@ pub struct RimServo {
     pub speed_gain: f64,
     /// Turning of the rims per commanded yaw rate, -.
     pub yaw_gain: f64,
+    /// Dead time of the commands of speed and of turning, s: nothing happens for so long, then what was told.
+    pub dead_time_s: [f64; 2],
     /// Largest turning of the rims, rad/s.
     pub yaw_limit_rad_s: f64,
     /// Largest speed of a rim, m/s; beyond it both sides shrink by the same share.
@@ -166,6 +168,7 @@ impl Default for RimServo {
         Self {
             speed_gain: 1.0,
             yaw_gain: 1.0,
+            dead_time_s: [0.0; 2],
             yaw_limit_rad_s: NONE,
             rim_limit_m_s: NONE,
             speed_lag_s: 0.0,
@@ -286,6 +289,18 @@ impl Vehicle {
             }
         }
         rims
+    }
+
+    /// Time by which the commands of speed and steering arrive late, s: the dead time of the card and what effects add to it.
+    pub fn command_delay_s(&self) -> [f64; 2] {
+        let [dead, added] = [self.driveline.rims.dead_time_s, self.effects.actuator.delay_s];
+        core::array::from_fn(|i| dead[i] + added[i])
+    }
+
+    /// Whether commands arrive at the actuators otherwise than they were sent, or leave them with play.
+    #[inline]
+    pub fn alters_commands(&self) -> bool {
+        self.driveline.rims.dead_time_s != [0.0; 2] || self.effects.actuator.alters_commands()
     }
 
     /// Whether the command lies in the range of the card. Compared in f32, as the service does, so that the ends of the range are admitted in both precisions.

@@ -81,6 +81,12 @@ fn analytic_estimates_of_a_bare_card() {
     assert_eq!((limited.command_range[0], limited.driveline.rims.rim_limit_m_s), ([-1.6, 1.6], 1.6));
     assert_eq!(card_from_json(&card_to_json(&v)).unwrap(), v);
     assert_eq!(read(&card_to_json(&v)).unwrap(), v, "a card in the schema of bundles is accepted");
+    assert!(!card_to_json(&v).contains("dead_time_s"), "commands that arrive at once are not mentioned");
+    let mut late = v;
+    late.driveline.rims.dead_time_s = [0.25, 0.375];
+    assert_eq!(card_from_json(&card_to_json(&late)).unwrap(), late);
+    let refused = card_from_json(&card_to_json(&late).replace("0.375", "0.875")).unwrap_err().to_string();
+    assert!(refused.contains("driveline.rims.dead_time_s") && refused.contains("0.875"), "{refused}");
 }
 
 #[test]

@@ -11,6 +11,9 @@ use serde::{Deserialize, Serialize};
 /// Format tag of the card.
 pub const FORMAT: &str = "nesam.vehicle/1";
 
+/// Longest dead time of a card, s: what the last commands that are kept reach back to at steps of 0.1 s, less what effects may add.
+const DEAD_TIME_MAX_S: f64 = 0.6;
+
 /// A card that cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[error("vehicle card: {0}")]
@@ -134,6 +137,8 @@ struct Rims {
     rim_limit_m_s: f64,
     speed_lag_s: f64,
     yaw_lag_s: f64,
+    #[serde(default, skip_serializing_if = "are_zero")]
+    dead_time_s: [f64; 2],
     #[serde(default = "no_limits", skip_serializing_if = "are_no_limits")]
     acceleration_limit: [f64; 2],
     turn_efficiency: f64,
@@ -141,6 +146,11 @@ struct Rims {
 
 fn no_limits() -> [f64; 2] {
     RimServo::default().acceleration_limit
+}
+
+/// Commands that arrive at once are left out, so that cards written before dead times were known keep their bytes.
+fn are_zero(pair: &[f64; 2]) -> bool {
+    *pair == [0.0; 2]
 }
 
 /// Limits that nothing reaches are left out, so that cards written before these were known keep their bytes.
@@ -242,6 +252,9 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
     let not_negative = [("driveline.side_coupling_n_m_s", c.driveline.side_coupling_n_m_s), ("soil_damping_pa_s_m", c.soil_damping_pa_s_m)];
     if let Some((key, value)) = not_negative.iter().find(|(_, value)| !value.is_finite() || *value < 0.0) {
         return Err(CardError(format!("`{key}` is {value}, must not be negative")));
+    }
+    if let Some(value) = c.driveline.rims.dead_time_s.iter().find(|value| !(0.0..=DEAD_TIME_MAX_S).contains(*value)) {
+        return Err(CardError(format!("`driveline.rims.dead_time_s` is {value}, must lie between 0 and {DEAD_TIME_MAX_S} s")));
     }
     if let Some(fault) = c.driveline.torque.as_ref().and_then(torque_at_fault) {
         return Err(CardError(fault));

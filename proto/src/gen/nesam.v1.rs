@@ -803,7 +803,8 @@ pub struct Measurement {
     pub wheels: ::core::option::Option<WheelMeasurement>,
     /// Start of the vehicle's software that `sequence` and `stamp_ns` belong to: any number that differs from start to start, for example a random one;
     /// 0 = not told. Another one than before begins a new history, keeps the soil, and ends the old start: its late measurements are TOO_OLD. Where its
-    /// stamps do not go on from those before, its first measurement is TOO_OLD too, and the second begins the history.
+    /// stamps do not go on from those before, its first measurement is TOO_OLD too, and the second begins the history. Within one start numbers only rise: what is
+    /// sent once more, however long after, is DUPLICATE or TOO_OLD and never taken for a restart.
     #[prost(uint64, tag = "7")]
     pub boot_id: u64,
     /// `MeasurementAnswer.run` of the answers so far; 0 = whatever it is. Where the session is at another run now, and so may lack what that one had not made
@@ -2178,10 +2179,18 @@ pub struct SessionContent {
     pub recent_sequence: ::prost::alloc::vec::Vec<u64>,
     #[prost(uint64, optional, tag = "12")]
     pub last_sequence: ::core::option::Option<u64>,
+    /// Accepted numbers of this start of the vehicle's software, as runs without a gap, ascending: the first and the last of each.
+    #[prost(uint64, repeated, tag = "38")]
+    pub accepted_first: ::prost::alloc::vec::Vec<u64>,
+    #[prost(uint64, repeated, tag = "39")]
+    pub accepted_last: ::prost::alloc::vec::Vec<u64>,
     #[prost(uint64, optional, tag = "13")]
     pub boot_id: ::core::option::Option<u64>,
+    /// Starts of the vehicle's software before, and the highest number accepted of each; 0 = none, or an image of a version that kept none.
     #[prost(uint64, repeated, tag = "14")]
     pub ended_boots: ::prost::alloc::vec::Vec<u64>,
+    #[prost(uint64, repeated, tag = "37")]
+    pub ended_last_sequence: ::prost::alloc::vec::Vec<u64>,
     #[prost(sint64, optional, tag = "15")]
     pub final_ns: ::core::option::Option<i64>,
     /// Ages of the newest measurement and of the newest step when the session was exported, ns; absent before the first.

@@ -1,8 +1,8 @@
 //! Who may do what.
 //!
 //! With `tls.client_ca` every client shows a certificate that the CA has signed; its subject alternative name `nesam:<role>:<name>` is who it is, and the
-//! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused is
-//! logged under the target `nesam::audit` with who asked for what. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
+//! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused and who
+//! changes what is logged under the target `nesam::audit`. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
 
 mod certificate;
 mod credentials;
@@ -11,6 +11,7 @@ mod fleet_file;
 mod identity;
 mod refusals;
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 
 use tokio::sync::watch;
@@ -67,6 +68,8 @@ pub struct Caller {
     access: Access,
     /// `None` = without client certificates.
     identity: Option<Identity>,
+    /// Where the connection comes from.
+    peer: Option<SocketAddr>,
 }
 
 /// TLS of the server and the rights of its clients, from the files of a configuration; `None` = without TLS.
@@ -108,7 +111,8 @@ impl Access {
     /// # Errors
     /// UNAUTHENTICATED when the certificate or the proxy names nobody, PERMISSION_DENIED when it is nobody of the fleet.
     pub fn caller<T>(&self, request: &Request<T>) -> Result<Caller, Status> {
-        let Some(fleet) = self.rights() else { return Ok(Caller { access: self.clone(), identity: None }) };
+        let from = |identity| Caller { access: self.clone(), identity, peer: request.remote_addr() };
+        let Some(fleet) = self.rights() else { return Ok(from(None)) };
         let certificates = request.peer_certs().unwrap_or_default();
         let shown = match certificates.first() {
             Some(certificate) => Identity::of_certificate(certificate),
@@ -120,7 +124,7 @@ impl Access {
         if let Identity::Proxy(_) = identity {
             identity = member(&fleet, behind(&identity, request.metadata()), peer).inspect_err(refused)?;
         }
-        Ok(Caller { access: self.clone(), identity: Some(identity) })
+        Ok(from(Some(identity)))
     }
 }
 
@@ -167,6 +171,13 @@ impl Caller {
     pub fn may_with(&self, wish: Wish<'_>, vehicle: &str) -> Result<(), Status> {
         let Some((fleet, identity)) = self.known() else { return Ok(()) };
         self.decide(&fleet, identity, wish, Some(vehicle.into())).map(drop)
+    }
+
+    /// Tells the log that the caller changes something and may. Not for single measurements.
+    pub fn changes(&self, wish: Wish<'_>) {
+        let by = self.identity.as_ref().map_or_else(|| "anybody".into(), ToString::to_string);
+        let peer = self.peer.map(|peer| peer.to_string()).unwrap_or_default();
+        tracing::info!(target: "nesam::audit", by, peer, "allowed: {wish}");
     }
 
     /// Resolves when the caller, who had it, has lost a right; never where there are no identities.

@@ -67,8 +67,11 @@ fn content(image: &SessionImage) -> pb::SessionContent {
         recent_stamp_ns: image.recent.iter().map(|(stamp_ns, _)| *stamp_ns).collect(),
         recent_sequence: image.recent.iter().map(|(_, number)| number.unwrap_or(0)).collect(),
         last_sequence: image.last_sequence,
+        accepted_first: image.numbers.iter().map(|(first, _)| *first).collect(),
+        accepted_last: image.numbers.iter().map(|(_, last)| *last).collect(),
         boot_id: image.boot,
-        ended_boots: image.ended_boots.clone(),
+        ended_boots: image.ended_boots.iter().map(|(boot, _)| *boot).collect(),
+        ended_last_sequence: image.ended_boots.iter().map(|(_, last)| last.unwrap_or(0)).collect(),
         final_ns: image.final_ns,
         newest_age_ns: image.newest_age_ns.map(|age| age.max(0) as u64),
         step_age_ns: image.step_age_ns.map(|age| age.max(0) as u64),
@@ -141,8 +144,13 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
     if content.recent_stamp_ns.len() != content.recent_sequence.len() {
         return Err(refused("has stamps without numbers"));
     }
+    if content.accepted_first.len() != content.accepted_last.len() {
+        return Err(refused("has numbers without an end"));
+    }
     let soil = from_soil(content)?;
     let numbers = content.recent_sequence.iter().map(|number| numbered(*number));
+    // An older service wrote none.
+    let ended_last = content.ended_last_sequence.iter().map(|number| numbered(*number)).chain(std::iter::repeat(None));
     let age = |age: u64| i64::try_from(age).unwrap_or(i64::MAX);
     // As an older service wrote it, steps have no stamps: the next buffer begins anew.
     let stamped = !content.filter_stamps_ns.is_empty();
@@ -158,8 +166,9 @@ fn from_content(content: &pb::SessionContent) -> Result<SessionImage, EngineErro
         open: content.open.iter().map(from_measured).collect::<Result<_, _>>()?,
         recent: content.recent_stamp_ns.iter().copied().zip(numbers).collect(),
         last_sequence: content.last_sequence,
+        numbers: content.accepted_first.iter().copied().zip(content.accepted_last.iter().copied()).collect(),
         boot: content.boot_id,
-        ended_boots: content.ended_boots.clone(),
+        ended_boots: content.ended_boots.iter().copied().zip(ended_last).collect(),
         final_ns: content.final_ns,
         newest_age_ns: content.newest_age_ns.map(age),
         step_age_ns: content.step_age_ns.map(age),

@@ -1,10 +1,12 @@
 //! The gRPC services: one file each, handlers that convert, ask the engine and convert back.
 
+mod arrives_in_time;
 mod deadline;
 mod diagnosis;
 mod measurements;
 mod news;
 mod prediction;
+mod refusals_timed;
 mod sessions;
 mod soil;
 mod terrain;
@@ -33,7 +35,9 @@ use crate::diagnosis::Diagnoses;
 use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
 
+use arrives_in_time::arrive_in_time;
 pub(crate) use prediction::predict;
+use refusals_timed::RefusalsTimed;
 pub(crate) use until_stopped::UntilStopped;
 
 /// A stream of replies.
@@ -99,13 +103,17 @@ impl Edge {
         deadline::budget(request.metadata(), Duration::from_secs_f64(self.config.deadline_s))
     }
 
-    /// Refuses a request whose sender has no right to it; gives the vehicle of the session that it is about. A session that another server has comes here.
+    /// Refuses a request whose sender has no right to it and notes who changes something; gives the vehicle of the session that it is about. A session that another server has comes here.
     ///
     /// # Errors
     /// UNAUTHENTICATED, PERMISSION_DENIED or NOT_FOUND; UNAVAILABLE when the session does not come.
     pub async fn allow<T>(&self, request: &tonic::Request<T>, wish: Wish<'_>) -> Result<Option<Arc<str>>, Status> {
         let caller = self.access.caller(request)?;
-        self.allow_caller(&caller, wish, self.budget(request)).await
+        let vehicle = self.allow_caller(&caller, wish, self.budget(request)).await?;
+        if !matches!(wish, Wish::ReadSession(_)) {
+            caller.changes(wish);
+        }
+        Ok(vehicle)
     }
 
     /// The same for one message of a stream.
@@ -229,12 +237,18 @@ pub(crate) async fn stopped(mut stopping: watch::Receiver<bool>) {
 pub(crate) fn routes(edge: &Edge) -> Routes {
     let queries = predict_bytes_max(edge.engine.handle().limits());
     let tiles = edge.config.tile_bytes_max;
-    Routes::new(pb::sessions_server::SessionsServer::new(sessions::Service(edge.clone())).max_decoding_message_size(IMAGE_BYTES_MAX))
-        .add_service(pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(queries))
-        .add_service(
-            pb::measurements_server::MeasurementsServer::new(measurements::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE),
-        )
-        .add_service(pb::terrain_server::TerrainServer::new(terrain::Service(edge.clone())).max_decoding_message_size(tiles))
-        .add_service(pb::soil_server::SoilServer::new(soil::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE))
-        .add_service(pb::diagnosis_server::DiagnosisServer::new(diagnosis::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE))
+    let predictions = pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(queries);
+    let routes =
+        Routes::new(pb::sessions_server::SessionsServer::new(sessions::Service(edge.clone())).max_decoding_message_size(IMAGE_BYTES_MAX))
+            .add_service(RefusalsTimed { service: predictions, metrics: edge.engine.metrics().clone() })
+            .add_service(
+                pb::measurements_server::MeasurementsServer::new(measurements::Service(edge.clone()))
+                    .max_decoding_message_size(SMALL_MESSAGE),
+            )
+            .add_service(pb::terrain_server::TerrainServer::new(terrain::Service(edge.clone())).max_decoding_message_size(tiles))
+            .add_service(pb::soil_server::SoilServer::new(soil::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE))
+            .add_service(
+                pb::diagnosis_server::DiagnosisServer::new(diagnosis::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE),
+            );
+    arrive_in_time(routes, edge.stream_budget())
 }

@@ -85,6 +85,7 @@ impl pb::sessions_server::Sessions for Service {
         if let Some(vehicle) = self.0.allow_caller(&caller, Wish::ChangeSession(&session_id), budget).await? {
             caller.may(Wish::OpenSession { vehicle: &vehicle, session: &new_session_id })?;
         }
+        caller.changes(Wish::ChangeSession(&session_id));
         let copy = self.0.engine.fork(&session_id, &new_session_id, budget);
         let view = self.0.begin("new_session_id", &new_session_id, budget, copy).await?;
         tracing::info!(session = session_id, copy = view.session, "session copied");
@@ -114,6 +115,7 @@ impl pb::sessions_server::Sessions for Service {
                 |status: Status| Status::new(status.code(), format!("the image says which effects the vehicle has: {}", status.message()));
             caller.may_with(Wish::ApplyEffects(name), &image.vehicle).map_err(refused)?;
         }
+        caller.changes(Wish::OpenSession { vehicle: &image.vehicle, session: name });
         if let Some((map, _)) = &image.map {
             self.0.bring_map(map, budget).await?;
         }

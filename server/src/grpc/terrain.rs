@@ -23,6 +23,7 @@ async fn receive(edge: &Edge, caller: &Caller, mut inbound: Streaming<pb::Upload
     let first = inbound.message().await?.and_then(|message| message.part);
     let Some(Part::Header(header)) = first else { return Err(missing()) };
     caller.may(Wish::ChangeMap(&header.map_id))?;
+    caller.changes(Wish::ChangeMap(&header.map_id));
     let mut builder = MapBuilder::new(&header, edge.engine.handle().limits()).map_err(to_status)?;
     while let Some(message) = inbound.message().await? {
         match message.part {

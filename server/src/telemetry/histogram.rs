@@ -22,6 +22,11 @@ impl Histogram {
         self.sum_ns.fetch_add(ns, Ordering::Relaxed);
     }
 
+    /// Number of durations up to the end of a bucket, s.
+    pub fn within(&self, bound_s: f64) -> u64 {
+        self.buckets.iter().zip(BOUNDS_S).filter(|(_, bound)| *bound <= bound_s).map(|(bucket, _)| bucket.load(Ordering::Relaxed)).sum()
+    }
+
     /// Number of durations.
     pub fn count(&self) -> u64 {
         self.buckets.iter().map(|b| b.load(Ordering::Relaxed)).sum()

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
 
 use nesam_engine::{Answer, Command, EngineError, Event, Reply};
 
@@ -48,6 +49,7 @@ pub struct Metrics {
     alarms: AlarmCounts,
     queue: Histogram,
     prediction: Histogram,
+    refusals: Histogram,
 }
 
 fn count(pairs: &Pairs, key: (&'static str, &'static str)) {
@@ -117,6 +119,16 @@ impl Metrics {
         self.alarms.note(event);
     }
 
+    /// Counts how long it took to refuse a request for want of room.
+    pub fn refused(&self, after: Duration) {
+        self.refusals.record_ns(u64::try_from(after.as_nanos()).unwrap_or(u64::MAX));
+    }
+
+    /// Such refusals: how many, and how many of them within a millisecond.
+    pub fn refusals(&self) -> [u64; 2] {
+        [self.refusals.count(), self.refusals.within(1e-3)]
+    }
+
     /// Number of predictions answered.
     pub fn predictions(&self) -> u64 {
         self.prediction.count()
@@ -171,6 +183,8 @@ impl Metrics {
         self.alarms.render(&mut out);
         self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
         self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
+        let help = "Time from the head of a request over gRPC to its refusal for want of room.";
+        self.refusals.render("nesam_prediction_refusal_seconds", help, &mut out);
         for (lane, value) in [("commands", waiting_commands), ("predictions", waiting_predictions)] {
             let _ = writeln!(
                 out,
@@ -195,6 +209,8 @@ mod tests {
         }
         metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
         metrics.measurement(Transport::Zenoh, "applied");
+        [200, 1000, 1100].into_iter().map(Duration::from_micros).for_each(|after| metrics.refused(after));
+        assert_eq!(metrics.refusals(), [3, 2]);
         metrics.event(&Event::MapChanged { map: "m".into(), held: 3 });
         assert!(metrics.render(0, 0).contains("nesam_events_total{event=\"soil_filter_failed\"} 0\n"));
         metrics.event(&Event::SoilFilterFailed { session: "s".into(), vehicle: "v".into(), reason: "why".into() });
@@ -210,6 +226,8 @@ mod tests {
             "nesam_measurements_total{transport=\"zenoh\",outcome=\"applied\"} 1",
             "nesam_prediction_queue_seconds_bucket{le=\"0.0025\"} 2",
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
+            "nesam_prediction_refusal_seconds_bucket{le=\"0.001\"} 2",
+            "nesam_prediction_refusal_seconds_count 3",
             "nesam_events_total{event=\"map_changed\"} 1",
             "nesam_events_total{event=\"soil_filter_failed\"} 1",
             "nesam_maps 3",

@@ -10,22 +10,24 @@ use std::cell::RefCell;
 use std::path::Path;
 
 use nesam_degradation::Degradation;
-use nesam_engine::Limits;
+use nesam_engine::{Command, Engine, Limits, Measurement, OpenSession, Reply, SessionImage, WheelMeasurement};
 use nesam_import::{Mapping, Options, Topics, drives, read_bag, read_csv};
-use nesam_model::{ModelBundle, Weights, effects_from_toml};
+use nesam_model::{ModelBundle, Predictor, Weights, effects_from_toml};
+use nesam_physics::{Control, VehicleState};
 use nesam_proto::{Message, v1 as pb};
 use nesam_server::access::FleetFile;
 use nesam_server::recording::Recording;
 use nesam_server::{Config, convert};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, read_vehicle_card};
+use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
 /// A reader: its name, which is also that of its corpus, and what feeds it.
 pub type Reader = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const READERS: [Reader; 22] = [
+pub const READERS: [Reader; 23] = [
     ("bag", bag),
     ("csv_log", csv_log),
     ("mapping", mapping),
@@ -43,6 +45,7 @@ pub const READERS: [Reader; 22] = [
     ("open_session", open_session),
     ("predict", predict),
     ("session_image", session_image),
+    ("session_content", session_content),
     ("fleet_soil_shares", fleet_soil_shares),
     ("map_messages", map_messages),
     ("recording", recording),
@@ -192,6 +195,61 @@ fn predict(bytes: &[u8]) {
 
 fn session_image(bytes: &[u8]) {
     drop(convert::session_image(bytes));
+}
+
+thread_local! {
+    /// An engine, and a session as it exports it.
+    static ENGINE: RefCell<Option<(Engine, Box<SessionImage>)>> = const { RefCell::new(None) };
+}
+
+/// Calls `read` with the thread's engine.
+fn in_engine(read: impl FnOnce(&mut Engine, &SessionImage)) {
+    ENGINE.with_borrow_mut(|engine| {
+        let (engine, exported) = engine.get_or_insert_with(|| {
+            let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal");
+            let bundle = ModelBundle::load(&folder).expect("the bundle is part of the repository");
+            let predictor = Predictor::new(bundle.into()).expect("the bundle fits");
+            let mut engine = Engine::new(predictor.into(), Limits::default()).expect("the settings fit");
+            let open = OpenSession {
+                vehicle: "own".into(),
+                session: String::new(),
+                vehicle_card: String::new(),
+                map: String::new(),
+                initial: None,
+            };
+            engine.execute(0, &Command::Open(open)).expect("it is the first one");
+            let Ok(Reply::Image(image)) = engine.execute(0, &Command::Export { session: "own".into() }) else {
+                panic!("an open session is exported")
+            };
+            (engine, image)
+        });
+        read(engine, exported);
+    });
+}
+
+/// What a session remembers, sealed as a server seals it, and as if it were of this one: it is opened, fed for a buffer of the soil filter and closed.
+fn session_content(bytes: &[u8]) {
+    in_engine(|engine, own| {
+        let Some(outer) = message::<pb::SessionImage>(&convert::image_bytes(own)) else { return };
+        let sealed = pb::SessionImage { checksum: Sha256::digest(bytes).to_vec().into(), content: bytes.to_vec().into(), ..outer };
+        let Ok(image) = convert::session_image(&sealed.encode_to_vec()) else { return };
+        let of_own =
+            SessionImage { bundle_hash: own.bundle_hash.clone(), filter_settings: own.filter_settings.clone(), map: None, ..image };
+        let import = Command::Import { image: Box::new(of_own), session: "copy".into() };
+        let Ok(Reply::Session(view)) = engine.execute(0, &import) else { return };
+        for i in 1..=12 {
+            let measurement = Measurement {
+                sequence: None,
+                boot: None,
+                stamp_ns: view.last_stamp_ns.unwrap_or(0).saturating_add(i * 100_000_000),
+                state: VehicleState::from_array([0.0; 12]),
+                command: Control { speed_m_s: 1.0, second: 0.0 },
+                wheels: WheelMeasurement::default(),
+            };
+            drop(engine.execute(i as u64 * 100_000_000, &Command::Measure { session: "copy".into(), vehicle: None, measurement }));
+        }
+        engine.execute(0, &Command::Close { session: "copy".into() }).expect("it was opened");
+    });
 }
 
 fn fleet_soil_shares(bytes: &[u8]) {

@@ -3,6 +3,7 @@
 use std::time::{Duration, Instant};
 
 use h2::client::SendRequest;
+use nesam_client::outcome_label;
 use prost::bytes::Bytes;
 
 use crate::stage::*;
@@ -41,6 +42,45 @@ async fn service_rapid_resets_harm_nobody_else() {
     }
     assert!(slowest < Duration::from_secs(5), "{slowest:?}");
     assert_eq!(client.session("truck").await.unwrap().history_steps, answered as u32);
+    server.shutdown().await;
+}
+
+/// Requests whose head comes and whose message never does, or a byte at a time: they end, although their client answers pings, and a stream may be silent for longer.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_request_that_never_ends_is_ended() {
+    let (server, mut client) = start_with(|config| config.grpc.deadline_s = 0.5).await;
+    open(&mut client, "truck", "").await;
+    let mut silent = client.measure().await.unwrap();
+    let mut waiting = Vec::new();
+    for drips in [false, true] {
+        for _ in 0..20 {
+            let attacker = raw(server.grpc_addr).await;
+            let (response, mut stream) = attacker.ready().await.unwrap().send_request(request("Get", "identity"), false).unwrap();
+            waiting.push(tokio::spawn(async move {
+                let begun = Instant::now();
+                let dripping = tokio::spawn(async move {
+                    for byte in [0, 0, 0, 0, 200].into_iter().chain([7; 200]) {
+                        if drips {
+                            let _ = stream.send_data(vec![byte].into(), false);
+                        }
+                        tokio::time::sleep(Duration::from_millis(50)).await;
+                    }
+                });
+                let response = tokio::time::timeout(Duration::from_secs(5), response).await.expect("the server ends it").unwrap();
+                dripping.abort();
+                (response.headers()["grpc-status"].clone(), begun.elapsed())
+            }));
+        }
+    }
+    for waited in waiting {
+        let (status, after) = waited.await.unwrap();
+        assert_eq!(status, "4", "DEADLINE_EXCEEDED");
+        assert!(after >= Duration::from_millis(450), "{after:?}");
+    }
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let recorded = recorded();
+    let answer = silent.exchange(sample("truck", &recorded.drive, 0)).await.unwrap();
+    assert_eq!(outcome_label(&answer), "APPLIED");
     server.shutdown().await;
 }
 

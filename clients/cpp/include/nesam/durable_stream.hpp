@@ -38,6 +38,7 @@ class DurableStream {
   ~DurableStream();
 
   /// Sends one measurement and waits for its answer, over as many connections as it takes. `Measurement::run` is left to the stream.
+  /// One without a `sequence` or `boot_id` gets one of this program, so that nothing is taken for new that is sent again.
   ///
   /// UNAVAILABLE: the service was not reached, did not answer or had no room for `DurableOptions::reconnect`. The measurement is kept, here and after every
   /// other error but one, and a later `send` or `flush` sends it. RESOURCE_EXHAUSTED of `pending_max`: so many are kept; this one is not, `flush` first. A

@@ -7,7 +7,8 @@ use nesam_model::{HISTORY, HistoryStep};
 use nesam_physics::SOIL_DIM;
 
 use super::forecast::OpenForecast;
-use super::order::Order;
+use super::numbers::Numbers;
+use super::order::{EndedBoot, Order};
 use super::soil::SoilLearner;
 use super::track::Track;
 use super::watch::{VALUES, Watch, WatchedBuffer};
@@ -41,10 +42,12 @@ pub struct SessionImage {
     pub recent: Vec<(i64, Option<u64>)>,
     /// Highest accepted number.
     pub last_sequence: Option<u64>,
+    /// Accepted numbers of the present start as runs without a gap, ascending.
+    pub numbers: Vec<(u64, u64)>,
     /// Start of the vehicle's software.
     pub boot: Option<u64>,
-    /// Starts before it, oldest first.
-    pub ended_boots: Vec<u64>,
+    /// Starts before it, oldest first, and the highest number accepted of each.
+    pub ended_boots: Vec<EndedBoot>,
     /// Newest stamp that is final, ns.
     pub final_ns: Option<i64>,
     /// Time since the newest measurement arrived, ns.
@@ -131,7 +134,7 @@ pub struct TrackImage {
 impl Session {
     /// Everything that the session remembers.
     pub(crate) fn image(&self, now_ns: u64, bundle_hash: &str, map: Option<(String, String)>) -> SessionImage {
-        let Order { recent, last_sequence, boot, ended_boots, newest_arrival_ns, final_ns, suspect: _ } = &self.order;
+        let Order { recent, last_sequence, numbers, boot, ended_boots, newest_arrival_ns, final_ns, suspect: _ } = &self.order;
         let age = |arrived_ns: i64| (now_ns as i64).saturating_sub(arrived_ns);
         let (filter, filter_steps, filter_first, filter_stamps_ns) = self.learner.parts();
         SessionImage {
@@ -145,6 +148,7 @@ impl Session {
             open: self.open.iter().copied().collect(),
             recent: recent.iter().copied().collect(),
             last_sequence: *last_sequence,
+            numbers: numbers.runs(),
             boot: *boot,
             ended_boots: ended_boots.iter().copied().collect(),
             final_ns: *final_ns,
@@ -194,6 +198,7 @@ impl Session {
             order: Order {
                 recent: image.recent.iter().copied().collect(),
                 last_sequence: image.last_sequence,
+                numbers: Numbers::of_runs(&image.numbers).unwrap_or_default(),
                 boot: image.boot,
                 ended_boots: image.ended_boots.iter().copied().collect(),
                 newest_arrival_ns: arrived(image.newest_age_ns),
@@ -235,6 +240,7 @@ impl SessionImage {
             ("an impossible buffer", self.filter_steps.len() <= self.filter_first + buffer),
             ("an impossible buffer", self.filter_steps.len().saturating_sub(self.filter_first) == self.filter_stamps_ns.len()),
             ("stamps that do not ascend", ascending(&mut self.filter_stamps_ns.iter().copied())),
+            ("impossible numbers", Numbers::of_runs(&self.numbers).is_some()),
             ("too many starts", self.ended_boots.len() <= super::order::ENDED_BOOTS_MAX),
             (
                 "a soil covariance that is none",

@@ -2,6 +2,7 @@
 
 use std::collections::VecDeque;
 
+use super::numbers::Numbers;
 use crate::error::EngineError;
 use crate::limits::Limits;
 use crate::measurement::{Measurement, Outcome};
@@ -28,6 +29,8 @@ pub(super) enum Verdict {
 
 /// An accepted stamp and its number.
 pub(super) type Numbered = (i64, Option<u64>);
+/// A start of the vehicle's software and the highest number accepted of it.
+pub type EndedBoot = (u64, Option<u64>);
 
 /// Why a measurement does not continue the line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,10 +62,12 @@ pub(super) struct Order {
     pub(super) recent: VecDeque<Numbered>,
     /// Highest accepted number.
     pub(super) last_sequence: Option<u64>,
+    /// All accepted numbers of the present start, where one is told.
+    pub(super) numbers: Numbers,
     /// Present start of the vehicle's software, where it is told.
     pub(super) boot: Option<u64>,
     /// Starts before it, oldest first.
-    pub(super) ended_boots: VecDeque<u64>,
+    pub(super) ended_boots: VecDeque<EndedBoot>,
     /// Engine clock when the newest measurement arrived, ns.
     pub(super) newest_arrival_ns: i64,
     /// Newest stamp that is final: nothing comes before it any more.
@@ -84,14 +89,18 @@ impl Order {
         let stamp_ns = measurement.stamp_ns;
         let behind_s = self.newest_ns().map_or(0.0, |newest| seconds(newest.saturating_sub(stamp_ns)).max(0.0));
         if let Some(boot) = measurement.boot.filter(|boot| self.boot.is_some_and(|present| present != *boot)) {
-            let ended = self.ended_boots.contains(&boot);
+            let over = self.ended_boots.iter().find(|(ended, _)| *ended == boot).map(|(_, last)| *last);
+            let ended = over.is_some();
             // One that was delayed or is sent once more is no restart, and would end the present one for good.
             let restarted = !ended && self.newest_ns().is_none_or(|newest| stamp_ns > newest)
-                || self.suspects(OffLine::OtherBoot { boot, ended }, measurement, now_ns, step_ns);
+                || !over.is_some_and(|last| counted(measurement.sequence, last))
+                    && self.suspects(OffLine::OtherBoot { boot, ended }, measurement, now_ns, step_ns);
             return Ok(if restarted { Verdict::Begin(Outcome::Restarted) } else { Verdict::Refuse(Outcome::TooOld { behind_s }) });
         }
         let Some(newest_ns) = self.newest_ns() else { return Ok(Verdict::Accept) };
-        let resent = measurement.sequence.is_some() && measurement.sequence == self.last_sequence;
+        let of_this_boot = measurement.boot.is_some() && measurement.boot == self.boot;
+        let resent = measurement.sequence.is_some() && measurement.sequence == self.last_sequence
+            || of_this_boot && measurement.sequence.is_some_and(|number| self.numbers.contains(number));
         let fresh = self.is_fresh(measurement.sequence);
         let place = self.recent.partition_point(|(recent_ns, _)| *recent_ns < stamp_ns);
         // A fresh number on the stamp of an older one is no copy: the clock was set back by whole intervals.
@@ -116,12 +125,16 @@ impl Order {
         } else {
             return Ok(Verdict::Accept);
         };
+        // Within one start numbers only rise: one that is not new, and was not accepted or is forgotten, begins no other line.
+        if of_this_boot && counted(measurement.sequence, self.last_sequence) {
+            return Ok(Verdict::Refuse(Outcome::TooOld { behind_s }));
+        }
         let jump_s = ahead_s - silent_s;
         Ok(match (off, self.suspects(off, measurement, now_ns, step_ns)) {
             (OffLine::Ahead, false) => Verdict::Refuse(Outcome::Future { ahead_s: jump_s }),
             (_, false) => Verdict::Refuse(Outcome::TooOld { behind_s }),
             (OffLine::Renumbered, true) => Verdict::Begin(Outcome::Restarted),
-            (_, true) if self.numbered_again(measurement) => Verdict::Begin(Outcome::Restarted),
+            (_, true) if counted(measurement.sequence, self.last_sequence) => Verdict::Begin(Outcome::Restarted),
             (_, true) => Verdict::Begin(Outcome::ClockJump { jump_s }),
         })
     }
@@ -137,11 +150,6 @@ impl Order {
         let before = self.recent.iter().take(place).rev().find_map(|(_, number)| *number);
         let after = self.recent.iter().skip(place).find_map(|(_, number)| *number);
         before.is_some_and(|before| before >= sequence) || after.is_some_and(|after| after <= sequence)
-    }
-
-    /// Whether the number says that the vehicle began to count anew.
-    fn numbered_again(&self, measurement: &Measurement) -> bool {
-        matches!((measurement.sequence, self.last_sequence), (Some(number), Some(last)) if number <= last)
     }
 
     /// Notes a measurement off the line and says whether enough of them agree on a new one.
@@ -183,6 +191,9 @@ impl Order {
         }
         self.last_sequence = self.last_sequence.max(measurement.sequence);
         self.boot = measurement.boot.or(self.boot);
+        if let (Some(_), Some(number)) = (measurement.boot, measurement.sequence) {
+            self.numbers.insert(number);
+        }
         self.suspect = None;
         if newest {
             self.newest_arrival_ns = now_ns as i64;
@@ -193,15 +204,20 @@ impl Order {
     /// Forgets the line: the next measurement begins another one.
     pub(super) fn begin(&mut self, boot: Option<u64>) {
         let mut ended_boots = core::mem::take(&mut self.ended_boots);
-        ended_boots.retain(|ended| Some(*ended) != boot);
+        ended_boots.retain(|(ended, _)| Some(*ended) != boot);
         if let Some(ended) = self.boot.filter(|present| boot.is_some_and(|boot| boot != *present)) {
-            ended_boots.push_back(ended);
+            ended_boots.push_back((ended, self.last_sequence));
             if ended_boots.len() > ENDED_BOOTS_MAX {
                 ended_boots.pop_front();
             }
         }
         *self = Self { boot: boot.or(self.boot), ended_boots, ..Self::default() };
     }
+}
+
+/// Whether a number is none that comes after the last one.
+fn counted(sequence: Option<u64>, last: Option<u64>) -> bool {
+    matches!((sequence, last), (Some(number), Some(last)) if number <= last)
 }
 
 fn seconds(ns: i64) -> f64 {

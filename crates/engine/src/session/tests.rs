@@ -150,6 +150,44 @@ fn analytic_a_restarted_vehicle_begins_anew_and_its_former_life_is_over() {
     assert_eq!(session.history().len(), 2);
 }
 
+/// Goal: whatever was accepted of a start that is told can be sent once more, at any time and pace, and changes nothing; with another stamp neither. Method: 400 measurements,
+/// of which 256 stamps are remembered; the first of them again, a tenth of a second apart, then numbers of old on new stamps; after a restart those of the start before.
+#[test]
+fn analytic_what_is_sent_again_begins_no_line() {
+    let boot = |boot: u64, i: i64| Measurement { boot: Some(boot), ..numbered(i * STEP_NS, i as u64 + 1) };
+    let rules = Rules { step_ns: STEP_NS, vehicle: &cart(), limits: &Limits::default() };
+    let mut session = driven(0);
+    let mut now_ns = 0;
+    let mut arrives = |session: &mut Session, measurement: &Measurement| {
+        now_ns += STEP_NS as u64;
+        session.observe(measurement, now_ns, rules).unwrap().outcome.label()
+    };
+    for i in 0..400 {
+        assert_eq!(arrives(&mut session, &boot(7, i)), "applied");
+    }
+    let before = trace(&session);
+    for i in (0..40).chain(380..390) {
+        assert_eq!(arrives(&mut session, &boot(7, i)), "duplicate");
+    }
+    for i in 401..410 {
+        assert_eq!(arrives(&mut session, &Measurement { sequence: Some(i as u64 - 100), ..boot(7, i) }), "duplicate");
+    }
+    assert_eq!(trace(&session), before);
+    // What was lost on its way and comes when nobody waits for it any more is no duplicate, and no restart either.
+    assert_eq!(arrives(&mut session, &boot(7, 420)), "gap");
+    let before = trace(&session);
+    for i in 405..415 {
+        assert_eq!(arrives(&mut session, &boot(7, i)), "too_old");
+    }
+    assert_eq!(trace(&session), before);
+    assert_eq!(arrives(&mut session, &boot(8, 450)), "restarted");
+    let before = trace(&session);
+    for i in 350..390 {
+        assert_eq!(arrives(&mut session, &boot(7, i)), "too_old");
+    }
+    assert_eq!((trace(&session), session.boot()), (before, Some(8)));
+}
+
 /// Goal: what was delayed or is sent once more ends no life of the vehicle, and a life that was taken for over can go on. Method: strays of another boot, new or over, among
 /// measurements of the present one; a boot with later stamps; then the former one alone, in a burst and at its pace.
 #[test]

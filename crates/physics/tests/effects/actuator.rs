@@ -52,6 +52,23 @@ fn analytic_speed_delay_shifts_by_fractions_of_a_step() {
     }
 }
 
+/// Goal: a dead time of a card and one that an effect brings are one thing, and they add up. Method: a robot under drawn twists, bit by bit.
+#[test]
+fn analytic_a_dead_time_of_the_card_is_a_delay() {
+    let commands: Vec<[f64; 2]> = (0..20).map(|k| [0.1 * f64::from((k * k) % 7), 0.2 * f64::from((k * 3) % 5)]).collect();
+    let late = |dead_time_s: [f64; 2], added: [f64; 2]| {
+        let mut vehicle = robot();
+        vehicle.driveline.rims.dead_time_s = dead_time_s;
+        let [speed, steering] = added;
+        let effects = [Effect::SpeedDelay(SpeedDelay { seconds: speed }), Effect::SteeringDelay(SteeringDelay { seconds: steering })];
+        let run = follow(&vehicle.with_effects(&effects), &commands);
+        run.iter().map(|(state, _)| [state.rim_speed_m_s, state.steering].map(f64::to_bits)).collect::<Vec<_>>()
+    };
+    assert_eq!(late([0.25, 0.5], [0.0; 2]), late([0.0; 2], [0.25, 0.5]));
+    assert_eq!(late([0.125, 0.25], [0.125, 0.25]), late([0.0; 2], [0.25, 0.5]));
+    assert_ne!(late([0.25, 0.5], [0.0; 2]), late([0.0; 2], [0.0; 2]));
+}
+
 #[test]
 fn analytic_steering_delay_of_whole_steps_shifts_the_angle() {
     let commands: Vec<[f64; 2]> = (0..12).map(|k| [1.0, 0.02 * ((k * 3) % 5) as f64]).collect();
