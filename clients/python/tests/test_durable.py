@@ -108,7 +108,8 @@ def test_service_what_is_sent_again_is_never_new(client, hills):
             assert stream.send(measurement).outcome == "DUPLICATE"
             time.sleep(0.1)
     after = client.session("again")
-    assert (after.accepted, after.history_epoch) == (before.accepted, before.history_epoch) == (320, before.history_epoch)
+    assert (after.accepted, after.last_stamp_ns) == (before.accepted, before.last_stamp_ns) == (320, kept[-1].stamp_ns)
+    np.testing.assert_array_equal(after.state, before.state)
 
 
 def test_service_without_a_store_so_many_are_kept_and_no_more(client, hills):
