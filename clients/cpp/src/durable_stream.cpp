@@ -57,6 +57,11 @@ class DurableStreamImpl {
     if (kept() >= options_.pending_max) {
       return Error(Code::resource_exhausted, "pending_max", std::to_string(kept()) + " measurements are not known to be durable; flush them first");
     }
+    const bool numbered = measurement.sequence != 0;
+    if (numbered_.value_or(numbered) != numbered) {
+      return Error(Code::invalid_argument, "sequence", "some measurements have a number and some have none; 0 is none, numbers begin at 1");
+    }
+    numbered_ = numbered;
     waiting_.push_back(measurement);
     // Which run counts is the matter of this object.
     waiting_.back().run = 0;
@@ -189,6 +194,8 @@ class DurableStreamImpl {
   std::deque<Measurement> waiting_;
   /// Who counts the places.
   std::uint64_t run_ = 0;
+  /// Whether measurements come with numbers of their own; absent before the first.
+  std::optional<bool> numbered_;
 };
 
 }  // namespace detail

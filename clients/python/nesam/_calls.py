@@ -234,13 +234,14 @@ class KnownStates:
         """Notes a measured state that is now the newest of its session."""
         begins_anew = answer.outcome in ("CLOCK_JUMP", "RESTARTED")
         if (begins_anew or answer.outcome in ("APPLIED", "GAP", "GATED")) and not answer.reordered:
-            state = np.asarray(measurement.state, dtype=np.float64)
+            # The vehicle may write its array anew.
+            state = np.array(measurement.state, dtype=np.float64)
             self._note(measurement.session_id, KnownState(state, measurement.stamp_ns), asked, begins_anew)
 
     def predicted(self, asked: int, question: Question, prediction: t.Prediction) -> t.Prediction:
         """Notes where a prediction of the session began that was not given its start, and gives it back."""
         if question.start is None:
-            self._note(question.session_id, KnownState(prediction.start, prediction.start_stamp_ns), asked, False)
+            self._note(question.session_id, KnownState(np.array(prediction.start, dtype=np.float64), prediction.start_stamp_ns), asked, False)
         return prediction
 
     def fall_back(self, question: Question, error: NesamError) -> t.Prediction:

@@ -321,7 +321,13 @@ class MeasurementStream:
         Raises DeadlineExceeded when none comes in time, which ends the stream, and Unavailable when the stream has ended.
         """
         self._put(measurement)
-        return self._next(self._client.timeout_s if timeout_s is None else timeout_s)
+        try:
+            return self._next(self._client.timeout_s if timeout_s is None else timeout_s)
+        except BaseException:
+            # Interrupted before its answer, which must not be taken for that of the next measurement.
+            self._call.cancel()
+            self.close()
+            raise
 
     def close(self) -> None:
         """Says that no more measurements come."""

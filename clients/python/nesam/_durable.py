@@ -6,9 +6,10 @@ import secrets
 import time
 from collections import deque
 from dataclasses import replace
-from typing import Deque, Dict, Iterator, List, Tuple
+from typing import Deque, Dict, Iterator, List, Optional, Tuple
 
 import grpc
+import numpy as np
 
 from . import _calls as calls
 from . import _messages as m
@@ -30,9 +31,15 @@ _NUMBERS: Dict[str, Iterator[int]] = {}
 """This start of the program, and by session the numbers of its measurements that have none of their own: by them the service knows what it has had, however long ago."""
 
 
-def _numbered(measurement: t.Measurement, session_id: str) -> t.Measurement:
+def _kept_copy(measurement: t.Measurement, session_id: str) -> t.Measurement:
+    """A measurement as it is now, with a number and a boot: whoever sent it may write its arrays anew before it is sent again."""
+    copied = {
+        name: None if getattr(measurement, name) is None else np.array(getattr(measurement, name), dtype=np.float64)
+        for name in ("state", "wheel_speed_rad_s", "road_wheel_angle_rad")
+    }
     number = measurement.sequence or next(_NUMBERS.setdefault(session_id, itertools.count(1)))
-    return replace(measurement, sequence=number, boot_id=measurement.boot_id or _BOOT_ID)
+    command = (float(measurement.command[0]), float(measurement.command[1]))
+    return replace(measurement, **copied, command=command, sequence=number, boot_id=measurement.boot_id or _BOOT_ID, run=0)
 
 
 class DurableStream:
@@ -55,6 +62,8 @@ class DurableStream:
         self._waiting: Deque[t.Measurement] = deque()
         # Who counts the places.
         self._run = 0
+        # Whether measurements come with numbers; None before the first.
+        self._is_numbered: Optional[bool] = None
 
     def __enter__(self) -> "DurableStream":
         return self
@@ -71,16 +80,20 @@ class DurableStream:
         """Sends one measurement and awaits its answer, over as many connections as it takes.
 
         Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises
-        Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, which is not kept.
+        Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, another session, or numbers
+        that some measurements have and some have not; such a one is not kept.
         """
         kept = self._kept()
         if kept >= self._pending_max:
             reason = f"{kept} measurements are not known to be durable; flush them first"
             raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
         # Which run counts is the matter of this object.
-        measurement = _numbered(replace(measurement, run=0), self._session_id)
         # One that cannot be sent would hold up all that come after it.
         m.measurement_message(measurement)
+        if measurement.session_id != self._session_id:
+            raise ValueError(f"the measurement is of session `{measurement.session_id}`, this stream is of `{self._session_id}`")
+        self._is_numbered = self._agrees(measurement)
+        measurement = _kept_copy(measurement, self._session_id)
         self._waiting.append(measurement)
         return self._deliver()
 
@@ -119,6 +132,13 @@ class DurableStream:
             self._stream.close()
             self._stream = None
         self._forget_places()
+
+    def _agrees(self, measurement: t.Measurement) -> bool:
+        """Whether it is numbered, as all of a stream are or none: a number of its own may be one that another got here."""
+        numbered = bool(measurement.sequence)
+        if self._is_numbered not in (None, numbered):
+            raise ValueError("this stream has measurements with and without a number; a `sequence` of 0 is none, numbers begin at 1")
+        return numbered
 
     def _kept(self) -> int:
         return len(self._answered) + len(self._waiting)

@@ -156,7 +156,9 @@ def tile(row: int, column: int, elevation: np.ndarray, rgb: Optional[np.ndarray]
         raise ValueError(f"elevation_m has shape {elevation.shape}, expected (rows, columns)")
     colours = b""
     if rgb is not None:
-        rgb = np.ascontiguousarray(rgb, dtype=np.uint8)
+        if np.asarray(rgb).dtype != np.uint8:
+            raise ValueError(f"semantic_rgb is of {np.asarray(rgb).dtype}, expected uint8 (0 to 255 for red, green and blue)")
+        rgb = np.ascontiguousarray(rgb)
         if rgb.shape != (*elevation.shape, 3):
             raise ValueError(f"semantic_rgb has shape {rgb.shape}, expected {(*elevation.shape, 3)}")
         colours = rgb.tobytes()
@@ -169,6 +171,8 @@ def tile(row: int, column: int, elevation: np.ndarray, rgb: Optional[np.ndarray]
 def upload_messages(world: t.WorldMap, elevation: np.ndarray) -> Iterator[terrain_pb2.UploadMapRequest]:
     """A map in tiles, after its header."""
     height, width = elevation.shape
+    if world.semantic_rgb is not None and np.shape(world.semantic_rgb)[:2] != elevation.shape:
+        raise ValueError(f"semantic_rgb has shape {np.shape(world.semantic_rgb)}, expected {(*elevation.shape, 3)}")
     rows = max(1, _TILE_CELLS // max(1, width))
     tiles = [
         tile(row, 0, elevation[row : row + rows], None if world.semantic_rgb is None else world.semantic_rgb[row : row + rows])

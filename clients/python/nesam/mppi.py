@@ -58,4 +58,10 @@ class HorizonDynamics:
         self._actions = self.planner.u_scale * self.planner.perturbed_action
         controls = self._actions.detach().cpu().numpy().astype(np.float32)
         self.prediction = self.client.predict(self.session_id, controls, **self.options)
+        expected = (*controls.shape[:2], 12)
+        if self.prediction.states.shape != expected or self.options.get("cost") is not None:
+            raise ValueError(
+                f"options leave states of shape {self.prediction.states.shape}, MPPI needs all of {expected} in the order of its candidates: without cost, "
+                "stride, channels, samples_min and other soils"
+            )
         self._states = torch.from_numpy(self.prediction.states.copy()).to(state)

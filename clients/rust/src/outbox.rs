@@ -42,6 +42,8 @@ pub struct Outbox {
     pushed: u64,
     /// Who counts the places.
     run: u64,
+    /// Whether measurements come with numbers of their own; `None` before the first.
+    numbered: Option<bool>,
 }
 
 impl Default for Outbox {
@@ -64,6 +66,7 @@ impl Outbox {
             no_room: BTreeSet::new(),
             pushed: 0,
             run: 0,
+            numbered: None,
         }
     }
 
@@ -71,7 +74,7 @@ impl Outbox {
     ///
     /// # Errors
     /// `ClientError::Refused` with RESOURCE_EXHAUSTED of `pending_max` when as many are not known to be durable; this one is not kept. Hand over answers, or a
-    /// `durable_place` ([`Outbox::durable`]), first.
+    /// `durable_place` ([`Outbox::durable`]), first. INVALID_ARGUMENT of `sequence` where some have a number of their own and some have none: one may be that which another got here.
     pub fn push(&mut self, mut measurement: v1::Measurement) -> Result<(), ClientError> {
         if self.kept.len() >= self.pending_max {
             return Err(ClientError::Refused {
@@ -81,6 +84,16 @@ impl Outbox {
                 retry_after: None,
             });
         }
+        let numbered = measurement.sequence != 0;
+        if self.numbered.is_some_and(|before| before != numbered) {
+            return Err(ClientError::Refused {
+                code: tonic::Code::InvalidArgument,
+                field: "sequence".into(),
+                message: "some measurements have a number and some have none; 0 is none, numbers begin at 1".into(),
+                retry_after: None,
+            });
+        }
+        self.numbered = Some(numbered);
         if measurement.boot_id == 0 {
             measurement.boot_id = *BOOT_ID;
         }

@@ -14,7 +14,7 @@ use crate::controls::{Kind, NullDrives, Setting};
 use crate::drive_line::{self, DriveLine};
 use crate::error::DiscoveryError;
 use crate::ground::{Ground, Soils};
-use crate::held_out::{HeldOut, Learned, Scoring, score_held_out};
+use crate::held_out::{HeldOut, Learned, Scoring, far_off, score_held_out};
 use crate::judge::{Judge, case_of, own_yardstick};
 use crate::judgement::{Verdict, judge};
 use crate::observe::{Bench, ObservedDrive, observe_all};
@@ -248,6 +248,10 @@ impl Asked<'_> {
                 reason += &said_by_others(&judgement, scores);
             }
         }
+        // A model on trial that errs to no side is not right for that.
+        let far = (judge_by.is_none() && verdict == Verdict::None).then(|| far_off(scores.as_ref()?, &held, &options.scoring)).flatten();
+        let verdict = if far.is_some() { Verdict::Unexplained } else { verdict };
+        reason += far.as_deref().unwrap_or_default();
         let (any, beside) = (verdict.claims(), taught.beside);
         let soils = case.ground_alone.as_ref().map(|ground| {
             let assumed = bundle.normalization.default_soil();

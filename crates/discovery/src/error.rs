@@ -4,7 +4,9 @@
 #[derive(Debug, thiserror::Error)]
 pub enum DiscoveryError {
     /// A drive is too short or stands off its map.
-    #[error("drive `{trajectory}` has no segment of {steps} steps on known ground; leave it out with --trajectories")]
+    #[error(
+        "drive `{trajectory}` has no segment of {steps} steps that is measured, and on a map that is known; leave it out with --trajectories, which names all others"
+    )]
     NoSegments {
         /// Drive.
         trajectory: String,

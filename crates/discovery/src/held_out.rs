@@ -1,7 +1,8 @@
 //! Proof on drives that were not fitted: full rollouts of the bundle before, with the best soil alone, and with the effect.
 
 use nesam_evaluation::{
-    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, Window, all_windows, roll_out, score,
+    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, Window, all_windows, constant_velocity,
+    roll_out, score,
 };
 use nesam_model::{Predictor, Variant};
 use nesam_physics::SoilCorrection;
@@ -116,6 +117,30 @@ pub fn score_held_out(
         resamples,
         counted: counted(maps),
         shows: shows(&windows, drives.len(), |d| &learned[d].effects),
+    })
+}
+
+/// Times the error of a vehicle that goes on as it begins, above which nobody may say that nothing is wrong (chosen).
+const FAR_OFF: f64 = 2.0;
+
+/// What is to be said of a model that errs to no side and is far off all the same, in position or yaw: more than twice as far as a vehicle that goes on as it begins.
+pub(crate) fn far_off(scores: &HeldOut, drives: &[Trajectory], scoring: &Scoring) -> Option<String> {
+    let windows = scoring.windows(drives).ok()?;
+    let goes_on = |w: &Window<'_>| {
+        let poses = constant_velocity(&w.trajectory.states[w.start], w.horizon, w.trajectory.dt_s);
+        PosePath { poses, predicts: [true; 6] }
+    };
+    let paths = windows.iter().map(goes_on).collect();
+    let going_on =
+        score(&ModelPaths { name: ModelName::ConstantVelocity, parameters: 0, paths }, &windows, Truth::Measured, &scores.resamples);
+    let off = |score: &ModelScore| Some([score.summary.tree.position_m.mean?, score.summary.tree.mae_mean.yaw_deg?]);
+    let ([position_m, yaw_deg], [on_m, on_deg]) = (off(&scores.scores[0])?, off(&going_on)?);
+    let seconds = scoring.horizon as f64 * windows.first()?.trajectory.dt_s;
+    (position_m > FAR_OFF * on_m || yaw_deg > FAR_OFF * on_deg).then(|| {
+        format!(
+            "; predictions over {seconds:.1} s are off by {position_m:.2} m and {yaw_deg:.1}° all the same, those of a vehicle that goes on as it begins by {on_m:.2} m and \
+             {on_deg:.1}°: what is wrong these drives do not tell; are the signs and units of all columns right (`nesam check`), and are there enough drives?"
+        )
     })
 }
 

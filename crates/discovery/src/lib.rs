@@ -58,6 +58,7 @@ mod tail;
 mod whiteness;
 
 pub use candidates::{Candidate, catalogue};
+pub use channels::SEGMENT_STEPS;
 pub use claims::Estimate;
 pub use diagnose::{Against, Diagnosis, OnProgress, Options, diagnose};
 pub use error::DiscoveryError;

@@ -131,7 +131,7 @@ fn clip(rows: &[Row], channels: &[usize]) -> Vec<DVector<f64>> {
         })
         .collect();
     rows.iter()
-        .map(|r| DVector::from_iterator(channels.len(), channels.iter().zip(&bounds).map(|(c, [low, high])| r[*c].clamp(*low, *high))))
+        .map(|r| DVector::from_iterator(channels.len(), channels.iter().zip(&bounds).map(|(c, [low, high])| r[*c].max(*low).min(*high))))
         .collect()
 }
 

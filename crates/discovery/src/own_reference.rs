@@ -43,7 +43,17 @@ pub fn metric(bench: &Bench<'_>, drives: &[ObservedDrive]) -> Result<Metric, Dis
         return Err(DiscoveryError::Drives { reason });
     }
     let rows: Vec<Vec<Row>> = drives.iter().map(|d| d.deviations(bench, &[], &SoilCorrection::NONE)).collect();
-    metric_of(&rows, &available_in_all(drives))
+    let available = available_in_all(drives);
+    for (drive, rows) in drives.iter().zip(&rows) {
+        if let Some(segment) = rows.iter().position(|row| row.iter().zip(available).any(|(v, has)| has && !v.is_finite())) {
+            let reason = format!(
+                "drive `{}`: what the model predicts of segment {segment} (0.8 s each) is no number; are the units and signs of its columns right? `nesam check` compares them",
+                drive.id
+            );
+            return Err(DiscoveryError::Drives { reason });
+        }
+    }
+    metric_of(&rows, &available)
 }
 
 /// The same from the deviations of each drive, on the channels that all of them have.

@@ -54,11 +54,12 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
     let gyro = topics.imu.as_ref().map(|_| pick(&topics.imu, IMU, "--imu")).transpose()?;
 
     let unreadable = |topic: &str, at: usize| ImportError::log(path, format!("{topic} message {at} is not readable as little-endian CDR"));
-    let mut rows: Vec<(i64, Odometry)> = Vec::new();
+    let mut poses: Vec<Received<Odometry>> = Vec::new();
     for (at, (recorded_ns, bytes)) in odometries.iter().enumerate() {
-        rows.push((*recorded_ns, odometry(bytes).ok_or_else(|| unreadable("odometry", at))?));
+        let value = odometry(bytes).ok_or_else(|| unreadable("odometry", at))?;
+        poses.push(Received { recorded_ns: *recorded_ns, stamp_ns: Some(value.stamp_ns), value });
     }
-    let foreign_clock = is_foreign(rows.iter().map(|(recorded_ns, o)| (*recorded_ns, o.stamp_ns)));
+    let foreign_clock = is_foreign(poses.iter().filter_map(|p| Some((p.recorded_ns, p.stamp_ns.filter(|ns| *ns != 0)?))));
     if foreign_clock {
         notes.push(of_another_clock("odometry"));
     }
@@ -76,7 +77,8 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
     }
     let told = by_instant("commands", told, foreign_clock, &mut notes);
     let turned = by_instant("imu", turned, foreign_clock, &mut notes);
-    let times: Vec<i64> = rows.iter().map(|(recorded_ns, o)| if foreign_clock { *recorded_ns } else { o.stamp_ns }).collect();
+    let rows = by_instant("odometry", poses, foreign_clock, &mut notes);
+    let times: Vec<i64> = rows.iter().map(|(at_ns, _)| *at_ns).collect();
     Ok((log(path, &times, &rows, (kind, told.as_slice()), gyro.is_some().then_some(turned.as_slice())), notes))
 }
 

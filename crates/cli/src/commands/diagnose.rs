@@ -10,7 +10,7 @@ use std::sync::{Arc, Mutex};
 use clap::Args;
 use nesam_discovery::channels::{self, CHANNELS};
 use nesam_discovery::report::{Report, describe};
-use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, Scoring, catalogue, diagnose, observe_all};
+use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, SEGMENT_STEPS, Scoring, catalogue, diagnose, observe_all};
 use nesam_evaluation::report::Short;
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
 use nesam_model::{ModelBundle, Predictor};
@@ -115,7 +115,20 @@ struct Input {
 
 /// The drives of a set in a data root.
 fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
-    let drives = read_drives(&args.data, false)?;
+    let mut drives = read_drives(&args.data, false)?;
+    let long_enough: Vec<bool> = drives.drives.iter().map(|drive| drive.states.len() > SEGMENT_STEPS).collect();
+    if let Some(short) = long_enough.iter().position(|long| !long).filter(|_| long_enough.contains(&true)) {
+        let count = long_enough.iter().filter(|long| !**long).count();
+        let (id, steps) = (&drives.drives[short].id, SEGMENT_STEPS);
+        output::note!(
+            "note: left out as too short to judge, with fewer than {steps} steps: {count} of {} drives, the first is `{id}`",
+            long_enough.len()
+        );
+        let mut kept = long_enough.iter();
+        drives.drives.retain(|_| kept.next() == Some(&true));
+        let mut kept = long_enough.iter();
+        drives.maps.retain(|_| kept.next() == Some(&true));
+    }
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let data_hash = drives.root.hash();
@@ -178,6 +191,12 @@ fn take_coupling(bundle: &mut ModelBundle, sheet: &Vehicle) {
     }
 }
 
+/// The shorter half of some drives: as many steps as the longest of them has, every second drive has.
+fn shorter_half<'a, 'd>(drives: &'a mut [&'d Trajectory]) -> &'a [&'d Trajectory] {
+    drives.sort_by_key(|drive| drive.states.len());
+    &drives[..drives.len().div_ceil(2)]
+}
+
 /// Ids of the drives to fit on; `train` stands for those of the train split.
 fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure> {
     if ids != ["train"] || drives.iter().any(|d| d.id == "train") {
@@ -185,7 +204,15 @@ fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure>
     }
     let train: Vec<String> = drives.iter().filter(|d| d.split == Some(Split::Train)).map(|d| d.id.clone()).collect();
     if train.is_empty() || train.len() == drives.len() {
-        return Err(Failure::input("--fit-on train: needs drives of the train split and others; use --split all"));
+        let split = |split| drives.iter().filter(|d| d.split == Some(split)).count();
+        return Err(Failure::input(format!(
+            "--fit-on train: needs drives whose index says `split` = train and others; of {} drives {} are train, {} test and {} say nothing. Mend the index, name the \
+             drives to fit on (--fit-on ID,ID), or leave --fit-on out: each drive is then judged by the others",
+            drives.len(),
+            split(Split::Train),
+            split(Split::Test),
+            drives.len() - split(Split::Train) - split(Split::Test)
+        )));
     }
     Ok(train)
 }
@@ -219,7 +246,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         hypotheses,
         against: reference.into(),
         scoring: Scoring {
-            horizon: args.window.horizon_on(&fitted),
+            horizon: args.window.horizon_on(shorter_half(&mut fitted)),
             history: args.window.history,
             resamples: DEFAULT_RESAMPLES,
             seed: args.seed,

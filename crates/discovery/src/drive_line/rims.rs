@@ -6,12 +6,16 @@ use nesam_physics::{Control, RimServo, Vehicle, WHEELS};
 use nesam_trajectories::{Trajectory, limited_starts};
 use rayon::prelude::*;
 
+use super::measured_wheels;
 use super::sized::Sized;
 use crate::candidates::Candidate;
 
 /// Most steps of drives that are looked at (chosen: half a minute on two cores), and the fewest of each drive.
 const STEPS_MAX: usize = 30_000;
 const STEPS_MIN: usize = 20;
+
+/// Stands for a drive without wheel speeds: a first sample, from which nothing is run.
+static UNMEASURED: [[f64; WHEELS]; 1] = [[0.0; WHEELS]];
 
 /// A drive: commands, wheel speeds (rad/s) and rim speeds left and right (m/s).
 #[derive(Debug)]
@@ -34,7 +38,8 @@ impl<'a> Rims<'a> {
     pub(super) fn of(vehicle: &'a Vehicle, drives: &'a [Trajectory], family: Vec<Candidate>) -> Self {
         let most = (STEPS_MAX / drives.len()).max(STEPS_MIN);
         let log = |drive: &'a Trajectory| {
-            let wheels = drive.wheel_speed_rad_s.as_deref().unwrap_or_default();
+            // One without wheel speeds says nothing.
+            let wheels = measured_wheels(drive).unwrap_or(&UNMEASURED);
             let wheels = &wheels[..wheels.len().min(most + 1)];
             let rims_m_s = wheels.iter().map(|wheels| rim_speeds_m_s(vehicle, wheels)).collect();
             Log { controls: &drive.controls, wheel_speed_rad_s: wheels, rims_m_s }

@@ -120,9 +120,14 @@ impl Rims<'_> {
         self.polished(self.sized(terms, values))
     }
 
+    /// Whether a size is held by the end of its range.
+    pub(super) fn is_held(&self, sized: &Sized, i: usize) -> bool {
+        self.family[sized.terms[i]].clamp(&mut [sized.values[i]])[0]
+    }
+
     /// Whether no size is held by the end of its range.
     fn inside(&self, sized: &Sized) -> bool {
-        sized.terms.iter().zip(&sized.values).all(|(term, value)| !self.family[*term].clamp(&mut [*value])[0])
+        (0..sized.terms.len()).all(|i| !self.is_held(sized, i))
     }
 
     /// What was found, but for what is not needed beside what was found after it.

@@ -24,6 +24,11 @@ impl Rims<'_> {
     /// What was found but for what has hardly a size, with how sure the sizes are.
     pub(super) fn sure(&self, mut found: Sized) -> (Sized, Spread) {
         loop {
+            // What is best at the end of its range has no size.
+            if let Some(held) = (0..found.terms.len()).find(|i| self.is_held(&found, *i)) {
+                found = self.dropped(&found, held);
+                continue;
+            }
             let spread = self.spread(&found);
             let share = |i: usize| spread.half_95[i] / self.family[found.terms[i]].magnitude(0, found.values[i]).max(1e-12);
             let worst = (0..found.terms.len()).max_by(|a, b| share(*a).total_cmp(&share(*b)));

@@ -16,6 +16,11 @@ impl Numbers {
         (runs.len() <= RUNS_MAX && apart && runs.iter().all(|(first, last)| first <= last)).then(|| Self(runs.iter().copied().collect()))
     }
 
+    /// All numbers up to this one.
+    pub fn up_to(last: u64) -> Self {
+        Self([(0, last)].into())
+    }
+
     /// The runs.
     pub fn runs(&self) -> Vec<(u64, u64)> {
         self.0.iter().copied().collect()

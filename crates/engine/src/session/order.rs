@@ -10,7 +10,7 @@ use crate::measurement::{Measurement, Outcome};
 /// Accepted stamps that are remembered to tell a resent measurement from a late one.
 pub(super) const RECENT_MAX: usize = 256;
 /// Former starts of the vehicle's software that are remembered to refuse their late measurements.
-pub(super) const ENDED_BOOTS_MAX: usize = 8;
+pub(super) const ENDED_BOOTS_MAX: usize = 64;
 /// Consecutive measurements off the line that prove a new one.
 const PROOF_COUNT: u32 = 2;
 /// Where numbers prove nothing: time of arrival over which the stamps have to keep pace with the arrivals, s and measurements.
@@ -204,6 +204,9 @@ impl Order {
     /// Forgets the line: the next measurement begins another one.
     pub(super) fn begin(&mut self, boot: Option<u64>) {
         let mut ended_boots = core::mem::take(&mut self.ended_boots);
+        // A start that goes on does not tell anew what it has told.
+        let told_before = ended_boots.iter().find(|(ended, _)| Some(*ended) == boot).and_then(|(_, last)| *last);
+        let numbers = told_before.map(Numbers::up_to).unwrap_or_default();
         ended_boots.retain(|(ended, _)| Some(*ended) != boot);
         if let Some(ended) = self.boot.filter(|present| boot.is_some_and(|boot| boot != *present)) {
             ended_boots.push_back((ended, self.last_sequence));
@@ -211,7 +214,7 @@ impl Order {
                 ended_boots.pop_front();
             }
         }
-        *self = Self { boot: boot.or(self.boot), ended_boots, ..Self::default() };
+        *self = Self { boot: boot.or(self.boot), ended_boots, numbers, ..Self::default() };
     }
 }
 

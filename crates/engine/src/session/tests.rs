@@ -188,6 +188,62 @@ fn analytic_what_is_sent_again_begins_no_line() {
     assert_eq!((trace(&session), session.boot()), (before, Some(8)));
 }
 
+/// Goal: no measurement counts twice. Method: a vehicle whose messages are lost, late, sent again in runs at its pace, and which is restarted with and without its clock, against
+/// the set of all (boot, number) that were accepted.
+#[test]
+fn property_no_measurement_counts_twice() {
+    for seed in 1..5_u64 {
+        let mut bits = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        let mut random = |below: u64| {
+            bits = bits.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (bits >> 33) % below
+        };
+        let mut session = driven(0);
+        let (mut now_ns, mut boot, mut number, mut stamp_ns) = (0_u64, 1_u64, 0_u64, 0_i64);
+        let (mut told, mut accepted) = (Vec::new(), std::collections::BTreeSet::new());
+        let (mut again, mut live) = (0, 0);
+        let mut send = |session: &mut Session, measurement: &Measurement, now_ns: u64| {
+            let key = (measurement.boot.unwrap(), measurement.sequence.unwrap());
+            let (present, before) = (session.boot(), accepted.contains(&key).then(|| trace(session)));
+            let outcome = observe_at(session, measurement, now_ns).unwrap();
+            if let Some(before) = before {
+                again += 1;
+                assert!(!outcome.accepted(), "seed {seed}: {key:?} counts twice as {outcome:?}, present boot {present:?}");
+                assert_eq!(trace(session), before, "seed {seed}: {key:?} was {outcome:?}");
+                assert!(present != Some(key.0) || outcome == Outcome::Duplicate, "seed {seed}: {key:?} is {outcome:?}");
+            } else if outcome.accepted() {
+                accepted.insert(key);
+            }
+            outcome.accepted()
+        };
+        for _ in 0..800 {
+            match random(100) {
+                0 => {
+                    (boot, number) = (boot + 1, 0);
+                    stamp_ns = if random(2) == 0 { stamp_ns + 5 * STEP_NS } else { 0 };
+                }
+                1..70 => {
+                    (number, stamp_ns, now_ns) = (number + 1, stamp_ns + STEP_NS, now_ns + STEP_NS as u64);
+                    told.push(Measurement { boot: Some(boot), ..numbered(stamp_ns, number) });
+                    if random(10) > 0 {
+                        live += usize::from(send(&mut session, &told[told.len() - 1], now_ns));
+                    }
+                }
+                _ if told.is_empty() => {}
+                _ => {
+                    let near = told.len().saturating_sub(random(4) as usize + 1);
+                    let first = if random(2) == 0 { near } else { random(told.len() as u64) as usize };
+                    for late in told[first..].iter().take(1 + random(9) as usize) {
+                        now_ns += random(2) * STEP_NS as u64;
+                        send(&mut session, late, now_ns);
+                    }
+                }
+            }
+        }
+        assert!(again > 200 && live > 300, "seed {seed}: {again} sent again, {live} new ones accepted of {}", told.len());
+    }
+}
+
 /// Goal: what was delayed or is sent once more ends no life of the vehicle, and a life that was taken for over can go on. Method: strays of another boot, new or over, among
 /// measurements of the present one; a boot with later stamps; then the former one alone, in a burst and at its pace.
 #[test]
