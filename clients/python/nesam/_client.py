@@ -321,13 +321,7 @@ class MeasurementStream:
         Raises DeadlineExceeded when none comes in time, which ends the stream, and Unavailable when the stream has ended.
         """
         self._put(measurement)
-        try:
-            return self._next(self._client.timeout_s if timeout_s is None else timeout_s)
-        except BaseException:
-            # Interrupted before its answer, which must not be taken for that of the next measurement.
-            self._call.cancel()
-            self.close()
-            raise
+        return self._next(self._client.timeout_s if timeout_s is None else timeout_s)
 
     def close(self) -> None:
         """Says that no more measurements come."""
@@ -360,6 +354,11 @@ class MeasurementStream:
         except queue.Empty:
             self._call.cancel()
             heard = DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s")
+        except BaseException:
+            # Interrupted before its answer, which must not be taken for that of the next measurement.
+            self._call.cancel()
+            self.close()
+            raise
         if isinstance(heard, NesamError):
             self.close()
             raise heard

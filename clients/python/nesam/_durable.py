@@ -39,6 +39,7 @@ def _kept_copy(measurement: t.Measurement, session_id: str) -> t.Measurement:
     }
     number = measurement.sequence or next(_NUMBERS.setdefault(session_id, itertools.count(1)))
     command = (float(measurement.command[0]), float(measurement.command[1]))
+    # Which run counts is the matter of the stream.
     return replace(measurement, **copied, command=command, sequence=number, boot_id=measurement.boot_id or _BOOT_ID, run=0)
 
 
@@ -87,7 +88,6 @@ class DurableStream:
         if kept >= self._pending_max:
             reason = f"{kept} measurements are not known to be durable; flush them first"
             raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
-        # Which run counts is the matter of this object.
         # One that cannot be sent would hold up all that come after it.
         m.measurement_message(measurement)
         if measurement.session_id != self._session_id:

@@ -1,7 +1,7 @@
 //! Proof on drives that were not fitted: full rollouts of the bundle before, with the best soil alone, and with the effect.
 
 use nesam_evaluation::{
-    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, Window, all_windows, constant_velocity,
+    DriveMaps, EvaluationError, ModelName, ModelPaths, ModelScore, PosePath, Resamples, Truth, Window, WindowPredictor, all_windows,
     roll_out, score,
 };
 use nesam_model::{Predictor, Variant};
@@ -126,11 +126,7 @@ const FAR_OFF: f64 = 2.0;
 /// What is to be said of a model that errs to no side and is far off all the same, in position or yaw: more than twice as far as a vehicle that goes on as it begins.
 pub(crate) fn far_off(scores: &HeldOut, drives: &[Trajectory], scoring: &Scoring) -> Option<String> {
     let windows = scoring.windows(drives).ok()?;
-    let goes_on = |w: &Window<'_>| {
-        let poses = constant_velocity(&w.trajectory.states[w.start], w.horizon, w.trajectory.dt_s);
-        PosePath { poses, predicts: [true; 6] }
-    };
-    let paths = windows.iter().map(goes_on).collect();
+    let paths = windows.iter().map(|w| WindowPredictor::ConstantVelocity.predict(w, None)).collect::<Result<_, _>>().ok()?;
     let going_on =
         score(&ModelPaths { name: ModelName::ConstantVelocity, parameters: 0, paths }, &windows, Truth::Measured, &scores.resamples);
     let off = |score: &ModelScore| Some([score.summary.tree.position_m.mean?, score.summary.tree.mae_mean.yaw_deg?]);

@@ -121,7 +121,7 @@ pub(crate) fn usual_range(values: &[f64]) -> (f64, f64) {
     (middle, CUT_OFF * spread)
 }
 
-/// Rows of a drive with every channel held within some robust standard deviations of its median.
+/// Rows of a drive with every channel held within some robust standard deviations of its median; what is no number makes none of them panic.
 fn clip(rows: &[Row], channels: &[usize]) -> Vec<DVector<f64>> {
     let bounds: Vec<[f64; 2]> = channels
         .iter()

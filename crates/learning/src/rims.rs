@@ -84,7 +84,7 @@ fn begun(servo: RimServo, track_m: f64, twists: impl Iterator<Item = [f64; 2]>) 
 /// no drive has wheel speeds. Which of the two the motion follows better is for others to say: a start that is known badly is held on to for a dead time.
 pub fn fit_rims(vehicle: &Vehicle, drives: &[&Drive], dt_s: f64) -> Vec<RimServo> {
     let measured: Vec<Log<'_>> = drives.iter().filter_map(|drive| Log::of(drive)).collect();
-    let sides = |log: &Log<'_>| log.wheel_speed_rad_s.iter().map(|wheels| rim_speeds_m_s(vehicle, wheels)).collect();
+    let sides = |log: &Log<'_>| log.wheel_speed_rad_s.iter().map(|wheels| rim_speeds_m_s(vehicle, wheels)).collect::<Vec<_>>();
     let limited = limited_starts(&measured.iter().map(sides).collect::<Vec<_>>());
     let logs: Vec<Log<'_>> = measured.iter().zip(limited).filter(|(_, limited)| !limited).map(|(log, _)| *log).collect();
     if logs.is_empty() {

@@ -7,18 +7,18 @@ const AWAY: f64 = 0.9;
 
 /// Which drives begin at a limit of the speed, the turning or a rim and come away from it, by the speeds of their left and right rims at every sample, m/s; none where fewer
 /// than a fourth would be left. How far beyond the limit the command was before shows in nothing, and a lag would be blamed for the time that it takes to come back to it.
-pub fn limited_starts(rims_m_s: &[Vec<[f64; 2]>]) -> Vec<bool> {
+pub fn limited_starts(rims_m_s: &[impl AsRef<[[f64; 2]]>]) -> Vec<bool> {
     let sizes = |[left, right]: [f64; 2]| [(0.5 * (left + right)).abs(), (0.5 * (right - left)).abs(), left.abs().max(right.abs())];
     let largest: [f64; 3] = core::array::from_fn(|i| {
-        let mut all: Vec<f64> = rims_m_s.iter().flatten().map(|rims| sizes(*rims)[i]).collect();
+        let mut all: Vec<f64> = rims_m_s.iter().flat_map(AsRef::as_ref).map(|rims| sizes(*rims)[i]).collect();
         all.sort_by(f64::total_cmp);
         all.get((LARGE * all.len().saturating_sub(1) as f64) as usize).copied().unwrap_or(0.0)
     });
-    let comes_away = |drive: &Vec<[f64; 2]>| {
+    let comes_away = |drive: &[[f64; 2]]| {
         let least = |i: usize| drive.iter().map(|rims| sizes(*rims)[i]).fold(f64::INFINITY, f64::min);
         drive.first().is_some_and(|first| (0..3).any(|i| sizes(*first)[i] > AT_LIMIT * largest[i] && least(i) < AWAY * largest[i]))
     };
-    let limited: Vec<bool> = rims_m_s.iter().map(comes_away).collect();
+    let limited: Vec<bool> = rims_m_s.iter().map(|drive| comes_away(drive.as_ref())).collect();
     if 4 * limited.iter().filter(|out| !**out).count() < limited.len() { vec![false; limited.len()] } else { limited }
 }
 
@@ -35,6 +35,7 @@ mod tests {
         assert_eq!(limited_starts(&drives), [false, true, false, false]);
         // All of them: better late than nothing.
         assert_eq!(limited_starts(&[held, away.clone(), away.clone(), away.clone(), away]), [false, true, true, true, true].map(|_| false));
-        assert!(limited_starts(&[Vec::new()]) == [false] && limited_starts(&[]).is_empty());
+        let none: [Vec<[f64; 2]>; 0] = [];
+        assert!(limited_starts(&[Vec::new()]) == [false] && limited_starts(&none).is_empty());
     }
 }

@@ -37,7 +37,7 @@ use crate::zenoh::Presence;
 
 use arrives_in_time::arrive_in_time;
 pub(crate) use prediction::predict;
-use refusals_timed::RefusalsTimed;
+use refusals_timed::time_refusals;
 pub(crate) use until_stopped::UntilStopped;
 
 /// A stream of replies.
@@ -237,10 +237,9 @@ pub(crate) async fn stopped(mut stopping: watch::Receiver<bool>) {
 pub(crate) fn routes(edge: &Edge) -> Routes {
     let queries = predict_bytes_max(edge.engine.handle().limits());
     let tiles = edge.config.tile_bytes_max;
-    let predictions = pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(queries);
     let routes =
         Routes::new(pb::sessions_server::SessionsServer::new(sessions::Service(edge.clone())).max_decoding_message_size(IMAGE_BYTES_MAX))
-            .add_service(RefusalsTimed { service: predictions, metrics: edge.engine.metrics().clone() })
+            .add_service(pb::prediction_server::PredictionServer::new(prediction::Service(edge.clone())).max_decoding_message_size(queries))
             .add_service(
                 pb::measurements_server::MeasurementsServer::new(measurements::Service(edge.clone()))
                     .max_decoding_message_size(SMALL_MESSAGE),
@@ -250,5 +249,5 @@ pub(crate) fn routes(edge: &Edge) -> Routes {
             .add_service(
                 pb::diagnosis_server::DiagnosisServer::new(diagnosis::Service(edge.clone())).max_decoding_message_size(SMALL_MESSAGE),
             );
-    arrive_in_time(routes, edge.stream_budget())
+    time_refusals(arrive_in_time(routes, edge.stream_budget()), edge.engine.metrics().clone())
 }

@@ -116,18 +116,15 @@ struct Input {
 /// The drives of a set in a data root.
 fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
     let mut drives = read_drives(&args.data, false)?;
-    let long_enough: Vec<bool> = drives.drives.iter().map(|drive| drive.states.len() > SEGMENT_STEPS).collect();
-    if let Some(short) = long_enough.iter().position(|long| !long).filter(|_| long_enough.contains(&true)) {
-        let count = long_enough.iter().filter(|long| !**long).count();
-        let (id, steps) = (&drives.drives[short].id, SEGMENT_STEPS);
+    let long_enough = |drive: &Trajectory| drive.states.len() > SEGMENT_STEPS;
+    let (all, short) = (drives.drives.len(), drives.drives.iter().find(|drive| !long_enough(drive)).map(|drive| drive.id.clone()));
+    if let Some(id) = short.filter(|_| drives.drives.iter().any(long_enough)) {
+        let driven = core::mem::take(&mut drives.drives).into_iter().zip(core::mem::take(&mut drives.maps));
+        (drives.drives, drives.maps) = driven.filter(|(drive, _)| long_enough(drive)).unzip();
+        let left_out = all - drives.drives.len();
         output::note!(
-            "note: left out as too short to judge, with fewer than {steps} steps: {count} of {} drives, the first is `{id}`",
-            long_enough.len()
+            "note: left out as too short to judge, with fewer than {SEGMENT_STEPS} steps: {left_out} of {all} drives, the first is `{id}`"
         );
-        let mut kept = long_enough.iter();
-        drives.drives.retain(|_| kept.next() == Some(&true));
-        let mut kept = long_enough.iter();
-        drives.maps.retain(|_| kept.next() == Some(&true));
     }
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);

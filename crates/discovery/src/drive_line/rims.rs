@@ -49,7 +49,7 @@ impl<'a> Rims<'a> {
         let alias = if limited { "wheel_speed_limit" } else { "torque_limit" };
         let family = family.into_iter().filter(|c| c.id() != alias).collect();
         let mut logs: Vec<Log<'a>> = drives.iter().map(log).collect();
-        let limited = limited_starts(&logs.iter().map(|log| log.rims_m_s.clone()).collect::<Vec<_>>());
+        let limited = limited_starts(&logs.iter().map(|log| &log.rims_m_s).collect::<Vec<_>>());
         for (log, _) in logs.iter_mut().zip(limited).filter(|(_, limited)| *limited) {
             log.rims_m_s.truncate(1);
             log.wheel_speed_rad_s = &log.wheel_speed_rad_s[..1];
