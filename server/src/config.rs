@@ -2,6 +2,7 @@
 
 mod cluster;
 mod diagnosis;
+mod ros2;
 mod store;
 mod tls;
 mod zenoh;
@@ -17,6 +18,7 @@ use serde::{Deserialize, Serialize};
 
 pub use self::cluster::ClusterConfig;
 pub use self::diagnosis::DiagnosisConfig;
+pub use self::ros2::{Distribution, Ros2Config, Ros2Vehicle};
 pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
 pub use self::zenoh::{ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint};
@@ -37,6 +39,8 @@ pub struct Config {
     pub http: HttpConfig,
     /// Zenoh.
     pub zenoh: ZenohConfig,
+    /// Machines that speak ROS 2 there.
+    pub ros2: Ros2Config,
     /// Threads that compute predictions.
     pub workers: WorkersConfig,
     /// What is accepted and held at most.
@@ -67,6 +71,8 @@ pub struct GrpcConfig {
     pub uploads_max: usize,
     /// Largest message with map tiles, bytes.
     pub tile_bytes_max: usize,
+    /// Connections at a time; more wait in the system until one ends.
+    pub connections_max: usize,
     /// Simultaneous requests of one connection; more wait.
     pub streams_per_connection_max: u32,
     /// Measurements of one stream that may wait for their answers; then the stream is read no further.
@@ -203,6 +209,7 @@ impl Default for GrpcConfig {
             upload_deadline_s: 120.0,
             uploads_max: 2,
             tile_bytes_max: 4 << 20,
+            connections_max: 4096,
             streams_per_connection_max: 256,
             measurements_in_flight_max: 256,
             keepalive_s: 20.0,
@@ -380,6 +387,8 @@ impl Config {
             ("store.interval_s", self.store.interval_s),
             ("diagnosis.limit_s", self.diagnosis.limit_s),
             ("zenoh.status_interval_s", self.zenoh.status_interval_s),
+            ("ros2.command_hold_s", self.ros2.command_hold_s),
+            ("ros2.diagnostics_interval_s", self.ros2.diagnostics_interval_s),
         ];
         for (key, value) in seconds {
             if !(value > 0.0 && value <= 1e6) {
@@ -394,6 +403,7 @@ impl Config {
             ("grpc.uploads_max", self.grpc.uploads_max),
             ("grpc.tile_bytes_max", self.grpc.tile_bytes_max),
             ("grpc.measurements_in_flight_max", self.grpc.measurements_in_flight_max),
+            ("grpc.connections_max", self.grpc.connections_max),
             ("grpc.streams_per_connection_max", self.grpc.streams_per_connection_max as usize),
             ("http.watchers_max", self.http.watchers_max),
             ("limits.sessions_max", self.limits.sessions_max),
@@ -426,6 +436,11 @@ impl Config {
         self.check_ports()?;
         self.tls.check()?;
         self.zenoh.check()?;
+        self.ros2.check()?;
+        if self.ros2.enabled && !self.zenoh.enabled {
+            let reason = "is on, but `zenoh.enabled` is off: machines of ROS 2 are heard over Zenoh".into();
+            return Err(ServerError::Value { key: "ros2.enabled", reason });
+        }
         self.cluster.check()?;
         self.diagnosis.check()?;
         if self.cluster.enabled() && self.store.enabled {

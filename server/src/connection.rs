@@ -11,6 +11,7 @@ use tokio::time::{Instant, Sleep};
 use tonic::transport::server::Connected;
 
 use crate::grpc::stopped;
+use crate::listener::Place;
 
 /// Bytes with which every client begins HTTP/2.
 const PREFACE_BYTES: usize = 24;
@@ -30,6 +31,8 @@ pub(crate) struct Closing {
 
 /// A connection over `io`.
 pub(crate) struct Connection<IO> {
+    /// Goes with it.
+    _place: Place,
     io: IO,
     /// Bytes of the preface that have not come yet.
     preface_left: usize,
@@ -44,12 +47,12 @@ pub(crate) struct Connection<IO> {
 
 impl<IO> Connection<IO> {
     /// A connection that has just been made.
-    pub fn new(io: IO, closing: &Closing) -> Self {
+    pub fn new(io: IO, place: Place, closing: &Closing) -> Self {
         let in_time = tokio::time::timeout(closing.begins_within, stopped(closing.stopping.clone()));
         let too_late = Box::pin(async move {
             let _ = in_time.await;
         });
-        Self { io, preface_left: PREFACE_BYTES, too_late, answered: None, reads_within: closing.reads_within, read_by: None }
+        Self { _place: place, io, preface_left: PREFACE_BYTES, too_late, answered: None, reads_within: closing.reads_within, read_by: None }
     }
 
     /// Notes what was written.
@@ -155,7 +158,8 @@ mod tests {
         let client = slow.connect(listener.local_addr().unwrap()).await.unwrap();
         let (socket, _) = listener.accept().await.unwrap();
         let (stop, stopping) = watch::channel(false);
-        (client, Connection::new(socket, &Closing { begins_within: PATIENCE, reads_within: PATIENCE, stopping }), stop)
+        let place = std::sync::Arc::new(tokio::sync::Semaphore::new(1)).try_acquire_owned().unwrap();
+        (client, Connection::new(socket, place, &Closing { begins_within: PATIENCE, reads_within: PATIENCE, stopping }), stop)
     }
 
     /// Goal: a slow client gets all of an answer although the server has closed the connection, and may send on meanwhile. Method: an answer of many times the

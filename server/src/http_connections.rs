@@ -16,12 +16,11 @@ use hyper_util::rt::{TokioExecutor, TokioIo, TokioTimer};
 use hyper_util::server::conn::auto;
 use hyper_util::service::TowerToHyperService;
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{Semaphore, watch};
+use tokio::sync::watch;
 use tokio::task::JoinSet;
-use tokio_stream::StreamExt as _;
 
 use crate::grpc::stopped;
-use crate::listener::Sockets;
+use crate::listener::PlacedSockets;
 
 /// After a stop, time for which the end of an answer may be on its way where no request is unanswered any more (chosen: several round trips).
 const LAST_WORDS: Duration = Duration::from_millis(500);
@@ -39,19 +38,13 @@ pub(crate) struct HttpLimits {
 pub(crate) async fn serve(listener: TcpListener, router: Router, limits: HttpLimits, stopping: watch::Receiver<bool>) {
     let unanswered = Unanswered::default();
     let router = unanswered.counts(router);
-    let places = Arc::new(Semaphore::new(limits.connections_max));
-    let mut sockets = Sockets::of(listener);
+    let mut sockets = PlacedSockets::of(listener, limits.connections_max);
     let mut connections = JoinSet::new();
-    let next = async |sockets: &mut Sockets| {
-        // First a place: what nobody can serve yet takes no file descriptor.
-        let place = Arc::clone(&places).acquire_owned().await.expect("nobody closes it; this is a bug");
-        Some((place, sockets.next().await?))
-    };
     let stop = stopped(stopping.clone());
     tokio::pin!(stop);
     loop {
         let taken = tokio::select! {
-            taken = next(&mut sockets) => taken,
+            taken = sockets.next() => taken,
             () = &mut stop => break,
         };
         let Some((place, socket)) = taken else { break };

@@ -32,8 +32,8 @@ mod zenoh;
 pub use clock::MonotonicClock;
 pub use cluster::etcd_endpoint;
 pub use config::{
-    ClusterConfig, Config, DiagnosisConfig, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig, StoreConfig, TlsConfig,
-    WorkersConfig, ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint,
+    ClusterConfig, Config, DiagnosisConfig, Distribution, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig,
+    Ros2Config, Ros2Vehicle, StoreConfig, TlsConfig, WorkersConfig, ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint,
 };
 pub use error::ServerError;
 pub use one_thread::{Sessions, serve_on_one_thread};

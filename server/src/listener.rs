@@ -7,7 +7,7 @@ use std::task::{Context, Poll, ready};
 use std::time::Duration;
 
 use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::{mpsc, watch};
+use tokio::sync::{OwnedSemaphorePermit, Semaphore, mpsc, watch};
 use tokio::time::Sleep;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::rustls::ServerConfig;
@@ -25,35 +25,34 @@ const WAITING: usize = 64;
 /// Pause after a connection could not be accepted, for want of file descriptors for instance.
 const PAUSE: Duration = Duration::from_millis(50);
 
-/// Connections without TLS.
-pub(crate) fn accept(listener: TcpListener, closing: Closing) -> impl Stream<Item = std::io::Result<Connection<TcpStream>>> {
-    Sockets::of(listener).map(move |socket| Ok(Connection::new(socket, &closing)))
+/// Connections of gRPC, `tls` says with which certificates; `places` of them at a time.
+pub(crate) struct Entrance {
+    pub listener: TcpListener,
+    pub places: usize,
+    pub closing: Closing,
 }
 
-/// Connections whose handshake has succeeded in the time that they have to begin; the others are closed and counted.
-pub(crate) fn accept_tls(
-    listener: TcpListener,
-    tls: watch::Receiver<Arc<ServerConfig>>,
-    refusals: Refusals,
-    closing: Closing,
-) -> ReceiverStream<std::io::Result<Connection<TlsStream<TcpStream>>>> {
-    let (sender, receiver) = mpsc::channel(WAITING);
-    tokio::spawn(async move {
-        let mut sockets = Sockets::of(listener);
-        let stop = stopped(closing.stopping.clone());
-        tokio::pin!(stop);
-        loop {
-            let socket = tokio::select! {
-                socket = sockets.next() => socket,
-                () = &mut stop => return,
-            };
-            let Some(socket) = socket else { return };
+impl Entrance {
+    /// Connections without TLS.
+    pub fn open(self) -> ReceiverStream<std::io::Result<Connection<TcpStream>>> {
+        self.admit(|socket, place, closing, sender| async move {
+            let _ = sender.send(Ok(Connection::new(socket, place, &closing))).await;
+        })
+    }
+
+    /// Connections whose handshake has succeeded in the time that they have to begin; the others are closed and counted.
+    pub fn with_tls(
+        self,
+        tls: watch::Receiver<Arc<ServerConfig>>,
+        refusals: Refusals,
+    ) -> ReceiverStream<std::io::Result<Connection<TlsStream<TcpStream>>>> {
+        self.admit(move |socket, place, closing, sender| {
             let acceptor = TlsAcceptor::from(tls.borrow().clone());
-            let (sender, refusals, closing) = (sender.clone(), refusals.clone(), closing.clone());
-            tokio::spawn(async move {
+            let refusals = refusals.clone();
+            async move {
                 let peer = socket.peer_addr().map(|address| address.to_string()).unwrap_or_default();
                 let reason = match tokio::time::timeout(closing.begins_within, acceptor.accept(socket)).await {
-                    Ok(Ok(connection)) => return drop(sender.send(Ok(Connection::new(connection, &closing))).await),
+                    Ok(Ok(connection)) => return drop(sender.send(Ok(Connection::new(connection, place, &closing))).await),
                     // A proxy that looks whether the port is open.
                     Ok(Err(error)) if error.kind() == ErrorKind::UnexpectedEof => return,
                     Ok(Err(error)) => error.to_string(),
@@ -61,14 +60,62 @@ pub(crate) fn accept_tls(
                 };
                 refusals.count(Refusal::Handshake);
                 tracing::info!(target: "nesam::audit", peer, reason, "refused: no handshake");
-            });
-        }
-    });
-    ReceiverStream::new(receiver)
+            }
+        })
+    }
+
+    /// Begins each connection beside the others, until the server stops.
+    fn admit<C, F>(
+        self,
+        begin: impl Fn(TcpStream, Place, Closing, mpsc::Sender<std::io::Result<C>>) -> F + Send + 'static,
+    ) -> ReceiverStream<std::io::Result<C>>
+    where
+        C: Send + 'static,
+        F: Future<Output = ()> + Send + 'static,
+    {
+        let (sender, receiver) = mpsc::channel(WAITING);
+        tokio::spawn(async move {
+            let stop = stopped(self.closing.stopping.clone());
+            let mut sockets = PlacedSockets::of(self.listener, self.places);
+            tokio::pin!(stop);
+            loop {
+                let admitted = tokio::select! {
+                    admitted = sockets.next() => admitted,
+                    () = &mut stop => return,
+                };
+                let Some((place, socket)) = admitted else { return };
+                tokio::spawn(begin(socket, place, self.closing.clone(), sender.clone()));
+            }
+        });
+        ReceiverStream::new(receiver)
+    }
+}
+
+/// One of the connections that may be open at a time.
+pub(crate) type Place = OwnedSemaphorePermit;
+
+/// The sockets of a listener, each with a place; while there is none they wait in the system.
+pub(crate) struct PlacedSockets {
+    sockets: Sockets,
+    places: Arc<Semaphore>,
+}
+
+impl PlacedSockets {
+    /// Of a listener, so many at a time.
+    pub fn of(listener: TcpListener, places: usize) -> Self {
+        Self { sockets: Sockets::of(listener), places: Arc::new(Semaphore::new(places)) }
+    }
+
+    /// The next one; `None` where none comes any more. Nothing is lost when it is not awaited to the end.
+    pub async fn next(&mut self) -> Option<(Place, TcpStream)> {
+        // First a place: what nobody can serve yet takes no file descriptor.
+        let place = Arc::clone(&self.places).acquire_owned().await.expect("nobody closes it; this is a bug");
+        Some((place, self.sockets.next().await?))
+    }
 }
 
 /// The sockets of a listener. Where none can be had, it is tried again after a pause, and said once.
-pub(crate) struct Sockets {
+struct Sockets {
     incoming: TcpIncoming,
     pause: Option<Pin<Box<Sleep>>>,
     is_failing: bool,
@@ -76,7 +123,7 @@ pub(crate) struct Sockets {
 
 impl Sockets {
     /// Of a listener.
-    pub fn of(listener: TcpListener) -> Self {
+    fn of(listener: TcpListener) -> Self {
         Self { incoming: TcpIncoming::from(listener).with_nodelay(Some(true)), pause: None, is_failing: false }
     }
 }

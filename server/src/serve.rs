@@ -28,12 +28,12 @@ use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, UntilStopped, stopped};
 use crate::http::{self, HttpState};
 use crate::http_connections::{self, HttpLimits};
-use crate::listener::{accept, accept_tls};
+use crate::listener::Entrance;
 use crate::recording::{Recorder, RecordingHeader};
 use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
 use crate::telemetry::Metrics;
 use crate::web::{Feed, Live, Raised};
-use crate::zenoh::{Presence, RenewedBus};
+use crate::zenoh::{BusConfig, Presence, RenewedBus};
 
 /// Events that a slow watcher may lag behind before it has to read anew.
 pub(crate) const EVENTS_KEPT: usize = 1024;
@@ -133,7 +133,8 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     };
     let bus = match config.zenoh.enabled {
         true => {
-            match RenewedBus::start(config.zenoh, config.fleet_soil, config.tls, edge.clone(), tls.as_ref().map(Credentials::tls)).await {
+            let network = BusConfig { zenoh: config.zenoh, ros2: config.ros2, fleet_soil: config.fleet_soil, tls: config.tls };
+            match RenewedBus::start(network, edge.clone(), tls.as_ref().map(Credentials::tls)).await {
                 Ok(bus) => Some(bus),
                 Err(error) => {
                     end_store(keeper, cluster).await;
@@ -354,13 +355,14 @@ fn spawn_grpc(
     health: &HealthReporter,
     closing: Closing,
 ) -> JoinHandle<()> {
-    let (router, stop) = (router(edge, health), stopped(closing.stopping.clone()));
+    let (router, stopping) = (router(edge, health), closing.stopping.clone());
+    let entrance = Entrance { listener, places: edge.config.connections_max, closing };
     let Some(credentials) = credentials else {
-        return tokio::spawn(ended(router.serve_with_incoming_shutdown(accept(listener, closing), stop)));
+        return tokio::spawn(ended(router.serve_with_incoming_shutdown(entrance.open(), stopped(stopping))));
     };
-    let connections = accept_tls(listener, credentials.tls(), edge.access.refusals.clone(), closing.clone());
-    tokio::spawn(credentials.follow(edge.engine.metrics().clone(), closing.stopping));
-    tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stop)))
+    let connections = entrance.with_tls(credentials.tls(), edge.access.refusals.clone());
+    tokio::spawn(credentials.follow(edge.engine.metrics().clone(), stopping.clone()));
+    tokio::spawn(ended(router.serve_with_incoming_shutdown(connections, stopped(stopping))))
 }
 
 pub(crate) async fn ended(serving: impl Future<Output = Result<(), tonic::transport::Error>>) {

@@ -8,11 +8,12 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
+from google.protobuf.internal.encoder import _VarintBytes
 
 import nesam
 from nesam import _calls as calls
 from nesam import _messages as messages
-from nesam.v1 import session_image_pb2, sharing_pb2, soil_pb2, types_pb2
+from nesam.v1 import effects_pb2, session_image_pb2, sharing_pb2, soil_pb2, terrain_pb2, types_pb2
 from serving import served
 
 CORPUS = Path(__file__).resolve().parents[1] / "hostile/corpus"
@@ -45,6 +46,16 @@ def requests():
     world = nesam.WorldMap("hills", np.zeros((9, 11), np.float32), 0.5, origin_m=(-2.0, -2.0), semantic_rgb=np.full((9, 11, 3), 90, np.uint8))
     parts = [part.SerializeToString() for part in calls.upload_map(world).request]
     keep("map_messages", "valid.bin", b"".join(len(part).to_bytes(2, "little") + part for part in parts))
+    # As a store keeps it: each message behind its length as a varint.
+    keep("stored_map", "valid.bin", b"".join(_VarintBytes(len(part)) + part for part in parts))
+    tile = terrain_pb2.MapTile(column=2, row=1, columns=3, rows=2, elevation_m=np.full(6, 0.25, "<f4").tobytes(), semantic_rgb=bytes(range(18)))
+    keep("map_tile", "valid.bin", tile.SerializeToString())
+    given = {"payload": {"mass_kg": 300.0, "x_m": -0.5, "y_m": 0.0, "z_m": 0.4}, "steering_delay": {"seconds": 0.2}}
+    effects = [
+        effects_pb2.Effect(id=name, parameters=[effects_pb2.EffectParameter(name=n, value=v) for n, v in values.items()]) for name, values in given.items()
+    ]
+    applied = effects_pb2.ApplyEffectsRequest(session_id="truck", source="by hand", effects=effects)
+    keep("apply_effects", "valid.bin", applied.SerializeToString())
     return state, world
 
 

@@ -9,9 +9,9 @@ use std::io::BufReader;
 use std::path::Path;
 
 use nesam_mcap::{ReadError, Reader, Record};
+use nesam_ros2::messages::{self, Command, CommandType, Odometry, imu_rates};
 
 use crate::bag_folder::parts;
-use crate::cdr::{Odometry, ackermann, imu, odometry, twist};
 use crate::error::ImportError;
 use crate::log::Log;
 use crate::part::Notes;
@@ -30,14 +30,13 @@ pub struct Topics {
     pub imu: Option<String>,
 }
 
-const ODOMETRY: &[&str] = &["nav_msgs/msg/Odometry"];
-const COMMANDS: &[&str] = &[
-    "geometry_msgs/msg/Twist",
-    "geometry_msgs/msg/TwistStamped",
-    "ackermann_msgs/msg/AckermannDrive",
-    "ackermann_msgs/msg/AckermannDriveStamped",
-];
-const IMU: &[&str] = &["sensor_msgs/msg/Imu"];
+/// Names of the types of a topic.
+const ODOMETRY: [&str; 1] = [messages::ODOMETRY.name];
+const COMMANDS: [&str; 4] = {
+    let [a, b, c, d] = CommandType::ALL;
+    [a.message().name, b.message().name, c.message().name, d.message().name]
+};
+const IMU: [&str; 1] = [messages::IMU.name];
 
 /// Messages of a bag: by topic the type, when each was recorded in ns, and its bytes.
 type Messages = BTreeMap<String, (String, Vec<(i64, Vec<u8>)>)>;
@@ -49,30 +48,29 @@ type Messages = BTreeMap<String, (String, Vec<(i64, Vec<u8>)>)>;
 pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportError> {
     let (messages, mut notes) = messages(path)?;
     let pick = |wanted: &Option<String>, types: &[&str], option: &str| choose(path, &messages, wanted.as_deref(), types, option);
-    let (_, odometries) = pick(&topics.odometry, ODOMETRY, "--odometry")?;
-    let (kind, commands) = pick(&topics.command, COMMANDS, "--command")?;
-    let gyro = topics.imu.as_ref().map(|_| pick(&topics.imu, IMU, "--imu")).transpose()?;
+    let (_, odometries) = pick(&topics.odometry, &ODOMETRY, "--odometry")?;
+    let (kind, commands) = pick(&topics.command, &COMMANDS, "--command")?;
+    let gyro = topics.imu.as_ref().map(|_| pick(&topics.imu, &IMU, "--imu")).transpose()?;
 
     let unreadable = |topic: &str, at: usize| ImportError::log(path, format!("{topic} message {at} is not readable as little-endian CDR"));
     let mut poses: Vec<Received<Odometry>> = Vec::new();
     for (at, (recorded_ns, bytes)) in odometries.iter().enumerate() {
-        let value = odometry(bytes).ok_or_else(|| unreadable("odometry", at))?;
+        let value = Odometry::read(bytes).ok_or_else(|| unreadable("odometry", at))?;
         poses.push(Received { recorded_ns: *recorded_ns, stamp_ns: Some(value.stamp_ns), value });
     }
     let foreign_clock = is_foreign(poses.iter().filter_map(|p| Some((p.recorded_ns, p.stamp_ns.filter(|ns| *ns != 0)?))));
     if foreign_clock {
         notes.push(of_another_clock("odometry"));
     }
-    let stamped = kind.ends_with("Stamped");
-    let read: fn(&[u8], bool) -> Option<(Option<i64>, [f64; 2])> = if kind.starts_with("ackermann") { ackermann } else { twist };
-    let mut told: Vec<Received<[f64; 2]>> = Vec::new();
+    let kind = CommandType::named(kind).expect("a type of COMMANDS; this is a bug");
+    let mut told: Vec<Received<Command>> = Vec::new();
     for (at, (recorded_ns, bytes)) in commands.iter().enumerate() {
-        let (stamp_ns, value) = read(bytes, stamped).ok_or_else(|| unreadable("command", at))?;
-        told.push(Received { recorded_ns: *recorded_ns, stamp_ns, value });
+        let value = kind.read(bytes).ok_or_else(|| unreadable("command", at))?;
+        told.push(Received { recorded_ns: *recorded_ns, stamp_ns: value.stamp_ns, value });
     }
     let mut turned: Vec<Received<[f64; 3]>> = Vec::new();
     for (at, (recorded_ns, bytes)) in gyro.iter().flat_map(|(_, messages)| messages.iter()).enumerate() {
-        let (stamp_ns, value) = imu(bytes).ok_or_else(|| unreadable("imu", at))?;
+        let (stamp_ns, value) = imu_rates(bytes).ok_or_else(|| unreadable("imu", at))?;
         turned.push(Received { recorded_ns: *recorded_ns, stamp_ns: Some(stamp_ns), value });
     }
     let told = by_instant("commands", told, foreign_clock, &mut notes);
@@ -118,7 +116,7 @@ fn log(
     path: &Path,
     times: &[i64],
     rows: &[(i64, Odometry)],
-    (kind, told): (&str, &[(i64, [f64; 2])]),
+    (kind, told): (CommandType, &[(i64, Command)]),
     turned: Option<&[(i64, [f64; 3])]>,
 ) -> Log {
     let first = times.iter().min().copied().unwrap_or(0);
@@ -127,24 +125,23 @@ fn log(
     // Nanoseconds since 1970 have more digits than a float.
     add("t", &|i| Some((times[i] - first) as f64 * 1e-9));
     for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
-        add(name, &|i| Some(rows[i].1.position[axis]));
+        add(name, &|i| Some(rows[i].1.position_m[axis]));
     }
     for (axis, name) in ["qx", "qy", "qz", "qw"].into_iter().enumerate() {
         add(name, &|i| Some(rows[i].1.orientation[axis]));
     }
     for (axis, name) in ["vbx", "vby", "vbz"].into_iter().enumerate() {
-        add(name, &|i| Some(rows[i].1.linear[axis]));
+        add(name, &|i| Some(rows[i].1.linear_m_s[axis]));
     }
     for (axis, name) in ["wx", "wy", "wz"].into_iter().enumerate() {
         add(name, &|i| match turned {
             Some(turned) => held(turned, times[i]).map(|rates| rates[axis]),
-            None => Some(rows[i].1.angular[axis]),
+            None => Some(rows[i].1.angular_rad_s[axis]),
         });
     }
-    let second = if kind.starts_with("ackermann") { "cmd_road_wheel_angle" } else { "cmd_yaw_rate" };
-    for (entry, name) in ["cmd_speed", second].into_iter().enumerate() {
-        add(name, &|i| held(told, times[i]).map(|command| command[entry]));
-    }
+    let second = if kind.is_steered() { "cmd_road_wheel_angle" } else { "cmd_yaw_rate" };
+    add("cmd_speed", &|i| held(told, times[i]).map(|command| command.speed_m_s));
+    add(second, &|i| held(told, times[i]).map(|command| command.turn));
     log
 }
 
@@ -190,7 +187,8 @@ fn add_messages(path: &Path, messages: &mut Messages) -> Result<Ending, ImportEr
             Ok(Some(Record::Message { channel_id, log_time_ns, data, .. })) => {
                 let held = channels.get(&channel_id).and_then(|topic| messages.get_mut(topic));
                 // What is not needed is not kept: bags hold images.
-                if let Some((_, kept)) = held.filter(|(name, _)| [ODOMETRY, COMMANDS, IMU].iter().any(|kind| kind.contains(&name.as_str())))
+                if let Some((_, kept)) =
+                    held.filter(|(name, _)| [&ODOMETRY[..], &COMMANDS, &IMU].iter().any(|kind| kind.contains(&name.as_str())))
                 {
                     kept.push((i64::try_from(log_time_ns).unwrap_or(i64::MAX), data));
                 }

@@ -10,7 +10,6 @@
 
 mod bag;
 mod bag_folder;
-mod cdr;
 mod error;
 mod frame;
 mod log;

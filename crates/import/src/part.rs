@@ -2,10 +2,11 @@
 
 use std::collections::HashMap;
 
+use nesam_physics::vec3::attitude_of_quaternion;
 use nesam_trajectories::{STEP_MAX_S, gap_limit_s};
 
 use crate::error::ImportError;
-use crate::frame::{FrameConvention, attitude_of};
+use crate::frame::FrameConvention;
 use crate::log::Log;
 use crate::mapping::Mapping;
 
@@ -137,7 +138,7 @@ fn pose(log: &Log, options: &Options, notes: &mut Notes) -> Result<Vec<Channel>,
     let position = [required(log, options, "x", "")?, required(log, options, "y", "")?, or_flat(number("z")?, "z")?];
     let quaternion = [number("qx")?, number("qy")?, number("qz")?, number("qw")?];
     let attitude = if let (None, [Some(x), Some(y), Some(z), Some(w)]) = (number("yaw")?, &quaternion) {
-        let of_row = |row: usize| attitude_of([x[row]?, y[row]?, z[row]?, w[row]?]);
+        let of_row = |row: usize| attitude_of_quaternion([x[row]?, y[row]?, z[row]?, w[row]?]);
         let rows: Vec<Option<[f64; 3]>> = (0..log.rows).map(of_row).collect();
         std::array::from_fn(|axis| rows.iter().map(|angles| angles.map(|a| a[axis])).collect())
     } else {

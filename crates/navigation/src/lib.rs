@@ -13,7 +13,7 @@ mod link;
 mod map_layers;
 mod mppi;
 mod oracle;
-mod plant_message;
+pub mod plant_message;
 mod plausibility;
 mod reference_path;
 mod remote;

@@ -6,7 +6,7 @@ use serde_json::Value;
 const BARE: [&str; 8] = ["-Infinity", "Infinity", "-NaN", "NaN", "-nan", "nan", "-inf", "inf"];
 
 /// A datagram as JSON, with null for numbers that are none; `None` where it is no JSON even so.
-pub(crate) fn read_json(datagram: &[u8]) -> Option<Value> {
+pub fn read_json(datagram: &[u8]) -> Option<Value> {
     let text = std::str::from_utf8(datagram).ok()?;
     serde_json::from_str(text).or_else(|_| serde_json::from_str(&with_nulls(text))).ok()
 }
@@ -30,7 +30,7 @@ fn with_nulls(text: &str) -> String {
 }
 
 /// Twelve numbers; a null is NaN, and so are all of a null in their place.
-pub(crate) fn twelve(value: &Value) -> Option<[f64; 12]> {
+pub fn twelve(value: &Value) -> Option<[f64; 12]> {
     let number = |v: &Value| if v.is_null() { Some(f64::NAN) } else { v.as_f64() };
     match value {
         Value::Null => Some([f64::NAN; 12]),

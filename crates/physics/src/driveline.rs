@@ -273,6 +273,20 @@ pub fn road_wheel_angles<T: Real<Value = f64>>(vehicle: &Vehicle, steering: T) -
     }
 }
 
+/// Second command at which the front wheels stand at this angle on average, rad, positive left: the inverse of [`road_wheel_angles`] up to the ends of
+/// the table and on with the slope there. `None` for a vehicle that is not steered.
+pub fn steering_command_of(vehicle: &Vehicle, road_wheel_angle_rad: f64) -> Option<f64> {
+    match (&vehicle.steering, vehicle.second) {
+        (Some(table), SecondCommand::SteeringNormalised) => {
+            let mean: Vec<f64> =
+                table.front_left_rad.iter().zip(&table.front_right_rad).map(|(left, right)| 0.5 * (left + right)).collect();
+            Some(interpolate(road_wheel_angle_rad, &mean, &table.command))
+        }
+        (_, SecondCommand::RoadWheelAngleRad) => Some(road_wheel_angle_rad),
+        _ => None,
+    }
+}
+
 /// What the command makes of the wheels over one step, from the mean actuator position of the step; constants in the scalar of the step.
 pub fn command_wheels<T: Real>(
     vehicle: &Vehicle,

@@ -35,6 +35,19 @@ pub fn normalise<T: Real>(a: Vec3<T>) -> Vec3<T> {
     scale(a, T::lit(1.0) / dot(a, a).sqrt())
 }
 
+/// Roll, pitch and yaw (R = Rz Ry Rx), rad, of a unit quaternion x, y, z, w; `None` where its length is far from one.
+pub fn attitude_of_quaternion([x, y, z, w]: [f64; 4]) -> Option<[f64; 3]> {
+    let length = (x * x + y * y + z * z + w * w).sqrt();
+    if !(0.5..2.0).contains(&length) {
+        return None;
+    }
+    let [x, y, z, w] = [x, y, z, w].map(|v| v / length);
+    let roll = (2.0 * (w * x + y * z)).atan2(1.0 - 2.0 * (x * x + y * y));
+    let pitch = (2.0 * (w * y - z * x)).clamp(-1.0, 1.0).asin();
+    let yaw = (2.0 * (w * z + x * y)).atan2(1.0 - 2.0 * (y * y + z * z));
+    Some([roll, pitch, yaw])
+}
+
 /// R_HB = Ry(pitch) Rx(roll): from Body to the heading frame H (World turned by yaw about z). Rows are the axes of H in Body.
 #[derive(Clone, Copy, Debug)]
 pub struct Tilt<T> {

@@ -5,8 +5,9 @@
 mod common;
 
 use common::{Drive, INPUTS, spread, unflatten};
+use nesam_physics::driveline::{road_wheel_angles, steering_command_of};
 use nesam_physics::step::{Ground, StepInput, StepModel};
-use nesam_physics::vec3::dot;
+use nesam_physics::vec3::{Tilt, attitude_of_quaternion, cross, dot};
 use nesam_physics::{DT_S, SecondCommand, Vehicle, VehicleState};
 use nesam_test_vehicles::{robot, truck};
 use proptest::collection::vec;
@@ -190,4 +191,47 @@ proptest! {
             }
         }
     }
+}
+
+#[test]
+fn property_the_steering_command_of_an_angle_makes_that_angle() {
+    let truck = truck();
+    for i in 0..=60 {
+        let command = -1.2 + 0.04 * f64::from(i);
+        let [left, right, ..] = road_wheel_angles(&truck, command);
+        let found = steering_command_of(&truck, 0.5 * (left + right)).expect("a steered vehicle");
+        assert!((found - command).abs() < 1e-12, "{command}: {found}");
+    }
+    assert_eq!(steering_command_of(&robot(), 0.1), None);
+}
+
+/// Goal: a quaternion and the angles of R = Rz Ry Rx are one rotation. Method: both turn the axes of Body; a negated quaternion is the same rotation.
+#[test]
+fn property_angles_of_quaternions_are_the_same_rotation() {
+    let mut runner = proptest::test_runner::TestRunner::new(seeded(200));
+    runner
+        .run(&[-1.0..1.0f64, -1.0..1.0, -1.0..1.0, -1.0..1.0], |quaternion| {
+            let length = quaternion.iter().map(|v| v * v).sum::<f64>().sqrt();
+            prop_assume!(length > 0.2);
+            let [x, y, z, w] = quaternion.map(|v| v / length);
+            let angles = attitude_of_quaternion([x, y, z, w]).expect("a rotation");
+            prop_assert_eq!(attitude_of_quaternion([-x, -y, -z, -w]), Some(angles));
+            let [roll, pitch, yaw] = angles;
+            let (sin, cos) = yaw.sin_cos();
+            for axis in [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]] {
+                let [ahead, left, up] = Tilt::new(roll, pitch).to_heading(axis);
+                // v + 2 w (q x v) + 2 q x (q x v).
+                let q = [x, y, z];
+                let turned = cross(q, axis);
+                let twice = cross(q, turned);
+                let expected: [f64; 3] = core::array::from_fn(|i| axis[i] + 2.0 * (w * turned[i] + twice[i]));
+                for (found, expected) in [cos * ahead - sin * left, sin * ahead + cos * left, up].into_iter().zip(expected) {
+                    prop_assert!((found - expected).abs() < 1e-9, "{:?}: {} {}", quaternion, found, expected);
+                }
+            }
+            Ok(())
+        })
+        .expect("holds");
+    assert_eq!(attitude_of_quaternion([0.0; 4]), None);
+    assert_eq!(attitude_of_quaternion([f64::NAN, 0.0, 0.0, 1.0]), None);
 }

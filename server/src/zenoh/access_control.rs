@@ -7,8 +7,12 @@ use std::path::Path;
 
 use serde_json::{Value, json};
 
+use nesam_ros2::messages::{DIAGNOSTIC_ARRAY, FLOAT64_MULTI_ARRAY, ODOMETRY};
+
 use super::keys;
+use super::ros2::DIAGNOSTICS;
 use crate::access::{FleetFile, Identity};
+use crate::config::{Ros2Config, Ros2Vehicle};
 
 /// Topics of a vehicle that servers publish.
 const TOLD: [&str; 3] = ["status", "soil", "alarm"];
@@ -68,15 +72,25 @@ impl Member<'_> {
 }
 
 /// The `access_control` of whatever the members of a fleet connect to.
-pub fn access_control(members: &FleetFile, fleet: &str) -> Value {
+pub fn access_control(members: &FleetFile, fleet: &str, ros2: &Ros2Config) -> Value {
     let mut all = Policies::default();
     for identity in members.members() {
         let mut member = Member { all: &mut all, name: identity.uri(), rules: Vec::new() };
         match &identity {
-            Identity::Vehicle(name) => vehicle(&mut member, fleet, name),
+            Identity::Vehicle(name) => {
+                vehicle(&mut member, fleet, name);
+                if let Some(machine) = ros2.machine(name) {
+                    machine_of_ros2(&mut member, ros2, machine);
+                }
+            }
             Identity::Planner(name) => planner(&mut member, fleet, &members.vehicles_of_planner(name).collect::<Vec<_>>()),
             Identity::Operator(_) => operator(&mut member, fleet),
-            Identity::Server(name) => server(&mut member, fleet, name),
+            Identity::Server(name) => {
+                server(&mut member, fleet, name);
+                if ros2.enabled {
+                    node_of_ros2(&mut member, ros2);
+                }
+            }
             // Zenoh's routers know whom they talk to.
             Identity::Proxy(_) => continue,
         }
@@ -140,6 +154,40 @@ fn shares_soil(member: &mut Member<'_>, fleet: &str, name: &str) {
     member.allow(&["ingress", "egress"], &["query"], all);
 }
 
+/// Keys of what a machine of ROS 2 says, whatever its distribution.
+fn said_by(ros2: &Ros2Config, machine: &Ros2Vehicle) -> Vec<String> {
+    let domain = ros2.domain();
+    let command = machine.kind().ok().map(|kind| domain.key_of_any_version(&machine.command_topic(), kind.message()));
+    [domain.key_of_any_version(&machine.odometry_topic(), ODOMETRY)].into_iter().chain(command).collect()
+}
+
+/// Keys of what such a machine is told.
+fn told_to(ros2: &Ros2Config, machine: &Ros2Vehicle) -> Vec<String> {
+    vec![ros2.domain().key(&machine.soil_topic(), FLOAT64_MULTI_ARRAY), ros2.domain().key(DIAGNOSTICS, DIAGNOSTIC_ARRAY)]
+}
+
+/// A vehicle that speaks ROS 2: its own topics. The graph of its domain is open to it, as tokens do not tell whose they are.
+fn machine_of_ros2(member: &mut Member<'_>, ros2: &Ros2Config, machine: &Ros2Vehicle) {
+    member.allow(&["ingress"], &["put"], said_by(ros2, machine));
+    member.allow(&["egress"], &["declare_subscriber"], said_by(ros2, machine));
+    member.hears(told_to(ros2, machine));
+    sees_the_graph(member, ros2);
+}
+
+/// A server in the graph of ROS 2: the topics of all machines.
+fn node_of_ros2(member: &mut Member<'_>, ros2: &Ros2Config) {
+    member.hears(ros2.vehicles.iter().flat_map(|machine| said_by(ros2, machine)).collect());
+    let told: Vec<String> = ros2.vehicles.iter().flat_map(|machine| told_to(ros2, machine)).collect();
+    member.allow(&["ingress"], &["put"], told.clone());
+    member.allow(&["egress"], &["declare_subscriber"], told);
+    sees_the_graph(member, ros2);
+}
+
+fn sees_the_graph(member: &mut Member<'_>, ros2: &Ros2Config) {
+    member.allow(&["ingress"], &["liveliness_token"], vec![ros2.domain().tokens()]);
+    member.watches(vec![ros2.domain().tokens()]);
+}
+
 /// What everybody may hear of servers. Their `status` names all sessions and vehicles and is for operators.
 fn of_servers(fleet: &str) -> [String; 2] {
     [keys::of_fleet(fleet, "soil_map"), keys::of_server(fleet, "*", "about")]
@@ -170,13 +218,13 @@ pub(super) fn link(files: LinkFiles<'_>) -> Value {
 }
 
 /// The configuration of a Zenoh router that lets each member of a fleet use its own keys and nobody else anything.
-pub fn router_config(members: &FleetFile, fleet: &str, listen: &[String], files: LinkFiles<'_>) -> Value {
+pub fn router_config(members: &FleetFile, fleet: &str, ros2: &Ros2Config, listen: &[String], files: LinkFiles<'_>) -> Value {
     json!({
         "mode": "router",
         "listen": { "endpoints": listen },
         "scouting": { "multicast": { "enabled": false } },
         "transport": { "link": { "protocols": ["tls"], "tls": link(files) } },
-        "access_control": access_control(members, fleet),
+        "access_control": access_control(members, fleet, ros2),
     })
 }
 
@@ -190,7 +238,7 @@ mod tests {
     #[test]
     fn property_nobody_but_operators_and_servers_has_keys_of_all_vehicles() {
         let text = "operators = [\"c\"]\nservers = [\"s\"]\n[vehicles.a]\n[vehicles.b]\n[planners.p]\nvehicles = [\"a\"]\n[planners.idle]";
-        let rules = access_control(&FleetFile::parse(text).unwrap(), "f");
+        let rules = access_control(&FleetFile::parse(text).unwrap(), "f", &Ros2Config::default());
         assert_eq!(rules["subjects"].as_array().unwrap().len(), 6);
         for rule in rules["rules"].as_array().unwrap() {
             let who = rule["id"].as_str().unwrap();
@@ -212,5 +260,33 @@ mod tests {
                 assert!(!of_status || who.contains(":server:"), "{who}: {key}");
             }
         }
+    }
+
+    #[test]
+    fn property_a_machine_of_ros2_says_nothing_on_topics_of_another() {
+        let members = FleetFile::parse("servers = [\"s\"]\n[vehicles.a]\n[vehicles.b]\n[vehicles.c]").unwrap();
+        let machine = |vehicle: &str| Ros2Vehicle { vehicle: vehicle.into(), ..Ros2Vehicle::default() };
+        let mut ros2 = Ros2Config { enabled: true, vehicles: vec![machine("a"), machine("b")], ..Ros2Config::default() };
+        let rules = access_control(&members, "f", &ros2);
+        let mut said = [0, 0, 0];
+        for rule in rules["rules"].as_array().unwrap() {
+            let who = rule["id"].as_str().unwrap();
+            let has = |list: &str, value: &str| rule[list].as_array().unwrap().iter().any(|held| held == value);
+            for key in rule["key_exprs"].as_array().unwrap().iter().map(|key| key.as_str().unwrap()) {
+                if key.starts_with("nesam/") {
+                    continue;
+                }
+                for (i, name) in ["a", "b", "c"].into_iter().enumerate().filter(|(_, name)| who.contains(&format!("vehicle:{name} "))) {
+                    let own = key.starts_with(&format!("0/{name}/")) || key.starts_with("@ros2_lv/0/") || key.starts_with("0/diagnostics/");
+                    assert!(own && name != "c", "{who}: {key}");
+                    let speaks = has("flows", "ingress") && has("messages", "put");
+                    said[i] += usize::from(speaks);
+                    assert!(!speaks || key.contains("/odom/") || key.contains("/cmd_vel/"), "{who}: {key}");
+                }
+            }
+        }
+        assert_eq!(said, [2, 2, 0]);
+        ros2.enabled = false;
+        assert_eq!(access_control(&members, "f", &ros2), access_control(&members, "f", &Ros2Config::default()));
     }
 }

@@ -1,11 +1,13 @@
 //! The Zenoh side: the same messages, the same conversions, the same engine.
 
 mod access_control;
+mod arrival;
 mod keys;
 mod measurements;
 mod predict;
 mod presence;
 mod renewal;
+mod ros2;
 mod sharing;
 mod soil;
 
@@ -19,7 +21,7 @@ use nesam_engine::EngineError;
 use tokio::sync::mpsc;
 
 use crate::access::FleetFile;
-use crate::config::{FleetSoilConfig, TlsConfig, ZenohConfig, ZenohMode};
+use crate::config::{FleetSoilConfig, Ros2Config, TlsConfig, ZenohConfig, ZenohMode};
 use crate::error::ServerError;
 use crate::grpc::Edge;
 
@@ -30,6 +32,18 @@ const MEASUREMENT_BYTES_MAX: usize = 64 << 10;
 /// Answers that may wait to be published; more are dropped, as the vehicle resends what it got no answer to.
 const ANSWERS_WAITING_MAX: usize = 4096;
 
+/// What the configuration says of the network.
+pub(crate) struct BusConfig {
+    /// Role, endpoints and keys.
+    pub zenoh: ZenohConfig,
+    /// Machines of ROS 2.
+    pub ros2: Ros2Config,
+    /// Whether servers share their soil maps.
+    pub fleet_soil: FleetSoilConfig,
+    /// Certificates.
+    pub tls: TlsConfig,
+}
+
 /// A running Zenoh side.
 struct Bus {
     session: ::zenoh::Session,
@@ -37,6 +51,8 @@ struct Bus {
     soil: tokio::task::JoinHandle<()>,
     sharing: Option<tokio::task::JoinHandle<()>>,
     status: tokio::task::JoinHandle<()>,
+    /// Machines of ROS 2, where there may be some.
+    graph: Option<ros2::Graph>,
     /// Tells the network that this server is there; goes with it.
     _token: ::zenoh::liveliness::LivelinessToken,
 }
@@ -46,12 +62,14 @@ type Outgoing = (String, Vec<u8>);
 
 impl Bus {
     /// Joins the network and declares subscriber, publisher, queryable and liveliness token.
-    pub async fn start(config: &ZenohConfig, fleet_soil: &FleetSoilConfig, tls: &TlsConfig, edge: &Edge) -> Result<Self, ServerError> {
+    pub async fn start(all: &BusConfig, edge: &Edge) -> Result<Self, ServerError> {
+        let BusConfig { zenoh: config, ros2, fleet_soil, .. } = all;
         if tokio::runtime::Handle::current().runtime_flavor() == tokio::runtime::RuntimeFlavor::CurrentThread {
             return Err(ServerError::Runtime);
         }
         let failed = |error: ::zenoh::Error| ServerError::Zenoh { reason: error.to_string() };
-        let session = ::zenoh::open(zenoh_config(config, tls, edge.access.rights().as_deref()).map_err(failed)?).await.map_err(failed)?;
+        ros2.check_for(&edge.predictor.bundle().vehicle)?;
+        let session = ::zenoh::open(zenoh_config(all, edge.access.rights().as_deref()).map_err(failed)?).await.map_err(failed)?;
         let (sender, receiver) = mpsc::channel(ANSWERS_WAITING_MAX);
         let name = if config.name.is_empty() { session.zid().to_string() } else { config.name.clone() };
         let shares = fleet_soil.enabled && fleet_soil.exchange_s > 0.0;
@@ -68,6 +86,10 @@ impl Bus {
         predict::declare(&session, &config.fleet, edge.clone()).await.map_err(failed)?;
         let presence = edge.presence.clone().unwrap_or_default();
         let token = presence::declare(&session, &config.fleet, &name, presence.clone()).await.map_err(failed)?;
+        let graph = match ros2.enabled {
+            true => Some(ros2::join(&session, ros2, edge).await.map_err(failed)?),
+            false => None,
+        };
         // Tasks begin when nothing can fail any more: one that holds the session would keep it, and its port, open.
         let soil = tokio::spawn(soil::publish_changes(events, config.fleet.clone(), sharing, sender.clone()));
         let sharing = asking.map(tokio::spawn);
@@ -75,11 +97,12 @@ impl Bus {
         let status = tokio::spawn(presence::publish_status(edge.clone(), presence, config.fleet.clone(), name, interval, sender));
         let publisher = tokio::spawn(publish(session.clone(), receiver));
         tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
-        Ok(Self { session, publisher, soil, sharing, status, _token: token })
+        Ok(Self { session, publisher, soil, sharing, status, graph, _token: token })
     }
 
     /// Leaves the network.
     pub async fn stop(self) {
+        drop(self.graph);
         if let Err(error) = self.session.close().await {
             tracing::warn!(%error, "zenoh did not close cleanly");
         }
@@ -91,7 +114,8 @@ impl Bus {
 }
 
 /// The configuration of the session. Whoever connects to this server over TLS gets the keys that the fleet file says.
-fn zenoh_config(config: &ZenohConfig, tls: &TlsConfig, members: Option<&FleetFile>) -> Result<::zenoh::Config, ::zenoh::Error> {
+fn zenoh_config(all: &BusConfig, members: Option<&FleetFile>) -> Result<::zenoh::Config, ::zenoh::Error> {
+    let BusConfig { zenoh: config, ros2, tls, .. } = all;
     let mode = match config.mode {
         ZenohMode::Peer => "peer",
         ZenohMode::Client => "client",
@@ -110,7 +134,7 @@ fn zenoh_config(config: &ZenohConfig, tls: &TlsConfig, members: Option<&FleetFil
         zenoh.insert_json5("transport/link/tls", &access_control::link(files).to_string())?;
     }
     if let Some(members) = members.filter(|_| config.listens_with_tls()) {
-        zenoh.insert_json5("access_control", &access_control::access_control(members, &config.fleet).to_string())?;
+        zenoh.insert_json5("access_control", &access_control::access_control(members, &config.fleet, ros2).to_string())?;
     }
     Ok(zenoh)
 }

@@ -7,8 +7,7 @@ use tokio::sync::{oneshot, watch};
 use tokio::task::JoinHandle;
 use tokio_rustls::rustls::ServerConfig;
 
-use super::{Bus, Presence};
-use crate::config::{FleetSoilConfig, TlsConfig, ZenohConfig};
+use super::{Bus, BusConfig, Presence};
 use crate::error::ServerError;
 use crate::grpc::Edge;
 
@@ -23,9 +22,7 @@ pub(crate) struct RenewedBus {
 
 /// What it takes to join.
 struct Joining {
-    config: ZenohConfig,
-    fleet_soil: FleetSoilConfig,
-    tls: TlsConfig,
+    config: BusConfig,
     edge: Edge,
 }
 
@@ -34,17 +31,11 @@ impl RenewedBus {
     ///
     /// # Errors
     /// `ServerError` when it cannot be joined the first time.
-    pub async fn start(
-        config: ZenohConfig,
-        fleet_soil: FleetSoilConfig,
-        tls: TlsConfig,
-        edge: Edge,
-        changes: Option<watch::Receiver<Arc<ServerConfig>>>,
-    ) -> Result<Self, ServerError> {
-        let bus = Bus::start(&config, &fleet_soil, &tls, &edge).await?;
-        let changes = changes.filter(|_| config.uses_tls());
+    pub async fn start(config: BusConfig, edge: Edge, changes: Option<watch::Receiver<Arc<ServerConfig>>>) -> Result<Self, ServerError> {
+        let bus = Bus::start(&config, &edge).await?;
+        let changes = changes.filter(|_| config.zenoh.uses_tls());
         let (stop, stopped) = oneshot::channel();
-        let task = tokio::spawn(Joining { config, fleet_soil, tls, edge }.renew(bus, changes, stopped));
+        let task = tokio::spawn(Joining { config, edge }.renew(bus, changes, stopped));
         Ok(Self { stop, task })
     }
 
@@ -71,7 +62,7 @@ impl Joining {
                 bus.stop().await;
                 self.edge.presence.iter().for_each(Presence::forget);
             }
-            match Bus::start(&self.config, &self.fleet_soil, &self.tls, &self.edge).await {
+            match Bus::start(&self.config, &self.edge).await {
                 Ok(bus) => {
                     tracing::info!(target: "nesam::audit", "zenoh joined anew with changed certificates or rights");
                     joined = Some(bus);

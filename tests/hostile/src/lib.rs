@@ -8,17 +8,24 @@
 
 use std::cell::RefCell;
 use std::path::Path;
+use std::sync::OnceLock;
 
+use nesam_adaptation::CalibratedFilter;
 use nesam_degradation::Degradation;
-use nesam_engine::{Command, Engine, Limits, Measurement, OpenSession, Reply, SessionImage, WheelMeasurement};
+use nesam_discovery::{DRIVES_MIN, Reference};
+use nesam_engine::{AppliedEffects, Command, Engine, Limits, Measurement, OpenSession, Reply, SessionImage, WheelMeasurement};
+use nesam_evaluation::Baselines;
 use nesam_import::{Mapping, Options, Topics, drives, read_bag, read_csv};
-use nesam_model::{ModelBundle, Predictor, Weights, effects_from_toml};
+use nesam_model::{ModelBundle, Normalization, Predictor, RolloutNoise, Weights, effects_from_toml};
+use nesam_navigation::plant_message::{read_json, twelve};
 use nesam_physics::{Control, VehicleState};
 use nesam_proto::{Message, v1 as pb};
-use nesam_server::access::FleetFile;
+use nesam_ros2::messages::{CommandType, Odometry, imu_rates};
+use nesam_server::access::{FleetFile, Identity};
 use nesam_server::recording::Recording;
+use nesam_server::store::map_of;
 use nesam_server::{Config, convert};
-use nesam_terrain::WorldMap;
+use nesam_terrain::{GridGeometry, WorldMap};
 use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, read_vehicle_card};
 use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
@@ -27,16 +34,24 @@ use tempfile::TempDir;
 pub type Reader = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const READERS: [Reader; 23] = [
+pub const READERS: [Reader; 37] = [
     ("bag", bag),
+    ("bag_metadata", bag_metadata),
+    ("ros2_message", ros2_message),
     ("csv_log", csv_log),
     ("mapping", mapping),
     ("degradation", degradation),
     ("effects", effects),
     ("weights", weights),
     ("manifest", manifest),
+    ("normalization", normalization),
+    ("soil_filter", soil_filter),
+    ("rollout_noise", rollout_noise),
+    ("baselines", baselines),
+    ("reference", reference),
     ("world_json", world_json),
     ("elevation_png", elevation_png),
+    ("semantic_png", semantic_png),
     ("vehicle_card", vehicle_card),
     ("index_json", index_json),
     ("index_parquet", index_parquet),
@@ -48,8 +63,14 @@ pub const READERS: [Reader; 23] = [
     ("session_content", session_content),
     ("fleet_soil_shares", fleet_soil_shares),
     ("map_messages", map_messages),
+    ("map_tile", map_tile),
+    ("stored_map", stored_map),
+    ("apply_effects", apply_effects),
+    ("plant_datagram", plant_datagram),
     ("recording", recording),
     ("fleet_file", fleet_file),
+    ("identity", identity),
+    ("certificate", certificate),
     ("configuration", configuration),
 ];
 
@@ -59,7 +80,8 @@ thread_local! {
 }
 
 /// Valid files, from below this folder, and where a reader looks for them.
-const AROUND: [(&str, &str); 11] = [
+const AROUND: [(&str, &str); 12] = [
+    ("corpus/bag/valid.mcap", "bag/valid.mcap"),
     ("corpus/vehicle_card/hmmwv.json", "vehicle.json"),
     ("corpus/index_json/valid.json", "run/index.json"),
     ("corpus/samples_parquet/valid.parquet", "run/samples.parquet"),
@@ -112,6 +134,15 @@ fn bag(bytes: &[u8]) {
     });
 }
 
+fn bag_metadata(bytes: &[u8]) {
+    instead("bag/metadata.yaml", bytes, |folder| drop(read_bag(&folder.join("bag"), &Topics::default())));
+}
+
+/// A message of each type that is read.
+fn ros2_message(bytes: &[u8]) {
+    let _ = (Odometry::read(bytes), imu_rates(bytes), CommandType::ALL.map(|kind| kind.read(bytes)));
+}
+
 fn csv_log(bytes: &[u8]) {
     instead("log.csv", bytes, |folder| {
         if let Ok(log) = read_csv(&folder.join("log.csv")) {
@@ -144,12 +175,51 @@ fn manifest(bytes: &[u8]) {
     instead("bundle/manifest.toml", bytes, |folder| drop(ModelBundle::load(&folder.join("bundle"))));
 }
 
+fn normalization(bytes: &[u8]) {
+    let read = text(bytes).and_then(|text| toml::from_str::<Normalization>(text).ok());
+    drop(read.map(|normalization| normalization.check()));
+}
+
+fn soil_filter(bytes: &[u8]) {
+    drop(text(bytes).map(|text| CalibratedFilter::config_of(Some(text))));
+}
+
+fn rollout_noise(bytes: &[u8]) {
+    drop(text(bytes).map(RolloutNoise::from_json));
+}
+
+fn baselines(bytes: &[u8]) {
+    drop(text(bytes).map(Baselines::from_json));
+}
+
+/// The shipped reference with eight of its drives, in which the bytes behind the first two stand where those say: in parts of 65 536 of its length.
+fn reference(bytes: &[u8]) {
+    static SHIPPED: OnceLock<String> = OnceLock::new();
+    let shipped = SHIPPED.get_or_init(|| {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal/reference.json");
+        let text = std::fs::read_to_string(path).expect("the reference is part of the repository");
+        let mut whole: serde_json::Value = serde_json::from_str(&text).expect("it is JSON");
+        whole["drives"].as_array_mut().expect("it has drives").truncate(DRIVES_MIN);
+        whole.to_string()
+    });
+    let Some((place, other)) = bytes.split_first_chunk::<2>() else { return };
+    let begin = usize::from(u16::from_le_bytes(*place)) * shipped.len() >> 16;
+    let end = (begin + other.len()).min(shipped.len());
+    let mut changed = shipped.clone().into_bytes();
+    changed.splice(begin..end, other.iter().copied());
+    drop(text(&changed).map(Reference::from_json));
+}
+
 fn world_json(bytes: &[u8]) {
     instead("worlds/w01/world.json", bytes, |folder| drop(WorldMap::load(&folder.join("worlds/w01"))));
 }
 
 fn elevation_png(bytes: &[u8]) {
     instead("worlds/w01/elevation.png", bytes, |folder| drop(WorldMap::load(&folder.join("worlds/w01"))));
+}
+
+fn semantic_png(bytes: &[u8]) {
+    instead("worlds/w01/semantic.png", bytes, |folder| drop(WorldMap::load(&folder.join("worlds/w01"))));
 }
 
 fn vehicle_card(bytes: &[u8]) {
@@ -273,6 +343,35 @@ fn map_messages(mut bytes: &[u8]) {
     drop(builder.map(convert::MapBuilder::finish));
 }
 
+/// A tile that replaces a part of a map of 11 x 9 cells.
+fn map_tile(bytes: &[u8]) {
+    static MAP: OnceLock<WorldMap> = OnceLock::new();
+    let map = MAP.get_or_init(|| {
+        let geometry = GridGeometry { origin_m: [-2.0, -2.0], resolution_m: 0.5, width: 11, height: 9 };
+        WorldMap::from_layers("hills", 1, geometry, vec![0.0; 99], Some(vec![[90, 90, 90]; 99])).expect("a sound map")
+    });
+    drop(message::<pb::MapTile>(bytes).map(|message| convert::patched(map, &message)));
+}
+
+fn stored_map(bytes: &[u8]) {
+    drop(map_of(bytes, &Limits { map_cells_max: 1 << 20, ..Limits::default() }));
+}
+
+/// Effects on a session, which predicts with what was taken.
+fn apply_effects(bytes: &[u8]) {
+    let Some(message) = message::<pb::ApplyEffectsRequest>(bytes) else { return };
+    in_engine(|engine, _| {
+        let set = |effects| Command::SetEffects { session: "own".into(), effects };
+        if engine.execute(0, &set(convert::applied_effects(&message.source, &message.effects))).is_ok() {
+            engine.execute(0, &set(AppliedEffects::default())).expect("effects are taken away");
+        }
+    });
+}
+
+fn plant_datagram(bytes: &[u8]) {
+    let _ = read_json(bytes).map(|value| twelve(&value["state"]));
+}
+
 fn recording(bytes: &[u8]) {
     instead("run.mcap", bytes, |folder| {
         if let Ok(mut recording) = Recording::open(&[folder.join("run.mcap")]) {
@@ -285,6 +384,15 @@ fn recording(bytes: &[u8]) {
 
 fn fleet_file(bytes: &[u8]) {
     drop(text(bytes).map(FleetFile::parse));
+}
+
+fn identity(bytes: &[u8]) {
+    drop(text(bytes).map(Identity::parse));
+}
+
+/// The names in a certificate, DER.
+fn certificate(bytes: &[u8]) {
+    drop(Identity::of_certificate(&bytes.into()));
 }
 
 fn configuration(bytes: &[u8]) {

@@ -24,6 +24,8 @@ mod reload;
 mod reorder;
 mod replay;
 mod resets;
+mod ros2;
+mod ros2_rights;
 mod routing;
 mod security;
 mod session_model;

@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use h2::client::SendRequest;
-use nesam_client::outcome_label;
+use nesam_client::{Client, outcome_label};
 use prost::bytes::Bytes;
 
 use crate::stage::*;
@@ -42,6 +42,30 @@ async fn service_rapid_resets_harm_nobody_else() {
     }
     assert!(slowest < Duration::from_secs(5), "{slowest:?}");
     assert_eq!(client.session("truck").await.unwrap().history_steps, answered as u32);
+    server.shutdown().await;
+}
+
+/// Goal: connections take no more than their places, and whoever waits for one is served when one ends. Method: two places, three clients.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_a_connection_waits_for_a_place() {
+    let (server, mut first) = start_with(|config| config.grpc.connections_max = 2).await;
+    let address = format!("http://{}", server.grpc_addr);
+    let connect = || Client::connect(&address);
+    let mut second = connect().await.unwrap();
+    for client in [&mut first, &mut second] {
+        assert!(client.list_sessions().await.unwrap().is_empty());
+    }
+    let waiting = connect();
+    tokio::pin!(waiting);
+    let asked = async {
+        let mut third = waiting.await.unwrap();
+        third.list_sessions().await.unwrap()
+    };
+    tokio::pin!(asked);
+    assert!(tokio::time::timeout(Duration::from_secs(1), &mut asked).await.is_err(), "three at two places");
+    assert!(first.list_sessions().await.is_ok() && second.list_sessions().await.is_ok(), "those who have one are served");
+    drop(first);
+    assert!(tokio::time::timeout(Duration::from_secs(10), asked).await.expect("a place is free").is_empty());
     server.shutdown().await;
 }
 

@@ -7,7 +7,7 @@ use std::time::Duration;
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{Client, Tls, outcome_label, v1};
 use nesam_server::access::FleetFile;
-use nesam_server::{LinkFiles, RunningServer, ZenohMode, router_config};
+use nesam_server::{LinkFiles, Ros2Config, RunningServer, ZenohMode, router_config};
 use prost::Message as _;
 
 use crate::authority::{Authority, FLEET, Stage, dns, secured_with, uri, written};
@@ -18,9 +18,9 @@ use crate::zenoh_presence::until_alive;
 type Subscriber = zenoh::pubsub::Subscriber<zenoh::handlers::FifoChannelHandler<zenoh::sample::Sample>>;
 
 /// Time in which something that is allowed would long have happened.
-const SILENCE: Duration = Duration::from_millis(1500);
+pub const SILENCE: Duration = Duration::from_millis(1500);
 
-fn free_endpoint() -> String {
+pub fn free_endpoint() -> String {
     let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
     format!("tls/localhost:{port}")
 }
@@ -98,7 +98,13 @@ async fn service_a_router_with_the_written_configuration_guards_the_fleet() {
     let ca = write("ca.pem", authority.pem.as_bytes());
     let members = FleetFile::parse(FLEET).unwrap();
     let listen = [endpoint.clone()];
-    let config = router_config(&members, "test", &listen, LinkFiles { certificate: &certificate, key: &key, authority: &ca });
+    let config = router_config(
+        &members,
+        "test",
+        &Ros2Config::default(),
+        &listen,
+        LinkFiles { certificate: &certificate, key: &key, authority: &ca },
+    );
     let router = zenoh::open(zenoh::Config::from_json5(&config.to_string()).unwrap()).await.unwrap();
 
     let server = async |authority: &Authority, name: &str| {
@@ -182,7 +188,7 @@ fn some_evidence() -> v1::SharedSoilCell {
 }
 
 /// Configuration of a Zenoh client with a certificate.
-fn joining(endpoint: &str, certificate: &Path, key: &Path, authority: &Path) -> String {
+pub fn joining(endpoint: &str, certificate: &Path, key: &Path, authority: &Path) -> String {
     serde_json::json!({
         "mode": "client",
         "connect": { "endpoints": [endpoint] },

@@ -18,6 +18,7 @@ pub fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
     let doubts = doubts(config)?;
     say!("bundle {} {}", bundle.name, bundle.hash);
     let predictor = rounded(Arc::new(Predictor::new(Arc::new(bundle)).or_input()?), config.workers.bf16, "workers.bf16")?;
+    config.ros2.check_for(&predictor.bundle().vehicle).or_input()?;
     say!("path   {}", predictor.path().as_str());
     say!(
         "grpc   {}, {}",
@@ -30,6 +31,9 @@ pub fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
     );
     say!("http   {}", http(config));
     zenoh(config).iter().for_each(|endpoint| say!("zenoh  {endpoint}"));
+    for machine in config.ros2.vehicles.iter().filter(|_| config.ros2.enabled) {
+        say!("ros2   {}: {}, {} ({})", machine.vehicle, machine.odometry_topic(), machine.command_topic(), machine.command_type);
+    }
     say!("store  {}", kept(config));
     fleet_soil(config).iter().for_each(|soil| say!("soil   {soil}"));
     doubts.iter().for_each(|doubt| say!("doubt  {doubt}"));
