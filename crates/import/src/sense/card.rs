@@ -1,0 +1,30 @@
+//! Whether a vehicle card makes sense.
+
+use nesam_physics::Vehicle;
+
+use super::{Doubt, doubt};
+
+/// What does not fit together in a card.
+pub fn card_doubts(vehicle: &Vehicle) -> Vec<Doubt> {
+    let mut found = Vec::new();
+    let [fl, fr, rl, rr] = vehicle.wheel_centre_m;
+    if fl[1] <= fr[1] || rl[1] <= rr[1] {
+        found
+            .push(doubt("the left wheels lie right of the right ones".into(), "y points to the left, and wheels are named FL, FR, RL, RR"));
+    }
+    if fl[0] <= rl[0] || fr[0] <= rr[0] {
+        found.push(doubt("the front wheels lie behind the rear ones".into(), "x points forward, and wheels are named FL, FR, RL, RR"));
+    } else if fl[0] <= 0.0 || rl[0] >= 0.0 {
+        let what = format!("the centre of gravity lies outside of the wheels (x of the axles {:.2} and {:.2} m)", fl[0], rl[0]);
+        found.push(doubt(what, "wheel centres are given relative to the centre of gravity"));
+    }
+    let about = |what: &str, value: f64, range: [f64; 2], unit: &str| {
+        let text = format!("{what} is {value:.3} {unit}, off-road vehicles have {} to {} {unit}", range[0], range[1]);
+        (!(range[0]..=range[1]).contains(&value)).then(|| doubt(text, "see the unit in the card"))
+    };
+    found.extend(about("the mass", vehicle.mass_kg, [5.0, 60_000.0], "kg"));
+    found.extend(about("the radius of the wheels", vehicle.wheel_radius_m, [0.05, 1.2], "m"));
+    found.extend(about("the width of the wheels", vehicle.wheel_width_m, [0.02, 1.2], "m"));
+    found.extend(about("the wheelbase", vehicle.wheelbase_m, [0.15, 8.0], "m"));
+    found
+}

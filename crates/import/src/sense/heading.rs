@@ -1,0 +1,69 @@
+//! Whether the vehicle goes where it points.
+
+use std::f64::consts::{FRAC_PI_2, PI};
+use std::ops::Range;
+
+use nesam_trajectories::Trajectory;
+
+use super::relation::surely_most;
+use super::{Doubt, doubt, ground_velocity_m_s, stretches};
+
+/// Speed over ground from which on a direction of motion is known, m/s.
+const MOVING_M_S: f64 = 0.7;
+/// Angle between heading and motion that is let pass on the whole, rad: vehicles slide.
+const SLIDES_RAD: f64 = 0.45;
+/// Agreement of directions, 0 to 1, that is none by chance.
+const AGREE: f64 = 0.8;
+
+/// The vehicle goes where it points.
+pub(super) fn heading(drives: &[Trajectory]) -> Option<Doubt> {
+    let apart: Vec<[f64; 2]> = drives.iter().flat_map(|drive| stretches(drive).filter_map(|stretch| apart(drive, stretch))).collect();
+    let [straight, negated] = [0, 1].map(|i| apart.iter().map(|angles| angles[i]).collect::<Vec<f64>>());
+    let (direction, agreement) = mean_direction(&straight);
+    let (_, clockwise) = mean_direction(&negated);
+    let off = straight.iter().filter(|angle| angle.abs() > SLIDES_RAD).count();
+    if !surely_most(off, straight.len()) {
+        return None;
+    }
+    // A vehicle that goes straight all the time has a fixed angle to both.
+    if clockwise > AGREE && clockwise > agreement + 0.1 {
+        let what =
+            format!("the heading turns against the direction of motion (agreement {agreement:.2} of 1, {clockwise:.2} when negated)");
+        return Some(doubt(what, "the yaw seems to count clockwise, like a compass; import with `--frame ned-frd` or negate it"));
+    }
+    if agreement > AGREE {
+        let advice = if direction.abs() > PI - SLIDES_RAD {
+            "x of the body seems to point to the rear, the yaw to be off by 180 degrees, or the speed command to be negated"
+        } else if (direction.abs() - FRAC_PI_2).abs() < SLIDES_RAD {
+            "the yaw seems to count from north; it must count from the x axis of World (east)"
+        } else {
+            "the position and the attitude seem to be in different frames"
+        };
+        return Some(doubt(format!("the vehicle moves {:.0} degrees off its heading", direction.to_degrees()), advice));
+    }
+    let advice = "the yaw seems to be in degrees, or of another frame";
+    Some(doubt(format!("heading and direction of motion are unrelated (agreement {agreement:.2} of 1)"), advice))
+}
+
+/// Angle from the heading to the motion of a stretch, and from the negated heading, rad; `None` where the vehicle hardly moves.
+fn apart(drive: &Trajectory, stretch: Range<usize>) -> Option<[f64; 2]> {
+    let samples = stretch.len() as f64;
+    let mut sums = [[0.0; 2]; 3];
+    for k in stretch {
+        let ([x, y, _], yaw) = (ground_velocity_m_s(drive, k), drive.states[k].attitude_rad[2]);
+        let forward = if drive.controls[k].speed_m_s < 0.0 { -1.0 } else { 1.0 };
+        for (sum, angle) in sums.iter_mut().zip([0.0, yaw, -yaw]) {
+            let (sin, cos) = angle.sin_cos();
+            *sum = [sum[0] + forward * (cos * x + sin * y), sum[1] + forward * (cos * y - sin * x)];
+        }
+    }
+    let [way, straight, negated] = sums;
+    (way[0].hypot(way[1]) > MOVING_M_S * samples).then(|| [straight, negated].map(|[x, y]| y.atan2(x)))
+}
+
+/// Direction of the mean of unit vectors, and how much they agree, 0 to 1.
+fn mean_direction(angles: &[f64]) -> (f64, f64) {
+    let n = angles.len().max(1) as f64;
+    let (c, s) = angles.iter().fold((0.0, 0.0), |(c, s), a| (c + a.cos(), s + a.sin()));
+    (s.atan2(c), c.hypot(s) / n)
+}

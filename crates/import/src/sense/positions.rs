@@ -1,0 +1,87 @@
+//! Whether positions follow one another as those of a vehicle do.
+
+use std::ops::Range;
+
+use nesam_physics::Vehicle;
+use nesam_trajectories::{Trajectory, VelocitySource};
+
+use super::{Doubt, doubt, rim_speed_m_s};
+
+/// Time, s, and way that is told meanwhile, m, from which on unchanged positions are doubted (chosen: the lidar poses of the Husky stay for 0.9 s and 0.9 m).
+const FROZEN: (f64, f64) = (1.5, 1.0);
+/// A vehicle moves no further than this many times its fastest speed tells (chosen: slip, lag, and a wrong unit, which is told elsewhere).
+const FASTER: f64 = 2.0;
+/// What it may move beyond that, m (chosen: poses of the Husky correct themselves by 0.8 m at most).
+const CORRECTION_M: f64 = 1.0;
+/// More jumps than one in so many steps are no jumps but a unit, which the velocities tell (chosen).
+const JUMPS_ONE_IN: usize = 20;
+
+/// Samples without a break at one position, to the bit: sensors have noise, and one that repeats itself exactly has nothing new.
+fn stays(drive: &Trajectory) -> Vec<Range<usize>> {
+    let mut begin = 0;
+    let stays = drive.states.chunk_by(|a, b| a.position_m[..2] == b.position_m[..2]).map(|stay| {
+        begin += stay.len();
+        begin - stay.len()..begin
+    });
+    stays.collect()
+}
+
+/// Speed at a sample as it is measured other than by positions, m/s: of the body, else of the rims.
+fn told_m_s(drive: &Trajectory, vehicle: &Vehicle, k: usize) -> Option<f64> {
+    let [x, y, _] = drive.states[k].velocity_m_s;
+    let rims = rim_speed_m_s(drive, vehicle, k).map(f64::abs);
+    if drive.measured.velocity_source == VelocitySource::Positions { rims } else { Some(x.hypot(y)) }
+}
+
+/// Positions that stay while the vehicle is said to move.
+pub(super) fn frozen(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Doubt> {
+    let longest_m = |drive: &Trajectory| {
+        let told = stays(drive).into_iter().map(|stay| {
+            let way_m = stay.clone().filter_map(|k| told_m_s(drive, vehicle, k)).sum::<f64>() * drive.dt_s;
+            (way_m, stay.len() as f64 * drive.dt_s, drive.time_s[stay.start])
+        });
+        told.filter(|(way_m, time_s, _)| *time_s >= FROZEN.0 && *way_m >= FROZEN.1).max_by(|a, b| a.0.total_cmp(&b.0))
+    };
+    let found: Vec<_> = drives.iter().filter_map(|drive| Some((drive, longest_m(drive)?))).collect();
+    let (drive, (way_m, time_s, at_s)) = found.iter().max_by(|a, b| a.1.0.total_cmp(&b.1.0))?;
+    let what = format!(
+        "positions are frozen in {} of {} drives: in `{}` for {time_s:.1} s from {at_s:.1} s on, while velocities or wheels say {way_m:.1} m",
+        found.len(),
+        drives.len(),
+        drive.id
+    );
+    Some(doubt(what, "the localisation seems to have stopped: leave those drives out, or part them there"))
+}
+
+/// Positions that no speed of the drive reaches.
+pub(super) fn jumps(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Doubt> {
+    let found: Vec<Jump> = drives.iter().flat_map(|drive| jumps_of(drive, vehicle)).collect();
+    let steps: usize = drives.iter().map(|drive| drive.states.len()).sum();
+    let Jump { drive, way_m, time_s, at_s, fastest_m_s } =
+        found.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m)).filter(|_| found.len() * JUMPS_ONE_IN <= steps)?;
+    let what = format!(
+        "positions jump {} times: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s",
+        found.len()
+    );
+    Some(doubt(what, "the localisation seems to have been set anew: part the drives there, or leave them out"))
+}
+
+struct Jump<'a> {
+    drive: &'a str,
+    way_m: f64,
+    time_s: f64,
+    at_s: f64,
+    fastest_m_s: f64,
+}
+
+fn jumps_of<'a>(drive: &'a Trajectory, vehicle: &Vehicle) -> Vec<Jump<'a>> {
+    let speeds = (0..drive.states.len()).map(|k| told_m_s(drive, vehicle, k).unwrap_or(0.0).max(drive.controls[k].speed_m_s.abs()));
+    let fastest_m_s = speeds.fold(0.0, f64::max);
+    let step = |pair: &[Range<usize>]| {
+        let [a, b] = [0, 1].map(|i| drive.states[pair[i].start].position_m);
+        let (way_m, time_s) = ((b[0] - a[0]).hypot(b[1] - a[1]), pair[0].len() as f64 * drive.dt_s);
+        let jump = way_m > FASTER * fastest_m_s * time_s + CORRECTION_M;
+        jump.then(|| Jump { drive: &drive.id, way_m, time_s, at_s: drive.time_s[pair[1].start], fastest_m_s })
+    };
+    stays(drive).windows(2).filter_map(step).collect()
+}

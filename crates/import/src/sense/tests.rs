@@ -1,0 +1,207 @@
+use nesam_physics::{Control, SecondCommand, VehicleState};
+
+use super::*;
+use nesam_trajectories::{MeasuredChannels, VelocitySource};
+
+/// The wheels of the car lie that far to the left, m.
+const LEFT_M: [f64; 4] = [0.9176, -0.9176, 0.91, -0.91];
+
+/// A car on a wavy plane that drives curves, in the conventions of the data root.
+fn sound() -> Trajectory {
+    let (dt_s, wheelbase_m) = (0.1, 3.3);
+    let (mut x, mut y, mut yaw) = (0.0_f64, 0.0_f64, 0.3_f64);
+    let (mut states, mut controls, mut wheels) = (Vec::new(), Vec::new(), Vec::new());
+    for k in 0..400 {
+        let t = f64::from(k) * dt_s;
+        let (speed, angle) = (2.0 + 0.8 * (0.7 * t).sin(), 0.3 * (0.15 * t).sin());
+        let slope = 0.15 * (0.3 * x).cos() * yaw.cos();
+        let yaw_rate = speed / wheelbase_m * angle.tan();
+        states.push(VehicleState {
+            position_m: [x, y, 0.5 * (0.3 * x).sin()],
+            attitude_rad: [0.02 * (1.3 * t).sin(), -slope.atan(), wrap_angle(yaw)],
+            velocity_m_s: [speed / slope.atan().cos(), 0.0, 0.0],
+            angular_velocity_rad_s: [0.026 * (1.3 * t).cos(), 0.0, yaw_rate],
+        });
+        controls.push(Control { speed_m_s: speed, second: angle });
+        wheels.push(LEFT_M.map(|left_m| (speed - left_m * yaw_rate) / 0.4));
+        (x, y, yaw) = (x + dt_s * speed * yaw.cos(), y + dt_s * speed * yaw.sin(), yaw + dt_s * yaw_rate);
+    }
+    let measured = MeasuredChannels { angular_velocity: [true, false, true], wheel_speed: true, ..MeasuredChannels::POSE_AND_TWIST };
+    Trajectory {
+        id: "a".into(),
+        set: "s".into(),
+        world: None,
+        split: None,
+        dt_s,
+        time_s: (0..400).map(|k| f64::from(k) * dt_s).collect(),
+        states,
+        controls,
+        wheel_speed_rad_s: Some(wheels),
+        road_wheel_angle_rad: None,
+        measured,
+        truth: None,
+    }
+}
+
+fn car() -> Vehicle {
+    let mut car = nesam_test_vehicles::truck();
+    (car.second, car.wheelbase_m, car.wheel_radius_m) = (SecondCommand::RoadWheelAngleRad, 3.3, 0.4);
+    car
+}
+
+fn told(change: impl Fn(&mut Trajectory)) -> String {
+    let mut drive = sound();
+    change(&mut drive);
+    doubts(&[drive], &car()).iter().map(|d| format!("{}; {}\n", d.what, d.advice)).collect()
+}
+
+fn states(change: impl Fn(&mut VehicleState<f64>)) -> impl Fn(&mut Trajectory) {
+    move |drive| drive.states.iter_mut().for_each(&change)
+}
+
+#[test]
+fn analytic_a_sound_drive_raises_no_doubt() {
+    assert_eq!(told(|_| {}), "");
+}
+
+/// A generator of numbers from 0 to 1 (Knuth's multiplier, high bits).
+fn numbers(mut seed: u64) -> impl FnMut() -> f64 {
+    move || {
+        seed = seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1);
+        (seed >> 11) as f64 / (1_u64 << 53) as f64
+    }
+}
+
+/// Goal: a velocity that has nothing to do with the positions is doubted. Method: noise about zero, noise with the mean of the true speed, a constant (seed 5).
+#[test]
+fn analytic_velocities_that_are_unrelated_to_positions_are_doubted() {
+    let noise = |mean: f64, spread: f64| {
+        told(move |drive| {
+            let mut next = numbers(5);
+            drive.states.iter_mut().for_each(|s| s.velocity_m_s[0] = mean + spread * (next() - 0.5));
+        })
+    };
+    for told in [noise(0.0, 8.0), noise(2.0, 4.0), noise(2.0, 0.0)] {
+        assert!(told.contains("forward velocity") && told.contains("from which column"), "{told}");
+    }
+}
+
+/// Goal: positions that stop while the rest moves, and positions that jump, are doubted with where and how much; what a sound localisation does is not.
+/// Method: 6 s of standing positions, 0.8 s of them, a jump of 10 m and one of 0.8 m in 0.1 s.
+#[test]
+fn analytic_frozen_and_jumping_positions_are_doubted() {
+    let frozen = |samples: usize| {
+        told(move |drive| {
+            let there = drive.states[100].position_m;
+            drive.states[100..100 + samples].iter_mut().for_each(|s| s.position_m = there);
+        })
+    };
+    let jump = |way_m: f64| told(move |drive| drive.states[200..].iter_mut().for_each(|s| s.position_m[0] += way_m));
+    let said = frozen(60);
+    assert!(said.contains("frozen in 1 of 1 drives: in `a` for 6.0 s from 10.0 s on") && said.lines().count() == 1, "{said}");
+    let said = jump(10.0);
+    assert!(said.contains("jump 1 times: in `a` by 9.7 m") && said.contains("at 20.0 s") && said.lines().count() == 1, "{said}");
+    assert_eq!(frozen(8) + &jump(0.8), "");
+}
+
+/// Goal: positions in degrees of latitude and longitude are called so, whatever else is measured. Method: the sound drive at 50 degrees of latitude with its
+/// velocities, with its wheels alone, with its commands alone.
+#[test]
+fn analytic_positions_in_degrees_are_named() {
+    let degrees = |drive: &mut Trajectory| {
+        for s in &mut drive.states {
+            s.position_m = [11.0 + s.position_m[0] / 71_700.0, 50.0 + s.position_m[1] / 111_300.0, s.position_m[2]];
+        }
+    };
+    let unmeasured = |drive: &mut Trajectory| {
+        degrees(drive);
+        drive.measured.velocity_source = VelocitySource::Positions;
+        drive.states.iter_mut().for_each(|s| s.velocity_m_s = [0.0; 3]);
+    };
+    let commands_alone = |drive: &mut Trajectory| {
+        unmeasured(drive);
+        drive.wheel_speed_rad_s = None;
+    };
+    for told in [told(degrees), told(unmeasured), told(commands_alone)] {
+        assert!(told.contains("degrees of latitude and longitude"), "{told}");
+    }
+}
+
+/// Goal: a single wheel with a wrong sign or unit is named, and so are swapped sides. Method: each mistake in the sound drive, which turns both ways.
+#[test]
+fn analytic_single_wheels_and_swapped_sides_are_named() {
+    let wheels = |change: fn([f64; 4]) -> [f64; 4]| {
+        told(move |drive| drive.wheel_speed_rad_s.iter_mut().flatten().for_each(|wheels| *wheels = change(*wheels)))
+    };
+    let mistakes: [(&[&str], String); 5] = [
+        (&["rim speed of RL", "-0.99", "wheels counted backwards"], wheels(|[fl, fr, rl, rr]| [fl, fr, -rl, rr])),
+        (&["rim speed of FR", "9.7", "revolutions per minute"], wheels(|[fl, fr, rl, rr]| [fl, 9.55 * fr, rl, rr])),
+        (&["rim speed of FR", "nothing moved"], wheels(|[fl, _, rl, rr]| [fl, 0.0, rl, rr])),
+        (&["the left and right wheels turn against the yaw"], wheels(|[fl, fr, rl, rr]| [fr, fl, rr, rl])),
+        (&["the rear left and right wheels turn against the yaw"], wheels(|[fl, fr, rl, rr]| [fl, fr, rr, rl])),
+    ];
+    for (expected, told) in mistakes {
+        assert!(expected.iter().all(|part| told.contains(part)) && told.lines().count() == 1, "{expected:?} is not all of\n{told}");
+    }
+}
+
+/// Goal: a few short drives, some with a pose that freezes and catches up, are sound; a wrong unit in them is told all the same. Method: sets of 1 to 12 drives
+/// of 2 s cut out of the sound one, of which a fourth freezes for 0.9 s, as the Husky's do (seeds 1 to 40).
+#[test]
+fn property_few_short_drives_with_freezing_poses_raise_no_doubt() {
+    let set = |seed: u64, drives: usize| -> Vec<Trajectory> {
+        let mut next = numbers(seed);
+        let cut = |i: usize| {
+            let (mut drive, begin) = (sound(), (next() * 380.0) as usize);
+            drive.time_s = drive.time_s[..20].to_vec();
+            drive.states = drive.states[begin..begin + 20].to_vec();
+            drive.controls = drive.controls[begin..begin + 20].to_vec();
+            drive.wheel_speed_rad_s = drive.wheel_speed_rad_s.map(|wheels| wheels[begin..begin + 20].to_vec());
+            if i.is_multiple_of(4) {
+                let held = drive.states[6];
+                for s in &mut drive.states[6..15] {
+                    (s.position_m, s.attitude_rad) = (held.position_m, held.attitude_rad);
+                }
+            }
+            drive
+        };
+        (0..drives).map(cut).collect()
+    };
+    for seed in 1..=40 {
+        for drives in 1..=12 {
+            let mut some = set(seed, drives);
+            assert_eq!(doubts(&some, &car()), [], "{drives} drives, seed {seed}");
+            some.iter_mut().flat_map(|drive| &mut drive.states).for_each(|s| s.velocity_m_s[0] *= 3.6);
+            let told = doubts(&some, &car());
+            assert!(drives < 6 || told.iter().any(|doubt| doubt.advice.contains("km/h")), "{drives} drives, seed {seed}: {told:?}");
+        }
+    }
+}
+
+#[test]
+fn analytic_every_mistake_is_named() {
+    let mistakes: [(&str, String); 11] = [
+        ("km/h", told(states(|s| s.velocity_m_s[0] *= 3.6))),
+        ("pointing to the rear", told(states(|s| s.velocity_m_s[0] *= -1.0))),
+        ("degrees instead of radians", told(states(|s| s.angular_velocity_rad_s[2] *= 57.3))),
+        ("clockwise", told(states(|s| s.attitude_rad[2] = wrap_angle(std::f64::consts::FRAC_PI_2 - s.attitude_rad[2])))),
+        ("from north", told(states(|s| s.attitude_rad[2] = wrap_angle(s.attitude_rad[2] - std::f64::consts::FRAC_PI_2)))),
+        ("nose points down", told(states(|s| s.attitude_rad[1] *= -1.0))),
+        ("degrees instead of radians", told(states(|s| s.attitude_rad[1] = 30.0 * (2.0 + s.attitude_rad[1])))),
+        ("opposite sign: steering to the left", told(|drive| drive.controls.iter_mut().for_each(|c| c.second *= -1.0))),
+        ("speed command: -1.0", told(|drive| drive.controls.iter_mut().for_each(|c| c.speed_m_s *= -1.0))),
+        ("km/h", told(|drive| drive.controls.iter_mut().for_each(|c| c.speed_m_s /= 3.6))),
+        ("rim speed", told(|drive| drive.wheel_speed_rad_s.iter_mut().flatten().for_each(|w| *w = w.map(|w| 9.55 * w)))),
+    ];
+    for (i, (expected, told)) in mistakes.iter().enumerate() {
+        assert!(told.contains(expected), "{i}: `{expected}` is not in\n{told}");
+    }
+}
+
+#[test]
+fn analytic_a_mirrored_card_is_doubted() {
+    assert!(card_doubts(&nesam_test_vehicles::truck()).is_empty());
+    let mut mirrored = nesam_test_vehicles::truck();
+    mirrored.wheel_centre_m.iter_mut().for_each(|w| w[1] *= -1.0);
+    assert!(card_doubts(&mirrored)[0].what.contains("left wheels"));
+}
