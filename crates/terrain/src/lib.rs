@@ -10,6 +10,7 @@ mod colours;
 mod disguise;
 mod error;
 mod geometry;
+mod holes;
 mod image;
 mod patch;
 mod read;

@@ -23,7 +23,7 @@ pub struct Patch {
     pub elevation: Vec<f32>,
     /// Colours, (channel = 3, row, column), normalised; all zero on a map without semantics.
     pub semantic: Vec<f32>,
-    /// Share of the pixels that lie on the map and next to no hole, 0..=1.
+    /// Share of the pixels that lie on the map and on known ground (holes up to 0.5 m from it included), 0..=1.
     pub known_share: f32,
 }
 
@@ -122,7 +122,7 @@ impl Walk {
         off_map
     }
 
-    /// As [`Walk::row`] on a map with holes; pixels next to a hole count too, once.
+    /// As [`Walk::row`] on a map with holes that are not known; pixels next to one count too, once.
     fn row_with_holes(&self, row: usize, map: &WorldMap, cells: &mut RowCells) -> usize {
         let width = map.geometry().width;
         self.row(row, width, cells);
@@ -182,8 +182,9 @@ impl<T: Copy> Corners<T> {
 /// Samples the patch around a pose (paper §III-A: the observation m_k at the predicted pose).
 ///
 /// Bilinear. Elevation is relative to the ground under the centre, divided by the half range and clamped to [-1, 1]; colours are
-/// shifted, scaled and clamped per channel. Pixels off the map take the nearest border value and pixels at holes the nearest known
-/// height; both count out of `known_share`. A pose that is not finite gives a patch at the origin of the map with `known_share` 0.
+/// shifted, scaled and clamped per channel. Pixels off the map take the nearest border value and pixels at holes heights
+/// from around; off the map and further than 0.5 m from known ground they count out of `known_share`. A pose that is not finite
+/// gives a patch at the origin of the map with `known_share` 0.
 /// Nothing is allocated when the patch is reused.
 pub fn sample_patch(map: &WorldMap, pose: Pose2, scale: &PatchScale, patch: &mut Patch) {
     patch.elevation.resize(PIXELS, 0.0);

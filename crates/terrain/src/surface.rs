@@ -1,8 +1,7 @@
 //! The elevation layer prepared for lookups: holes filled, slopes ready.
 
-use std::collections::VecDeque;
-
 use crate::geometry::{Bilinear, GridGeometry};
+use crate::holes::{Filled, fill_holes};
 
 /// Side of the square over which slopes are smoothed, about the footprint of a wheel, m (chosen).
 const FOOTPRINT_M: f64 = 0.3;
@@ -14,11 +13,20 @@ pub(crate) struct Surface {
     pub(crate) height_m: Vec<f32>,
     /// dz/dx, dz/dy at each cell.
     pub(crate) slope: Vec<[f32; 2]>,
-    /// True where the height is known; `None` when all are.
+    /// True where the height was given, no hole; `None` when all were.
+    pub(crate) given: Option<Vec<bool>>,
+    /// True where the height was given or is believed (see [`crate::holes`]); `None` when all are.
     pub(crate) known: Option<Vec<bool>>,
 }
 
 impl Surface {
+    /// Fills the holes of a layer; `None` when nothing is given.
+    pub(crate) fn new(geometry: &GridGeometry, elevation_m: Vec<f32>) -> Option<Self> {
+        let Filled { height_m, given, known } = fill_holes(geometry, elevation_m)?;
+        let slope = footprint_slopes(geometry, &height_m);
+        Some(Self { height_m, slope, given, known })
+    }
+
     /// Whether the four cells around a lookup are known.
     #[inline]
     pub(crate) fn is_known(&self, index: usize, width: usize) -> bool {
@@ -49,40 +57,8 @@ fn mix(at: Bilinear, sw: f64, se: f64, nw: f64, ne: f64) -> f64 {
     south + at.north * (north - south)
 }
 
-/// Fills holes with the nearest known height (in city-block distance) and returns the mask; `None` when nothing is known.
-pub(crate) fn fill_holes(geometry: &GridGeometry, mut height_m: Vec<f32>) -> Option<(Vec<f32>, Option<Vec<bool>>)> {
-    if !height_m.iter().any(|z| z.is_nan()) {
-        return Some((height_m, None));
-    }
-    let known: Vec<bool> = height_m.iter().map(|z| !z.is_nan()).collect();
-    let mut filled = known.clone();
-    // Breadth first from all known cells at once: each hole is reached first from a nearest one.
-    let mut front: VecDeque<usize> = (0..known.len()).filter(|i| known[*i]).collect();
-    if front.is_empty() {
-        return None;
-    }
-    let (width, height) = (geometry.width, geometry.height);
-    while let Some(at) = front.pop_front() {
-        let (row, column) = (at / width, at % width);
-        let neighbours = [
-            (column > 0).then(|| at - 1),
-            (column + 1 < width).then(|| at + 1),
-            (row > 0).then(|| at - width),
-            (row + 1 < height).then(|| at + width),
-        ];
-        for next in neighbours.into_iter().flatten() {
-            if !filled[next] {
-                filled[next] = true;
-                height_m[next] = height_m[at];
-                front.push_back(next);
-            }
-        }
-    }
-    Some((height_m, Some(known)))
-}
-
 /// Slopes at each cell: central differences over the footprint, averaged over three lines across it; one-sided at the border.
-pub(crate) fn footprint_slopes(geometry: &GridGeometry, height_m: &[f32]) -> Vec<[f32; 2]> {
+fn footprint_slopes(geometry: &GridGeometry, height_m: &[f32]) -> Vec<[f32; 2]> {
     let (width, height) = (geometry.width, geometry.height);
     let reach = ((FOOTPRINT_M / 2.0 / geometry.resolution_m).round() as usize).max(1);
     let mut slopes = Vec::with_capacity(height_m.len());

@@ -9,7 +9,7 @@ use crate::colours::{pack, smoothed, unpack};
 
 use crate::error::TerrainError;
 use crate::geometry::{Bilinear, GridGeometry};
-use crate::surface::{Surface, fill_holes, footprint_slopes};
+use crate::surface::Surface;
 
 /// Prior knowledge about one semantic class: its colour and the range of each soil parameter.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,8 +47,9 @@ pub struct Ground {
 /// Elevation and semantics of a world on one regular grid, row 0 in the south.
 ///
 /// A map never changes: [`WorldMap::with_tile`] gives a new map with the next version, so a prediction can name the version it used
-/// and share the map without a lock. Holes are kept apart from heights: patches see them filled with the nearest known height,
-/// while [`WorldMap::height_m`] and [`WorldMap::ground`] answer `None` next to them.
+/// and share the map without a lock. Holes are filled from the ground around them. Up to 0.5 m from a known cell that counts as known;
+/// further in, patches see it and [`WorldMap::height_m`] and [`WorldMap::ground`] answer `None`. The layers are hashed and given back
+/// with their holes.
 #[derive(Debug)]
 pub struct WorldMap {
     id: String,
@@ -96,10 +97,8 @@ impl WorldMap {
         }
         let colour = semantic_rgb.map(|rgb| rgb.into_iter().map(pack).collect::<Vec<u32>>());
         let hash = hash_layers(&geometry, &elevation_m, colour.as_deref());
-        let (height_m, known) =
-            fill_holes(&geometry, elevation_m).ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
-        let slope = footprint_slopes(&geometry, &height_m);
-        let surface = Surface { height_m, slope, known };
+        let surface =
+            Surface::new(&geometry, elevation_m).ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
         let (smooth_colour, soil_classes, source) = (OnceLock::new(), Vec::new(), MapSource::default());
         Ok(Self { id: id.into(), version, hash, geometry, surface, colour, smooth_colour, soil_classes, source })
     }
@@ -247,8 +246,8 @@ impl WorldMap {
     /// When the map has no such cell.
     #[inline]
     pub fn cell_elevation_m(&self, cell: usize) -> f32 {
-        let known = self.surface.known.as_ref().is_none_or(|known| known[cell]);
-        if known { self.surface.height_m[cell] } else { f32::NAN }
+        let given = self.surface.given.as_ref().is_none_or(|given| given[cell]);
+        if given { self.surface.height_m[cell] } else { f32::NAN }
     }
 
     /// Semantic layer as given, row-major, row 0 in the south.
@@ -276,7 +275,7 @@ impl WorldMap {
         Some(if smooth { self.smooth_colour.get_or_init(|| smoothed(&self.geometry, colour)) } else { colour })
     }
 
-    /// Bilinear height, m; `None` off the map or where one of the four cells around is a hole.
+    /// Bilinear height, m; `None` off the map or where one of the four cells around is further than 0.5 m from known ground.
     #[inline]
     pub fn height_m(&self, x_m: f64, y_m: f64) -> Option<f64> {
         self.lookup(x_m, y_m).map(|at| self.surface.height(at, self.geometry.width))
@@ -290,7 +289,7 @@ impl WorldMap {
         Some(Ground { height_m: self.surface.height(at, self.geometry.width), slope_x, slope_y })
     }
 
-    /// Height with holes filled and points off the map clamped to the border, m; a fallback where any height beats none.
+    /// Height with all holes filled and points off the map clamped to the border, m; a fallback where any height beats none.
     pub fn nearest_height_m(&self, x_m: f64, y_m: f64) -> f64 {
         self.surface.height(self.geometry.bilinear(x_m, y_m), self.geometry.width)
     }

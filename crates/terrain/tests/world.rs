@@ -140,17 +140,17 @@ fn analytic_share_of_known_ground_at_the_border() {
 #[test]
 fn analytic_holes_are_none_and_are_filled_in_patches() {
     let mut z = heights(|x, _| if x < 0.0 { -1.0 } else { 1.0 });
-    // A hole of 1 m by 1 m around (-5, 0): everything near is at -1 m.
+    // A hole of 2 m by 2 m around (-5, 0): everything near is at -1 m, and its middle is further than 0.5 m from known ground.
     let g = grid();
     for (i, z) in z.iter_mut().enumerate() {
         let [x, y] = g.to_world(i % SIDE, i / SIDE);
-        if (x + 5.0).abs() < 0.5 && y.abs() < 0.5 {
+        if (x + 5.0).abs() < 1.0 && y.abs() < 1.0 {
             *z = f32::NAN;
         }
     }
     let map = WorldMap::from_layers("holes", 1, g, z, None).unwrap();
-    assert!(map.height_m(-5.0, 0.0).is_none() && map.ground(-5.5, 0.0).is_none());
-    assert_eq!(map.height_m(-5.7, 0.0), Some(-1.0));
+    assert!(map.height_m(-5.0, 0.0).is_none() && map.ground(-5.3, 0.0).is_none());
+    assert_eq!((map.height_m(-5.7, 0.0), map.height_m(-6.1, 0.0)), (Some(-1.0), Some(-1.0)));
     assert!(map.contains(-5.0, 0.0));
     let patch = patch_at(&map, -10.0, 0.0, 0.3);
     assert!(patch.known_share < 1.0 && patch.known_share > 0.98, "{}", patch.known_share);
@@ -196,9 +196,9 @@ fn analytic_tile_makes_a_new_version() {
     assert_eq!((flat.height_m(x, y), raised.height_m(x, y)), (Some(0.0), Some(0.5)));
     let back = raised.with_tile(200, 210, 4, 3, &[0.0; 12], None).unwrap();
     assert_eq!((back.version(), back.hash()), (3, flat.hash()), "equal content, equal hash");
-    let hole = flat.with_tile(200, 210, 4, 3, &[f32::NAN; 12], None).unwrap();
+    let hole = flat.with_tile(190, 200, 24, 23, &[f32::NAN; 24 * 23], None).unwrap();
     assert!(hole.height_m(x, y).is_none());
-    let filled = hole.with_tile(200, 210, 4, 3, &[0.0; 12], None).unwrap();
+    let filled = hole.with_tile(190, 200, 24, 23, &[0.0; 24 * 23], None).unwrap();
     assert_eq!(filled.hash(), flat.hash());
 }
 
