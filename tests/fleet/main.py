@@ -53,7 +53,7 @@ def kill(fleet, run):
 def stop_and_resume(fleet, run):
     name = victim(fleet, run)
     before = {session: owner for session, owner in fleet.owners().items() if owner == name and session in run.sessions}
-    with nesam.Client(f"{fleet.hosts.address[name]}:50051", timeout_s=2.0) as direct:
+    with nesam.Client(f"{fleet.hosts.address[name]}:50051", timeout_s=2.0, attempts_max=1) as direct:
         epochs = {session: direct.session(session).run for session in before}
         fleet.processes[name].signal(signal.SIGSTOP)
         yield

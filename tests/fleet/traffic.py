@@ -227,7 +227,8 @@ class Planner(threading.Thread):
 
     def __init__(self, address, session, every_s=PLAN_S):
         super().__init__(name=f"planner of {session}", daemon=True)
-        self.client = nesam.Client(address, timeout_s=8.0, vehicle_id=session)
+        # What fails is counted here, and not mended by the client.
+        self.client = nesam.Client(address, timeout_s=8.0, vehicle_id=session, attempts_max=1)
         self._session, self._every_s = session, every_s
         self._ending = threading.Event()
         self._began = False

@@ -6,6 +6,7 @@ Body.
 """
 
 from ._aio import AsyncClient, AsyncMeasurementStream
+from ._aio_durable import AsyncDurableStream
 from ._candidates import Drawing, PathCost, Ranking
 from ._client import Client, MeasurementStream
 from ._durable import DurableStream
@@ -51,6 +52,7 @@ __all__ = [
     "AlreadyExists",
     "Answer",
     "AsyncClient",
+    "AsyncDurableStream",
     "AsyncMeasurementStream",
     "Client",
     "DeadlineExceeded",

@@ -1,7 +1,7 @@
 """The client for asyncio."""
 
 import asyncio
-from typing import AsyncIterator, List, Optional, Sequence, Tuple, Union
+from typing import AsyncIterable, AsyncIterator, Awaitable, Iterable, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -10,9 +10,10 @@ from . import _calls as calls
 from . import _diagnosis as diagnosis
 from . import _messages as m
 from . import _types as t
+from ._aio_durable import AsyncDurableStream
 from ._candidates import Drawing, PathCost
-from ._connection import arguments
-from ._errors import DeadlineExceeded, Unavailable, from_rpc
+from ._connection import ATTEMPTS_MAX, arguments, trying_again
+from ._errors import DeadlineExceeded, NesamError, Unavailable, from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
@@ -28,6 +29,8 @@ from .v1 import (
     terrain_pb2_grpc,
 )
 
+Measurements = Union[Iterable[t.Measurement], AsyncIterable[t.Measurement]]
+
 
 class AsyncClient:
     """`Client` in asyncio: the same methods with the same arguments, errors and answers, to be awaited; tasks of one event loop may share it. Use it in an
@@ -36,16 +39,23 @@ class AsyncClient:
     A call that is cancelled is cancelled in the service too: a planner that has no more use for an answer costs no one else time.
     """
 
-    def __init__(self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = ""):
+    def __init__(
+        self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = "", attempts_max: int = ATTEMPTS_MAX
+    ):
         self.timeout_s = timeout_s
         options, credentials = arguments(tls)
-        secure = credentials is not None
-        channel = grpc.aio.secure_channel(address, credentials, options) if secure else grpc.aio.insecure_channel(address, options)
-        self._channel = channel
+
+        def opened(options):
+            return grpc.aio.insecure_channel(address, options) if credentials is None else grpc.aio.secure_channel(address, credentials, options)
+
+        self._channel = channel = opened(options + trying_again(attempts_max))
+        # As in `Client`.
+        self._once = opened(options)
         self._metadata: Tuple[Tuple[str, str], ...] = ((HEADER, vehicle_id),) if vehicle_id else ()
         self._stubs = {
             "sessions": sessions_pb2_grpc.SessionsStub(channel),
             "prediction": prediction_pb2_grpc.PredictionStub(channel),
+            "prediction_once": prediction_pb2_grpc.PredictionStub(self._once),
             "terrain": terrain_pb2_grpc.TerrainStub(channel),
             "soil": soil_pb2_grpc.SoilStub(channel),
             "diagnosis": diagnosis_pb2_grpc.DiagnosisStub(channel),
@@ -62,6 +72,7 @@ class AsyncClient:
     async def close(self) -> None:
         """Closes the connection."""
         await self._channel.close()
+        await self._once.close()
 
     async def _do(self, call: calls.Call, timeout_s: Optional[float] = None):
         method = getattr(self._stubs[call.service], call.method)
@@ -71,8 +82,8 @@ class AsyncClient:
         except grpc.RpcError as error:
             raise from_rpc(error) from None
 
-    async def _watch(self, service: str, method: str, request, read):
-        call = getattr(self._stubs[service], method)(request, metadata=self._metadata)
+    async def _watch(self, service: str, method: str, request, read, timeout_s: Optional[float]):
+        call = getattr(self._stubs[service], method)(request, timeout=timeout_s, metadata=self._metadata)
         try:
             async for message in call:
                 yield read(message)
@@ -130,9 +141,10 @@ class AsyncClient:
         """As `Client.revert_effects`."""
         return await self._do(calls.revert_effects(session_id))
 
-    def alarms(self, session_id: str) -> AsyncIterator[t.Alarm]:
+    def alarms(self, session_id: str, timeout_s: Optional[float] = None) -> AsyncIterator[t.Alarm]:
         """As `Client.alarms`, for `async for`."""
-        return self._watch("sessions", "WatchAlarms", alarms_pb2.WatchAlarmsRequest(session_id=session_id), m.alarm)
+        request = alarms_pb2.WatchAlarmsRequest(session_id=session_id)
+        return self._watch("sessions", "WatchAlarms", request, m.alarm, timeout_s)
 
     def diagnose(
         self,
@@ -143,16 +155,18 @@ class AsyncClient:
         seed: Optional[int] = None,
         reference: str = "bundle",
         controls: bool = True,
+        timeout_s: Optional[float] = None,
     ) -> AsyncIterator[t.DiagnosisEvent]:
         """As `Client.diagnose`, for `async for`; `aclose()` or the end of the task ends it."""
         request = diagnosis.request(session_id, recording, from_stamp_ns, to_stamp_ns, seed, reference, controls)
-        return self._watch("diagnosis", "Start", request, diagnosis.event)
+        return self._watch("diagnosis", "Start", request, diagnosis.event, timeout_s)
 
     # Soil
 
-    def watch_soil(self, session_id: str) -> AsyncIterator[t.SoilEstimate]:
+    def watch_soil(self, session_id: str, timeout_s: Optional[float] = None) -> AsyncIterator[t.SoilEstimate]:
         """As `Client.watch_soil`, for `async for`."""
-        return self._watch("soil", "Watch", soil_pb2.WatchSoilRequest(session_id=session_id), t.soil_estimate)
+        request = soil_pb2.WatchSoilRequest(session_id=session_id)
+        return self._watch("soil", "Watch", request, t.soil_estimate, timeout_s)
 
     async def fleet_soil(self, map_id: str = "") -> t.FleetSoil:
         """As `Client.fleet_soil`."""
@@ -190,9 +204,20 @@ class AsyncClient:
 
     # Measurements
 
+    async def measure(self, measurements: Measurements) -> List[t.Answer]:
+        """As `Client.measure`; measurements may also come from an asynchronous iterator."""
+        async with self.measurement_stream() as stream:
+            return await stream._send_all(measurements, self.timeout_s)
+
     def measurement_stream(self) -> "AsyncMeasurementStream":
         """An open stream for a vehicle that reports at its own pace; use it in an `async with` block."""
         return AsyncMeasurementStream(self)
+
+    def durable_stream(
+        self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2, pending_max: int = 65536
+    ) -> AsyncDurableStream:
+        """As `Client.durable_stream`; use it in an `async with` block."""
+        return AsyncDurableStream(self, session_id, reconnect_s, pause_s, pending_max)
 
     # Predictions
 
@@ -255,29 +280,107 @@ class AsyncMeasurementStream:
     async def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
         """As `MeasurementStream.send`."""
         message = m.measurement_message(measurement)
-        timeout_s = self._client.timeout_s if timeout_s is None else timeout_s
         async with self._turn:
             asked = self._client._known_states.ask()
-            try:
-                reply = await asyncio.wait_for(self._exchange(message), timeout_s)
-            except asyncio.TimeoutError:
-                self._stream.cancel()
-                raise DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s") from None
-            except asyncio.InvalidStateError:
-                raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed") from None
-            except grpc.RpcError as error:
-                raise from_rpc(error) from None
-        if reply is grpc.aio.EOF:
-            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream")
-        answer = m.answer(reply)
-        self._client._known_states.measured(asked, measurement, answer)
-        return answer
-
-    async def _exchange(self, message: measurements_pb2.Measurement) -> measurements_pb2.MeasurementAnswer:
-        await self._stream.write(message)
-        return await self._stream.read()
+            answering = self._exchange(message)
+            return await self._answer(asked, measurement, answering, self._client.timeout_s if timeout_s is None else timeout_s)
 
     async def close(self) -> None:
         """Says that no more measurements come."""
         if not self._stream.done():
             await self._stream.done_writing()
+
+    def _cancel(self) -> None:
+        self._stream.cancel()
+
+    async def _send_all(self, measurements: Measurements, timeout_s: float) -> List[t.Answer]:
+        """The answers to measurements that are sent without waiting for them, each within `timeout_s` of the one before or of its own sending."""
+        unanswered: "asyncio.Queue[Optional[Tuple[int, t.Measurement]]]" = asyncio.Queue()
+        sending = asyncio.ensure_future(self._put_all(measurements, unanswered))
+        answers = []
+        try:
+            waiting = await unanswered.get()
+            while waiting is not None:
+                answers.append(await self._answer(*waiting, self._read(), timeout_s))
+                unanswered.task_done()
+                waiting = await unanswered.get()
+            await sending
+            return answers
+        finally:
+            sending.cancel()
+            await asyncio.gather(sending, return_exceptions=True)
+
+    async def _put_all(self, measurements: Measurements, unanswered: "asyncio.Queue[Optional[Tuple[int, t.Measurement]]]") -> None:
+        """Sends measurements, and tells of each and of the end."""
+        is_first = True
+        try:
+            async for measurement in _each(measurements):
+                message = m.measurement_message(measurement)
+                unanswered.put_nowait((self._client._known_states.ask(), measurement))
+                await self._write(message)
+                if is_first:
+                    # The service may refuse the whole stream, and why is lost to who goes on writing, see `_ENDED_WHILE_WRITING`.
+                    await unanswered.join()
+                    is_first = False
+        finally:
+            unanswered.put_nowait(None)
+
+    async def _answer(
+        self, asked: int, measurement: t.Measurement, answering: Awaitable[measurements_pb2.MeasurementAnswer], timeout_s: float
+    ) -> t.Answer:
+        try:
+            answer = m.answer(await asyncio.wait_for(answering, timeout_s))
+        except asyncio.TimeoutError:
+            self._cancel()
+            raise DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s") from None
+        self._client._known_states.measured(asked, measurement, answer)
+        return answer
+
+    async def _exchange(self, message: measurements_pb2.Measurement) -> measurements_pb2.MeasurementAnswer:
+        await self._write(message)
+        return await self._read()
+
+    async def _write(self, message: measurements_pb2.Measurement) -> None:
+        try:
+            await self._stream.write(message)
+        except asyncio.InvalidStateError:
+            raise await self._end() from None
+        except grpc.RpcError as error:
+            raise _stream_error(error) from None
+
+    async def _read(self) -> measurements_pb2.MeasurementAnswer:
+        try:
+            reply = await self._stream.read()
+        except grpc.RpcError as error:
+            raise _stream_error(error) from None
+        if reply is grpc.aio.EOF:
+            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream")
+        return reply
+
+    async def _end(self) -> NesamError:
+        """Why nothing more can be sent."""
+        if self._stream.done() and not self._stream.cancelled():
+            try:
+                await self._stream.wait_for_connection()
+            except grpc.RpcError as error:
+                return _stream_error(error)
+        return Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed")
+
+
+# What grpc.aio says of a stream that ended while a message was written to it, and keeps saying when it hears why.
+_ENDED_WHILE_WRITING = (grpc.StatusCode.INTERNAL, "Internal error from Core")
+
+
+def _stream_error(error: grpc.RpcError) -> NesamError:
+    if (error.code(), error.details()) == _ENDED_WHILE_WRITING:
+        return Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream while it was written to; why is not known")
+    return from_rpc(error)
+
+
+async def _each(measurements: Measurements) -> AsyncIterator[t.Measurement]:
+    if isinstance(measurements, AsyncIterable):
+        async for measurement in measurements:
+            yield measurement
+    else:
+        for measurement in measurements:
+            yield measurement

@@ -12,7 +12,7 @@ from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
 from ._extras import Extras
-from ._fallback import KinematicFallback, KnownState
+from ._fallback import KinematicFallback, KnownState, finite_state
 from .v1 import effects_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2, types_pb2
 
 LATE = (DeadlineExceeded, Overloaded, Unavailable)
@@ -21,7 +21,7 @@ LATE = (DeadlineExceeded, Overloaded, Unavailable)
 
 @dataclass(frozen=True)
 class Call:
-    """A unary call: `service` and `method` by name, the request or an iterator of requests, and how the reply is read."""
+    """A unary call: `service` and `method` by the name of the stub, the request or an iterator of requests, and how the reply is read."""
 
     service: str
     method: str
@@ -188,19 +188,26 @@ class Question:
             extras=None if self.extras is None else self.extras.message(),
             samples_min=self.samples_min,
         )
-        return Call("prediction", "Predict", request, lambda reply: m.prediction(reply, self.stride, horizon, self.extras))
+        # Who has a fallback does not wait for another attempt.
+        service = "prediction" if self.fallback is None else "prediction_once"
+        return Call(service, "Predict", request, lambda reply: m.prediction(reply, self.stride, horizon, self.extras))
 
     def fall_back(self, error: NesamError, known: Optional[KnownState]) -> t.Prediction:
-        """What the fallback answers from `start` or the newest known state, rolled forward to `start_stamp_ns`; raises the error again without one of them."""
+        """What the fallback answers from `start` or the newest known state, rolled forward to `start_stamp_ns`; raises the error again without one of them.
+
+        Raises InvalidArgument where the service would refuse commands or start, too.
+        """
         if self.fallback is None:
             raise error
+        names, controls = m.channel_names(self.channels), self.commands()
+        sent = self.sent if self.start is None and self.start_stamp_ns is not None else ()
+        self.fallback.check(controls, sent, "drawing.nominal" if isinstance(self.controls, Drawing) else "controls")
         if self.start is not None:
-            known = KnownState(t.array(self.start, (12,), "start"))
+            known = KnownState(finite_state(t.array(self.start, (12,), "start"), "start"))
         elif known is not None and self.start_stamp_ns is not None:
             known = self.fallback.rolled_forward(known, self.start_stamp_ns, self.sent)
         if known is None:
             raise error
-        names, controls = m.channel_names(self.channels), self.commands()
         answered = m.fallback_prediction(self.fallback, known, controls, names, self.stride, error)
         return replace(answered, controls=controls) if isinstance(self.controls, Drawing) else answered
 

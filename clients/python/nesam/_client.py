@@ -14,7 +14,7 @@ from . import _diagnosis as diagnosis
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
-from ._connection import arguments
+from ._connection import ATTEMPTS_MAX, arguments, trying_again
 from ._durable import DurableStream
 from ._errors import DeadlineExceeded, NesamError, Unavailable, from_rpc
 from ._extras import Extras
@@ -37,18 +37,28 @@ class Client:
 
     timeout_s: longest wait of a call that gives no other, s. tls: what the client trusts and shows; None = no TLS.
     vehicle_id: told with every call, for a proxy in front of several servers (deploy/haproxy); "" = not told.
+    attempts_max: how often a call is tried that only reads (`session`, `sessions`, `export_session`, `map`, `maps`, `fleet_soil`, `predict`) and is UNAVAILABLE, 1 to 5;
+    1 = once. The pauses between them grow from 0.1 s to 1 s, together about 2 s; all is over by the deadline of the call. A prediction with a fallback is tried
+    once, and so is all that changes something. ValueError for another number.
     """
 
-    def __init__(self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = ""):
+    def __init__(
+        self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = "", attempts_max: int = ATTEMPTS_MAX
+    ):
         self.timeout_s = timeout_s
         options, credentials = arguments(tls)
-        secure = credentials is not None
-        self._channel = grpc.secure_channel(address, credentials, options) if secure else grpc.insecure_channel(address, options)
-        if vehicle_id:
-            self._channel = grpc.intercept_channel(self._channel, VehicleHeader(vehicle_id))
+
+        def opened(options):
+            channel = grpc.insecure_channel(address, options) if credentials is None else grpc.secure_channel(address, credentials, options)
+            return grpc.intercept_channel(channel, VehicleHeader(vehicle_id)) if vehicle_id else channel
+
+        self._channel = opened(options + trying_again(attempts_max))
+        # gRPC gives both the same connection; over TLS the first prediction with a fallback makes another one.
+        self._once = opened(options)
         self._stubs = {
             "sessions": sessions_pb2_grpc.SessionsStub(self._channel),
             "prediction": prediction_pb2_grpc.PredictionStub(self._channel),
+            "prediction_once": prediction_pb2_grpc.PredictionStub(self._once),
             "terrain": terrain_pb2_grpc.TerrainStub(self._channel),
             "soil": soil_pb2_grpc.SoilStub(self._channel),
             "diagnosis": diagnosis_pb2_grpc.DiagnosisStub(self._channel),
@@ -65,6 +75,7 @@ class Client:
     def close(self) -> None:
         """Closes the connection."""
         self._channel.close()
+        self._once.close()
 
     def _do(self, call: calls.Call, timeout_s: Optional[float] = None):
         method = getattr(self._stubs[call.service], call.method)
@@ -73,8 +84,8 @@ class Client:
         except grpc.RpcError as error:
             raise from_rpc(error) from None
 
-    def _watch(self, service: str, method: str, request, read):
-        call = getattr(self._stubs[service], method)(request)
+    def _watch(self, service: str, method: str, request, read, timeout_s: Optional[float]):
+        call = getattr(self._stubs[service], method)(request, timeout=timeout_s)
         try:
             for message in call:
                 yield read(message)
@@ -142,9 +153,15 @@ class Client:
         """Takes the applied effects away again. Raises NotFound."""
         return self._do(calls.revert_effects(session_id))
 
-    def alarms(self, session_id: str) -> Iterator[t.Alarm]:
-        """The alarms of a session as they come: the active one first, then each that is raised or cleared. Ends when the session closes. Raises NotFound."""
-        return self._watch("sessions", "WatchAlarms", alarms_pb2.WatchAlarmsRequest(session_id=session_id), m.alarm)
+    def alarms(self, session_id: str, timeout_s: Optional[float] = None) -> Iterator[t.Alarm]:
+        """The alarms of a session as they come: the active one first, then each that is raised or cleared. Ends when the session closes.
+
+        timeout_s: longest time to listen from the first that is asked for, s; None = until the session closes.
+
+        Raises NotFound, DeadlineExceeded (after `timeout_s`), Unavailable (ask anew).
+        """
+        request = alarms_pb2.WatchAlarmsRequest(session_id=session_id)
+        return self._watch("sessions", "WatchAlarms", request, m.alarm, timeout_s)
 
     def diagnose(
         self,
@@ -155,24 +172,31 @@ class Client:
         seed: Optional[int] = None,
         reference: str = "bundle",
         controls: bool = True,
+        timeout_s: Optional[float] = None,
     ) -> Iterator[t.DiagnosisEvent]:
         """Diagnoses what the service recorded of a session: which effect does the model lack? Tells the start, progress, and last the report; it takes minutes.
 
         It begins when the first event is asked for; leaving the iterator ends it. recording: name of an earlier run of the server, "" = what it has recorded until
         now. Stamps bound the window by the vehicle's clock, None = all. reference: "bundle" or "physics". controls: whether to try what would expose a wrong claim,
-        too. Needs the rights of an operator.
+        too. timeout_s: longest time for all of it, s; None = that of the service. Needs the rights of an operator.
 
         Raises FailedPrecondition (nothing is recorded, or what was cannot be diagnosed), NotFound (recording), InvalidArgument, Overloaded (others run),
-        DeadlineExceeded (`diagnosis.limit_s` of the service), PermissionDenied as NesamError; ValueError for an unknown reference.
+        DeadlineExceeded (`timeout_s`, or `diagnosis.limit_s` of the service), PermissionDenied as NesamError; ValueError for an unknown reference.
         """
         request = diagnosis.request(session_id, recording, from_stamp_ns, to_stamp_ns, seed, reference, controls)
-        return self._watch("diagnosis", "Start", request, diagnosis.event)
+        return self._watch("diagnosis", "Start", request, diagnosis.event, timeout_s)
 
     # Soil
 
-    def watch_soil(self, session_id: str) -> Iterator[t.SoilEstimate]:
-        """What a session knows of the soil: the present estimate at once, then each change. Ends when the session closes. Raises NotFound."""
-        return self._watch("soil", "Watch", soil_pb2.WatchSoilRequest(session_id=session_id), t.soil_estimate)
+    def watch_soil(self, session_id: str, timeout_s: Optional[float] = None) -> Iterator[t.SoilEstimate]:
+        """What a session knows of the soil: the present estimate at once, then each change. Ends when the session closes.
+
+        timeout_s: longest time to listen from the first that is asked for, s; None = until the session closes.
+
+        Raises NotFound, DeadlineExceeded (after `timeout_s`), Unavailable (ask anew).
+        """
+        request = soil_pb2.WatchSoilRequest(session_id=session_id)
+        return self._watch("soil", "Watch", request, t.soil_estimate, timeout_s)
 
     def fleet_soil(self, map_id: str = "") -> t.FleetSoil:
         """What the fleet has learned of the ground of a map, "" = of all. Raises FailedPrecondition (the service keeps no such map: `fleet_soil.enabled`)."""
@@ -262,7 +286,8 @@ class Client:
         arrays then have as many rows as were computed. start: (12,); with
         `use_history` it is taken to hold at the instant of the newest measurement. channels: names from CHANNELS to return, default all.
         stride: returns the steps stride, 2 stride, ... timeout_s: deadline, default that of the client. fallback: answers instead when the
-        service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so.
+        service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so. It does so at once, without
+        another attempt, and refuses what the service would: numbers that are not finite, commands outside the range of its card.
         start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session forward to it with the commands `sent`,
         pairs (stamp_ns, (speed, second)) by ascending stamp. half: lets the reply travel as 16-bit numbers; positions are rounded by at most
         4 mm within 16 m of the start. extras: Jacobians, covariance, risk and what-if soils; the answer is in `Prediction.extras`.

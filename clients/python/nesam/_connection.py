@@ -1,10 +1,15 @@
 """What a connection needs, of either kind of client."""
 
-from typing import List, Optional, Tuple
+import json
+from typing import Dict, List, Optional, Tuple
 
 import grpc
+from google.protobuf.descriptor_pb2 import MethodOptions
 
 from ._types import Tls
+from .v1 import diagnosis_pb2, measurements_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2
+
+Options = List[Tuple[str, object]]
 
 REPLY_BYTES_MAX = 64 << 20
 """Largest reply that is accepted; the soil map of a fleet takes 25 MiB at the default limits of a server."""
@@ -18,12 +23,43 @@ _PATIENCE = [
     ("grpc.max_reconnect_backoff_ms", 2_000),
 ]
 
+# What gRPC keeps of a call, to send it again; without room for it a call is not tried again. It takes a prediction at the limits of the protocol.
+_KEPT_BYTES_MAX = 16 << 20
 
-def arguments(tls: Optional[Tls]) -> Tuple[List[Tuple[str, object]], Optional[grpc.ChannelCredentials]]:
+ATTEMPTS_MAX = 5
+"""As many as gRPC makes at most."""
+
+# About 2 s from the first to the last of five attempts: a server has started again by then, or another one has taken its sessions over. gRPC makes each pause
+# up to a fifth shorter or longer, so that clients of one server do not come back at once.
+_PAUSES = {"initialBackoff": "0.1s", "backoffMultiplier": 2.5, "maxBackoff": "1s"}
+
+
+def arguments(tls: Optional[Tls]) -> Tuple[Options, Optional[grpc.ChannelCredentials]]:
     """Options and credentials of a channel; None = no TLS."""
-    options: List[Tuple[str, object]] = [("grpc.max_receive_message_length", REPLY_BYTES_MAX), *_PATIENCE]
+    options: Options = [("grpc.max_receive_message_length", REPLY_BYTES_MAX), ("grpc.per_rpc_retry_buffer_size", _KEPT_BYTES_MAX), *_PATIENCE]
     if tls is None:
         return options, None
     if tls.server_name:
         options.append(("grpc.ssl_target_name_override", tls.server_name))
     return options, grpc.ssl_channel_credentials(tls.authority, tls.key, tls.certificate)
+
+
+def trying_again(attempts_max: int) -> Options:
+    """What lets gRPC try calls again that only read, on UNAVAILABLE and within their deadline. ValueError for less than 1 attempt or more than 5."""
+    if not 1 <= attempts_max <= ATTEMPTS_MAX:
+        raise ValueError(f"attempts_max is {attempts_max}, allowed are 1 to {ATTEMPTS_MAX}")
+    if attempts_max == 1:
+        return []
+    policy = {"maxAttempts": attempts_max, "retryableStatusCodes": ["UNAVAILABLE"], **_PAUSES}
+    return [("grpc.service_config", json.dumps({"methodConfig": [{"name": reading_methods(), "retryPolicy": policy}]}))]
+
+
+def reading_methods() -> List[Dict[str, str]]:
+    """The methods of the protocol that have no side effects, as it says itself."""
+    return [
+        {"service": service.full_name, "method": method.name}
+        for file in (diagnosis_pb2, measurements_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2)
+        for service in file.DESCRIPTOR.services_by_name.values()
+        for method in service.methods
+        if method.GetOptions().idempotency_level == MethodOptions.NO_SIDE_EFFECTS
+    ]

@@ -62,7 +62,8 @@ def from_rpc(error: grpc.RpcError) -> NesamError:
     code = error.code()
     if (code, error.details()) == _TIME_IS_OVER:
         code = grpc.StatusCode.DEADLINE_EXCEEDED
-    metadata = dict(error.trailing_metadata() or ())
+    # A tuple first: old metadata of grpc.aio are pairs that `dict` takes for keys.
+    metadata = dict(tuple(error.trailing_metadata() or ()))
     field = metadata.get("nesam-field", "")
     field = field.decode() if isinstance(field, bytes) else field
     return _CLASSES.get(code, NesamError)(code, field, error.details() or "")

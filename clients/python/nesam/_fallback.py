@@ -3,8 +3,10 @@
 from dataclasses import dataclass
 from typing import Optional, Sequence, Tuple
 
+import grpc
 import numpy as np
 
+from ._errors import InvalidArgument
 from ._types import VehicleCard
 
 ROLLED_FORWARD_STEPS_MAX = 32
@@ -30,6 +32,28 @@ class KinematicFallback:
     vehicle: VehicleCard
     dt_s: float = 0.1
 
+    def check(self, controls: np.ndarray, sent: Sequence[Tuple[int, Sequence[float]]] = (), name: str = "controls") -> None:
+        """Refuses commands as the service does: numbers that are not finite, and those outside the range of the vehicle card.
+
+        controls: (samples, horizon, 2). sent: pairs (stamp_ns, (speed, second)) by ascending stamp. name: of `controls` in the error.
+
+        Raises InvalidArgument; `field` names the first of them, as `controls[sample, step].speed_m_s` or `sent[i].command.second`.
+        """
+        controls = np.asarray(controls, dtype=np.float32)
+        for sample, step in np.argwhere(~self._admits(controls).all(axis=2))[:1]:
+            place, command = f"{name}[{sample}, {step}]", controls[sample, step]
+            if not np.isfinite(command).all():
+                raise _invalid(place, "holds a number that is not finite")
+            self._check_range(place, command)
+        for i, (stamp_ns, command) in enumerate(sent):
+            if i > 0 and stamp_ns <= sent[i - 1][0]:
+                reason = f"is {stamp_ns}, not after the {sent[i - 1][0]} before it; give the commands by ascending stamp"
+                raise _invalid(f"sent[{i}].stamp_ns", reason)
+            for entry, value in zip(_ENTRIES, command):
+                if not np.isfinite(value):
+                    raise _invalid(f"sent[{i}].command.{entry}", f"is {value}, a finite number is needed")
+            self._check_range(f"sent[{i}].command", command)
+
     def yaw_rate_rad_s(self, speed_m_s: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Yaw rate that a command means."""
         if self.vehicle.second_kind == "yaw_rate_rad_s":
@@ -39,7 +63,7 @@ class KinematicFallback:
         return speed_m_s * np.tan(angle) / self.vehicle.wheelbase_m
 
     def rollout(self, start: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        """States (samples, horizon, 12) float32 from start (12,) and controls (samples, horizon, 2)."""
+        """States (samples, horizon, 12) float32 from start (12,) and controls (samples, horizon, 2), which are taken as they are; `check` refuses wrong ones."""
         samples, horizon, _ = controls.shape
         controls = controls.astype(np.float64)
         state = np.tile(np.asarray(start, dtype=np.float64), (samples, 1))
@@ -83,3 +107,33 @@ class KinematicFallback:
         after[:, 6:] = 0.0
         after[:, 6], after[:, 11] = speed, rate
         return after
+
+    def _range(self) -> np.ndarray:
+        """(2, 2) float32: lowest and highest speed and second command. In float32 the ends of the range are admitted in both precisions."""
+        return np.array([self.vehicle.speed_range_m_s, self.vehicle.second_range], dtype=np.float32)
+
+    def _admits(self, controls: np.ndarray) -> np.ndarray:
+        """Whether each number (..., 2) lies in its range, as bool; NaN does not."""
+        low, high = self._range().T
+        return (controls >= low) & (controls <= high)
+
+    def _check_range(self, place: str, command: Sequence[float]) -> None:
+        for entry, value, (low, high), admitted in zip(_ENTRIES, command, self._range(), self._admits(np.asarray(command, dtype=np.float32))):
+            if not admitted:
+                raise _invalid(f"{place}.{entry}", f"is {value:g}, the card of {self.vehicle.name} admits {low:g} to {high:g}")
+
+
+_ENTRIES = ("speed_m_s", "second")
+_STATE_FIELDS = [f"{part}.{axis}" for part in ("position_m", "attitude_rad", "velocity_m_s", "angular_velocity_rad_s") for axis in "xyz"]
+
+
+def finite_state(state: np.ndarray, name: str) -> np.ndarray:
+    """A state (12,) as it is given. Raises InvalidArgument naming the first number that is not finite, as the service does."""
+    for field, value in zip(_STATE_FIELDS, state):
+        if not np.isfinite(value):
+            raise _invalid(f"{name}.{field}", f"is {value}, allowed is a finite number")
+    return state
+
+
+def _invalid(field: str, reason: str) -> InvalidArgument:
+    return InvalidArgument(grpc.StatusCode.INVALID_ARGUMENT, field, f"`{field}`: {reason}")

@@ -60,6 +60,38 @@ def test_service_a_drive_in_asyncio(client, server_address, hills):
     assert (client.predict("truck", fan(2, 4)).start == prediction.start).all()
 
 
+@pytest.mark.parametrize("in_turns", [False, True], ids=["at hand", "as they come"])
+def test_service_measurements_are_answered_in_order(client, server_address, in_turns):
+    client.open_session("truck")
+    drive = list(straight("truck", 300))
+    expected = client.measure(drive)
+    client.close_session("truck")
+    client.open_session("truck")
+
+    async def as_they_come():
+        for i, measurement in enumerate(drive):
+            if i % 100 == 50:
+                # Longer than the client waits for an answer.
+                await asyncio.sleep(0.6)
+            yield measurement
+
+    async def work():
+        async with nesam.AsyncClient(server_address, timeout_s=0.5) as aio:
+            assert await aio.measure([]) == []
+            answers = await aio.measure(as_they_come() if in_turns else drive)
+            with pytest.raises(ValueError, match="state"):
+                await aio.measure([drive[0], nesam.Measurement("truck", 0, np.zeros(6), (1.0, 0.0))])
+            bad = await aio.measure([nesam.Measurement("nobody", 0, np.zeros(12), (1.0, 0.0))])
+            fallback = nesam.KinematicFallback((await aio.session("truck")).vehicle)
+            return answers, bad, await aio.predict("truck", fan(1, 4), timeout_s=-1.0, fallback=fallback)
+
+    answers, [bad], late = asyncio.run(work())
+    assert [(a.sequence, a.outcome, a.place) for a in answers] == [(a.sequence, a.outcome, a.place) for a in expected]
+    assert bad.outcome == "REJECTED"
+    # What was measured is where the fallback begins.
+    np.testing.assert_array_equal(late.start, drive[-1].state)
+
+
 def test_service_refusals_are_typed_and_a_late_answer_falls_back(driven, server_address):
     fallback = nesam.KinematicFallback(driven.session("truck").vehicle)
 

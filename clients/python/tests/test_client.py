@@ -380,6 +380,65 @@ def test_service_away_is_unavailable_or_fallback():
         assert prediction.computed_by == "kinematic_fallback"
 
 
+def with_number(values, at, number):
+    """A copy of an array with another number at a place."""
+    values = np.array(values)
+    values[at] = number
+    return values
+
+
+WRONG_COMMANDS = [
+    pytest.param({"controls": with_number(fan(3, 5), (1, 2, 0), np.nan)}, "controls[1, 2]", id="not a number"),
+    pytest.param({"controls": with_number(fan(3, 5), (2, 4, 1), np.inf)}, "controls[2, 4]", id="infinite"),
+    pytest.param({"controls": with_number(fan(3, 5), (1, 3, 0), 99.0)}, "controls[1, 3].speed_m_s", id="too fast"),
+    pytest.param({"controls": with_number(fan(3, 5), (0, 0, 1), -9.0)}, "controls[0, 0].second", id="too far to the right"),
+    pytest.param({"controls": fan(3, 5, speed=99.0)}, "controls[0, 0].speed_m_s", id="the first of many"),
+    pytest.param(
+        {"controls": nesam.Drawing(with_number(fan(1, 5)[0], (2, 0), 99.0), samples=4, sd=(0.1, 0.1))}, "drawing.nominal[0, 2].speed_m_s", id="a drawing"
+    ),
+    pytest.param({"start": with_number(np.zeros(12), 3, np.nan)}, "start.attitude_rad.x", id="a start that is not a number"),
+    pytest.param({"sent": [(0, (2.0, 0.0)), (1, (99.0, 0.0))], "start_stamp_ns": 4 * 10**9}, "sent[1].command.speed_m_s", id="sent too fast"),
+    pytest.param({"sent": [(0, (2.0, np.nan))], "start_stamp_ns": 4 * 10**9}, "sent[0].command.second", id="sent and not a number"),
+    pytest.param({"sent": [(5, (2.0, 0.0)), (5, (2.0, 0.0))], "start_stamp_ns": 4 * 10**9}, "sent[1].stamp_ns", id="sent in disorder"),
+]
+
+
+@pytest.fixture
+def away(driven):
+    """A client that knows what `driven` knows, of a service that is not there."""
+    with nesam.Client("127.0.0.1:1") as alone:
+        alone._known_states = driven._known_states
+        yield alone
+
+
+@pytest.mark.parametrize("asked, field", WRONG_COMMANDS)
+def test_service_a_fallback_refuses_what_the_service_does(driven, away, asked, field):
+    """Method: the same question to the service, and where only a fallback would answer."""
+    question = {"controls": fan(3, 5), "fallback": nesam.KinematicFallback(driven.session("truck").vehicle), **asked}
+    refusals = []
+    for client in (driven, away):
+        with pytest.raises(nesam.InvalidArgument) as refused:
+            client.predict("truck", **question)
+        refusals.append(refused.value)
+    of_the_service, of_the_fallback = refusals
+    assert of_the_service.field == of_the_fallback.field == field and of_the_service.code == of_the_fallback.code
+    # The service tells the limits of a start, which are its own.
+    told = of_the_service.message.split(" of magnitude up to")[0].replace("NaN", "nan")
+    assert of_the_fallback.message == told
+
+
+def test_service_a_fallback_admits_the_ends_of_the_range_as_the_service_does(driven, away):
+    card = driven.session("truck").vehicle
+    ends = np.stack(np.meshgrid(card.speed_range_m_s, card.second_range), axis=-1).reshape(4, 1, 2).astype(np.float32)
+    assert driven.predict("truck", ends).computed_by == "service"
+    assert away.predict("truck", ends, fallback=nesam.KinematicFallback(card)).computed_by == "kinematic_fallback"
+    # The number next to a tenth in float32 lies above it in float64.
+    narrow = nesam.KinematicFallback(replace(card, speed_range_m_s=(-0.1, 0.1), second_range=(-0.1, 0.1)))
+    narrow.check(np.full((1, 1, 2), 0.1, np.float32), [(0, (0.1, -0.1))])
+    with pytest.raises(nesam.InvalidArgument, match=r"controls\[0, 0\].second"):
+        narrow.check(np.array([[[0.1, 0.10001]]]))
+
+
 def test_analytic_fallback_drives_arcs():
     card = nesam.VehicleCard("cart", "road_wheel_angle_rad", (-5.0, 5.0), (-0.5, 0.5), 2.5, 0.5)
     start = np.zeros(12)

@@ -13,7 +13,7 @@ import pytest
 from conftest import straight
 
 import nesam
-from nesam.v1 import measurements_pb2, sessions_pb2, soil_pb2, types_pb2
+from nesam.v1 import alarms_pb2, diagnosis_pb2, measurements_pb2, sessions_pb2, soil_pb2, types_pb2
 
 
 @contextmanager
@@ -135,8 +135,101 @@ def test_service_a_silent_service_is_given_up():
                     await stream.send(drive[0])
                 with pytest.raises(nesam.Unavailable):
                     await stream.send(drive[1])
+                for measurements in (drive, slowly_in_asyncio()):
+                    begun = time.monotonic()
+                    with pytest.raises(nesam.DeadlineExceeded):
+                        await client.measure(measurements)
+                    assert 0.3 < time.monotonic() - begun < 2.0
 
-        asyncio.run(asyncio.wait_for(work(), 5.0))
+        async def slowly_in_asyncio():
+            for measurement in drive:
+                await asyncio.sleep(0.1)
+                yield measurement
+
+        asyncio.run(asyncio.wait_for(work(), 10.0))
+
+
+def test_service_a_refused_stream_says_why_in_asyncio():
+    """A vehicle without rights is told so where the refusal is there before the measurement; where they meet, grpc.aio may forget it."""
+
+    def refuse(_, context):
+        context.abort(grpc.StatusCode.PERMISSION_DENIED, "no right")
+
+    async def work(address):
+        drive = list(straight("truck", 3))
+        async with nesam.AsyncClient(address) as client:
+            async with client.measurement_stream() as stream:
+                for measurement in drive:
+                    await asyncio.sleep(0.1)
+                    with pytest.raises(nesam.NesamError, match="no right"):
+                        await stream.send(measurement)
+            told = set()
+            for _ in range(20):
+                with pytest.raises(nesam.NesamError) as refused:
+                    await client.measure(drive * 10)
+                told.add((type(refused.value), refused.value.code))
+            reason = (nesam.NesamError, grpc.StatusCode.PERMISSION_DENIED)
+            assert reason in told and told <= {reason, (nesam.Unavailable, grpc.StatusCode.UNAVAILABLE)}
+            async with client.durable_stream("truck", pause_s=0.01) as stream:
+                with pytest.raises(nesam.NesamError, match="no right"):
+                    await stream.send(drive[0])
+
+    with listening(measurements(refuse)) as address:
+        asyncio.run(asyncio.wait_for(work(address), 5.0))
+
+
+def test_service_a_stream_that_ends_midway_is_unavailable_in_both_clients():
+    def ends_midway(requests, context):
+        for i, request in enumerate(requests):
+            if i == 5:
+                context.abort(grpc.StatusCode.UNAVAILABLE, "going")
+            yield measurements_pb2.MeasurementAnswer(sequence=request.sequence, applied=measurements_pb2.Applied())
+
+    async def work(address):
+        async with nesam.AsyncClient(address) as client:
+            for _ in range(20):
+                with pytest.raises(nesam.Unavailable):
+                    await client.measure(straight("truck", 300))
+
+    with listening(measurements(ends_midway)) as address, nesam.Client(address) as client:
+        asyncio.run(asyncio.wait_for(work(address), 20.0))
+        with pytest.raises(nesam.Unavailable):
+            client.measure(straight("truck", 300))
+
+
+def test_service_a_watch_ends_with_its_time():
+    """A service that tells something again after half a second, to a client that waits a tenth for its calls."""
+
+    def slowly(message):
+        def tell(*_):
+            yield message
+            time.sleep(0.5)
+            yield message
+
+        return grpc.unary_stream_rpc_method_handler(tell, None, lambda message: message.SerializeToString())
+
+    services = (
+        ("nesam.v1.Soil", "Watch", slowly(soil_pb2.SoilEstimate(session_id="truck"))),
+        ("nesam.v1.Sessions", "WatchAlarms", slowly(alarms_pb2.Alarm(session_id="truck"))),
+        ("nesam.v1.Diagnosis", "Start", slowly(diagnosis_pb2.DiagnosisEvent())),
+    )
+
+    async def watched(address, watch, timeout_s, told):
+        async with nesam.AsyncClient(address, timeout_s=0.1) as client:
+            async for one in getattr(client, watch)("truck", timeout_s=timeout_s):
+                told.append(one)
+
+    with listening(*services) as address, nesam.Client(address, timeout_s=0.1) as client:
+        for watch in ("watch_soil", "alarms", "diagnose"):
+            told, told_in_asyncio = [], []
+            with pytest.raises(nesam.DeadlineExceeded):
+                for one in getattr(client, watch)("truck", timeout_s=0.25):
+                    told.append(one)
+            with pytest.raises(nesam.DeadlineExceeded):
+                asyncio.run(watched(address, watch, 0.25, told_in_asyncio))
+            assert len(told) == len(told_in_asyncio) == 1
+            asyncio.run(watched(address, watch, None, told_in_asyncio))
+            assert len(list(getattr(client, watch)("truck"))) == 2 and len(told_in_asyncio) == 3
 
 
 def test_service_a_refusal_takes_no_place_away():
@@ -162,8 +255,8 @@ def test_service_a_refusal_takes_no_place_away():
 
 
 @contextmanager
-def counting(answers, session):
-    """A client of a service whose n-th stream gives the n-th list of answers, (run, place), and whose session is at (run, durable place); and the sequence
+def counted(answers, session):
+    """The address of a service whose n-th stream gives the n-th list of answers, (run, place), and whose session is at (run, durable place); and the sequence
     numbers that each stream heard."""
     heard = []
 
@@ -176,7 +269,14 @@ def counting(answers, session):
 
     told = sessions_pb2.Session(session_id="truck", run=session[0], durable_place=session[1])
     get = grpc.unary_unary_rpc_method_handler(lambda *_: told, None, sessions_pb2.Session.SerializeToString)
-    with listening(measurements(stream), ("nesam.v1.Sessions", "Get", get)) as address, nesam.Client(address) as client:
+    with listening(measurements(stream), ("nesam.v1.Sessions", "Get", get)) as address:
+        yield address, heard
+
+
+@contextmanager
+def counting(answers, session):
+    """A client of such a service."""
+    with counted(answers, session) as (address, heard), nesam.Client(address) as client:
         yield client, heard
 
 
@@ -194,6 +294,22 @@ def test_service_who_counts_otherwise_midway_is_sent_everything_in_order(answers
         assert heard == [[1, 2, 3], [1, 2, 3, 4]] and [m.sequence for m in stream.pending] == [1, 2, 3, 4]
         stream.flush()
         assert not stream.pending and len(heard) == 2
+
+
+def test_service_in_asyncio_who_counts_otherwise_is_sent_everything_in_order():
+    """Midway as above, and then the session is at another run, too."""
+    answers = [[(5, 1), (5, 2), (6, 9), (6, 9)], [(6, 10), (6, 11), (6, 11)], [(7, 1), (7, 2), (7, 3)]]
+
+    async def work(address):
+        async with nesam.AsyncClient(address) as client, client.durable_stream("truck", pause_s=0.01) as stream:
+            for measurement in straight("truck", 3):
+                await stream.send(measurement)
+            await stream.flush()
+            assert not stream.pending
+
+    with counted(answers, (7, 3)) as (address, heard):
+        asyncio.run(asyncio.wait_for(work(address), 5.0))
+        assert heard == [[1, 2, 3], [1, 2, 3], [1, 2, 3]]
 
 
 def test_service_a_session_at_another_run_is_sent_everything_over_a_new_stream():

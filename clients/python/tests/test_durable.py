@@ -1,6 +1,7 @@
 """Goal: a vehicle that keeps what is not durable loses nothing when the server is killed or stands still, and does not wait for it for ever; where nothing
 becomes durable it keeps so much and no more. Method: the real binary, SIGKILL and a restart on its store, SIGSTOP and SIGCONT, no store."""
 
+import asyncio
 import os
 import signal
 import threading
@@ -40,6 +41,8 @@ def test_service_a_killed_server_costs_nothing(start, hills):
         with client.durable_stream("truck") as stream:
             for measurement in drive[:33]:
                 assert stream.send(measurement).outcome in ("APPLIED", "GATED")
+                if measurement is drive[19]:
+                    stream.flush()
             process.kill()
             process.wait()
             pending = len(stream.pending)
@@ -91,6 +94,87 @@ def test_service_a_server_that_stands_still_is_given_up_and_loses_nothing(start,
         session = client.session("truck")
         assert session.accepted == session.durable_place == 30 and session.last_sequence == 30
         np.testing.assert_array_equal(session.state, drive[-1].state)
+
+
+def test_service_in_asyncio_neither_a_kill_nor_a_cancelled_send_costs_anything(start, hills):
+    """The first half as `test_service_a_killed_server_costs_nothing`; then one send is cancelled while the server stands still, and two tasks send at once."""
+    drive = list(straight("truck", 60))
+    process, address = start()
+
+    async def work():
+        async with nesam.AsyncClient(address, timeout_s=60.0) as client:
+            await client.upload_map(hills)
+            await client.open_session("truck", map_id="hills")
+            async with client.durable_stream("truck", pause_s=0.05) as stream:
+                for measurement in drive[:20]:
+                    assert (await stream.send(measurement)).outcome in ("APPLIED", "GATED")
+                await stream.flush()
+                for measurement in drive[20:33]:
+                    await stream.send(measurement)
+                process.kill()
+                process.wait()
+                assert 0 < len(stream.pending) < 33, "some are durable and some are not"
+                starting = asyncio.get_running_loop().run_in_executor(None, start)
+                for measurement in drive[33:40]:
+                    answer = await stream.send(measurement)
+                second, _ = await starting
+                assert answer.outcome in ("APPLIED", "GATED") and answer.history_epoch == 40
+
+                second.send_signal(signal.SIGSTOP)
+                os.waitpid(second.pid, os.WUNTRACED)
+                with pytest.raises(asyncio.TimeoutError):
+                    await asyncio.wait_for(stream.send(drive[40]), 0.3)
+                assert stream.pending[-1].sequence == 41
+                begun = time.monotonic()
+                with pytest.raises(nesam.DeadlineExceeded):
+                    await stream.flush(timeout_s=0.5)
+                assert time.monotonic() - begun < 2.0
+                second.send_signal(signal.SIGCONT)
+
+                await asyncio.gather(*(stream.send(measurement) for measurement in drive[41:]), stream.flush())
+                await stream.flush()
+                assert not stream.pending
+            session = await client.session("truck")
+            assert session.accepted == session.durable_place == 60 and session.last_sequence == 60
+            await client.open_session("other", map_id="hills")
+            await client.measure(nesam.Measurement("other", m.stamp_ns, m.state, m.command, m.sequence) for m in drive)
+            other = await client.session("other")
+            np.testing.assert_array_equal(session.state, drive[-1].state)
+            np.testing.assert_array_equal(session.soil.delta, other.soil.delta)
+            np.testing.assert_array_equal(session.soil.covariance, other.soil.covariance)
+
+    asyncio.run(asyncio.wait_for(work(), 60.0))
+
+
+def test_service_in_asyncio_so_many_are_kept_and_no_more(client, server_address):
+    drive = list(straight("truck", 12))
+    client.open_session("truck")
+
+    async def work():
+        async with nesam.AsyncClient(server_address) as aio, aio.durable_stream("truck", pending_max=10) as stream:
+            for measurement in drive[:10]:
+                assert (await stream.send(measurement)).durable_place == 0
+            with pytest.raises(nesam.Overloaded) as refused:
+                await stream.send(drive[10])
+            assert refused.value.field == "pending_max"
+            with pytest.raises(nesam.DeadlineExceeded):
+                await stream.flush(timeout_s=0.2)
+            with pytest.raises(ValueError, match="session `other`"):
+                await aio.durable_stream("truck").send(next(straight("other", 1)))
+            return [m.sequence for m in stream.pending]
+
+    assert asyncio.run(work()) == list(range(1, 11)) and client.session("truck").accepted == 10
+
+
+def test_service_in_asyncio_nobody_there_is_given_up():
+    async def work():
+        async with nesam.AsyncClient(f"127.0.0.1:{free_port()}") as client, client.durable_stream("truck", reconnect_s=0.5) as stream:
+            begun = time.monotonic()
+            with pytest.raises(nesam.Unavailable):
+                await stream.send(next(straight("truck", 1)))
+            assert 0.4 < time.monotonic() - begun < 2.0 and len(stream.pending) == 1
+
+    asyncio.run(work())
 
 
 def test_service_what_is_sent_again_is_never_new(client, hills):

@@ -1,0 +1,137 @@
+"""What a durable stream keeps, however its measurements travel."""
+
+import itertools
+import math
+import secrets
+from collections import deque
+from dataclasses import replace
+from typing import Deque, Dict, Iterator, List, Optional, Tuple
+
+import grpc
+import numpy as np
+
+from . import _messages as m
+from . import _types as t
+from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
+
+BROKEN = {
+    grpc.StatusCode.UNAVAILABLE,
+    grpc.StatusCode.CANCELLED,
+    grpc.StatusCode.UNKNOWN,
+    grpc.StatusCode.INTERNAL,
+    grpc.StatusCode.DEADLINE_EXCEEDED,
+}
+"""How a connection looks that broke or fell silent, by itself or through a proxy. Everything else is a refusal."""
+
+
+_BOOT_ID = secrets.randbits(63) | 1
+_NUMBERS: Dict[str, Iterator[int]] = {}
+"""This start of the program, and by session the numbers of its measurements that have none of their own: by them the service knows what it has had, however long ago."""
+
+
+def _kept_copy(measurement: t.Measurement, session_id: str) -> t.Measurement:
+    """A measurement as it is now, with a number and a boot: whoever sent it may write its arrays anew before it is sent again."""
+    copied = {
+        name: None if getattr(measurement, name) is None else np.array(getattr(measurement, name), dtype=np.float64)
+        for name in ("state", "wheel_speed_rad_s", "road_wheel_angle_rad")
+    }
+    number = measurement.sequence or next(_NUMBERS.setdefault(session_id, itertools.count(1)))
+    command = (float(measurement.command[0]), float(measurement.command[1]))
+    # Which run counts is the matter of the stream.
+    return replace(measurement, **copied, command=command, sequence=number, boot_id=measurement.boot_id or _BOOT_ID, run=0)
+
+
+class Kept:
+    """The measurements of one session that are not known to be durable, at most `pending_max`."""
+
+    def __init__(self, session_id: str, pending_max: int):
+        self._session_id = session_id
+        self._pending_max = pending_max
+        # What is kept, oldest first: all that is answered is older than all that waits. Durable ones leave from the left, as places only rise.
+        self._answered: Deque[Tuple[t.Measurement, int]] = deque()
+        # Without an answer of this run of the server.
+        self._waiting: Deque[t.Measurement] = deque()
+        # Who counts the places.
+        self._run = 0
+        # Whether measurements come with numbers; None before the first.
+        self._is_numbered: Optional[bool] = None
+
+    def __len__(self) -> int:
+        return len(self._answered) + len(self._waiting)
+
+    @property
+    def pending(self) -> List[t.Measurement]:
+        """Oldest first."""
+        return [measurement for measurement, _ in self._answered] + list(self._waiting)
+
+    @property
+    def next(self) -> Optional[t.Measurement]:
+        """The oldest that has to be sent; None where all is answered."""
+        return self._waiting[0] if self._waiting else None
+
+    def put(self, measurement: t.Measurement) -> None:
+        """Keeps one more. Raises Overloaded where there is no room, ValueError where it does not belong here; it is not kept then."""
+        if len(self) >= self._pending_max:
+            reason = f"{len(self)} measurements are not known to be durable; flush them first"
+            raise Overloaded(grpc.StatusCode.RESOURCE_EXHAUSTED, "pending_max", reason)
+        # One that cannot be sent would hold up all that come after it.
+        m.measurement_message(measurement)
+        if measurement.session_id != self._session_id:
+            raise ValueError(f"the measurement is of session `{measurement.session_id}`, this stream is of `{self._session_id}`")
+        self._is_numbered = self._agrees(measurement)
+        self._waiting.append(_kept_copy(measurement, self._session_id))
+
+    def answered(self, answer: t.Answer) -> None:
+        """Notes the answer to `next`. Raises Unavailable where the connection is of no more use."""
+        if answer.code in (grpc.StatusCode.RESOURCE_EXHAUSTED.value[0], grpc.StatusCode.UNAVAILABLE.value[0]):
+            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", answer.message)
+        # A refused measurement has no place and is not kept; its answer need not tell who counts.
+        if answer.place:
+            if self._counted_by_another(answer.run, answer.place):
+                raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "another run of the server counts now")
+            self._run = answer.run
+            self._answered.append((self._waiting[0], answer.place))
+        self._waiting.popleft()
+        if answer.run == self._run:
+            self._durable(answer.run, answer.durable_place)
+
+    def told(self, session: t.Session) -> bool:
+        """Notes what the session says is durable; False where another run of the server counts now and all is to be sent again over another connection."""
+        if self._counted_by_another(session.run):
+            return False
+        self._durable(session.run, session.durable_place)
+        return True
+
+    def unheard(self, error: NesamError) -> None:
+        """Notes that the session said nothing; raises the error again where it is a refusal."""
+        if error.code not in BROKEN:
+            raise error
+        # Who is only late may have everything.
+        if error.code != grpc.StatusCode.DEADLINE_EXCEEDED:
+            self.forget_places()
+
+    def overdue(self, timeout_s: float) -> DeadlineExceeded:
+        """The error where not all is durable in time."""
+        reason = f"{len(self)} measurements are not durable after {timeout_s} s; is the server there, and does it keep a store?"
+        return DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", reason)
+
+    def forget_places(self) -> None:
+        """Another run of the server may count otherwise: all is sent again."""
+        self._waiting.extendleft(measurement for measurement, _ in reversed(self._answered))
+        self._answered.clear()
+
+    def _agrees(self, measurement: t.Measurement) -> bool:
+        """Whether it is numbered, as all of a stream are or none: a number of its own may be one that another got here."""
+        numbered = bool(measurement.sequence)
+        if self._is_numbered not in (None, numbered):
+            raise ValueError("this stream has measurements with and without a number; a `sequence` of 0 is none, numbers begin at 1")
+        return numbered
+
+    def _counted_by_another(self, run: int, place: float = math.inf) -> bool:
+        """Whether the answers so far came from another run of the server, or from a session that began anew: then all is sent again, from the oldest on."""
+        return bool(self._answered) and (run != self._run or place < self._answered[-1][1])
+
+    def _durable(self, run: int, durable_place: int) -> None:
+        self._run = run
+        while self._answered and self._answered[0][1] <= durable_place:
+            self._answered.popleft()
