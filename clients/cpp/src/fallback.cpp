@@ -83,6 +83,32 @@ std::optional<Start> start_of(const PredictRequest& request, const std::optional
   return rolled_forward(*request.fallback, *known, *request.start_stamp_ns, request.sent);
 }
 
+/// Whether the service would take a command: finite and within the card's range, compared in single precision, so that the ends of the range are admitted in both.
+bool admitted(const VehicleCard& card, float speed_m_s, float second) noexcept {
+  const auto within = [](float value, double low, double high) { return value >= static_cast<float>(low) && value <= static_cast<float>(high); };
+  return within(speed_m_s, card.speed_min_m_s, card.speed_max_m_s) && within(second, card.second_min, card.second_max);
+}
+
+/// Whether the service would take all numbers of a request.
+bool admitted(const PredictRequest& request, const View3<const float>& controls) noexcept {
+  const VehicleCard& card = request.fallback->vehicle;
+  for (std::size_t n = 0; n < controls.samples(); ++n) {
+    for (std::size_t k = 0; k < controls.steps(); ++k) {
+      if (!admitted(card, controls(n, k, 0), controls(n, k, 1))) return false;
+    }
+  }
+  for (const SentCommand& sent : request.sent) {
+    if (!admitted(card, static_cast<float>(sent.command.speed_m_s), static_cast<float>(sent.command.second))) return false;
+  }
+  if (!request.start) return true;
+  for (const auto* part : {&request.start->position_m, &request.start->attitude_rad, &request.start->velocity_m_s, &request.start->angular_velocity_rad_s}) {
+    for (const double value : *part) {
+      if (!std::isfinite(value)) return false;
+    }
+  }
+  return true;
+}
+
 /// What a fallback may answer instead of.
 bool late(const Error& error) noexcept {
   return error.retryable() || error.code() == Code::deadline_exceeded;
@@ -121,7 +147,7 @@ std::optional<Prediction> fallback_prediction(const PredictRequest& request, con
   View3<const float> controls = request.controls;
   if (request.drawing) controls = {request.drawing->nominal, 1, request.drawing->nominal.size() / 2, 2};
   const std::uint32_t channels = request.channels == 0 ? all_channels : request.channels & all_channels;
-  if (controls.empty() || channels == 0) return std::nullopt;
+  if (controls.empty() || channels == 0 || !admitted(request, controls)) return std::nullopt;
   const std::size_t stride = std::max<std::size_t>(1, request.stride);
   Prediction prediction;
   prediction.tag = request.tag;

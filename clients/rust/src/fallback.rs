@@ -48,6 +48,14 @@ impl KinematicFallback {
         speed_m_s * angle_rad.tan() / self.vehicle.wheelbase_m
     }
 
+    /// Whether the service would take these commands, pairs of speed and second: finite and within the card's range. In single precision, so that the ends of
+    /// the range are admitted in both.
+    fn admits(&self, commands: &[f32]) -> bool {
+        let card = &self.vehicle;
+        let range = [[card.speed_min_m_s, card.speed_max_m_s], [card.second_min, card.second_max]].map(|ends| ends.map(|end| end as f32));
+        commands.chunks_exact(2).all(|command| command.iter().zip(range).all(|(value, [low, high])| (low..=high).contains(value)))
+    }
+
     /// States, row-major (samples, horizon, 12), from a start and controls, row-major (samples, horizon, 2). Numbers at the end that make no whole sample
     /// are left out.
     pub fn rollout(&self, start: &[f64; STATE], controls: &[f32], horizon: usize) -> Vec<f32> {
@@ -95,12 +103,18 @@ impl KinematicFallback {
     }
 
     /// What it answers instead of the service, and why. `None` where the error is no lateness, where there is neither a start nor a known state that is new
-    /// enough, or where the candidates contradict themselves.
+    /// enough, or where the candidates contradict themselves or are not what the service takes: a number that is none, a command
+    /// beyond the card.
     pub(crate) fn answer(&self, candidates: &Candidates, known: Option<KnownState>, error: &ClientError) -> Option<Prediction> {
         let reason = match error {
             ClientError::Refused { code, message, .. } if LATE.contains(code) => FallbackReason { code: *code, message: message.clone() },
             _ => return None,
         };
+        let sent: Vec<f32> = candidates.sent.iter().flat_map(|(_, command)| command.map(|value| value as f32)).collect();
+        let finite = candidates.start.is_none_or(|start| start.iter().all(|value| value.is_finite()));
+        if !finite || !self.admits(&sent) {
+            return None;
+        }
         let (start, start_stamp_ns, rolled_forward_steps) = match (candidates.start, candidates.start_stamp_ns) {
             (Some(start), _) => (start, None, 0),
             (None, None) => known.map(|known| (known.state, Some(known.stamp_ns), 0))?,
@@ -114,7 +128,7 @@ impl KinematicFallback {
             None => (candidates.samples, Cow::Borrowed(candidates.controls.as_slice())),
         };
         let horizon = candidates.horizon;
-        if controls.is_empty() || controls.len() != samples.checked_mul(horizon)?.checked_mul(2)? {
+        if controls.is_empty() || controls.len() != samples.checked_mul(horizon)?.checked_mul(2)? || !self.admits(&controls) {
             return None;
         }
         let asked = candidates.output.channels;
@@ -163,7 +177,16 @@ mod tests {
     use super::*;
 
     fn card(second: v1::SecondCommand, wheelbase_m: f64) -> v1::VehicleCard {
-        v1::VehicleCard { second: second.into(), wheelbase_m, road_wheel_angle_max_rad: 0.5, ..Default::default() }
+        v1::VehicleCard {
+            second: second.into(),
+            speed_min_m_s: -2.0,
+            speed_max_m_s: 4.0,
+            second_min: -1.0,
+            second_max: 1.0,
+            wheelbase_m,
+            road_wheel_angle_max_rad: 0.5,
+            ..Default::default()
+        }
     }
 
     fn late() -> ClientError {
@@ -237,6 +260,23 @@ mod tests {
             assert!(((f64::from(turning[0]) + radius).hypot(f64::from(turning[1])) - radius).abs() < 1e-4, "{k}");
             assert!((f64::from(turning[11]) - 2.0 / radius).abs() < 1e-6, "{k}");
         }
+    }
+
+    /// Goal: what the service would refuse is no answer of the fallback either. Method: the ends of the range in single precision, then one step beyond each.
+    #[test]
+    fn analytic_a_fallback_takes_what_the_service_takes() {
+        let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
+        let answers = |controls: Vec<f32>, start: [f64; STATE]| {
+            let asked = Candidates { start: Some(start), ..Candidates::new("s", 1, 2, controls) };
+            fallback.answer(&asked, None, &late()).is_some()
+        };
+        assert!(answers(vec![4.0, -1.0, -2.0, 1.0], [0.0; STATE]));
+        for beyond in [[4.001, 0.0], [-2.001, 0.0], [0.0, 1.001], [0.0, -1.001], [f32::NAN, 0.0], [0.0, f32::INFINITY]] {
+            assert!(!answers([[0.0, 0.0], beyond].concat(), [0.0; STATE]), "{beyond:?}");
+        }
+        assert!(!answers(vec![0.0; 4], [f64::NAN; STATE]));
+        let from_now = Candidates::new("s", 1, 1, vec![0.0; 2]).starting_at(100_000_000, vec![(0, [9.0, 0.0])]);
+        assert!(fallback.answer(&from_now, known([0.0; STATE], 0), &late()).is_none(), "a command that was never taken");
     }
 
     /// Goal: what was selected is returned and marked. Method: two candidates, every second step, two channels; then the nominal sequence of a drawing.

@@ -33,6 +33,8 @@ pub struct Report<'a> {
     pub dt_s: f64,
     /// What the drives were held against.
     pub against: Against,
+    /// What does not fit together in the drives themselves, by which a claim may be wrong: units, signs, frames.
+    pub doubts: &'a [String],
 }
 
 impl Report<'_> {
@@ -66,6 +68,7 @@ impl Report<'_> {
             "learned_per_held_out_drive": self.learned(),
             "stop_rule": STOP_RULE,
             "reference": match self.against { Against::Bundle => "bundle", Against::Physics => "physics" },
+            "doubts": self.doubts,
             "provenance": self.provenance,
         });
         let map = document.as_object_mut().expect("an object was built; this is a bug");
@@ -183,6 +186,13 @@ impl Report<'_> {
             d.held_out.len()
         );
         let mut page = Page::new(&format!("nesam diagnose: {}", self.set), &lead);
+        if !self.doubts.is_empty() {
+            page.section("What does not fit together in the drives")
+                .text("A claim may be wrong by this: mend the log first, and see what `nesam check` says of it.");
+            for doubt in self.doubts {
+                page.text(doubt);
+            }
+        }
         page.section("What was seen")
             .text("Mean deviation of every channel from the frozen reference, by residual layer; z is against groups of drives without an effect.")
             .table(&self.level_table())
@@ -468,9 +478,12 @@ mod tests {
             provenance: &provenance,
             dt_s: 0.1,
             against: Against::Bundle,
+            doubts: &["yaw counts like a compass".into()],
         };
         let json: Value = serde_json::from_str(&report.to_json()).unwrap();
         let without_numbers = json!(ErrorSummary::default());
+        assert_eq!(json["doubts"][0], "yaw counts like a compass");
+        assert!(report.to_html().contains("<p>yaw counts like a compass</p>"));
         assert_eq!(without_numbers["windows"], 0);
         for errors in [&json["before"], &json["soil_only"], &json["after"], &json["controls"]["black_box_refit"]] {
             assert_eq!(errors, &without_numbers);

@@ -32,6 +32,7 @@ fn report(root: &Path) -> String {
         provenance: &provenance,
         dt_s: 0.1,
         against: Default::default(),
+        doubts: &[],
     }
     .to_json()
 }

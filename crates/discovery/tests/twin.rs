@@ -268,8 +268,16 @@ fn property_without_a_claim_the_free_form_stands_against_the_model_as_it_is() {
     assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.reason);
     let provenance = nesam_evaluation::Provenance::default();
     let against = Against::Bundle;
-    let report =
-        Report { set: "twin", diagnosis: &found, bundle: None, free_form_bundle: None, provenance: &provenance, dt_s: 0.1, against };
+    let report = Report {
+        set: "twin",
+        diagnosis: &found,
+        bundle: None,
+        free_form_bundle: None,
+        provenance: &provenance,
+        dt_s: 0.1,
+        against,
+        doubts: &[],
+    };
     let json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
     assert_eq!(json["controls"]["free_form"]["before"], json["before"]);
 }

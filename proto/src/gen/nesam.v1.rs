@@ -1663,7 +1663,7 @@ pub enum Validity {
     Unspecified = 0,
     /// A state of this sample is not finite; the other samples are unaffected.
     NotFinite = 1,
-    /// The sample left the known map.
+    /// The sample left the known map: beyond its edge, or in a hole further than 0.5 m from a known pixel.
     OffMap = 2,
     /// The session has no map: flat ground and the default soil were used.
     NoMap = 4,
@@ -4099,7 +4099,8 @@ pub struct MapTile {
     pub rows: u32,
     #[prost(uint32, tag = "4")]
     pub columns: u32,
-    /// Packed f32, shape (rows, columns): elevation in World, m; NaN = hole.
+    /// Packed f32, shape (rows, columns): elevation in World, m; NaN = hole. Holes are interpolated up to 0.5 m from a known pixel and count as known there;
+    /// further in they are unknown (VALIDITY_OFF_MAP).
     #[prost(bytes = "bytes", tag = "5")]
     pub elevation_m: ::prost::bytes::Bytes,
     /// One byte for each channel, shape (rows, columns, 3): red, green, blue of the semantic map. Empty when the map has none.

@@ -203,7 +203,7 @@ fn reference(bytes: &[u8]) {
         whole.to_string()
     });
     let Some((place, other)) = bytes.split_first_chunk::<2>() else { return };
-    let begin = usize::from(u16::from_le_bytes(*place)) * shipped.len() >> 16;
+    let begin = (usize::from(u16::from_le_bytes(*place)) * shipped.len()) >> 16;
     let end = (begin + other.len()).min(shipped.len());
     let mut changed = shipped.clone().into_bytes();
     changed.splice(begin..end, other.iter().copied());

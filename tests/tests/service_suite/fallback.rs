@@ -120,7 +120,7 @@ async fn service_a_deadline_holds_without_a_connection() {
     let patience = Duration::from_secs(20);
     let refused = tokio::time::timeout(patience, client.predict_within(asked.clone(), deadline)).await.expect("the deadline holds");
     assert_eq!(refused.expect_err("nobody is there").code(), Some(Code::DeadlineExceeded));
-    let card = nesam_client::v1::VehicleCard { wheelbase_m: 2.0, ..Default::default() };
+    let card = nesam_client::v1::VehicleCard { wheelbase_m: 2.0, speed_max_m_s: 1.0, ..Default::default() };
     let answered = client.predict_within(asked.or_fall_back(KinematicFallback::new(card)), deadline);
     let prediction = assert_fallback(tokio::time::timeout(patience, answered).await.expect("the deadline holds"), [0.0; 12]);
     assert!((prediction.state(0, 1)[0] - 0.2).abs() < 1e-6, "straight ahead at 1 m/s");

@@ -13,6 +13,7 @@ use nesam_discovery::report::{Report, describe};
 use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, SEGMENT_STEPS, Scoring, catalogue, diagnose, observe_all};
 use nesam_evaluation::report::Short;
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
+use nesam_import::doubts;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::Vehicle;
 use nesam_physics::effects::ScheduledEffect;
@@ -270,6 +271,8 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         Some(_) => Some(save_with_effects(predictor.bundle(), &with_free_form, &data_hash, &out.join("bundle-free-form"))?),
     };
     let [shown, free_form_bundle] = [bundle, free_form_bundle].map(|b| b.map(|p| p.display().to_string()));
+    let doubts: Vec<String> =
+        doubts(&drives.drives, &predictor.bundle().vehicle).iter().map(|d| format!("{}. {}", d.what, d.advice)).collect();
     let report = Report {
         set: &drives.set,
         diagnosis: &found,
@@ -278,6 +281,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         provenance: &drives.provenance,
         dt_s: predictor.bundle().normalization.dt_s,
         against: reference.into(),
+        doubts: &doubts,
     };
     summary(&report, &found);
     let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
@@ -290,6 +294,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
 
 fn summary(report: &Report<'_>, found: &Diagnosis) {
     say!("{}: {} - {}", report.set, found.verdict.as_str().to_uppercase(), found.reason);
+    report.doubts.iter().for_each(|doubt| say!("doubt: {doubt} (`nesam check` tells more; a claim may be wrong by it)"));
     let s = &found.selection;
     let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
     say!(

@@ -108,6 +108,8 @@ mod tests {
         // Two bytes of text leave two of padding before the size.
         expected.extend([2, 0, 0, 0, b'c', 0, 0, 0, 2, 0, 0, 0, 2, 0, 0, 0]);
         expected.extend([0, 0, 0, 0, 2, 0, 0, 0]);
+        // The 44 bytes so far leave four of padding before doubles.
+        expected.extend([0; 4]);
         expected.extend([0.5f64.to_le_bytes(), (-2.0f64).to_le_bytes()].concat());
         assert_eq!(message, expected);
     }

@@ -46,8 +46,16 @@ fn of_set(predictor: &Predictor, data: DataArgs, show: &dyn Fn(Value)) -> Result
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let dt_s = predictor.bundle().normalization.dt_s;
     let against = options.against;
-    let report =
-        Report { set: &drives.set, diagnosis: &found, bundle: None, free_form_bundle: None, provenance: &provenance, dt_s, against };
+    let report = Report {
+        set: &drives.set,
+        diagnosis: &found,
+        bundle: None,
+        free_form_bundle: None,
+        provenance: &provenance,
+        dt_s,
+        against,
+        doubts: &[],
+    };
     show(serde_json::from_str(&report.to_json()).unwrap_or_default());
     let position: Vec<Option<f64>> = found.scores.iter().flat_map(|s| s.scores.iter().map(|m| m.summary.tree.position_m.mean)).collect();
     if found.verdict == Verdict::Explained {
