@@ -117,6 +117,18 @@ void service_a_late_answer_falls_back_and_says_so(const nesam::Session& session,
   check(nominal.ok() && nominal->rows() == 1 && equal_bits(nominal->states().values(), whole->states().sample(0)), "the nominal sequence of a drawing");
   check(nominal.ok() && equal_bits(nominal->drawn_controls().values(), drawn.drawing->nominal), "and which that is");
 
+  // What the service would refuse is no answer of the fallback either: the error is that of the service.
+  const auto refused = [&](std::size_t at, float value) {
+    std::vector<float> wrong(controls.begin(), controls.end());
+    wrong[at] = value;
+    nesam::PredictRequest asked = request_of(wrong, 3, 8);
+    asked.fallback = request.fallback;
+    check_error(session.predict(asked, 0ns), nesam::Code::deadline_exceeded, "", "a command that nobody takes");
+  };
+  refused(4, static_cast<float>(session.vehicle().speed_max_m_s) + 0.01F);
+  refused(47, static_cast<float>(session.vehicle().second_min) - 0.01F);
+  refused(9, std::nanf(""));
+
   // A session that this client has not measured is known by where its predictions from now began, and is rolled forward from there.
   const nesam::Session copy = std::move(session.fork(unique("copy")).value());
   const nesam::Measurement newest = cruise(4, session.vehicle());
