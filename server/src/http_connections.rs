@@ -38,16 +38,9 @@ pub(crate) struct HttpLimits {
 pub(crate) async fn serve(listener: TcpListener, router: Router, limits: HttpLimits, stopping: watch::Receiver<bool>) {
     let unanswered = Unanswered::default();
     let router = unanswered.counts(router);
-    let mut sockets = PlacedSockets::of(listener, limits.connections_max);
+    let mut sockets = PlacedSockets::of(listener, limits.connections_max, stopping.clone());
     let mut connections = JoinSet::new();
-    let stop = stopped(stopping.clone());
-    tokio::pin!(stop);
-    loop {
-        let taken = tokio::select! {
-            taken = sockets.next() => taken,
-            () = &mut stop => break,
-        };
-        let Some((place, socket)) = taken else { break };
+    while let Some((place, socket)) = sockets.next().await {
         let served = serve_one(socket, router.clone(), limits.asks_within, unanswered.clone(), stopping.clone());
         connections.spawn(async move {
             served.await;

@@ -75,15 +75,8 @@ impl Entrance {
     {
         let (sender, receiver) = mpsc::channel(WAITING);
         tokio::spawn(async move {
-            let stop = stopped(self.closing.stopping.clone());
-            let mut sockets = PlacedSockets::of(self.listener, self.places);
-            tokio::pin!(stop);
-            loop {
-                let admitted = tokio::select! {
-                    admitted = sockets.next() => admitted,
-                    () = &mut stop => return,
-                };
-                let Some((place, socket)) = admitted else { return };
+            let mut sockets = PlacedSockets::of(self.listener, self.places, self.closing.stopping.clone());
+            while let Some((place, socket)) = sockets.next().await {
                 tokio::spawn(begin(socket, place, self.closing.clone(), sender.clone()));
             }
         });
@@ -94,23 +87,30 @@ impl Entrance {
 /// One of the connections that may be open at a time.
 pub(crate) type Place = OwnedSemaphorePermit;
 
-/// The sockets of a listener, each with a place; while there is none they wait in the system.
+/// The sockets of a listener until the server stops, each with a place; while there is none they wait in the system.
 pub(crate) struct PlacedSockets {
     sockets: Sockets,
     places: Arc<Semaphore>,
+    stopping: watch::Receiver<bool>,
 }
 
 impl PlacedSockets {
     /// Of a listener, so many at a time.
-    pub fn of(listener: TcpListener, places: usize) -> Self {
-        Self { sockets: Sockets::of(listener), places: Arc::new(Semaphore::new(places)) }
+    pub fn of(listener: TcpListener, places: usize, stopping: watch::Receiver<bool>) -> Self {
+        Self { sockets: Sockets::of(listener), places: Arc::new(Semaphore::new(places)), stopping }
     }
 
-    /// The next one; `None` where none comes any more. Nothing is lost when it is not awaited to the end.
+    /// The next one; `None` where none comes any more, or none is wanted.
     pub async fn next(&mut self) -> Option<(Place, TcpStream)> {
-        // First a place: what nobody can serve yet takes no file descriptor.
-        let place = Arc::clone(&self.places).acquire_owned().await.expect("nobody closes it; this is a bug");
-        Some((place, self.sockets.next().await?))
+        let placed = async {
+            // First a place: what nobody can serve yet takes no file descriptor.
+            let place = Arc::clone(&self.places).acquire_owned().await.expect("nobody closes it; this is a bug");
+            Some((place, self.sockets.next().await?))
+        };
+        tokio::select! {
+            placed = placed => placed,
+            () = stopped(self.stopping.clone()) => None,
+        }
     }
 }
 

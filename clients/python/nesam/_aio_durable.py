@@ -3,27 +3,21 @@
 import asyncio
 import math
 import time
-from typing import List
 
 from . import _calls as calls
 from . import _types as t
 from ._errors import NesamError, Unavailable
-from ._kept import BROKEN, Kept
+from ._kept import BROKEN, KeepingStream
 
 
-class AsyncDurableStream:
+class AsyncDurableStream(KeepingStream):
     """`DurableStream` in asyncio; open it with `client.durable_stream`. Tasks may share it: each `send` and `flush` waits for its turn.
 
     A `send` that is cancelled keeps its measurement; a later `send` or `flush` sends it again.
     """
 
     def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
-        self._client = client
-        self._session_id = session_id
-        self._reconnect_s = reconnect_s
-        self._pause_s = pause_s
-        self._kept = Kept(session_id, pending_max)
-        self._stream = None
+        super().__init__(client, session_id, reconnect_s, pause_s, pending_max)
         self._turn = asyncio.Lock()
 
     async def __aenter__(self) -> "AsyncDurableStream":
@@ -31,11 +25,6 @@ class AsyncDurableStream:
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
-
-    @property
-    def pending(self) -> List[t.Measurement]:
-        """As `DurableStream.pending`."""
-        return self._kept.pending
 
     async def send(self, measurement: t.Measurement) -> t.Answer:
         """As `DurableStream.send`."""

@@ -2,39 +2,25 @@
 
 import math
 import time
-from typing import List
 
 from . import _calls as calls
 from . import _types as t
 from ._errors import NesamError, Unavailable
-from ._kept import BROKEN, Kept
+from ._kept import BROKEN, KeepingStream
 
 
-class DurableStream:
+class DurableStream(KeepingStream):
     """A stream of the measurements of one session that outlives crashes of the server; open it with `client.durable_stream`.
 
     What is not known to be durable is kept, at most `pending_max` measurements, and sent again over a new connection; the service drops what it has.
     Measurements without a number or a boot get one of this program, so that nothing is taken for new that is sent again. Threads must not share it.
     """
 
-    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
-        self._client = client
-        self._session_id = session_id
-        self._reconnect_s = reconnect_s
-        self._pause_s = pause_s
-        self._kept = Kept(session_id, pending_max)
-        self._stream = None
-
     def __enter__(self) -> "DurableStream":
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    @property
-    def pending(self) -> List[t.Measurement]:
-        """Measurements that are not known to be durable, oldest first."""
-        return self._kept.pending
 
     def send(self, measurement: t.Measurement) -> t.Answer:
         """Sends one measurement and awaits its answer, over as many connections as it takes.

@@ -135,3 +135,20 @@ class Kept:
         self._run = run
         while self._answered and self._answered[0][1] <= durable_place:
             self._answered.popleft()
+
+
+class KeepingStream:
+    """What durable streams have in common, however they wait."""
+
+    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
+        self._client = client
+        self._session_id = session_id
+        self._reconnect_s = reconnect_s
+        self._pause_s = pause_s
+        self._kept = Kept(session_id, pending_max)
+        self._stream = None
+
+    @property
+    def pending(self) -> List[t.Measurement]:
+        """Measurements that are not known to be durable, oldest first."""
+        return self._kept.pending

@@ -70,7 +70,7 @@ impl Machine {
     /// A machine of which nothing was heard yet. Its type of commands has been checked with the configuration.
     pub fn new(vehicle: Ros2Vehicle, config: &Ros2Config, edge: &Edge) -> Self {
         Self {
-            kind: vehicle.kind().unwrap_or(CommandType::Twist),
+            kind: vehicle.kind().expect("the configuration was checked; this is a bug"),
             config: vehicle,
             hold: Duration::from_secs_f64(config.command_hold_s),
             edge: edge.clone(),

@@ -110,13 +110,17 @@ impl Telling {
 /// The correction of the soil prior: rows [`SOIL_ROWS`], a column for each parameter; a standard deviation is NaN while no filter runs, learned is 1 or 0.
 fn soil_array(soil: &SoilEstimate) -> Float64MultiArray {
     let state = &soil.state;
-    let deviation = state.variance.map_or([f64::NAN; SOIL_DIM], |variance| variance.map(f64::sqrt));
     let learned = state.learned.map(|learned| f64::from(u8::from(learned)));
     let axis = |label: String, size: usize| Dimension { label, size: size as u32 };
     Float64MultiArray {
         dimensions: vec![axis(SOIL_ROWS.into(), 3), axis(SOIL_NAMES.join(","), SOIL_DIM)],
-        data: [state.correction.delta, deviation, learned].concat(),
+        data: [state.correction.delta, deviations(soil), learned].concat(),
     }
+}
+
+/// Standard deviations of the correction; NaN while no filter runs.
+fn deviations(soil: &SoilEstimate) -> [f64; SOIL_DIM] {
+    soil.state.variance.map_or([f64::NAN; SOIL_DIM], |variance| variance.map(f64::sqrt))
 }
 
 /// How a machine is.
@@ -134,10 +138,10 @@ fn status(machine: &Machine, session: Option<&SessionView>, bundle: &str) -> Dia
         add("soil epoch", view.provenance.soil_epoch.to_string());
         add("map", view.provenance.map.as_ref().map_or_else(|| "none: flat ground".into(), |(id, ..)| id.clone()));
         add("effects", view.effects.effects.iter().map(|effect| effect.id.as_str()).collect::<Vec<_>>().join(","));
-        let state = &view.soil.state;
+        let (state, deviations) = (&view.soil.state, deviations(&view.soil));
         for (i, name) in SOIL_NAMES.iter().enumerate() {
-            let deviation = state.variance.map_or(f64::NAN, |variance| variance[i].sqrt());
-            let told = if state.learned[i] { format!("{:+.4} ± {deviation:.4}", state.correction.delta[i]) } else { "not learned".into() };
+            let told =
+                if state.learned[i] { format!("{:+.4} ± {:.4}", state.correction.delta[i], deviations[i]) } else { "not learned".into() };
             add(&format!("soil {name}"), told);
         }
     }
