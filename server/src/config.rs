@@ -22,6 +22,7 @@ pub use self::ros2::{Distribution, Ros2Config, Ros2Vehicle};
 pub use self::store::StoreConfig;
 pub use self::tls::TlsConfig;
 pub use self::zenoh::{ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint};
+use crate::convert::predict_bytes_max;
 use crate::error::ServerError;
 
 /// Most worker threads: more than processors of any one machine, and few enough to start.
@@ -436,6 +437,11 @@ impl Config {
         self.check_ports()?;
         self.tls.check()?;
         self.zenoh.check()?;
+        let query_bytes = predict_bytes_max(&Limits::from(&self.limits));
+        if self.zenoh.message_bytes_max < query_bytes {
+            let reason = format!("is {}, but a prediction within `limits` takes {query_bytes}", self.zenoh.message_bytes_max);
+            return Err(ServerError::Value { key: "zenoh.message_bytes_max", reason });
+        }
         self.ros2.check()?;
         if self.ros2.enabled && !self.zenoh.enabled {
             let reason = "is on, but `zenoh.enabled` is off: machines of ROS 2 are heard over Zenoh".into();

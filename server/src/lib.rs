@@ -30,12 +30,13 @@ mod workers;
 mod zenoh;
 
 pub use clock::MonotonicClock;
-pub use cluster::etcd_endpoint;
+pub use cluster::{etcd_endpoint, knows_record};
 pub use config::{
     ClusterConfig, Config, DiagnosisConfig, Distribution, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig,
     Ros2Config, Ros2Vehicle, StoreConfig, TlsConfig, WorkersConfig, ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint,
 };
 pub use error::ServerError;
+pub use grpc::grpc_timeout;
 pub use one_thread::{Sessions, serve_on_one_thread};
 pub use serve::{RunningServer, serve};
 pub use signals::{outlive_file_limit, second_interrupt, termination};

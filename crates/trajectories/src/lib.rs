@@ -10,6 +10,7 @@
 
 mod channels;
 mod command_range;
+mod commands;
 mod data_root;
 mod data_sheet;
 mod drive;
@@ -28,6 +29,7 @@ mod velocity;
 mod windows;
 
 pub use command_range::BeyondRange;
+pub use commands::commands_from_csv;
 pub use data_root::{DataRoot, SetQuery, SplitFilter};
 pub use data_sheet::{card_from_json, card_to_json, read_vehicle_card};
 pub use error::TrajectoryError;

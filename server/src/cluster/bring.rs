@@ -19,6 +19,8 @@ use crate::store::{StoredSession, resumed};
 const WAIT_MAX: Duration = Duration::from_secs(10);
 /// Longest pause between two looks at etcd; the watch usually tells sooner.
 const LOOK_AGAIN: Duration = Duration::from_millis(100);
+/// Longest wait for a lease: as long as a proxy takes that looks at /health as those in `deploy` do, twice with 0.3 s between.
+const LEASE_WAIT: Duration = Duration::from_millis(750);
 /// Pause between two looks at the lease.
 const LEASE_PAUSE: Duration = Duration::from_millis(20);
 /// Shortest pause between two searches for one session on behalf of a bus.
@@ -147,10 +149,11 @@ impl Cluster {
         budget: Duration,
         permit: impl Fn(&str) -> Result<(), Status>,
     ) -> Result<Brought, Status> {
-        let until = Instant::now() + budget.min(WAIT_MAX);
-        // Without a lease nothing can be said. It may come back, and else a proxy that watches /health cuts the connection soon: a refusal at once would only
-        // bring the client back to this server.
-        while self.0.lease.id().is_none() && Instant::now() < until {
+        let now = Instant::now();
+        let until = now + budget.min(WAIT_MAX);
+        // Without a lease nothing can be said. It may come back; a refusal at once would only bring the client back to this server. Once a proxy that watches
+        // /health knows, another server answers who asks again; not every proxy cuts off who waits here.
+        while self.0.lease.id().is_none() && Instant::now() < until.min(now + LEASE_WAIT) {
             tokio::time::sleep(LEASE_PAUSE).await;
         }
         if self.is_here(session)? {

@@ -39,6 +39,7 @@ pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, get
 pub(crate) use self::keys::Keys;
 use self::lease::Lease;
 use self::record::Server;
+pub use self::record::knows_record;
 pub(crate) use self::record::session_bytes;
 use crate::call::EngineClient;
 use crate::config::ClusterConfig;

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::keys::{Keys, Topic};
+use crate::convert::session_image;
 use crate::store::StoredSession;
 
 /// Who has a session, or who asks for it.
@@ -44,6 +46,20 @@ pub(crate) fn session_bytes(session: &StoredSession) -> Vec<u8> {
 pub(super) fn session_of(name: &str, bytes: &[u8]) -> Option<StoredSession> {
     let (saved, image) = bytes.split_first_chunk::<8>()?;
     Some(StoredSession { name: name.into(), saved_unix_ns: i64::from_be_bytes(*saved), image: image.to_vec() })
+}
+
+/// Whether a server knows what stands under a key of etcd that begins with `prefix`, read as it does.
+#[must_use]
+pub fn knows_record(prefix: &str, key: &[u8], value: &[u8]) -> bool {
+    let keys = Keys::new(prefix);
+    match keys.topic(key) {
+        Some(Topic::Owner(_) | Topic::Want(_)) => of_json::<Server>(value).is_some(),
+        Some(Topic::Map(_)) => of_json::<MapHead>(value).is_some(),
+        None => {
+            let session = keys.session_name(key).and_then(|name| session_of(name, value));
+            session.is_some_and(|stored| session_image(&stored.image).is_ok())
+        }
+    }
 }
 
 #[cfg(test)]

@@ -42,6 +42,9 @@ pub struct ZenohConfig {
     pub name: String,
     /// Interval at which the status of this server is published, s.
     pub status_interval_s: f64,
+    /// Largest message that is put together from its pieces, bytes; a larger one is dropped on its way, and its sender is not told. It bounds the memory that whoever may
+    /// connect can take: so much for each connection, priority and reliability.
+    pub message_bytes_max: usize,
     /// Whether large messages to and from processes of the same host go through shared memory where the other side can; never together with `tls/...`.
     pub shared_memory: bool,
 }
@@ -56,6 +59,7 @@ impl Default for ZenohConfig {
             fleet: "default".into(),
             name: String::new(),
             status_interval_s: 1.0,
+            message_bytes_max: 64 << 20,
             shared_memory: true,
         }
     }

@@ -9,12 +9,13 @@ const MARGIN: Duration = Duration::from_millis(2);
 
 /// Time that a request may take: the `grpc-timeout` of the client, at most `longest`.
 pub fn budget(metadata: &MetadataMap, longest: Duration) -> Duration {
-    let asked = metadata.get("grpc-timeout").and_then(|value| value.to_str().ok()).and_then(parse);
+    let asked = metadata.get("grpc-timeout").and_then(|value| value.to_str().ok()).and_then(grpc_timeout);
     asked.map_or(longest, |asked| longest.min(asked.saturating_sub(MARGIN)))
 }
 
-/// `TimeoutValue TimeoutUnit` of the gRPC protocol: up to eight digits and one of H M S m u n.
-fn parse(text: &str) -> Option<Duration> {
+/// The time that a `grpc-timeout` names: `TimeoutValue TimeoutUnit` of the gRPC protocol, up to eight digits and one of H M S m u n.
+#[must_use]
+pub fn grpc_timeout(text: &str) -> Option<Duration> {
     let (digits, unit) = text.split_at_checked(text.len().checked_sub(1)?)?;
     if digits.is_empty() || digits.len() > 8 || !digits.bytes().all(|b| b.is_ascii_digit()) {
         return None;
@@ -49,7 +50,7 @@ mod tests {
             ("1x", None),
             ("1é", None),
         ] {
-            assert_eq!(parse(text), expected, "{text}");
+            assert_eq!(grpc_timeout(text), expected, "{text}");
         }
     }
 

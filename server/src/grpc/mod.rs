@@ -36,6 +36,7 @@ use crate::store::{Keeper, Key};
 use crate::zenoh::Presence;
 
 use arrives_in_time::arrive_in_time;
+pub use deadline::grpc_timeout;
 pub(crate) use prediction::predict;
 use refusals_timed::time_refusals;
 pub(crate) use until_stopped::UntilStopped;

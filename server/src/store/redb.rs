@@ -39,11 +39,16 @@ fn failed(error: impl core::fmt::Display) -> StoreError {
     StoreError::Database { reason: error.to_string() }
 }
 
+/// The same with the file at fault.
+fn failed_in(path: &Path, error: impl core::fmt::Display) -> StoreError {
+    failed(format_args!("{}: {error}", path.display()))
+}
+
 /// The same for a file that was opened.
 fn of_file(path: &Path, opened: Result<Database, DatabaseError>) -> Result<Database, StoreError> {
     opened.map_err(|error| match error {
         DatabaseError::DatabaseAlreadyOpen => StoreError::InUse { path: path.into() },
-        other => StoreError::Database { reason: format!("{}: {other}", path.display()) },
+        other => failed_in(path, other),
     })
 }
 
@@ -59,15 +64,29 @@ impl RedbStore {
         };
         std::fs::create_dir_all(folder).map_err(at(folder))?;
         let path = folder.join(FILE);
-        let database = of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).create(&path))?;
-        // A new file is there after a power cut only when its folder is on the disk too.
-        std::fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(at(folder))?;
-        // A file that has gone is no empty store: what was durable in it would be missing from the new one.
-        Self::prepared(database, move || of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).open(&path)))
+        // What is damaged in the head of the file no checksum covers, and the database may panic on it.
+        let opened = std::panic::catch_unwind(|| {
+            let database = of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).create(&path))?;
+            // A new file is there after a power cut only when its folder is on the disk too.
+            std::fs::File::open(folder).and_then(|folder| folder.sync_all()).map_err(at(folder))?;
+            // A file that has gone is no empty store: what was durable in it would be missing from the new one.
+            let again = path.clone();
+            let prepared = Self::prepared(database, move || of_file(&again, Database::builder().set_cache_size(CACHE_BYTES).open(&again)));
+            prepared.map_err(|error| match error {
+                StoreError::Database { reason } => failed_in(&path, reason),
+                other => other,
+            })
+        });
+        opened.unwrap_or_else(|_| Err(failed_in(&path, "is damaged; put a copy in its place, or take another folder")))
     }
 
-    /// Makes the tables, or refuses a database of another format.
-    fn prepared(database: Database, reopen: impl Fn() -> Result<Database, StoreError> + Send + 'static) -> Result<Self, StoreError> {
+    /// Checks every page, which the database itself does only after a crash, and makes the tables; refuses a damaged database and one of another format.
+    fn prepared(mut database: Database, reopen: impl Fn() -> Result<Database, StoreError> + Send + 'static) -> Result<Self, StoreError> {
+        if !database.check_integrity().map_err(failed)? {
+            return Err(failed(
+                "was damaged, and is now what an earlier commit held; what came later is lost: start again to go on with that, or put a copy in its place",
+            ));
+        }
         let transaction = database.begin_write().map_err(failed)?;
         {
             let mut facts = transaction.open_table(FACTS).map_err(failed)?;

@@ -12,7 +12,7 @@ use nesam_ros2::messages::{DIAGNOSTIC_ARRAY, FLOAT64_MULTI_ARRAY, ODOMETRY};
 use super::keys;
 use super::ros2::DIAGNOSTICS;
 use crate::access::{FleetFile, Identity};
-use crate::config::{Ros2Config, Ros2Vehicle};
+use crate::config::{Config, Ros2Config, Ros2Vehicle};
 
 /// Topics of a vehicle that servers publish.
 const TOLD: [&str; 3] = ["status", "soil", "alarm"];
@@ -218,13 +218,15 @@ pub(super) fn link(files: LinkFiles<'_>) -> Value {
 }
 
 /// The configuration of a Zenoh router that lets each member of a fleet use its own keys and nobody else anything.
-pub fn router_config(members: &FleetFile, fleet: &str, ros2: &Ros2Config, listen: &[String], files: LinkFiles<'_>) -> Value {
+/// Of the configuration of its servers it takes the machines of ROS 2 and the limit on messages.
+pub fn router_config(members: &FleetFile, fleet: &str, servers: &Config, listen: &[String], files: LinkFiles<'_>) -> Value {
+    let received = json!({ "max_message_size": servers.zenoh.message_bytes_max });
     json!({
         "mode": "router",
         "listen": { "endpoints": listen },
         "scouting": { "multicast": { "enabled": false } },
-        "transport": { "link": { "protocols": ["tls"], "tls": link(files) } },
-        "access_control": access_control(members, fleet, ros2),
+        "transport": { "link": { "protocols": ["tls"], "tls": link(files), "rx": received } },
+        "access_control": access_control(members, fleet, &servers.ros2),
     })
 }
 

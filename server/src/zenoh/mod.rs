@@ -127,6 +127,7 @@ fn zenoh_config(all: &BusConfig, members: Option<&FleetFile>) -> Result<::zenoh:
     zenoh.insert_json5("scouting/multicast/enabled", "false")?;
     zenoh.insert_json5("listen/endpoints", &list(&config.listen))?;
     zenoh.insert_json5("connect/endpoints", &list(&config.connect))?;
+    zenoh.insert_json5("transport/link/rx/max_message_size", &config.message_bytes_max.to_string())?;
     let shared = config.shared_memory && !config.uses_tls();
     zenoh.insert_json5("transport/shared_memory/enabled", &shared.to_string())?;
     if config.uses_tls() {

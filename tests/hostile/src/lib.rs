@@ -6,6 +6,8 @@
 //! `tests/tools/hostile_messages.py`; `random_bytes.rs` of the service suite sends random bytes to a real server.
 #![forbid(unsafe_code)]
 
+mod kept;
+
 use std::cell::RefCell;
 use std::path::Path;
 use std::sync::OnceLock;
@@ -22,11 +24,9 @@ use nesam_physics::{Control, VehicleState};
 use nesam_proto::{Message, v1 as pb};
 use nesam_ros2::messages::{CommandType, Odometry, imu_rates};
 use nesam_server::access::{FleetFile, Identity};
-use nesam_server::recording::Recording;
-use nesam_server::store::map_of;
-use nesam_server::{Config, convert};
+use nesam_server::{Config, convert, grpc_timeout};
 use nesam_terrain::{GridGeometry, WorldMap};
-use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, read_vehicle_card};
+use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, commands_from_csv, read_vehicle_card};
 use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
@@ -34,11 +34,12 @@ use tempfile::TempDir;
 pub type Reader = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const READERS: [Reader; 37] = [
+pub const READERS: [Reader; 42] = [
     ("bag", bag),
     ("bag_metadata", bag_metadata),
     ("ros2_message", ros2_message),
     ("csv_log", csv_log),
+    ("commands_csv", commands_csv),
     ("mapping", mapping),
     ("degradation", degradation),
     ("effects", effects),
@@ -59,15 +60,19 @@ pub const READERS: [Reader; 37] = [
     ("measurement", measurement),
     ("open_session", open_session),
     ("predict", predict),
-    ("session_image", session_image),
+    ("deadline", deadline),
+    ("session_image", kept::session_image),
     ("session_content", session_content),
     ("fleet_soil_shares", fleet_soil_shares),
     ("map_messages", map_messages),
     ("map_tile", map_tile),
-    ("stored_map", stored_map),
+    ("stored_map", kept::stored_map),
+    ("etcd_record", kept::etcd_record),
+    ("store", kept::store),
     ("apply_effects", apply_effects),
     ("plant_datagram", plant_datagram),
-    ("recording", recording),
+    ("recording", kept::recording),
+    ("recorded_commands", kept::recorded_commands),
     ("fleet_file", fleet_file),
     ("identity", identity),
     ("certificate", certificate),
@@ -116,6 +121,7 @@ fn instead(name: &str, bytes: &[u8], read: impl FnOnce(&Path)) {
     in_folder(|folder| {
         let path = folder.join(name);
         let before = std::fs::read(&path).ok();
+        std::fs::create_dir_all(path.parent().unwrap_or(folder)).expect("a folder can be made");
         std::fs::write(&path, bytes).expect("a file can be written");
         read(folder);
         match before {
@@ -153,6 +159,10 @@ fn csv_log(bytes: &[u8]) {
 
 fn text(bytes: &[u8]) -> Option<&str> {
     std::str::from_utf8(bytes).ok()
+}
+
+fn commands_csv(bytes: &[u8]) {
+    drop(text(bytes).map(commands_from_csv));
 }
 
 fn mapping(bytes: &[u8]) {
@@ -263,10 +273,6 @@ fn predict(bytes: &[u8]) {
     drop(message::<pb::PredictRequest>(bytes).map(|message| convert::predict_query(&message, &Limits::default()).map(drop)));
 }
 
-fn session_image(bytes: &[u8]) {
-    drop(convert::session_image(bytes));
-}
-
 thread_local! {
     /// An engine, and a session as it exports it.
     static ENGINE: RefCell<Option<(Engine, Box<SessionImage>)>> = const { RefCell::new(None) };
@@ -353,10 +359,6 @@ fn map_tile(bytes: &[u8]) {
     drop(message::<pb::MapTile>(bytes).map(|message| convert::patched(map, &message)));
 }
 
-fn stored_map(bytes: &[u8]) {
-    drop(map_of(bytes, &Limits { map_cells_max: 1 << 20, ..Limits::default() }));
-}
-
 /// Effects on a session, which predicts with what was taken.
 fn apply_effects(bytes: &[u8]) {
     let Some(message) = message::<pb::ApplyEffectsRequest>(bytes) else { return };
@@ -372,14 +374,9 @@ fn plant_datagram(bytes: &[u8]) {
     let _ = read_json(bytes).map(|value| twelve(&value["state"]));
 }
 
-fn recording(bytes: &[u8]) {
-    instead("run.mcap", bytes, |folder| {
-        if let Ok(mut recording) = Recording::open(&[folder.join("run.mcap")]) {
-            while let Ok(Some(command)) = recording.next_command() {
-                drop(command);
-            }
-        }
-    });
+/// The deadline of a request.
+fn deadline(bytes: &[u8]) {
+    let _ = text(bytes).map(grpc_timeout);
 }
 
 fn fleet_file(bytes: &[u8]) {

@@ -4,6 +4,7 @@
 mod alarms;
 mod authority;
 mod bad_input;
+mod commits;
 mod effects;
 mod extras;
 mod fallback;

@@ -2,7 +2,7 @@
 //! real certificates; each publishes on both topics.
 
 use nesam_server::access::FleetFile;
-use nesam_server::{LinkFiles, router_config};
+use nesam_server::{Config, LinkFiles, router_config};
 
 use crate::authority::{Authority, FLEET, dns, secured_with, uri, written};
 use crate::ros2::{ODOMETRY, bag, machines};
@@ -26,7 +26,8 @@ async fn service_a_machine_of_ros2_is_heard_on_its_own_topics_alone() {
     let (certificate, key) = signed(&authority, "router");
     let links = LinkFiles { certificate: &certificate, key: &key, authority: &ca };
     let members = FleetFile::parse(FLEET).unwrap();
-    let config = router_config(&members, "test", &ros2, std::slice::from_ref(&endpoint), links);
+    let servers = Config { ros2: ros2.clone(), ..Config::default() };
+    let config = router_config(&members, "test", &servers, std::slice::from_ref(&endpoint), links);
     let router = zenoh::open(zenoh::Config::from_json5(&config.to_string()).unwrap()).await.unwrap();
     let (certificate, key) = signed(&authority, "nesam:server:alpha");
     let mut stage = secured_with(|config| {

@@ -8,6 +8,7 @@ use nesam_server::{Config, ZenohMode};
 use prost::Message as _;
 
 use crate::stage::*;
+use crate::zenoh_security::free_endpoint;
 
 pub const PATIENCE: Duration = Duration::from_secs(20);
 
@@ -228,4 +229,50 @@ async fn refuses_sessions_of_others(vehicle: &ZenohVehicle, recorded: &Recorded,
     assert!(!message.contains("neighbour"), "{message}");
     assert_refused("query of another vehicle's session", asked, tonic::Code::InvalidArgument, "session_id");
     assert_eq!(client.session("theirs").await.unwrap(), before);
+}
+
+/// Goal: nobody fills the memory of a server that others connect to. Method: messages below and above the limit from one connection, which goes on after both; the
+/// small one is refused by the measurement's own limit, so it is answered, and of the large one nothing arrives.
+#[tokio::test(flavor = "multi_thread")]
+async fn service_messages_beyond_the_limit_are_dropped_and_the_vehicle_goes_on() {
+    const LIMIT: usize = 2 << 20;
+    let (recorded, endpoint) = (recorded(), free_endpoint().replace("tls/localhost", "tcp/127.0.0.1"));
+    let (server, mut client) = start_with(|config| {
+        behind(config, "");
+        (config.zenoh.mode, config.zenoh.listen) = (ZenohMode::Router, vec![endpoint.clone()]);
+        config.zenoh.connect.clear();
+        config.zenoh.message_bytes_max = LIMIT;
+    })
+    .await;
+    open(&mut client, "truck", "").await;
+    let vehicle = ZenohVehicle::connect_through_socket(&endpoint, "test", "truck").await.unwrap();
+    vehicle.wait_for_service(PATIENCE).await.unwrap();
+    let mut config = zenoh::Config::default();
+    for (key, value) in [
+        ("mode", "\"client\"".into()),
+        ("scouting/multicast/enabled", "false".into()),
+        ("transport/shared_memory/enabled", "false".into()),
+        ("connect/endpoints", format!("[{endpoint:?}]")),
+    ] {
+        config.insert_json5(key, &value).unwrap();
+    }
+    let sender = zenoh::open(config).await.unwrap();
+    let key = "nesam/v1/test/truck/measurement";
+    let put =
+        async |bytes: usize| sender.put(key, vec![0xff; bytes]).congestion_control(zenoh::qos::CongestionControl::Block).await.unwrap();
+    for _ in 0..3 {
+        put(LIMIT / 2).await;
+        let answer = vehicle.answer(PATIENCE).await.unwrap().expect("an answer on the status key");
+        assert_eq!(outcome_label(&answer), "REJECTED");
+        put(2 * LIMIT).await;
+        assert!(vehicle.answer(Duration::from_millis(500)).await.unwrap().is_none(), "it is dropped on its way");
+    }
+    vehicle.publish(&sample("", &recorded.drive, 0)).await.unwrap();
+    assert_eq!(outcome_label(&vehicle.answer(PATIENCE).await.unwrap().unwrap()), "APPLIED");
+    // The sender is not cut off either.
+    sender.put(key, sample("", &recorded.drive, 1).encode_to_vec()).await.unwrap();
+    assert_eq!(outcome_label(&vehicle.answer(PATIENCE).await.unwrap().unwrap()), "APPLIED");
+    vehicle.close().await.unwrap();
+    sender.close().await.unwrap();
+    server.shutdown().await;
 }

@@ -7,7 +7,7 @@ use std::time::Duration;
 use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{Client, Tls, outcome_label, v1};
 use nesam_server::access::FleetFile;
-use nesam_server::{LinkFiles, Ros2Config, RunningServer, ZenohMode, router_config};
+use nesam_server::{Config, LinkFiles, RunningServer, ZenohMode, router_config};
 use prost::Message as _;
 
 use crate::authority::{Authority, FLEET, Stage, dns, secured_with, uri, written};
@@ -98,13 +98,8 @@ async fn service_a_router_with_the_written_configuration_guards_the_fleet() {
     let ca = write("ca.pem", authority.pem.as_bytes());
     let members = FleetFile::parse(FLEET).unwrap();
     let listen = [endpoint.clone()];
-    let config = router_config(
-        &members,
-        "test",
-        &Ros2Config::default(),
-        &listen,
-        LinkFiles { certificate: &certificate, key: &key, authority: &ca },
-    );
+    let config =
+        router_config(&members, "test", &Config::default(), &listen, LinkFiles { certificate: &certificate, key: &key, authority: &ca });
     let router = zenoh::open(zenoh::Config::from_json5(&config.to_string()).unwrap()).await.unwrap();
 
     let server = async |authority: &Authority, name: &str| {

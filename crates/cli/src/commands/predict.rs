@@ -9,6 +9,7 @@ use nesam_evaluation::{Truth, Window, horizontal_distance, pose_of};
 use nesam_model::{MAX_HORIZON, Predictor, Rollout, RolloutQuery, Variant, flag};
 use nesam_physics::{Control, SOIL_NAMES, SoilCorrection};
 use nesam_terrain::WorldMap;
+use nesam_trajectories::commands_from_csv;
 use serde_json::{Map, Value, json};
 
 use crate::args::{BundleArgs, CommandsArgs, DataArgs, WindowArgs};
@@ -146,23 +147,9 @@ fn recorded(window: &Window<'_>) -> Result<Vec<Control<f64>>, Failure> {
 
 /// Reads commands, no more than `horizon` where one is asked for; errors name file, line and what was expected.
 fn read_controls(file: &Path, horizon: Option<usize>) -> Result<Vec<Control<f64>>, Failure> {
-    let text = std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?;
-    let mut lines = text.lines().enumerate().filter(|(_, l)| !l.trim().is_empty());
-    let header = lines.next().map_or("", |(_, l)| l.trim());
-    if header.replace(' ', "") != "speed_m_s,second" {
-        return Err(Failure::input(format!("{}: line 1 is `{header}`, expected `speed_m_s,second`", file.display())));
-    }
-    let mut controls = Vec::new();
-    for (i, line) in lines {
-        let cells: Vec<Option<f64>> = line.split(',').map(|c| c.trim().parse().ok().filter(|v: &f64| v.is_finite())).collect();
-        let [Some(speed_m_s), Some(second)] = cells[..] else {
-            return Err(Failure::input(format!("{}: line {}: `{line}` is not two finite numbers", file.display(), i + 1)));
-        };
-        controls.push(Control { speed_m_s, second });
-    }
-    if controls.is_empty() {
-        return Err(Failure::input(format!("{}: no commands below the header", file.display())));
-    }
+    let named = |reason: &dyn std::fmt::Display| Failure::input(format!("{}: {reason}", file.display()));
+    let text = std::fs::read_to_string(file).map_err(|error| named(&error))?;
+    let mut controls = commands_from_csv(&text).map_err(|reason| named(&reason))?;
     if let Some(horizon) = horizon.filter(|horizon| *horizon < controls.len()) {
         note!("note: the first {horizon} of {} commands in {} are used, as --horizon says", controls.len(), file.display());
         controls.truncate(horizon);

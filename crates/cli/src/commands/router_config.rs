@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use nesam_server::access::FleetFile;
-use nesam_server::{Config, LinkFiles, Ros2Config, is_tls_endpoint, router_config};
+use nesam_server::{Config, LinkFiles, is_tls_endpoint, router_config};
 
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
@@ -23,7 +23,7 @@ pub struct RouterConfigArgs {
     /// Fleet in the keys nesam/v1/<fleet>/<vehicle>/...
     #[arg(long, value_name = "NAME", default_value = "default")]
     fleet: String,
-    /// Configuration of the servers, whose [ros2] says which topics of ROS 2 the vehicles use; without it, none
+    /// Configuration of the servers, which says which topics of ROS 2 the vehicles use and how large messages may be; without it, none and 64 MiB
     #[arg(long, value_name = "FILE.toml")]
     config: Option<PathBuf>,
     /// Endpoints to listen on
@@ -51,8 +51,8 @@ pub fn run(args: &RouterConfigArgs) -> Result<(), Failure> {
         return Err(Failure::input(format!("--listen {open}: only tls/... shows who connects")));
     }
     let files = LinkFiles { certificate: &args.certificate, key: &args.key, authority: &args.authority };
-    let ros2 = args.config.as_deref().map(Config::load).transpose().or_input()?.map_or_else(Ros2Config::default, |config| config.ros2);
-    let config = router_config(&members, &args.fleet, &ros2, &args.listen, files);
+    let servers = args.config.as_deref().map(Config::load).transpose().or_input()?.unwrap_or_default();
+    let config = router_config(&members, &args.fleet, &servers, &args.listen, files);
     say!("{}", serde_json::to_string_pretty(&config).or_failed()?);
     Ok(())
 }

@@ -273,6 +273,23 @@ fn service_damaged_foreign_and_shared_stores_are_refused() {
     assert!(message.contains(FILE), "{message}");
     std::fs::write(&file, &bytes).unwrap();
     assert_eq!(RedbStore::open(folder.path()).unwrap().load().unwrap(), expected(20));
+    // Damage in any page, after an orderly end, when the database itself would look at none.
+    const PAGE: usize = 4096;
+    let used: Vec<usize> = (0..bytes.len() / PAGE).filter(|page| bytes[page * PAGE..][..PAGE].iter().any(|byte| *byte != 0)).collect();
+    let mut refused = 0;
+    for at in used.iter().flat_map(|page| [0, 9, 64, 70, 128, 900].map(|offset| page * PAGE + offset)) {
+        let mut damaged = bytes.clone();
+        damaged[at..at + 8].iter_mut().for_each(|byte| *byte ^= 0x5a);
+        std::fs::write(&file, damaged).unwrap();
+        match RedbStore::open(folder.path()).and_then(|store| store.load()) {
+            Ok(held) => assert_eq!(held, expected(20), "damage at {at}"),
+            Err(error) => {
+                refused += 1;
+                assert!(error.to_string().contains(FILE), "damage at {at}: {error}");
+            }
+        }
+    }
+    assert!(refused > used.len(), "{refused} of six in each of {} pages", used.len());
     // A folder that is a file.
     assert!(matches!(RedbStore::open(&file), Err(StoreError::File { .. })));
 }
