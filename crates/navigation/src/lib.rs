@@ -23,7 +23,7 @@ mod session;
 mod tracker;
 mod trial;
 
-pub use caution::{Caution, CautionSettings};
+pub use caution::{Caution, CautionSettings, Stretch};
 pub use error::NavigationError;
 pub use forecast::{Forecaster, KinematicForecaster, Situation};
 pub use lap::{Lap, LapPlan, Lean, Scored, run_lap};

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, SoilKind, TrackingCost};
+use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, SoilKind, Stretch, TrackingCost};
 use nesam_physics::{SecondCommand, Vehicle, driveline::road_wheel_angles};
 use nesam_plant::HiddenEffects;
 use nesam_terrain::WorldMap;
@@ -34,7 +34,7 @@ const SPEED_LIMITS_M_S: [f64; 2] = [0.5, 4.0];
 /// Weights of progress and tilt against the squared distance from the path.
 const LAG_WEIGHT: f64 = 0.1;
 const TILT_WEIGHT: f64 = 2.0;
-/// What the planner does about ground further ahead that will not hold the vehicle on the path (ADR 0061).
+/// What the planner does about ground further ahead that will not hold the vehicle on the path (ADR 0061, 0078).
 const CAUTION: CautionSettings = CautionSettings {
     ahead_m: [6.0, 10.0, 14.0, 18.0],
     every_steps: 10,
@@ -42,11 +42,10 @@ const CAUTION: CautionSettings = CautionSettings {
     slowed_by_m: [-0.8, -0.5],
     slow_m_s: 2.2,
     slow_limits_m_s: [2.0, 2.6],
+    slowed_over: Stretch { lead_m: 12.0, ramp_m: 6.0, behind_m: 3.0 },
     moved_by_m: [-0.7, -0.2],
     inside_m: 1.8,
-    lead_m: 12.0,
-    ramp_m: 6.0,
-    behind_m: 3.0,
+    moved_over: Stretch { lead_m: 8.0, ramp_m: 8.0, behind_m: 0.0 },
 };
 /// Worlds of the scenario, where the data root has them.
 const SCENARIO: [&str; 5] = ["w35", "w36", "w37", "w38", "w39"];
