@@ -1,7 +1,8 @@
 """The client for asyncio."""
 
 import asyncio
-from typing import AsyncIterable, AsyncIterator, Awaitable, Iterable, List, Optional, Sequence, Tuple, Union
+import functools
+from typing import Any, AsyncIterable, AsyncIterator, Callable, Iterable, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -13,14 +14,14 @@ from . import _types as t
 from ._aio_durable import AsyncDurableStream
 from ._candidates import Drawing, PathCost
 from ._connection import ATTEMPTS_MAX, arguments, trying_again
-from ._errors import DeadlineExceeded, NesamError, Unavailable, from_rpc
+from ._errors import from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
+from ._stream import OpenStream
 from .v1 import (
     alarms_pb2,
     diagnosis_pb2_grpc,
-    measurements_pb2,
     measurements_pb2_grpc,
     prediction_pb2_grpc,
     sessions_pb2_grpc,
@@ -59,8 +60,10 @@ class AsyncClient:
             "terrain": terrain_pb2_grpc.TerrainStub(channel),
             "soil": soil_pb2_grpc.SoilStub(channel),
             "diagnosis": diagnosis_pb2_grpc.DiagnosisStub(channel),
-            "measurements": measurements_pb2_grpc.MeasurementsStub(channel),
         }
+        # See `_stream`; without TLS gRPC gives it the same connection.
+        self._threads = grpc.insecure_channel(address, options) if credentials is None else grpc.secure_channel(address, credentials, options)
+        self._open_measurements = functools.partial(measurements_pb2_grpc.MeasurementsStub(self._threads).Stream, metadata=self._metadata)
         self._known_states = calls.KnownStates()
 
     async def __aenter__(self) -> "AsyncClient":
@@ -73,6 +76,7 @@ class AsyncClient:
         """Closes the connection."""
         await self._channel.close()
         await self._once.close()
+        self._threads.close()
 
     async def _do(self, call: calls.Call, timeout_s: Optional[float] = None):
         method = getattr(self._stubs[call.service], call.method)
@@ -263,13 +267,13 @@ class AsyncClient:
             return self._known_states.fall_back(question, error)
 
 
-class AsyncMeasurementStream:
+class AsyncMeasurementStream(OpenStream):
     """One open stream. Tasks may share it: each `send` is answered in its turn."""
 
     def __init__(self, client: AsyncClient):
-        self._client = client
-        self._stream = client._stubs["measurements"].Stream(metadata=client._metadata)
+        self._heard: "asyncio.Queue[Any]" = asyncio.Queue()
         self._turn = asyncio.Lock()
+        super().__init__(client, _teller(self._heard))
 
     async def __aenter__(self) -> "AsyncMeasurementStream":
         return self
@@ -278,103 +282,65 @@ class AsyncMeasurementStream:
         await self.close()
 
     async def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
-        """As `MeasurementStream.send`."""
-        message = m.measurement_message(measurement)
+        """As `MeasurementStream.send`. One that is cancelled ends the stream."""
         async with self._turn:
-            asked = self._client._known_states.ask()
-            answering = self._exchange(message)
-            return await self._answer(asked, measurement, answering, self._client.timeout_s if timeout_s is None else timeout_s)
+            self._put(measurement)
+            return await self._next(self._client.timeout_s if timeout_s is None else timeout_s)
 
     async def close(self) -> None:
         """Says that no more measurements come."""
-        if not self._stream.done():
-            await self._stream.done_writing()
-
-    def _cancel(self) -> None:
-        self._stream.cancel()
+        self._say_end()
 
     async def _send_all(self, measurements: Measurements, timeout_s: float) -> List[t.Answer]:
         """The answers to measurements that are sent without waiting for them, each within `timeout_s` of the one before or of its own sending."""
-        unanswered: "asyncio.Queue[Optional[Tuple[int, t.Measurement]]]" = asyncio.Queue()
-        sending = asyncio.ensure_future(self._put_all(measurements, unanswered))
+        sent: "asyncio.Queue[bool]" = asyncio.Queue()
+        sending = asyncio.ensure_future(self._put_all(measurements, sent))
         answers = []
         try:
-            waiting = await unanswered.get()
-            while waiting is not None:
-                answers.append(await self._answer(*waiting, self._read(), timeout_s))
-                unanswered.task_done()
-                waiting = await unanswered.get()
+            while await sent.get():
+                answers.append(await self._next(timeout_s))
             await sending
             return answers
         finally:
             sending.cancel()
             await asyncio.gather(sending, return_exceptions=True)
 
-    async def _put_all(self, measurements: Measurements, unanswered: "asyncio.Queue[Optional[Tuple[int, t.Measurement]]]") -> None:
-        """Sends measurements, and tells of each and of the end."""
-        is_first = True
+    async def _put_all(self, measurements: Measurements, sent: "asyncio.Queue[bool]") -> None:
+        """Sends measurements, and tells of each (True) and of the end (False)."""
         try:
             async for measurement in _each(measurements):
-                message = m.measurement_message(measurement)
-                unanswered.put_nowait((self._client._known_states.ask(), measurement))
-                await self._write(message)
-                if is_first:
-                    # The service may refuse the whole stream, and why is lost to who goes on writing, see `_ENDED_WHILE_WRITING`.
-                    await unanswered.join()
-                    is_first = False
+                self._put(measurement)
+                sent.put_nowait(True)
+                # What is at hand is sent at once; answers and other tasks have their turn all the same.
+                await asyncio.sleep(0)
         finally:
-            unanswered.put_nowait(None)
+            sent.put_nowait(False)
 
-    async def _answer(
-        self, asked: int, measurement: t.Measurement, answering: Awaitable[measurements_pb2.MeasurementAnswer], timeout_s: float
-    ) -> t.Answer:
+    async def _next(self, timeout_s: float) -> t.Answer:
+        """The answer to the oldest measurement that waits for one."""
         try:
-            answer = m.answer(await asyncio.wait_for(answering, timeout_s))
+            # `wait_for` gives up at once where no time is left, whatever is there.
+            heard = await asyncio.wait_for(self._heard.get(), self._left_s(timeout_s)) if self._heard.empty() else self._heard.get_nowait()
         except asyncio.TimeoutError:
+            raise self._late(timeout_s) from None
+        except BaseException:
             self._cancel()
-            raise DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s") from None
-        self._client._known_states.measured(asked, measurement, answer)
-        return answer
+            raise
+        return self._answer(heard)
 
-    async def _exchange(self, message: measurements_pb2.Measurement) -> measurements_pb2.MeasurementAnswer:
-        await self._write(message)
-        return await self._read()
 
-    async def _write(self, message: measurements_pb2.Measurement) -> None:
+def _teller(heard: "asyncio.Queue[Any]") -> Callable[[Any], None]:
+    """Puts what another thread hears into a queue of the running loop."""
+    loop = asyncio.get_running_loop()
+
+    def tell(message: Any) -> None:
         try:
-            await self._stream.write(message)
-        except asyncio.InvalidStateError:
-            raise await self._end() from None
-        except grpc.RpcError as error:
-            raise _stream_error(error) from None
+            loop.call_soon_threadsafe(heard.put_nowait, message)
+        except RuntimeError:
+            # The loop is closed; nobody waits any more.
+            pass
 
-    async def _read(self) -> measurements_pb2.MeasurementAnswer:
-        try:
-            reply = await self._stream.read()
-        except grpc.RpcError as error:
-            raise _stream_error(error) from None
-        if reply is grpc.aio.EOF:
-            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream")
-        return reply
-
-    async def _end(self) -> NesamError:
-        """Why nothing more can be sent."""
-        if self._stream.done() and not self._stream.cancelled():
-            try:
-                await self._stream.wait_for_connection()
-            except grpc.RpcError as error:
-                return _stream_error(error)
-        return Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed")
-
-
-# What grpc.aio says of a stream that ended while a message was written to it, and keeps saying when it hears why.
-_ENDED_WHILE_WRITING = (grpc.StatusCode.INTERNAL, "Internal error from Core")
-
-
-def _stream_error(error: grpc.RpcError) -> NesamError:
-    if (error.code(), error.details()) == _ENDED_WHILE_WRITING:
-        return Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream while it was written to; why is not known")
-    return from_rpc(error)
+    return tell
 
 
 async def _each(measurements: Measurements) -> AsyncIterator[t.Measurement]:

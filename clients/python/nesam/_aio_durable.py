@@ -78,9 +78,10 @@ class AsyncDurableStream(KeepingStream):
                 self._drop()
                 if error.code not in BROKEN:
                     raise
-                if time.monotonic() >= until:
-                    raise Unavailable(error.code, error.field, error.message) from error
-                await asyncio.sleep(self._pause_s)
+                left_s = until - time.monotonic()
+                if left_s <= 0.0:
+                    raise Unavailable(error.code, error.field, error.message, error.retry_after_s) from error
+                await asyncio.sleep(min(left_s, self._until_again_s(error)))
             except BaseException:
                 # Cancelled before its answer, which must not be taken for that of the next measurement.
                 self._drop()

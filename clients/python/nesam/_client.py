@@ -1,10 +1,7 @@
 """The synchronous client."""
 
 import queue
-import threading
-import time
-from collections import deque
-from typing import Any, Deque, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Any, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -16,14 +13,14 @@ from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._connection import ATTEMPTS_MAX, arguments, trying_again
 from ._durable import DurableStream
-from ._errors import DeadlineExceeded, NesamError, Unavailable, from_rpc
+from ._errors import from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
+from ._stream import OpenStream
 from .v1 import (
     alarms_pb2,
     diagnosis_pb2_grpc,
-    measurements_pb2,
     measurements_pb2_grpc,
     prediction_pb2_grpc,
     sessions_pb2_grpc,
@@ -31,6 +28,7 @@ from .v1 import (
     soil_pb2_grpc,
     terrain_pb2_grpc,
 )
+
 
 class Client:
     """A connection to a service, e.g. `Client("127.0.0.1:50051")`. Threads may share it. Close it, or use it in a `with` block.
@@ -63,7 +61,7 @@ class Client:
             "soil": soil_pb2_grpc.SoilStub(self._channel),
             "diagnosis": diagnosis_pb2_grpc.DiagnosisStub(self._channel),
         }
-        self._measurements = measurements_pb2_grpc.MeasurementsStub(self._channel)
+        self._open_measurements = measurements_pb2_grpc.MeasurementsStub(self._channel).Stream
         self._known_states = calls.KnownStates()
 
     def __enter__(self) -> "Client":
@@ -252,7 +250,7 @@ class Client:
     def durable_stream(self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2, pending_max: int = 65536) -> DurableStream:
         """A stream that keeps measurements until the service has them on stable storage, and sends them again after a crash of the server.
 
-        reconnect_s: longest time without the service before `send` gives up, s. pause_s: time between two attempts, s. pending_max: measurements that are kept at
+        reconnect_s: longest time without the service before `send` gives up, s. pause_s: time between two attempts where the service asks for none, s. pending_max: measurements that are kept at
         most; beyond it `send` raises Overloaded. A store commits at least every second (`store.interval_s`), so the default is more than ten minutes at 100 Hz.
         The server needs a store (`nesam serve --store DIR`): without one nothing becomes durable, and `pending_max` measurements are all that can be sent.
         """
@@ -320,19 +318,12 @@ class Client:
             return self._known_states.fall_back(question, error)
 
 
-class MeasurementStream:
+class MeasurementStream(OpenStream):
     """One open stream: `send` returns the answer. Threads must not share it."""
 
     def __init__(self, client: Client):
-        self._client = client
-        self._outgoing: "queue.SimpleQueue[Optional[measurements_pb2.Measurement]]" = queue.SimpleQueue()
         self._heard: "queue.SimpleQueue[Any]" = queue.SimpleQueue()
-        self._waiting: Deque[Tuple[int, t.Measurement]] = deque()
-        # Since when the oldest of those that wait has been waited for.
-        self._since = 0.0
-        self._closed = False
-        self._call = client._measurements.Stream(iter(self._outgoing.get, None))
-        threading.Thread(target=_listen, args=(self._call, self._heard), daemon=True).start()
+        super().__init__(client, self._heard.put)
 
     def __enter__(self) -> "MeasurementStream":
         return self
@@ -343,60 +334,32 @@ class MeasurementStream:
     def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
         """Sends one measurement and awaits its answer, at most for `timeout_s`, default that of the client.
 
-        Raises DeadlineExceeded when none comes in time, which ends the stream, and Unavailable when the stream has ended.
+        Raises DeadlineExceeded when none comes in time, which ends the stream; what the service ended the stream with, also when asked again; Unavailable after
+        `close`; ValueError for an array of a wrong shape.
         """
         self._put(measurement)
         return self._next(self._client.timeout_s if timeout_s is None else timeout_s)
 
     def close(self) -> None:
         """Says that no more measurements come."""
-        if not self._closed:
-            self._closed = True
-            self._outgoing.put(None)
+        self._say_end()
 
     def _exchange(self, measurements: Iterable[t.Measurement], timeout_s: float) -> Iterator[t.Answer]:
         """The answers to measurements that are sent without waiting for them."""
         for measurement in measurements:
             self._put(measurement)
-            while self._waiting and (not self._heard.empty() or time.monotonic() > self._since + timeout_s):
+            while self._waiting and (not self._heard.empty() or self._left_s(timeout_s) == 0.0):
                 yield self._next(timeout_s)
         while self._waiting:
             yield self._next(timeout_s)
 
-    def _put(self, measurement: t.Measurement) -> None:
-        if self._closed:
-            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed")
-        message = m.measurement_message(measurement)
-        if not self._waiting:
-            self._since = time.monotonic()
-        self._waiting.append((self._client._known_states.ask(), measurement))
-        self._outgoing.put(message)
-
     def _next(self, timeout_s: float) -> t.Answer:
         """The answer to the oldest measurement that waits for one."""
         try:
-            heard = self._heard.get(timeout=max(0.0, self._since + timeout_s - time.monotonic()))
+            heard = self._heard.get(timeout=self._left_s(timeout_s))
         except queue.Empty:
-            self._call.cancel()
-            heard = DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s")
+            raise self._late(timeout_s) from None
         except BaseException:
-            # Interrupted before its answer, which must not be taken for that of the next measurement.
-            self._call.cancel()
-            self.close()
+            self._cancel()
             raise
-        if isinstance(heard, NesamError):
-            self.close()
-            raise heard
-        answer, self._since = m.answer(heard), time.monotonic()
-        self._client._known_states.measured(*self._waiting.popleft(), answer)
-        return answer
-
-
-def _listen(call: Iterable[measurements_pb2.MeasurementAnswer], heard: "queue.SimpleQueue[Any]") -> None:
-    """Tells every answer on a stream, and then what ended it."""
-    try:
-        for message in call:
-            heard.put(message)
-        heard.put(Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream"))
-    except grpc.RpcError as error:
-        heard.put(from_rpc(error))
+        return self._answer(heard)

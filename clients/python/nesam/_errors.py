@@ -1,16 +1,23 @@
 """Errors: one class for each kind of refusal."""
 
+from typing import Optional, Union
+
 import grpc
+from google.protobuf.message import DecodeError
+from google.rpc import error_details_pb2, status_pb2
 
 
 class NesamError(Exception):
-    """A call failed. `code` is the gRPC code, `field` the path of the field at fault ("" when none is), `message` what was wrong."""
+    """A call failed. `code` is the gRPC code, `field` the path of the field at fault ("" when none is), `message` what was wrong. retry_after_s: pause after
+    which the service may have room or be there again, s, as it says itself; None = it does not say.
+    """
 
-    def __init__(self, code: grpc.StatusCode, field: str, message: str):
+    def __init__(self, code: grpc.StatusCode, field: str, message: str, retry_after_s: Optional[float] = None):
         super().__init__(f"{code.name}: {message}")
         self.code = code
         self.field = field
         self.message = message
+        self.retry_after_s = retry_after_s
 
 
 class InvalidArgument(NesamError):
@@ -30,7 +37,7 @@ class FailedPrecondition(NesamError):
 
 
 class Overloaded(NesamError):
-    """Too many requests wait, or a limit on sessions, maps or what a durable stream keeps is reached; ask again later."""
+    """Too many requests wait, or a limit on sessions, maps or what a durable stream keeps is reached; ask again later, where the service says when after `retry_after_s`."""
 
 
 class DeadlineExceeded(NesamError):
@@ -66,4 +73,17 @@ def from_rpc(error: grpc.RpcError) -> NesamError:
     metadata = dict(tuple(error.trailing_metadata() or ()))
     field = metadata.get("nesam-field", "")
     field = field.decode() if isinstance(field, bytes) else field
-    return _CLASSES.get(code, NesamError)(code, field, error.details() or "")
+    retry_after_s = _retry_after_s(metadata.get("grpc-status-details-bin", b""))
+    return _CLASSES.get(code, NesamError)(code, field, error.details() or "", retry_after_s)
+
+
+def _retry_after_s(details: Union[str, bytes]) -> Optional[float]:
+    """What google.rpc.RetryInfo says in the details of a status; None where it is not there, or they are none."""
+    try:
+        status = status_pb2.Status.FromString(details if isinstance(details, bytes) else b"")
+        retry = error_details_pb2.RetryInfo()
+        # `Unpack` says whether it is one.
+        found = next((True for detail in status.details if detail.Unpack(retry)), False)
+    except DecodeError:
+        return None
+    return retry.retry_delay.seconds + 1e-9 * retry.retry_delay.nanos if found else None

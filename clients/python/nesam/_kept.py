@@ -152,3 +152,7 @@ class KeepingStream:
     def pending(self) -> List[t.Measurement]:
         """Measurements that are not known to be durable, oldest first."""
         return self._kept.pending
+
+    def _until_again_s(self, error: NesamError) -> float:
+        """Pause before the next connection: what the service asks for, else `pause_s`; never none at all."""
+        return self._pause_s if error.retry_after_s is None else max(0.01, error.retry_after_s)

@@ -12,10 +12,13 @@ import grpc
 import numpy as np
 import pytest
 from conftest import free_port, start_server, straight
+from google.protobuf import any_pb2, duration_pb2
+from google.rpc import error_details_pb2, status_pb2
 from test_client import fan
-from test_connection import listening
+from test_connection import at_once, listening, measurements
 
 import nesam
+from nesam._errors import from_rpc
 from nesam.v1 import prediction_pb2, sessions_pb2
 
 CARD = nesam.VehicleCard("cart", "yaw_rate_rad_s", (-1.0, 3.0), (-1.0, 1.0), 1.0, 0.0)
@@ -201,3 +204,73 @@ def test_property_attempts_are_counted_from_one_to_five(kind):
     for wrong in (0, 6):
         with pytest.raises(ValueError, match="allowed are 1 to 5"):
             kind("127.0.0.1:1", attempts_max=wrong)
+
+
+def status_with(code, message, retry_after_s):
+    """Trailing metadata of a refusal that says when to come back, as the service writes it."""
+    retry = error_details_pb2.RetryInfo(retry_delay=duration_pb2.Duration(seconds=int(retry_after_s), nanos=round(retry_after_s % 1 * 1e9)))
+    detail = any_pb2.Any()
+    detail.Pack(retry)
+    return ("grpc-status-details-bin", status_pb2.Status(code=code.value[0], message=message, details=[detail]).SerializeToString())
+
+
+@KINDS
+def test_service_an_overloaded_service_says_when_it_has_room(request, kind):
+    """The real server, asked for more than it can compute in the time that it is given."""
+    server, address = start_server(request, "--grpc", "127.0.0.1:0", "--no-http", "--no-zenoh")
+    try:
+        with nesam.Client(address) as client:
+            client.open_session("truck")
+            client.measure(straight("truck", 20))
+            client.predict("truck", fan(64, 32))
+            # It knows by now how long a candidate takes.
+            for _ in range(20):
+                [(refused, _)] = Blocking(kind, address).ask(lambda client: client.predict("truck", fan(2048, 32), timeout_s=0.02))
+                if isinstance(refused, nesam.Overloaded):
+                    break
+            assert isinstance(refused, nesam.Overloaded) and 0.0 < refused.retry_after_s < 60.0
+            with pytest.raises(nesam.NotFound) as unknown:
+                client.session("nobody")
+            assert unknown.value.retry_after_s is None
+    finally:
+        server.terminate()
+        assert server.wait(timeout=30) == 0
+
+
+@KINDS
+def test_service_a_durable_stream_comes_back_when_the_service_asks_for_it(kind):
+    """The pause of its own would be 5 s."""
+    streams = []
+
+    def moves(requests, context):
+        streams.append(time.monotonic())
+        if len(streams) == 1:
+            context.set_trailing_metadata((status_with(grpc.StatusCode.UNAVAILABLE, "moves", 0.3),))
+            context.abort(grpc.StatusCode.UNAVAILABLE, "moves")
+        yield from at_once(requests, context)
+
+    with listening(measurements(moves)) as address:
+        client = Blocking(kind, address)
+        [(answer, _)] = client.ask(lambda client: client.durable_stream("truck", pause_s=5.0).send(next(straight("truck", 1))))
+        assert answer.outcome == "APPLIED" and 0.28 < streams[1] - streams[0] < 2.0
+        streams.clear()
+        [(refused, _)] = client.ask(lambda client: client.measure(straight("truck", 1)))
+        assert isinstance(refused, nesam.Unavailable) and refused.retry_after_s == pytest.approx(0.3)
+
+
+def test_property_details_that_are_none_say_nothing():
+    class Refused(grpc.RpcError):
+        def __init__(self, details):
+            self._details = details
+
+        def code(self):
+            return grpc.StatusCode.UNAVAILABLE
+
+        def details(self):
+            return "away"
+
+        def trailing_metadata(self):
+            return (("grpc-status-details-bin", self._details),)
+
+    for details in (b"", b"\xff\xff\xff", b"\x1a\x04\x0a\x02ab", "text"):
+        assert from_rpc(Refused(details)).retry_after_s is None

@@ -1,0 +1,84 @@
+"""What measurement streams have in common, however their answers are waited for.
+
+Threads of gRPC carry both kinds: grpc.aio forgets why a stream ended that was written to at that moment.
+"""
+
+import queue
+import threading
+import time
+from collections import deque
+from typing import Any, Callable, Deque, Iterable, Optional, Tuple
+
+import grpc
+
+from . import _messages as m
+from . import _types as t
+from ._errors import DeadlineExceeded, NesamError, Unavailable, from_rpc
+from .v1 import measurements_pb2
+
+
+class OpenStream:
+    """One open stream. hear: takes every answer, and then the NesamError that says what ended the stream; it is called from another thread."""
+
+    def __init__(self, client: Any, hear: Callable[[Any], None]):
+        self._client = client
+        self._outgoing: "queue.SimpleQueue[Optional[measurements_pb2.Measurement]]" = queue.SimpleQueue()
+        self._waiting: Deque[Tuple[int, t.Measurement]] = deque()
+        # Since when the oldest of those that wait has been waited for.
+        self._since = 0.0
+        self._closed = False
+        self._ended: Optional[NesamError] = None
+        self._call = client._open_measurements(iter(self._outgoing.get, None))
+        threading.Thread(target=_listen, args=(self._call, hear), daemon=True).start()
+
+    def _put(self, measurement: t.Measurement) -> None:
+        """Sends one. Raises what ended the stream where that has been heard, ValueError for an array of a wrong shape."""
+        if self._ended is not None:
+            raise self._ended
+        if self._closed:
+            raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the measurement stream is closed")
+        message = m.measurement_message(measurement)
+        if not self._waiting:
+            self._since = time.monotonic()
+        self._waiting.append((self._client._known_states.ask(), measurement))
+        self._outgoing.put(message)
+
+    def _left_s(self, timeout_s: float) -> float:
+        """How long the oldest answer may still take."""
+        return max(0.0, self._since + timeout_s - time.monotonic())
+
+    def _late(self, timeout_s: float) -> NesamError:
+        """The error of an answer that did not come in time, which ends the stream."""
+        self._cancel()
+        return DeadlineExceeded(grpc.StatusCode.DEADLINE_EXCEEDED, "", f"no answer to a measurement in {timeout_s:.3g} s")
+
+    def _answer(self, heard: Any) -> t.Answer:
+        """The answer to the oldest measurement that waits for one. Raises what ended the stream."""
+        if isinstance(heard, NesamError):
+            self._ended = heard
+            self._say_end()
+            raise heard
+        answer, self._since = m.answer(heard), time.monotonic()
+        self._client._known_states.measured(*self._waiting.popleft(), answer)
+        return answer
+
+    def _cancel(self) -> None:
+        """Leaves the stream at once; what has no answer gets none, which must not be taken for that of another measurement."""
+        self._call.cancel()
+        self._say_end()
+
+    def _say_end(self) -> None:
+        """Says that no more measurements come."""
+        if not self._closed:
+            self._closed = True
+            self._outgoing.put(None)
+
+
+def _listen(call: Iterable[measurements_pb2.MeasurementAnswer], hear: Callable[[Any], None]) -> None:
+    """Tells every answer on a stream, and then what ended it."""
+    try:
+        for message in call:
+            hear(message)
+        hear(Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the service ended the measurement stream"))
+    except grpc.RpcError as error:
+        hear(from_rpc(error))
