@@ -110,7 +110,7 @@ def test_service_reordering_repetition_gap_and_restart_over_zenoh(network):
 
 
 @pytest.mark.skipif(not FLEET_PAGE.is_file(), reason="the book is in the repository")
-def test_service_the_fleet_of_the_book_keeps_to_its_own_keys(request, tmp_path):
+def test_service_the_fleet_of_the_book_keeps_to_its_own_keys(request, tmp_path, monkeypatch):
     server = Path(request.config.getoption("--server")).resolve()
     block = re.search(r"<!-- run -->\n```sh\n(.*?)```", FLEET_PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
     environment = {**os.environ, "REPO": str(FLEET_PAGE.parents[1]), "PATH": f"{server.parent}:{os.environ['PATH']}"}
@@ -146,6 +146,13 @@ def test_service_the_fleet_of_the_book_keeps_to_its_own_keys(request, tmp_path):
             time.sleep(1.0)
             assert answers.empty() and overheard.empty()
             assert client.session("truck-7").accepted == 1
+            # The planner of the page, as it is written there.
+            connects = re.search(r"```python\n(.*?)```", FLEET_PAGE.read_text(encoding="utf-8"), re.DOTALL).group(1)
+            monkeypatch.chdir(tmp_path)
+            planner_names = {"nesam": nesam}
+            exec(connects.replace("server:50051", address.replace("127.0.0.1", "localhost")), planner_names)
+            with planner_names["client"] as asks:
+                assert asks.session("truck-7").accepted == 1
             for vehicle in (own, planner, other):
                 vehicle.close()
     finally:
