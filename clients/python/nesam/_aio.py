@@ -13,7 +13,7 @@ from . import _messages as m
 from . import _types as t
 from ._aio_durable import AsyncDurableStream
 from ._candidates import Drawing, PathCost
-from ._connection import ATTEMPTS_MAX, arguments, trying_again
+from ._connection import ATTEMPTS_MAX, Options, arguments, trying_again
 from ._errors import from_rpc
 from ._extras import Extras
 from ._fallback import KinematicFallback
@@ -46,7 +46,7 @@ class AsyncClient:
         self.timeout_s = timeout_s
         options, credentials = arguments(tls)
 
-        def opened(options):
+        def opened(options: Options) -> Any:
             return grpc.aio.insecure_channel(address, options) if credentials is None else grpc.aio.secure_channel(address, credentials, options)
 
         self._channel = channel = opened(options + trying_again(attempts_max))
@@ -78,7 +78,7 @@ class AsyncClient:
         await self._once.close()
         self._threads.close()
 
-    async def _do(self, call: calls.Call, timeout_s: Optional[float] = None):
+    async def _do(self, call: calls.Call[calls.Told], timeout_s: Optional[float] = None) -> calls.Told:
         method = getattr(self._stubs[call.service], call.method)
         try:
             timeout = self.timeout_s if timeout_s is None else timeout_s
@@ -86,7 +86,7 @@ class AsyncClient:
         except grpc.RpcError as error:
             raise from_rpc(error) from None
 
-    async def _watch(self, service: str, method: str, request, read, timeout_s: Optional[float]):
+    async def _watch(self, service: str, method: str, request: Any, read: Callable[[Any], calls.Told], timeout_s: Optional[float]) -> AsyncIterator[calls.Told]:
         call = getattr(self._stubs[service], method)(request, timeout=timeout_s, metadata=self._metadata)
         try:
             async for message in call:
@@ -229,7 +229,7 @@ class AsyncClient:
         self,
         session_id: str,
         controls: Union[np.ndarray, Drawing],
-        start: Optional[Sequence[float]] = None,
+        start: Optional[t.Vector] = None,
         use_history: bool = True,
         channels: Optional[Sequence[str]] = None,
         stride: int = 1,

@@ -3,6 +3,7 @@
 import asyncio
 import math
 import time
+from typing import Any
 
 from . import _calls as calls
 from . import _types as t
@@ -16,7 +17,7 @@ class AsyncDurableStream(KeepingStream):
     A `send` that is cancelled keeps its measurement; a later `send` or `flush` sends it again.
     """
 
-    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
+    def __init__(self, client: Any, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
         super().__init__(client, session_id, reconnect_s, pause_s, pending_max)
         self._turn = asyncio.Lock()
 
@@ -92,7 +93,7 @@ class AsyncDurableStream(KeepingStream):
         if self._stream is None:
             self._stream = self._client.measurement_stream()
         while True:
-            answer = await self._stream.send(self._kept.next, max(0.0, min(self._reconnect_s, end - time.monotonic())))
+            answer: t.Answer = await self._stream.send(self._kept.next, max(0.0, min(self._reconnect_s, end - time.monotonic())))
             self._kept.answered(answer)
             if not self._kept.next:
                 return answer

@@ -3,7 +3,7 @@
 import itertools
 import threading
 from dataclasses import dataclass, replace
-from typing import Any, Callable, Dict, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Dict, Generic, List, Optional, Sequence, Tuple, TypeVar, Union
 
 import numpy as np
 
@@ -19,21 +19,24 @@ LATE = (DeadlineExceeded, Overloaded, Unavailable)
 """What a fallback may answer instead of."""
 
 
+Told = TypeVar("Told")
+
+
 @dataclass(frozen=True)
-class Call:
+class Call(Generic[Told]):
     """A unary call: `service` and `method` by the name of the stub, the request or an iterator of requests, and how the reply is read."""
 
     service: str
     method: str
     request: Any
-    read: Callable[[Any], Any]
+    read: Callable[[Any], Told]
 
 
 def _nothing(_: Any) -> None:
     return None
 
 
-def open_session(vehicle_id: str, session_id: str, map_id: str, vehicle_card: str, initial: Optional[t.Measurement]) -> Call:
+def open_session(vehicle_id: str, session_id: str, map_id: str, vehicle_card: str, initial: Optional[t.Measurement]) -> Call[t.Session]:
     """Opens a session."""
     request = sessions_pb2.OpenSessionRequest(
         vehicle_id=vehicle_id,
@@ -45,12 +48,12 @@ def open_session(vehicle_id: str, session_id: str, map_id: str, vehicle_card: st
     return Call("sessions", "Open", request, m.session)
 
 
-def session(session_id: str) -> Call:
+def session(session_id: str) -> Call[t.Session]:
     """Reads a session."""
     return Call("sessions", "Get", sessions_pb2.GetSessionRequest(session_id=session_id), m.session)
 
 
-def sessions() -> Call:
+def sessions() -> Call[List[t.Session]]:
     """Lists the sessions."""
 
     def read(reply: sessions_pb2.ListSessionsReply) -> List[t.Session]:
@@ -59,40 +62,40 @@ def sessions() -> Call:
     return Call("sessions", "List", sessions_pb2.ListSessionsRequest(), read)
 
 
-def fork_session(session_id: str, new_session_id: str) -> Call:
+def fork_session(session_id: str, new_session_id: str) -> Call[t.Session]:
     """Copies a session."""
     request = sessions_pb2.ForkSessionRequest(session_id=session_id, new_session_id=new_session_id)
     return Call("sessions", "Fork", request, m.session)
 
 
-def export_session(session_id: str) -> Call:
+def export_session(session_id: str) -> Call[bytes]:
     """Reads everything that a session remembers."""
     return Call("sessions", "Export", sessions_pb2.ExportSessionRequest(session_id=session_id), lambda reply: reply.image)
 
 
-def import_session(image: bytes, session_id: str) -> Call:
+def import_session(image: bytes, session_id: str) -> Call[t.Session]:
     """Opens a session from an export."""
     return Call("sessions", "Import", sessions_pb2.ImportSessionRequest(image=image, session_id=session_id), m.session)
 
 
-def close_session(session_id: str) -> Call:
+def close_session(session_id: str) -> Call[None]:
     """Closes a session."""
     return Call("sessions", "Close", sessions_pb2.CloseSessionRequest(session_id=session_id), _nothing)
 
 
-def apply_effects(session_id: str, effects: Sequence[t.Effect], source: str) -> Call:
+def apply_effects(session_id: str, effects: Sequence[t.Effect], source: str) -> Call[t.Session]:
     """Puts effects on a session."""
     messages = [effects_pb2.Effect(id=e.id, parameters=m.parameter_messages(e)) for e in effects]
     request = effects_pb2.ApplyEffectsRequest(session_id=session_id, source=source, effects=messages)
     return Call("sessions", "ApplyEffects", request, m.session)
 
 
-def revert_effects(session_id: str) -> Call:
+def revert_effects(session_id: str) -> Call[t.Session]:
     """Takes effects away."""
     return Call("sessions", "RevertEffects", effects_pb2.RevertEffectsRequest(session_id=session_id), m.session)
 
 
-def upload_map(world: t.WorldMap) -> Call:
+def upload_map(world: t.WorldMap) -> Call[t.MapDescription]:
     """Uploads a map in tiles."""
     elevation = np.ascontiguousarray(world.elevation_m, dtype="<f4")
     if elevation.ndim != 2:
@@ -102,19 +105,19 @@ def upload_map(world: t.WorldMap) -> Call:
 
 def patch_tile(
     map_id: str, base_version: int, row: int, column: int, elevation_m: np.ndarray, semantic_rgb: Optional[np.ndarray]
-) -> Call:
+) -> Call[t.MapDescription]:
     """Replaces a rectangle of a map."""
     tile = m.tile(row, column, np.ascontiguousarray(elevation_m, dtype="<f4"), semantic_rgb)
     request = terrain_pb2.PatchTileRequest(map_id=map_id, base_version=base_version, tile=tile)
     return Call("terrain", "PatchTile", request, m.map_description)
 
 
-def map_(map_id: str) -> Call:
+def map_(map_id: str) -> Call[t.MapDescription]:
     """Describes a map."""
     return Call("terrain", "Get", terrain_pb2.GetMapRequest(map_id=map_id), m.map_description)
 
 
-def maps() -> Call:
+def maps() -> Call[List[t.MapDescription]]:
     """Lists the maps."""
 
     def read(reply: terrain_pb2.ListMapsReply) -> List[t.MapDescription]:
@@ -123,12 +126,12 @@ def maps() -> Call:
     return Call("terrain", "List", terrain_pb2.ListMapsRequest(), read)
 
 
-def fleet_soil(map_id: str) -> Call:
+def fleet_soil(map_id: str) -> Call[t.FleetSoil]:
     """Reads the soil map of the fleet."""
     return Call("soil", "Map", soil_pb2.FleetSoilRequest(map_id=map_id), t.fleet_soil)
 
 
-def delete_map(map_id: str) -> Call:
+def delete_map(map_id: str) -> Call[None]:
     """Forgets a map."""
     return Call("terrain", "Delete", terrain_pb2.DeleteMapRequest(map_id=map_id), _nothing)
 
@@ -139,7 +142,7 @@ class Question:
 
     session_id: str
     controls: Union[np.ndarray, Drawing]
-    start: Optional[Sequence[float]] = None
+    start: Optional[t.Vector] = None
     use_history: bool = True
     channels: Optional[Sequence[str]] = None
     stride: int = 1
@@ -160,7 +163,7 @@ class Question:
             raise ValueError(f"controls have shape {controls.shape}, expected (samples, horizon, 2)")
         return controls
 
-    def call(self) -> Call:
+    def call(self) -> Call[t.Prediction]:
         """The call. ValueError for arrays of a wrong shape."""
         controls = self.commands()
         drawing = self.controls if isinstance(self.controls, Drawing) else None

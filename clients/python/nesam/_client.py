@@ -1,7 +1,7 @@
 """The synchronous client."""
 
 import queue
-from typing import Any, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
+from typing import Any, Callable, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -11,7 +11,7 @@ from . import _diagnosis as diagnosis
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
-from ._connection import ATTEMPTS_MAX, arguments, trying_again
+from ._connection import ATTEMPTS_MAX, Options, arguments, trying_again
 from ._durable import DurableStream
 from ._errors import from_rpc
 from ._extras import Extras
@@ -46,7 +46,7 @@ class Client:
         self.timeout_s = timeout_s
         options, credentials = arguments(tls)
 
-        def opened(options):
+        def opened(options: Options) -> Any:
             channel = grpc.insecure_channel(address, options) if credentials is None else grpc.secure_channel(address, credentials, options)
             return grpc.intercept_channel(channel, VehicleHeader(vehicle_id)) if vehicle_id else channel
 
@@ -75,14 +75,14 @@ class Client:
         self._channel.close()
         self._once.close()
 
-    def _do(self, call: calls.Call, timeout_s: Optional[float] = None):
+    def _do(self, call: calls.Call[calls.Told], timeout_s: Optional[float] = None) -> calls.Told:
         method = getattr(self._stubs[call.service], call.method)
         try:
             return call.read(method(call.request, timeout=self.timeout_s if timeout_s is None else timeout_s))
         except grpc.RpcError as error:
             raise from_rpc(error) from None
 
-    def _watch(self, service: str, method: str, request, read, timeout_s: Optional[float]):
+    def _watch(self, service: str, method: str, request: Any, read: Callable[[Any], calls.Told], timeout_s: Optional[float]) -> Iterator[calls.Told]:
         call = getattr(self._stubs[service], method)(request, timeout=timeout_s)
         try:
             for message in call:
@@ -262,7 +262,7 @@ class Client:
         self,
         session_id: str,
         controls: Union[np.ndarray, Drawing],
-        start: Optional[Sequence[float]] = None,
+        start: Optional[t.Vector] = None,
         use_history: bool = True,
         channels: Optional[Sequence[str]] = None,
         stride: int = 1,

@@ -84,7 +84,7 @@ class DurableStream(KeepingStream):
         if self._stream is None:
             self._stream = self._client.measurement_stream()
         while True:
-            answer = self._stream.send(self._kept.next, max(0.0, min(self._reconnect_s, end - time.monotonic())))
+            answer: t.Answer = self._stream.send(self._kept.next, max(0.0, min(self._reconnect_s, end - time.monotonic())))
             self._kept.answered(answer)
             if not self._kept.next:
                 return answer

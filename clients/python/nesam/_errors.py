@@ -1,6 +1,6 @@
 """Errors: one class for each kind of refusal."""
 
-from typing import Optional, Union
+from typing import Any, Dict, Optional, Union, cast
 
 import grpc
 from google.protobuf.message import DecodeError
@@ -70,7 +70,7 @@ def from_rpc(error: grpc.RpcError) -> NesamError:
     if (code, error.details()) == _TIME_IS_OVER:
         code = grpc.StatusCode.DEADLINE_EXCEEDED
     # A tuple first: old metadata of grpc.aio are pairs that `dict` takes for keys.
-    metadata = dict(tuple(error.trailing_metadata() or ()))
+    metadata: Dict[str, Union[str, bytes]] = dict(cast(Any, tuple(error.trailing_metadata() or ())))
     field = metadata.get("nesam-field", "")
     field = field.decode() if isinstance(field, bytes) else field
     retry_after_s = _retry_after_s(metadata.get("grpc-status-details-bin", b""))

@@ -115,7 +115,7 @@ class KinematicFallback:
     def _admits(self, controls: np.ndarray) -> np.ndarray:
         """Whether each number (..., 2) lies in its range, as bool; NaN does not."""
         low, high = self._range().T
-        return (controls >= low) & (controls <= high)
+        return np.asarray((controls >= low) & (controls <= high))
 
     def _check_range(self, place: str, command: Sequence[float]) -> None:
         for entry, value, (low, high), admitted in zip(_ENTRIES, command, self._range(), self._admits(np.asarray(command, dtype=np.float32))):

@@ -5,7 +5,7 @@ import math
 import secrets
 from collections import deque
 from dataclasses import replace
-from typing import Deque, Dict, Iterator, List, Optional, Tuple
+from typing import Any, Deque, Dict, Iterator, List, Optional, Tuple
 
 import grpc
 import numpy as np
@@ -31,7 +31,7 @@ _NUMBERS: Dict[str, Iterator[int]] = {}
 
 def _kept_copy(measurement: t.Measurement, session_id: str) -> t.Measurement:
     """A measurement as it is now, with a number and a boot: whoever sent it may write its arrays anew before it is sent again."""
-    copied = {
+    copied: Dict[str, Any] = {
         name: None if getattr(measurement, name) is None else np.array(getattr(measurement, name), dtype=np.float64)
         for name in ("state", "wheel_speed_rad_s", "road_wheel_angle_rad")
     }
@@ -140,13 +140,13 @@ class Kept:
 class KeepingStream:
     """What durable streams have in common, however they wait."""
 
-    def __init__(self, client, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
+    def __init__(self, client: Any, session_id: str, reconnect_s: float, pause_s: float, pending_max: int):
         self._client = client
         self._session_id = session_id
         self._reconnect_s = reconnect_s
         self._pause_s = pause_s
         self._kept = Kept(session_id, pending_max)
-        self._stream = None
+        self._stream: Any = None
 
     @property
     def pending(self) -> List[t.Measurement]:

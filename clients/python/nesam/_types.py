@@ -3,13 +3,18 @@
 import enum
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Dict, List, Optional, Sequence, Tuple, Union
+from typing import Any, Dict, List, Optional, Sequence, Tuple, Union
 
 import numpy as np
+import numpy.typing as npt
 
 from ._candidates import Ranking
 from ._extras import ExtraOutputs
 from .v1 import soil_pb2, types_pb2
+
+
+Vector = Union[Sequence[float], "npt.NDArray[Any]"]
+"""A list, a tuple or a one-dimensional array of numbers."""
 
 
 class Validity(enum.IntFlag):
@@ -240,8 +245,8 @@ class Tls:
     @classmethod
     def from_files(cls, authority: str, certificate: Optional[str] = None, key: Optional[str] = None, server_name: str = "") -> "Tls":
         """Reads the files. Raises OSError naming the one that cannot be read."""
-        given = [None if path is None else Path(path).read_bytes() for path in (authority, certificate, key)]
-        return cls(given[0], given[1], given[2], server_name)
+        given = [None if path is None else Path(path).read_bytes() for path in (certificate, key)]
+        return cls(Path(authority).read_bytes(), given[0], given[1], server_name)
 
 
 @dataclass(frozen=True)
@@ -257,11 +262,11 @@ class Measurement:
 
     session_id: str
     stamp_ns: int
-    state: Sequence[float]
-    command: Sequence[float]
+    state: Vector
+    command: Vector
     sequence: int = 0
-    wheel_speed_rad_s: Optional[Sequence[float]] = None
-    road_wheel_angle_rad: Optional[Sequence[float]] = None
+    wheel_speed_rad_s: Optional[Vector] = None
+    road_wheel_angle_rad: Optional[Vector] = None
     boot_id: int = 0
     run: int = 0
 
@@ -370,7 +375,7 @@ class Prediction:
     ranking: Optional[Ranking] = None
 
 
-def array(values: Sequence[float], shape: Tuple[int, ...], name: str) -> np.ndarray:
+def array(values: Vector, shape: Tuple[int, ...], name: str) -> np.ndarray:
     """`values` as float64 of the given shape; ValueError naming it otherwise."""
     result = np.asarray(values, dtype=np.float64)
     if result.shape != shape:
@@ -378,7 +383,7 @@ def array(values: Sequence[float], shape: Tuple[int, ...], name: str) -> np.ndar
     return result
 
 
-def state_message(state: Sequence[float], name: str = "state") -> types_pb2.VehicleState:
+def state_message(state: Vector, name: str = "state") -> types_pb2.VehicleState:
     """A state message from (12,)."""
     x = array(state, (12,), name)
     parts = [types_pb2.Vector3(x=x[i], y=x[i + 1], z=x[i + 2]) for i in (0, 3, 6, 9)]

@@ -7,7 +7,7 @@
 Needs casadi, which this package does not install.
 """
 
-from typing import Any, Dict, List, Optional
+from typing import Any, List, Mapping, Optional, Sequence
 
 import casadi
 import numpy as np
@@ -54,14 +54,14 @@ class Rollout(casadi.Callback):
     def get_sparsity_out(self, i: int) -> casadi.Sparsity:
         return casadi.Sparsity.dense(_STATE, self.horizon)
 
-    def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
+    def eval(self, arguments: Sequence[casadi.DM]) -> List[casadi.DM]:
         """The states."""
-        return [casadi.DM(self.predict(*arguments).states[0].astype(np.float64).T)]
+        return [casadi.DM(self.predict(arguments[0], arguments[1]).states[0].astype(np.float64).T)]
 
     def has_jacobian(self) -> bool:
         return True
 
-    def get_jacobian(self, name: str, inames: List[str], onames: List[str], options: Dict[str, Any]) -> casadi.Function:
+    def get_jacobian(self, name: str, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]) -> casadi.Function:
         """The Jacobian as a function of start, commands and states."""
         self._jacobian = _Jacobian(name, self, inames, onames, options)
         return self._jacobian
@@ -75,7 +75,7 @@ class Rollout(casadi.Callback):
 class _Jacobian(casadi.Callback):
     """Blocks dx/dx0 (12 horizon, 12) and dx/du (12 horizon, 2 horizon), columns stacked as CasADi does."""
 
-    def __init__(self, name: str, rollout: Rollout, inames: List[str], onames: List[str], options: Dict[str, Any]):
+    def __init__(self, name: str, rollout: Rollout, inames: Sequence[str], onames: Sequence[str], options: Mapping[str, Any]):
         casadi.Callback.__init__(self)
         self._rollout, self._inames, self._onames = rollout, inames, onames
         self.construct(name, options)
@@ -99,12 +99,13 @@ class _Jacobian(casadi.Callback):
         horizon = self._rollout.horizon
         return casadi.Sparsity.dense(_STATE * horizon, (_STATE, _COMMAND * horizon)[i])
 
-    def eval(self, arguments: List[casadi.DM]) -> List[casadi.DM]:
+    def eval(self, arguments: Sequence[casadi.DM]) -> List[casadi.DM]:
         prediction = self._rollout.predict(arguments[0], arguments[1], Extras(jacobians=True))
         if prediction.fallback_reason is not None:
             # A fallback knows no Jacobians: why the service did not tell them is what the caller has to know.
             raise prediction.fallback_reason
         extras = prediction.extras
+        assert extras is not None and extras.jacobian_start is not None and extras.jacobian_controls is not None, "asked for; this is a bug"
         rows = _STATE * self._rollout.horizon
         start = extras.jacobian_start[0].reshape(rows, _STATE)
         controls = extras.jacobian_controls[0].reshape(rows, _COMMAND * self._rollout.horizon)

@@ -40,7 +40,7 @@ POINTS_MAX = 400_000
 DRIVEN_MAX = 2_000
 """Poses of a driven path at most; of a longer one the newest."""
 
-_AS_RECORDED = {
+_AS_RECORDED: Dict[str, Any] = {
     "/measurement": measurements_pb2.Measurement,
     "/measurement/answer": measurements_pb2.MeasurementAnswer,
     "/soil": soil_pb2.SoilEstimate,
@@ -50,8 +50,8 @@ _AGAINST = ~int(t.Validity.SOIL_NOT_LEARNED | t.Validity.ALARM_ACTIVE | t.Validi
 _GOOD, _BAD = (0, 114, 178), (213, 94, 0)
 _POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("red", "u1"), ("green", "u1"), ("blue", "u1"), ("alpha", "u1")])
 _FIELDS = [
-    PackedElementField(name=str(name), offset=_POINT.fields[name][1], type=PackedElementField.FLOAT32 if name in "xyz" else PackedElementField.UINT8)
-    for name in _POINT.names or ()
+    PackedElementField(name=str(name), offset=offset, type=PackedElementField.FLOAT32 if name in "xyz" else PackedElementField.UINT8)
+    for name, (_, offset, *_) in (_POINT.fields or {}).items()
 ]
 
 

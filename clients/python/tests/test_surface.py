@@ -1,6 +1,9 @@
 """Goal: what threads can do asyncio can too, by the same names. Method: the public surfaces, held against each other and against the protocol."""
 
 import inspect
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
@@ -46,3 +49,58 @@ def test_property_what_is_tried_again_is_what_the_protocol_says_changes_nothing(
     sessions = {"nesam.v1.Sessions/Get", "nesam.v1.Sessions/List", "nesam.v1.Sessions/Export"}
     maps = {"nesam.v1.Terrain/Get", "nesam.v1.Terrain/List", "nesam.v1.Soil/Map"}
     assert found == {*sessions, *maps, "nesam.v1.Prediction/Predict"}
+
+
+def test_property_every_public_name_is_explained():
+    for name in nesam.__all__:
+        told = getattr(nesam, name)
+        if inspect.isclass(told):
+            assert (told.__doc__ or "").strip() and not told.__doc__.startswith(f"{name}("), name
+            for method, member in inspect.getmembers(told, inspect.isfunction):
+                assert method.startswith("_") or inspect.getdoc(member), f"{name}.{method}"
+
+
+STRICT = """
+import asyncio
+from typing import Optional
+
+import nesam
+import numpy as np
+
+
+def plan(client: nesam.Client) -> Optional[float]:
+    state = np.zeros(12)
+    client.measure([nesam.Measurement("truck", 0, state, (1.0, 0.0), wheel_speed_rad_s=np.ones(4))])
+    controls = np.full((64, 32, 2), [2.0, 0.1], np.float32)
+    try:
+        prediction = client.predict("truck", controls, start=state, cost=nesam.PathCost(np.zeros((2, 2)), speed_m_s=3.0, best=4))
+    except nesam.Overloaded as error:
+        return error.retry_after_s
+    for event in client.diagnose("truck"):
+        if isinstance(event, nesam.DiagnosisReport):
+            client.apply_effects("truck", event.effects)
+    return float(prediction.states[0, -1, 0]) if not prediction.validity[0] & nesam.Validity.OFF_MAP else None
+
+
+async def watch(client: nesam.AsyncClient) -> list[nesam.Alarm]:
+    async with client.durable_stream("truck") as stream:
+        answer: nesam.Answer = await stream.send(nesam.Measurement("truck", 0, [0.0] * 12, np.zeros(2)))
+        assert answer.outcome
+    return [alarm async for alarm in client.alarms("truck")]
+
+
+async def ask(client: nesam.AsyncClient) -> nesam.Prediction:
+    return (await asyncio.gather(client.predict("truck", np.zeros((1, 1, 2)))))[0]
+"""
+
+
+def test_property_types_hold_strictly(tmp_path):
+    """Of the package itself, and of a program that uses it."""
+    pytest.importorskip("mypy")
+    pytest.importorskip("numpy", minversion="1.26")
+    (tmp_path / "program.py").write_text(STRICT)
+    mypy = [sys.executable, "-m", "mypy", "--cache-dir", tmp_path / "cache"]
+    settings = Path(__file__).parents[1] / "pyproject.toml"
+    for checked in ([*mypy, "--config-file", settings, "-p", "nesam"], [*mypy, "--strict", tmp_path / "program.py"]):
+        done = subprocess.run(checked, capture_output=True, text=True, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr
