@@ -6,6 +6,7 @@
 #include "convert.hpp"
 #include "convert_prediction.hpp"
 #include "fallback_prediction.hpp"
+#include "retry_after.hpp"
 
 namespace nesam::detail {
 
@@ -48,7 +49,7 @@ Error error_from(const grpc::Status& status, const grpc::ClientContext& context)
   // How the server's transport says that the time the client gave was over, where it notices before engine and client do.
   const bool late = status.error_code() == grpc::StatusCode::CANCELLED && status.error_message() == "Timeout expired";
   const auto code = late ? grpc::StatusCode::DEADLINE_EXCEEDED : status.error_code();
-  return Error(code_from(static_cast<int>(code)), std::move(field), status.error_message());
+  return Error(code_from(static_cast<int>(code)), std::move(field), status.error_message(), retry_after_of(status.error_details()));
 }
 
 Core::Core(const std::string& target, const ClientOptions& settings)

@@ -24,7 +24,7 @@ const char* name(Code code) noexcept {
   return "UNKNOWN";
 }
 
-Error::Error(Code code, std::string field, const std::string& message)
-    : std::runtime_error(std::string(name(code)) + ": " + message), code_(code), field_(std::move(field)) {}
+Error::Error(Code code, std::string field, const std::string& message, std::optional<std::chrono::nanoseconds> retry_after)
+    : std::runtime_error(std::string(name(code)) + ": " + message), code_(code), field_(std::move(field)), retry_after_(retry_after) {}
 
 }  // namespace nesam

@@ -17,6 +17,7 @@
 #include <vector>
 
 #include "../src/half.hpp"
+#include "../src/retry_after.hpp"
 #include "check.hpp"
 #include "scenario.hpp"
 
@@ -32,6 +33,31 @@ void published_halves_of_ieee_754() {
   check(std::isnan(nesam::detail::from_half(0x7e00)) && std::signbit(nesam::detail::from_half(0x8000)), "not a number, and minus zero");
   const auto two = nesam::detail::unpack_half(std::string("\x00\x3c\x00\xc0\x01", 5));
   check(two == std::vector<float>{1.0F, -2.0F}, "little-endian; a left-over byte is ignored");
+}
+
+void published_retry_info_of_google_rpc() {
+  // Status{code: 8, details: Any{"type.googleapis.com/google.rpc.RetryInfo", RetryInfo{retry_delay: 1.5 s}}} as protoc encodes it.
+  const std::string url = "type.googleapis.com/google.rpc.RetryInfo", delay("\x0a\x08\x08\x01\x10\x80\xca\xb5\xee\x01", 10);
+  const std::string any = "\x0a" + std::string(1, static_cast<char>(url.size())) + url + "\x12" + std::string(1, static_cast<char>(delay.size())) + delay;
+  const std::string status = "\x08\x08\x1a" + std::string(1, static_cast<char>(any.size())) + any;
+  check(nesam::detail::retry_after_of(status) == std::chrono::nanoseconds(1500ms), "a second and a half");
+  check(!nesam::detail::retry_after_of("") && !nesam::detail::retry_after_of("\xff\xff"), "nothing is said");
+  for (std::size_t cut = 1; cut < status.size(); ++cut) nesam::detail::retry_after_of(status.substr(0, cut));
+}
+
+/// A service that is asked for more than it can compute in time says when it has room.
+void service_who_is_overloaded_is_told_when_to_come_back(const nesam::Session& session) {
+  constexpr std::size_t samples = 2048, horizon = 32;
+  std::vector<float> controls(2 * samples * horizon, 1.0F);
+  for (std::size_t i = 1; i < controls.size(); i += 2) controls[i] = 0.0F;
+  for (int attempt = 0; attempt < 50; ++attempt) {
+    auto refused = session.predict(request_of(controls, samples, horizon), 20ms);
+    if (refused || refused.error().code() != nesam::Code::resource_exhausted) continue;
+    const auto pause = refused.error().retry_after();
+    check(pause && *pause > 0ns && *pause < 60s, "the time to wait is told");
+    return;
+  }
+  check(false, "50 predictions of 2048 candidates in 20 ms: none was refused for the load");
 }
 
 /// Checks that `half` is `whole` rounded to eleven significant bits: 4 mm for positions within 16 m of the start, 2^-11 of other numbers.
@@ -181,6 +207,7 @@ void service_bad_instants_are_refused(const nesam::Session& session) {
 
 void run_all(nesam::Client& client) {
   run("published_halves_of_ieee_754", published_halves_of_ieee_754);
+  run("published_retry_info_of_google_rpc", published_retry_info_of_google_rpc);
   const HillyMap hills;
   const std::string map_id = unique("hills");
   client.upload_map(hills.view(map_id, 1)).value();
@@ -191,6 +218,7 @@ void run_all(nesam::Client& client) {
     run("service_a_prediction_from_now_rolls_forward_with_what_was_sent",
         [&] { service_a_prediction_from_now_rolls_forward_with_what_was_sent(planner); });
     run("service_bad_instants_are_refused", [&] { service_bad_instants_are_refused(planner); });
+    run("service_who_is_overloaded_is_told_when_to_come_back", [&] { service_who_is_overloaded_is_told_when_to_come_back(planner); });
   }
   client.delete_map(map_id).value();
 }

@@ -197,7 +197,10 @@ impl Reference {
         let fail = |reason: &str| DiscoveryError::Reference { reason: reason.into() };
         let channels = self.compared().ok_or_else(|| fail("names a channel that this program does not know"))?;
         if let Some(missing) = channels.iter().find(|c| !available[**c]) {
-            let reason = format!("the reference compares {}, which a drive of this set does not measure", channels::name(*missing));
+            let reason = format!(
+                "the reference compares {}, which a drive of this set does not measure; `--reference physics` compares what the drives measure, from eight of them on",
+                channels::name(*missing)
+            );
             return Err(DiscoveryError::Drives { reason });
         }
         let size = channels.len();

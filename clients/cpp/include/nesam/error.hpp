@@ -1,5 +1,7 @@
 #pragma once
 
+#include <chrono>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -35,18 +37,21 @@ const char* name(Code code) noexcept;
 /// The client throws only in the thread that calls `value()`: its own threads hand failures over as values.
 class Error : public std::runtime_error {
  public:
-  Error(Code code, std::string field, const std::string& message);
+  Error(Code code, std::string field, const std::string& message, std::optional<std::chrono::nanoseconds> retry_after = std::nullopt);
 
   Code code() const noexcept { return code_; }
   /// Path of the field at fault, for example `controls[2, 3].speed_m_s`; empty when no field is.
   const std::string& field() const noexcept { return field_; }
   /// Whether the same call may succeed later without any change: UNAVAILABLE or RESOURCE_EXHAUSTED.
   bool retryable() const noexcept { return code_ == Code::unavailable || code_ == Code::resource_exhausted; }
+  /// Pause after which the service may have room or be there again, as it says itself; nothing where it does not say.
+  std::optional<std::chrono::nanoseconds> retry_after() const noexcept { return retry_after_; }
   // what(): "INVALID_ARGUMENT: ..." with what was wrong and what is allowed.
 
  private:
   Code code_;
   std::string field_;
+  std::optional<std::chrono::nanoseconds> retry_after_;
 };
 
 /// The value of a call, or why there is none. `T` is `void` for calls without a value.

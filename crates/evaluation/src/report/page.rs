@@ -72,7 +72,8 @@ impl Page {
         let mut footer = String::new();
         for (name, value) in &self.footer {
             let code = format!("<code>{}</code>", escape(value));
-            let shown = if value.len() > LONG { format!("<details><summary>show</summary>{code}</details>") } else { code };
+            let folded = || format!("<details><summary><code>{} …</code></summary>{code}</details>", escape(beginning(value)));
+            let shown = if value.len() > LONG { folded() } else { code.clone() };
             let _ = writeln!(footer, "<dt>{}</dt><dd>{shown}</dd>", escape(name));
         }
         format!(
@@ -83,6 +84,12 @@ impl Page {
             self.body
         )
     }
+}
+
+/// The first words of a folded value, at most 60 characters.
+fn beginning(value: &str) -> &str {
+    let end = value.char_indices().nth(60).map_or(value.len(), |(i, _)| i);
+    value[..end].rsplit_once([' ', ',']).map_or(&value[..end], |(words, _)| words)
 }
 
 const STYLE: &str = r#"
@@ -179,6 +186,7 @@ mod tests {
         let html = page.render();
         assert!(html.contains("a &lt; b") && html.contains("&lt;model&gt;") && html.contains("--set &quot;x&quot;"));
         assert_eq!(html.matches("<details>").count(), 1, "what is long is folded, what is short is not");
+        assert!(html.contains("<summary><code>1,1,1,"), "a folded value shows how it begins");
         for outside in ["http://", "https://", "src=", "@import", "url("] {
             assert!(!html.contains(outside), "the page must not load `{outside}`");
         }
