@@ -95,6 +95,13 @@ def test_property_the_program_has_every_command_and_option_that_is_told(request)
     assert len(told) > 150
 
 
+def test_service_the_reference_pages_are_what_the_program_says(request):
+    """Services by the protocol's files, settings by the file of defaults, metrics by a server with everything switched on."""
+    made = [sys.executable, ROOT / "tests/tools/reference.py", request.config.getoption("--server"), "--check"]
+    done = subprocess.run(made, capture_output=True, text=True)
+    assert done.returncode == 0, f"{done.stdout}{done.stderr}run tests/tools/reference.py"
+
+
 def drive(client, session):
     """A session that has driven for four seconds, opened where it is not there."""
     if session not in [one.session_id for one in client.sessions()]:
