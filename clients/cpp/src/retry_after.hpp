@@ -8,6 +8,7 @@
 #include <google/protobuf/any.pb.h>
 #include <google/protobuf/duration.pb.h>
 #include <google/protobuf/empty.pb.h>
+#include <google/protobuf/message.h>
 #include <google/protobuf/unknown_field_set.h>
 
 namespace nesam::detail {
@@ -21,12 +22,12 @@ inline std::optional<std::chrono::nanoseconds> retry_after_of(const std::string&
   google::protobuf::Any detail;
   google::protobuf::Duration delay;
   if (!status.ParseFromString(details)) return std::nullopt;
-  const auto& fields = status.unknown_fields();
+  const auto& fields = status.GetReflection()->GetUnknownFields(status);
   for (int i = 0; i < fields.field_count(); ++i) {
     const UnknownField& field = fields.field(i);
     if (field.number() != 3 || field.type() != UnknownField::TYPE_LENGTH_DELIMITED || !detail.ParseFromString(field.length_delimited())) continue;
     if (detail.type_url() != "type.googleapis.com/google.rpc.RetryInfo" || !retry.ParseFromString(detail.value())) continue;
-    const auto& told = retry.unknown_fields();
+    const auto& told = retry.GetReflection()->GetUnknownFields(retry);
     for (int k = 0; k < told.field_count(); ++k) {
       if (told.field(k).number() != 1 || told.field(k).type() != UnknownField::TYPE_LENGTH_DELIMITED) continue;
       constexpr std::int64_t longest_s = 24 * 3600 * 365;
