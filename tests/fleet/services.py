@@ -138,7 +138,7 @@ class Fleet:
         command = ["etcd", "--name", name, "--data-dir", str(self.folder / name), "--listen-client-urls", client, "--advertise-client-urls", client]
         command += ["--listen-peer-urls", peers[name], "--initial-advertise-peer-urls", peers[name]]
         command += ["--initial-cluster", ",".join(f"{member}={peer}" for member, peer in peers.items())]
-        return [*command, "--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--log-level", "error"]
+        return [*command, "--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--quota-backend-bytes", str(8 << 30), "--log-level", "error"]
 
     def _haproxy(self):
         text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()

@@ -1,7 +1,7 @@
 """tests/fleet/run --store-limit: how many vehicles one etcd bears. An input of docs/capacity.md.
 
 Servers write each session once a second, on condition that its owner is who it was, as `server/src/store/etcd.rs` does: what is due together goes into one
-transaction. Here nothing but that happens: writers send the same transactions for more and more vehicles, until a write that is due waits for longer than a second."""
+transaction. Here nothing but that happens: writers send the same transactions for more and more vehicles, until a write that is due waits for longer than a second, or etcd is full."""
 
 import threading
 import time
@@ -16,9 +16,9 @@ WRITERS = 3
 GROUP = 32
 """Sessions of one transaction."""
 SECONDS = 65.0
-"""Of each load: long enough for two compactions."""
+"""Of each load: the first compaction that lets something go comes after 60 s."""
 COMPACT_EVERY_S = 30.0
-LOADS = (125, 250, 500, 1000, 2000)
+LOADS = (250, 500, 1000, 2000, 4000)
 LATE_S = 1.0
 
 
@@ -99,9 +99,15 @@ class Writer(threading.Thread):
     def __init__(self, address, sessions, content):
         super().__init__()
         self._store, self._sessions, self._content = Store(address), sessions, content
-        self.waits_s, self.refused = [], 0
+        self.waits_s, self.refused, self.ended = [], 0, ""
 
     def run(self):
+        try:
+            self._write()
+        except grpc.RpcError as error:
+            self.ended = error.details()
+
+    def _write(self):
         owners = [(f"limit/owner/{name}".encode(), name) for name in self._sessions]
         revisions = [self._store.put(owner, b"writer") for owner, _ in owners]
         begun = time.monotonic()
@@ -137,14 +143,21 @@ def measure(fleet):
         while any(writer.is_alive() for writer in writers):
             writers[0].join(COMPACT_EVERY_S)
             # Up to where it was at the last compaction, as servers do.
-            now = store.put(b"limit/compacted", b"")
-            if revision:
-                store.call("KV/Compact", _field(1, revision))
-            revision = now
+            try:
+                now = store.put(b"limit/compacted", b"")
+                if revision:
+                    store.call("KV/Compact", _field(1, revision))
+                revision = now
+            except grpc.RpcError as error:
+                print(f"{vehicles:>8} not compacted: {error.details()}", flush=True)
         for writer in writers:
             writer.join()
         took_s = time.monotonic() - begun
         waits = sorted(wait for writer in writers for wait in writer.waits_s)
+        ended = next((writer.ended for writer in writers if writer.ended), "")
+        if ended or not waits:
+            print(f"{vehicles:>8} ended after {took_s:.0f} s: {ended}", flush=True)
+            break
         refused = sum(writer.refused for writer in writers)
         total, used = store.status()
         p99 = waits[int(0.99 * len(waits))]
