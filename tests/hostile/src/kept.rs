@@ -1,17 +1,16 @@
 //! What servers keep and read again: stores, recordings, records of etcd.
 
-use std::cell::OnceCell;
+use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::{Arc, OnceLock};
+use std::sync::OnceLock;
 
 use nesam_engine::Limits;
 use nesam_mcap::{Record, Writer};
-use nesam_model::{ModelBundle, Predictor};
 use nesam_server::recording::{Recording, Topic, replay, window};
 use nesam_server::store::{Change, RedbStore, SessionStore, StoredSession, StoredSoil, map_of};
 use nesam_server::{convert, knows_record};
 
-use crate::instead;
+use crate::{instead, predictor};
 
 pub fn session_image(bytes: &[u8]) {
     drop(convert::session_image(bytes));
@@ -76,9 +75,6 @@ pub fn recording(bytes: &[u8]) {
 /// it the others stand, in parts of 65 536 of its length, and the fifth how many of its bytes go. Its measurements are read, and its commands executed again.
 pub fn recorded_commands(bytes: &[u8]) {
     static RECORDS: OnceLock<Vec<Record>> = OnceLock::new();
-    thread_local! {
-        static PREDICTOR: OnceCell<Arc<Predictor>> = const { OnceCell::new() };
-    }
     let records = RECORDS.get_or_init(|| {
         let whole = committed("recording/valid.mcap");
         let mut reader = nesam_mcap::Reader::new(&whole[..]);
@@ -95,7 +91,7 @@ pub fn recorded_commands(bytes: &[u8]) {
         writer.add_channel(0, topic.name(), "protobuf").expect("memory can be written");
     }
     let number_of = |name: &str| Topic::ALL.iter().position(|topic| topic.name() == name).unwrap_or(0) as u16;
-    let mut channels = std::collections::BTreeMap::new();
+    let mut channels = BTreeMap::new();
     let mut number = 0;
     for record in records {
         match record {
@@ -119,14 +115,6 @@ pub fn recorded_commands(bytes: &[u8]) {
     instead("changed.mcap", &file, |folder| {
         let open = || Recording::open(&[folder.join("changed.mcap")]);
         drop(open().and_then(|mut recording| window(&mut recording, "truck", i64::MIN, i64::MAX)));
-        let predictor = PREDICTOR.with(|held| {
-            let predictor = held.get_or_init(|| {
-                let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal");
-                let bundle = ModelBundle::load(&folder).expect("the bundle is part of the repository");
-                Predictor::new(bundle.into()).expect("the bundle fits").into()
-            });
-            Arc::clone(predictor)
-        });
-        drop(open().and_then(|mut recording| replay(&mut recording, predictor, true, &mut |_| {})));
+        drop(open().and_then(|mut recording| replay(&mut recording, predictor(), true, &mut |_| {})));
     });
 }

@@ -10,7 +10,7 @@ mod kept;
 
 use std::cell::RefCell;
 use std::path::Path;
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use nesam_adaptation::CalibratedFilter;
 use nesam_degradation::Degradation;
@@ -273,6 +273,17 @@ fn predict(bytes: &[u8]) {
     drop(message::<pb::PredictRequest>(bytes).map(|message| convert::predict_query(&message, &Limits::default()).map(drop)));
 }
 
+/// That of the shipped bundle.
+fn predictor() -> Arc<Predictor> {
+    static SHIPPED: OnceLock<Arc<Predictor>> = OnceLock::new();
+    let shipped = SHIPPED.get_or_init(|| {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal");
+        let bundle = ModelBundle::load(&folder).expect("the bundle is part of the repository");
+        Predictor::new(bundle.into()).expect("the bundle fits").into()
+    });
+    Arc::clone(shipped)
+}
+
 thread_local! {
     /// An engine, and a session as it exports it.
     static ENGINE: RefCell<Option<(Engine, Box<SessionImage>)>> = const { RefCell::new(None) };
@@ -282,10 +293,7 @@ thread_local! {
 fn in_engine(read: impl FnOnce(&mut Engine, &SessionImage)) {
     ENGINE.with_borrow_mut(|engine| {
         let (engine, exported) = engine.get_or_insert_with(|| {
-            let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal");
-            let bundle = ModelBundle::load(&folder).expect("the bundle is part of the repository");
-            let predictor = Predictor::new(bundle.into()).expect("the bundle fits");
-            let mut engine = Engine::new(predictor.into(), Limits::default()).expect("the settings fit");
+            let mut engine = Engine::new(predictor(), Limits::default()).expect("the settings fit");
             let open = OpenSession {
                 vehicle: "own".into(),
                 session: String::new(),
