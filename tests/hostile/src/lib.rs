@@ -12,7 +12,7 @@ use std::cell::RefCell;
 use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
-use nesam_adaptation::CalibratedFilter;
+use nesam_adaptation::{CalibratedFilter, FilterSettings};
 use nesam_degradation::Degradation;
 use nesam_discovery::{DRIVES_MIN, Reference};
 use nesam_engine::{AppliedEffects, Command, Engine, Limits, Measurement, OpenSession, Reply, SessionImage, WheelMeasurement};
@@ -190,7 +190,9 @@ fn normalization(bytes: &[u8]) {
     drop(read.map(|normalization| normalization.check()));
 }
 
+/// The filter of a bundle, and settings by themselves.
 fn soil_filter(bytes: &[u8]) {
+    drop(text(bytes).map(FilterSettings::from_json));
     drop(text(bytes).map(|text| CalibratedFilter::config_of(Some(text))));
 }
 
