@@ -271,12 +271,15 @@ fn row(load: f64, seconds: f64, tally: &mut Tally, at_once_inside: f64) -> Value
     let samples = tally.samples as f64 / tally.good_ms.len() as f64;
     let good_of: Vec<f64> = tally.good_of.iter().map(|count| rate(*count)).collect();
     let others = good_of[1..].iter().sum::<f64>() / (good_of.len() - 1) as f64;
-    let (each, refusals) =
-        (format!("{:.1}, {others:.1}", good_of[0]), format!("{refused_p50_ms:.2}, {refused_ms:.2}, {:.1} %", 100.0 * at_once));
+    let each = format!("{:.1}, {others:.1}", good_of[0]);
+    let (refusals, inside) = if tally.refused_ms.is_empty() {
+        ("-".into(), "-".into())
+    } else {
+        (format!("{refused_p50_ms:.2}, {refused_ms:.2}, {:.1} %", 100.0 * at_once), format!("{:.1} %", 100.0 * at_once_inside))
+    };
     say!(
-        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>28} {:>14} {measured_ms:>18.1}",
-        rate(asked),
-        format!("{:.1} %", 100.0 * at_once_inside)
+        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>28} {inside:>14} {measured_ms:>18.1}",
+        rate(asked)
     );
     json!({
         "load": load, "asked_hz": rate(asked), "in_time_hz": good, "in_time_hz_by_vehicle": good_of, "samples_mean": samples, "refused_hz": refused,
