@@ -141,23 +141,21 @@ class Fleet:
         return [*command, "--heartbeat-interval", "50", "--election-timeout", "500", "--snapshot-count", "1000", "--quota-backend-bytes", str(8 << 30), "--log-level", "error"]
 
     def _haproxy(self):
-        text = (ROOT / "deploy/haproxy/haproxy.cfg").read_text()
-        text = text.replace("bind :50051", f"bind {self.hosts.address['proxy']}:50051")
-        for name in REPLICAS:
-            text = text.replace(f"{name}:50051", f"{self.hosts.address[name]}:50051")
-        path = self.folder / "haproxy.cfg"
-        path.write_text(text)
-        return ["haproxy", "-db", "-f", str(path)]
+        return ["haproxy", "-db", "-f", self._at_our_addresses("haproxy/haproxy.cfg", "bind :50051", "bind {}:50051", "{}:50051")]
 
     def _envoy(self):
-        text = (ROOT / "deploy/envoy/envoy.yaml").read_text()
-        text = text.replace("address: 0.0.0.0,", f"address: {self.hosts.address['proxy']},")
-        for name in REPLICAS:
-            text = text.replace(f"address: {name},", f"address: {self.hosts.address[name]},")
-        path = self.folder / "envoy.yaml"
-        path.write_text(text)
+        path = self._at_our_addresses("envoy/envoy.yaml", "address: 0.0.0.0,", "address: {},", "address: {},")
         program = Path(sys.executable).parent / "envoy"
-        return [str(program), "-c", str(path), "--use-dynamic-base-id", "--concurrency", "1", "--log-level", "error"]
+        return [str(program), "-c", path, "--use-dynamic-base-id", "--concurrency", "1", "--log-level", "error"]
+
+    def _at_our_addresses(self, shipped, everywhere, here, replica):
+        """Path of a copy of what is shipped for a proxy: it listens `here` and not `everywhere`, and finds each `replica` by its address and not by its name."""
+        text = (ROOT / "deploy" / shipped).read_text().replace(everywhere, here.format(self.hosts.address["proxy"]))
+        for name in REPLICAS:
+            text = text.replace(replica.format(name), replica.format(self.hosts.address[name]))
+        path = self.folder / Path(shipped).name
+        path.write_text(text)
+        return str(path)
 
     def _configuration(self, name):
         address = self.hosts.address[name]

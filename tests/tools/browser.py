@@ -132,7 +132,10 @@ class Browser:
 
     def click(self, selector):
         """Clicks the middle of an element."""
-        x, y = self.middle(selector)
+        self.click_at(*self.middle(selector))
+
+    def click_at(self, x, y):
+        """Clicks a place of the window."""
         for kind in ("mousePressed", "mouseReleased"):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
 
@@ -142,7 +145,7 @@ class Browser:
         self.call("Input.dispatchMouseEvent", type="mouseMoved", x=end[0], y=end[1], button="left", buttons=1)
         self.call("Input.dispatchMouseEvent", type="mouseReleased", x=end[0], y=end[1], button="left", clickCount=1)
 
-    def screenshot(self, path):
-        """Writes what is seen as PNG."""
+    def screenshot(self, path, whole=False):
+        """Writes what is seen as PNG, or the whole page."""
         with open(path, "wb") as file:
-            file.write(base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"]))
+            file.write(base64.b64decode(self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"]))

@@ -8,10 +8,11 @@ on says at /metrics. With --check nothing is written; exit code 1 where a page i
 import argparse
 import pathlib
 import re
-import subprocess
 import sys
 import tempfile
 import urllib.request
+
+from serving import served
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 MADE = "Made by `tests/tools/reference.py`; a test fails when it is stale."
@@ -76,17 +77,8 @@ def told_by_a_server(binary):
         (pathlib.Path(folder) / "nesam.toml").write_text("[fleet_soil]\nenabled = true\n[ros2]\nenabled = true\n")
         ports = ["--grpc", "127.0.0.1:0", "--http", "127.0.0.1:0", "--zenoh-listen", "tcp/127.0.0.1:0"]
         command = [binary, "serve", "--config", "nesam.toml", *ports, "--store", "store", "--record", "run"]
-        server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-        try:
-            for line in server.stdout:
-                if line.startswith("http"):
-                    address = line.split()[1].rstrip("/")
-                if line.startswith("ready;"):
-                    break
-            return urllib.request.urlopen(f"{address}/metrics", timeout=30).read().decode()
-        finally:
-            server.terminate()
-            server.wait(60)
+        with served(command, "http", folder) as address:
+            return urllib.request.urlopen(f"{address.rstrip('/')}/metrics", timeout=30).read().decode()
 
 
 def metrics(binary):

@@ -7,13 +7,13 @@ import threading
 
 
 @contextlib.contextmanager
-def served(command):
-    """Runs `nesam serve` as this command says; gives its gRPC address when it is ready, and ends it."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+def served(command, of="grpc", cwd=None):
+    """Runs `nesam serve` as this command says; gives the address of its gRPC, or of what else it tells, when it is ready, and ends it."""
+    process = subprocess.Popen(command, cwd=cwd, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
     try:
         address = None
         for line in process.stdout:
-            if match := re.match(r"grpc\s+(\S+)", line):
+            if match := re.match(rf"{of}\s+(\S+)", line):
                 address = match.group(1)
             if line.startswith("ready"):
                 break

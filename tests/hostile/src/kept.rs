@@ -33,11 +33,11 @@ fn committed(name: &str) -> Vec<u8> {
 /// A store with a session, a map and evidence of the soil, in which the bytes behind the first four stand where those say: in which page that is not empty, and
 /// where in it. It is opened, read, and committed to.
 pub fn store(bytes: &[u8]) {
-    static WHOLE: OnceLock<Vec<u8>> = OnceLock::new();
+    static WHOLE: OnceLock<(Vec<u8>, Vec<usize>)> = OnceLock::new();
     const FILE: &str = "sessions.redb";
     const PAGE: usize = 4096;
     let change = Change::PutSession(StoredSession { name: "new".into(), saved_unix_ns: 2, image: vec![3; 700] });
-    let whole = WHOLE.get_or_init(|| {
+    let (whole, used) = WHOLE.get_or_init(|| {
         let folder = tempfile::tempdir().expect("a temporary folder");
         let mut store = RedbStore::open(folder.path()).expect("a new store");
         let session = StoredSession { name: "truck".into(), saved_unix_ns: 1, image: committed("session_image/valid.bin") };
@@ -45,10 +45,11 @@ pub fn store(bytes: &[u8]) {
         let map = Change::PutMap("hills".into(), committed("stored_map/valid.bin"));
         store.commit(&[Change::PutSession(session), map, Change::PutSoil(soil)]).expect("it can be written");
         drop(store);
-        std::fs::read(folder.path().join(FILE)).expect("it was written")
+        let whole = std::fs::read(folder.path().join(FILE)).expect("it was written");
+        let used = (0..whole.len() / PAGE).filter(|page| whole[page * PAGE..][..PAGE].iter().any(|byte| *byte != 0)).collect();
+        (whole, used)
     });
     let Some(([page @ .., low, high], other)) = bytes.split_first_chunk::<4>() else { return };
-    let used: Vec<usize> = (0..whole.len() / PAGE).filter(|page| whole[page * PAGE..][..PAGE].iter().any(|byte| *byte != 0)).collect();
     let begin = used[usize::from(u16::from_le_bytes(*page)) % used.len()] * PAGE + usize::from(u16::from_le_bytes([*low, *high])) % PAGE;
     let end = (begin + other.len()).min(whole.len());
     let mut changed = whole.clone();
