@@ -35,11 +35,13 @@ pub use config::{
     ClusterConfig, Config, DiagnosisConfig, Distribution, FleetSoilConfig, GrpcConfig, HttpConfig, LimitsConfig, RecordingConfig,
     Ros2Config, Ros2Vehicle, StoreConfig, TlsConfig, WorkersConfig, ZenohConfig, ZenohMode, is_loopback_endpoint, is_tls_endpoint,
 };
+pub use diagnosis::knows_report;
 pub use error::ServerError;
 pub use grpc::grpc_timeout;
 pub use one_thread::{Sessions, serve_on_one_thread};
 pub use serve::{RunningServer, serve};
 pub use signals::{outlive_file_limit, second_interrupt, termination};
 pub use telemetry::Metrics;
+pub use web::shown_reports;
 pub use workers::start_workers;
 pub use zenoh::{LinkFiles, router_config};

@@ -2,6 +2,7 @@
 
 Run it again when the messages change; what it writes is committed."""
 
+import dataclasses
 import shutil
 import sys
 import tempfile
@@ -85,7 +86,12 @@ def of_a_server(binary, state, world):
         exported = client.export_session("truck")
         keep("session_image", "valid.bin", exported)
         keep("session_content", "valid.bin", session_image_pb2.SessionImage.FromString(exported).content)
-        client.predict("truck", np.tile(np.float32([2.0, 0.1]), (2, 2, 1)))
+        controls = np.tile(np.float32([2.0, 0.1]), (2, 2, 1))
+        client.predict("truck", controls)
+        extras = nesam.Extras(jacobians=True, covariance=True)
+        for name, question in {"valid": calls.Question("truck", controls), "extras": calls.Question("truck", controls, half=True, extras=extras)}.items():
+            whole = dataclasses.replace(question.call(), read=lambda reply: reply)
+            keep("prediction", f"{name}.bin", client._do(whole).SerializeToString())
     keep("recording", "valid.mcap", next(folder.glob("*.mcap")).read_bytes())
     shutil.rmtree(folder)
 

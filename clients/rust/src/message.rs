@@ -53,8 +53,9 @@ pub fn outcome_label(answer: &v1::MeasurementAnswer) -> &'static str {
 /// Unpacks `count` little-endian numbers.
 pub(crate) fn unpack(field: &str, packed: &[u8], count: usize, precision: v1::Precision) -> Result<Vec<f32>, ClientError> {
     let width = if precision == v1::Precision::F16 { 2 } else { 4 };
-    if packed.len() != width * count {
-        return Err(ClientError::protocol(format!("`{field}` has {} bytes, {} were expected", packed.len(), width * count)));
+    let expected = count.saturating_mul(width);
+    if packed.len() != expected {
+        return Err(ClientError::protocol(format!("`{field}` has {} bytes, {expected} were expected", packed.len())));
     }
     Ok(match precision {
         v1::Precision::F16 => packed.chunks_exact(2).map(|b| f16::from_le_bytes([b[0], b[1]]).to_f32()).collect(),

@@ -256,16 +256,24 @@ impl Prediction {
     /// Unpacks a reply.
     ///
     /// # Errors
-    /// `ClientError::Protocol` when a part is missing or a length does not fit.
+    /// `ClientError::Protocol` when a part is missing, or a length or a sample does not fit.
     pub fn from_message(reply: &v1::PredictReply) -> Result<Self, ClientError> {
         let channels: Vec<usize> = (0..12).filter(|i| reply.channels >> i & 1 == 1).collect();
         let (samples, steps) = (reply.samples as usize, reply.steps as usize);
         let soil_groups = (reply.soil_groups as usize).max(1);
-        let rows = if reply.costs.is_empty() { soil_groups * samples } else { reply.best.len() };
-        let sinkage = if reply.sinkage_m.is_empty() { 0 } else { rows * steps * 4 };
+        // No reply is as long as numbers that do not fit say.
+        let count = |factors: [usize; 3]| factors.into_iter().fold(1, usize::saturating_mul);
+        let rows = if reply.costs.is_empty() { soil_groups.saturating_mul(samples) } else { reply.best.len() };
+        let sinkage = if reply.sinkage_m.is_empty() { 0 } else { count([rows, steps, 4]) };
         let missing = |part: &str| ClientError::protocol(format!("`{part}` is missing"));
+        if reply.validity.len() != rows {
+            return Err(ClientError::protocol(format!("`validity` has {} words, {rows} were expected", reply.validity.len())));
+        }
+        if let Some(sample) = reply.best.iter().find(|sample| **sample as usize >= samples) {
+            return Err(ClientError::protocol(format!("`best` names sample {sample} of {samples}")));
+        }
         let start = reply.start.as_ref().and_then(state_array).ok_or_else(|| missing("start"))?;
-        let mut states = unpack("states", &reply.states, rows * steps * channels.len(), reply.precision())?;
+        let mut states = unpack("states", &reply.states, count([rows, steps, channels.len()]), reply.precision())?;
         if reply.precision() == v1::Precision::F16 {
             for row in states.chunks_exact_mut(channels.len().max(1)) {
                 let positions = row.iter_mut().zip(&channels).filter(|(_, channel)| **channel < 3);
@@ -294,7 +302,7 @@ impl Prediction {
             soil_groups,
             extras: ExtraOutputs::from_message(reply)?,
             drawn_controls: plain("drawn_controls", &reply.drawn_controls)?,
-            costs: plain("costs", &reply.costs)?,
+            costs: unpack("costs", &reply.costs, if reply.costs.is_empty() { 0 } else { samples }, v1::Precision::F32)?,
             best: reply.best.clone(),
             mean_controls: plain("mean_controls", &reply.mean_controls)?,
             computed_by: ComputedBy::Service,

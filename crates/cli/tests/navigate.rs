@@ -65,6 +65,16 @@ fn service_laps_are_taken_on_the_same_plant_alone() {
     let (before, said) = taken(&unnamed, &[]);
     assert!(!before && said.contains("--resume") && said.contains("scored by `state`"), "{said}");
     assert!(!taken(&unnamed, &[]).0 && taken(&unnamed, &["--resume"]).0);
+    // A file that is torn, or that of another lap, is said to be so.
+    let file = std::fs::read_dir(folder.path().join("laps")).unwrap().next().unwrap().unwrap().path();
+    let whole = std::fs::read_to_string(&file).unwrap();
+    for (other, reason) in
+        [(&whole[..whole.len() / 2], "cannot be read"), (&whole.replace("\"start\": 0", "\"start\": 1"), "is another lap")]
+    {
+        std::fs::write(&file, other).unwrap();
+        let (other, said) = taken(&unnamed, &["--resume"]);
+        assert!(!other && said.contains(reason) && said.contains("driven again"), "{said}");
+    }
     // Nor is a lap of another plant one of the built-in.
     let built_in = navigate(folder.path(), &sample(), &KINEMATIC);
     assert!(built_in.status.success() && !stderr(&built_in).contains("taken from"), "{}", stderr(&built_in));

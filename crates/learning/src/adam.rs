@@ -71,6 +71,23 @@ impl Adam {
         weights.insert("adam.steps", &[1], vec![self.steps as f32]);
     }
 
+    /// Why moments of a checkpoint after `step` steps are not of a network with these weights.
+    pub fn mismatch(&self, weights: &Weights, step: usize) -> Option<String> {
+        if usize::try_from(self.steps) != Ok(step) {
+            return Some(format!("it is of step {}, state.json of step {step}", self.steps));
+        }
+        let unpaired =
+            self.first.keys().chain(self.second.keys()).find(|name| !(self.first.contains_key(*name) && self.second.contains_key(*name)));
+        if let Some(name) = unpaired {
+            return Some(format!("of `{name}` one of two moments is missing"));
+        }
+        let sizes: HashMap<&str, usize> = weights.iter().map(|(name, array)| (name, array.values.len())).collect();
+        let other = self.first.iter().chain(&self.second).find(|(name, moments)| sizes.get(name.as_str()) != Some(&moments.len()));
+        other.map(|(name, moments)| {
+            format!("it has {} moments of `{name}`, the network {}", moments.len(), sizes.get(name.as_str()).unwrap_or(&0))
+        })
+    }
+
     /// Takes the moments back out of a checkpoint.
     pub fn load(weights: &Weights) -> Self {
         let mut adam = Self::default();
@@ -80,7 +97,7 @@ impl Adam {
             } else if let Some(name) = name.strip_prefix("adam.second.") {
                 adam.second.insert(name.into(), array.values.clone());
             } else if name == "adam.steps" {
-                adam.steps = array.values[0] as i32;
+                adam.steps = array.values.first().map_or(0, |steps| *steps as i32);
             }
         }
         adam

@@ -9,6 +9,7 @@ pub mod adam;
 pub mod autoencoder;
 pub mod batch;
 pub mod calibrate;
+pub mod checkpoint;
 pub mod class_soil;
 pub mod drives;
 mod features;

@@ -133,6 +133,7 @@ pub fn run(
     let trained_on_maps = any_mapped(&drives, &train_at);
     if trained_on_maps && recipe.start.is_none() {
         for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
+            weights.get(name, &array.shape)?;
             weights.insert(name, &array.shape, array.values.clone());
         }
     }

@@ -1,12 +1,11 @@
-//! The training loop: fully autoregressive rollouts, two shards of a batch side by side, checkpoints, validation.
+//! The training loop: fully autoregressive rollouts, two shards of a batch side by side, validation.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Instant;
 
 use candle_core::{DType, Result, Tensor};
-use nesam_model::bundle::sha256_hex;
 use nesam_model::reference::{ComputeDevice, Network, ReferenceRollout};
 use nesam_model::{HISTORY, ModelError, Normalization, Variant, Weights};
 use nesam_physics::step::StepModel;
@@ -14,8 +13,8 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Deserializer, Serialize};
 
-use crate::adam::Adam;
 use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, sustained_residual, targets};
+use crate::checkpoint::Checkpoint;
 use crate::drives::Drive;
 use crate::pooling::Pooling;
 use crate::schedule::{cosine, curriculum};
@@ -280,16 +279,8 @@ pub fn train(
     mut report: impl FnMut(&EpochReport),
 ) -> std::result::Result<Trained, TrainingError> {
     let starts = window_starts(set, plan)?;
-    let mut checkpoint = if resume { Checkpoint::load(&plan.folder)? } else { None }.unwrap_or_else(|| Checkpoint {
-        step: 0,
-        best_score: f64::INFINITY,
-        best: weights.clone(),
-        latest: weights.clone(),
-        average: weights.clone(),
-        adam: Adam::default(),
-        curve: Vec::new(),
-        unreported: Unreported::default(),
-    });
+    let resumed = if resume { Checkpoint::load(&plan.folder, weights)? } else { None };
+    let mut checkpoint = resumed.unwrap_or_else(|| Checkpoint::new(weights));
     let device = plan.device.open()?;
     let network = Network::from_weights(&checkpoint.latest, &device)?;
     let pools: Vec<rayon::ThreadPool> = (0..plan.shards)
@@ -419,158 +410,4 @@ fn merged(base: &Weights, trained: &Weights) -> Weights {
         weights.insert(name, &array.shape, array.values.clone());
     }
     weights
-}
-
-/// Steps since the last line of the curve.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct Unreported {
-    /// Finite losses.
-    losses: Vec<f64>,
-    steps: usize,
-    /// Time of the steps, over all the runs that took them.
-    seconds: f64,
-}
-
-impl Unreported {
-    /// Mean loss, NaN where none was finite, and seconds per step.
-    fn means(&self) -> (f32, f64) {
-        let sum = self.losses.iter().map(|loss| *loss as f32).sum::<f32>();
-        (sum / self.losses.len() as f32, self.seconds / self.steps as f64)
-    }
-}
-
-/// What an interrupted run needs.
-struct Checkpoint {
-    step: usize,
-    best_score: f64,
-    best: Weights,
-    latest: Weights,
-    average: Weights,
-    adam: Adam,
-    curve: Vec<EpochReport>,
-    unreported: Unreported,
-}
-
-impl Checkpoint {
-    fn save(&self, folder: &Path) -> std::result::Result<(), TrainingError> {
-        let fail = |path: &Path, e: std::io::Error| TrainingError::Checkpoint { path: path.to_path_buf(), reason: e.to_string() };
-        std::fs::create_dir_all(folder).map_err(|e| fail(folder, e))?;
-        let mut moments = Weights::default();
-        self.adam.save(&mut moments);
-        let arrays = [
-            ("best.safetensors", self.best.to_bytes()),
-            ("latest.safetensors", self.latest.to_bytes()),
-            ("average.safetensors", self.average.to_bytes()),
-            ("adam.safetensors", moments.to_bytes()),
-        ];
-        let hashes: HashMap<&str, String> = arrays.iter().map(|(name, bytes)| (*name, sha256_hex(bytes))).collect();
-        let state = serde_json::json!({
-            "step": self.step,
-            "best_score": self.best_score,
-            "curve": self.curve,
-            "unreported": self.unreported,
-            "hashes": hashes,
-        });
-        // The state is renamed first: of a run that is killed in between, `load` finds the arrays of that state under either name.
-        let files: Vec<(&str, Vec<u8>)> = std::iter::once(("state.json", state.to_string().into_bytes())).chain(arrays).collect();
-        for (name, bytes) in &files {
-            let path = folder.join(format!("{name}.new"));
-            std::fs::write(&path, bytes).map_err(|e| fail(&path, e))?;
-        }
-        for (name, _) in &files {
-            let path = folder.join(name);
-            std::fs::rename(folder.join(format!("{name}.new")), &path).map_err(|e| fail(&path, e))?;
-        }
-        Ok(())
-    }
-
-    fn load(folder: &Path) -> std::result::Result<Option<Self>, TrainingError> {
-        let state_path = folder.join("state.json");
-        if !state_path.exists() {
-            return Ok(None);
-        }
-        let fail = |path: &Path, reason: String| TrainingError::Checkpoint { path: path.to_path_buf(), reason };
-        let bytes = std::fs::read(&state_path).map_err(|e| fail(&state_path, e.to_string()))?;
-        let state: serde_json::Value = serde_json::from_slice(&bytes).map_err(|e| fail(&state_path, e.to_string()))?;
-        let arrays = |name: &str| -> std::result::Result<Weights, TrainingError> {
-            let (path, unnamed) = (folder.join(name), folder.join(format!("{name}.new")));
-            let hash = state["hashes"][name].as_str();
-            let of_state = |path: &Path| std::fs::read(path).ok().filter(|bytes| hash.is_none_or(|hash| hash == sha256_hex(bytes)));
-            if of_state(&path).is_none() && of_state(&unnamed).is_some() {
-                std::fs::rename(&unnamed, &path).map_err(|e| fail(&path, e.to_string()))?;
-            }
-            let lost = "is missing or of another step than state.json; start without --resume";
-            let bytes = of_state(&path).ok_or_else(|| fail(&path, lost.into()))?;
-            Ok(Weights::from_bytes(&bytes, &path)?)
-        };
-        let missing = |key: &str| fail(&state_path, format!("`{key}` is missing"));
-        Ok(Some(Self {
-            step: state["step"].as_u64().ok_or_else(|| missing("step"))? as usize,
-            best_score: state["best_score"].as_f64().unwrap_or(f64::INFINITY),
-            curve: serde_json::from_value(state["curve"].clone()).map_err(|e| fail(&state_path, e.to_string()))?,
-            // A checkpoint that says none was validated when it was written.
-            unreported: serde_json::from_value::<Option<Unreported>>(state["unreported"].clone())
-                .map_err(|e| fail(&state_path, e.to_string()))?
-                .unwrap_or_default(),
-            best: arrays("best.safetensors")?,
-            latest: arrays("latest.safetensors")?,
-            average: arrays("average.safetensors")?,
-            adam: Adam::load(&arrays("adam.safetensors")?),
-        }))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn checkpoint(step: usize, line: EpochReport) -> Checkpoint {
-        let mut weights = Weights::default();
-        weights.insert("w", &[1], vec![step as f32]);
-        Checkpoint {
-            step,
-            best_score: f64::INFINITY,
-            best: weights.clone(),
-            latest: weights.clone(),
-            average: weights,
-            adam: Adam::default(),
-            curve: vec![line],
-            unreported: Unreported { losses: vec![0.5, 1.5], steps: 3, seconds: 0.25 },
-        }
-    }
-
-    const LINE: EpochReport = EpochReport { step: 2, loss: f32::NAN, validation: [0.5, f64::NAN, 0.0, 0.0, 0.0], diverged: 3, step_s: 0.1 };
-
-    #[test]
-    fn regress_a_checkpoint_with_numbers_that_are_none_can_be_read() {
-        let folder = tempfile::tempdir().unwrap();
-        checkpoint(2, LINE).save(folder.path()).unwrap();
-        let found = Checkpoint::load(folder.path()).unwrap().unwrap();
-        assert_eq!((found.step, found.best_score, found.best.clone()), (2, f64::INFINITY, found.latest));
-        assert_eq!(found.unreported, checkpoint(2, LINE).unreported);
-        let line = found.curve[0];
-        assert!(line.loss.is_nan() && line.validation[0] == 0.5 && line.validation[1].is_nan() && line.diverged == 3, "{line:?}");
-    }
-
-    #[test]
-    fn property_a_run_killed_while_it_saved_goes_on_and_mixed_files_are_refused() {
-        let [folder, later] = [2, 4].map(|step| {
-            let folder = tempfile::tempdir().unwrap();
-            checkpoint(step, LINE).save(folder.path()).unwrap();
-            folder
-        });
-        let take = |from: &str, to: &str| std::fs::copy(later.path().join(from), folder.path().join(to)).unwrap();
-        take("best.safetensors", "best.safetensors");
-        let error = Checkpoint::load(folder.path()).err().expect("files of two steps").to_string();
-        assert!(error.contains("best.safetensors") && error.contains("another step"), "{error}");
-        // Two of five have their names.
-        take("state.json", "state.json");
-        for name in ["latest", "average", "adam"] {
-            take(&format!("{name}.safetensors"), &format!("{name}.safetensors.new"));
-        }
-        for _ in 0..2 {
-            let found = Checkpoint::load(folder.path()).unwrap().unwrap();
-            assert_eq!((found.step, found.latest), (4, checkpoint(4, LINE).latest));
-        }
-    }
 }

@@ -8,6 +8,7 @@
 mod caution;
 mod error;
 mod forecast;
+mod kept_lap;
 mod lap;
 mod link;
 mod map_layers;
@@ -26,6 +27,7 @@ mod trial;
 pub use caution::{Caution, CautionSettings, Stretch};
 pub use error::NavigationError;
 pub use forecast::{Forecaster, KinematicForecaster, Situation};
+pub use kept_lap::KeptLap;
 pub use lap::{Lap, LapPlan, Lean, Scored, run_lap};
 pub use link::{Answer, BuiltInPlant, PlantLink, Reading, Start};
 pub use map_layers::map_layers;

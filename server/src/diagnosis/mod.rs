@@ -27,6 +27,7 @@ use crate::convert::{refused, to_status};
 use crate::recording::{Recorder, utc};
 use crate::web::Live;
 
+pub use report::knows_report;
 pub(crate) use work::Told;
 
 /// What a server needs to diagnose.

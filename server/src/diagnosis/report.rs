@@ -44,6 +44,12 @@ pub(super) fn read(folder: &Path, diagnosis_id: String, notes: Vec<String>) -> R
     Ok((report, document))
 }
 
+/// Whether a server takes what lies in the folder of a diagnosis as its report.
+#[must_use]
+pub fn knows_report(folder: &Path) -> bool {
+    read(folder, String::new(), Vec::new()).is_ok()
+}
+
 /// Hash of a bundle, which is that of its manifest; empty without one.
 fn bundle_hash(bundle: &str) -> String {
     if bundle.is_empty() {

@@ -21,6 +21,7 @@ use axum::routing::get;
 pub(crate) use alarms::Raised;
 pub(crate) use feed::Feed;
 pub(crate) use live::Live;
+pub use reports::shown_reports;
 
 use crate::http::HttpState;
 

@@ -81,6 +81,12 @@ impl Reports {
     }
 }
 
+/// How many reports of a folder the live page shows.
+#[must_use]
+pub fn shown_reports(folder: &Path) -> usize {
+    Reports::new(folder).read().as_array().map_or(0, Vec::len)
+}
+
 /// JSON files of a folder and of the folders in it, the newest first.
 fn files(folder: &Path) -> Vec<(SystemTime, PathBuf)> {
     let entries = |folder: &Path| std::fs::read_dir(folder).into_iter().flatten().flatten().map(|entry| entry.path());

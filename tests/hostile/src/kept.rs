@@ -1,14 +1,17 @@
-//! What servers keep and read again: stores, recordings, records of etcd.
+//! What programs keep and read again: stores, recordings, records of etcd, checkpoints, laps, reports.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::OnceLock;
 
 use nesam_engine::Limits;
+use nesam_learning::checkpoint::Checkpoint;
 use nesam_mcap::{Record, Writer};
+use nesam_model::Weights;
+use nesam_navigation::{KeptLap, NavigationReport};
 use nesam_server::recording::{Recording, Topic, replay, window};
 use nesam_server::store::{Change, RedbStore, SessionStore, StoredSession, StoredSoil, map_of};
-use nesam_server::{convert, knows_record};
+use nesam_server::{convert, knows_record, knows_report, shown_reports};
 
 use crate::{instead, predictor};
 
@@ -117,5 +120,41 @@ pub fn recorded_commands(bytes: &[u8]) {
         let open = || Recording::open(&[folder.join("changed.mcap")]);
         drop(open().and_then(|mut recording| window(&mut recording, "truck", i64::MIN, i64::MAX)));
         drop(open().and_then(|mut recording| replay(&mut recording, predictor(), true, &mut |_| {})));
+    });
+}
+
+/// What the checkpoint in the thread's folder is to be one of.
+fn network() -> &'static Weights {
+    static WEIGHTS: OnceLock<Weights> = OnceLock::new();
+    let file = "checkpoint_arrays/weights.safetensors";
+    WEIGHTS.get_or_init(|| Weights::from_bytes(&committed(file), Path::new(file)).expect("a sound file"))
+}
+
+/// The state of a checkpoint beside arrays of step 3.
+pub fn checkpoint(bytes: &[u8]) {
+    instead("checkpoint/state.json", bytes, |folder| drop(Checkpoint::load(&folder.join("checkpoint"), network())));
+}
+
+/// Arrays of a checkpoint as weights and as moments.
+pub fn checkpoint_arrays(bytes: &[u8]) {
+    for name in ["latest", "adam"] {
+        let file = format!("checkpoint/{name}.safetensors");
+        instead(&file, bytes, |folder| drop(Checkpoint::load(&folder.join("checkpoint"), network())));
+    }
+}
+
+/// A lap, and the report of it beside itself with another model.
+pub fn kept_lap(bytes: &[u8]) {
+    let Ok(KeptLap { settings, run }) = KeptLap::from_json(bytes) else { return };
+    let other = nesam_navigation::Run { configuration: "fixed".into(), ..run.clone() };
+    let report = NavigationReport { runs: vec![run, other], settings, provenance: Vec::new() };
+    drop((report.rows(), report.to_json(), report.page().render()));
+}
+
+/// A report of a diagnosis, for whoever asked for it and for the live page.
+pub fn diagnosis_report(bytes: &[u8]) {
+    instead("diagnosis/diagnose.json", bytes, |folder| {
+        let folder = folder.join("diagnosis");
+        let _ = (knows_report(&folder), shown_reports(&folder));
     });
 }

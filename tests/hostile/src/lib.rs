@@ -13,6 +13,7 @@ use std::path::Path;
 use std::sync::{Arc, OnceLock};
 
 use nesam_adaptation::{CalibratedFilter, FilterSettings};
+use nesam_client::Prediction;
 use nesam_degradation::Degradation;
 use nesam_discovery::{DRIVES_MIN, Reference};
 use nesam_engine::{AppliedEffects, Command, Engine, Limits, Measurement, OpenSession, Reply, SessionImage, WheelMeasurement};
@@ -23,10 +24,10 @@ use nesam_navigation::plant_message::{read_json, twelve};
 use nesam_physics::{Control, VehicleState};
 use nesam_proto::{Message, v1 as pb};
 use nesam_ros2::messages::{CommandType, Odometry, imu_rates};
-use nesam_server::access::{FleetFile, Identity};
-use nesam_server::{Config, convert, grpc_timeout};
+use nesam_server::access::{self, FleetFile, Identity};
+use nesam_server::{Config, TlsConfig, convert, grpc_timeout};
 use nesam_terrain::{GridGeometry, WorldMap};
-use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, commands_from_csv, read_vehicle_card};
+use nesam_trajectories::{DataRoot, SetQuery, SplitFilter, commands_from_csv, read_ground_truth_soil, read_vehicle_card};
 use sha2::{Digest as _, Sha256};
 use tempfile::TempDir;
 
@@ -34,7 +35,7 @@ use tempfile::TempDir;
 pub type Reader = (&'static str, fn(&[u8]));
 
 /// All of them.
-pub const READERS: [Reader; 42] = [
+pub const READERS: [Reader; 49] = [
     ("bag", bag),
     ("bag_metadata", bag_metadata),
     ("ros2_message", ros2_message),
@@ -53,6 +54,7 @@ pub const READERS: [Reader; 42] = [
     ("world_json", world_json),
     ("elevation_png", elevation_png),
     ("semantic_png", semantic_png),
+    ("soil_truth", soil_truth),
     ("vehicle_card", vehicle_card),
     ("index_json", index_json),
     ("index_parquet", index_parquet),
@@ -60,6 +62,7 @@ pub const READERS: [Reader; 42] = [
     ("measurement", measurement),
     ("open_session", open_session),
     ("predict", predict),
+    ("prediction", prediction),
     ("deadline", deadline),
     ("session_image", kept::session_image),
     ("session_content", session_content),
@@ -73,9 +76,14 @@ pub const READERS: [Reader; 42] = [
     ("plant_datagram", plant_datagram),
     ("recording", kept::recording),
     ("recorded_commands", kept::recorded_commands),
+    ("checkpoint", kept::checkpoint),
+    ("checkpoint_arrays", kept::checkpoint_arrays),
+    ("kept_lap", kept::kept_lap),
+    ("diagnosis_report", kept::diagnosis_report),
     ("fleet_file", fleet_file),
     ("identity", identity),
     ("certificate", certificate),
+    ("tls_file", tls_file),
     ("configuration", configuration),
 ];
 
@@ -85,7 +93,7 @@ thread_local! {
 }
 
 /// Valid files, from below this folder, and where a reader looks for them.
-const AROUND: [(&str, &str); 12] = [
+const AROUND: [(&str, &str); 17] = [
     ("corpus/bag/valid.mcap", "bag/valid.mcap"),
     ("corpus/vehicle_card/hmmwv.json", "vehicle.json"),
     ("corpus/index_json/valid.json", "run/index.json"),
@@ -95,6 +103,11 @@ const AROUND: [(&str, &str); 12] = [
     ("corpus/world_json/valid.json", "worlds/w01/world.json"),
     ("corpus/elevation_png/valid.png", "worlds/w01/elevation.png"),
     ("semantic.png", "worlds/w01/semantic.png"),
+    ("corpus/checkpoint/valid.json", "checkpoint/state.json"),
+    ("corpus/checkpoint_arrays/moments.safetensors", "checkpoint/adam.safetensors"),
+    ("corpus/checkpoint_arrays/weights.safetensors", "checkpoint/average.safetensors"),
+    ("corpus/checkpoint_arrays/weights.safetensors", "checkpoint/best.safetensors"),
+    ("corpus/checkpoint_arrays/weights.safetensors", "checkpoint/latest.safetensors"),
     ("../../deploy/bundles/hmmwv-nominal/vehicle.json", "bundle/vehicle.json"),
     ("../../deploy/bundles/hmmwv-nominal/normalization.toml", "bundle/normalization.toml"),
     ("../../deploy/bundles/hmmwv-nominal/effects.toml", "bundle/effects.toml"),
@@ -234,6 +247,10 @@ fn semantic_png(bytes: &[u8]) {
     instead("worlds/w01/semantic.png", bytes, |folder| drop(WorldMap::load(&folder.join("worlds/w01"))));
 }
 
+fn soil_truth(bytes: &[u8]) {
+    instead("worlds/w01/gt_soil.json", bytes, |folder| drop(read_ground_truth_soil(&folder.join("worlds/w01"))));
+}
+
 fn vehicle_card(bytes: &[u8]) {
     instead("vehicle_card.json", bytes, |folder| drop(read_vehicle_card(&folder.join("vehicle_card.json"))));
 }
@@ -273,6 +290,14 @@ fn open_session(bytes: &[u8]) {
 
 fn predict(bytes: &[u8]) {
     drop(message::<pb::PredictRequest>(bytes).map(|message| convert::predict_query(&message, &Limits::default()).map(drop)));
+}
+
+/// What a client is answered.
+fn prediction(bytes: &[u8]) {
+    let Some(Ok(prediction)) = message::<pb::PredictReply>(bytes).map(|message| Prediction::from_message(&message)) else { return };
+    if !prediction.validity.is_empty() && prediction.steps > 0 {
+        prediction.state(prediction.validity.len() - 1, prediction.steps - 1);
+    }
 }
 
 /// That of the shipped bundle.
@@ -400,6 +425,29 @@ fn identity(bytes: &[u8]) {
 /// The names in a certificate, DER.
 fn certificate(bytes: &[u8]) {
     drop(Identity::of_certificate(&bytes.into()));
+}
+
+/// Certificates, a key, authorities or the members of a fleet, the other three of which are as they should be.
+fn tls_file(bytes: &[u8]) {
+    static SOUND: OnceLock<[String; 4]> = OnceLock::new();
+    let sound = SOUND.get_or_init(|| {
+        let own = rcgen::generate_simple_self_signed(["localhost".to_string()]).expect("a certificate can be made");
+        [own.cert.pem(), own.signing_key.serialize_pem(), own.cert.pem(), "[vehicles]\n".into()]
+    });
+    in_folder(|folder| {
+        let names = ["tls.certificate", "tls.key", "tls.authority", "tls.fleet"];
+        let [certificate, key, client_ca, fleet] = names.map(|name| folder.join(name));
+        let config = TlsConfig { certificate, key, client_ca, fleet, ..TlsConfig::default() };
+        for changed in 0..names.len() {
+            for (i, (name, sound)) in names.iter().zip(sound).enumerate() {
+                let content = if i == changed { bytes } else { sound.as_bytes() };
+                std::fs::write(folder.join(name), content).expect("a file can be written");
+            }
+            if let Ok((Some(credentials), _)) = access::load(&config) {
+                drop(credentials.doubts());
+            }
+        }
+    });
 }
 
 fn configuration(bytes: &[u8]) {

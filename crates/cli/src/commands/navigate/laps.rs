@@ -3,14 +3,14 @@
 use std::collections::HashMap;
 use std::path::PathBuf;
 
-use nesam_navigation::{Run, Scored};
+use nesam_navigation::{KeptLap, Run, Scored};
 use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 
 use super::Task;
 use super::stage::Stage;
-use crate::failure::{Failure, OrFail};
-use crate::output;
+use crate::failure::Failure;
+use crate::output::{self, note};
 use crate::progress::Progress;
 
 /// Measured positions and velocities that differ by more are not those of one point in one frame, m/s: noise of a few centimetres makes a tenth of it.
@@ -61,17 +61,19 @@ impl Kept {
             return None;
         }
         let file = self.file(task);
-        let read: Value = serde_json::from_slice(&std::fs::read(&file).ok()?).ok()?;
-        let same = read.get("settings") == self.settings.get(&task.world);
-        if !same {
-            crate::output::note!("{} was driven with other settings; it is driven again", file.display());
-        }
-        same.then(|| serde_json::from_value(read.get("run")?.clone()).ok()).flatten()
+        let other = match KeptLap::from_json(&std::fs::read(&file).ok()?) {
+            Err(reason) => format!("cannot be read ({reason})"),
+            Ok(kept) if self.settings.get(&task.world) != Some(&kept.settings) => "was driven with other settings".into(),
+            Ok(kept) if !task.is_of(&kept.run) => "is another lap than its name says".into(),
+            Ok(kept) => return Some(kept.run),
+        };
+        note!("{} {other}; it is driven again", file.display());
+        None
     }
 
     fn keep(&self, task: &Task, run: &Run) -> Result<(), Failure> {
-        let text = serde_json::to_string_pretty(&json!({ "settings": self.settings.get(&task.world), "run": run })).or_failed()?;
-        output::write_file(&self.file(task), text.as_bytes())
+        let kept = KeptLap { settings: self.settings.get(&task.world).cloned().unwrap_or_default(), run: run.clone() };
+        output::write_file(&self.file(task), kept.to_json().as_bytes())
     }
 
     /// What to do when a command has ended after so many laps.
@@ -117,7 +119,7 @@ pub fn drive_all(stage: &mut Stage<'_>, runtime: &Runtime, tasks: &[Task], kept:
         progress.finish();
     }
     if taken > 0 {
-        crate::output::note!("{taken} laps taken from {}", kept.out.display());
+        note!("{taken} laps taken from {}", kept.out.display());
     }
     (runs, ended)
 }
@@ -136,12 +138,12 @@ impl Notes {
         }
         if run.lap.scored == Scored::State && !self.no_truth {
             self.no_truth = true;
-            crate::output::note!("note: the plant tells no `truth`: laps are scored by `state`, with its noise");
+            note!("note: the plant tells no `truth`: laps are scored by `state`, with its noise");
         }
         let mismatch_m_s = run.lap.velocity_mismatch_m_s.filter(|m_s| *m_s > VELOCITY_MISMATCH_MAX_M_S && !self.velocity);
         if let Some(mismatch_m_s) = mismatch_m_s {
             self.velocity = true;
-            crate::output::note!(
+            note!(
                 "warning: {}: positions and velocities of `state` differ by {mismatch_m_s:.2} m/s (rms): are velocities in Body, and those of the reference point?",
                 task.file_name()
             );

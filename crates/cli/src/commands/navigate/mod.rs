@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, SoilKind, Stretch, TrackingCost};
+use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, Stretch, TrackingCost};
 use nesam_physics::{SecondCommand, Vehicle, driveline::road_wheel_angles};
 use nesam_plant::HiddenEffects;
 use nesam_terrain::WorldMap;
@@ -157,6 +157,11 @@ pub struct Task {
 impl Task {
     fn file_name(&self) -> String {
         format!("{}-{}-start{}-seed{}.json", self.configuration.as_str(), self.world, self.start, self.seed)
+    }
+
+    fn is_of(&self, run: &Run) -> bool {
+        (self.configuration.as_str(), &self.world, self.soil, self.start, self.seed)
+            == (run.configuration.as_str(), &run.world, run.soil, run.start, run.seed)
     }
 }
 
