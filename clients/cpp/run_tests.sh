@@ -98,6 +98,11 @@ done
 timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
 finish_server
 
+# What the pages tell needs a store.
+start_server --store "$scratch/store" "$@"
+timeout 300 "$build/blocks_test" "$address" || failed=yes
+finish_server
+
 # The soil of a fleet is shared only where that is switched on.
 printf '[fleet_soil]\nenabled = true\n' > "$scratch/fleet-soil.toml"
 start_server --config "$scratch/fleet-soil.toml" "$@"

@@ -2,7 +2,7 @@
 what runs it or why nothing can; every `nesam` command anywhere in the text is held against the options that the program has.
 
 A block is marked by the remark above it: `run` (by crates/cli/tests/book.rs), `python`, `run beside a server` (both here), `run by FILE` or `not run: WHY`. A remark
-`before` has Python that comes first, with `client`, `address`, `candidates` and `drive(client, session)`."""
+`before` has Python that comes first, with `client`, `address`, `candidates` and `drive(client, session)`. Blocks of C++ are run by clients/cpp/tests/blocks.awk."""
 
 import os
 import re
@@ -56,6 +56,7 @@ def run_here(block):
 
 
 def test_property_every_block_is_run_or_says_why_not():
+    assert all(re.fullmatch(r"|compiled only: .{10,}", block.mark) for block in blocks() if block.language == "cpp")
     found = [block for block in blocks() if block.language not in ("text", "toml", "cmake", "cpp")]
     for block in found:
         what = f"{block.page}:\n{block.text}"
