@@ -33,7 +33,7 @@ pub enum ClientError {
         field: String,
         /// What was wrong and what is allowed.
         message: String,
-        /// Pause after which an overloaded service may have room.
+        /// As [`ClientError::retry_after`].
         retry_after: Option<Duration>,
     },
     /// The service answered something that the protocol does not allow.
@@ -67,7 +67,8 @@ impl ClientError {
         }
     }
 
-    /// Pause after which to ask again, where the service was overloaded.
+    /// Pause after which the service may have room or be there again, as it says itself; `None` where it does not say. No call is tried again by itself: what a
+    /// planner asked would be late then, and who has many questions asks fewer at a time (docs/planner.md).
     pub fn retry_after(&self) -> Option<Duration> {
         match self {
             Self::Refused { retry_after, .. } => *retry_after,
