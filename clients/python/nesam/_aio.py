@@ -44,7 +44,7 @@ class AsyncClient:
         self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = "", attempts_max: int = ATTEMPTS_MAX
     ):
         self.timeout_s = timeout_s
-        options, credentials = arguments(tls)
+        options, credentials = arguments(address, tls)
 
         def opened(options: Options) -> Any:
             return grpc.aio.insecure_channel(address, options) if credentials is None else grpc.aio.secure_channel(address, credentials, options)

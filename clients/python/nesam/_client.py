@@ -33,18 +33,18 @@ from .v1 import (
 class Client:
     """A connection to a service, e.g. `Client("127.0.0.1:50051")`. Threads may share it. Close it, or use it in a `with` block.
 
-    timeout_s: longest wait of a call that gives no other, s. tls: what the client trusts and shows; None = no TLS.
+    address: host:port. timeout_s: longest wait of a call that gives no other, s. tls: what the client trusts and shows; None = no TLS.
     vehicle_id: told with every call, for a proxy in front of several servers (deploy/haproxy); "" = not told.
     attempts_max: how often a call is tried that only reads (`session`, `sessions`, `export_session`, `map`, `maps`, `fleet_soil`, `predict`) and is UNAVAILABLE, 1 to 5;
     1 = once. The pauses between them grow from 0.1 s to 1 s, together about 2 s; all is over by the deadline of the call. A prediction with a fallback is tried
-    once, and so is all that changes something. ValueError for another number.
+    once, and so is all that changes something. ValueError for another number, or an address that begins with http.
     """
 
     def __init__(
         self, address: str, timeout_s: float = 10.0, tls: Optional[t.Tls] = None, vehicle_id: str = "", attempts_max: int = ATTEMPTS_MAX
     ):
         self.timeout_s = timeout_s
-        options, credentials = arguments(tls)
+        options, credentials = arguments(address, tls)
 
         def opened(options: Options) -> Any:
             channel = grpc.insecure_channel(address, options) if credentials is None else grpc.secure_channel(address, credentials, options)
@@ -148,7 +148,10 @@ class Client:
         return self._do(calls.apply_effects(session_id, effects, source))
 
     def revert_effects(self, session_id: str) -> t.Session:
-        """Takes the applied effects away again. Raises NotFound."""
+        """Takes the applied effects away again; its soil begins again from the prior. Needs the rights of an operator.
+
+        Raises NotFound, PermissionDenied as NesamError.
+        """
         return self._do(calls.revert_effects(session_id))
 
     def alarms(self, session_id: str, timeout_s: Optional[float] = None) -> Iterator[t.Alarm]:
@@ -203,7 +206,11 @@ class Client:
     # Maps
 
     def upload_map(self, world: t.WorldMap, timeout_s: float = 120.0) -> t.MapDescription:
-        """Uploads a map in tiles. Raises InvalidArgument, AlreadyExists (this or a newer version is there), Overloaded (too many maps or cells)."""
+        """Uploads a map in tiles.
+
+        Raises InvalidArgument, AlreadyExists (this or a newer version is there), Overloaded (too many maps or cells); ValueError for arrays of a wrong shape or
+        colours that are not uint8.
+        """
         return self._do(calls.upload_map(world), timeout_s)
 
     def patch_tile(
@@ -217,7 +224,10 @@ class Client:
     ) -> t.MapDescription:
         """Replaces the rectangle whose south-west cell is (row, column); without colours the old ones stay. The result is the next version.
 
-        Raises NotFound, InvalidArgument, NesamError with code ABORTED when the map is not at `base_version` any more.
+        elevation_m: (rows, columns), m in World, NaN = hole. semantic_rgb: (rows, columns, 3) uint8.
+
+        Raises NotFound, InvalidArgument (it lies outside the map), NesamError with code ABORTED when the map is not at `base_version` any more; ValueError for
+        arrays of a wrong shape.
         """
         return self._do(calls.patch_tile(map_id, base_version, row, column, elevation_m, semantic_rgb))
 
@@ -236,9 +246,9 @@ class Client:
     # Measurements
 
     def measure(self, measurements: Iterable[t.Measurement]) -> List[t.Answer]:
-        """Sends measurements and returns the answer to each, in order. A bad measurement is answered, not raised.
+        """Sends measurements and returns the answer to each, in order. What the service refuses is answered (REJECTED), not raised.
 
-        Raises DeadlineExceeded when an answer takes longer than the client's `timeout_s`, Unavailable.
+        Raises DeadlineExceeded when an answer takes longer than the client's `timeout_s`, Unavailable; ValueError for an array of a wrong shape.
         """
         with self.measurement_stream() as stream:
             return list(stream._exchange(measurements, self.timeout_s))
@@ -280,17 +290,16 @@ class Client:
 
         controls: (samples, horizon, 2): speed m/s, second command in the unit of the vehicle card; one step is 0.1 s; or a `Drawing`, by which the
         service draws them: `Prediction.controls` then tells what they were. cost: lets the service rank the candidates along a path and send the best
-        only; `Prediction.ranking` has the costs of all. samples_min: fewest samples that are of use when the deadline is near, 0 = all or nothing; the
-        arrays then have as many rows as were computed. start: (12,); with
-        `use_history` it is taken to hold at the instant of the newest measurement. channels: names from CHANNELS to return, default all.
-        stride: returns the steps stride, 2 stride, ... timeout_s: deadline, default that of the client. fallback: answers instead when the
-        service is late, overloaded or away, from `start` or the newest state that this client knows; the prediction says so. It does so at once, without
-        another attempt, and refuses what the service would: numbers that are not finite, commands outside the range of its card.
-        start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session forward to it with the commands `sent`,
-        pairs (stamp_ns, (speed, second)) by ascending stamp. half: lets the reply travel as 16-bit numbers; positions are rounded by at most
-        4 mm within 16 m of the start. extras: Jacobians, covariance, risk and what-if soils; the answer is in `Prediction.extras`.
-        A fallback rolls a known state forward by its own kinematics, no further than 32 steps, predicts the nominal sequence of a drawing alone, and has
-        no extras and no `ranking` (None).
+        only; `Prediction.ranking` has the costs of all; not together with extras. samples_min: fewest samples that are of use when the deadline is near, 0 =
+        all or nothing; the arrays then have as many rows as were computed. start: (12,), pose in World, twist in Body; with `use_history` it is taken to hold
+        at the instant of the newest measurement. channels: names from CHANNELS to return, default all. stride: returns the steps stride, 2 stride, ...
+        timeout_s: deadline, default that of the client. fallback: answers instead when the service is late, overloaded or away, from `start` or the newest
+        state that this client knows; the prediction says so. It does so at once, without another attempt, and refuses what the service would: numbers that are
+        not finite, commands outside the range of its card. start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session
+        forward to it with the commands `sent`, pairs (stamp_ns, (speed, second)) by ascending stamp; not together with `start`. half: lets the reply travel as
+        16-bit numbers; positions are rounded by at most 4 mm within 16 m of the start. extras: Jacobians, covariance, risk and what-if soils; the answer is in
+        `Prediction.extras`. A fallback rolls a known state forward by its own kinematics, no further than 32 steps, predicts the nominal sequence of a drawing
+        alone, and has no extras and no `ranking` (None).
 
         Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, or it lies off the map), Overloaded, DeadlineExceeded,
         Unavailable; ValueError for arrays of a wrong shape.

@@ -34,8 +34,10 @@ ATTEMPTS_MAX = 5
 _PAUSES = {"initialBackoff": "0.1s", "backoffMultiplier": 2.5, "maxBackoff": "1s"}
 
 
-def arguments(tls: Optional[Tls]) -> Tuple[Options, Optional[grpc.ChannelCredentials]]:
-    """Options and credentials of a channel; None = no TLS."""
+def arguments(address: str, tls: Optional[Tls]) -> Tuple[Options, Optional[grpc.ChannelCredentials]]:
+    """Options and credentials of a channel; None = no TLS. ValueError for an address as a browser has it, which gRPC takes for the name of a host."""
+    if address.startswith(("http://", "https://")):
+        raise ValueError(f"the address is {address}, expected host:port without http; whether TLS is used says `tls`")
     options: Options = [("grpc.max_receive_message_length", REPLY_BYTES_MAX), ("grpc.per_rpc_retry_buffer_size", _KEPT_BYTES_MAX), *_PATIENCE]
     if tls is None:
         return options, None

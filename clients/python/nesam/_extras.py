@@ -13,12 +13,12 @@ class Extras:
     """What to compute beyond the states; what is not asked for costs nothing.
 
     jacobians: derivatives of every state in start, commands and soil correction; at most 8 samples. covariance: of every state; at most 64 samples.
-    start_covariance: (12, 12) of the start, default that of a measured state as the bundle knows it. risk: wheel loads and slips, load transfer,
-    traction reserve. soil_deltas: (soils, 6) what-if corrections in the order k_phi k_c n c phi k_shear, added to the session's in its coordinates;
-    `Prediction.states` then is (soils, samples, steps, channels). soil_sigma_points: thirteen such groups for the sigma points of what the session
-    knows of the soil: the estimate first, then twelve with equal weights. exact_terrain: encodes the terrain at every pose instead of interpolating on the
-    pose grid; at most 16 samples. interpolation_deviation: how far that moves the first candidate; not together with exact_terrain. What-if soils do not go
-    together with Jacobians, covariance and exact terrain.
+    start_covariance: (12, 12) of the start in the units of a state squared, default that of a measured state as the bundle knows it. risk: wheel loads and
+    slips, load transfer, traction reserve. soil_deltas: (soils, 6) what-if corrections in the order k_phi k_c n c phi k_shear, added to the session's in its
+    coordinates; `Prediction.states` then is (soils, samples, steps, channels). soil_sigma_points: thirteen such groups for the sigma points of what the session
+    knows of the soil: the estimate first, then twelve with equal weights. exact_terrain: encodes the terrain at every pose instead of interpolating on the pose
+    grid; at most 16 samples. interpolation_deviation: how far that moves the first candidate; not together with exact_terrain. What-if soils do not go together
+    with Jacobians, covariance and exact terrain.
     """
 
     jacobians: bool = False
@@ -60,7 +60,7 @@ class ExtraOutputs:
     with the wheels front left, front right, rear left, rear right. load_transfer_ratio: (..., steps), 0 even to 1 one side carries nothing.
     traction_reserve: (..., steps), drawbar pull that is left over the weight in the direction of the speed command; below 0 the vehicle gets stuck, or does
     not start. `...` is (samples,), or (soils, samples) with what-if soils. interpolation_deviation_m: mean over the horizon of the horizontal distance between the first candidate and the same one with the terrain
-    encoded at every pose.
+    encoded at every pose; None without a map, too, where nothing is interpolated.
     """
 
     jacobian_start: Optional[np.ndarray] = None

@@ -34,7 +34,12 @@ class Validity(enum.IntFlag):
 
 @dataclass(frozen=True)
 class VehicleCard:
-    """The part of the vehicle card that a client needs. `second_kind` is steering_normalised, road_wheel_angle_rad or yaw_rate_rad_s."""
+    """The part of the vehicle card that a client needs.
+
+    second_kind: what the second command is, positive to the left: steering_normalised (-1 to 1), road_wheel_angle_rad or yaw_rate_rad_s (of a skid-steer vehicle).
+    speed_range_m_s, second_range: lowest and highest command that is admitted, the second in the unit of its kind. road_wheel_angle_max_rad: mean of left and
+    right at the highest second command, 0 for a vehicle that does not steer its wheels.
+    """
 
     name: str
     second_kind: str
@@ -46,7 +51,11 @@ class VehicleCard:
 
 @dataclass(frozen=True)
 class Provenance:
-    """What a reply was computed from."""
+    """What a reply was computed from.
+
+    history_epoch: changes of the session's history, 0 = no measurement yet. soil_epoch: changes of its soil correction, 0 = none yet. map_id: "" = no map. map_hash:
+    SHA-256 (hex) of its layers. bundle_hash: SHA-256 (hex) of the manifest of the model bundle.
+    """
 
     history_epoch: int
     soil_epoch: int
@@ -74,8 +83,9 @@ class Soil:
 
 @dataclass(frozen=True)
 class SoilEstimate:
-    """What a session knows of the soil after an update. soil_epoch counts the updates, 0 = none yet; stamp_ns: last measurement that went in, of the vehicle's clock, None before
-    the first update. history_epoch, map_version (0 = no map) and bundle_hash: where the session stood then.
+    """What a session knows of the soil after a change. soil_epoch counts the changes, 0 = none yet: updates, and beginnings anew from the prior (effects were
+    applied or reverted) or from the fleet's soil. stamp_ns: last measurement that went in, of the vehicle's clock, None where none has since the beginning.
+    history_epoch, map_version (0 = no map) and bundle_hash: where the session stood then.
     """
 
     session_id: str
@@ -126,7 +136,10 @@ class Alarm:
     """An episode in which the measurements of a session disagree with its predictions; `active` is False when it has ended.
 
     kind: nis_large, nis_small, correlated, motion_jump or sensor_jump. channel: what jumped, "" for a test of all. size: mean of the channel since the onset, in
-    the unit that its name ends in. soil_share: share of the misfit that another soil could explain at most. Stamps are of the vehicle's clock.
+    the unit that its name ends in, measured minus predicted. statistic: of the test that raised it, beyond threshold. soil_share: share of the misfit that
+    another soil could explain at most, 0 to 1. onset_stamp_ns: from which on it disagrees, stamp_ns: of the last measurement that was seen, both of the
+    vehicle's clock. description: what it looks like, in one sentence. diagnose: command that diagnoses the recorded window, RECORDING stands for the recording
+    of the server.
     """
 
     session_id: str
@@ -306,7 +319,7 @@ class Answer:
 class WorldMap:
     """A map to upload; row 0 is the southernmost.
 
-    elevation_m: (height, width) float32, NaN = hole. semantic_rgb: (height, width, 3) uint8 or None. origin_m: World position of cell (0, 0).
+    elevation_m: (height, width) float32, m in World, NaN = hole. semantic_rgb: (height, width, 3) uint8 or None. origin_m: World position of cell (0, 0).
     stamp_ns: instant that it was made at, of the vehicle's clock; frame: as its source names it, at most 64 bytes, "" = World. Both are carried for those who
     read the map, nothing is computed from them.
     """
@@ -323,7 +336,7 @@ class WorldMap:
 
 @dataclass(frozen=True)
 class MapDescription:
-    """A map on the service, without its layers."""
+    """A map on the service, without its layers. hash: SHA-256 (hex) of them. width, height: columns and rows. semantic: whether it has colours."""
 
     map_id: str
     version: int
@@ -341,15 +354,20 @@ class MapDescription:
 class Prediction:
     """Predicted trajectories.
 
-    states: (samples, steps, channels) float32. channels: names of the channels. steps_s: (steps,) time of each returned step after the start, s.
-    sinkage_m: (samples, steps, 4) float32 or None. validity: (samples,) uint32 of `Validity` bits. start: (12,).
-    start_stamp_ns: instant of the start by the vehicle's clock, None when a start was given. rolled_forward_steps: steps of 0.1 s from the newest
-    measurement to the start. soil: (6,) k_phi k_c n c phi k_shear under the start; soil_variance: (6,) or None while no filter runs;
-    soil_correction: what the session knew of the soil. extras: what `Extras` asked for; with what-if soils, states, sinkage_m and validity have a first
-    dimension more, one group for each soil. controls: (samples, horizon, 2) float32 of candidates that the service drew, None of those that were sent.
-    ranking: with a `PathCost`, the costs of all candidates; states, validity, sinkage_m and controls then have the rows of `ranking.best`.
-    computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a fallback was given; then soil, provenance,
-    sinkage_m, extras and ranking are None, validity is 0, controls of a drawing are its nominal sequence alone, and `fallback_reason` is the service's error.
+    Arrays may be read-only: copy what you change.
+
+    states: (samples, steps, channels) float32, m and rad in World (yaw in (-pi, pi]), m/s and rad/s in Body. channels: names of the channels, in the order of
+    CHANNELS. steps_s: (steps,) time of each returned step after the start, s. sinkage_m: (samples, steps, 4) float32, wheels front left, front right, rear
+    left, rear right; None unless asked for. validity: (samples,) uint32 of `Validity` bits. start: (12,), given, measured or rolled forward. history_steps:
+    measured steps before the start, 0 to 31. measurement_age_s: from the arrival of the newest measurement to the computation, None before the first. queue_s,
+    compute_s: how long the request waited and the engine computed, s. start_stamp_ns: instant of the start by the vehicle's clock, None when a start was given.
+    rolled_forward_steps: steps of 0.1 s from the newest measurement to the start. soil: (6,) k_phi k_c n c phi k_shear under the start, N/m^(n+2), N/m^(n+1),
+    -, Pa, rad, m; soil_variance: (6,), of these squared, or None while no filter runs; soil_correction: what the session knew of the soil. extras: what
+    `Extras` asked for; with what-if soils, states, sinkage_m and validity have a first dimension more, one group for each soil. controls: (samples, horizon, 2)
+    float32 of candidates that the service drew, None of those that were sent. ranking: with a `PathCost`, the costs of all candidates; states, validity,
+    sinkage_m and controls then have the rows of `ranking.best`. computed_by: "service", or "kinematic_fallback" when the service did not answer in time and a
+    fallback was given; then soil, provenance, sinkage_m, extras and ranking are None, validity is 0, controls of a drawing are its nominal sequence alone, and
+    `fallback_reason` is the service's error.
     """
 
     states: np.ndarray

@@ -1,8 +1,9 @@
 """The rollout of a session as a CasADi function with exact Jacobians, for gradient-based planners (IPOPT, acados' external functions, ...).
 
     rollout = nesam.casadi.Rollout("rollout", client, "truck-1", horizon=20)
+    u = casadi.MX.sym("u", 2, 20)
     x = rollout(x0, u)                      # (12, 20) from (12,) and (2, 20)
-    solver = casadi.nlpsol("plan", "ipopt", {"x": vec(u), "f": cost(x)}, {"ipopt.hessian_approximation": "limited-memory"})
+    solver = casadi.nlpsol("plan", "ipopt", {"x": casadi.vec(u), "f": cost(x)}, {"ipopt.hessian_approximation": "limited-memory"})
 
 Needs casadi, which this package does not install.
 """

@@ -356,6 +356,13 @@ def test_service_an_interrupted_send_shifts_no_answers():
         assert stream.send(second).sequence == 2 and heard == [[1], [1, 2]] and [m.sequence for m in stream.pending] == [1, 2]
 
 
+@pytest.mark.parametrize("kind", (nesam.Client, nesam.AsyncClient))
+def test_property_an_address_is_no_url(kind):
+    for address in ("http://127.0.0.1:50051", "https://server:50051"):
+        with pytest.raises(ValueError, match="expected host:port"):
+            kind(address)
+
+
 def test_service_a_slow_vehicle_is_not_a_silent_service():
     def slowly():
         for measurement in straight("truck", 4):

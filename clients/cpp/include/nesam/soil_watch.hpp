@@ -19,9 +19,10 @@ class SoilWatchImpl;
 /// What a session has learned of the soil.
 struct SoilEstimate {
   std::string session_id;
-  /// Counts the updates since the session was opened; 0 = none yet.
+  /// Counts the changes since the session was opened: updates, and beginnings anew from the prior (effects were applied or reverted) or from the fleet's
+  /// soil; 0 = none yet.
   std::uint64_t soil_epoch = 0;
-  /// Stamp of the last measurement that went into the estimate, ns of the vehicle's clock; absent before the first update.
+  /// Stamp of the last measurement that went into the estimate, ns of the vehicle's clock; absent where none has since the beginning.
   std::optional<std::int64_t> stamp_ns;
   SoilCorrection correction;
   std::uint64_t history_epoch = 0;  ///< Counts the changes of the session's history; 0 = no measurement yet.

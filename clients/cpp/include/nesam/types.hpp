@@ -97,7 +97,7 @@ struct SoilCorrection {
 /// What a reply was computed from. A planner may refuse a reply whose provenance it does not accept.
 struct Provenance {
   std::uint64_t history_epoch = 0;  ///< Changes of the session's history since it was opened; 0 = no measurement yet.
-  std::uint64_t soil_epoch = 0;     ///< Updates of the session's soil correction; 0 = none yet.
+  std::uint64_t soil_epoch = 0;     ///< Changes of the session's soil correction; 0 = none yet.
   std::string map_id;               ///< Map of the session; empty = no map.
   std::uint64_t map_version = 0;
   std::string map_hash;             ///< SHA-256 (hex) of the layers of the map.
