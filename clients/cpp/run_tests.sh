@@ -95,7 +95,11 @@ start_server "$@"
 for test in client_test extras_test fallback_test predictions_test sessions_test streams_test; do
   timeout 300 "$build/$test" "$address" || failed=yes
 done
-timeout 120 "$build/examples/planner" "$address" 5 || failed=yes
+# The example drives to its goal, and tells how it is called.
+driven="$(timeout 120 "$build/examples/planner" "$address" 400)" || failed=yes
+echo "example planner: ${driven##*$'\n'}"
+[ "${driven##*$'\n'}" = arrived ] || failed=yes
+"$build/examples/planner" --help | grep -q '^usage: ' || failed=yes
 finish_server
 
 # What the pages tell needs a store.

@@ -3,15 +3,17 @@
 // There is no vehicle here, so the predicted next state is taken for the measured one: this shows how a planner is wired, not how well the model predicts.
 // In a vehicle the measurements come from its localisation, at any rate, and the planner only calls `predict`.
 //
-// Usage: planner HOST:PORT [STEPS]
+// Usage: planner HOST:PORT [STEPS]        Exit code 0 = arrived or no steps left, 1 = a call failed, 2 = wrong usage, 130 = interrupted; the session is closed in any case.
 
 #include <nesam/nesam.hpp>
 
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <csignal>
 #include <cstdio>
 #include <cstdlib>
+#include <limits>
 #include <random>
 #include <string>
 #include <vector>
@@ -19,9 +21,11 @@
 namespace {
 
 constexpr std::size_t samples = 64;
-constexpr std::size_t horizon = 20;
+constexpr std::size_t horizon = 32;
 constexpr double goal_x_m = 12.0;
 constexpr double goal_y_m = 4.0;
+
+volatile std::sig_atomic_t interrupted = 0;
 
 /// Random command sequences, shape (samples, horizon, 2): first-order autoregressive noise, so that a vehicle can follow them.
 std::vector<float> draw(const nesam::VehicleCard& card, std::mt19937& random) {
@@ -46,13 +50,14 @@ std::vector<float> draw(const nesam::VehicleCard& card, std::mt19937& random) {
   return controls;
 }
 
-/// Distance to the goal at the end of a sample, m; a sample that cannot be trusted costs more than any other.
+/// Distance to the goal where a sample comes nearest, m; a sample that cannot be trusted costs more than any other.
 double cost(const nesam::Prediction& prediction, std::size_t n) {
   constexpr std::uint32_t hopeless = nesam::validity_not_finite | nesam::validity_off_map | nesam::validity_overturned;
   if ((prediction.validity[n] & hopeless) != 0) return 1e9;
   const auto states = prediction.states();
-  const std::size_t last = states.steps() - 1;
-  return std::hypot(states(n, last, 0) - goal_x_m, states(n, last, 1) - goal_y_m);
+  double nearest_m = std::numeric_limits<double>::infinity();
+  for (std::size_t k = 0; k < states.steps(); ++k) nearest_m = std::min(nearest_m, std::hypot(states(n, k, 0) - goal_x_m, states(n, k, 1) - goal_y_m));
+  return nearest_m;
 }
 
 nesam::VehicleState state_of(nesam::Span<const float> values) {
@@ -69,7 +74,7 @@ void drive(const std::string& target, int steps) {
 
   std::mt19937 random(1);
   nesam::Measurement now;
-  for (int step = 0; step < steps; ++step) {
+  for (int step = 0; step < steps && !interrupted; ++step) {
     now.stamp_ns += 100'000'000;
     now.sequence += 1;
     if (!session.send(now).value().accepted()) {
@@ -99,15 +104,18 @@ void drive(const std::string& target, int steps) {
 }  // namespace
 
 int main(int argc, char** argv) {
-  if (argc != 2 && argc != 3) {
-    std::fprintf(stderr, "usage: planner HOST:PORT [STEPS]\n");
-    return 2;
+  const bool help = argc == 2 && (std::string(argv[1]) == "--help" || std::string(argv[1]) == "-h");
+  const int steps = argc == 3 ? std::atoi(argv[2]) : 60;
+  if (help || (argc != 2 && argc != 3) || steps < 1) {
+    std::fprintf(help ? stdout : stderr, "usage: planner HOST:PORT [STEPS]\n");
+    return help ? 0 : 2;
   }
+  std::signal(SIGINT, [](int) { interrupted = 1; });
   try {
-    drive(argv[1], argc == 3 ? std::atoi(argv[2]) : 60);
+    drive(argv[1], steps);
   } catch (const nesam::Error& error) {
     std::fprintf(stderr, "planner: %s\n", error.what());
     return 1;
   }
-  return 0;
+  return interrupted ? 130 : 0;
 }

@@ -6,6 +6,7 @@ Put your simulator where `Bicycle` is: `reset` sets the vehicle down at rest, `s
 x y z roll pitch yaw (World, m and rad), velocity and angular velocity (Body, m/s and rad/s).
 """
 
+import argparse
 import json
 import math
 import socket
@@ -48,10 +49,7 @@ def answer(plant, request):
     return {"state": plant.state()}
 
 
-def main(address):
-    host, port = address.rsplit(":", 1)
-    plug = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    plug.bind((host, int(port)))
+def serve(plug):
     plant, last, client = Bicycle(), {}, None
     while True:
         request, sender = plug.recvfrom(2048)
@@ -64,5 +62,21 @@ def main(address):
         plug.sendto(json.dumps(last).encode(), sender)
 
 
+def main():
+    arguments = argparse.ArgumentParser(description="The smallest plant for `nesam navigate --plant HOST:PORT`.")
+    arguments.add_argument("address", nargs="?", default="127.0.0.1:5599", help="HOST:PORT to listen on (%(default)s)")
+    address = arguments.parse_args().address
+    host, _, port = address.rpartition(":")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as plug:
+        try:
+            plug.bind((host, int(port)))
+        except (OSError, ValueError, OverflowError) as error:
+            sys.exit(f"error: cannot listen on {address}: {error}")
+        try:
+            serve(plug)
+        except KeyboardInterrupt:
+            pass
+
+
 if __name__ == "__main__":
-    main(sys.argv[1] if len(sys.argv) > 1 else "127.0.0.1:5599")
+    main()

@@ -86,13 +86,29 @@ def measured(t_s: float):
     return [*position, 0.0, 0.0, yaw, speed, 0.0, 0.0, 0.0, 0.0, speed / radius], [speed, 0.1]
 
 
+def report(vehicle: ZenohVehicle, rate: float, count: int) -> None:
+    """Publishes so many measurements as soon as somebody listens."""
+    begun, told = time.monotonic(), False
+    while not vehicle.heard():
+        if not told and time.monotonic() - begun > 2.0:
+            told = True
+            print("waiting for a service that listens to this fleet", file=sys.stderr)
+        time.sleep(0.05)
+    start = time.monotonic()
+    for i in range(count):
+        due = i / rate
+        time.sleep(max(0.0, start + due - time.monotonic()))
+        vehicle.publish(time.time_ns(), *measured(due))
+
+
 def main() -> int:
+    """Exit code: 0 every measurement was answered, 1 not, 2 wrong usage, 130 interrupted."""
     parser = argparse.ArgumentParser(description="Publishes measurements of a made-up vehicle over Zenoh.")
-    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="endpoint of the router or server")
-    parser.add_argument("--fleet", default="default")
-    parser.add_argument("--vehicle", default="truck-1")
-    parser.add_argument("--rate", type=float, default=50.0, help="measurements per second, 10 to 200")
-    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--connect", default="tcp/127.0.0.1:7447", help="endpoint of the router or server (%(default)s)")
+    parser.add_argument("--fleet", default="default", help="as the server names it, zenoh.fleet (%(default)s)")
+    parser.add_argument("--vehicle", default="truck-1", help="name of an open session (%(default)s)")
+    parser.add_argument("--rate", type=float, default=50.0, help="measurements per second, 10 to 200 (%(default)s)")
+    parser.add_argument("--seconds", type=float, default=10.0, help="how long to publish, s (%(default)s)")
     parser.add_argument("--authority", help="for tls/...: authority of the router's certificate, PEM")
     parser.add_argument("--certificate", help="this vehicle's certificate, common name nesam:vehicle:<vehicle>")
     parser.add_argument("--key", help="its private key")
@@ -100,6 +116,8 @@ def main() -> int:
     tls = (arguments.authority, arguments.certificate, arguments.key)
     if any(tls) and not all(tls):
         parser.error("--authority, --certificate and --key go together")
+    if not 10.0 <= arguments.rate <= 200.0:
+        parser.error("--rate is 10 to 200")
     counts = {}
 
     def on_answer(answer):
@@ -108,19 +126,21 @@ def main() -> int:
         if kind == "REJECTED":
             print(f"measurement {answer.sequence}: {answer.rejected.message}", file=sys.stderr)
 
-    vehicle = ZenohVehicle(arguments.connect, arguments.fleet, arguments.vehicle, on_answer, tls if all(tls) else None)
-    while not vehicle.heard():
-        time.sleep(0.05)
-    start = time.monotonic()
+    try:
+        vehicle = ZenohVehicle(arguments.connect, arguments.fleet, arguments.vehicle, on_answer, tls if all(tls) else None)
+    except zenoh.ZError as error:
+        print(f"error: {arguments.connect}: {error}", file=sys.stderr)
+        return 1
     count = int(arguments.seconds * arguments.rate)
-    for i in range(count):
-        due = i / arguments.rate
-        time.sleep(max(0.0, start + due - time.monotonic()))
-        vehicle.publish(time.time_ns(), *measured(due))
-    deadline = time.monotonic() + 5.0
-    while sum(counts.values()) < count and time.monotonic() < deadline:
-        time.sleep(0.05)
-    vehicle.close()
+    try:
+        report(vehicle, arguments.rate, count)
+        deadline = time.monotonic() + 5.0
+        while sum(counts.values()) < count and time.monotonic() < deadline:
+            time.sleep(0.05)
+    except KeyboardInterrupt:
+        return 130
+    finally:
+        vehicle.close()
     print("  ".join(f"{kind} {n}" for kind, n in sorted(counts.items())))
     return 0 if sum(counts.values()) == count else 1
 
