@@ -5,6 +5,7 @@
 //! `cargo test --release -p nesam-proto -- --ignored regenerate` makes it again.
 
 pub mod packed;
+pub mod pieces;
 
 pub use prost::Message;
 
@@ -19,6 +20,16 @@ pub const CONNECTION_WINDOW_BYTES: u32 = 8 << 20;
 #[allow(missing_docs, clippy::all, unused_qualifications)]
 pub mod v1 {
     include!("gen/nesam.v1.rs");
+
+    impl PredictReply {
+        /// Number of the field `states`.
+        pub const STATES: u32 = 5;
+    }
+
+    impl PredictRequest {
+        /// Number of the field `controls`.
+        pub const CONTROLS: u32 = 6;
+    }
 
     /// Encoded `FileDescriptorSet` of all files of the package, for server reflection.
     pub const FILE_DESCRIPTOR_SET: &[u8] = include_bytes!("gen/nesam.v1.descriptor.bin");

@@ -1,9 +1,8 @@
 //! The vehicle's side over Zenoh: publishes measurements, hears their answers, says that it is there, may ask for predictions.
 
-use std::borrow::Cow;
 use std::time::Duration;
 
-use bytes::Bytes;
+use nesam_proto::pieces::{Pieces, head};
 use nesam_proto::v1;
 use prost::Message as _;
 use zenoh::bytes::ZBytes;
@@ -59,18 +58,18 @@ fn refusal(payload: &[u8]) -> ClientError {
     }
 }
 
-/// The bytes of a payload where they lie, in shared memory or as received; copied only where they are in pieces.
-fn in_place(payload: &ZBytes) -> Bytes {
-    struct Piece(ZBytes);
-    impl AsRef<[u8]> for Piece {
-        fn as_ref(&self) -> &[u8] {
-            self.0.slices().next().unwrap_or_default()
-        }
-    }
-    match payload.to_bytes() {
-        Cow::Borrowed(_) => Bytes::from_owner(Piece(payload.clone())),
-        Cow::Owned(joined) => joined.into(),
-    }
+/// The bytes of a payload where they lie, in shared memory or as received.
+fn in_place(payload: &ZBytes) -> Pieces {
+    Pieces::lent(payload, payload.slices().count(), |payload, at| payload.slices().nth(at).unwrap_or_default())
+}
+
+/// The commands behind the rest as they lie in the message: the network copies them once.
+fn in_pieces(mut request: v1::PredictRequest) -> ZBytes {
+    let controls = std::mem::take(&mut request.controls);
+    let mut message = ZBytes::writer();
+    message.append(head(&request, v1::PredictRequest::CONTROLS, controls.len()).into());
+    message.append(controls.into());
+    message.finish()
 }
 
 impl ZenohVehicle {
@@ -164,7 +163,7 @@ impl ZenohVehicle {
     /// # Errors
     /// `ClientError::Refused` with the service's reason, `ClientError::Zenoh` when nobody answers.
     pub async fn predict(&self, candidates: &Candidates) -> Result<Prediction, ClientError> {
-        let payload = candidates.to_message().encode_to_vec();
+        let payload = in_pieces(candidates.to_message());
         let replies = self.session.get(self.predict_key.as_str()).payload(payload).await.map_err(failed)?;
         let reply = replies.recv_async().await.map_err(|_| failed("nobody answers predictions"))?;
         match reply.result() {

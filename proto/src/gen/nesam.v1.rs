@@ -692,7 +692,7 @@ pub struct Provenance {
     /// Counts the changes of the session's history since it was opened; 0 = no measurement yet.
     #[prost(uint64, tag = "1")]
     pub history_epoch: u64,
-    /// Counts the updates of the session's soil correction; 0 = none yet.
+    /// Counts the changes of the session's soil correction: updates, and beginnings anew from the prior; 0 = none yet.
     #[prost(uint64, tag = "2")]
     pub soil_epoch: u64,
     /// Map of the session; empty = no map.
@@ -3522,7 +3522,7 @@ pub struct WatchSoilRequest {
 pub struct SoilEstimate {
     #[prost(string, tag = "1")]
     pub session_id: ::prost::alloc::string::String,
-    /// Counts the updates since the session was opened; 0 = none yet.
+    /// Counts the changes since the session was opened: updates, and beginnings anew from the prior (effects were applied or reverted); 0 = none yet.
     #[prost(uint64, tag = "2")]
     pub soil_epoch: u64,
     /// Stamp of the last measurement that went into the estimate, ns of the vehicle's clock; absent before the first update.
@@ -4023,7 +4023,7 @@ pub struct SessionStatus {
     /// Counts the changes of the history.
     #[prost(uint64, tag = "4")]
     pub history_epoch: u64,
-    /// Counts the updates of the soil.
+    /// Counts the changes of the soil: updates, and beginnings anew from the prior.
     #[prost(uint64, tag = "5")]
     pub soil_epoch: u64,
     /// Whether the vehicle's liveliness token is there.

@@ -38,7 +38,7 @@ fn receive(edge: &Edge, sender: &mpsc::Sender<Outgoing>, fleet: &str, sample: &S
     edge.engine.metrics().request(Transport::Zenoh, "measurement");
     let vehicle = keys::vehicle(sample.key_expr().as_str());
     let decoded = match sample.kind() {
-        SampleKind::Put => decode::<pb::Measurement>("nesam.v1.Measurement", &sample.payload().to_bytes(), MEASUREMENT_BYTES_MAX),
+        SampleKind::Put => decode::<pb::Measurement>("nesam.v1.Measurement", &*sample.payload().to_bytes(), MEASUREMENT_BYTES_MAX),
         SampleKind::Delete => Err(EngineError::invalid("", "a key that is deleted carries no measurement; put one")),
     };
     let (message, undecodable) = decoded.map_or_else(|error| (pb::Measurement::default(), Some(error)), |message| (message, None));

@@ -150,9 +150,10 @@ async fn publish(session: ::zenoh::Session, mut outgoing: mpsc::Receiver<Outgoin
 }
 
 /// A message of `kind` from a payload of limited size.
-fn decode<M: prost::Message + Default>(kind: &str, payload: &[u8], limit: usize) -> Result<M, EngineError> {
-    if payload.len() > limit {
-        return Err(EngineError::invalid("", format!("a payload of {} bytes is above the limit of {limit}", payload.len())));
+fn decode<M: prost::Message + Default>(kind: &str, payload: impl bytes::Buf, limit: usize) -> Result<M, EngineError> {
+    let length = payload.remaining();
+    if length > limit {
+        return Err(EngineError::invalid("", format!("a payload of {length} bytes is above the limit of {limit}")));
     }
     M::decode(payload).map_err(|error| EngineError::invalid("", format!("the payload is no {kind}: {error}")))
 }

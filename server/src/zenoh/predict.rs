@@ -1,6 +1,8 @@
 //! Predictions over Zenoh: a queryable on `.../predict`.
 
+use ::zenoh::bytes::ZBytes;
 use nesam_engine::EngineError;
+use nesam_proto::pieces::{Pieces, head};
 use nesam_proto::v1 as pb;
 
 use super::{decode, encode, keys};
@@ -52,12 +54,25 @@ async fn absent(edge: &Edge, session: &str, vehicle: &str) -> Option<Absent> {
     }
 }
 
+/// The states behind the rest as they lie in the engine's answer: the network copies them once, to where they are read.
+fn in_pieces(mut reply: pb::PredictReply) -> ZBytes {
+    let states = std::mem::take(&mut reply.states);
+    let mut message = ZBytes::writer();
+    message.append(head(&reply, pb::PredictReply::STATES, states.len()).into());
+    message.append(states.into());
+    message.finish()
+}
+
+fn slice(payload: &ZBytes, at: usize) -> &[u8] {
+    payload.slices().nth(at).unwrap_or_default()
+}
+
 async fn reply(edge: Edge, query: ::zenoh::query::Query) {
     let key = query.key_expr().clone();
     let decoded = {
         // Read where it lies: in shared memory that is the planner's own buffer.
-        let payload = query.payload().map(|p| p.to_bytes()).unwrap_or_default();
-        decode::<pb::PredictRequest>("nesam.v1.PredictRequest", &payload, predict_bytes_max(edge.engine.handle().limits()))
+        let payload = query.payload().map(|payload| Pieces::lent(payload, payload.slices().count(), slice)).unwrap_or_default();
+        decode::<pb::PredictRequest>("nesam.v1.PredictRequest", payload, predict_bytes_max(edge.engine.handle().limits()))
     };
     let result = match decoded {
         Ok(mut request) => {
@@ -77,7 +92,7 @@ async fn reply(edge: Edge, query: ::zenoh::query::Query) {
         Err(error) => Err((0, error)),
     };
     let sent = match result {
-        Ok(prediction) => query.reply(key, encode(&prediction)).await,
+        Ok(prediction) => query.reply(key, in_pieces(prediction)).await,
         Err((tag, error)) => query.reply_err(encode(&predict_error(tag, &error))).await,
     };
     if let Err(error) = sent {
