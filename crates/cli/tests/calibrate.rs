@@ -76,3 +76,38 @@ fn chrono_a_single_drive_is_scored_on_itself_and_says_so() {
         assert!(output.status.code() == Some(2) && said(&output).contains(words), "{}", said(&output));
     }
 }
+
+/// Goal: a number that the fit could only bring to the end of its range is told, in words and in the JSON. Method: a drive of the sample on a card whose springs are a twentieth of the
+/// true ones, of which a fit makes three times as much at most; on the card as it is, springs are told by the drives.
+#[test]
+fn chrono_a_number_that_ends_at_its_range_is_told() {
+    let here = tempfile::tempdir().unwrap();
+    let mut card: Value = serde_json::from_slice(&std::fs::read(Path::new(&sample()).join("vehicle_hmmwv.json")).unwrap()).unwrap();
+    for axle in ["front", "rear"] {
+        let spring = &mut card["suspension"][axle]["spring_N_per_m"];
+        *spring = (spring.as_f64().unwrap() / 20.0).into();
+    }
+    std::fs::write(here.path().join("soft.json"), card.to_string()).unwrap();
+    let data = sample();
+    let fitted = |more: &[&str], out: &str| {
+        let args = ["calibrate", "--data", &data, "--set", "nominal", "--trajectories", "n0001", "--out", out];
+        let output = nesam(&[&args[..], more].concat(), here.path());
+        assert!(output.status.success(), "{}", said(&output));
+        let json: Value = serde_json::from_slice(&std::fs::read(here.path().join(out).join("calibrate.json")).unwrap()).unwrap();
+        (String::from_utf8_lossy(&output.stderr).into_owned(), json["at_ends"].as_array().unwrap().clone())
+    };
+    let warned = |errors: &str| errors.lines().filter(|line| line.starts_with("warning: ")).count();
+    let (errors, ends) = fitted(&["--vehicle", "soft.json"], "soft");
+    assert_eq!(warned(&errors), ends.len(), "{errors}");
+    for axle in ["front", "rear"] {
+        let name = format!("suspension_n_m of the {axle} axle");
+        let line = errors.lines().find(|line| line.starts_with(&format!("warning: {name} ends at "))).expect(&errors);
+        assert!(line.contains("N/m: it may be more, the data do not tell it, or the card is wrong about something else"), "{line}");
+        let end = ends.iter().find(|end| end["name"] == name.as_str()).unwrap();
+        assert!(end["unit"] == "N/m" && end["value"] == end["range"][1], "{end}");
+        assert!((end["range"][1].as_f64().unwrap() / end["range"][0].as_f64().unwrap() - 9.0).abs() < 1e-9, "{end}");
+    }
+    let (errors, ends) = fitted(&[], "sheet");
+    assert_eq!(warned(&errors), ends.len(), "{errors}");
+    assert!(!ends.iter().any(|end| end["name"].as_str().unwrap().starts_with("suspension_n_m ")), "{ends:?}");
+}

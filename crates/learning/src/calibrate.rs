@@ -4,6 +4,7 @@ use nesam_model::Normalization;
 use nesam_physics::terramechanics::ContactLaw;
 use nesam_physics::{SecondCommand, TORQUE_KNOTS, TorqueDrive, Vehicle};
 
+use crate::at_end::{self, AtEnd};
 use crate::drives::Drive;
 use crate::recipe::Reporter;
 use crate::rims::{self, fit_rims, fit_rims_to_motion};
@@ -11,33 +12,33 @@ use crate::scales::measure;
 use crate::suspension::{TURNS, calibrate_suspension};
 use crate::symbolic::{HORIZON, descend, symbolic_error};
 
-/// A number of the drive line that is calibrated, with its range.
-pub type Knob = (&'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
+/// A number of the drive line that is calibrated: its key in the card, its unit, and its range.
+pub type Knob = (&'static str, &'static str, fn(&mut Vehicle) -> &mut f64, [f64; 2]);
 
-const STEERING: Knob = ("steering_lag_s", |v| &mut v.driveline.steering_lag_s, [0.0, 0.5]);
+const STEERING: Knob = ("driveline.steering_lag_s", "s", |v| &mut v.driveline.steering_lag_s, [0.0, 0.5]);
 
 /// Numbers of a drive that holds its rims at an over-speed.
 const OVERSPEED: [Knob; 4] = [
-    ("speed_gain", |v| &mut v.driveline.speed_gain, [0.01, 1.0]),
-    ("speed_integral_gain_per_s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 0.5]),
-    ("overspeed_limit_m_s", |v| &mut v.driveline.overspeed_limit_m_s, [0.05, 3.0]),
+    ("driveline.speed_gain", "", |v| &mut v.driveline.speed_gain, [0.01, 1.0]),
+    ("driveline.speed_integral_gain_per_s", "1/s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 0.5]),
+    ("driveline.overspeed_limit_m_s", "m/s", |v| &mut v.driveline.overspeed_limit_m_s, [0.05, 3.0]),
     STEERING,
 ];
 
 /// Numbers of a drive by torque; the gain stands for the torque per demand, which is fixed by the vehicle, and the curve is relative to its middle.
 const TORQUE: [Knob; 13] = [
-    ("speed_gain", |v| &mut v.driveline.speed_gain, [0.05, 5.0]),
-    ("speed_integral_gain_per_s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 2.0]),
-    ("holding_demand_m_s", |v| &mut torque(v).holding_demand_m_s, [0.0, 2.0]),
-    ("speed_integral_leak_s", |v| &mut v.driveline.speed_integral_leak_s, [0.5, 100.0]),
-    ("integral_observer_per_s", |v| &mut torque(v).integral_observer_per_s, [0.0, 2.0]),
-    ("curve 0", |v| &mut torque(v).curve[0], [0.2, 3.0]),
-    ("curve 1", |v| &mut torque(v).curve[1], [0.2, 3.0]),
-    ("curve 3", |v| &mut torque(v).curve[3], [0.2, 3.0]),
-    ("curve 4", |v| &mut torque(v).curve[4], [0.2, 3.0]),
-    ("closed_n_m", |v| &mut torque(v).closed_n_m, [0.0, 2000.0]),
-    ("brake_ratio", |v| &mut torque(v).brake_ratio, [0.0, 3.0]),
-    ("side_coupling_n_m_s", |v| &mut v.driveline.side_coupling_n_m_s, [0.0, 2000.0]),
+    ("driveline.speed_gain", "", |v| &mut v.driveline.speed_gain, [0.05, 5.0]),
+    ("driveline.speed_integral_gain_per_s", "1/s", |v| &mut v.driveline.speed_integral_gain_per_s, [0.0, 2.0]),
+    ("driveline.torque.holding_demand_m_s", "m/s", |v| &mut torque(v).holding_demand_m_s, [0.0, 2.0]),
+    ("driveline.speed_integral_leak_s", "s", |v| &mut v.driveline.speed_integral_leak_s, [0.5, 100.0]),
+    ("driveline.torque.integral_observer_per_s", "1/s", |v| &mut torque(v).integral_observer_per_s, [0.0, 2.0]),
+    ("driveline.torque.curve[0]", "", |v| &mut torque(v).curve[0], [0.2, 3.0]),
+    ("driveline.torque.curve[1]", "", |v| &mut torque(v).curve[1], [0.2, 3.0]),
+    ("driveline.torque.curve[3]", "", |v| &mut torque(v).curve[3], [0.2, 3.0]),
+    ("driveline.torque.curve[4]", "", |v| &mut torque(v).curve[4], [0.2, 3.0]),
+    ("driveline.torque.closed_n_m", "N m", |v| &mut torque(v).closed_n_m, [0.0, 2000.0]),
+    ("driveline.torque.brake_ratio", "", |v| &mut torque(v).brake_ratio, [0.0, 3.0]),
+    ("driveline.side_coupling_n_m_s", "N m s/rad", |v| &mut v.driveline.side_coupling_n_m_s, [0.0, 2000.0]),
     STEERING,
 ];
 
@@ -94,7 +95,8 @@ impl DriveLaw {
 }
 
 /// The vehicle with its drive line fitted on drives under each contact law and drive, the best pair kept, its suspension fitted with that where drives have a
-/// map, and the scales of the drives; `None` where it was interrupted, which is asked before each number.
+/// map, and the scales of the drives; `None` where it was interrupted, which is asked before each number. A number that ends at an end of its range is a line of
+/// warning.
 pub fn calibrate_vehicle(
     vehicle: Vehicle,
     training: &[&Drive],
@@ -131,8 +133,10 @@ pub fn calibrate_vehicle(
             best = Some((after, candidate));
         }
     }
-    let mut chosen = best.map_or(vehicle, |(_, chosen)| chosen);
+    let mut chosen = best.map_or_else(|| vehicle.clone(), |(_, chosen)| chosen);
+    let warn = |fitted: &Vehicle| at_end::at_ends(&vehicle, fitted).iter().for_each(|end| reporter.line(&format!("warning: {end}")));
     if training.iter().all(|drive| drive.map.is_none()) {
+        warn(&chosen);
         return Some((chosen, scales));
     }
     reporter.stage("suspension", TURNS);
@@ -151,7 +155,14 @@ pub fn calibrate_vehicle(
         before.to_degrees(),
         after.to_degrees()
     ));
+    warn(&chosen);
     Some((chosen, scales))
+}
+
+/// Numbers of the drive line of a car that lie at an end of their range.
+pub(crate) fn at_ends(vehicle: &Vehicle) -> Vec<AtEnd> {
+    let mut vehicle = vehicle.clone();
+    knobs(&vehicle).iter().filter_map(|&(name, unit, knob, range)| AtEnd::of(name, unit, *knob(&mut vehicle), range)).collect()
 }
 
 /// Numbers that are calibrated on a car.
@@ -186,7 +197,7 @@ pub fn calibrate_driveline(
     }
     let mut best = before;
     for round in 0..3 {
-        for &(name, knob, [low, high]) in knobs(vehicle) {
+        for &(name, _, knob, [low, high]) in knobs(vehicle) {
             if interrupted() {
                 return [before, best];
             }
@@ -200,7 +211,7 @@ pub fn calibrate_driveline(
                 })
             };
             best = descend(vehicle, best, reach, trials, |trial| symbolic_error(trial, drives, scales).position_m);
-            progress(name, *knob(vehicle), best);
+            progress(name.rsplit('.').next().unwrap_or(name), *knob(vehicle), best);
         }
     }
     [before, best]

@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 pub mod adam;
+pub mod at_end;
 pub mod autoencoder;
 pub mod batch;
 pub mod calibrate;

@@ -7,27 +7,40 @@ use nesam_physics::{RimServo, Vehicle, WHEELS};
 use nesam_trajectories::limited_starts;
 use rayon::prelude::*;
 
+use crate::at_end::AtEnd;
 use crate::drives::Drive;
 use crate::symbolic::{descend, symbolic_error};
 
-/// A number of the servo that is fitted, with its range.
-type Knob = (fn(&mut RimServo) -> &mut f64, [f64; 2]);
+/// A number of the servo that is fitted: its key in the servo of a card, its unit, and its range.
+type Knob = (&'static str, &'static str, fn(&mut RimServo) -> &mut f64, [f64; 2]);
 
 /// Those that the motion alone tells; the others are told by measured rims.
 pub(crate) const KNOBS_OF_MOTION: [Knob; 6] = [KNOBS[0], KNOBS[1], KNOBS[2], KNOBS[3], KNOBS[4], KNOBS[5]];
 
 const KNOBS: [Knob; 10] = [
-    (|s| &mut s.speed_gain, [0.1, 5.0]),
-    (|s| &mut s.yaw_gain, [0.1, 5.0]),
-    (|s| &mut s.yaw_limit_rad_s, [0.1, 20.0]),
-    (|s| &mut s.rim_limit_m_s, [0.1, 20.0]),
-    (|s| &mut s.speed_lag_s, [0.01, 2.0]),
-    (|s| &mut s.yaw_lag_s, [0.01, 2.0]),
-    (|s| &mut s.dead_time_s[0], [0.0, 0.6]),
-    (|s| &mut s.dead_time_s[1], [0.0, 0.6]),
-    (|s| &mut s.acceleration_limit[0], [0.05, RimServo::NO_LIMIT]),
-    (|s| &mut s.acceleration_limit[1], [0.05, RimServo::NO_LIMIT]),
+    ("speed_gain", "", |s| &mut s.speed_gain, [0.1, 5.0]),
+    ("yaw_gain", "", |s| &mut s.yaw_gain, [0.1, 5.0]),
+    ("yaw_limit_rad_s", "rad/s", |s| &mut s.yaw_limit_rad_s, [0.1, 20.0]),
+    ("rim_limit_m_s", "m/s", |s| &mut s.rim_limit_m_s, [0.1, 20.0]),
+    ("speed_lag_s", "s", |s| &mut s.speed_lag_s, [0.01, 2.0]),
+    ("yaw_lag_s", "s", |s| &mut s.yaw_lag_s, [0.01, 2.0]),
+    ("dead_time_s[0]", "s", |s| &mut s.dead_time_s[0], [0.0, 0.6]),
+    ("dead_time_s[1]", "s", |s| &mut s.dead_time_s[1], [0.0, 0.6]),
+    ("acceleration_limit[0]", "m/s²", |s| &mut s.acceleration_limit[0], [0.05, RimServo::NO_LIMIT]),
+    ("acceleration_limit[1]", "rad/s²", |s| &mut s.acceleration_limit[1], [0.05, RimServo::NO_LIMIT]),
 ];
+
+/// Numbers of a fitted servo that lie at an end of their range, none where the card's stood. A dead time or a ramp that nothing asks for is no end.
+pub(crate) fn at_ends(card: &RimServo, fitted: &RimServo) -> Vec<AtEnd> {
+    if card == fitted {
+        return Vec::new();
+    }
+    let mut servo = *fitted;
+    let asked = |value: f64| value != 0.0 && value != RimServo::NO_LIMIT;
+    let numbers = KNOBS.iter().map(|&(name, unit, knob, range)| (name, unit, *knob(&mut servo), range));
+    let ends = numbers.filter(|(_, _, value, _)| asked(*value));
+    ends.filter_map(|(name, unit, value, range)| AtEnd::of(format!("driveline.rims.{name}"), unit, value, range)).collect()
+}
 
 /// Dead time, s, from which a search begins where it may be that there is one.
 const DEAD_TIME_S: f64 = 0.2;
@@ -125,7 +138,7 @@ fn searched(vehicle: &Vehicle, from: RimServo, logs: &[Log<'_>], dt_s: f64) -> (
     let mut error = servo_error(&best, logs, dt_s);
     for round in 0..ROUNDS {
         let before = error;
-        for (knob, [low, high]) in KNOBS {
+        for (_, _, knob, [low, high]) in KNOBS {
             let mut reach = 0.5 / f64::from(1 << round.min(5));
             while reach > 0.000_5 && *knob(&mut best.driveline.rims) > 0.0 {
                 let current = *knob(&mut best.driveline.rims);
@@ -171,7 +184,7 @@ pub fn fit_rims_to_motion(
     found.driveline.rims = begun(vehicle.driveline.rims, vehicle.track_m, commands);
     let mut best = error(&found);
     for reach in [0.5, 0.2, 0.1] {
-        for (knob, [low, high]) in KNOBS_OF_MOTION {
+        for (_, _, knob, [low, high]) in KNOBS_OF_MOTION {
             let trials = |vehicle: &Vehicle, reach: f64| {
                 [1.0 / (1.0 + reach), 1.0 + reach].map(|factor| {
                     let mut trial = vehicle.clone();

@@ -6,6 +6,7 @@
 use nesam_model::Normalization;
 use nesam_physics::{Vehicle, WHEELS};
 
+use crate::at_end::AtEnd;
 use crate::drives::Drive;
 use crate::symbolic::{descend, symbolic_error};
 
@@ -20,6 +21,23 @@ const NUMBERS: [(&str, fn(&mut Vehicle) -> &mut [f64; WHEELS], [usize; 2]); 4] =
 const FIRST_REACH: [f64; 3] = [0.5, 0.2, 0.1];
 /// A number may be this much larger or smaller than the card has it.
 const MOST: f64 = 3.0;
+
+/// Numbers of a fitted suspension that lie at an end of their range about those of the card.
+pub(crate) fn at_ends(card: &Vehicle, fitted: &Vehicle) -> Vec<AtEnd> {
+    let (mut card, mut fitted) = (card.clone(), fitted.clone());
+    let end = |(name, number, [wheel, _]): (&str, fn(&mut Vehicle) -> &mut [f64; WHEELS], [usize; 2])| {
+        let (of_card, value) = (number(&mut card)[wheel], number(&mut fitted)[wheel]);
+        let (key, unit) = if name.starts_with("rate") { ("suspension_n_m", "N/m") } else { ("suspension_n_s_m", "N s/m") };
+        let axle = if wheel < 2 { "front" } else { "rear" };
+        AtEnd::of(format!("{key} of the {axle} axle"), unit, value, range(of_card))
+    };
+    NUMBERS.into_iter().filter_map(end).collect()
+}
+
+/// Least and most that is tried of a number.
+fn range(of_card: f64) -> [f64; 2] {
+    [of_card / MOST, of_card * MOST]
+}
 
 /// Steps of progress of a calibration.
 pub const TURNS: usize = NUMBERS.len() * FIRST_REACH.len();
@@ -50,7 +68,8 @@ pub fn calibrate_suspension(
                     let mut trial = vehicle.clone();
                     for wheel in wheels {
                         let value = &mut number(&mut trial)[wheel];
-                        *value = (*value * factor).clamp(of_card[wheel] / MOST, of_card[wheel] * MOST);
+                        let [low, high] = range(of_card[wheel]);
+                        *value = (*value * factor).clamp(low, high);
                     }
                     trial
                 })

@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use nesam_learning::Drive;
+use nesam_learning::at_end::{AtEnd, at_ends};
 use nesam_learning::calibrate::calibrate_vehicle;
 use nesam_learning::recipe::{Reporter, load_drives};
 use nesam_learning::symbolic::{HORIZON, symbolic_error};
@@ -35,7 +36,8 @@ which were measured with the old card: make them again with `nesam adapt --calib
 
 What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
 rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds or, \
-without any, from the motion. A range of commands that the card does not state is widened to the commands of the drives.
+without any, from the motion. A range of commands that the card does not state is widened to the commands of the drives. A number that ends at an end of \
+what is tried is a line of warning (`at_ends` in the JSON): the drives chose the end and not the number.
 
 Examples:
   nesam calibrate --data mine --set first --out mine-calibrated
@@ -97,7 +99,8 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
         let needed_s = (HORIZON + 1) as f64 * args.data.dt;
         return Err(Failure::input(format!("no drive of set `{}` is of {needed_s:.1} s or more, so nothing can be predicted", drives.set)));
     }
-    let (vehicle, scales) = calibrated(drives.root.vehicle_of(&drives.drives), &usable, args.data.dt, &Console::default());
+    let widened = drives.root.vehicle_of(&drives.drives);
+    let (vehicle, scales) = calibrated(widened.clone(), &usable, args.data.dt, &Console::default());
     let scored = if usable.len() > 1 { held_out(card, &usable, &scales) } else { scored(card, &vehicle, &usable, &scales) };
     let changes = changes(card, &vehicle);
     let path = out.join(CARD);
@@ -108,7 +111,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     }
     write_file(&path, (card_to_json(&vehicle) + "\n").as_bytes())?;
     say!("wrote {}", path.display());
-    let document = document(args, &drives, &scored, &changes, &path);
+    let document = document(args, &drives, &scored, (&changes, &at_ends(&widened, &vehicle)), &path);
     let saved = bundle.as_ref().map(|base| save_bundle(base, &vehicle, &drives.root.hash(), &out.join("bundle"))).transpose()?;
     let document = with_bundle(document, saved.as_deref(), provenance(bundle.as_ref(), &drives));
     let file = args.json.clone().unwrap_or_else(|| out.join("calibrate.json"));
@@ -221,13 +224,21 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
     }
 }
 
-fn document(args: &CalibrateArgs, drives: &Drives, scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, card: &Path) -> Value {
+fn document(
+    args: &CalibrateArgs,
+    drives: &Drives,
+    scored: &[Scored],
+    (changes, ends): (&BTreeMap<String, [Value; 2]>, &[AtEnd]),
+    card: &Path,
+) -> Value {
     let errors =
         |e: Errors| json!({"position_m": e.position_m, "yaw_deg": e.yaw_rad.to_degrees(), "tilt_deg": e.tilt_rad.map(f64::to_degrees)});
     let parameters: Vec<Value> =
         changes.iter().map(|(name, [before, after])| json!({"name": name, "card": before, "fitted": after})).collect();
     let trajectories: Vec<Value> =
         scored.iter().map(|s| json!({"trajectory": s.trajectory, "before": errors(s.before), "after": errors(s.after)})).collect();
+    let at_ends: Vec<Value> =
+        ends.iter().map(|end| json!({"name": end.name, "value": end.value, "unit": end.unit, "range": end.range})).collect();
     json!({
         "schema": "nesam.calibrate/1",
         "set": drives.set,
@@ -239,6 +250,7 @@ fn document(args: &CalibrateArgs, drives: &Drives, scored: &[Scored], changes: &
         "after": errors(mean(scored.iter().map(|s| s.after))),
         "trajectories": trajectories,
         "parameters": parameters,
+        "at_ends": at_ends,
         "vehicle": card.display().to_string(),
     })
 }
