@@ -2,6 +2,7 @@
 
 use std::io::IsTerminal;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -14,7 +15,7 @@ const LINE_EVERY: Duration = Duration::from_secs(10);
 /// Progress of one task with a known number of parts.
 pub struct Progress {
     label: String,
-    total: usize,
+    total: AtomicUsize,
     bar: Option<ProgressBar>,
     started: Instant,
     last_line: Mutex<Instant>,
@@ -32,7 +33,15 @@ impl Progress {
             bar
         });
         let now = Instant::now();
-        Self { label: label.into(), total, bar, started: now, last_line: Mutex::new(now) }
+        Self { label: label.into(), total: AtomicUsize::new(total), bar, started: now, last_line: Mutex::new(now) }
+    }
+
+    /// Says that there are `total` parts, as far as is known by now.
+    pub fn set_total(&self, total: usize) {
+        self.total.store(total, Ordering::Relaxed);
+        if let Some(bar) = &self.bar {
+            bar.set_length(total as u64);
+        }
     }
 
     /// Says that `done` parts are finished.
@@ -44,8 +53,12 @@ impl Progress {
         let Ok(mut last) = self.last_line.lock() else { return };
         if last.elapsed() >= LINE_EVERY {
             *last = Instant::now();
-            note!("{}: {done}/{} after {:.0} s", self.label, self.total, self.started.elapsed().as_secs_f64());
+            note!("{}: {done}/{} after {:.0} s", self.label, self.total(), self.started.elapsed().as_secs_f64());
         }
+    }
+
+    fn total(&self) -> usize {
+        self.total.load(Ordering::Relaxed)
     }
 
     /// Says that `done` parts are finished, with a remark.
@@ -61,6 +74,6 @@ impl Progress {
         if let Some(bar) = &self.bar {
             bar.finish_and_clear();
         }
-        note!("{}: {} in {:.1} s", self.label, self.total, self.started.elapsed().as_secs_f64());
+        note!("{}: {} in {:.1} s", self.label, self.total(), self.started.elapsed().as_secs_f64());
     }
 }

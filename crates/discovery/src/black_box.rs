@@ -40,6 +40,7 @@ impl BlackBox {
         let scale = bundle.normalization.residual_scale.map(f64::from);
         let (mean, directions) = principal(case)?;
         let metric = case.metric_without.believing_all();
+        case.work.expect(case.prepared.len());
         let drives = case
             .prepared
             .par_iter()
@@ -58,6 +59,7 @@ impl BlackBox {
                         difference(rows, &changed.deviations(&case.bench, &[], &SoilCorrection::NONE), 1.0)
                     })
                     .collect();
+                case.work.done();
                 prepared.signatures.profiled(&metric, rows, &columns)
             })
             .collect();

@@ -19,6 +19,7 @@ use crate::observe::Bench;
 use crate::onset::{Onset, PossibleOnset};
 use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick, mismatch};
 use crate::settled::Settled;
+use crate::work::Work;
 
 /// Largest half of the 95 % interval of a claimed magnitude, as a share of it. The interval contains the disagreement between drives: another effect may
 /// pass for this one on a drive, but seldom with the same size on all.
@@ -159,6 +160,8 @@ pub struct Case<'a> {
     pub(crate) dating: Option<Dating>,
     /// The soil that explains the drives best without an effect, where a model on trial has no map to tell it.
     pub(crate) ground_alone: Option<Ground>,
+    /// Who is told how far the work on it is.
+    pub(crate) work: Work<'a>,
 }
 
 impl Case<'_> {
@@ -215,6 +218,7 @@ impl Case<'_> {
         settled: &[Option<Settled>],
     ) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
+        self.work.expect(selection.chosen.len());
         let mut changes = self.changes(yardstick, fit, &selection.chosen);
         (0..selection.chosen.len())
             .map(|i| {
@@ -250,6 +254,7 @@ impl Case<'_> {
                 if let Some(possible) = self.possible_onset(hypothesis).filter(|_| finding.onset.is_none()) {
                     finding.allow_for(possible);
                 }
+                self.work.done();
                 finding
             })
             .collect()

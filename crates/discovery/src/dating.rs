@@ -76,7 +76,10 @@ impl Case<'_> {
         for look in 0..LOOKS {
             let mut moved = false;
             let more = if look == 0 { strongest.as_slice() } else { &[] };
-            for (hypothesis, beside) in places(&selection, more) {
+            let places = places(&selection, more);
+            self.work.expect(places.len());
+            for (hypothesis, beside) in places {
+                self.work.done();
                 let acting = dating.acting(&beside);
                 if dating.beside[hypothesis].as_ref() == Some(&acting) {
                     continue;

@@ -23,6 +23,7 @@ use crate::proof::Trial;
 use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
 use crate::pursuit::{Pursued, pursue};
 use crate::select::{EFFECTS_MAX, EFFECTS_ON_TRIAL_MAX, Selection};
+use crate::work::Work;
 
 /// What drives are held against.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -118,7 +119,7 @@ impl Diagnosis {
     }
 }
 
-/// Told how far a diagnosis is.
+/// Told how far a diagnosis is: the stage, the parts of it that are done, and those known by now, which may become more.
 pub type OnProgress<'a> = &'a (dyn Fn(&str, usize, usize) + Sync);
 
 /// Diagnoses a set with the reference that the predictor's bundle carries.
@@ -170,8 +171,8 @@ pub fn diagnose(
     }
     // Wheel speeds tell the drive line whatever the ground does; everything else is asked of a vehicle that has it.
     let (others, of_rims) = beside_rims(&options.hypotheses);
-    progress("wheel speeds", 0, 1);
-    let told = DriveLine::told_by(&bundle.vehicle, seen, &of_rims, others.len(), &options.without);
+    let work = Work::begin("wheel speeds", progress);
+    let told = DriveLine::told_by(&bundle.vehicle, seen, (&of_rims, others.len()), &options.without, work);
     let found = asked.diagnosed(&told, &others, of_rims)?;
     if told.is_empty() || found.verdict.claims() {
         return Ok(found);
@@ -214,10 +215,9 @@ impl Asked<'_> {
         let bundle = predictor.bundle();
         let observed = observe_all(predictor, seen, fit_maps, &|done| progress("drives as the model sees them", done, total))?;
         let bench = Bench::new(bundle, catalogue);
-        let trial = Trial { predictor, drives: fit_drives, maps: fit_maps, scoring: &options.scoring };
         let (mut case, Pursued { yardstick, refused }) =
-            held_against(judge_by, bench, observed, options, (plain, &trial, !told.is_empty()), progress)?;
-        progress("hypotheses", 0, 1);
+            held_against(judge_by, bench, observed, options, (plain, predictor, !told.is_empty()), self)?;
+        case.work = Work::begin("hypotheses", progress);
         let judgement = judge(&mut case, &yardstick).with_refused(refused);
         let fewer = match judge_by {
             Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
@@ -231,8 +231,10 @@ impl Asked<'_> {
         };
         let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
         let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
-        progress("held-out windows", 0, held.len());
-        let held_drives = HeldDrives { predictor: plain, told, drives: &held, maps: &held_maps, options, fitted: options.fit_on.is_none() };
+        let proof = Work::begin("held-out windows", progress);
+        case.work = proof.clone();
+        let fitted = options.fit_on.is_none();
+        let held_drives = HeldDrives { predictor: plain, told, drives: &held, maps: &held_maps, options, fitted, work: &proof };
         let apart = options.fit_on.is_some() && judge_by.is_some();
         let proving = if apart { held_drives.among_fitted(fit_drives, fit_maps) } else { held_drives };
         let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
@@ -240,7 +242,7 @@ impl Asked<'_> {
         if apart {
             learned = vec![taught.clone(); held.len()];
             scores = if options.scoring.windows(&held).is_ok() {
-                Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring)?)
+                Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring, &proof)?)
             } else {
                 None
             };
@@ -276,12 +278,11 @@ impl Asked<'_> {
             unproven(&mut of_rims_found);
         }
         let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
+        let others = if options.controls && scores.is_some() { Work::begin("controls", progress) } else { proof.clone() };
+        case.work = others.clone();
         let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: named, predictor, held_out: &places };
         let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {
-            Some(scores) => {
-                progress("controls", 0, held.len());
-                score_controls(&setting, scores, &held_drives)?
-            }
+            Some(scores) => score_controls(&setting, scores, &HeldDrives { work: &others, ..held_drives })?,
             None => (Vec::new(), None),
         };
         let null_drives = judge_by.and_then(|j| setting.on_null_drives(&j.nulls));
@@ -352,13 +353,13 @@ fn held_against<'a>(
     bench: Bench<'a>,
     observed: Vec<ObservedDrive>,
     options: &Options,
-    (plain, trial, told): (&Predictor, &Trial<'_>, bool),
-    progress: OnProgress<'_>,
+    (plain, predictor, told): (&Predictor, &Predictor, bool),
+    asked: &Asked<'a>,
 ) -> Result<(Case<'a>, Pursued), DiscoveryError> {
-    let total = observed.len();
+    let (total, progress) = (observed.len(), asked.progress);
     let Some(judge_by) = judge_by else {
         let mut ground_alone = None;
-        if trial.maps.iter().all(Option::is_none) {
+        if asked.fit_maps.iter().all(Option::is_none) {
             let plain = Bench { vehicle: &plain.bundle().vehicle, ..bench };
             let drives: Vec<&ObservedDrive> = observed.iter().collect();
             ground_alone = Some(Ground::fitted(&plain, &own_reference::metric(&plain, &observed)?, &drives, &[]));
@@ -367,7 +368,10 @@ fn held_against<'a>(
         case.ground_alone = ground_alone;
         let drives: Vec<Condensed> = case.condensed().cloned().collect();
         let first = own_yardstick(&case, &drives, &options.without)?;
-        let pursued = pursue(&mut case, first, &options.without, (trial, told), progress)?;
+        let work = Work::begin("drives held against every effect beside those found", progress);
+        case.work = work.clone();
+        let trial = Trial { predictor, drives: asked.fit_drives, maps: asked.fit_maps, scoring: &options.scoring, work: &work };
+        let pursued = pursue(&mut case, first, &options.without, (&trial, told))?;
         return Ok((case, pursued));
     };
     let case = judge_by.case(bench, observed, progress)?;

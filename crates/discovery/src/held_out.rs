@@ -12,6 +12,7 @@ use rayon::prelude::*;
 use nesam_physics::effects::ScheduledEffect;
 
 use crate::proof::{Counted, counted};
+use crate::work::Work;
 
 /// What was learned without a drive, for that drive.
 #[derive(Clone, Debug)]
@@ -87,8 +88,10 @@ pub fn score_held_out(
     maps: &DriveMaps,
     learned: &[Learned],
     scoring: &Scoring,
+    work: &Work<'_>,
 ) -> Result<HeldOut, EvaluationError> {
     let windows = scoring.windows(drives)?;
+    work.expect(windows.len());
     let after: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
     let paths: Vec<[PosePath; 3]> = windows
         .par_iter()
@@ -98,6 +101,7 @@ pub fn score_held_out(
             let before = with(predictor, SoilCorrection::NONE)?;
             let soil = with(predictor, learned[w.drive].soil)?;
             let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&after[w.drive], learned[w.drive].beside)? };
+            work.done();
             Ok([before, soil, after])
         })
         .collect::<Result<_, EvaluationError>>()?;
@@ -150,10 +154,14 @@ pub fn score_models(
     models: &[(&Predictor, SoilCorrection)],
     parameters: usize,
     resamples: &Resamples,
+    work: &Work<'_>,
 ) -> Result<ModelScore, EvaluationError> {
+    work.expect(windows.len());
     let roll = |w: &Window<'_>| {
         let (predictor, soil) = models[w.drive];
-        roll_out(predictor, Variant::Full, soil, w, None, maps[w.drive].as_ref())
+        let path = roll_out(predictor, Variant::Full, soil, w, None, maps[w.drive].as_ref());
+        work.done();
+        path
     };
     let paths = windows.par_iter().map(roll).collect::<Result<_, _>>()?;
     Ok(score(&ModelPaths { name: ModelName::Nesam, parameters, paths }, windows, Truth::Measured, resamples))

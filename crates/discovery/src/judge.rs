@@ -16,6 +16,7 @@ use crate::observe::{Bench, ObservedDrive, available_in_all};
 use crate::own_reference;
 use crate::reference::{NullGroups, Reference};
 use crate::select::Yardstick;
+use crate::work::Work;
 
 /// What a diagnosis is made with: the reference of a bundle, read once.
 #[derive(Clone, Debug)]
@@ -100,7 +101,7 @@ pub(crate) fn case_of<'a>(metric: Metric, bench: Bench<'a>, observed: Vec<Observ
             Prepared { drive, signatures, condensed }
         })
         .collect();
-    Case { bench, metric_without: metric.clone(), metric, prepared, rows, dating: None, ground_alone: None }
+    Case { bench, metric_without: metric.clone(), metric, prepared, rows, dating: None, ground_alone: None, work: Work::default() }
 }
 
 /// What drives are compared with that stand for themselves (`--reference physics`), whose scatter is that of `drives`.

@@ -56,6 +56,7 @@ pub mod select;
 pub mod settled;
 mod tail;
 mod whiteness;
+mod work;
 
 pub use candidates::{Candidate, catalogue};
 pub use channels::SEGMENT_STEPS;
@@ -69,3 +70,4 @@ pub use judgement::{Judgement, Verdict, judge};
 pub use metric::Metric;
 pub use observe::{Bench, ObservedDrive, Stepping, observe, observe_all};
 pub use reference::{DRIVES_MIN, NullGroups, Reference};
+pub use work::Work;

@@ -12,6 +12,7 @@ use nesam_trajectories::Trajectory;
 
 use crate::consistency::Contradictions;
 use crate::held_out::{HeldOut, Scoring, score_models, shows};
+use crate::work::Work;
 
 /// Most windows of a trial.
 const WINDOWS_MAX: usize = 1000;
@@ -143,6 +144,8 @@ pub struct Trial<'a> {
     pub maps: &'a DriveMaps,
     /// Rollouts.
     pub scoring: &'a Scoring,
+    /// Who is told how far they are.
+    pub work: &'a Work<'a>,
 }
 
 impl Trial<'_> {
@@ -164,7 +167,7 @@ impl Trial<'_> {
         let scored = |(effects, ground): (&[ScheduledEffect], &SoilCorrection)| {
             let predictor = self.predictor.with_effects(effects);
             let models = vec![(&predictor, *ground); self.drives.len()];
-            score_models(&windows, self.maps, &models, 0, &resamples)
+            score_models(&windows, self.maps, &models, 0, &resamples, self.work)
         };
         let (before, after) = (scored(without)?, scored(with)?);
         let shows = shows(&windows, self.drives.len(), |_| with.0);

@@ -16,6 +16,7 @@ use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::judgement::{Judgement, Verdict, judge, together};
 use crate::proof::{Counted, Rise, falls_surely, not_proven, rises_surely, several_scored, several_show};
 use crate::select::Yardstick;
+use crate::work::Work;
 
 /// Share by which an error on held-out drives must surely fall where the model itself is on trial (chosen). A model of a new vehicle is wrong in many ways at
 /// once, and evidence by the scatter of the judged drives themselves saturates; what is left is therefore no measure of what was explained there.
@@ -41,6 +42,8 @@ pub(crate) struct HeldDrives<'a> {
     pub options: &'a Options,
     /// Whether they are those that were fitted: each is predicted with what the others teach.
     pub fitted: bool,
+    /// Who is told how far predictions are.
+    pub work: &'a Work<'a>,
 }
 
 /// A judgement with what held-out drives say of it.
@@ -159,7 +162,7 @@ fn tried(
     mut judgement: Judgement,
     held: &HeldDrives<'_>,
 ) -> Result<Proven, EvaluationError> {
-    let HeldDrives { predictor, drives, maps, options, .. } = *held;
+    let HeldDrives { predictor, drives, maps, options, work, .. } = *held;
     loop {
         let taught = learned_by_all(case, &judgement, held.told);
         let learned = match drives.len() {
@@ -167,7 +170,8 @@ fn tried(
             0 => Vec::new(),
             _ => leave_each_out(fewer, case, &judgement, held.told),
         };
-        let scores = if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring)?) };
+        let scores =
+            if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring, work)?) };
         let needless = match &scores {
             Some(scores) => last_needless(&judgement, held.told, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
             None => None,
@@ -204,7 +208,7 @@ impl<'a> HeldDrives<'a> {
         resamples: &Resamples,
     ) -> Result<ModelScore, EvaluationError> {
         let windows = self.options.scoring.windows(self.drives)?;
-        score_models(&windows, self.maps, models, parameters, resamples)
+        score_models(&windows, self.maps, models, parameters, resamples, self.work)
     }
 
     /// Whether the measurements of the drives surely contradict one another less, by a share as errors of predictions must fall, with what was learned.

@@ -15,7 +15,6 @@ use rayon::prelude::*;
 use crate::channels::Row;
 use crate::claims::{Case, Finding};
 use crate::condense::{Beside, Condensed, condense, signatures_beside};
-use crate::diagnose::OnProgress;
 use crate::error::DiscoveryError;
 use crate::evidence::Group;
 use crate::fit::{Fit, Term};
@@ -51,13 +50,12 @@ pub(crate) fn pursue(
     mut yardstick: Yardstick,
     without: &[String],
     (trial, told): (&Trial<'_>, bool),
-    progress: OnProgress<'_>,
 ) -> Result<Pursued, DiscoveryError> {
     let (mut known, mut refused): (Vec<Known>, Vec<Finding>) = (Vec::new(), Vec::new());
     let alone = case.ground_alone.as_ref().filter(|_| !told).map(Ground::correction);
     let first = alone.or_else(|| case.ground_alone.is_some().then(|| Ground::beside(case, &[]).correction()));
     if first.map_or(Ok(false), |soil| take_ground(case, soil, &[], trial))? {
-        let left = look_beside(case, &[], progress)?;
+        let left = look_beside(case, &[])?;
         yardstick = own_yardstick(case, &left, without)?;
     }
     for _ in 0..LOOKS {
@@ -95,7 +93,7 @@ pub(crate) fn pursue(
             let soil = Ground::beside(case, &fit.effects()).correction();
             take_ground(case, soil, &fit.effects(), trial)?;
         }
-        let left = look_beside(case, &fitted, progress)?;
+        let left = look_beside(case, &fitted)?;
         yardstick = Yardstick { known: known.clone(), refused: yardstick.refused, ..own_yardstick(case, &left, without)? };
         if known.len() == EFFECTS_ON_TRIAL_MAX {
             break;
@@ -186,17 +184,16 @@ fn none_stands_out(yardstick: &Yardstick, left: &Group, channels: &[usize]) -> b
 }
 
 /// Measures scatter and signatures of every drive beside fitted effects; returns what these leave of each drive.
-fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>) -> Result<Vec<Condensed>, DiscoveryError> {
+fn look_beside(case: &mut Case<'_>, fitted: &[Beside]) -> Result<Vec<Condensed>, DiscoveryError> {
     let effects: Vec<ScheduledEffect> = fitted.iter().map(|f| f.effect).collect();
     let bench = case.bench;
     let rows: Vec<Vec<Row>> = case.prepared.par_iter().map(|p| p.drive.deviations(&bench, &effects, &SoilCorrection::NONE)).collect();
     case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
     // Signatures that are measured again are whole.
     case.dating = None;
-    let total = case.prepared.len();
-    let mut left = Vec::with_capacity(total);
-    for (done, (prepared, rows)) in case.prepared.iter_mut().zip(&rows).enumerate() {
-        progress("drives held against every effect beside those found", done, total);
+    case.work.expect(case.prepared.len());
+    let mut left = Vec::with_capacity(case.prepared.len());
+    for (prepared, rows) in case.prepared.iter_mut().zip(&rows) {
         prepared.signatures = signatures_beside(&bench, &prepared.drive, fitted);
         let after = condense(&case.metric, rows, &prepared.signatures);
         let before = fitted.iter().fold(after.clone(), |with, f| with.plus(f.candidate.columns()[0], f.share));
@@ -204,6 +201,7 @@ fn look_beside(case: &mut Case<'_>, fitted: &[Beside], progress: OnProgress<'_>)
         let Condensed { soil_score, soil_information, .. } = prepared.condensed.clone();
         prepared.condensed = Condensed { soil_score, soil_information, ..before };
         left.push(after);
+        case.work.done();
     }
     Ok(left)
 }

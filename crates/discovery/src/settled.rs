@@ -132,13 +132,16 @@ impl Case<'_> {
         }
         let others = without(&selection.chosen, i);
         let members: Vec<usize> = std::iter::once(own).chain(close).collect();
+        self.work.expect(members.len());
         let left = members
             .iter()
             .map(|h| {
                 let with: Vec<usize> = std::iter::once(*h).chain(others.iter().copied()).collect();
                 let mut onsets = onsets.to_vec();
                 onsets[*h] = onset_in_place(&onsets, *h, own);
-                self.left(&self.size(yardstick, before, &with, &onsets))
+                let left = self.left(&self.size(yardstick, before, &with, &onsets));
+                self.work.done();
+                left
             })
             .collect();
         Some(Settled { members, others, left })

@@ -21,6 +21,29 @@ fn value(found: &Diagnosis, name: &str) -> (f64, [f64; 2]) {
     (e.value, e.ci95.unwrap())
 }
 
+/// Goal: no stage works for long without a word, and what is told holds: never more than all, never less than before. Method: eight drives with a steering offset, controls
+/// included; what is told of every stage.
+#[test]
+fn property_every_stage_tells_how_far_it_is() {
+    let bundle = bundle();
+    let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 })];
+    let drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil)).collect();
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
+    let told = std::sync::Mutex::new(Vec::<(String, usize, usize)>::new());
+    let progress = |stage: &str, done: usize, total: usize| told.lock().unwrap().push((stage.into(), done, total));
+    let options = nesam_discovery::Options { controls: true, ..options() };
+    let found = nesam_discovery::diagnose(&predictor, &drives, &vec![Some(world()); 8], &options, &progress).unwrap();
+    assert!(found.verdict.claims(), "{}", found.reason);
+    let told = told.into_inner().unwrap();
+    assert!(told.iter().all(|(_, done, total)| done <= total && *total > 0), "{told:?}");
+    let of = |stage: &str| told.iter().filter(|one| one.0 == stage).map(|one| (one.1, one.2)).collect::<Vec<_>>();
+    for (stage, parts) in [("hypotheses", 5), ("held-out windows", 100), ("controls", 100)] {
+        let parts_told = of(stage);
+        assert!(parts_told.windows(2).all(|pair| pair[0].0 <= pair[1].0 && pair[0].1 <= pair[1].1), "{stage}: {parts_told:?}");
+        assert!(parts_told.last().is_some_and(|(done, total)| *done >= parts && done + 1 == *total), "{stage}: {parts_told:?}");
+    }
+}
+
 /// The effect is claimed, by name or as a rival that the drives cannot tell from the claim; true when by name.
 fn explained_by(found: &Diagnosis, id: &str) -> bool {
     let class: Vec<&str> = found.claims().flat_map(|f| f.rivals.iter().map(|r| r.candidate.id()).chain([f.candidate.id()])).collect();

@@ -398,6 +398,7 @@ impl Console {
             ended.finish();
         }
         if let Some((_, progress)) = now.as_ref() {
+            progress.set_total(total);
             progress.set(done);
         }
     }

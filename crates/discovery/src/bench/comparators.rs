@@ -30,6 +30,7 @@ use crate::judgement::Judgement;
 use crate::onset::Onset;
 use crate::ridge;
 use crate::select::Yardstick;
+use crate::work::Work;
 
 /// Share of a column's typical size below which STLSQ strikes it out (chosen).
 const STRUCK: f64 = 0.25;
@@ -74,7 +75,7 @@ impl Compared<'_> {
         let windows = scoring.windows(self.drives)?;
         let score = |entry: &Entry| {
             let models: Vec<(&Predictor, SoilCorrection)> = entry.predictors.iter().zip(entry.soils.iter().copied()).collect();
-            score_models(&windows, self.maps, &models, 0, &resamples)
+            score_models(&windows, self.maps, &models, 0, &resamples, &Work::default())
         };
         let plain = self.entry("before", |_| Vec::new(), Vec::new());
         let before = score(&plain)?;

@@ -20,6 +20,7 @@ use crate::candidates::Candidate;
 use crate::claims::Finding;
 use crate::judgement::{Judgement, Verdict, together};
 use crate::reference::DRIVES_MIN;
+use crate::work::Work;
 use rims::Rims;
 
 const EFFICIENCY: &str = "turn_efficiency";
@@ -37,9 +38,15 @@ pub(crate) struct DriveLine {
 
 impl DriveLine {
     /// From drives of a vehicle that [tell](tells) it. `family` begins at this place of the catalogue; effects in `without` are not considered.
-    pub fn told_by(vehicle: &Vehicle, drives: &[Trajectory], family: &[Candidate], first: usize, without: &[String]) -> Self {
+    pub fn told_by(
+        vehicle: &Vehicle,
+        drives: &[Trajectory],
+        (family, first): (&[Candidate], usize),
+        without: &[String],
+        work: Work<'_>,
+    ) -> Self {
         let considered = |c: &Candidate| !without.iter().any(|id| id == c.id());
-        let rims = Rims::of(vehicle, drives, family.iter().copied().filter(|c| considered(c) && c.id() != EFFICIENCY).collect());
+        let rims = Rims::of(vehicle, drives, family.iter().copied().filter(|c| considered(c) && c.id() != EFFICIENCY).collect(), work);
         let place = |candidate: Candidate| first + family.iter().position(|c| *c == candidate).expect("it is of the family; this is a bug");
         let (settled, mut doubts) = rims.settled(rims.chosen());
         let (chosen, spread) = rims.sure(settled);

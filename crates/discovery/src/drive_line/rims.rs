@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use super::measured_wheels;
 use super::sized::Sized;
 use crate::candidates::Candidate;
+use crate::work::Work;
 
 /// Most steps of drives that are looked at (chosen: half a minute on two cores), and the fewest of each drive.
 const STEPS_MAX: usize = 30_000;
@@ -32,10 +33,12 @@ pub(super) struct Rims<'a> {
     pub dt_s: f64,
     pub logs: Vec<Log<'a>>,
     pub family: Vec<Candidate>,
+    /// Who is told how far the search is.
+    pub work: Work<'a>,
 }
 
 impl<'a> Rims<'a> {
-    pub(super) fn of(vehicle: &'a Vehicle, drives: &'a [Trajectory], family: Vec<Candidate>) -> Self {
+    pub(super) fn of(vehicle: &'a Vehicle, drives: &'a [Trajectory], family: Vec<Candidate>, work: Work<'a>) -> Self {
         let most = (STEPS_MAX / drives.len()).max(STEPS_MIN);
         let log = |drive: &'a Trajectory| {
             // One without wheel speeds says nothing.
@@ -54,7 +57,7 @@ impl<'a> Rims<'a> {
             log.rims_m_s.truncate(1);
             log.wheel_speed_rad_s = &log.wheel_speed_rad_s[..1];
         }
-        Self { vehicle, dt_s: drives[0].dt_s, logs, family }
+        Self { vehicle, dt_s: drives[0].dt_s, logs, family, work }
     }
 
     pub(super) fn effects(&self, terms: &[usize], values: &[f64]) -> Vec<Effect> {
