@@ -1,0 +1,83 @@
+//! Goal: what a person hears of a diagnosis beside its verdict, or in its place. Method: the real binary on logs that are imported, one of them with a column of another
+//! sign, and on drives of the plant.
+#![allow(clippy::unwrap_used)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use serde_json::Value;
+
+fn repository() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
+}
+
+fn shipped() -> String {
+    repository().join("deploy/bundles/hmmwv-nominal").display().to_string()
+}
+
+fn nesam(args: &[&str], folder: &Path) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+fn sample() -> String {
+    repository().join("tests/data/chrono_sample").display().to_string()
+}
+
+fn imported(log: &str, set: &str, folder: &Path, more: &[&str]) {
+    let card = format!("{}/vehicle_hmmwv.json", sample());
+    let output = nesam(&[&["import", log, "--to", "mine", "--set", set, "--vehicle", &card], more].concat(), folder);
+    assert!(output.status.success(), "{}", text(&output.stderr));
+}
+
+/// Goal: what is printed of doubts in the drives is what the JSON has, and what `nesam check` doubts. Method: the log of the book, with its gyro and one wheel read with the other sign;
+/// as it is, nothing is doubted.
+#[test]
+fn chrono_doubts_are_printed_as_the_json_has_them() {
+    let here = tempfile::tempdir().unwrap();
+    let log = std::fs::read_to_string(repository().join("docs/example/pulls-left.csv")).unwrap();
+    let mut lines = log.lines().map(|line| line.split(',').map(String::from).collect::<Vec<_>>());
+    let header = lines.next().unwrap();
+    let turned: Vec<usize> = ["wz", "om_rl"].map(|name| header.iter().position(|column| column == name).unwrap()).into();
+    let rows = lines.map(|mut row| {
+        turned.iter().for_each(|column| row[*column] = (-row[*column].parse::<f64>().unwrap()).to_string());
+        row.join(",")
+    });
+    let changed: Vec<String> = std::iter::once(header.join(",")).chain(rows).collect();
+    std::fs::write(here.path().join("turned.csv"), changed.join("\n") + "\n").unwrap();
+    std::fs::write(here.path().join("sound.csv"), &log).unwrap();
+    let world = repository().join("tests/data/chrono_sample/worlds/w25");
+    let copy = here.path().join("mine/worlds/w25");
+    std::fs::create_dir_all(&copy).unwrap();
+    std::fs::read_dir(world).unwrap().flatten().for_each(|file| {
+        std::fs::copy(file.path(), copy.join(file.file_name())).unwrap();
+    });
+    let bundle = shipped();
+    for (set, doubted) in [("turned", true), ("sound", false)] {
+        imported(&format!("{set}.csv"), set, here.path(), &["--world", "w25"]);
+        let output = nesam(&["diagnose", "--data", "mine", "--set", set, "--bundle", &bundle, "--no-controls", "--out", set], here.path());
+        let said = text(&output.stdout);
+        assert!(output.status.success(), "{said}{}", text(&output.stderr));
+        let json: Value = serde_json::from_slice(&std::fs::read(here.path().join(set).join("diagnose.json")).unwrap()).unwrap();
+        let doubts: Vec<&str> = json["doubts"].as_array().unwrap().iter().map(|doubt| doubt.as_str().unwrap()).collect();
+        let end = " (`nesam check` tells more; a claim may be wrong by it)";
+        let printed: Vec<&str> =
+            said.lines().filter_map(|line| line.strip_prefix("doubt: ")).map(|line| line.strip_suffix(end).expect(line)).collect();
+        assert_eq!(printed, doubts);
+        assert_eq!(!doubts.is_empty(), doubted, "{doubts:?}");
+        let html = std::fs::read_to_string(here.path().join(set).join("diagnose.html")).unwrap();
+        let check = text(&nesam(&["check", "mine"], here.path()).stdout);
+        for doubt in doubts {
+            let what = doubt.split(". ").next().unwrap();
+            assert!(check.contains(&format!("doubt: set {set}: {what}; ")), "{what}: {check}");
+            assert!(html.contains(what.split(['<', '>', '&', '\'', '"']).next().unwrap()), "{what}");
+        }
+        if doubted {
+            let all = printed.join("\n");
+            assert!(all.contains("yaw rate") && all.contains("rim speed of RL"), "the gyro and the wheel: {all}");
+        }
+    }
+}
