@@ -4,7 +4,9 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
+use std::sync::Arc;
 
+use nesam_plant::{Command as Told, DriveRecorder, Ground, HiddenEffects, Plant, PlantVehicle, Sensors, write_set};
 use serde_json::Value;
 
 fn repository() -> PathBuf {
@@ -31,6 +33,14 @@ fn imported(log: &str, set: &str, folder: &Path, more: &[&str]) {
     let card = format!("{}/vehicle_hmmwv.json", sample());
     let output = nesam(&[&["import", log, "--to", "mine", "--set", set, "--vehicle", &card], more].concat(), folder);
     assert!(output.status.success(), "{}", text(&output.stderr));
+}
+
+/// Asserts that a diagnosis of a set of `mine` ends with exit code 2 and says this.
+fn refused(set: &str, folder: &Path, more: &[&str], words: &[&str]) {
+    let bundle = shipped();
+    let output = nesam(&[&["diagnose", "--data", "mine", "--bundle", &bundle, "--set", set], more].concat(), folder);
+    let said = text(&output.stderr);
+    assert!(output.status.code() == Some(2) && words.iter().all(|word| said.contains(word)), "{words:?}: {said}");
 }
 
 /// Goal: what is printed of doubts in the drives is what the JSON has, and what `nesam check` doubts. Method: the log of the book, with its gyro and one wheel read with the other sign;
@@ -80,4 +90,32 @@ fn chrono_doubts_are_printed_as_the_json_has_them() {
             assert!(all.contains("yaw rate") && all.contains("rim speed of RL"), "the gyro and the wheel: {all}");
         }
     }
+}
+
+/// Goal: a drive that was left out is no unknown one. Method: two drives of the plant, one of five samples, which is named to fit on.
+#[test]
+fn service_a_drive_that_is_too_short_to_fit_on_is_told_as_such() {
+    let here = tempfile::tempdir().unwrap();
+    let root = here.path().join("mine");
+    let vehicle = Arc::new(PlantVehicle::of_root(Path::new(&sample())).unwrap());
+    let ground = Arc::new(Ground::read(&Path::new(&sample()).join("worlds/w01")).unwrap());
+    let effects = HiddenEffects::default();
+    let drive = |id: &str, samples: usize| {
+        let mut plant = Plant::at_rest(Arc::clone(&vehicle), Arc::clone(&ground), effects, 0.0, 0.0, 0.0);
+        let (mut sensors, mut recorder) = (Sensors::new(1, &effects), DriveRecorder::default());
+        let told = Told { speed_m_s: 2.0, steering: 0.0 };
+        for _ in 0..samples {
+            let truth = plant.truth();
+            recorder.sample(&sensors.read(&truth), &truth, told);
+            plant.advance(told);
+        }
+        recorder.finish(id, "w01", "test")
+    };
+    write_set(&root.join("plant"), &[drive("long", 30), drive("brief", 5)]).unwrap();
+    std::fs::copy(format!("{}/vehicle_hmmwv.json", sample()), root.join("vehicle_hmmwv.json")).unwrap();
+    let short = ["--fit-on brief: the drive is too short to be judged, 0.4 s (5 samples of 0.1 s)", "0.8 s (9 samples) or more"];
+    for ids in ["brief", "long,brief"] {
+        refused("plant", here.path(), &["--fit-on", ids], &short);
+    }
+    refused("plant", here.path(), &["--fit-on", "other"], &["no drive `other` to fit on"]);
 }

@@ -112,25 +112,33 @@ struct Input {
     data_hash: String,
     predictor: Arc<Predictor>,
     provenance: ReportProvenance,
+    /// Drives of the set that are too short to be judged beside the others, with their samples.
+    short: Vec<(String, usize)>,
 }
 
 /// The drives of a set in a data root.
 fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
     let mut drives = read_drives(&args.data, false)?;
     let long_enough = |drive: &Trajectory| drive.states.len() > SEGMENT_STEPS;
-    let (all, short) = (drives.drives.len(), drives.drives.iter().find(|drive| !long_enough(drive)).map(|drive| drive.id.clone()));
-    if let Some(id) = short.filter(|_| drives.drives.iter().any(long_enough)) {
+    let all = drives.drives.len();
+    let mut short: Vec<(String, usize)> =
+        drives.drives.iter().filter(|drive| !long_enough(drive)).map(|drive| (drive.id.clone(), drive.states.len())).collect();
+    if short.len() == all {
+        // The diagnosis says that none has a segment.
+        short.clear();
+    }
+    if let Some((id, _)) = short.first() {
         let driven = core::mem::take(&mut drives.drives).into_iter().zip(core::mem::take(&mut drives.maps));
         (drives.drives, drives.maps) = driven.filter(|(drive, _)| long_enough(drive)).unzip();
-        let left_out = all - drives.drives.len();
         output::note!(
-            "note: left out as too short to judge, with fewer than {SEGMENT_STEPS} steps: {left_out} of {all} drives, the first is `{id}`"
+            "note: left out as too short to judge, with fewer than {SEGMENT_STEPS} steps: {} of {all} drives, the first is `{id}`",
+            short.len()
         );
     }
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let data_hash = drives.root.hash();
-    Ok(Input { set: drives.set, drives: drives.drives, maps: drives.maps, data_hash, predictor, provenance })
+    Ok(Input { set: drives.set, drives: drives.drives, maps: drives.maps, data_hash, predictor, provenance, short })
 }
 
 /// Runs the command.
@@ -196,7 +204,15 @@ fn shorter_half<'a, 'd>(drives: &'a mut [&'d Trajectory]) -> &'a [&'d Trajectory
 }
 
 /// Ids of the drives to fit on; `train` stands for those of the train split.
-fn fit_on(ids: &[String], drives: &[Trajectory]) -> Result<Vec<String>, Failure> {
+fn fit_on(ids: &[String], Input { drives, short, .. }: &Input, dt_s: f64) -> Result<Vec<String>, Failure> {
+    if let Some((id, samples)) = short.iter().find(|(id, _)| ids.contains(id)) {
+        let least = SEGMENT_STEPS + 1;
+        return Err(Failure::input(format!(
+            "--fit-on {id}: the drive is too short to be judged, {:.1} s ({samples} samples of {dt_s} s); it must be of {:.1} s ({least} samples) or more",
+            samples.saturating_sub(1) as f64 * dt_s,
+            SEGMENT_STEPS as f64 * dt_s
+        )));
+    }
     if ids != ["train"] || drives.iter().any(|d| d.id == "train") {
         return Ok(ids.to_vec());
     }
@@ -231,7 +247,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
             predictor.bundle().vehicle.name
         );
     }
-    let fit_on = args.fit_on.as_deref().map(|ids| fit_on(ids, &drives.drives)).transpose()?;
+    let fit_on = args.fit_on.as_deref().map(|ids| fit_on(ids, &drives, predictor.bundle().normalization.dt_s)).transpose()?;
     // What is claimed does not hang on other drives, nor does how far they are predicted.
     let mut fitted: Vec<&Trajectory> = drives.drives.iter().filter(|d| fit_on.as_ref().is_none_or(|ids| ids.contains(&d.id))).collect();
     if fitted.is_empty() {

@@ -70,7 +70,7 @@ impl RecordingArgs {
         let maps = vec![window.map; drives.len()];
         let provenance = output::provenance_of(Some(&bundle), &data_hash, &maps_hash(&maps));
         let predictor = std::sync::Arc::new(nesam_model::Predictor::new(std::sync::Arc::new(bundle)).or_input()?);
-        Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance })
+        Ok(Input { set: format!("recording-{session}"), drives, maps, data_hash, predictor, provenance, short: Vec::new() })
     }
 
     /// What a session measured in the newest recording that has something of it in the window; where none has, what the newest says.
