@@ -119,3 +119,31 @@ fn service_a_drive_that_is_too_short_to_fit_on_is_told_as_such() {
     }
     refused("plant", here.path(), &["--fit-on", "other"], &["no drive `other` to fit on"]);
 }
+
+/// Goal: a vehicle that stands is no vehicle with a large drag. Method: eight logs of 6 s of one pose to the bit, under commands and under none.
+#[test]
+fn service_drives_in_which_nothing_moves_are_told_as_such() {
+    let here = tempfile::tempdir().unwrap();
+    for (set, speed_m_s) in [("held", 2.0), ("parked", 0.0)] {
+        let row = |drive: usize, k: usize| format!("{:.1},1,2,0.6,0,0,0.3,{speed_m_s},0\n", 30.0 * drive as f64 + 0.1 * k as f64);
+        let rows: String = (0..8).flat_map(|drive| (0..60).map(move |k| row(drive, k))).collect();
+        std::fs::write(here.path().join(format!("{set}.csv")), format!("t,x,y,z,roll,pitch,yaw,cmd_speed,cmd_steer\n{rows}")).unwrap();
+        imported(&format!("{set}.csv"), set, here.path(), &[]);
+    }
+    for reference in ["bundle", "physics"] {
+        let asked = ["--reference", reference];
+        let held = [
+            "the vehicle never moved (0.00 m at most) in the 8 drives to fit on",
+            "up to 2.00 m/s was commanded",
+            "give drives in which it moves",
+        ];
+        refused("held", here.path(), &asked, &held);
+        refused(
+            "parked",
+            here.path(),
+            &asked,
+            &["nothing was commanded and nothing moved", "record drives in which the vehicle is driven"],
+        );
+    }
+    assert!(!here.path().join("nesam-out/diagnose-held/diagnose.json").exists());
+}

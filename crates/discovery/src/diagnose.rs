@@ -23,6 +23,7 @@ use crate::proof::Trial;
 use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
 use crate::pursuit::{Pursued, pursue};
 use crate::select::{EFFECTS_MAX, EFFECTS_ON_TRIAL_MAX, Selection};
+use crate::still::refuse_still;
 use crate::work::Work;
 
 /// What drives are held against.
@@ -125,7 +126,7 @@ pub type OnProgress<'a> = &'a (dyn Fn(&str, usize, usize) + Sync);
 /// Diagnoses a set with the reference that the predictor's bundle carries.
 ///
 /// # Errors
-/// `DiscoveryError::Reference` without a usable reference, `Drives` for unknown ids, `NoSegments`, and the model's own errors.
+/// `DiscoveryError::Reference` without a usable reference, `Drives` for unknown ids and for drives in which nothing moves, `NoSegments`, and the model's own errors.
 pub fn diagnose(
     predictor: &Predictor,
     drives: &[Trajectory],
@@ -150,6 +151,7 @@ pub fn diagnose(
     let fit_at = fitted(drives, options)?;
     // The model itself is judged from the best that is known of each state; a bundle's network knows what the past tells, and is judged from that.
     let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
+    refuse_still(&bundle.vehicle, &fit_drives)?;
     let in_hindsight: Option<Vec<Trajectory>> =
         (options.against == Against::Physics).then(|| fit_drives.iter().map(Trajectory::in_hindsight).collect());
     let seen = in_hindsight.as_ref().unwrap_or(&fit_drives);

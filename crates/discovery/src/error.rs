@@ -19,7 +19,7 @@ pub enum DiscoveryError {
         /// What was wrong and what to do.
         reason: String,
     },
-    /// A drive was asked for that the set does not have, or too few are left.
+    /// A drive was asked for that the set does not have, too few are left, or nothing moves in any of them.
     #[error("{reason}")]
     Drives {
         /// What was wrong and what to do.

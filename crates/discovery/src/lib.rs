@@ -54,6 +54,7 @@ pub mod report;
 mod ridge;
 pub mod select;
 pub mod settled;
+mod still;
 mod tail;
 mod whiteness;
 mod work;
