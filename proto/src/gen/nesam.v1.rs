@@ -196,7 +196,7 @@ pub struct DiagnosisProgress {
     /// What is being done, for people.
     #[prost(string, tag = "1")]
     pub stage: ::prost::alloc::string::String,
-    /// Parts of this stage that are done, and all of them.
+    /// Parts of this stage that are done, and all of them that are known by now: further ones may come up.
     #[prost(uint64, tag = "2")]
     pub done: u64,
     #[prost(uint64, tag = "3")]
