@@ -292,7 +292,7 @@ class Client:
         service draws them: `Prediction.controls` then tells what they were. cost: lets the service rank the candidates along a path and send the best
         only; `Prediction.ranking` has the costs of all; not together with extras. samples_min: fewest samples that are of use when the deadline is near, 0 =
         all or nothing; the arrays then have as many rows as were computed. start: (12,), pose in World, twist in Body; with `use_history` it is taken to hold
-        at the instant of the newest measurement. channels: names from CHANNELS to return, default all. stride: returns the steps stride, 2 stride, ...
+        at the instant of the newest measurement. channels: names from CHANNELS to return, default all; they come in the order of CHANNELS, whatever that of the names, and Prediction.channels says which. stride: returns the steps stride, 2 stride, ...
         timeout_s: deadline, default that of the client. fallback: answers instead when the service is late, overloaded or away, from `start` or the newest
         state that this client knows; the prediction says so. It does so at once, without another attempt, and refuses what the service would: numbers that are
         not finite, commands outside the range of its card. start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session

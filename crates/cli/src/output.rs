@@ -1,5 +1,6 @@
 //! Where results and remarks go.
 
+use std::collections::BTreeSet;
 use std::io::{ErrorKind, Write};
 use std::path::{Path, PathBuf};
 use std::sync::OnceLock;
@@ -81,6 +82,7 @@ pub fn result_files<const N: usize>(
     let dir = if none_needs_it { out_place(out, command, set)? } else { out_dir(out, command, set)? };
     let files = files.map(|(given, name)| given.clone().unwrap_or_else(|| dir.join(name)));
     files.iter().try_for_each(|file| check_file(file))?;
+    check_apart(files.iter().map(PathBuf::as_path))?;
     Ok(files)
 }
 
@@ -104,6 +106,21 @@ pub fn check_file(path: &Path) -> Result<(), Failure> {
         Some(above) if !above.is_dir() => refused(&format!("cannot be written: {} is not a folder", above.display())),
         _ => Ok(()),
     }
+}
+
+/// Refuses a file that two outputs, or an output and an input, share: the later one would take the place of the other.
+pub fn check_apart<'a>(files: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
+    let mut known = BTreeSet::new();
+    for file in files {
+        let Ok(Some(place)) = replaceable(file) else { continue };
+        let folder = place.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        // A folder that is not there yet is known by its name.
+        let folder = folder.canonicalize().or_else(|_| std::path::absolute(folder)).unwrap_or_else(|_| folder.into());
+        if !known.insert(folder.join(place.file_name().unwrap_or_default())) {
+            return Err(Failure::input(format!("{} is named twice; give each file a place of its own", file.display())));
+        }
+    }
+    Ok(())
 }
 
 /// The file behind the links of a path, whose place a whole new one can take; `None` for what is written as it is: a device, a pipe, a file that is open

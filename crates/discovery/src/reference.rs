@@ -198,7 +198,7 @@ impl Reference {
         let channels = self.compared().ok_or_else(|| fail("names a channel that this program does not know"))?;
         if let Some(missing) = channels.iter().find(|c| !available[**c]) {
             let reason = format!(
-                "the reference compares {}, which a drive of this set does not measure; `--reference physics` compares what the drives measure, from eight of them on",
+                "the reference compares {}, which a drive of this set does not measure (heights, roll and pitch are measured against its map, which `nesam import --world` names); `--reference physics` compares what the drives measure, from eight of them on",
                 channels::name(*missing)
             );
             return Err(DiscoveryError::Drives { reason });

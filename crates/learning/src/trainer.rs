@@ -127,6 +127,9 @@ pub enum TrainingError {
     /// The data cannot be trained on.
     #[error("training data: {0}")]
     Drives(String),
+    /// The weights are no numbers.
+    #[error("training diverged: weights after step {0} are not finite; lower --lr, or look for drives with absurd motions")]
+    Diverged(usize),
     /// Stopped on request before the first step, while something was prepared that a run does each time.
     #[error(
         "training was interrupted before its first step, while {0}: that part is not kept, checkpoints and finished encoders are; the same command with \
@@ -338,6 +341,9 @@ pub fn train(
         }
     }
     let chosen = if checkpoint.best_score.is_finite() { checkpoint.best } else { checkpoint.average };
+    if chosen.iter().any(|(_, array)| array.values.iter().any(|value| !value.is_finite())) {
+        return Err(TrainingError::Diverged(checkpoint.step));
+    }
     Ok(Trained { weights: chosen, curve: checkpoint.curve, steps: checkpoint.step })
 }
 

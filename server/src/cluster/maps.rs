@@ -147,13 +147,14 @@ impl Cluster {
         Ok(parts.into_iter().flatten().count())
     }
 
-    /// Removes a map, if what stands there is what this server has read or written last, and the engine has not got it again meanwhile.
+    /// Removes a map, if what stands there is what this server has read or written last, the engine has not got it again meanwhile, and no session drives on it:
+    /// another server may have written it again after it was lost.
     ///
     /// # Errors
     /// What etcd says.
     pub(crate) async fn remove_map(&self, map: &str) -> Result<(), Status> {
         let keys = &self.0.keys;
-        if self.0.engine.get_map(map, PUT).await.is_ok() {
+        if self.0.engine.get_map(map, PUT).await.is_ok() || self.map_user(map).await?.is_some() {
             return Ok(());
         }
         let known = self.lock().maps.get(map).cloned();

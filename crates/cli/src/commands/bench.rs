@@ -96,6 +96,10 @@ struct PredictBench {
     html: Option<PathBuf>,
 }
 
+/// Candidates of a query at most: their states are 1.5 kB each.
+const SAMPLES_MAX: usize = 1 << 18;
+/// Queries at most.
+const QUERIES_MAX: usize = 1_000_000;
 /// Memory of the commands' noise from step to step, as sampling planners draw it.
 const NOISE_MEMORY: f32 = 0.8;
 /// Standard deviation of the noise: speed, m/s, and share of the second command's range.
@@ -119,8 +123,8 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
 }
 
 fn predict(args: &PredictBench) -> Result<(), Failure> {
-    check_count("--samples", args.samples, 1..=usize::MAX)?;
-    check_count("--queries", args.queries, 1..=usize::MAX)?;
+    check_count("--samples", args.samples, 1..=SAMPLES_MAX)?;
+    check_count("--queries", args.queries, 1..=QUERIES_MAX)?;
     check_count("--horizon", args.horizon, 1..=MAX_HORIZON)?;
     exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;

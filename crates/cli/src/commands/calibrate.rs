@@ -92,6 +92,13 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     let card = drives.root.vehicle();
     let bundle = args.bundle.as_deref().map(|dir| bundle_to_change(dir, args.data.dt)).transpose()?;
     let out = out_dir(args.out.as_deref(), "calibrate", &drives.set)?;
+    if drives.root.card().parent().and_then(|root| root.canonicalize().ok()) == out.canonicalize().ok() {
+        let card = drives.root.card().display();
+        return Err(Failure::input(format!(
+            "--out {}: two cards in a data root are one too many; give another folder, then put the new card into the place of {card}",
+            out.display()
+        )));
+    }
     args.json.iter().try_for_each(|file| check_file(file))?;
     let measured = load_drives(&drives.root, &drives.drives).or_input()?;
     let usable: Vec<&Drive> = measured.iter().filter(|drive| drive.states.len() > HORIZON + 1).collect();

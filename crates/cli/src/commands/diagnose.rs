@@ -234,9 +234,11 @@ fn fit_on(ids: &[String], Input { drives, short, .. }: &Input, dt_s: f64) -> Res
 fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
+    args.recording.check()?;
     let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.reference)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
     args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
+    output::check_apart(args.json.iter().chain(&args.html).map(PathBuf::as_path))?;
     let predictor = Arc::clone(&drives.predictor);
     let reference = reference(args.reference, predictor.bundle());
     if args.reference.is_none() && reference == ReferenceArg::Physics {

@@ -88,7 +88,11 @@ pub fn run(args: &EffectsArgs) -> Result<(), Failure> {
             }
             OnSession::List(args) => {
                 let sessions = connect(args).await?.list_sessions().await.map_err(refused)?;
-                sessions.iter().filter(|s| args.session.is_empty() || s.session_id == args.session).for_each(show);
+                let asked: Vec<_> = sessions.iter().filter(|s| args.session.is_empty() || s.session_id == args.session).collect();
+                if asked.is_empty() && !args.session.is_empty() {
+                    return Err(Failure::input(format!("session `{}` is not open", args.session)));
+                }
+                asked.into_iter().for_each(show);
             }
         }
         Ok(())

@@ -42,6 +42,7 @@ pub struct EvaluateArgs {
         long,
         value_name = "SD,…",
         value_delimiter = ',',
+        requires = "calibrate_coverage",
         default_value = "0.015,0.015,0.02,0.001745,0.001745,0.001745,0.025,0.025,0.025,0.002,0.002,0.002",
         hide_default_value = true
     )]
@@ -125,6 +126,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     let names_of_files = [(&args.json, "evaluate.json"), (&args.html, "evaluate.html")];
     let files = output::result_files(args.out.as_deref(), "evaluate", &drives.set, names_of_files)?;
     args.markdown.iter().chain(&args.predictions).try_for_each(|file| output::check_file(file))?;
+    output::check_apart(files.iter().chain(&args.markdown).chain(&args.predictions).map(PathBuf::as_path))?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     warn_about_training_drives(args, &drives);

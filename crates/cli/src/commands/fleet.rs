@@ -58,6 +58,9 @@ pub fn run(args: &FleetArgs) -> Result<(), Failure> {
     if args.horizon == 0 || args.horizon > MAX_HORIZON {
         return Err(Failure::input(format!("--horizon {} is not 1 to {MAX_HORIZON}", args.horizon)));
     }
+    if !(args.first_s > 0.0 && args.first_s.is_finite()) {
+        return Err(Failure::input(format!("--first-s {} is not above 0", args.first_s)));
+    }
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;

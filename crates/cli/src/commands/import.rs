@@ -10,7 +10,7 @@ use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
-use crate::output::{check_file, say, write_file};
+use crate::output::{check_apart, check_file, say, write_file};
 
 /// Options of `nesam import`.
 #[derive(Args, Debug)]
@@ -60,6 +60,9 @@ pub struct ImportArgs {
     html: Option<PathBuf>,
 }
 
+/// Logs that are measured less often are doubted: the model steps at 10 Hz, and stamps tremble.
+const RATE_MIN_HZ: f64 = 9.0;
+
 const EXAMPLES: &str =
     "Columns of a data root (TARGET): t x y z, roll pitch yaw or qx qy qz qw, cmd_speed, and cmd_steer, cmd_road_wheel_angle or
 cmd_yaw_rate as the card says; where measured vbx vby vbz or vx vy vz, wx wy wz, om_fl om_fr om_rl om_rr or om_l om_r,
@@ -84,6 +87,10 @@ enum FrameArg {
 pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     let folder = target(args)?;
     args.html.iter().try_for_each(|file| check_file(file))?;
+    args.html
+        .iter()
+        .flat_map(|html| args.logs.iter().map(move |log| [html, log]))
+        .try_for_each(|both| check_apart(both.map(PathBuf::as_path)))?;
     let lines = match &args.columns {
         Some(file) => std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?,
         None => String::new(),
@@ -95,15 +102,30 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
         all.extend(found);
     }
     let card = card(args)?;
-    // The topmost folder that is made for the set.
-    let made = folder.ancestors().take_while(|dir| !dir.as_os_str().is_empty() && !dir.exists()).last().unwrap_or(&folder);
+    let made = make(&folder)?;
     if let Err(failure) = write(args, &folder, &all, card) {
-        // What cannot be read again is no set.
-        let _ = std::fs::remove_dir_all(made);
+        // What cannot be read again is no set. Of the folders above it those go that were made for it and hold nothing else.
+        let _ = std::fs::remove_dir_all(&folder);
+        made.iter().all(|dir| std::fs::remove_dir(dir).is_ok());
         return Err(failure);
     }
     say!("{} drives in {}", all.len(), folder.display());
     Ok(())
+}
+
+/// Makes the folder of a set, which nobody else may have made meanwhile; gives those above it that were made, from below.
+fn make(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
+    let failed = |e: std::io::Error| Failure::input(format!("cannot make the folder {}: {e}", folder.display()));
+    let above = folder.ancestors().skip(1).take_while(|dir| !dir.as_os_str().is_empty() && !dir.exists()).map(PathBuf::from).collect();
+    std::fs::create_dir_all(folder.parent().unwrap_or(folder)).map_err(failed)?;
+    match std::fs::create_dir(folder) {
+        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Err(exists(folder)),
+        made => made.map_err(failed).map(|()| above),
+    }
+}
+
+fn exists(folder: &Path) -> Failure {
+    Failure::input(format!("{} exists; choose another --set or remove it", folder.display()))
 }
 
 /// Writes the set, judges it, and puts the card into a data root that has none.
@@ -126,7 +148,7 @@ fn target(args: &ImportArgs) -> Result<PathBuf, Failure> {
         return Err(Failure::input(format!("--to {} lies in a bundle, which no command may change", args.to.display())));
     }
     if folder.exists() {
-        return Err(Failure::input(format!("{} exists; choose another --set or remove it", folder.display())));
+        return Err(exists(&folder));
     }
     if let Some(world) = args.world.as_ref().filter(|world| !args.to.join("worlds").join(world).is_dir()) {
         return Err(Failure::input(format!("--world {world}: no folder {}", args.to.join("worlds").join(world).display())));
@@ -163,7 +185,13 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
     for drive in &found {
         let t = drive.time_s();
         let length_s = t[t.len() - 1] - t[0];
-        say!("  {}: {length_s:.1} s, {} samples, {:.1} Hz", drive.id, t.len(), (t.len() - 1) as f64 / length_s);
+        let rate_hz = (t.len() - 1) as f64 / length_s;
+        say!("  {}: {length_s:.1} s, {} samples, {rate_hz:.1} Hz", drive.id, t.len());
+        if rate_hz < RATE_MIN_HZ {
+            say!(
+                "  doubt: {rate_hz:.1} Hz is slower than the model's steps of 0.1 s: what lies between is interpolated; record at 10 Hz or faster"
+            );
+        }
     }
     Ok(found)
 }
@@ -209,7 +237,7 @@ fn judge(args: &ImportArgs, card: Option<&Path>, html: &Path) -> Result<(), Fail
         say!("  doubt: {}; {}", doubt.what, doubt.advice);
     }
     for beyond in root.beyond_range(&drives) {
-        let cost = if beyond.implied { "" } else { ", and will not be read so" };
+        let cost = if beyond.implied { "" } else { ", and no service would take that" };
         say!("  doubt: {} drives command beyond the range of the card{cost}: {beyond}; see the units of the commands", beyond.drives);
     }
     write_file(html, page::page(&args.set, &drives, root.vehicle()).as_bytes())?;

@@ -161,6 +161,11 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if let Some(horizon) = args.horizon.filter(|horizon| !(1..=MAX_HORIZON).contains(horizon)) {
         return Err(Failure::input(format!("--horizon {horizon} is not 1 to {MAX_HORIZON}")));
     }
+    for (option, rate) in [("--lr", args.lr), ("--encoder-lr", args.encoder_lr)] {
+        if !(rate > 0.0 && rate <= 1.0) {
+            return Err(Failure::input(format!("{option} {rate} is not above 0 and at most 1")));
+        }
+    }
     if !(0.0..0.9).contains(&args.dropout) {
         return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
     }

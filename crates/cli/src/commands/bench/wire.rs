@@ -9,7 +9,7 @@ use nesam_client::{Candidates, Client, ClientError, Prediction, v1};
 use nesam_server::Config;
 use serde_json::{Value, json};
 
-use super::{DRIVEN, percentile, straight_on};
+use super::{DRIVEN, QUERIES_MAX, percentile, straight_on};
 use crate::args::{BundleArgs, check_count};
 use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
@@ -62,7 +62,7 @@ pub(super) fn run(args: &WireBench) -> Result<(), Failure> {
     check_count("--horizon", args.horizon, 1..=limits.horizon_max)?;
     // Both together have a limit too.
     check_count("--samples", args.samples, 1..=limits.samples_max.min(limits.sample_steps_max / args.horizon))?;
-    check_count("--queries", args.queries, 1..=usize::MAX)?;
+    check_count("--queries", args.queries, 1..=QUERIES_MAX)?;
     restart_with(&OF_A_SERVER)?;
     exit_on_ctrl_c("nothing was written");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;

@@ -43,6 +43,19 @@ pub struct RecordingArgs {
 }
 
 impl RecordingArgs {
+    /// Refuses parts of a recording where none is given: the parser lets them pass beside a set, which a recording excludes.
+    pub fn check(&self) -> Result<(), Failure> {
+        let of_recording =
+            [("--session", self.session.is_some()), ("--from-ns", self.from_ns != i64::MIN), ("--to-ns", self.to_ns != i64::MAX)];
+        match of_recording.into_iter().find(|(_, given)| *given && self.recording.is_empty()) {
+            Some((option, _)) => Err(Failure::input(format!("{option} is for --recording, and a set was given"))),
+            None if self.from_ns > self.to_ns => {
+                Err(Failure::input(format!("--from-ns {} is behind --to-ns {}", self.from_ns, self.to_ns)))
+            }
+            None => Ok(()),
+        }
+    }
+
     /// The pieces of the window in steps of the model, with the map of the session.
     pub fn input(&self, bundle: &BundleArgs, asked: Option<ReferenceArg>) -> Result<Input, Failure> {
         let session = self.session.as_deref().unwrap_or_default();

@@ -63,12 +63,16 @@ pub fn run(args: &WriteArgs) -> Result<(), Failure> {
     if inside_bundle(&args.out) {
         return Err(Failure::input(format!("--out {} lies in a bundle, which no command may change", args.out.display())));
     }
+    let set = args.out.join(&args.set);
+    if set.exists() {
+        return Err(Failure::input(format!("{} exists; choose another --set or remove it", set.display())));
+    }
     let effects = effects_of(&args.effect)?;
     copy_vehicle_and_worlds(&root, &args.out, &args.worlds)?;
     let progress = Progress::start("drives", args.drives);
-    write_drives(&root, &args.out.join(&args.set), &effects, &asked, &|done| progress.set(done))?;
+    write_drives(&root, &set, &effects, &asked, &|done| progress.set(done))?;
     progress.finish();
-    say!("{} drives in {}", args.drives, args.out.join(&args.set).display());
+    say!("{} drives in {}", args.drives, set.display());
     Ok(())
 }
 
@@ -149,28 +153,48 @@ fn drive(vehicle: &Arc<PlantVehicle>, ground: &Arc<Ground>, effects: &HiddenEffe
     recorder.finish(&format!("p{seed:04}"), world, "test")
 }
 
-/// Vehicle cards and worlds of a data root in another one.
+/// Puts vehicle cards and worlds of a data root into another one, or the same. What is there already stays, and has to be the same.
+///
+/// # Errors
+/// `Failure` naming a world that the first lacks, or a file that the other one has otherwise; nothing is written then.
 pub fn copy_vehicle_and_worlds(from: &Path, to: &Path, worlds: &[String]) -> Result<(), Failure> {
     let fail = |e: std::io::Error| Failure::Failed(format!("cannot copy to {}: {e}", to.display()));
     if let Some(missing) = worlds.iter().find(|world| !from.join("worlds").join(world).is_dir()) {
         return Err(Failure::input(format!("--worlds {missing}: {} has no such world", from.display())));
     }
-    std::fs::create_dir_all(to).map_err(fail)?;
-    copy_files(from, to, &|name| name.starts_with("vehicle_") && name.ends_with(".json")).map_err(fail)?;
+    let is_card = |name: &str| name.starts_with("vehicle_") && name.ends_with(".json");
+    let mut names = files(from, Path::new(""), &is_card).map_err(fail)?;
+    let others = if to.is_dir() { files(to, Path::new(""), &is_card).map_err(fail)? } else { Vec::new() };
+    if let Some(other) = others.iter().find(|card| !names.contains(card)) {
+        return Err(Failure::input(format!("{} has a vehicle of its own; choose another --out", to.join(other).display())));
+    }
     for world in worlds {
-        let folder = to.join("worlds").join(world);
-        std::fs::create_dir_all(&folder).map_err(fail)?;
-        copy_files(&from.join("worlds").join(world), &folder, &|_| true).map_err(fail)?;
+        names.extend(files(from, &Path::new("worlds").join(world), &|_| true).map_err(fail)?);
+    }
+    let (mut there, mut new) = (Vec::new(), Vec::new());
+    names.into_iter().for_each(|name| if to.join(&name).exists() { there.push(name) } else { new.push(name) });
+    for name in there {
+        if std::fs::read(to.join(&name)).map_err(fail)? != std::fs::read(from.join(&name)).map_err(fail)? {
+            let [other, own] = [to, from].map(|root| root.join(&name).display().to_string());
+            return Err(Failure::input(format!("{other} is there and is not {own}; choose another --out")));
+        }
+    }
+    for name in new {
+        let copy = to.join(&name);
+        std::fs::create_dir_all(copy.parent().unwrap_or(to)).map_err(fail)?;
+        std::fs::copy(from.join(&name), copy).map_err(fail)?;
     }
     Ok(())
 }
 
-fn copy_files(from: &Path, to: &Path, wanted: &dyn Fn(&str) -> bool) -> std::io::Result<()> {
-    for entry in std::fs::read_dir(from)? {
+/// Names of the files in a folder of a root, from the root on.
+fn files(root: &Path, folder: &Path, wanted: &dyn Fn(&str) -> bool) -> std::io::Result<Vec<PathBuf>> {
+    let mut names = Vec::new();
+    for entry in std::fs::read_dir(root.join(folder))? {
         let entry = entry?;
         if entry.file_type()?.is_file() && entry.file_name().to_str().is_some_and(wanted) {
-            std::fs::copy(entry.path(), to.join(entry.file_name()))?;
+            names.push(folder.join(entry.file_name()));
         }
     }
-    Ok(())
+    Ok(names)
 }

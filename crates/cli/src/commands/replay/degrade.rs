@@ -24,7 +24,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
     let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
-    every_nth(&mut drives, args.every);
+    every_nth(&mut drives, args.every.get());
     let longest = drives.drives.iter().map(|drive| drive.states.len()).max().unwrap_or(0);
     let horizon = args.horizon.unwrap_or_else(|| longest_horizon(&drives.drives));
     let asked: Vec<Vec<usize>> = drives.drives.iter().map(|drive| windows(drive.states.len(), horizon, MAX_HORIZON)).collect();
@@ -66,7 +66,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
 fn every_nth(drives: &mut Drives, every: usize) {
     let mut all: Vec<_> = std::mem::take(&mut drives.drives).into_iter().zip(std::mem::take(&mut drives.maps)).collect();
     all.sort_by(|(a, _), (b, _)| a.id.cmp(&b.id));
-    (drives.drives, drives.maps) = all.into_iter().step_by(every.max(1)).unzip();
+    (drives.drives, drives.maps) = all.into_iter().step_by(every).unzip();
 }
 
 /// Every drive through an engine of its own, on all cores; drives of one world together, as a predictor keeps few maps.

@@ -3,7 +3,9 @@
 mod degrade;
 mod recording;
 
+use std::num::NonZeroUsize;
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use clap::{ArgAction, Args};
 
@@ -31,8 +33,8 @@ pub struct ReplayArgs {
     #[command(flatten)]
     data: DataArgs,
     /// Use every N-th drive by name
-    #[arg(long, value_name = "N", default_value_t = 1)]
-    every: usize,
+    #[arg(long, value_name = "N", default_value = "1", value_parser = NonZeroUsize::from_str)]
+    every: NonZeroUsize,
     /// Steps to predict [default: 32, or what the longest drive allows]
     #[arg(long, value_name = "STEPS")]
     horizon: Option<usize>,
