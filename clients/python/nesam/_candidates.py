@@ -25,10 +25,13 @@ class Drawing:
 
     def message(self) -> prediction_pb2.CandidateDrawing:
         """As message. ValueError for an array of a wrong shape."""
+        if np.shape(self.sd) != (2,):
+            raise ValueError(f"sd must be two numbers, for speed and second command, not {self.sd!r}")
+        speed_sd, second_sd = self.sd
         return prediction_pb2.CandidateDrawing(
             nominal=_pairs(self.nominal, "nominal"),
-            speed_sd_m_s=self.sd[0],
-            second_sd=self.sd[1],
+            speed_sd_m_s=speed_sd,
+            second_sd=second_sd,
             correlation=self.correlation,
             seed=self.seed,
         )

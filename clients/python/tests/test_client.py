@@ -387,6 +387,11 @@ def with_number(values, at, number):
     return values
 
 
+def test_property_a_drawing_has_two_standard_deviations():
+    with pytest.raises(ValueError, match="sd must be two numbers"):
+        nesam.Drawing(fan(1, 5)[0], samples=4, sd=(0.1,)).message()
+
+
 WRONG_COMMANDS = [
     pytest.param({"controls": with_number(fan(3, 5), (1, 2, 0), np.nan)}, "controls[1, 2]", id="not a number"),
     pytest.param({"controls": with_number(fan(3, 5), (2, 4, 1), np.inf)}, "controls[2, 4]", id="infinite"),

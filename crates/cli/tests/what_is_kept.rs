@@ -115,7 +115,7 @@ fn service_of_two_imports_into_one_set_one_is_refused() {
     for round in 0..8 {
         let set = format!("s{round}");
         let begun = ["short.csv", "long.csv"].map(|name| {
-            let args = ["import", name, "--to", "mine", "--set", &set, "--vehicle", &card];
+            let args = ["import", name, "--flat", "--to", "mine", "--set", &set, "--vehicle", &card];
             Command::new(env!("CARGO_BIN_EXE_nesam"))
                 .args(args)
                 .current_dir(folder.path())
@@ -167,7 +167,7 @@ fn service_a_slow_log_is_doubted() {
             "t,x,y,yaw,cmd_speed,cmd_steer\n".to_string() + &rows.collect::<String>(),
         )
         .unwrap();
-        let output = nesam(&["import", &format!("{name}.csv"), "--to", "mine", "--set", name, "--vehicle", &card], folder.path());
+        let output = nesam(&["import", &format!("{name}.csv"), "--flat", "--to", "mine", "--set", name, "--vehicle", &card], folder.path());
         let said = String::from_utf8_lossy(&output.stdout).into_owned();
         assert!(
             output.status.success() && said.contains("10 Hz or faster") == doubted,

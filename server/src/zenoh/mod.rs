@@ -143,8 +143,11 @@ fn zenoh_config(all: &BusConfig, members: Option<&FleetFile>) -> Result<::zenoh:
 /// Publishes what the others hand over, so that no callback of Zenoh or of the engine waits for the network.
 async fn publish(session: ::zenoh::Session, mut outgoing: mpsc::Receiver<Outgoing>) {
     while let Some((key, payload)) = outgoing.recv().await {
-        if let Err(error) = session.put(key.as_str(), payload).await {
-            tracing::warn!(%error, key, "not published");
+        match session.put(key.as_str(), payload).await {
+            // The server stops.
+            Err(_) if session.is_closed() => return,
+            Err(error) => tracing::warn!(%error, key, "not published"),
+            Ok(()) => {}
         }
     }
 }
