@@ -266,12 +266,12 @@ fn service_a_root_without_samples_says_what_makes_a_set() {
 fn service_bench_names_the_one_option_that_is_at_fault() {
     let here = tempfile::tempdir().unwrap();
     for (args, words) in [
-        (["predict", "--queries", "0"], "--queries must be at least 1, not 0"),
-        (["predict", "--samples", "0"], "--samples must be at least 1, not 0"),
+        (["predict", "--queries", "0"], "--queries must be 1 to 1000000, not 0"),
+        (["predict", "--samples", "0"], "--samples must be 1 to 262144, not 0"),
         (["predict", "--horizon", "33"], "--horizon must be 1 to 32, not 33"),
         (["wire", "--horizon", "33"], "--horizon must be 1 to 32, not 33"),
         (["wire", "--samples", "100000"], "--samples must be 1 to"),
-        (["wire", "--queries", "0"], "--queries must be at least 1, not 0"),
+        (["wire", "--queries", "0"], "--queries must be 1 to 1000000, not 0"),
         (["consistency", "--border", "30"], "--border must be 0 to 29, not 30"),
     ] {
         refused(&[&["bench"][..], &args].concat(), here.path(), &[words]);
