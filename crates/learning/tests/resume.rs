@@ -20,6 +20,10 @@ const EPOCH: usize = 4;
 
 /// `steps` steps with checkpoints in a folder, with the weights they began from; `stop` = interrupted after every step.
 fn run(folder: &Path, steps: usize, resume: bool, stop: bool) -> (Result<Trained, TrainingError>, Weights) {
+    run_at(0.01, folder, steps, resume, stop)
+}
+
+fn run_at(rate: f64, folder: &Path, steps: usize, resume: bool, stop: bool) -> (Result<Trained, TrainingError>, Weights) {
     let learned_from = drive(None, 60);
     let scales = measured_scales(&learned_from);
     let weights = initial_weights(7, &scales);
@@ -33,7 +37,7 @@ fn run(folder: &Path, steps: usize, resume: bool, stop: bool) -> (Result<Trained
     let plan = TrainingPlan {
         steps,
         batch: 2,
-        rate: 0.01,
+        rate,
         horizon: HORIZON,
         seed: 1,
         epoch: EPOCH,
@@ -84,4 +88,11 @@ fn regress_an_interruption_before_the_first_epoch_leaves_what_was_trained() {
     let ended = ended.expect("a plan of no further steps");
     assert_eq!((ended.steps, ended.curve.len()), (1, 0));
     assert!(ended.weights != weights, "the running mean after the step");
+}
+
+#[test]
+fn property_weights_that_are_no_numbers_are_an_error_and_no_result() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let error = run_at(f64::NAN, folder.path(), STEPS, false, false).0.err().expect("nothing can come of it");
+    assert!(matches!(error, TrainingError::Diverged(STEPS)) && error.to_string().contains("lower --lr"), "{error}");
 }

@@ -1,5 +1,6 @@
 //! The store of one machine: one file, one process, fsync at every commit.
 
+use std::io::Read as _;
 use std::path::Path;
 
 use ::redb::{Database, DatabaseError, Durability, ReadableDatabase as _, ReadableTable as _, TableDefinition};
@@ -52,6 +53,28 @@ fn of_file(path: &Path, opened: Result<Database, DatabaseError>) -> Result<Datab
     })
 }
 
+/// Refuses a head that names pages larger than the file: the database takes the memory of a page, up to 4 GiB, before it looks whether the page is whole.
+fn check_head(path: &Path) -> Result<(), StoreError> {
+    // Two commits, each with the page numbers of two roots, whose five highest bits are the binary logarithm of their size in pages (redb, docs/design.md).
+    const COMMITS: [usize; 2] = [64, 192];
+    const ROOTS: [usize; 2] = [8, 40];
+    const PAGE_BYTES: u64 = 4096;
+    let mut head = [0; 320];
+    let Ok(mut file) = std::fs::File::open(path) else { return Ok(()) };
+    let length = file.metadata().map_or(0, |about| about.len());
+    if file.read_exact(&mut head).is_err() || !head.starts_with(b"redb") {
+        return Ok(());
+    }
+    let sizes = COMMITS.iter().flat_map(|commit| ROOTS.map(|root| PAGE_BYTES << (head[commit + root + 7] >> 3)));
+    match sizes.max().filter(|size| *size > length) {
+        Some(size) => Err(failed_in(
+            path,
+            format_args!("is damaged: a page of {size} bytes in a file of {length}; put a copy in its place, or take another folder"),
+        )),
+        None => Ok(()),
+    }
+}
+
 impl RedbStore {
     /// Opens the store in a folder, and makes both if they are not there.
     ///
@@ -64,6 +87,7 @@ impl RedbStore {
         };
         std::fs::create_dir_all(folder).map_err(at(folder))?;
         let path = folder.join(FILE);
+        check_head(&path)?;
         // What is damaged in the head of the file no checksum covers, and the database may panic on it.
         let opened = std::panic::catch_unwind(|| {
             let database = of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).create(&path))?;

@@ -290,6 +290,14 @@ fn service_damaged_foreign_and_shared_stores_are_refused() {
         }
     }
     assert!(refused > used.len(), "{refused} of six in each of {} pages", used.len());
+    // A root that is said to be larger than the file costs no memory.
+    for root in [72, 104, 200, 232] {
+        let mut damaged = bytes.clone();
+        damaged[root + 7] = 20 << 3;
+        std::fs::write(&file, damaged).unwrap();
+        let error = RedbStore::open(folder.path()).unwrap_err().to_string();
+        assert!(error.contains(FILE) && error.contains("a page of 4294967296 bytes"), "{root}: {error}");
+    }
     // A folder that is a file.
     assert!(matches!(RedbStore::open(&file), Err(StoreError::File { .. })));
 }
