@@ -71,18 +71,18 @@ pub fn out_dir(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf
 }
 
 /// Where results of these names go: each where it is asked for, else into the command's folder, which is made only where one needs it. Checked before the
-/// work, so that none is lost for a place that cannot take it.
-pub fn result_files<const N: usize>(
+/// work, so that none is lost for a place that cannot take it; those that are written `beside` them are checked with them.
+pub fn result_files<const N: usize, const M: usize>(
     out: Option<&Path>,
     command: &str,
     set: &str,
     files: [(&Option<PathBuf>, &str); N],
+    beside: [&Option<PathBuf>; M],
 ) -> Result<[PathBuf; N], Failure> {
     let none_needs_it = files.iter().all(|(given, _)| given.is_some());
     let dir = if none_needs_it { out_place(out, command, set)? } else { out_dir(out, command, set)? };
     let files = files.map(|(given, name)| given.clone().unwrap_or_else(|| dir.join(name)));
-    files.iter().try_for_each(|file| check_file(file))?;
-    check_apart(files.iter().map(PathBuf::as_path))?;
+    check_files(files.iter().chain(beside.into_iter().flatten()))?;
     Ok(files)
 }
 
@@ -108,8 +108,14 @@ pub fn check_file(path: &Path) -> Result<(), Failure> {
     }
 }
 
+/// Refuses outputs of a command that cannot be written ([`check_file`]) or share a file.
+pub fn check_files<'a>(files: impl Iterator<Item = &'a PathBuf> + Clone) -> Result<(), Failure> {
+    files.clone().try_for_each(|file| check_file(file))?;
+    check_apart(files)
+}
+
 /// Refuses a file that two outputs, or an output and an input, share: the later one would take the place of the other.
-pub fn check_apart<'a>(files: impl IntoIterator<Item = &'a Path>) -> Result<(), Failure> {
+pub fn check_apart<'a>(files: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
     let mut known = BTreeSet::new();
     for file in files {
         let Ok(Some(place)) = replaceable(file) else { continue };
@@ -121,6 +127,11 @@ pub fn check_apart<'a>(files: impl IntoIterator<Item = &'a Path>) -> Result<(), 
         }
     }
     Ok(())
+}
+
+/// Why nothing is written into the folder of a set that is there.
+pub fn set_exists(folder: &Path) -> Failure {
+    Failure::input(format!("{} exists; choose another --set or remove it", folder.display()))
 }
 
 /// The file behind the links of a path, whose place a whole new one can take; `None` for what is written as it is: a device, a pipe, a file that is open

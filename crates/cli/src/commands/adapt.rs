@@ -149,9 +149,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     }
     let true_soils = if args.also.iter().any(|also| also.needs_true_soil()) { read_true_soils(&drives)? } else { Vec::new() };
     let names = [(&args.json, "adapt.json"), (&args.html, "adapt.html")];
-    let [json, html] = output::result_files(args.out.as_deref(), "adapt", &drives.set, names)?;
-    args.predictions.iter().try_for_each(|file| output::check_file(file))?;
-    output::check_apart([&json, &html].into_iter().chain(&args.predictions).map(PathBuf::as_path))?;
+    let [json, html] = output::result_files(args.out.as_deref(), "adapt", &drives.set, names, [&args.predictions])?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;

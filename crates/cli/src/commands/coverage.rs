@@ -21,7 +21,7 @@ use crate::{interrupt, output};
 pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
-    let [file] = output::result_files(args.out.as_deref(), "coverage", &drives.set, [(&args.json, "coverage.json")])?;
+    let [file] = output::result_files(args.out.as_deref(), "coverage", &drives.set, [(&args.json, "coverage.json")], [])?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let noise = noise_of(predictor.bundle())?;
     let resamples = Resamples::draw(drives.drives.len(), args.resamples, args.seed);

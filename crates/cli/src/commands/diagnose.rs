@@ -237,8 +237,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     args.recording.check()?;
     let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.reference)? };
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
-    args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
-    output::check_apart(args.json.iter().chain(&args.html).map(PathBuf::as_path))?;
+    output::check_files(args.json.iter().chain(&args.html))?;
     let predictor = Arc::clone(&drives.predictor);
     let reference = reference(args.reference, predictor.bundle());
     if args.reference.is_none() && reference == ReferenceArg::Physics {

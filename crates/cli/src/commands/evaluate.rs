@@ -124,9 +124,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         start_noise_free(&mut drives)?;
     }
     let names_of_files = [(&args.json, "evaluate.json"), (&args.html, "evaluate.html")];
-    let files = output::result_files(args.out.as_deref(), "evaluate", &drives.set, names_of_files)?;
-    args.markdown.iter().chain(&args.predictions).try_for_each(|file| output::check_file(file))?;
-    output::check_apart(files.iter().chain(&args.markdown).chain(&args.predictions).map(PathBuf::as_path))?;
+    let files = output::result_files(args.out.as_deref(), "evaluate", &drives.set, names_of_files, [&args.markdown, &args.predictions])?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     warn_about_training_drives(args, &drives);

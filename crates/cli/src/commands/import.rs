@@ -10,7 +10,7 @@ use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
-use crate::output::{check_apart, check_file, say, write_file};
+use crate::output::{check_apart, check_file, say, set_exists, write_file};
 
 /// Options of `nesam import`.
 #[derive(Args, Debug)]
@@ -87,10 +87,7 @@ enum FrameArg {
 pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     let folder = target(args)?;
     args.html.iter().try_for_each(|file| check_file(file))?;
-    args.html
-        .iter()
-        .flat_map(|html| args.logs.iter().map(move |log| [html, log]))
-        .try_for_each(|both| check_apart(both.map(PathBuf::as_path)))?;
+    args.html.iter().flat_map(|html| args.logs.iter().map(move |log| [html, log])).try_for_each(check_apart)?;
     let lines = match &args.columns {
         Some(file) => std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?,
         None => String::new(),
@@ -119,13 +116,9 @@ fn make(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
     let above = folder.ancestors().skip(1).take_while(|dir| !dir.as_os_str().is_empty() && !dir.exists()).map(PathBuf::from).collect();
     std::fs::create_dir_all(folder.parent().unwrap_or(folder)).map_err(failed)?;
     match std::fs::create_dir(folder) {
-        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Err(exists(folder)),
+        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Err(set_exists(folder)),
         made => made.map_err(failed).map(|()| above),
     }
-}
-
-fn exists(folder: &Path) -> Failure {
-    Failure::input(format!("{} exists; choose another --set or remove it", folder.display()))
 }
 
 /// Writes the set, judges it, and puts the card into a data root that has none.
@@ -148,7 +141,7 @@ fn target(args: &ImportArgs) -> Result<PathBuf, Failure> {
         return Err(Failure::input(format!("--to {} lies in a bundle, which no command may change", args.to.display())));
     }
     if folder.exists() {
-        return Err(exists(&folder));
+        return Err(set_exists(&folder));
     }
     if let Some(world) = args.world.as_ref().filter(|world| !args.to.join("worlds").join(world).is_dir()) {
         return Err(Failure::input(format!("--world {world}: no folder {}", args.to.join("worlds").join(world).display())));

@@ -168,8 +168,7 @@ impl Task {
 /// Runs the command.
 pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     check(args)?;
-    args.json.iter().chain(&args.html).try_for_each(|file| output::check_file(file))?;
-    output::check_apart(args.json.iter().chain(&args.html).map(PathBuf::as_path))?;
+    output::check_files(args.json.iter().chain(&args.html))?;
     exit_on_ctrl_c(match args.plant {
         None => "laps that were driven to their end are kept, and the same command goes on after them",
         Some(_) => {

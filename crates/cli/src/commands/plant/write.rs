@@ -13,7 +13,7 @@ use super::{effects_of, root_of};
 use crate::args::check_count;
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
-use crate::output::say;
+use crate::output::{say, set_exists};
 use crate::progress::Progress;
 
 /// Steps at rest and of straight acceleration before a drive begins.
@@ -65,7 +65,7 @@ pub fn run(args: &WriteArgs) -> Result<(), Failure> {
     }
     let set = args.out.join(&args.set);
     if set.exists() {
-        return Err(Failure::input(format!("{} exists; choose another --set or remove it", set.display())));
+        return Err(set_exists(&set));
     }
     let effects = effects_of(&args.effect)?;
     copy_vehicle_and_worlds(&root, &args.out, &args.worlds)?;
