@@ -396,6 +396,16 @@ impl Config {
                 return Err(ServerError::Value { key, reason: format!("is {value}, allowed is above 0 and up to 1e6 s") });
             }
         }
+        let magnitudes = [
+            ("limits.position_max_m", self.limits.position_max_m),
+            ("limits.speed_max_m_s", self.limits.speed_max_m_s),
+            ("limits.angular_speed_max_rad_s", self.limits.angular_speed_max_rad_s),
+        ];
+        for (key, value) in magnitudes {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(ServerError::Value { key, reason: format!("is {value}, allowed is a finite number above 0") });
+            }
+        }
         if self.workers.threads > THREADS_MAX {
             let reason = format!("is {}, at most {THREADS_MAX} are allowed", self.workers.threads);
             return Err(ServerError::Value { key: "workers.threads", reason });
@@ -555,6 +565,9 @@ mod tests {
             ("[grpc]\nlisten = 3\n", "listen"),
             ("[grpc]\nport = 3\n", "port"),
             ("[limits]\nsessions_max = 0\n", "limits.sessions_max"),
+            ("[limits]\nposition_max_m = nan\n", "limits.position_max_m"),
+            ("[limits]\nspeed_max_m_s = -1.0\n", "limits.speed_max_m_s"),
+            ("[limits]\nangular_speed_max_rad_s = inf\n", "limits.angular_speed_max_rad_s"),
             ("[limits]\nhorizon_max = 33\n", "`limits.horizon_max`: is 33, the model predicts 32 steps at most"),
             ("[http]\nreports = \"/dev/null\"\n", "`http.reports`: /dev/null is not a folder"),
             ("[zenoh]\nfleet = \"a/b\"\n", "configuration key `zenoh.fleet`: must be"),

@@ -116,6 +116,12 @@ class DurableStreamImpl {
   static std::chrono::nanoseconds left(SteadyTime end) { return bounded(end - std::chrono::steady_clock::now()); }
   static bool over(SteadyTime end) { return std::chrono::steady_clock::now() >= end; }
 
+  /// Pause before the next connection: what the service asks for, else `pause`; never none at all.
+  std::chrono::nanoseconds until_again(const Error& error) const {
+    constexpr std::chrono::nanoseconds least = std::chrono::milliseconds(10);
+    return error.retry_after() ? std::max(least, bounded(*error.retry_after())) : bounded(options_.pause);
+  }
+
   /// Sends what has no answer yet, oldest first, over as many connections as it takes until `end`; the answer to the newest.
   Result<MeasurementAnswer> deliver(SteadyTime end) {
     const SteadyTime until = std::min(end, std::chrono::steady_clock::now() + bounded(options_.reconnect));
@@ -128,7 +134,7 @@ class DurableStreamImpl {
         if (answer.error().code() == Code::unavailable) return answer;
         return Error(Code::unavailable, answer.error().field(), answer.error().what());
       }
-      std::this_thread::sleep_for(std::min(bounded(options_.pause), left(until)));
+      std::this_thread::sleep_for(std::min(until_again(answer.error()), left(until)));
     }
   }
 

@@ -5,7 +5,7 @@ use std::ops::RangeInclusive;
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
-use nesam_evaluation::Inputs;
+use nesam_evaluation::{Inputs, Truth};
 use nesam_model::{HISTORY, MAX_HORIZON};
 use nesam_trajectories::Trajectory;
 
@@ -83,6 +83,24 @@ impl From<InputsArg> for Inputs {
     }
 }
 
+/// What errors are measured against.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum TruthArg {
+    /// The measured channels.
+    Measured,
+    /// The noise-free channels, where a set has them.
+    Gt,
+}
+
+impl From<TruthArg> for Truth {
+    fn from(truth: TruthArg) -> Self {
+        match truth {
+            TruthArg::Measured => Self::Measured,
+            TruthArg::Gt => Self::Gt,
+        }
+    }
+}
+
 /// What drives the predictions of a command that knows commands alone.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct CommandsArgs {
@@ -135,12 +153,7 @@ impl WindowArgs {
     /// # Errors
     /// Wrong usage.
     pub fn check_horizon(&self) -> Result<(), Failure> {
-        match self.horizon {
-            Some(horizon) if horizon > MAX_HORIZON => {
-                Err(Failure::input(format!("--horizon {horizon} exceeds the model's {MAX_HORIZON} steps")))
-            }
-            _ => Ok(()),
-        }
+        self.horizon.map_or(Ok(()), |horizon| check_count("--horizon", horizon, 1..=MAX_HORIZON))
     }
 }
 

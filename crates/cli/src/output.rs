@@ -7,6 +7,8 @@ use std::sync::OnceLock;
 
 use nesam_evaluation::Provenance;
 use nesam_model::ModelBundle;
+use rustix::fs::{Access, access};
+use serde::Serialize;
 
 use crate::bundle_path::inside_bundle;
 use crate::failure::Failure;
@@ -89,21 +91,27 @@ pub fn result_files<const N: usize, const M: usize>(
 /// Links followed from one to the next at most, as Linux does.
 const LINKS_MAX: usize = 40;
 
-/// Refuses a file that no command may write: one in a bundle, one that is a folder, one below a file. What links lead to counts.
+/// Refuses a file that no command may write: one in a bundle, one that is a folder, one below a file, one in a folder that takes none. What links lead to
+/// counts.
 pub fn check_file(path: &Path) -> Result<(), Failure> {
     let refused = |why: &str| Err(Failure::input(format!("{} {why}", path.display())));
     if path.is_dir() {
         return refused("is a folder; give a file");
     }
-    let file = match replaceable(path) {
+    let (file, drafted) = match replaceable(path) {
         Err(error) => return refused(&format!("cannot be written: {error}")),
-        Ok(file) => file.unwrap_or_else(|| path.to_path_buf()),
+        Ok(Some(file)) => (file, true),
+        Ok(None) => (path.to_path_buf(), false),
     };
     if inside_bundle(file.parent().unwrap_or(Path::new("."))) {
         return refused("lies in a bundle, which no command may change");
     }
-    match file.ancestors().skip(1).find(|above| above.exists()) {
+    let here = Path::new(".");
+    match file.ancestors().skip(1).map(|above| if above.as_os_str().is_empty() { here } else { above }).find(|above| above.exists()) {
         Some(above) if !above.is_dir() => refused(&format!("cannot be written: {} is not a folder", above.display())),
+        Some(above) if drafted => {
+            access(above, Access::WRITE_OK).or_else(|error| refused(&format!("cannot be written: {}: {error}", above.display())))
+        }
         _ => Ok(()),
     }
 }
@@ -161,7 +169,17 @@ pub fn write_file(path: &Path, text: &[u8]) -> Result<(), Failure> {
     write_with(path, |draft| std::fs::write(draft, text).map_err(|e| cannot_write(path, &e)))
 }
 
-/// The same for what is written by a function that is told the neighbour, or the device or pipe itself.
+/// Writes a document as JSON, see [`write_file`].
+pub fn write_json(path: &Path, document: &impl Serialize) -> Result<(), Failure> {
+    write_file(path, json_text(document).as_bytes())
+}
+
+/// A document as JSON for people and programs.
+pub fn json_text(document: &impl Serialize) -> String {
+    serde_json::to_string_pretty(document).expect("numbers and text always serialise; this is a bug") + "\n"
+}
+
+/// As [`write_file`] for what is written by a function that is told the neighbour, or the device or pipe itself.
 pub fn write_with(path: &Path, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
     check_file(path)?;
     let Some(file) = replaceable(path).map_err(|e| cannot_write(path, &e))? else { return write(path) };
@@ -193,7 +211,7 @@ pub fn provenance(bundle: Option<&ModelBundle>, drives: &Drives) -> Provenance {
     provenance_of(bundle, &drives.root.hash(), &maps_hash(&drives.maps))
 }
 
-/// The same of drives that do not lie in a data root.
+/// The same of drives that do not lie in a data root; empty hashes where there are none.
 pub fn provenance_of(bundle: Option<&ModelBundle>, data_hash: &str, maps_hash: &str) -> Provenance {
     Provenance {
         version: env!("CARGO_PKG_VERSION").into(),

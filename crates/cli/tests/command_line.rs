@@ -399,7 +399,7 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     refused(&["train", "--model", "transformer", "--sustained=0.2"], here.path(), &["--sustained", "transformer"]);
     refused(&["train", "--model", "transformer", "--soil-prior=0.2"], here.path(), &["--soil-prior", "transformer"]);
     for horizon in ["0", "34"] {
-        refused(&["train", "--horizon", horizon], here.path(), &[&format!("--horizon {horizon} is not 1 to 32")]);
+        refused(&["train", "--horizon", horizon], here.path(), &[&format!("--horizon must be 1 to 32, not {horizon}")]);
     }
 }
 

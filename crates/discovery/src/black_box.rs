@@ -40,7 +40,7 @@ impl BlackBox {
         let scale = bundle.normalization.residual_scale.map(f64::from);
         let (mean, directions) = principal(case)?;
         let metric = case.metric_without.believing_all();
-        case.work.expect(case.prepared.len());
+        case.work.add(case.prepared.len());
         let drives = case
             .prepared
             .par_iter()

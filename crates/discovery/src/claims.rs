@@ -218,7 +218,7 @@ impl Case<'_> {
         settled: &[Option<Settled>],
     ) -> Vec<Finding> {
         let group = yardstick.group(self.condensed());
-        self.work.expect(selection.chosen.len());
+        self.work.add(selection.chosen.len());
         let mut changes = self.changes(yardstick, fit, &selection.chosen);
         (0..selection.chosen.len())
             .map(|i| {

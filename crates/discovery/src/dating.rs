@@ -77,7 +77,7 @@ impl Case<'_> {
             let mut moved = false;
             let more = if look == 0 { strongest.as_slice() } else { &[] };
             let places = places(&selection, more);
-            self.work.expect(places.len());
+            self.work.add(places.len());
             for (hypothesis, beside) in places {
                 self.work.done();
                 let acting = dating.acting(&beside);

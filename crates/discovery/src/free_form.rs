@@ -41,7 +41,7 @@ impl Leftover {
         let units: Vec<f64> = (0..PARAMETERS).map(|p| force / FEATURE_UNITS[p % FREE_FORM_FEATURES]).collect();
         let named = fit.map_or_else(Vec::new, Fit::effects);
         let metric = case.metric.believing_all();
-        case.work.expect(case.prepared.len());
+        case.work.add(case.prepared.len());
         let drives = case
             .prepared
             .par_iter()

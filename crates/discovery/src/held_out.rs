@@ -91,7 +91,7 @@ pub fn score_held_out(
     work: &Work<'_>,
 ) -> Result<HeldOut, EvaluationError> {
     let windows = scoring.windows(drives)?;
-    work.expect(windows.len());
+    work.add(windows.len());
     let after: Vec<Predictor> = learned.iter().map(|l| predictor.with_effects(&l.effects)).collect();
     let paths: Vec<[PosePath; 3]> = windows
         .par_iter()
@@ -156,7 +156,7 @@ pub fn score_models(
     resamples: &Resamples,
     work: &Work<'_>,
 ) -> Result<ModelScore, EvaluationError> {
-    work.expect(windows.len());
+    work.add(windows.len());
     let roll = |w: &Window<'_>| {
         let (predictor, soil) = models[w.drive];
         let path = roll_out(predictor, Variant::Full, soil, w, None, maps[w.drive].as_ref());

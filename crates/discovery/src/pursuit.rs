@@ -191,7 +191,7 @@ fn look_beside(case: &mut Case<'_>, fitted: &[Beside]) -> Result<Vec<Condensed>,
     case.metric = own_reference::metric_of(&rows, &available_in_all(case.prepared.iter().map(|p| &p.drive)))?;
     // Signatures that are measured again are whole.
     case.dating = None;
-    case.work.expect(case.prepared.len());
+    case.work.add(case.prepared.len());
     let mut left = Vec::with_capacity(case.prepared.len());
     for (prepared, rows) in case.prepared.iter_mut().zip(&rows) {
         prepared.signatures = signatures_beside(&bench, &prepared.drive, fitted);

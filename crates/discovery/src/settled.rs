@@ -132,7 +132,7 @@ impl Case<'_> {
         }
         let others = without(&selection.chosen, i);
         let members: Vec<usize> = std::iter::once(own).chain(close).collect();
-        self.work.expect(members.len());
+        self.work.add(members.len());
         let left = members
             .iter()
             .map(|h| {

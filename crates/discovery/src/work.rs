@@ -21,7 +21,7 @@ impl<'a> Work<'a> {
     }
 
     /// So many more parts came up.
-    pub(crate) fn expect(&self, more: usize) {
+    pub(crate) fn add(&self, more: usize) {
         self.count([0, more]);
     }
 
@@ -55,9 +55,9 @@ mod tests {
         let told = Mutex::new(Vec::new());
         let progress = |stage: &str, done: usize, total: usize| told.lock().unwrap().push((stage.to_string(), done, total));
         let work = Work::begin("hypotheses", &progress);
-        work.expect(2);
+        work.add(2);
         work.clone().done();
-        work.expect(1);
+        work.add(1);
         work.done();
         Work::default().expect(7);
         let told: Vec<(usize, usize)> = told.lock().unwrap().iter().map(|(_, done, total)| (*done, *total)).collect();

@@ -43,7 +43,8 @@ pub fn write_set(folder: &Path, drives: &[Drive], world: Option<&str>, split: Op
         json!({"trajectory": d.id, "world": world, "split": split, "n_samples": t.len(), "duration_s": duration_s})
     };
     let index = folder.join("index.json");
-    let text = serde_json::to_string_pretty(&drives.iter().map(entry).collect::<Vec<_>>()).unwrap_or_default();
+    let text =
+        serde_json::to_string_pretty(&drives.iter().map(entry).collect::<Vec<_>>()).expect("names and hashes serialise; this is a bug");
     std::fs::write(&index, text + "\n").map_err(|source| ImportError::file(&index, source))?;
     Ok(notes)
 }

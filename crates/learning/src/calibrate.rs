@@ -65,6 +65,14 @@ impl DriveLaw {
     /// Both.
     pub const ALL: [Self; 2] = [Self::Overspeed, Self::Torque];
 
+    /// As whoever watches a calibration reads it.
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Overspeed => "rims at an over-speed",
+            Self::Torque => "hubs under a torque",
+        }
+    }
+
     /// The vehicle under this law, uncalibrated; a torque curve has its knots where the drives have their speeds. `None` where they do not move.
     pub fn of(self, vehicle: &Vehicle, drives: &[&Drive]) -> Option<Vehicle> {
         let mut vehicle = vehicle.clone();
@@ -94,6 +102,13 @@ impl DriveLaw {
     }
 }
 
+fn name_of(law: ContactLaw) -> &'static str {
+    match law {
+        ContactLaw::WongReece => "Wong and Reece",
+        ContactLaw::SoilContactModel => "soil contact model",
+    }
+}
+
 /// The vehicle with its drive line fitted on drives under each contact law and drive, the best pair kept, its suspension fitted with that where drives have a
 /// map, and the scales of the drives; `None` where it was interrupted, which is asked before each number. A number that ends at an end of its range is a line of
 /// warning.
@@ -116,7 +131,7 @@ pub fn calibrate_vehicle(
     for (law, drive) in laws.flat_map(|law| drives_by.iter().map(move |drive| (law, *drive))) {
         let Some(start) = drive.of(&vehicle, &few) else { continue };
         let mut candidate = Vehicle { contact_law: law, ..start };
-        let name = format!("{law:?}, {drive:?}");
+        let name = format!("{}, {}", name_of(law), drive.as_str());
         reporter.stage(&format!("drive line, {name}"), 3 * if skid { rims::KNOBS_OF_MOTION.len() } else { knobs(&candidate).len() });
         let mut done = 0;
         let progress = |name: &str, value: f64, error: f64| {
@@ -127,8 +142,7 @@ pub fn calibrate_vehicle(
         if interrupted() {
             return None;
         }
-        reporter
-            .line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s; {:?}", candidate.driveline));
+        reporter.line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s"));
         if best.as_ref().is_none_or(|(error, _)| after < *error) {
             best = Some((after, candidate));
         }

@@ -8,7 +8,9 @@ use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::state::VehicleState;
 use crate::step::{StepInput, StepModel, fresh_share};
-use crate::terramechanics::{ContactLaw, Support, WheelGeometry, WheelMotion, bekker_sinkage, travel_direction, viscous_rate_n_m};
+use crate::terramechanics::{
+    ContactLaw, SINKAGE_FLOOR_M, SINKAGE_SHARE_MAX, Support, WheelGeometry, WheelMotion, bekker_sinkage, travel_direction, viscous_rate_n_m,
+};
 use crate::vehicle::WHEELS;
 
 /// Largest share of the shear strength that the guess mobilises (chosen: beyond it the wheel spins and traction control works).
@@ -37,8 +39,10 @@ const DRAGGED: f64 = 1.08;
 const VISCOUS_ARM: f64 = 0.8;
 /// Slip over the square of the entry angle at which the shear of front and bottom balance (fitted to the same; the mean displacement alone gives 1/6).
 const NEUTRAL_SLIP: f64 = 1.0 / 9.0;
-/// Sinkage below which soil springs back by all of it, m.
-const SINKAGE_FLOOR_M: f64 = 1e-5;
+/// Lever arm of the pressure ahead of the axle over the length of the contact, and what the exponent takes of it: centroid of a pressure (1 - x²)^n,
+/// 0.424 of the length for n = 1/2, 3/8 for n = 1.
+const ARM: f64 = 0.475;
+const ARM_PER_EXPONENT: f64 = 0.1;
 /// Smallest contact length, m.
 const LENGTH_FLOOR_M: f64 = 5e-3;
 
@@ -74,9 +78,8 @@ impl<T: Real> Grip<T> {
         let chord = entry.sqr() * T::lit(1.0 / 6.0);
         match wheel.law {
             ContactLaw::WongReece => Self { limit_n, length_m, lead_m: zero, compaction_n: zero, neutral_slip: -chord },
-            // Centroid of a pressure (1 - x²)^n ahead of the axle: 0.424 of the length for n = 1/2, 3/8 for n = 1.
             ContactLaw::SoilContactModel => {
-                let arm = T::lit(0.475) - T::lit(0.1) * soil.n;
+                let arm = T::lit(ARM) - T::lit(ARM_PER_EXPONENT) * soil.n;
                 Self { limit_n, length_m, lead_m: zero, compaction_n: load_n * entry * arm, neutral_slip: chord }
             }
         }
@@ -108,7 +111,7 @@ impl<T: Real> Grip<T> {
         let (length_m, limit_n) = held(wheel, sinkage_m, load_n, soil);
         let entry = length_m * T::lit(1.0 / radius);
         // Centroid of a pressure (1 - x²)^n ahead of the axle: 0.424 of the length for n = 1/2, 3/8 for n = 1; that of damping, and what lies behind.
-        let arm = T::lit(0.475 * DRAGGED) - T::lit(0.1 * DRAGGED) * soil.n;
+        let arm = T::lit(ARM * DRAGGED) - T::lit(ARM_PER_EXPONENT * DRAGGED) * soil.n;
         let viscous_n = viscous_rate_n_m(wheel, pressing_m_s) * length_m.sqr() * T::lit(0.5 / radius);
         let viscous_share = (viscous_n / (load_n + T::lit(LEAST_PRELOAD_N))).min(one);
         let lead_m = length_m * (arm + viscous_share * (T::lit(VISCOUS_ARM) - arm)) * (one - root);
@@ -146,7 +149,7 @@ impl<T: Real> Grip<T> {
 #[inline(always)]
 fn held<T: Real>(wheel: &WheelGeometry, sinkage_m: T, load_n: T, soil: &Soil<T>) -> (T, T) {
     let radius = wheel.radius_m;
-    let z = sinkage_m.max(T::lit(0.0)).min(T::lit(0.9 * radius));
+    let z = sinkage_m.max(T::lit(0.0)).min(T::lit(SINKAGE_SHARE_MAX * radius));
     let length_m = (z * (T::lit(2.0 * radius) - z) + T::lit(LENGTH_FLOOR_M * LENGTH_FLOOR_M)).sqrt();
     (length_m, (load_n * soil.phi.tan() + soil.c * length_m * T::lit(wheel.width_m)).relu_smooth(1.0))
 }

@@ -3,7 +3,7 @@
 
 use std::path::{Path, PathBuf};
 
-use nesam_terrain::{Patch, PatchScale, Pose2, TerrainError, WorldMap, read_gray8, sample_patch};
+use nesam_terrain::{TerrainError, WorldMap, read_gray8};
 use tempfile::TempDir;
 
 const WIDTH: u32 = 5;
@@ -162,32 +162,4 @@ fn chrono_sample_world_agrees_with_its_description() {
         .collect();
     slopes.sort_by(f64::total_cmp);
     assert!((4.0..20.0).contains(&slopes[9500]), "{}", slopes[9500]);
-}
-
-/// Prints what a patch costs; the budget is guarded by the benches, not here.
-#[test]
-fn regress_patch_cost_is_printed() {
-    let map = WorldMap::load(&sample_world()).unwrap();
-    let (mut patch, scale) = (Patch::new(), PatchScale::default());
-    for (name, reach) in [("inside the map", 25.0), ("across the border", 38.0)] {
-        let pose = |k: i32| {
-            let a = 0.7 * f64::from(k);
-            Pose2 { x_m: reach * a.cos(), y_m: reach * a.sin(), yaw_rad: a * 1.3 }
-        };
-        (0..20).for_each(|k| sample_patch(&map, pose(k), &scale, &mut patch));
-        let start = std::time::Instant::now();
-        (0..500).for_each(|k| sample_patch(&map, pose(k), &scale, &mut patch));
-        println!("sample_patch {name}: {} ns", start.elapsed().as_nanos() / 500);
-    }
-    let bare = WorldMap::from_layers("bare", 1, *map.geometry(), map.elevation_m(), None).unwrap();
-    let start = std::time::Instant::now();
-    (0..500)
-        .for_each(|k| sample_patch(&bare, Pose2 { x_m: 0.02 * f64::from(k), y_m: 0.0, yaw_rad: 0.1 * f64::from(k) }, &scale, &mut patch));
-    println!("sample_patch without semantics: {} ns", start.elapsed().as_nanos() / 500);
-    let start = std::time::Instant::now();
-    let sum: f64 = (0..1_000_000).map(|k| map.ground(0.00003 * f64::from(k) - 15.0, 0.00002 * f64::from(k)).unwrap().slope_x).sum();
-    println!("ground: {} ns ({sum})", start.elapsed().as_nanos() / 1_000_000);
-    let start = std::time::Instant::now();
-    let _ = map.with_tile(0, 0, 1, 1, &[0.0], None).unwrap();
-    println!("with_tile: {} ms", start.elapsed().as_millis());
 }

@@ -29,7 +29,7 @@ pub(super) struct MapHead {
 
 /// As JSON.
 pub(super) fn json(record: &impl Serialize) -> Vec<u8> {
-    serde_json::to_vec(record).unwrap_or_default()
+    serde_json::to_vec(record).expect("names and numbers serialise; this is a bug")
 }
 
 /// From JSON; `None` for something else.

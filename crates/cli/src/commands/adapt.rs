@@ -21,7 +21,7 @@ use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use self::alternatives::{Scene, read_true_soils};
-use crate::args::{BundleArgs, CommandsArgs, DataArgs, SplitArg, WindowArgs};
+use crate::args::{BundleArgs, CommandsArgs, DataArgs, SplitArg, TruthArg, WindowArgs};
 use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
@@ -66,8 +66,8 @@ pub struct AdaptArgs {
     #[arg(long, value_name = "SET", conflicts_with = "calibrate")]
     reference: Option<String>,
     /// Score against the noise-free channels, where a set has them
-    #[arg(long, value_name = "CHANNELS", value_parser = ["measured", "gt"], default_value = "measured")]
-    truth: String,
+    #[arg(long, value_name = "CHANNELS", value_enum, default_value_t = TruthArg::Measured)]
+    truth: TruthArg,
     /// Seed of the bootstrap and of what --disguise draws
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -142,11 +142,13 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         return calibrate(args);
     }
     interrupt::exit_on_ctrl_c("nothing was written");
-    let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
+    let truth = Truth::from(args.truth);
     let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
     if let Some(look) = args.disguise {
         disguise(&mut drives, look, args.seed)?;
     }
+    let apart = apart(&drives.drives, &args.apart)?;
+    let reference_drives = args.reference.as_deref().map(|set| reference_drives(args, set)).transpose()?;
     let true_soils = if args.also.iter().any(|also| also.needs_true_soil()) { read_true_soils(&drives)? } else { Vec::new() };
     let names = [(&args.json, "adapt.json"), (&args.html, "adapt.html")];
     let [json, html] = output::result_files(args.out.as_deref(), "adapt", &drives.set, names, [&args.predictions])?;
@@ -174,8 +176,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         if args.also.contains(&AlsoArg::OracleSoil) { KnownSoil::of(&drives.drives, &filtered, &true_soils, &resamples) } else { None };
     let alternatives = args.also.iter().map(|also| scene.paths(*also, &filter)).collect::<Result<Vec<_>, _>>()?;
     let others: Vec<Row> = alternatives.iter().map(|(key, paths)| Row { key, score: score(paths, &windows, truth, &resamples) }).collect();
-    let apart = apart(&drives.drives, &args.apart)?;
-    let reference = args.reference.as_deref().map(|set| Ok((set, reference(args, set, horizon, &predictor)?))).transpose()?;
+    let reference = reference_drives.map(|drives| Ok((drives.set.clone(), reference(args, &drives, horizon, &predictor)?))).transpose()?;
     let provenance = output::provenance(Some(predictor.bundle()), &drives);
     let adaptation = Adaptation {
         set: &drives.set,
@@ -191,7 +192,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         adapted: &adapted,
         others: &others,
         apart: &apart,
-        reference: reference.as_ref().map(|(set, summary)| (*set, summary)),
+        reference: reference.as_ref().map(|(set, summary)| (set.as_str(), summary)),
         filtered: &filtered,
         known_soil: known_soil.as_ref(),
         filter: &filter,
@@ -220,11 +221,15 @@ fn apart(drives: &[Trajectory], ids: &[String]) -> Result<Vec<usize>, Failure> {
     ids.iter().map(place).collect()
 }
 
-/// What the model scores with its soil prior on another set.
-fn reference(args: &AdaptArgs, set: &str, horizon: usize, predictor: &Arc<Predictor>) -> Result<ErrorSummary, Failure> {
+/// Drives of another set, whole.
+fn reference_drives(args: &AdaptArgs, set: &str) -> Result<Drives, Failure> {
     let data = DataArgs { set: Some(set.into()), trajectories: None, split: SplitArg::All, ..args.data.clone() };
-    let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
-    let drives = read_drives(&data, truth == Truth::Gt)?;
+    read_drives(&data, args.truth == TruthArg::Gt)
+}
+
+/// What the model scores with its soil prior on them.
+fn reference(args: &AdaptArgs, drives: &Drives, horizon: usize, predictor: &Arc<Predictor>) -> Result<ErrorSummary, Failure> {
+    let truth = Truth::from(args.truth);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     let none = Arc::new(vec![DriveAdaptation::default(); drives.drives.len()]);
     let model = [(ModelName::Nesam, WindowPredictor::Adapted { predictor: Arc::clone(predictor), filtered: none })];

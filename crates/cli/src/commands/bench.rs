@@ -28,7 +28,7 @@ use serde_json::json;
 use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{provenance, say, write_file};
+use crate::output::{check_files, provenance, say, write_file, write_json};
 use crate::progress::Progress;
 use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 
@@ -123,6 +123,7 @@ pub fn run(args: &BenchArgs) -> Result<(), Failure> {
 }
 
 fn predict(args: &PredictBench) -> Result<(), Failure> {
+    check_files(args.json.iter().chain(&args.html))?;
     check_count("--samples", args.samples, 1..=SAMPLES_MAX)?;
     check_count("--queries", args.queries, 1..=QUERIES_MAX)?;
     check_count("--horizon", args.horizon, 1..=MAX_HORIZON)?;
@@ -218,9 +219,7 @@ fn predict(args: &PredictBench) -> Result<(), Failure> {
         write_file(file, page::predict_page(&figures).as_bytes())?;
     }
     match &args.json {
-        Some(file) => {
-            write_file(file, (serde_json::to_string_pretty(&figures).expect("numbers serialise; this is a bug") + "\n").as_bytes())
-        }
+        Some(file) => write_json(file, &figures),
         None => Ok(()),
     }
 }

@@ -19,7 +19,7 @@ use crate::args::DataArgs;
 use crate::bundle_version::derived_from;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
-use crate::output::{check_file, out_dir, provenance, say, write_file};
+use crate::output::{check_files, out_dir, provenance, say, write_file, write_json};
 use crate::progress::Progress;
 use crate::sources::{Drives, load_bundle, read_drives};
 
@@ -99,7 +99,8 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
             out.display()
         )));
     }
-    args.json.iter().try_for_each(|file| check_file(file))?;
+    let [path, file] = [out.join(CARD), args.json.clone().unwrap_or_else(|| out.join("calibrate.json"))];
+    check_files([&path, &file].into_iter())?;
     let measured = load_drives(&drives.root, &drives.drives).or_input()?;
     let usable: Vec<&Drive> = measured.iter().filter(|drive| drive.states.len() > HORIZON + 1).collect();
     if usable.is_empty() {
@@ -110,7 +111,6 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     let (vehicle, scales) = calibrated(widened.clone(), &usable, args.data.dt, &Console::default());
     let scored = if usable.len() > 1 { held_out(card, &usable, &scales) } else { scored(card, &vehicle, &usable, &scales) };
     let changes = changes(card, &vehicle);
-    let path = out.join(CARD);
     let seconds = HORIZON as f64 * args.data.dt;
     summary(&scored, &changes, usable.len() > 1, seconds);
     if card.second == SecondCommand::YawRateRadS && usable.iter().all(|d| d.wheel_speed_rad_s.is_none()) {
@@ -121,8 +121,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     let document = document(args, &drives, &scored, (&changes, &at_ends(&widened, &vehicle)), &path);
     let saved = bundle.as_ref().map(|base| save_bundle(base, &vehicle, &drives.root.hash(), &out.join("bundle"))).transpose()?;
     let document = with_bundle(document, saved.as_deref(), provenance(bundle.as_ref(), &drives));
-    let file = args.json.clone().unwrap_or_else(|| out.join("calibrate.json"));
-    write_file(&file, (serde_json::to_string_pretty(&document).expect("numbers and text serialise; this is a bug") + "\n").as_bytes())?;
+    write_json(&file, &document)?;
     say!("wrote {}", file.display());
     Ok(())
 }

@@ -48,8 +48,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         "learned": learned,
         "provenance": provenance,
     });
-    let text = serde_json::to_string_pretty(&document).or_failed()?;
-    output::write_file(&file, text.as_bytes())?;
+    output::write_json(&file, &document)?;
     say!("\nwrote {}", file.display());
     Ok(())
 }

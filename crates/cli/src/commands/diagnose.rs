@@ -236,8 +236,10 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let hypotheses = hypotheses::read(args.hypotheses.as_deref())?;
     args.recording.check()?;
     let drives = if args.recording.recording.is_empty() { of_set(args)? } else { args.recording.input(&args.bundle, args.reference)? };
+    // A bundle may go beside them, so that the folder is made in any case.
     let out = output::out_dir(args.out.as_deref(), "diagnose", &drives.set)?;
-    output::check_files(args.json.iter().chain(&args.html))?;
+    let names = [(&args.json, "diagnose.json"), (&args.html, "diagnose.html")];
+    let [json, html] = output::result_files(Some(&out), "diagnose", &drives.set, names, [])?;
     let predictor = Arc::clone(&drives.predictor);
     let reference = reference(args.reference, predictor.bundle());
     if args.reference.is_none() && reference == ReferenceArg::Physics {
@@ -301,8 +303,6 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         doubts: &doubts,
     };
     summary(&report, &found);
-    let at = |given: &Option<PathBuf>, name: &str| given.clone().unwrap_or_else(|| out.join(name));
-    let (json, html) = (at(&args.json, "diagnose.json"), at(&args.html, "diagnose.html"));
     output::write_file(&json, report.to_json().as_bytes())?;
     output::write_file(&html, report.to_html().as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());

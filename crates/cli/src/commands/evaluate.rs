@@ -12,7 +12,7 @@ use nesam_model::Predictor;
 use nesam_trajectories::Trajectory;
 
 use super::coverage;
-use crate::args::{BundleArgs, DataArgs, InputsArg, SplitArg, WindowArgs};
+use crate::args::{BundleArgs, DataArgs, InputsArg, SplitArg, TruthArg, WindowArgs};
 use crate::bundle_path::{baseline_bundles, bundles_in};
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
@@ -51,19 +51,19 @@ pub struct EvaluateArgs {
     #[arg(long, value_enum, default_value_t = InputsArg::Commands)]
     inputs: InputsArg,
     /// What errors are measured against
-    #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
+    #[arg(long, value_enum, default_value_t = TruthArg::Measured, conflicts_with_all = ["coverage", "calibrate_coverage"])]
     truth: TruthArg,
     /// What start and history are taken from; `gt` is for an error budget (how much the noise of the start costs) and implies `--truth gt`
-    #[arg(long, value_enum, default_value_t = TruthArg::Measured)]
+    #[arg(long, value_enum, default_value_t = TruthArg::Measured, conflicts_with_all = ["coverage", "calibrate_coverage"])]
     start: TruthArg,
     /// Round the network's products to bf16, as `nesam serve --bf16` does: of nesam and of trained baselines
     #[arg(long, conflicts_with_all = ["coverage", "calibrate_coverage"])]
     bf16: bool,
     /// Models to compare [default: all that bundle and data allow]
-    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',', conflicts_with_all = ["coverage", "calibrate_coverage"])]
     models: Option<Vec<String>>,
     /// Folder of baselines trained with `nesam train --model …` [default: deploy/baselines, found from the executable]
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", conflicts_with_all = ["coverage", "calibrate_coverage"])]
     baselines: Option<PathBuf>,
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
@@ -78,22 +78,14 @@ pub struct EvaluateArgs {
     #[arg(long, value_name = "FILE")]
     pub(super) json: Option<PathBuf>,
     /// Write the HTML report here instead
-    #[arg(long, value_name = "FILE")]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["coverage", "calibrate_coverage"])]
     html: Option<PathBuf>,
     /// Also write the tables as Markdown
-    #[arg(long, value_name = "FILE.md")]
+    #[arg(long, value_name = "FILE.md", conflicts_with_all = ["coverage", "calibrate_coverage"])]
     markdown: Option<PathBuf>,
     /// Also write every predicted pose: model, trajectory, t0, k, x, y, z, roll, pitch, yaw
-    #[arg(long, value_name = "FILE.parquet")]
+    #[arg(long, value_name = "FILE.parquet", conflicts_with_all = ["coverage", "calibrate_coverage"])]
     predictions: Option<PathBuf>,
-}
-
-#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
-enum TruthArg {
-    /// The measured channels.
-    Measured,
-    /// The noise-free channels, where a set has them.
-    Gt,
 }
 
 fn at_least_1000(text: &str) -> Result<usize, String> {
@@ -118,7 +110,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
     }
     interrupt::exit_on_ctrl_c("nothing was written");
     let noise_free = args.start == TruthArg::Gt;
-    let truth = if noise_free || args.truth == TruthArg::Gt { Truth::Gt } else { Truth::Measured };
+    let truth = if noise_free { Truth::Gt } else { args.truth.into() };
     let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
     if noise_free {
         start_noise_free(&mut drives)?;

@@ -1,6 +1,7 @@
 //! `nesam fleet`: what a vehicle gains from the soil map of a fleet in its first seconds.
 
 use std::collections::BTreeMap;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use clap::Args;
@@ -11,11 +12,13 @@ use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, PosePath, Resamples, Truth, 
 use nesam_model::{MAX_HORIZON, Predictor};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
+use serde::Serialize;
+use serde_json::json;
 
-use crate::args::{BundleArgs, DataArgs};
+use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
-use crate::output::say;
+use crate::output::{check_file, provenance, say, write_json};
 use crate::progress::Progress;
 use crate::sources::{load_bundle_for, predictor_for, read_drives};
 
@@ -44,6 +47,9 @@ pub struct FleetArgs {
     /// Seed of the bootstrap
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Write the figures as JSON (schema nesam.fleet/1)
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
 }
 
 /// Two drives of one world: the first teaches, the second is scored.
@@ -55,12 +61,11 @@ struct Pair<'a> {
 
 /// Runs the command.
 pub fn run(args: &FleetArgs) -> Result<(), Failure> {
-    if args.horizon == 0 || args.horizon > MAX_HORIZON {
-        return Err(Failure::input(format!("--horizon {} is not 1 to {MAX_HORIZON}", args.horizon)));
-    }
+    check_count("--horizon", args.horizon, 1..=MAX_HORIZON)?;
     if !(args.first_s > 0.0 && args.first_s.is_finite()) {
         return Err(Failure::input(format!("--first-s {} is not above 0", args.first_s)));
     }
+    args.json.iter().try_for_each(|file| check_file(file))?;
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
@@ -77,8 +82,24 @@ pub fn run(args: &FleetArgs) -> Result<(), Failure> {
         progress.set(index + 1);
     }
     progress.finish();
-    print_table(&drives.set, args, &pairs, &errors);
-    Ok(())
+    let gains = gains(&errors, pairs.len(), args);
+    print_table(&drives.set, args, pairs.len(), errors[0].windows(), &gains);
+    let Some(file) = &args.json else { return Ok(()) };
+    let document = json!({
+        "schema": "nesam.fleet/1",
+        "set": drives.set,
+        "split": args.data.split.as_str(),
+        "pairs": pairs.iter().map(|p| json!({ "teacher": p.teacher.id, "driver": p.driver.id })).collect::<Vec<_>>(),
+        "windows": errors[0].windows(),
+        "horizon": args.horizon,
+        "first_s": args.first_s,
+        "reach_m": args.reach_m,
+        "process_share": args.process_share,
+        "seed": args.seed,
+        "errors": gains.iter().map(|gain| (gain.name, gain)).collect::<BTreeMap<_, _>>(),
+        "provenance": provenance(Some(predictor.bundle()), &drives),
+    });
+    write_json(file, &document)
 }
 
 /// Every drive behind the one before it in the same world, the first behind the last: each is scored once.
@@ -173,27 +194,63 @@ fn predict(engine: &mut Engine, now_ns: u64, drive: &Trajectory, sample: usize, 
     }
 }
 
-fn print_table(set: &str, args: &FleetArgs, pairs: &[Pair<'_>], errors: &[WindowErrors; 2]) {
-    let [without, with] = errors;
-    say!(
-        "{set}: {} windows of {} steps from the first {} s of {} drives, each behind another drive of its world; mean absolute errors over the horizon",
-        without.windows(),
-        args.horizon,
-        args.first_s,
-        pairs.len()
-    );
-    let resamples = Resamples::draw(pairs.len(), DEFAULT_RESAMPLES, args.seed);
-    say!("\n{:<12}{:>28}{:>28}{:>28}", "", "without the map", "with the map of another", "with / without");
-    for (name, column) in [("position m", POSE_DIM), ("z m", 2), ("roll °", 3), ("pitch °", 4), ("yaw °", 5)] {
+/// A figure with its 95 % interval over pairs of drives.
+#[derive(Serialize)]
+struct Figure {
+    mean: f64,
+    ci95: Option<[f64; 2]>,
+}
+
+impl Figure {
+    fn cell(&self) -> String {
+        let interval = self.ci95.map_or(String::new(), |[low, high]| format!(" [{low:.3}, {high:.3}]"));
+        format!("{:.3}{interval}", self.mean)
+    }
+}
+
+/// Mean absolute errors over the horizon of one quantity, without and with the soil map of the vehicle before, and their ratio.
+#[derive(Serialize)]
+struct Gain {
+    #[serde(skip)]
+    name: &'static str,
+    #[serde(skip)]
+    title: &'static str,
+    without: Figure,
+    with: Figure,
+    ratio: Figure,
+}
+
+fn gains([without, with]: &[WindowErrors; 2], pairs: usize, args: &FleetArgs) -> Vec<Gain> {
+    let resamples = Resamples::draw(pairs, DEFAULT_RESAMPLES, args.seed);
+    let quantities = [
+        ("position_m", "position m", POSE_DIM),
+        ("z_m", "z m", 2),
+        ("roll_deg", "roll °", 3),
+        ("pitch_deg", "pitch °", 4),
+        ("yaw_deg", "yaw °", 5),
+    ];
+    let gain = |(name, title, column)| {
         let rows = |errors: &WindowErrors| -> Vec<f64> {
             let columns: Vec<Vec<f64>> = (0..args.horizon).map(|k| errors.column(k, column)).collect();
             (0..errors.windows()).map(|w| columns.iter().map(|c| c[w]).sum::<f64>() / args.horizon as f64).collect()
         };
-        let (a, b) = (rows(without), rows(with));
         let mean = |rows: &[f64]| rows.iter().sum::<f64>() / rows.len() as f64;
-        let interval = |ci: Option<[f64; 2]>| ci.map_or(String::new(), |[low, high]| format!(" [{low:.3}, {high:.3}]"));
-        let cell = |rows: &[f64]| format!("{:.3}{}", mean(rows), interval(resamples.mean_interval(rows, &without.trajectory)));
-        let ratio = format!("{:.3}{}", mean(&b) / mean(&a), interval(resamples.ratio_interval(&b, &a, &without.trajectory)));
-        say!("{name:<12}{:>28}{:>28}{ratio:>28}", cell(&a), cell(&b));
+        let figure = |rows: &[f64]| Figure { mean: mean(rows), ci95: resamples.mean_interval(rows, &without.trajectory) };
+        let (a, b) = (rows(without), rows(with));
+        let ratio = Figure { mean: mean(&b) / mean(&a), ci95: resamples.ratio_interval(&b, &a, &without.trajectory) };
+        Gain { name, title, without: figure(&a), with: figure(&b), ratio }
+    };
+    quantities.map(gain).into()
+}
+
+fn print_table(set: &str, args: &FleetArgs, pairs: usize, windows: usize, gains: &[Gain]) {
+    say!(
+        "{set}: {windows} windows of {} steps from the first {} s of {pairs} drives, each behind another drive of its world; mean absolute errors over the horizon",
+        args.horizon,
+        args.first_s,
+    );
+    say!("\n{:<12}{:>28}{:>28}{:>28}", "", "without the map", "with the map of another", "with / without");
+    for Gain { title, without, with, ratio, .. } in gains {
+        say!("{title:<12}{:>28}{:>28}{:>28}", without.cell(), with.cell(), ratio.cell());
     }
 }

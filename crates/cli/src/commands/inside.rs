@@ -10,7 +10,7 @@ use serde_json::{Map, Value, json};
 use crate::args::{BundleArgs, DataArgs};
 use crate::failure::Failure;
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{check_file, provenance, say, write_file};
+use crate::output::{check_file, provenance, say, write_json};
 use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 
 /// Options of `nesam inside`.
@@ -79,7 +79,7 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
         "wheel_rate_n_m": { "bundle": believed, "seen": seen },
         "provenance": provenance(Some(predictor.bundle()), &drives),
     });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    write_json(file, &document)
 }
 
 /// True soils of each drive's world; `None` where the world states none.

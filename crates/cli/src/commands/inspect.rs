@@ -37,11 +37,15 @@ pub fn run(args: &InspectArgs) -> Result<(), Failure> {
     if !path.is_dir() {
         return Err(Failure::input(format!("{} is not a folder; give a bundle or a data root", path.display())));
     }
-    let summary = if path.join(MANIFEST).is_file() { bundle(&path)? } else { data_root(&path, args.vehicle.as_deref())? };
-    let text = serde_json::to_string_pretty(&summary).expect("numbers and text always serialise; this is a bug") + "\n";
+    args.json.iter().try_for_each(|file| output::check_file(file))?;
+    let is_bundle = path.join(MANIFEST).is_file();
+    if is_bundle && args.vehicle.is_some() {
+        return Err(Failure::input(format!("--vehicle is for data roots; {} is a bundle and has a card of its own", path.display())));
+    }
+    let summary = if is_bundle { bundle(&path)? } else { data_root(&path, args.vehicle.as_deref())? };
     print_tree(&summary, 0);
     if let Some(file) = &args.json {
-        output::write_file(file, text.as_bytes())?;
+        output::write_json(file, &summary)?;
     }
     Ok(())
 }

@@ -73,6 +73,7 @@ enum Format {
 
 /// Runs the command.
 pub fn run(args: &PredictArgs) -> Result<(), Failure> {
+    args.out.iter().try_for_each(|file| output::check_file(file))?;
     args.inputs.check("a prediction is made as the service makes it, under commands alone")?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
@@ -125,7 +126,11 @@ fn window<'a>(args: &PredictArgs, drives: &'a Drives, horizon: usize) -> Result<
             if !at.is_finite() || at < drive.time_s[0] || at > end {
                 return Err(Failure::input(format!("--at {at} lies outside drive `{}`, {}…{end} s", drive.id, drive.time_s[0])));
             }
-            drive.time_s.iter().rposition(|t| *t <= at + 1e-6).unwrap_or(0)
+            let start = drive.time_s.iter().rposition(|t| *t <= at + 1e-6).unwrap_or(0);
+            if at - drive.time_s[start] > 1e-3 {
+                note!("note: the prediction starts at the sample before --at {at}, at {:.3} s", drive.time_s[start]);
+            }
+            start
         }
     };
     let first_history = (start + 1).saturating_sub(args.window.history);
@@ -150,6 +155,12 @@ fn read_controls(file: &Path, horizon: Option<usize>) -> Result<Vec<Control<f64>
     let named = |reason: &dyn std::fmt::Display| Failure::input(format!("{}: {reason}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|error| named(&error))?;
     let mut controls = commands_from_csv(&text).map_err(|reason| named(&reason))?;
+    if let Some(horizon) = horizon.filter(|horizon| *horizon > controls.len()) {
+        return Err(named(&format!(
+            "has {} commands and --horizon asks for {horizon} steps; give a command for each or a shorter --horizon",
+            controls.len()
+        )));
+    }
     if let Some(horizon) = horizon.filter(|horizon| *horizon < controls.len()) {
         note!("note: the first {horizon} of {} commands in {} are used, as --horizon says", controls.len(), file.display());
         controls.truncate(horizon);
@@ -236,7 +247,7 @@ fn as_json(drives: &Drives, predictor: &Predictor, window: &Window<'_>, controls
         "steps": steps,
         "provenance": output::provenance(Some(predictor.bundle()), drives),
     });
-    serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+    output::json_text(&document)
 }
 
 fn as_csv(window: &Window<'_>, controls: &[Control<f64>], rollout: &Rollout) -> String {

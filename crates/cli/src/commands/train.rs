@@ -11,7 +11,7 @@ use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
 use nesam_model::reference::ComputeDevice;
 use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 
-use crate::args::{DataArgs, SplitArg, horizon_of};
+use crate::args::{DataArgs, SplitArg, check_count, horizon_of};
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, out_place};
@@ -158,9 +158,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     if args.batches * args.batch_size * shards == 0 || (args.epochs == 0 && args.from.is_none()) {
         return Err(Failure::input("--batches, --batch-size and --threads must be at least 1, and so must --epochs without --from"));
     }
-    if let Some(horizon) = args.horizon.filter(|horizon| !(1..=MAX_HORIZON).contains(horizon)) {
-        return Err(Failure::input(format!("--horizon {horizon} is not 1 to {MAX_HORIZON}")));
-    }
+    args.horizon.map_or(Ok(()), |horizon| check_count("--horizon", horizon, 1..=MAX_HORIZON))?;
     for (option, rate) in [("--lr", args.lr), ("--encoder-lr", args.encoder_lr)] {
         if !(rate > 0.0 && rate <= 1.0) {
             return Err(Failure::input(format!("{option} {rate} is not above 0 and at most 1")));
@@ -180,6 +178,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     }
     if let Some(damping) = args.soil_damping.filter(|d| !(0.0..=1e6).contains(d)) {
         return Err(Failure::input(format!("--soil-damping {damping} is not in 0..1e6 Pa s/m")));
+    }
+    if let Some(name) = args.name.as_ref().filter(|name| !is_name(name)) {
+        return Err(Failure::input(format!("--name `{name}` has other than letters, digits, `-`, `_` and `.`")));
     }
     if args.sustained > 0.0 && variant.is_end_to_end() {
         return Err(Failure::input(format!("--sustained is for models whose physics carries what lasts; {} has none", args.model)));
@@ -247,6 +248,11 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     };
     note!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
     Ok(())
+}
+
+/// Whether a bundle can be called so wherever it is named: in paths, tables and pages.
+fn is_name(text: &str) -> bool {
+    !text.is_empty() && text.chars().all(|c| c.is_alphanumeric() || "-_.".contains(c))
 }
 
 /// The bundle that a run starts from.

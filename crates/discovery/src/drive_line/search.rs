@@ -81,7 +81,7 @@ impl Rims<'_> {
 
     /// All sizes sought together from where they are, one after the other with steps that shrink and all together.
     pub(super) fn polished(&self, mut best: Sized) -> Sized {
-        self.work.expect(1);
+        self.work.add(1);
         let mut error = best.error();
         for round in 0..ROUNDS {
             let before = error;

@@ -7,7 +7,7 @@
 use crate::scalar::Real;
 use crate::soil::Soil;
 use crate::terramechanics::slip::ContactMotion;
-use crate::terramechanics::wheel::{WheelGeometry, angle_of_depth, exit_angle};
+use crate::terramechanics::wheel::{SINKAGE_FLOOR_M, SINKAGE_SHARE_MAX, WheelGeometry, angle_of_depth, exit_angle};
 
 /// Slip angle within which the side resistance grows to its full size, rad (chosen: about one degree, so that it is smooth at zero).
 const SLIP_ANGLE_SCALE_RAD: f64 = 0.02;
@@ -28,7 +28,7 @@ pub struct ContactArc<T> {
 impl<T: Real> ContactArc<T> {
     /// Arc of a wheel at a sinkage, m, with the angles of [`wheel_wrench`](super::wheel_wrench).
     pub fn of(wheel: &WheelGeometry, sinkage_m: T, soil: &Soil<T>) -> Self {
-        let z = sinkage_m.max(T::lit(1e-5)).min(T::lit(0.9 * wheel.radius_m));
+        let z = sinkage_m.max(T::lit(SINKAGE_FLOOR_M)).min(T::lit(SINKAGE_SHARE_MAX * wheel.radius_m));
         let share = z * T::lit(1.0 / wheel.radius_m);
         let (entry_rad, _, cos_entry) = angle_of_depth(share);
         Self { entry_rad, exit_rad: exit_angle(wheel, z, share, wheel.is_damped(), soil), cos_entry }

@@ -4,7 +4,7 @@ use crate::scalar::{Dual, Real};
 use crate::soil::Soil;
 use crate::terramechanics::pressure_sinkage::bekker_sinkage;
 use crate::terramechanics::slip::ContactMotion;
-use crate::terramechanics::wheel::{ContactLaw, WheelGeometry, viscous_rate_n_m, wheel_wrench};
+use crate::terramechanics::wheel::{ContactLaw, SINKAGE_FLOOR_M, WheelGeometry, viscous_rate_n_m, wheel_wrench};
 
 /// Exponents that W may have between two sinkages, and the least ratio of these (as a logarithm) that tells one.
 const EXPONENT: [f64; 2] = [0.3, 4.0];
@@ -113,5 +113,5 @@ fn exponent_between<V: Real>((z_0, w_0): (V, V), (z_1, w_1): (V, V), other: V) -
 /// Keeps a step within a decade and the wheel.
 #[inline(always)]
 fn bounded<T: Real>(z: T, next: T, wheel: &WheelGeometry) -> T {
-    next.max(z * T::lit(0.1)).min(z * T::lit(4.0)).min(T::lit(0.85 * wheel.radius_m)).max(T::lit(1e-5))
+    next.max(z * T::lit(0.1)).min(z * T::lit(4.0)).min(T::lit(0.85 * wheel.radius_m)).max(T::lit(SINKAGE_FLOOR_M))
 }

@@ -19,5 +19,5 @@ pub use pressure_sinkage::{bekker_sinkage, normal_stress};
 pub use shear::{mobilised_share, mohr_coulomb};
 pub use slip::{ContactMotion, WheelMotion};
 pub(crate) use slip::{TRAVEL_SPEED_FLOOR_M_S, travel_direction};
-pub(crate) use wheel::viscous_rate_n_m;
 pub use wheel::{ContactLaw, WheelGeometry, WheelWrench, wheel_wrench};
+pub(crate) use wheel::{SINKAGE_FLOOR_M, SINKAGE_SHARE_MAX, viscous_rate_n_m};

@@ -11,9 +11,9 @@ use crate::terramechanics::slip::ContactMotion;
 /// Shear displacement below which its direction is smoothed, m.
 const SHEAR_FLOOR_M: f64 = 1e-6;
 /// Largest sinkage as a share of the radius at which the contact geometry is evaluated.
-const SINKAGE_SHARE_MAX: f64 = 0.9;
+pub(crate) const SINKAGE_SHARE_MAX: f64 = 0.9;
 /// Smallest sinkage, m: a wheel off the ground carries no load, but its contact stays differentiable.
-const SINKAGE_FLOOR_M: f64 = 1e-5;
+pub(crate) const SINKAGE_FLOOR_M: f64 = 1e-5;
 /// Sliding speed over rim speed around which the direction of sliding turns smoothly (chosen: 5 cm/s at 2.5 m/s).
 const SLIDING_FLOOR: f64 = 0.02;
 /// Recovery λ of the soil contact model (chosen: the elastic part of soils with a stiffness of 4e7 Pa/m under a tonne is a few millimetres).

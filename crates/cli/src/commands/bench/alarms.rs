@@ -17,7 +17,7 @@ use serde_json::{Value, json};
 use crate::args::{BundleArgs, DataArgs, SplitArg};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{check_file, provenance, say, write_file};
+use crate::output::{check_file, provenance, say, write_json};
 use crate::sources::{load_bundle_for, predictor_for, read_drives, validation_drives};
 
 /// Options of `nesam bench alarms`.
@@ -86,7 +86,7 @@ pub(super) fn run(args: &AlarmBench) -> Result<(), Failure> {
         "hidden": hidden,
         "provenance": provenance(Some(predictor.bundle()), &drives),
     });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    write_json(file, &document)
 }
 
 /// Prints and gives the alarms of drives in which nothing was hidden.

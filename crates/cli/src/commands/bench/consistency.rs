@@ -14,7 +14,7 @@ use crate::args::{BundleArgs, check_count};
 use crate::commands::adapt::{filter_in_force, settings_file};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{command_line, say, write_file};
+use crate::output::{check_file, provenance_of, say, write_json};
 use crate::sources::load_bundle;
 
 /// Options of `nesam bench consistency`.
@@ -47,6 +47,7 @@ pub(super) struct ConsistencyBench {
 
 /// Runs the command.
 pub(super) fn run(args: &ConsistencyBench) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| check_file(file))?;
     check_count("--runs", args.runs, 1..=usize::MAX)?;
     check_count("--buffers", args.buffers, 1..=usize::MAX)?;
     if let Some(border) = args.border {
@@ -55,7 +56,6 @@ pub(super) fn run(args: &ConsistencyBench) -> Result<(), Failure> {
     exit_on_ctrl_c("nothing was written");
     let bundle = load_bundle(args.bundle.bundle.as_deref())?;
     let config = filter_in_force(&settings_file(args.filter.as_deref())?, args.literal, &bundle)?;
-    let (name, hash) = (bundle.name.clone(), bundle.hash.clone());
     let predictor = Predictor::new(Arc::new(bundle)).or_input()?;
     let plan = TwinPlan { runs: args.runs, buffers: args.buffers, border: args.border, seed: args.seed };
     let report = run_twins(predictor.step_model(), &config, &plan).or_failed()?;
@@ -66,11 +66,9 @@ pub(super) fn run(args: &ConsistencyBench) -> Result<(), Failure> {
         "plan": { "runs": args.runs, "buffers": args.buffers, "border": args.border, "seed": args.seed, "literal": args.literal },
         "report": report,
         "filter": FilterSettings::of(&config),
-        "command": command_line(),
-        "bundle": name,
-        "bundle_hash": hash,
+        "provenance": provenance_of(Some(predictor.bundle()), "", ""),
     });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    write_json(file, &document)
 }
 
 fn print_report(r: &TwinReport) {

@@ -12,7 +12,7 @@ use serde_json::json;
 use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{check_file, provenance, say, write_file};
+use crate::output::{check_file, provenance, say, write_json};
 use crate::progress::Progress;
 use crate::sources::{load_bundle_for, predictor_for, validation_drives};
 
@@ -87,7 +87,7 @@ pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
         "runs": outcomes,
         "provenance": provenance(Some(predictor.bundle()), &drives),
     });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    write_json(file, &document)
 }
 
 /// What is run: hidden effects with their group of drives. Without effects every group is tried once, because there are so few.

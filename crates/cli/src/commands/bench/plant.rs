@@ -17,7 +17,7 @@ use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::commands::plant::write::{Asked, copy_vehicle_and_worlds, write_drives};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{self, say, write_file};
+use crate::output::{self, say, write_json};
 use crate::progress::Progress;
 use crate::sources::{load_bundle_for, open_root, predictor_for, read_drives};
 
@@ -105,6 +105,7 @@ struct Run {
 
 /// Runs the command.
 pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| output::check_file(file))?;
     let doses = chosen(args)?;
     let labels = drawn(args, &doses)?;
     exit_on_ctrl_c("drives that were written are in the folder, figures were not");
@@ -129,9 +130,9 @@ pub(super) fn run(args: &PlantBench) -> Result<(), Failure> {
     let nulls: Vec<&Run> = runs.iter().filter(|run| run.hidden.is_empty()).collect();
     say!("without an effect: {} sets, {} with a claim", nulls.len(), nulls.iter().filter(|run| !run.named.is_empty()).count());
     let Some(file) = &args.json else { return Ok(()) };
-    let document =
-        json!({ "schema": "nesam.bench.plant/1", "effects": lines, "runs": runs, "seed": args.seed, "command": output::command_line() });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    let provenance = output::provenance_of(Some(predictor.bundle()), &root.hash(), "");
+    let document = json!({ "schema": "nesam.bench.plant/1", "effects": lines, "runs": runs, "seed": args.seed, "provenance": provenance });
+    write_json(file, &document)
 }
 
 fn chosen(args: &PlantBench) -> Result<Vec<Dose>, Failure> {

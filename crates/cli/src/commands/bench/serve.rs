@@ -18,7 +18,7 @@ use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{command_line, say, write_file};
+use crate::output::{check_file, provenance_of, say, write_json};
 use crate::sources::load_bundle;
 
 /// Options of `nesam bench serve`.
@@ -78,6 +78,7 @@ struct Tally {
 
 /// Runs the command.
 pub(super) fn run(args: &ServeBench) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| check_file(file))?;
     let counts = [("--vehicles", args.vehicles), ("--greedy", args.greedy), ("--samples", args.samples), ("--horizon", args.horizon)];
     let times = [("--deadline-ms", args.deadline_ms), ("--seconds", args.seconds)];
     let loads = args.loads.iter().map(|load| ("--loads", *load));
@@ -145,9 +146,9 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
         "schema": "nesam.bench.serve/1",
         "samples": args.samples, "samples_min": args.samples_min, "horizon": args.horizon, "vehicles": args.vehicles, "greedy": args.greedy, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
         "woken_1_ms_late": woken_late, "capacity_hz": capacity_hz, "loads": rows, "goodput_share_of_peak": last / peak.max(f64::MIN_POSITIVE),
-        "command": command_line(), "bundle": bundle.name, "bundle_hash": bundle.hash,
+        "provenance": provenance_of(Some(&bundle), "", ""),
     });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    write_json(file, &document)
 }
 
 /// Share of short sleeps that end more than 1 ms late, for so long: what the machine alone may add to a time that is measured.

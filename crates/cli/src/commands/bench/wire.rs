@@ -15,7 +15,7 @@ use crate::commands::serve::start;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{command_line, say, write_file};
+use crate::output::{check_file, provenance_of, say, write_json};
 use crate::progress::Progress;
 use crate::sources::load_bundle;
 
@@ -58,6 +58,7 @@ impl Way {
 
 /// Runs the command.
 pub(super) fn run(args: &WireBench) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| check_file(file))?;
     let limits = Config::ephemeral().limits;
     check_count("--horizon", args.horizon, 1..=limits.horizon_max)?;
     // Both together have a limit too.
@@ -120,9 +121,9 @@ async fn measure(args: &WireBench, bundle: nesam_model::ModelBundle) -> Result<(
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.bench.wire/1", "samples": args.samples, "horizon": args.horizon, "queries": args.queries, "request_bytes": request_bytes,
-        "reply_bytes": reply_bytes, "ways": rows, "command": command_line(), "bundle": bundle.name, "bundle_hash": bundle.hash,
+        "reply_bytes": reply_bytes, "ways": rows, "provenance": provenance_of(Some(&bundle), "", ""),
     });
-    write_file(file, (serde_json::to_string_pretty(&document).expect("numbers serialise; this is a bug") + "\n").as_bytes())
+    write_json(file, &document)
 }
 
 fn question(args: &WireBench) -> Candidates {

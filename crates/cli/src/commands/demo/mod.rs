@@ -73,6 +73,7 @@ fn positive_seconds(text: &str) -> Result<f64, String> {
 
 /// Runs the command.
 pub fn run(args: &DemoArgs) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| output::check_file(file))?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
         data.trajectories = Some(vec![id.clone()]);

@@ -73,6 +73,6 @@ impl Summary {
             "diagnoses": diagnoses,
             "provenance": provenance,
         });
-        serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+        crate::output::json_text(&document)
     }
 }

@@ -414,8 +414,7 @@ fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> 
         line(row.iter().map(String::as_str).collect());
     }
     if let Some(file) = &args.json {
-        let text = serde_json::to_string_pretty(&report.to_json()).or_failed()? + "\n";
-        output::write_file(file, text.as_bytes())?;
+        output::write_json(file, &report.to_json())?;
     }
     if let Some(file) = &args.html {
         output::write_file(file, report.page().render().as_bytes())?;

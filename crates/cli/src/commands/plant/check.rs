@@ -16,7 +16,7 @@ use serde_json::{Value, json};
 use crate::args::DataArgs;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{check_file, say, write_file};
+use crate::output::{check_file, provenance, say, write_json};
 use crate::progress::Progress;
 use crate::sources::{open_root, read_drives};
 
@@ -74,8 +74,8 @@ pub fn run(args: &CheckArgs) -> Result<(), Failure> {
     print(&compared);
     if let Some(file) = &args.json {
         let rows: Vec<Value> = REPORTED.iter().filter_map(|after| of_step(&compared, *after)).collect();
-        let document = json!({ "schema": "nesam.plant_check/1", "set": drives.set, "drives": drives.drives.len(), "after": rows });
-        write_file(file, (serde_json::to_string_pretty(&document).or_failed()? + "\n").as_bytes())?;
+        let document = json!({ "schema": "nesam.plant_check/1", "set": drives.set, "drives": drives.drives.len(), "after": rows, "provenance": provenance(None, &drives) });
+        write_json(file, &document)?;
     }
     Ok(())
 }

@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use serde_json::json;
 
 use super::ReplayArgs;
-use crate::args::longest_horizon;
+use crate::args::{check_count, longest_horizon};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::{self, say};
@@ -22,20 +22,19 @@ use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
     let specs = args.degrade.iter().map(|text| Degradation::parse(text).or_input()).collect::<Result<Vec<_>, _>>()?;
     interrupt::exit_on_ctrl_c("nothing was written");
-    let truth = if args.truth == "gt" { Truth::Gt } else { Truth::Measured };
+    let truth = Truth::from(args.truth);
+    args.horizon.map_or(Ok(()), |horizon| check_count("--horizon", horizon, 1..=MAX_HORIZON))?;
     let mut drives = read_drives(&args.data, truth == Truth::Gt)?;
     every_nth(&mut drives, args.every.get());
     let longest = drives.drives.iter().map(|drive| drive.states.len()).max().unwrap_or(0);
     let horizon = args.horizon.unwrap_or_else(|| longest_horizon(&drives.drives));
     let asked: Vec<Vec<usize>> = drives.drives.iter().map(|drive| windows(drive.states.len(), horizon, MAX_HORIZON)).collect();
-    if horizon > MAX_HORIZON || asked.iter().all(Vec::is_empty) {
-        let reason =
-            format!("--horizon {horizon} does not fit: the model knows {MAX_HORIZON} steps, the longest drive has {longest} samples");
-        return Err(Failure::input(reason));
+    if asked.iter().all(Vec::is_empty) {
+        return Err(Failure::input(format!("--horizon {horizon} does not fit: the longest drive has {longest} samples")));
     }
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let setup = Setup { predictor: Arc::clone(&predictor), horizon, truth };
-    let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, 1);
+    let resamples = Resamples::draw(drives.drives.len(), DEFAULT_RESAMPLES, args.seed);
     let clean = passages(&setup, &drives, &asked, &Degradation::default(), args.seed)?;
     let mut rows = vec![summarise("none", &drives.drives, &clean, &clean, horizon, &resamples)];
     for spec in &specs {
@@ -56,8 +55,7 @@ pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
             "rows": rows,
             "provenance": output::provenance(Some(predictor.bundle()), &drives),
         });
-        let text = serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n";
-        output::write_file(file, text.as_bytes())?;
+        output::write_json(file, &document)?;
     }
     Ok(())
 }

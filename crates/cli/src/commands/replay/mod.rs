@@ -9,8 +9,9 @@ use std::str::FromStr;
 
 use clap::{ArgAction, Args};
 
-use crate::args::{BundleArgs, DataArgs};
+use crate::args::{BundleArgs, DataArgs, TruthArg};
 use crate::failure::Failure;
+use crate::output;
 
 /// Options of `nesam replay`.
 #[derive(Args, Debug)]
@@ -39,9 +40,9 @@ pub struct ReplayArgs {
     #[arg(long, value_name = "STEPS")]
     horizon: Option<usize>,
     /// Score against the noise-free channels, where a set has them
-    #[arg(long, value_name = "CHANNELS", value_parser = ["measured", "gt"], default_value = "measured")]
-    truth: String,
-    /// Seed of the degradation
+    #[arg(long, value_name = "CHANNELS", value_enum, default_value_t = TruthArg::Measured)]
+    truth: TruthArg,
+    /// Seed of the degradation and of the bootstrap
     #[arg(long, default_value_t = 1)]
     seed: u64,
 }
@@ -73,6 +74,7 @@ Exit codes: 0 all answers equal, 1 an answer differs or the file is damaged, 2 n
 
 /// Runs the command.
 pub fn run(args: &ReplayArgs) -> Result<(), Failure> {
+    args.json.iter().try_for_each(|file| output::check_file(file))?;
     if !args.degrade.is_empty() {
         return degrade::run(args);
     }

@@ -117,7 +117,7 @@ fn to_json(mut documents: Vec<Value>, several: bool, all_equal: bool) -> String 
             json!({"schema": "nesam.replays/1", "all_equal": all_equal, "runs": documents})
         }
     };
-    serde_json::to_string_pretty(&document).expect("numbers and text always serialise; this is a bug") + "\n"
+    output::json_text(&document)
 }
 
 fn document(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport, files: &[PathBuf]) -> Value {
