@@ -189,9 +189,9 @@ void service_bad_instants_are_refused(const nesam::Session& session) {
   const auto controls = varied_controls(1, horizon, session.vehicle());
   nesam::PredictRequest request = request_of(controls, 1, horizon);
   request.start_stamp_ns = newest_ns + 4 * grid_ns;
-  check_error(session.predict(request), invalid, "start_stamp_ns", "34 positions");
-  request.start_stamp_ns = newest_ns - grid_ns;
-  check_error(session.predict(request), invalid, "start_stamp_ns", "the past");
+  check_error(session.predict(request), nesam::Code::failed_precondition, "start_stamp_ns", "34 positions");
+  request.start_stamp_ns = newest_ns - 40 * grid_ns;
+  check_error(session.predict(request), invalid, "start_stamp_ns", "before the history");
   request.start_stamp_ns = newest_ns;
   check_ok(predicted(session, request), "the newest step");
   std::swap(sent[1], sent[2]);

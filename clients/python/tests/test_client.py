@@ -94,7 +94,7 @@ def test_service_prediction_from_now_rolls_forward_with_what_was_sent(driven):
     assert (now.states == by_hand.states[:, 4:]).all()
     assert (now.rolled_forward_steps, now.start_stamp_ns) == (4, newest_ns + 4 * step_ns)
     np.testing.assert_array_equal(now.start, by_hand.states[0, 3].astype(np.float64))
-    with pytest.raises(nesam.InvalidArgument) as caught:
+    with pytest.raises(nesam.FailedPrecondition) as caught:
         driven.predict("truck", fan(3, 30), start_stamp_ns=newest_ns + 4 * step_ns)
     assert caught.value.field == "start_stamp_ns" and "2" in caught.value.message
 

@@ -7,7 +7,6 @@ use std::sync::atomic::AtomicBool;
 use nesam_model::HistoryStep;
 use nesam_terrain::WorldMap;
 
-use crate::error::EngineError;
 use crate::fleet::{FleetCell, FleetShare};
 use crate::measurement::{Measurement, Outcome};
 use crate::query::{PredictQuery, Prediction, Provenance};
@@ -123,16 +122,6 @@ pub(crate) struct Until<'a> {
 }
 
 impl Command {
-    /// What of a command that ended so was answered: of a prediction the samples that were computed.
-    pub(crate) fn answered(mut self, result: &Result<Reply, EngineError>) -> Self {
-        if let (Self::Predict(query), Ok(Reply::Predicted(prediction))) = (&mut self, result)
-            && prediction.candidates() < query.samples
-        {
-            query.keep_first(prediction.candidates());
-        }
-        self
-    }
-
     /// The names of all commands: counters of what seldom happens are there before it does.
     pub const LABELS: [&str; 19] = [
         "open",

@@ -1,22 +1,22 @@
 //! The engine: all sessions and maps, one command at a time.
 
 mod effects;
+mod prepared;
+
+pub(crate) use self::prepared::Prepared;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilter};
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
-use nesam_model::{Due, HistoryStep, ModelError, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, Variant, is_raised};
-use nesam_physics::{Vehicle, VehicleState};
+use nesam_model::{ModelError, Predictor, RolloutNoise};
+use nesam_physics::Vehicle;
 use nesam_terrain::WorldMap;
 
-use crate::candidates::Candidates;
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot, Until};
 use crate::error::EngineError;
-use crate::extras::ExtraOutputs;
 use crate::fleet::{Fleet, FleetCell, FleetShare};
-use crate::forward::RollForward;
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
@@ -33,7 +33,7 @@ pub struct Engine {
     /// The filter that every session starts with.
     filter: SoilFilter,
     /// What the bundle knows of its own errors.
-    noise: Option<RolloutNoise>,
+    noise: Option<Arc<RolloutNoise>>,
     step_ns: i64,
     sessions: BTreeMap<String, Session>,
     maps: MapRegistry,
@@ -63,7 +63,7 @@ impl Engine {
             predictor,
             limits,
             filter,
-            noise,
+            noise: noise.map(Arc::new),
             step_ns,
             sessions: BTreeMap::new(),
             maps: MapRegistry::default(),
@@ -118,13 +118,24 @@ impl Engine {
     /// The same, as far as it goes until then. A prediction that is given up leaves no trace, one of fewer samples that of a command for these.
     pub(crate) fn execute_until(&mut self, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
         let result = self.answer(now_ns, command, until);
-        if matches!(result, Err(EngineError::Abandoned)) {
-            return result;
-        }
-        if let Some(session) = command.uses().and_then(|id| self.sessions.get_mut(id)) {
-            session.touch(now_ns);
+        if let Some(session) = command.uses() {
+            self.touch(now_ns, session);
         }
         result
+    }
+
+    /// Keeps a session from being idle, as every command does that names it.
+    pub(crate) fn touch(&mut self, now_ns: u64, session: &str) {
+        if let Some(session) = self.sessions.get_mut(session) {
+            session.touch(now_ns);
+        }
+    }
+
+    /// Does what a command leaves behind that was not executed: the session that it names was not idle.
+    pub fn not_executed(&mut self, now_ns: u64, command: &Command) {
+        if let Some(session) = command.uses() {
+            self.touch(now_ns, session);
+        }
     }
 
     fn answer(&mut self, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
@@ -188,7 +199,7 @@ impl Engine {
             }
             let map = map.and_then(|id| self.maps.get(id).ok());
             session.begin_from(self.fleet.as_mut(), map, now_ns);
-            session.learn(&self.predictor, self.noise.as_ref(), map, self.step_ns, observed.outcome);
+            session.learn(&self.predictor, self.noise.as_deref(), map, self.step_ns, observed.outcome);
         }
         Ok(self.insert(session))
     }
@@ -333,7 +344,7 @@ impl Engine {
         };
         let map = session.map().and_then(|id| self.maps.get(id).ok()).cloned();
         session.begin_from(self.fleet.as_mut(), map.as_ref(), now_ns);
-        let outcome = session.learn(&self.predictor, self.noise.as_ref(), map.as_ref(), self.step_ns, outcome);
+        let outcome = session.learn(&self.predictor, self.noise.as_deref(), map.as_ref(), self.step_ns, outcome);
         let (vehicle, brought, told) = (session.vehicle().to_string(), session.take_brought(), session.take_told());
         let failures = session.take_soil_failures();
         let (soil, history_steps, accepted) = (*session.soil(), session.history().len(), session.accepted());
@@ -361,95 +372,7 @@ impl Engine {
     }
 
     fn predict(&self, now_ns: u64, query: &PredictQuery, until: Until<'_>) -> Result<Prediction, EngineError> {
-        let session = self.session(&query.session)?;
-        let predictor = session.predictor().unwrap_or(&self.predictor);
-        query.check(&self.limits, self.vehicle())?;
-        let exact = query.extras.exact_terrain.then(|| predictor.exactly());
-        let predictor = exact.as_ref().unwrap_or(predictor);
-        let map = session.map().map(|id| self.maps.get(id)).transpose()?;
-        let start = start_state(session, query, map)?;
-        let newest = session.newest_at().filter(|_| query.start.is_none());
-        let forward = match (&query.instant, newest) {
-            (Some(instant), Some(newest)) => RollForward::plan(instant, newest, self.step_ns, query.horizon, &self.limits)?,
-            _ => RollForward::default(),
-        };
-        let horizon = query.horizon + forward.steps();
-        let soils = query.extras.corrections(session.soil());
-        self.limits.check_shape(query.samples * soils.len().max(1), horizon)?;
-        let before = if query.use_history { session.history().len().saturating_sub(1) } else { 0 };
-        let history: Vec<HistoryStep> = session.history().iter().take(before).copied().collect();
-        let commands = query.controls.commands(query.samples, self.vehicle().command_range);
-        let controls = forward.prepend(&commands, query.horizon);
-        let asked = RolloutQuery {
-            history: &history,
-            start,
-            controls: &controls,
-            samples: query.samples,
-            horizon,
-            map,
-            soil_correction: session.soil().state.correction,
-            variant: Variant::Full,
-            start_time_s: None,
-            wheels: None,
-        };
-        let learned = session.soil_field(map);
-        let Until { abandoned, due } = until;
-        let due = due.filter(|_| query.takes_fewer()).map(|flag| Due { flag, least: query.least() });
-        let looked_at = query.extras.interpolation_deviation && map.is_some();
-        let asked_extras =
-            RolloutExtras { field: Some(&learned), soils: &soils, risk: query.extras.risk, unrounded: looked_at, abandoned, due };
-        let (mut rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
-        let samples = if due.is_some() { rollout.samples } else { query.samples };
-        let taken = &commands[..samples * query.horizon * 2];
-        let deviation_m = looked_at.then(|| predictor.interpolation_deviation_m(&asked, &asked_extras, &rollout)).transpose()?;
-        // An answer carries the states alone.
-        rollout.position_m = Vec::new();
-        let mut extras = ExtraOutputs {
-            soil_groups: soils.len().max(1),
-            interpolation_deviation_m: deviation_m.filter(|deviation_m| deviation_m.is_finite()),
-            risk: risk.map(|risk| forward.split_risk(risk, horizon)),
-            ..Default::default()
-        };
-        if query.extras.derived() {
-            let linearisations = predictor.linearise_unless(&asked, abandoned)?;
-            (extras.jacobians, extras.covariance) =
-                query.extras.derive(&linearisations, forward.steps(), session.soil(), self.noise.as_ref())?;
-            if is_raised(abandoned) {
-                return Err(EngineError::Abandoned);
-            }
-        }
-        let (rolled, mut rollout) = forward.split(rollout);
-        let of_session = session.flags();
-        rollout.flags.iter_mut().for_each(|flags| *flags |= of_session);
-        let ranking = query.cost.as_ref().map(|cost| cost.rank(&rollout, taken));
-        if let Some(ranking) = &ranking {
-            rollout = ranking.best_of(&rollout);
-        }
-        let drawn_controls = match (&query.controls, &ranking) {
-            (Candidates::Given(_), _) => Vec::new(),
-            (Candidates::Drawn(_), None) => taken.to_vec(),
-            (Candidates::Drawn(_), Some(ranking)) => ranking.rows_of_best(taken, 2 * query.horizon),
-        };
-        Ok(Prediction {
-            soil_variance: session.soil().state.variance_at(&rollout.soil),
-            rollout,
-            start: rolled.unwrap_or(start),
-            start_stamp_ns: newest.map(|newest| newest.stamp_ns.saturating_add(forward.steps() as i64 * self.step_ns)),
-            rolled_forward_steps: forward.steps(),
-            soil: *session.soil(),
-            history_steps: history.len(),
-            measurement_age_s: session.age_s(now_ns),
-            provenance: self.provenance(session),
-            extras,
-            drawn_controls,
-            ranking,
-        })
-    }
-
-    /// Nodes of terrain that have been encoded on the map of a session.
-    pub(crate) fn encoded_nodes(&self, session: &str) -> u64 {
-        let map = self.sessions.get(session).and_then(Session::map).and_then(|id| self.maps.get(id).ok());
-        map.map_or(0, |map| self.predictor.terrain_cache(map).encoded)
+        self.prepare(now_ns, query)?.compute(query, until)
     }
 
     fn fleet(&self) -> Result<&Fleet, EngineError> {
@@ -518,29 +441,6 @@ impl Engine {
             sink(event);
         }
     }
-}
-
-/// The given state or the newest measured one, on the map.
-fn start_state(session: &Session, query: &PredictQuery, map: Option<&Arc<WorldMap>>) -> Result<VehicleState<f64>, EngineError> {
-    let start = match (query.start, session.newest()) {
-        (Some(start), _) => start,
-        (None, Some(newest)) => newest.state,
-        (None, None) => {
-            let reason = "is absent and the session has no measurement yet; give one or send measurements first";
-            return Err(EngineError::NotReady { field: "start".into(), reason: reason.into() });
-        }
-    };
-    if let Some(map) = map
-        && !map.contains(start.position_m[0], start.position_m[1])
-    {
-        let [x, y, _] = start.position_m;
-        let reason = format!("({x:.2}, {y:.2}) m lies outside map `{}`", map.id());
-        return Err(match query.start {
-            Some(_) => EngineError::invalid("start.position_m", reason),
-            None => EngineError::NotReady { field: "session_id".into(), reason: format!("the measured position {reason}") },
-        });
-    }
-    Ok(start)
 }
 
 /// Puts the field of an error below a parent field.

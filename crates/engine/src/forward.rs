@@ -69,34 +69,48 @@ pub(crate) struct Newest {
     pub command: Control<f64>,
 }
 
-/// The steps between the newest measured step and the start of a query, one command for each.
+/// The steps between the newest measured step and the start of a query, one command for each, or the measured steps that came after it.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(crate) struct RollForward {
     commands: Vec<[f32; 2]>,
+    back: usize,
 }
 
 impl RollForward {
     /// Rounds the instant to the grid of steps and looks up the command that was in effect at the middle of each step. What was sent before the
-    /// newest step is part of what the vehicle has reported with it.
+    /// newest step is part of what the vehicle has reported with it. An instant before the newest of `measured` steps, which came while the question waited, is
+    /// answered from the step that was measured then.
     ///
     /// # Errors
-    /// `EngineError::Invalid` naming `start_stamp_ns` when the instant lies before the newest step, or so far after it that the steps rolled
-    /// forward and the horizon exceed the positions of the model.
-    pub fn plan(instant: &StartInstant, newest: Newest, step_ns: i64, horizon: usize, limits: &Limits) -> Result<Self, EngineError> {
+    /// Naming `start_stamp_ns`: `EngineError::Invalid` when the instant lies before the history, `EngineError::NotReady` when it lies so far after the newest step
+    /// that the steps rolled forward and the horizon exceed the positions of the model: what was measured is too old for it.
+    pub fn plan(
+        instant: &StartInstant,
+        newest: Newest,
+        step_ns: i64,
+        horizon: usize,
+        measured: usize,
+        limits: &Limits,
+    ) -> Result<Self, EngineError> {
         let ahead_ns = i128::from(instant.stamp_ns) - i128::from(newest.stamp_ns);
         let step = i128::from(step_ns);
         let steps = (2 * ahead_ns + step).div_euclid(2 * step);
         let seconds = ahead_ns as f64 * 1e-9;
         if steps < 0 {
-            let reason = format!("lies {} s before the newest measured step; allowed is half a step of {} s", -seconds, step as f64 * 1e-9);
-            return Err(EngineError::invalid("start_stamp_ns", reason));
+            let Some(back) = usize::try_from(-steps).ok().filter(|back| *back < measured) else {
+                let reason =
+                    format!("lies {} s before the newest measured step, and the session holds {measured} steps without a gap", -seconds);
+                return Err(EngineError::invalid("start_stamp_ns", reason));
+            };
+            return Ok(Self { commands: Vec::new(), back });
         }
         let steps_max = limits.steps_max().saturating_sub(horizon);
         let Some(steps) = usize::try_from(steps).ok().filter(|steps| *steps <= steps_max) else {
             let reason = format!(
-                "lies {seconds} s = {steps} steps after the newest measured step; with horizon {horizon} at most {steps_max} are allowed"
+                "lies {seconds} s = {steps} steps after the newest measured step; with horizon {horizon} at most {steps_max} are allowed: send newer \
+                 measurements or ask for a shorter horizon"
             );
-            return Err(EngineError::invalid("start_stamp_ns", reason));
+            return Err(EngineError::NotReady { field: "start_stamp_ns".into(), reason });
         };
         let command_in = |step: usize| {
             let middle_ns = i128::from(newest.stamp_ns) + (step as i128) * i128::from(step_ns) + i128::from(step_ns) / 2;
@@ -105,7 +119,12 @@ impl RollForward {
             let command = in_effect.map_or(newest.command, |sent| sent.command);
             [command.speed_m_s as f32, command.second as f32]
         };
-        Ok(Self { commands: (0..steps).map(command_in).collect() })
+        Ok(Self { commands: (0..steps).map(command_in).collect(), back: 0 })
+    }
+
+    /// Measured steps after the start, which are left aside.
+    pub fn back(&self) -> usize {
+        self.back
     }
 
     /// Number of steps.
@@ -161,7 +180,7 @@ mod tests {
     }
 
     fn plan(stamp_ns: i64, sent: Vec<SentCommand>, horizon: usize) -> Result<RollForward, EngineError> {
-        RollForward::plan(&StartInstant { stamp_ns, sent }, NEWEST, STEP_NS, horizon, &Limits::default())
+        RollForward::plan(&StartInstant { stamp_ns, sent }, NEWEST, STEP_NS, horizon, 3, &Limits::default())
     }
 
     #[test]
@@ -171,8 +190,18 @@ mod tests {
         {
             assert_eq!(plan(NEWEST.stamp_ns + offset_ns, vec![], 10).unwrap().steps(), steps, "{offset_ns}");
         }
-        for stamp_ns in [NEWEST.stamp_ns - STEP_NS / 2 - 1, NEWEST.stamp_ns + 23 * STEP_NS, i64::MIN, i64::MAX] {
-            assert_eq!(plan(stamp_ns, vec![], 10).unwrap_err().field(), "start_stamp_ns", "{stamp_ns}");
+        // What was measured after the instant is left aside, as long as a step before it is held.
+        for (offset_ns, back) in [(-STEP_NS / 2 - 1, 1), (-2 * STEP_NS, 2), (-2 * STEP_NS - STEP_NS / 2, 2)] {
+            let start = plan(NEWEST.stamp_ns + offset_ns, vec![sent(0, 1.0)], 32).unwrap();
+            assert_eq!((start.back(), start.steps()), (back, 0), "{offset_ns}");
+        }
+        let refused = |stamp_ns: i64| plan(stamp_ns, vec![], 10).unwrap_err();
+        for stamp_ns in [NEWEST.stamp_ns - 3 * STEP_NS, i64::MIN] {
+            assert!(matches!(refused(stamp_ns), EngineError::Invalid { field, .. } if field == "start_stamp_ns"), "{stamp_ns}");
+        }
+        // What is known is too old for it.
+        for stamp_ns in [NEWEST.stamp_ns + 23 * STEP_NS, i64::MAX] {
+            assert!(matches!(refused(stamp_ns), EngineError::NotReady { field, .. } if field == "start_stamp_ns"), "{stamp_ns}");
         }
         assert!(plan(NEWEST.stamp_ns + STEP_NS, vec![], 32).is_err() && plan(NEWEST.stamp_ns, vec![], 32).is_ok());
     }
@@ -191,7 +220,7 @@ mod tests {
 
     #[test]
     fn analytic_split_undoes_prepend() {
-        let forward = RollForward { commands: vec![[1.0, 2.0], [3.0, 4.0]] };
+        let forward = RollForward { commands: vec![[1.0, 2.0], [3.0, 4.0]], back: 0 };
         assert_eq!(*forward.prepend(&[5.0, 6.0, 7.0, 8.0], 1), [1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1.0, 2.0, 3.0, 4.0, 7.0, 8.0]);
         let (samples, horizon) = (2, 3);
         let count = |width: usize| (0..samples * horizon * width).map(|v| v as f32).collect::<Vec<_>>();

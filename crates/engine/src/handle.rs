@@ -9,9 +9,11 @@ use nesam_physics::Vehicle;
 
 use crate::clock::Clock;
 use crate::command::{Command, Reply, Until};
-use crate::engine::Engine;
+use crate::engine::{Engine, Prepared};
 use crate::error::EngineError;
+use crate::heard::{Heard, HeardPlace};
 use crate::limits::Limits;
+use crate::query::PredictQuery;
 use crate::queue::{Queue, Took, Turn};
 use crate::service_time::{encoding_work, work};
 use crate::sync::thread::{self, JoinHandle};
@@ -27,7 +29,7 @@ pub struct Submission {
     pub abandoned: Option<Arc<AtomicBool>>,
     /// Raised when the answer is due: a prediction of which fewer samples are of use then ends with those that are done.
     pub due: Option<Arc<AtomicBool>>,
-    /// Called once with the answer, on the engine's thread or on the submitter's; it must not wait.
+    /// Called once with the answer, on one of the engine's threads or on the submitter's; it must not wait.
     pub reply: Box<dyn FnOnce(Answer) + Send>,
     /// Vehicle that the command counts for when vehicles compete; `None` = its session stands for it.
     pub share: Option<Arc<str>>,
@@ -105,7 +107,8 @@ pub struct Executed {
     pub busy_ns: u64,
 }
 
-/// Hears of every command but snapshots after its answer was sent, in the order of execution; called on the engine's thread, so it must not wait.
+/// Hears of every command but snapshots after its answer was sent, in the order of execution: what was executed while a prediction was computed comes after that
+/// prediction. Called on the engine's threads, so it must not wait.
 pub type Tap = Box<dyn FnMut(Executed) + Send>;
 
 /// The way to an engine. Clones share the engine.
@@ -123,7 +126,7 @@ enum Worker {
     /// A thread of its own.
     Thread(Mutex<Option<JoinHandle<Engine>>>),
     /// Whoever submits.
-    Submitter(Box<Mutex<Option<(Engine, Option<Tap>)>>>),
+    Submitter(Box<Mutex<Option<(Engine, Heard)>>>),
 }
 
 impl core::fmt::Debug for EngineHandle {
@@ -153,7 +156,7 @@ impl EngineHandle {
             .name("nesam-engine".into())
             .spawn({
                 let (queue, clock) = (queue.clone(), clock.clone());
-                move || run(engine, &queue, clock.as_ref(), tap)
+                move || run(engine, &queue, &clock, tap)
             })
             .expect("the system starts a thread");
         Self { queue, clock, limits, vehicle, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
@@ -168,7 +171,7 @@ impl EngineHandle {
             clock,
             limits,
             vehicle,
-            worker: Arc::new(Worker::Submitter(Box::new(Mutex::new(Some((engine, tap)))))),
+            worker: Arc::new(Worker::Submitter(Box::new(Mutex::new(Some((engine, Heard::new(tap))))))),
         }
     }
 
@@ -201,9 +204,9 @@ impl EngineHandle {
         let Worker::Submitter(held) = self.worker.as_ref() else { return };
         while self.queue.has_turn() {
             let Ok(mut held) = held.try_lock() else { return };
-            let Some((engine, tap)) = held.as_mut() else { return };
+            let Some((engine, heard)) = held.as_mut() else { return };
             while self.queue.has_turn() {
-                take_turn(self.queue.next(|| self.clock.now_ns()), engine, &self.queue, self.clock.as_ref(), tap);
+                take_turn(self.queue.next(|| self.clock.now_ns()), engine, &self.queue, self.clock.as_ref(), heard);
             }
         }
     }
@@ -232,38 +235,61 @@ impl EngineHandle {
         match self.worker.as_ref() {
             Worker::Thread(thread) => thread.lock().ok()?.take()?.join().ok(),
             Worker::Submitter(held) => {
-                let (engine, tap) = held.lock().ok()?.take()?;
-                Some(run(engine, &self.queue, self.clock.as_ref(), tap))
+                let (mut engine, heard) = held.lock().ok()?.take()?;
+                while take_turn(self.queue.next(|| self.clock.now_ns()), &mut engine, &self.queue, self.clock.as_ref(), &heard) {}
+                Some(engine)
             }
         }
     }
 }
 
-/// Does all that is asked for until the end.
-fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, mut tap: Option<Tap>) -> Engine {
-    while take_turn(queue.next(|| clock.now_ns()), &mut engine, queue, clock, &mut tap) {}
+/// Does all that is asked for until the end. Predictions are computed beside the engine, one at a time, so that measurements do not wait for them.
+fn run(mut engine: Engine, queue: &Arc<Queue>, clock: &Arc<dyn Clock>, tap: Option<Tap>) -> Engine {
+    // Shared out among the threads of predictions, the work of a measurement would wait for theirs.
+    let _alone = work_alone();
+    let heard = Arc::new(Heard::new(tap));
+    let (begun, waiting) = mpsc::channel::<Begun>();
+    let computing = thread::Builder::new()
+        .name("nesam-predict".into())
+        .spawn({
+            let (queue, clock, heard) = (queue.clone(), clock.clone(), heard.clone());
+            move || {
+                while let Ok(prediction) = waiting.recv() {
+                    prediction.finish(&queue, clock.as_ref(), &heard);
+                }
+            }
+        })
+        .expect("the system starts a thread");
+    loop {
+        match queue.next(|| clock.now_ns()) {
+            Turn::Commands(commands) => answer_all(&mut engine, commands, clock.as_ref(), &heard),
+            Turn::Prediction(submission) => {
+                let prediction = Begun::new(&mut engine, *submission, queue, clock.as_ref(), &heard);
+                begun.send(prediction).expect("the computing thread ends after this one; this is a bug");
+            }
+            Turn::End => break,
+        }
+    }
+    drop(begun);
+    computing.join().expect("panics of a prediction are caught; this is a bug");
     engine
 }
 
-/// Does what a turn asks for; false at the end.
-fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, tap: &mut Option<Tap>) -> bool {
+/// Keeps parallel work of this thread on this thread for as long as what is given lives; `None` where it has a place among others already.
+#[cfg(not(feature = "shuttle"))]
+fn work_alone() -> Option<rayon::ThreadPool> {
+    rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build().ok()
+}
+
+/// The threads of a schedule share one thread of the system.
+#[cfg(feature = "shuttle")]
+fn work_alone() {}
+
+/// Does what a turn asks for, on this thread; false at the end.
+fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, heard: &Heard) -> bool {
     match turn {
-        Turn::Commands(commands) => commands.into_iter().for_each(|submission| {
-            answer(engine, submission, Ok(()), clock, tap, |_, _, _| ());
-        }),
-        Turn::Prediction(mut submission) => {
-            if let Command::Predict(query) = &mut submission.command {
-                // Of one that is asked wrongly fewer samples may be within the limits: it stays whole, to be refused for what is wrong with it.
-                let right = query.samples_min == 0 || query.check(engine.limits(), engine.vehicle()).is_ok();
-                let fits = if right { queue.fit(query, submission.deadline_ns, clock.now_ns()) } else { Ok(()) };
-                let before = engine.encoded_nodes(&query.session);
-                answer(engine, *submission, fits, clock, tap, |engine, command, took| {
-                    let Command::Predict(query) = command else { return };
-                    let encoded = engine.encoded_nodes(&query.session).saturating_sub(before);
-                    queue.done(work(query, query.samples) + encoding_work(encoded), took, clock.now_ns());
-                });
-            }
-        }
+        Turn::Commands(commands) => answer_all(engine, commands, clock, heard),
+        Turn::Prediction(submission) => Begun::new(engine, *submission, queue, clock, heard).finish(queue, clock, heard),
         Turn::End => return false,
     }
     true
@@ -274,53 +300,91 @@ fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, 
 /// # Errors
 /// Any [`EngineError`]; `Internal` after a panic.
 pub fn execute_guarded(engine: &mut Engine, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
-    guarded(engine, now_ns, command, Until::default())
+    guarded(command.label(), || engine.execute(now_ns, command))
 }
 
-fn guarded(engine: &mut Engine, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
-    catch_unwind(AssertUnwindSafe(|| engine.execute_until(now_ns, command, until)))
-        .unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{}` panicked", command.label()) }))
+fn guarded<T>(label: &str, work: impl FnOnce() -> Result<T, EngineError>) -> Result<T, EngineError> {
+    catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| Err(EngineError::Internal { reason: format!("command `{label}` panicked") }))
 }
 
-/// Executes one submission and answers it, or refuses it where it does not fit; a recording hears of it last. `done` is told what of it was
-/// answered and the time that it took, if it was not refused, before the answer leaves.
-fn answer(
-    engine: &mut Engine,
-    submission: Submission,
-    fits: Result<(), EngineError>,
-    clock: &dyn Clock,
-    tap: &mut Option<Tap>,
-    done: impl FnOnce(&Engine, &Command, Option<Took>),
-) {
-    let Submission { command, deadline_ns, abandoned, due, reply, submitted_ns, share: _ } = submission;
-    let now_ns = clock.now_ns();
-    let is_prediction = matches!(command, Command::Predict(_));
-    let abandoned = abandoned.as_deref().filter(|_| is_prediction);
-    let is_past = |now_ns: u64| is_prediction && deadline_ns.is_some_and(|deadline_ns| now_ns > deadline_ns);
-    let begun = if is_raised(abandoned) {
-        Err(EngineError::Abandoned)
-    } else if is_past(now_ns) {
-        Err(EngineError::Expired)
-    } else {
-        fits
-    };
-    let is_begun = begun.is_ok();
-    let result = begun.and_then(|()| match guarded(engine, now_ns, &command, Until { abandoned, due: due.as_deref() }) {
-        // Nobody waits any more since it is too late.
-        Err(EngineError::Abandoned) if is_past(clock.now_ns()) => Err(EngineError::Expired),
-        result => result,
-    });
-    let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
-    let took = match &result {
-        Ok(_) => Some(Took::All(busy_ns)),
-        Err(EngineError::Abandoned | EngineError::Expired) if is_begun => Some(Took::AtLeast(busy_ns)),
-        Err(_) => None,
-    };
-    let heard = tap.as_ref().filter(|_| !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil)).map(|_| result.clone());
-    let command = command.answered(&result);
-    done(engine, &command, took);
-    reply(Answer { result, queued_ns, busy_ns });
-    if let (Some(tap), Some(result)) = (tap, heard) {
-        tap(Executed { now_ns, command, result, queued_ns, busy_ns });
+/// Executes commands other than predictions, answers them, and lets a recording hear of them.
+fn answer_all(engine: &mut Engine, commands: impl IntoIterator<Item = Submission>, clock: &dyn Clock, heard: &Heard) {
+    for Submission { command, reply, submitted_ns, .. } in commands {
+        let place = heard.reserve();
+        let now_ns = clock.now_ns();
+        let result = execute_guarded(engine, now_ns, &command);
+        let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
+        let is_told = heard.listens() && !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil);
+        let executed = is_told.then(|| Executed { now_ns, command, result: result.clone(), queued_ns, busy_ns });
+        reply(Answer { result, queued_ns, busy_ns });
+        heard.tell(place, executed);
+    }
+}
+
+/// A prediction whose turn it was: all that it is computed from was read.
+struct Begun {
+    query: PredictQuery,
+    prepared: Result<Prepared, EngineError>,
+    deadline_ns: Option<u64>,
+    abandoned: Option<Arc<AtomicBool>>,
+    due: Option<Arc<AtomicBool>>,
+    reply: Box<dyn FnOnce(Answer) + Send>,
+    now_ns: u64,
+    queued_ns: u64,
+    place: HeardPlace,
+}
+
+impl Begun {
+    /// Begins a prediction, unless nobody waits for it any more, it is too late, or it does not fit.
+    fn new(engine: &mut Engine, submission: Submission, queue: &Queue, clock: &dyn Clock, heard: &Heard) -> Self {
+        let Submission { command, deadline_ns, abandoned, due, reply, submitted_ns, share: _ } = submission;
+        let Command::Predict(mut query) = command else { unreachable!("the lane of predictions holds nothing else; this is a bug") };
+        // Of one that is asked wrongly fewer samples may be within the limits: it stays whole, to be refused for what is wrong with it.
+        let right = query.samples_min == 0 || query.check(engine.limits(), engine.vehicle()).is_ok();
+        let fits = if right { queue.fit(&mut query, deadline_ns, clock.now_ns()) } else { Ok(()) };
+        let place = heard.reserve();
+        let now_ns = clock.now_ns();
+        let begun = if is_raised(abandoned.as_deref()) {
+            Err(EngineError::Abandoned)
+        } else if deadline_ns.is_some_and(|deadline_ns| now_ns > deadline_ns) {
+            Err(EngineError::Expired)
+        } else {
+            fits
+        };
+        engine.touch(now_ns, &query.session);
+        let prepared = begun.and_then(|()| guarded("predict", || engine.prepare(now_ns, &query)));
+        let queued_ns = now_ns.saturating_sub(submitted_ns);
+        Self { query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, place }
+    }
+
+    /// Computes and answers it. The queue is told what of it was answered and how long that took, if it was begun, before the answer leaves.
+    fn finish(self, queue: &Queue, clock: &dyn Clock, heard: &Heard) {
+        let Self { mut query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, place } = self;
+        let is_begun = prepared.is_ok();
+        let until = Until { abandoned: abandoned.as_deref(), due: due.as_deref() };
+        let (result, encoded) = match prepared {
+            Err(error) => (Err(error), 0),
+            Ok(prepared) => {
+                let before = prepared.encoded_nodes();
+                let result = guarded("predict", || prepared.compute(&query, until));
+                (result, prepared.encoded_nodes().saturating_sub(before))
+            }
+        };
+        let result = match result {
+            // Nobody waits any more since it is too late.
+            Err(EngineError::Abandoned) if deadline_ns.is_some_and(|deadline_ns| clock.now_ns() > deadline_ns) => Err(EngineError::Expired),
+            result => result.map(|prediction| Reply::Predicted(Arc::new(prediction))),
+        };
+        let busy_ns = clock.now_ns().saturating_sub(now_ns);
+        let took = match &result {
+            Ok(_) => Some(Took::All(busy_ns)),
+            Err(EngineError::Abandoned | EngineError::Expired) if is_begun => Some(Took::AtLeast(busy_ns)),
+            Err(_) => None,
+        };
+        query.keep_answered(&result);
+        queue.done(work(&query, query.samples) + encoding_work(encoded), took, clock.now_ns());
+        let told = heard.listens().then(|| result.clone());
+        reply(Answer { result, queued_ns, busy_ns });
+        heard.tell(place, told.map(|result| Executed { now_ns, command: Command::Predict(query), result, queued_ns, busy_ns }));
     }
 }

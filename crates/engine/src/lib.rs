@@ -5,8 +5,8 @@
 //! thread, no clock. The same commands at the same instants give the same answers, so a run can be recorded ([`EngineHandle::spawn_tapped`]) and
 //! replayed bit for bit.
 //!
-//! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own. Measurements overtake predictions there: a planner that
-//! asks for much never delays what a vehicle reports by more than the prediction that is being computed. A full queue is an
+//! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own, and computes predictions on another, one at a time, from what the
+//! sessions were when their turn came: measurements do not wait for them. A full queue is an
 //! [`EngineError::Overloaded`], never a wait and never a panic, and so is a prediction that would not be done before its deadline; one whose asker has
 //! gone or whose deadline has passed is skipped or given up. Vehicles share the time for predictions evenly.
 //!
@@ -27,6 +27,7 @@ mod fleet;
 mod forward;
 mod grid;
 mod handle;
+mod heard;
 mod limits;
 mod maps;
 mod measurement;

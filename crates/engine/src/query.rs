@@ -4,6 +4,7 @@ use nesam_model::Rollout;
 use nesam_physics::{Control, SOIL_DIM, Vehicle, VehicleState};
 
 use crate::candidates::Candidates;
+use crate::command::Reply;
 use crate::error::EngineError;
 use crate::extras::{ExtraOutputs, PredictExtras};
 use crate::forward::StartInstant;
@@ -103,6 +104,15 @@ impl Prediction {
 }
 
 impl PredictQuery {
+    /// Leaves of a query that was answered so the samples that were computed.
+    pub(crate) fn keep_answered(&mut self, result: &Result<Reply, EngineError>) {
+        if let Ok(Reply::Predicted(prediction)) = result
+            && prediction.candidates() < self.samples
+        {
+            self.keep_first(prediction.candidates());
+        }
+    }
+
     /// Fewest samples that answer it.
     pub(crate) fn least(&self) -> usize {
         if self.samples_min == 0 { self.samples } else { self.samples_min.min(self.samples) }

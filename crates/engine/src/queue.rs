@@ -85,7 +85,7 @@ struct Admitted {
 pub(crate) enum Turn {
     /// All waiting commands, in order of arrival.
     Commands(VecDeque<Submission>),
-    /// One prediction, since no command waits.
+    /// One prediction, since no command waits and none is computed.
     Prediction(Box<Submission>),
     /// Nothing more will come.
     End,
@@ -129,7 +129,10 @@ impl Queue {
             if lanes.stopped {
                 return Turn::End;
             }
-            if let Some(next) = lanes.predictions.pop() {
+            // One at a time: they share the processors.
+            if lanes.running.is_none()
+                && let Some(next) = lanes.predictions.pop()
+            {
                 let deadline_ns = next.item.deadline_ns;
                 lanes.running = Some(Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns, deadline_ns });
                 return Turn::Prediction(Box::new(next.item));
@@ -178,6 +181,7 @@ impl Queue {
             None => lanes.correct(0, now_ns),
         }
         lanes.running = None;
+        self.filled.notify_one();
     }
 
     /// Refuses new commands and gives back the predictions that wait.

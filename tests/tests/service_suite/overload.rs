@@ -281,6 +281,37 @@ fn service_a_prediction_that_nobody_waits_for_is_given_up() {
     handle.stop();
 }
 
+/// Goal: measurements do not wait for a prediction, and a recording has both in the order in which they were executed. Method: a prediction of seconds, a measurement
+/// that is answered while it is computed, then its flag.
+#[test]
+fn service_measurements_do_not_wait_for_a_prediction() {
+    let recorded = recorded();
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let tap = {
+        let heard = heard.clone();
+        Box::new(move |executed: Executed| heard.lock().unwrap().push(executed.command.label()))
+    };
+    let engine = Engine::new(predictor(), Limits::default()).unwrap();
+    let handle = EngineHandle::spawn_tapped(engine, Arc::new(ManualClock::default()), Some(tap));
+    drive(&handle, &recorded, "");
+    let extras = PredictExtras { jacobians: true, ..Default::default() };
+    let (mut asked, answer) = asked(PredictQuery { extras, ..engine_query("s", &recorded.drive, 2, 8, 32) });
+    let abandoned = Arc::new(AtomicBool::new(false));
+    asked.abandoned = Some(abandoned.clone());
+    handle.submit(asked);
+    while handle.waiting().1 > 0 {
+        std::thread::yield_now();
+    }
+    let measurement = engine_sample(&recorded.drive, 3);
+    handle.call(Command::Measure { session: "s".into(), vehicle: None, measurement }).unwrap();
+    assert!(answer.try_recv().is_err(), "the prediction is still computed");
+    assert_eq!(heard.lock().unwrap().len(), 4, "what came after it is told after it");
+    abandoned.store(true, Ordering::Relaxed);
+    assert!(matches!(answer.recv().unwrap(), Err(EngineError::Abandoned)));
+    handle.stop();
+    assert_eq!(*heard.lock().unwrap(), ["open", "measure", "measure", "measure", "predict", "measure"]);
+}
+
 /// Goal: an answer that is due has what is done, is the beginning of the whole, and replays. Method: the flag is raised before a prediction begins, so that it ends
 /// as soon as enough is done; the whole of it, and what a recording hears of.
 #[test]

@@ -20,7 +20,7 @@ class DurableStreamImpl;
 struct DurableOptions {
   /// Longest time without the service before `DurableStream::send` gives up.
   std::chrono::nanoseconds reconnect = std::chrono::seconds(30);
-  /// Time between two attempts.
+  /// Time between two attempts, where the service asks for no other.
   std::chrono::nanoseconds pause = std::chrono::milliseconds(200);
   /// Measurements that are kept at most; beyond it `send` refuses. A store commits at least every second (`store.interval_s`), so this many are more than ten
   /// minutes at 100 Hz and about 15 MB; without a store nothing becomes durable, and they are all that can be sent.
