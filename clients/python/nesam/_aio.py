@@ -2,7 +2,7 @@
 
 import asyncio
 import functools
-from typing import Any, AsyncIterable, AsyncIterator, Callable, Iterable, List, Optional, Sequence, Tuple, Union
+from typing import Any, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -13,8 +13,8 @@ from . import _messages as m
 from . import _types as t
 from ._aio_durable import AsyncDurableStream
 from ._candidates import Drawing, PathCost
-from ._connection import ATTEMPTS_MAX, Options, arguments, trying_again
-from ._errors import from_rpc
+from ._connection import ATTEMPTS_MAX, Connected, Options, arguments, finite_timeout, trying_again
+from ._errors import NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
@@ -33,7 +33,7 @@ from .v1 import (
 Measurements = Union[Iterable[t.Measurement], AsyncIterable[t.Measurement]]
 
 
-class AsyncClient:
+class AsyncClient(Connected):
     """`Client` in asyncio: the same methods with the same arguments, errors and answers, to be awaited; tasks of one event loop may share it. Use it in an
     `async with` block.
 
@@ -73,29 +73,47 @@ class AsyncClient:
         await self.close()
 
     async def close(self) -> None:
-        """Closes the connection."""
+        """As `Client.close`."""
+        self._is_closed = True
         await self._channel.close()
         await self._once.close()
         self._threads.close()
 
     async def _do(self, call: calls.Call[calls.Told], timeout_s: Optional[float] = None) -> calls.Told:
         method = getattr(self._stubs[call.service], call.method)
+        timeout = finite_timeout(self.timeout_s if timeout_s is None else timeout_s)
         try:
-            timeout = self.timeout_s if timeout_s is None else timeout_s
-            return call.read(await method(call.request, timeout=timeout, metadata=self._metadata))
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+            return call.read(await self._settled(method(call.request, timeout=timeout, metadata=self._metadata)))
+        except _FAILURES as error:
+            raise self._refusal(error) from None
+
+    async def _settled(self, call: Awaitable[Any]) -> Any:
+        """What a call of gRPC gives. A channel that is closed cancels its calls, and gRPC tells the tasks that wait for them that they are cancelled; with a task in
+        between, one that is not hears _CallCancelled."""
+        waiting = asyncio.ensure_future(call)
+        try:
+            await asyncio.wait({waiting})
+        except BaseException:
+            waiting.cancel()
+            # Nobody asks any more how it ended.
+            waiting.add_done_callback(lambda ended: ended.cancelled() or ended.exception())
+            raise
+        if waiting.cancelled() and self._is_closed:
+            raise _CallCancelled
+        return waiting.result()
 
     async def _watch(self, service: str, method: str, request: Any, read: Callable[[Any], calls.Told], timeout_s: Optional[float]) -> AsyncIterator[calls.Told]:
-        call = getattr(self._stubs[service], method)(request, timeout=timeout_s, metadata=self._metadata)
+        call = None
         try:
-            async for message in call:
+            call = getattr(self._stubs[service], method)(request, timeout=finite_timeout(timeout_s), metadata=self._metadata)
+            while (message := await self._settled(call.read())) is not grpc.aio.EOF:  # type: ignore[attr-defined]
                 yield read(message)
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+        except _FAILURES as error:
+            raise self._refusal(error) from None
         finally:
             # Whoever stops listening ends the call, and what the service does for it.
-            call.cancel()
+            if call is not None:
+                call.cancel()
 
     # Sessions
 
@@ -108,7 +126,7 @@ class AsyncClient:
         initial: Optional[t.Measurement] = None,
     ) -> t.Session:
         """As `Client.open_session`."""
-        return await self._do(calls.open_session(vehicle_id, session_id, map_id, vehicle_card, initial))
+        return self._known_states.opened(await self._do(calls.open_session(vehicle_id, session_id, map_id, vehicle_card, initial)))
 
     async def session(self, session_id: str) -> t.Session:
         """As `Client.session`."""
@@ -120,7 +138,7 @@ class AsyncClient:
 
     async def fork_session(self, session_id: str, new_session_id: str) -> t.Session:
         """As `Client.fork_session`."""
-        return await self._do(calls.fork_session(session_id, new_session_id))
+        return self._known_states.opened(await self._do(calls.fork_session(session_id, new_session_id)))
 
     async def export_session(self, session_id: str) -> bytes:
         """As `Client.export_session`."""
@@ -128,7 +146,7 @@ class AsyncClient:
 
     async def import_session(self, image: bytes, session_id: str = "") -> t.Session:
         """As `Client.import_session`."""
-        return await self._do(calls.import_session(image, session_id))
+        return self._known_states.opened(await self._do(calls.import_session(image, session_id)))
 
     async def close_session(self, session_id: str) -> None:
         """As `Client.close_session`."""
@@ -227,7 +245,7 @@ class AsyncClient:
 
     async def predict(
         self,
-        session_id: str,
+        session_id: Union[str, t.Session],
         controls: Union[np.ndarray, Drawing],
         start: Optional[t.Vector] = None,
         use_history: bool = True,
@@ -245,7 +263,7 @@ class AsyncClient:
     ) -> t.Prediction:
         """As `Client.predict`."""
         question = calls.Question(
-            session_id,
+            calls.name_of(session_id),
             controls,
             start=start,
             use_history=use_history,
@@ -263,8 +281,16 @@ class AsyncClient:
         asked = self._known_states.ask()
         try:
             return self._known_states.predicted(asked, question, await self._do(question.call(), timeout_s))
-        except calls.LATE as error:
+        except NesamError as error:
             return self._known_states.fall_back(question, error)
+
+
+class _CallCancelled(Exception):
+    """A call ended with its channel."""
+
+
+# A channel that is closed is a wrong use of it.
+_FAILURES = (grpc.RpcError, grpc.aio.UsageError, _CallCancelled)
 
 
 class AsyncMeasurementStream(OpenStream):

@@ -8,7 +8,7 @@ from typing import Any
 from . import _calls as calls
 from . import _types as t
 from ._errors import NesamError, Unavailable
-from ._kept import BROKEN, KeepingStream
+from ._kept import KeepingStream
 
 
 class AsyncDurableStream(KeepingStream):
@@ -30,7 +30,7 @@ class AsyncDurableStream(KeepingStream):
     async def send(self, measurement: t.Measurement) -> t.Answer:
         """As `DurableStream.send`."""
         async with self._turn:
-            self._kept.put(measurement)
+            self._keep(measurement)
             return await self._deliver()
 
     async def flush(self, timeout_s: float = 10.0) -> None:
@@ -77,8 +77,7 @@ class AsyncDurableStream(KeepingStream):
                 return await self._attempt(end)
             except NesamError as error:
                 self._drop()
-                if error.code not in BROKEN:
-                    raise
+                self._failed(error)
                 left_s = until - time.monotonic()
                 if left_s <= 0.0:
                     raise Unavailable(error.code, error.field, error.message, error.retry_after_s) from error

@@ -2,21 +2,40 @@
 
 import itertools
 import threading
+import time
 from dataclasses import dataclass, replace
 from typing import Any, Callable, Dict, Generic, List, Optional, Sequence, Tuple, TypeVar, Union
 
+import grpc
 import numpy as np
 
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
-from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
+from ._errors import DeadlineExceeded, FailedPrecondition, NesamError, NotFound, Overloaded, Unavailable
 from ._extras import Extras
-from ._fallback import KinematicFallback, KnownState, finite_state
+from ._fallback import KinematicFallback, KnownState
+from ._refused import check_question
 from .v1 import effects_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2, types_pb2
 
 LATE = (DeadlineExceeded, Overloaded, Unavailable)
-"""What a fallback may answer instead of."""
+"""Errors of a service that is late, overloaded or away."""
+
+KNOWN_AGE_MAX_S = 3.2
+"""Oldest state that a fallback begins at, s by the client's clock: as far as it rolls one forward."""
+
+_NO_ROOM = (grpc.StatusCode.RESOURCE_EXHAUSTED.value[0], grpc.StatusCode.UNAVAILABLE.value[0])
+_NOT_FOUND = grpc.StatusCode.NOT_FOUND.value[0]
+
+
+def is_late(error: NesamError) -> bool:
+    """Whether a fallback may answer instead: the service is late, overloaded or away, or what it knows of the session is too old to be rolled forward."""
+    return isinstance(error, LATE) or (isinstance(error, FailedPrecondition) and error.field == "start_stamp_ns")
+
+
+def name_of(session: Union[str, t.Session]) -> str:
+    """The id of a session, given as it is or as the session."""
+    return session.session_id if isinstance(session, t.Session) else session
 
 
 Told = TypeVar("Told")
@@ -198,15 +217,16 @@ class Question:
     def fall_back(self, error: NesamError, known: Optional[KnownState]) -> t.Prediction:
         """What the fallback answers from `start` or the newest known state, rolled forward to `start_stamp_ns`; raises the error again without one of them.
 
-        Raises InvalidArgument where the service would refuse commands or start, too.
+        Raises InvalidArgument where the service would refuse the question, too.
         """
         if self.fallback is None:
             raise error
         names, controls = m.channel_names(self.channels), self.commands()
-        sent = self.sent if self.start is None and self.start_stamp_ns is not None else ()
+        check_question(self, controls)
+        sent = self.sent if self.start_stamp_ns is not None else ()
         self.fallback.check(controls, sent, "drawing.nominal" if isinstance(self.controls, Drawing) else "controls")
         if self.start is not None:
-            known = KnownState(finite_state(t.array(self.start, (12,), "start"), "start"))
+            known = KnownState(t.array(self.start, (12,), "start"))
         elif known is not None and self.start_stamp_ns is not None:
             known = self.fallback.rolled_forward(known, self.start_stamp_ns, self.sent)
         if known is None:
@@ -216,19 +236,47 @@ class Question:
 
 
 @dataclass(frozen=True)
-class _Newest:
-    """A known state, the number of what it answered or of what was answered before, and of the measurement with which the vehicle's clock began anew."""
+class Moment:
+    """When something was sent: its number among all that is, and the client's clock, s."""
 
-    known: KnownState
+    number: int
+    at_s: float
+
+
+@dataclass(frozen=True)
+class Reported:
+    """A measurement that was sent, as it was then; `known` is None where its state has a number that is not finite."""
+
+    session_id: str
+    known: Optional[KnownState]
+    sent: Moment
+
+
+@dataclass(frozen=True)
+class _Newest:
+    """A known state, None where the session was opened and nothing is known of it yet.
+
+    asked: number of what it answered or of what was answered before. clock: of that with which the session or the vehicle's clock began anew. at_s: when it
+    was so, by the client's clock. is_ahead: whether it is no step of the session yet, as far as the client knows: it waits for the grid, or got no answer.
+    """
+
+    known: Optional[KnownState]
     asked: int
     clock: int
+    at_s: float
+    is_ahead: bool = False
+
+    def young(self) -> Optional[KnownState]:
+        """The state where it is not too old to begin at."""
+        return self.known if time.monotonic() - self.at_s <= KNOWN_AGE_MAX_S else None
 
 
 class KnownStates:
     """The newest state that a client knows of each session; a fallback without a given start begins there.
 
     What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only where
-    its stamp is larger and the vehicle's clock has not begun anew since.
+    its stamp is larger and neither session nor vehicle's clock has begun anew since. A measurement that is no step of the session yet stays until a state with
+    a larger stamp comes, or it is too old to begin at.
     """
 
     def __init__(self) -> None:
@@ -236,41 +284,81 @@ class KnownStates:
         self._states: Dict[str, _Newest] = {}
         self._lock = threading.Lock()
 
-    def ask(self) -> int:
-        """Number of what is sent now."""
-        return next(self._numbers)
+    def ask(self) -> Moment:
+        """Number and time of what is sent now."""
+        return Moment(next(self._numbers), time.monotonic())
 
-    def measured(self, asked: int, measurement: t.Measurement, answer: t.Answer) -> None:
+    def report(self, measurement: t.Measurement) -> Reported:
+        """A measurement that is sent now. ValueError for a state of a wrong shape."""
+        # The vehicle may write its array anew.
+        state = np.array(t.array(measurement.state, (12,), "state"))
+        known = KnownState(state, measurement.stamp_ns) if np.isfinite(state).all() else None
+        return Reported(measurement.session_id, known, self.ask())
+
+    def measured(self, reported: Reported, answer: t.Answer) -> None:
         """Notes a measured state that is now the newest of its session."""
         begins_anew = answer.outcome in ("CLOCK_JUMP", "RESTARTED")
-        if (begins_anew or answer.outcome in ("APPLIED", "GAP", "GATED")) and not answer.reordered:
-            # The vehicle may write its array anew.
-            state = np.array(measurement.state, dtype=np.float64)
-            self._note(measurement.session_id, KnownState(state, measurement.stamp_ns), asked, begins_anew)
+        if (begins_anew or answer.outcome in ("APPLIED", "BUFFERED", "GAP", "GATED")) and not answer.reordered:
+            self._note(reported.session_id, reported.known, reported.sent, begins_anew, answer.outcome == "BUFFERED")
+        elif answer.outcome == "REJECTED" and answer.code in _NO_ROOM:
+            self.unheard(reported)
+        elif answer.outcome == "REJECTED" and (answer.code, answer.field) == (_NOT_FOUND, "session_id"):
+            self.forget(reported.session_id)
 
-    def predicted(self, asked: int, question: Question, prediction: t.Prediction) -> t.Prediction:
+    def unheard(self, reported: Reported) -> None:
+        """Notes a measured state that got no answer: the vehicle was there all the same."""
+        newest = self._states.get(reported.session_id)
+        # The same one sent again, or what was kept meanwhile, is not where the vehicle is now.
+        if reported.known is not None and (newest is None or _is_later(reported.known, newest.known)):
+            self._note(reported.session_id, reported.known, reported.sent, is_ahead=True)
+
+    def predicted(self, asked: Moment, question: Question, prediction: t.Prediction) -> t.Prediction:
         """Notes where a prediction of the session began that was not given its start, and gives it back."""
         if question.start is None:
-            self._note(question.session_id, KnownState(np.array(prediction.start, dtype=np.float64), prediction.start_stamp_ns), asked, False)
+            # Who asks from an instant asks from now.
+            age_s = 0.0 if question.start_stamp_ns is not None else prediction.measurement_age_s or 0.0
+            known = KnownState(np.array(prediction.start, dtype=np.float64), prediction.start_stamp_ns)
+            self._note(question.session_id, known, replace(asked, at_s=asked.at_s - age_s))
         return prediction
 
     def fall_back(self, question: Question, error: NesamError) -> t.Prediction:
-        """What the fallback of a question answers; raises the error again without one or without a state."""
+        """What the fallback of a question answers; raises the error again where it is no lateness, without a fallback or without a state that is new enough."""
+        if isinstance(error, NotFound) and error.field == "session_id":
+            self.forget(question.session_id)
+        if not is_late(error):
+            raise error
         newest = self._states.get(question.session_id)
-        return question.fall_back(error, None if newest is None else newest.known)
+        return question.fall_back(error, None if newest is None else newest.young())
+
+    def opened(self, session: t.Session) -> t.Session:
+        """Forgets what was known under the name of a session that was opened now, also what comes late, and gives it back."""
+        now = self.ask()
+        with self._lock:
+            self._states[session.session_id] = _Newest(None, now.number, now.number, now.at_s)
+        return session
 
     def forget(self, session_id: str) -> None:
         """Forgets a closed session."""
         self._states.pop(session_id, None)
 
-    def _note(self, session_id: str, known: KnownState, asked: int, begins_anew: bool) -> None:
+    def _note(self, session_id: str, known: Optional[KnownState], sent: Moment, begins_anew: bool = False, is_ahead: bool = False) -> None:
+        if known is None:
+            return
         with self._lock:
             newest = self._states.get(session_id)
-            if newest is None or begins_anew:
-                self._states[session_id] = _Newest(known, asked, asked if begins_anew else 0)
-            elif asked > newest.asked or (asked > newest.clock and _is_later(known, newest.known)):
-                self._states[session_id] = _Newest(known, max(asked, newest.asked), newest.clock)
+            if newest is None:
+                self._states[session_id] = _Newest(known, sent.number, sent.number if begins_anew else 0, sent.at_s, is_ahead)
+            elif sent.number > newest.clock and (begins_anew or _replaces(known, sent, newest)):
+                clock = sent.number if begins_anew else newest.clock
+                self._states[session_id] = _Newest(known, max(sent.number, newest.asked), clock, sent.at_s, is_ahead)
 
 
-def _is_later(known: KnownState, other: KnownState) -> bool:
-    return known.stamp_ns is not None and other.stamp_ns is not None and known.stamp_ns > other.stamp_ns
+def _replaces(known: KnownState, sent: Moment, newest: _Newest) -> bool:
+    """Whether a state of the same clock is newer than the newest one."""
+    if newest.is_ahead and sent.at_s - newest.at_s <= KNOWN_AGE_MAX_S:
+        return _is_later(known, newest.known)
+    return sent.number > newest.asked or _is_later(known, newest.known)
+
+
+def _is_later(known: KnownState, other: Optional[KnownState]) -> bool:
+    return other is None or (known.stamp_ns is not None and other.stamp_ns is not None and known.stamp_ns > other.stamp_ns)

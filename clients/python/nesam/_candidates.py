@@ -8,9 +8,10 @@ import numpy as np
 from .v1 import prediction_pb2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Drawing:
-    """Candidates as MPPI draws them: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the vehicle card.
+    """Candidates as MPPI draws them: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the vehicle card
+    and to nothing narrower: not to what was trained, nor to limits of a planner or of how fast commands may change.
 
     nominal: (horizon, 2), speed m/s and second command in the unit of the vehicle card. samples: N. sd: standard deviations of the two, in their units.
     correlation: of the noise from one step to the next, 0 (white) to below 1. seed: the same drawing gives the same candidates from the same version of the
@@ -37,14 +38,15 @@ class Drawing:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PathCost:
     """What candidates are worth along a path: the mean over the steps of weighted squares; only the best are sent.
 
     path: (points, 2), World, m, in the order they are driven. speed_m_s: to be made along it. path_weight: of the distance, per m^2. speed_weight: of the
     velocity along the path against `speed_m_s`, per (m/s)^2. tilt_weight: of roll and pitch, per rad^2. speed_change_weight, second_change_weight: of the
     changes of the commands from step to step, per unit squared. best: candidates to send, 0 = none. temperature: of the mean command, in units of the cost; 0 = no
-    mean. A candidate that overturns, leaves the map or has a state that is not finite costs infinitely much. Not together with extras.
+    mean. A candidate that overturns, leaves the map or has a state that is not finite costs infinitely much; other flags of
+    `Prediction.validity`, such as SPEED_UNTRAINED, cost nothing. Not together with extras.
     """
 
     path: np.ndarray
@@ -72,7 +74,7 @@ class PathCost:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ranking:
     """What became of all candidates.
 

@@ -11,9 +11,9 @@ from . import _diagnosis as diagnosis
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
-from ._connection import ATTEMPTS_MAX, Options, arguments, trying_again
+from ._connection import ATTEMPTS_MAX, Connected, Options, arguments, finite_timeout, trying_again
 from ._durable import DurableStream
-from ._errors import from_rpc
+from ._errors import NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
@@ -30,14 +30,16 @@ from .v1 import (
 )
 
 
-class Client:
+class Client(Connected):
     """A connection to a service, e.g. `Client("127.0.0.1:50051")`. Threads may share it. Close it, or use it in a `with` block.
 
-    address: host:port. timeout_s: longest wait of a call that gives no other, s. tls: what the client trusts and shows; None = no TLS.
+    address: host:port. timeout_s: longest wait of a call that gives no other, s; infinite = no limit. tls: what the client trusts and shows; None = no TLS.
     vehicle_id: told with every call, for a proxy in front of several servers (deploy/haproxy); "" = not told.
     attempts_max: how often a call is tried that only reads (`session`, `sessions`, `export_session`, `map`, `maps`, `fleet_soil`, `predict`) and is UNAVAILABLE, 1 to 5;
     1 = once. The pauses between them grow from 0.1 s to 1 s, together about 2 s; all is over by the deadline of the call. A prediction with a fallback is tried
-    once, and so is all that changes something. ValueError for another number, or an address that begins with http.
+    once, and so is all that changes something. ValueError for another number, or an address that begins with http or has no port.
+
+    What is asked of a client that is closed, or was on its way when it was, is Unavailable.
     """
 
     def __init__(
@@ -71,27 +73,30 @@ class Client:
         self.close()
 
     def close(self) -> None:
-        """Closes the connection."""
+        """Closes the connection. What is on its way is Unavailable."""
+        self._is_closed = True
         self._channel.close()
         self._once.close()
 
     def _do(self, call: calls.Call[calls.Told], timeout_s: Optional[float] = None) -> calls.Told:
         method = getattr(self._stubs[call.service], call.method)
         try:
-            return call.read(method(call.request, timeout=self.timeout_s if timeout_s is None else timeout_s))
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+            return call.read(method(call.request, timeout=finite_timeout(self.timeout_s if timeout_s is None else timeout_s)))
+        except (grpc.RpcError, ValueError) as error:
+            raise self._refusal(error) from None
 
     def _watch(self, service: str, method: str, request: Any, read: Callable[[Any], calls.Told], timeout_s: Optional[float]) -> Iterator[calls.Told]:
-        call = getattr(self._stubs[service], method)(request, timeout=timeout_s)
+        call = None
         try:
+            call = getattr(self._stubs[service], method)(request, timeout=finite_timeout(timeout_s))
             for message in call:
                 yield read(message)
-        except grpc.RpcError as error:
-            raise from_rpc(error) from None
+        except (grpc.RpcError, ValueError) as error:
+            raise self._refusal(error) from None
         finally:
             # Whoever stops listening ends the call, and what the service does for it.
-            call.cancel()
+            if call is not None:
+                call.cancel()
 
     # Sessions
 
@@ -107,7 +112,7 @@ class Client:
 
         Raises InvalidArgument (bad name, other vehicle card, bad initial measurement), NotFound (map), AlreadyExists, Overloaded.
         """
-        return self._do(calls.open_session(vehicle_id, session_id, map_id, vehicle_card, initial))
+        return self._known_states.opened(self._do(calls.open_session(vehicle_id, session_id, map_id, vehicle_card, initial)))
 
     def session(self, session_id: str) -> t.Session:
         """Reads a session. Raises NotFound."""
@@ -119,7 +124,7 @@ class Client:
 
     def fork_session(self, session_id: str, new_session_id: str) -> t.Session:
         """Copies a session with its history and soil under another name. Raises NotFound, InvalidArgument, AlreadyExists, Overloaded."""
-        return self._do(calls.fork_session(session_id, new_session_id))
+        return self._known_states.opened(self._do(calls.fork_session(session_id, new_session_id)))
 
     def export_session(self, session_id: str) -> bytes:
         """Everything that a session remembers, for `import_session` here or on another server with the same bundle. Raises NotFound."""
@@ -131,7 +136,7 @@ class Client:
         Raises InvalidArgument (damaged, another version, another bundle), NotFound (map), FailedPrecondition (the map has other layers), AlreadyExists,
         PermissionDenied as NesamError (another's vehicle, or an image with effects without the rights of an operator).
         """
-        return self._do(calls.import_session(image, session_id))
+        return self._known_states.opened(self._do(calls.import_session(image, session_id)))
 
     def close_session(self, session_id: str) -> None:
         """Closes a session and forgets its history. Raises NotFound."""
@@ -246,7 +251,8 @@ class Client:
     # Measurements
 
     def measure(self, measurements: Iterable[t.Measurement]) -> List[t.Answer]:
-        """Sends measurements and returns the answer to each, in order. What the service refuses is answered (REJECTED), not raised.
+        """Sends measurements as they come from an iterable, without waiting for answers in between, and returns the answer to each, in order, after the last. What
+        the service refuses is answered (REJECTED), not raised.
 
         Raises DeadlineExceeded when an answer takes longer than the client's `timeout_s`, Unavailable; ValueError for an array of a wrong shape.
         """
@@ -270,7 +276,7 @@ class Client:
 
     def predict(
         self,
-        session_id: str,
+        session_id: Union[str, t.Session],
         controls: Union[np.ndarray, Drawing],
         start: Optional[t.Vector] = None,
         use_history: bool = True,
@@ -286,26 +292,28 @@ class Client:
         cost: Optional[PathCost] = None,
         samples_min: int = 0,
     ) -> t.Prediction:
-        """Rolls candidate command sequences out from the session's newest state, or from `start`.
+        """Rolls candidate command sequences out from the newest state of a session, given by its id or as it is, or from `start`.
 
         controls: (samples, horizon, 2): speed m/s, second command in the unit of the vehicle card; one step is 0.1 s; or a `Drawing`, by which the
         service draws them: `Prediction.controls` then tells what they were. cost: lets the service rank the candidates along a path and send the best
         only; `Prediction.ranking` has the costs of all; not together with extras. samples_min: fewest samples that are of use when the deadline is near, 0 =
         all or nothing; the arrays then have as many rows as were computed. start: (12,), pose in World, twist in Body; with `use_history` it is taken to hold
         at the instant of the newest measurement. channels: names from CHANNELS to return, default all; they come in the order of CHANNELS, whatever that of the names, and Prediction.channels says which. stride: returns the steps stride, 2 stride, ...
-        timeout_s: deadline, default that of the client. fallback: answers instead when the service is late, overloaded or away, from `start` or the newest
-        state that this client knows; the prediction says so. It does so at once, without another attempt, and refuses what the service would: numbers that are
-        not finite, commands outside the range of its card. start_stamp_ns: asks from this instant of the vehicle's clock on: the service rolls the session
-        forward to it with the commands `sent`, pairs (stamp_ns, (speed, second)) by ascending stamp; not together with `start`. half: lets the reply travel as
-        16-bit numbers; positions are rounded by at most 4 mm within 16 m of the start. extras: Jacobians, covariance, risk and what-if soils; the answer is in
-        `Prediction.extras`. A fallback rolls a known state forward by its own kinematics, no further than 32 steps, predicts the nominal sequence of a drawing
-        alone, and has no extras and no `ranking` (None).
+        timeout_s: deadline, default that of the client, infinite = none. fallback: answers instead when the service is late, overloaded or away, or knows no
+        measurement that is new enough for `start_stamp_ns`, from `start` or the newest state that this client knows and that is not older than 3.2 s; the
+        prediction says so. It does so at once, without another attempt, and refuses what the service would: numbers that are not finite, commands outside the
+        range of its card, shapes, costs and starts beyond the limits (number of samples and extras apart). start_stamp_ns: asks from this instant of the
+        vehicle's clock on: the service rolls the session forward to it, rounded to the nearest step of 0.1 s after the newest measurement, so by up to 50 ms
+        (`Prediction.start_stamp_ns` says from when), with the commands `sent`, pairs (stamp_ns, (speed, second)) by ascending stamp; not together with `start`.
+        half: lets the reply travel as 16-bit numbers; positions are rounded by at most 4 mm within 16 m of the start. extras: Jacobians, covariance, risk and
+        what-if soils; the answer is in `Prediction.extras`. A fallback rolls a known state forward by its own kinematics, no further than 32 steps, predicts the
+        nominal sequence of a drawing alone, and has no extras and no `ranking` (None).
 
-        Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, or it lies off the map), Overloaded, DeadlineExceeded,
-        Unavailable; ValueError for arrays of a wrong shape.
+        Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, none that is new enough for `start_stamp_ns`, or it lies off the map),
+        Overloaded, DeadlineExceeded, Unavailable; ValueError for arrays of a wrong shape.
         """
         question = calls.Question(
-            session_id,
+            calls.name_of(session_id),
             controls,
             start=start,
             use_history=use_history,
@@ -323,7 +331,7 @@ class Client:
         asked = self._known_states.ask()
         try:
             return self._known_states.predicted(asked, question, self._do(question.call(), timeout_s))
-        except calls.LATE as error:
+        except NesamError as error:
             return self._known_states.fall_back(question, error)
 
 
@@ -341,7 +349,8 @@ class MeasurementStream(OpenStream):
         self.close()
 
     def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
-        """Sends one measurement and awaits its answer, at most for `timeout_s`, default that of the client.
+        """Sends one measurement and waits for its answer, at most for `timeout_s`, default that of the client: a busy service holds up whoever sends so.
+        `Client.measure` with an iterator sends the next measurements meanwhile.
 
         Raises DeadlineExceeded when none comes in time, which ends the stream; what the service ended the stream with, also when asked again; Unavailable after
         `close`; ValueError for an array of a wrong shape.

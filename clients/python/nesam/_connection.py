@@ -1,11 +1,13 @@
 """What a connection needs, of either kind of client."""
 
 import json
+import re
 from typing import Dict, List, Optional, Tuple
 
 import grpc
 from google.protobuf.descriptor_pb2 import MethodOptions
 
+from ._errors import Unavailable, from_rpc
 from ._types import Tls
 from .v1 import diagnosis_pb2, measurements_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2
 
@@ -34,10 +36,43 @@ ATTEMPTS_MAX = 5
 _PAUSES = {"initialBackoff": "0.1s", "backoffMultiplier": 2.5, "maxBackoff": "1s"}
 
 
+# Addresses that gRPC takes apart itself.
+_SCHEMES = ("unix:", "unix-abstract:", "vsock:", "dns:", "ipv4:", "ipv6:", "xds:")
+_HOST_AND_PORT = re.compile(r"(\[[^\[\]]+\]|[^:\[\]]+):[0-9]+")
+
+# Longer than anybody waits; gRPC takes an infinite time for one that is over.
+_FOR_EVER_S = 1e9
+
+
+class Connected:
+    """What both clients know of their connection: whether they have closed it."""
+
+    _is_closed = False
+
+    def _refusal(self, error: Exception) -> Exception:
+        """What a call raises that failed: the error by its class, and Unavailable where this client was closed before or meanwhile."""
+        if not isinstance(error, grpc.RpcError):
+            return _client_is_closed() if self._is_closed else error
+        told = from_rpc(error)
+        return _client_is_closed() if self._is_closed and told.code == grpc.StatusCode.CANCELLED else told
+
+
+def _client_is_closed() -> Unavailable:
+    return Unavailable(grpc.StatusCode.UNAVAILABLE, "", "the client is closed")
+
+
+def finite_timeout(timeout_s: Optional[float]) -> Optional[float]:
+    """A timeout as gRPC and the standard library take it, s; None = none, also for an infinite one."""
+    return None if timeout_s is None or timeout_s >= _FOR_EVER_S else timeout_s
+
+
 def arguments(address: str, tls: Optional[Tls]) -> Tuple[Options, Optional[grpc.ChannelCredentials]]:
-    """Options and credentials of a channel; None = no TLS. ValueError for an address as a browser has it, which gRPC takes for the name of a host."""
+    """Options and credentials of a channel; None = no TLS. ValueError for an address as a browser has it, which gRPC takes for the name of a host, and for one
+    without a port, for which gRPC takes that of https."""
     if address.startswith(("http://", "https://")):
         raise ValueError(f"the address is {address}, expected host:port without http; whether TLS is used says `tls`")
+    if not address.startswith(_SCHEMES) and not _HOST_AND_PORT.fullmatch(address):
+        raise ValueError(f"the address is {address!r}, expected host:port, for example 127.0.0.1:50051 or [::1]:50051; the port is missing")
     options: Options = [("grpc.max_receive_message_length", REPLY_BYTES_MAX), ("grpc.per_rpc_retry_buffer_size", _KEPT_BYTES_MAX), *_PATIENCE]
     if tls is None:
         return options, None

@@ -6,7 +6,7 @@ import time
 from . import _calls as calls
 from . import _types as t
 from ._errors import NesamError, Unavailable
-from ._kept import BROKEN, KeepingStream
+from ._kept import KeepingStream
 
 
 class DurableStream(KeepingStream):
@@ -29,7 +29,7 @@ class DurableStream(KeepingStream):
         Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, another session, or numbers
         that some measurements have and some have not; such a one is not kept.
         """
-        self._kept.put(measurement)
+        self._keep(measurement)
         return self._deliver()
 
     def flush(self, timeout_s: float = 10.0) -> None:
@@ -68,8 +68,7 @@ class DurableStream(KeepingStream):
                 return self._attempt(end)
             except NesamError as error:
                 self.close()
-                if error.code not in BROKEN:
-                    raise
+                self._failed(error)
                 left_s = until - time.monotonic()
                 if left_s <= 0.0:
                     raise Unavailable(error.code, error.field, error.message, error.retry_after_s) from error

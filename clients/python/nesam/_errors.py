@@ -1,6 +1,6 @@
 """Errors: one class for each kind of refusal."""
 
-from typing import Any, Dict, Optional, Union, cast
+from typing import Any, Dict, Optional, Tuple, Union, cast
 
 import grpc
 from google.protobuf.message import DecodeError
@@ -19,6 +19,10 @@ class NesamError(Exception):
         self.message = message
         self.retry_after_s = retry_after_s
 
+    def __reduce__(self) -> Tuple[Any, ...]:
+        """By its arguments: it travels between processes, as out of a pool of workers."""
+        return type(self), (self.code, self.field, self.message, self.retry_after_s)
+
 
 class InvalidArgument(NesamError):
     """A value is not acceptable; `field` says which."""
@@ -33,7 +37,7 @@ class AlreadyExists(NesamError):
 
 
 class FailedPrecondition(NesamError):
-    """The session cannot answer yet, for example because it has no measurement."""
+    """The session cannot answer as it is: it has no measurement yet, or none that is new enough for `start_stamp_ns`."""
 
 
 class Overloaded(NesamError):
@@ -45,7 +49,7 @@ class DeadlineExceeded(NesamError):
 
 
 class Unavailable(NesamError):
-    """The service cannot be reached or is shutting down."""
+    """The service cannot be reached or is shutting down, or the client is closed."""
 
 
 _CLASSES = {

@@ -8,15 +8,15 @@ import numpy as np
 from .v1 import prediction_pb2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Extras:
     """What to compute beyond the states; what is not asked for costs nothing.
 
-    jacobians: derivatives of every state in start, commands and soil correction; at most 8 samples. covariance: of every state; at most 64 samples.
+    jacobians: derivatives of every state in start, commands and soil correction, with the terrain held as the rollout met it; at most 8 samples. covariance: of every state; at most 64 samples.
     start_covariance: (12, 12) of the start in the units of a state squared, default that of a measured state as the bundle knows it. risk: wheel loads and
     slips, load transfer, traction reserve. soil_deltas: (soils, 6) what-if corrections in the order k_phi k_c n c phi k_shear, added to the session's in its
     coordinates; `Prediction.states` then is (soils, samples, steps, channels). soil_sigma_points: thirteen such groups for the sigma points of what the session
-    knows of the soil: the estimate first, then twelve with equal weights. exact_terrain: encodes the terrain at every pose instead of interpolating on the pose
+    knows of the soil: the estimate first, then twelve with equal weights, +1, -1, +2, -2, ... of the columns of the Cholesky factor of its covariance. exact_terrain: encodes the terrain at every pose instead of interpolating on the pose
     grid; at most 16 samples. interpolation_deviation: how far that moves the first candidate; not together with exact_terrain. What-if soils do not go together
     with Jacobians, covariance and exact terrain.
     """
@@ -49,7 +49,7 @@ class Extras:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ExtraOutputs:
     """What was computed beyond the states, float32; None where it was not asked for.
 

@@ -43,15 +43,15 @@ class KinematicFallback:
         for sample, step in np.argwhere(~self._admits(controls).all(axis=2))[:1]:
             place, command = f"{name}[{sample}, {step}]", controls[sample, step]
             if not np.isfinite(command).all():
-                raise _invalid(place, "holds a number that is not finite")
+                raise invalid(place, "holds a number that is not finite")
             self._check_range(place, command)
         for i, (stamp_ns, command) in enumerate(sent):
             if i > 0 and stamp_ns <= sent[i - 1][0]:
                 reason = f"is {stamp_ns}, not after the {sent[i - 1][0]} before it; give the commands by ascending stamp"
-                raise _invalid(f"sent[{i}].stamp_ns", reason)
+                raise invalid(f"sent[{i}].stamp_ns", reason)
             for entry, value in zip(_ENTRIES, command):
                 if not np.isfinite(value):
-                    raise _invalid(f"sent[{i}].command.{entry}", f"is {value}, a finite number is needed")
+                    raise invalid(f"sent[{i}].command.{entry}", f"is {value}, a finite number is needed")
             self._check_range(f"sent[{i}].command", command)
 
     def yaw_rate_rad_s(self, speed_m_s: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -120,20 +120,12 @@ class KinematicFallback:
     def _check_range(self, place: str, command: Sequence[float]) -> None:
         for entry, value, (low, high), admitted in zip(_ENTRIES, command, self._range(), self._admits(np.asarray(command, dtype=np.float32))):
             if not admitted:
-                raise _invalid(f"{place}.{entry}", f"is {value:g}, the card of {self.vehicle.name} admits {low:g} to {high:g}")
+                raise invalid(f"{place}.{entry}", f"is {value:g}, the card of {self.vehicle.name} admits {low:g} to {high:g}")
 
 
 _ENTRIES = ("speed_m_s", "second")
-_STATE_FIELDS = [f"{part}.{axis}" for part in ("position_m", "attitude_rad", "velocity_m_s", "angular_velocity_rad_s") for axis in "xyz"]
 
 
-def finite_state(state: np.ndarray, name: str) -> np.ndarray:
-    """A state (12,) as it is given. Raises InvalidArgument naming the first number that is not finite, as the service does."""
-    for field, value in zip(_STATE_FIELDS, state):
-        if not np.isfinite(value):
-            raise _invalid(f"{name}.{field}", f"is {value}, allowed is a finite number")
-    return state
-
-
-def _invalid(field: str, reason: str) -> InvalidArgument:
+def invalid(field: str, reason: str) -> InvalidArgument:
+    """A refusal as that of the service."""
     return InvalidArgument(grpc.StatusCode.INVALID_ARGUMENT, field, f"`{field}`: {reason}")

@@ -146,12 +146,26 @@ class KeepingStream:
         self._reconnect_s = reconnect_s
         self._pause_s = pause_s
         self._kept = Kept(session_id, pending_max)
+        self._newest: Any = None
         self._stream: Any = None
 
     @property
     def pending(self) -> List[t.Measurement]:
         """Measurements that are not known to be durable, oldest first."""
         return self._kept.pending
+
+    def _keep(self, measurement: t.Measurement) -> None:
+        """Keeps one more. Raises what `Kept.put` raises."""
+        self._kept.put(measurement)
+        self._newest = self._client._known_states.report(measurement)
+
+    def _failed(self, error: NesamError) -> None:
+        """Notes that a connection broke: where the vehicle was is known by the newest measurement all the same. Raises the error again where it is a refusal, or
+        the client is closed."""
+        if error.code not in BROKEN or self._client._is_closed:
+            raise error
+        if self._newest is not None:
+            self._client._known_states.unheard(self._newest)
 
     def _until_again_s(self, error: NesamError) -> float:
         """Pause before the next connection: what the service asks for, else `pause_s`; never none at all."""

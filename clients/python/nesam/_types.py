@@ -1,4 +1,4 @@
-"""What goes in and what comes out."""
+"""What goes in and what comes out. What holds arrays is equal to itself alone: whether arrays are equal is no yes or no."""
 
 import enum
 from dataclasses import dataclass, field
@@ -66,7 +66,7 @@ class Provenance:
     bundle_hash: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Soil:
     """What a session knows of the soil: a correction of the prior in the order k_phi k_c n c phi k_shear.
 
@@ -81,7 +81,7 @@ class Soil:
     learned: np.ndarray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SoilEstimate:
     """What a session knows of the soil after a change. soil_epoch counts the changes, 0 = none yet: updates, and beginnings anew from the prior (effects were
     applied or reverted) or from the fleet's soil. stamp_ns: last measurement that went in, of the vehicle's clock, None where none has since the beginning.
@@ -97,7 +97,7 @@ class SoilEstimate:
     bundle_hash: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SoilCell:
     """Evidence of the fleet on one cell of ground that looks alike, without any prior, in the coordinates of `Soil`.
 
@@ -114,7 +114,7 @@ class SoilCell:
     age_s: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class FleetSoil:
     """What the fleet has learned of the ground: edge of a cell in m, and the cells by map, colour and place."""
 
@@ -197,7 +197,7 @@ class DiagnosisReport:
 DiagnosisEvent = Union[DiagnosisStarted, DiagnosisProgress, DiagnosisReport]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ForecastCheck:
     """Predictions of a session held against what was measured in the end, one every 3.2 s.
 
@@ -213,7 +213,7 @@ class ForecastCheck:
     height_scale: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Session:
     """A session as the service holds it. `state` is (12,), `command` is (2,); both are None before the first measurement.
 
@@ -262,7 +262,7 @@ class Tls:
         return cls(Path(authority).read_bytes(), given[0], given[1], server_name)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """What a vehicle measures at one instant.
 
@@ -284,7 +284,7 @@ class Measurement:
     run: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Answer:
     """The service's answer to one measurement.
 
@@ -315,7 +315,7 @@ class Answer:
     bundle_hash: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class WorldMap:
     """A map to upload; row 0 is the southernmost.
 
@@ -350,7 +350,7 @@ class MapDescription:
     frame: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prediction:
     """Predicted trajectories.
 
