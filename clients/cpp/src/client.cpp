@@ -21,7 +21,7 @@ Result<void> Client::connect(std::chrono::nanoseconds timeout) {
 Result<Session> Client::open(const OpenOptions& options, Timeout timeout) {
   auto reply = core_->call(*core_->sessions, &v1::Sessions::Stub::Open, detail::to_message(options), timeout);
   if (!reply) return reply.error();
-  return Session(std::make_unique<detail::SessionImpl>(core_, detail::from_message(*reply)));
+  return Session(std::make_unique<detail::SessionImpl>(core_, core_->opened(*reply)));
 }
 
 Result<Session> Client::attach(const std::string& session_id, Timeout timeout) {
@@ -50,7 +50,7 @@ Result<Session> Client::import_session(const std::string& image, const std::stri
   request.set_session_id(session_id);
   auto reply = core_->call(*core_->sessions, &v1::Sessions::Stub::Import, request, timeout);
   if (!reply) return reply.error();
-  return Session(std::make_unique<detail::SessionImpl>(core_, detail::from_message(*reply)));
+  return Session(std::make_unique<detail::SessionImpl>(core_, core_->opened(*reply)));
 }
 
 Result<FleetSoilMap> Client::fleet_soil(const std::string& map_id, Timeout timeout) const {

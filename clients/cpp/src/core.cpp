@@ -70,6 +70,11 @@ Result<SessionStatus> Core::session(const std::string& id, Timeout timeout) cons
   return from_message(*reply);
 }
 
+SessionStatus Core::opened(const v1::Session& session) const {
+  known_states.opened(session.session_id());
+  return from_message(session);
+}
+
 Result<void> Core::close(const std::string& id, Timeout timeout) const {
   v1::CloseSessionRequest request;
   request.set_session_id(id);
@@ -90,9 +95,10 @@ Result<std::string> Core::export_session(const std::string& id, Timeout timeout)
 Result<Prediction> Core::predict(const std::string& id, const PredictRequest& request, Timeout timeout) const {
   auto message = to_message(id, request);
   if (!message) return message.error();
-  const std::uint64_t asked = known_states.ask();
+  const Moment asked = known_states.ask();
   auto reply = call(*prediction, &v1::Prediction::Stub::Predict, *message, timeout);
   if (!reply) {
+    known_states.refused(id, reply.error());
     if (auto fallback = fallback_prediction(request, known_states.of(id), reply.error())) return *std::move(fallback);
     return reply.error();
   }

@@ -67,6 +67,8 @@ class Core {
   }
 
   Result<SessionStatus> session(const std::string& id, Timeout timeout) const;
+  /// What the reply to an opening says, of a session that is another one than any of the same name before.
+  SessionStatus opened(const v1::Session& session) const;
   Result<void> close(const std::string& id, Timeout timeout) const;
   Result<Prediction> predict(const std::string& id, const PredictRequest& request, Timeout timeout) const;
   Result<std::string> export_session(const std::string& id, Timeout timeout) const;

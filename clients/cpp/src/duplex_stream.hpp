@@ -21,7 +21,8 @@ namespace nesam::detail {
 /// it, then reads the final status, so that nothing is called on the stream after that.
 ///
 /// `Kind` says what travels: the messages `Request` and `Reply`, what is kept of a request until its answer comes (`Sent`), the `Answer`, the most of them that
-/// may be outstanding or uncollected (`pending_max`), how the stream is opened (`open`) and how a reply is read (`answer`).
+/// may be outstanding or uncollected (`pending_max`), how the stream is opened (`open`), how a reply is read (`answer`) and what becomes of a request that gets none, or
+/// none in time (`unanswered`).
 template <class Kind>
 class DuplexStream {
  public:
@@ -51,6 +52,10 @@ class DuplexStream {
   /// Hands a reply over as the answer to the oldest request. False: there is none.
   bool take(const Reply& reply);
   void end(std::optional<Error> error) noexcept;
+  /// Tells of what has no answer; under the lock.
+  void forgo() const {
+    for (const Sent& sent : unanswered_) Kind::unanswered(*core, session_id, sent);
+  }
   /// What to say after the end. Only when `ended_`.
   Error ending() const;
 
@@ -119,7 +124,11 @@ template <class Kind>
 auto DuplexStream<Kind>::receive(std::chrono::nanoseconds timeout) -> Result<Answer> {
   std::unique_lock lock(mutex_);
   const bool ready = changed_.wait_for(lock, bounded(timeout), [this] { return !inbox_.empty() || ended_; });
-  if (!ready) return Error(Code::deadline_exceeded, "", "no answer came in time");
+  if (!ready) {
+    // Who only looks whether there is an answer has not waited for it.
+    if (timeout > std::chrono::nanoseconds(0)) forgo();
+    return Error(Code::deadline_exceeded, "", "no answer came in time");
+  }
   if (inbox_.empty()) return ending();
   Answer answer = std::move(inbox_.front());
   inbox_.pop_front();
@@ -199,7 +208,7 @@ bool DuplexStream<Kind>::take(const Reply& reply) {
     sent = &unanswered_.front();
   }
   // Only this thread takes requests off, and others that are added leave this one where it is: no lock is held while a large reply is unpacked.
-  Answer answer = Kind::answer(*core, reply, *sent);
+  Answer answer = Kind::answer(*core, session_id, reply, *sent);
   {
     const std::lock_guard lock(mutex_);
     inbox_.push_back(std::move(answer));
@@ -215,6 +224,7 @@ void DuplexStream<Kind>::end(std::optional<Error> error) noexcept {
     const std::lock_guard lock(mutex_);
     // An end without a failure that nobody asked for is one all the same: another stream can be opened, as after any break.
     const bool early = !finishing_ || !unanswered_.empty();
+    forgo();
     if (!error && early) error = Error(Code::unavailable, "", "the server ended the stream before it was finished and everything answered");
     failure_ = std::move(error);
     ended_ = true;

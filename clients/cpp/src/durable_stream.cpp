@@ -66,6 +66,7 @@ class DurableStreamImpl {
     // Which run counts is the matter of this object.
     waiting_.back().run = 0;
     number(waiting_.back(), session_id_);
+    newest_.emplace(waiting_.back(), core_->known_states.ask());
     return deliver(SteadyTime::max());
   }
 
@@ -130,6 +131,8 @@ class DurableStreamImpl {
       if (answer) return answer;
       close();
       if (!broken(answer.error())) return answer;
+      // Where the vehicle was is known by the newest measurement, though older ones go first.
+      if (newest_) core_->known_states.unheard(newest_->second, session_id_, newest_->first);
       if (over(until)) {
         if (answer.error().code() == Code::unavailable) return answer;
         return Error(Code::unavailable, answer.error().field(), answer.error().what());
@@ -200,6 +203,8 @@ class DurableStreamImpl {
   std::deque<Measurement> waiting_;
   /// Who counts the places.
   std::uint64_t run_ = 0;
+  /// The measurement that was given last, and when.
+  std::optional<std::pair<Measurement, Moment>> newest_;
   /// Whether measurements come with numbers of their own; absent before the first.
   std::optional<bool> numbered_;
 };

@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "fallback_prediction.hpp"
+#include "refused.hpp"
 
 namespace nesam {
 
@@ -89,7 +90,7 @@ bool admitted(const VehicleCard& card, float speed_m_s, float second) noexcept {
   return within(speed_m_s, card.speed_min_m_s, card.speed_max_m_s) && within(second, card.second_min, card.second_max);
 }
 
-/// Whether the service would take all numbers of a request.
+/// Whether the service would take all commands of a request.
 bool admitted(const PredictRequest& request, const View3<const float>& controls) noexcept {
   const VehicleCard& card = request.fallback->vehicle;
   for (std::size_t n = 0; n < controls.samples(); ++n) {
@@ -100,18 +101,13 @@ bool admitted(const PredictRequest& request, const View3<const float>& controls)
   for (const SentCommand& sent : request.sent) {
     if (!admitted(card, static_cast<float>(sent.command.speed_m_s), static_cast<float>(sent.command.second))) return false;
   }
-  if (!request.start) return true;
-  for (const auto* part : {&request.start->position_m, &request.start->attitude_rad, &request.start->velocity_m_s, &request.start->angular_velocity_rad_s}) {
-    for (const double value : *part) {
-      if (!std::isfinite(value)) return false;
-    }
-  }
   return true;
 }
 
-/// What a fallback may answer instead of.
+/// Whether a fallback may answer instead: the service is late, overloaded or away, or what it knows of the session is too old to be rolled forward.
 bool late(const Error& error) noexcept {
-  return error.retryable() || error.code() == Code::deadline_exceeded;
+  const bool knows_nothing_new = error.code() == Code::failed_precondition && error.field() == "start_stamp_ns";
+  return error.retryable() || error.code() == Code::deadline_exceeded || knows_nothing_new;
 }
 
 }  // namespace
@@ -141,7 +137,7 @@ std::vector<float> KinematicFallback::rollout(const VehicleState& start, View3<c
 namespace detail {
 
 std::optional<Prediction> fallback_prediction(const PredictRequest& request, const std::optional<KnownState>& known, const Error& reason) {
-  if (!request.fallback || !late(reason)) return std::nullopt;
+  if (!request.fallback || !late(reason) || !takes(request)) return std::nullopt;
   const std::optional<Start> start = start_of(request, known);
   if (!start) return std::nullopt;
   View3<const float> controls = request.controls;

@@ -1,17 +1,29 @@
 #pragma once
 
 #include <algorithm>
-#include <atomic>
+#include <chrono>
+#include <cmath>
 #include <cstdint>
 #include <mutex>
 #include <optional>
 #include <string>
 #include <unordered_map>
 
+#include <nesam/error.hpp>
 #include <nesam/measurement.hpp>
 #include <nesam/prediction.hpp>
 
 namespace nesam::detail {
+
+/// Whether all numbers of a state are finite.
+inline bool finite(const VehicleState& state) noexcept {
+  for (const auto* part : {&state.position_m, &state.attitude_rad, &state.velocity_m_s, &state.angular_velocity_rad_s}) {
+    for (const double value : *part) {
+      if (!std::isfinite(value)) return false;
+    }
+  }
+  return true;
+}
 
 /// A state of a session and its instant, ns of the vehicle's clock; absent for a start that was given.
 struct KnownState {
@@ -19,33 +31,73 @@ struct KnownState {
   std::optional<std::int64_t> stamp_ns;
 };
 
-/// The newest state that a client knows of each session; a fallback without a given start begins there. Safe from several threads at once.
+/// When something was sent: its number among all that is, and the client's clock.
+struct Moment {
+  std::uint64_t number = 0;
+  std::chrono::steady_clock::time_point at;
+};
+
+/// The newest state that a client knows of each session; a fallback without a given start begins there, unless it is too old. Safe from several threads at once.
 ///
 /// What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only where its
-/// stamp is larger and the vehicle's clock has not begun anew since.
+/// stamp is larger and neither session nor vehicle's clock has begun anew since. A measurement that is no step of the session yet stays until a state with a larger
+/// stamp comes, or it is too old to begin at.
 class KnownStates {
  public:
-  /// Number of what is sent now.
-  std::uint64_t ask() { return ++asked_; }
+  using Time = std::chrono::steady_clock::time_point;
+  /// Oldest state that a fallback begins at, by the client's clock: as far as it rolls one forward.
+  static constexpr std::chrono::milliseconds age_max{3200};
 
-  /// Notes a measured state that is now the newest of its session; `asked` is the number of the measurement.
-  void measured(std::uint64_t asked, const Measurement& measurement, const MeasurementAnswer& answer) {
-    // One that is buffered is no step of the history yet.
-    if (!answer.accepted() || answer.is<Buffered>() || answer.reordered) return;
-    note(answer.session_id, {measurement.state, measurement.stamp_ns}, asked, answer.is<ClockJump>() || answer.is<Restarted>());
-  }
-
-  /// Notes where a prediction of the session began that was not given its start; `asked` is the number of its question.
-  void predicted(std::uint64_t asked, const std::string& session_id, const PredictRequest& request, const Prediction& prediction) {
-    if (!request.start) note(session_id, {prediction.start, prediction.start_stamp_ns}, asked, false);
-  }
-
-  /// The newest known state of a session.
-  std::optional<KnownState> of(const std::string& session_id) const {
+  /// Number and time of what is sent now.
+  Moment ask() {
     const std::lock_guard lock(mutex_);
-    const auto known = states_.find(session_id);
-    if (known == states_.end()) return std::nullopt;
-    return known->second.known;
+    return {++asked_, std::chrono::steady_clock::now()};
+  }
+
+  /// Notes a measured state that is now the newest of its session; `sent` is when the measurement was.
+  void measured(const Moment& sent, const std::string& session_id, const Measurement& measurement, const MeasurementAnswer& answer) {
+    if (const auto* rejected = answer.is<Rejected>()) {
+      const bool no_room = rejected->code == Code::resource_exhausted || rejected->code == Code::unavailable;
+      if (no_room) unheard(sent, session_id, measurement);
+      if (rejected->code == Code::not_found && rejected->field == "session_id") forget(session_id);
+      return;
+    }
+    if (!answer.accepted() || answer.reordered) return;
+    const bool begins_anew = answer.is<ClockJump>() || answer.is<Restarted>();
+    note(session_id, {measurement.state, measurement.stamp_ns}, sent, begins_anew, answer.is<Buffered>());
+  }
+
+  /// Notes a measured state that got no answer: the vehicle was there all the same. The same one sent again, or what was kept meanwhile, is not where it is now.
+  void unheard(const Moment& sent, const std::string& session_id, const Measurement& measurement) {
+    const std::lock_guard lock(mutex_);
+    const auto held = states_.find(session_id);
+    const KnownState known{measurement.state, measurement.stamp_ns};
+    if (held == states_.end() || held->second.is_before(known)) note_locked(session_id, known, sent, false, true);
+  }
+
+  /// Notes where a prediction of the session began that was not given its start; `asked` is when its question was.
+  void predicted(Moment asked, const std::string& session_id, const PredictRequest& request, const Prediction& prediction) {
+    if (request.start) return;
+    // Who asks from an instant asks from now.
+    const double age_s = request.start_stamp_ns ? 0.0 : prediction.measurement_age_s.value_or(0.0);
+    if (!(age_s >= 0.0 && age_s < 1e6)) return;
+    asked.at -= std::chrono::duration_cast<Time::duration>(std::chrono::duration<double>(age_s));
+    note(session_id, {prediction.start, prediction.start_stamp_ns}, asked, false, false);
+  }
+
+  /// The newest known state of a session, where it is not too old to begin at.
+  std::optional<KnownState> of(const std::string& session_id, Time now = std::chrono::steady_clock::now()) const {
+    const std::lock_guard lock(mutex_);
+    const auto held = states_.find(session_id);
+    if (held == states_.end() || now - held->second.at > age_max) return std::nullopt;
+    return held->second.known;
+  }
+
+  /// Forgets what was known under the name of a session that was opened now, also what comes late.
+  void opened(const std::string& session_id) {
+    const Moment now = ask();
+    const std::lock_guard lock(mutex_);
+    states_[session_id] = {std::nullopt, now.number, now.number, now.at, false};
   }
 
   /// Forgets a closed session.
@@ -54,27 +106,46 @@ class KnownStates {
     states_.erase(session_id);
   }
 
- private:
-  struct Newest {
-    KnownState known;
-    /// Number of what it answered, or of what was answered before.
-    std::uint64_t asked = 0;
-    /// Number of the measurement with which the vehicle's clock began anew.
-    std::uint64_t clock = 0;
-  };
-
-  void note(const std::string& session_id, const KnownState& known, std::uint64_t asked, bool begins_anew) {
-    const std::lock_guard lock(mutex_);
-    const auto [held, is_new] = states_.try_emplace(session_id);
-    Newest& newest = held->second;
-    if (is_new || begins_anew) {
-      newest = {known, asked, begins_anew ? asked : 0};
-    } else if (asked > newest.asked || (asked > newest.clock && known.stamp_ns && newest.known.stamp_ns && *known.stamp_ns > *newest.known.stamp_ns)) {
-      newest = {known, std::max(asked, newest.asked), newest.clock};
-    }
+  /// Forgets a session where the service says that it is not open.
+  void refused(const std::string& session_id, const Error& error) {
+    if (error.code() == Code::not_found && error.field() == "session_id") forget(session_id);
   }
 
-  std::atomic<std::uint64_t> asked_ = 0;
+ private:
+  struct Newest {
+    /// Absent where the session was opened and nothing is known of it yet.
+    std::optional<KnownState> known;
+    /// Number of what it answered, or of what was answered before.
+    std::uint64_t asked = 0;
+    /// Number of that with which the session or the vehicle's clock began anew.
+    std::uint64_t clock = 0;
+    /// When it was so.
+    Time at;
+    /// Whether it is no step of the session yet, as far as the client knows: it waits for the grid, or got no answer.
+    bool ahead = false;
+
+    bool is_before(const KnownState& other) const { return !known || (other.stamp_ns && known->stamp_ns && *other.stamp_ns > *known->stamp_ns); }
+    /// Whether a state of the same clock is newer.
+    bool is_replaced_by(const KnownState& other, const Moment& sent) const {
+      const bool stays = ahead && sent.at - at <= age_max;
+      return is_before(other) || (!stays && sent.number > asked);
+    }
+  };
+
+  void note(const std::string& session_id, const KnownState& known, const Moment& sent, bool begins_anew, bool ahead) {
+    const std::lock_guard lock(mutex_);
+    note_locked(session_id, known, sent, begins_anew, ahead);
+  }
+
+  void note_locked(const std::string& session_id, const KnownState& known, const Moment& sent, bool begins_anew, bool ahead) {
+    if (!finite(known.state)) return;
+    const auto [held, is_new] = states_.try_emplace(session_id);
+    Newest& newest = held->second;
+    if (!is_new && (sent.number <= newest.clock || !(begins_anew || newest.is_replaced_by(known, sent)))) return;
+    newest = {known, std::max(sent.number, newest.asked), begins_anew ? sent.number : newest.clock, sent.at, ahead};
+  }
+
+  std::uint64_t asked_ = 0;
   mutable std::mutex mutex_;
   std::unordered_map<std::string, Newest> states_;
 };

@@ -1,6 +1,6 @@
 #include <nesam/measurement_stream.hpp>
 
-#include <cstdint>
+#include <string>
 #include <utility>
 
 #include "convert.hpp"
@@ -9,10 +9,10 @@
 namespace nesam {
 namespace detail {
 
-/// A measurement and its number among what the client has sent.
+/// A measurement and when it was sent.
 struct Reported {
   Measurement measurement;
-  std::uint64_t asked;
+  Moment sent;
 };
 
 struct MeasurementExchange {
@@ -23,10 +23,13 @@ struct MeasurementExchange {
   static constexpr std::size_t pending_max = MeasurementStream::pending_max;
 
   static auto open(Core& core, grpc::ClientContext& context) { return core.measurements->Stream(&context); }
-  static Answer answer(const Core& core, const Reply& reply, const Sent& sent) {
+  static Answer answer(const Core& core, const std::string& session_id, const Reply& reply, const Sent& sent) {
     Answer answer = from_message(reply);
-    core.known_states.measured(sent.asked, sent.measurement, answer);
+    core.known_states.measured(sent.sent, session_id, sent.measurement, answer);
     return answer;
+  }
+  static void unanswered(const Core& core, const std::string& session_id, const Sent& sent) {
+    core.known_states.unheard(sent.sent, session_id, sent.measurement);
   }
 };
 
@@ -35,7 +38,10 @@ class MeasurementStreamImpl : public DuplexStream<MeasurementExchange> {
   using DuplexStream::DuplexStream;
 
   Result<void> send(const Measurement& measurement) {
-    return DuplexStream::send(to_message(session_id, measurement), {measurement, core->known_states.ask()});
+    const Reported reported{measurement, core->known_states.ask()};
+    auto queued = DuplexStream::send(to_message(session_id, measurement), reported);
+    if (!queued) MeasurementExchange::unanswered(*core, session_id, reported);
+    return queued;
   }
 };
 

@@ -1,5 +1,6 @@
 #include <nesam/prediction_stream.hpp>
 
+#include <string>
 #include <utility>
 
 #include "convert_prediction.hpp"
@@ -16,7 +17,8 @@ struct PredictionExchange {
   static constexpr std::size_t pending_max = PredictionStream::pending_max;
 
   static auto open(Core& core, grpc::ClientContext& context) { return core.prediction->PredictStream(&context); }
-  static Answer answer(const Core&, const Reply& reply, const Sent& asked) { return from_message(reply, asked); }
+  static Answer answer(const Core&, const std::string&, const Reply& reply, const Sent& asked) { return from_message(reply, asked); }
+  static void unanswered(const Core&, const std::string&, const Sent&) {}
 };
 
 class PredictionStreamImpl : public DuplexStream<PredictionExchange> {

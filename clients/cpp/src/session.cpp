@@ -94,7 +94,7 @@ Result<Session> Session::fork(const std::string& new_id, Timeout timeout) const 
   request.set_new_session_id(new_id);
   auto reply = impl_->core->call(*impl_->core->sessions, &v1::Sessions::Stub::Fork, request, timeout);
   if (!reply) return reply.error();
-  return Session(std::make_unique<detail::SessionImpl>(impl_->core, detail::from_message(*reply)));
+  return Session(std::make_unique<detail::SessionImpl>(impl_->core, impl_->core->opened(*reply)));
 }
 
 Result<std::string> Session::export_image(Timeout timeout) const { return impl_->core->export_session(impl_->id, timeout); }

@@ -120,29 +120,30 @@ void service_streams_outlive_a_restart(const Place& place) {
   check_error(stream.send(cruise(2, card)), nesam::Code::unavailable, "", "nobody is there");
   check(std::chrono::steady_clock::now() - begin < 20s, "it gives up in time");
   check(stream.pending().size() == 1, "and keeps the measurement");
-  // A prediction that was asked for with a fallback comes all the same, from the newest measurement that was answered, and says so.
+  check_error(stream.send(cruise(3, card)), nesam::Code::unavailable, "", "nobody is there yet");
+  // A prediction that was asked for with a fallback comes all the same, from the newest measurement, though that was sent in vain, and says so.
   const auto controls = varied_controls(2, 4, card);
   nesam::PredictRequest request = request_of(controls, 2, 4);
   check_error(session.predict(request, 20s), nesam::Code::unavailable, "", "a prediction without one");
   request.fallback = nesam::KinematicFallback{card};
   const auto fallback = session.predict(request, 20s);
   check(fallback.ok() && fallback->computed_by == nesam::ComputedBy::kinematic_fallback && fallback->fallback_reason &&
-            fallback->fallback_reason->code() == nesam::Code::unavailable && fallback->start.position_m == cruise(1, card).state.position_m,
+            fallback->fallback_reason->code() == nesam::Code::unavailable && fallback->start.position_m == cruise(3, card).state.position_m,
         fallback.ok() ? "the fallback is marked" : fallback.error().what());
   server.start();
   check_ok(client.connect(30s), "the server is there again");
   check_ok(stream.flush(30s), "flush sends it");
-  const auto answer = session.send(cruise(3, card));
-  check(answer.ok() && answer->accepted() && answer->place == 4, answer.ok() ? "place 4" : answer.error().what());
+  const auto answer = session.send(cruise(4, card));
+  check(answer.ok() && answer->accepted() && answer->place == 5, answer.ok() ? "place 5" : answer.error().what());
 
   // Refused measurements are answered and not kept; a closed stream begins again; a session that is closed is not waited for.
-  nesam::Measurement bad = cruise(4, card);
+  nesam::Measurement bad = cruise(5, card);
   bad.state.velocity_m_s[0] = nan_d;
   const auto refused = stream.send(bad);
   check(refused.ok() && refused->is<nesam::NotFinite>() && stream.pending().empty(), "not finite: not kept");
   stream.close();
-  const auto again = stream.send(cruise(4, card));
-  check(again.ok() && again->accepted() && again->place == 5 && stream.pending().size() == 1, "after close");
+  const auto again = stream.send(cruise(5, card));
+  check(again.ok() && again->accepted() && again->place == 6 && stream.pending().size() == 1, "after close");
   check_ok(session.close(), "close");
   check_error(stream.flush(), nesam::Code::not_found, "session_id", "a closed session");
 }

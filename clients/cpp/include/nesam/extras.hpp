@@ -26,7 +26,7 @@ struct Extras {
   /// none. Each makes a group of N trajectories: see `Prediction::row`. Only read during the call.
   Span<const float> soil_deltas;
   /// Instead: thirteen groups for the sigma points of what the session knows of the soil. First the estimate, then estimate plus and minus sqrt(6) times each
-  /// column of the lower Cholesky factor of its covariance: mean and covariance over the last twelve, equally weighted, are those of the unscented transform.
+  /// column of the lower Cholesky factor of its covariance in turn (+1, -1, +2, -2, ...): mean and covariance over the last twelve, equally weighted, are those of the unscented transform.
   bool soil_sigma_points = false;
   /// Encodes the terrain at every predicted pose instead of interpolating on the pose grid. At most 16 samples, not together with what-if soils.
   bool exact_terrain = false;

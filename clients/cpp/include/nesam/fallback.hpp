@@ -11,7 +11,8 @@ namespace nesam {
 ///
 /// The commanded speed is reached at once, a bicycle turns with tan(angle) / wheelbase, a skid-steer vehicle with the commanded yaw rate. It knows no terrain, soil
 /// or slip; height, roll and pitch stay those of the start. It answers only where a caller puts it into `PredictRequest::fallback` or
-/// `MotionModelOptions::fallback`, and the prediction says so in `Prediction::computed_by`. What the service would refuse it does not answer: a number that is none, a command beyond the card.
+/// `MotionModelOptions::fallback`, and the prediction says so in `Prediction::computed_by`. What the service would refuse it does not answer: a number that is none, a command beyond the card,
+/// a shape, start or cost beyond the limits.
 struct KinematicFallback {
   /// Vehicle card, as `Session::vehicle` has it.
   VehicleCard vehicle;

@@ -42,7 +42,8 @@ enum class HistoryUse {
   none = 2,      ///< The start stands alone, as for a what-if question at another place.
 };
 
-/// Candidates that the service draws as MPPI does: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the card.
+/// Candidates that the service draws as MPPI does: the first is the nominal sequence, the others are nominal plus Gaussian noise, cut to the range of the card
+/// and to nothing narrower: not to what was trained, nor to limits of a planner or of how fast commands may change.
 struct CandidateDrawing {
   /// Number of candidates N.
   std::uint32_t samples = 0;
@@ -57,7 +58,8 @@ struct CandidateDrawing {
   std::uint64_t seed = 0;
 };
 
-/// Cost of a candidate: the mean over its steps of weighted squares. Infinite for one that overturns, leaves the map or is not finite.
+/// Cost of a candidate: the mean over its steps of weighted squares. Infinite for one that overturns, leaves the map or is not finite; other bits of `Validity`, such as
+/// `validity_speed_untrained`, cost nothing.
 struct PathCost {
   /// Shape (points, 2): the path in the order it is driven, World, m; 2 to 1024 points. Only read during the call.
   Span<const float> path_m;
@@ -91,7 +93,7 @@ struct PredictRequest {
   std::optional<VehicleState> start;
   HistoryUse history_use = HistoryUse::measured;
   /// Instant from which the controls apply, ns of the vehicle's clock; absent = that of the newest measured step. The session is rolled forward to it, rounded to
-  /// the nearest step of 0.1 s: at most half a step before the newest one, and so near after it that the steps rolled forward and K together do not exceed 32.
+  /// the nearest step of 0.1 s, so by up to 50 ms (`Prediction::start_stamp_ns` says to which): at most half a step before the newest one, and so near after it that the steps rolled forward and K together do not exceed 32.
   /// Not together with `start`.
   std::optional<std::int64_t> start_stamp_ns;
   /// Commands that the vehicle was sent, by ascending stamp, at most 256; only with `start_stamp_ns`. Each step that is rolled forward uses the one in effect at
@@ -118,9 +120,10 @@ struct PredictRequest {
   std::optional<PathCost> cost;
   /// What to compute beyond the states.
   Extras extras;
-  /// Answers `Session::predict` when the service is late, overloaded or away, from `start` or the newest state that this client knows, which it rolls forward to
-  /// `start_stamp_ns` by its own kinematics, no further than 32 steps; absent = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the
-  /// nominal sequence alone. Streams leave it unread.
+  /// Answers `Session::predict` when the service is late, overloaded or away, or knows no measurement that is new enough for `start_stamp_ns`, from `start` or the newest
+  /// state that this client knows, which it rolls forward to `start_stamp_ns` by its own kinematics, no further than 32 steps; a state that is older than 3.2 s by the
+  /// clock of this program is none. Absent = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone. Streams leave
+  /// it unread.
   std::optional<KinematicFallback> fallback;
 };
 
