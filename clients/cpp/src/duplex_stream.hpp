@@ -21,8 +21,8 @@ namespace nesam::detail {
 /// it, then reads the final status, so that nothing is called on the stream after that.
 ///
 /// `Kind` says what travels: the messages `Request` and `Reply`, what is kept of a request until its answer comes (`Sent`), the `Answer`, the most of them that
-/// may be outstanding or uncollected (`pending_max`), how the stream is opened (`open`), how a reply is read (`answer`) and what becomes of a request that gets none, or
-/// none in time (`unanswered`).
+/// may be outstanding or uncollected (`pending_max`), how the stream is opened (`open`), how a reply is read (`answer`) and what becomes of a request that gets
+/// none, or none in time (`unanswered`).
 template <class Kind>
 class DuplexStream {
  public:

@@ -58,8 +58,8 @@ struct CandidateDrawing {
   std::uint64_t seed = 0;
 };
 
-/// Cost of a candidate: the mean over its steps of weighted squares. Infinite for one that overturns, leaves the map or is not finite; other bits of `Validity`, such as
-/// `validity_speed_untrained`, cost nothing.
+/// Cost of a candidate: the mean over its steps of weighted squares. Infinite for one that overturns, leaves the map or is not finite; other bits of
+/// `Validity`, such as `validity_speed_untrained`, cost nothing.
 struct PathCost {
   /// Shape (points, 2): the path in the order it is driven, World, m; 2 to 1024 points. Only read during the call.
   Span<const float> path_m;
@@ -92,9 +92,9 @@ struct PredictRequest {
   /// State to start from; absent = the newest measured step.
   std::optional<VehicleState> start;
   HistoryUse history_use = HistoryUse::measured;
-  /// Instant from which the controls apply, ns of the vehicle's clock; absent = that of the newest measured step. The session is rolled forward to it, rounded to
-  /// the nearest step of 0.1 s, so by up to 50 ms (`Prediction::start_stamp_ns` says to which): at most half a step before the newest one, and so near after it that the steps rolled forward and K together do not exceed 32.
-  /// Not together with `start`.
+  /// Instant from which the controls apply, ns of the vehicle's clock; absent = that of the newest measured step. The session is rolled forward to it, rounded
+  /// to the nearest step of 0.1 s, so by up to 50 ms (`Prediction::start_stamp_ns` says to which): at most half a step before the newest one, and so near after
+  /// it that the steps rolled forward and K together do not exceed 32. Not together with `start`.
   std::optional<std::int64_t> start_stamp_ns;
   /// Commands that the vehicle was sent, by ascending stamp, at most 256; only with `start_stamp_ns`. Each step that is rolled forward uses the one in effect at
   /// its middle; before the first of them that is later than the newest step, the command measured with this step. Only read during the call.
@@ -120,10 +120,10 @@ struct PredictRequest {
   std::optional<PathCost> cost;
   /// What to compute beyond the states.
   Extras extras;
-  /// Answers `Session::predict` when the service is late, overloaded or away, or knows no measurement that is new enough for `start_stamp_ns`, from `start` or the newest
-  /// state that this client knows, which it rolls forward to `start_stamp_ns` by its own kinematics, no further than 32 steps; a state that is older than 3.2 s by the
-  /// clock of this program is none. Absent = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone. Streams leave
-  /// it unread.
+  /// Answers `Session::predict` when the service is late, overloaded or away, or knows no measurement that is new enough for `start_stamp_ns`, from `start` or
+  /// the newest state that this client knows, which it rolls forward to `start_stamp_ns` by its own kinematics, no further than 32 steps; a state that is older
+  /// than 3.2 s by the clock of this program is none. Absent = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the nominal
+  /// sequence alone. Streams leave it unread.
   std::optional<KinematicFallback> fallback;
 };
 
