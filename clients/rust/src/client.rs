@@ -10,7 +10,7 @@ use tonic::service::interceptor::InterceptedService;
 use tonic::transport::{Channel, Endpoint};
 
 use crate::error::ClientError;
-use crate::known_states::{KnownStates, Reported};
+use crate::known_states::{KnownStates, Waiting};
 use crate::map::MapLayers;
 use crate::measure::{MeasurementStream, WAITING_MAX};
 use crate::prediction::{Candidates, Prediction};
@@ -134,7 +134,9 @@ impl Client {
     /// # Errors
     /// `ClientError::Refused` with the service's reason, as all methods below.
     pub async fn open_session(&mut self, request: v1::OpenSessionRequest) -> Result<v1::Session, ClientError> {
-        Ok(self.sessions().open(request).await?.into_inner())
+        let session = self.sessions().open(request).await?.into_inner();
+        self.known.opened(&session.session_id);
+        Ok(session)
     }
 
     /// Reads a session.
@@ -150,7 +152,9 @@ impl Client {
     /// Copies a session under another name.
     pub async fn fork_session(&mut self, session: &str, copy: &str) -> Result<v1::Session, ClientError> {
         let request = v1::ForkSessionRequest { session_id: session.into(), new_session_id: copy.into() };
-        Ok(self.sessions().fork(request).await?.into_inner())
+        let session = self.sessions().fork(request).await?.into_inner();
+        self.known.opened(&session.session_id);
+        Ok(session)
     }
 
     /// Everything that a session remembers, for [`Client::import_session`] here or elsewhere.
@@ -162,7 +166,9 @@ impl Client {
     /// Opens a session from an export; an empty name keeps that of the exported one.
     pub async fn import_session(&mut self, image: Vec<u8>, session: &str) -> Result<v1::Session, ClientError> {
         let request = v1::ImportSessionRequest { image: image.into(), session_id: session.into() };
-        Ok(self.sessions().import(request).await?.into_inner())
+        let session = self.sessions().import(request).await?.into_inner();
+        self.known.opened(&session.session_id);
+        Ok(session)
     }
 
     /// Puts physical effects on a session, in place of those that were applied before; `source` says where they come from.
@@ -237,13 +243,12 @@ impl Client {
     /// Sends measurements and collects their answers.
     pub async fn feed(&mut self, measurements: Vec<v1::Measurement>) -> Result<Vec<v1::MeasurementAnswer>, ClientError> {
         let mut client = v1::measurements_client::MeasurementsClient::new(self.routed());
-        let reported: Vec<Reported> = measurements.iter().map(|measurement| self.known.report(measurement)).collect();
+        let mut waiting = Waiting::new(self.known.clone());
+        measurements.iter().for_each(|measurement| waiting.push(measurement));
+        let mut answers = Vec::with_capacity(measurements.len());
         let mut inbound = client.stream(tokio_stream::iter(measurements)).await?.into_inner();
-        let mut answers = Vec::with_capacity(reported.len());
         while let Some(answer) = inbound.message().await? {
-            if let Some(reported) = reported.get(answers.len()) {
-                self.known.measured(reported, &answer);
-            }
+            waiting.answered(&answer);
             answers.push(answer);
         }
         Ok(answers)
@@ -255,11 +260,11 @@ impl Client {
     }
 
     /// Rolls candidates out within a deadline, which also holds while there is no connection. A [`Candidates::fallback`] answers where the service does not in
-    /// time, is overloaded or away, and [`Prediction::computed_by`] says so.
+    /// time, is overloaded or away, or knows no measurement that is new enough for `start_stamp_ns`, and [`Prediction::computed_by`] says so.
     ///
     /// # Errors
     /// `ClientError::Refused` with the service's reason. A fallback leaves it where neither a start is given nor a state of the session is known, or
-    /// the known one is too old.
+    /// the known one is too old: more than 3.2 s by the clock of this program, or more than 32 steps before `start_stamp_ns`.
     pub async fn predict_within(&mut self, candidates: Candidates, deadline: Option<Duration>) -> Result<Prediction, ClientError> {
         let mut request = tonic::Request::new(candidates.to_message());
         if let Some(deadline) = deadline {
@@ -272,6 +277,7 @@ impl Client {
                 Ok(prediction)
             }
             Err(error) => {
+                self.known.refused(&candidates.session, &error);
                 let known = self.known.of(&candidates.session);
                 candidates.fallback.as_ref().and_then(|fallback| fallback.answer(&candidates, known, &error)).ok_or(error)
             }

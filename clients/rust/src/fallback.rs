@@ -10,6 +10,7 @@ use tonic::Code;
 use crate::error::ClientError;
 use crate::known_states::KnownState;
 use crate::prediction::{Candidates, ComputedBy, ExtraOutputs, FallbackReason, Prediction};
+use crate::refused;
 
 /// Entries of a state.
 const STATE: usize = 12;
@@ -17,8 +18,11 @@ const STATE: usize = 12;
 /// Steps that a known state is rolled forward at most, as in the service.
 const ROLLED_FORWARD_STEPS_MAX: usize = 32;
 
-/// What a fallback may answer instead of.
-const LATE: [Code; 3] = [Code::DeadlineExceeded, Code::ResourceExhausted, Code::Unavailable];
+/// Whether a fallback may answer instead: the service is late, overloaded or away, or what it knows of the session is too old to be rolled forward.
+fn is_late(code: Code, field: &str) -> bool {
+    let late = [Code::DeadlineExceeded, Code::ResourceExhausted, Code::Unavailable].contains(&code);
+    late || (code == Code::FailedPrecondition && field == "start_stamp_ns")
+}
 
 /// Flat-ground kinematics of a vehicle card: the commanded speed is reached at once, a bicycle turns with tan(angle) / wheelbase, a skid-steer vehicle
 /// with the commanded yaw rate. It knows no terrain, soil or slip; height, roll and pitch stay those of the start. It answers only where a caller puts
@@ -104,15 +108,16 @@ impl KinematicFallback {
 
     /// What it answers instead of the service, and why. `None` where the error is no lateness, where there is neither a start nor a known state that is new
     /// enough, or where the candidates contradict themselves or are not what the service takes: a number that is none, a command
-    /// beyond the card.
+    /// beyond the card, a shape, start or cost beyond the limits.
     pub(crate) fn answer(&self, candidates: &Candidates, known: Option<KnownState>, error: &ClientError) -> Option<Prediction> {
         let reason = match error {
-            ClientError::Refused { code, message, .. } if LATE.contains(code) => FallbackReason { code: *code, message: message.clone() },
+            ClientError::Refused { code, field, message, .. } if is_late(*code, field) => {
+                FallbackReason { code: *code, message: message.clone() }
+            }
             _ => return None,
         };
         let sent: Vec<f32> = candidates.sent.iter().flat_map(|(_, command)| command.map(|value| value as f32)).collect();
-        let finite = candidates.start.is_none_or(|start| start.iter().all(|value| value.is_finite()));
-        if !finite || !self.admits(&sent) {
+        if !refused::takes(candidates) || !self.admits(&sent) {
             return None;
         }
         let (start, start_stamp_ns, rolled_forward_steps) = match (candidates.start, candidates.start_stamp_ns) {
@@ -341,6 +346,14 @@ mod tests {
             assert!(fallback.answer(&asked, known, &status.into()).is_none());
         }
         assert!(fallback.answer(&asked, known, &ClientError::protocol("a part is missing")).is_none());
+        let refusal = |field: &str| {
+            let (field, message) = (field.into(), "no measurement is new enough".into());
+            ClientError::Refused { code: Code::FailedPrecondition, field, message, retry_after: None }
+        };
+        let from_now = asked.clone().starting_at(300_000_000, Vec::new());
+        let stalled = fallback.answer(&from_now, known, &refusal("start_stamp_ns")).unwrap();
+        assert_eq!((stalled.rolled_forward_steps, stalled.fallback_reason.unwrap().code), (3, Code::FailedPrecondition));
+        assert!(fallback.answer(&from_now, known, &refusal("")).is_none(), "the session has no measurement");
         assert!(fallback.answer(&asked, None, &late()).is_none());
         let given = Candidates { start: Some([0.0; STATE]), ..asked.clone() };
         assert!(fallback.answer(&given, None, &late()).is_some());

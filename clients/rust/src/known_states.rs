@@ -1,12 +1,18 @@
 //! Where vehicles were last.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
 
 use nesam_proto::v1;
+use v1::measurement_answer::Outcome;
 
-use crate::message::{outcome_label, state_array};
+use crate::error::ClientError;
+use crate::message::state_array;
 use crate::prediction::{Candidates, Prediction};
+
+/// Oldest state that a fallback begins at, by the client's clock: as far as it rolls one forward.
+const AGE_MAX: Duration = Duration::from_millis(3200);
 
 /// A state of a session and its instant, ns of the vehicle's clock.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -15,10 +21,18 @@ pub(crate) struct KnownState {
     pub stamp_ns: i64,
 }
 
-/// The newest state that a client and its clones know of each session; a fallback without a given start begins there.
+/// When something was sent: its number among all that is, and the client's clock.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Moment {
+    number: u64,
+    at: Instant,
+}
+
+/// The newest state that a client and its clones know of each session; a fallback without a given start begins there, unless it is too old.
 ///
 /// What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only
-/// where its stamp is larger and the vehicle's clock has not begun anew since.
+/// where its stamp is larger and neither session nor vehicle's clock has begun anew since. A measurement that is no step of the session yet stays until a
+/// state with a larger stamp comes, or it is too old to begin at.
 #[derive(Clone, Debug, Default)]
 pub(crate) struct KnownStates(Arc<Mutex<Numbered>>);
 
@@ -30,56 +44,104 @@ struct Numbered {
 
 #[derive(Clone, Copy, Debug)]
 struct Newest {
-    known: KnownState,
+    /// `None` where the session was opened and nothing is known of it yet.
+    known: Option<KnownState>,
     /// Number of what it answered, or of what was answered before.
     asked: u64,
-    /// Number of the measurement with which the vehicle's clock began anew.
+    /// Number of that with which the session or the vehicle's clock began anew.
     clock: u64,
+    /// When it was so.
+    at: Instant,
+    /// Whether it is no step of the session yet, as far as the client knows: it waits for the grid, or got no answer.
+    ahead: bool,
 }
 
-/// What is kept of a measurement until its answer comes.
+impl Newest {
+    fn is_before(&self, known: &KnownState) -> bool {
+        self.known.is_none_or(|held| known.stamp_ns > held.stamp_ns)
+    }
+
+    /// Whether a state of the same clock is newer.
+    fn is_replaced_by(&self, known: &KnownState, sent: Moment) -> bool {
+        let stays = self.ahead && sent.at.saturating_duration_since(self.at) <= AGE_MAX;
+        self.is_before(known) || (!stays && sent.number > self.asked)
+    }
+}
+
+/// What is kept of a measurement until its answer comes; no state where it holds a number that is not finite.
 #[derive(Clone, Debug)]
 pub(crate) struct Reported {
     session: String,
     known: Option<KnownState>,
-    asked: u64,
+    sent: Moment,
 }
 
 impl KnownStates {
-    /// Number of a question that is sent now.
-    pub(crate) fn ask(&self) -> u64 {
+    /// Number and time of a question that is sent now.
+    pub(crate) fn ask(&self) -> Moment {
         let mut numbered = self.numbered();
         numbered.asked += 1;
-        numbered.asked
+        Moment { number: numbered.asked, at: Instant::now() }
     }
 
     /// A measurement that is sent now.
     pub(crate) fn report(&self, measurement: &v1::Measurement) -> Reported {
-        let state = measurement.state.as_ref().and_then(state_array);
+        let state = measurement.state.as_ref().and_then(state_array).filter(|state| state.iter().all(|value| value.is_finite()));
         let known = state.map(|state| KnownState { state, stamp_ns: measurement.stamp_ns });
-        Reported { session: measurement.session_id.clone(), known, asked: self.ask() }
+        Reported { session: measurement.session_id.clone(), known, sent: self.ask() }
     }
 
     /// Notes a measured state that is now the newest of its session.
     pub(crate) fn measured(&self, reported: &Reported, answer: &v1::MeasurementAnswer) {
-        let outcome = outcome_label(answer);
-        let begins_anew = ["CLOCK_JUMP", "RESTARTED"].contains(&outcome);
-        let newest = (begins_anew || ["APPLIED", "GAP", "GATED"].contains(&outcome)) && !answer.reordered;
-        if let (true, Some(known)) = (newest, reported.known) {
-            self.note(&reported.session, known, reported.asked, begins_anew);
+        match &answer.outcome {
+            Some(Outcome::Rejected(rejected)) => match tonic::Code::from(rejected.code) {
+                tonic::Code::ResourceExhausted | tonic::Code::Unavailable => self.unheard(reported),
+                tonic::Code::NotFound if rejected.field == "session_id" => self.forget(&reported.session),
+                _ => {}
+            },
+            _ if answer.reordered => {}
+            Some(Outcome::ClockJump(_) | Outcome::Restarted(_)) => self.note(reported, true, false),
+            Some(Outcome::Buffered(_)) => self.note(reported, false, true),
+            Some(Outcome::Applied(_) | Outcome::Gap(_) | Outcome::Gated(_)) => self.note(reported, false, false),
+            _ => {}
         }
     }
 
-    /// Notes where a prediction of the session began that was not given its start; `asked` is the number of its question.
-    pub(crate) fn predicted(&self, asked: u64, candidates: &Candidates, prediction: &Prediction) {
-        if let (None, Some(stamp_ns)) = (candidates.start, prediction.start_stamp_ns) {
-            self.note(&candidates.session, KnownState { state: prediction.start, stamp_ns }, asked, false);
+    /// Notes a measured state that got no answer: the vehicle was there all the same. The same one sent again, or what was kept meanwhile, is not where it
+    /// is now.
+    pub(crate) fn unheard(&self, reported: &Reported) {
+        let newest = self.numbered().states.get(&reported.session).copied();
+        if reported.known.is_some_and(|known| newest.is_none_or(|newest| newest.is_before(&known))) {
+            self.note(reported, false, true);
         }
     }
 
-    /// The newest known state of a session.
+    /// Notes where a prediction of the session began that was not given its start; `asked` is the moment of its question.
+    pub(crate) fn predicted(&self, asked: Moment, candidates: &Candidates, prediction: &Prediction) {
+        // Who asks from an instant asks from now.
+        let age_s = if candidates.start_stamp_ns.is_some() { 0.0 } else { prediction.measurement_age_s.unwrap_or(0.0) };
+        let at = Duration::try_from_secs_f64(age_s).ok().and_then(|age| asked.at.checked_sub(age));
+        if let (None, Some(stamp_ns), Some(at)) = (candidates.start, prediction.start_stamp_ns, at) {
+            let known = Some(KnownState { state: prediction.start, stamp_ns });
+            self.note(&Reported { session: candidates.session.clone(), known, sent: Moment { at, ..asked } }, false, false);
+        }
+    }
+
+    /// The newest known state of a session, where it is not too old to begin at.
     pub(crate) fn of(&self, session: &str) -> Option<KnownState> {
-        self.numbered().states.get(session).map(|newest| newest.known)
+        self.of_at(session, Instant::now())
+    }
+
+    fn of_at(&self, session: &str, now: Instant) -> Option<KnownState> {
+        let newest = *self.numbered().states.get(session)?;
+        newest.known.filter(|_| now.saturating_duration_since(newest.at) <= AGE_MAX)
+    }
+
+    /// Forgets what was known under the name of a session that was opened now, also what comes late.
+    pub(crate) fn opened(&self, session: &str) {
+        let now = self.ask();
+        let newest = Newest { known: None, asked: now.number, clock: now.number, at: now.at, ahead: false };
+        self.numbered().states.insert(session.into(), newest);
     }
 
     /// Forgets a closed session.
@@ -87,17 +149,25 @@ impl KnownStates {
         self.numbered().states.remove(session);
     }
 
-    fn note(&self, session: &str, known: KnownState, asked: u64, begins_anew: bool) {
-        let mut numbered = self.numbered();
-        let Some(newest) = numbered.states.get_mut(session) else {
-            let clock = if begins_anew { asked } else { 0 };
-            numbered.states.insert(session.into(), Newest { known, asked, clock });
+    /// Forgets a session where the service says that it is not open.
+    pub(crate) fn refused(&self, session: &str, error: &ClientError) {
+        if error.code() == Some(tonic::Code::NotFound) && error.field() == "session_id" {
+            self.forget(session);
+        }
+    }
+
+    fn note(&self, reported: &Reported, begins_anew: bool, ahead: bool) {
+        let (Some(known), sent) = (reported.known, reported.sent) else {
             return;
         };
-        if begins_anew {
-            *newest = Newest { known, asked, clock: asked };
-        } else if asked > newest.asked || (asked > newest.clock && known.stamp_ns > newest.known.stamp_ns) {
-            *newest = Newest { known, asked: asked.max(newest.asked), ..*newest };
+        let mut numbered = self.numbered();
+        let newest = numbered.states.get(&reported.session).copied();
+        let replaced = |newest: Newest| sent.number > newest.clock && (begins_anew || newest.is_replaced_by(&known, sent));
+        if newest.is_none_or(replaced) {
+            let (asked, clock) = newest.map_or((0, 0), |newest| (newest.asked, newest.clock));
+            let clock = if begins_anew { sent.number } else { clock };
+            let noted = Newest { known: Some(known), asked: asked.max(sent.number), clock, at: sent.at, ahead };
+            numbered.states.insert(reported.session.clone(), noted);
         }
     }
 
@@ -106,17 +176,93 @@ impl KnownStates {
     }
 }
 
+/// Measurements without an answer, oldest first. Those that it leaves with are unheard.
+#[derive(Debug)]
+pub(crate) struct Waiting {
+    known: KnownStates,
+    reported: VecDeque<Reported>,
+}
+
+impl Waiting {
+    pub(crate) fn new(known: KnownStates) -> Self {
+        Self { known, reported: VecDeque::new() }
+    }
+
+    /// A measurement that is sent now.
+    pub(crate) fn push(&mut self, measurement: &v1::Measurement) {
+        self.reported.push_back(self.known.report(measurement));
+    }
+
+    /// Takes the answer to the oldest.
+    pub(crate) fn answered(&mut self, answer: &v1::MeasurementAnswer) {
+        if let Some(reported) = self.reported.pop_front() {
+            self.known.measured(&reported, answer);
+        }
+    }
+
+    /// They get no answer any more.
+    pub(crate) fn unheard(&mut self) {
+        self.reported.drain(..).for_each(|reported| self.known.unheard(&reported));
+    }
+}
+
+impl Drop for Waiting {
+    fn drop(&mut self) {
+        self.unheard();
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::message::measurement;
 
+    fn report(known: &KnownStates, stamp_ns: i64) -> Reported {
+        known.report(&measurement("s", stamp_ns, [stamp_ns as f64; 12], [0.0; 2]))
+    }
+
+    fn applied() -> Outcome {
+        Outcome::Applied(v1::Applied::default())
+    }
+
+    fn newest(known: &KnownStates) -> Option<i64> {
+        known.of("s").map(|known| known.stamp_ns)
+    }
+
+    fn hear(known: &KnownStates, reported: &Reported, outcome: Outcome) -> Option<i64> {
+        known.measured(reported, &v1::MeasurementAnswer { outcome: Some(outcome), ..Default::default() });
+        newest(known)
+    }
+
+    /// A prediction that began there.
+    fn begins(known: &KnownStates, asked: Moment, stamp_ns: i64) -> Option<i64> {
+        begins_aged(known, asked, stamp_ns, None);
+        newest(known)
+    }
+
+    fn begins_aged(known: &KnownStates, asked: Moment, stamp_ns: i64, measurement_age_s: Option<f64>) {
+        let reply = v1::PredictReply {
+            start: Some(v1::VehicleState {
+                position_m: Some(v1::Vector3::default()),
+                attitude_rad: Some(v1::Vector3::default()),
+                velocity_m_s: Some(v1::Vector3::default()),
+                angular_velocity_rad_s: Some(v1::Vector3::default()),
+            }),
+            start_stamp_ns: Some(stamp_ns),
+            measurement_age_s,
+            soil: Some(v1::SoilVector::default()),
+            soil_correction: Some(v1::SoilCorrection::default()),
+            provenance: Some(v1::Provenance::default()),
+            ..Default::default()
+        };
+        let prediction = Prediction::from_message(&reply).expect("a whole reply");
+        known.predicted(asked, &Candidates::new("s", 1, 1, vec![0.0; 2]), &prediction);
+    }
+
     /// Goal: a fallback begins at the newest state of its own session. Method: answers of several kinds, late ones among them.
     #[test]
     fn analytic_the_newest_accepted_state_is_known() {
-        use v1::measurement_answer::Outcome;
         let known = KnownStates::default();
-        let applied = || Outcome::Applied(v1::Applied::default());
         let hear = |state: f64, outcome: Outcome, reordered: bool| {
             let answer = v1::MeasurementAnswer { outcome: Some(outcome), reordered, ..Default::default() };
             known.measured(&known.report(&measurement("s", 0, [state; 12], [0.0; 2])), &answer);
@@ -125,7 +271,6 @@ mod tests {
         assert_eq!(hear(1.0, Outcome::Rejected(v1::Rejected::default()), false), None);
         assert_eq!(hear(2.0, applied(), false), Some(2.0));
         assert_eq!(hear(3.0, applied(), true), Some(2.0), "it came after a later one");
-        assert_eq!(hear(4.0, Outcome::Buffered(v1::Buffered::default()), false), Some(2.0), "it is no step yet");
         assert_eq!(hear(5.0, Outcome::Gap(v1::Gap::default()), false), Some(5.0));
         assert_eq!(known.clone().of("s"), Some(KnownState { state: [5.0; 12], stamp_ns: 0 }), "clones know the same");
         assert_eq!(known.of("another"), None);
@@ -137,32 +282,103 @@ mod tests {
     /// another order.
     #[test]
     fn analytic_what_was_asked_for_earlier_replaces_only_what_is_older() {
-        use v1::measurement_answer::Outcome;
         let known = KnownStates::default();
-        let report = |stamp_ns: i64| known.report(&measurement("s", stamp_ns, [stamp_ns as f64; 12], [0.0; 2]));
-        let measured = |reported: &Reported, outcome: Outcome| {
-            known.measured(reported, &v1::MeasurementAnswer { outcome: Some(outcome), ..Default::default() });
-            known.of("s").map(|known| known.stamp_ns)
-        };
-        let predicted = |asked: u64, stamp_ns: i64| {
-            known.note("s", KnownState { state: [0.0; 12], stamp_ns }, asked, false);
-            known.of("s").map(|known| known.stamp_ns)
-        };
-        let applied = || Outcome::Applied(v1::Applied::default());
         let [late, ahead] = [known.ask(), known.ask()];
-        assert_eq!(measured(&report(200), applied()), Some(200));
-        assert_eq!(predicted(late, 100), Some(200), "it was asked for before the measurement and is older");
-        assert_eq!(predicted(ahead, 300), Some(300), "somebody else had measured more");
-        assert_eq!(measured(&report(250), applied()), Some(250), "what was sent later tells what the session has now");
+        assert_eq!(hear(&known, &report(&known, 200), applied()), Some(200));
+        assert_eq!(begins(&known, late, 100), Some(200), "it was asked for before the measurement and is older");
+        assert_eq!(begins(&known, ahead, 300), Some(300), "somebody else had measured more");
+        assert_eq!(hear(&known, &report(&known, 250), applied()), Some(250), "what was sent later tells what the session has now");
         let of_the_old_clock = known.ask();
-        let jump = report(10);
+        let jump = report(&known, 10);
         let after = known.ask();
-        assert_eq!(predicted(after, 260), Some(260));
-        assert_eq!(measured(&jump, Outcome::ClockJump(v1::ClockJump::default())), Some(10), "stamps of before say nothing");
-        assert_eq!(predicted(of_the_old_clock, 400), Some(10), "the clock has begun anew since");
-        assert_eq!(measured(&report(20), applied()), Some(20));
-        assert_eq!(measured(&report(5), Outcome::Restarted(v1::Restarted {})), Some(5));
-        assert_eq!(predicted(after, 500), Some(5), "the vehicle has been restarted since");
-        assert_eq!(predicted(known.ask(), 7), Some(7));
+        assert_eq!(begins(&known, after, 260), Some(260));
+        assert_eq!(hear(&known, &jump, Outcome::ClockJump(v1::ClockJump::default())), Some(10), "stamps of before say nothing");
+        assert_eq!(begins(&known, of_the_old_clock, 400), Some(10), "the clock has begun anew since");
+        assert_eq!(hear(&known, &report(&known, 20), applied()), Some(20));
+        assert_eq!(hear(&known, &report(&known, 5), Outcome::Restarted(v1::Restarted {})), Some(5));
+        assert_eq!(begins(&known, after, 500), Some(5), "the vehicle has been restarted since");
+        assert_eq!(begins(&known, known.ask(), 7), Some(7));
+    }
+
+    /// Goal: a fallback follows a vehicle that gets no answers. Method: what becomes of measurements, refusals among them.
+    #[test]
+    fn analytic_a_measurement_counts_whatever_became_of_it_unless_it_is_refused() {
+        let known = KnownStates::default();
+        let rejected = |code: tonic::Code, field: &str| {
+            Outcome::Rejected(v1::Rejected { code: code.into(), field: field.into(), ..Default::default() })
+        };
+        assert_eq!(hear(&known, &report(&known, 10), applied()), Some(10));
+        assert_eq!(hear(&known, &report(&known, 11), Outcome::Buffered(v1::Buffered::default())), Some(11), "it waits for the grid");
+        assert_eq!(begins(&known, known.ask(), 10), Some(11), "the step before it is older");
+        assert_eq!(begins(&known, known.ask(), 20), Some(20));
+        let mut waiting = Waiting::new(known.clone());
+        [30, 31].into_iter().for_each(|stamp_ns| waiting.push(&measurement("s", stamp_ns, [0.0; 12], [0.0; 2])));
+        assert_eq!(newest(&known), Some(20));
+        waiting.answered(&v1::MeasurementAnswer { outcome: Some(applied()), ..Default::default() });
+        assert_eq!(newest(&known), Some(30));
+        drop(waiting);
+        assert_eq!(newest(&known), Some(31), "it got no answer");
+        assert_eq!(hear(&known, &report(&known, 40), rejected(tonic::Code::ResourceExhausted, "")), Some(40), "there was no room");
+        for refused in
+            [Outcome::TooOld(v1::TooOld::default()), Outcome::Duplicate(v1::Duplicate {}), rejected(tonic::Code::InvalidArgument, "")]
+        {
+            assert_eq!(hear(&known, &report(&known, 50), refused), Some(40));
+        }
+        known.unheard(&known.report(&measurement("s", 60, [f64::NAN; 12], [0.0; 2])));
+        assert_eq!(newest(&known), Some(40), "it is nowhere");
+        known.unheard(&report(&known, 35));
+        assert_eq!(newest(&known), Some(40), "kept since before, sent again");
+    }
+
+    /// Goal: nothing begins where the vehicle was long ago. Method: moments before and after the limit.
+    #[test]
+    fn analytic_a_state_grows_too_old() {
+        let known = KnownStates::default();
+        let now = Instant::now();
+        let sent = |stamp_ns: i64, after_ms: u64| {
+            let mut reported = report(&known, stamp_ns);
+            reported.sent.at = now + Duration::from_millis(after_ms);
+            reported
+        };
+        let after = |ms: u64| known.of_at("s", now + Duration::from_millis(ms)).map(|known| known.stamp_ns);
+        hear(&known, &sent(10, 0), applied());
+        assert_eq!((after(3200), after(3201)), (Some(10), None));
+        known.unheard(&sent(10, 4000));
+        assert_eq!(after(4000), None, "the same one sent again");
+        // What a prediction began at is as old as it says.
+        let mut asked = known.ask();
+        asked.at = now + Duration::from_millis(6000);
+        begins_aged(&known, asked, 20, Some(3.0));
+        assert_eq!((after(6200), after(6201)), (Some(20), None));
+        for age_s in [f64::NAN, -1.0, 1e300] {
+            begins_aged(&known, asked, 30, Some(age_s));
+        }
+        assert_eq!(known.of_at("s", now).map(|known| known.stamp_ns), Some(20), "an age that is none");
+        // One that is no step yet holds nothing up for longer.
+        known.unheard(&sent(90, 7000));
+        hear(&known, &sent(60, 10_200), applied());
+        assert_eq!(after(7000), Some(90));
+        hear(&known, &sent(60, 10_201), applied());
+        assert_eq!(after(10_201), Some(60));
+    }
+
+    /// Goal: another session of the same name begins nowhere. Method: what was sent before it was opened is heard after, then the service has lost it.
+    #[test]
+    fn analytic_a_session_of_the_same_name_is_another_one() {
+        let known = KnownStates::default();
+        assert_eq!(hear(&known, &report(&known, 10), applied()), Some(10));
+        let (sent, asked) = (report(&known, 20), known.ask());
+        known.opened("s");
+        assert_eq!(newest(&known), None);
+        assert_eq!((hear(&known, &sent, applied()), begins(&known, asked, 30)), (None, None), "they are of the session before");
+        known.unheard(&sent);
+        assert_eq!(newest(&known), None);
+        assert_eq!(hear(&known, &report(&known, 1), applied()), Some(1));
+        let refusal =
+            |code: tonic::Code| ClientError::Refused { code, field: "session_id".into(), message: String::new(), retry_after: None };
+        known.refused("s", &refusal(tonic::Code::PermissionDenied));
+        assert_eq!(newest(&known), Some(1));
+        known.refused("s", &refusal(tonic::Code::NotFound));
+        assert_eq!(newest(&known), None);
     }
 }

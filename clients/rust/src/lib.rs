@@ -45,6 +45,7 @@ mod measure;
 mod message;
 mod outbox;
 mod prediction;
+mod refused;
 mod tls;
 pub mod zenoh_vehicle;
 

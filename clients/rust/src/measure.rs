@@ -1,6 +1,5 @@
 //! A stream of measurements.
 
-use std::collections::VecDeque;
 use std::sync::{Mutex, PoisonError};
 
 use nesam_proto::v1;
@@ -8,7 +7,7 @@ use tokio::sync::mpsc;
 use tonic::Streaming;
 
 use crate::error::ClientError;
-use crate::known_states::{KnownStates, Reported};
+use crate::known_states::{KnownStates, Waiting};
 
 /// Measurements that may wait in the client.
 pub(crate) const WAITING_MAX: usize = 64;
@@ -18,14 +17,13 @@ pub(crate) const WAITING_MAX: usize = 64;
 pub struct MeasurementStream {
     sender: mpsc::Sender<v1::Measurement>,
     answers: Streaming<v1::MeasurementAnswer>,
-    known: KnownStates,
-    /// What was sent and not answered yet, oldest first.
-    waiting: Mutex<VecDeque<Reported>>,
+    /// What was sent and not answered yet.
+    waiting: Mutex<Waiting>,
 }
 
 impl MeasurementStream {
     pub(crate) fn new(sender: mpsc::Sender<v1::Measurement>, answers: Streaming<v1::MeasurementAnswer>, known: KnownStates) -> Self {
-        Self { sender, answers, known, waiting: Mutex::default() }
+        Self { sender, answers, waiting: Mutex::new(Waiting::new(known)) }
     }
 
     /// Sends one measurement; waits only while the service is behind.
@@ -33,11 +31,17 @@ impl MeasurementStream {
     /// # Errors
     /// `ClientError::Protocol` when the stream has ended.
     pub async fn send(&self, measurement: v1::Measurement) -> Result<(), ClientError> {
-        let place = self.sender.reserve().await.map_err(|_| ClientError::protocol("the measurement stream has ended"))?;
+        let place = self.sender.reserve().await;
         // Under the lock, so that both queues have the same order.
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
-        waiting.push_back(self.known.report(&measurement));
-        place.send(measurement);
+        waiting.push(&measurement);
+        match place {
+            Ok(place) => place.send(measurement),
+            Err(_) => {
+                waiting.unheard();
+                return Err(ClientError::protocol("the measurement stream has ended"));
+            }
+        }
         Ok(())
     }
 
@@ -46,14 +50,13 @@ impl MeasurementStream {
     /// # Errors
     /// `ClientError::Refused` when the service ended the stream.
     pub async fn answer(&mut self) -> Result<Option<v1::MeasurementAnswer>, ClientError> {
-        let answer = self.answers.message().await?;
-        if let Some(answer) = &answer {
-            let waiting = self.waiting.get_mut().unwrap_or_else(PoisonError::into_inner);
-            if let Some(reported) = waiting.pop_front() {
-                self.known.measured(&reported, answer);
-            }
+        let answer = self.answers.message().await;
+        let waiting = self.waiting.get_mut().unwrap_or_else(PoisonError::into_inner);
+        match &answer {
+            Ok(Some(answer)) => waiting.answered(answer),
+            _ => waiting.unheard(),
         }
-        Ok(answer)
+        Ok(answer?)
     }
 
     /// Sends one measurement and awaits its answer.

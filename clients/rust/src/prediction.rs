@@ -16,7 +16,8 @@ pub struct Candidates {
     pub session: String,
     /// State to start from (x y z roll pitch yaw vx vy vz wx wy wz); `None` = the newest measured one.
     pub start: Option<[f64; 12]>,
-    /// Instant of the vehicle's clock to start from, ns; `None` = that of the newest measured state. Not together with `start`.
+    /// Instant of the vehicle's clock to start from, ns; `None` = that of the newest measured state. Not together with `start`. It is rounded to the nearest step of
+    /// 0.1 s after the newest measurement, so by up to 50 ms; [`Prediction::start_stamp_ns`] says to which.
     pub start_stamp_ns: Option<i64>,
     /// Commands `[speed_m_s, second]` that the vehicle was sent, each with the instant from which it applies it, by ascending instant.
     pub sent: Vec<(i64, [f64; 2])>,
@@ -43,8 +44,9 @@ pub struct Candidates {
     /// Copied to the prediction.
     pub tag: u64,
     /// Answers [`Client::predict`](crate::Client::predict) and [`Client::predict_within`](crate::Client::predict_within) when the service is late, overloaded
-    /// or away, from `start` or the newest state that the client knows, which it rolls forward to `start_stamp_ns` by its own kinematics, no further than 32
-    /// steps; `None` = nothing does. It has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone.
+    /// or away, or knows no measurement that is new enough for `start_stamp_ns`, from `start` or the newest state that the client knows, which it rolls forward to
+    /// `start_stamp_ns` by its own kinematics, no further than 32 steps; a state that is older than 3.2 s by the clock of this program is none. `None` = nothing
+    /// does. It has no extras, costs or what-if soils; of a drawing it predicts the nominal sequence alone.
     pub fallback: Option<KinematicFallback>,
 }
 
@@ -134,7 +136,7 @@ pub enum ComputedBy {
 /// The service's error that a fallback has answered instead of.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct FallbackReason {
-    /// gRPC code: DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED or UNAVAILABLE.
+    /// gRPC code: DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED or UNAVAILABLE; FAILED_PRECONDITION where no measurement is new enough for `start_stamp_ns`.
     pub code: tonic::Code,
     /// What the service or the transport said.
     pub message: String,
