@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 use nesam_evaluation::{
     Baselines, DEFAULT_RESAMPLES, Evaluation, Inputs, Kinematic, ModelName, ModelPaths, ModelScore, Resamples, Truth, Window,
     WindowPredictor, all_windows, path_median_m, predict_all, report, score, slices, write_predictions,
