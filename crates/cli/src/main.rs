@@ -8,6 +8,7 @@ mod commands;
 mod environment;
 mod failure;
 mod interrupt;
+mod logging;
 mod output;
 mod progress;
 mod sources;

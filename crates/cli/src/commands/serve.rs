@@ -2,7 +2,6 @@
 
 mod checked;
 
-use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -11,14 +10,14 @@ use std::time::Duration;
 use clap::Args;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_server::{Config, RunningServer, ZenohConfig, outlive_file_limit, second_interrupt, serve, start_workers, termination};
-use tracing_subscriber::EnvFilter;
 
 pub use self::checked::check_configuration;
 use crate::args::BundleArgs;
 use crate::bundle_path::bundle_dir;
 use crate::environment::{OF_A_SERVER, restart_with};
 use crate::failure::{Failure, OrFail};
-use crate::output::{note, say};
+use crate::logging::log_to_stderr;
+use crate::output::say;
 use crate::sources::{load_bundle, rounded};
 
 /// Time that tasks get to end once the server has stopped.
@@ -39,16 +38,16 @@ pub struct ServeArgs {
     /// Address of gRPC; port 0 takes a free one
     #[arg(long, value_name = "ADDRESS:PORT")]
     grpc: Option<SocketAddr>,
-    /// Address of the live page, metrics and status; port 0 takes a free one
+    /// Address of the live page, metrics and status, which are then on whatever the file says; port 0 takes a free one
     #[arg(long, value_name = "ADDRESS:PORT", conflicts_with = "no_http")]
     http: Option<SocketAddr>,
     /// Serve no live page, metrics and status
     #[arg(long)]
     no_http: bool,
-    /// Zenoh endpoints to listen on, for instance tcp/0.0.0.0:7447
+    /// Zenoh endpoints to listen on, for instance tcp/0.0.0.0:7447; Zenoh is then on whatever the file says
     #[arg(long, value_name = "ENDPOINT,…", value_delimiter = ',', conflicts_with = "no_zenoh")]
     zenoh_listen: Option<Vec<String>>,
-    /// Zenoh endpoints to connect to, for instance tcp/router:7447
+    /// Zenoh endpoints to connect to, for instance tcp/router:7447; Zenoh is then on whatever the file says
     #[arg(long, value_name = "ENDPOINT,…", value_delimiter = ',', conflicts_with = "no_zenoh")]
     zenoh_connect: Option<Vec<String>>,
     /// Take no part in a Zenoh network
@@ -151,26 +150,13 @@ pub async fn start(config: Config, bundle: ModelBundle) -> Result<(RunningServer
     Ok((serve(config, predictor).await.or_input()?, bundle))
 }
 
+/// The configuration that file and options ask for, checked.
 fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
     let mut config = match &args.config {
         Some(file) => Config::read(file).or_input()?,
         None => Config::default(),
     };
-    config.grpc.listen = args.grpc.unwrap_or(config.grpc.listen);
-    config.http.listen = args.http.unwrap_or(config.http.listen);
-    config.http.enabled &= !args.no_http;
-    config.zenoh.enabled &= !args.no_zenoh;
-    for (given, kept) in [(&args.zenoh_listen, &mut config.zenoh.listen), (&args.zenoh_connect, &mut config.zenoh.connect)] {
-        if let Some(endpoints) = given {
-            kept.clone_from(endpoints);
-        }
-    }
-    if let Some(fleet) = &args.fleet {
-        config.zenoh.fleet.clone_from(fleet);
-    }
-    if let Some(folder) = &args.reports {
-        config.http.reports.clone_from(folder);
-    }
+    override_network(args, &mut config)?;
     if let Some(folder) = &args.record {
         config.recording.enabled = true;
         config.recording.directory.clone_from(folder);
@@ -188,6 +174,34 @@ fn configuration(args: &ServeArgs) -> Result<Config, Failure> {
     }
     config.check().or_input()?;
     Ok(config)
+}
+
+/// Puts the options of gRPC, HTTP and Zenoh in the place of what the file says. An address switches on what it is for.
+///
+/// # Errors
+/// Wrong usage: reports for a page that is off.
+fn override_network(args: &ServeArgs, config: &mut Config) -> Result<(), Failure> {
+    config.grpc.listen = args.grpc.unwrap_or(config.grpc.listen);
+    config.http.listen = args.http.unwrap_or(config.http.listen);
+    config.http.enabled = (config.http.enabled || args.http.is_some()) && !args.no_http;
+    let endpoints = args.zenoh_listen.is_some() || args.zenoh_connect.is_some();
+    config.zenoh.enabled = (config.zenoh.enabled || endpoints) && !args.no_zenoh;
+    for (given, kept) in [(&args.zenoh_listen, &mut config.zenoh.listen), (&args.zenoh_connect, &mut config.zenoh.connect)] {
+        if let Some(endpoints) = given {
+            kept.clone_from(endpoints);
+        }
+    }
+    if let Some(fleet) = &args.fleet {
+        config.zenoh.fleet.clone_from(fleet);
+    }
+    if let Some(folder) = &args.reports {
+        if !config.http.enabled {
+            let way = "the file has `http.enabled = false`; switch the page on with --http ADDRESS:PORT";
+            return Err(Failure::input(format!("--reports {}: the live page is off, as {way}", folder.display())));
+        }
+        config.http.reports.clone_from(folder);
+    }
+    Ok(())
 }
 
 /// Where sessions are kept.
@@ -229,23 +243,43 @@ fn announce(server: &RunningServer, bundle: &ModelBundle, zenoh: &ZenohConfig) {
     }
 }
 
-/// Structured logs on standard error; `RUST_LOG` changes what is shown, and a value that is not understood is told and changes nothing. A line that standard
-/// error does not take is lost: the subscriber would print of its own failure there, and panic in the call that logged.
-pub fn log_to_stderr(default: &str) {
-    let usual = format!("{default},zenoh=warn");
-    let asked = std::env::var("RUST_LOG").ok().filter(|text| !text.is_empty());
-    let filter = asked.and_then(|text| match EnvFilter::try_new(&text) {
-        Ok(filter) => Some(filter),
-        Err(error) => {
-            note!("RUST_LOG={text}: {error}; `{usual}` is logged");
-            None
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: ServeArgs,
+    }
+
+    #[test]
+    fn property_an_address_switches_on_what_the_file_has_off() {
+        // Goal: no option is passed over silently. Method: a file in which HTTP and Zenoh are off, with and without options for them.
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("off.toml");
+        std::fs::write(&file, "[http]\nenabled = false\n[zenoh]\nenabled = false\n").unwrap();
+        let asked = |options: &[&str]| {
+            let line = [&["serve", "--config", file.to_str().unwrap()], options].concat();
+            configuration(&Line::parse_from(line).args).map(|config| (config.http.enabled, config.zenoh.enabled, config))
+        };
+        for (options, http, zenoh) in [
+            (&["--http", "127.0.0.1:8080"][..], true, false),
+            (&[], false, false),
+            (&["--zenoh-listen", "tcp/127.0.0.1:7448"], false, true),
+            (&["--zenoh-connect", "tcp/router:7447"], false, true),
+            (&["--no-http", "--zenoh-connect", "tcp/router:7447"], false, true),
+            (&["--no-zenoh", "--http", "127.0.0.1:8080"], true, false),
+        ] {
+            let (has_http, has_zenoh, _) = asked(options).unwrap();
+            assert_eq!((has_http, has_zenoh), (http, zenoh), "{options:?}");
         }
-    });
-    let filter = filter.unwrap_or_else(|| EnvFilter::new(&usual));
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .log_internal_errors(false)
-        .with_writer(std::io::stderr)
-        .with_ansi(std::io::stderr().is_terminal())
-        .try_init();
+        let (_, _, config) = asked(&["--http", "127.0.0.1:8080", "--zenoh-listen", "tcp/127.0.0.1:7448", "--reports", "reports"]).unwrap();
+        assert_eq!((config.http.listen.port(), config.zenoh.listen.join(",")), (8080, "tcp/127.0.0.1:7448".into()));
+        assert!(asked(&["--reports", "reports"]).unwrap_err().to_string().contains("--http"));
+        let plain = configuration(&Line::parse_from(["serve", "--no-http", "--no-zenoh"]).args).unwrap();
+        assert!(!plain.http.enabled && !plain.zenoh.enabled);
+    }
 }

@@ -90,7 +90,7 @@ pub fn run(args: &DemoArgs) -> Result<(), Failure> {
             drives.root.vehicle().name
         )));
     }
-    super::serve::log_to_stderr("warn");
+    crate::logging::log_to_stderr("warn");
     let provenance = output::provenance(Some(&bundle), &drives);
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     let Played { summary, server, interrupted } = runtime.block_on(stage.play(bundle.clone()))?;

@@ -193,7 +193,7 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     let of_worlds = worlds.iter().map(|(world, _)| Ok((world.clone(), settings_of_lap(&settings, &root, world)?)));
     let mut of_worlds: HashMap<String, Value> = of_worlds.collect::<Result<_, Failure>>()?;
     let out = output::out_dir(args.out.as_deref(), "navigate", "laps")?;
-    super::serve::log_to_stderr("error");
+    crate::logging::log_to_stderr("error");
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().or_failed()?;
     let mut provenance = vec![
         ("command".to_string(), output::command_line()),

@@ -70,7 +70,8 @@ Examples:
   nesam replay --data ROOT --set NAME --degrade
   nesam replay --data ROOT --set NAME --degrade loss=0.05 --degrade imu,loss=0.05
 
-Exit codes: 0 all answers equal, 1 an answer differs or the file is damaged, 2 not a recording or not its bundle.";
+Exit codes: 0 all answers equal, 1 an answer differs, the file is damaged or was cut off before its first answer, 2 not a recording or
+not its bundle.";
 
 /// Runs the command.
 pub fn run(args: &ReplayArgs) -> Result<(), Failure> {

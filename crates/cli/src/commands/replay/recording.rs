@@ -60,12 +60,22 @@ fn replay_one(args: &ReplayArgs, mut recording: Recording) -> Result<(Value, Opt
         Failure::Input(format!("{error}{hint}"))
     })?;
     print(&header, &report);
+    let wrong = wrong(&report);
+    Ok((document(&header, &bundle, &report, &files, wrong.is_none()), wrong))
+}
+
+/// Why a replay proves nothing, or the opposite of what it should; `None` where all is well.
+fn wrong(report: &ReplayReport) -> Option<String> {
     let total = report.total();
-    let wrong = (!report.all_equal()).then(|| match total.different {
-        0 => "the recording is damaged".to_string(),
-        different => format!("{different} of {} answers differ", total.commands - total.not_executed),
-    });
-    Ok((document(&header, &bundle, &report, &files), wrong))
+    if total.different > 0 {
+        return Some(format!("{} of {} answers differ", total.different, total.commands - total.not_executed));
+    }
+    if !report.all_equal() {
+        return Some("the recording is damaged".into());
+    }
+    // A server that was asked nothing leaves a recording without an answer, which is whole.
+    let whole = matches!(report.ending, Some(Ending::Finished { dropped_commands: 0, .. }));
+    (total.equal == 0 && !whole).then(|| "no answer was compared: what is left of the recording holds none".into())
 }
 
 fn print(header: &RecordingHeader, report: &ReplayReport) {
@@ -120,12 +130,12 @@ fn to_json(mut documents: Vec<Value>, several: bool, all_equal: bool) -> String 
     output::json_text(&document)
 }
 
-fn document(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport, files: &[PathBuf]) -> Value {
+fn document(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayReport, files: &[PathBuf], all_equal: bool) -> Value {
     json!({
         "schema": "nesam.replay/1",
         "run": header.run,
         "files": files,
-        "all_equal": report.all_equal(),
+        "all_equal": all_equal,
         "total": report.total(),
         "kinds": report.kinds,
         "first_difference": report.first_difference,
@@ -140,4 +150,28 @@ fn document(header: &RecordingHeader, bundle: &ModelBundle, report: &ReplayRepor
             "bundle": bundle.name, "bundle_hash": bundle.hash,
         },
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn analytic_a_replay_that_compares_nothing_is_no_proof() {
+        // Goal: a recording that was cut off before its first answer passes no gate. Method: reports with each ending, with and without answers.
+        let report = |equal: u64, different: u64, ending: Ending| {
+            let count = KindCount { commands: equal + different, equal, different, not_executed: 0 };
+            let kinds = [("measure".to_string(), count)].into();
+            ReplayReport { kinds, first_difference: None, span_s: 0.0, ending: Some(ending) }
+        };
+        let finished = |dropped_commands| Ending::Finished { reason: "the server stopped".into(), dropped_commands };
+        assert_eq!(wrong(&report(0, 0, finished(0))), None, "nothing was asked");
+        assert_eq!(wrong(&report(3, 0, Ending::CutOff)), None, "as far as it goes");
+        for ending in [Ending::CutOff, finished(2), Ending::Missing { commands: 2, first: 0 }] {
+            let told = wrong(&report(0, 0, ending.clone())).unwrap();
+            assert!(told.contains("no answer was compared"), "{ending:?}: {told}");
+        }
+        assert_eq!(wrong(&report(2, 1, Ending::CutOff)).unwrap(), "1 of 3 answers differ");
+        assert_eq!(wrong(&report(2, 0, Ending::Damaged { reason: "a checksum".into() })).unwrap(), "the recording is damaged");
+    }
 }
