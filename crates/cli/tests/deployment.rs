@@ -55,6 +55,30 @@ fn regress_the_unit_runs_in_the_folder_that_it_may_write() {
     }
 }
 
+/// A server that ends at once where what it needs is not there yet, such as a router, is started again as long as it takes.
+#[test]
+fn regress_the_unit_is_started_again_without_end() {
+    let unit = std::fs::read_to_string(common::repository().join("deploy/systemd/nesam.service")).unwrap();
+    let (of_unit, of_service) = unit.split_once("[Service]").unwrap();
+    assert!(of_unit.lines().any(|line| line == "StartLimitIntervalSec=0"), "the default gives up after five starts in 10 s");
+    let pause_s = of_service.lines().find_map(|line| line.strip_prefix("RestartSec=")?.parse::<u32>().ok());
+    assert!(pause_s.is_some_and(|s| s >= 5) && of_service.lines().any(|line| line == "Restart=always"), "{pause_s:?}");
+}
+
+/// Goal: no replica of the chart is killed for memory that the default limits allow. Method: what docs/capacity.md and deploy/config/default.toml say that things take.
+#[test]
+fn analytic_the_chart_gives_the_memory_that_the_default_limits_allow() {
+    let values = std::fs::read_to_string(common::repository().join("deploy/helm/nesam/values.yaml")).unwrap();
+    let limit =
+        values.split("resources:").nth(1).and_then(|rest| rest.split("limits: {memory: ").nth(1)).and_then(|rest| rest.split("Gi}").next());
+    let limit_bytes = f64::from(1 << 30) * limit.and_then(|text| text.parse::<f64>().ok()).expect("a limit in Gi");
+    let config = nesam_server::Config::default();
+    let (sessions, cells, uploads) = (config.limits.sessions_max, config.limits.map_cells_total_max, config.grpc.uploads_max);
+    let terrain_bytes = 3.5e9;
+    let needed_bytes = 90e3 * sessions as f64 + 16.0 * cells as f64 + 120e6 * uploads as f64 + terrain_bytes;
+    assert!(limit_bytes > needed_bytes, "{limit_bytes} of {needed_bytes} bytes");
+}
+
 /// Three workers over the processors that this process may use: each stays on one, and none has more than its share.
 #[test]
 #[cfg(target_os = "linux")]
