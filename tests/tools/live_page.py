@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
 """Drives the live page in a headless Chromium against the real server: `live_page.py NESAM [--shots DIR]`.
 
-Goal: the page comes alive with real data, says what to do when there is none, and can be used with the keyboard, on a laptop and a tablet, in light and
+Goal: the page comes alive with real data, also behind a proxy below a path of its own, says what to do when there is none, and can be used with the keyboard, on a laptop and a tablet, in light and
 dark. Method: `nesam serve` without vehicles, then `nesam demo`, which plays a recorded drive; what is asserted is what a person would see.
 Prints `skipped: no chromium` and ends well where there is none.
 """
 
+import http.client
+import http.server
 import json
 import pathlib
 import re
@@ -109,6 +111,46 @@ class Program:
     def stop(self):
         self.process.terminate()
         self.process.wait(60)
+
+
+class Proxy:
+    """Passes on what is asked below /fleet/, without that path, and nothing else. Use as a context manager."""
+
+    def __init__(self, url):
+        self.host = re.sub(r"http://|/", "", url)
+
+    def __enter__(self):
+        host = self.host
+
+        class Handler(http.server.BaseHTTPRequestHandler):
+            def do_GET(self):
+                if not self.path.startswith("/fleet/"):
+                    return self.send_error(404)
+                behind = http.client.HTTPConnection(host, timeout=60)
+                behind.request("GET", self.path.removeprefix("/fleet"))
+                answer = behind.getresponse()
+                self.send_response(answer.status)
+                for name in ("content-type", "content-security-policy"):
+                    if answer.getheader(name):
+                        self.send_header(name, answer.getheader(name))
+                self.end_headers()
+                try:
+                    while part := answer.read1(1 << 16):
+                        self.wfile.write(part)
+                        self.wfile.flush()
+                except OSError:
+                    pass  # the page or the service has gone
+
+            def log_message(self, *_):
+                pass
+
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.server.daemon_threads = True
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        return f"http://127.0.0.1:{self.server.server_address[1]}/fleet/"
+
+    def __exit__(self, *_):
+        self.server.shutdown()
 
 
 def becomes(browser, element, pressed=True):
@@ -232,6 +274,10 @@ def with_a_drive(browser, nesam, shots):
         interactions(browser)
         check(browser.value(NAMELESS) == 0, "everything has a name for a screen reader")
         check(browser.value(FOREIGN) == [], "nothing is loaded from elsewhere")
+        with Proxy(demo.url) as url:
+            browser.open(url)
+            browser.wait(f"location.pathname === '/fleet/' && document.getElementById('link')?.dataset.state === 'live' && {PAINTED} > 50")
+            check(True, "it comes alive below a path of a proxy, map and all")
     finally:
         demo.stop()
 

@@ -13,7 +13,7 @@ export class Ground {
   }
 
   async load() {
-    const path = `/live/map/${encodeURIComponent(this.id)}`;
+    const path = `live/map/${encodeURIComponent(this.id)}`;
     const get = async (url) => {
       const answer = await fetch(url);
       if (!answer.ok) throw new Error(await answer.text());

@@ -25,7 +25,7 @@ function schedule(ofUser = false) {
 }
 
 function connect() {
-  const stream = new EventSource("/live/events");
+  const stream = new EventSource("live/events");
   const take = (event, isWhole) => {
     lastUpdate = performance.now();
     if (paused) return;
