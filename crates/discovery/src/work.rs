@@ -59,7 +59,7 @@ mod tests {
         work.clone().done();
         work.add(1);
         work.done();
-        Work::default().expect(7);
+        Work::default().add(7);
         let told: Vec<(usize, usize)> = told.lock().unwrap().iter().map(|(_, done, total)| (*done, *total)).collect();
         assert_eq!(told, [(0, 1), (0, 3), (1, 3), (1, 4), (2, 4)]);
     }
