@@ -70,7 +70,7 @@ pub(crate) fn build(
         states: states.collect(),
         controls: controls.collect(),
         wheel_speed_rad_s: log.wheel_speed.as_deref().map(|w| grid.linear(w)),
-        road_wheel_angle_rad: log.road_wheel_angle.as_deref().map(|a| grid.angles(a)),
+        road_wheel_angle_rad: log.road_wheel_angle.as_deref().map(|a| grid.linear(a)),
         measured,
         truth: channels.truth.as_ref().map(|truth| truth.of(rows, &grid)).transpose()?,
         time_s: grid.time_s,

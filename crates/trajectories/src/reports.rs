@@ -87,7 +87,7 @@ fn drive(id: &str, reports: &[Report], dt_s: f64) -> Option<Trajectory> {
             ..MeasuredChannels::POSE_AND_TWIST
         },
         wheel_speed_rad_s: wheels.map(|w| grid.linear(&w)),
-        road_wheel_angle_rad: angles.map(|a| grid.angles(&a)),
+        road_wheel_angle_rad: angles.map(|a| grid.linear(&a)),
         truth: None,
         time_s: grid.time_s,
     })

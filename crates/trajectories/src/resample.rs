@@ -1,13 +1,16 @@
 //! From the clock of the log to the step of the model.
 
+use std::f64::consts::PI;
+
 use nesam_physics::wrap_angle;
 
 /// Longest usual step of a log, s: the longest that drives are resampled to. What is longer counts milliseconds or the like.
 pub const STEP_MAX_S: f64 = 10.0;
 /// Samples of a drive at most: eleven days at 10 Hz. A longer one would take gigabytes.
 const SAMPLES_MAX: f64 = 1e7;
-/// A log whose usual step is shorter than this share of the model's is finer; what is closer differs by jitter (chosen).
-const FINER: f64 = 0.9;
+/// A log is coarser than the model where the model's step is shorter than this share of the log's usual one: below 9 Hz at steps of 0.1 s, which `nesam import`
+/// doubts (chosen).
+const COARSER: f64 = 0.9;
 
 /// Longest gap between samples that is bridged in a log of this usual step, s: five steps, at least half a second (chosen: beyond it the motion is unknown).
 pub fn gap_limit_s(usual_step_s: f64) -> f64 {
@@ -34,7 +37,7 @@ pub(crate) struct Grid {
     pub(crate) time_s: Vec<f64>,
     places: Vec<Place>,
     dt_s: f64,
-    /// Time stamps of a log that is finer than the step; `None` of any other.
+    /// Time stamps of a log whose commands change inside steps; `None` of one that lies on the grid, and of a coarser one.
     stamps_s: Option<Vec<f64>>,
 }
 
@@ -82,7 +85,7 @@ impl Grid {
                 Place { at, share: ((t - time_s[at]) / (time_s[at + 1] - time_s[at])).clamp(0.0, 1.0) }
             })
             .collect();
-        let stamps_s = (median_s < FINER * dt_s).then(|| time_s.to_vec());
+        let stamps_s = (COARSER * median_s <= dt_s).then(|| time_s.to_vec());
         Ok(Self { time_s: grid, places, dt_s, stamps_s })
     }
 
@@ -91,9 +94,12 @@ impl Grid {
         self.blend(values, |a, b, share| a + share * (b - a))
     }
 
-    /// Interpolation of angles along the shorter way; results are wrapped into (-pi, pi].
+    /// Interpolation of angles along the shorter way; results are wrapped into (-pi, pi]. What lies there keeps every bit where nothing is interpolated.
     pub(crate) fn angles<const N: usize>(&self, values: &[[f64; N]]) -> Vec<[f64; N]> {
-        self.blend(values, |a, b, share| wrap_angle(a + share * wrap_angle(b - a)))
+        let mut angles = self.blend(values, |a, b, share| wrap_angle(a + share * wrap_angle(b - a)));
+        let outside = angles.as_flattened_mut().iter_mut().filter(|angle| !(**angle > -PI && **angle <= PI));
+        outside.for_each(|angle| *angle = wrap_angle(*angle));
+        angles
     }
 
     /// The value of the last sample at or before each time (zero-order hold).
@@ -101,10 +107,11 @@ impl Grid {
         self.places.iter().map(|p| values[p.last()]).collect()
     }
 
-    /// The mean over each step, from its sample to the next, of values that hold from their stamp on, where the log is finer than the step; the value at its
-    /// begin where the log is not. The last value holds on.
+    /// The mean over each step, from its sample to the next, of values that hold from their stamp on; the value at its begin where the log lies on the grid or
+    /// is coarser than the step. The last value holds on.
     ///
-    /// A step has one command. In a finer log it changes inside steps: taken at their begin, it would come half a step late on average.
+    /// A step has one command. In a log off the grid it changes inside steps: taken at their begin, it would come half a step late on average, and nearly a whole
+    /// one where stamps come just after the grid.
     pub(crate) fn averaged<const N: usize>(&self, values: &[[f64; N]]) -> Vec<[f64; N]> {
         let Some(stamps_s) = &self.stamps_s else { return self.held(values) };
         let mean = |(place, from_s): (&Place, &f64)| {
@@ -190,7 +197,7 @@ mod tests {
         }
         let turn: Vec<[f64; 1]> = time.iter().map(|t| [wrap_angle(3.0 + t)]).collect();
         for (t, v) in grid.time_s.iter().zip(grid.angles(&turn)) {
-            assert!(wrap_angle(v[0] - 3.0 - t).abs() < 1e-12 && v[0].abs() <= std::f64::consts::PI);
+            assert!(wrap_angle(v[0] - 3.0 - t).abs() < 1e-12 && v[0].abs() <= PI);
         }
         let held = grid.held(&time);
         for (t, h) in grid.time_s.iter().zip(held) {
@@ -213,14 +220,50 @@ mod tests {
                 assert!(constant == 0.7, "what stays keeps every bit");
             }
         }
-        // Logs at the step of the model, in single precision and with jitter too, and coarser ones keep every bit.
+        // Logs on the grid, in single precision and with stamps within a tenth of a step of it too, and coarser ones keep every bit.
         let single: Vec<f64> = clock(41, 0.1).iter().map(|t| f64::from(*t as f32)).collect();
-        let jitter: Vec<f64> = (0..41).map(|k| 0.1 * f64::from(k) + if k % 3 == 1 { 0.02 } else { 0.0 }).collect();
-        for time in [clock(41, 0.1), single, jitter, clock(41, 0.125), clock(9, 0.5)] {
+        let near: Vec<f64> = (0..41).map(|k| 0.1 * f64::from(k) + if k % 3 == 1 { 0.009 } else { 0.0 }).collect();
+        for time in [clock(41, 0.1), single, near, clock(41, 0.125), clock(9, 0.5)] {
             let values: Vec<[f64; 1]> = (0..time.len()).map(|k| [(0.7 * k as f64).sin()]).collect();
             let grid = Grid::new(&time, 0.1).unwrap();
             assert_eq!(grid.averaged(&values), grid.held(&values));
         }
+    }
+
+    #[test]
+    fn analytic_commands_near_the_step_of_the_model_come_in_time() {
+        // Goal: a log near 10 Hz that is not on the grid does not shift its commands. Method: a ramp u(t) = t, told at each stamp and held: its mean over a
+        // step is the stamp that holds, weighted by time. A clock that is 0.1 % fast or slow, stamps that tremble by 20 ms, and 9.7 Hz.
+        let jitter: Vec<f64> = (0..201).map(|k| 0.1 * f64::from(k) + if k % 3 == 1 { 0.02 } else { 0.0 }).collect();
+        for time in [clock(201, 0.1001), clock(201, 0.0999), jitter, clock(201, 1.0 / 9.7)] {
+            let values: Vec<[f64; 1]> = time.iter().map(|t| [*t]).collect();
+            let grid = Grid::new(&time, 0.1).unwrap();
+            let held_at = |t: f64| time.iter().rev().find(|stamp| **stamp <= t + 1e-9).copied().unwrap();
+            for (t, mean) in grid.time_s.iter().zip(grid.averaged(&values)) {
+                // The midpoint rule over a thousand parts is off by less than one of them of the change.
+                let expected = (0..1000).map(|i| held_at(t + 1e-4 * (f64::from(i) + 0.5))).sum::<f64>() / 1000.0;
+                assert!((mean[0] - expected).abs() < 2e-4, "{} for {expected} at {t}", mean[0]);
+            }
+        }
+    }
+
+    #[test]
+    fn analytic_angles_are_wrapped_on_the_grid_too() {
+        // Goal: angles that count on, or lie in 0 to 2 pi, are the same on and off the grid; what lies in (-pi, pi] keeps every bit.
+        let yaw = |t: f64| -2.0 + 0.7 * t;
+        let inside = |t: f64| wrap_angle(yaw(t));
+        for time in [clock(101, 0.1), clock(101, 0.103)] {
+            let grid = Grid::new(&time, 0.1).unwrap();
+            let told = |of: &dyn Fn(f64) -> f64| grid.angles(&time.iter().map(|t| [of(*t)]).collect::<Vec<_>>());
+            for counted in [told(&yaw), told(&|t| yaw(t).rem_euclid(std::f64::consts::TAU)), told(&|t| yaw(t) + 40.0 * PI)] {
+                for (wrapped, [angle]) in told(&inside).into_iter().zip(counted) {
+                    assert!(angle > -PI && angle <= PI && wrap_angle(angle - wrapped[0]).abs() < 1e-12, "{angle} for {}", wrapped[0]);
+                }
+            }
+        }
+        let grid = Grid::new(&clock(101, 0.1), 0.1).unwrap();
+        let values: Vec<[f64; 2]> = (0..101).map(|k| [0.03 * f64::from(k) - 1.5, if k == 7 { PI } else { -1e-300 }]).collect();
+        assert_eq!(grid.angles(&values), values);
     }
 
     #[test]
