@@ -1,7 +1,7 @@
 //! ROS 2 bags in MCAP files: odometry, commands and, where it is wanted, another gyro.
 //!
-//! One row per odometry message. Commands hold until the next one, as the vehicle does; a gyro reading counts until the next one. A message counts from its
-//! stamp; from when it was recorded where it has none, where the stamps of its topic are of another clock, or those of the odometry.
+//! One row per odometry message and one per command, by time; a gyro reading counts until the next one. A message counts from its stamp; from when it was
+//! recorded where it has none, where the stamps of its topic are of another clock, or those of the odometry.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -18,6 +18,8 @@ use crate::part::Notes;
 
 /// Stamps further from the recorder's clock than this are of another one, ns.
 const CLOCKS_APART_NS: u64 = 1_000_000_000;
+/// Commands this long before the first odometry say nothing of the drive, ns (chosen: longer than any command holds).
+const BEFORE_NS: i64 = 60_000_000_000;
 
 /// Topics to read; `None` = the only one of a type that fits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -42,6 +44,7 @@ const IMU: [&str; 1] = [messages::IMU.name];
 type Messages = BTreeMap<String, (String, Vec<(i64, Vec<u8>)>)>;
 
 /// Reads a bag, a file or a folder with its parts, as a log with the columns `t x y z qx qy qz qw vbx vby vbz wx wy wz cmd_speed` and `cmd_yaw_rate` or `cmd_road_wheel_angle`.
+/// Rows of odometry lack the commands and rows of commands the rest.
 ///
 /// # Errors
 /// `ImportError::Log` when a file is no MCAP file or compressed, a folder is no bag, a topic is missing, ambiguous or of another type, or a message is not readable.
@@ -76,8 +79,7 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
     let told = by_instant("commands", told, foreign_clock, &mut notes);
     let turned = by_instant("imu", turned, foreign_clock, &mut notes);
     let rows = by_instant("odometry", poses, foreign_clock, &mut notes);
-    let times: Vec<i64> = rows.iter().map(|(at_ns, _)| *at_ns).collect();
-    Ok((log(path, &times, &rows, (kind, told.as_slice()), gyro.is_some().then_some(turned.as_slice())), notes))
+    Ok((log(path, &rows, (kind, told.as_slice()), gyro.is_some().then_some(turned.as_slice())), notes))
 }
 
 /// A message of a topic that is held between its messages.
@@ -112,36 +114,49 @@ fn by_instant<T>(topic: &str, mut messages: Vec<Received<T>>, as_recorded: bool,
     entries
 }
 
+/// What a row of a bag tells.
+enum Told<'a> {
+    Odometry(&'a Odometry),
+    Command(&'a Command),
+}
+
 fn log(
     path: &Path,
-    times: &[i64],
-    rows: &[(i64, Odometry)],
-    (kind, told): (CommandType, &[(i64, Command)]),
+    poses: &[(i64, Odometry)],
+    (kind, commands): (CommandType, &[(i64, Command)]),
     turned: Option<&[(i64, [f64; 3])]>,
 ) -> Log {
-    let first = times.iter().min().copied().unwrap_or(0);
+    let first = poses.first().map_or(0, |(at_ns, _)| *at_ns);
+    let of_drive = commands.iter().filter(|(at_ns, _)| *at_ns >= first.saturating_sub(BEFORE_NS));
+    let mut rows: Vec<(i64, Told)> = poses.iter().map(|(at_ns, pose)| (*at_ns, Told::Odometry(pose))).collect();
+    rows.extend(of_drive.map(|(at_ns, command)| (*at_ns, Told::Command(command))));
+    rows.sort_by_key(|(at_ns, _)| *at_ns);
     let mut log = Log { path: path.into(), rows: rows.len(), places: (0..rows.len()).collect(), ..Log::default() };
-    let mut add = |name: &str, of: &dyn Fn(usize) -> Option<f64>| log.numbers.push((name.into(), (0..rows.len()).map(of).collect()));
+    let mut add = |name: &str, of: &dyn Fn(i64, &Told) -> Option<f64>| {
+        log.numbers.push((name.into(), rows.iter().map(|(at_ns, told)| of(*at_ns, told)).collect()));
+    };
+    let posed = |told: &Told, of: &dyn Fn(&Odometry) -> f64| if let Told::Odometry(pose) = told { Some(of(pose)) } else { None };
+    let commanded = |told: &Told, of: &dyn Fn(&Command) -> f64| if let Told::Command(command) = told { Some(of(command)) } else { None };
     // Nanoseconds since 1970 have more digits than a float.
-    add("t", &|i| Some((times[i] - first) as f64 * 1e-9));
+    add("t", &|at_ns, _| Some(at_ns.saturating_sub(first) as f64 * 1e-9));
     for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
-        add(name, &|i| Some(rows[i].1.position_m[axis]));
+        add(name, &|_, told| posed(told, &|pose| pose.position_m[axis]));
     }
     for (axis, name) in ["qx", "qy", "qz", "qw"].into_iter().enumerate() {
-        add(name, &|i| Some(rows[i].1.orientation[axis]));
+        add(name, &|_, told| posed(told, &|pose| pose.orientation[axis]));
     }
     for (axis, name) in ["vbx", "vby", "vbz"].into_iter().enumerate() {
-        add(name, &|i| Some(rows[i].1.linear_m_s[axis]));
+        add(name, &|_, told| posed(told, &|pose| pose.linear_m_s[axis]));
     }
     for (axis, name) in ["wx", "wy", "wz"].into_iter().enumerate() {
-        add(name, &|i| match turned {
-            Some(turned) => held(turned, times[i]).map(|rates| rates[axis]),
-            None => Some(rows[i].1.angular_rad_s[axis]),
+        add(name, &|at_ns, told| match turned {
+            Some(turned) => held(turned, at_ns).map(|rates| rates[axis]),
+            None => posed(told, &|pose| pose.angular_rad_s[axis]),
         });
     }
     let second = if kind.is_steered() { "cmd_road_wheel_angle" } else { "cmd_yaw_rate" };
-    add("cmd_speed", &|i| held(told, times[i]).map(|command| command.speed_m_s));
-    add(second, &|i| held(told, times[i]).map(|command| command.turn));
+    add("cmd_speed", &|_, told| commanded(told, &|command| command.speed_m_s));
+    add(second, &|_, told| commanded(told, &|command| command.turn));
     log
 }
 
@@ -310,7 +325,7 @@ mod tests {
         let topics = Topics { command: Some("/cmd_vel".into()), ..Topics::default() };
         let (one, _) = read_bag(&whole, &topics).expect("readable");
         let (two, notes) = read_bag(&split, &topics).expect("readable");
-        assert_eq!((one.rows, &one.numbers), (80, &two.numbers));
+        assert_eq!((one.rows, &one.numbers), (80 + 8, &two.numbers), "odometry and commands");
         assert!(notes.len() == 1 && notes[0].contains("c.mcap"), "{notes:?}");
     }
 
@@ -344,12 +359,57 @@ mod tests {
         writer.finish().expect("finished");
         let (log, notes) = read_bag(&path, &Topics { imu: Some("/imu".into()), ..Topics::default() }).expect("readable");
         assert_eq!(notes, [of_another_clock("imu")]);
-        let column = |name: &str| log.column(name).expect("there");
-        let commanded = column("cmd_speed");
-        assert_eq!((commanded[0], commanded[9], commanded[10], commanded[39]), (Some(1.0), Some(1.0), Some(11.0), Some(31.0)));
-        // The reading of a row is recorded 1 ms after the stamp of its odometry: the one before counts.
-        let turned = column("wz");
-        assert_eq!((turned[0], turned[1], turned[39]), (None, Some(0.0), Some(38.0)));
+        let (drives, notes) = drives(&log, &Options { name: "run".into(), ..Options::default() }).expect("a drive");
+        // The reading of a row is recorded 1 ms after the stamp of its odometry: the one before counts, and the first row has none.
+        assert!(notes.iter().any(|note| note.contains("1 of 40 rows left out") && note.contains("wz 1")), "{notes:?}");
+        let column = |name: &str| &drives[0].columns.iter().find(|(held, _)| held == name).expect("there").1;
+        let (commanded, turned) = (column("cmd_speed"), column("wz"));
+        assert_eq!((commanded[0], commanded[8], commanded[9], commanded[38]), (1.0, 1.0, 11.0, 31.0));
+        assert_eq!((turned[0], turned[38]), (0.0, 38.0));
+    }
+
+    /// Goal: a command counts from its instant, wherever it lies between messages of the odometry. Method: odometry at 10 Hz, commands that count up at 10 Hz 5 ms
+    /// late, 5 ms early and at the same stamps, and at 50 Hz; the last command comes two seconds before the end.
+    #[test]
+    fn regress_commands_between_messages_of_the_odometry_are_averaged() {
+        for (commands_hz, late_ns, expected) in [
+            (10, 5_000_000, [0.0, 0.95, 9.95]),
+            (10, -5_000_000, [0.05, 1.05, 10.05]),
+            (10, 0, [0.0, 1.0, 10.0]),
+            (50, 0, [2.0, 7.0, 52.0]),
+        ] {
+            let folder = tempfile::tempdir().expect("a folder");
+            let path = folder.path().join("run.mcap");
+            let mut writer = Writer::create(File::create(&path).expect("made"), "ros2", "test").expect("made");
+            let mut channel = |name: &str, topic: &str| {
+                let schema = writer.add_schema(name, "ros2msg", b"").expect("added");
+                writer.add_channel(schema, topic, "cdr").expect("added")
+            };
+            let (odometry, twist) = (channel("nav_msgs/msg/Odometry", "/odom"), channel("geometry_msgs/msg/TwistStamped", "/cmd_vel"));
+            let begin = 1_700_000_000_000_000_000_i64;
+            for k in 0..50 {
+                let at = begin + k * 100_000_000;
+                writer.write(odometry, 0, at as u64, &odometry_bytes(at, 0.1 * k as f64, 1.0)).expect("written");
+            }
+            for k in 0..3 * commands_hz {
+                let at = begin + late_ns + k * 1_000_000_000 / commands_hz;
+                let bytes = stamped(at, &["base_link"], &[k as f64, 0.0, 0.0, 0.0, 0.0, 0.5]);
+                writer.write(twist, 0, at as u64, &bytes).expect("written");
+            }
+            writer.finish().expect("finished");
+            let (log, _) = read_bag(&path, &Topics::default()).expect("readable");
+            let (drives, notes) = drives(&log, &Options { name: "run".into(), ..Options::default() }).expect("a drive");
+            let speeds = &drives[0].columns.iter().find(|(name, _)| name == "cmd_speed").expect("there").1;
+            for (row, expected) in [0, 1, 10].into_iter().zip(expected) {
+                assert!(
+                    (speeds[row] - expected).abs() < 1e-6,
+                    "{commands_hz} Hz, {late_ns} ns: {} for {expected} in row {row}",
+                    speeds[row]
+                );
+            }
+            assert!(notes.iter().any(|note| note.contains("older than 0.50 s")) && speeds.len() < 36, "{} rows: {notes:?}", speeds.len());
+            assert_eq!(notes.iter().any(|note| note.contains("commands change between rows")), commands_hz != 10 || late_ns != 0);
+        }
     }
 
     #[test]

@@ -1,25 +1,25 @@
 //! Drives from a log: channels, conventions, gaps.
 
-use std::collections::HashMap;
-
-use nesam_physics::vec3::attitude_of_quaternion;
 use nesam_trajectories::{STEP_MAX_S, gap_limit_s};
 
+use crate::commands::{Span, Told, usual_step_s};
 use crate::error::ImportError;
 use crate::frame::FrameConvention;
+use crate::left_out::LeftOut;
 use crate::log::Log;
 use crate::mapping::Mapping;
+use crate::pose::pose;
 
 /// Shorter drives hold no prediction and are left out, s.
 const DRIVE_MIN_S: f64 = 1.0;
-/// A channel that is missing in a larger share of the rows is left out; else the rows are.
+/// A channel that is missing in a larger share of a drive's rows is left out; else the rows are.
 const MISSING_SHARE: f64 = 0.2;
 /// Times beyond this count from an epoch and are made to count from the start of the log, s.
 const EPOCH_S: f64 = 1e6;
 /// Names of the second command.
 const SECOND: [&str; 3] = ["cmd_steer", "cmd_road_wheel_angle", "cmd_yaw_rate"];
-/// Channels that are used together or not at all.
-const GROUPS: [&[&str]; 7] = [
+/// Channels that are used together or not at all; of velocities the third may be missing.
+const GROUPS: [&[&str]; 8] = [
     &["vbx", "vby", "vbz"],
     &["vx", "vy", "vz"],
     &["wx"],
@@ -27,6 +27,7 @@ const GROUPS: [&[&str]; 7] = [
     &["wz"],
     &["om_fl", "om_fr", "om_rl", "om_rr"],
     &["steer_fl", "steer_fr"],
+    &["om_l", "om_r"],
 ];
 
 /// How to read a log.
@@ -61,8 +62,26 @@ impl Drive {
 /// What an import did besides copying, one sentence each.
 pub type Notes = Vec<String>;
 
-/// Channels before rows are chosen.
-type Channel = (String, Vec<Option<f64>>);
+/// A channel before rows are chosen.
+pub(crate) type Channel = (String, Vec<Option<f64>>);
+
+/// Channels of a log by what a row must have of them.
+struct Channels {
+    time: Vec<Option<f64>>,
+    /// All in each row.
+    pose: Vec<Channel>,
+    /// Some in some rows.
+    commands: Vec<Channel>,
+    /// Those that most rows of a drive have.
+    measured: Vec<Channel>,
+}
+
+/// A row that becomes a sample, and the time until the next one.
+#[derive(Clone, Copy)]
+struct Row {
+    row: usize,
+    span: Span,
+}
 
 /// Makes drives of a log.
 ///
@@ -70,47 +89,160 @@ type Channel = (String, Vec<Option<f64>>);
 /// `ImportError::Log` naming the channel that is missing, the line at which time goes backwards, or time stamps that count no seconds.
 pub fn drives(log: &Log, options: &Options) -> Result<(Vec<Drive>, Notes), ImportError> {
     let mut notes = Notes::new();
+    let channels = Channels {
+        time: time(log, options, &mut notes)?,
+        pose: pose(log, options, &mut notes)?,
+        commands: commands(log, options)?,
+        measured: measured(log, options, &mut notes)?,
+    };
     let names = options.mapping.texts(log, "trajectory");
-    let mut channels = vec![("t".to_string(), time(log, options, &mut notes)?)];
-    channels.extend(pose(log, options, &mut notes)?);
-    channels.extend(commands(log, options, names.as_deref())?);
-    let needed = channels.len();
-    for group in GROUPS {
-        channels.extend(motion(log, options, group, &mut notes)?);
+    let (mut drives, mut left_out, mut of_drives) = (Vec::new(), LeftOut::default(), Notes::new());
+    let all = by_name(log.rows, names.as_deref(), &options.name);
+    for (name, rows) in &all {
+        let of_one = of_one_name(log, &channels, name, rows, &mut left_out, &mut of_drives)?;
+        drives.extend(of_one);
     }
-    channels.extend(sides(log, options)?);
-    let whole = leave_out(&mut channels, needed, log.rows, &mut notes);
-    let mut drives = Vec::new();
-    for (name, rows) in by_name(&whole, names.as_deref(), &options.name) {
-        let rows = ascending(log, &channels[0].1, rows, &mut notes)?;
-        let parts = at_gaps(log, &channels[0].1, &rows)?;
-        let several = parts.len() > 1;
-        for (i, part) in parts.into_iter().enumerate() {
-            let id = if several { format!("{name}-{}", i + 1) } else { name.clone() };
-            let pick = |(name, values): &Channel| (name.clone(), part.iter().map(|row| values[*row].unwrap_or(f64::NAN)).collect());
-            let drive = Drive { id, columns: channels.iter().map(pick).collect() };
-            let length_s = drive.time_s().last().copied().unwrap_or(0.0) - drive.time_s().first().copied().unwrap_or(0.0);
-            if length_s < DRIVE_MIN_S {
-                notes.push(format!("{}: left out, {length_s:.2} s long, at least {DRIVE_MIN_S} s are of use", drive.id));
-            } else {
-                drives.push(drive);
-            }
-        }
-    }
+    notes.extend(left_out.notes(all.len()));
+    notes.extend(of_drives);
     if drives.is_empty() {
         return Err(ImportError::log(&log.path, format!("holds no drive of at least {DRIVE_MIN_S} s; {}", notes.join("; "))));
     }
     Ok((drives, notes))
 }
 
-fn absent(log: &Log, target: &str, hint: &str) -> ImportError {
+/// The drives between the gaps of the rows of one name.
+fn of_one_name(
+    log: &Log,
+    channels: &Channels,
+    name: &str,
+    rows: &[usize],
+    left_out: &mut LeftOut,
+    notes: &mut Notes,
+) -> Result<Vec<Drive>, ImportError> {
+    let mut lacking = LeftOut::default();
+    let posed = posed(channels, rows, &mut lacking);
+    let posed = ascending(log, &channels.time, posed, notes)?;
+    let told: Vec<Told> = channels.commands.iter().map(|(_, values)| Told::new(at_instants(&channels.time, values, rows))).collect();
+    let commanded = commanded(channels, &told, posed, name, &mut lacking, notes);
+    let measured = kept(&channels.measured, &commanded, name, &mut lacking);
+    let whole: Vec<Row> = commanded.into_iter().filter(|row| has_all(&measured, row.row, &mut lacking)).collect();
+    if whole.is_empty() {
+        notes.push(format!("{name}: left out, none of its {} rows has all that is needed ({})", rows.len(), lacking.lacks()));
+    }
+    left_out.add(lacking);
+    let parts = at_gaps(log, &whole, name, notes)?;
+    let several = parts.len() > 1;
+    let mut drives = Vec::new();
+    for (i, part) in parts.into_iter().enumerate() {
+        let id = if several { format!("{name}-{}", i + 1) } else { name.to_string() };
+        let columns = columns(channels, &told, &measured, &part);
+        let drive = Drive { id, columns };
+        let length_s = drive.time_s().last().copied().unwrap_or(0.0) - drive.time_s().first().copied().unwrap_or(0.0);
+        if length_s < DRIVE_MIN_S {
+            notes.push(format!("{}: left out, {length_s:.2} s long, at least {DRIVE_MIN_S} s are of use", drive.id));
+        } else {
+            drives.push(drive);
+        }
+    }
+    Ok(drives)
+}
+
+/// The rows that have a pose. Those that have none and a command are of another topic.
+fn posed(channels: &Channels, rows: &[usize], left_out: &mut LeftOut) -> Vec<usize> {
+    let has = |some: &[Channel], row: usize| some.iter().any(|(_, values)| values[row].is_some());
+    let mut posed = Vec::new();
+    for row in rows.iter().copied() {
+        let timed = channels.time[row].is_some();
+        if timed && !has(&channels.pose, row) && has(&channels.commands, row) {
+            left_out.commands_alone += 1;
+            continue;
+        }
+        left_out.count(1);
+        let lacking: Vec<&str> = channels.pose.iter().filter(|(_, values)| values[row].is_none()).map(|(name, _)| name.as_str()).collect();
+        if timed && lacking.is_empty() {
+            posed.push(row);
+        } else {
+            left_out.row(lacking.into_iter().chain((!timed).then_some("t")));
+        }
+    }
+    posed
+}
+
+/// Values of a channel in some rows, with their instants, s.
+fn at_instants(time: &[Option<f64>], values: &[Option<f64>], rows: &[usize]) -> Vec<(f64, f64)> {
+    rows.iter().filter_map(|row| time[*row].zip(values[*row])).collect()
+}
+
+/// The rows whose commands are known until the next row.
+fn commanded(channels: &Channels, told: &[Told], rows: Vec<Row>, name: &str, left_out: &mut LeftOut, notes: &mut Notes) -> Vec<Row> {
+    let (mut changing, mut silent) = (0, 0);
+    let mut commanded = Vec::with_capacity(rows.len());
+    for row in rows {
+        let unknown: Vec<usize> = (0..told.len()).filter(|i| !told[*i].is_known(row.span)).collect();
+        if unknown.is_empty() {
+            changing += usize::from(told.iter().any(|t| t.over(row.span).is_some_and(|mean| mean.changes)));
+            commanded.push(row);
+        } else {
+            silent += usize::from(unknown.iter().all(|i| told[*i].last(row.span.from_s).is_some()));
+            left_out.row(unknown.iter().map(|i| channels.commands[*i].0.as_str()));
+        }
+    }
+    if changing > 0 {
+        notes
+            .push(format!("{name}: commands change between rows; {changing} of {} rows have the mean until the next row", commanded.len()));
+    }
+    if silent > 0 {
+        let hold_s = told.iter().map(|t| t.hold_s).fold(f64::INFINITY, f64::min);
+        notes.push(format!(
+            "{name}: {silent} rows left out whose last command is older than {hold_s:.2} s; write it into rows for which it held"
+        ));
+    }
+    commanded
+}
+
+/// Measured channels that a drive has, by the rows that have all else.
+fn kept<'a>(measured: &'a [Channel], rows: &[Row], drive: &str, left_out: &mut LeftOut) -> Vec<&'a Channel> {
+    let mut keep = |(name, values): &&Channel| {
+        let missing = rows.iter().filter(|row| values[row.row].is_none()).count();
+        let keep = missing as f64 <= MISSING_SHARE * rows.len() as f64;
+        if !keep {
+            left_out.channel(name, drive, missing, rows.len());
+        }
+        keep
+    };
+    measured.iter().filter(|channel| keep(channel)).collect()
+}
+
+/// Whether a row has all of some channels.
+fn has_all(channels: &[&Channel], row: usize, left_out: &mut LeftOut) -> bool {
+    let lacking: Vec<&str> = channels.iter().filter(|(_, values)| values[row].is_none()).map(|(name, _)| name.as_str()).collect();
+    if !lacking.is_empty() {
+        left_out.row(lacking.iter().copied());
+    }
+    lacking.is_empty()
+}
+
+/// The columns of a drive in rows that have all of them. A command counts until the next row that is left.
+fn columns(channels: &Channels, told: &[Told], measured: &[&Channel], rows: &[Row]) -> Vec<(String, Vec<f64>)> {
+    let pick = |(name, values): &Channel| (name.clone(), rows.iter().map(|row| values[row.row].unwrap_or(f64::NAN)).collect());
+    let until = |i: usize| rows.get(i + 1).map_or(rows[i].span, |next| Span { from_s: rows[i].span.from_s, to_s: next.span.from_s });
+    let command = |((name, _), told): (&Channel, &Told)| {
+        (name.clone(), (0..rows.len()).map(|i| told.over(until(i)).map_or(f64::NAN, |mean| mean.value)).collect())
+    };
+    let time = ("t".to_string(), rows.iter().map(|row| row.span.from_s).collect());
+    let commands = channels.commands.iter().zip(told).map(command);
+    let measured = measured.iter().map(|channel| pick(channel));
+    std::iter::once(time).chain(channels.pose.iter().map(pick)).chain(commands).chain(measured).collect()
+}
+
+pub(crate) fn absent(log: &Log, target: &str, hint: &str) -> ImportError {
     ImportError::log(
         &log.path,
         format!("has no column `{target}`{hint}; name it with --column {target}=COLUMN:UNIT. It has {}", log.names()),
     )
 }
 
-fn required(log: &Log, options: &Options, target: &str, hint: &str) -> Result<Vec<Option<f64>>, ImportError> {
+pub(crate) fn required(log: &Log, options: &Options, target: &str, hint: &str) -> Result<Vec<Option<f64>>, ImportError> {
     options.mapping.numbers(log, target)?.ok_or_else(|| absent(log, target, hint))
 }
 
@@ -126,65 +258,19 @@ fn time(log: &Log, options: &Options, notes: &mut Notes) -> Result<Vec<Option<f6
     Ok(stamps.into_iter().map(|t| t.map(|t| t - first)).collect())
 }
 
-/// Position and attitude in the conventions of a data root.
-fn pose(log: &Log, options: &Options, notes: &mut Notes) -> Result<Vec<Channel>, ImportError> {
-    let zero = || vec![Some(0.0); log.rows];
-    let or_flat = |found: Option<Vec<Option<f64>>>, target: &str| match found {
-        Some(values) => Ok(values),
-        None if options.flat => Ok(zero()),
-        None => Err(absent(log, target, " (with --flat it may be missing and is taken for zero)")),
-    };
-    let number = |target: &str| options.mapping.numbers(log, target);
-    let position = [required(log, options, "x", "")?, required(log, options, "y", "")?, or_flat(number("z")?, "z")?];
-    let quaternion = [number("qx")?, number("qy")?, number("qz")?, number("qw")?];
-    let attitude = if let (None, [Some(x), Some(y), Some(z), Some(w)]) = (number("yaw")?, &quaternion) {
-        let of_row = |row: usize| attitude_of_quaternion([x[row]?, y[row]?, z[row]?, w[row]?]);
-        let rows: Vec<Option<[f64; 3]>> = (0..log.rows).map(of_row).collect();
-        std::array::from_fn(|axis| rows.iter().map(|angles| angles.map(|a| a[axis])).collect())
-    } else {
-        let yaw = required(log, options, "yaw", " nor a quaternion `qx` to `qw`")?;
-        [or_flat(number("roll")?, "roll")?, or_flat(number("pitch")?, "pitch")?, yaw]
-    };
-    let of_quaternion = number("yaw")?.is_none();
-    let given = [number("z")?.is_some(), of_quaternion || number("roll")?.is_some(), of_quaternion || number("pitch")?.is_some()];
-    let lacking: Vec<&str> = ["z", "roll", "pitch"].into_iter().zip(given).filter(|(_, given)| !given).map(|(name, _)| name).collect();
-    if !lacking.is_empty() {
-        notes.push(format!("no {} in the set, as --flat allows: taken for zero, on level ground, and not scored", lacking.join(", ")));
-    }
-    let position = turned(position, |v| options.frame.world(v));
-    let attitude = turned(attitude, |v| options.frame.attitude(v));
-    let all = named(&["x", "y", "z"], position).chain(named(&["roll", "pitch", "yaw"], attitude));
-    Ok(all.filter(|(name, _)| !lacking.contains(&name.as_str())).collect())
-}
-
-fn named<const N: usize>(names: &[&str; N], values: [Vec<Option<f64>>; N]) -> impl Iterator<Item = Channel> {
-    names.map(String::from).into_iter().zip(values)
-}
-
 /// Three channels through a change of axes; a row that lacks one lacks all.
-fn turned(channels: [Vec<Option<f64>>; 3], turn: impl Fn([f64; 3]) -> [f64; 3]) -> [Vec<Option<f64>>; 3] {
+pub(crate) fn turned(channels: [Vec<Option<f64>>; 3], turn: impl Fn([f64; 3]) -> [f64; 3]) -> [Vec<Option<f64>>; 3] {
     let [x, y, z] = &channels;
     let rows: Vec<Option<[f64; 3]>> = (0..x.len()).map(|row| Some(turn([x[row]?, y[row]?, z[row]?]))).collect();
     std::array::from_fn(|axis| rows.iter().map(|v| v.map(|v| v[axis])).collect())
 }
 
-/// Commands; each holds until the next of its drive.
-fn commands(log: &Log, options: &Options, names: Option<&[String]>) -> Result<Vec<Channel>, ImportError> {
-    let hold = |values: Vec<Option<f64>>| {
-        let mut last: HashMap<&str, f64> = HashMap::new();
-        let held = |(row, value): (usize, Option<f64>)| {
-            let name = names.map_or("", |names| names[row].as_str());
-            if let Some(value) = value {
-                last.insert(name, value);
-            }
-            last.get(name).copied()
-        };
-        values.into_iter().enumerate().map(held).collect::<Vec<_>>()
-    };
-    let mut channels = vec![("cmd_speed".to_string(), hold(required(log, options, "cmd_speed", " (commanded speed)")?))];
+/// Commands as they were told.
+fn commands(log: &Log, options: &Options) -> Result<Vec<Channel>, ImportError> {
+    let mut channels = vec![("cmd_speed".to_string(), required(log, options, "cmd_speed", " (commanded speed)")?)];
     for name in SECOND {
         if let Some(values) = options.mapping.numbers(log, name)? {
-            let about_up = hold(values).into_iter().map(|v| v.map(|v| options.frame.about_up(v))).collect();
+            let about_up = values.into_iter().map(|v| v.map(|v| options.frame.about_up(v))).collect();
             channels.push((name.into(), about_up));
         }
     }
@@ -194,12 +280,22 @@ fn commands(log: &Log, options: &Options, names: Option<&[String]>) -> Result<Ve
     Ok(channels)
 }
 
-/// Measured motion and wheels: channels that are used together or not at all.
-fn motion(log: &Log, options: &Options, group: &[&str], notes: &mut Notes) -> Result<Vec<Channel>, ImportError> {
-    let found = group.iter().map(|name| options.mapping.numbers(log, name)).collect::<Result<Vec<_>, _>>()?;
+/// Measured motion and wheels.
+fn measured(log: &Log, options: &Options, notes: &mut Notes) -> Result<Vec<Channel>, ImportError> {
+    let groups = GROUPS.iter().map(|group| of_group(log, options, group, notes)).collect::<Result<Vec<_>, _>>()?;
+    Ok(groups.into_iter().flatten().collect())
+}
+
+/// Channels that are used together or not at all.
+fn of_group(log: &Log, options: &Options, group: &[&str], notes: &mut Notes) -> Result<Vec<Channel>, ImportError> {
+    let mut found = group.iter().map(|name| options.mapping.numbers(log, name)).collect::<Result<Vec<_>, _>>()?;
     let there: Vec<&str> = group.iter().zip(&found).filter(|(_, values)| values.is_some()).map(|(name, _)| *name).collect();
-    if !there.is_empty() && there.len() < group.len() {
-        notes.push(format!("{} not used: {} are needed together", there.join(", "), group.join(", ")));
+    // A planar velocity says nothing of the third axis: zero for the change of axes, which leaves it to itself.
+    let planar = group[0].starts_with('v') && there == group[..2];
+    if planar {
+        found[2] = Some(vec![Some(0.0); log.rows]);
+    } else if !there.is_empty() && there.len() < group.len() {
+        notes.push(incomplete(&there, group));
     }
     let Some(values) = found.into_iter().collect::<Option<Vec<_>>>() else { return Ok(Vec::new()) };
     let values: Vec<Vec<Option<f64>>> = match (group[0], <[Vec<Option<f64>>; 3]>::try_from(values)) {
@@ -211,52 +307,30 @@ fn motion(log: &Log, options: &Options, group: &[&str], notes: &mut Notes) -> Re
         }
         (_, Err(values)) => values,
     };
-    Ok(group.iter().map(|name| (*name).to_string()).zip(values).collect())
+    let used = if planar { there.len() } else { group.len() };
+    Ok(group.iter().map(|name| (*name).to_string()).zip(values).take(used).collect())
 }
 
-/// Wheel speeds of a vehicle whose sides are coupled.
-fn sides(log: &Log, options: &Options) -> Result<Vec<Channel>, ImportError> {
-    let found = [options.mapping.numbers(log, "om_l")?, options.mapping.numbers(log, "om_r")?];
-    let [Some(left), Some(right)] = found else { return Ok(Vec::new()) };
-    Ok(vec![("om_l".into(), left), ("om_r".into(), right)])
-}
-
-/// Drops channels that are mostly missing; gives the rows that have all others.
-fn leave_out(channels: &mut Vec<Channel>, needed: usize, rows: usize, notes: &mut Notes) -> Vec<usize> {
-    let missing = |values: &[Option<f64>]| values.iter().filter(|v| v.is_none()).count();
-    let mut at = 0;
-    channels.retain(|(name, values)| {
-        at += 1;
-        let keep = at <= needed || missing(values) as f64 <= MISSING_SHARE * rows as f64;
-        if !keep {
-            notes.push(format!("{name} not used: missing in {} of {rows} rows", missing(values)));
-        }
-        keep
-    });
-    let whole: Vec<usize> = (0..rows).filter(|row| channels.iter().all(|(_, values)| values[*row].is_some())).collect();
-    if whole.len() < rows {
-        let lacking: Vec<String> =
-            channels.iter().filter(|(_, v)| missing(v) > 0).map(|(name, v)| format!("{name} {}", missing(v))).collect();
-        notes.push(format!("{} of {rows} rows left out for missing values ({})", rows - whole.len(), lacking.join(", ")));
-    }
-    whole
+/// Says which columns are of no use without others.
+pub(crate) fn incomplete(there: &[&str], needed: &[&str]) -> String {
+    format!("{} not used: {} are needed together", there.join(", "), needed.join(", "))
 }
 
 /// Rows of each drive, in the order of their first rows.
-fn by_name(rows: &[usize], names: Option<&[String]>, default: &str) -> Vec<(String, Vec<usize>)> {
+fn by_name(rows: usize, names: Option<&[String]>, default: &str) -> Vec<(String, Vec<usize>)> {
     let mut drives: Vec<(String, Vec<usize>)> = Vec::new();
-    for row in rows {
-        let name = names.map_or(default, |names| names[*row].as_str());
+    for row in 0..rows {
+        let name = names.map_or(default, |names| names[row].as_str());
         match drives.iter_mut().rev().find(|(held, _)| held == name) {
-            Some((_, held)) => held.push(*row),
-            None => drives.push((name.into(), vec![*row])),
+            Some((_, held)) => held.push(row),
+            None => drives.push((name.into(), vec![row])),
         }
     }
     drives
 }
 
-/// The rows without those that repeat a time stamp.
-fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Notes) -> Result<Vec<usize>, ImportError> {
+/// The rows without those that repeat a time stamp, each until the next one.
+fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Notes) -> Result<Vec<Row>, ImportError> {
     let at = |row: usize| time[row].unwrap_or(f64::NAN);
     let mut kept: Vec<usize> = Vec::with_capacity(rows.len());
     let mut repeated = 0;
@@ -278,27 +352,29 @@ fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Note
     if repeated > 0 {
         notes.push(format!("{repeated} rows left out that repeat a time stamp"));
     }
-    Ok(kept)
+    let usual_s = usual_step_s(kept.iter().map(|row| at(*row)));
+    let limit_s = gap_limit_s(usual_s);
+    // Before a gap, and at the end, a row counts for as long as usual.
+    let lasts_s = if usual_s > 0.0 { usual_s } else { limit_s };
+    let until_s = |i: usize| kept.get(i + 1).map(|next| at(*next)).filter(|next_s| next_s - at(kept[i]) <= limit_s);
+    let span = |i: usize| Span { from_s: at(kept[i]), to_s: until_s(i).unwrap_or(at(kept[i]) + lasts_s) };
+    Ok((0..kept.len()).map(|i| Row { row: kept[i], span: span(i) }).collect())
 }
 
 /// Parts of a drive between gaps.
-fn at_gaps(log: &Log, time: &[Option<f64>], rows: &[usize]) -> Result<Vec<Vec<usize>>, ImportError> {
-    let step = |pair: &[usize]| time[pair[1]].zip(time[pair[0]]).map_or(f64::NAN, |(b, a)| b - a);
-    let mut steps: Vec<f64> = rows.windows(2).map(step).collect();
-    steps.sort_by(f64::total_cmp);
-    let median_s = steps.get(steps.len() / 2).copied().unwrap_or(0.0);
-    if median_s > STEP_MAX_S {
-        let what = format!("samples lie {median_s} s apart in `t`, at most {STEP_MAX_S} s are usual");
+fn at_gaps(log: &Log, rows: &[Row], name: &str, notes: &mut Notes) -> Result<Vec<Vec<Row>>, ImportError> {
+    let usual_s = usual_step_s(rows.iter().map(|row| row.span.from_s));
+    if usual_s > STEP_MAX_S {
+        let what = format!("samples lie {usual_s} s apart in `t`, at most {STEP_MAX_S} s are usual");
         let advice = "where its unit is not the second, name it: --column t=COLUMN:ns, or ms, us";
         return Err(ImportError::log(&log.path, format!("{what}; {advice}")));
     }
-    let limit_s = gap_limit_s(median_s);
-    let mut parts: Vec<Vec<usize>> = Vec::new();
-    for (i, row) in rows.iter().enumerate() {
-        if i == 0 || step(&rows[i - 1..=i]) > limit_s {
-            parts.push(Vec::new());
-        }
-        parts.last_mut().expect("a part was begun; this is a bug").push(*row);
+    let limit_s = gap_limit_s(usual_s);
+    let is_gap = |a: &Row, b: &Row| b.span.from_s - a.span.from_s > limit_s;
+    let gaps_s: Vec<f64> = rows.windows(2).filter(|pair| is_gap(&pair[0], &pair[1])).map(|p| p[1].span.from_s - p[0].span.from_s).collect();
+    if !gaps_s.is_empty() {
+        let (count, sum_s) = (gaps_s.len(), gaps_s.iter().sum::<f64>());
+        notes.push(format!("{name}: parted at {count} gaps of more than {limit_s:.2} s, {sum_s:.2} s in all"));
     }
-    Ok(parts)
+    Ok(rows.chunk_by(|a, b| !is_gap(a, b)).map(<[Row]>::to_vec).collect())
 }

@@ -4,7 +4,7 @@
 use std::fmt::Write;
 use std::path::{Path, PathBuf};
 
-use nesam_import::{FrameConvention, Mapping, Options, drives, read_csv, write_set};
+use nesam_import::{Drive, FrameConvention, ImportError, Mapping, Notes, Options, Topics, drives, read_bag, read_csv, write_set};
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory};
 
 fn sample() -> PathBuf {
@@ -24,6 +24,23 @@ fn imported(table: &str, options: &Options) -> Vec<Trajectory> {
     let (drives, _) = drives(&read_csv(&root.join("log.csv")).expect("a table"), options).expect("drives");
     write_set(&root.join("mine"), &drives, None, Some("test")).expect("written");
     DataRoot::open(root, None).expect("a root").load_set(&SetQuery::all("mine")).expect("drives")
+}
+
+/// The drives of a table, and what was said.
+fn read(table: &str, options: &Options) -> Result<(Vec<Drive>, Notes), ImportError> {
+    let folder = tempfile::tempdir().expect("a folder");
+    let path = folder.path().join("log.csv");
+    std::fs::write(&path, table).expect("written");
+    drives(&read_csv(&path).expect("a table"), options)
+}
+
+/// A column of a drive.
+fn column<'a>(drive: &'a Drive, name: &str) -> Option<&'a [f64]> {
+    drive.columns.iter().find(|(held, _)| held == name).map(|(_, values)| values.as_slice())
+}
+
+fn flat(lines: &[&str]) -> Options {
+    Options { flat: true, ..options(lines, FrameConvention::EnuFlu) }
 }
 
 fn options(lines: &[&str], frame: FrameConvention) -> Options {
@@ -50,6 +67,21 @@ fn chrono_a_table_with_our_names_gives_the_same_bits() {
         assert_eq!((&read.id, read.states == drive.states, read.controls == drive.controls), (&drive.id, true, true));
         assert!(read.wheel_speed_rad_s == drive.wheel_speed_rad_s && read.road_wheel_angle_rad == drive.road_wheel_angle_rad);
         assert_eq!(read.measured, drive.measured);
+    }
+}
+
+/// A bag whose commands were recorded a microsecond from the odometry: they are those of its rows, to the bit.
+#[test]
+fn chrono_commands_of_a_bag_that_come_with_the_odometry_keep_every_bit() {
+    let root = DataRoot::open(&sample(), None).expect("the sample");
+    let recorded = root.load_set(&SetQuery::all("nominal")).expect("drives").into_iter().find(|drive| drive.id == "n0005").expect("there");
+    for command in ["/truck/ackermann_cmd", "/truck/cmd_vel"] {
+        let topics = Topics { command: Some(command.into()), odometry: Some("/truck/odom".into()), ..Topics::default() };
+        let (log, _) = read_bag(&sample().join("../ros2/n0005"), &topics).expect("a bag");
+        let (found, notes) = drives(&log, &options(&[], FrameConvention::EnuFlu)).expect("a drive");
+        let commanded = column(&found[0], "cmd_speed").expect("there");
+        assert!(commanded.len() == 101 && !notes.iter().any(|note| note.contains("commands change")), "{command}: {notes:?}");
+        assert!(commanded.iter().zip(&recorded.controls).all(|(told, control)| *told == control.speed_m_s), "{command}: {commanded:?}");
     }
 }
 
@@ -185,4 +217,129 @@ fn analytic_time_stamps_that_are_no_seconds_are_refused() {
     let told = drives(&log, &flat(&[])).expect_err("nanoseconds").to_string();
     assert!(told.contains("`t`") && told.contains("--column t=COLUMN:ns"), "{told}");
     assert_eq!(drives(&log, &flat(&["t=t:ns"])).expect("a drive").0[0].time_s().len(), 30);
+}
+
+/// Goal: a table that a recorder of two topics writes is read as what was driven. Method: poses and wheel speeds at 10 Hz in rows of their own, commands that count
+/// up in rows 5 ms before, at and after them; the share of the row that is another command's is 5 %.
+#[test]
+fn regress_a_table_of_two_topics_keeps_its_channels_and_the_time_of_its_commands() {
+    for (late_s, share) in [(-0.005, 0.05), (0.0, 0.0), (0.005, -0.05)] {
+        let mut rows: Vec<(f64, String)> = Vec::new();
+        for k in 0..50 {
+            let t = 0.1 * f64::from(k);
+            rows.push((t, format!("{t},{k},0,0,,,5,5,5,5\n")));
+            rows.push((t + late_s, format!("{},,,,{k},0.1,,,,\n", t + late_s)));
+        }
+        rows.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let head = "t,x,y,yaw,cmd_speed,cmd_steer,om_fl,om_fr,om_rl,om_rr\n".to_string();
+        let table = rows.iter().fold(head, |table, (_, row)| table + row);
+        let (found, notes) = read(&table, &flat(&[])).expect("a drive");
+        assert_eq!((found.len(), found[0].time_s().len()), (1, 50), "{notes:?}");
+        assert_eq!(column(&found[0], "om_rr"), Some(&[5.0; 50][..]), "{notes:?}");
+        for (k, speed) in column(&found[0], "cmd_speed").expect("there").iter().enumerate().take(49).skip(1) {
+            assert!((speed - k as f64 - share).abs() < 1e-6, "{late_s} s: {speed} in row {k}");
+        }
+        assert!(notes.iter().any(|n| n.contains("50 rows have commands and no pose")), "{notes:?}");
+        assert!(!notes.iter().any(|n| n.contains("left out")), "{notes:?}");
+    }
+}
+
+/// Goal: what one drive lacks costs no other, and no drive goes without a word. Method: five drives; one lacks a wheel speed, one yaws, one commands.
+#[test]
+fn regress_what_a_drive_lacks_is_decided_by_drive_and_named() {
+    let mut table = "trajectory,t,x,y,yaw,cmd_speed,cmd_steer,om_l,om_r\n".to_string();
+    for name in ["a", "wheel", "pose", "mute", "e"] {
+        for k in 0..30 {
+            let t = 0.1 * f64::from(k);
+            let of = |lacking: &str, value: &'static str| if name == lacking { "" } else { value };
+            let _ = writeln!(table, "{name},{t},{t},0,{},{},0,3,{}", of("pose", "0.1"), of("mute", "1"), of("wheel", "3"));
+        }
+    }
+    let (found, notes) = read(&table, &flat(&[])).expect("drives");
+    let lengths: Vec<(&str, usize)> = found.iter().map(|d| (d.id.as_str(), d.time_s().len())).collect();
+    assert_eq!(lengths, [("a", 30), ("wheel", 30), ("e", 30)], "{notes:?}");
+    assert!(column(&found[0], "om_r").is_some() && column(&found[1], "om_r").is_none());
+    for expected in [
+        "om_r not used in wheel: missing in 30 of 30 rows",
+        "60 of 150 rows left out for missing values (yaw 30, cmd_speed 30)",
+        "pose: left out, none of its 30 rows has all that is needed (yaw 30)",
+        "mute: left out, none of its 30 rows has all that is needed (cmd_speed 30)",
+    ] {
+        assert!(notes.iter().any(|n| n == expected), "{expected}: {notes:?}");
+    }
+}
+
+#[test]
+fn regress_commands_do_not_hold_across_a_gap() {
+    // 3 s with commands, 60 s of nothing, 3 s whose first second has none.
+    let mut table = "t,x,y,yaw,cmd_speed,cmd_steer\n".to_string();
+    for k in (0..30).chain(630..660) {
+        let command = if (630..640).contains(&k) { "," } else { "2,0" };
+        let _ = writeln!(table, "{},{},0,0,{command}", 0.1 * f64::from(k), 0.2 * f64::from(k));
+    }
+    let (found, notes) = read(&table, &flat(&[])).expect("two drives");
+    assert_eq!(found.iter().map(|d| (d.id.as_str(), d.time_s().len())).collect::<Vec<_>>(), [("log-1", 30), ("log-2", 20)], "{notes:?}");
+    for expected in [
+        "10 of 60 rows left out for missing values (cmd_speed 10, cmd_steer 10)",
+        "log: 10 rows left out whose last command is older than 0.50 s; write it into rows for which it held",
+        "log: parted at 1 gaps of more than 0.50 s, 61.10 s in all",
+    ] {
+        assert!(notes.iter().any(|n| n == expected), "{expected}: {notes:?}");
+    }
+}
+
+/// Goal: of two attitudes in a log the mapped one counts, else the quaternion, and that is said. Method: angles that say yaw 1 and roll 0.3, and a quaternion of a yaw of
+/// half a turn less a right angle.
+#[test]
+fn regress_a_mapped_attitude_counts_before_one_that_is_not() {
+    let table = |angles: &str| {
+        let mut table = format!("t,x,y,z,{angles},qx,qy,qz,qw,cmd_speed,cmd_steer\n");
+        let values = angles.replace("yaw", "1").replace("roll", "0.3").replace("pitch", "0");
+        for k in 0..30 {
+            let half = std::f64::consts::FRAC_1_SQRT_2;
+            let _ = writeln!(table, "{},0,0,0,{values},0,0,{half},{half},1,0", 0.1 * f64::from(k));
+        }
+        table
+    };
+    let strict = |lines: &[&str]| options(lines, FrameConvention::EnuFlu);
+    let yaw = |angles: &str, lines: &[&str]| {
+        let (found, notes) = read(&table(angles), &strict(lines)).expect("a drive");
+        (column(&found[0], "yaw").expect("there")[0], notes.join("; "))
+    };
+    let quaternion = ["qx=qx", "qy=qy", "qz=qz", "qw=qw"];
+    for (angles, lines) in [("yaw", &[][..]), ("yaw", &quaternion), ("roll,pitch,yaw", &[]), ("roll,pitch,yaw", &quaternion)] {
+        let (yaw, said) = yaw(angles, lines);
+        assert!((yaw - std::f64::consts::FRAC_PI_2).abs() < 1e-12, "{angles} {lines:?}: {yaw}");
+        assert!(said.contains(&format!("attitude of the quaternion qx, qy, qz, qw; {} not used", angles.replace(',', ", "))), "{said}");
+    }
+    let (of_angles, said) = yaw("roll,pitch,yaw", &["yaw=yaw"]);
+    assert!(of_angles == 1.0 && said.contains("attitude of roll, pitch, yaw, which the mapping names; qx, qy, qz, qw not used"), "{said}");
+    let told = read(&table("yaw"), &strict(&["yaw=yaw"])).expect_err("no roll").to_string();
+    assert!(told.contains("no column `roll` (the quaternion has it") && !told.contains("--flat"), "{told}");
+    let cut = table("roll,pitch,yaw").replace(",qw,", ",other,");
+    let (found, notes) = read(&cut, &strict(&[])).expect("a drive");
+    assert!(column(&found[0], "yaw").is_some_and(|yaw| yaw[0] == 1.0));
+    assert!(notes.iter().any(|n| n == "qx, qy, qz not used: qx, qy, qz, qw are needed together"), "{notes:?}");
+}
+
+#[test]
+fn regress_planar_velocities_are_used_and_half_a_pair_is_told() {
+    for (names, frame, expected) in [
+        (["vbx", "vby"], FrameConvention::EnuFlu, [1.0, 0.2]),
+        (["vbx", "vby"], FrameConvention::NedFrd, [1.0, -0.2]),
+        (["vx", "vy"], FrameConvention::EnuFlu, [1.0, 0.2]),
+        (["vx", "vy"], FrameConvention::NedFrd, [0.2, 1.0]),
+    ] {
+        let mut table = format!("t,x,y,yaw,cmd_speed,cmd_steer,{},om_l\n", names.join(","));
+        for k in 0..30 {
+            let _ = writeln!(table, "{},{},0,0,1,0,1,0.2,5", 0.1 * f64::from(k), 0.1 * f64::from(k));
+        }
+        let (found, notes) = read(&table, &Options { flat: true, ..options(&[], frame) }).expect("a drive");
+        for (name, value) in names.into_iter().zip(expected) {
+            assert_eq!(column(&found[0], name).map(|v| v[0]), Some(value), "{name}: {notes:?}");
+        }
+        assert!(column(&found[0], "vbz").is_none() && column(&found[0], "vz").is_none() && column(&found[0], "om_l").is_none());
+        assert!(notes.iter().any(|n| n == "om_l not used: om_l, om_r are needed together"), "{notes:?}");
+        assert!(!notes.iter().any(|n| n.starts_with('v')), "{notes:?}");
+    }
 }
