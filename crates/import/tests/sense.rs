@@ -15,6 +15,7 @@ fn begin(drive: &Trajectory, samples: usize) -> Trajectory {
     drive.states.truncate(samples);
     drive.controls.truncate(samples);
     drive.wheel_speed_rad_s.iter_mut().for_each(|wheels| wheels.truncate(samples));
+    drive.road_wheel_angle_rad.iter_mut().for_each(|angles| angles.truncate(samples));
     drive
 }
 
@@ -47,6 +48,9 @@ fn chrono_one_mistake_is_told_and_no_other() {
     let wheels = |change: fn([f64; 4]) -> [f64; 4]| {
         told(&|drive| drive.wheel_speed_rad_s.iter_mut().flatten().for_each(|wheels| *wheels = change(*wheels)), usize::MAX)
     };
+    let angles = |change: fn(f64) -> f64| {
+        told(&|drive| drive.road_wheel_angle_rad.iter_mut().flatten().for_each(|angles| *angles = angles.map(change)), usize::MAX)
+    };
     let frozen = |drive: &mut Trajectory| {
         let held = drive.states[100].position_m;
         drive.states[100..150].iter_mut().for_each(|s| s.position_m = held);
@@ -55,6 +59,8 @@ fn chrono_one_mistake_is_told_and_no_other() {
         ("rim speed of FL", wheels(|[fl, fr, rl, rr]| [-fl, fr, rl, rr])),
         ("rim speed of RR", wheels(|[fl, fr, rl, rr]| [fl, fr, rl, 9.55 * rr])),
         ("the left and right wheels turn against the yaw", wheels(|[fl, fr, rl, rr]| [fr, fl, rr, rl])),
+        ("road-wheel angle against the steering command: -1.0", angles(|a| -a)),
+        ("degrees instead of radians", angles(f64::to_degrees)),
         ("positions are frozen in 1 of 6 drives", told(&frozen, 1)),
         ("positions jump 1 times", told(&|drive| drive.states[120..].iter_mut().for_each(|s| s.position_m[1] += 10.0), 1)),
     ] {

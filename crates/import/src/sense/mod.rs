@@ -11,6 +11,7 @@ mod heading;
 mod motion;
 mod positions;
 mod relation;
+mod road_wheels;
 #[cfg(test)]
 mod tests;
 mod wheels;
@@ -61,6 +62,7 @@ pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
     found.extend(motion::climb(drives));
     found.extend(commands::speed(drives, attitude_holds));
     found.extend(commands::turning(drives, vehicle));
+    found.extend(road_wheels::angles(drives, vehicle));
     found
 }
 

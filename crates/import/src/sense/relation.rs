@@ -16,13 +16,36 @@ pub(super) const SPEEDS: &[Unit] = &[
     (1.0 / 3.6, "m/s that were divided by 3.6 once too often"),
     (2.237, "miles per hour instead of m/s"),
     (3.281, "feet instead of metres"),
-    (1e3, "millimetres instead of metres"),
+    (1e3, "time stamps in milliseconds that were taken for seconds (`--column t=COLUMN:ms`), or else millimetres instead of metres"),
 ];
-/// The same of wheel speeds.
-pub(super) const WHEEL_SPEEDS: &[Unit] =
-    &[(9.549, "revolutions per minute instead of rad/s"), (0.159_155, "revolutions per second instead of rad/s")];
+/// The same where the command is expected and the speed is found: the wrong unit is rather that of the command, which the speed is held against alone.
+pub(super) const COMMANDED_SPEEDS: &[Unit] = &[
+    (1.0 / 3.6, "a speed command in km/h or the like instead of m/s"),
+    (3.6, "a speed command that was divided by 3.6 once too often, or else speeds in km/h instead of m/s"),
+    (1.0 / 2.237, "a speed command in miles per hour instead of m/s"),
+    (1.0 / 3.281, "a speed command in feet instead of metres"),
+    (3.281, "positions and speeds in feet instead of metres"),
+    (
+        1e-3,
+        "a speed command in millimetres instead of metres, or else time stamps in milliseconds that were taken for seconds (`--column t=COLUMN:ms`)",
+    ),
+    (1e3, "positions and speeds in millimetres instead of metres"),
+];
+/// The same of wheel speeds, rad/s, for wheels of a radius.
+pub(super) fn wheel_speeds(radius_m: f64) -> [Unit; 4] {
+    const TURNS_PER_RAD: f64 = 0.159_155;
+    let (turns, rims) =
+        ("revolutions per second instead of rad/s", "metres per second instead of rad/s (divide by the radius of the wheels)");
+    let alike = (radius_m / TURNS_PER_RAD - 1.0).abs() < UNIT_TOLERANCE;
+    let either = "revolutions per second instead of rad/s, or else metres per second (divide by the radius of the wheels)";
+    let [turns, rims] = if alike { [either; 2] } else { [turns, rims] };
+    [(9.549, "revolutions per minute instead of rad/s"), (TURNS_PER_RAD, turns), (radius_m, rims), (1e3, CLOCK)]
+}
 /// The same of angles and their rates.
-pub(super) const ANGLES: &[Unit] = &[(57.296, "degrees instead of radians"), (0.017_453, "radians that were taken for degrees")];
+pub(super) const ANGLES: &[Unit] =
+    &[(57.296, "degrees instead of radians"), (0.017_453, "radians that were taken for degrees"), (1e3, CLOCK)];
+/// What makes rates a thousand times as large as the changes that they are held against.
+const CLOCK: &str = "time stamps in milliseconds that were taken for seconds (`--column t=COLUMN:ms`)";
 /// Times as much as expected below which nothing is found but noise (chosen).
 const NOTHING: f64 = 0.02;
 /// What to do where two channels are unrelated.

@@ -3,7 +3,7 @@
 use nesam_physics::{Vehicle, WHEELS};
 use nesam_trajectories::Trajectory;
 
-use super::relation::{Relation, WHEEL_SPEEDS};
+use super::relation::{Relation, wheel_speeds};
 use super::{Doubt, SPEED_M_S, YAW_RATE_RAD_S, angle_rate_rad_s, doubt, forward_m_s, rim_speed_m_s};
 
 /// Rim speeds per speed over ground that are let pass: wheels slip.
@@ -14,11 +14,14 @@ const STRAIGHT: f64 = 0.1;
 const ALONE: f64 = 0.75;
 const NAMES: [&str; WHEELS] = ["FL", "FR", "RL", "RR"];
 const BACKWARDS: &str = "wheels counted backwards";
+/// What swaps the sides of a log that agrees with itself in all else.
+const MIRRORED: &str = "; or the log has y to the right and yaw clockwise, as PX4 and ArduPilot have: import it with `--frame ned-frd`";
 
 /// Rims go as fast as the ground below the vehicle: the wheels that do not, where they are fewer than all, and else the mean of all.
 pub(super) fn speeds(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
+    let units = wheel_speeds(vehicle.wheel_radius_m);
     let judge = |relation: &Relation, of: &str| {
-        relation.judge(&format!("rim speed{of} (wheel speed times radius)"), "positions", SLIPS, BACKWARDS, WHEEL_SPEEDS)
+        relation.judge(&format!("rim speed{of} (wheel speed times radius)"), "positions", SLIPS, BACKWARDS, &units)
     };
     let wheel = |i: usize| {
         Relation::of(drives, SPEED_M_S, |drive, k, v| {
@@ -55,18 +58,18 @@ pub(super) fn sides(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
             Some([angle_rate_rad_s(drive, k, 2), (wheels[right] - wheels[left]) * vehicle.wheel_radius_m / track_m])
         })
     };
-    let told = |name: &str, (count, of): (usize, usize)| {
+    let told = |name: &str, (count, of): (usize, usize), or_else: &str| {
         let what = format!("{name} left and right wheels turn against the yaw in {count} of {of} seconds of turning");
-        doubt(what, "the left and right wheel speeds seem to be swapped: swap their columns")
+        doubt(what, format!("the left and right wheel speeds seem to be swapped: swap their columns{or_else}"))
     };
     let axles = [axle([0, 1]), axle([2, 3])];
     let [front, rear] = axles.each_ref().map(|axle| axle.reversed(YAW_RATE_RAD_S));
     if let (Some(both), Some(_)) = (front, rear) {
-        return vec![told("the", both)];
+        return vec![told("the", both, MIRRORED)];
     }
     let alone = |(name, (axle, reversed)): (&str, (Relation, Option<(usize, usize)>))| {
         let clearly = reversed.filter(|(count, of)| *count as f64 >= ALONE * *of as f64)?;
-        axle.about_means().reversed(YAW_RATE_RAD_S).map(|_| told(name, clearly))
+        axle.about_means().reversed(YAW_RATE_RAD_S).map(|_| told(name, clearly, ""))
     };
     ["the front", "the rear"].into_iter().zip(axles.into_iter().zip([front, rear])).filter_map(alone).collect()
 }
