@@ -89,13 +89,15 @@ pub struct Mapping {
 }
 
 impl Mapping {
-    /// Reads entries `TARGET=[-]SOURCE[:UNIT]`: `yaw=heading:deg`, `cmd_steer=-steering`. Blank entries and those that begin with `#` say nothing.
+    /// Reads entries `TARGET=[-]SOURCE[:UNIT]`: `yaw=heading:deg`, `cmd_steer=-steering`. Blank entries and those that begin with `#` say nothing, nor does the
+    /// byte order mark that a file may begin with.
     ///
     /// # Errors
     /// `ImportError::Mapping` naming the entry: no such target, a target twice, or an entry without `=`.
     pub fn parse<'a>(lines: impl IntoIterator<Item = &'a str>) -> Result<Self, ImportError> {
         let mut entries: Vec<Entry> = Vec::new();
-        for line in lines.into_iter().map(str::trim).filter(|line| !line.is_empty() && !line.starts_with('#')) {
+        let lines = lines.into_iter().map(|line| line.trim_start_matches('\u{feff}').trim());
+        for line in lines.filter(|line| !line.is_empty() && !line.starts_with('#')) {
             let entry = entry(line)?;
             if entries.iter().any(|held| held.target == entry.target) {
                 return Err(ImportError::mapping(line, format!("`{}` is mapped twice", entry.target)));
@@ -112,14 +114,7 @@ impl Mapping {
             None if log.holds(target) => (target, 1.0),
             None => return Ok(None),
         };
-        let Some(values) = log.column(source) else {
-            let text = log.text(source).and_then(|texts| texts.into_iter().find(|t| t.parse::<f64>().is_err() && !t.is_empty()));
-            let reason = match text {
-                Some(text) => format!("column `{source}` (for `{target}`) holds `{text}`, expected numbers"),
-                None => format!("has no column `{source}` (for `{target}`); it has {}", log.names()),
-            };
-            return Err(ImportError::log(&log.path, reason));
-        };
+        let values = log.column(source).ok_or_else(|| ImportError::log(&log.path, no_numbers(log, source, target)))?;
         // A factor of one leaves every bit.
         Ok(Some(values.iter().map(|v| v.map(|v| if factor == 1.0 { v } else { v * factor })).collect()))
     }
@@ -128,6 +123,41 @@ impl Mapping {
     pub(crate) fn texts(&self, log: &Log, target: &str) -> Option<Vec<String>> {
         log.text(self.entries.iter().find(|entry| entry.target == target).map_or(target, |entry| entry.source.as_str()))
     }
+}
+
+/// Why a log has no numbers under a name.
+fn no_numbers(log: &Log, source: &str, target: &str) -> String {
+    let texts = log.text(source).unwrap_or_default();
+    if let Some((row, text)) = texts.iter().enumerate().find(|(_, text)| text.parse::<f64>().is_err() && !text.is_empty()) {
+        let line = log.places.get(row).map_or(String::new(), |line| format!("line {line}: "));
+        return format!("{line}column `{source}` (for `{target}`) holds `{text}`, expected numbers{}", remedy(text));
+    }
+    let quantity = COLUMNS.iter().find(|(name, _)| *name == target).map(|(_, quantity)| *quantity);
+    if let (Some((name, unit)), Some(quantity)) = (source.rsplit_once(':'), quantity)
+        && log.holds(name.trim_end())
+    {
+        return format!("column `{}`: {}", name.trim_end(), no_unit(unit, target, quantity));
+    }
+    format!("has no column `{source}` (for `{target}`); it has {}", log.names())
+}
+
+/// What to do about a cell that is no number.
+fn remedy(text: &str) -> &'static str {
+    let digits = |text: &str| text.bytes().any(|b| b.is_ascii_digit());
+    if text.replace(',', ".").parse::<f64>().is_ok() {
+        "; write them with a decimal point"
+    } else if digits(text) && text.contains(':') {
+        "; write times as seconds, for instance since 1970"
+    } else if digits(text) {
+        "; write them without units or separators of thousands"
+    } else {
+        "; leave the cell empty where the value is missing"
+    }
+}
+
+fn no_unit(unit: &str, target: &str, quantity: Quantity) -> String {
+    let units: Vec<&str> = quantity.units().iter().map(|(unit, _)| *unit).collect();
+    format!("`{}` is no unit of `{target}`; allowed are {}", unit.trim(), units.join(", "))
 }
 
 fn entry(line: &str) -> Result<Entry, ImportError> {
@@ -149,8 +179,7 @@ fn entry(line: &str) -> Result<Entry, ImportError> {
         && let Some((_, unknown)) = source.rsplit_once(':')
         && COLUMNS.iter().flat_map(|(_, q)| q.units()).any(|(known, _)| *known == unknown.trim())
     {
-        let units: Vec<&str> = quantity.units().iter().map(|(unit, _)| *unit).collect();
-        return Err(wrong(format!("`{unknown}` is no unit of `{target}`; allowed are {}", units.join(", "))));
+        return Err(wrong(no_unit(unknown, target, quantity)));
     }
     let (source, factor) = unit.unwrap_or((source, 1.0));
     if source.is_empty() {
@@ -178,7 +207,8 @@ mod tests {
         assert_eq!(value("cmd_speed").expect("there"), Some(10.0));
         assert_eq!(value("t").expect("there"), Some(2.0));
         assert_eq!(value("wz").expect("absent"), None);
-        assert!(value("x").expect_err("no number").to_string().contains("column `x` (for `x`) holds `n/a`, expected numbers"));
+        let told = value("x").expect_err("no number").to_string();
+        assert!(told.contains("line 2: column `x` (for `x`) holds `n/a`, expected numbers; leave the cell empty"), "{told}");
         assert_eq!(mapping.texts(&log, "trajectory"), Some(vec!["one".to_string()]));
     }
 
@@ -190,5 +220,39 @@ mod tests {
         assert!(told("yaw=heading:km/h").contains("allowed are rad, deg"));
         assert!(told("yaw=").contains("names no column"));
         assert!(Mapping::parse(["yaw=a", "yaw=b"]).is_err());
+    }
+
+    /// Goal: a file of an editor that writes byte order marks is one. Method: a mark before the first entry, and before a comment.
+    #[test]
+    fn regress_a_byte_order_mark_is_no_part_of_an_entry() {
+        for first in ["\u{feff}yaw=heading:deg", "\u{feff}# names\nyaw=heading:deg"] {
+            assert_eq!(Mapping::parse(first.lines()).expect("valid"), Mapping::parse(["yaw=heading:deg"]).expect("valid"));
+        }
+    }
+
+    /// Goal: an error of a cell names line and remedy, one of an unknown unit those that there are. Method: a log whose third line holds what is no number.
+    #[test]
+    fn analytic_what_is_no_number_is_told_with_its_line_and_a_remedy() {
+        let told = |text: &str, entries: &[&str]| {
+            let log = Log {
+                path: "log.csv".into(),
+                rows: 2,
+                texts: vec![("t".into(), vec!["1.5".into(), text.into()]), ("h:deg".into(), vec![String::new(); 2])],
+                places: vec![2, 3],
+                ..Log::default()
+            };
+            Mapping::parse(entries.iter().copied()).expect("valid").numbers(&log, "t").expect_err("no numbers").to_string()
+        };
+        for (text, remedy) in [
+            ("0,1", "decimal point"),
+            ("2026-05-01T12:00:00Z", "times as seconds"),
+            ("3 m", "without units"),
+            ("fault", "leave the cell empty"),
+        ] {
+            let told = told(text, &[]);
+            assert!(told.contains("line 3: column `t`") && told.contains(&format!("`{text}`")) && told.contains(remedy), "{told}");
+        }
+        assert!(told("1", &["t=t:sec"]).contains("column `t`: `sec` is no unit of `t`; allowed are s, ms, us, ns"));
+        assert!(told("1", &["t=stamp:sec"]).contains("has no column `stamp:sec` (for `t`)"));
     }
 }
