@@ -327,16 +327,34 @@ fn command_range(
             ([CAR_SPEED_RANGE_M_S, [-largest, largest]], [true, stated.is_none()])
         }
     };
-    let stated = |key: &str| {
-        let Some(value) = sheet.get(key) else { return Ok(None) };
-        let range: [f64; 2] = sheet.array(key, value)?;
-        if range[0] < range[1] { Ok(Some(range)) } else { Err(sheet.wrong(key, "expected [min, max] with min < max")) }
-    };
-    let stated = [stated("command_range.speed_m_s")?, stated("command_range.second")?];
+    let stated = stated_range(sheet)?;
     Ok((
         core::array::from_fn(|axis| stated[axis].unwrap_or(implied[axis])),
         core::array::from_fn(|axis| is_implied[axis] && stated[axis].is_none()),
     ))
+}
+
+/// The ranges of the speed and of the second command that a card states.
+fn stated_range(sheet: &JsonFile) -> Result<[Option<[f64; 2]>; 2], TrajectoryError> {
+    const KEY: &str = "command_range";
+    const NAMES: [&str; 2] = ["speed_m_s", "second"];
+    let shape = r#"expected {"speed_m_s": [min, max], "second": [min, max]} or one of the two"#;
+    match sheet.get(KEY) {
+        None => return Ok([None; 2]),
+        Some(Value::Object(given)) => {
+            if let Some(other) = given.keys().find(|key| !NAMES.contains(&key.as_str())) {
+                return Err(sheet.wrong(&format!("{KEY}.{other}"), format!("no such key; {shape}")));
+            }
+        }
+        Some(other) => return Err(sheet.wrong(KEY, format!("{shape}, found {other}"))),
+    }
+    let range = |name: &str| {
+        let key = format!("{KEY}.{name}");
+        let Some(value) = sheet.get(&key) else { return Ok(None) };
+        let range: [f64; 2] = sheet.array(&key, value)?;
+        if range[0] < range[1] { Ok(Some(range)) } else { Err(sheet.wrong(&key, "expected [min, max] with min < max")) }
+    };
+    Ok([range(NAMES[0])?, range(NAMES[1])?])
 }
 
 /// The largest angle of a road wheel, rad, where the card gives one or one for each wheel: each above 0, for it is turned to both sides.

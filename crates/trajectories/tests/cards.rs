@@ -227,3 +227,27 @@ fn analytic_stated_ranges_win() {
     card["command_range"]["second"] = json!([0.9, -0.9]);
     assert!(read(&card.to_string()).unwrap_err().to_string().contains("`command_range.second`"));
 }
+
+/// Goal: a range that is stated counts or is refused. Method: other shapes and other names of the keys; one range alone, and none.
+#[test]
+fn regress_a_range_of_commands_in_another_shape_is_refused() {
+    let with = |range: Value| {
+        let mut card = hmmwv_json();
+        card["command_range"] = range;
+        read(&card.to_string())
+    };
+    for (range, key) in [
+        (json!([[-1.0, 5.0], [-0.9, 0.9]]), "`command_range`"),
+        (json!(5.0), "`command_range`"),
+        (json!({"speed": [-1.0, 5.0]}), "`command_range.speed`"),
+        (json!({"speed_m_s": [-1.0, 5.0], "steering": [-0.9, 0.9]}), "`command_range.steering`"),
+    ] {
+        let error = with(range.clone()).unwrap_err().to_string();
+        assert!(error.contains(key) && error.contains(r#"{"speed_m_s": [min, max], "second": [min, max]}"#), "{range}: {error}");
+    }
+    for (range, expected) in
+        [(json!({"speed_m_s": [-1.0, 5.0]}), [-1.0, 5.0]), (json!({"second": null}), [-2.0, 12.0]), (json!(null), [-2.0, 12.0])]
+    {
+        assert_eq!(with(range.clone()).unwrap().command_range[0], expected, "{range}");
+    }
+}
