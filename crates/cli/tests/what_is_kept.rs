@@ -176,3 +176,31 @@ fn service_a_slow_log_is_doubted() {
         );
     }
 }
+
+/// Goal: a training takes the place of no other one, and goes on from no other one. Method: folders that hold a bundle, a checkpoint, one that does not say what it was
+/// begun with, one that says something else; all is refused before the work.
+#[test]
+fn service_a_training_takes_the_place_of_no_other() {
+    let folder = tempfile::tempdir().unwrap();
+    root(folder.path());
+    let state = |out: &str, text: &str| {
+        std::fs::create_dir_all(folder.path().join(out).join("checkpoint")).unwrap();
+        std::fs::write(folder.path().join(out).join("checkpoint/state.json"), text).unwrap();
+    };
+    state("begun", r#"{"step": 1}"#);
+    state("other", r#"{"step": 1, "begun_with": {"--seed": "7", "drives": "of another set"}}"#);
+    std::fs::create_dir_all(folder.path().join("made/bundle")).unwrap();
+    std::fs::write(folder.path().join("made/bundle/manifest.toml"), "").unwrap();
+    let before = files(folder.path());
+    for (out, resume, words) in [
+        ("made", false, &["--out made holds a bundle and no checkpoint", "choose another --out or remove it"][..]),
+        ("made", true, &["--out made holds a bundle and no checkpoint"]),
+        ("begun", false, &["--out begun holds the checkpoint of another run", "--resume", "choose another --out"]),
+        ("begun", true, &["begun/checkpoint/state.json does not say what it was begun with", "older versions"]),
+        ("other", true, &["was begun with other settings", "--seed 7, now 1", "drives of another set, now", "vehicle card nothing, now"]),
+    ] {
+        let resume = if resume { &["--resume"][..] } else { &[] };
+        refused(&[&["train", "--data", "root", "--set", "nominal", "--out", out][..], resume].concat(), folder.path(), words);
+    }
+    assert_eq!(files(folder.path()), before);
+}

@@ -8,6 +8,7 @@ use nesam_model::{ModelError, Weights};
 use serde::{Deserialize, Serialize};
 
 use crate::adam::Adam;
+use crate::origin::{self, Origin};
 use crate::trainer::{EpochReport, TrainingError};
 
 /// Steps since the last line of the curve.
@@ -59,7 +60,8 @@ impl Checkpoint {
         }
     }
 
-    pub(crate) fn save(&self, folder: &Path) -> Result<(), TrainingError> {
+    /// Writes it into a folder, with what the run was begun with.
+    pub(crate) fn save(&self, folder: &Path, begun_with: &Origin) -> Result<(), TrainingError> {
         let fail = |path: &Path, e: std::io::Error| TrainingError::Checkpoint { path: path.to_path_buf(), reason: e.to_string() };
         std::fs::create_dir_all(folder).map_err(|e| fail(folder, e))?;
         let mut moments = Weights::default();
@@ -77,6 +79,7 @@ impl Checkpoint {
             "curve": self.curve,
             "unreported": self.unreported,
             "hashes": hashes,
+            origin::KEY: begun_with,
         });
         // The state is renamed first: of a run that is killed in between, `load` finds the arrays of that state under either name.
         let files: Vec<(&str, Vec<u8>)> = std::iter::once(("state.json", state.to_string().into_bytes())).chain(arrays).collect();
@@ -183,7 +186,7 @@ mod tests {
     #[test]
     fn regress_a_checkpoint_with_numbers_that_are_none_can_be_read() {
         let folder = tempfile::tempdir().unwrap();
-        checkpoint(2, LINE).save(folder.path()).unwrap();
+        checkpoint(2, LINE).save(folder.path(), &Origin::new()).unwrap();
         let found = load(folder.path()).unwrap();
         assert_eq!((found.step, found.best_score, found.best.clone()), (2, f64::INFINITY, found.latest));
         assert_eq!(found.unreported, checkpoint(2, LINE).unreported);
@@ -195,7 +198,7 @@ mod tests {
     fn property_a_run_killed_while_it_saved_goes_on_and_mixed_files_are_refused() {
         let [folder, later] = [2, 4].map(|step| {
             let folder = tempfile::tempdir().unwrap();
-            checkpoint(step, LINE).save(folder.path()).unwrap();
+            checkpoint(step, LINE).save(folder.path(), &Origin::new()).unwrap();
             folder
         });
         let take = |from: &str, to: &str| std::fs::copy(later.path().join(from), folder.path().join(to)).unwrap();
@@ -218,7 +221,7 @@ mod tests {
     fn property_files_of_another_network_are_refused_by_name() {
         let folder = tempfile::tempdir().unwrap();
         let refused = |file: &str, other: &Weights| {
-            checkpoint(2, LINE).save(folder.path()).unwrap();
+            checkpoint(2, LINE).save(folder.path(), &Origin::new()).unwrap();
             let state = folder.path().join("state.json");
             // Without its hashes nothing but what is in the files tells that they do not belong together.
             let mut read: serde_json::Value = serde_json::from_slice(&std::fs::read(&state).unwrap()).unwrap();
@@ -248,7 +251,7 @@ mod tests {
         assert!(moments(&[0.0], &[], &[2.0]).contains("one of two moments is missing"));
         assert!(moments(&[0.0, 0.0], &[second], &[2.0]).contains("2 moments of `w`, the network 1"));
         let late = EpochReport { step: 3, ..LINE };
-        checkpoint(2, late).save(folder.path()).unwrap();
+        checkpoint(2, late).save(folder.path(), &Origin::new()).unwrap();
         assert!(load(folder.path()).err().expect("a line of a later step").to_string().contains("not in order"));
     }
 }

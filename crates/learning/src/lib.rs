@@ -15,6 +15,7 @@ pub mod class_soil;
 pub mod drives;
 mod features;
 pub mod initial;
+pub mod origin;
 pub mod pooling;
 pub mod recipe;
 pub mod rims;

@@ -18,6 +18,7 @@ use crate::autoencoder::{Places, PretrainPlan, pretrain};
 use crate::calibrate::calibrate_vehicle;
 use crate::drives::{Drive, encode_drives};
 use crate::initial::initial_weights;
+use crate::origin::{self, Origin, digest};
 use crate::pooling::Pooling;
 use crate::scales::measure_increments;
 use crate::trainer::{EpochReport, TrainingError, TrainingPlan, TrainingSet, train};
@@ -39,7 +40,7 @@ pub struct Recipe {
     pub mirror: bool,
     /// Cells that share a weight of the terrain projection.
     pub pooling: Pooling,
-    /// Training plan; its folder is `out/checkpoint`.
+    /// Training plan; its folder is `out/checkpoint`, its origin what this recipe and the data say.
     pub plan: TrainingPlan,
     /// Starts from the weights, scales and vehicle of this bundle instead of from nothing.
     pub start: Option<ModelBundle>,
@@ -90,6 +91,15 @@ pub fn run(
     interrupted: &(dyn Fn() -> bool + Sync),
 ) -> Result<ModelBundle, TrainingError> {
     let mut drives = load_drives(root, trajectories)?;
+    let plan = TrainingPlan {
+        folder: recipe.out.join("checkpoint"),
+        origin: origin_of(recipe, root.vehicle(), data_hash, &drives),
+        ..recipe.plan.clone()
+    };
+    if recipe.resume {
+        // Before the work that comes first: minutes.
+        origin::check(&plan)?;
+    }
     let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
         (0..drives.len()).filter(|i| is_validation(*i, drives.len()) == validation).collect()
     };
@@ -116,6 +126,7 @@ pub fn run(
     };
     scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);
 
+    let learned_from = train_at.len();
     if recipe.mirror {
         let images = mirrored(&drives, &train_at);
         train_at.extend(drives.len()..drives.len() + images.len());
@@ -158,14 +169,10 @@ pub fn run(
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
         pooling: recipe.pooling.clone(),
     };
-    reporter.line(&format!(
-        "{} drives train, {} validate, {} parameters",
-        set.train.len(),
-        set.validation.iter().filter(|drive| drive.states.len() > recipe.plan.horizon).count(),
-        trained_parameters(&weights, recipe.plan.objective.variant)
-    ));
+    let validating = set.validating(plan.horizon);
+    let parameters = trained_parameters(&weights, recipe.plan.objective.variant);
+    reporter.line(&format!("{}, {parameters} parameters", who_trains(learned_from, recipe.mirror, validating)));
     reporter.stage("training", recipe.plan.steps);
-    let plan = TrainingPlan { folder: recipe.out.join("checkpoint"), ..recipe.plan.clone() };
     let trained = train(
         &set,
         &weights,
@@ -173,7 +180,7 @@ pub fn run(
         recipe.resume,
         interrupted,
         |step, loss, norm| reporter.progress(step, &format!("loss {loss:.3}, gradient {norm:.2}")),
-        |line| reporter.line(&describe(line)),
+        |line| reporter.line(&describe(line, validating > 0)),
     )?;
     let curve = serde_json::to_string_pretty(&trained.curve).expect("numbers serialise; this is a bug");
     write(&recipe.out.join("loss_curve.json"), curve.as_bytes())?;
@@ -222,15 +229,48 @@ fn optimisation_s(curve: &[EpochReport]) -> f64 {
     0.0 + curve.iter().scan(0, |before, line| Some((line.step - std::mem::replace(before, line.step)) as f64 * line.step_s)).sum::<f64>()
 }
 
-/// One line of the loss curve for people.
-fn describe(line: &EpochReport) -> String {
+/// All that a run hangs on beside its plan.
+fn origin_of(recipe: &Recipe, card: &Vehicle, data_hash: &str, drives: &[Drive]) -> Origin {
+    let list = |of: &dyn Fn(&Drive) -> String| digest(&drives.iter().map(of).collect::<Vec<_>>().join("\n"));
+    let stated = |value: Option<String>| value.unwrap_or_else(|| "as given".into());
+    let settings = [
+        ("data", data_hash.get(..12).unwrap_or(data_hash).to_string()),
+        ("drives", list(&|drive| drive.id.clone())),
+        ("maps", list(&|drive| drive.map.as_ref().map_or(String::new(), |map| map.hash().into()))),
+        ("vehicle card", digest(&format!("{card:?}"))),
+        ("--dt", recipe.dt_s.to_string()),
+        ("--encoder-steps", recipe.encoder_steps.to_string()),
+        ("--encoder-lr", recipe.encoder_rate.to_string()),
+        ("mirror images", recipe.mirror.to_string()),
+        ("--pool", recipe.pooling.cells().to_string()),
+        ("--from", recipe.start.as_ref().map_or("nothing", |bundle| bundle.hash.get(..12).unwrap_or(&bundle.hash)).to_string()),
+        ("--recalibrate", recipe.recalibrate.to_string()),
+        ("--soil-damping", stated(recipe.soil_damping_pa_s_m.map(|damping| damping.to_string()))),
+        ("smooth --borders", stated(recipe.smooth_borders.map(|smooth| smooth.to_string()))),
+    ];
+    settings.into_iter().map(|(name, value)| (name.to_string(), value)).collect()
+}
+
+/// How many drives train and validate, for people: mirror images are no drives of their own.
+fn who_trains(train: usize, mirrored: bool, validate: usize) -> String {
+    let images = if mirrored { ", each with its mirror image" } else { "" };
+    let validation = match validate {
+        0 => "none validates (the choice among epochs is made on those that train)".into(),
+        some => format!("{some} validate"),
+    };
+    format!("{train} drives train{images}; {validation}")
+}
+
+/// One line of the loss curve for people; `held_out` = the drives that validate do not train.
+fn describe(line: &EpochReport, held_out: bool) -> String {
+    let on = if held_out { "validation" } else { "on the drives that train" };
     let [position, z, roll, pitch, yaw] = line.validation;
     let diverged = match line.diverged {
         0 => String::new(),
         windows => format!(", windows left out because they diverged: {windows}"),
     };
     format!(
-        "step {}: loss {:.3}; validation, mean over the horizon: position {position:.3} m, z {z:.3} m, roll {:.2}°, pitch {:.2}°, yaw {:.2}°{diverged}; {:.2} s per step",
+        "step {}: loss {:.3}; {on}, mean over the horizon: position {position:.3} m, z {z:.3} m, roll {:.2}°, pitch {:.2}°, yaw {:.2}°{diverged}; {:.2} s per step",
         line.step,
         line.loss,
         roll.to_degrees(),
@@ -355,6 +395,18 @@ mod tests {
         let map = Arc::new(WorldMap::from_layers("plain", 1, geometry, vec![0.0; 4], None).unwrap());
         let drives = [None, Some(map)].map(|map| Drive::new("made".into(), map, Vec::new(), Vec::new()));
         assert!(!any_mapped(&drives, &[0]) && any_mapped(&drives, &[1]) && any_mapped(&drives, &[0, 1]));
+    }
+
+    /// Goal: nobody takes the error on drives that train for one on drives that do not, nor mirror images for drives.
+    #[test]
+    fn regress_who_trains_and_what_was_scored_is_told_as_it_is() {
+        let few = who_trains(6, true, 0);
+        assert!(few.starts_with("6 drives train, each with its mirror image; none validates"), "{few}");
+        assert_eq!(who_trains(9, false, 1), "9 drives train; 1 validate");
+        let line = EpochReport { step: 2, loss: 1.0, validation: [0.5, 0.1, 0.0, 0.0, 0.0], diverged: 0, step_s: 0.1 };
+        let [held_out, own] = [true, false].map(|held_out| describe(&line, held_out));
+        assert!(held_out.contains("; validation, mean over") && own.contains("; on the drives that train, mean over"), "{held_out} {own}");
+        assert!(!own.contains("validation"), "{own}");
     }
 
     #[test]

@@ -16,6 +16,7 @@ use serde::{Deserialize, Deserializer, Serialize};
 use crate::batch::{Dropout, PathTerrain, Sight, Window, absolute_errors, rows, state_loss, sustained_residual, targets};
 use crate::checkpoint::Checkpoint;
 use crate::drives::Drive;
+use crate::origin::{self, Origin};
 use crate::pooling::Pooling;
 use crate::schedule::{cosine, curriculum};
 
@@ -46,6 +47,8 @@ pub struct TrainingPlan {
     pub objective: Objective,
     /// Where checkpoints go.
     pub folder: PathBuf,
+    /// What the run hangs on beside these: drives, vehicle, what is done before the first step.
+    pub origin: Origin,
 }
 
 impl TrainingPlan {
@@ -122,6 +125,14 @@ pub enum TrainingError {
         /// File.
         path: PathBuf,
         /// What was wrong.
+        reason: String,
+    },
+    /// A checkpoint of another run.
+    #[error("checkpoint {} {reason}", path.display())]
+    Foreign {
+        /// File.
+        path: PathBuf,
+        /// What differs, and what to do.
         reason: String,
     },
     /// The data cannot be trained on.
@@ -209,12 +220,14 @@ impl TrainingSet<'_> {
         Ok((loss.to_scalar::<f32>()?, gradients))
     }
 
+    /// Validation drives that are longer than a horizon. Where there are none, those to learn from stand in for them.
+    pub fn validating(&self, horizon: usize) -> usize {
+        self.validation.iter().filter(|drive| drive.states.len() > horizon).count()
+    }
+
     /// Mean absolute errors over fixed windows of the validation drives, and how many of these diverged and are left out.
     fn validate(&self, network: &Network, horizon: usize, variant: Variant) -> Result<([f64; 5], usize)> {
-        let mut windows = fixed_windows(&self.validation, horizon);
-        if windows.is_empty() {
-            windows = fixed_windows(&self.train, horizon);
-        }
+        let windows = fixed_windows(if self.validating(horizon) > 0 { &self.validation } else { &self.train }, horizon);
         let rollout = ReferenceRollout { network, model: &self.model, scales: self.scales, variant };
         let mut errors: Vec<[f64; 5]> = Vec::with_capacity(windows.len());
         for windows in windows.chunks(64) {
@@ -270,7 +283,7 @@ fn steps_needed(variant: Variant, available: usize) -> usize {
 /// A run that is interrupted and resumed gives the weights that it gives in one go: what is validated, and may so be chosen, depends on the plan alone.
 ///
 /// # Errors
-/// `TrainingError`; an interruption leaves a checkpoint, also before the first epoch: one that is resumed with a plan of no further steps gives the running
+/// `TrainingError`, a checkpoint that was begun with something else among them; an interruption leaves a checkpoint, also before the first epoch: one that is resumed with a plan of no further steps gives the running
 /// mean where nothing was validated yet.
 pub fn train(
     set: &TrainingSet<'_>,
@@ -282,7 +295,11 @@ pub fn train(
     mut report: impl FnMut(&EpochReport),
 ) -> std::result::Result<Trained, TrainingError> {
     let starts = window_starts(set, plan)?;
+    if resume {
+        origin::check(plan)?;
+    }
     let resumed = if resume { Checkpoint::load(&plan.folder, weights)? } else { None };
+    let begun_with = origin::of_plan(plan);
     let mut checkpoint = resumed.unwrap_or_else(|| Checkpoint::new(weights));
     let device = plan.device.open()?;
     let network = Network::from_weights(&checkpoint.latest, &device)?;
@@ -330,11 +347,11 @@ pub fn train(
                 checkpoint.best = checkpoint.average.clone();
             }
             checkpoint.curve.push(line);
-            checkpoint.save(&plan.folder)?;
+            checkpoint.save(&plan.folder, &begun_with)?;
             report(&line);
             since = Instant::now();
         } else if stop {
-            checkpoint.save(&plan.folder)?;
+            checkpoint.save(&plan.folder, &begun_with)?;
         }
         if stop {
             return Err(TrainingError::Interrupted(checkpoint.step));

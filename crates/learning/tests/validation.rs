@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use common::{drive, measured_scales, single_cells, truck};
 use nesam_learning::initial::initial_weights;
+use nesam_learning::origin::Origin;
 use nesam_learning::{Drive, Objective, Trained, TrainingPlan, TrainingSet, train};
 use nesam_model::reference::ComputeDevice;
 use nesam_model::{Variant, Weights};
@@ -40,6 +41,7 @@ fn two_steps(validation: &[&Drive]) -> (Trained, Weights) {
         decay: 0.0,
         objective: Objective { variant: Variant::Full, sustained: 0.0, soil_prior: 0.0 },
         folder: folder.path().into(),
+        origin: Origin::new(),
     };
     let trained = train(&set, &weights, &plan, false, &|| false, |_, _, _| {}, |_| {}).expect("two steps");
     (trained, weights)

@@ -6,12 +6,14 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
+use nesam_learning::origin::Origin;
 use nesam_learning::recipe::{Recipe, Reporter, run as train};
 use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
 use nesam_model::reference::ComputeDevice;
 use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 
 use crate::args::{DataArgs, SplitArg, check_count, horizon_of};
+use crate::bundle_path::MANIFEST;
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, out_place};
@@ -23,7 +25,7 @@ use crate::sources::{load_bundle, read_drives};
 pub struct TrainArgs {
     #[command(flatten)]
     data: DataArgs,
-    /// Folder of the new bundle and its checkpoints [default: nesam-out/train-<set>, for another model than nesam nesam-out/train-<set>-<model>]
+    /// Folder of the new bundle and its checkpoints, which must hold none, or with --resume those of the same command [default: nesam-out/train-<set>, for another model than nesam nesam-out/train-<set>-<model>]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
     /// Name of the new bundle [default: <vehicle's first word>-<set>]
@@ -204,6 +206,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let baselines = Baselines::fit(drives.root.vehicle(), &drives.drives, horizon).or_input()?;
     let form = if variant == Variant::Full { String::new() } else { format!("-{}", variant.as_str().replace('_', "-")) };
     let out = out_place(args.out.as_deref(), "train", &format!("{}{form}", drives.set))?;
+    check_unused(&out, args.resume)?;
     let name = args.name.clone().unwrap_or_else(|| {
         let vehicle = drives.root.vehicle().name.split_whitespace().next().unwrap_or("vehicle").to_lowercase();
         format!("{vehicle}-{}{form}", drives.set.replace('/', "-"))
@@ -229,6 +232,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
             decay: args.decay,
             objective: Objective { variant, sustained: args.sustained, soil_prior: args.soil_prior },
             folder: out.join("checkpoint"),
+            origin: Origin::new(),
         },
         start,
         recalibrate: args.recalibrate,
@@ -243,10 +247,25 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let bundle =
         train(&drives.root, &drives.drives, &hash, &recipe, Some(baselines.to_json()), &console, &|| INTERRUPTED.load(Ordering::SeqCst));
     let bundle = match bundle {
-        Err(error @ TrainingError::Drives(_)) => return Err(Failure::input(error.to_string())),
+        Err(error @ (TrainingError::Drives(_) | TrainingError::Foreign { .. })) => return Err(Failure::input(error.to_string())),
         other => other.or_failed()?,
     };
     note!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
+    Ok(())
+}
+
+/// Refuses a folder that holds the results of another run, which this one would take the place of.
+fn check_unused(out: &Path, resume: bool) -> Result<(), Failure> {
+    let checkpoint = out.join("checkpoint/state.json").exists();
+    let refused = |why: &str| Err(Failure::input(format!("--out {} {why}", out.display())));
+    if checkpoint && !resume {
+        return refused(
+            "holds the checkpoint of another run; go on with --resume if it was the same command, choose another --out, or remove it",
+        );
+    }
+    if !checkpoint && out.join("bundle").join(MANIFEST).exists() {
+        return refused("holds a bundle and no checkpoint to go on from; choose another --out or remove it");
+    }
     Ok(())
 }
 
