@@ -78,6 +78,10 @@ fn chrono_doubts_are_printed_as_the_json_has_them() {
             said.lines().filter_map(|line| line.strip_prefix("doubt: ")).map(|line| line.strip_suffix(end).expect(line)).collect();
         assert_eq!(printed, doubts);
         assert_eq!(!doubts.is_empty(), doubted, "{doubts:?}");
+        // Where a bundle is, if one was written, is printed too.
+        let bundle = json["bundle"].as_str();
+        assert!(doubted || bundle == Some("sound/bundle"), "{json}");
+        assert_eq!(said.lines().find_map(|line| line.strip_prefix("bundle with what is claimed: ")), bundle, "{said}");
         let html = std::fs::read_to_string(here.path().join(set).join("diagnose.html")).unwrap();
         let check = text(&nesam(&["check", "mine"], here.path()).stdout);
         for doubt in doubts {

@@ -303,10 +303,19 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
         doubts: &doubts,
     };
     summary(&report, &found);
+    bundles(&report);
     output::write_file(&json, report.to_json().as_bytes())?;
     output::write_file(&html, report.to_html().as_bytes())?;
     say!("\nwrote {} and {}", json.display(), html.display());
     Ok(())
+}
+
+/// Where the bundles are that have what was found.
+fn bundles(report: &Report<'_>) {
+    let told = [(report.bundle, "what is claimed"), (report.free_form_bundle, "what is claimed and the free form of what is left")];
+    for (bundle, what) in told.into_iter().filter_map(|(bundle, what)| Some((bundle?, what))) {
+        say!("bundle with {what}: {bundle}");
+    }
 }
 
 fn summary(report: &Report<'_>, found: &Diagnosis) {
