@@ -4,10 +4,16 @@ use crate::output::note;
 
 /// On Ctrl-C, says what was left undone and exits with code 1. Files are written whole at the end, so none is left half-written.
 pub fn exit_on_ctrl_c(left_undone: &'static str) {
+    exit_on_ctrl_c_after(left_undone, || {});
+}
+
+/// The same after removing what is not finished.
+pub fn exit_on_ctrl_c_after(left_undone: &'static str, remove: impl FnOnce() + Send + 'static) {
     std::thread::spawn(move || {
         let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
         if runtime.block_on(tokio::signal::ctrl_c()).is_ok() {
             note!("\ninterrupted: {left_undone}");
+            remove();
             std::process::exit(1);
         }
     });

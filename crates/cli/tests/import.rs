@@ -2,7 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
 
 fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
@@ -143,4 +143,104 @@ fn service_a_card_that_does_not_fit_is_not_kept_and_a_second_one_does_not_count(
     assert!(code == Some(0) && !said.contains("counts"), "{said}");
     let (code, said) = import_of(folder.path(), &example(), &of_another, "second", &[]);
     assert!(code == Some(0) && said.contains("vehicle_hmmwv.json counts, the card of the data root"), "{said}");
+}
+
+/// Goal: measured road-wheel angles in another unit or with another sign are doubted, whatever the clock of the log. Method: the log of the car that pulls to the left
+/// as it is, with angles in degrees, negated and taken for degrees, at its stamps and at others, between which angles are interpolated.
+#[test]
+fn chrono_wrong_road_wheel_angles_are_doubted() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = std::fs::read_to_string(repository().join("docs/example/pulls-left.csv")).unwrap();
+    let head: Vec<&str> = text.lines().next().unwrap().split(',').collect();
+    let log = |name: &str, seconds: f64, angle: f64| {
+        let row = |line: &str| {
+            let cell = |(name, cell): (&&str, &str)| match *name {
+                "t" => format!("{:.4}", seconds * cell.parse::<f64>().unwrap()),
+                "steer_fl" | "steer_fr" => (angle * cell.parse::<f64>().unwrap()).to_string(),
+                _ => cell.to_string(),
+            };
+            head.iter().zip(line.split(',')).map(cell).collect::<Vec<_>>().join(",") + "\n"
+        };
+        let rows: String = text.lines().skip(1).map(row).collect();
+        std::fs::write(folder.path().join(name), head.join(",") + "\n" + &rows).unwrap();
+        folder.path().join(name)
+    };
+    for (i, (angle, more, doubt)) in [
+        (1.0, &[][..], None),
+        (180.0 / std::f64::consts::PI, &[], Some("degrees instead of radians")),
+        (-1.0, &[], Some("angles to the left are positive")),
+        (1.0, &["--column", "steer_fl=steer_fl:deg", "--column", "steer_fr=steer_fr:deg"], Some("radians that were taken for degrees")),
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        for (j, seconds) in [1.0, 1.003].into_iter().enumerate() {
+            let log = log("log.csv", seconds, angle);
+            let set = format!("s{i}{j}");
+            let (code, said) = import_of(folder.path(), &log, &card(), &set, more);
+            let doubts: Vec<&str> = said.lines().filter(|line| line.contains("doubt:")).collect();
+            assert!(code == Some(0) && doubts.len() == usize::from(doubt.is_some()), "{set}: {said}");
+            assert!(doubt.is_none_or(|doubt| said.contains("road-wheel angle against") && said.contains(doubt)), "{set}: {said}");
+        }
+    }
+}
+
+/// Goal: an import that is interrupted leaves nothing, and what a killed one leaves is in nobody's way. Method: Ctrl-C once its hidden folder is there; a hidden folder
+/// with half a set before the next import.
+#[test]
+fn service_an_interrupted_import_leaves_nothing_and_left_overs_block_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let row = |i: usize| format!("{:.1},{:.2},0,0,{:.4},1,0\n", 0.1 * i as f64, 0.1 * i as f64, 1e-4 * (i % 7919) as f64);
+    let rows: String = (0..400_000).map(row).collect();
+    std::fs::write(folder.path().join("long.csv"), "t,x,y,yaw,wz,cmd_speed,cmd_steer\n".to_string() + &rows).unwrap();
+    let card_path = card().display().to_string();
+    let args = ["import", "long.csv", "--flat", "--to", "root", "--set", "a/b", "--vehicle", &card_path];
+    let mut import = Command::new(env!("CARGO_BIN_EXE_nesam"));
+    import.args(args).current_dir(folder.path()).stdout(Stdio::null()).stderr(Stdio::piped());
+    let mut import = import.spawn().unwrap();
+    while !folder.path().join("root").exists() && import.try_wait().unwrap().is_none() {
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    assert!(Command::new("kill").args(["-INT", &import.id().to_string()]).status().unwrap().success());
+    let output = import.wait_with_output().unwrap();
+    let said = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.code() == Some(1) && said.contains("interrupted: nothing was imported"), "{:?}: {said}", output.status);
+    assert!(!folder.path().join("root").exists(), "what was interrupted leaves nothing behind");
+
+    let left_over = folder.path().join("root/.import-1-1/a/b");
+    std::fs::create_dir_all(&left_over).unwrap();
+    std::fs::write(left_over.join("samples.parquet"), "PAR1").unwrap();
+    let (code, said) = import(folder.path(), "a/b", &["--html", "root/a/b/plots.html"]);
+    assert!(code == Some(0) && said.contains("wrote root/a/b/plots.html"), "{said}");
+    assert!(folder.path().join("root/a/b/plots.html").is_file());
+    let (code, said) = import(folder.path(), "c", &["--column", "cmd_steer=-cmd_steer"]);
+    assert!(code == Some(0) && !said.contains(".import-"), "{said}");
+    let check = nesam(folder.path(), &["check", "root"]);
+    let said = String::from_utf8_lossy(&check.stdout).into_owned();
+    assert!(check.status.success() && said.contains("set a/b: 1 drives") && !said.contains(".import-"), "{said}");
+    let visible = std::fs::read_dir(folder.path().join("root")).unwrap().flatten().map(|e| e.file_name().to_string_lossy().into_owned());
+    let mut visible: Vec<String> = visible.collect();
+    visible.sort();
+    assert_eq!(visible, [".import-1-1", "a", "c", "vehicle_hmmwv.json"]);
+}
+
+/// Goal: what makes no log is told as what it is. Method: an empty file, a Parquet file, a cell that is no number, a unit that is none, each with what is said.
+#[test]
+fn service_what_is_no_log_is_told_as_what_it_is() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = std::fs::read_to_string(example()).unwrap();
+    let comma = text.replacen("\n0.1,", "\n\"0,1\",", 1);
+    assert_ne!(text, comma);
+    for (name, content, more, word) in [
+        ("empty.mcap", "", &[][..], "is empty"),
+        ("set.csv", "PAR1", &[], "seems to be a Parquet file"),
+        ("comma.csv", &comma, &[], "line 3: column `t` (for `t`) holds `0,1`, expected numbers; write them with a decimal point"),
+        ("unit.csv", &text, &["--column", "yaw=yaw:degrees"], "`degrees` is no unit of `yaw`; allowed are rad, deg"),
+    ] {
+        let log = folder.path().join(name);
+        std::fs::write(&log, content).unwrap();
+        let (code, said) = import_of(folder.path(), &log, &card(), "s", more);
+        assert!(code == Some(2) && said.contains(word), "{name} should say `{word}`: {said}");
+    }
+    assert!(!folder.path().join("root").exists(), "what was refused leaves nothing behind");
 }

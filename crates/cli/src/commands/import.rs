@@ -1,5 +1,6 @@
 //! `nesam import`: a log of another tool becomes a set of a data root.
 
+mod draft;
 mod page;
 
 use std::path::{Path, PathBuf};
@@ -8,8 +9,10 @@ use clap::{Args, ValueEnum};
 use nesam_import::{CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, write_set};
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
+use self::draft::Draft;
 use crate::bundle_path::inside_bundle;
 use crate::failure::{Failure, OrFail};
+use crate::interrupt;
 use crate::output::{check_apart, check_file, say, set_exists, write_file};
 
 /// Options of `nesam import`.
@@ -62,6 +65,10 @@ pub struct ImportArgs {
 
 /// Logs that are measured less often are doubted: the model steps at 10 Hz, and stamps tremble.
 const RATE_MIN_HZ: f64 = 9.0;
+/// Those that are measured less often than this may count their time in milliseconds: at a kilohertz they would lie a second apart.
+const SECONDS_MIN_HZ: f64 = 1.5;
+/// Plots of the drives, in the folder of their set.
+const PAGE: &str = "import.html";
 
 const EXAMPLES: &str =
     "Columns of a data root (TARGET): t x y z, roll pitch yaw or qx qy qz qw, cmd_speed, and cmd_steer, cmd_road_wheel_angle or
@@ -85,9 +92,12 @@ enum FrameArg {
 
 /// Runs the command.
 pub fn run(args: &ImportArgs) -> Result<(), Failure> {
-    let folder = target(args)?;
+    let draft = Draft::new(&args.to, &args.set);
+    check_target(args, draft.folder())?;
     args.html.iter().try_for_each(|file| check_file(file))?;
     args.html.iter().flat_map(|html| args.logs.iter().map(move |log| [html, log])).try_for_each(check_apart)?;
+    let unfinished = draft.clone();
+    interrupt::exit_on_ctrl_c_after("nothing was imported", move || unfinished.discard());
     let lines = match &args.columns {
         Some(file) => std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?,
         None => String::new(),
@@ -99,54 +109,50 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
         all.extend(found);
     }
     let card = card(args)?;
-    let made = make(&folder)?;
-    if let Err(failure) = write(args, &folder, &all, card) {
-        // What cannot be read again is no set. Of the folders above it those go that were made for it and hold nothing else.
-        let _ = std::fs::remove_dir_all(&folder);
-        made.iter().all(|dir| std::fs::remove_dir(dir).is_ok());
-        return Err(failure);
-    }
-    say!("{} drives in {}", all.len(), folder.display());
+    let written = write(args, &draft, &all, card);
+    // What cannot be read again is no set.
+    draft.discard();
+    written.map_err(|failure| draft.told_of(failure))?;
+    say!("{} drives in {}", all.len(), draft.folder().display());
     Ok(())
 }
 
-/// Makes the folder of a set, which nobody else may have made meanwhile; gives those above it that were made, from below.
-fn make(folder: &Path) -> Result<Vec<PathBuf>, Failure> {
-    let failed = |e: std::io::Error| Failure::input(format!("cannot make the folder {}: {e}", folder.display()));
-    let above = folder.ancestors().skip(1).take_while(|dir| !dir.as_os_str().is_empty() && !dir.exists()).map(PathBuf::from).collect();
-    std::fs::create_dir_all(folder.parent().unwrap_or(folder)).map_err(failed)?;
-    match std::fs::create_dir(folder) {
-        Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => Err(set_exists(folder)),
-        made => made.map_err(failed).map(|()| above),
-    }
-}
-
-/// Writes the set, judges it, and puts the card into a data root that has none.
-fn write(args: &ImportArgs, folder: &Path, drives: &[Drive], card: Option<&Path>) -> Result<(), Failure> {
-    let notes = write_set(folder, drives, args.world.as_deref(), args.split.as_deref()).or_input()?;
+/// Writes the set and judges it where nobody sees it, puts it in its place, and the card into a data root that has none.
+fn write(args: &ImportArgs, draft: &Draft, drives: &[Drive], card: Option<&Path>) -> Result<(), Failure> {
+    draft.make()?;
+    let notes = write_set(&draft.root().join(&args.set), drives, args.world.as_deref(), args.split.as_deref()).or_input()?;
     notes.iter().for_each(|note| say!("  note: {note}"));
-    judge(args, card, &args.html.clone().unwrap_or_else(|| folder.join("import.html")))?;
-    card.map_or(Ok(()), |card| put_card(args, card))
+    judge(args, card, draft)?;
+    let card = card.map(|card| copy_card(card, draft.root())).transpose()?;
+    draft.publish(&args.set)?;
+    if let Some((copy, name)) = card
+        && let Err(error) = std::fs::rename(copy, args.to.join(name))
+    {
+        let _ = std::fs::remove_dir_all(draft.folder());
+        return Err(Failure::Failed(format!("cannot copy the card: {error}")));
+    }
+    let html = args.html.clone().unwrap_or_else(|| draft.folder().join(PAGE));
+    say!("wrote {}", html.display());
+    Ok(())
 }
 
-/// The folder of the new set.
-fn target(args: &ImportArgs) -> Result<PathBuf, Failure> {
+/// Refuses a folder that no new set may have.
+fn check_target(args: &ImportArgs, folder: &Path) -> Result<(), Failure> {
     let plain =
         |part: &str| !part.is_empty() && !part.starts_with('.') && part.chars().all(|c| c.is_ascii_alphanumeric() || "_-.".contains(c));
-    if !args.set.split('/').all(plain) || args.set == "worlds" {
+    if !args.set.split('/').all(plain) || args.set.starts_with("worlds/") || args.set == "worlds" {
         return Err(Failure::input(format!("--set {}: letters, digits, _ - . and / between them are allowed, and not `worlds`", args.set)));
     }
-    let folder = args.to.join(&args.set);
-    if inside_bundle(&folder) {
+    if inside_bundle(folder) {
         return Err(Failure::input(format!("--to {} lies in a bundle, which no command may change", args.to.display())));
     }
     if folder.exists() {
-        return Err(set_exists(&folder));
+        return Err(set_exists(folder));
     }
     if let Some(world) = args.world.as_ref().filter(|world| !args.to.join("worlds").join(world).is_dir()) {
         return Err(Failure::input(format!("--world {world}: no folder {}", args.to.join("worlds").join(world).display())));
     }
-    Ok(folder)
+    Ok(())
 }
 
 fn extension(log: &Path) -> String {
@@ -157,6 +163,9 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
     // A folder is a bag whatever its name ends in.
     let (name, kind) = if log.is_dir() { (log.file_name(), "mcap".into()) } else { (log.file_stem(), extension(log)) };
     let name = name.map_or_else(|| "log".into(), |name| name.to_string_lossy().into_owned());
+    if std::fs::metadata(log).is_ok_and(|file| file.is_file() && file.len() == 0) {
+        return Err(Failure::input(format!("{}: is empty: nothing was recorded, or it was not copied", log.display())));
+    }
     let (table, mut notes) = match kind.as_str() {
         "mcap" => {
             let topics = Topics { odometry: args.odometry.clone(), command: args.command.clone(), imu: args.imu.clone() };
@@ -181,9 +190,12 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
         let rate_hz = (t.len() - 1) as f64 / length_s;
         say!("  {}: {length_s:.1} s, {} samples, {rate_hz:.1} Hz", drive.id, t.len());
         if rate_hz < RATE_MIN_HZ {
-            say!(
-                "  doubt: {rate_hz:.1} Hz is slower than the model's steps of 0.1 s: what lies between is interpolated; record at 10 Hz or faster"
-            );
+            let advice = if rate_hz < SECONDS_MIN_HZ {
+                "record at 10 Hz or faster, or, where its time stamps are milliseconds, import with `--column t=COLUMN:ms`"
+            } else {
+                "record at 10 Hz or faster"
+            };
+            say!("  doubt: {rate_hz:.1} Hz is slower than the model's steps of 0.1 s: what lies between is interpolated; {advice}");
         }
     }
     Ok(found)
@@ -212,15 +224,33 @@ fn card(args: &ImportArgs) -> Result<Option<&Path>, Failure> {
     Ok(None)
 }
 
-fn put_card(args: &ImportArgs, card: &Path) -> Result<(), Failure> {
+/// Copies a card into a folder; gives the copy and its name in a data root.
+fn copy_card(card: &Path, folder: &Path) -> Result<(PathBuf, String), Failure> {
     let name = card.file_stem().map_or_else(|| "card".into(), |name| name.to_string_lossy().into_owned());
     let name = format!("vehicle_{}.json", name.trim_start_matches("vehicle_"));
-    std::fs::copy(card, args.to.join(name)).map(|_| ()).map_err(|e| Failure::Failed(format!("cannot copy the card: {e}")))
+    let copy = folder.join(&name);
+    std::fs::copy(card, &copy).map_err(|e| Failure::Failed(format!("cannot copy the card: {e}")))?;
+    Ok((copy, name))
+}
+
+/// Opens the draft with the card that counts: the one to copy, else that of the data root.
+fn open(args: &ImportArgs, card: Option<&Path>, draft: &Draft) -> Result<DataRoot, Failure> {
+    if let Some(card) = card {
+        return DataRoot::open(draft.root(), Some(card)).or_input();
+    }
+    let whole = DataRoot::open(&args.to, None).or_input()?;
+    let root = DataRoot::open(draft.root(), Some(whole.card())).or_input()?;
+    if whole.vehicle().second != root.vehicle().second {
+        let card = whole.card().display();
+        let reason = "the log and the sets of the data root give the second command another meaning";
+        return Err(Failure::input(format!("{card}: {reason}; state it in the card with `second`, or import into another root")));
+    }
+    Ok(root)
 }
 
 /// Reads the set as every other command will, says what does not fit together, and draws what was driven.
-fn judge(args: &ImportArgs, card: Option<&Path>, html: &Path) -> Result<(), Failure> {
-    let root = DataRoot::open(&args.to, card).or_input()?;
+fn judge(args: &ImportArgs, card: Option<&Path>, draft: &Draft) -> Result<(), Failure> {
+    let root = open(args, card, draft)?;
     let of_card = root.notes();
     let drives: Vec<Trajectory> = root.load_set(&SetQuery::all(&args.set)).or_input()?;
     for note in root.notes().iter().filter(|note| args.world.is_some() || of_card.contains(note)) {
@@ -233,7 +263,11 @@ fn judge(args: &ImportArgs, card: Option<&Path>, html: &Path) -> Result<(), Fail
         let cost = if beyond.implied { "" } else { ", and no service would take that" };
         say!("  doubt: {} drives command beyond the range of the card{cost}: {beyond}; see the units of the commands", beyond.drives);
     }
-    write_file(html, page::page(&args.set, &drives, root.vehicle()).as_bytes())?;
-    say!("wrote {}", html.display());
-    Ok(())
+    let own = draft.root().join(&args.set);
+    let html = match &args.html {
+        None => own.join(PAGE),
+        // In the folder of the set, which is not there yet.
+        Some(file) => file.strip_prefix(draft.folder()).map_or_else(|_| file.clone(), |inside| own.join(inside)),
+    };
+    write_file(&html, page::page(&args.set, &drives, root.vehicle()).as_bytes())
 }
