@@ -79,6 +79,20 @@ impl Diagnoses {
         }
     }
 
+    /// The program that is run with the arguments of `nesam diagnose`.
+    ///
+    /// # Errors
+    /// INTERNAL when this program does not know where it is.
+    fn program(&self) -> Result<PathBuf, Status> {
+        let named = &self.config.executable;
+        if !named.as_os_str().is_empty() {
+            return Ok(named.clone());
+        }
+        std::env::current_exe().map_err(|error| {
+            Status::internal(format!("nesam diagnose: where this program lies is not known: {error}; `diagnosis.executable` names it"))
+        })
+    }
+
     /// Longest duration of one.
     pub fn longest(&self) -> Duration {
         Duration::from_secs_f64(self.config.limit_s)

@@ -45,7 +45,11 @@ impl Work {
     pub async fn run(self, told: &Told) -> Result<(), Status> {
         let Self { diagnoses, asked, source, .. } = &self;
         let (session, directory) = (asked.session_id.as_str(), &diagnoses.directory);
-        let folder = Folder::make(directory, unix_ns(), session).map_err(|error| {
+        let made = {
+            let (directory, session) = (directory.clone(), session.to_string());
+            beside(move || Folder::make(&directory, unix_ns(), &session)).await?
+        };
+        let folder = made.map_err(|error| {
             let reason = format!("{} cannot be written: {error}", directory.display());
             refused(Code::FailedPrecondition, "diagnosis.directory", reason)
         })?;
@@ -56,7 +60,11 @@ impl Work {
         if source.live {
             tokio::time::sleep(WRITTEN_AFTER).await;
         }
-        let mut child = self.command(folder.path())?.spawn().map_err(|error| Status::internal(format!("nesam diagnose: {error}")))?;
+        let program = diagnoses.program()?;
+        let mut child = self.command(&program, folder.path()).spawn().map_err(|error| {
+            let reason = format!("nesam diagnose: {} does not start: {error}; `diagnosis.executable` names the program", program.display());
+            Status::internal(reason)
+        })?;
         let said = match child.stderr.take() {
             Some(stderr) => listen(stderr, told).await,
             None => Said::default(),
@@ -65,30 +73,26 @@ impl Work {
         if !status.success() {
             return Err(said.failure(status.code(), &status.to_string()));
         }
-        let (report, document) = report::read(folder.path(), folder.name(), said.notes)
-            .map_err(|reason| Status::internal(format!("nesam diagnose {reason}")))?;
+        let read = {
+            let (path, name) = (folder.path().to_path_buf(), folder.name());
+            beside(move || report::read(&path, name, said.notes)).await?
+        };
+        let (report, document) = read.map_err(|reason| Status::internal(format!("nesam diagnose {reason}")))?;
         let verdict = report.verdict().as_str_name();
         tracing::info!(session, diagnosis = folder.name(), verdict, effects = report.effects.len(), "diagnosis finished");
         diagnoses.live.reports.add(document);
-        folder.keep(diagnoses.config.kept_max);
+        let kept_max = diagnoses.config.kept_max;
+        beside(move || folder.keep(kept_max)).await?;
         tell(told, Event::Report(report)).await;
         Ok(())
     }
 
     /// The command that makes the diagnosis and leaves everything in `folder`.
-    ///
-    /// # Errors
-    /// INTERNAL when this program does not know where it is.
-    fn command(&self, folder: &Path) -> Result<Command, Status> {
+    fn command(&self, program: &Path, folder: &Path) -> Command {
         let (config, asked) = (&self.diagnoses.config, &self.asked);
-        let given = |path: &Path| !path.as_os_str().is_empty();
-        let executable = match given(&config.executable) {
-            true => config.executable.clone(),
-            false => std::env::current_exe().map_err(|error| Status::internal(format!("this program is not found: {error}")))?,
-        };
-        let mut command = Command::new(executable);
+        let mut command = Command::new(program);
         command.arg("diagnose").arg("--recording").args(&self.source.files).arg(format!("--session={}", asked.session_id));
-        if given(&config.bundle) {
+        if !config.bundle.as_os_str().is_empty() {
             command.arg("--bundle").arg(&config.bundle);
         }
         if let Some(from_ns) = asked.from_stamp_ns {
@@ -110,8 +114,18 @@ impl Work {
         command.arg("--out").arg(folder);
         command.env("RAYON_NUM_THREADS", config.threads.to_string());
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::piped()).kill_on_drop(true);
-        Ok(command)
+        command
     }
+}
+
+/// What work on files gives, on a thread that may wait for the disk.
+///
+/// # Errors
+/// INTERNAL when it panicked.
+async fn beside<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, Status> {
+    tokio::task::spawn_blocking(work)
+        .await
+        .map_err(|_| Status::internal("files of the diagnosis: the work on them panicked; this is a bug"))
 }
 
 impl Said {
