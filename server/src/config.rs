@@ -28,6 +28,9 @@ use crate::error::ServerError;
 /// Most worker threads: more than processors of any one machine, and few enough to start.
 const THREADS_MAX: usize = 1024;
 
+/// Most connections, uploads, pages and measurements of a stream at a time: more than any machine bears, and few enough to count places for.
+const AT_A_TIME_MAX: usize = 1_000_000;
+
 /// Everything that can be configured. Unknown keys are refused.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
@@ -335,6 +338,15 @@ impl HttpConfig {
     }
 }
 
+/// What is wrong with a file, each with its key: figment's own words name its profile as if it were a part of the key.
+fn in_words(error: figment::Error) -> String {
+    let one = |error: figment::Error| match error.path.is_empty() {
+        true => error.kind.to_string(),
+        false => format!("`{}`: {}", error.path.join("."), error.kind),
+    };
+    error.into_iter().map(one).collect::<Vec<_>>().join("; ")
+}
+
 fn loopback(port: u16) -> SocketAddr {
     (Ipv4Addr::LOCALHOST, port).into()
 }
@@ -358,7 +370,7 @@ impl Config {
         Figment::from(Serialized::defaults(Self::default()))
             .merge(Toml::file_exact(path))
             .extract()
-            .map_err(|error| ServerError::Config { path: path.into(), reason: error.to_string() })
+            .map_err(|error| ServerError::Config { path: path.into(), reason: in_words(error) })
     }
 
     /// A configuration for tests and the demo: loopback, free ports, no Zenoh.
@@ -433,6 +445,17 @@ impl Config {
         for (key, value) in counts {
             if value == 0 {
                 return Err(ServerError::Value { key, reason: "is 0, at least 1 is needed".into() });
+            }
+        }
+        let at_a_time = [
+            ("grpc.uploads_max", self.grpc.uploads_max),
+            ("grpc.connections_max", self.grpc.connections_max),
+            ("grpc.measurements_in_flight_max", self.grpc.measurements_in_flight_max),
+            ("http.watchers_max", self.http.watchers_max),
+        ];
+        for (key, value) in at_a_time {
+            if value > AT_A_TIME_MAX {
+                return Err(ServerError::Value { key, reason: format!("is {value}, at most {AT_A_TIME_MAX} are allowed") });
             }
         }
         if self.limits.horizon_max > MAX_HORIZON {
@@ -562,8 +585,14 @@ mod tests {
         let dir = std::env::temp_dir().join(format!("nesam-config-{}", std::process::id()));
         std::fs::create_dir_all(&dir).unwrap();
         for (text, part) in [
-            ("[grpc]\nlisten = 3\n", "listen"),
+            ("[grpc]\nlisten = 3\n", "default.toml: `grpc.listen`: invalid type"),
+            ("[grpc]\nlisten = \"here\"\n", "default.toml: `grpc.listen`: "),
             ("[grpc]\nport = 3\n", "port"),
+            ("[grpc]\nconnections_max = 9223372036854775807\n", "grpc.connections_max"),
+            ("[grpc]\nmeasurements_in_flight_max = 1000001\n", "grpc.measurements_in_flight_max"),
+            ("[grpc]\nuploads_max = 1000001\n", "`grpc.uploads_max`: is 1000001, at most 1000000 are allowed"),
+            ("[http]\nwatchers_max = 1000001\n", "http.watchers_max"),
+            ("[zenoh]\nmode = \"client\"\n", "zenoh.connect"),
             ("[limits]\nsessions_max = 0\n", "limits.sessions_max"),
             ("[limits]\nposition_max_m = nan\n", "limits.position_max_m"),
             ("[limits]\nspeed_max_m_s = -1.0\n", "limits.speed_max_m_s"),

@@ -87,6 +87,10 @@ impl ZenohConfig {
                 return Err(ServerError::Value { key, reason });
             }
         }
+        if self.enabled && self.mode == ZenohMode::Client && self.connect.is_empty() {
+            let reason = "is empty, but with `zenoh.mode = \"client\"` it has to name a router, for instance tcp/router:7447".into();
+            return Err(ServerError::Value { key: "zenoh.connect", reason });
+        }
         let name = |key: &'static str, name: &str| {
             check_name(key, name).map_err(|error| match error {
                 EngineError::Invalid { reason, .. } => ServerError::Value { key, reason },
