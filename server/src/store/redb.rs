@@ -53,6 +53,15 @@ fn of_file(path: &Path, opened: Result<Database, DatabaseError>) -> Result<Datab
     })
 }
 
+/// Refuses a file that may be opened and is none: it would become a new store, and what was durable would be missing from it.
+fn check_file(path: &Path) -> Result<(), StoreError> {
+    let empty = std::fs::metadata(path).is_ok_and(|about| about.is_file() && about.len() == 0);
+    if empty {
+        return Err(failed_in(path, "is empty; put a copy in its place, remove it to begin without sessions, or take another folder"));
+    }
+    check_head(path)
+}
+
 /// Refuses a head that names pages larger than the file: the database takes the memory of a page, up to 4 GiB, before it looks whether the page is whole.
 fn check_head(path: &Path) -> Result<(), StoreError> {
     // Two commits, each with the page numbers of two roots, whose five highest bits are the binary logarithm of their size in pages (redb, docs/design.md).
@@ -79,7 +88,7 @@ impl RedbStore {
     /// Opens the store in a folder, and makes both if they are not there.
     ///
     /// # Errors
-    /// `StoreError::File` when the folder cannot be made, `InUse` when another process has the store, `Database` when the file is damaged or no store.
+    /// `StoreError::File` when the folder cannot be made, `InUse` when another process has the store, `Database` when the file is damaged, empty or no store.
     pub fn open(folder: &Path) -> Result<Self, StoreError> {
         let at = |path: &Path| {
             let path = path.to_path_buf();
@@ -87,7 +96,7 @@ impl RedbStore {
         };
         std::fs::create_dir_all(folder).map_err(at(folder))?;
         let path = folder.join(FILE);
-        check_head(&path)?;
+        check_file(&path)?;
         // What is damaged in the head of the file no checksum covers, and the database may panic on it.
         let opened = std::panic::catch_unwind(|| {
             let database = of_file(&path, Database::builder().set_cache_size(CACHE_BYTES).create(&path))?;
@@ -102,6 +111,19 @@ impl RedbStore {
             })
         });
         opened.unwrap_or_else(|_| Err(failed_in(&path, "is damaged; put a copy in its place, or take another folder")))
+    }
+
+    /// Looks whether the store in a folder may be read and written, without opening it: a server may have it. A folder without one is sound.
+    ///
+    /// # Errors
+    /// `StoreError::File` when the system refuses the file, `Database` when its head is damaged or it is empty.
+    pub fn look(folder: &Path) -> Result<(), StoreError> {
+        let path = folder.join(FILE);
+        if !path.exists() {
+            return Ok(());
+        }
+        std::fs::OpenOptions::new().read(true).write(true).open(&path).map_err(|source| StoreError::File { path: path.clone(), source })?;
+        check_file(&path)
     }
 
     /// Checks every page, which the database itself does only after a crash, and makes the tables; refuses a damaged database and one of another format.

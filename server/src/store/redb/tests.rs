@@ -301,3 +301,23 @@ fn service_damaged_foreign_and_shared_stores_are_refused() {
     // A folder that is a file.
     assert!(matches!(RedbStore::open(&file), Err(StoreError::File { .. })));
 }
+
+/// Goal: a file that was emptied is no new store, and a look at it says what opening it would. Method: a store that is made, looked at while it is open, emptied.
+#[test]
+fn regress_an_empty_file_is_no_store() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join(FILE);
+    RedbStore::look(folder.path()).unwrap();
+    assert!(!file.exists(), "a look makes nothing");
+    let store = RedbStore::open(folder.path()).unwrap();
+    RedbStore::look(folder.path()).unwrap();
+    drop(store);
+    std::fs::write(&file, "").unwrap();
+    for error in [RedbStore::open(folder.path()).map(drop).unwrap_err(), RedbStore::look(folder.path()).unwrap_err()] {
+        assert!(error.to_string().contains("sessions.redb: is empty; "), "{error}");
+    }
+    assert_eq!(std::fs::metadata(&file).unwrap().len(), 0, "nothing is made of it");
+    std::fs::remove_file(&file).unwrap();
+    std::fs::create_dir(&file).unwrap();
+    assert!(matches!(RedbStore::look(folder.path()), Err(StoreError::File { .. })));
+}
