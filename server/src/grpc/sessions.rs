@@ -52,9 +52,9 @@ impl pb::sessions_server::Sessions for Service {
         self.0.engine.metrics().request(Transport::Grpc, "open");
         let budget = self.0.budget(&request);
         let pb::OpenSessionRequest { vehicle_id: vehicle, session_id: session, .. } = request.get_ref();
-        self.0.allow(&request, Wish::OpenSession { vehicle, session }).await?;
-        let open = open_session(request.get_ref()).map_err(to_status)?;
         let name = if session.is_empty() { vehicle } else { session };
+        self.0.allow(&request, Wish::OpenSession { vehicle, session: name }).await?;
+        let open = open_session(request.get_ref()).map_err(to_status)?;
         self.0.bring_map(&open.map, budget).await?;
         let view = self.0.begin("session_id", name, budget, self.0.engine.open(open, budget)).await?;
         tracing::info!(session = view.session, vehicle = view.vehicle, "session opened");
