@@ -18,7 +18,7 @@ use tonic_health::server::HealthReporter;
 use crate::access::{self, Credentials, Directory};
 use crate::call::EngineClient;
 use crate::clock::{MonotonicClock, unix_ns};
-use crate::cluster::{Cluster, Etcd};
+use crate::cluster::{Cluster, ClusterFiles, Etcd};
 use crate::config::{Config, GrpcConfig};
 use crate::connection::Closing;
 use crate::convert::SoilTeller;
@@ -83,6 +83,7 @@ impl core::fmt::Debug for RunningServer {
 pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningServer, ServerError> {
     config.check()?;
     let (tls, access) = access::load(&config.tls)?;
+    let tls = tls.map(|tls| tls.on_zenoh(config.zenoh.uses_tls()));
     // Everything that can fail for want of an address comes before the first thread.
     let grpc_listener = listen(config.grpc.listen, "grpc.listen").await?;
     let http_listener = match config.http.enabled {
@@ -109,15 +110,16 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let handle = EngineHandle::spawn_tapped(engine, Arc::new(clock), tap);
     let engine =
         EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()).shown_on(http_addr.map(|_| live.feed.clone()));
-    let cluster = match &keeper {
+    let reload_every = Duration::from_secs_f64(config.tls.reload_s);
+    let (cluster, cluster_files) = match &keeper {
         Some(keeper) => match open_store(&config, grpc_addr, keeper, &engine).await {
-            Ok(cluster) => cluster,
+            Ok(opened) => opened,
             Err(error) => {
                 handle.stop();
                 return Err(error);
             }
         },
-        None => None,
+        None => (None, None),
     };
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
@@ -134,7 +136,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let bus = match config.zenoh.enabled {
         true => {
             let network = BusConfig { zenoh: config.zenoh, ros2: config.ros2, fleet_soil: config.fleet_soil, tls: config.tls };
-            match RenewedBus::start(network, edge.clone(), tls.as_ref().map(Credentials::tls)).await {
+            match RenewedBus::start(network, edge.clone(), tls.as_ref().map(Credentials::files)).await {
                 Ok(bus) => Some(bus),
                 Err(error) => {
                     end_store(keeper, cluster).await;
@@ -159,6 +161,9 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         tokio::spawn(http_connections::serve(listener, http::health_router(edge.clone()), limits, stopping.clone()));
     }
     tokio::spawn(expire_sessions(edge.clone()));
+    if let Some(files) = cluster_files {
+        tokio::spawn(files.follow(reload_every, metrics.clone(), stopping.clone()));
+    }
     let health = HealthReporter::new();
     report(&health, ServingStatus::Serving).await;
     let secure = match (edge.access.is_restricted(), &tls) {
@@ -248,25 +253,26 @@ pub(crate) fn event_sink(
     })
 }
 
-/// Opens the store that the configuration asks for, gives the engine what it holds and starts the keeper.
+/// Opens the store that the configuration asks for, gives the engine what it holds and starts the keeper. Where servers share sessions, gives this one among them
+/// and what reads its certificates again.
 async fn open_store(
     config: &Config,
     grpc_addr: SocketAddr,
     keeper: &Arc<Keeper>,
     engine: &EngineClient,
-) -> Result<Option<Cluster>, ServerError> {
+) -> Result<(Option<Cluster>, Option<ClusterFiles>), ServerError> {
     if !config.cluster.enabled() {
         let opened = open_folder(&config.store.directory, keeper, engine.handle()).await;
-        return opened.map(|()| None).map_err(|source| ServerError::Store { source });
+        return opened.map(|()| (None, None)).map_err(|source| ServerError::Store { source });
     }
-    let etcd = Etcd::new(&config.cluster)?;
+    let (etcd, files) = Etcd::new(&config.cluster)?;
     let cluster = Cluster::start(etcd, &config.cluster, grpc_addr.to_string(), engine.clone(), keeper.clone()).await?;
     let store = EtcdStore::new(cluster.clone(), tokio::runtime::Handle::current());
     if let Err(source) = keeper.start(Box::new(store), engine.handle().clone(), Restored::default()) {
         cluster.stop().await;
         return Err(ServerError::Store { source });
     }
-    Ok(Some(cluster))
+    Ok((Some(cluster), Some(files).filter(|_| config.cluster.uses_tls())))
 }
 
 /// Commits what is left, then lets the sessions go: others may have them from now on. Gives how much the store did not take.

@@ -13,29 +13,40 @@ use tokio_rustls::rustls::{Error, RootCertStore, ServerConfig};
 
 use super::certificate;
 use super::fleet_file::FleetFile;
+use super::identity::Identity;
+use super::rereading::Rereading;
 use crate::config::TlsConfig;
 use crate::error::ServerError;
 use crate::grpc::stopped;
-use crate::telemetry::Metrics;
+use crate::telemetry::{Metrics, Part};
 
-/// The bytes of the files; empty = not configured.
+/// The bytes of the files of TLS; empty = not configured.
 #[derive(PartialEq, Eq)]
-struct Files {
+pub(crate) struct TlsFiles {
     certificate: Vec<u8>,
     key: Vec<u8>,
     client_ca: Vec<u8>,
-    fleet: Vec<u8>,
 }
 
-/// TLS of new connections and the rights of the fleet, as the files say.
+/// The rights of the fleet, and the file that says them.
+struct Rights {
+    file: Vec<u8>,
+    in_force: watch::Sender<Arc<FleetFile>>,
+}
+
+/// TLS of new connections and the rights of the fleet, as the files say. Both change by themselves: what is wrong with the files of one keeps no change of the
+/// other out.
 pub struct Credentials {
     config: TlsConfig,
-    files: Files,
+    /// What is in force of the files of TLS; told anew when the rights change too.
+    files: watch::Sender<Arc<TlsFiles>>,
     /// When the certificate expires, s since 1970.
     expires_s: u64,
     tls: watch::Sender<Arc<ServerConfig>>,
     /// `None` = clients show no certificates.
-    rights: Option<watch::Sender<Arc<FleetFile>>>,
+    rights: Option<Rights>,
+    /// Whether the certificate is shown on Zenoh too.
+    on_zenoh: bool,
 }
 
 impl Credentials {
@@ -44,14 +55,24 @@ impl Credentials {
     /// # Errors
     /// `ServerError::Tls` naming the key whose file cannot be used.
     pub fn read(config: &TlsConfig) -> Result<Self, ServerError> {
-        let files = Files::read(config)?;
+        let files = TlsFiles::read(config)?;
         let tls = watch::channel(Arc::new(files.server_config()?)).0;
         let expires_s = files.expiry_s(&config.certificate)?;
         let rights = match config.restricts() {
-            true => Some(watch::channel(Arc::new(files.rights(&config.fleet)?)).0),
+            true => {
+                let file = read("tls.fleet", &config.fleet)?;
+                let in_force = watch::channel(Arc::new(fleet(&file, &config.fleet)?)).0;
+                Some(Rights { file, in_force })
+            }
             false => None,
         };
-        Ok(Self { config: config.clone(), files, expires_s, tls, rights })
+        Ok(Self { config: config.clone(), files: watch::channel(Arc::new(files)).0, expires_s, tls, rights, on_zenoh: false })
+    }
+
+    /// The same, shown on Zenoh too, which knows servers by their common name.
+    #[must_use]
+    pub fn on_zenoh(self, on_zenoh: bool) -> Self {
+        Self { on_zenoh, ..self }
     }
 
     /// The configuration that new connections get.
@@ -59,54 +80,84 @@ impl Credentials {
         self.tls.subscribe()
     }
 
-    /// The rights of the fleet, where clients have identities.
-    pub(super) fn rights(&self) -> Option<watch::Receiver<Arc<FleetFile>>> {
-        self.rights.as_ref().map(watch::Sender::subscribe)
+    /// The files of TLS that are in force; a change of the rights is told there too.
+    pub(crate) fn files(&self) -> watch::Receiver<Arc<TlsFiles>> {
+        self.files.subscribe()
     }
 
-    /// Reads the files again and puts them in force when they have changed and are sound; says whether they have changed.
+    /// The rights of the fleet, where clients have identities.
+    pub(super) fn rights(&self) -> Option<watch::Receiver<Arc<FleetFile>>> {
+        self.rights.as_ref().map(|rights| rights.in_force.subscribe())
+    }
+
+    /// Reads the files of TLS again and puts them in force when they have changed and are sound; says whether they have changed.
     ///
     /// # Errors
     /// As [`Credentials::read`]; what was in force stays so.
-    fn reread(&mut self) -> Result<bool, ServerError> {
-        let files = Files::read(&self.config)?;
-        if files == self.files {
+    fn reread_tls(&mut self) -> Result<bool, ServerError> {
+        let (files, before) = (TlsFiles::read(&self.config)?, self.files.borrow().clone());
+        if files == *before {
             return Ok(false);
         }
         let tls = files.server_config()?;
-        // One that expired while it was in force is no reason to keep rights that were withdrawn.
-        let expires_s = match files.certificate == self.files.certificate {
-            true => self.expires_s,
-            false => files.expiry_s(&self.config.certificate)?,
-        };
-        if let Some(rights) = &self.rights {
-            rights.send_replace(Arc::new(files.rights(&self.config.fleet)?));
+        // One that expired while it was in force is no reason to keep an authority that was withdrawn.
+        if files.certificate != before.certificate {
+            self.expires_s = files.expiry_s(&self.config.certificate)?;
         }
         self.tls.send_replace(Arc::new(tls));
-        (self.files, self.expires_s) = (files, expires_s);
+        self.files.send_replace(Arc::new(files));
+        Ok(true)
+    }
+
+    /// The same for the rights.
+    ///
+    /// # Errors
+    /// As [`Credentials::read`]; what was in force stays so.
+    fn reread_rights(&mut self) -> Result<bool, ServerError> {
+        let Some(rights) = &mut self.rights else { return Ok(false) };
+        let file = read("tls.fleet", &self.config.fleet)?;
+        if file == rights.file {
+            return Ok(false);
+        }
+        rights.in_force.send_replace(Arc::new(fleet(&file, &self.config.fleet)?));
+        rights.file = file;
+        self.files.send_modify(|_| {});
         Ok(true)
     }
 
     /// What is readable and may be a mistake.
     pub fn doubts(&self) -> Vec<String> {
-        let of_rights = self.rights.as_ref().map_or_else(Vec::new, |rights| rights.borrow().doubts());
-        self.files.foreign_certificate().into_iter().chain(of_rights).collect()
+        let files = self.files.borrow().clone();
+        let of_rights = self.rights.as_ref().map_or_else(Vec::new, |rights| rights.in_force.borrow().doubts());
+        files.foreign_certificate().into_iter().chain(self.stranger_on_zenoh(&files)).chain(of_rights).collect()
+    }
+
+    /// Why routers may take this server for a stranger, where it shows its certificate on Zenoh.
+    fn stranger_on_zenoh(&self, files: &TlsFiles) -> Option<String> {
+        let rights = self.rights.as_ref().filter(|_| self.on_zenoh)?.in_force.borrow().clone();
+        let name = certificate::common_name(certificates("tls.certificate", &files.certificate).ok()?.first()?).unwrap_or_default();
+        let known = Identity::parse(&name).is_ok_and(|who| matches!(who, Identity::Server(_)) && rights.knows(&who));
+        let doubt = format!(
+            "the certificate in `tls.certificate` has the common name `{name}`: Zenoh routers let nobody answer vehicles but `nesam:server:NAME` with a NAME from \
+             `servers` in `tls.fleet`"
+        );
+        (!known).then_some(doubt)
     }
 
     /// Says what is in force: when the certificate expires as a metric, what may be a mistake in the log.
     fn in_force(&self, metrics: &Metrics) {
-        metrics.certificate_expires(self.expires_s);
+        metrics.reloads().expires(Part::Certificate, self.expires_s);
         self.doubts().iter().for_each(|doubt| tracing::warn!(target: "nesam::audit", doubt, "certificates or rights may be wrong"));
     }
 
-    /// Follows the files until the server stops. What cannot be used is logged once and counted, and changes nothing.
+    /// Follows the files until the server stops. What cannot be used is logged once, counted and told as long as it is so, and changes nothing.
     pub async fn follow(mut self, metrics: Arc<Metrics>, stopping: watch::Receiver<bool>) {
         self.in_force(&metrics);
         let stop = stopped(stopping);
         tokio::pin!(stop);
         let mut tick = tokio::time::interval(Duration::from_secs_f64(self.config.reload_s));
         tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
-        let mut said = String::new();
+        let mut parts = [Part::Certificate, Part::Rights].map(Rereading::of);
         loop {
             tokio::select! {
                 _ = tick.tick() => {}
@@ -114,25 +165,17 @@ impl Credentials {
             }
             // A file system that hangs holds up no request.
             let read = tokio::task::spawn_blocking(move || {
-                let result = self.reread();
-                (self, result)
+                let results = [self.reread_tls(), self.reread_rights()];
+                (self, results)
             });
-            let Ok((back, result)) = read.await else { return };
+            let Ok((back, results)) = read.await else {
+                tracing::error!(target: "nesam::audit", "reading certificates and rights panicked: they are not read again; this is a bug");
+                return;
+            };
             self = back;
-            match result {
-                Ok(false) => said.clear(),
-                Ok(true) => {
-                    said.clear();
-                    metrics.reloaded(true);
-                    tracing::info!(target: "nesam::audit", "certificates and rights were read anew");
-                    self.in_force(&metrics);
-                }
-                Err(error) if error.to_string() == said => {}
-                Err(error) => {
-                    said = error.to_string();
-                    metrics.reloaded(false);
-                    tracing::error!(target: "nesam::audit", %error, "changed certificates or rights cannot be used; those before stay in force");
-                }
+            let changed: Vec<bool> = parts.iter_mut().zip(results).map(|(part, result)| part.tell(result, metrics.reloads())).collect();
+            if changed.contains(&true) {
+                self.in_force(&metrics);
             }
         }
     }
@@ -143,17 +186,30 @@ fn unusable(key: &'static str, reason: impl Into<String>) -> ServerError {
     ServerError::Tls { key, reason: reason.into() }
 }
 
-impl Files {
-    fn read(config: &TlsConfig) -> Result<Self, ServerError> {
-        let read = |key: &'static str, path: &Path| match path.as_os_str().is_empty() {
-            true => Ok(Vec::new()),
-            false => std::fs::read(path).map_err(|source| unusable(key, format!("{}: {source}", path.display()))),
-        };
+/// The bytes of the file of a key; none where no file is configured.
+fn read(key: &'static str, path: &Path) -> Result<Vec<u8>, ServerError> {
+    match path.as_os_str().is_empty() {
+        true => Ok(Vec::new()),
+        false => std::fs::read(path).map_err(|source| unusable(key, format!("{}: {source}", path.display()))),
+    }
+}
+
+/// What the fleet file says.
+fn fleet(file: &[u8], path: &Path) -> Result<FleetFile, ServerError> {
+    let text = std::str::from_utf8(file).map_err(|error| error.to_string());
+    text.and_then(FleetFile::parse).map_err(|reason| unusable("tls.fleet", format!("{}: {reason}", path.display())))
+}
+
+impl TlsFiles {
+    /// Reads them.
+    ///
+    /// # Errors
+    /// `ServerError::Tls` naming the key whose file cannot be read.
+    pub fn read(config: &TlsConfig) -> Result<Self, ServerError> {
         Ok(Self {
             certificate: read("tls.certificate", &config.certificate)?,
             key: read("tls.key", &config.key)?,
             client_ca: read("tls.client_ca", &config.client_ca)?,
-            fleet: read("tls.fleet", &config.fleet)?,
         })
     }
 
@@ -201,14 +257,16 @@ impl Files {
             "no authority in `tls.client_ca` has signed the certificate in `tls.certificate`: who trusts them alone refuses this server ({error})"
         ))
     }
-
-    fn rights(&self, path: &Path) -> Result<FleetFile, ServerError> {
-        let text = std::str::from_utf8(&self.fleet).map_err(|error| error.to_string());
-        text.and_then(FleetFile::parse).map_err(|reason| unusable("tls.fleet", format!("{}: {reason}", path.display())))
-    }
 }
 
-fn certificates(key: &'static str, pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, ServerError> {
+/// The certificates in the file of a key.
+///
+/// # Errors
+/// `ServerError::Tls` where there is none.
+pub(crate) fn certificates(key: &'static str, pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, ServerError> {
     let read: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
     read.ok().filter(|list| !list.is_empty()).ok_or_else(|| unusable(key, "the file holds no certificate in PEM"))
 }
+
+#[cfg(test)]
+mod tests;

@@ -4,12 +4,13 @@
 //! fleet file says what that one may do. Both are read again when they change. Every handler asks [`Access`] before the engine does; what is refused and who
 //! changes what is logged under the target `nesam::audit`. Without `tls.client_ca` everybody may do everything, and the server says so when it starts.
 
-mod certificate;
+pub(crate) mod certificate;
 mod credentials;
 mod directory;
 mod fleet_file;
 mod identity;
 mod refusals;
+mod rereading;
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -19,10 +20,12 @@ use tonic::metadata::MetadataMap;
 use tonic::{Request, Status};
 
 pub use self::credentials::Credentials;
+pub(crate) use self::credentials::{TlsFiles, certificates};
 pub use self::directory::Directory;
 pub use self::fleet_file::FleetFile;
 pub use self::identity::Identity;
 pub use self::refusals::{Refusal, Refusals};
+pub(crate) use self::rereading::Rereading;
 use crate::config::TlsConfig;
 use crate::error::ServerError;
 

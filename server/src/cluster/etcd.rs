@@ -1,14 +1,14 @@
 //! etcd: transactions, leases and watches with deadlines.
 
-use std::path::Path;
 use std::time::Duration;
 
 use nesam_proto::etcd as pb;
 use pb::request_op::Request;
-use tonic::transport::{Certificate, Channel, ClientTlsConfig, Endpoint, Identity};
+use tonic::transport::{Channel, Endpoint};
 use tonic::{Status, Streaming};
 
 use super::again;
+use super::files::ClusterFiles;
 use super::keys::behind;
 use crate::config::ClusterConfig;
 use crate::error::ServerError;
@@ -19,6 +19,8 @@ const CONNECT: Duration = Duration::from_millis(500);
 const TRANSACTION: Duration = Duration::from_secs(2);
 /// Pause before something that etcd has not done is asked for again.
 const RETRY_AFTER: Duration = Duration::from_millis(100);
+/// Renewed connections to members that may wait to be taken.
+const RENEWALS_WAITING: usize = 64;
 /// Answers with all parts of a map may be this large, bytes.
 const ANSWER_BYTES_MAX: usize = 256 << 20;
 
@@ -42,13 +44,13 @@ pub(crate) struct Done {
 }
 
 impl Etcd {
-    /// A client that connects when it is first used, and again when it has to.
+    /// A client that connects when it is first used, and again when it has to or its certificates change; what reads those.
     ///
     /// # Errors
     /// `ServerError::Value` for an endpoint that is none, `ServerError::Tls` for files that cannot be used.
-    pub fn new(config: &ClusterConfig) -> Result<Self, ServerError> {
-        let endpoints = config.etcd.iter().map(|address| etcd_endpoint(address, config)).collect::<Result<Vec<_>, _>>()?;
-        Ok(Self::over(Channel::balance_list(endpoints.into_iter())))
+    pub fn new(config: &ClusterConfig) -> Result<(Self, ClusterFiles), ServerError> {
+        let (channel, renewals) = Channel::balance_channel(RENEWALS_WAITING.max(config.etcd.len()));
+        Ok((Self::over(channel), ClusterFiles::read(config, renewals)?))
     }
 
     /// A client over connections that somebody else makes.
@@ -136,40 +138,39 @@ impl Etcd {
 async fn within<T>(limit: Duration, asked: impl Future<Output = Result<T, Status>>) -> Result<T, Status> {
     let reason = match tokio::time::timeout(limit, asked).await {
         Ok(Ok(answer)) => return Ok(answer),
-        Ok(Err(status)) => status.message().to_string(),
+        Ok(Err(status)) => std::error::Error::source(&status).map_or_else(|| status.message().into(), in_short),
         Err(_) => format!("no answer within {:.1} s", limit.as_secs_f64()),
     };
     Err(again(&format!("etcd: {reason}"), RETRY_AFTER))
 }
 
-/// How servers connect to a member of etcd.
+/// How servers connect to a member of etcd, without certificates.
 ///
 /// # Errors
-/// `ServerError::Value` for an address that is none, `ServerError::Tls` for files that cannot be used.
-pub fn etcd_endpoint(address: &str, config: &ClusterConfig) -> Result<Endpoint, ServerError> {
-    let wrong = |reason: String| ServerError::Value { key: "cluster.etcd", reason: format!("`{address}`: {reason}") };
+/// `ServerError::Value` for an address that is none.
+pub(super) fn plain_endpoint(address: &str) -> Result<Endpoint, ServerError> {
+    let wrong = |error| ServerError::Value { key: "cluster.etcd", reason: format!("`{address}`: {error}") };
     let endpoint = Endpoint::from_shared(address.to_string()).map_err(|error| wrong(error.to_string()))?;
-    let endpoint = endpoint
+    Ok(endpoint
         .connect_timeout(CONNECT)
         .tcp_nodelay(true)
         .http2_keep_alive_interval(Duration::from_secs(1))
         .keep_alive_timeout(Duration::from_secs(1))
-        .keep_alive_while_idle(true);
-    if !address.starts_with("https://") {
-        return Ok(endpoint);
+        .keep_alive_while_idle(true))
+}
+
+/// An error with what it came from: the network says `transport error`, and below why.
+pub(super) fn in_short(error: &(dyn std::error::Error + 'static)) -> String {
+    let mut text = error.to_string();
+    let mut source = error.source();
+    while let Some(error) = source {
+        let reason = error.to_string();
+        if !text.contains(&reason) {
+            text = format!("{text}: {reason}");
+        }
+        source = error.source();
     }
-    let read = |key: &'static str, path: &Path| {
-        std::fs::read(path).map_err(|error| ServerError::Tls { key, reason: format!("{}: {error}", path.display()) })
-    };
-    let mut tls = ClientTlsConfig::new();
-    if !config.authority.as_os_str().is_empty() {
-        tls = tls.ca_certificate(Certificate::from_pem(read("cluster.authority", &config.authority)?));
-    }
-    if !config.certificate.as_os_str().is_empty() {
-        let certificate = read("cluster.certificate", &config.certificate)?;
-        tls = tls.identity(Identity::from_pem(certificate, read("cluster.key", &config.key)?));
-    }
-    endpoint.tls_config(tls).map_err(|error| wrong(error.to_string()))
+    text
 }
 
 fn bytes(text: &str) -> bytes::Bytes {

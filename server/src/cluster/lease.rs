@@ -29,13 +29,15 @@ struct Term {
 #[derive(Clone, Debug)]
 pub(crate) struct Lease {
     term: Arc<Mutex<Option<Term>>>,
+    /// Why it was not had or extended when that was last tried.
+    trouble: Arc<Mutex<Option<String>>>,
     length: Duration,
 }
 
 impl Lease {
     /// None yet.
     pub fn new(length_s: f64) -> Self {
-        Self { term: Arc::default(), length: Duration::from_secs_f64(length_s) }
+        Self { term: Arc::default(), trouble: Arc::default(), length: Duration::from_secs_f64(length_s) }
     }
 
     /// Number of the lease while it lasts.
@@ -49,6 +51,11 @@ impl Lease {
         self.held().map(|term| term.id)
     }
 
+    /// Why it was not had or extended when that was last tried; `None` = it was, or nobody knows yet.
+    pub fn trouble(&self) -> Option<String> {
+        self.trouble.lock().ok()?.clone()
+    }
+
     /// Length of a lease.
     pub fn length(&self) -> Duration {
         self.length
@@ -57,7 +64,11 @@ impl Lease {
     /// Keeps a lease for ever. Whenever one has ended `lost` is awaited, and another one is asked for.
     pub async fn keep<F: Future<Output = ()>>(self, etcd: Etcd, lost: impl Fn() -> F) {
         loop {
-            match self.extended(&etcd).await {
+            let extended = self.extended(&etcd).await;
+            if let Ok(mut trouble) = self.trouble.lock() {
+                *trouble = extended.as_ref().err().map(|status| status.message().into());
+            }
+            match extended {
                 Ok(true) => tokio::time::sleep(self.length.mul_f64(EXTEND_AFTER)).await,
                 Ok(false) => self.end(&lost, "etcd has ended it").await,
                 Err(status) => {

@@ -14,6 +14,7 @@
 mod bring;
 mod claim;
 mod etcd;
+mod files;
 mod keys;
 mod lease;
 mod leave;
@@ -34,8 +35,9 @@ use tonic_types::{ErrorDetails, StatusExt as _};
 
 pub(crate) use self::bring::{Brought, Standing};
 pub(crate) use self::claim::Claim;
-pub use self::etcd::etcd_endpoint;
 pub(crate) use self::etcd::{Etcd, created, delete, delete_all, get, get_all, get_keys, put, written};
+pub(crate) use self::files::ClusterFiles;
+pub use self::files::etcd_endpoint;
 pub(crate) use self::keys::Keys;
 use self::lease::Lease;
 use self::record::Server;
@@ -208,7 +210,8 @@ impl Cluster {
         while cluster.0.lease.id().is_none() {
             if begun.elapsed() > FIRST_LEASE {
                 cluster.stop().await;
-                let reason = format!("{}: no answer within {} s; is etcd there?", config.etcd.join(", "), FIRST_LEASE.as_secs());
+                let trouble = cluster.0.lease.trouble().unwrap_or_else(|| "no answer".into());
+                let reason = format!("{}: no lease within {} s ({trouble}); is etcd there?", config.etcd.join(", "), FIRST_LEASE.as_secs());
                 return Err(ServerError::Value { key: "cluster.etcd", reason });
             }
             tokio::time::sleep(Duration::from_millis(10)).await;
@@ -271,10 +274,15 @@ impl Cluster {
         self.0.left.subscribe()
     }
 
+    /// Whether this server may answer for sessions now.
+    pub fn is_leased(&self) -> bool {
+        self.0.lease.id().is_some()
+    }
+
     /// Counters.
     pub fn counts(&self) -> ClusterCounts {
         let state = self.lock();
-        ClusterCounts { held: state.held.len(), leased: self.0.lease.id().is_some(), ..state.counts }
+        ClusterCounts { held: state.held.len(), leased: self.is_leased(), ..state.counts }
     }
 }
 

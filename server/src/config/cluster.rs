@@ -39,6 +39,11 @@ impl ClusterConfig {
         !self.etcd.is_empty()
     }
 
+    /// Whether a member needs certificates.
+    pub fn uses_tls(&self) -> bool {
+        self.etcd.iter().any(|address| address.starts_with("https://"))
+    }
+
     /// Checks what the types do not.
     ///
     /// # Errors
@@ -57,8 +62,7 @@ impl ClusterConfig {
         if self.certificate.as_os_str().is_empty() != self.key.as_os_str().is_empty() {
             return wrong("cluster.key", "a certificate and its key come together".into());
         }
-        let secure = self.etcd.iter().any(|address| address.starts_with("https://"));
-        if secure && self.authority.as_os_str().is_empty() {
+        if self.uses_tls() && self.authority.as_os_str().is_empty() {
             return wrong("cluster.authority", "is needed for `https://` endpoints: the authority of etcd's certificates".into());
         }
         Ok(())

@@ -10,6 +10,7 @@ use nesam_engine::{Answer, Command, EngineError, Event, Reply};
 
 use super::alarms::AlarmCounts;
 use super::histogram::Histogram;
+use super::reloads::Reloads;
 
 /// What brought a measurement or a request.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,10 +40,7 @@ pub struct Metrics {
     commands: Pairs,
     measurements: Pairs,
     requests: Pairs,
-    /// Changes of certificates and rights that were not usable, and that were.
-    reloads: [AtomicU64; 2],
-    /// When the certificate of the server expires, s since 1970; 0 = it has none.
-    certificate_expires_s: AtomicU64,
+    reloads: Reloads,
     events: Mutex<BTreeMap<&'static str, u64>>,
     /// Held maps.
     maps: AtomicU64,
@@ -96,14 +94,9 @@ impl Metrics {
         count(&self.requests, (transport.label(), method));
     }
 
-    /// Counts that certificates or rights have changed, and whether they were usable.
-    pub fn reloaded(&self, usable: bool) {
-        self.reloads[usize::from(usable)].fetch_add(1, Ordering::Relaxed);
-    }
-
-    /// Notes when the certificate that is in force expires, s since 1970.
-    pub fn certificate_expires(&self, at_s: u64) {
-        self.certificate_expires_s.store(at_s, Ordering::Relaxed);
+    /// What became of certificates and rights that were read again.
+    pub(crate) fn reloads(&self) -> &Reloads {
+        &self.reloads
     }
 
     /// Counts something that happened to a session.
@@ -165,21 +158,7 @@ impl Metrics {
         }
         let (name, maps) = ("nesam_maps", self.maps.load(Ordering::Relaxed));
         let _ = writeln!(out, "# HELP {name} Maps that are held.\n# TYPE {name} gauge\n{name} {maps}");
-        // Both from the start, so that the first failure is an increase.
-        let name = "nesam_credentials_reloads_total";
-        let _ = writeln!(out, "# HELP {name} Changes of certificates and rights, by whether they were usable.\n# TYPE {name} counter");
-        for (result, count) in ["failed", "ok"].iter().zip(&self.reloads) {
-            let _ = writeln!(out, "{name}{{result=\"{result}\"}} {}", count.load(Ordering::Relaxed));
-        }
-        let name = "nesam_certificate_expires_seconds";
-        let _ = writeln!(
-            out,
-            "# HELP {name} When the certificate of the server expires, since 1970; without TLS there is none.\n# TYPE {name} gauge"
-        );
-        let expires_s = self.certificate_expires_s.load(Ordering::Relaxed);
-        if expires_s > 0 {
-            let _ = writeln!(out, "{name} {expires_s}");
-        }
+        self.reloads.render(&mut out);
         self.alarms.render(&mut out);
         self.queue.render("nesam_prediction_queue_seconds", "Time that predictions waited for the engine.", &mut out);
         self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
@@ -197,6 +176,7 @@ impl Metrics {
 
 #[cfg(test)]
 mod tests {
+    use super::super::reloads::Part;
     use super::*;
 
     #[test]
@@ -214,9 +194,11 @@ mod tests {
         metrics.event(&Event::MapChanged { map: "m".into(), held: 3 });
         assert!(metrics.render(0, 0).contains("nesam_events_total{event=\"soil_filter_failed\"} 0\n"));
         metrics.event(&Event::SoilFilterFailed { session: "s".into(), vehicle: "v".into(), reason: "why".into() });
-        metrics.reloaded(false);
-        assert!(!metrics.render(0, 0).contains("nesam_certificate_expires_seconds 0"), "no certificate");
-        metrics.certificate_expires(1_800_000_000);
+        metrics.reloads().changed(Part::Rights, false);
+        metrics.reloads().unusable(Part::Rights, true);
+        assert!(!metrics.render(0, 0).contains("certificate_expires_seconds 0"), "no certificate");
+        metrics.reloads().expires(Part::Certificate, 1_800_000_000);
+        metrics.reloads().expires(Part::Cluster, 1_700_000_000);
         let text = metrics.render(3, 4);
         for line in [
             "nesam_commands_total{command=\"close\",result=\"ok\"} 3",
@@ -231,8 +213,13 @@ mod tests {
             "nesam_events_total{event=\"map_changed\"} 1",
             "nesam_events_total{event=\"soil_filter_failed\"} 1",
             "nesam_maps 3",
-            "nesam_credentials_reloads_total{result=\"failed\"} 1",
-            "nesam_credentials_reloads_total{result=\"ok\"} 0",
+            "nesam_credentials_reloads_total{part=\"rights\",result=\"failed\"} 1",
+            "nesam_credentials_reloads_total{part=\"rights\",result=\"ok\"} 0",
+            "nesam_credentials_reloads_total{part=\"certificate\",result=\"failed\"} 0",
+            "nesam_credentials_unusable{part=\"rights\"} 1",
+            "nesam_credentials_unusable{part=\"certificate\"} 0",
+            "nesam_credentials_unusable{part=\"cluster\"} 0",
+            "nesam_cluster_certificate_expires_seconds 1700000000",
             "nesam_alarms_total{kind=\"sensor_jump\"} 0",
             "nesam_certificate_expires_seconds 1800000000",
             "nesam_alarms_active 0",

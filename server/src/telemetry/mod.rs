@@ -3,5 +3,7 @@
 mod alarms;
 mod histogram;
 mod metrics;
+mod reloads;
 
 pub use metrics::{Metrics, Transport};
+pub(crate) use reloads::{Part, Reloads};

@@ -45,10 +45,25 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     // Files that cannot be used are counted and change nothing, for new connections either.
     stage.replace("server.key", b"half a ke");
     eventually(NOTICED, "counted", || async {
-        stage.server.metrics().render(0, 0).contains("nesam_credentials_reloads_total{result=\"failed\"} 1")
+        stage.server.metrics().render(0, 0).contains("nesam_credentials_reloads_total{part=\"certificate\",result=\"failed\"} 1")
     })
     .await;
     stage.client("nesam:vehicle:truck").await.list_sessions().await.unwrap();
+
+    // They keep no right in force either, and a fleet file that cannot be used changes none.
+    let without_mission = revoked.replace("[planners.mission]", "[planners.relay]");
+    let mission = stage.client("nesam:planner:mission").await;
+    mission.clone().list_sessions().await.unwrap();
+    stage.replace("fleet.toml", without_mission.as_bytes());
+    eventually(NOTICED, "revoked beside half a key", || async {
+        mission.clone().list_sessions().await.is_err_and(|error| error.code() == Some(Code::PermissionDenied))
+    })
+    .await;
+    let unusable = |part: &str| format!("nesam_credentials_unusable{{part=\"{part}\"}} 1");
+    assert!(stage.server.metrics().render(0, 0).contains(&unusable("certificate")));
+    stage.replace("fleet.toml", b"[vehicle.x]\n");
+    eventually(NOTICED, "an unusable fleet file", || async { stage.server.metrics().render(0, 0).contains(&unusable("rights")) }).await;
+    truck.clone().list_sessions().await.unwrap();
 
     // Nor does a certificate that has expired, which nobody would accept.
     let expires =
@@ -58,13 +73,13 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     stage.replace("server.pem", &certificate);
     stage.replace("server.key", &key);
     eventually(NOTICED, "expired", || async {
-        stage.server.metrics().render(0, 0).contains("nesam_credentials_reloads_total{result=\"failed\"} 2")
+        stage.server.metrics().render(0, 0).contains("nesam_credentials_reloads_total{part=\"certificate\",result=\"failed\"} 2")
     })
     .await;
     stage.client("nesam:vehicle:truck").await.list_sessions().await.unwrap();
     assert!(expires_before.is_some() && expires() == expires_before, "{expires_before:?}, {:?}", expires());
 
-    // A certificate and an authority that have nothing to do with those before.
+    // A certificate and an authority that have nothing to do with those before; the fleet file is still unusable.
     let successor = Authority::new();
     let (certificate, key) = successor.sign(&[dns("localhost"), uri("nesam:server:alpha")], false);
     stage.replace("server.pem", &certificate);
@@ -77,6 +92,8 @@ async fn service_rights_and_certificates_change_without_a_restart() {
     eventually(NOTICED, "renewed", || async { connect(successor.tls("nesam:vehicle:truck")).await.is_ok() }).await;
     assert!(connect(stage.authority.tls("nesam:vehicle:truck")).await.is_err(), "certificates of the authority before are strangers now");
     truck.clone().list_sessions().await.expect("open connections go on");
+    let text = stage.server.metrics().render(0, 0);
+    assert!(!text.contains(&unusable("certificate")) && text.contains(&unusable("rights")), "{text}");
     drop((truck, other));
     stage.server.shutdown().await;
 }
