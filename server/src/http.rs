@@ -17,6 +17,7 @@ use crate::grpc::Edge;
 use crate::recording::Recorder;
 use crate::store::StoreCounts;
 use crate::web::Live;
+use crate::zenoh::Neighbours;
 
 /// What the HTTP side reads.
 #[derive(Clone)]
@@ -76,20 +77,30 @@ async fn metrics(State(state): State<HttpState>) -> Response {
     if let Some(presence) = &state.edge.presence {
         text += &metric("nesam_vehicles_alive", "gauge", "Vehicles whose Zenoh liveliness token is there.", presence.count());
     }
+    text += &neighbour_metrics(&state.edge.presence.map_or_else(Neighbours::default, |presence| presence.neighbours));
     ([("content-type", "text/plain; version=0.0.4; charset=utf-8")], text).into_response()
 }
 
 fn store_metrics(counts: &StoreCounts) -> String {
-    let StoreCounts { commits, failures, bytes, commit_s, waiting } = *counts;
+    let StoreCounts { commits, failures, bytes, commit_s, waiting, oldest_s } = *counts;
     [
         ("commits_total", "counter", "Commits of sessions and maps to the store.", commits as f64),
         ("failures_total", "counter", "Commits that the store did not take; they are tried again.", failures as f64),
         ("bytes_total", "counter", "Bytes of sessions and maps committed.", bytes as f64),
         ("commit_seconds_total", "counter", "Time of all commits together.", commit_s),
         ("waiting", "gauge", "Sessions and maps that are not durable yet.", waiting as f64),
+        ("oldest_waiting_seconds", "gauge", "Time for which the oldest change that is not durable has waited; 0 = none waits.", oldest_s),
     ]
     .map(|(name, kind, help, value)| metric(&format!("nesam_store_{name}"), kind, help, value))
     .concat()
+}
+
+fn neighbour_metrics(neighbours: &Neighbours) -> String {
+    let name = "nesam_zenoh_neighbours";
+    let lines = neighbours.counts().map(|(kind, count)| format!("{name}{{kind=\"{kind}\"}} {count}\n")).concat();
+    let help = "1 while `zenoh.connect` names somebody and no router or peer is connected.";
+    let alone = metric("nesam_zenoh_alone", "gauge", help, u8::from(neighbours.is_alone()));
+    format!("# HELP {name} Zenoh routers and peers that this server is connected to.\n# TYPE {name} gauge\n{lines}{alone}")
 }
 
 /// Each from the start, so that the first one is an increase.
@@ -123,7 +134,7 @@ async fn health(State(state): State<HttpState>) -> StatusCode {
 
 /// Whether requests should come here: not while the server stops, and not without a lease.
 fn health_of(edge: &Edge) -> StatusCode {
-    let leased = edge.cluster.as_ref().is_none_or(|cluster| cluster.counts().leased);
+    let leased = edge.cluster.as_ref().is_none_or(Cluster::is_leased);
     if *edge.stopping.borrow() || !leased { StatusCode::SERVICE_UNAVAILABLE } else { StatusCode::OK }
 }
 

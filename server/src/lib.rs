@@ -16,6 +16,7 @@ mod diagnosis;
 mod error;
 mod expiry;
 mod grpc;
+mod health;
 mod http;
 mod http_connections;
 mod listener;

@@ -2,7 +2,9 @@
 
 use std::net::SocketAddr;
 use std::path::Path;
+use std::pin::Pin;
 use std::sync::Arc;
+use std::task::Poll;
 use std::time::Duration;
 
 use nesam_engine::{Clock as _, Engine, EngineHandle, Event, EventSink, Limits, Tap};
@@ -12,7 +14,6 @@ use tokio::net::TcpListener;
 use tokio::sync::{broadcast, watch};
 use tokio::task::JoinHandle;
 use tonic::transport::server::Router;
-use tonic_health::ServingStatus;
 use tonic_health::server::HealthReporter;
 
 use crate::access::{self, Credentials, Directory};
@@ -26,11 +27,12 @@ use crate::diagnosis::Diagnoses;
 use crate::error::ServerError;
 use crate::expiry::expire_sessions;
 use crate::grpc::{self, Edge, UntilStopped, stopped};
+use crate::health::Health;
 use crate::http::{self, HttpState};
 use crate::http_connections::{self, HttpLimits};
 use crate::listener::Entrance;
 use crate::recording::{Recorder, RecordingHeader};
-use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore};
+use crate::store::{Change, EtcdStore, Keeper, RedbStore, Restored, SessionStore as _, StoreError, restore, tell_stalls};
 use crate::telemetry::Metrics;
 use crate::web::{Feed, Live, Raised};
 use crate::zenoh::{BusConfig, Presence, RenewedBus};
@@ -43,10 +45,12 @@ pub(crate) const EVENTS_KEPT: usize = 1024;
 const ASKERS_MAX: usize = 64;
 /// Connections that a browser opens to one server.
 const BROWSER_CONNECTIONS: usize = 6;
+/// Longest wait at shutdown for the store, and for the recording: a disk that hangs must not keep the process (chosen: both after the usual `grpc.drain_s` within
+/// the 30 s that `deploy` gives a server to stop).
+const DISK_ENDS_WITHIN: Duration = Duration::from_secs(10);
 
-/// Names under which health is reported; the empty one stands for the whole server.
-const HEALTH_NAMES: [&str; 7] =
-    ["", "nesam.v1.Sessions", "nesam.v1.Prediction", "nesam.v1.Measurements", "nesam.v1.Terrain", "nesam.v1.Soil", "nesam.v1.Diagnosis"];
+/// What is served at one address, by its key.
+type Listener = (&'static str, JoinHandle<()>);
 
 /// A server that listens. Dropping it leaves its tasks running; end it with [`RunningServer::shutdown`].
 pub struct RunningServer {
@@ -58,10 +62,9 @@ pub struct RunningServer {
     pub health_addr: Option<SocketAddr>,
     handle: EngineHandle,
     metrics: Arc<Metrics>,
-    health: HealthReporter,
+    health: Health,
     stop: watch::Sender<bool>,
-    grpc: JoinHandle<()>,
-    http: Option<JoinHandle<()>>,
+    listeners: Vec<Listener>,
     bus: Option<RenewedBus>,
     recorder: Option<Arc<Recorder>>,
     keeper: Option<Arc<Keeper>>,
@@ -111,6 +114,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let engine =
         EngineClient::new(handle.clone(), metrics.clone(), access.directory.clone()).shown_on(http_addr.map(|_| live.feed.clone()));
     let reload_every = Duration::from_secs_f64(config.tls.reload_s);
+    let store_interval = Duration::from_secs_f64(config.store.interval_s);
     let (cluster, cluster_files) = match &keeper {
         Some(keeper) => match open_store(&config, grpc_addr, keeper, &engine).await {
             Ok(opened) => opened,
@@ -147,31 +151,36 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         }
         false => None,
     };
-    let http = http_listener.map(|listener| {
+    let mut listeners: Vec<Listener> = Vec::new();
+    if let Some(listener) = http_listener {
         live.start(&edge, clock, recorder.clone(), passed);
         let state = HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() };
         // Prometheus, scripts and the pages, each with what a browser opens to one server.
         let connections_max = ASKERS_MAX.saturating_add(config.http.watchers_max.saturating_mul(BROWSER_CONNECTIONS));
         let limits = HttpLimits { asks_within: begins_within, connections_max };
-        tokio::spawn(http_connections::serve(listener, http::router(state), limits, stopping.clone()))
-    });
+        listeners.push(("http.listen", tokio::spawn(http_connections::serve(listener, http::router(state), limits, stopping.clone()))));
+    }
     let health_addr = health_listener.as_ref().and_then(|listener| listener.local_addr().ok());
     if let Some(listener) = health_listener {
         let limits = HttpLimits { asks_within: begins_within, connections_max: ASKERS_MAX };
-        tokio::spawn(http_connections::serve(listener, http::health_router(edge.clone()), limits, stopping.clone()));
+        let served = http_connections::serve(listener, http::health_router(edge.clone()), limits, stopping.clone());
+        listeners.push(("http.health", tokio::spawn(served)));
     }
     tokio::spawn(expire_sessions(edge.clone()));
     if let Some(files) = cluster_files {
         tokio::spawn(files.follow(reload_every, metrics.clone(), stopping.clone()));
     }
-    let health = HealthReporter::new();
-    report(&health, ServingStatus::Serving).await;
+    if let Some(keeper) = &keeper {
+        tokio::spawn(tell_stalls(keeper.clone(), store_interval, stopping.clone()));
+    }
+    let health = Health::start(cluster.clone()).await;
     let secure = match (edge.access.is_restricted(), &tls) {
         (true, _) => "mutual TLS",
         (false, Some(_)) => "TLS, clients unknown",
         (false, None) => "none",
     };
-    let grpc = spawn_grpc(grpc_listener, tls, &edge, &health, Closing { begins_within, reads_within: drain, stopping });
+    let closing = Closing { begins_within, reads_within: drain, stopping };
+    listeners.push(("grpc.listen", spawn_grpc(grpc_listener, tls, &edge, health.reporter(), closing)));
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
     Ok(RunningServer {
         grpc_addr,
@@ -181,8 +190,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         metrics,
         health,
         stop,
-        grpc,
-        http,
+        listeners,
         bus,
         recorder,
         keeper,
@@ -278,8 +286,11 @@ async fn open_store(
 /// Commits what is left, then lets the sessions go: others may have them from now on. Gives how much the store did not take.
 async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) -> usize {
     let lost = match keeper {
-        // A panic there leaves nobody who could count: something was lost.
-        Some(keeper) => tokio::task::spawn_blocking(move || keeper.finish()).await.unwrap_or(1),
+        Some(keeper) => {
+            let finishing = keeper.clone();
+            // A panic there leaves nobody who could count, nor does a store that takes nothing and says nothing: something was lost.
+            ended_within(DISK_ENDS_WITHIN, move || finishing.finish()).await.unwrap_or_else(|| keeper.counts().waiting.max(1))
+        }
         None => 0,
     };
     if lost > 0 {
@@ -289,6 +300,15 @@ async fn end_store(keeper: Option<Arc<Keeper>>, cluster: Option<Cluster>) -> usi
         cluster.stop().await;
     }
     lost
+}
+
+/// What `work` on a disk gives, on a thread of its own; `None` when it panicked, and when it takes longer than a server may take to stop: it is left behind.
+async fn ended_within<T: Send + 'static>(limit: Duration, work: impl FnOnce() -> T + Send + 'static) -> Option<T> {
+    let ended = tokio::time::timeout(limit, tokio::task::spawn_blocking(work)).await;
+    if ended.is_err() {
+        tracing::error!(limit_s = limit.as_secs_f64(), "the disk hangs: it is not waited for any longer");
+    }
+    ended.ok()?.ok()
 }
 
 async fn open_folder(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle) -> Result<(), StoreError> {
@@ -313,12 +333,6 @@ async fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, S
 
 fn local(listener: &TcpListener, asked: SocketAddr) -> SocketAddr {
     listener.local_addr().unwrap_or(asked)
-}
-
-async fn report(health: &HealthReporter, status: ServingStatus) {
-    for name in HEALTH_NAMES {
-        health.set_service_status(name, status).await;
-    }
 }
 
 /// Connection settings of gRPC.
@@ -399,44 +413,89 @@ impl RunningServer {
     }
 
     /// Stops: health goes to NOT_SERVING, Zenoh leaves, streams end, running requests get `grpc.drain_s`, the engine finishes its measurements, the
-    /// recording is written to its end. Sessions of a store are committed before the engine stops. Gives how many sessions, maps and cells of the soil map have
-    /// changes that the store did not take, which are lost.
+    /// recording is written to its end. Sessions of a store are committed before the engine stops. A disk that hangs is not waited for longer than 10 s. Gives how
+    /// many sessions, maps and cells of the soil map have changes that the store did not take, which are lost.
     pub async fn shutdown(mut self) -> usize {
-        report(&self.health, ServingStatus::NotServing).await;
+        self.health.stop().await;
         if let Some(bus) = self.bus.take() {
             bus.stop().await;
         }
         let _ = self.stop.send(true);
         self.live.stop();
-        let mut serving: Vec<JoinHandle<()>> = [Some(self.grpc), self.http.take()].into_iter().flatten().collect();
         let ended = async {
-            for task in &mut serving {
+            for (_, task) in &mut self.listeners {
                 let _ = task.await;
             }
         };
         if tokio::time::timeout(self.drain, ended).await.is_err() {
             tracing::warn!("requests still ran, or answers were still read, after the drain time and were cut off");
-            serving.iter().for_each(JoinHandle::abort);
+            self.listeners.iter().for_each(|(_, task)| task.abort());
         }
         let lost = end_store(self.keeper, self.cluster).await;
         let (handle, recorder) = (self.handle, self.recorder);
-        let _ = tokio::task::spawn_blocking(move || {
-            handle.stop();
-            if let Some(recorder) = recorder {
+        let _ = tokio::task::spawn_blocking(move || handle.stop()).await;
+        if let Some(recorder) = recorder {
+            let finished = ended_within(DISK_ENDS_WITHIN, move || {
                 recorder.join();
                 let counts = recorder.counts();
                 tracing::info!(commands = counts.recorded, dropped = counts.dropped, bytes = counts.bytes, "recording finished");
+            });
+            if finished.await.is_none() {
+                tracing::error!("the end of the recording is missing");
             }
-        })
-        .await;
+        }
         tracing::info!("stopped");
         lost
     }
 
     /// Serves until `signal` resolves, then shuts down; gives what [`RunningServer::shutdown`] does.
-    pub async fn run_until(self, signal: impl Future<Output = ()>) -> usize {
-        signal.await;
+    ///
+    /// # Panics
+    /// When it has shut down because a listener had ended by itself: whoever started the server starts it anew, where a part of it would be missing.
+    pub async fn run_until(mut self, signal: impl Future<Output = ()>) -> usize {
+        let ended = tokio::select! {
+            () = signal => None,
+            key = first_ended(&mut self.listeners) => Some(key),
+        };
         tracing::info!("stopping");
-        self.shutdown().await
+        let lost = self.shutdown().await;
+        assert!(ended.is_none(), "the listener of `{}` ended by itself; this is a bug", ended.unwrap_or_default());
+        lost
+    }
+}
+
+/// Resolves with the key of the first listener that ends, which is none from then on.
+async fn first_ended(listeners: &mut Vec<Listener>) -> &'static str {
+    std::future::poll_fn(|context| match listeners.iter_mut().position(|(_, task)| Pin::new(task).poll(context).is_ready()) {
+        Some(ended) => Poll::Ready(listeners.swap_remove(ended).0),
+        None => Poll::Pending,
+    })
+    .await
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test]
+    async fn regress_a_listener_that_ends_by_itself_is_noticed() {
+        let waits = || tokio::spawn(std::future::pending());
+        let mut listeners: Vec<Listener> = vec![("grpc.listen", waits()), ("http.listen", waits())];
+        assert!(tokio::time::timeout(Duration::from_millis(50), first_ended(&mut listeners)).await.is_err());
+        listeners.push(("http.health", tokio::spawn(async { panic!("as a listener with a bug") })));
+        assert_eq!(first_ended(&mut listeners).await, "http.health");
+        assert_eq!(listeners.iter().map(|(key, _)| *key).collect::<Vec<_>>(), ["grpc.listen", "http.listen"], "the others go on");
+    }
+
+    /// Goal: a disk that hangs keeps no server from stopping. Method: work that ends long after the limit, work in time, and work that panics.
+    #[tokio::test]
+    async fn regress_a_disk_that_hangs_is_waited_for_no_longer_than_the_limit() {
+        let (go_on, waits) = std::sync::mpsc::channel::<()>();
+        let hangs = move || waits.recv().is_ok();
+        assert_eq!(ended_within(Duration::from_millis(50), hangs).await, None);
+        drop(go_on);
+        let long = Duration::from_secs(60);
+        assert_eq!(ended_within(long, || 3).await, Some(3));
+        assert_eq!(ended_within(long, || -> usize { panic!("as a thread with a bug") }).await, None);
     }
 }

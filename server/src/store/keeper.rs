@@ -42,6 +42,8 @@ struct Dirty {
     /// First and last change that no commit holds.
     first: u64,
     latest: u64,
+    /// When the first of them was made, at the latest.
+    since: Instant,
     due: Instant,
 }
 
@@ -55,6 +57,8 @@ pub(crate) struct StoreCounts {
     pub commit_s: f64,
     /// Sessions and maps that wait for a commit.
     pub waiting: usize,
+    /// Time for which the oldest of them has waited, s.
+    pub oldest_s: f64,
 }
 
 #[derive(Debug, Default)]
@@ -82,8 +86,8 @@ impl State {
     fn change(&mut self, key: Key, due: Instant) -> u64 {
         self.changes += 1;
         let latest = self.changes;
-        let entry = self.dirty.entry(key).or_insert(Dirty { first: latest, latest, due });
-        *entry = Dirty { first: entry.first, latest, due: due.min(entry.due) };
+        let entry = self.dirty.entry(key).or_insert(Dirty { first: latest, latest, since: Instant::now(), due });
+        *entry = Dirty { latest, due: due.min(entry.due), ..*entry };
         latest
     }
 
@@ -91,6 +95,11 @@ impl State {
     fn leave(&mut self, session: &str, change: u64) {
         let before = self.left.get(session).map_or(0, |(before, _)| *before);
         self.left.insert(session.into(), (change.max(before), Instant::now()));
+    }
+
+    /// Time for which the oldest change that is not on stable storage has waited; `None` = nothing waits.
+    fn oldest(&self) -> Option<Duration> {
+        self.dirty.values().map(|dirty| dirty.since).min().map(|since| since.elapsed())
     }
 
     /// Whether the changes of a session or map up to this one are on stable storage; `None` = not yet.
@@ -183,7 +192,12 @@ impl Keeper {
     /// Counters.
     pub(crate) fn counts(&self) -> StoreCounts {
         let state = self.lock();
-        StoreCounts { waiting: state.dirty.len(), ..state.counts }
+        StoreCounts { waiting: state.dirty.len(), oldest_s: state.oldest().unwrap_or_default().as_secs_f64(), ..state.counts }
+    }
+
+    /// Time for which the oldest change that is not on stable storage has waited; `None` = nothing waits.
+    pub(crate) fn oldest(&self) -> Option<Duration> {
+        self.lock().oldest()
     }
 
     /// Resolves when every change that is noted now of a session or map is on stable storage; says whether that was within `budget`. A session that left for
@@ -343,9 +357,12 @@ impl Keeper {
     /// Notes a commit of changes up to these.
     fn committed(&self, due: &BTreeMap<Key, u64>, places: &Places, bytes: u64, took: Duration) {
         let mut state = self.lock();
+        let now = Instant::now();
+        let begun = now.checked_sub(took).unwrap_or(now);
         for (key, written) in due {
             if let Some(dirty) = state.dirty.get_mut(key) {
-                dirty.first = written + 1;
+                // What is left came while this was committed.
+                (dirty.first, dirty.since) = (written + 1, begun);
                 if dirty.latest == *written {
                     state.dirty.remove(key);
                 }

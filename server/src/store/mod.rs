@@ -17,6 +17,7 @@ mod keeper;
 mod map_bytes;
 mod redb;
 mod restore;
+mod stall;
 
 use std::path::PathBuf;
 use std::pin::Pin;
@@ -29,6 +30,7 @@ pub(crate) use self::map_bytes::map_version;
 pub use self::redb::RedbStore;
 pub use self::restore::Restored;
 pub(crate) use self::restore::{restore, resumed};
+pub(crate) use self::stall::tell_stalls;
 
 /// Something that keeps sessions and maps on stable storage: [`RedbStore`] for one process, etcd for several.
 pub trait SessionStore: Send {

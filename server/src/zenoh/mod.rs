@@ -4,6 +4,7 @@ mod access_control;
 mod arrival;
 mod keys;
 mod measurements;
+mod neighbours;
 mod predict;
 mod presence;
 mod renewal;
@@ -12,6 +13,7 @@ mod sharing;
 mod soil;
 
 pub use access_control::{LinkFiles, router_config};
+pub(crate) use neighbours::Neighbours;
 pub(crate) use presence::Presence;
 pub(crate) use renewal::RenewedBus;
 
@@ -51,6 +53,7 @@ struct Bus {
     soil: tokio::task::JoinHandle<()>,
     sharing: Option<tokio::task::JoinHandle<()>>,
     status: tokio::task::JoinHandle<()>,
+    neighbours: tokio::task::JoinHandle<()>,
     /// Machines of ROS 2, where there may be some.
     graph: Option<ros2::Graph>,
     /// Tells the network that this server is there; goes with it.
@@ -94,10 +97,12 @@ impl Bus {
         let soil = tokio::spawn(soil::publish_changes(events, config.fleet.clone(), sharing, sender.clone()));
         let sharing = asking.map(tokio::spawn);
         let interval = Duration::from_secs_f64(config.status_interval_s);
+        presence.neighbours.seek(!config.connect.is_empty());
+        let neighbours = tokio::spawn(presence.neighbours.clone().watch(session.clone()));
         let status = tokio::spawn(presence::publish_status(edge.clone(), presence, config.fleet.clone(), name, interval, sender));
         let publisher = tokio::spawn(publish(session.clone(), receiver));
-        tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh joined");
-        Ok(Self { session, publisher, soil, sharing, status, graph, _token: token })
+        tracing::info!(zid = %session.zid(), fleet = config.fleet, "zenoh started");
+        Ok(Self { session, publisher, soil, sharing, status, neighbours, graph, _token: token })
     }
 
     /// Leaves the network.
@@ -110,6 +115,7 @@ impl Bus {
         self.soil.abort();
         self.sharing.iter().for_each(tokio::task::JoinHandle::abort);
         self.status.abort();
+        self.neighbours.abort();
     }
 }
 

@@ -8,6 +8,7 @@ use ::zenoh::sample::{Sample, SampleKind};
 use nesam_proto::v1 as pb;
 use tokio::sync::{Notify, mpsc};
 
+use super::neighbours::Neighbours;
 use super::{Outgoing, encode, keys};
 use crate::convert::{alarm_message, effect_messages};
 use crate::grpc::Edge;
@@ -15,9 +16,11 @@ use crate::grpc::Edge;
 /// Tokens that are remembered; a network that shows more is not one of vehicles.
 const VEHICLES_MAX: usize = 4096;
 
-/// The vehicles whose liveliness token is there. Shared between Zenoh, gRPC and the metrics.
+/// Who is in the network: the vehicles whose liveliness token is there, and whom this server is connected to. Shared between Zenoh, gRPC and the metrics.
 #[derive(Clone, Debug, Default)]
 pub struct Presence {
+    /// Routers and peers.
+    pub neighbours: Neighbours,
     alive: Arc<Mutex<BTreeSet<String>>>,
     changed: Arc<Notify>,
 }
@@ -41,6 +44,7 @@ impl Presence {
     /// Nobody is seen from outside of the network.
     pub fn forget(&self) {
         self.vehicles().iter().for_each(|vehicle| self.note(vehicle, false));
+        self.neighbours.forget();
     }
 
     fn note(&self, vehicle: &str, alive: bool) {

@@ -63,3 +63,21 @@ async fn regress_what_a_commit_left_to_another_server_is_not_settled() {
     assert!(!keeper.settled(&key, BUDGET).await && keeper.has_left("s"));
     assert_eq!(keeper.durable("s"), 0);
 }
+
+/// Goal: the age of the oldest change that is not durable is what it is, also where a session changes again while it is committed. Method: a commit that is said to
+/// have begun long before.
+#[tokio::test]
+async fn regress_the_age_of_what_waits_is_known() {
+    let (begun, long) = (std::time::Instant::now(), Duration::from_secs(1000));
+    let (keeper, _) = keeper();
+    let due: BTreeMap<Key, u64> = keeper.lock().dirty.iter().map(|(key, dirty)| (key.clone(), dirty.latest)).collect();
+    assert!(keeper.oldest().unwrap() <= begun.elapsed());
+    keeper.note(&Event::MeasurementAccepted { session: "s".into(), buffer_ended: false });
+    keeper.committed(&due, &written(), 0, Duration::ZERO);
+    assert!(keeper.oldest().is_some_and(|oldest| oldest <= begun.elapsed()), "the measurement waits");
+    keeper.committed(&due, &written(), 0, long);
+    assert!(keeper.oldest().is_some_and(|oldest| oldest >= long), "it may have come as soon as the commit began");
+    assert!(keeper.counts().oldest_s >= long.as_secs_f64());
+    commit(&keeper, &written());
+    assert_eq!((keeper.oldest(), keeper.counts().oldest_s), (None, 0.0));
+}
