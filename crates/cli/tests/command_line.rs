@@ -603,6 +603,35 @@ fn service_a_configuration_is_checked_without_serving() {
     assert!(check.status.code() == Some(2) && stdout(&check).contains("store.directory"), "{}", stdout(&check));
     let check = nesam(&["check", "file"], here.path());
     assert!(check.status.success() && stdout(&check).contains("doubt: is empty"), "{}", stdout(&check));
+    // What a server would refuse, or a diagnosis would miss.
+    std::fs::create_dir(here.path().join("emptied")).unwrap();
+    std::fs::write(here.path().join("emptied/sessions.redb"), "").unwrap();
+    for (text, words) in [
+        ("[cluster]\netcd = [\"http://no host\"]\n", ["cluster.etcd", "no host"]),
+        ("[cluster]\netcd = [\"https://etcd:2379\"]\nauthority = \"absent.pem\"\n", ["cluster.authority", "absent.pem"]),
+        ("[cluster]\netcd = [\"https://etcd:2379\"]\nauthority = \"file\"\n", ["cluster.authority", "no certificate"]),
+        (
+            "[cluster]\netcd = [\"https://etcd:2379\"]\nauthority = \"file\"\ncertificate = \"file\"\nkey = \"file\"\n",
+            ["cluster.certificate", "no certificate"],
+        ),
+        ("[zenoh]\nmode = \"client\"\nlisten = []\n", ["zenoh.connect", "router"]),
+        ("[store]\nenabled = true\ndirectory = \"emptied\"\n", ["sessions.redb", "is empty"]),
+    ] {
+        std::fs::write(here.path().join("wrong.toml"), text).unwrap();
+        refused(&["serve", "--check", "--config", "wrong.toml"], here.path(), &words);
+    }
+    for (text, doubt) in [
+        ("executable = \"./no-such-program\"", "doubt  `diagnosis.executable` ./no-such-program: does not exist"),
+        ("executable = \"no-such-program\"", "doubt  `diagnosis.executable` no-such-program: does not exist"),
+        ("bundle = \"no-such-bundle\"", "doubt  `diagnosis.bundle` no-such-bundle: does not exist"),
+    ] {
+        std::fs::write(here.path().join("doubtful.toml"), format!("[diagnosis]\n{text}\n")).unwrap();
+        let text = stdout(&nesam(&["serve", "--check", "--config", "doubtful.toml"], here.path()));
+        assert!(text.contains(doubt), "{text}");
+    }
+    std::fs::write(here.path().join("sound.toml"), "[diagnosis]\nexecutable = \"true\"\n").unwrap();
+    let text = stdout(&nesam(&["serve", "--check", "--config", "sound.toml"], here.path()));
+    assert!(!text.contains("doubt") && text.ends_with("sound\n"), "{text}");
     std::fs::write(here.path().join("half.toml"), "[tls]\ncertificate = \"server.pem\"\n").unwrap();
     refused(&["serve", "--check", "--config", "half.toml"], here.path(), &["tls.certificate", "tls.key"]);
     std::fs::write(here.path().join("absent.toml"), "[tls]\ncertificate = \"server.pem\"\nkey = \"server.key\"\n").unwrap();

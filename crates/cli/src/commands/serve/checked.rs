@@ -5,7 +5,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use nesam_model::{ModelBundle, Predictor};
-use nesam_server::{Config, ServerError, access, is_loopback_endpoint, is_tls_endpoint};
+use nesam_server::store::RedbStore;
+use nesam_server::{Config, DiagnosisConfig, ServerError, access, etcd_endpoint, is_loopback_endpoint, is_tls_endpoint};
 
 use super::super::check::verdict;
 use super::{fleet_soil, kept};
@@ -13,7 +14,7 @@ use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::sources::rounded;
 
-/// Says what would be served. Ports are not tried, and a store is not opened: both may be in use by the server that this configuration is meant for.
+/// Says what would be served. Ports are not tried, a store is not opened and etcd is not asked: all may be in use by the server that this configuration is meant for.
 pub fn checked(config: &Config, bundle: ModelBundle) -> Result<(), Failure> {
     let doubts = doubts(config)?;
     say!("bundle {} {}", bundle.name, bundle.hash);
@@ -64,7 +65,13 @@ fn doubts(config: &Config) -> Result<Vec<String>, Failure> {
     for (key, _, folder) in folders.into_iter().filter(|(_, used, _)| *used) {
         writable(folder).map_err(|error| Failure::input(format!("`{key}` {}: {error}", folder.display())))?;
     }
-    let mut doubts = tls.map_or_else(Vec::new, |tls| tls.doubts());
+    if config.store.enabled {
+        RedbStore::look(&config.store.directory).map_err(|source| ServerError::Store { source }).or_input()?;
+    }
+    for address in &config.cluster.etcd {
+        etcd_endpoint(address, &config.cluster).or_input()?;
+    }
+    let mut doubts = tls.map_or_else(Vec::new, |tls| tls.on_zenoh(config.zenoh.uses_tls()).doubts());
     let reports = &config.http.reports;
     if config.http.enabled && !reports.as_os_str().is_empty() && !reports.exists() {
         doubts.push(format!("`http.reports` {}: does not exist; the page shows its reports once it does", reports.display()));
@@ -76,7 +83,27 @@ fn doubts(config: &Config) -> Result<Vec<String>, Failure> {
     {
         doubts.push(format!("`diagnosis.directory` {}: {error}; no diagnosis can be started", folder.display()));
     }
+    doubts.extend(doubts_of_diagnoses(&config.diagnosis));
     Ok(doubts)
+}
+
+/// What a diagnosis would miss, where some can be started.
+fn doubts_of_diagnoses(config: &DiagnosisConfig) -> Vec<String> {
+    let missing = |key: &str, path: &Path| format!("`{key}` {}: does not exist; diagnoses fail", path.display());
+    let program = Some(&config.executable).filter(|program| !program.as_os_str().is_empty() && !is_program(program));
+    let bundle = Some(&config.bundle).filter(|folder| !folder.as_os_str().is_empty() && !folder.is_dir());
+    let doubts =
+        [program.map(|program| missing("diagnosis.executable", program)), bundle.map(|folder| missing("diagnosis.bundle", folder))];
+    if config.at_once > 0 { doubts.into_iter().flatten().collect() } else { Vec::new() }
+}
+
+/// Whether the system finds a program: a name alone is looked for in the folders of `PATH`.
+fn is_program(program: &Path) -> bool {
+    if program.components().count() > 1 {
+        return program.is_file();
+    }
+    let folders = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&folders).any(|folder| folder.join(program).is_file())
 }
 
 /// Tries whether a folder can be made and written to, and leaves nothing.
