@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use bytes::Bytes;
-use parquet::basic::LogicalType;
+use parquet::basic::{Compression, LogicalType};
 use parquet::column::reader::{ColumnReader, ColumnReaderImpl};
 use parquet::data_type::DataType;
 use parquet::file::metadata::{ColumnChunkMetaData, ParquetMetaData};
@@ -174,6 +174,14 @@ impl Table {
         if descriptor.max_rep_level() > 0 {
             return Err(TrajectoryError::column(&self.path, name, "lists are not supported"));
         }
+        let groups = self.reader.metadata().row_groups().iter();
+        if let Some(codec) = groups.map(|group| group.column(column).compression()).find(|codec| !is_read(*codec)) {
+            let codec = codec.to_string();
+            // Without the level, which a reader does not know.
+            let codec = codec.split_once('(').map_or(codec.as_str(), |(codec, _)| codec);
+            let reason = format!("compressed with {codec}, which is not read; write the file anew with zstd, snappy or gzip");
+            return Err(TrajectoryError::column(&self.path, name, reason));
+        }
         let mut first = 0;
         for group in 0..self.reader.num_row_groups() {
             let rows = self.reader.metadata().row_group(group).num_rows() as usize;
@@ -273,6 +281,11 @@ fn append<T: DataType, V: Clone>(
     Ok(Some(null))
 }
 
+/// Whether columns that are compressed in this way are read.
+fn is_read(codec: Compression) -> bool {
+    matches!(codec, Compression::UNCOMPRESSED | Compression::ZSTD(_) | Compression::SNAPPY | Compression::GZIP(_))
+}
+
 /// The first column chunk that the footer places outside a file of this length.
 fn column_outside(metadata: &ParquetMetaData, length: usize) -> Option<String> {
     let chunks = metadata.row_groups().iter().flat_map(|group| group.columns());
@@ -289,5 +302,50 @@ fn guarded<R, E: ToString>(step: impl FnOnce() -> Result<R, E>) -> Result<R, Str
     match catch_unwind(AssertUnwindSafe(step)) {
         Ok(outcome) => outcome.map_err(|error| error.to_string()),
         Err(_) => Err("damaged (the decoder gave up)".into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use parquet::basic::{BrotliLevel, GzipLevel, ZstdLevel};
+    use parquet::data_type::{ByteArray, ByteArrayType, DoubleType};
+    use parquet::file::properties::WriterProperties;
+    use parquet::file::writer::SerializedFileWriter;
+    use parquet::schema::parser::parse_message_type;
+
+    use super::*;
+
+    /// Goal: files of other tools are read as they usually compress them. Method: numbers and texts, written with each codec that is read.
+    #[test]
+    fn property_usual_codecs_are_read() {
+        let here = tempfile::tempdir().unwrap();
+        let schema = Arc::new(parse_message_type("message t { required double v; required binary n (UTF8); }").unwrap());
+        let numbers: Vec<f64> = (0..1000).map(|i| f64::from(i / 10)).collect();
+        for codec in [
+            Compression::UNCOMPRESSED,
+            Compression::ZSTD(ZstdLevel::default()),
+            Compression::SNAPPY,
+            Compression::GZIP(GzipLevel::default()),
+        ] {
+            let path = here.path().join(format!("{codec}.parquet"));
+            let properties = WriterProperties::builder().set_compression(codec).build();
+            let file = std::fs::File::create(&path).unwrap();
+            let mut writer = SerializedFileWriter::new(file, Arc::clone(&schema), Arc::new(properties)).unwrap();
+            let mut group = writer.next_row_group().unwrap();
+            let mut column = group.next_column().unwrap().unwrap();
+            column.typed::<DoubleType>().write_batch(&numbers, None, None).unwrap();
+            column.close().unwrap();
+            let mut column = group.next_column().unwrap().unwrap();
+            column.typed::<ByteArrayType>().write_batch(&vec![ByteArray::from("a"); 1000], None, None).unwrap();
+            column.close().unwrap();
+            group.close().unwrap();
+            writer.close().unwrap();
+            let table = Table::open(&path).unwrap();
+            assert_eq!(table.reader.metadata().row_group(0).column(0).compression(), codec);
+            assert_eq!(table.numbers("v").unwrap().values, numbers, "{codec}");
+            assert!(table.texts("n").unwrap().iter().all(|text| text.as_deref() == Some("a")), "{codec}");
+        }
+        let unread = [Compression::LZO, Compression::BROTLI(BrotliLevel::default()), Compression::LZ4, Compression::LZ4_RAW];
+        assert!(unread.into_iter().all(|codec| !is_read(codec)));
     }
 }
