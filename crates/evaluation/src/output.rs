@@ -8,6 +8,7 @@ use serde::ser::{SerializeMap, Serializer};
 
 use crate::dimension::DIMENSION_KEYS;
 use crate::evaluate::{HorizonCurve, ModelScore};
+use crate::models::ModelName;
 use crate::score::{ErrorTree, paired_difference, values};
 use crate::slices::Slice;
 use crate::{Resamples, Truth};
@@ -73,7 +74,8 @@ struct Document<'a> {
     dt_s: f64,
     windows: usize,
     path_m_median: f64,
-    models: ByName<ModelJson<'a>>,
+    /// Null where a model was not scored.
+    models: ByName<Option<ModelJson<'a>>>,
     trajectories: usize,
     history_steps: usize,
     truth: &'static str,
@@ -129,9 +131,12 @@ impl<T: Serialize> Serialize for ByName<T> {
 }
 
 impl Evaluation<'_> {
-    /// The JSON document, pretty-printed, with a trailing newline.
+    /// The JSON document, pretty-printed, with a trailing newline. Every model of the contract has its key; that of a model that was not scored (not asked for, or
+    /// not there) is null.
     pub fn to_json(&self) -> String {
-        let models = self.models.iter().map(|m| (m.name.to_string(), model_json(m))).collect();
+        let scored = self.models.iter().map(|m| (m.name.to_string(), Some(model_json(m))));
+        let left_out = ModelName::ALL.into_iter().filter(|name| !name.is_switch() && self.models.iter().all(|m| m.name != *name));
+        let models = scored.chain(left_out.map(|name| (name.to_string(), None))).collect();
         let slices = self.slices.iter().map(|s| (s.name.clone(), self.slice_json(s))).collect();
         let document = Document {
             schema: "nesam.evaluate/1",

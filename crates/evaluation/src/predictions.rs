@@ -29,7 +29,7 @@ const SCHEMA: &str = "message predictions {
     optional double yaw;
 }";
 
-/// Writes one row per named model, window and step: model, trajectory, t0 (s, time of the start in the drive), k (1…K), x, y, z (m), roll,
+/// Writes one row per named model, window and step: model, trajectory, t0 (s, time of the start in the drive, to the nanosecond), k (1…K), x, y, z (m), roll,
 /// pitch, yaw (rad). What a model does not predict is null. One row group per model, zstd.
 ///
 /// # Errors
@@ -64,7 +64,7 @@ fn write_model(
     };
     text(group, &repeat(&|_| ByteArray::from(name)))?;
     text(group, &repeat(&|w| ByteArray::from(w.trajectory.id.as_str())))?;
-    let t0: Vec<f64> = windows.iter().flat_map(|w| std::iter::repeat_n(w.start_time_s(), steps(w))).collect();
+    let t0: Vec<f64> = windows.iter().flat_map(|w| std::iter::repeat_n(to_the_nanosecond(w.start_time_s()), steps(w))).collect();
     number(group, &t0, None)?;
     let k: Vec<i32> = windows.iter().flat_map(|w| 1..=i32::try_from(w.horizon).unwrap_or(i32::MAX)).collect();
     let mut column = next(group)?;
@@ -77,6 +77,11 @@ fn write_model(
         number(group, &values, Some(&levels))?;
     }
     Ok(())
+}
+
+/// Without what a sum of steps leaves in the last bits: 4.8, not 4.800000000000001.
+fn to_the_nanosecond(time_s: f64) -> f64 {
+    (time_s * 1e9).round() / 1e9
 }
 
 fn next<'a>(group: &'a mut SerializedRowGroupWriter<'_, File>) -> Result<parquet::file::writer::SerializedColumnWriter<'a>, ParquetError> {

@@ -83,6 +83,11 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
     let model = &json["models"]["constant_velocity"];
     assert_eq!(model["parameters"], 0);
     assert_eq!(model["windows"], 16);
+    // Whoever reads a model by its name finds it, scored or not.
+    for name in ModelName::ALL.into_iter().filter(|name| !name.is_switch()) {
+        let there = json["models"].get(name.as_str());
+        assert_eq!(there.map(|model| !model.is_null()), Some(name == ModelName::ConstantVelocity), "{name}");
+    }
 
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("p.parquet");
@@ -94,7 +99,9 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
         assert_eq!(row.get_string(0).unwrap(), "constant_velocity");
         let truth = drives.iter().find(|d| d.id == *row.get_string(1).unwrap()).unwrap();
         let k = usize::try_from(row.get_int(3).unwrap()).unwrap();
-        let at = (row.get_double(2).unwrap() / 0.1).round() as usize + k;
+        let t0 = row.get_double(2).unwrap();
+        assert!(t0.to_string().len() <= 4, "a start on the grid of 0.1 s: {t0}");
+        let at = (t0 / 0.1).round() as usize + k;
         x_sum += (row.get_double(4).unwrap() - truth.states[at].position_m[0]).abs();
         if k == 32 {
             let difference = row.get_double(9).unwrap() - truth.states[at].attitude_rad[2];
