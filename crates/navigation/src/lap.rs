@@ -86,8 +86,12 @@ pub struct Lap {
     pub time_s: f64,
     /// Share of the lap driven.
     pub progress: f64,
-    /// Hausdorff distance between what was driven and that part of the path, m.
+    /// Hausdorff distance between what was driven and that part of the path, m: how well the path was kept to, also by a lap that ends early.
     pub hausdorff_m: f64,
+    /// Hausdorff distance between what was driven and the whole path, m: a lap that ends early is as far off as the farthest place that it never came to. `None` of a
+    /// lap that an earlier version has kept.
+    #[serde(default)]
+    pub hausdorff_whole_path_m: Option<f64>,
     /// Mean distance from the path, m.
     pub off_path_mean_m: f64,
     /// Mean |roll|, degrees.
@@ -262,7 +266,8 @@ struct Track {
     off_path_m: f64,
     off_path_sum_m: f64,
     lean: Vec<Lean>,
-    local: Vec<[f64; 2]>,
+    /// The whole path.
+    whole: Vec<[f64; 2]>,
     scored: Scored,
     velocity: VelocityCheck,
     /// How the lap ended before its time: the vehicle or its simulation is beyond driving.
@@ -280,7 +285,7 @@ impl Track {
             off_path_m: 0.0,
             off_path_sum_m: 0.0,
             lean: Vec::new(),
-            local: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
+            whole: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
             scored: Scored::Truth,
             velocity: VelocityCheck::default(),
             ended: None,
@@ -306,7 +311,7 @@ impl Track {
         let [x, y, _, roll, pitch, ..] = *reading.scored();
         self.phi = unwrapped(plan.path.offset(x, y).phi, self.phi);
         self.positions.push([x, y]);
-        self.off_path_m = distance_to_line([x, y], &self.local);
+        self.off_path_m = distance_to_line([x, y], &self.whole);
         self.off_path_sum_m += self.off_path_m;
         self.lean.push(Lean { progress: self.progress(plan), roll_deg: roll.abs().to_degrees(), pitch_deg: pitch.abs().to_degrees() });
         self.note(reading);
@@ -345,6 +350,7 @@ impl Track {
             time_s: self.time_s(),
             progress: self.progress(plan).clamp(0.0, 1.0),
             hausdorff_m: hausdorff_m(&self.positions, &part),
+            hausdorff_whole_path_m: Some(hausdorff_m(&self.positions, &self.whole)),
             off_path_mean_m: self.off_path_sum_m / steps,
             roll_deg: mean_lean(&self.lean, |lean| lean.roll_deg),
             pitch_deg: mean_lean(&self.lean, |lean| lean.pitch_deg),
@@ -355,5 +361,49 @@ impl Track {
             path: self.positions.iter().step_by(2).copied().collect(),
             lean: self.lean.clone(),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: how far a lap that ends early is from the path is told of the part that was driven and of the whole. Method: half of the path, exactly on it, and all of it;
+    /// the farthest place that the half never came to lies as far from its nearest end as a count over the path's points says.
+    #[test]
+    fn analytic_distances_of_the_part_that_was_driven_and_of_the_whole_path() {
+        let path = ReferencePath::of_ood_soil();
+        let plan = LapPlan {
+            world: String::new(),
+            start_phi: 0.0,
+            seed: 1,
+            path: path.clone(),
+            cost: TrackingCost { speed_m_s: 3.0, lag: 0.1, tilt: 2.0 },
+            mppi: MppiSettings {
+                candidates: 2,
+                limits: [[0.5, 4.0], [-1.0, 1.0]],
+                noise_sd: [0.4, 0.1],
+                noise_correlation: 0.8,
+                temperature: 0.1,
+            },
+            horizon: 1,
+            plan_every: 1,
+            steering_guess: 0.0,
+            caution: None,
+        };
+        let driven = |until_phi: f64| {
+            let mut track = Track::at(&plan, path.point(0.0));
+            track.positions = path.points_between(0.0, until_phi, REFERENCE_STEP_M);
+            track.phi = until_phi;
+            track.lap(&plan)
+        };
+        let half = driven(std::f64::consts::PI);
+        let left = path.points_between(std::f64::consts::PI, std::f64::consts::TAU, REFERENCE_STEP_M);
+        let line = path.points_between(0.0, std::f64::consts::PI, REFERENCE_STEP_M);
+        let farthest_m = left.iter().map(|point| distance_to_line(*point, &line)).fold(0.0, f64::max);
+        assert!(half.hausdorff_m < 0.01, "{}", half.hausdorff_m);
+        assert!(farthest_m > 10.0 && (half.hausdorff_whole_path_m.unwrap() - farthest_m).abs() < 0.1, "{half:?}");
+        let whole = driven(std::f64::consts::TAU);
+        assert!(whole.hausdorff_m < 0.01 && whole.hausdorff_whole_path_m.unwrap() < 0.01, "{}", whole.hausdorff_m);
     }
 }

@@ -70,7 +70,8 @@ pub struct NavigationReport {
 }
 
 impl NavigationReport {
-    /// The JSON of the contract, extended by intervals, kinds of soil and comparisons with `fixed`.
+    /// The JSON of the contract, extended by intervals, kinds of soil and comparisons with `fixed`. `hausdorff_m` is over the part of the path that a lap drove,
+    /// `hausdorff_whole_path_m` over all of it.
     pub fn to_json(&self) -> Value {
         let configurations: Map<String, Value> = configuration_names(&self.runs)
             .iter()
@@ -220,6 +221,7 @@ fn of_summary(s: &Summary) -> Value {
         "completion_ci95": s.completion_ci95,
         "time_s": figures(&s.time_s),
         "hausdorff_m": figures(&s.hausdorff_m),
+        "hausdorff_whole_path_m": figures(&s.hausdorff_whole_path_m),
         "off_path_m": figures(&s.off_path_m),
         "roll_deg": figures(&s.roll_deg),
         "pitch_deg": figures(&s.pitch_deg),
@@ -263,6 +265,8 @@ mod tests {
                 assert!(of[quantity].get("mean").is_some() && of[quantity].get("sd").is_some(), "{name}.{quantity}");
             }
         }
+        let whole_m = |configuration: &str| value["configurations"][configuration]["hausdorff_whole_path_m"]["mean"].as_f64();
+        assert_eq!([whole_m("fixed"), whole_m("adapted")], [Some(20.0), Some(10.0)]);
         let time_s = &value["configurations"]["fixed"]["time_s"];
         assert!(time_s["mean"].is_null() && time_s["sd"].is_null(), "no lap of `fixed` was completed: {time_s}");
         assert_eq!(value["configurations"]["adapted"]["over_fixed"]["soft"]["hausdorff_m"]["ratio"], 0.5);
@@ -273,9 +277,21 @@ mod tests {
         for key in ["completed", "end", "time_s", "progress", "hausdorff_m", "off_path_mean_m", "roll_deg", "pitch_deg", "scored"] {
             assert!(!value["each"][0]["lap"][key].is_null(), "{key}");
         }
+        assert_eq!(value["each"][0]["lap"]["hausdorff_whole_path_m"], 20.0);
         let html = report.page().render();
         assert!(html.contains("path to follow") && html.contains("off_path") && !html.contains("http://"));
     }
+
+    /// Goal: a mean over the whole path is one of all laps or none. Method: a lap that an earlier version has kept among others.
+    #[test]
+    fn property_no_mean_where_a_lap_does_not_tell_it() {
+        let mut runs = vec![run("fixed", "a", 0, 1, 2.0, true), run("fixed", "a", 0, 2, 2.0, true)];
+        runs[1].lap.hausdorff_whole_path_m = None;
+        let value = NavigationReport { runs, settings: json!({}), provenance: Vec::new() }.to_json();
+        let fixed = &value["configurations"]["fixed"];
+        assert!(fixed["hausdorff_whole_path_m"]["mean"].is_null() && fixed["hausdorff_m"]["mean"] == 2.0, "{fixed}");
+    }
+
     /// Goal: laps on ground of unknown soil are not told among those whose soil is as promised. Method: one of each.
     #[test]
     fn property_unknown_soil_is_a_kind_of_its_own() {

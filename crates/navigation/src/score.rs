@@ -59,8 +59,10 @@ pub struct Summary {
     pub completion_ci95: [f64; 2],
     /// Over completed laps only, s.
     pub time_s: Figures,
-    /// m.
+    /// Over the part of the path that each lap drove, m.
     pub hausdorff_m: Figures,
+    /// Over the whole path, m; without numbers where a lap does not tell it.
+    pub hausdorff_whole_path_m: Figures,
     /// Mean distance from the path, m.
     pub off_path_m: Figures,
     /// Mean |roll|, degrees.
@@ -99,6 +101,7 @@ pub fn summarise(runs: &[Run], configuration: &str, soil: Option<SoilKind>) -> O
     }
     let completed: Vec<&Run> = chosen.iter().filter(|r| r.lap.completed).copied().collect();
     let completion = completed.len() as f64 / chosen.len() as f64;
+    let whole: &[&Run] = if chosen.iter().all(|r| r.lap.hausdorff_whole_path_m.is_some()) { &chosen } else { &[] };
     Some(Summary {
         runs: chosen.len(),
         places: places(&chosen).1,
@@ -106,6 +109,7 @@ pub fn summarise(runs: &[Run], configuration: &str, soil: Option<SoilKind>) -> O
         completion_ci95: wilson(completion, chosen.len()),
         time_s: figures(&completed, |lap| lap.time_s),
         hausdorff_m: figures(&chosen, |lap| lap.hausdorff_m),
+        hausdorff_whole_path_m: figures(whole, |lap| lap.hausdorff_whole_path_m.unwrap_or(f64::NAN)),
         off_path_m: figures(&chosen, |lap| lap.off_path_mean_m),
         roll_deg: figures(&chosen, |lap| lap.roll_deg),
         pitch_deg: figures(&chosen, |lap| lap.pitch_deg),
@@ -179,6 +183,7 @@ pub(crate) mod tests {
             time_s: 50.0,
             progress: 1.0,
             hausdorff_m,
+            hausdorff_whole_path_m: Some(10.0 * hausdorff_m),
             off_path_mean_m: 0.3 * hausdorff_m,
             roll_deg: 2.0,
             pitch_deg: 3.0,
