@@ -139,6 +139,14 @@ fn service_a_root_without_true_soil_serves_another_simulator() {
         std::fs::copy(sample().join("worlds/w01").join(file), world.join(file)).unwrap();
     }
     std::fs::copy(sample().join("vehicle_hmmwv.json"), root.path().join("vehicle_hmmwv.json")).unwrap();
+    // The built-in one drives on true soil.
+    let refused = navigate(folder.path(), root.path(), &["--runs", "1"]);
+    assert!(refused.status.code() == Some(2) && stderr(&refused).contains("--worlds w01"), "{}", stderr(&refused));
+    assert!(stderr(&refused).contains("gt_soil.json") && stderr(&refused).contains("--plant"), "{}", stderr(&refused));
+    let mut anywhere = Command::new(env!("CARGO_BIN_EXE_nesam"));
+    let refused = anywhere.current_dir(folder.path()).args(["navigate", "--runs", "1", "--data"]).arg(root.path()).output().unwrap();
+    assert!(refused.status.code() == Some(2) && stderr(&refused).contains("no world with true soil"), "{}", stderr(&refused));
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0, "nothing is left of what was refused");
     let address = plant(None);
     let refused = navigate(folder.path(), root.path(), &["--plant", &address, "--runs", "1", "--configurations", "fixed,oracle"]);
     assert!(refused.status.code() == Some(2) && stderr(&refused).contains("gt_soil.json"), "{}", stderr(&refused));

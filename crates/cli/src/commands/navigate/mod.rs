@@ -49,6 +49,8 @@ const CAUTION: CautionSettings = CautionSettings {
 };
 /// Worlds of the scenario, where the data root has them.
 const SCENARIO: [&str; 5] = ["w35", "w36", "w37", "w38", "w39"];
+/// Files that tell the true soil of a world.
+const TRUE_SOIL: [&str; 2] = ["gt_soil.json", "gt_region.png"];
 /// Steps of a candidate at most: one of the 32 positions of the model is the step whose command is already on its way.
 const HORIZON_MAX: usize = 31;
 
@@ -60,7 +62,7 @@ pub struct NavigateArgs {
     data: Option<PathBuf>,
     #[command(flatten)]
     bundle: BundleArgs,
-    /// Worlds to drive in [default: w35 to w39 where there are any, else every world with true soil]
+    /// Worlds to drive in [default: those of w35 to w39 with true soil, else every world with true soil; with --plant true soil is not needed]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     worlds: Option<Vec<String>>,
     /// Where predictions come from [default: fixed, adapted, oracle, kinematic, and diagnosed where --diagnosed is given]
@@ -292,24 +294,34 @@ fn configurations(
 /// The worlds to drive in, with the kind of their soil.
 fn worlds_of(args: &NavigateArgs, root: &DataRoot) -> Result<Vec<(String, SoilKind)>, Failure> {
     let there = root.world_ids();
-    let scenario: Vec<String> = SCENARIO.iter().map(|w| (*w).to_string()).filter(|w| there.contains(w)).collect();
-    let with_truth: Vec<String> = there.iter().filter(|world| has_true_soil(root, world)).cloned().collect();
-    let chosen = match &args.worlds {
-        Some(given) => given.clone(),
-        None if !scenario.is_empty() => scenario,
-        // Another simulator knows its soil itself.
-        None if with_truth.is_empty() && args.plant.is_some() => there,
-        None => with_truth,
-    };
+    // Another simulator knows its soil itself.
+    let drivable = |world: &str| args.plant.is_some() || has_true_soil(root, world);
+    let advice = format!("true soil ({}), which the simulated vehicle drives on; --plant drives another simulator", TRUE_SOIL.join(", "));
+    let chosen = args.worlds.clone().unwrap_or_else(|| default_worlds(&there, &drivable, &|world| has_true_soil(root, world)));
     if chosen.is_empty() {
-        return Err(Failure::input("the data root has no world with true soil (gt_soil.json) to drive in"));
+        return Err(Failure::input(format!("the data root has no world with {advice}")));
     }
-    chosen.into_iter().map(|world| Ok((world.clone(), soil_kind(&root.world_dir(&world), &*root.world(&world).or_input()?)?))).collect()
+    let kind_of = |world: String| {
+        let map = root.world(&world).or_input()?;
+        if !drivable(&world) {
+            return Err(Failure::input(format!("--worlds {world}: the data root does not have its {advice}")));
+        }
+        let kind = soil_kind(&root.world_dir(&world), &map)?;
+        Ok((world, kind))
+    };
+    chosen.into_iter().map(kind_of).collect()
+}
+
+/// The worlds of the scenario that can be driven in; else those with true soil; else those that can be driven in.
+fn default_worlds(there: &[String], drivable: &dyn Fn(&str) -> bool, has_truth: &dyn Fn(&str) -> bool) -> Vec<String> {
+    let of = |wanted: &dyn Fn(&str) -> bool| there.iter().filter(|world| wanted(world)).cloned().collect::<Vec<_>>();
+    let choices = [of(&|world| SCENARIO.contains(&world) && drivable(world)), of(has_truth), of(drivable)];
+    choices.into_iter().find(|worlds| !worlds.is_empty()).unwrap_or_default()
 }
 
 /// Whether a root tells the true soil of a world.
 fn has_true_soil(root: &DataRoot, world: &str) -> bool {
-    ["gt_soil.json", "gt_region.png"].iter().all(|file| root.world_dir(world).join(file).exists())
+    TRUE_SOIL.iter().all(|file| root.world_dir(world).join(file).exists())
 }
 
 /// Compares the true sinkage modulus of every region with what its class promises.
@@ -425,6 +437,23 @@ fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Goal: worlds are left to choose from where those of the scenario tell no true soil. Method: with and without it, and another simulator, which needs none.
+    #[test]
+    fn analytic_worlds_of_the_scenario_come_first_where_they_can_be_driven_in() {
+        let there: Vec<String> = ["w01", "w02", "w35", "w36"].map(String::from).to_vec();
+        let chosen = |with_truth: &[&str], plant: bool| {
+            let has_truth = |world: &str| with_truth.contains(&world);
+            default_worlds(&there, &|world| plant || has_truth(world), &has_truth)
+        };
+        assert_eq!(chosen(&["w01", "w35"], false), ["w35"]);
+        assert_eq!(chosen(&["w01", "w02"], false), ["w01", "w02"]);
+        assert!(chosen(&[], false).is_empty());
+        assert_eq!(chosen(&["w01"], true), ["w35", "w36"]);
+        let own = &there[..2];
+        assert_eq!(default_worlds(own, &|_| true, &|world| world == "w02"), ["w02"]);
+        assert_eq!(default_worlds(own, &|_| true, &|_| false), ["w01", "w02"]);
+    }
 
     const HUSKY: &str = include_str!("../../../../../deploy/bundles/clearpath-husky/vehicle.json");
 
