@@ -178,6 +178,20 @@ fn chrono_a_damaged_file_is_named() {
     assert!(stdout(&check).contains("samples.parquet"), "{}", stdout(&check));
 }
 
+/// Goal: true soil that cannot be read is not taken for none. Method: `gt_soil.json` of every world torn in the middle.
+#[test]
+fn service_true_soil_that_is_damaged_is_named() {
+    let root = tempfile::tempdir().unwrap();
+    copy_folder(&sample(), root.path());
+    for world in std::fs::read_dir(root.path().join("worlds")).unwrap().flatten() {
+        let file = world.path().join("gt_soil.json");
+        let text = std::fs::read_to_string(&file).unwrap();
+        std::fs::write(&file, &text[..text.len() / 2]).unwrap();
+    }
+    let data = root.path().display().to_string();
+    refused(&["inside", "--data", &data, "--set", "nominal"], root.path(), &["gt_soil.json", "not valid json"]);
+}
+
 #[test]
 fn chrono_the_sample_is_sound() {
     let data = sample().display().to_string();

@@ -4,11 +4,11 @@ use std::path::PathBuf;
 
 use clap::Args;
 use nesam_evaluation::{ResidualPart, look_inside, wheel_rates};
-use nesam_trajectories::{SoilTruth, read_ground_truth_soil};
+use nesam_trajectories::{SoilTruth, Trajectory, read_ground_truth_soil};
 use serde_json::{Map, Value, json};
 
 use crate::args::{BundleArgs, DataArgs};
-use crate::failure::Failure;
+use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{check_file, provenance, say, write_json};
 use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
@@ -35,8 +35,9 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
     if drives.drives.iter().all(|d| d.truth.is_none()) {
         return Err(Failure::input(format!("set `{}` has no gt_ columns: there is nothing to compare the physics with", drives.set)));
     }
+    let true_soils = true_soils(&drives)?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
-    let (comparison, residual) = look_inside(&predictor, &drives.drives, &drives.maps, &true_soils(&drives));
+    let (comparison, residual) = look_inside(&predictor, &drives.drives, &drives.maps, &true_soils);
     say!("{:<28}{:>9}{:>12}{:>12}{:>12}{:>8}{:>8}", "quantity/class", "values", "true mean", "bias", "mean |err|", "corr.", "rank");
     let mut quantities = Map::new();
     for (name, pairs) in &comparison {
@@ -82,7 +83,12 @@ pub fn run(args: &InsideArgs) -> Result<(), Failure> {
     write_json(file, &document)
 }
 
-/// True soils of each drive's world; `None` where the world states none.
-fn true_soils(drives: &Drives) -> Vec<Option<SoilTruth>> {
-    drives.drives.iter().map(|d| read_ground_truth_soil(&drives.root.world_dir(d.world.as_deref()?)).ok()).collect()
+/// True soils of each drive's world; `None` where the world states none. A statement that cannot be read is an error.
+fn true_soils(drives: &Drives) -> Result<Vec<Option<SoilTruth>>, Failure> {
+    let of = |drive: &Trajectory| {
+        let world = drive.world.as_deref().map(|world| drives.root.world_dir(world));
+        let stated = world.filter(|folder| folder.join("gt_soil.json").exists());
+        stated.map(|folder| read_ground_truth_soil(&folder).or_input()).transpose()
+    };
+    drives.drives.iter().map(of).collect()
 }
