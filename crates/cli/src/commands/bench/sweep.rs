@@ -8,7 +8,8 @@ use nesam_model::{Path, Precision, Predictor};
 use nesam_physics::STATE_DIM;
 use serde_json::{Value, json};
 
-use super::{Planner, percentile};
+use super::percentile;
+use super::predict::Planner;
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 
