@@ -19,7 +19,7 @@ pub struct DataArgs {
     #[arg(long, value_name = "ROOT")]
     pub data: Option<PathBuf>,
     /// Set to read, a folder of the data root; may contain slashes [default: `nominal` if there is one, else the only set]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = set_name)]
     pub set: Option<String>,
     /// Rows of the set's index to use
     #[arg(long, value_enum, default_value_t = SplitArg::All)]
@@ -125,7 +125,7 @@ impl CommandsArgs {
 /// Which model to use.
 #[derive(Args, Clone, Debug)]
 pub struct BundleArgs {
-    /// Model bundle [default: the one in deploy/bundles for the vehicle, else the newest there; found from the executable]
+    /// Model bundle [default: the one in deploy/bundles for the vehicle, else the last by name there; found from the executable]
     #[arg(long, value_name = "DIR")]
     pub bundle: Option<PathBuf>,
 }
@@ -227,6 +227,12 @@ fn history(text: &str) -> Result<usize, String> {
     }
 }
 
+/// The name of a set as the data root has it, whichever way its folder is written.
+fn set_name(text: &str) -> Result<String, String> {
+    let parts: Vec<&str> = text.split('/').filter(|part| !part.is_empty() && *part != ".").collect();
+    if parts.is_empty() { Err("empty name of a set".into()) } else { Ok(parts.join("/")) }
+}
+
 /// One of the names of a list.
 fn name(text: &str) -> Result<String, String> {
     if text.is_empty() { Err("empty name in --trajectories".into()) } else { Ok(text.into()) }
@@ -254,6 +260,14 @@ mod tests {
             measured: MeasuredChannels::POSE_AND_TWIST,
             truth: None,
         }
+    }
+
+    #[test]
+    fn analytic_a_set_is_named_by_its_folder_however_it_is_written() {
+        for text in ["effect_open/payload", "effect_open/payload/", "./effect_open//payload", "effect_open/./payload"] {
+            assert_eq!(set_name(text), Ok("effect_open/payload".into()), "{text}");
+        }
+        assert!(set_name("").is_err() && set_name("./").is_err());
     }
 
     #[test]

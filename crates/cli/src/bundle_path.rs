@@ -7,11 +7,16 @@ use crate::failure::Failure;
 /// File that makes a folder a bundle.
 pub const MANIFEST: &str = "manifest.toml";
 
-/// Finds the bundle to use: `--bundle`, else the newest by name in `deploy/bundles`, searched upward from the executable and then from the
+/// Finds the bundle to use: `--bundle`, else the last by name in `deploy/bundles`, searched upward from the executable and then from the
 /// current folder.
 pub fn bundle_dir(given: Option<&Path>) -> Result<PathBuf, Failure> {
     match given {
         Some(dir) if dir.join(MANIFEST).is_file() => Ok(dir.to_path_buf()),
+        Some(dir) if dir.join("bundle").join(MANIFEST).is_file() => Err(Failure::input(format!(
+            "{} is not a bundle: it has no {MANIFEST}; did you mean {}?",
+            dir.display(),
+            dir.join("bundle").display()
+        ))),
         Some(dir) if dir.exists() => Err(Failure::input(format!(
             "{} is not a bundle: it has no {MANIFEST}; give a folder such as deploy/bundles/<name>",
             dir.display()
@@ -25,7 +30,7 @@ pub fn bundle_dir(given: Option<&Path>) -> Result<PathBuf, Failure> {
 
 /// The shipped bundle, if there is one.
 pub fn default_bundle() -> Option<PathBuf> {
-    upward("deploy/bundles").into_iter().find_map(|folder| newest(&folder))
+    upward("deploy/bundles").into_iter().find_map(|folder| last_by_name(&folder))
 }
 
 /// The shipped bundle that was trained for a vehicle, by the name on its card.
@@ -72,7 +77,7 @@ fn upward(relative: &str) -> Vec<PathBuf> {
     found
 }
 
-fn newest(folder: &Path) -> Option<PathBuf> {
+fn last_by_name(folder: &Path) -> Option<PathBuf> {
     bundles_in(folder).pop()
 }
 
@@ -82,4 +87,32 @@ pub fn bundles_in(folder: &Path) -> Vec<PathBuf> {
     let mut bundles: Vec<PathBuf> = entries.flatten().map(|e| e.path()).filter(|p| p.join(MANIFEST).is_file()).collect();
     bundles.sort();
     bundles
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: who gives the folder of a diagnosis for the bundle in it is told which one was meant. Method: such a folder, and an empty one.
+    #[test]
+    fn regress_a_folder_with_a_bundle_in_it_is_no_bundle_and_says_so() {
+        let here = tempfile::tempdir().unwrap();
+        let refused = || bundle_dir(Some(here.path())).unwrap_err().to_string();
+        assert!(refused().contains("not a bundle") && !refused().contains("did you mean"));
+        let inner = here.path().join("bundle");
+        std::fs::create_dir(&inner).unwrap();
+        std::fs::write(inner.join(MANIFEST), "").unwrap();
+        assert!(refused().contains(&format!("did you mean {}?", inner.display())), "{}", refused());
+    }
+
+    /// Goal: of several bundles the last by name is the shipped one, whenever they were made. Method: two, the later name made first.
+    #[test]
+    fn regress_the_last_by_name_is_taken() {
+        let here = tempfile::tempdir().unwrap();
+        for name in ["b", "a"] {
+            std::fs::create_dir(here.path().join(name)).unwrap();
+            std::fs::write(here.path().join(name).join(MANIFEST), "").unwrap();
+        }
+        assert_eq!(last_by_name(here.path()), Some(here.path().join("b")));
+    }
 }
