@@ -17,9 +17,21 @@ use crate::sources::{Drives, maps_hash};
 /// Why standard output did not take a line; the first failure that is no reader's choice.
 static NOT_PRINTED: OnceLock<String> = OnceLock::new();
 
-/// Prints a line of results. A reader that closes the pipe early (`| head`) ends nothing: the files are still written. Any other failure is kept for
-/// [`check_printed`].
+/// The name of standard output where a file is asked for.
+const STANDARD_OUTPUT: &str = "-";
+
+/// Whether the command line sends a document to standard output, which then has nothing else on it.
+fn document_is_printed() -> bool {
+    static PRINTED: OnceLock<bool> = OnceLock::new();
+    *PRINTED.get_or_init(|| std::env::args().any(|word| word == STANDARD_OUTPUT || word.starts_with("--") && word.ends_with("=-")))
+}
+
+/// Prints a line of results; on standard error where `--json -` has the other for itself. A reader that closes the pipe early (`| head`) ends nothing: the files
+/// are still written. Any other failure is kept for [`check_printed`].
 pub fn print_line(line: &str) {
+    if document_is_printed() {
+        return note_line(line);
+    }
     if let Err(e) = writeln!(std::io::stdout(), "{line}")
         && e.kind() != ErrorKind::BrokenPipe
     {
@@ -55,8 +67,8 @@ macro_rules! note {
 }
 pub(crate) use note;
 
-/// The folder for a command's results: `--out`, else `nesam-out/<command>-<set>`. Never inside a bundle. It is not made.
-pub fn out_place(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
+/// The folder for a command's results: `--out`, else `nesam-out/<command>-<set>`. Never inside a bundle.
+fn out_place(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
     let dir = given.map_or_else(|| Path::new("nesam-out").join(format!("{command}-{}", set.replace('/', "-"))), Path::to_path_buf);
     if inside_bundle(&dir) {
         return Err(Failure::input(format!("--out {} lies in a bundle, which no command may change", dir.display())));
@@ -64,16 +76,46 @@ pub fn out_place(given: Option<&Path>, command: &str, set: &str) -> Result<PathB
     Ok(dir)
 }
 
-/// The same, made if needed.
+/// The same, which can be made and written into. Who writes the first file into it makes it: a command that is refused or fails leaves none.
 pub fn out_dir(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
     let dir = out_place(given, command, set)?;
-    std::fs::create_dir_all(&dir)
-        .map_err(|e| Failure::input(format!("cannot make the folder {}: {e}; give another with --out DIR", dir.display())))?;
+    if let Some(above) = nearest(&dir) {
+        let refused = |why: String| {
+            let (dir, above) = (dir.display(), above.display());
+            Failure::input(format!("cannot make the folder {dir} or write into it: {above} {why}; give another with --out DIR"))
+        };
+        if !above.is_dir() {
+            return Err(refused("is not a folder".into()));
+        }
+        access(above, Access::WRITE_OK).map_err(|error| refused(format!("cannot be written into ({error})")))?;
+    }
     Ok(dir)
 }
 
-/// Where results of these names go: each where it is asked for, else into the command's folder, which is made only where one needs it. Checked before the
-/// work, so that none is lost for a place that cannot take it; those that are written `beside` them are checked with them.
+/// What is there of a path: itself, or the nearest of what lies above it.
+fn nearest(path: &Path) -> Option<&Path> {
+    path.ancestors().map(|above| if above.as_os_str().is_empty() { Path::new(".") } else { above }).find(|above| above.exists())
+}
+
+/// As [`result_files`] for results that each stand alone: without `--out` those that are asked for by name are all that is written, and no folder is made for
+/// the others.
+pub fn asked_files<const N: usize, const M: usize>(
+    out: Option<&Path>,
+    command: &str,
+    set: &str,
+    files: [(&Option<PathBuf>, &str); N],
+    beside: [&Option<PathBuf>; M],
+) -> Result<[Option<PathBuf>; N], Failure> {
+    if out.is_none() && files.iter().any(|(given, _)| given.is_some()) {
+        let files = files.map(|(given, _)| given.clone());
+        check_files(files.iter().chain(beside).flatten())?;
+        return Ok(files);
+    }
+    result_files(out, command, set, files, beside).map(|files| files.map(Some))
+}
+
+/// Where results of these names go: each where it is asked for, else into the command's folder, see [`out_dir`]. Checked before the work, so that none is lost
+/// for a place that cannot take it; those that are written `beside` them are checked with them.
 pub fn result_files<const N: usize, const M: usize>(
     out: Option<&Path>,
     command: &str,
@@ -91,10 +133,36 @@ pub fn result_files<const N: usize, const M: usize>(
 /// Links followed from one to the next at most, as Linux does.
 const LINKS_MAX: usize = 40;
 
+/// Refuses a file that no output may replace: what [`check_place`] refuses, and a file of a data root.
+pub fn check_file(path: &Path) -> Result<(), Failure> {
+    check_place(path)?;
+    let behind = replaceable(path).ok().flatten();
+    if behind.is_some_and(|file| is_recorded(&file)) {
+        return Err(Failure::input(format!("{} is part of a data root, which no output may replace; give another file", path.display())));
+    }
+    Ok(())
+}
+
+/// Whether a file is there and is one that commands read as data: samples, index, world or card of a data root.
+fn is_recorded(file: &Path) -> bool {
+    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let name = file.file_name().unwrap_or_default().to_string_lossy();
+    let of_set = ["samples.parquet", "index.parquet", "index.json"].contains(&&*name) && folder.join("samples.parquet").is_file();
+    let of_world = folder.join("world.json").is_file();
+    let is_card = || name.starts_with("vehicle_") && name.ends_with(".json");
+    let has_sets = || {
+        folder.join("worlds").is_dir() || nesam_trajectories::DataRoot::open(folder, Some(file)).is_ok_and(|root| !root.sets().is_empty())
+    };
+    file.is_file() && (of_set || of_world || is_card() && has_sets())
+}
+
 /// Refuses a file that no command may write: one in a bundle, one that is a folder, one below a file, one in a folder that takes none. What links lead to
 /// counts.
-pub fn check_file(path: &Path) -> Result<(), Failure> {
+fn check_place(path: &Path) -> Result<(), Failure> {
     let refused = |why: &str| Err(Failure::input(format!("{} {why}", path.display())));
+    if path == Path::new(STANDARD_OUTPUT) {
+        return Ok(());
+    }
     if path.is_dir() {
         return refused("is a folder; give a file");
     }
@@ -106,8 +174,7 @@ pub fn check_file(path: &Path) -> Result<(), Failure> {
     if inside_bundle(file.parent().unwrap_or(Path::new("."))) {
         return refused("lies in a bundle, which no command may change");
     }
-    let here = Path::new(".");
-    match file.ancestors().skip(1).map(|above| if above.as_os_str().is_empty() { here } else { above }).find(|above| above.exists()) {
+    match file.parent().and_then(nearest) {
         Some(above) if !above.is_dir() => refused(&format!("cannot be written: {} is not a folder", above.display())),
         Some(above) if drafted => {
             access(above, Access::WRITE_OK).or_else(|error| refused(&format!("cannot be written: {}: {error}", above.display())))
@@ -143,9 +210,9 @@ pub fn set_exists(folder: &Path) -> Failure {
 }
 
 /// The file behind the links of a path, whose place a whole new one can take; `None` for what is written as it is: a device, a pipe, a file that is open
-/// already and named by its number.
+/// already and named by its number, standard output.
 fn replaceable(path: &Path) -> std::io::Result<Option<PathBuf>> {
-    if std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
+    if path == Path::new(STANDARD_OUTPUT) || std::fs::metadata(path).is_ok_and(|there| !there.is_file()) {
         return Ok(None);
     }
     let mut file = path.to_path_buf();
@@ -161,7 +228,7 @@ fn replaceable(path: &Path) -> std::io::Result<Option<PathBuf>> {
 
 /// Writes a whole file or none: a neighbour first, then a rename. Folders above it are made. Devices and pipes are written as they are.
 pub fn write_file(path: &Path, text: &[u8]) -> Result<(), Failure> {
-    if path == Path::new("/dev/stdout") {
+    if [STANDARD_OUTPUT, "/dev/stdout"].map(Path::new).contains(&path) {
         // Opened anew it would begin at the start of a file that holds the printed lines.
         let mut stdout = std::io::stdout().lock();
         return stdout.write_all(text).and_then(|()| stdout.flush()).map_err(|e| cannot_write(path, &e));
@@ -181,8 +248,10 @@ pub fn json_text(document: &impl Serialize) -> String {
 
 /// As [`write_file`] for what is written by a function that is told the neighbour, or the device or pipe itself.
 pub fn write_with(path: &Path, write: impl FnOnce(&Path) -> Result<(), Failure>) -> Result<(), Failure> {
-    check_file(path)?;
-    let Some(file) = replaceable(path).map_err(|e| cannot_write(path, &e))? else { return write(path) };
+    check_place(path)?;
+    let Some(file) = replaceable(path).map_err(|e| cannot_write(path, &e))? else {
+        return write(if path == Path::new(STANDARD_OUTPUT) { Path::new("/dev/stdout") } else { path });
+    };
     if let Some(folder) = file.parent().filter(|p| !p.as_os_str().is_empty()) {
         std::fs::create_dir_all(folder).map_err(|e| cannot_write(path, &e))?;
     }
@@ -201,8 +270,13 @@ fn cannot_write(path: &Path, error: &std::io::Error) -> Failure {
 
 /// The command line as it was typed, fit to be pasted into a shell.
 pub fn command_line() -> String {
-    let plain = |a: &str| !a.is_empty() && a.chars().all(|c| c.is_ascii_alphanumeric() || "-_./,=:+@%".contains(c));
-    let words = std::env::args().skip(1).map(|a| if plain(&a) { a } else { format!("'{}'", a.replace('\'', r"'\''")) });
+    shell_line(std::env::args().skip(1))
+}
+
+/// A command line of this program with such words behind its name, quoted where a shell wants it.
+pub fn shell_line(words: impl Iterator<Item = String>) -> String {
+    let plain = |a: &str| !a.is_empty() && a.chars().all(|c| c.is_ascii_alphanumeric() || "-_./,=:+@%…".contains(c));
+    let words = words.map(|a| if plain(&a) { a } else { format!("'{}'", a.replace('\'', r"'\''")) });
     std::iter::once("nesam".to_string()).chain(words).collect::<Vec<_>>().join(" ")
 }
 
@@ -248,6 +322,24 @@ mod tests {
         std::os::unix::fs::symlink("kept/new", at("into")).unwrap();
         assert!(check_file(&at("into")).unwrap_err().to_string().contains("lies in a bundle"));
         assert!(!here.path().read_dir().unwrap().flatten().any(|e| e.file_name().to_string_lossy().ends_with(".part")));
+    }
+
+    /// Goal: no output takes the place of recorded data, and one that is written again is. Method: the files of a data root, and others of their names elsewhere.
+    #[test]
+    fn property_no_output_replaces_a_file_of_a_data_root() {
+        let sample = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample");
+        for file in
+            ["nominal/samples.parquet", "nominal/index.json", "worlds/w01/world.json", "worlds/w01/elevation.png", "vehicle_hmmwv.json"]
+        {
+            let refused = check_file(&sample.join(file)).unwrap_err().to_string();
+            assert!(refused.contains("part of a data root"), "{refused}");
+        }
+        assert!(check_file(&sample.join("nominal/report.json")).is_ok(), "beside them there is place");
+        let here = tempfile::tempdir().unwrap();
+        for name in ["index.json", "vehicle_calibrated.json", "world.png"] {
+            std::fs::write(here.path().join(name), "{}").unwrap();
+            assert!(check_file(&here.path().join(name)).is_ok(), "{name}");
+        }
     }
 
     /// Goal: what is no file stays what it is, and what it does not take is a failure. Method: a named pipe with a reader, `/dev/full` behind a link.

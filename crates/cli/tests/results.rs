@@ -66,16 +66,90 @@ fn service_a_place_that_cannot_take_results_is_refused_before_the_work() {
     assert_eq!(there, ["p.parquet"]);
 }
 
-/// Goal: who says where everything goes needs no folder besides. Method: `nesam-out` is a file, so that no folder of that name can be made.
+/// Names of what is in a folder.
+fn names(folder: &Path) -> Vec<String> {
+    let mut names: Vec<String> = std::fs::read_dir(folder).unwrap().flatten().map(|e| e.file_name().into_string().unwrap()).collect();
+    names.sort();
+    names
+}
+
+/// Goal: who says what to write gets that and no folder besides, and who is refused gets nothing. Method: each result alone, all of them by default and with `--out`; refusals
+/// after the results were placed; a file in the place of the folder.
 #[test]
-fn service_no_folder_is_made_where_every_result_has_a_place() {
+fn service_no_folder_is_made_that_no_result_needs() {
+    let here = tempfile::tempdir().unwrap();
+    let (root, bundle) = (sample(), bundle().display().to_string());
+    let evaluate =
+        |more: &[&'static str]| [&["evaluate", "--data", &root, "--set", "nominal/", "--models", "constant_velocity"][..], more].concat();
+    let missing = ["evaluate", "--data", &root, "--set", "nominal", "--models", "tal_elev", "--baselines", "."];
+    refused(&missing, here.path(), &["tal_elev"]);
+    refused(&evaluate(&["--horizon", "5000"]), here.path(), &["5000 steps"]);
+    assert!(names(here.path()).is_empty(), "{:?}", names(here.path()));
+    done(&evaluate(&["--json", "a.json"]), here.path());
+    done(&evaluate(&["--html", "a.html"]), here.path());
+    let adapt = ["adapt", "--data", &root, "--set", "./nominal", "--bundle", &bundle, "--trajectories", "n0005", "--json", "b.json"];
+    done(&adapt, here.path());
+    assert_eq!(names(here.path()), ["a.html", "a.json", "b.json"]);
+    done(&evaluate(&["--json", "a.json", "--out", "c"]), here.path());
+    assert_eq!(names(&here.path().join("c")), ["evaluate.html"]);
+    done(&evaluate(&[]), here.path());
+    assert_eq!(names(&here.path().join("nesam-out/evaluate-nominal")), ["evaluate.html", "evaluate.json"]);
+    std::fs::remove_dir_all(here.path().join("nesam-out")).unwrap();
+    std::fs::write(here.path().join("nesam-out"), "").unwrap();
+    refused(&evaluate(&[]), here.path(), &["cannot make the folder nesam-out/evaluate-nominal", "nesam-out is not a folder", "--out"]);
+    done(&evaluate(&["--json", "a.json", "--html", "a.html"]), here.path());
+}
+
+/// Goal: `--json -` is a document that a program reads from a pipe, with nothing else in it. Method: commands that print tables beside it.
+#[test]
+fn service_a_document_on_standard_output_is_alone_there() {
+    let here = tempfile::tempdir().unwrap();
+    let (root, bundle) = (sample(), bundle().display().to_string());
+    for (args, schema) in [
+        (&["evaluate", "--data", &root, "--set", "nominal", "--models", "constant_velocity", "--json", "-"][..], "nesam.evaluate/1"),
+        (&["predict", "--data", &root, "--set", "nominal", "--bundle", &bundle, "--horizon", "2", "--json=-"], "nesam.predict/1"),
+        (&["check", &root, "--json", "-"], "nesam.check/1"),
+        (&["inspect", &bundle, "--json", "-"], "nesam.inspect/1"),
+    ] {
+        let document: Value = serde_json::from_str(&done(args, here.path())).unwrap();
+        assert_eq!(document["schema"], schema);
+    }
+    assert!(names(here.path()).is_empty(), "{:?}", names(here.path()));
+}
+
+/// Goal: a prediction is written as the other commands write theirs, and as before. Method: each option alone and together.
+#[test]
+fn service_a_prediction_goes_where_it_is_asked_for() {
+    let here = tempfile::tempdir().unwrap();
+    let (root, bundle) = (sample(), bundle().display().to_string());
+    let predict = |more: &[&str]| {
+        done(&[&["predict", "--data", &root, "--set", "nominal", "--bundle", &bundle, "--horizon", "2"][..], more].concat(), here.path())
+    };
+    let read = |name: &str| std::fs::read_to_string(here.path().join(name)).unwrap();
+    let is_json = |text: &str| serde_json::from_str::<Value>(text).is_ok_and(|document| document["schema"] == "nesam.predict/1");
+    assert!(is_json(&predict(&[])));
+    assert_eq!(predict(&["--json", "a.json", "--html", "a.html"]), "", "no further answer");
+    assert!(is_json(&read("a.json")) && read("a.html").contains("<svg"));
+    assert!(predict(&["--json", "b.json", "--format", "csv"]).starts_with("k,t_s,"));
+    assert_eq!(predict(&["--json", "c.json", "--out", "c.csv", "--format", "csv"]), "");
+    assert!(is_json(&read("b.json")) && is_json(&read("c.json")) && read("c.csv").starts_with("k,t_s,"));
+    assert_eq!(predict(&["--out", "d.json"]), "");
+    assert!(is_json(&read("d.json")));
+    let twice = ["predict", "--data", &root, "--set", "nominal", "--json", "e", "--out", "e"];
+    refused(&twice, here.path(), &["e is named twice"]);
+}
+
+/// Goal: what a check finds can be read by a program, sound or not. Method: a root and a folder that is none.
+#[test]
+fn service_a_check_is_told_in_json() {
     let here = tempfile::tempdir().unwrap();
     let root = sample();
-    std::fs::write(here.path().join("nesam-out"), "").unwrap();
-    let args = ["evaluate", "--data", &root, "--set", "nominal", "--models", "constant_velocity", "--json", "a.json"];
-    refused(&args, here.path(), &["cannot make the folder nesam-out/evaluate-nominal", "--out"]);
-    done(&[&args[..], &["--html", "a.html"]].concat(), here.path());
-    assert!(here.path().join("a.json").exists() && here.path().join("a.html").exists());
+    refused(&["check", &root, "none", "--json", "c.json"], here.path(), &["the check found errors: 1"]);
+    let found: Value = serde_json::from_slice(&std::fs::read(here.path().join("c.json")).unwrap()).unwrap();
+    assert!(found["errors"] == 1 && found["checked"][0]["kind"] == "data root", "{found}");
+    let of_root = &found["checked"][0];
+    assert!(of_root["errors"].as_array().unwrap().is_empty() && !of_root["notes"].as_array().unwrap().is_empty(), "{of_root}");
+    assert_eq!(found["checked"][1]["errors"][0], "does not exist");
 }
 
 #[test]

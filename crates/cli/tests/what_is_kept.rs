@@ -92,6 +92,11 @@ fn service_no_output_takes_the_place_of_another_file() {
     let evaluate = ["evaluate", "--data", "root", "--set", "nominal", "--models", "constant_velocity"];
     let twice = ["--json", "e.json", "--html", "./e.json"];
     refused(&[&evaluate[..], &twice].concat(), folder.path(), &["e.json is named twice"]);
+    let before = files(&root);
+    for file in ["root/nominal/index.json", "root/vehicle_hmmwv.json", "root/worlds/w01/world.json"] {
+        refused(&[&evaluate[..], &["--json", file]].concat(), folder.path(), &[file, "part of a data root"]);
+    }
+    assert_eq!(files(&root), before);
     std::fs::write(folder.path().join("log.csv"), "t,x\n").unwrap();
     let import = ["import", "log.csv", "--to", "mine", "--set", "a", "--html", "log.csv", "--vehicle", "root/vehicle_hmmwv.json"];
     refused(&import, folder.path(), &["log.csv is named twice"]);

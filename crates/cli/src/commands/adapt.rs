@@ -71,13 +71,13 @@ pub struct AdaptArgs {
     /// Seed of the bootstrap and of what --disguise draws
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// Folder for adapt.json and adapt.html [default: nesam-out/adapt-<set>]
+    /// Folder for adapt.json and adapt.html [default: nesam-out/adapt-<set>, or none where --json or --html says what to write]
     #[arg(long, value_name = "DIR")]
     out: Option<PathBuf>,
-    /// Write the JSON here instead
+    /// Write the JSON here; `-` is standard output
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
-    /// Write the HTML report here instead
+    /// Write the HTML report here
     #[arg(long, value_name = "FILE")]
     html: Option<PathBuf>,
     /// Write every predicted pose of every row of the table as Parquet: model, trajectory, t0, k, x, y, z, roll, pitch, yaw
@@ -151,7 +151,7 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
     let reference_drives = args.reference.as_deref().map(|set| reference_drives(args, set)).transpose()?;
     let true_soils = if args.also.iter().any(|also| also.needs_true_soil()) { read_true_soils(&drives)? } else { Vec::new() };
     let names = [(&args.json, "adapt.json"), (&args.html, "adapt.html")];
-    let [json, html] = output::result_files(args.out.as_deref(), "adapt", &drives.set, names, [&args.predictions])?;
+    let [json, html] = output::asked_files(args.out.as_deref(), "adapt", &drives.set, names, [&args.predictions])?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
@@ -201,9 +201,15 @@ pub fn run(args: &AdaptArgs) -> Result<(), Failure> {
         provenance: &provenance,
     };
     print_table(&adaptation);
-    output::write_file(&json, adaptation.to_json().as_bytes())?;
-    output::write_file(&html, adaptation_page(&adaptation).as_bytes())?;
-    say!("\nwrote {} and {}", json.display(), html.display());
+    say!("");
+    if let Some(file) = &json {
+        output::write_file(file, adaptation.to_json().as_bytes())?;
+        say!("wrote {}", file.display());
+    }
+    if let Some(file) = &html {
+        output::write_file(file, adaptation_page(&adaptation).as_bytes())?;
+        say!("wrote {}", file.display());
+    }
     if let Some(file) = &args.predictions {
         let own = [("fixed", &paths[0]), ("adapted", &paths[1])].into_iter();
         let named: Vec<_> = own.chain(alternatives.iter().map(|(key, paths)| (*key, paths))).collect();

@@ -8,11 +8,12 @@ use nesam_import::{Doubt, card_doubts, doubts};
 use nesam_model::{ModelBundle, Predictor};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{DataRoot, Trajectory};
+use serde_json::{Value, json};
 
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
-use crate::output::say;
+use crate::output::{check_apart, check_file, say, write_json};
 use crate::sources::{beyond_range_note, query};
 
 /// Heights of a vehicle that follows its map spread less than this about their mean, m (chosen; the simulated drives have 0.03).
@@ -29,6 +30,9 @@ pub struct CheckArgs {
     /// Vehicle card, when a data root has none of its own
     #[arg(long, value_name = "FILE")]
     vehicle: Option<PathBuf>,
+    /// Also write what was found as JSON (schema nesam.check/1); `-` is standard output
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
 }
 
 /// What was found, worst first when printed.
@@ -53,6 +57,19 @@ impl Findings {
         verdict(self.errors.len(), self.doubts.len())
     }
 
+    fn print(&self, path: &Path, kind: &str) {
+        say!("{} ({kind})", path.display());
+        for (word, texts) in [("note", &self.notes), ("doubt", &self.doubts), ("error", &self.errors)] {
+            texts.iter().for_each(|text| say!("  {word}: {text}"));
+        }
+        say!("  {}", self.verdict());
+    }
+
+    fn to_json(&self, path: &Path, kind: &str) -> Value {
+        let path = path.display().to_string();
+        json!({ "path": path, "kind": kind, "verdict": self.verdict(), "errors": self.errors, "doubts": self.doubts, "notes": self.notes })
+    }
+
     fn error(&mut self, text: impl Into<String>) {
         self.errors.push(text.into());
     }
@@ -68,22 +85,18 @@ impl Findings {
 
 /// Runs the command: exit code 2 when anything is wrong. A doubt is no error: what is odd may be true.
 pub fn run(args: &CheckArgs) -> Result<(), Failure> {
-    let mut wrong = 0;
+    args.json.iter().try_for_each(|file| check_file(file))?;
+    args.json.iter().flat_map(|json| args.paths.iter().map(move |path| [path, json])).try_for_each(check_apart)?;
+    let (mut wrong, mut checked) = (0, Vec::new());
     for path in &args.paths {
         let mut findings = Findings::default();
         let kind = check(path, args.vehicle.as_deref(), &mut findings);
-        say!("{} ({kind})", path.display());
-        for note in &findings.notes {
-            say!("  note: {note}");
-        }
-        for doubt in &findings.doubts {
-            say!("  doubt: {doubt}");
-        }
-        for error in &findings.errors {
-            say!("  error: {error}");
-        }
-        say!("  {}", findings.verdict());
+        findings.print(path, kind);
         wrong += findings.errors.len();
+        checked.push(findings.to_json(path, kind));
+    }
+    if let Some(file) = &args.json {
+        write_json(file, &json!({ "schema": "nesam.check/1", "errors": wrong, "checked": checked }))?;
     }
     if wrong > 0 {
         return Err(Failure::input(format!("the check found errors: {wrong}")));

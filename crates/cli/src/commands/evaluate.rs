@@ -71,13 +71,13 @@ pub struct EvaluateArgs {
     /// Bootstrap draws
     #[arg(long, default_value_t = DEFAULT_RESAMPLES, value_parser = at_least_1000)]
     pub(super) resamples: usize,
-    /// Folder for evaluate.json and evaluate.html [default: nesam-out/evaluate-<set>]
+    /// Folder for evaluate.json and evaluate.html [default: nesam-out/evaluate-<set>, or none where --json or --html says what to write]
     #[arg(long, value_name = "DIR")]
     pub(super) out: Option<PathBuf>,
-    /// Write the JSON here instead
+    /// Write the JSON here; `-` is standard output
     #[arg(long, value_name = "FILE")]
     pub(super) json: Option<PathBuf>,
-    /// Write the HTML report here instead
+    /// Write the HTML report here
     #[arg(long, value_name = "FILE", conflicts_with_all = ["coverage", "calibrate_coverage"])]
     html: Option<PathBuf>,
     /// Also write the tables as Markdown
@@ -116,7 +116,7 @@ pub fn run(args: &EvaluateArgs) -> Result<(), Failure> {
         start_noise_free(&mut drives)?;
     }
     let names_of_files = [(&args.json, "evaluate.json"), (&args.html, "evaluate.html")];
-    let files = output::result_files(args.out.as_deref(), "evaluate", &drives.set, names_of_files, [&args.markdown, &args.predictions])?;
+    let files = output::asked_files(args.out.as_deref(), "evaluate", &drives.set, names_of_files, [&args.markdown, &args.predictions])?;
     let horizon = args.window.horizon_on(&drives.drives);
     let windows = all_windows(&drives.drives, horizon, args.window.history, truth).or_input()?;
     warn_about_training_drives(args, &drives);
@@ -166,14 +166,20 @@ fn start_noise_free(drives: &mut Drives) -> Result<(), Failure> {
 
 fn write_results(
     args: &EvaluateArgs,
-    [json, html]: &[PathBuf; 2],
+    [json, html]: &[Option<PathBuf>; 2],
     evaluation: &Evaluation<'_>,
     paths: &[ModelPaths],
     windows: &[Window<'_>],
 ) -> Result<(), Failure> {
-    output::write_file(json, evaluation.to_json().as_bytes())?;
-    output::write_file(html, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
-    say!("\nwrote {} and {}", json.display(), html.display());
+    say!("");
+    if let Some(file) = json {
+        output::write_file(file, evaluation.to_json().as_bytes())?;
+        say!("wrote {}", file.display());
+    }
+    if let Some(file) = html {
+        output::write_file(file, report::evaluation_page(evaluation, paths, windows).as_bytes())?;
+        say!("wrote {}", file.display());
+    }
     if let Some(file) = &args.markdown {
         output::write_file(file, report::evaluation_markdown(evaluation).as_bytes())?;
         say!("wrote {}", file.display());

@@ -45,12 +45,18 @@ pub struct PredictArgs {
     /// Round the network's products to bf16, as `nesam serve --bf16` does
     #[arg(long)]
     bf16: bool,
-    /// Form of the answer
-    #[arg(long, value_enum, default_value_t = Format::Json)]
-    format: Format,
-    /// Write here instead of to standard output
+    /// Form of the answer on standard output or in --out [default: json, or no further answer where --json or --html says what to write]
+    #[arg(long, value_enum)]
+    format: Option<Format>,
+    /// Write the answer here instead of to standard output
     #[arg(long, value_name = "FILE")]
     out: Option<PathBuf>,
+    /// Write the JSON here; `-` is standard output
+    #[arg(long, value_name = "FILE")]
+    json: Option<PathBuf>,
+    /// Write the page with plots here
+    #[arg(long, value_name = "FILE")]
+    html: Option<PathBuf>,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -71,9 +77,17 @@ enum Format {
     Html,
 }
 
+impl PredictArgs {
+    /// Form of the answer beside the files that have a form of their own; `None` where those are all that is asked for.
+    fn answer(&self) -> Option<Format> {
+        let only_files = self.out.is_none() && (self.json.is_some() || self.html.is_some());
+        self.format.or((!only_files).then_some(Format::Json))
+    }
+}
+
 /// Runs the command.
 pub fn run(args: &PredictArgs) -> Result<(), Failure> {
-    args.out.iter().try_for_each(|file| output::check_file(file))?;
+    output::check_files(args.out.iter().chain(&args.json).chain(&args.html))?;
     args.inputs.check("a prediction is made as the service makes it, under commands alone")?;
     let mut data = args.data.clone();
     if let Some(id) = &args.trajectory {
@@ -100,18 +114,21 @@ pub fn run(args: &PredictArgs) -> Result<(), Failure> {
     let predictor = rounded(predictor, args.bf16, "--bf16")?;
     let map = drives.maps[0].as_ref();
     let rollout = rollout(args, &predictor, &window, &controls, map)?;
-    let text = match args.format {
+    let text = |format: Format| match format {
         Format::Json => as_json(&drives, &predictor, &window, &controls, &rollout),
         Format::Csv => as_csv(&window, &controls, &rollout),
         Format::Html => as_html(&drives, &predictor, &window, &rollout),
     };
-    match &args.out {
-        Some(file) => output::write_file(file, text.as_bytes()).inspect(|()| note!("wrote {}", file.display())),
-        None => {
-            say!("{}", text.trim_end());
-            Ok(())
-        }
+    let answer = args.answer();
+    let files = [(&args.json, Some(Format::Json)), (&args.html, Some(Format::Html)), (&args.out, answer)];
+    for (file, format) in files.into_iter().filter_map(|(file, format)| file.as_ref().zip(format)) {
+        output::write_file(file, text(format).as_bytes())?;
+        note!("wrote {}", file.display());
     }
+    if let (Some(format), None) = (answer, &args.out) {
+        say!("{}", text(format).trim_end());
+    }
+    Ok(())
 }
 
 /// The window that the options name. Without `--controls` it must lie in the drive whole.
