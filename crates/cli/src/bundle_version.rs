@@ -5,13 +5,13 @@ use std::path::{Path, PathBuf};
 use nesam_model::{ModelBundle, Provenance};
 use nesam_physics::effects::ScheduledEffect;
 
+use crate::cli::command_without_paths;
 use crate::failure::{Failure, OrFail};
-use crate::output::command_line;
 
-/// Where a bundle that is made of another comes from: this command, the data, and the bundle before as its parent.
+/// Where a bundle that is made of another comes from: this command without its paths, the data, and the bundle before as its parent.
 pub fn derived_from(base: &ModelBundle, data_hash: &str) -> Provenance {
     Provenance {
-        command: command_line(),
+        command: command_without_paths(),
         data_hash: data_hash.into(),
         program: format!("nesam {}", env!("CARGO_PKG_VERSION")),
         parent: Some(base.hash.clone()),

@@ -1,16 +1,17 @@
 //! The command line: names, one-line purposes, examples.
 
+use clap::builder::ValueParser;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
 
 use crate::bundle_path::{MANIFEST, default_bundle};
 use crate::commands;
 use crate::failure::Failure;
-use crate::output::{check_printed, note, say};
+use crate::output::{check_printed, note, say, shell_line};
 
 /// Predicts how an off-road vehicle will move over deformable ground, as a service for planners.
 ///
 /// The model joins Bekker-Wong terramechanics with a Transformer; it is shipped as a bundle. Commands read drives from a data root
-/// (without --data: the sample in the repository) and write JSON and HTML where you say.
+/// (without --data: the sample in the repository) and write JSON and HTML where you say (`-` is standard output).
 #[derive(Parser, Debug)]
 #[command(name = "nesam", disable_version_flag = true, after_help = EXAMPLES, max_term_width = 110)]
 struct Cli {
@@ -104,6 +105,41 @@ fn arguments() -> clap::Command {
     take_negative_numbers(Cli::command())
 }
 
+/// The command line as it was typed, without the paths of this machine: what stands in a bundle, so that the same work in another folder makes the same bytes.
+pub fn command_without_paths() -> String {
+    let words: Vec<String> = std::env::args().skip(1).collect();
+    shell_line(without_paths(&words).into_iter())
+}
+
+/// The words of a command line with `…` in the place of every value that is a path.
+fn without_paths(words: &[String]) -> Vec<String> {
+    const HIDDEN: &str = "…";
+    let is_path = |arg: &clap::Arg| arg.get_value_parser().type_id() == ValueParser::path_buf().type_id();
+    let program = arguments();
+    let mut command = &program;
+    // The option whose value comes next.
+    let mut open: Option<&clap::Arg> = None;
+    let mut kept = Vec::with_capacity(words.len());
+    for word in words {
+        if let Some(option) = word.strip_prefix("--") {
+            let (name, value) = option.split_once('=').map_or((option, None), |(name, value)| (name, Some(value)));
+            let arg = command.get_arguments().find(|arg| arg.get_long() == Some(name) && arg.get_action().takes_values());
+            open = arg.filter(|_| value.is_none());
+            let hides = value.is_some() && arg.is_some_and(is_path);
+            kept.push(if hides { format!("--{name}={HIDDEN}") } else { word.clone() });
+        } else if let Some(arg) = open {
+            open = open.filter(|arg| arg.get_num_args().is_some_and(|count| count.max_values() > 1));
+            kept.push(if is_path(arg) { HIDDEN.into() } else { word.clone() });
+        } else if let Some(inner) = command.find_subcommand(word) {
+            command = inner;
+            kept.push(word.clone());
+        } else {
+            kept.push(if command.get_positionals().any(is_path) { HIDDEN.into() } else { word.clone() });
+        }
+    }
+    kept
+}
+
 fn command(command: Option<Command>) -> Result<(), Failure> {
     match command {
         None => {
@@ -144,6 +180,23 @@ fn version() -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Goal: a bundle names the command that made it and none of this machine's folders. Method: options with and without `=`, several values, places of their own and flags.
+    #[test]
+    fn regress_paths_of_a_command_line_are_left_out() {
+        let kept = |line: &str| without_paths(&line.split(' ').map(String::from).collect::<Vec<_>>()).join(" ");
+        for (line, expected) in [
+            (
+                "diagnose --data /home/me/root --set a/b --fit-on x,y --no-controls --out found --json=d.json",
+                "diagnose --data … --set a/b --fit-on x,y --no-controls --out … --json=…",
+            ),
+            ("diagnose --recording a.mcap b.mcap --session s --seed 3", "diagnose --recording … … --session s --seed 3"),
+            ("effects write --file e.toml --to new --bundle old", "effects write --file … --to … --bundle …"),
+            ("replay recordings --force", "replay … --force"),
+        ] {
+            assert_eq!(kept(line), expected);
+        }
+    }
 
     /// Goal: a wrong number is refused by the name of its option. Method: negative numbers, too much history and a name too few, with a space and with `=`.
     #[test]

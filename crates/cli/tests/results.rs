@@ -180,19 +180,19 @@ fn service_wheels_that_a_set_does_not_measure_are_wrong_input() {
     done(&[&evaluate[..], &["constant_velocity"]].concat(), here.path());
 }
 
-/// Goal: `--fit-on` opens no other drive for what it finds. Method: drives of the plant with a steering offset, once with two further ones and once without; the
-/// same command writes the same bytes, and the bundle names what it has.
+/// Goal: `--fit-on` opens no other drive for what it finds. Method: drives of the plant with a steering offset, once with two further ones and once without, in folders of
+/// other names; the same command writes the same bytes, and the bundle names what it has.
 #[test]
 fn service_a_patched_bundle_is_made_of_the_fitted_drives_alone() {
     let bundle = bundle().display().to_string();
     let root = sample();
-    let patched = |drives: &str| {
+    let patched = |drives: &str, data: &str, out: &str| {
         let here = tempfile::tempdir().unwrap();
-        let write = ["plant", "write", "--data", &root, "--out", "root", "--set", "hidden", "--worlds", "w01,w05", "--drives", drives];
+        let write = ["plant", "write", "--data", &root, "--out", data, "--set", "hidden", "--worlds", "w01,w05", "--drives", drives];
         done(&[&write[..], &["--effect", "steering_offset=0.12"]].concat(), here.path());
-        let fit_on = ["--fit-on", "p0001,p0002", "--no-controls", "--out", "found"];
-        done(&[&["diagnose", "--data", "root", "--set", "hidden", "--bundle", &bundle][..], &fit_on].concat(), here.path());
-        let mut files: Vec<(String, Vec<u8>)> = std::fs::read_dir(here.path().join("found/bundle"))
+        let fit_on = ["--fit-on", "p0001,p0002", "--no-controls", "--out", out];
+        done(&[&["diagnose", "--data", data, "--set", "hidden", "--bundle", &bundle][..], &fit_on].concat(), here.path());
+        let mut files: Vec<(String, Vec<u8>)> = std::fs::read_dir(here.path().join(out).join("bundle"))
             .unwrap()
             .flatten()
             .map(|e| (e.file_name().to_string_lossy().into_owned(), std::fs::read(e.path()).unwrap()))
@@ -200,7 +200,7 @@ fn service_a_patched_bundle_is_made_of_the_fitted_drives_alone() {
         files.sort();
         (here, files)
     };
-    let ((here, alone), (_, among_others)) = (patched("2"), patched("4"));
+    let ((here, alone), (_, among_others)) = (patched("2", "root", "found"), patched("4", "elsewhere/root", "some/where else"));
     for ((name, bytes), (_, same)) in alone.iter().zip(&among_others) {
         assert_eq!(String::from_utf8_lossy(bytes), String::from_utf8_lossy(same), "{name}");
     }
