@@ -67,8 +67,8 @@ macro_rules! note {
 }
 pub(crate) use note;
 
-/// The folder for a command's results: `--out`, else `nesam-out/<command>-<set>`. Never inside a bundle.
-fn out_place(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
+/// The folder for a command's results: `--out`, else `nesam-out/<command>-<set>`. Never inside a bundle. It is not made.
+pub fn out_place(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf, Failure> {
     let dir = given.map_or_else(|| Path::new("nesam-out").join(format!("{command}-{}", set.replace('/', "-"))), Path::to_path_buf);
     if inside_bundle(&dir) {
         return Err(Failure::input(format!("--out {} lies in a bundle, which no command may change", dir.display())));
