@@ -195,14 +195,14 @@ fn service_an_interrupted_import_leaves_nothing_and_left_overs_block_nothing() {
     std::fs::write(folder.path().join("long.csv"), "t,x,y,yaw,wz,cmd_speed,cmd_steer\n".to_string() + &rows).unwrap();
     let card_path = card().display().to_string();
     let args = ["import", "long.csv", "--flat", "--to", "root", "--set", "a/b", "--vehicle", &card_path];
-    let mut import = Command::new(env!("CARGO_BIN_EXE_nesam"));
-    import.args(args).current_dir(folder.path()).stdout(Stdio::null()).stderr(Stdio::piped());
-    let mut import = import.spawn().unwrap();
-    while !folder.path().join("root").exists() && import.try_wait().unwrap().is_none() {
+    let mut begun = Command::new(env!("CARGO_BIN_EXE_nesam"));
+    begun.args(args).current_dir(folder.path()).stdout(Stdio::null()).stderr(Stdio::piped());
+    let mut begun = begun.spawn().unwrap();
+    while !folder.path().join("root").exists() && begun.try_wait().unwrap().is_none() {
         std::thread::sleep(std::time::Duration::from_millis(1));
     }
-    assert!(Command::new("kill").args(["-INT", &import.id().to_string()]).status().unwrap().success());
-    let output = import.wait_with_output().unwrap();
+    assert!(Command::new("kill").args(["-INT", &begun.id().to_string()]).status().unwrap().success());
+    let output = begun.wait_with_output().unwrap();
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.code() == Some(1) && said.contains("interrupted: nothing was imported"), "{:?}: {said}", output.status);
     assert!(!folder.path().join("root").exists(), "what was interrupted leaves nothing behind");
