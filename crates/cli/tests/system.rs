@@ -206,7 +206,7 @@ async fn service_the_log_tells_who_changes_what_and_no_secret() {
             std::thread::sleep(Duration::from_millis(50));
         }
     };
-    for wish in ["open session `` of vehicle `truck`", "change session `truck`"] {
+    for wish in ["open session `truck` of vehicle `truck`", "change session `truck`"] {
         let line = logged(&format!("allowed: {wish}"));
         assert!(line.contains("vehicle `truck`") && line.contains("127.0.0.1"), "{line}");
     }

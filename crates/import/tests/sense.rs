@@ -59,7 +59,7 @@ fn chrono_one_mistake_is_told_and_no_other() {
         ("rim speed of FL", wheels(|[fl, fr, rl, rr]| [-fl, fr, rl, rr])),
         ("rim speed of RR", wheels(|[fl, fr, rl, rr]| [fl, fr, rl, 9.55 * rr])),
         ("the left and right wheels turn against the yaw", wheels(|[fl, fr, rl, rr]| [fr, fl, rr, rl])),
-        ("road-wheel angle against the steering command: -1.0", angles(|a| -a)),
+        ("road-wheel angle against the steering command: -0.99", angles(|a| -a)),
         ("degrees instead of radians", angles(f64::to_degrees)),
         ("positions are frozen in 1 of 6 drives", told(&frozen, 1)),
         ("positions jump 1 times", told(&|drive| drive.states[120..].iter_mut().for_each(|s| s.position_m[1] += 10.0), 1)),

@@ -92,7 +92,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     let card = drives.root.vehicle();
     let bundle = args.bundle.as_deref().map(|dir| bundle_to_change(dir, args.data.dt)).transpose()?;
     let out = out_dir(args.out.as_deref(), "calibrate", &drives.set)?;
-    if drives.root.card().parent().and_then(|root| root.canonicalize().ok()) == out.canonicalize().ok() {
+    if drives.root.card().parent().is_some_and(|root| same_folder(root, &out)) {
         let card = drives.root.card().display();
         return Err(Failure::input(format!(
             "--out {}: two cards in a data root are one too many; give another folder, then put the new card into the place of {card}",
@@ -124,6 +124,12 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     write_json(&file, &document)?;
     say!("wrote {}", file.display());
     Ok(())
+}
+
+/// Whether two folders are one that is there.
+fn same_folder(a: &Path, b: &Path) -> bool {
+    let there = |folder: &Path| if folder.as_os_str().is_empty() { Path::new(".") } else { folder }.canonicalize().ok();
+    there(a).is_some_and(|a| there(b) == Some(a))
 }
 
 /// Calibrates to the end: Ctrl-C ends this command as a whole.

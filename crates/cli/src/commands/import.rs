@@ -4,6 +4,7 @@ mod draft;
 mod page;
 
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use clap::{Args, ValueEnum};
 use nesam_import::{CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, write_set};
@@ -97,7 +98,11 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     args.html.iter().try_for_each(|file| check_file(file))?;
     args.html.iter().flat_map(|html| args.logs.iter().map(move |log| [html, log])).try_for_each(check_apart)?;
     let unfinished = draft.clone();
-    interrupt::exit_on_ctrl_c_after("nothing was imported", move || unfinished.discard());
+    interrupt::exit_on_ctrl_c_after("nothing was imported", move || {
+        // Kept for good: what is taken away is not written again.
+        std::mem::forget(writing());
+        unfinished.discard();
+    });
     let lines = match &args.columns {
         Some(file) => std::fs::read_to_string(file).map_err(|e| Failure::input(format!("{}: {e}", file.display())))?,
         None => String::new(),
@@ -117,12 +122,23 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     Ok(())
 }
 
+/// The right to change files: of the import for a stage at a time, of who interrupts it for good.
+fn writing() -> MutexGuard<'static, ()> {
+    static WRITING: Mutex<()> = Mutex::new(());
+    WRITING.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// Writes the set and judges it where nobody sees it, puts it in its place, and the card into a data root that has none.
 fn write(args: &ImportArgs, draft: &Draft, drives: &[Drive], card: Option<&Path>) -> Result<(), Failure> {
+    let stage = writing();
     draft.make()?;
     let notes = write_set(&draft.root().join(&args.set), drives, args.world.as_deref(), args.split.as_deref()).or_input()?;
     notes.iter().for_each(|note| say!("  note: {note}"));
+    drop(stage);
+    let stage = writing();
     judge(args, card, draft)?;
+    drop(stage);
+    let _stage = writing();
     let card = card.map(|card| copy_card(card, draft.root())).transpose()?;
     draft.publish(&args.set)?;
     if let Some((copy, name)) = card
