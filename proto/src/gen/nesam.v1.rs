@@ -1303,8 +1303,9 @@ pub struct PredictRequest {
     #[prost(uint64, tag = "8")]
     pub tag: u64,
     /// Instant from which `controls` apply, ns of the vehicle's clock; absent = that of the newest step of the history. The session is rolled forward
-    /// from its newest step to this instant, rounded to the nearest step of 0.1 s. At most half a step before the newest step, and so near after
-    /// it that the steps rolled forward and K together do not exceed the 32 positions of the model. Not together with `start`.
+    /// from its newest step to this instant, rounded to the nearest step of 0.1 s. An instant before the newest step, which came while the request waited, is
+    /// answered from the step that was measured then. One so far after it that the steps rolled forward and K together exceed the 32 positions of the model
+    /// is FAILED_PRECONDITION: what was measured is too old. Not together with `start`.
     #[prost(int64, optional, tag = "9")]
     pub start_stamp_ns: ::core::option::Option<i64>,
     /// Commands that the vehicle was sent, by ascending stamp, at most 256; only with `start_stamp_ns`. Each step that is rolled forward uses the one
@@ -1354,7 +1355,8 @@ pub struct CandidateDrawing {
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct PathCost {
     /// Points of the path in the order they are driven, packed f32, shape (points, 2), World, m; 2 to 1024 points. A step is held against the place of
-    /// the path that is nearest to it, not far from that of the step before, so that a path may cross itself.
+    /// the path that is nearest to it, from 1 m behind that of the step before to 3.5 m ahead of it or some segments further, so that a path may cross itself.
+    /// Points nearer than 5 cm to the one before are left out.
     #[prost(bytes = "bytes", tag = "1")]
     pub path: ::prost::bytes::Bytes,
     /// Speed to be made along the path, m/s.
