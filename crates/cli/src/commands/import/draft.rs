@@ -69,7 +69,8 @@ impl Draft {
     /// Removes the hidden folder, and of the folders above the set those that were made for it and hold nothing.
     pub fn discard(&self) {
         let _ = std::fs::remove_dir_all(&self.root);
-        self.above.iter().all(|dir| std::fs::remove_dir(dir).is_ok());
+        // Those that were not made yet are none, and those that hold something stay.
+        self.above.iter().for_each(|dir| drop(std::fs::remove_dir(dir)));
     }
 
     /// A failure that names the place that the set is for, and not that of the draft.
@@ -107,9 +108,11 @@ mod tests {
         assert!(drafts[2].root().exists() && !drafts[0].root().exists() && !drafts[1].root().exists());
         let told = drafts[2].told_of(Failure::input(format!("{}/a/b: no", drafts[2].root().display()))).to_string();
         assert_eq!(told, format!("{}/a/b: no", root.display()));
-        let other = Draft::new(&here.path().join("new/root"), "a");
-        other.make().unwrap();
-        other.discard();
-        assert!(!here.path().join("new").exists());
+        for set in ["a", "a/b"] {
+            let other = Draft::new(&here.path().join("new/root"), set);
+            other.make().unwrap();
+            other.discard();
+            assert!(!here.path().join("new").exists(), "{set}");
+        }
     }
 }
