@@ -191,7 +191,7 @@ fn chrono_wrong_road_wheel_angles_are_doubted() {
 fn service_an_interrupted_import_leaves_nothing_and_left_overs_block_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let row = |i: usize| format!("{:.1},{:.2},0,0,{:.4},1,0\n", 0.1 * i as f64, 0.1 * i as f64, 1e-4 * (i % 7919) as f64);
-    let rows: String = (0..400_000).map(row).collect();
+    let rows: String = (0..1_200_000).map(row).collect();
     std::fs::write(folder.path().join("long.csv"), "t,x,y,yaw,wz,cmd_speed,cmd_steer\n".to_string() + &rows).unwrap();
     let card_path = card().display().to_string();
     let args = ["import", "long.csv", "--flat", "--to", "root", "--set", "a/b", "--vehicle", &card_path];

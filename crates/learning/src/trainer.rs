@@ -283,8 +283,8 @@ fn steps_needed(variant: Variant, available: usize) -> usize {
 /// A run that is interrupted and resumed gives the weights that it gives in one go: what is validated, and may so be chosen, depends on the plan alone.
 ///
 /// # Errors
-/// `TrainingError`, a checkpoint that was begun with something else among them; an interruption leaves a checkpoint, also before the first epoch: one that is resumed with a plan of no further steps gives the running
-/// mean where nothing was validated yet.
+/// `TrainingError`, also for a checkpoint that was begun with something else. An interruption leaves a checkpoint, also before the first epoch: one that is
+/// resumed with a plan of no further steps gives the running mean where nothing was validated yet.
 pub fn train(
     set: &TrainingSet<'_>,
     weights: &Weights,
