@@ -7,13 +7,13 @@ pub fn exit_on_ctrl_c(left_undone: &'static str) {
     exit_on_ctrl_c_after(left_undone, || {});
 }
 
-/// The same after removing what is not finished.
+/// The same after removing what is not finished; removing may wait for ever where nothing is left to interrupt.
 pub fn exit_on_ctrl_c_after(left_undone: &'static str, remove: impl FnOnce() + Send + 'static) {
     std::thread::spawn(move || {
         let Ok(runtime) = tokio::runtime::Builder::new_current_thread().enable_io().build() else { return };
         if runtime.block_on(tokio::signal::ctrl_c()).is_ok() {
-            note!("\ninterrupted: {left_undone}");
             remove();
+            note!("\ninterrupted: {left_undone}");
             std::process::exit(1);
         }
     });

@@ -4,6 +4,7 @@ mod draft;
 mod page;
 
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use clap::{Args, ValueEnum};
@@ -99,8 +100,7 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     args.html.iter().flat_map(|html| args.logs.iter().map(move |log| [html, log])).try_for_each(check_apart)?;
     let unfinished = draft.clone();
     interrupt::exit_on_ctrl_c_after("nothing was imported", move || {
-        // Kept for good: what is taken away is not written again.
-        std::mem::forget(writing());
+        stop_writing();
         unfinished.discard();
     });
     let lines = match &args.columns {
@@ -122,10 +122,27 @@ pub fn run(args: &ImportArgs) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The right to change files: of the import for a stage at a time, of who interrupts it for good.
+/// The right to change files: of the import for a stage at a time, and for good of what ends first, the import or its interruption.
+static WRITING: Mutex<()> = Mutex::new(());
+/// Somebody wants to interrupt: no further stage begins.
+static INTERRUPTED: AtomicBool = AtomicBool::new(false);
+
+/// The right to change files for a stage; an import that is interrupted never gets it.
 fn writing() -> MutexGuard<'static, ()> {
-    static WRITING: Mutex<()> = Mutex::new(());
-    WRITING.lock().unwrap_or_else(PoisonError::into_inner)
+    let stage = WRITING.lock().unwrap_or_else(PoisonError::into_inner);
+    if INTERRUPTED.load(Ordering::SeqCst) {
+        drop(stage);
+        loop {
+            std::thread::park();
+        }
+    }
+    stage
+}
+
+/// Waits until the stage at work is over and lets no other begin; does not return where that was the last one.
+fn stop_writing() {
+    INTERRUPTED.store(true, Ordering::SeqCst);
+    std::mem::forget(WRITING.lock().unwrap_or_else(PoisonError::into_inner));
 }
 
 /// Writes the set and judges it where nobody sees it, puts it in its place, and the card into a data root that has none.
@@ -138,7 +155,7 @@ fn write(args: &ImportArgs, draft: &Draft, drives: &[Drive], card: Option<&Path>
     let stage = writing();
     judge(args, card, draft)?;
     drop(stage);
-    let _stage = writing();
+    let last = writing();
     let card = card.map(|card| copy_card(card, draft.root())).transpose()?;
     draft.publish(&args.set)?;
     if let Some((copy, name)) = card
@@ -147,6 +164,8 @@ fn write(args: &ImportArgs, draft: &Draft, drives: &[Drive], card: Option<&Path>
         let _ = std::fs::remove_dir_all(draft.folder());
         return Err(Failure::Failed(format!("cannot copy the card: {error}")));
     }
+    // The set is there: nothing interrupts what is left to say.
+    std::mem::forget(last);
     let html = args.html.clone().unwrap_or_else(|| draft.folder().join(PAGE));
     say!("wrote {}", html.display());
     Ok(())
