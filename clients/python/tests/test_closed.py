@@ -74,6 +74,14 @@ async def ask_awaited(client, what):
         await client.measure(straight("truck", 2))
 
 
+async def begin_asking(address, what, begun):
+    """A client in asyncio and the task in which it asks, once the service has heard the question."""
+    client = nesam.AsyncClient(address)
+    asking = asyncio.ensure_future(ask_awaited(client, what))
+    await asyncio.get_running_loop().run_in_executor(None, begun.wait, 20.0)
+    return client, asking
+
+
 @pytest.mark.parametrize("what", ASKED)
 def test_service_a_client_that_is_closed_is_unavailable(what):
     begun = threading.Event()
@@ -106,9 +114,7 @@ def test_service_a_client_that_is_closed_is_unavailable_in_asyncio(what):
     begun = threading.Event()
 
     async def work(address):
-        client = nesam.AsyncClient(address)
-        asking = asyncio.ensure_future(ask_awaited(client, what))
-        await asyncio.get_running_loop().run_in_executor(None, begun.wait, 20.0)
+        client, asking = await begin_asking(address, what, begun)
         await client.close()
         with pytest.raises(nesam.Unavailable, match=CLOSED):
             await asyncio.wait_for(asking, 20.0)
@@ -126,9 +132,7 @@ def test_service_a_task_that_is_cancelled_is_cancelled_even_if_its_client_closes
     begun = threading.Event()
 
     async def work(address):
-        client = nesam.AsyncClient(address)
-        asking = asyncio.ensure_future(ask_awaited(client, what))
-        await asyncio.get_running_loop().run_in_executor(None, begun.wait, 20.0)
+        client, asking = await begin_asking(address, what, begun)
         asking.cancel()
         await client.close()
         with pytest.raises(asyncio.CancelledError):

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use crate::failure::Failure;
+use crate::output::or_here;
 
 /// File that makes a folder a bundle.
 pub const MANIFEST: &str = "manifest.toml";
@@ -57,7 +58,7 @@ pub fn sample_root() -> Option<PathBuf> {
 
 /// Whether `dir` lies in a bundle (or is one), where no command may write.
 pub fn inside_bundle(dir: &Path) -> bool {
-    let dir = if dir.as_os_str().is_empty() { Path::new(".") } else { dir };
+    let dir = or_here(dir);
     let absolute = std::path::absolute(dir).unwrap_or_else(|_| dir.to_path_buf());
     absolute.ancestors().any(|a| a.join(MANIFEST).is_file())
 }

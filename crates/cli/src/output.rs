@@ -94,7 +94,12 @@ pub fn out_dir(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf
 
 /// What is there of a path: itself, or the nearest of what lies above it.
 fn nearest(path: &Path) -> Option<&Path> {
-    path.ancestors().map(|above| if above.as_os_str().is_empty() { Path::new(".") } else { above }).find(|above| above.exists())
+    path.ancestors().map(or_here).find(|above| above.exists())
+}
+
+/// A folder by a name that the system knows: the one above a plain file has an empty one.
+pub fn or_here(folder: &Path) -> &Path {
+    if folder.as_os_str().is_empty() { Path::new(".") } else { folder }
 }
 
 /// As [`result_files`] for results that each stand alone: without `--out` those that are asked for by name are all that is written, and no folder is made for
@@ -145,7 +150,7 @@ pub fn check_file(path: &Path) -> Result<(), Failure> {
 
 /// Whether a file is there and is one that commands read as data: samples, index, world or card of a data root.
 fn is_recorded(file: &Path) -> bool {
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let folder = file.parent().map_or(Path::new("."), or_here);
     let name = file.file_name().unwrap_or_default().to_string_lossy();
     let of_set = ["samples.parquet", "index.parquet", "index.json"].contains(&&*name) && folder.join("samples.parquet").is_file();
     let of_world = folder.join("world.json").is_file();
@@ -194,7 +199,7 @@ pub fn check_apart<'a>(files: impl IntoIterator<Item = &'a PathBuf>) -> Result<(
     let mut known = BTreeSet::new();
     for file in files {
         let Ok(Some(place)) = replaceable(file) else { continue };
-        let folder = place.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+        let folder = place.parent().map_or(Path::new("."), or_here);
         // A folder that is not there yet is known by its name.
         let folder = folder.canonicalize().or_else(|_| std::path::absolute(folder)).unwrap_or_else(|_| folder.into());
         if !known.insert(folder.join(place.file_name().unwrap_or_default())) {

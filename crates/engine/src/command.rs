@@ -171,7 +171,7 @@ impl Command {
     }
 
     /// The session that this command keeps from being idle: one that is fed or asked. Reading it is no use of it.
-    pub(crate) fn uses(&self) -> Option<&str> {
+    pub fn uses(&self) -> Option<&str> {
         match self {
             Self::Measure { session, .. } | Self::Fork { session, .. } | Self::Export { session } | Self::SetEffects { session, .. } => {
                 Some(session)

@@ -20,7 +20,7 @@ use crate::fleet::{Fleet, FleetCell, FleetShare};
 use crate::limits::{Limits, check_name};
 use crate::maps::MapRegistry;
 use crate::measurement::Measurement;
-use crate::query::{PredictQuery, Prediction, Provenance};
+use crate::query::Provenance;
 use crate::session::{Acting, Observed, Rules, Session, SessionImage, refused};
 
 /// Hears what happens in the engine; called on the engine's thread, so it must not wait.
@@ -112,33 +112,19 @@ impl Engine {
     /// # Errors
     /// Any [`EngineError`] that names why the command was refused.
     pub fn execute(&mut self, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
-        self.execute_until(now_ns, command, Until::default())
-    }
-
-    /// The same, as far as it goes until then. A prediction that is given up leaves no trace, one of fewer samples that of a command for these.
-    pub(crate) fn execute_until(&mut self, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
-        let result = self.answer(now_ns, command, until);
-        if let Some(session) = command.uses() {
-            self.touch(now_ns, session);
-        }
+        let result = self.answer(now_ns, command);
+        self.touch(now_ns, command.uses());
         result
     }
 
-    /// Keeps a session from being idle, as every command does that names it.
-    pub(crate) fn touch(&mut self, now_ns: u64, session: &str) {
-        if let Some(session) = self.sessions.get_mut(session) {
+    /// Keeps a session from being idle, as every command does that names it, also one that is not executed.
+    pub fn touch(&mut self, now_ns: u64, session: Option<&str>) {
+        if let Some(session) = session.and_then(|id| self.sessions.get_mut(id)) {
             session.touch(now_ns);
         }
     }
 
-    /// Does what a command leaves behind that was not executed: the session that it names was not idle.
-    pub fn not_executed(&mut self, now_ns: u64, command: &Command) {
-        if let Some(session) = command.uses() {
-            self.touch(now_ns, session);
-        }
-    }
-
-    fn answer(&mut self, now_ns: u64, command: &Command, until: Until<'_>) -> Result<Reply, EngineError> {
+    fn answer(&mut self, now_ns: u64, command: &Command) -> Result<Reply, EngineError> {
         match command {
             Command::Open(open) => self.open(now_ns, open),
             Command::Get { session } => Ok(Reply::Session(Box::new(self.view(self.session(session)?)))),
@@ -154,7 +140,7 @@ impl Engine {
             Command::FleetSoil { map } => self.fleet_soil(now_ns, map),
             Command::TellFleetSoil => self.fleet().map(|fleet| Reply::FleetShares(fleet.cell_m(), fleet.shares(now_ns))),
             Command::HearFleetSoil { cell_m, shares } => self.hear_fleet_soil(now_ns, *cell_m, shares),
-            Command::Predict(query) => self.predict(now_ns, query, until).map(|p| Reply::Predicted(Arc::new(p))),
+            Command::Predict(query) => self.prepare(now_ns, query)?.compute(query, Until::default()).map(|p| Reply::Predicted(Arc::new(p))),
             Command::PutMap { map, base } => {
                 self.maps.put(map.clone(), *base, &self.limits)?;
                 self.emit(Event::MapChanged { map: map.id().into(), held: self.maps.count() });
@@ -369,10 +355,6 @@ impl Engine {
             self.emit(Event::SoilChanged { session: id.into(), vehicle, soil: soil.into(), provenance });
         }
         Ok(Reply::Measured(Box::new(MeasureAnswer { outcome, reordered, history_steps, provenance, accepted, soil })))
-    }
-
-    fn predict(&self, now_ns: u64, query: &PredictQuery, until: Until<'_>) -> Result<Prediction, EngineError> {
-        self.prepare(now_ns, query)?.compute(query, until)
     }
 
     fn fleet(&self) -> Result<&Fleet, EngineError> {

@@ -152,11 +152,13 @@ impl EngineHandle {
     pub fn spawn_tapped(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
         let queue = Arc::new(Queue::default());
         let (limits, vehicle) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()));
+        let heard = Arc::new(Heard::new(tap));
+        let computing = Computing::start(queue.clone(), clock.clone(), heard.clone());
         let thread = thread::Builder::new()
             .name("nesam-engine".into())
             .spawn({
                 let (queue, clock) = (queue.clone(), clock.clone());
-                move || run(engine, &queue, &clock, tap)
+                move || run(engine, &queue, clock.as_ref(), computing, &heard)
             })
             .expect("the system starts a thread");
         Self { queue, clock, limits, vehicle, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
@@ -243,35 +245,49 @@ impl EngineHandle {
     }
 }
 
+/// The thread that computes predictions, in the order in which they were begun.
+struct Computing {
+    begun: mpsc::Sender<Begun>,
+    thread: JoinHandle<()>,
+}
+
+impl Computing {
+    /// # Panics
+    /// When the system refuses to start a thread.
+    fn start(queue: Arc<Queue>, clock: Arc<dyn Clock>, heard: Arc<Heard>) -> Self {
+        let (begun, waiting) = mpsc::channel::<Begun>();
+        let compute = move || {
+            while let Ok(prediction) = waiting.recv() {
+                prediction.finish(&queue, clock.as_ref(), &heard);
+            }
+        };
+        let thread = thread::Builder::new().name("nesam-predict".into()).spawn(compute).expect("the system starts a thread");
+        Self { begun, thread }
+    }
+
+    fn compute(&self, prediction: Begun) {
+        self.begun.send(prediction).expect("the thread ends after this; this is a bug");
+    }
+
+    /// Ends the thread after all that was begun.
+    fn end(self) {
+        drop(self.begun);
+        self.thread.join().expect("panics of a prediction are caught; this is a bug");
+    }
+}
+
 /// Does all that is asked for until the end. Predictions are computed beside the engine, one at a time, so that measurements do not wait for them.
-fn run(mut engine: Engine, queue: &Arc<Queue>, clock: &Arc<dyn Clock>, tap: Option<Tap>) -> Engine {
+fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, computing: Computing, heard: &Heard) -> Engine {
     // Shared out among the threads of predictions, the work of a measurement would wait for theirs.
     let _alone = work_alone();
-    let heard = Arc::new(Heard::new(tap));
-    let (begun, waiting) = mpsc::channel::<Begun>();
-    let computing = thread::Builder::new()
-        .name("nesam-predict".into())
-        .spawn({
-            let (queue, clock, heard) = (queue.clone(), clock.clone(), heard.clone());
-            move || {
-                while let Ok(prediction) = waiting.recv() {
-                    prediction.finish(&queue, clock.as_ref(), &heard);
-                }
-            }
-        })
-        .expect("the system starts a thread");
     loop {
         match queue.next(|| clock.now_ns()) {
-            Turn::Commands(commands) => answer_all(&mut engine, commands, clock.as_ref(), &heard),
-            Turn::Prediction(submission) => {
-                let prediction = Begun::new(&mut engine, *submission, queue, clock.as_ref(), &heard);
-                begun.send(prediction).expect("the computing thread ends after this one; this is a bug");
-            }
+            Turn::Commands(commands) => answer_all(&mut engine, commands, clock, heard),
+            Turn::Prediction(submission) => computing.compute(Begun::new(&mut engine, *submission, queue, clock, heard)),
             Turn::End => break,
         }
     }
-    drop(begun);
-    computing.join().expect("panics of a prediction are caught; this is a bug");
+    computing.end();
     engine
 }
 
@@ -351,7 +367,7 @@ impl Begun {
         } else {
             fits
         };
-        engine.touch(now_ns, &query.session);
+        engine.touch(now_ns, Some(&query.session));
         let prepared = begun.and_then(|()| guarded("predict", || engine.prepare(now_ns, &query)));
         let queued_ns = now_ns.saturating_sub(submitted_ns);
         Self { query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, place }

@@ -292,7 +292,7 @@ mod tests {
     }
 
     /// Goal: what candidates are worth along a path does not hang on how many points it has, nor on the vehicle having stood while it was recorded. Method: an
-    /// arc in points 0.25 m apart, 1.25 cm apart, and with thirty points within a centimetre where it begins; a candidate at 8 m/s beside it.
+    /// arc in points 0.25 m apart, 1.25 cm apart, and with thirty points within a centimetre where it begins; a candidate at 6 m/s beside it.
     #[test]
     fn regress_points_close_together_change_no_cost() {
         let (radius, horizon) = (20.0_f64, 20);

@@ -273,13 +273,23 @@ mod tests {
         stamped(stamp_ns, &["odom", "base_link"], &values)
     }
 
+    fn writer(path: &Path) -> Writer<File> {
+        Writer::create(File::create(path).expect("made"), "ros2", "test").expect("made")
+    }
+
+    /// A topic of messages of this type.
+    fn channel(writer: &mut Writer<File>, message: &str, topic: &str) -> u16 {
+        let schema = writer.add_schema(message, "ros2msg", b"").expect("added");
+        writer.add_channel(schema, topic, "cdr").expect("added")
+    }
+
     fn bag(path: &Path, commands: &[&str]) {
         part(path, commands, 0..40);
     }
 
     /// Twentieths of a second of a bag.
     fn part(path: &Path, commands: &[&str], instants: std::ops::Range<i64>) {
-        let mut writer = Writer::create(File::create(path).expect("made"), "ros2", "test").expect("made");
+        let mut writer = writer(path);
         let odometry = writer.add_schema("nav_msgs/msg/Odometry", "ros2msg", b"").expect("added");
         let twist = writer.add_schema("geometry_msgs/msg/Twist", "ros2msg", b"").expect("added");
         let odometry = writer.add_channel(odometry, "/odom", "cdr").expect("added");
@@ -335,11 +345,8 @@ mod tests {
     fn analytic_messages_count_from_their_stamps_unless_they_are_of_another_clock() {
         let folder = tempfile::tempdir().expect("a folder");
         let path = folder.path().join("run.mcap");
-        let mut writer = Writer::create(File::create(&path).expect("made"), "ros2", "test").expect("made");
-        let mut channel = |name: &str, topic: &str| {
-            let schema = writer.add_schema(name, "ros2msg", b"").expect("added");
-            writer.add_channel(schema, topic, "cdr").expect("added")
-        };
+        let mut writer = writer(&path);
+        let mut channel = |name: &str, topic: &str| channel(&mut writer, name, topic);
         let odometry = channel("nav_msgs/msg/Odometry", "/odom");
         let twist = channel("geometry_msgs/msg/TwistStamped", "/cmd_vel");
         let gyro = channel("sensor_msgs/msg/Imu", "/imu");
@@ -380,11 +387,8 @@ mod tests {
         ] {
             let folder = tempfile::tempdir().expect("a folder");
             let path = folder.path().join("run.mcap");
-            let mut writer = Writer::create(File::create(&path).expect("made"), "ros2", "test").expect("made");
-            let mut channel = |name: &str, topic: &str| {
-                let schema = writer.add_schema(name, "ros2msg", b"").expect("added");
-                writer.add_channel(schema, topic, "cdr").expect("added")
-            };
+            let mut writer = writer(&path);
+            let mut channel = |name: &str, topic: &str| channel(&mut writer, name, topic);
             let (odometry, twist) = (channel("nav_msgs/msg/Odometry", "/odom"), channel("geometry_msgs/msg/TwistStamped", "/cmd_vel"));
             let begin = 1_700_000_000_000_000_000_i64;
             for k in 0..50 {

@@ -107,9 +107,18 @@ impl Mapping {
         Ok(Self { entries })
     }
 
+    /// Whether an entry names the column of a target.
+    pub(crate) fn maps(&self, target: &str) -> bool {
+        self.entry(target).is_some()
+    }
+
+    fn entry(&self, target: &str) -> Option<&Entry> {
+        self.entries.iter().find(|entry| entry.target == target)
+    }
+
     /// Numbers of a target in SI and radians; `None` when the log has no such column. A column that holds something else is refused, mapped or not.
     pub(crate) fn numbers(&self, log: &Log, target: &str) -> Result<Option<Vec<Option<f64>>>, ImportError> {
-        let (source, factor) = match self.entries.iter().find(|entry| entry.target == target) {
+        let (source, factor) = match self.entry(target) {
             Some(entry) => (entry.source.as_str(), entry.factor),
             None if log.holds(target) => (target, 1.0),
             None => return Ok(None),
@@ -121,7 +130,7 @@ impl Mapping {
 
     /// Texts of a target; `None` when the log has no such column.
     pub(crate) fn texts(&self, log: &Log, target: &str) -> Option<Vec<String>> {
-        log.text(self.entries.iter().find(|entry| entry.target == target).map_or(target, |entry| entry.source.as_str()))
+        log.text(self.entry(target).map_or(target, |entry| entry.source.as_str()))
     }
 }
 

@@ -4,7 +4,6 @@ use nesam_physics::vec3::attitude_of_quaternion;
 
 use crate::error::ImportError;
 use crate::log::Log;
-use crate::mapping::Mapping;
 use crate::part::{Channel, Notes, Options, absent, incomplete, required, turned};
 
 const ANGLES: [&str; 3] = ["roll", "pitch", "yaw"];
@@ -43,7 +42,7 @@ fn or_flat(log: &Log, options: &Options, found: Found, target: &str, hint: &str)
 fn attitude(log: &Log, options: &Options, lacking: &mut Vec<&str>, notes: &mut Notes) -> Result<[Vec<Option<f64>>; 3], ImportError> {
     let columns = |names: &[&str]| names.iter().map(|name| options.mapping.numbers(log, name)).collect::<Result<Vec<Found>, _>>();
     let (angles, quaternion) = (columns(&ANGLES)?, columns(&QUATERNION)?);
-    let some_mapped = |names: &[&str]| names.iter().any(|name| is_mapped(&options.mapping, name));
+    let some_mapped = |names: &[&str]| names.iter().any(|name| options.mapping.maps(name));
     let (there, parts) = (there(&ANGLES, &angles), there(&QUATERNION, &quaternion));
     let whole = parts.len() == QUATERNION.len();
     let has_yaw = there.contains(&"yaw");
@@ -68,11 +67,6 @@ fn attitude(log: &Log, options: &Options, lacking: &mut Vec<&str>, notes: &mut N
 /// Which of some columns a log has.
 fn there<'a>(names: &[&'a str], columns: &[Found]) -> Vec<&'a str> {
     names.iter().zip(columns).filter(|(_, column)| column.is_some()).map(|(name, _)| *name).collect()
-}
-
-/// Whether a mapping names the column of a target: then it asks for it even of a log without columns.
-fn is_mapped(mapping: &Mapping, target: &str) -> bool {
-    mapping.numbers(&Log::default(), target).is_err()
 }
 
 /// Roll, pitch and yaw of the columns of a quaternion.

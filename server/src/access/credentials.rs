@@ -14,10 +14,9 @@ use tokio_rustls::rustls::{Error, RootCertStore, ServerConfig};
 use super::certificate;
 use super::fleet_file::FleetFile;
 use super::identity::Identity;
-use super::rereading::Rereading;
+use super::rereading::{Rereading, read_file, reread};
 use crate::config::TlsConfig;
 use crate::error::ServerError;
-use crate::grpc::stopped;
 use crate::telemetry::{Metrics, Part};
 
 /// The bytes of the files of TLS; empty = not configured.
@@ -60,7 +59,7 @@ impl Credentials {
         let expires_s = files.expiry_s(&config.certificate)?;
         let rights = match config.restricts() {
             true => {
-                let file = read("tls.fleet", &config.fleet)?;
+                let file = read_file("tls.fleet", &config.fleet)?;
                 let in_force = watch::channel(Arc::new(fleet(&file, &config.fleet)?)).0;
                 Some(Rights { file, in_force })
             }
@@ -115,7 +114,7 @@ impl Credentials {
     /// As [`Credentials::read`]; what was in force stays so.
     fn reread_rights(&mut self) -> Result<bool, ServerError> {
         let Some(rights) = &mut self.rights else { return Ok(false) };
-        let file = read("tls.fleet", &self.config.fleet)?;
+        let file = read_file("tls.fleet", &self.config.fleet)?;
         if file == rights.file {
             return Ok(false);
         }
@@ -151,47 +150,24 @@ impl Credentials {
     }
 
     /// Follows the files until the server stops. What cannot be used is logged once, counted and told as long as it is so, and changes nothing.
-    pub async fn follow(mut self, metrics: Arc<Metrics>, stopping: watch::Receiver<bool>) {
+    pub async fn follow(self, metrics: Arc<Metrics>, stopping: watch::Receiver<bool>) {
         self.in_force(&metrics);
-        let stop = stopped(stopping);
-        tokio::pin!(stop);
-        let mut tick = tokio::time::interval(Duration::from_secs_f64(self.config.reload_s));
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+        let every = Duration::from_secs_f64(self.config.reload_s);
         let mut parts = [Part::Certificate, Part::Rights].map(Rereading::of);
-        loop {
-            tokio::select! {
-                _ = tick.tick() => {}
-                () = &mut stop => return,
-            }
-            // A file system that hangs holds up no request.
-            let read = tokio::task::spawn_blocking(move || {
-                let results = [self.reread_tls(), self.reread_rights()];
-                (self, results)
-            });
-            let Ok((back, results)) = read.await else {
-                tracing::error!(target: "nesam::audit", "reading certificates and rights panicked: they are not read again; this is a bug");
-                return;
-            };
-            self = back;
+        let read = |credentials: &mut Self| [credentials.reread_tls(), credentials.reread_rights()];
+        reread("certificates and rights", self, every, stopping, read, |credentials, results| {
             let changed: Vec<bool> = parts.iter_mut().zip(results).map(|(part, result)| part.tell(result, metrics.reloads())).collect();
             if changed.contains(&true) {
-                self.in_force(&metrics);
+                credentials.in_force(&metrics);
             }
-        }
+        })
+        .await;
     }
 }
 
 /// Failure of the file of a key. What is in the file never reaches a message.
 fn unusable(key: &'static str, reason: impl Into<String>) -> ServerError {
     ServerError::Tls { key, reason: reason.into() }
-}
-
-/// The bytes of the file of a key; none where no file is configured.
-fn read(key: &'static str, path: &Path) -> Result<Vec<u8>, ServerError> {
-    match path.as_os_str().is_empty() {
-        true => Ok(Vec::new()),
-        false => std::fs::read(path).map_err(|source| unusable(key, format!("{}: {source}", path.display()))),
-    }
 }
 
 /// What the fleet file says.
@@ -207,9 +183,9 @@ impl TlsFiles {
     /// `ServerError::Tls` naming the key whose file cannot be read.
     pub fn read(config: &TlsConfig) -> Result<Self, ServerError> {
         Ok(Self {
-            certificate: read("tls.certificate", &config.certificate)?,
-            key: read("tls.key", &config.key)?,
-            client_ca: read("tls.client_ca", &config.client_ca)?,
+            certificate: read_file("tls.certificate", &config.certificate)?,
+            key: read_file("tls.key", &config.key)?,
+            client_ca: read_file("tls.client_ca", &config.client_ca)?,
         })
     }
 

@@ -25,7 +25,7 @@ pub use self::directory::Directory;
 pub use self::fleet_file::FleetFile;
 pub use self::identity::Identity;
 pub use self::refusals::{Refusal, Refusals};
-pub(crate) use self::rereading::Rereading;
+pub(crate) use self::rereading::{Rereading, read_file, reread};
 use crate::config::TlsConfig;
 use crate::error::ServerError;
 

@@ -1,6 +1,5 @@
 //! The certificates towards etcd, read at the start and again when they change.
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -10,10 +9,9 @@ use tonic::transport::channel::Change;
 use tonic::transport::{Certificate, ClientTlsConfig, Endpoint, Identity};
 
 use super::etcd::{in_short, plain_endpoint};
-use crate::access::{Rereading, certificate, certificates};
+use crate::access::{Rereading, certificate, certificates, read_file, reread};
 use crate::config::ClusterConfig;
 use crate::error::ServerError;
-use crate::grpc::stopped;
 use crate::telemetry::{Metrics, Part};
 
 /// A member of etcd that is connected to from now on as its endpoint says, by its address.
@@ -44,14 +42,10 @@ impl Files {
         if !config.uses_tls() {
             return Ok(Self::default());
         }
-        let read = |key: &'static str, path: &Path| match path.as_os_str().is_empty() {
-            true => Ok(Vec::new()),
-            false => std::fs::read(path).map_err(|error| ServerError::Tls { key, reason: format!("{}: {error}", path.display()) }),
-        };
         Ok(Self {
-            authority: read("cluster.authority", &config.authority)?,
-            certificate: read("cluster.certificate", &config.certificate)?,
-            key: read("cluster.key", &config.key)?,
+            authority: read_file("cluster.authority", &config.authority)?,
+            certificate: read_file("cluster.certificate", &config.certificate)?,
+            key: read_file("cluster.key", &config.key)?,
         })
     }
 
@@ -130,30 +124,15 @@ impl ClusterFiles {
 
     /// Follows the files until the server stops, looking at them this often. What cannot be used is logged once, counted and told as long as it is so, and changes
     /// nothing.
-    pub async fn follow(mut self, every: Duration, metrics: Arc<Metrics>, stopping: watch::Receiver<bool>) {
-        let stop = stopped(stopping);
-        tokio::pin!(stop);
-        let mut tick = tokio::time::interval(every);
-        tick.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
+    pub async fn follow(self, every: Duration, metrics: Arc<Metrics>, stopping: watch::Receiver<bool>) {
+        let expires = |files: &Self| metrics.reloads().expires(Part::Cluster, files.expires_s.unwrap_or_default());
+        expires(&self);
         let mut told = Rereading::of(Part::Cluster);
-        loop {
-            metrics.reloads().expires(Part::Cluster, self.expires_s.unwrap_or_default());
-            tokio::select! {
-                _ = tick.tick() => {}
-                () = &mut stop => return,
-            }
-            // A file system that hangs holds up no request.
-            let read = tokio::task::spawn_blocking(move || {
-                let result = self.reread();
-                (self, result)
-            });
-            let Ok((back, result)) = read.await else {
-                tracing::error!(target: "nesam::audit", "reading the certificates towards etcd panicked: they are not read again; this is a bug");
-                return;
-            };
-            self = back;
+        reread("the certificates towards etcd", self, every, stopping, Self::reread, |files, result| {
             told.tell(result, metrics.reloads());
-        }
+            expires(files);
+        })
+        .await;
     }
 }
 
@@ -169,6 +148,8 @@ pub fn etcd_endpoint(address: &str, config: &ClusterConfig) -> Result<Endpoint, 
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use rcgen::{BasicConstraints, CertificateParams, IsCa, Issuer, KeyPair, date_time_ymd};
 
     use super::*;

@@ -154,7 +154,7 @@ impl Again {
         let command = of_entries(&recorded.asked, &self.limits, &self.maps)?;
         let kind = command.label();
         if not_executed(&recorded.answer) {
-            self.engine.not_executed(recorded.now_ns, &command);
+            self.engine.touch(recorded.now_ns, command.uses());
             return Ok((kind, Outcome::NotExecuted));
         }
         let result = execute_guarded(&mut self.engine, recorded.now_ns, &command);

@@ -19,7 +19,7 @@ use crate::args::DataArgs;
 use crate::bundle_version::derived_from;
 use crate::failure::{Failure, OrFail};
 use crate::interrupt;
-use crate::output::{check_files, out_dir, provenance, say, write_file, write_json};
+use crate::output::{check_files, or_here, out_dir, provenance, say, write_file, write_json};
 use crate::progress::Progress;
 use crate::sources::{Drives, load_bundle, read_drives};
 
@@ -128,7 +128,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
 
 /// Whether two folders are one that is there.
 fn same_folder(a: &Path, b: &Path) -> bool {
-    let there = |folder: &Path| if folder.as_os_str().is_empty() { Path::new(".") } else { folder }.canonicalize().ok();
+    let there = |folder: &Path| or_here(folder).canonicalize().ok();
     there(a).is_some_and(|a| there(b) == Some(a))
 }
 
