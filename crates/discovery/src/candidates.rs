@@ -214,6 +214,13 @@ impl Candidate {
         if self.line.variant.is_empty() { self.id().into() } else { format!("{} {}", self.id(), self.line.variant) }
     }
 
+    /// The wheel of a hypothesis of one wheel, in the order front left, front right, rear left, rear right.
+    pub fn wheel(&self) -> Option<usize> {
+        let quantities = self.line.effect.quantities();
+        let at = quantities.iter().position(|q| q.unit == "index")?;
+        Some(self.line.columns[0][at] as usize)
+    }
+
     /// Its columns in the linear form of the catalogue.
     pub fn columns(&self) -> Vec<usize> {
         (self.first_column..self.first_column + self.line.columns.len()).collect()

@@ -16,8 +16,9 @@ use crate::error::DiscoveryError;
 use crate::ground::{Ground, Soils};
 use crate::held_out::{HeldOut, Learned, Scoring, far_off, score_held_out};
 use crate::judge::{Judge, case_of, own_yardstick};
-use crate::judgement::{Verdict, judge};
-use crate::observe::{Bench, ObservedDrive, observe_all};
+use crate::judgement::{Verdict, judge, too_few};
+use crate::lack::Lack;
+use crate::observe::{Bench, ObservedDrive, available_in_all, observe_all};
 use crate::own_reference;
 use crate::proof::Trial;
 use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
@@ -72,6 +73,10 @@ pub struct Diagnosis {
     pub catalogue: Vec<Candidate>,
     /// Channels that were compared, in the order of the selection's levels.
     pub channels: Vec<usize>,
+    /// Channels that the reference compares and a drive does not measure.
+    pub left_out: Vec<usize>,
+    /// Ids of effects that cannot be seen without those, which are not asked for.
+    pub unseen: Vec<&'static str>,
     /// Mean deviation of each compared channel from its usual level, in its unit.
     pub levels: Vec<f64>,
     /// Course of the most unusual channel of each residual layer.
@@ -98,7 +103,7 @@ pub struct Diagnosis {
     pub held_out: Vec<String>,
     /// What each held-out drive was predicted with.
     pub learned: Vec<Learned>,
-    /// Scores; `None` when no drive is held out.
+    /// Scores; `None` when no drive is held out. Without a claim nothing is added: after is before.
     pub scores: Option<HeldOut>,
 }
 
@@ -149,11 +154,11 @@ pub fn diagnose(
     };
     let all = hypotheses(bundle, judge_by.as_ref(), options)?;
     let fit_at = fitted(drives, options)?;
-    // The model itself is judged from the best that is known of each state; a bundle's network knows what the past tells, and is judged from that.
+    // The model itself is judged from the best that is known of each state, and so is a change against drives of which the same was done.
     let fit_drives: Vec<Trajectory> = fit_at.iter().map(|&d| drives[d].clone()).collect();
     refuse_still(&bundle.vehicle, &fit_drives)?;
     let in_hindsight: Option<Vec<Trajectory>> =
-        (options.against == Against::Physics).then(|| fit_drives.iter().map(Trajectory::in_hindsight).collect());
+        judge_by.as_ref().is_none_or(Judge::in_hindsight).then(|| fit_drives.iter().map(Trajectory::in_hindsight).collect());
     let seen = in_hindsight.as_ref().unwrap_or(&fit_drives);
     let fit_maps: Vec<_> = fit_at.iter().map(|&d| maps[d].clone()).collect();
     let asked = Asked {
@@ -216,11 +221,14 @@ impl Asked<'_> {
         };
         let bundle = predictor.bundle();
         let observed = observe_all(predictor, seen, fit_maps, &|done| progress("drives as the model sees them", done, total))?;
+        let judge_by = judge_by.map(|j| j.over(Lack::of(fit_drives, fit_maps), &available_in_all(&observed))).transpose()?;
+        let judge_by = judge_by.as_deref();
         let bench = Bench::new(bundle, catalogue);
         let (mut case, Pursued { yardstick, refused }) =
             held_against(judge_by, bench, observed, options, (plain, predictor, !told.is_empty()), self)?;
         case.work = Work::begin("hypotheses", progress);
-        let judgement = judge(&mut case, &yardstick).with_refused(refused);
+        let few = judge_by.is_none() && own_reference::too_few(total);
+        let judgement = if few { too_few(&case, &yardstick) } else { judge(&mut case, &yardstick).with_refused(refused) };
         let fewer = match judge_by {
             Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
             _ => None,
@@ -241,6 +249,9 @@ impl Asked<'_> {
         let proving = if apart { held_drives.among_fitted(fit_drives, fit_maps) } else { held_drives };
         let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
             prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
+        // A model on trial that errs to no side is not right for that.
+        let far =
+            (judge_by.is_none() && verdict == Verdict::None).then(|| far_off(scores.as_ref()?, proving.drives, &options.scoring)).flatten();
         if apart {
             learned = vec![taught.clone(); held.len()];
             scores = if options.scoring.windows(&held).is_ok() {
@@ -252,8 +263,6 @@ impl Asked<'_> {
                 reason += &said_by_others(&judgement, scores);
             }
         }
-        // A model on trial that errs to no side is not right for that.
-        let far = (judge_by.is_none() && verdict == Verdict::None).then(|| far_off(scores.as_ref()?, &held, &options.scoring)).flatten();
         let verdict = if far.is_some() { Verdict::Unexplained } else { verdict };
         reason += far.as_deref().unwrap_or_default();
         let (any, beside) = (verdict.claims(), taught.beside);
@@ -287,6 +296,9 @@ impl Asked<'_> {
             Some(scores) => score_controls(&setting, scores, &HeldDrives { work: &others, ..held_drives })?,
             None => (Vec::new(), None),
         };
+        if let Some(scores) = scores.as_mut().filter(|_| !any) {
+            scores.add_nothing();
+        }
         let null_drives = judge_by.and_then(|j| setting.on_null_drives(&j.nulls));
         let claimed = if named { judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects())) } else { Vec::new() };
         let traces = case.traces(&judgement.selection, &claimed);
@@ -306,6 +318,8 @@ impl Asked<'_> {
             levels: levels(&case),
             catalogue: yardstick.catalogue.into_iter().chain(of_rims).collect(),
             channels: yardstick.channels,
+            left_out: judge_by.map_or_else(Vec::new, |j| j.left_out.clone()),
+            unseen: judge_by.map_or_else(Vec::new, |j| j.unseen.clone()),
             findings,
             selection,
             estimates,
@@ -370,6 +384,9 @@ fn held_against<'a>(
         case.ground_alone = ground_alone;
         let drives: Vec<Condensed> = case.condensed().cloned().collect();
         let first = own_yardstick(&case, &drives, &options.without)?;
+        if own_reference::too_few(total) {
+            return Ok((case, Pursued { yardstick: first, refused: Vec::new() }));
+        }
         let work = Work::begin("drives held against every effect beside those found", progress);
         case.work = work.clone();
         let trial = Trial { predictor, drives: asked.fit_drives, maps: asked.fit_maps, scoring: &options.scoring, work: &work };

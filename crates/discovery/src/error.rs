@@ -19,6 +19,12 @@ pub enum DiscoveryError {
         /// What was wrong and what to do.
         reason: String,
     },
+    /// The drives behind the reference of the bundle cannot be used.
+    #[error("{reason}")]
+    ReferenceDrives {
+        /// What was wrong and what to do.
+        reason: String,
+    },
     /// A drive was asked for that the set does not have, too few are left, or nothing moves in any of them.
     #[error("{reason}")]
     Drives {

@@ -13,6 +13,9 @@ use crate::tail::{equivalent_z, ln_chi_square_tail};
 /// Least scatter of the scores of a block of several columns, as a ratio of variances to what the metric says (chosen).
 const BLOCK_FLOOR: f64 = 0.3;
 
+/// Fewest drives without an effect whose scatter is a measure (chosen).
+const NULL_DRIVES_MIN: usize = 4;
+
 /// What drives without an effect say of each column.
 #[derive(Clone, Debug)]
 pub struct Nulls {
@@ -40,7 +43,11 @@ pub struct Group {
 impl Nulls {
     /// From null drives; `None` with fewer than four.
     pub fn new(drives: &[&Condensed]) -> Option<Self> {
-        let first = drives.first().filter(|_| drives.len() > 3)?;
+        if drives.len() < NULL_DRIVES_MIN { None } else { Self::of(drives) }
+    }
+
+    fn of(drives: &[&Condensed]) -> Option<Self> {
+        let first = drives.first().filter(|_| drives.len() > 1)?;
         let size = first.score.len();
         let count = drives.len() as f64;
         let sum = |of: &dyn Fn(&Condensed) -> DVector<f64>| drives.iter().fold(DVector::zeros(size), |sum, d| sum + of(d));
@@ -59,9 +66,9 @@ impl Nulls {
     }
 
     /// From the drives that are judged, against a model that is right on average: the scatter is theirs about their own mean, the share zero. `None` with
-    /// fewer than four.
+    /// fewer than two.
     pub fn about_zero(drives: &[&Condensed]) -> Option<Self> {
-        let measured = Self::new(drives)?;
+        let measured = Self::of(drives)?;
         let size = measured.share.len();
         // The centre is known without drives.
         Some(Self { share: DVector::zeros(size), total: DVector::from_element(size, f64::INFINITY), ..measured })

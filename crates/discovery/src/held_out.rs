@@ -55,6 +55,14 @@ pub struct HeldOut {
     pub shows: Vec<bool>,
 }
 
+impl HeldOut {
+    /// As nothing is claimed, nothing is added: after is before, and there is no onset.
+    pub(crate) fn add_nothing(&mut self) {
+        self.scores[2] = self.scores[0].clone();
+        self.before_onset = None;
+    }
+}
+
 /// How the rollouts are cut and scored.
 #[derive(Clone, Copy, Debug)]
 pub struct Scoring {

@@ -4,6 +4,7 @@ use crate::candidates::Candidate;
 use crate::claims::{Case, Finding};
 use crate::fit::Fit;
 use crate::onset::Onset;
+use crate::reference::DRIVES_MIN;
 use crate::select::{DECISIVE, FURTHER, Selection, Yardstick, without};
 use crate::settled::{Settled, onset_in_place};
 
@@ -106,6 +107,22 @@ pub fn judge(case: &mut Case<'_>, yardstick: &Yardstick) -> Judgement {
     let (selection, onsets) = case.select(yardstick);
     let judgement = concluded(case, yardstick, selection, onsets, &[], Vec::new());
     unless_unrest(case, yardstick, rival_instead(case, yardstick, judgement))
+}
+
+/// What drives say that are too few to claim anything by the scatter of their own: what stands out, of which nothing is chosen.
+pub(crate) fn too_few(case: &Case<'_>, yardstick: &Yardstick) -> Judgement {
+    let none = Yardstick { withheld: (0..yardstick.catalogue.len()).collect(), ..yardstick.clone() };
+    let selection = none.select(&none.group(case.condensed()));
+    let (verdict, told) = nothing_chosen(&selection, yardstick.model_on_trial);
+    let drives = case.prepared.len();
+    let least = selection.probability.map_or(1.0, |[_, least]| least);
+    let most = &selection.remaining.1;
+    let few = format!(
+        "{drives} drives are too few to claim an effect of the model itself: their signs show no probability below {least:.3}; it takes {DRIVES_MIN}"
+    );
+    let reason = if verdict == Verdict::None { format!("{few}; what stands out most is {most}") } else { format!("{told}; {few}") };
+    let onsets = vec![None; yardstick.catalogue.len()];
+    Judgement { selection, findings: Vec::new(), onsets, settled: Vec::new(), fit: None, verdict, reason }
 }
 
 /// That nothing differs is said where sensors do not wander or jump either.

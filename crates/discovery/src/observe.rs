@@ -158,11 +158,25 @@ pub fn observe_all(
     maps: &DriveMaps,
     done: &(dyn Fn(usize) + Sync),
 ) -> Result<Vec<ObservedDrive>, DiscoveryError> {
+    in_order(drives, maps, &|drive, map| observe(predictor, drive, map), done)
+}
+
+/// The same for deviations without effects alone: how the network follows the pose, which is most of the work, is not asked.
+pub(crate) fn observe_plain(predictor: &Predictor, drives: &[Trajectory], maps: &DriveMaps) -> Result<Vec<ObservedDrive>, DiscoveryError> {
+    in_order(drives, maps, &|drive, map| observed(predictor, drive, map, false), &|_| {})
+}
+
+fn in_order(
+    drives: &[Trajectory],
+    maps: &DriveMaps,
+    observe: &dyn Fn(&Trajectory, Option<&Arc<WorldMap>>) -> Result<ObservedDrive, DiscoveryError>,
+    done: &(dyn Fn(usize) + Sync),
+) -> Result<Vec<ObservedDrive>, DiscoveryError> {
     let mut order: Vec<usize> = (0..drives.len()).collect();
     order.sort_by_key(|&d| maps[d].as_ref().map(|m| m.hash().to_string()));
     let mut observed = Vec::with_capacity(drives.len());
     for (count, d) in order.into_iter().enumerate() {
-        observed.push((d, observe(predictor, &drives[d], maps[d].as_ref())?));
+        observed.push((d, observe(&drives[d], maps[d].as_ref())?));
         done(count + 1);
     }
     observed.sort_by_key(|(d, _)| *d);
@@ -174,6 +188,15 @@ pub fn observe_all(
 /// # Errors
 /// `DiscoveryError::NoSegments` when no segment fits on known ground.
 pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<WorldMap>>) -> Result<ObservedDrive, DiscoveryError> {
+    observed(predictor, drive, map, predictor.bundle().speaks())
+}
+
+fn observed(
+    predictor: &Predictor,
+    drive: &Trajectory,
+    map: Option<&Arc<WorldMap>>,
+    following: bool,
+) -> Result<ObservedDrive, DiscoveryError> {
     let steps = history_steps(drive);
     let asked = |predictor: &Predictor| -> Vec<Transition> {
         let of = |k: usize| predictor.transition(&steps[..k], &steps[k].state, &steps[k].control, map);
@@ -181,7 +204,7 @@ pub fn observe(predictor: &Predictor, drive: &Trajectory, map: Option<&Arc<World
     };
     let transitions = asked(predictor);
     let mut follows = Vec::new();
-    if predictor.bundle().speaks() {
+    if following {
         let elsewhere: [Vec<Transition>; 3] = core::array::from_fn(|i| {
             let mut without = [0.0; 3];
             without[i] = ASKED_APART;

@@ -4,6 +4,8 @@
 //! usual; the scatter is that of the same drives about their mean, the drive being the unit of replication. The null distribution comes from changing the
 //! sign of whole drives at random: if the model were right on average, a drive would deviate as often to one side as to the other. What segments say within a
 //! drive is believed whole: these drives have the effect that is sought, and its answer would count as disagreement between them.
+//!
+//! Signs of n drives show no probability below 2^-(n - 1). Of fewer than eight drives no effect is claimed; what stands out is told.
 
 use nalgebra::DVector;
 use nesam_model::{ModelBundle, Predictor};
@@ -23,6 +25,13 @@ use crate::reference::{DRIVES_MIN, NullGroups, all_evidence};
 
 /// Random choices of signs.
 const FLIPS: usize = 1000;
+/// Fewest drives that can be held against one another.
+const OWN_DRIVES_MIN: usize = 2;
+
+/// Whether some drives are too few to claim an effect by the scatter of their own.
+pub fn too_few(drives: usize) -> bool {
+    drives < DRIVES_MIN
+}
 
 /// The symbolic half of a bundle: what the network says of sinkage and of the next state is silenced, its soil prior stays.
 ///
@@ -36,10 +45,13 @@ pub fn symbolic(bundle: &ModelBundle) -> Result<Predictor, DiscoveryError> {
 /// Metric of drives whose deviations are measured against zero.
 ///
 /// # Errors
-/// `DiscoveryError::Drives` with fewer than 8 drives, or drives whose deviations have no scatter.
+/// `DiscoveryError::Drives` with fewer than two drives, or drives whose deviations have no scatter.
 pub fn metric(bench: &Bench<'_>, drives: &[ObservedDrive]) -> Result<Metric, DiscoveryError> {
-    if drives.len() < DRIVES_MIN {
-        let reason = format!("--reference physics needs at least {DRIVES_MIN} drives to fit on, there are {}", drives.len());
+    if drives.len() < OWN_DRIVES_MIN {
+        let reason = format!(
+            "where the model itself is tested (--reference physics) it takes {OWN_DRIVES_MIN} drives to fit on or more, there is {}: what differs from the model is held against what differs between drives",
+            drives.len()
+        );
         return Err(DiscoveryError::Drives { reason });
     }
     let rows: Vec<Vec<Row>> = drives.iter().map(|d| d.deviations(bench, &[], &SoilCorrection::NONE)).collect();
@@ -66,10 +78,16 @@ pub fn metric_of(rows: &[Vec<Row>], available: &[bool; CHANNELS]) -> Result<Metr
         .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })
 }
 
-/// Null distribution of the evidence of these drives under random signs.
+/// Null distribution of the evidence of these drives under random signs; of a few drives under all of them.
 pub fn sign_flips(drives: &[Condensed], catalogue: &[Candidate], channels: &[usize]) -> Option<NullGroups> {
     let mut rng = ChaCha8Rng::seed_from_u64(drives.len() as u64);
-    let signs: Vec<Vec<f64>> = (0..FLIPS).map(|_| drives.iter().map(|_| if rng.random::<bool>() { 1.0 } else { -1.0 }).collect()).collect();
+    let (count, all) = (drives.len(), too_few(drives.len()));
+    let sign = |positive: bool| if positive { 1.0 } else { -1.0 };
+    let signs: Vec<Vec<f64>> = if all {
+        (0..1usize << count).map(|flips| (0..count).map(|d| sign(flips & (1 << d) == 0)).collect()).collect()
+    } else {
+        (0..FLIPS).map(|_| drives.iter().map(|_| sign(rng.random::<bool>())).collect()).collect()
+    };
     let groups: Vec<Vec<f64>> = signs
         .par_iter()
         .map(|signs| {
@@ -79,5 +97,37 @@ pub fn sign_flips(drives: &[Condensed], catalogue: &[Candidate], channels: &[usi
             Some(all_evidence(&group, catalogue, channels, &[]))
         })
         .collect::<Option<_>>()?;
-    Some(NullGroups::of(groups))
+    Some(NullGroups::of(groups).of_signs(count, all))
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::DMatrix;
+
+    use super::*;
+
+    /// Goal: few drives are held against all their signs, and show no more than those can. Method: drives of one score each; of four that agree no signs but theirs and the
+    /// reverse show as much, of two of opposite signs all do.
+    #[test]
+    fn analytic_signs_of_a_few_drives_are_all_looked_at() {
+        let drive = |score: f64| Condensed {
+            score: DVector::from_element(1, score),
+            information: DMatrix::identity(1, 1),
+            square: 0.0,
+            soil_score: DVector::zeros(0),
+            soil_information: DMatrix::zeros(0, 0),
+        };
+        let shown = |scores: &[f64]| {
+            let drives: Vec<Condensed> = scores.iter().copied().map(drive).collect();
+            let groups = sign_flips(&drives, &[], &[0]).unwrap();
+            let nulls = Nulls::about_zero(&drives.iter().collect::<Vec<_>>()).unwrap();
+            let own = all_evidence(&nulls.group(drives.iter()), &[], &[0], &[])[0] / groups.spread[0];
+            (groups.largest.len(), groups.probability(own), groups.attainable())
+        };
+        assert_eq!(shown(&[1.0, 1.1, 0.9, 1.05]), (16, 0.125, 0.125));
+        assert_eq!(shown(&[1.0, -1.0]), (4, 1.0, 0.5));
+        let (groups, p, least) = shown(&[1.0, 1.1, 0.9, 1.05, 1.0, 0.95, 1.0, 1.1]);
+        assert!(groups == FLIPS && least == 1.0 / 128.0 && p < 0.02, "{groups} {p} {least}");
+        assert!(Nulls::about_zero(&[&drive(1.0)]).is_none());
+    }
 }

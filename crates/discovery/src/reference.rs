@@ -6,7 +6,6 @@
 use nalgebra::{DMatrix, DVector};
 use nesam_evaluation::quantile_sorted;
 use nesam_model::{effects_from_toml, effects_to_toml};
-use nesam_physics::SoilCorrection;
 use nesam_physics::effects::{Effect, ScheduledEffect, Written};
 use rand::SeedableRng;
 use rand::seq::index::sample;
@@ -16,12 +15,13 @@ use serde::{Deserialize, Serialize};
 
 use crate::bend;
 use crate::candidates::{Candidate, catalogue};
-use crate::channels::{self, CHANNELS, Row};
-use crate::condense::{Condensed, Signatures, believed_within, bend_column, column_names, condense, level_column, signatures};
+use crate::channels::{self, CHANNELS};
+use crate::condense::{Condensed, believed_within, bend_column, column_names, condense, level_column};
 use crate::error::DiscoveryError;
 use crate::evidence::{Group, Nulls};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive, available_in_all};
+use crate::reference_drives::Segmented;
 use crate::whiteness::{Succession, Whiteness, asked};
 
 const SCHEMA: &str = "nesam.reference/7";
@@ -47,6 +47,17 @@ pub struct NullDrive {
     pub information: Vec<f32>,
     /// How each compared channel that is asked for whiteness goes on from segment to segment.
     pub successions: Vec<Succession>,
+}
+
+impl NullDrive {
+    fn of(trajectory: &str, condensed: &Condensed, successions: Vec<Succession>) -> Self {
+        Self {
+            trajectory: trajectory.into(),
+            score: condensed.score.iter().map(|v| *v as f32).collect(),
+            information: lower(&condensed.information).into_iter().map(|v| v as f32).collect(),
+            successions,
+        }
+    }
 }
 
 /// The reference of a bundle.
@@ -85,6 +96,10 @@ pub struct NullGroups {
     pub largest: Vec<f64>,
     /// Family-wise threshold on the spread-corrected evidence.
     pub threshold: f64,
+    /// Smallest probability that as few drives show, however many groups were drawn.
+    least: f64,
+    /// Groups beside those drawn that count: what is judged, unless it is among them.
+    beside: usize,
 }
 
 impl Reference {
@@ -98,51 +113,63 @@ impl Reference {
         data_hash: &str,
         done: &(dyn Fn(usize) + Sync),
     ) -> Result<Self, DiscoveryError> {
+        Self::of(bench, drives, &Segmented::of(bench, drives, done), data_hash)
+    }
+
+    /// The same of drives whose segments are known.
+    ///
+    /// # Errors
+    /// As [`Reference::measure`].
+    pub fn of(bench: &Bench<'_>, drives: &[ObservedDrive], segmented: &Segmented, data_hash: &str) -> Result<Self, DiscoveryError> {
         if drives.len() < DRIVES_MIN {
             return Err(DiscoveryError::Drives {
                 reason: format!("a reference needs at least {DRIVES_MIN} drives, there are {}", drives.len()),
             });
         }
-        let rows: Vec<Vec<Row>> = drives.iter().map(|d| d.deviations(bench, &[], &SoilCorrection::NONE)).collect();
-        let available = available_in_all(drives);
-        let metric = Metric::measure(&rows, &available)
-            .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })?;
-        let signatures: Vec<Signatures> = drives
-            .iter()
-            .enumerate()
-            .map(|(count, drive)| {
-                let signatures = signatures(bench, drive);
-                done(count + 1);
-                signatures
-            })
-            .collect();
-        let within_believed = believed_within(&metric, rows.iter().map(Vec::as_slice).zip(&signatures));
-        let metric = metric.believing(within_believed);
-        let nulls = drives
-            .iter()
-            .zip(rows.iter().zip(&signatures))
-            .map(|(drive, (rows, signatures))| {
-                let condensed = condense(&metric, rows, signatures);
-                NullDrive {
-                    trajectory: drive.id.clone(),
-                    score: condensed.score.iter().map(|v| *v as f32).collect(),
-                    information: lower(&condensed.information).into_iter().map(|v| v as f32).collect(),
-                    successions: asked_of(&metric.channels).map(|c| Succession::of(drive, &[], rows, c)).collect(),
-                }
-            })
-            .collect();
-        Ok(Self {
+        let (metric, condensed) = scored(segmented, &available_in_all(drives))?;
+        let nulls = drives.iter().zip(&segmented.rows).zip(condensed).map(|((drive, rows), condensed)| {
+            let successions = asked_of(&metric.channels).map(|c| Succession::of(drive, &[], rows, c)).collect();
+            NullDrive::of(&drive.id, &condensed, successions)
+        });
+        let empty = Self {
             schema: SCHEMA.into(),
             data_hash: data_hash.into(),
-            channels: metric.channels.iter().map(|c| channels::name(*c)).collect(),
+            channels: Vec::new(),
             hypotheses: text_of(bench.catalogue),
             columns: column_names(bench.catalogue),
+            centre: Vec::new(),
+            within: Vec::new(),
+            within_believed: 1.0,
+            between: Vec::new(),
+            drives: Vec::new(),
+        };
+        Ok(empty.with(nulls.collect(), &metric))
+    }
+
+    /// The same measured again in the channels that are available, on what its drives are in `segmented`.
+    ///
+    /// # Errors
+    /// `DiscoveryError::Drives` where no channel is left or the deviations have no scatter.
+    pub fn over(&self, segmented: &Segmented, available: &[bool; CHANNELS]) -> Result<Self, DiscoveryError> {
+        let compared = self.compared()?;
+        let (metric, condensed) = scored(segmented, &core::array::from_fn(|c| available[c] && compared.contains(&c)))?;
+        let nulls = self.drives.iter().zip(condensed).map(|(null, condensed)| {
+            let known = asked_of(&compared).zip(&null.successions).filter(|(c, _)| available[*c]);
+            NullDrive::of(&null.trajectory, &condensed, known.map(|(_, own)| *own).collect())
+        });
+        Ok(self.clone().with(nulls.collect(), &metric))
+    }
+
+    fn with(self, drives: Vec<NullDrive>, metric: &Metric) -> Self {
+        Self {
+            channels: metric.channels.iter().map(|c| channels::name(*c)).collect(),
             centre: metric.centre.iter().copied().collect(),
             within: lower(&metric.within),
-            within_believed,
+            within_believed: metric.within_believed,
             between: lower(&metric.between),
-            drives: nulls,
-        })
+            drives,
+            ..self
+        }
     }
 
     /// Reads the text of `reference.json`.
@@ -165,7 +192,7 @@ impl Reference {
             && read.within.len() == half(channels)
             && read.between.len() == half(channels)
             && read.drives.iter().all(|d| d.score.len() == columns && d.information.len() == half(columns))
-            && read.compared().is_some_and(|compared| read.drives.iter().all(|d| d.successions.len() == asked_of(&compared).count()));
+            && read.compared().is_ok_and(|compared| read.drives.iter().all(|d| d.successions.len() == asked_of(&compared).count()));
         if !sized || read.drives.len() < DRIVES_MIN {
             return Err(fail("has arrays of another size; run `nesam diagnose --make-reference`".into()));
         }
@@ -195,12 +222,9 @@ impl Reference {
     /// `DiscoveryError::Reference` when a channel is unknown or a covariance is not definite; `Drives` when a drive lacks a compared channel.
     pub fn metric(&self, available: &[bool; CHANNELS]) -> Result<Metric, DiscoveryError> {
         let fail = |reason: &str| DiscoveryError::Reference { reason: reason.into() };
-        let channels = self.compared().ok_or_else(|| fail("names a channel that this program does not know"))?;
+        let channels = self.compared()?;
         if let Some(missing) = channels.iter().find(|c| !available[**c]) {
-            let reason = format!(
-                "the reference compares {}, which a drive of this set does not measure (heights, roll and pitch are measured against its map, which `nesam import --world` names); `--reference physics` compares what the drives measure, from eight of them on",
-                channels::name(*missing)
-            );
+            let reason = format!("the reference compares {}, which a drive does not measure", channels::name(*missing));
             return Err(DiscoveryError::Drives { reason });
         }
         let size = channels.len();
@@ -215,9 +239,14 @@ impl Reference {
         Whiteness::of(asked_of(&self.compared().unwrap_or_default()), &drives)
     }
 
-    /// Channels that are compared; `None` where one is not known.
-    fn compared(&self) -> Option<Vec<usize>> {
-        self.channels.iter().map(|name| (0..CHANNELS).find(|c| channels::name(*c) == *name)).collect()
+    /// Channels that are compared.
+    ///
+    /// # Errors
+    /// `DiscoveryError::Reference` where one is not known.
+    pub(crate) fn compared(&self) -> Result<Vec<usize>, DiscoveryError> {
+        let known = |name: &String| (0..CHANNELS).find(|c| channels::name(*c) == *name);
+        let unknown = || DiscoveryError::Reference { reason: "names a channel that this program does not know".into() };
+        self.channels.iter().map(known).collect::<Option<_>>().ok_or_else(unknown)
     }
 
     /// Scores of the null drives.
@@ -234,6 +263,19 @@ impl Reference {
             })
             .collect()
     }
+}
+
+/// The metric of drives without an effect in some channels, and what each of them says in it.
+fn scored(segmented: &Segmented, available: &[bool; CHANNELS]) -> Result<(Metric, Vec<Condensed>), DiscoveryError> {
+    if available.iter().all(|has| !has) {
+        return Err(DiscoveryError::Drives { reason: "these drives measure nothing that the reference compares".into() });
+    }
+    let metric = Metric::measure(&segmented.rows, available)
+        .ok_or_else(|| DiscoveryError::Drives { reason: "the deviations of these drives have no scatter".into() })?;
+    let within_believed = believed_within(&metric, segmented.drives());
+    let metric = metric.believing(within_believed);
+    let condensed = segmented.drives().map(|(rows, signatures)| condense(&metric, rows, signatures)).collect();
+    Ok((metric, condensed))
 }
 
 /// Evidence of every hypothesis, then of the level of every compared channel and of the bend of each of `bending`, with nothing fitted.
@@ -281,18 +323,23 @@ impl NullGroups {
         let mut largest: Vec<f64> = groups.iter().map(|z| z.iter().zip(&spread).map(|(z, s)| z / s).fold(0.0, f64::max)).collect();
         largest.sort_by(f64::total_cmp);
         let threshold = quantile_sorted(&largest, 1.0 - FALSE_ALARM).max(THRESHOLD_FLOOR);
-        Self { threshold, spread, largest }
+        Self { threshold, spread, largest, least: 0.0, beside: 1 }
     }
 
-    /// Share of null groups whose largest evidence reaches this one, never below 1 / (groups + 1).
+    /// Share of null groups whose largest evidence reaches this one, never below what can be shown.
     pub fn probability(&self, largest: f64) -> f64 {
         let above = self.largest.len() - self.largest.partition_point(|v| *v < largest);
-        (above + 1) as f64 / (self.largest.len() + 1) as f64
+        self.attainable().max((above + self.beside) as f64 / (self.largest.len() + self.beside) as f64)
+    }
+
+    /// The same where the groups are signs of drives, which of `drives` show no less than 2^-(drives - 1); where `all` signs are among them, so is what was measured.
+    pub(crate) fn of_signs(self, drives: usize, all: bool) -> Self {
+        Self { least: 0.5f64.powi(drives.saturating_sub(1) as i32), beside: usize::from(!all), ..self }
     }
 
     /// Smallest probability that the groups can show.
     pub fn attainable(&self) -> f64 {
-        1.0 / (self.largest.len() + 1) as f64
+        self.least.max(1.0 / (self.largest.len() + self.beside) as f64)
     }
 }
 

@@ -7,7 +7,7 @@ use serde_json::{Value, json};
 
 use crate::candidates::Candidate;
 use crate::channels;
-use crate::claims::{Finding, Trace};
+use crate::claims::{Estimate, Finding, Trace};
 use crate::controls::Kind;
 use crate::diagnose::{Against, Diagnosis};
 use crate::manoeuvre;
@@ -75,6 +75,10 @@ impl Report<'_> {
         map.insert("soils".into(), json!(d.soils.map(|s| json!({"assumed": s.assumed, "alone": s.alone, "beside_effects": s.beside}))));
         map.insert("levels".into(), self.levels());
         map.insert("bends".into(), self.bends());
+        if !d.left_out.is_empty() {
+            map.insert("left_out_channels".into(), json!(d.left_out.iter().map(|c| channels::name(*c)).collect::<Vec<_>>()));
+            map.insert("unseen_effects".into(), json!(d.unseen));
+        }
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
     }
 
@@ -174,6 +178,21 @@ impl Report<'_> {
             .collect()
     }
 
+    /// What was not compared, and which effects therefore cannot be seen, as a sentence; `None` where drives measure all that the reference compares.
+    pub fn left_out(&self) -> Option<String> {
+        let d = self.diagnosis;
+        if d.left_out.is_empty() {
+            return None;
+        }
+        let named: Vec<String> = d.left_out.iter().map(|c| channels::name(*c)).collect();
+        let unseen = if d.unseen.is_empty() {
+            "every effect can be seen without them".into()
+        } else {
+            format!("without them these effects cannot be seen: {}", d.unseen.join(", "))
+        };
+        Some(format!("Not compared, because a drive does not measure it, or has no map: {}; {unseen}.", named.join(", ")))
+    }
+
     /// The page.
     pub fn to_html(&self) -> String {
         let d = self.diagnosis;
@@ -193,10 +212,13 @@ impl Report<'_> {
                 page.text(doubt);
             }
         }
-        page.section("What was seen")
-            .text("Mean deviation of every channel from the frozen reference, by residual layer; z is against groups of drives without an effect.")
-            .table(&self.level_table())
-            .table(&self.bend_table());
+        let seen = page
+            .section("What was seen")
+            .text("Mean deviation of every channel from the frozen reference, by residual layer; z is against groups of drives without an effect.");
+        if let Some(left_out) = self.left_out() {
+            seen.text(&left_out);
+        }
+        seen.table(&self.level_table()).table(&self.bend_table());
         let traces: Vec<LinePlot> = d.traces.iter().map(trace_plot).collect();
         page.section("The most unusual channel of each layer").plots(
             &traces,
@@ -392,6 +414,7 @@ fn control_json(kind: Kind, parameters: usize, score: &ModelScore) -> Value {
         map.insert("parameters".into(), json!(parameters));
         if let Kind::Placebo(candidate) | Kind::Rival(candidate) = kind {
             map.insert("id".into(), json!(candidate.id()));
+            return of_wheel(tree, candidate);
         }
     }
     tree
@@ -418,10 +441,27 @@ pub fn describe(finding: &Finding) -> String {
     parameters.join(", ") + &onset
 }
 
+/// A parameter; one of a wheel is a whole number that was chosen, not measured.
+fn estimate_json(e: &Estimate) -> Value {
+    let chosen = e.value as i64;
+    match e.ci95 {
+        None if e.unit == "index" => json!({"name": e.name, "unit": e.unit, "value": chosen, "ci95": [chosen, chosen]}),
+        ci95 => json!({"name": e.name, "unit": e.unit, "value": e.value, "ci95": ci95}),
+    }
+}
+
+/// With the wheel of a hypothesis that has one.
+fn of_wheel(mut tree: Value, candidate: Candidate) -> Value {
+    if let (Some(map), Some(wheel)) = (tree.as_object_mut(), candidate.wheel()) {
+        map.insert("wheel".into(), json!(wheel));
+    }
+    tree
+}
+
 fn effect_json(finding: &Finding) -> Value {
-    let parameters: Vec<Value> =
-        finding.estimates.iter().map(|e| json!({"name": e.name, "unit": e.unit, "value": e.value, "ci95": e.ci95})).collect();
-    let rivals: Vec<Value> = finding.rivals.iter().map(|r| json!({"id": r.candidate.id(), "weight": r.weight})).collect();
+    let parameters: Vec<Value> = finding.estimates.iter().map(estimate_json).collect();
+    let rivals: Vec<Value> =
+        finding.rivals.iter().map(|r| of_wheel(json!({"id": r.candidate.id(), "weight": r.weight}), r.candidate)).collect();
     json!({
         "id": finding.candidate.id(),
         "weight": finding.weight,
@@ -443,6 +483,7 @@ fn layer_name(layer: Layer) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::claims::Member;
     use crate::judgement::Verdict;
     use crate::select::Selection;
 
@@ -454,6 +495,8 @@ mod tests {
             reason: "nothing stands out".into(),
             catalogue: Vec::new(),
             channels: Vec::new(),
+            left_out: Vec::new(),
+            unseen: Vec::new(),
             levels: Vec::new(),
             traces: Vec::new(),
             controls: Vec::new(),
@@ -491,5 +534,25 @@ mod tests {
         for gain in ["improvement", "improvement_ci95"] {
             assert!(json[gain]["position_m"].is_object() && json[gain]["position_m"]["mean"].is_null(), "{}", json[gain]);
         }
+    }
+
+    /// Goal: the wheel that drags is a whole number with an interval, and hypotheses of one wheel say which wherever they are named. Method: a drag of the rear left wheel as an
+    /// effect, as a rival and as a control.
+    #[test]
+    fn property_a_wheel_is_a_whole_number_wherever_it_is_named() {
+        let catalogue = crate::candidates::catalogue(&[]);
+        let drag = *catalogue.iter().find(|c| c.label() == "wheel_drag RL").unwrap();
+        let estimates = [("wheel", "index", 2.0, None), ("torque_nm", "N m", 900.0, Some([800.0, 1000.0]))];
+        let estimates = estimates.map(|(name, unit, value, ci95)| Estimate { name, unit, value, ci95 }).to_vec();
+        let mut finding = Finding::of(&catalogue, "wheel_drag", 9.0, estimates);
+        let tow = Finding::of(&catalogue, "tow", 9.0, Vec::new()).candidate;
+        finding.rivals = [tow, drag].map(|candidate| Member { candidate, weight: 0.25 }).to_vec();
+        let json = effect_json(&finding);
+        assert_eq!(json["parameters"][0], json!({"name": "wheel", "unit": "index", "value": 2, "ci95": [2, 2]}));
+        assert_eq!(json["parameters"][1]["ci95"], json!([800.0, 1000.0]));
+        assert_eq!((json["rivals"][0].get("wheel"), &json["rivals"][1]["wheel"]), (None, &json!(2)));
+        let score = crate::proof::tests::score([0.1; POSE_DIM]);
+        let control = control_json(Kind::Placebo(drag), 1, &score);
+        assert_eq!((&control["id"], &control["wheel"]), (&json!("wheel_drag"), &json!(2)));
     }
 }

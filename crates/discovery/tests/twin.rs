@@ -5,8 +5,8 @@
 mod common;
 
 use common::{
-    bundle, diagnose_drives, diagnose_from, diagnose_rover, diagnose_rover_beside, diagnose_rover_on, diagnose_twin, drive, drive_from,
-    options, plough, rover, rover_logs, world,
+    bundle, bundle_with_drives, diagnose_drives, diagnose_from, diagnose_rover, diagnose_rover_beside, diagnose_rover_on, diagnose_twin,
+    drive, drive_from, options, plough, rover, rover_logs, world,
 };
 use nesam_discovery::controls::Kind;
 use nesam_discovery::report::Report;
@@ -303,6 +303,99 @@ fn property_without_a_claim_the_free_form_stands_against_the_model_as_it_is() {
     };
     let json: serde_json::Value = serde_json::from_str(&report.to_json()).unwrap();
     assert_eq!(json["controls"]["free_form"]["before"], json["before"]);
+    assert_eq!((&json["after"], &json["effects"]), (&json["before"], &serde_json::json!([])), "what is not claimed is not in after");
+}
+
+/// Eight drives of the twin that lack something.
+fn lacking(effects: &[Effect], lack: impl Fn(&mut Trajectory)) -> Vec<Trajectory> {
+    let bundle = bundle();
+    let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 500 + i, effects, &bundle.default_soil)).collect();
+    for drive in &mut drives {
+        lack(drive);
+        // What stands for a velocity that is not measured is of no use.
+        for state in &mut drive.states {
+            if !drive.measured.linear_velocity {
+                state.velocity_m_s = [0.0; 3];
+            }
+            if !drive.measured.angular_velocity[2] {
+                state.angular_velocity_rad_s = [0.0; 3];
+            }
+        }
+    }
+    drives
+}
+
+/// Goal: drives that lack a channel or a map are judged in the others, against drives without an effect that lack the same. Method: eight drives without and with a steering
+/// offset, each time without something: its size is found, nothing is claimed of the others, and the report says what was left out and what cannot be seen.
+#[test]
+fn property_drives_that_lack_a_channel_are_judged_in_the_others() {
+    type Lacks = fn(&mut Trajectory);
+    let cases: [(&str, Lacks, bool, &str, &str); 5] = [
+        ("steering", |d| (d.measured.road_wheel_angle, d.road_wheel_angle_rad) = (false, None), true, "early_road_wheel_angle_rad", ""),
+        ("velocity", |d| d.measured.linear_velocity = false, true, "late_vx_m_s", "velocity_scale"),
+        ("gyro", |d| d.measured.angular_velocity = [false; 3], true, "late_wz_rad_s", "gyro_bias"),
+        ("map", |_| {}, false, "late_pitch_rad", "map_offset"),
+        ("tilt", |d| (d.measured.height, d.measured.attitude) = (false, [false, false, true]), false, "early_z_m", "map_offset"),
+    ];
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle_with_drives())).unwrap();
+    for (what, lacks, mapped, left_out, unseen) in cases {
+        let found = |effects: &[Effect]| {
+            let drives = lacking(effects, lacks);
+            let maps = vec![mapped.then(world); drives.len()];
+            nesam_discovery::diagnose(&predictor, &drives, &maps, &options(), &|_, _, _| {}).unwrap()
+        };
+        let without = found(&[]);
+        assert_eq!(without.verdict, Verdict::None, "{what}: {}", without.reason);
+        let with = found(&[Effect::SteeringOffset(SteeringOffset { second: 0.08 })]);
+        assert!(explained_by(&with, "steering_offset"), "{what}: {}", with.reason);
+        let (size, [low, high]) = value(&with, "second");
+        assert!((size - 0.08).abs() < 0.012 && low < 0.08 && 0.08 < high, "{what}: {size} [{low}, {high}]");
+        let names: Vec<String> = with.left_out.iter().map(|c| nesam_discovery::channels::name(*c)).collect();
+        assert!(names.contains(&left_out.into()), "{what}: {names:?}");
+        assert!(with.channels.iter().all(|c| !with.left_out.contains(c)));
+        assert!(unseen.is_empty() || with.unseen.contains(&unseen), "{what}: {:?}", with.unseen);
+    }
+}
+
+/// Goal: a bundle whose reference cannot do without a channel says so. Method: drives without steering angles before a bundle with a reference alone, and with drives that are
+/// cut off.
+#[test]
+fn property_a_reference_that_cannot_do_without_a_channel_says_so() {
+    let drives = lacking(&[], |d| (d.measured.road_wheel_angle, d.road_wheel_angle_rad) = (false, None));
+    let whole = bundle_with_drives().reference_drives.unwrap();
+    for (behind, reason) in
+        [(None, "run `nesam diagnose --make-reference`"), (Some(whole[..whole.len() / 2].into()), "no readable safetensors")]
+    {
+        let bundle = ModelBundle { reference_drives: behind, ..bundle() };
+        let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
+        let maps = vec![Some(world()); drives.len()];
+        let refused = nesam_discovery::diagnose(&predictor, &drives, &maps, &options(), &|_, _, _| {}).unwrap_err().to_string();
+        assert!(refused.contains(reason), "{refused}");
+    }
+}
+
+/// Goal: drives that are too few to prove an effect of the model itself have a report that claims nothing and says why. Method: one to seven drives with a large steering
+/// offset; n signs show no less than 2^-(n - 1).
+#[test]
+fn property_of_few_drives_nothing_is_claimed_of_the_model_itself() {
+    let bundle = bundle();
+    let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.08 })];
+    let drives: Vec<_> = (0..7).map(|i| drive(&format!("d{i}"), 500 + i, &effects, &bundle.default_soil)).collect();
+    let predictor = nesam_model::Predictor::new(std::sync::Arc::new(bundle)).unwrap();
+    let options = nesam_discovery::Options { against: Against::Physics, ..options() };
+    let of = |count: usize| nesam_discovery::diagnose(&predictor, &drives[..count], &vec![Some(world()); count], &options, &|_, _, _| {});
+    assert!(of(1).unwrap_err().to_string().contains("it takes 2 drives to fit on or more, there is 1"));
+    for count in [2, 4, 5, 7] {
+        let found = of(count).unwrap();
+        assert!(!found.verdict.claims() && found.claimed.is_empty(), "{}", found.reason);
+        assert!(found.reason.contains("it takes 8") && found.reason.contains(&format!("{count} drives")), "{}", found.reason);
+        let [p, attainable] = found.selection.probability.unwrap();
+        assert_eq!(attainable, 0.5f64.powi(count as i32 - 1));
+        assert!(p >= attainable && p <= 1.0, "{p}");
+        assert!(found.selection.z.iter().flatten().any(|z| *z > 1.0), "there is evidence to read");
+        let scores = &found.scores.as_ref().unwrap().scores;
+        assert_eq!(scores[0].errors.steps, scores[2].errors.steps);
+    }
 }
 
 /// A drive without an effect, prepared, with its bundle.

@@ -195,6 +195,7 @@ pub fn run(
         weights: trained.weights,
         baselines_json,
         reference_json: None,
+        reference_drives: None,
         soil_filter_json: None,
         rollout_noise_json: None,
         effects: Vec::new(),

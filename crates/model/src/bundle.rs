@@ -25,6 +25,7 @@ const NORMALIZATION: &str = "normalization.toml";
 const EFFECTS: &str = "effects.toml";
 const BASELINES: &str = "baselines.json";
 const REFERENCE: &str = "reference.json";
+const REFERENCE_DRIVES: &str = "reference_drives.safetensors";
 const SOIL_FILTER: &str = "soil_filter.json";
 const ROLLOUT_NOISE: &str = "rollout_noise.json";
 const REQUIRED: [&str; 4] = [WEIGHTS, VEHICLE, NORMALIZATION, EFFECTS];
@@ -89,6 +90,8 @@ pub struct ModelBundle {
     pub baselines_json: Option<String>,
     /// What a diagnosis must know of the model's usual errors as JSON, if the bundle carries it.
     pub reference_json: Option<Arc<str>>,
+    /// The drives behind that reference, segment by segment, if the bundle carries them: what measures it again for drives that lack a channel or a map.
+    pub reference_drives: Option<Arc<[u8]>>,
     /// Settings of the soil filter that were estimated for this model as JSON, if the bundle carries them.
     pub soil_filter_json: Option<String>,
     /// Covariance of the model's own errors along a rollout as JSON, if the bundle carries it ([`crate::RolloutNoise`]).
@@ -177,6 +180,7 @@ impl ModelBundle {
         let effects = effects_file::read(&text_of(EFFECTS)?).map_err(|reason| folder.fail(EFFECTS, reason))?;
         let baselines_json = take(BASELINES).map(|bytes| folder.text(BASELINES, bytes)).transpose()?;
         let reference_json = take(REFERENCE).map(|bytes| folder.text(REFERENCE, bytes)).transpose()?.map(Arc::from);
+        let reference_drives = take(REFERENCE_DRIVES).map(Arc::from);
         let soil_filter_json = take(SOIL_FILTER).map(|bytes| folder.text(SOIL_FILTER, bytes)).transpose()?;
         let rollout_noise_json = take(ROLLOUT_NOISE).map(|bytes| folder.text(ROLLOUT_NOISE, bytes)).transpose()?;
         Ok(Self {
@@ -191,6 +195,7 @@ impl ModelBundle {
             weights,
             baselines_json,
             reference_json,
+            reference_drives,
             soil_filter_json,
             rollout_noise_json,
             provenance: manifest.provenance,
@@ -246,6 +251,7 @@ impl ModelBundle {
         if !self.is_of(vehicle) {
             self.baselines_json = None;
             self.reference_json = None;
+            self.reference_drives = None;
             self.soil_filter_json = None;
             self.rollout_noise_json = None;
         }
@@ -271,6 +277,9 @@ impl ModelBundle {
         }
         if let Some(json) = &self.reference_json {
             files.push((REFERENCE, json.as_bytes().to_vec()));
+        }
+        if let Some(drives) = &self.reference_drives {
+            files.push((REFERENCE_DRIVES, drives.to_vec()));
         }
         if let Some(json) = &self.soil_filter_json {
             files.push((SOIL_FILTER, json.clone().into_bytes()));
@@ -309,19 +318,19 @@ mod tests {
         };
         let measured = |bundle: &ModelBundle| {
             let texts = [&bundle.baselines_json, &bundle.soil_filter_json, &bundle.rollout_noise_json].map(|text| text.is_some());
-            (texts, bundle.reference_json.is_some())
+            (texts, [bundle.reference_json.is_some(), bundle.reference_drives.is_some()])
         };
         let (mut car, robot) = (shipped("hmmwv-nominal"), shipped("clearpath-husky"));
         let own = car.vehicle.clone();
         car.move_to(&own);
-        assert_eq!(measured(&car), ([true; 3], true), "its own vehicle changes nothing");
+        assert_eq!(measured(&car), ([true; 3], [true; 2]), "its own vehicle changes nothing");
         let mut otherwise = own.clone();
         otherwise.second = robot.vehicle.second;
         for another in [&robot.vehicle, &otherwise] {
             let mut moved = car.clone();
             moved.move_to(another);
             assert!(!car.is_of(another) && moved.is_of(another));
-            assert_eq!(measured(&moved), ([false; 3], false));
+            assert_eq!(measured(&moved), ([false; 3], [false; 2]));
         }
     }
 }

@@ -238,7 +238,7 @@ pub enum DiagnosisReference {
     Unspecified = 0,
     /// The change against the drives without an effect that the bundle knows.
     Bundle = 1,
-    /// The symbolic model itself, the network silent; needs at least 8 pieces of recording.
+    /// The symbolic model itself, the network silent; of fewer than 8 pieces of recording no effect is claimed.
     Physics = 2,
 }
 impl DiagnosisReference {

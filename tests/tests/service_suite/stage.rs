@@ -67,6 +67,7 @@ fn bundle() -> Arc<ModelBundle> {
                 normalization,
                 baselines_json: None,
                 reference_json: None,
+                reference_drives: None,
                 soil_filter_json: None,
                 rollout_noise_json: None,
                 effects: Vec::new(),

@@ -281,6 +281,7 @@ fn save_bundle(base: &ModelBundle, vehicle: &Vehicle, data_hash: &str, to: &Path
         vehicle: vehicle.clone(),
         baselines_json: base.baselines_json.clone().filter(|_| same_vehicle),
         reference_json: None,
+        reference_drives: None,
         soil_filter_json: None,
         rollout_noise_json: None,
         provenance: derived_from(base, data_hash),

@@ -10,7 +10,10 @@ use std::sync::{Arc, Mutex};
 use clap::Args;
 use nesam_discovery::channels::{self, CHANNELS};
 use nesam_discovery::report::{Report, describe};
-use nesam_discovery::{Against, Bench, Diagnosis, Judge, Options, Reference, SEGMENT_STEPS, Scoring, catalogue, diagnose, observe_all};
+use nesam_discovery::{
+    Against, Bench, Diagnosis, Judge, Options, Reference, ReferenceDrives, SEGMENT_STEPS, Scoring, Segmented, catalogue, diagnose,
+    observe_all,
+};
 use nesam_evaluation::report::Short;
 use nesam_evaluation::{DEFAULT_RESAMPLES, POSE_DIM, Provenance as ReportProvenance};
 use nesam_import::doubts;
@@ -86,7 +89,7 @@ pub struct DiagnoseArgs {
 pub enum ReferenceArg {
     /// The change against the frozen bundle.
     Bundle,
-    /// The symbolic model itself, the network silent but for its soil prior; at least 8 drives to fit on.
+    /// The symbolic model itself, the network silent but for its soil prior; of fewer than 8 drives no effect is claimed.
     Physics,
 }
 
@@ -158,13 +161,21 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
     take_coupling(&mut bundle, drives.root.vehicle());
     let predictor = predictor_for(bundle.clone(), &drives.root, args.data.dt)?;
     let progress = Progress::start("validation drives, as the model sees them", drives.drives.len());
-    let observed = observe_all(&predictor, &drives.drives, &drives.maps, &|done| progress.set(done)).or_input()?;
+    let seen: Vec<Trajectory> = drives.drives.iter().map(Trajectory::in_hindsight).collect();
+    let observed = observe_all(&predictor, &seen, &drives.maps, &|done| progress.set(done)).or_input()?;
     progress.finish();
     let catalogue = catalogue(&hypotheses);
     let bench = Bench::new(predictor.bundle(), &catalogue);
     let progress = Progress::start("validation drives against every effect", observed.len());
-    let reference = Reference::measure(&bench, &observed, &drives.root.hash(), &|done| progress.set(done)).or_input()?;
+    let segmented = Segmented::of(&bench, &observed, &|done| progress.set(done));
     progress.finish();
+    let reference = Reference::of(&bench, &observed, &segmented, &drives.root.hash()).or_input()?;
+    let looks = Console::default();
+    let behind = ReferenceDrives::measure(&predictor, &bench, (&drives.drives, &drives.maps), (&reference, &segmented), &|done, total| {
+        looks.show("validation drives as if they lacked channels or maps", done, total);
+    });
+    looks.end();
+    let behind = behind.or_input()?.to_bytes();
     let text = reference.to_json();
     let judge = Judge::new(reference).or_input()?;
     let channels: Vec<usize> = (0..CHANNELS).filter(|c| observed.iter().all(|d| d.available[*c])).collect();
@@ -182,6 +193,7 @@ fn make_reference(args: &DiagnoseArgs) -> Result<(), Failure> {
         }
     }
     bundle.reference_json = Some(text.into());
+    bundle.reference_drives = Some(behind.into());
     bundle.save(&dir).or_failed()?;
     say!("bundle {} now carries the reference of {} drives; its hash is {}", bundle.name, observed.len(), &bundle.hash[..12]);
     Ok(())
@@ -320,6 +332,7 @@ fn bundles(report: &Report<'_>) {
 
 fn summary(report: &Report<'_>, found: &Diagnosis) {
     say!("{}: {} - {}", report.set, found.verdict.as_str().to_uppercase(), found.reason);
+    report.left_out().iter().for_each(|left_out| say!("{left_out}"));
     report.doubts.iter().for_each(|doubt| say!("doubt: {doubt} (`nesam check` tells more; a claim may be wrong by it)"));
     let s = &found.selection;
     let p = s.probability.map_or(String::new(), |[p, least]| format!("; family-wise p = {p:.4} (smallest that can be shown {least:.4})"));
@@ -392,7 +405,7 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
         let helped = n.null.iter().filter(|g| **g > 0.0).count();
         say!("the same effects on {} drives without one: they would help {helped}", n.null.len());
     }
-    if found.learned.iter().all(|l| l.effects.is_empty()) {
+    if found.claimed.is_empty() {
         return;
     }
     for (name, gain, interval) in report.gains() {

@@ -3,7 +3,9 @@
 
 use std::sync::{Arc, OnceLock};
 
-use nesam_discovery::{Against, Bench, Diagnosis, Options, Reference, Scoring, catalogue, diagnose, observe_all};
+use nesam_discovery::{
+    Against, Bench, Diagnosis, Options, Reference, ReferenceDrives, Scoring, Segmented, catalogue, diagnose, observe_all,
+};
 use nesam_learning::{Drive, initial::initial_weights, scales};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Provenance, Variant, effects_from_toml};
 use nesam_physics::driveline::{DrivelineState, command_wheels};
@@ -163,18 +165,44 @@ pub fn bundle() -> ModelBundle {
                 normalization: scales,
                 baselines_json: None,
                 reference_json: None,
+                reference_drives: None,
                 soil_filter_json: None,
                 rollout_noise_json: None,
                 provenance: Provenance::default(),
             };
-            let drives: Vec<Trajectory> = (0..24).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();
-            let maps = vec![Some(world()); drives.len()];
+            let (drives, maps) = null_drives(&bundle);
             let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
             let observed = observe_all(&predictor, &drives, &maps, &|_| {}).unwrap();
             let catalogue = catalogue(&[plough()]);
             let bench = Bench::new(&bundle, &catalogue);
             let reference = Reference::measure(&bench, &observed, "twin", &|_| {}).unwrap();
             bundle.reference_json = Some(reference.to_json().into());
+            bundle
+        })
+        .clone()
+}
+
+/// Drives without an effect, with their maps.
+fn null_drives(bundle: &ModelBundle) -> (Vec<Trajectory>, Vec<Option<Arc<WorldMap>>>) {
+    let drives: Vec<Trajectory> = (0..24).map(|i| drive(&format!("null{i:02}"), 100 + i, &[], &bundle.default_soil)).collect();
+    let maps = vec![Some(world()); drives.len()];
+    (drives, maps)
+}
+
+/// The same bundle with what it takes to judge drives that lack something.
+pub fn bundle_with_drives() -> ModelBundle {
+    static BUNDLE: OnceLock<ModelBundle> = OnceLock::new();
+    BUNDLE
+        .get_or_init(|| {
+            let mut bundle = bundle();
+            let (drives, maps) = null_drives(&bundle);
+            let predictor = Predictor::new(Arc::new(bundle.clone())).unwrap();
+            let reference = Reference::from_json(bundle.reference_json.as_ref().unwrap()).unwrap();
+            let catalogue = reference.catalogue().unwrap();
+            let bench = Bench::new(&bundle, &catalogue);
+            let segmented = Segmented::of(&bench, &observe_all(&predictor, &drives, &maps, &|_| {}).unwrap(), &|_| {});
+            let behind = ReferenceDrives::measure(&predictor, &bench, (&drives, &maps), (&reference, &segmented), &|_, _| {}).unwrap();
+            bundle.reference_drives = Some(behind.to_bytes().into());
             bundle
         })
         .clone()

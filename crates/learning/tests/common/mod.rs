@@ -113,6 +113,7 @@ pub fn predictor_of(vehicle: Vehicle, scales: &Normalization, weights: Weights) 
         weights,
         baselines_json: None,
         reference_json: None,
+        reference_drives: None,
         soil_filter_json: None,
         rollout_noise_json: None,
         effects: Vec::new(),

@@ -17,7 +17,7 @@ use crate::sources::{load_recorded_bundle, maps_hash};
 
 /// Pieces of a recording that stand for drives.
 const PIECES: usize = 5;
-/// The same where the model itself is tested, which needs eight drives: pauses cut unevenly.
+/// The same where the model itself is tested, of which effects are claimed by eight drives or more: pauses cut unevenly.
 const PIECES_OF_THE_MODEL: usize = 10;
 
 /// Options that take the drives from a recording.
@@ -37,7 +37,7 @@ pub struct RecordingArgs {
     #[arg(long, value_name = "NS", requires = "recording", allow_negative_numbers = true, default_value_t = i64::MAX, hide_default_value = true)]
     to_ns: i64,
     /// Pieces that stand for drives. They share ground and driver, so the evidence is weaker than that of as many drives [default: 5; 10 where the
-    /// model itself is tested, which needs eight]
+    /// model itself is tested, which claims effects by eight or more]
     #[arg(long, value_name = "N", requires = "recording")]
     pieces: Option<usize>,
 }
