@@ -233,7 +233,7 @@ impl Asked<'_> {
             Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
             _ => None,
         };
-        // What is claimed by a reference follows from the fitted drives alone, others only say what comes of it. A model on trial is proven on others where there are some.
+        // What is claimed follows from the fitted drives alone, others only say what comes of it.
         let held_at: Vec<usize> = match options.fit_on {
             Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
             None if total > 1 => fit_at.to_vec(),
@@ -245,7 +245,7 @@ impl Asked<'_> {
         case.work = proof.clone();
         let fitted = options.fit_on.is_none();
         let held_drives = HeldDrives { predictor: plain, told, drives: &held, maps: &held_maps, options, fitted, work: &proof };
-        let apart = options.fit_on.is_some() && judge_by.is_some();
+        let apart = options.fit_on.is_some();
         let proving = if apart { held_drives.among_fitted(fit_drives, fit_maps) } else { held_drives };
         let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
             prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
@@ -255,7 +255,7 @@ impl Asked<'_> {
         if apart {
             learned = vec![taught.clone(); held.len()];
             scores = if options.scoring.windows(&held).is_ok() {
-                Some(score_held_out(predictor, &held, &held_maps, &learned, &options.scoring, &proof)?)
+                Some(score_held_out(plain, &held, &held_maps, &learned, &options.scoring, &proof)?)
             } else {
                 None
             };

@@ -51,8 +51,8 @@ pub struct DiagnoseArgs {
     inputs: CommandsArgs,
     #[command(flatten)]
     recording: RecordingArgs,
-    /// Find, prove and claim by these drives only, each left out once, and score the others; a model on trial (--reference physics) is proven on the others. `train`
-    /// stands for those of the train split [default: leave each drive out once]
+    /// Find, prove and claim by these drives only, each left out once, and score the others. `train` stands for those of the train split [default: leave each drive out
+    /// once]
     #[arg(long, value_name = "ID,…", value_delimiter = ',')]
     fit_on: Option<Vec<String>>,
     /// Effects that are not considered
