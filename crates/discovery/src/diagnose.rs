@@ -260,7 +260,7 @@ impl Asked<'_> {
                 None
             };
             if let Some(scores) = scores.as_ref().filter(|_| verdict.claims()) {
-                reason += &said_by_others(&judgement, scores);
+                reason += &said_by_others(&judgement, told, judge_by.is_none(), scores);
             }
         }
         let verdict = if far.is_some() { Verdict::Unexplained } else { verdict };

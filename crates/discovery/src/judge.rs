@@ -23,8 +23,9 @@ use crate::reference_drives::ReferenceDrives;
 use crate::select::Yardstick;
 use crate::work::Work;
 
-/// Share of what the drives of a reference tell of an effect in all channels below which it cannot be seen in some of them (chosen): its evidence is a tenth then.
-const UNSEEN: f64 = 0.01;
+/// Share of what the drives of a reference tell of an effect in all channels below which it cannot be seen in some of them (chosen): its evidence is a
+/// hundredth then. A steering offset of hundreds by steering angles is one of tens by the motion.
+const UNSEEN: f64 = 1e-4;
 
 /// What a diagnosis is made with: the reference of a bundle, read once.
 #[derive(Clone, Debug)]

@@ -341,14 +341,14 @@ fn labels(findings: &[&Finding]) -> String {
     together(&findings.iter().map(|f| f.candidate.label()).collect::<Vec<_>>())
 }
 
-/// What drives beside those that were fitted say of a proven judgement.
-pub(crate) fn said_by_others(judgement: &Judgement, scores: &HeldOut) -> String {
+/// What drives beside those that were fitted say of a proven judgement, and of what wheel speeds told.
+pub(crate) fn said_by_others(judgement: &Judgement, told: &DriveLine, model_on_trial: bool, scores: &HeldOut) -> String {
     let claimed: Vec<&Finding> = judgement.claimed().iter().map(|i| &judgement.findings[*i]).collect();
     if !several_show(scores) {
         return "; the other drives are too few to say".into();
     }
-    let least_gain = claimed.iter().any(|f| acts(f)).then_some(0.0);
-    match not_proven(scores, least_gain, claimed.len() > 1) {
+    let least_gain = (!told.is_empty() || claimed.iter().any(|f| acts(f))).then_some(0.0);
+    match not_proven(scores, least_gain, claimed.len() > 1 && !model_on_trial) {
         Some(why) => format!("; the other drives do not bear it out: {why}"),
         None if least_gain.is_some() => "; so it does on the other drives".into(),
         None => "; no error of the other drives surely rises".into(),
