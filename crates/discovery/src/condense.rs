@@ -10,7 +10,7 @@ use nesam_evaluation::{median, quantile_sorted};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
 
-use crate::bend::{self, Commands};
+use crate::bend::{self, Bend, Commands};
 use crate::candidates::{Candidate, column_count};
 use crate::channels::{CHANNELS, Row};
 use crate::metric::Metric;
@@ -173,11 +173,11 @@ pub fn difference(less: &[Row], more: &[Row], factor: f64) -> Vec<Row> {
     less.iter().zip(more).map(|(l, m)| core::array::from_fn(|c| (l[c] - m[c]) * factor)).collect()
 }
 
-/// Names of all columns: those of the catalogue, then the level of each channel, then the bend of each of an actuator.
+/// Names of all columns: those of the catalogue, then the level of each channel, then the bends of actuators.
 pub fn column_names(catalogue: &[Candidate]) -> Vec<String> {
     let effects = catalogue.iter().flat_map(|c| c.columns().into_iter().map(|j| format!("{} {j}", c.label())).collect::<Vec<_>>());
-    let named = |what: &'static str| move |c: usize| format!("{what} of {}", crate::channels::name(c));
-    effects.chain((0..CHANNELS).map(named("level"))).chain(bend::ASKED.map(named("bend"))).collect()
+    let level = |c: usize| format!("level of {}", crate::channels::name(c));
+    effects.chain((0..CHANNELS).map(level)).chain(bend::all().map(|bend| bend.name())).collect()
 }
 
 /// Column of the level of a channel, after those of all hypotheses.
@@ -185,12 +185,12 @@ pub fn level_column(catalogue: &[Candidate], channel: usize) -> usize {
     column_count(catalogue) + channel
 }
 
-/// Column of the bend of a channel of an actuator, after those of all levels.
-pub fn bend_column(catalogue: &[Candidate], channel: usize) -> usize {
-    column_count(catalogue) + CHANNELS + channel - bend::ASKED.start
+/// Column of a bend, after those of all levels.
+pub fn bend_column(catalogue: &[Candidate], bend: Bend) -> usize {
+    column_count(catalogue) + CHANNELS + bend.place()
 }
 
-/// Condenses a drive: the catalogue's columns and, after them, the level of every channel and the bend of every one of an actuator as columns of their own, which name no
+/// Condenses a drive: the catalogue's columns and, after them, the level of every channel and the bends of actuators as columns of their own, which name no
 /// cause.
 pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Condensed {
     let mut columns = whitened(metric, &signatures.columns);
@@ -198,9 +198,9 @@ pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Conde
         metric.channels.iter().position(|own| *own == c).map_or_else(|| DVector::zeros(metric.channels.len()), |at| metric.unit(at))
     };
     columns.extend((0..CHANNELS).map(|c| vec![unit(c); rows.len()]));
-    columns.extend(bend::ASKED.map(|c| {
-        let unit = unit(c);
-        bend::shape(&signatures.commands, c).into_iter().map(|share| &unit * share).collect()
+    columns.extend(bend::all().map(|bend| {
+        let unit = unit(bend.channel);
+        bend.over(&signatures.commands).into_iter().map(|share| &unit * share).collect()
     }));
     let named = columns.len();
     columns.extend(whitened(metric, &signatures.soil));

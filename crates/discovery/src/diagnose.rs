@@ -6,7 +6,7 @@ use nesam_physics::effects::written::WRITTEN_MAX;
 use nesam_physics::effects::{Effect, Written};
 use nesam_trajectories::Trajectory;
 
-use crate::bend;
+use crate::bend::{self, Bend};
 use crate::candidates::{Candidate, beside_rims, catalogue};
 use crate::claims::{Case, Estimate, Finding, Trace};
 use crate::condense::Condensed;
@@ -119,8 +119,8 @@ impl Diagnosis {
         self.selection.levels.iter().copied().zip(self.channels.iter().copied()).collect()
     }
 
-    /// How unusually each channel of an actuator bends as it is commanded, with the channel; empty where the model is on trial.
-    pub fn bends_seen(&self) -> Vec<(f64, usize)> {
+    /// How unusually actuators bend as they are commanded; empty where the model is on trial.
+    pub fn bends_seen(&self) -> Vec<(f64, Bend)> {
         self.selection.bends.iter().copied().zip(bend::asked_of(&self.channels)).collect()
     }
 }

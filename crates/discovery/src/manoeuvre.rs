@@ -17,7 +17,7 @@ pub fn separating(finding: &Finding) -> Option<&'static str> {
         "drive the same straight line in both directions"
     } else if both(&["tow", "linear_drag", "quadratic_drag", "rolling_resistance", "wheel_drag", "speed_gain", "front_bulldozing"]) {
         "coast straight ahead from full speed to rest on level ground, up and down the same slope"
-    } else if either(&["tyre_radius_front", "tyre_radius_rear", "speed_gain", "velocity_scale", "clock_drift"]) {
+    } else if either(&["tyre_radius", "tyre_radius_front", "tyre_radius_rear", "speed_gain", "velocity_scale", "clock_drift"]) {
         "drive a measured straight distance at two constant speeds on hard ground"
     } else if either(&[
         "steering_lag",

@@ -9,7 +9,7 @@ use std::sync::Arc;
 use nesam_evaluation::{DriveMaps, history_steps};
 use nesam_model::{GroundSource, ModelBundle, Predictor, Transition};
 use nesam_physics::driveline::{DrivelineState, command_wheels, rim_twist};
-use nesam_physics::effects::{Phases, ScheduledEffect};
+use nesam_physics::effects::{MapTerms, Phases, ScheduledEffect};
 use nesam_physics::step::{StepInput, StepModel, StepOutput};
 use nesam_physics::{Ride, SOIL_DIM, STATE_DIM, SecondCommand, Soil, SoilCorrection, UsualRide, Vehicle, VehicleState, WHEELS, wrap_angle};
 use nesam_terrain::WorldMap;
@@ -102,12 +102,21 @@ pub struct ObservedDrive {
     transitions: Vec<Transition>,
     /// How what the network says of each sample follows the pose that it is asked about; empty where it says nothing.
     follows: Vec<Follows>,
-    /// What effects of the bundle make of the ride: the network was asked about poses without it.
-    ride_known: Ride,
+    /// What the network knew of effects when it was asked.
+    known: Known,
     wheel_speed_rad_s: Option<Vec<[f64; WHEELS]>>,
     road_wheel_angle_rad: Option<Vec<[f64; 2]>>,
     /// ∂(tractive force)/∂(rim over-speed) of each wheel at each sample, N per m/s.
     traction_slope: Vec<[f64; WHEELS]>,
+}
+
+/// Effects of the bundle, without which the network was asked about a pose.
+#[derive(Clone, Copy, Debug)]
+struct Known {
+    /// What they make of the ride.
+    ride_shift: Ride,
+    /// Where they put the ground.
+    map: MapTerms,
 }
 
 /// A drive as a vehicle with some effects would explain it: its physics, its actuators, and the states behind what was measured.
@@ -236,7 +245,7 @@ fn observed(
         states: drive.states.clone(),
         transitions,
         follows,
-        ride_known: *model.ride_shift(),
+        known: Known { ride_shift: *model.ride_shift(), map: model.vehicle().effects.map },
         wheel_speed_rad_s: drive.wheel_speed_rad_s.clone(),
         road_wheel_angle_rad: drive.road_wheel_angle_rad.clone(),
         traction_slope,
@@ -459,12 +468,17 @@ impl ObservedDrive {
         add_consistency(&states[start..=start + SEGMENT_STEPS], model.dt_s(), &mut row);
         let mut state = states[start];
         let ground = GroundSource::new(self.map.as_deref(), model, &state);
-        let ride_shift: Ride = core::array::from_fn(|i| model.ride_shift()[i] - self.ride_known[i]);
+        let ride_shift: Ride = core::array::from_fn(|i| model.ride_shift()[i] - self.known.ride_shift[i]);
         for (j, transition) in self.transitions[start..start + SEGMENT_STEPS].iter().enumerate() {
             let [before, after] = &reading.actuators[start + j];
             let unshifted = (transition.residual, transition.input.sinkage_log_ratio);
-            let (residual, sinkage_log_ratio) =
-                self.follows.get(start + j).map_or(unshifted, |follows| follows.said(transition, &ride_shift));
+            let (residual, sinkage_log_ratio) = self.follows.get(start + j).map_or(unshifted, |follows| {
+                // A vehicle is as much lower over the ground as that lies higher than the map says.
+                let [x_m, y_m, _] = self.states[start + j].position_m;
+                let raised = |map: &MapTerms| map.raised(x_m, y_m, (0.0, [0.0; 2])).0;
+                let up_m = raised(&model.vehicle().effects.map) - raised(&self.known.map);
+                follows.said(transition, &[ride_shift[0] + up_m, ride_shift[1], ride_shift[2]])
+            });
             let input = StepInput {
                 state,
                 wheels: command_wheels(model.vehicle(), before, after, &transition.control),

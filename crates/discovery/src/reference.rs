@@ -13,7 +13,7 @@ use rand_chacha::ChaCha8Rng;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::bend;
+use crate::bend::{self, Bend};
 use crate::candidates::{Candidate, catalogue};
 use crate::channels::{self, CHANNELS};
 use crate::condense::{Condensed, believed_within, bend_column, column_names, condense, level_column};
@@ -73,7 +73,7 @@ pub struct Reference {
     /// Hypotheses beside the catalogue: written effects, as the text of an `effects.toml`; empty without any.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub hypotheses: String,
-    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel and the bend of each of an actuator.
+    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel and the bends of actuators.
     pub columns: Vec<String>,
     /// Usual level of each compared channel.
     pub centre: Vec<f64>,
@@ -90,7 +90,7 @@ pub struct Reference {
 /// Null distribution of the evidence of groups of n drives.
 #[derive(Clone, Debug)]
 pub struct NullGroups {
-    /// Factor by which the null evidence of each hypothesis, then of each channel's level and bend, exceeds a standard normal deviate (at least 1).
+    /// Factor by which the null evidence of each hypothesis, then of each channel's level and of each bend, exceeds a standard normal deviate (at least 1).
     pub spread: Vec<f64>,
     /// Largest spread-corrected evidence of each group, ascending.
     pub largest: Vec<f64>,
@@ -278,13 +278,13 @@ fn scored(segmented: &Segmented, available: &[bool; CHANNELS]) -> Result<(Metric
     Ok((metric, condensed))
 }
 
-/// Evidence of every hypothesis, then of the level of every compared channel and of the bend of each of `bending`, with nothing fitted.
-pub fn all_evidence(group: &Group, catalogue: &[Candidate], channels: &[usize], bending: &[usize]) -> Vec<f64> {
+/// Evidence of every hypothesis, then of the level of every compared channel and of each bend, with nothing fitted.
+pub fn all_evidence(group: &Group, catalogue: &[Candidate], channels: &[usize], bends: &[Bend]) -> Vec<f64> {
     let hypotheses = catalogue.iter().map(|c| {
         let found = group.remainder(&[], &c.columns());
         if c.positive() && found.shares[0] <= 0.0 { 0.0 } else { found.z }
     });
-    let nameless = channels.iter().map(|c| level_column(catalogue, *c)).chain(bending.iter().map(|c| bend_column(catalogue, *c)));
+    let nameless = channels.iter().map(|c| level_column(catalogue, *c)).chain(bends.iter().map(|bend| bend_column(catalogue, *bend)));
     hypotheses.chain(nameless.map(|column| group.remainder(&[], &[column]).z)).collect()
 }
 

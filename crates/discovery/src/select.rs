@@ -5,7 +5,7 @@
 
 use nesam_physics::effects::Layer;
 
-use crate::bend;
+use crate::bend::{self, Bend};
 use crate::candidates::Candidate;
 use crate::channels::{PATH_AT, RIM_AT};
 use crate::condense::{Condensed, bend_column, level_column};
@@ -100,7 +100,7 @@ pub struct Selection {
     pub z: Vec<Option<f64>>,
     /// Evidence that the level of each compared channel is unusual.
     pub levels: Vec<f64>,
-    /// Evidence that each of those of an actuator bends as it is commanded; empty where the model is on trial.
+    /// Evidence of each bend of an actuator; empty where the model is on trial.
     pub bends: Vec<f64>,
     /// Family-wise threshold.
     pub threshold: f64,
@@ -361,38 +361,38 @@ impl Yardstick {
         let chosen = &selection.chosen;
         let levels = self.levels_after_fit(left, before, chosen).map(|(channel, z)| (z, level_name(channel)));
         let level = levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
-        let bends = self.bends_after_fit(left, before, chosen).map(|(channel, z)| (z, bend_name(channel)));
+        let bends = self.bends_after_fit(left, before, chosen).map(|(bend, z)| (z, bend_name(bend)));
         let bend = bends.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         let hypotheses = self.looked_at(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
         let most = hypotheses.chain([level.clone(), bend.clone()]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         (selection.remaining, selection.remaining_level, selection.remaining_bend) = (most, level, bend);
     }
 
-    /// Channels of which it is asked whether they bend: those of actuators, but for a model on trial, which lacks more.
-    fn bending(&self) -> Vec<usize> {
+    /// Bends that are asked for: those of actuators, but for a model on trial, which lacks more.
+    fn bending(&self) -> Vec<Bend> {
         if self.model_on_trial { Vec::new() } else { bend::asked_of(&self.channels) }
     }
 
-    /// Evidence that each channel of an actuator bends as it is commanded in what the chosen ones leave.
-    fn bends_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (usize, f64)> {
+    /// Evidence that actuators bend as they are commanded in what the chosen ones leave.
+    fn bends_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (Bend, f64)> {
         let first = self.catalogue.len() + self.channels.len();
-        let asked = self.bending().into_iter().enumerate().map(move |(i, channel)| (channel, first + i));
+        let asked = self.bending().into_iter().enumerate().map(move |(i, bend)| (bend, first + i));
         self.nameless_after_fit(left, before, chosen, asked, bend_column)
     }
 
-    /// Evidence of columns without a cause, each with its channel and its place among all evidence, in what the chosen ones leave.
-    fn nameless_after_fit(
+    /// Evidence of columns without a cause, each with its place among all evidence, in what the chosen ones leave.
+    fn nameless_after_fit<C: Copy>(
         &self,
         left: &Group,
         before: &Group,
         chosen: &[usize],
-        asked: impl Iterator<Item = (usize, usize)>,
-        column: impl Fn(&[Candidate], usize) -> usize,
-    ) -> impl Iterator<Item = (usize, f64)> {
+        asked: impl Iterator<Item = (C, usize)>,
+        column: impl Fn(&[Candidate], C) -> usize,
+    ) -> impl Iterator<Item = (C, f64)> {
         let believed = self.believed(chosen);
-        asked.map(move |(channel, place)| {
-            let found = left.remainder_since(before, &believed, &[column(&self.catalogue, channel)]);
-            (channel, found.z / self.spread(place))
+        asked.map(move |(what, place)| {
+            let found = left.remainder_since(before, &believed, &[column(&self.catalogue, what)]);
+            (what, found.z / self.spread(place))
         })
     }
 
@@ -409,8 +409,8 @@ impl Yardstick {
     }
 }
 
-fn bend_name(channel: usize) -> String {
-    format!("the bend of {}", crate::channels::name(channel))
+fn bend_name(bend: Bend) -> String {
+    format!("the {}", bend.name())
 }
 
 fn level_name(channel: usize) -> String {

@@ -349,10 +349,12 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
     for e in order.into_iter().take(SHOWN) {
         say!("  {:<24} z {:7.1}", found.catalogue[e].label(), s.z[e].unwrap_or(0.0));
     }
-    for (what, mut evidence) in [("level", found.levels_seen()), ("bend", found.bends_seen())] {
+    let levels = found.levels_seen().into_iter().map(|(z, channel)| (z, format!("level of {}", channels::name(channel))));
+    let bends = found.bends_seen().into_iter().map(|(z, bend)| (z, bend.name()));
+    for mut evidence in [levels.collect::<Vec<_>>(), bends.collect()] {
         evidence.sort_by(|a, b| b.0.total_cmp(&a.0));
-        for (z, channel) in evidence.into_iter().take_while(|(z, _)| *z >= s.threshold).take(SHOWN_LEVELS) {
-            say!("  {:<24} z {z:7.1}  ({what})", channels::name(channel));
+        for (z, what) in evidence.into_iter().take_while(|(z, _)| *z >= s.threshold).take(SHOWN_LEVELS) {
+            say!("  {what:<24} z {z:7.1}");
         }
     }
     for f in &found.findings {

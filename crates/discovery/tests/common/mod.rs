@@ -42,17 +42,18 @@ pub fn truck() -> Vehicle {
 /// Hills of a decimetre to half a metre over 140 m.
 pub fn world() -> Arc<WorldMap> {
     static WORLD: OnceLock<Arc<WorldMap>> = OnceLock::new();
-    WORLD
-        .get_or_init(|| {
-            let (size, resolution) = (281, 0.5);
-            let geometry = GridGeometry { origin_m: [-70.0, -70.0], resolution_m: resolution, width: size, height: size };
-            let height = |i: usize| {
-                let (x, y) = ((i % size) as f64 * resolution, (i / size) as f64 * resolution);
-                (0.5 * (x / 6.0).sin() * (y / 7.0).cos() + 0.15 * (x / 2.5 + y / 3.1).sin()) as f32
-            };
-            Arc::new(WorldMap::from_layers("twin", 1, geometry, (0..size * size).map(height).collect(), None).unwrap())
-        })
-        .clone()
+    WORLD.get_or_init(|| world_lower_by(0.0)).clone()
+}
+
+/// The same on a map that is too low, m.
+pub fn world_lower_by(lower_m: f64) -> Arc<WorldMap> {
+    let (size, resolution) = (281, 0.5);
+    let geometry = GridGeometry { origin_m: [-70.0, -70.0], resolution_m: resolution, width: size, height: size };
+    let height = |i: usize| {
+        let (x, y) = ((i % size) as f64 * resolution, (i / size) as f64 * resolution);
+        (0.5 * (x / 6.0).sin() * (y / 7.0).cos() + 0.15 * (x / 2.5 + y / 3.1).sin() - lower_m) as f32
+    };
+    Arc::new(WorldMap::from_layers("twin", 1, geometry, (0..size * size).map(height).collect(), None).unwrap())
 }
 
 /// A drive of the vehicle with effects; every number follows from the seed.

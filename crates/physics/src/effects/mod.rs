@@ -152,7 +152,7 @@ macro_rules! catalogue {
 catalogue! {
     Payload CgForward CgLateral CgHeight LinearDrag QuadraticDrag Tow Wind RollingResistance WheelDrag TorqueLimit
     SpeedLag SpeedDelay SteeringLag SteeringDelay SteeringOffset SteeringRatio SteeringBacklash SteeringCompliance SpeedGain
-    TyreRadiusFront TyreRadiusRear LockedDifferential SkidSteerTrack
+    TyreRadius TyreRadiusFront TyreRadiusRear LockedDifferential SkidSteerTrack
     SlipSinkage MultiPass ElasticRecovery ThetaMShift Grousers FrontBulldozing SideBulldozing
     RollStiffness PitchStiffness MapTilt MapOffset SoilDrift
     GyroBias GyroScale VelocityScale PositionLatency LeverArm MountAngle ClockDrift FrictionCap SoilCrust

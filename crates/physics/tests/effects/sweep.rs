@@ -55,7 +55,7 @@ fn mirrored(effect: &Effect) -> Effect {
 
 #[test]
 fn property_ids_are_unique_and_parameters_round_trip_within_their_ranges() {
-    assert_eq!(Effect::IDS.len(), 53);
+    assert_eq!(Effect::IDS.len(), 54);
     for (i, effect) in Effect::examples().iter().enumerate() {
         assert_eq!(Effect::IDS[i], effect.id());
         assert_eq!(Effect::IDS.iter().filter(|id| **id == effect.id()).count(), 1);
@@ -122,7 +122,7 @@ fn property_the_mirror_image_of_every_effect_mirrors_the_drive() {
 #[test]
 fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
     // Channel of the state (x y z roll pitch yaw v ω) and direction, in a left turn while speeding up.
-    const EXPECTED: [(&str, usize, f64); 45] = [
+    const EXPECTED: [(&str, usize, f64); 46] = [
         ("payload", 2, -1.0),
         ("cg_forward", 4, 1.0),
         ("cg_lateral", 3, -1.0),
@@ -143,6 +143,7 @@ fn property_every_effect_moves_the_measured_motion_the_way_it_should() {
         ("steering_backlash", 5, -1.0),
         ("steering_compliance", 5, -1.0),
         ("speed_gain", 6, 1.0),
+        ("tyre_radius", 2, 1.0),
         ("tyre_radius_front", 4, -1.0),
         ("tyre_radius_rear", 4, 1.0),
         ("locked_differential", 5, -1.0),
