@@ -162,9 +162,13 @@ impl Selection {
 }
 
 /// How wrong the predicted response to an effect may be, as a share of it (chosen): the angle of a road wheel is geometry, two accepted pressure laws
-/// give forces that differ by a quarter, mostly by a common factor that a fit takes up.
+/// give forces that differ by a quarter, mostly by a common factor that a fit takes up. What a network says over ground of another height is known by its slope.
 pub fn mismatch(layer: Layer) -> f64 {
-    if layer.is_force() { 0.12 } else { 0.02 }
+    match layer {
+        layer if layer.is_force() => 0.12,
+        Layer::Map => 0.05,
+        _ => 0.02,
+    }
 }
 
 /// The same of what it leaves: a map has a height that geometry tells, and lets wheels sink by forces.

@@ -203,7 +203,7 @@ impl TlsFiles {
             let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(self.authorities()?), provider).build();
             builder.with_client_cert_verifier(verifier.map_err(|error| unusable("tls.client_ca", error.to_string()))?)
         };
-        let key = PrivateKeyDer::from_pem_slice(&self.key).map_err(|_| unusable("tls.key", "the file holds no private key in PEM"))?;
+        let key = private_key(&self.key)?;
         let mut config = builder.with_single_cert(certificates("tls.certificate", &self.certificate)?, key).map_err(failed)?;
         config.alpn_protocols.push(b"h2".to_vec());
         Ok(config)
@@ -233,6 +233,17 @@ impl TlsFiles {
             "no authority in `tls.client_ca` has signed the certificate in `tls.certificate`: who trusts them alone refuses this server ({error})"
         ))
     }
+}
+
+/// The private key of a server.
+fn private_key(pem: &[u8]) -> Result<PrivateKeyDer<'static>, ServerError> {
+    let text = String::from_utf8_lossy(pem);
+    if ["BEGIN ENCRYPTED PRIVATE KEY", "4,ENCRYPTED"].iter().any(|head| text.contains(head)) {
+        let reason = "the private key is encrypted, and a server has nobody to ask for its passphrase: write it without one (`openssl pkey -in KEY -out PLAIN_KEY`) and \
+                      let only the server read it";
+        return Err(unusable("tls.key", reason));
+    }
+    PrivateKeyDer::from_pem_slice(pem).map_err(|_| unusable("tls.key", "the file holds no private key in PEM"))
 }
 
 /// The certificates in the file of a key.

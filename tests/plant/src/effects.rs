@@ -35,9 +35,11 @@ pub struct HiddenEffects {
     pub wind_n: [f64; 2],
     /// Rolling resistance over weight.
     pub rolling_resistance: f64,
-    /// Relative change of the radius of the front tyres.
+    /// Relative change of the radius of all tyres.
+    pub tyre_radius: f64,
+    /// The same of the front tyres, in addition.
     pub tyre_radius_front: f64,
-    /// Relative change of the radius of the rear tyres.
+    /// The same of the rear tyres, in addition.
     pub tyre_radius_rear: f64,
     /// Share of the engine's torque that is missing.
     pub torque_limit: f64,
@@ -69,7 +71,7 @@ macro_rules! entry {
 }
 
 /// Every effect that the plant knows, by id.
-pub const EFFECTS: [Entry; 22] = [
+pub const EFFECTS: [Entry; 23] = [
     entry!("payload", 0.0, 1500.0, payload_kg),
     entry!("wheel_drag", 0.0, 3000.0, wheel_drag_n_m),
     entry!("steering_offset", -0.5, 0.5, steering_offset),
@@ -84,6 +86,7 @@ pub const EFFECTS: [Entry; 22] = [
     entry!("wind_x", -5000.0, 5000.0, wind_n[0]),
     entry!("wind_y", -5000.0, 5000.0, wind_n[1]),
     entry!("rolling_resistance", 0.0, 0.2, rolling_resistance),
+    entry!("tyre_radius", -0.2, 0.2, tyre_radius),
     entry!("tyre_radius_front", -0.2, 0.2, tyre_radius_front),
     entry!("tyre_radius_rear", -0.2, 0.2, tyre_radius_rear),
     entry!("torque_limit", 0.0, 0.95, torque_limit),

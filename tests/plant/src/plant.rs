@@ -242,7 +242,8 @@ impl Plant {
         let angle = if w < 2 { self.road_wheel_angles()[w] } else { 0.0 };
         let axle = m.rotation.to_world([-angle.sin(), angle.cos(), 0.0]);
         let in_plane = add(m.velocity, cross(m.rate, place));
-        let radius = 1.0 + if w < 2 { self.effects.tyre_radius_front } else { self.effects.tyre_radius_rear };
+        let of_axle = if w < 2 { self.effects.tyre_radius_front } else { self.effects.tyre_radius_rear };
+        let radius = 1.0 + self.effects.tyre_radius + of_axle;
         Wheel {
             centre: add(m.centre, m.rotation.to_world(place)),
             axle,

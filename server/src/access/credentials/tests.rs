@@ -98,6 +98,22 @@ fn regress_files_are_unusable_until_they_can_be_used() {
     assert!(rights.tell(Ok(true), &reloads));
 }
 
+/// Goal: a key with a passphrase is told as what it is. Method: the heads of both forms of such files.
+#[test]
+fn regress_an_encrypted_key_is_told_from_none() {
+    let folder = Folder::new();
+    let mut credentials = folder.credentials();
+    let mut refused = |text: &str| {
+        folder.write("server.key", text);
+        credentials.reread_tls().unwrap_err().to_string()
+    };
+    for (head, more) in [("ENCRYPTED PRIVATE KEY", ""), ("RSA PRIVATE KEY", "Proc-Type: 4,ENCRYPTED\nDEK-Info: AES-256-CBC,00\n\n")] {
+        let said = refused(&format!("-----BEGIN {head}-----\n{more}MIIB\n-----END {head}-----\n"));
+        assert!(said.contains("tls.key") && said.contains("is encrypted") && said.contains("openssl pkey"), "{said}");
+    }
+    assert!(refused("MIIB").contains("holds no private key in PEM"));
+}
+
 #[test]
 fn regress_a_common_name_that_routers_refuse_is_a_doubt_on_zenoh() {
     let folder = Folder::new();

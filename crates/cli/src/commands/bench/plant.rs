@@ -23,7 +23,7 @@ use crate::sources::{load_bundle_for, open_root, predictor_for, read_drives};
 
 /// Id of an effect, the parameter that its size is, and its usual size.
 type Dose = (&'static str, &'static str, f64);
-const DOSES: [Dose; 15] = [
+const DOSES: [Dose; 16] = [
     ("payload", "mass_kg", 600.0),
     ("wheel_drag", "torque_nm", 900.0),
     ("steering_offset", "second", 0.08),
@@ -39,6 +39,7 @@ const DOSES: [Dose; 15] = [
     ("velocity_scale", "relative", 0.03),
     ("map_offset", "z_m", 0.05),
     ("position_latency", "seconds", 0.12),
+    ("tyre_radius", "relative", 0.04),
 ];
 /// The effect whose sign is drawn too.
 const EITHER_SIDE: &str = "steering_offset";
