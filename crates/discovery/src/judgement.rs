@@ -13,6 +13,8 @@ use crate::settled::{Settled, onset_in_place};
 const LEFT_MAX: f64 = 0.4;
 /// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
 const LEFT_MAX_GEOMETRY: f64 = 0.2;
+/// [`LEFT_MAX`] of bends of actuators (chosen): a steering that turns a tenth further to one side leaves twice that and more, and none is quite straight.
+const BEND_LEFT_MAX: f64 = 0.03;
 
 /// Outcome for a person in a hurry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -220,13 +222,13 @@ fn surely_differs(selection: &Selection) -> bool {
 }
 
 /// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence; or
-/// such a bend, of which straight answers leave none whatever their size.
+/// a bend, of more than [`BEND_LEFT_MAX`] of it.
 fn left_over(selection: &Selection, share_max: f64) -> Option<&(f64, String)> {
-    let needed = |times: f64| (times * selection.threshold).max(share_max * selection.largest());
+    let needed = |times: f64, share: f64| (times * selection.threshold).max(share * selection.largest());
     let all = [
-        (&selection.remaining, needed(FURTHER)),
-        (&selection.remaining_level, needed(1.0)),
-        (&selection.remaining_bend, FURTHER * selection.threshold),
+        (&selection.remaining, needed(FURTHER, share_max)),
+        (&selection.remaining_level, needed(1.0, share_max)),
+        (&selection.remaining_bend, needed(FURTHER, BEND_LEFT_MAX)),
     ];
     all.into_iter().find(|(left, needed)| left.0 >= *needed).map(|(left, _)| left)
 }

@@ -51,7 +51,7 @@ pub struct HiddenEffects {
     pub velocity_scale: f64,
     /// Added to the measured height, m.
     pub map_offset_m: f64,
-    /// Age of the measured pose, s.
+    /// Age of the measured position, s.
     pub position_latency_s: f64,
 }
 

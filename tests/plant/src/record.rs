@@ -39,7 +39,7 @@ pub struct DriveRecorder {
 }
 
 impl DriveRecorder {
-    /// Takes one sample: what was measured, what was the case, and the command from now on. The sensors' latency counts as noise of the pose.
+    /// Takes one sample: what was measured, what was the case, and the command from now on. The latency of positions counts as their noise.
     pub fn sample(&mut self, measured: &Measured, truth: &Truth, command: Command) {
         let mut row = vec![("t".to_string(), self.samples as f64 * STEP_S)];
         row.extend(motion("", &measured.state));

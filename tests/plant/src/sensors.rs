@@ -31,30 +31,37 @@ pub struct Measured {
 pub struct Sensors {
     rng: ChaCha8Rng,
     effects: HiddenEffects,
-    /// True poses, newest last, for a pose that comes late.
-    poses: Vec<(f64, [f64; 6])>,
+    /// True positions, newest last, for one that comes late.
+    positions: Vec<(f64, [f64; 3])>,
 }
 
 impl Sensors {
     /// Sensors of a vehicle; the same seed gives the same noise.
     pub fn new(seed: u64, effects: &HiddenEffects) -> Self {
-        Self { rng: ChaCha8Rng::seed_from_u64(seed), effects: *effects, poses: Vec::new() }
+        Self { rng: ChaCha8Rng::seed_from_u64(seed), effects: *effects, positions: Vec::new() }
+    }
+
+    /// The true position at an instant, on a straight line between those of the steps around it; the first one before it.
+    fn position_at(&self, time_s: f64) -> [f64; 3] {
+        let after = self.positions.partition_point(|(at, _)| *at < time_s).min(self.positions.len() - 1);
+        let ((from_s, from), (to_s, to)) = (self.positions[after.saturating_sub(1)], self.positions[after]);
+        let share = if to_s > from_s { ((time_s - from_s) / (to_s - from_s)).clamp(0.0, 1.0) } else { 1.0 };
+        std::array::from_fn(|i| (1.0 - share) * from[i] + share * to[i])
     }
 
     /// Reads the sensors; to be called once per step.
     pub fn read(&mut self, truth: &Truth) -> Measured {
         let e = self.effects;
-        self.poses.push((truth.time_s, std::array::from_fn(|i| truth.state[i])));
-        if self.poses.len() > 32 {
-            self.poses.remove(0);
-        }
-        let due = truth.time_s - e.position_latency_s + 1e-6;
-        let pose = self.poses.iter().rev().find(|(at, _)| *at <= due).or(self.poses.first()).map_or([0.0; 6], |(_, pose)| *pose);
-        let mut noise = |sd: f64| sd * normal(&mut self.rng);
-        let position: [f64; 3] = std::array::from_fn(|i| pose[i] + noise(POSITION_M[i]) + if i == 2 { e.map_offset_m } else { 0.0 });
-        let attitude: [f64; 3] = std::array::from_fn(|i| pose[3 + i] + noise(ATTITUDE_RAD));
-        // The velocity is measured in World and turned by the measured attitude, as in the recorded drives.
         let of = |from: usize| [truth.state[from], truth.state[from + 1], truth.state[from + 2]];
+        self.positions.push((truth.time_s, of(0)));
+        if self.positions.len() > 32 {
+            self.positions.remove(0);
+        }
+        let late = self.position_at(truth.time_s - e.position_latency_s);
+        let mut noise = |sd: f64| sd * normal(&mut self.rng);
+        let position: [f64; 3] = std::array::from_fn(|i| late[i] + noise(POSITION_M[i]) + if i == 2 { e.map_offset_m } else { 0.0 });
+        let attitude: [f64; 3] = of(3).map(|angle| angle + noise(ATTITUDE_RAD));
+        // The velocity is measured in World and turned by the measured attitude, as in the recorded drives.
         let world = Rotation::from_attitude(of(3)).to_world(of(6));
         let measured = add(world.map(|v| v * (1.0 + e.velocity_scale)), std::array::from_fn(|_| noise(VELOCITY_M_S)));
         let velocity = Rotation::from_attitude(attitude).to_body(measured);
@@ -76,6 +83,22 @@ fn normal(rng: &mut ChaCha8Rng) -> f64 {
         let s = u * u + v * v;
         if s > 0.0 && s < 1.0 {
             return u * (-2.0 * s.ln() / s).sqrt();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: a late position is late by the latency and not by whole steps. Method: positions of a straight drive at the steps; instants at, between and before them.
+    #[test]
+    fn analytic_a_late_position_lies_between_steps() {
+        let mut sensors = Sensors::new(1, &HiddenEffects::default());
+        sensors.positions = (0..4).map(|k| (0.1 * f64::from(k), [f64::from(k), 0.0, -2.0 * f64::from(k)])).collect();
+        for (time_s, x) in [(0.3, 3.0), (0.2, 2.0), (0.238, 2.38), (0.1, 1.0), (0.01, 0.1), (0.0, 0.0), (-0.5, 0.0)] {
+            let at = sensors.position_at(time_s);
+            assert!((at[0] - x).abs() < 1e-9 && (at[2] + 2.0 * x).abs() < 1e-9, "{time_s}: {at:?}");
         }
     }
 }
