@@ -22,8 +22,9 @@ pub fn start(folder: &Path, options: &[&str]) -> (Child, Vec<String>) {
 
 /// The same with another bundle.
 pub fn start_on(folder: &Path, bundle: &str, options: &[&str]) -> (Child, Vec<String>) {
-    let mut server = Command::new(BINARY)
-        .args(["serve", "--bundle", bundle, "--grpc", "127.0.0.1:0", "--no-zenoh"])
+    // It hears a terminal close, also where the tests do not (nohup).
+    let mut server = Command::new("env")
+        .args(["--default-signal=HUP", BINARY, "serve", "--bundle", bundle, "--grpc", "127.0.0.1:0", "--no-zenoh"])
         .args(options)
         .current_dir(folder)
         .stdout(Stdio::piped())
