@@ -63,6 +63,8 @@ class Core {
   }
 
   static std::chrono::system_clock::time_point deadline(std::chrono::nanoseconds timeout) {
+    // No time is none: gRPC rounds deadlines up to milliseconds, within which a service may refuse.
+    if (timeout.count() <= 0) return {};
     return std::chrono::system_clock::now() + std::chrono::duration_cast<std::chrono::system_clock::duration>(bounded(timeout));
   }
 
