@@ -16,6 +16,7 @@ import traffic
 from services import REPLICAS, Fleet, slow_disk, why_no_slow_disk
 
 VEHICLES = 6
+"""Unless asked for others."""
 ZENOH_VEHICLES = 2
 """Of them over Zenoh; the others over gRPC."""
 FAULT_AFTER_S = 2.0
@@ -149,9 +150,9 @@ CHECKS = [
 ]
 
 
-def abandoned(fleet):
+def abandoned(fleet, vehicles):
     """All replicas die and come back, and nobody asks for the sessions: do they leave etcd?"""
-    opened = [f"left-{i}" for i in range(VEHICLES)]
+    opened = [f"left-{i}" for i in range(vehicles)]
     for session in opened:
         with nesam.Client(fleet.proxy_address, timeout_s=10.0, vehicle_id=session) as client:
             client.open_session(session, map_id=traffic.MAP)
@@ -177,9 +178,9 @@ def abandoned(fleet):
 class Run:
     """Vehicles and planners of one check, and what was found."""
 
-    def __init__(self, fleet, name):
+    def __init__(self, fleet, name, vehicles):
         self.fleet = fleet
-        self.sessions = [f"{name}-{i}" for i in range(VEHICLES)]
+        self.sessions = [f"{name}-{i}" for i in range(vehicles)]
         self.vehicles = [traffic.Vehicle(fleet.proxy_address, session) for session in self.sessions[ZENOH_VEHICLES:]]
         router = f"tcp/{fleet.hosts.address['router']}:7447"
         self.vehicles += [traffic.ZenohVehicle(fleet.proxy_address, session, router, "fleet") for session in self.sessions[:ZENOH_VEHICLES]]
@@ -229,8 +230,8 @@ class Run:
         return count
 
 
-def perform(check, fleet, oracle, attempt):
-    run = Run(fleet, f"{check.name}-{attempt}")
+def perform(check, fleet, oracle, vehicles, attempt):
+    run = Run(fleet, f"{check.name}-{attempt}", vehicles)
     try:
         since = run.drive(check.fault)
         run.compare(oracle)
@@ -265,6 +266,7 @@ def main():
     parser.add_argument("--only", default="", help="checks, by name")
     parser.add_argument("--from", dest="before", metavar="NESAM", help="only the upgrade, from an older program, which lies where it finds its bundles")
     parser.add_argument("--envoy", action="store_true", help="Envoy in the place of HAProxy")
+    parser.add_argument("--vehicles", type=int, default=VEHICLES, help=f"each with a planner [default: {VEHICLES}]")
     parser.add_argument("--loopback", action="store_true", help="without namespaces")
     parser.add_argument("--members", type=int, choices=(1, 3), default=1, help="members of etcd [default: 1]")
     parser.add_argument("--scaling", action="store_true", help="measure what sessions and queries cost, and check nothing")
@@ -307,11 +309,11 @@ def main():
                 skipped.append(check.name)
                 row(check.name, "not run", {}, missing[check.needs])
                 continue
-            figures, violations, late = perform(check, fleet, oracle, 1)
+            figures, violations, late = perform(check, fleet, oracle, arguments.vehicles, 1)
             if late and not violations:
                 # Nothing is lost or wrong, and what else runs on the machine takes time, too.
                 row(check.name, "late", figures, f"an answer took longer than {TAKEOVER_S} s; once more")
-                figures, violations, late = perform(check, fleet, oracle, 2)
+                figures, violations, late = perform(check, fleet, oracle, arguments.vehicles, 2)
             if late:
                 violations.append(f"a planner waited {figures['silence s']} s for an answer")
             row(check.name, "VIOLATED" if violations else "holds", figures, check.what)
@@ -319,7 +321,11 @@ def main():
                 print(f"    {violation}", flush=True)
             failed += violations
         if not only or "abandoned" in only:
-            failed += abandoned(fleet)
+            failed += abandoned(fleet, arguments.vehicles)
+        if arguments.envoy:
+            declined = [f"Envoy declined calls: {counter}" for counter in fleet.declined_by_envoy()]
+            print("\n".join(declined) or "Envoy declined nothing", flush=True)
+            failed += declined
     finally:
         fleet.stop()
         hosts.close()

@@ -190,6 +190,12 @@ class Fleet:
                 raise RuntimeError(f"{name} does not come up; see {self.folder / (name + '.log')}")
             time.sleep(0.05)
 
+    def declined_by_envoy(self):
+        """Counters of calls that Envoy declined by a limit of its own, and did not send or not send again, where they are not 0."""
+        ask = "import sys, urllib.request; sys.stdout.buffer.write(urllib.request.urlopen('http://127.0.0.1:9901/stats?filter=overflow$', timeout=5).read())"
+        told = subprocess.run(self.hosts.command("proxy", [sys.executable, "-c", ask]), check=True, capture_output=True, text=True).stdout
+        return [line for line in told.splitlines() if not line.endswith(": 0")]
+
     def metric(self, name, metric):
         with urllib.request.urlopen(f"http://{self.hosts.address[name]}:50080/metrics", timeout=5) as reply:
             return float(re.search(rf"^{metric} (\S+)$", reply.read().decode(), re.M).group(1))
