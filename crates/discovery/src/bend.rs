@@ -5,13 +5,16 @@
 //! S about the middle, as of a dead band), or with the square of the commanded speed; each less what a constant and a straight line in the command make of it on the same
 //! drive. Offsets, ratios and gains leave nothing there, whatever their size; how much drives without an effect bend is measured like everything else.
 
+use serde::Serialize;
+
 use crate::channels::{PATH_AT, RIM_AT, STEERING_AT, name};
 
 /// The mean commands of a segment: speed, m/s, and the second command in its unit.
 pub type Commands = [f64; 2];
 
 /// How a channel goes with its command beside a straight line.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
 pub enum Shape {
     /// With the size of the second command.
     Side,

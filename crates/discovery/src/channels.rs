@@ -39,6 +39,11 @@ pub fn name(channel: usize) -> String {
     }
 }
 
+/// Name of the level of a channel.
+pub fn level_name(channel: usize) -> String {
+    format!("level of {}", name(channel))
+}
+
 /// Residual layer of a channel: `actuator`, `force`, `kinematic` or `map`.
 pub fn layer(channel: usize) -> &'static str {
     match channel {

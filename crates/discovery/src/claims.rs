@@ -17,7 +17,7 @@ use crate::ground::Ground;
 use crate::metric::Metric;
 use crate::observe::Bench;
 use crate::onset::{Onset, PossibleOnset};
-use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick, mismatch};
+use crate::select::{DECISIVE, RIVALS_MAX, Selection, Yardstick, mismatch_of_size};
 use crate::settled::Settled;
 use crate::work::Work;
 
@@ -364,7 +364,8 @@ fn estimates(group: &Group, fit: &Fit, term: usize) -> Vec<Estimate> {
         .map(|(p, parameter)| {
             let ci95 = free.iter().position(|f| f.parameter == p).map(|i| {
                 // The first value is the magnitude, which answers for the scale of the response.
-                let scale = if i == 0 { 1.96 * mismatch(candidate.layer()) * candidate.magnitude(i, fit.values[term][i]) } else { 0.0 };
+                let scale =
+                    if i == 0 { 1.96 * mismatch_of_size(candidate.layer()) * candidate.magnitude(i, fit.values[term][i]) } else { 0.0 };
                 let half = half_width(group, fit, term, &[(i, 1.0)], |values| values[i]).hypot(scale);
                 let end = if quantities[p].complete { parameter.range[1] } else { f64::INFINITY };
                 [parameter.value - half, (parameter.value + half).min(end)]

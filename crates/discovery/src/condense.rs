@@ -12,7 +12,7 @@ use rayon::prelude::*;
 
 use crate::bend::{self, Bend, Commands};
 use crate::candidates::{Candidate, column_count};
-use crate::channels::{CHANNELS, Row};
+use crate::channels::{CHANNELS, Row, level_name};
 use crate::metric::Metric;
 use crate::observe::{Bench, ObservedDrive};
 use nesam_physics::effects::{Effect, ScheduledEffect};
@@ -176,8 +176,7 @@ pub fn difference(less: &[Row], more: &[Row], factor: f64) -> Vec<Row> {
 /// Names of all columns: those of the catalogue, then the level of each channel, then the bends of actuators.
 pub fn column_names(catalogue: &[Candidate]) -> Vec<String> {
     let effects = catalogue.iter().flat_map(|c| c.columns().into_iter().map(|j| format!("{} {j}", c.label())).collect::<Vec<_>>());
-    let level = |c: usize| format!("level of {}", crate::channels::name(c));
-    effects.chain((0..CHANNELS).map(level)).chain(bend::all().map(|bend| bend.name())).collect()
+    effects.chain((0..CHANNELS).map(level_name)).chain(bend::all().map(|bend| bend.name())).collect()
 }
 
 /// Column of the level of a channel, after those of all hypotheses.

@@ -145,10 +145,7 @@ impl Report<'_> {
     /// How unusually actuators bend as they are commanded.
     fn bends(&self) -> Value {
         let d = self.diagnosis;
-        let of = |(z, bend): (f64, Bend)| {
-            let (channel, shape) = (bend.channel, format!("{:?}", bend.shape).to_lowercase());
-            json!({"channel": channels::name(channel), "layer": channels::layer(channel), "shape": shape, "z": z})
-        };
+        let of = |(z, Bend { channel, shape }): (f64, Bend)| json!({"channel": channels::name(channel), "layer": channels::layer(channel), "shape": shape, "z": z});
         d.bends_seen().into_iter().map(of).collect()
     }
 

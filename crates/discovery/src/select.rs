@@ -162,13 +162,14 @@ impl Selection {
 }
 
 /// How wrong the predicted response to an effect may be, as a share of it (chosen): the angle of a road wheel is geometry, two accepted pressure laws
-/// give forces that differ by a quarter, mostly by a common factor that a fit takes up. What a network says over ground of another height is known by its slope.
+/// give forces that differ by a quarter, mostly by a common factor that a fit takes up.
 pub fn mismatch(layer: Layer) -> f64 {
-    match layer {
-        layer if layer.is_force() => 0.12,
-        Layer::Map => 0.05,
-        _ => 0.02,
-    }
+    if layer.is_force() { 0.12 } else { 0.02 }
+}
+
+/// The same of a size over all drives (of a map: chosen): what a network says over ground of another height is known by its slope.
+pub(crate) fn mismatch_of_size(layer: Layer) -> f64 {
+    if layer == Layer::Map { 0.05 } else { mismatch(layer) }
 }
 
 /// The same of what it leaves: a map has a height that geometry tells, and lets wheels sink by forces.
@@ -418,7 +419,7 @@ fn bend_name(bend: Bend) -> String {
 }
 
 fn level_name(channel: usize) -> String {
-    format!("the level of {}", crate::channels::name(channel))
+    format!("the {}", crate::channels::level_name(channel))
 }
 
 /// All but the `i`-th.

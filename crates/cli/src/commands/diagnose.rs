@@ -349,7 +349,7 @@ fn summary(report: &Report<'_>, found: &Diagnosis) {
     for e in order.into_iter().take(SHOWN) {
         say!("  {:<24} z {:7.1}", found.catalogue[e].label(), s.z[e].unwrap_or(0.0));
     }
-    let levels = found.levels_seen().into_iter().map(|(z, channel)| (z, format!("level of {}", channels::name(channel))));
+    let levels = found.levels_seen().into_iter().map(|(z, channel)| (z, channels::level_name(channel)));
     let bends = found.bends_seen().into_iter().map(|(z, bend)| (z, bend.name()));
     for mut evidence in [levels.collect::<Vec<_>>(), bends.collect()] {
         evidence.sort_by(|a, b| b.0.total_cmp(&a.0));
