@@ -5,12 +5,13 @@
 #![allow(clippy::unwrap_used)]
 
 use std::collections::BTreeMap;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use nesam_engine::{
-    Candidates, Clock, Command, Engine, EngineError, EngineHandle, EventSink, Limits, ManualClock, Measurement, OpenSession, PredictQuery,
-    Reply, SessionView, Submission, WheelMeasurement,
+    Candidates, Clock, Command, Engine, EngineError, EngineHandle, EventSink, Executed, Limits, ManualClock, Measurement, OpenSession,
+    PredictQuery, Reply, SessionView, Submission, WheelMeasurement,
 };
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::{Control, VehicleState};
@@ -32,7 +33,7 @@ fn schedules() -> usize {
 }
 
 /// Runs `threads` under random schedules, and under schedules in which the threads have priorities that seldom change.
-fn try_schedules(threads: fn()) {
+fn try_schedules(threads: impl Fn() + Copy + Send + Sync + 'static) {
     let mut config = Config::new();
     config.stack_size = STACK_BYTES;
     Runner::new(RandomScheduler::new_from_seed(SEED, schedules()), config.clone()).run(threads);
@@ -159,6 +160,58 @@ fn shuttle_without_a_thread_nothing_is_left_lying() {
         let (engine, clock) = engine(None);
         vehicles_and_a_planner(EngineHandle::unthreaded(engine, clock, None));
     });
+}
+
+/// Goes on whenever somebody looks at it, so that predictions take time.
+#[derive(Default)]
+struct Ticking(AtomicU64);
+
+impl Clock for Ticking {
+    fn now_ns(&self) -> u64 {
+        self.0.fetch_add(1_000_000, Ordering::Relaxed)
+    }
+}
+
+/// Goal: whenever a short prediction comes in the midst of a long one both are answered, and in some schedules the short one first, though it was begun later. Method: two
+/// planners, and somebody who stops the engine; the order of answers, and that of a recording.
+#[test]
+fn shuttle_a_short_prediction_in_the_midst_of_a_long_one() {
+    const LONG: usize = 1200;
+    static OVERTAKEN: AtomicU64 = AtomicU64::new(0);
+    let of = |samples: usize| {
+        let Command::Predict(query) = predict("a") else { panic!("a prediction was asked for") };
+        Command::Predict(PredictQuery { samples, controls: Candidates::Given(vec![0.0; 2 * samples]), ..query })
+    };
+    try_schedules(move || {
+        let begun = Arc::new(Mutex::new(Vec::new()));
+        let answered = Arc::new(Mutex::new(Vec::new()));
+        let tap = {
+            let begun = begun.clone();
+            Box::new(move |executed: Executed| {
+                if let (Command::Predict(query), Ok(_)) = (executed.command, executed.result) {
+                    begun.lock().unwrap().push(query.samples);
+                }
+            })
+        };
+        let engine = EngineHandle::spawn_tapped(engine(None).0, Arc::new(Ticking::default()), Some(tap));
+        engine.call(open("a")).unwrap();
+        engine.call(measure("a", 0)).unwrap();
+        engine.call(of(1)).unwrap();
+        let planners = [LONG, 1].map(|samples| {
+            let (engine, answered) = (engine.clone(), answered.clone());
+            thread::spawn(move || {
+                engine.submit(Submission::new(of(samples), move |answer| answered.lock().unwrap().push((samples, answer.result.is_ok()))));
+            })
+        });
+        planners.into_iter().for_each(|planner| planner.join().unwrap());
+        engine.stop().unwrap();
+        let mut answered = answered.lock().unwrap().clone();
+        let overtaken = answered == [(1, true), (LONG, true)] && *begun.lock().unwrap() == [1, LONG, 1];
+        OVERTAKEN.fetch_add(u64::from(overtaken), Ordering::Relaxed);
+        answered.sort_unstable();
+        assert_eq!(answered.iter().map(|(samples, _)| *samples).collect::<Vec<_>>(), [1, LONG]);
+    });
+    assert!(OVERTAKEN.load(Ordering::Relaxed) > 0, "in no schedule the short one came first");
 }
 
 /// What is on stable storage: accepted measurements of each session.

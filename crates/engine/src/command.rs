@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use nesam_model::HistoryStep;
+use nesam_model::{HistoryStep, Interruption};
 use nesam_terrain::WorldMap;
 
 use crate::fleet::{FleetCell, FleetShare};
@@ -115,8 +115,8 @@ pub enum Command {
 /// When to end a prediction before it is complete. The default is never.
 #[derive(Clone, Copy, Debug, Default)]
 pub(crate) struct Until<'a> {
-    /// Raised when nobody waits for the answer any more: it is given up.
-    pub abandoned: Option<&'a AtomicBool>,
+    /// It is given up, or waits.
+    pub interruption: Interruption<'a>,
     /// Raised when the answer is due: it ends with the samples that are done, where fewer are of use.
     pub due: Option<&'a AtomicBool>,
 }

@@ -4,7 +4,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-use nesam_model::is_raised;
+use nesam_model::{Interruption, is_raised};
 use nesam_physics::Vehicle;
 
 use crate::clock::Clock;
@@ -153,7 +153,7 @@ impl EngineHandle {
         let queue = Arc::new(Queue::default());
         let (limits, vehicle) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()));
         let heard = Arc::new(Heard::new(tap));
-        let computing = Computing::start(queue.clone(), clock.clone(), heard.clone());
+        let computing = Computing::start(&queue, &clock, &heard);
         let thread = thread::Builder::new()
             .name("nesam-engine".into())
             .spawn({
@@ -245,45 +245,65 @@ impl EngineHandle {
     }
 }
 
-/// The thread that computes predictions, in the order in which they were begun.
+/// The threads that compute predictions, those that run and urgent ones, each in the order in which they were begun.
 struct Computing {
-    begun: mpsc::Sender<Begun>,
-    thread: JoinHandle<()>,
+    running: Computer,
+    urgent: Computer,
 }
 
 impl Computing {
     /// # Panics
     /// When the system refuses to start a thread.
-    fn start(queue: Arc<Queue>, clock: Arc<dyn Clock>, heard: Arc<Heard>) -> Self {
-        let (begun, waiting) = mpsc::channel::<Begun>();
-        let compute = move || {
-            while let Ok(prediction) = waiting.recv() {
-                prediction.finish(&queue, clock.as_ref(), &heard);
-            }
+    fn start(queue: &Arc<Queue>, clock: &Arc<dyn Clock>, heard: &Arc<Heard>) -> Self {
+        let start = |name: &str, within: Workers| {
+            let (queue, clock, heard) = (queue.clone(), clock.clone(), heard.clone());
+            Computer::start(name, move |prediction| within.run(|| prediction.finish(&queue, clock.as_ref(), &heard)))
         };
-        let thread = thread::Builder::new().name("nesam-predict".into()).spawn(compute).expect("the system starts a thread");
-        Self { begun, thread }
+        Self { running: start("nesam-predict", Workers::shared()), urgent: start("nesam-urgent", Workers::own("nesam-urgent")) }
     }
 
     fn compute(&self, prediction: Begun) {
-        self.begun.send(prediction).expect("the thread ends after this; this is a bug");
+        let computer = if prediction.is_urgent { &self.urgent } else { &self.running };
+        computer.begun.send(prediction).expect("the thread ends after this; this is a bug");
     }
 
-    /// Ends the thread after all that was begun.
+    /// Ends the threads after all that was begun.
     fn end(self) {
-        drop(self.begun);
-        self.thread.join().expect("panics of a prediction are caught; this is a bug");
+        for Computer { begun, thread } in [self.urgent, self.running] {
+            drop(begun);
+            thread.join().expect("panics of a prediction are caught; this is a bug");
+        }
+    }
+}
+
+/// A thread that does something with each prediction.
+struct Computer {
+    begun: mpsc::Sender<Begun>,
+    thread: JoinHandle<()>,
+}
+
+impl Computer {
+    fn start(name: &str, compute: impl Fn(Begun) + Send + 'static) -> Self {
+        let (begun, waiting) = mpsc::channel::<Begun>();
+        let each = move || {
+            while let Ok(prediction) = waiting.recv() {
+                compute(prediction);
+            }
+        };
+        let thread = thread::Builder::new().name(name.into()).spawn(each).expect("the system starts a thread");
+        Self { begun, thread }
     }
 }
 
 /// Does all that is asked for until the end. Predictions are computed beside the engine, one at a time, so that measurements do not wait for them.
 fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, computing: Computing, heard: &Heard) -> Engine {
     // Shared out among the threads of predictions, the work of a measurement would wait for theirs.
-    let _alone = work_alone();
+    let _alone = Workers::alone();
     loop {
         match queue.next(|| clock.now_ns()) {
             Turn::Commands(commands) => answer_all(&mut engine, commands, clock, heard),
-            Turn::Prediction(submission) => computing.compute(Begun::new(&mut engine, *submission, queue, clock, heard)),
+            Turn::Prediction(submission) => computing.compute(Begun::new(&mut engine, *submission, false, queue, clock, heard)),
+            Turn::Urgent(submission) => computing.compute(Begun::new(&mut engine, *submission, true, queue, clock, heard)),
             Turn::End => break,
         }
     }
@@ -291,21 +311,53 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, computing: Computin
     engine
 }
 
-/// Keeps parallel work of this thread on this thread for as long as what is given lives; `None` where it has a place among others already.
-#[cfg(not(feature = "shuttle"))]
-fn work_alone() -> Option<rayon::ThreadPool> {
-    rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build().ok()
-}
+/// Whether schedules of threads are tried: these share one thread of the system, which must not wait.
+const SCHEDULED: bool = cfg!(feature = "shuttle");
 
-/// The threads of a schedule share one thread of the system.
-#[cfg(feature = "shuttle")]
-fn work_alone() {}
+/// Who does the parallel work of a thread.
+struct Workers(Option<rayon::ThreadPool>);
+
+impl Workers {
+    /// Those of the process.
+    fn shared() -> Self {
+        Self(None)
+    }
+
+    /// As many as the process has, which are there when those wait.
+    ///
+    /// # Panics
+    /// When the system refuses to start a thread.
+    fn own(name: &'static str) -> Self {
+        if SCHEDULED {
+            return Self(None);
+        }
+        let threads = rayon::ThreadPoolBuilder::new().num_threads(rayon::current_num_threads());
+        let pool = threads.thread_name(move |number| format!("{name}-{number}")).build().expect("the system starts threads");
+        Self(Some(pool))
+    }
+
+    /// The current thread alone, for as long as what is given lives; where it is one of others already these.
+    fn alone() -> Self {
+        if SCHEDULED {
+            return Self(None);
+        }
+        Self(rayon::ThreadPoolBuilder::new().num_threads(1).use_current_thread().build().ok())
+    }
+
+    fn run(&self, work: impl FnOnce() + Send) {
+        match &self.0 {
+            Some(pool) => pool.install(work),
+            None => work(),
+        }
+    }
+}
 
 /// Does what a turn asks for, on this thread; false at the end.
 fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, heard: &Heard) -> bool {
     match turn {
         Turn::Commands(commands) => answer_all(engine, commands, clock, heard),
-        Turn::Prediction(submission) => Begun::new(engine, *submission, queue, clock, heard).finish(queue, clock, heard),
+        Turn::Prediction(submission) => Begun::new(engine, *submission, false, queue, clock, heard).finish(queue, clock, heard),
+        Turn::Urgent(_) => unreachable!("a prediction has ended before this thread looks for another; this is a bug"),
         Turn::End => return false,
     }
     true
@@ -347,17 +399,18 @@ struct Begun {
     reply: Box<dyn FnOnce(Answer) + Send>,
     now_ns: u64,
     queued_ns: u64,
+    is_urgent: bool,
     place: HeardPlace,
 }
 
 impl Begun {
     /// Begins a prediction, unless nobody waits for it any more, it is too late, or it does not fit.
-    fn new(engine: &mut Engine, submission: Submission, queue: &Queue, clock: &dyn Clock, heard: &Heard) -> Self {
+    fn new(engine: &mut Engine, submission: Submission, is_urgent: bool, queue: &Queue, clock: &dyn Clock, heard: &Heard) -> Self {
         let Submission { command, deadline_ns, abandoned, due, reply, submitted_ns, share: _ } = submission;
         let Command::Predict(mut query) = command else { unreachable!("the lane of predictions holds nothing else; this is a bug") };
         // Of one that is asked wrongly fewer samples may be within the limits: it stays whole, to be refused for what is wrong with it.
         let right = query.samples_min == 0 || query.check(engine.limits(), engine.vehicle()).is_ok();
-        let fits = if right { queue.fit(&mut query, deadline_ns, clock.now_ns()) } else { Ok(()) };
+        let fits = if right { queue.fit(&mut query, is_urgent, deadline_ns, clock.now_ns()) } else { Ok(()) };
         let place = heard.reserve();
         let now_ns = clock.now_ns();
         let begun = if is_raised(abandoned.as_deref()) {
@@ -370,14 +423,15 @@ impl Begun {
         engine.touch(now_ns, Some(&query.session));
         let prepared = begun.and_then(|()| guarded("predict", || engine.prepare(now_ns, &query)));
         let queued_ns = now_ns.saturating_sub(submitted_ns);
-        Self { query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, place }
+        Self { query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, is_urgent, place }
     }
 
     /// Computes and answers it. The queue is told what of it was answered and how long that took, if it was begun, before the answer leaves.
     fn finish(self, queue: &Queue, clock: &dyn Clock, heard: &Heard) {
-        let Self { mut query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, place } = self;
+        let Self { mut query, prepared, deadline_ns, abandoned, due, reply, now_ns, queued_ns, is_urgent, place } = self;
         let is_begun = prepared.is_ok();
-        let until = Until { abandoned: abandoned.as_deref(), due: due.as_deref() };
+        let gate = Some(queue.gate()).filter(|_| !is_urgent && !SCHEDULED);
+        let until = Until { interruption: Interruption { abandoned: abandoned.as_deref(), gate }, due: due.as_deref() };
         let (result, encoded) = match prepared {
             Err(error) => (Err(error), 0),
             Ok(prepared) => {
@@ -398,7 +452,7 @@ impl Begun {
             Err(_) => None,
         };
         query.keep_answered(&result);
-        queue.done(work(&query, query.samples) + encoding_work(encoded), took, clock.now_ns());
+        queue.done(work(&query, query.samples) + encoding_work(encoded), is_urgent, took, clock.now_ns());
         let told = heard.listens().then(|| result.clone());
         reply(Answer { result, queued_ns, busy_ns });
         heard.tell(place, told.map(|result| Executed { now_ns, command: Command::Predict(query), result, queued_ns, busy_ns }));

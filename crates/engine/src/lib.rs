@@ -6,7 +6,8 @@
 //! replayed bit for bit.
 //!
 //! [`EngineHandle::spawn`] puts an engine behind a bounded queue on a thread of its own, and computes predictions on another, one at a time, from what the
-//! sessions were when their turn came: measurements do not wait for them. A full queue is an
+//! sessions were when their turn came: measurements do not wait for them. A prediction that is much shorter than the one at work does not wait for its turn, as far as nobody is late
+//! by it: that one pauses within a step. A full queue is an
 //! [`EngineError::Overloaded`], never a wait and never a panic, and so is a prediction that would not be done before its deadline; one whose asker has
 //! gone or whose deadline has passed is skipped or given up. Vehicles share the time for predictions evenly.
 //!

@@ -2,13 +2,16 @@
 //!
 //! Every share (a vehicle, with all its sessions and planners) gets the same part of the engine's time while it asks for more than that: start-time fair queueing over
 //! the time that each prediction is expected to take, and order of arrival within a share. A place in the plan is a promise: nothing is put before a prediction that
-//! would then miss its due time. Nothing here looks at a clock.
+//! would then miss its due time. Urgent ones, which do not wait for the one that is computed, stand before all others. Nothing here looks at a clock.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
 /// Share by which waiting and computing may take longer than expected: measurements come in between, and times scatter.
 const LONGER: f64 = 0.3;
+
+/// A prediction is short beside one that needs this many times as long (chosen): that one is then held up little.
+const LONG_FOR_SHORT: u64 = 4;
 
 /// Predictions that wait, in the order of the plan.
 #[derive(Debug)]
@@ -31,6 +34,8 @@ pub(crate) struct Planned<T> {
     pub cost_ns: u64,
     /// Instant by which it has to be done, ns; `u64::MAX` = whenever.
     pub due_ns: u64,
+    /// Whether it is computed before the one that runs goes on.
+    pub is_urgent: bool,
     /// Virtual time at which its share lets it begin.
     start_ns: u64,
 }
@@ -41,6 +46,22 @@ pub(crate) struct Place {
     index: usize,
     /// Time for which it would wait, ns.
     pub wait_ns: u64,
+    is_urgent: bool,
+}
+
+/// What runs when a new prediction might be computed before that goes on.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Underway {
+    /// Time that it is expected to take in all, ns.
+    pub cost_ns: u64,
+    /// Time that it still needs, without the urgent ones for which it waits, ns.
+    pub left_ns: u64,
+    /// Time that an urgent one is expected to need that is computed now, ns.
+    pub urgent_left_ns: u64,
+    /// Time for which others may still be computed before it goes on, ns.
+    pub spare_ns: u64,
+    /// Instant by which it has to be done, ns; `u64::MAX` = whenever.
+    pub due_ns: u64,
 }
 
 impl<T> Default for Plan<T> {
@@ -52,6 +73,11 @@ impl<T> Default for Plan<T> {
 /// Instant until which something is surely done that is expected to take this long from now on, ns.
 pub(crate) fn surely_done_ns(now_ns: u64, expected_ns: u64) -> u64 {
     now_ns.saturating_add(((1.0 + LONGER) * expected_ns as f64) as u64)
+}
+
+/// What has to be expected of a prediction that has run for some time, as a part of what [`surely_done_ns`] adds to: who takes longer does so at the end.
+pub(crate) fn left_ns(expected_ns: u64, ran_ns: u64) -> u64 {
+    budget_ns(ran_ns, surely_done_ns(0, expected_ns))
 }
 
 /// What may be expected to take until then, for it to be surely done, ns.
@@ -68,13 +94,38 @@ impl<T> Plan<T> {
         let mut index = self.waiting.len();
         for planned in self.waiting.iter().rev() {
             let would_be_late = wait_ns + cost_ns > budget_ns(now_ns, planned.due_ns);
-            if would_be_late || planned.start_ns <= start_ns || &*planned.share == share {
+            if would_be_late || planned.is_urgent || planned.start_ns <= start_ns || &*planned.share == share {
                 break;
             }
             index -= 1;
             wait_ns -= planned.cost_ns;
         }
-        Place { index, wait_ns }
+        Place { index, wait_ns, is_urgent: false }
+    }
+
+    /// The place of a new prediction that is computed before the one that runs goes on: where it is much shorter than that, nobody is late by it and none
+    /// of its share waits, for these come first.
+    pub fn urgent_place(&self, share: &str, cost_ns: u64, now_ns: u64, underway: Underway) -> Option<Place> {
+        let index = self.waiting.iter().take_while(|planned| planned.is_urgent).count();
+        let (urgent, others) = (self.waiting.range(..index), self.waiting.range(index..));
+        let before_ns: u64 = urgent.map(|planned| planned.cost_ns).sum();
+        let wait_ns = underway.urgent_left_ns + before_ns;
+        let is_short = cost_ns < underway.cost_ns / LONG_FOR_SHORT && wait_ns + cost_ns <= underway.spare_ns;
+        let running_ns = wait_ns + cost_ns + underway.left_ns;
+        let is_late = |done_ns: u64, due_ns: u64| done_ns > budget_ns(now_ns, due_ns);
+        let mut done_ns = running_ns;
+        let harms_nobody = !is_late(running_ns, underway.due_ns)
+            && others.clone().all(|planned| {
+                done_ns += planned.cost_ns;
+                // Who is late whatever happens is not held up.
+                &*planned.share != share && (!is_late(done_ns, planned.due_ns) || now_ns + done_ns - cost_ns > planned.due_ns)
+            });
+        (is_short && harms_nobody).then_some(Place { index, wait_ns, is_urgent: true })
+    }
+
+    /// Whether the next prediction is urgent.
+    pub fn is_next_urgent(&self) -> bool {
+        self.waiting.front().is_some_and(|planned| planned.is_urgent)
     }
 
     /// Puts a prediction there that is expected to take this long.
@@ -82,7 +133,7 @@ impl<T> Plan<T> {
         let start_ns = self.start_of(&share);
         // Predictions of unknown cost take turns as if each took a little.
         self.next_start_ns.insert(Arc::clone(&share), start_ns + cost_ns.max(1));
-        self.waiting.insert(place.index, Planned { item, share, cost_ns, due_ns, start_ns });
+        self.waiting.insert(place.index, Planned { item, share, cost_ns, due_ns, is_urgent: place.is_urgent, start_ns });
     }
 
     /// Virtual time at which a new prediction of this share may begin: who asked for nothing has saved nothing up.
@@ -200,11 +251,38 @@ mod tests {
             plan.insert(place, "a".into(), i, 10, due_ns);
         }
         // Another share would come after the first one; it comes after the second.
-        assert_eq!(plan.place("b", 10, 0, 0), Place { index: 2, wait_ns: 20 });
-        assert_eq!(plan.place("a", 10, 0, 7), Place { index: 3, wait_ns: 37 });
+        assert_eq!(plan.place("b", 10, 0, 0), Place { index: 2, wait_ns: 20, is_urgent: false });
+        assert_eq!(plan.place("a", 10, 0, 7), Place { index: 3, wait_ns: 37, is_urgent: false });
         // The first one is taken: it may take what it asked for. Three instants later nothing is left to spare, and then the second is late whatever happens.
         assert_eq!(plan.pop().map(|next| next.item), Some(0));
         assert_eq!((plan.spare_ns(0), plan.spare_ns(13), plan.spare_ns(17)), (10, 0, WHENEVER));
+    }
+
+    /// Goal: a short one is computed before the one that runs goes on, unless somebody is late by it, one of its share waits, or that one waited long enough. Method:
+    /// by hand; one runs that needs 100 more.
+    #[test]
+    fn analytic_a_short_one_does_not_wait_for_a_long_one() {
+        let underway = Underway { cost_ns: 100, left_ns: 100, urgent_left_ns: 0, spare_ns: 100, due_ns: WHENEVER };
+        let mut plan = Plan::default();
+        let place = |plan: &Plan<u32>, share, cost_ns, underway| {
+            plan.urgent_place(share, cost_ns, 0, underway).map(|place| (place.index, place.wait_ns))
+        };
+        assert_eq!((place(&plan, "a", 24, underway), place(&plan, "a", 25, underway)), (Some((0, 0)), None), "a quarter");
+        // 1.3 · (24 + 100) = 161.2.
+        let due = |due_ns: u64| Underway { due_ns, ..underway };
+        assert_eq!((place(&plan, "a", 24, due(162)), place(&plan, "a", 24, due(161))), (Some((0, 0)), None));
+        assert_eq!(place(&plan, "a", 24, Underway { spare_ns: 23, ..underway }), None, "it waited long enough");
+        assert_eq!(place(&plan, "a", 24, Underway { urgent_left_ns: 7, ..underway }), Some((0, 7)));
+        // Behind other urgent ones, before all others, of which one has to be done at 1.3 · (10 + 10 + 100 + 30).
+        let others = plan.place("b", 30, 0, 100);
+        plan.insert(others, "b".into(), 0, 30, 195);
+        let first = plan.urgent_place("a", 10, 0, underway).unwrap();
+        plan.insert(first, "a".into(), 1, 10, WHENEVER);
+        assert_eq!((place(&plan, "a", 10, underway), place(&plan, "a", 11, underway)), (Some((1, 10)), None));
+        assert_eq!(place(&plan, "b", 1, underway), None, "order within a share");
+        assert!(plan.is_next_urgent() && plan.place("c", 1, 0, 100).index >= 1);
+        assert_eq!(plan.pop().map(|next| (next.item, next.is_urgent)), Some((1, true)));
+        assert!(!plan.is_next_urgent());
     }
 
     #[test]

@@ -3,12 +3,14 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 
+use nesam_model::Gate;
+
 use crate::command::Command;
 use crate::demand::Demand;
 use crate::error::EngineError;
 use crate::handle::Submission;
 use crate::limits::Limits;
-use crate::plan::{Place, Plan, surely_done_ns};
+use crate::plan::{Place, Plan, Underway, left_ns, surely_done_ns};
 use crate::query::PredictQuery;
 use crate::service_time::{ServiceTime, work};
 use crate::sync::{Condvar, Mutex, MutexGuard};
@@ -32,6 +34,8 @@ const RETRY_MAX_NS: u64 = 5_000_000_000;
 pub(crate) struct Queue {
     lanes: Mutex<Lanes>,
     filled: Condvar,
+    /// Closed while the prediction that runs waits for an urgent one.
+    gate: Gate,
 }
 
 #[derive(Debug, Default)]
@@ -42,25 +46,31 @@ struct Lanes {
     predictions: Plan<Submission>,
     demand: Demand,
     running: Option<Running>,
+    /// A short one for which that waits.
+    urgent: Option<Running>,
     service_time: ServiceTime,
     /// Instant until which the expected times are relied on, ns.
     relied_on_until_ns: u64,
     stopped: bool,
 }
 
-/// The prediction that the engine computes now.
+/// A prediction that the engine computes now.
 #[derive(Clone, Debug)]
 struct Running {
     share: Arc<str>,
     since_ns: u64,
     expected_ns: u64,
+    /// Time for which it waited for urgent ones that are done, ns.
+    paused_ns: u64,
     deadline_ns: Option<u64>,
 }
 
 impl Running {
-    /// Time for which it still runs: it is given up at its deadline.
-    fn left_ns(&self, now_ns: u64) -> u64 {
-        (self.since_ns + self.expected_ns).min(self.deadline_ns.unwrap_or(u64::MAX)).saturating_sub(now_ns)
+    /// Time that it still needs: it is given up at its deadline. `pause_ns` = time for which it has waited for the urgent one that is computed now.
+    fn left_ns(&self, now_ns: u64, pause_ns: u64) -> u64 {
+        let ran_ns = now_ns.saturating_sub(self.since_ns + self.paused_ns + pause_ns);
+        let given_up_ns = self.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(now_ns));
+        left_ns(self.expected_ns, ran_ns).min(given_up_ns)
     }
 }
 
@@ -71,6 +81,16 @@ pub(crate) enum Took {
     All(u64),
     /// It was given up.
     AtLeast(u64),
+}
+
+impl Took {
+    /// The same without the time for which it waited.
+    fn less(self, paused_ns: u64) -> Self {
+        match self {
+            Self::All(ns) => Self::All(ns.saturating_sub(paused_ns)),
+            Self::AtLeast(ns) => Self::AtLeast(ns.saturating_sub(paused_ns)),
+        }
+    }
 }
 
 /// How a prediction is let in.
@@ -87,6 +107,8 @@ pub(crate) enum Turn {
     Commands(VecDeque<Submission>),
     /// One prediction, since no command waits and none is computed.
     Prediction(Box<Submission>),
+    /// One that is computed before the one at work goes on; until it is done that one waits at its next step.
+    Urgent(Box<Submission>),
     /// Nothing more will come.
     End,
 }
@@ -130,12 +152,19 @@ impl Queue {
                 return Turn::End;
             }
             // One at a time: they share the processors.
-            if lanes.running.is_none()
+            let is_urgent = lanes.running.is_some() && lanes.predictions.is_next_urgent();
+            if lanes.urgent.is_none()
+                && (is_urgent || lanes.running.is_none())
                 && let Some(next) = lanes.predictions.pop()
             {
                 let deadline_ns = next.item.deadline_ns;
-                lanes.running = Some(Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns, deadline_ns });
-                return Turn::Prediction(Box::new(next.item));
+                let running = Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns, paused_ns: 0, deadline_ns };
+                *lanes.at_work(is_urgent) = Some(running);
+                let submission = Box::new(next.item);
+                if is_urgent {
+                    self.gate.close();
+                }
+                return if is_urgent { Turn::Urgent(submission) } else { Turn::Prediction(submission) };
             }
             lanes = self.filled.wait(lanes).expect("no holder of the queue panics; this is a bug");
         }
@@ -145,15 +174,17 @@ impl Queue {
     ///
     /// # Errors
     /// `EngineError::Expired` where it would be late all the same and others wait, who may not be: it was let in, and others took longer than was expected of them.
-    pub fn fit(&self, query: &mut PredictQuery, deadline_ns: Option<u64>, now_ns: u64) -> Result<(), EngineError> {
+    pub fn fit(&self, query: &mut PredictQuery, is_urgent: bool, deadline_ns: Option<u64>, now_ns: u64) -> Result<(), EngineError> {
         let mut lanes = self.lock();
         if query.least() < query.samples {
             let own_ns = deadline_ns.map_or(u64::MAX, |deadline_ns| (DUE_AFTER * deadline_ns.saturating_sub(now_ns) as f64) as u64);
-            let affordable = lanes.service_time.affordable(query, own_ns.min(lanes.predictions.spare_ns(now_ns)));
+            // Others wait for an urgent one: it takes what it was let in for.
+            let let_in_ns = lanes.urgent.as_ref().filter(|_| is_urgent).map_or(u64::MAX, |urgent| urgent.expected_ns);
+            let affordable = lanes.service_time.affordable(query, own_ns.min(let_in_ns).min(lanes.predictions.spare_ns(now_ns)));
             query.keep_first(affordable);
         }
         let expected_ns = lanes.service_time.expected_ns(work(query, query.samples));
-        lanes.correct(expected_ns, now_ns);
+        lanes.correct(is_urgent, expected_ns, now_ns);
         let waiting = lanes.predictions.len();
         if waiting > 0 && deadline_ns.is_some_and(|deadline_ns| now_ns + expected_ns > deadline_ns) {
             return Err(EngineError::Expired);
@@ -161,12 +192,18 @@ impl Queue {
         Ok(())
     }
 
+    /// Where the prediction that runs waits for urgent ones.
+    pub fn gate(&self) -> &Gate {
+        &self.gate
+    }
+
     /// The prediction whose turn it was is done: learns how long it took if it was computed, or that it takes longer if it was given up later than expected.
     /// Said before its answer leaves, so that whoever asks again at once finds the engine idle.
-    pub fn done(&self, work: f64, took: Option<Took>, now_ns: u64) {
+    pub fn done(&self, work: f64, is_urgent: bool, took: Option<Took>, now_ns: u64) {
         let mut lanes = self.lock();
         let expected_ns = lanes.service_time.expected_ns(work);
-        match took {
+        let paused_ns = lanes.at_work(is_urgent).as_ref().map_or(0, |running| running.paused_ns);
+        match took.map(|took| took.less(paused_ns)) {
             Some(Took::All(took_ns)) => {
                 let bears_out = took_ns / HOPELESS <= expected_ns && expected_ns / HOPELESS <= took_ns;
                 lanes.relied_on_until_ns = if bears_out { now_ns + RELIED_ON_NS } else { 0 };
@@ -176,11 +213,17 @@ impl Queue {
                 if (1..took_ns).contains(&expected_ns) {
                     lanes.service_time.learn(work, WHOLE_OF_GIVEN_UP * took_ns);
                 }
-                lanes.correct(took_ns, now_ns);
+                lanes.correct(is_urgent, took_ns, now_ns);
             }
-            None => lanes.correct(0, now_ns),
+            None => lanes.correct(is_urgent, 0, now_ns),
         }
-        lanes.running = None;
+        let done = lanes.at_work(is_urgent).take();
+        if is_urgent {
+            self.gate.open();
+        }
+        if let (true, Some(urgent), Some(running)) = (is_urgent, done, &mut lanes.running) {
+            running.paused_ns += now_ns.saturating_sub(urgent.since_ns.max(running.since_ns));
+        }
         self.filled.notify_one();
     }
 
@@ -192,7 +235,7 @@ impl Queue {
         lanes.predictions.drain()
     }
 
-    /// Whether [`Queue::next`] would give a command or a prediction at once.
+    /// Whether [`Queue::next`] would give a command or a prediction at once, where none is computed.
     pub fn has_turn(&self) -> bool {
         let lanes = self.lock();
         !lanes.commands.is_empty() || (!lanes.stopped && lanes.predictions.len() > 0)
@@ -210,19 +253,28 @@ impl Lanes {
     fn admit(&mut self, share: &Arc<str>, submission: &Submission, query: &PredictQuery, limits: &Limits) -> Result<Admitted, EngineError> {
         let now_ns = submission.submitted_ns();
         self.demand.ask(share, self.service_time.expected_ns(work(query, query.samples)), now_ns);
-        let running_ns = self.running.as_ref().map_or(0, |running| running.left_ns(now_ns));
+        let urgent_left_ns = self.urgent.as_ref().map_or(0, |urgent| urgent.left_ns(now_ns, 0));
+        let left_ns = self.running.as_ref().map_or(0, |running| running.left_ns(now_ns, self.pause_ns(now_ns)));
         let due_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS));
         let room_ns = (self.demand.room(share) * due_ns.saturating_sub(now_ns) as f64) as u64;
         let of = |samples| {
             let expected_ns = self.service_time.expected_ns(work(query, samples));
-            let place = self.predictions.place(share, expected_ns, now_ns, running_ns);
+            let underway = self.running.as_ref().map(|running| Underway {
+                cost_ns: running.expected_ns,
+                left_ns,
+                urgent_left_ns,
+                spare_ns: running.expected_ns.saturating_sub(running.paused_ns + self.pause_ns(now_ns)),
+                due_ns: running.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS)),
+            });
+            let urgent = underway.and_then(|underway| self.predictions.urgent_place(share, expected_ns, now_ns, underway));
+            let place = urgent.unwrap_or_else(|| self.predictions.place(share, expected_ns, now_ns, left_ns + urgent_left_ns));
             let late_ns = surely_done_ns(now_ns, place.wait_ns + expected_ns).saturating_sub(now_ns.saturating_add(room_ns));
             (Admitted { place, expected_ns, due_ns }, late_ns)
         };
         let (admitted, late_ns) = Some(of(query.samples)).filter(|(_, late_ns)| *late_ns == 0).unwrap_or_else(|| of(query.least()));
         let (waiting, own) = (self.predictions.len(), self.predictions.len_of(share));
         // Whoever comes while nothing else is to be done is let in though it may be late, so that the estimate stays true; not in vain while the estimate is.
-        let first = waiting + usize::from(self.running.is_some());
+        let first = waiting + self.running.iter().chain(&self.urgent).count();
         let is_hopeless = now_ns < self.relied_on_until_ns && admitted.expected_ns / HOPELESS > due_ns.saturating_sub(now_ns);
         if waiting >= limits.waiting_predictions_max {
             Err(overloaded("predictions", first, admitted.place.wait_ns))
@@ -238,12 +290,23 @@ impl Lanes {
         }
     }
 
-    /// The prediction that runs is expected to take this long.
-    fn correct(&mut self, expected_ns: u64, now_ns: u64) {
-        if let Some(running) = &mut self.running {
-            self.demand.give(&running.share, expected_ns as f64 - running.expected_ns as f64, now_ns);
-            running.expected_ns = expected_ns;
-        }
+    /// The prediction that is computed, or the urgent one.
+    fn at_work(&mut self, is_urgent: bool) -> &mut Option<Running> {
+        if is_urgent { &mut self.urgent } else { &mut self.running }
+    }
+
+    /// Time for which the prediction that runs has waited for the urgent one that is computed now, ns.
+    fn pause_ns(&self, now_ns: u64) -> u64 {
+        self.urgent.as_ref().map_or(0, |urgent| now_ns.saturating_sub(urgent.since_ns))
+    }
+
+    /// A prediction at work is expected to take this long.
+    fn correct(&mut self, is_urgent: bool, expected_ns: u64, now_ns: u64) {
+        let Some(running) = self.at_work(is_urgent) else { return };
+        let more_ns = expected_ns as f64 - running.expected_ns as f64;
+        running.expected_ns = expected_ns;
+        let share = Arc::clone(&running.share);
+        self.demand.give(&share, more_ns, now_ns);
     }
 
     /// Lets another command in, unless too many wait.
@@ -281,6 +344,8 @@ mod tests {
     /// Time that is simulated, and of that the time after which answers count.
     const ENDS_NS: u64 = 12_000 * MS;
     const COUNTS_NS: u64 = 4_000 * MS;
+    /// Times as long where few ask.
+    const LONGER: u64 = 20;
 
     /// What became of the questions of one vehicle.
     #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -292,21 +357,44 @@ mod tests {
         samples: usize,
     }
 
+    /// A vehicle that asks at random instants: how often, in multiples of what the engine can do, for how many samples, and by when.
+    #[derive(Clone, Copy, Debug)]
+    struct Asker {
+        rate: f64,
+        samples: usize,
+        deadline_ns: u64,
+    }
+
+    impl Asker {
+        fn usual(rate: f64) -> Self {
+            Self { rate, samples: SAMPLES, deadline_ns: DEADLINE_NS }
+        }
+
+        /// Until it asks again.
+        fn pause_ns(&self, random: f64) -> f64 {
+            -random.ln() * NS_PER_WORK * (TAKES_NS / NS_PER_WORK - SAMPLES as f64 + self.samples as f64) / self.rate
+        }
+    }
+
     fn question(vehicle: usize, samples_min: usize, now_ns: u64) -> Submission {
+        of_asker(vehicle, Asker::usual(1.0), samples_min, now_ns)
+    }
+
+    fn of_asker(vehicle: usize, asker: Asker, samples_min: usize, now_ns: u64) -> Submission {
         let query = PredictQuery {
             session: vehicle.to_string(),
             start: None,
             instant: None,
             use_history: true,
-            samples: SAMPLES,
+            samples: asker.samples,
             samples_min,
             horizon: 1,
-            controls: Candidates::Given(vec![0.0; 2 * SAMPLES]),
+            controls: Candidates::Given(vec![0.0; 2 * asker.samples]),
             cost: None,
             extras: Default::default(),
         };
         let mut submission = Submission::new(Command::Predict(query), |_| ()).at(now_ns);
-        submission.deadline_ns = Some(now_ns + DEADLINE_NS);
+        submission.deadline_ns = Some(now_ns + asker.deadline_ns);
         submission
     }
 
@@ -319,46 +407,72 @@ mod tests {
         }
     }
 
-    /// Vehicles that ask at random instants, at these rates in multiples of what the engine can do, an engine that takes 0.85 to 1.15 of what is expected.
+    /// Vehicles that ask at these rates for what takes 16 ms.
     fn simulate(rates: &[f64], samples_min: usize) -> Vec<Tally> {
+        simulate_askers(&rates.iter().map(|rate| Asker::usual(*rate)).collect::<Vec<_>>(), samples_min, ENDS_NS)
+    }
+
+    /// A prediction at work.
+    #[derive(Clone, Copy)]
+    struct AtWork {
+        vehicle: usize,
+        work: f64,
+        begin_ns: u64,
+        end_ns: u64,
+        deadline_ns: u64,
+    }
+
+    /// An engine that takes 0.85 to 1.15 of what is expected, and in which a prediction waits for urgent ones.
+    fn simulate_askers(askers: &[Asker], samples_min: usize, ends_ns: u64) -> Vec<Tally> {
         let (queue, limits, mut random) = (Queue::default(), Limits::default(), random(11));
-        queue.done(1.0, Some(Took::All(NS_PER_WORK as u64)), 0);
-        let mut tallies = vec![Tally::default(); rates.len()];
-        let mut asks_ns: Vec<f64> = rates.iter().map(|rate| -random().ln() * TAKES_NS / rate).collect();
-        // Whose prediction runs, its work, its begin and end.
-        let mut running: Option<(usize, f64, u64, u64)> = None;
+        queue.done(1.0, false, Some(Took::All(NS_PER_WORK as u64)), 0);
+        let mut tallies = vec![Tally::default(); askers.len()];
+        let mut asks_ns: Vec<f64> = askers.iter().map(|asker| asker.pause_ns(random())).collect();
+        let mut at_work: [Option<AtWork>; 2] = [None; 2];
         loop {
             let (vehicle, ask_ns) = asks_ns.iter().copied().enumerate().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
             let mut now_ns = ask_ns as u64;
-            if let Some((_, work, begin_ns, end_ns)) = running.filter(|(.., end_ns)| *end_ns <= now_ns) {
-                queue.done(work, Some(Took::All(end_ns - begin_ns)), end_ns);
-                (running, now_ns) = (None, end_ns);
-            } else if now_ns > ENDS_NS {
+            let is_urgent = at_work[1].is_some();
+            if let Some(done) = at_work[usize::from(is_urgent)].filter(|at_work| at_work.end_ns <= now_ns) {
+                queue.done(done.work, is_urgent, Some(Took::All(done.end_ns - done.begin_ns)), done.end_ns);
+                if let (true, Some(running)) = (is_urgent, &mut at_work[0]) {
+                    running.end_ns += done.end_ns - done.begin_ns;
+                }
+                at_work[usize::from(is_urgent)] = None;
+                if done.begin_ns > COUNTS_NS {
+                    let tally = &mut tallies[done.vehicle];
+                    tally.in_time += usize::from(done.end_ns <= done.deadline_ns);
+                    tally.late += usize::from(done.end_ns > done.deadline_ns);
+                }
+                now_ns = done.end_ns;
+            } else if now_ns > ends_ns {
                 return tallies;
             } else {
                 tallies[vehicle].asked += usize::from(now_ns > COUNTS_NS);
-                let _ = queue.push(question(vehicle, samples_min, now_ns), &limits);
-                asks_ns[vehicle] -= random().ln() * TAKES_NS / rates[vehicle];
+                let _ = queue.push(of_asker(vehicle, askers[vehicle], samples_min, now_ns), &limits);
+                asks_ns[vehicle] += askers[vehicle].pause_ns(random());
             }
-            while running.is_none() && queue.has_turn() {
-                let Turn::Prediction(mut submission) = queue.next(|| now_ns) else { panic!("only predictions were asked for") };
+            while at_work[1].is_none() && (at_work[0].is_none() || queue.lock().predictions.is_next_urgent()) && queue.has_turn() {
+                let (mut submission, is_urgent) = match queue.next(|| now_ns) {
+                    Turn::Prediction(submission) => (submission, false),
+                    Turn::Urgent(submission) => (submission, true),
+                    _ => panic!("only predictions were asked for"),
+                };
                 let deadline_ns = submission.deadline_ns;
                 let Command::Predict(query) = &mut submission.command else { panic!("only predictions were asked for") };
-                let fits = queue.fit(query, deadline_ns, now_ns).is_ok();
+                let fits = queue.fit(query, is_urgent, deadline_ns, now_ns).is_ok();
                 let work = work(query, query.samples);
                 let end_ns = now_ns + (NS_PER_WORK * work * (0.85 + 0.3 * random())) as u64;
                 let vehicle = query.session.parse::<usize>().unwrap();
                 if now_ns > COUNTS_NS {
-                    let (in_time, tally) = (Some(end_ns) <= deadline_ns, &mut tallies[vehicle]);
-                    tally.in_time += usize::from(fits && in_time);
-                    tally.late += usize::from(fits && !in_time);
-                    tally.refused_at_turn += usize::from(!fits);
-                    tally.samples += if fits { query.samples } else { 0 };
+                    tallies[vehicle].refused_at_turn += usize::from(!fits);
+                    tallies[vehicle].samples += if fits { query.samples } else { 0 };
                 }
                 if fits {
-                    running = Some((vehicle, work, now_ns, end_ns));
+                    let begun = AtWork { vehicle, work, begin_ns: now_ns, end_ns, deadline_ns: deadline_ns.unwrap() };
+                    at_work[usize::from(is_urgent)] = Some(begun);
                 } else {
-                    queue.done(work, None, now_ns);
+                    queue.done(work, is_urgent, None, now_ns);
                 }
             }
         }
@@ -394,6 +508,20 @@ mod tests {
         assert!(first < 1.5 * others && 20.0 * others > 0.9 * ANSWERS, "{first} and {others}: {tallies:?}");
     }
 
+    /// Goal: who asks for little and soon does not wait for who asks for much, and nobody who was let in is late. Method: two ask for 0.2 s within 1 s, together for half of
+    /// the time, two for 16 ms within 60 ms; then with so many short ones that long ones have to wait for their turn.
+    #[test]
+    fn property_short_questions_do_not_wait_for_long_ones() {
+        let long = |rate: f64| Asker { rate, samples: 20_000, deadline_ns: 1_000 * MS };
+        let short = |rate: f64| Asker { rate, samples: SAMPLES, deadline_ns: 60 * MS };
+        let part = |tallies: &[Tally]| sum(tallies, |one| one.in_time) / sum(tallies, |one| one.asked);
+        for (of_short, all_short, all_long) in [(0.05, 0.95, 0.9), (0.2, 0.9, 0.6)] {
+            let tallies = simulate_askers(&[long(0.25), long(0.25), short(of_short), short(of_short)], 0, LONGER * ENDS_NS);
+            assert_eq!(sum(&tallies, |one| one.late + one.refused_at_turn), 0.0, "{tallies:?}");
+            assert!(part(&tallies[2..]) > all_short && part(&tallies[..2]) > all_long, "{tallies:?}");
+        }
+    }
+
     #[test]
     fn property_fewer_samples_mean_more_answers() {
         let [all, fewer] = [0, 16].map(|samples_min| simulate(&[0.75; 4], samples_min));
@@ -407,7 +535,7 @@ mod tests {
     fn analytic_who_is_refused_hears_of_the_one_that_is_computed_and_may_come_back_soon() {
         let (queue, limits) = (Queue::default(), Limits::default());
         // A quarter of an hour for a unit of work, which nobody would wait for.
-        queue.done(1.0, Some(Took::All(900_000 * MS)), 0);
+        queue.done(1.0, false, Some(Took::All(900_000 * MS)), 0);
         assert!(queue.push(question(0, 0, 0), &limits).is_ok(), "nothing else is to be done");
         assert!(matches!(queue.next(|| 0), Turn::Prediction(_)));
         let (refused, _) = *queue.push(question(1, 0, 0), &limits).unwrap_err();
@@ -428,20 +556,20 @@ mod tests {
             })
         };
         let begin = |now_ns: u64| assert!(matches!(queue.next(|| now_ns), Turn::Prediction(_)));
-        queue.done(of_one, Some(Took::All(takes_ns)), 0);
+        queue.done(of_one, false, Some(Took::All(takes_ns)), 0);
         assert_eq!(ask(0, 0, 4 * MS), Ok(()));
         begin(0);
         // It will be given up after 4 ms: another one is in time behind it.
         assert_eq!(ask(1, 0, 30 * MS), Ok(()));
-        queue.done(of_one, Some(Took::AtLeast(4 * MS)), 4 * MS);
+        queue.done(of_one, false, Some(Took::AtLeast(4 * MS)), 4 * MS);
         assert_eq!(queue.lock().service_time.expected_ns(of_one), takes_ns, "it says nothing of how long it would have taken");
         begin(4 * MS);
-        queue.done(of_one, Some(Took::All(takes_ns)), 20 * MS);
+        queue.done(of_one, false, Some(Took::All(takes_ns)), 20 * MS);
         assert_eq!(ask(0, 20 * MS, 4 * MS), Err(EngineError::Expired));
         assert_eq!(ask(0, 20 * MS, 12 * MS), Ok(()), "it may be in time");
         begin(20 * MS);
         // Given up later than it was expected to end: such a question takes longer.
-        queue.done(of_one, Some(Took::AtLeast(40 * MS)), 60 * MS);
+        queue.done(of_one, false, Some(Took::AtLeast(40 * MS)), 60 * MS);
         assert!(queue.lock().service_time.expected_ns(of_one) > takes_ns);
         assert_eq!(ask(0, 20 * MS + RELIED_ON_NS, 4 * MS), Ok(()), "the machine may have become faster since");
     }

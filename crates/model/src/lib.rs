@@ -11,6 +11,7 @@ mod effects_file;
 pub mod encoder;
 mod fused;
 mod ground;
+mod interruption;
 pub mod normalization;
 mod precision;
 mod predictor;
@@ -33,6 +34,7 @@ pub use effects_file::named_effect;
 pub use effects_file::{read as effects_from_toml, write as effects_to_toml};
 pub use fused::{Order, Path};
 pub use ground::{GroundSource, history_actuators};
+pub use interruption::{Gate, Interruption};
 pub use normalization::Normalization;
 pub use precision::Precision;
 pub use predictor::{PartTimes, Predictor, Transition};
@@ -70,7 +72,7 @@ pub enum ModelError {
         /// What was wrong and the limit.
         reason: String,
     },
-    /// Nobody waits for the answer any more ([`RolloutExtras::abandoned`]).
+    /// Nobody waits for the answer any more ([`Interruption::abandoned`]).
     #[error("nobody waits for the rollout any more")]
     Abandoned,
     /// What a bundle says of its own errors cannot be used.

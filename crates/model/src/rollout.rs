@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use crate::dims::{CONTEXT, FEATURES, HISTORY};
+use crate::interruption::Interruption;
 use crate::soil_field::SoilField;
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, SoilCorrection, VehicleState, WHEELS};
 use nesam_terrain::WorldMap;
@@ -164,8 +165,8 @@ pub struct RolloutExtras<'a> {
     pub risk: bool,
     /// Whether to keep [`Rollout::position_m`], for scores far from the origin.
     pub unrounded: bool,
-    /// Raised when nobody waits for the answer any more: the rollout is then given up within a step.
-    pub abandoned: Option<&'a AtomicBool>,
+    /// What may happen to it meanwhile.
+    pub interruption: Interruption<'a>,
     /// When an answer of fewer samples is due; then the rollout has the first of them. Without what-if soils.
     pub due: Option<Due<'a>>,
 }

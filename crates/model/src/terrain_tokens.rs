@@ -71,7 +71,7 @@ impl TerrainProjection {
             ..=LANES => self.tokens::<1>(map, poses),
             _ => self.tokens::<2>(map, poses),
         };
-        poses.chunks(BATCH * rayon::current_num_threads()).flat_map(tokens).collect()
+        poses.chunks(batch()).flat_map(tokens).collect()
     }
 
     /// The exact tokens at a few poses: each worker encodes some of the patches and then works out some of the outputs of all of them, so that W_c, far larger
@@ -254,15 +254,26 @@ impl TerrainTokens {
     }
 
     /// Encodes nodes, in parallel; those that several poses miss once.
-    pub fn encode(&self, projection: &TerrainProjection, mut missing: Vec<Node>) {
+    pub fn encode(&self, projection: &TerrainProjection, missing: Vec<Node>) {
+        self.encode_unless(projection, missing, || false);
+    }
+
+    /// The same until `ends`, which may wait, says so before some of them.
+    pub fn encode_unless(&self, projection: &TerrainProjection, mut missing: Vec<Node>, ends: impl Fn() -> bool) {
         // Nodes of one heading stand together.
         missing.sort_unstable_by_key(|(x, y, heading)| (*heading, *x, *y));
         missing.dedup();
-        self.encoded.fetch_add(missing.len() as u64, Ordering::Relaxed);
-        let poses: Vec<Pose2> = missing.iter().map(|node| pose_of(*node)).collect();
-        let encoded = projection.exact(&self.map, &poses);
+        let batches = missing.chunks(batch()).take_while(|_| !ends());
+        let poses = batches.map(|nodes| nodes.iter().map(|node| pose_of(*node)).collect::<Vec<_>>());
+        let encoded: Vec<TerrainToken> = poses.flat_map(|poses| projection.exact(&self.map, &poses)).collect();
+        self.encoded.fetch_add(encoded.len() as u64, Ordering::Relaxed);
         self.nodes.insert(missing.into_iter().zip(encoded));
     }
+}
+
+/// Patches that are encoded together.
+fn batch() -> usize {
+    BATCH * rayon::current_num_threads()
 }
 
 #[inline]

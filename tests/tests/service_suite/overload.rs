@@ -11,6 +11,7 @@ use nesam_engine::{
     Clock, Command, Engine, EngineError, EngineHandle, Executed, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply,
     Submission,
 };
+use nesam_server::MonotonicClock;
 use tonic::Code;
 
 use crate::stage::*;
@@ -310,6 +311,55 @@ fn service_measurements_do_not_wait_for_a_prediction() {
     assert!(matches!(answer.recv().unwrap(), Err(EngineError::Abandoned)));
     handle.stop();
     assert_eq!(*heard.lock().unwrap(), ["open", "measure", "measure", "measure", "predict", "measure"]);
+}
+
+/// Goal: a short question does not wait for a long one, neither answer is another for it, and a recording has them in the order in which they began. Method: a long one,
+/// of states or of derivatives, and a short one in the midst of it; both once more alone.
+#[test]
+fn service_a_short_question_does_not_wait_for_a_long_one() {
+    let recorded = recorded();
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let tap = {
+        let heard = heard.clone();
+        Box::new(move |executed: Executed| {
+            if let Command::Predict(query) = executed.command {
+                heard.lock().unwrap().push(query.samples);
+            }
+        })
+    };
+    let engine = Engine::new(predictor(), Limits::default()).unwrap();
+    let handle = EngineHandle::spawn_tapped(engine, Arc::new(MonotonicClock::default()), Some(tap));
+    handle.call(Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();
+    drive(&handle, &recorded, recorded.world.id());
+    let of = |answer: Result<Reply, EngineError>| {
+        let Ok(Reply::Predicted(prediction)) = answer else { panic!("a prediction was asked for") };
+        (prediction.rollout.states.clone(), format!("{:?}", prediction.extras))
+    };
+    let jacobians = PredictExtras { jacobians: true, ..Default::default() };
+    for (samples, extras) in [(2048, PredictExtras::default()), (8, jacobians)] {
+        let long = PredictQuery { extras, ..engine_query("s", &recorded.drive, 2, samples, 32) };
+        let short = engine_query("s", &recorded.drive, 2, 24, 8);
+        let alone = [&long, &short].map(|query| of(handle.call(Command::Predict(query.clone()))));
+        heard.lock().unwrap().clear();
+        let [(first, of_long), (second, of_short)] = [long, short].map(asked);
+        handle.submit(first);
+        while handle.waiting().1 > 0 {
+            std::thread::yield_now();
+        }
+        std::thread::sleep(Duration::from_millis(5));
+        handle.submit(second);
+        let of_short = of(of_short.recv().unwrap());
+        assert!(of_long.try_recv().is_err(), "the long one is still computed");
+        assert!([of(of_long.recv().unwrap()), of_short] == alone, "both as they are alone");
+        // It hears of an answer after that was sent.
+        handle.call(Command::List).unwrap();
+        let deadline = Instant::now() + PATIENCE;
+        while heard.lock().unwrap().len() < 2 && Instant::now() < deadline {
+            std::thread::yield_now();
+        }
+        assert_eq!(*heard.lock().unwrap(), [samples, 24]);
+    }
+    handle.stop();
 }
 
 /// Goal: an answer that is due has what is done, is the beginning of the whole, and replays. Method: the flag is raised before a prediction begins, so that it ends

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use nesam_model::{Due, HistoryStep, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, SoilByClass, Variant, is_raised};
+use nesam_model::{Due, HistoryStep, Predictor, RolloutExtras, RolloutNoise, RolloutQuery, SoilByClass, Variant};
 use nesam_physics::{SoilCorrection, VehicleState};
 use nesam_terrain::WorldMap;
 
@@ -135,10 +135,10 @@ impl Prepared {
             start_time_s: None,
             wheels: None,
         };
-        let Until { abandoned, due } = until;
+        let Until { interruption, due } = until;
         let due = due.filter(|_| query.takes_fewer()).map(|flag| Due { flag, least: query.least() });
         let looked_at = query.extras.interpolation_deviation && map.is_some();
-        let asked_extras = RolloutExtras { field: Some(learned), soils, risk: query.extras.risk, unrounded: looked_at, abandoned, due };
+        let asked_extras = RolloutExtras { field: Some(learned), soils, risk: query.extras.risk, unrounded: looked_at, interruption, due };
         let (mut rollout, risk) = predictor.rollout_with(&asked, &asked_extras)?;
         let samples = if due.is_some() { rollout.samples } else { query.samples };
         let taken = &commands[..samples * query.horizon * 2];
@@ -152,9 +152,9 @@ impl Prepared {
             ..Default::default()
         };
         if query.extras.derived() {
-            let linearisations = predictor.linearise_unless(&asked, abandoned)?;
+            let linearisations = predictor.linearise_with(&asked, interruption)?;
             (extras.jacobians, extras.covariance) = query.extras.derive(&linearisations, forward.steps(), soil, self.noise.as_deref())?;
-            if is_raised(abandoned) {
+            if interruption.is_abandoned() {
                 return Err(EngineError::Abandoned);
             }
         }

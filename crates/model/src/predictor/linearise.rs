@@ -1,7 +1,6 @@
 //! Linearisations of rollouts.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use nesam_physics::VehicleState;
 use rayon::prelude::*;
@@ -9,6 +8,7 @@ use rayon::prelude::*;
 use super::{LogClock, Predictor, control, pose, raw_soil, validate};
 use crate::ModelError;
 use crate::ground::{GroundSource, wheel_points};
+use crate::interruption::Interruption;
 use crate::rollout::RolloutQuery;
 use crate::soil_coordinates::from_raw;
 use crate::tangent::{ExactTransformer, Linearisation, Plane, Scenery, TangentRollout};
@@ -20,17 +20,17 @@ impl Predictor {
     /// # Errors
     /// As [`Predictor::rollout`].
     pub fn linearise<'a>(&'a self, query: &RolloutQuery<'a>) -> Result<Vec<Linearisation<'a>>, ModelError> {
-        self.linearise_unless(query, None)
+        self.linearise_with(query, Interruption::default())
     }
 
-    /// The same until `abandoned` is raised, when nobody waits for the answer any more: rollouts and their derivatives then end within a step and are of no use.
+    /// The same with what may happen meanwhile: rollouts and their derivatives that are abandoned end within a step and are of no use.
     ///
     /// # Errors
     /// As [`Predictor::linearise`].
-    pub fn linearise_unless<'a>(
+    pub fn linearise_with<'a>(
         &'a self,
         query: &RolloutQuery<'a>,
-        abandoned: Option<&'a AtomicBool>,
+        interruption: Interruption<'a>,
     ) -> Result<Vec<Linearisation<'a>>, ModelError> {
         validate(query)?;
         let scales = &self.bundle.normalization;
@@ -54,7 +54,7 @@ impl Predictor {
             prefix: self.prefix(variant, history, &ground, tokens.as_deref(), clock),
             coordinates: query.soil_correction.coordinates,
             wheels: query.wheels,
-            abandoned,
+            interruption,
             previous: history.last().map(|step| step.state),
             observed_share: self.observed_share(history, clock),
             actuators: (!history.is_empty()).then(|| self.actuators(history, &start, &first, clock)),

@@ -4,7 +4,6 @@
 //! block that meets terrain which is not encoded yet stands aside; when all have finished or stand aside, what they miss is encoded together, in parallel, and they
 //! go on. Which block waits for what changes nothing in the results: a node of the terrain is a function of its pose alone.
 
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use nesam_physics::{Control, SOIL_DIM, STATE_DIM, Soil, SoilCorrection, WHEELS};
@@ -18,6 +17,7 @@ use super::{LogClock, OFF_GROUND_M, Predictor, Sample, control, pose, raw_soil, 
 use crate::ModelError;
 use crate::fused::{BlockCache, LANES, Prefix};
 use crate::ground::GroundSource;
+use crate::interruption::Interruption;
 use crate::precision::Precision;
 use crate::rollout::{Due, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};
 use crate::soil_coordinates::from_raw;
@@ -34,7 +34,7 @@ pub(super) struct Scene<'a> {
     pub(super) variant: Variant,
     pub(super) risk: bool,
     pub(super) unrounded: bool,
-    pub(super) abandoned: Option<&'a AtomicBool>,
+    pub(super) interruption: Interruption<'a>,
     pub(super) due: Option<Due<'a>>,
     pub(super) clock: LogClock,
     pub(super) tokens: Option<&'a TerrainTokens>,
@@ -47,18 +47,13 @@ impl Scene<'_> {
         control(self.query, row % self.query.samples, k)
     }
 
-    /// Whether nobody waits for the answer any more.
-    pub(super) fn is_abandoned(&self) -> bool {
-        is_raised(self.abandoned)
-    }
-
-    /// Whether nothing more is to be computed of a block that begins with this row: nobody waits, or the answer is due and has enough without it.
+    /// Whether nothing more is to be computed of a block that begins with this row, once nothing is more urgent: nobody waits, or the answer is due and has enough without it.
     pub(super) fn is_over(&self, first: usize) -> bool {
-        self.is_abandoned() || self.due.is_some_and(|due| first >= due.least && is_raised(Some(due.flag)))
+        self.interruption.ends() || self.due.is_some_and(|due| first >= due.least && is_raised(Some(due.flag)))
     }
 }
 
-/// Caches of blocks of 16 H samples, used again by the next block and the next query: as many as threads work on blocks.
+/// Caches of blocks of 16 H samples, used again by the next block and the next query: as many as threads work on blocks of a rollout and of one that waits for it.
 #[derive(Debug, Default)]
 pub(super) struct Caches<const H: usize>(Mutex<Vec<BlockCache<H>>>);
 
@@ -74,7 +69,7 @@ impl<const H: usize> Caches<H> {
     /// Gives one back. More than threads can use at once are there only while blocks wait for terrain.
     pub(super) fn give(&self, cache: BlockCache<H>) {
         let mut free = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        if free.len() < rayon::current_num_threads() {
+        if free.len() < 2 * rayon::current_num_threads() {
             free.push(cache);
         }
     }
@@ -139,7 +134,7 @@ impl Predictor {
             variant,
             risk: extras.risk,
             unrounded: extras.unrounded,
-            abandoned: extras.abandoned,
+            interruption: extras.interruption,
             due: extras.due.filter(|_| extras.soils.is_empty()),
             clock,
             tokens: tokens.as_deref(),
@@ -177,7 +172,7 @@ impl Predictor {
             true => self.roll_blocks(&scene, &self.caches.wide, &mut samples, &mut rollout),
             false => self.roll_blocks(&scene, &self.caches.narrow, &mut samples, &mut rollout),
         };
-        if scene.is_abandoned() {
+        if scene.interruption.is_abandoned() {
             return Err(ModelError::Abandoned);
         }
         rollout.flags = samples[..rollout.samples].iter().map(|s| s.flags).collect();
@@ -275,7 +270,7 @@ impl Predictor {
             let aside = blocks.iter_mut().filter(|block| !scene.is_over(block.first));
             let missing: Vec<Node> = aside.flat_map(|block| block.missing.drain(..)).collect();
             match scene.tokens {
-                Some(tokens) if !missing.is_empty() => tokens.encode(&self.projection, missing),
+                Some(tokens) if !missing.is_empty() => tokens.encode_unless(&self.projection, missing, || scene.interruption.ends()),
                 _ => return,
             }
         }

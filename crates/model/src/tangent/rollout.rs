@@ -1,7 +1,6 @@
 //! A rollout in f64 with its terrain held, and its derivatives.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 use nesam_physics::driveline::{DrivelineState, differentiable_wheels, measured_wheels};
 use nesam_physics::effects::Phases;
@@ -12,9 +11,10 @@ use rayon::prelude::*;
 
 use crate::dims::CONTROL_DIM;
 use crate::fused::Prefix;
+use crate::interruption::Interruption;
 use crate::normalization::Normalization;
 use crate::predictor::LogClock;
-use crate::rollout::{MeasuredWheels, Variant, is_raised};
+use crate::rollout::{MeasuredWheels, Variant};
 use crate::symbolic::symbolic_step;
 use crate::tangent::transformer::{ExactCache, ExactTransformer};
 use crate::tangent::{Number, Scenery};
@@ -38,8 +38,7 @@ pub struct TangentRollout<'a> {
     pub prefix: Prefix,
     pub coordinates: SoilCoordinates,
     pub wheels: Option<&'a [MeasuredWheels]>,
-    /// Raised when nobody waits for the answer any more.
-    pub abandoned: Option<&'a AtomicBool>,
+    pub interruption: Interruption<'a>,
     /// Last measured state before the start.
     pub previous: Option<VehicleState<f64>>,
     /// Actuators after the history; `None` without a history, where they begin as start and first command say.
@@ -198,7 +197,7 @@ impl<'a> Linearisation<'a> {
             }
             let motion = motions[k];
             let next = shared.step(k, &motion, control, &delta, &seen, &mut cache);
-            if is_raised(shared.abandoned) || !next.state.to_array().iter().all(|v| v.is_finite()) {
+            if shared.interruption.ends() || !next.state.to_array().iter().all(|v| v.is_finite()) {
                 break;
             }
             scenery.push(seen);
@@ -245,7 +244,7 @@ impl<'a> Linearisation<'a> {
             motion = self.shared.on_soil(motion, delta, under_start);
         }
         (from..self.scenery.len())
-            .take_while(|_| !is_raised(self.shared.abandoned))
+            .take_while(|_| !self.shared.interruption.ends())
             .map(|k| {
                 motion = self.shared.step(k, &motion, &control(k), delta, &self.scenery[k], cache);
                 self.shared.reported(k + 1, &motion.state)

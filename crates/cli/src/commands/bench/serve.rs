@@ -35,6 +35,9 @@ pub(super) struct ServeBench {
     /// The first vehicle asks this many times as often as each other one
     #[arg(long, value_name = "FACTOR", default_value_t = 1)]
     greedy: usize,
+    /// One more vehicle, which asks for this many candidates again and again, each time when it has the answer and without a deadline [default: none]
+    #[arg(long, value_name = "SAMPLES", default_value_t = 0, hide_default_value = true)]
+    beside: usize,
     /// Fewest of them that are of use: the server then answers with fewer when time is short [default: all or nothing]
     #[arg(long, value_name = "SAMPLES", default_value_t = 0, hide_default_value = true)]
     samples_min: usize,
@@ -74,6 +77,8 @@ struct Tally {
     samples: usize,
     /// Answers in time by vehicle.
     good_of: Vec<usize>,
+    /// Latencies of the answers to the vehicle beside them, ms.
+    beside_ms: Vec<f64>,
 }
 
 /// Runs the command.
@@ -97,7 +102,8 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     let (server, bundle) = start(Config::ephemeral(), bundle).await?;
     let address = format!("http://{}", server.grpc_addr);
     let mut clients = Vec::new();
-    for vehicle in 0..args.vehicles {
+    // The one beside them is the last.
+    for vehicle in 0..args.vehicles + usize::from(args.beside > 0) {
         let mut client = Client::connect(&address).await.or_failed()?;
         let name = name(vehicle);
         client.open_session(v1::OpenSessionRequest { vehicle_id: name.clone(), ..Default::default() }).await.or_failed()?;
@@ -105,6 +111,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
         clients.push(client);
     }
     let woken_late = tokio::task::spawn_blocking(|| woken_late(Duration::from_secs(2))).await.or_failed()?;
+    let beside = clients.split_off(args.vehicles).pop();
     let capacity_hz = capacity(args, &clients).await?;
     say!(
         "{} candidates of {} steps on flat ground, {} vehicles, deadline {} ms",
@@ -114,9 +121,12 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
         args.deadline_ms
     );
     say!("capacity: {capacity_hz:.1} answers/s to {ASKERS} askers");
+    if args.beside > 0 {
+        say!("beside them one asks for {} candidates again and again", args.beside);
+    }
     say!("this machine, with nothing to do, wakes who sleeps more than 1 ms late in {:.1} of 100 cases", 100.0 * woken_late);
     say!(
-        "{:>6} {:>9} {:>11} {:>19} {:>12} {:>9} {:>7} {:>14} {:>28} {:>14} {:>18}",
+        "{:>6} {:>9} {:>11} {:>19} {:>12} {:>9} {:>7} {:>14} {:>28} {:>14} {:>18} {:>18}",
         "load",
         "asked/s",
         "in time/s",
@@ -127,12 +137,13 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
         "p99 in time ms",
         "p50, p99 refused ms, in 1 ms",
         "by the server",
-        "p99 measurement ms"
+        "p99 measurement ms",
+        "beside/s, p50 ms"
     );
     let mut rows = Vec::new();
     for load in &args.loads {
         let before = server.metrics().refusals();
-        let mut tally = offer(args, &clients, load * capacity_hz).await?;
+        let mut tally = offer(args, &clients, beside.as_ref(), load * capacity_hz).await?;
         let after = server.metrics().refusals();
         let [refused, at_once] = core::array::from_fn(|i| (after[i] - before[i]) as f64);
         rows.push(row(*load, args.seconds, &mut tally, at_once / refused));
@@ -144,7 +155,7 @@ async fn measure(args: &ServeBench, bundle: nesam_model::ModelBundle) -> Result<
     let Some(file) = &args.json else { return Ok(()) };
     let document = json!({
         "schema": "nesam.bench.serve/1",
-        "samples": args.samples, "samples_min": args.samples_min, "horizon": args.horizon, "vehicles": args.vehicles, "greedy": args.greedy, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
+        "samples": args.samples, "samples_min": args.samples_min, "horizon": args.horizon, "vehicles": args.vehicles, "greedy": args.greedy, "beside": args.beside, "deadline_ms": args.deadline_ms, "seconds": args.seconds,
         "woken_1_ms_late": woken_late, "capacity_hz": capacity_hz, "loads": rows, "goodput_share_of_peak": last / peak.max(f64::MIN_POSITIVE),
         "provenance": provenance_of(Some(&bundle), "", ""),
     });
@@ -169,11 +180,16 @@ fn name(vehicle: usize) -> String {
 }
 
 fn question(args: &ServeBench, vehicle: usize) -> Candidates {
-    let controls = (0..args.samples).flat_map(|n| {
-        let second = 0.4 * n as f32 / args.samples as f32 - 0.2;
+    Candidates { samples_min: args.samples_min, ..fan(args, vehicle, args.samples) }
+}
+
+/// Candidates that turn further and further.
+fn fan(args: &ServeBench, vehicle: usize, samples: usize) -> Candidates {
+    let controls = (0..samples).flat_map(|n| {
+        let second = 0.4 * n as f32 / samples as f32 - 0.2;
         std::iter::repeat_n([2.0, second], args.horizon).flatten()
     });
-    Candidates { samples_min: args.samples_min, ..Candidates::new(&name(vehicle), args.samples, args.horizon, controls.collect()) }
+    Candidates::new(&name(vehicle), samples, args.horizon, controls.collect())
 }
 
 /// Answers per second to askers who each wait for an answer before they ask again.
@@ -203,7 +219,7 @@ async fn capacity(args: &ServeBench, clients: &[Client]) -> Result<f64, Failure>
 }
 
 /// Asks at random instants with this mean rate, whatever comes back, while the vehicles report.
-async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Tally, Failure> {
+async fn offer(args: &ServeBench, clients: &[Client], beside: Option<&Client>, rate_hz: f64) -> Result<Tally, Failure> {
     let tally = Arc::new(Mutex::new(Tally { good_of: vec![0; args.vehicles], ..Tally::default() }));
     let begin = tokio::time::Instant::now();
     let deadline = Duration::from_secs_f64(args.deadline_ms * 1e-3);
@@ -212,6 +228,10 @@ async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Ta
         .enumerate()
         .map(|(v, client)| tokio::spawn(report(client.clone(), name(v), args.seconds, Arc::clone(&tally))))
         .collect();
+    let beside = beside.map(|client| {
+        let (client, question) = (client.clone(), fan(args, args.vehicles, args.beside));
+        tokio::spawn(ask_again_and_again(client, question, args.seconds, Arc::clone(&tally)))
+    });
     let mut random = ChaCha8Rng::seed_from_u64(args.seed);
     let (mut at_s, mut asked) = (0.0, Vec::new());
     while at_s < args.seconds {
@@ -237,10 +257,25 @@ async fn offer(args: &ServeBench, clients: &[Client], rate_hz: f64) -> Result<Ta
         }));
         at_s -= (1.0 - random.random::<f64>()).ln() / rate_hz;
     }
-    for task in asked.into_iter().chain(vehicles) {
+    for task in asked.into_iter().chain(vehicles).chain(beside) {
         task.await.or_failed()?;
     }
     Arc::try_unwrap(tally).ok().and_then(|tally| tally.into_inner().ok()).ok_or_else(|| Failure::Failed("an asker panicked".into()))
+}
+
+/// Asks whenever the answer to the last question is there.
+async fn ask_again_and_again(mut client: Client, question: Candidates, seconds: f64, tally: Arc<Mutex<Tally>>) {
+    let begin = Instant::now();
+    while begin.elapsed().as_secs_f64() < seconds {
+        let sent = Instant::now();
+        match client.predict(question.clone()).await {
+            Ok(_) => {
+                let Ok(mut tally) = tally.lock() else { return };
+                tally.beside_ms.push(sent.elapsed().as_secs_f64() * 1e3);
+            }
+            Err(error) => tokio::time::sleep(error.retry_after().unwrap_or_default()).await,
+        }
+    }
 }
 
 /// Streams measurements at 10 Hz to a copy of the session, so that every load begins alike.
@@ -278,13 +313,16 @@ fn row(load: f64, seconds: f64, tally: &mut Tally, at_once_inside: f64) -> Value
     } else {
         (format!("{refused_p50_ms:.2}, {refused_ms:.2}, {:.1} %", 100.0 * at_once), format!("{:.1} %", 100.0 * at_once_inside))
     };
+    let (beside_hz, beside_ms) = (rate(tally.beside_ms.len()), quantile(&mut tally.beside_ms, 0.5));
+    let beside = if tally.beside_ms.is_empty() { "-".into() } else { format!("{beside_hz:.1}, {beside_ms:.0}") };
     say!(
-        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>28} {inside:>14} {measured_ms:>18.1}",
+        "{load:>6.2} {:>9.1} {good:>11.1} {each:>19} {samples:>12.1} {refused:>9.1} {late:>7.1} {good_ms:>14.1} {refusals:>28} {inside:>14} {measured_ms:>18.1} {beside:>18}",
         rate(asked)
     );
     json!({
         "load": load, "asked_hz": rate(asked), "in_time_hz": good, "in_time_hz_by_vehicle": good_of, "samples_mean": samples, "refused_hz": refused,
         "late_hz": late, "in_time_p99_ms": good_ms, "refused_p50_ms": refused_p50_ms, "refused_p99_ms": refused_ms, "refused_within_1_ms": at_once, "refused_within_1_ms_inside": at_once_inside, "measurement_p99_ms": measured_ms,
+        "beside_hz": beside_hz, "beside_p50_ms": beside_ms,
         "measurements": tally.measured_ms.len(), "measurements_refused": tally.measurements_refused,
     })
 }
