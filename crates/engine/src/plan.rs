@@ -56,6 +56,10 @@ pub(crate) struct Underway {
     pub cost_ns: u64,
     /// Time that it still needs, without the urgent ones for which it waits, ns.
     pub left_ns: u64,
+    /// The same for the fewest samples that are of use: with these it ends when it is due.
+    pub least_left_ns: u64,
+    /// Time after which it is given up, ns.
+    pub given_up_after_ns: u64,
     /// Time that an urgent one is expected to need that is computed now, ns.
     pub urgent_left_ns: u64,
     /// Time for which others may still be computed before it goes on, ns.
@@ -111,10 +115,9 @@ impl<T> Plan<T> {
         let before_ns: u64 = urgent.map(|planned| planned.cost_ns).sum();
         let wait_ns = underway.urgent_left_ns + before_ns;
         let is_short = cost_ns < underway.cost_ns / LONG_FOR_SHORT && wait_ns + cost_ns <= underway.spare_ns;
-        let running_ns = wait_ns + cost_ns + underway.left_ns;
         let is_late = |done_ns: u64, due_ns: u64| done_ns > budget_ns(now_ns, due_ns);
-        let mut done_ns = running_ns;
-        let harms_nobody = !is_late(running_ns, underway.due_ns)
+        let mut done_ns = (wait_ns + cost_ns + underway.left_ns).min(underway.given_up_after_ns);
+        let harms_nobody = !is_late(wait_ns + cost_ns + underway.least_left_ns, underway.due_ns)
             && others.clone().all(|planned| {
                 done_ns += planned.cost_ns;
                 // Who is late whatever happens is not held up.
@@ -262,7 +265,15 @@ mod tests {
     /// by hand; one runs that needs 100 more.
     #[test]
     fn analytic_a_short_one_does_not_wait_for_a_long_one() {
-        let underway = Underway { cost_ns: 100, left_ns: 100, urgent_left_ns: 0, spare_ns: 100, due_ns: WHENEVER };
+        let underway = Underway {
+            cost_ns: 100,
+            left_ns: 100,
+            least_left_ns: 100,
+            given_up_after_ns: WHENEVER,
+            urgent_left_ns: 0,
+            spare_ns: 100,
+            due_ns: WHENEVER,
+        };
         let mut plan = Plan::default();
         let place = |plan: &Plan<u32>, share, cost_ns, underway| {
             plan.urgent_place(share, cost_ns, 0, underway).map(|place| (place.index, place.wait_ns))
@@ -271,6 +282,8 @@ mod tests {
         // 1.3 · (24 + 100) = 161.2.
         let due = |due_ns: u64| Underway { due_ns, ..underway };
         assert_eq!((place(&plan, "a", 24, due(162)), place(&plan, "a", 24, due(161))), (Some((0, 0)), None));
+        // With fewer samples it is in time.
+        assert_eq!(place(&plan, "a", 24, Underway { least_left_ns: 90, ..due(161) }), Some((0, 0)));
         assert_eq!(place(&plan, "a", 24, Underway { spare_ns: 23, ..underway }), None, "it waited long enough");
         assert_eq!(place(&plan, "a", 24, Underway { urgent_left_ns: 7, ..underway }), Some((0, 7)));
         // Behind other urgent ones, before all others, of which one has to be done at 1.3 · (10 + 10 + 100 + 30).

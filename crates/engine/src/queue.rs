@@ -60,17 +60,30 @@ struct Running {
     share: Arc<str>,
     since_ns: u64,
     expected_ns: u64,
+    /// The same of the fewest samples that are of use.
+    least_ns: u64,
     /// Time for which it waited for urgent ones that are done, ns.
     paused_ns: u64,
     deadline_ns: Option<u64>,
 }
 
 impl Running {
-    /// Time that it still needs: it is given up at its deadline. `pause_ns` = time for which it has waited for the urgent one that is computed now.
-    fn left_ns(&self, now_ns: u64, pause_ns: u64) -> u64 {
-        let ran_ns = now_ns.saturating_sub(self.since_ns + self.paused_ns + pause_ns);
-        let given_up_ns = self.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(now_ns));
-        left_ns(self.expected_ns, ran_ns).min(given_up_ns)
+    /// Where it stands. `pause_ns` = time for which it has waited for the urgent one that is computed now, which needs `urgent_left_ns`.
+    fn underway(&self, now_ns: u64, pause_ns: u64, urgent_left_ns: u64) -> Underway {
+        let paused_ns = self.paused_ns + pause_ns;
+        let ran_ns = now_ns.saturating_sub(self.since_ns + paused_ns);
+        let given_up_after_ns = self.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(now_ns));
+        // All of it may last twice as long, and where fewer samples are of use half of them are left.
+        let pause_max_ns = if self.least_ns < self.expected_ns { self.expected_ns / 2 } else { self.expected_ns };
+        Underway {
+            cost_ns: self.expected_ns,
+            left_ns: left_ns(self.expected_ns, ran_ns).min(given_up_after_ns),
+            least_left_ns: left_ns(self.least_ns, ran_ns),
+            given_up_after_ns,
+            urgent_left_ns,
+            spare_ns: pause_max_ns.saturating_sub(paused_ns),
+            due_ns: self.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS)),
+        }
     }
 }
 
@@ -158,7 +171,8 @@ impl Queue {
                 && let Some(next) = lanes.predictions.pop()
             {
                 let deadline_ns = next.item.deadline_ns;
-                let running = Running { share: next.share, since_ns: now_ns(), expected_ns: next.cost_ns, paused_ns: 0, deadline_ns };
+                let (share, expected_ns) = (next.share, next.cost_ns);
+                let running = Running { share, since_ns: now_ns(), expected_ns, least_ns: expected_ns, paused_ns: 0, deadline_ns };
                 *lanes.at_work(is_urgent) = Some(running);
                 let submission = Box::new(next.item);
                 if is_urgent {
@@ -185,6 +199,9 @@ impl Queue {
         }
         let expected_ns = lanes.service_time.expected_ns(work(query, query.samples));
         lanes.correct(is_urgent, expected_ns, now_ns);
+        let least = if query.takes_fewer() { query.least() } else { query.samples };
+        let least_ns = lanes.service_time.expected_ns(work(query, least));
+        lanes.at_work(is_urgent).iter_mut().for_each(|running| running.least_ns = least_ns);
         let waiting = lanes.predictions.len();
         if waiting > 0 && deadline_ns.is_some_and(|deadline_ns| now_ns + expected_ns > deadline_ns) {
             return Err(EngineError::Expired);
@@ -253,21 +270,16 @@ impl Lanes {
     fn admit(&mut self, share: &Arc<str>, submission: &Submission, query: &PredictQuery, limits: &Limits) -> Result<Admitted, EngineError> {
         let now_ns = submission.submitted_ns();
         self.demand.ask(share, self.service_time.expected_ns(work(query, query.samples)), now_ns);
-        let urgent_left_ns = self.urgent.as_ref().map_or(0, |urgent| urgent.left_ns(now_ns, 0));
-        let left_ns = self.running.as_ref().map_or(0, |running| running.left_ns(now_ns, self.pause_ns(now_ns)));
+        let urgent_left_ns = self.urgent.as_ref().map_or(0, |urgent| urgent.underway(now_ns, 0, 0).left_ns);
+        let pause_ns = self.urgent.as_ref().map_or(0, |urgent| now_ns.saturating_sub(urgent.since_ns));
+        let underway = self.running.as_ref().map(|running| running.underway(now_ns, pause_ns, urgent_left_ns));
+        let before_ns = urgent_left_ns + underway.map_or(0, |underway| underway.left_ns);
         let due_ns = submission.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS));
         let room_ns = (self.demand.room(share) * due_ns.saturating_sub(now_ns) as f64) as u64;
         let of = |samples| {
             let expected_ns = self.service_time.expected_ns(work(query, samples));
-            let underway = self.running.as_ref().map(|running| Underway {
-                cost_ns: running.expected_ns,
-                left_ns,
-                urgent_left_ns,
-                spare_ns: running.expected_ns.saturating_sub(running.paused_ns + self.pause_ns(now_ns)),
-                due_ns: running.deadline_ns.map_or(u64::MAX, |deadline_ns| deadline_ns.saturating_sub(WAY_BACK_NS)),
-            });
             let urgent = underway.and_then(|underway| self.predictions.urgent_place(share, expected_ns, now_ns, underway));
-            let place = urgent.unwrap_or_else(|| self.predictions.place(share, expected_ns, now_ns, left_ns + urgent_left_ns));
+            let place = urgent.unwrap_or_else(|| self.predictions.place(share, expected_ns, now_ns, before_ns));
             let late_ns = surely_done_ns(now_ns, place.wait_ns + expected_ns).saturating_sub(now_ns.saturating_add(room_ns));
             (Admitted { place, expected_ns, due_ns }, late_ns)
         };
@@ -293,11 +305,6 @@ impl Lanes {
     /// The prediction that is computed, or the urgent one.
     fn at_work(&mut self, is_urgent: bool) -> &mut Option<Running> {
         if is_urgent { &mut self.urgent } else { &mut self.running }
-    }
-
-    /// Time for which the prediction that runs has waited for the urgent one that is computed now, ns.
-    fn pause_ns(&self, now_ns: u64) -> u64 {
-        self.urgent.as_ref().map_or(0, |urgent| now_ns.saturating_sub(urgent.since_ns))
     }
 
     /// A prediction at work is expected to take this long.
@@ -520,6 +527,27 @@ mod tests {
             assert_eq!(sum(&tallies, |one| one.late + one.refused_at_turn), 0.0, "{tallies:?}");
             assert!(part(&tallies[2..]) > all_short && part(&tallies[..2]) > all_long, "{tallies:?}");
         }
+    }
+
+    /// Where fewer samples are of use a long one takes all the time that it has; a short one is computed in the midst of it all the same, and no second one when that would leave
+    /// less than half.
+    #[test]
+    fn analytic_a_short_question_does_not_wait_for_one_that_takes_what_time_it_has() {
+        let (queue, limits) = (Queue::default(), Limits::default());
+        queue.done(1.0, false, Some(Took::All(NS_PER_WORK as u64)), 0);
+        let long = Asker { rate: 1.0, samples: 20_000, deadline_ns: 100 * MS };
+        assert!(queue.push(of_asker(0, long, 64, 0), &limits).is_ok());
+        let Turn::Prediction(mut begun) = queue.next(|| 0) else { panic!("nothing else was asked for") };
+        let Command::Predict(query) = &mut begun.command else { panic!("a prediction was asked for") };
+        queue.fit(query, false, Some(100 * MS), 0).unwrap();
+        assert!((8000..9000).contains(&query.samples), "nine tenths of the time, {}", query.samples);
+        let short = |vehicle: usize, now_ns: u64| of_asker(vehicle, Asker { rate: 1.0, samples: SAMPLES, deadline_ns: 60 * MS }, 0, now_ns);
+        for at_ns in [5 * MS, 30 * MS] {
+            assert!(queue.push(short(1, at_ns), &limits).is_ok());
+            assert!(matches!(queue.next(|| at_ns), Turn::Urgent(_)));
+            queue.done(work(query, SAMPLES), true, Some(Took::All(16 * MS)), at_ns + 16 * MS);
+        }
+        assert!(queue.push(short(1, 47 * MS), &limits).is_err(), "it paused for 32 ms of 44");
     }
 
     #[test]

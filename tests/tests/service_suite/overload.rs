@@ -340,26 +340,25 @@ fn service_a_short_question_does_not_wait_for_a_long_one() {
         let long = PredictQuery { extras, ..engine_query("s", &recorded.drive, 2, samples, 32) };
         let short = engine_query("s", &recorded.drive, 2, 24, 8);
         let alone = [&long, &short].map(|query| of(handle.call(Command::Predict(query.clone()))));
-        heard.lock().unwrap().clear();
-        let [(first, of_long), (second, of_short)] = [long, short].map(asked);
-        handle.submit(first);
-        while handle.waiting().1 > 0 {
-            std::thread::yield_now();
-        }
-        std::thread::sleep(Duration::from_millis(5));
-        handle.submit(second);
-        let of_short = of(of_short.recv().unwrap());
-        assert!(of_long.try_recv().is_err(), "the long one is still computed");
-        assert!([of(of_long.recv().unwrap()), of_short] == alone, "both as they are alone");
-        // It hears of an answer after that was sent.
-        handle.call(Command::List).unwrap();
-        let deadline = Instant::now() + PATIENCE;
-        while heard.lock().unwrap().len() < 2 && Instant::now() < deadline {
-            std::thread::yield_now();
-        }
-        assert_eq!(*heard.lock().unwrap(), [samples, 24]);
+        // On a machine that does other things too the long one may have ended before the short one is asked for.
+        let overtook = (0..10).any(|_| {
+            let [(first, of_long), (second, of_short)] = [&long, &short].map(|query| asked(query.clone()));
+            handle.submit(first);
+            while handle.waiting().1 > 0 {
+                std::thread::yield_now();
+            }
+            handle.submit(second);
+            let of_short = of(of_short.recv().unwrap());
+            let is_first = of_long.try_recv();
+            let of_long = is_first.clone().unwrap_or_else(|_| of_long.recv().unwrap());
+            assert!([of(of_long), of_short] == alone, "both as they are alone");
+            is_first.is_err()
+        });
+        assert!(overtook, "{samples} samples");
     }
     handle.stop();
+    let heard = heard.lock().unwrap();
+    assert!(heard.chunks(2).all(|asked| asked[0] != 24 && asked[1] == 24), "{heard:?}");
 }
 
 /// Goal: an answer that is due has what is done, is the beginning of the whole, and replays. Method: the flag is raised before a prediction begins, so that it ends
@@ -555,7 +554,7 @@ async fn service_vehicles_share_the_time_evenly() {
         client.open_session(request).await.unwrap();
         client.feed(samples(session, &recorded.drive, 40)).await.unwrap();
     }
-    let question = |session: &str| candidates(session, &recorded.drive, 40, 256, 32);
+    let question = |session: &str| candidates(session, &recorded.drive, 40, 1024, 32);
     client.predict(question("modest")).await.unwrap();
     // One vehicle asks for forty predictions through two sessions; the limit holds for the vehicle.
     let greedy: Vec<_> = (0..40)
@@ -564,9 +563,7 @@ async fn service_vehicles_share_the_time_evenly() {
             tokio::spawn(async move { client.predict(question).await })
         })
         .collect();
-    while server.engine().waiting().1 < 15 {
-        tokio::time::sleep(Duration::from_millis(1)).await;
-    }
+    eventually(PATIENCE, "most of them wait", async || server.engine().waiting().1 >= 15).await;
     // The other one asks once: before it come the prediction that runs and one of the greedy vehicle's, and not all of them.
     let before = server.metrics().predictions();
     client.predict(question("modest")).await.unwrap();
