@@ -79,7 +79,7 @@ pub(crate) fn surely_done_ns(now_ns: u64, expected_ns: u64) -> u64 {
     now_ns.saturating_add(((1.0 + LONGER) * expected_ns as f64) as u64)
 }
 
-/// What has to be expected of a prediction that has run for some time, as a part of what [`surely_done_ns`] adds to: who takes longer does so at the end.
+/// Time to count on for a prediction that has run for so long, ns, before [`surely_done_ns`] adds to it: it adds to the whole, since whether it takes longer shows at the end.
 pub(crate) fn left_ns(expected_ns: u64, ran_ns: u64) -> u64 {
     budget_ns(ran_ns, surely_done_ns(0, expected_ns))
 }
@@ -121,7 +121,8 @@ impl<T> Plan<T> {
             && others.clone().all(|planned| {
                 done_ns += planned.cost_ns;
                 // Who is late whatever happens is not held up.
-                &*planned.share != share && (!is_late(done_ns, planned.due_ns) || now_ns + done_ns - cost_ns > planned.due_ns)
+                &*planned.share != share
+                    && (!is_late(done_ns, planned.due_ns) || (now_ns + done_ns).saturating_sub(cost_ns) > planned.due_ns)
             });
         (is_short && harms_nobody).then_some(Place { index, wait_ns, is_urgent: true })
     }

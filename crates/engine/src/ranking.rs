@@ -164,7 +164,8 @@ impl Polyline {
                 continue;
             }
             if near && points.len() > 1 {
-                (points.pop(), along_m.pop());
+                points.pop();
+                along_m.pop();
             }
             along_m.push(along_m.last().copied().unwrap_or(0.0) + step(&points).unwrap_or(0.0));
             points.push(point);
