@@ -302,8 +302,9 @@ fn run(mut engine: Engine, queue: &Queue, clock: &dyn Clock, computing: Computin
     loop {
         match queue.next(|| clock.now_ns()) {
             Turn::Commands(commands) => answer_all(&mut engine, commands, clock, heard),
-            Turn::Prediction(submission) => computing.compute(Begun::new(&mut engine, *submission, false, queue, clock, heard)),
-            Turn::Urgent(submission) => computing.compute(Begun::new(&mut engine, *submission, true, queue, clock, heard)),
+            Turn::Prediction { submission, is_urgent } => {
+                computing.compute(Begun::new(&mut engine, *submission, is_urgent, queue, clock, heard));
+            }
             Turn::End => break,
         }
     }
@@ -356,8 +357,9 @@ impl Workers {
 fn take_turn(turn: Turn, engine: &mut Engine, queue: &Queue, clock: &dyn Clock, heard: &Heard) -> bool {
     match turn {
         Turn::Commands(commands) => answer_all(engine, commands, clock, heard),
-        Turn::Prediction(submission) => Begun::new(engine, *submission, false, queue, clock, heard).finish(queue, clock, heard),
-        Turn::Urgent(_) => unreachable!("a prediction has ended before this thread looks for another; this is a bug"),
+        Turn::Prediction { submission, is_urgent } => {
+            Begun::new(engine, *submission, is_urgent, queue, clock, heard).finish(queue, clock, heard)
+        }
         Turn::End => return false,
     }
     true

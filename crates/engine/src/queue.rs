@@ -118,10 +118,8 @@ struct Admitted {
 pub(crate) enum Turn {
     /// All waiting commands, in order of arrival.
     Commands(VecDeque<Submission>),
-    /// One prediction, since no command waits and none is computed.
-    Prediction(Box<Submission>),
-    /// One that is computed before the one at work goes on; until it is done that one waits at its next step.
-    Urgent(Box<Submission>),
+    /// One prediction, since no command waits and none is computed; or an urgent one, for which the one at work waits at its next step.
+    Prediction { submission: Box<Submission>, is_urgent: bool },
     /// Nothing more will come.
     End,
 }
@@ -174,11 +172,10 @@ impl Queue {
                 let (share, expected_ns) = (next.share, next.cost_ns);
                 let running = Running { share, since_ns: now_ns(), expected_ns, least_ns: expected_ns, paused_ns: 0, deadline_ns };
                 *lanes.at_work(is_urgent) = Some(running);
-                let submission = Box::new(next.item);
                 if is_urgent {
                     self.gate.close();
                 }
-                return if is_urgent { Turn::Urgent(submission) } else { Turn::Prediction(submission) };
+                return Turn::Prediction { submission: Box::new(next.item), is_urgent };
             }
             lanes = self.filled.wait(lanes).expect("no holder of the queue panics; this is a bug");
         }
@@ -239,7 +236,7 @@ impl Queue {
             self.gate.open();
         }
         if let (true, Some(urgent), Some(running)) = (is_urgent, done, &mut lanes.running) {
-            running.paused_ns += now_ns.saturating_sub(urgent.since_ns.max(running.since_ns));
+            running.paused_ns += now_ns.saturating_sub(urgent.since_ns);
         }
         self.filled.notify_one();
     }
@@ -460,10 +457,8 @@ mod tests {
                 asks_ns[vehicle] += askers[vehicle].pause_ns(random());
             }
             while at_work[1].is_none() && (at_work[0].is_none() || queue.lock().predictions.is_next_urgent()) && queue.has_turn() {
-                let (mut submission, is_urgent) = match queue.next(|| now_ns) {
-                    Turn::Prediction(submission) => (submission, false),
-                    Turn::Urgent(submission) => (submission, true),
-                    _ => panic!("only predictions were asked for"),
+                let Turn::Prediction { mut submission, is_urgent } = queue.next(|| now_ns) else {
+                    panic!("only predictions were asked for")
                 };
                 let deadline_ns = submission.deadline_ns;
                 let Command::Predict(query) = &mut submission.command else { panic!("only predictions were asked for") };
@@ -537,14 +532,14 @@ mod tests {
         queue.done(1.0, false, Some(Took::All(NS_PER_WORK as u64)), 0);
         let long = Asker { rate: 1.0, samples: 20_000, deadline_ns: 100 * MS };
         assert!(queue.push(of_asker(0, long, 64, 0), &limits).is_ok());
-        let Turn::Prediction(mut begun) = queue.next(|| 0) else { panic!("nothing else was asked for") };
+        let Turn::Prediction { submission: mut begun, is_urgent: false } = queue.next(|| 0) else { panic!("nothing else was asked for") };
         let Command::Predict(query) = &mut begun.command else { panic!("a prediction was asked for") };
         queue.fit(query, false, Some(100 * MS), 0).unwrap();
         assert!((8000..9000).contains(&query.samples), "nine tenths of the time, {}", query.samples);
         let short = |vehicle: usize, now_ns: u64| of_asker(vehicle, Asker { rate: 1.0, samples: SAMPLES, deadline_ns: 60 * MS }, 0, now_ns);
         for at_ns in [5 * MS, 30 * MS] {
             assert!(queue.push(short(1, at_ns), &limits).is_ok());
-            assert!(matches!(queue.next(|| at_ns), Turn::Urgent(_)));
+            assert!(matches!(queue.next(|| at_ns), Turn::Prediction { is_urgent: true, .. }));
             queue.done(work(query, SAMPLES), true, Some(Took::All(16 * MS)), at_ns + 16 * MS);
         }
         assert!(queue.push(short(1, 47 * MS), &limits).is_err(), "it paused for 32 ms of 44");
@@ -565,7 +560,7 @@ mod tests {
         // A quarter of an hour for a unit of work, which nobody would wait for.
         queue.done(1.0, false, Some(Took::All(900_000 * MS)), 0);
         assert!(queue.push(question(0, 0, 0), &limits).is_ok(), "nothing else is to be done");
-        assert!(matches!(queue.next(|| 0), Turn::Prediction(_)));
+        assert!(matches!(queue.next(|| 0), Turn::Prediction { is_urgent: false, .. }));
         let (refused, _) = *queue.push(question(1, 0, 0), &limits).unwrap_err();
         assert!(matches!(refused, EngineError::Overloaded { waiting: 1, retry_after_ns: RETRY_MAX_NS, .. }), "{refused}");
     }
@@ -583,7 +578,7 @@ mod tests {
                 error
             })
         };
-        let begin = |now_ns: u64| assert!(matches!(queue.next(|| now_ns), Turn::Prediction(_)));
+        let begin = |now_ns: u64| assert!(matches!(queue.next(|| now_ns), Turn::Prediction { is_urgent: false, .. }));
         queue.done(of_one, false, Some(Took::All(takes_ns)), 0);
         assert_eq!(ask(0, 0, 4 * MS), Ok(()));
         begin(0);

@@ -9,7 +9,7 @@ use nesam_client::zenoh_vehicle::ZenohVehicle;
 use nesam_client::{outcome_label, v1};
 use nesam_engine::{
     Clock, Command, Engine, EngineError, EngineHandle, Executed, Limits, ManualClock, OpenSession, PredictExtras, PredictQuery, Reply,
-    Submission,
+    Submission, Tap,
 };
 use nesam_server::MonotonicClock;
 use tonic::Code;
@@ -183,6 +183,13 @@ fn drive(handle: &EngineHandle, recorded: &Recorded, map: &str) {
     }
 }
 
+/// What a recording notes of each executed command, and what lets it hear of them.
+fn listen<T: Send + 'static>(note: impl Fn(Executed) -> Option<T> + Send + 'static) -> (Arc<Mutex<Vec<T>>>, Tap) {
+    let heard = Arc::new(Mutex::new(Vec::new()));
+    let noted = heard.clone();
+    (heard, Box::new(move |executed| noted.lock().unwrap().extend(note(executed))))
+}
+
 /// A prediction to be submitted, and where its answer comes.
 fn asked(query: PredictQuery) -> (Submission, Receiver<Result<Reply, EngineError>>) {
     let (sender, receiver) = channel();
@@ -287,11 +294,7 @@ fn service_a_prediction_that_nobody_waits_for_is_given_up() {
 #[test]
 fn service_measurements_do_not_wait_for_a_prediction() {
     let recorded = recorded();
-    let heard = Arc::new(Mutex::new(Vec::new()));
-    let tap = {
-        let heard = heard.clone();
-        Box::new(move |executed: Executed| heard.lock().unwrap().push(executed.command.label()))
-    };
+    let (heard, tap) = listen(|executed| Some(executed.command.label()));
     let engine = Engine::new(predictor(), Limits::default()).unwrap();
     let handle = EngineHandle::spawn_tapped(engine, Arc::new(ManualClock::default()), Some(tap));
     drive(&handle, &recorded, "");
@@ -318,15 +321,10 @@ fn service_measurements_do_not_wait_for_a_prediction() {
 #[test]
 fn service_a_short_question_does_not_wait_for_a_long_one() {
     let recorded = recorded();
-    let heard = Arc::new(Mutex::new(Vec::new()));
-    let tap = {
-        let heard = heard.clone();
-        Box::new(move |executed: Executed| {
-            if let Command::Predict(query) = executed.command {
-                heard.lock().unwrap().push(query.samples);
-            }
-        })
-    };
+    let (heard, tap) = listen(|executed| match executed.command {
+        Command::Predict(query) => Some(query.samples),
+        _ => None,
+    });
     let engine = Engine::new(predictor(), Limits::default()).unwrap();
     let handle = EngineHandle::spawn_tapped(engine, Arc::new(MonotonicClock::default()), Some(tap));
     handle.call(Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();
@@ -366,11 +364,7 @@ fn service_a_short_question_does_not_wait_for_a_long_one() {
 #[test]
 fn service_an_answer_that_is_due_has_what_is_done() {
     let recorded = recorded();
-    let heard = Arc::new(Mutex::new(Vec::new()));
-    let tap = {
-        let heard = heard.clone();
-        Box::new(move |executed: Executed| heard.lock().unwrap().push(executed))
-    };
+    let (heard, tap) = listen(Some);
     let engine = Engine::new(predictor(), Limits::default()).unwrap();
     let handle = EngineHandle::unthreaded(engine, Arc::new(ManualClock::default()), Some(tap));
     handle.call(Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();

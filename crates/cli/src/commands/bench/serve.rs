@@ -257,25 +257,29 @@ async fn offer(args: &ServeBench, clients: &[Client], beside: Option<&Client>, r
         }));
         at_s -= (1.0 - random.random::<f64>()).ln() / rate_hz;
     }
-    for task in asked.into_iter().chain(vehicles).chain(beside) {
+    for task in asked.into_iter().chain(vehicles) {
         task.await.or_failed()?;
+    }
+    if let Some(beside) = beside {
+        beside.await.or_failed()?.or_failed()?;
     }
     Arc::try_unwrap(tally).ok().and_then(|tally| tally.into_inner().ok()).ok_or_else(|| Failure::Failed("an asker panicked".into()))
 }
 
-/// Asks whenever the answer to the last question is there.
-async fn ask_again_and_again(mut client: Client, question: Candidates, seconds: f64, tally: Arc<Mutex<Tally>>) {
+/// Asks whenever the answer to the last question is there. An error is what is not for want of room.
+async fn ask_again_and_again(mut client: Client, question: Candidates, seconds: f64, tally: Arc<Mutex<Tally>>) -> Result<(), ClientError> {
     let begin = Instant::now();
     while begin.elapsed().as_secs_f64() < seconds {
         let sent = Instant::now();
         match client.predict(question.clone()).await {
             Ok(_) => {
-                let Ok(mut tally) = tally.lock() else { return };
+                let Ok(mut tally) = tally.lock() else { return Ok(()) };
                 tally.beside_ms.push(sent.elapsed().as_secs_f64() * 1e3);
             }
-            Err(error) => tokio::time::sleep(error.retry_after().unwrap_or_default()).await,
+            Err(error) => tokio::time::sleep(error.retry_after().ok_or(error)?).await,
         }
     }
+    Ok(())
 }
 
 /// Streams measurements at 10 Hz to a copy of the session, so that every load begins alike.
