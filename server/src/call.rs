@@ -59,7 +59,7 @@ impl Future for Pending {
         if self.due.as_mut().is_some_and(|due| due.at.as_mut().poll(context).is_ready()) {
             self.due.take().into_iter().for_each(|due| due.flag.store(true, Ordering::Relaxed));
         }
-        let stopped = |_| Answer { result: Err(EngineError::Stopped), queued_ns: 0, busy_ns: 0 };
+        let stopped = |_| Answer::refused(EngineError::Stopped);
         Pin::new(&mut self.answer).poll(context).map(|answer| answer.unwrap_or_else(stopped))
     }
 }

@@ -387,6 +387,44 @@ impl Config {
     /// # Errors
     /// `ServerError::Value` naming the key.
     pub fn check(&self) -> Result<(), ServerError> {
+        self.check_numbers()?;
+        let reports = &self.http.reports;
+        if self.http.enabled && reports.exists() && !reports.is_dir() {
+            let reason = format!("{} is not a folder; give the one that `nesam diagnose` writes its reports to", reports.display());
+            return Err(ServerError::Value { key: "http.reports", reason });
+        }
+        self.check_ports()?;
+        self.tls.check()?;
+        self.zenoh.check()?;
+        let query_bytes = predict_bytes_max(&Limits::from(&self.limits));
+        if self.zenoh.message_bytes_max < query_bytes {
+            let reason = format!("is {}, but a prediction within `limits` takes {query_bytes}", self.zenoh.message_bytes_max);
+            return Err(ServerError::Value { key: "zenoh.message_bytes_max", reason });
+        }
+        self.ros2.check()?;
+        if self.ros2.enabled && !self.zenoh.enabled {
+            let reason = "is on, but `zenoh.enabled` is off: machines of ROS 2 are heard over Zenoh".into();
+            return Err(ServerError::Value { key: "ros2.enabled", reason });
+        }
+        self.cluster.check()?;
+        self.diagnosis.check()?;
+        if self.cluster.enabled() && self.store.enabled {
+            let reason = "is on, but with `cluster.etcd` sessions are kept in etcd; choose one".into();
+            return Err(ServerError::Value { key: "store.enabled", reason });
+        }
+        if self.zenoh.uses_tls() && !self.tls.restricts() {
+            let reason = "has an endpoint `tls/...`, which needs certificates for both sides: set `tls.client_ca`".into();
+            return Err(ServerError::Value { key: "zenoh", reason });
+        }
+        self.check_side_doors()?;
+        FleetSoilSettings::from(&self.fleet_soil)
+            .check()
+            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
+        Ok(())
+    }
+
+    /// Checks the range of each number by itself.
+    fn check_numbers(&self) -> Result<(), ServerError> {
         let seconds = [
             ("grpc.deadline_s", self.grpc.deadline_s),
             ("grpc.upload_deadline_s", self.grpc.upload_deadline_s),
@@ -462,42 +500,10 @@ impl Config {
             let reason = format!("is {}, the model predicts {MAX_HORIZON} steps at most", self.limits.horizon_max);
             return Err(ServerError::Value { key: "limits.horizon_max", reason });
         }
-        let reports = &self.http.reports;
-        if self.http.enabled && reports.exists() && !reports.is_dir() {
-            let reason = format!("{} is not a folder; give the one that `nesam diagnose` writes its reports to", reports.display());
-            return Err(ServerError::Value { key: "http.reports", reason });
-        }
-        self.check_ports()?;
-        self.tls.check()?;
-        self.zenoh.check()?;
-        let query_bytes = predict_bytes_max(&Limits::from(&self.limits));
-        if self.zenoh.message_bytes_max < query_bytes {
-            let reason = format!("is {}, but a prediction within `limits` takes {query_bytes}", self.zenoh.message_bytes_max);
-            return Err(ServerError::Value { key: "zenoh.message_bytes_max", reason });
-        }
-        self.ros2.check()?;
-        if self.ros2.enabled && !self.zenoh.enabled {
-            let reason = "is on, but `zenoh.enabled` is off: machines of ROS 2 are heard over Zenoh".into();
-            return Err(ServerError::Value { key: "ros2.enabled", reason });
-        }
-        self.cluster.check()?;
-        self.diagnosis.check()?;
-        if self.cluster.enabled() && self.store.enabled {
-            let reason = "is on, but with `cluster.etcd` sessions are kept in etcd; choose one".into();
-            return Err(ServerError::Value { key: "store.enabled", reason });
-        }
-        if self.zenoh.uses_tls() && !self.tls.restricts() {
-            let reason = "has an endpoint `tls/...`, which needs certificates for both sides: set `tls.client_ca`".into();
-            return Err(ServerError::Value { key: "zenoh", reason });
-        }
-        self.check_side_doors()?;
         if !(self.fleet_soil.exchange_s >= 0.0 && self.fleet_soil.exchange_s <= 1e6) {
             let reason = format!("is {}, allowed is 0 (off) up to 1e6 s", self.fleet_soil.exchange_s);
             return Err(ServerError::Value { key: "fleet_soil.exchange_s", reason });
         }
-        FleetSoilSettings::from(&self.fleet_soil)
-            .check()
-            .map_err(|error| ServerError::Value { key: "fleet_soil", reason: error.to_string() })?;
         let window_s = self.limits.reorder_window_s;
         if !(0.0..=1.0).contains(&window_s) {
             return Err(ServerError::Value { key: "limits.reorder_window_s", reason: format!("is {window_s}, allowed is 0 to 1 s") });

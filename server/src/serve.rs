@@ -88,17 +88,10 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (tls, access) = access::load(&config.tls)?;
     let tls = tls.map(|tls| tls.on_zenoh(config.zenoh.uses_tls()));
     // Everything that can fail for want of an address comes before the first thread.
-    let grpc_listener = listen(config.grpc.listen, "grpc.listen").await?;
-    let http_listener = match config.http.enabled {
-        true => Some(listen(config.http.listen, "http.listen").await?),
-        false => None,
-    };
-    let health_listener = match config.http.health_address()? {
-        Some(address) => Some(listen(address, "http.health").await?),
-        None => None,
-    };
-    let grpc_addr = local(&grpc_listener, config.grpc.listen);
-    let http_addr = http_listener.as_ref().map(|listener| local(listener, config.http.listen));
+    let sockets = Sockets::bind(&config).await?;
+    let grpc_addr = local(&sockets.grpc, config.grpc.listen);
+    let http_addr = sockets.http.as_ref().map(|listener| local(listener, config.http.listen));
+    let health_addr = sockets.health.as_ref().and_then(|listener| listener.local_addr().ok());
 
     let (events, _) = broadcast::channel::<Event>(EVENTS_KEPT);
     let metrics = Arc::new(Metrics::default());
@@ -128,6 +121,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
     let (stop, stopping) = watch::channel(false);
     let drain = Duration::from_secs_f64(config.grpc.drain_s);
     let begins_within = Duration::from_secs_f64(config.tls.handshake_s);
+    let watchers_max = config.http.watchers_max;
     let diagnoses = Some(Arc::new(Diagnoses::new(&config, recorder.clone(), live.clone())));
     let edge = Edge {
         diagnoses,
@@ -151,21 +145,11 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         }
         false => None,
     };
-    let mut listeners: Vec<Listener> = Vec::new();
-    if let Some(listener) = http_listener {
+    if http_addr.is_some() {
         live.start(&edge, clock, recorder.clone(), passed);
-        let state = HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() };
-        // Prometheus, scripts and the pages, each with what a browser opens to one server.
-        let connections_max = ASKERS_MAX.saturating_add(config.http.watchers_max.saturating_mul(BROWSER_CONNECTIONS));
-        let limits = HttpLimits { asks_within: begins_within, connections_max };
-        listeners.push(("http.listen", tokio::spawn(http_connections::serve(listener, http::router(state), limits, stopping.clone()))));
     }
-    let health_addr = health_listener.as_ref().and_then(|listener| listener.local_addr().ok());
-    if let Some(listener) = health_listener {
-        let limits = HttpLimits { asks_within: begins_within, connections_max: ASKERS_MAX };
-        let served = http_connections::serve(listener, http::health_router(edge.clone()), limits, stopping.clone());
-        listeners.push(("http.health", tokio::spawn(served)));
-    }
+    let state = HttpState { edge: edge.clone(), clock, recorder: recorder.clone(), live: live.clone() };
+    let mut listeners = spawn_http((sockets.http, sockets.health), state, watchers_max, begins_within, &stopping);
     tokio::spawn(expire_sessions(edge.clone()));
     if let Some(files) = cluster_files {
         tokio::spawn(files.follow(reload_every, metrics.clone(), stopping.clone()));
@@ -180,7 +164,7 @@ pub async fn serve(config: Config, predictor: Arc<Predictor>) -> Result<RunningS
         (false, None) => "none",
     };
     let closing = Closing { begins_within, reads_within: drain, stopping };
-    listeners.push(("grpc.listen", spawn_grpc(grpc_listener, tls, &edge, health.reporter(), closing)));
+    listeners.push(("grpc.listen", spawn_grpc(sockets.grpc, tls, &edge, health.reporter(), closing)));
     tracing::info!(%grpc_addr, ?http_addr, zenoh = bus.is_some(), recording = recorder.is_some(), secure, "serving");
     Ok(RunningServer {
         grpc_addr,
@@ -327,6 +311,29 @@ async fn open_folder(folder: &Path, keeper: &Arc<Keeper>, handle: &EngineHandle)
         .unwrap_or_else(|_| Err(StoreError::Content { what: "something".into(), reason: "reading it panicked; this is a bug".into() }))
 }
 
+/// The addresses that a server listens at.
+struct Sockets {
+    grpc: TcpListener,
+    http: Option<TcpListener>,
+    /// For `/health` alone.
+    health: Option<TcpListener>,
+}
+
+impl Sockets {
+    async fn bind(config: &Config) -> Result<Self, ServerError> {
+        let grpc = listen(config.grpc.listen, "grpc.listen").await?;
+        let http = match config.http.enabled {
+            true => Some(listen(config.http.listen, "http.listen").await?),
+            false => None,
+        };
+        let health = match config.http.health_address()? {
+            Some(address) => Some(listen(address, "http.health").await?),
+            None => None,
+        };
+        Ok(Self { grpc, http, health })
+    }
+}
+
 async fn listen(address: SocketAddr, key: &'static str) -> Result<TcpListener, ServerError> {
     TcpListener::bind(address).await.map_err(|source| ServerError::Listen { address, key, source })
 }
@@ -366,6 +373,25 @@ pub(crate) fn router(edge: &Edge, health: &HealthReporter) -> Router {
         .add_service(UntilStopped { service: reflection, stopping: stopping() })
         .add_service(UntilStopped { service: reflection_v1alpha, stopping: stopping() });
     builder(&edge.config).add_routes(routes)
+}
+
+/// Serves HTTP, and `/health` alone, where they are listened for.
+fn spawn_http(
+    (http, health): (Option<TcpListener>, Option<TcpListener>),
+    state: HttpState,
+    watchers_max: usize,
+    asks_within: Duration,
+    stopping: &watch::Receiver<bool>,
+) -> Vec<Listener> {
+    let serve = |listener, router, connections_max| {
+        let limits = HttpLimits { asks_within, connections_max };
+        tokio::spawn(http_connections::serve(listener, router, limits, stopping.clone()))
+    };
+    // Prometheus, scripts and the pages, each with what a browser opens to one server.
+    let connections_max = ASKERS_MAX.saturating_add(watchers_max.saturating_mul(BROWSER_CONNECTIONS));
+    let health = health.map(|listener| ("http.health", serve(listener, http::health_router(state.edge.clone()), ASKERS_MAX)));
+    let http = http.map(|listener| ("http.listen", serve(listener, http::router(state), connections_max)));
+    http.into_iter().chain(health).collect()
 }
 
 fn spawn_grpc(

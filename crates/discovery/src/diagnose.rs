@@ -1,9 +1,13 @@
 //! The whole diagnosis of a set: detect, select, refit, prove on drives that were not fitted.
 
+use std::sync::Arc;
+
 use nesam_evaluation::DriveMaps;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::effects::written::WRITTEN_MAX;
 use nesam_physics::effects::{Effect, Written};
+use nesam_physics::{SOIL_DIM, SoilCorrection};
+use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 
 use crate::bend::{self, Bend};
@@ -16,14 +20,14 @@ use crate::error::DiscoveryError;
 use crate::ground::{Ground, Soils};
 use crate::held_out::{HeldOut, Learned, Scoring, far_off, score_held_out};
 use crate::judge::{Judge, case_of, own_yardstick};
-use crate::judgement::{Verdict, judge, too_few};
+use crate::judgement::{Judgement, Verdict, judge, too_few};
 use crate::lack::Lack;
 use crate::observe::{Bench, ObservedDrive, available_in_all, observe_all};
 use crate::own_reference;
 use crate::proof::Trial;
 use crate::proven::{HeldDrives, Proven, keep, prove, said_by_others, said_of_ground};
 use crate::pursuit::{Pursued, pursue};
-use crate::select::{EFFECTS_MAX, EFFECTS_ON_TRIAL_MAX, Selection};
+use crate::select::{EFFECTS_MAX, EFFECTS_ON_TRIAL_MAX, Selection, Yardstick};
 use crate::still::refuse_still;
 use crate::work::Work;
 
@@ -210,102 +214,56 @@ struct Asked<'a> {
 impl Asked<'_> {
     /// Asks with hypotheses of a vehicle with what wheel speeds told, which is of `of_rims`.
     fn diagnosed(&self, told: &DriveLine, catalogue: &[Candidate], of_rims: Vec<Candidate>) -> Result<Diagnosis, DiscoveryError> {
-        let Self { plain, judge_by, drives, maps, fit_at, fit_drives, seen, fit_maps, options, progress } = *self;
-        let total = fit_at.len();
-        let driven;
-        let predictor = if told.is_empty() {
-            plain
-        } else {
-            driven = plain.with_effects(&told.effects);
-            &driven
-        };
-        let bundle = predictor.bundle();
+        let Self { plain, judge_by, fit_drives, seen, fit_maps, options, progress, .. } = *self;
+        let total = fit_drives.len();
+        let driven = (!told.is_empty()).then(|| plain.with_effects(&told.effects));
+        let predictor = driven.as_ref().unwrap_or(plain);
         let observed = observe_all(predictor, seen, fit_maps, &|done| progress("drives as the model sees them", done, total))?;
         let judge_by = judge_by.map(|j| j.over(Lack::of(fit_drives, fit_maps), &available_in_all(&observed))).transpose()?;
         let judge_by = judge_by.as_deref();
-        let bench = Bench::new(bundle, catalogue);
+        let bench = Bench::new(predictor.bundle(), catalogue);
         let (mut case, Pursued { yardstick, refused }) =
             held_against(judge_by, bench, observed, options, (plain, predictor, !told.is_empty()), self)?;
         case.work = Work::begin("hypotheses", progress);
         let few = judge_by.is_none() && own_reference::too_few(total);
         let judgement = if few { too_few(&case, &yardstick) } else { judge(&mut case, &yardstick).with_refused(refused) };
-        let fewer = match judge_by {
-            Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
-            _ => None,
-        };
-        // What is claimed follows from the fitted drives alone, others only say what comes of it.
-        let held_at: Vec<usize> = match options.fit_on {
-            Some(_) => (0..drives.len()).filter(|d| !fit_at.contains(d)).collect(),
-            None if total > 1 => fit_at.to_vec(),
-            None => Vec::new(),
-        };
-        let held: Vec<Trajectory> = held_at.iter().map(|&d| drives[d].clone()).collect();
-        let held_maps: Vec<_> = held_at.iter().map(|&d| maps[d].clone()).collect();
+
+        let (held_at, held, held_maps) = self.held_out();
         let proof = Work::begin("held-out windows", progress);
         case.work = proof.clone();
         let fitted = options.fit_on.is_none();
         let held_drives = HeldDrives { predictor: plain, told, drives: &held, maps: &held_maps, options, fitted, work: &proof };
-        let apart = options.fit_on.is_some();
-        let proving = if apart { held_drives.among_fitted(fit_drives, fit_maps) } else { held_drives };
-        let Proven { mut judgement, mut learned, taught, mut scores, verdict, mut reason } =
-            prove(&mut case, &yardstick, fewer.as_ref().unwrap_or(&yardstick), judgement, &proving)?;
-        // A model on trial that errs to no side is not right for that.
-        let far =
-            (judge_by.is_none() && verdict == Verdict::None).then(|| far_off(scores.as_ref()?, proving.drives, &options.scoring)).flatten();
-        if apart {
-            learned = vec![taught.clone(); held.len()];
-            scores = if options.scoring.windows(&held).is_ok() {
-                Some(score_held_out(plain, &held, &held_maps, &learned, &options.scoring, &proof)?)
-            } else {
-                None
-            };
-            if let Some(scores) = scores.as_ref().filter(|_| verdict.claims()) {
-                reason += &said_by_others(&judgement, told, judge_by.is_none(), scores);
-            }
-        }
-        let verdict = if far.is_some() { Verdict::Unexplained } else { verdict };
-        reason += far.as_deref().unwrap_or_default();
-        let (any, beside) = (verdict.claims(), taught.beside);
-        let soils = case.ground_alone.as_ref().map(|ground| {
-            let assumed = bundle.normalization.default_soil();
-            Soils {
-                assumed,
-                alone: ground.correction().apply(&assumed),
-                beside: if any { beside } else { case.bench.ground }.apply(&assumed),
-            }
-        });
+        let Proven { mut judgement, learned, taught, mut scores, verdict, mut reason } =
+            self.proven(&mut case, judge_by, &yardstick, judgement, &held_drives)?;
+        let claims = verdict.claims();
+        let assumed = predictor.bundle().normalization.default_soil();
+        let soils = soils(&case, assumed, if claims { taught.beside } else { case.bench.ground });
         if let Some(scores) = scores.as_ref().filter(|_| soils.is_some()) {
             reason += &said_of_ground(scores);
         }
-        let named = any && judgement.verdict.claims();
+        let named = claims && judgement.verdict.claims();
         let mut of_rims_found = told.findings.clone();
-        let unproven = |findings: &mut [Finding]| {
-            findings.iter_mut().filter(|f| f.refused.is_none()).for_each(|f| f.refused = Some(reason.clone()));
-        };
-        if !named {
-            unproven(&mut judgement.findings);
+        for (findings, proven) in [(&mut judgement.findings, named), (&mut of_rims_found, claims)] {
+            findings.iter_mut().filter(|f| !proven && f.refused.is_none()).for_each(|f| f.refused = Some(reason.clone()));
         }
-        if !any {
-            unproven(&mut of_rims_found);
-        }
-        let places: Vec<Option<usize>> = held_at.iter().map(|d| options.fit_on.is_none().then_some(*d)).collect();
+
         let others = if options.controls && scores.is_some() { Work::begin("controls", progress) } else { proof.clone() };
         case.work = others.clone();
-        let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: named, predictor, held_out: &places };
+        let held_out: Vec<Option<usize>> = held_at.iter().map(|d| fitted.then_some(*d)).collect();
+        let setting = Setting { case: &case, yardstick: &yardstick, judgement: &judgement, claimed: named, predictor, held_out: &held_out };
         let (controls, free_form) = match scores.as_mut().filter(|_| options.controls) {
             Some(scores) => score_controls(&setting, scores, &HeldDrives { work: &others, ..held_drives })?,
             None => (Vec::new(), None),
         };
-        if let Some(scores) = scores.as_mut().filter(|_| !any) {
+        if let Some(scores) = scores.as_mut().filter(|_| !claims) {
             scores.add_nothing();
         }
         let null_drives = judge_by.and_then(|j| setting.on_null_drives(&j.nulls));
-        let claimed = if named { judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects())) } else { Vec::new() };
-        let traces = case.traces(&judgement.selection, &claimed);
+        let beside_rims = if named { judgement.fit.as_ref().map_or_else(Vec::new, |f| keep(&judgement, f.effects())) } else { Vec::new() };
+        let traces = case.traces(&judgement.selection, &beside_rims);
         let findings: Vec<Finding> = of_rims_found.into_iter().chain(judgement.findings).collect();
-        let claims = findings.iter().filter(|f| any && f.refused.is_none());
-        let estimates = claims.flat_map(|f| f.estimates.clone()).collect();
-        let claimed = if any { told.effects.iter().copied().chain(claimed).collect() } else { Vec::new() };
+        let estimates = findings.iter().filter(|f| claims && f.refused.is_none()).flat_map(|f| f.estimates.clone()).collect();
+        let claimed = if claims { told.effects.iter().copied().chain(beside_rims).collect() } else { Vec::new() };
         let mut selection = judgement.selection;
         selection.z.extend(of_rims.iter().map(|c| told.findings.iter().find(|f| f.candidate == *c).map(|f| f.z)));
         Ok(Diagnosis {
@@ -331,6 +289,61 @@ impl Asked<'_> {
             scores,
         })
     }
+
+    /// Places of the drives that are predicted as a proof, with the drives and their maps: those that were not fitted, or each that the others are enough for.
+    fn held_out(&self) -> (Vec<usize>, Vec<Trajectory>, Vec<Option<Arc<WorldMap>>>) {
+        let at: Vec<usize> = match self.options.fit_on {
+            Some(_) => (0..self.drives.len()).filter(|d| !self.fit_at.contains(d)).collect(),
+            None if self.fit_at.len() > 1 => self.fit_at.to_vec(),
+            None => Vec::new(),
+        };
+        let drives = at.iter().map(|&d| self.drives[d].clone()).collect();
+        let maps = at.iter().map(|&d| self.maps[d].clone()).collect();
+        (at, drives, maps)
+    }
+
+    /// A judgement with what predictions say of it. What is claimed follows from the fitted drives alone, others only say what comes of it.
+    fn proven(
+        &self,
+        case: &mut Case<'_>,
+        judge_by: Option<&Judge>,
+        yardstick: &Yardstick,
+        judgement: Judgement,
+        held: &HeldDrives<'_>,
+    ) -> Result<Proven, DiscoveryError> {
+        let (options, total) = (self.options, self.fit_drives.len());
+        let fewer = match judge_by {
+            Some(judge_by) if total > 1 => Some(judge_by.yardstick(&case.metric.channels, total - 1, &options.without)?),
+            _ => None,
+        };
+        let proving = if held.fitted { *held } else { held.among_fitted(self.fit_drives, self.fit_maps) };
+        let mut proven = prove(case, yardstick, fewer.as_ref().unwrap_or(yardstick), judgement, &proving)?;
+        // A model on trial that errs to no side is not right for that.
+        let on_trial = judge_by.is_none();
+        let in_vain = proven.scores.as_ref().filter(|_| on_trial && proven.verdict == Verdict::None);
+        let far = in_vain.and_then(|scores| far_off(scores, proving.drives, &options.scoring));
+        if !held.fitted {
+            proven.learned = vec![proven.taught.clone(); held.drives.len()];
+            proven.scores = match options.scoring.windows(held.drives) {
+                Ok(_) => Some(score_held_out(self.plain, held.drives, held.maps, &proven.learned, &options.scoring, held.work)?),
+                Err(_) => None,
+            };
+            if let Some(scores) = proven.scores.as_ref().filter(|_| proven.verdict.claims()) {
+                proven.reason += &said_by_others(&proven.judgement, held.told, on_trial, scores);
+            }
+        }
+        if let Some(far) = far {
+            proven.verdict = Verdict::Unexplained;
+            proven.reason += &far;
+        }
+        Ok(proven)
+    }
+}
+
+/// Soils under the drives of a case that has no map to tell them, `beside` what is claimed.
+fn soils(case: &Case<'_>, assumed: [f64; SOIL_DIM], beside: SoilCorrection) -> Option<Soils> {
+    let alone = case.ground_alone.as_ref()?.correction().apply(&assumed);
+    Some(Soils { assumed, alone, beside: beside.apply(&assumed) })
 }
 
 /// All hypotheses of a diagnosis.

@@ -77,7 +77,7 @@ impl Submission {
     }
 
     fn refuse(self, error: EngineError) {
-        (self.reply)(Answer { result: Err(error), queued_ns: 0, busy_ns: 0 });
+        (self.reply)(Answer::refused(error));
     }
 }
 
@@ -90,6 +90,17 @@ pub struct Answer {
     pub queued_ns: u64,
     /// Time in the engine, ns.
     pub busy_ns: u64,
+    /// Whether a longer prediction paused for this one.
+    pub is_urgent: bool,
+    /// Time of `busy_ns` in which this prediction paused for others, ns.
+    pub paused_ns: u64,
+}
+
+impl Answer {
+    /// To what never had its turn.
+    pub fn refused(error: EngineError) -> Self {
+        Self { result: Err(error), queued_ns: 0, busy_ns: 0, is_urgent: false, paused_ns: 0 }
+    }
 }
 
 /// A command that the engine's thread has answered, for a recording.
@@ -386,7 +397,7 @@ fn answer_all(engine: &mut Engine, commands: impl IntoIterator<Item = Submission
         let (queued_ns, busy_ns) = (now_ns.saturating_sub(submitted_ns), clock.now_ns().saturating_sub(now_ns));
         let is_told = heard.listens() && !matches!(command, Command::Snapshot { .. } | Command::TellFleetSoil);
         let executed = is_told.then(|| Executed { now_ns, command, result: result.clone(), queued_ns, busy_ns });
-        reply(Answer { result, queued_ns, busy_ns });
+        reply(Answer { result, queued_ns, busy_ns, is_urgent: false, paused_ns: 0 });
         heard.tell(place, executed);
     }
 }
@@ -454,9 +465,9 @@ impl Begun {
             Err(_) => None,
         };
         query.keep_answered(&result);
-        queue.done(work(&query, query.samples) + encoding_work(encoded), is_urgent, took, clock.now_ns());
+        let paused_ns = queue.done(work(&query, query.samples) + encoding_work(encoded), is_urgent, took, clock.now_ns());
         let told = heard.listens().then(|| result.clone());
-        reply(Answer { result, queued_ns, busy_ns });
+        reply(Answer { result, queued_ns, busy_ns, is_urgent, paused_ns });
         heard.tell(place, told.map(|result| Executed { now_ns, command: Command::Predict(query), result, queued_ns, busy_ns }));
     }
 }

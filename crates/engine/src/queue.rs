@@ -212,8 +212,8 @@ impl Queue {
     }
 
     /// The prediction whose turn it was is done: learns how long it took if it was computed, or that it takes longer if it was given up later than expected.
-    /// Said before its answer leaves, so that whoever asks again at once finds the engine idle.
-    pub fn done(&self, work: f64, is_urgent: bool, took: Option<Took>, now_ns: u64) {
+    /// Said before its answer leaves, so that whoever asks again at once finds the engine idle. Tells for how long it waited for urgent ones, ns.
+    pub fn done(&self, work: f64, is_urgent: bool, took: Option<Took>, now_ns: u64) -> u64 {
         let mut lanes = self.lock();
         let expected_ns = lanes.service_time.expected_ns(work);
         let paused_ns = lanes.at_work(is_urgent).as_ref().map_or(0, |running| running.paused_ns);
@@ -239,6 +239,7 @@ impl Queue {
             running.paused_ns += now_ns.saturating_sub(urgent.since_ns);
         }
         self.filled.notify_one();
+        paused_ns
     }
 
     /// Refuses new commands and gives back the predictions that wait.
@@ -540,9 +541,10 @@ mod tests {
         for at_ns in [5 * MS, 30 * MS] {
             assert!(queue.push(short(1, at_ns), &limits).is_ok());
             assert!(matches!(queue.next(|| at_ns), Turn::Prediction { is_urgent: true, .. }));
-            queue.done(work(query, SAMPLES), true, Some(Took::All(16 * MS)), at_ns + 16 * MS);
+            assert_eq!(queue.done(work(query, SAMPLES), true, Some(Took::All(16 * MS)), at_ns + 16 * MS), 0, "nobody pauses it");
         }
         assert!(queue.push(short(1, 47 * MS), &limits).is_err(), "it paused for 32 ms of 44");
+        assert_eq!(queue.done(work(query, SAMPLES), false, Some(Took::All(90 * MS)), 90 * MS), 32 * MS);
     }
 
     #[test]

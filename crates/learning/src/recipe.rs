@@ -100,30 +100,9 @@ pub fn run(
         // Before the work that comes first: minutes.
         origin::check(&plan)?;
     }
-    let choose = |drives: &[Drive], validation: bool| -> Vec<usize> {
-        (0..drives.len()).filter(|i| is_validation(*i, drives.len()) == validation).collect()
-    };
-    let (mut train_at, validation_at) = (choose(&drives, false), choose(&drives, true));
-    let damped = |vehicle: &Vehicle| Vehicle {
-        soil_damping_pa_s_m: recipe.soil_damping_pa_s_m.unwrap_or(vehicle.soil_damping_pa_s_m),
-        ..vehicle.clone()
-    };
-    let fitted = || {
-        let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
-        let vehicle = root.vehicle_of(trajectories);
-        if vehicle.command_range != root.vehicle().command_range {
-            let [speed_m_s, second] = vehicle.command_range;
-            reporter
-                .line(&format!("the card states no range of commands; with that of the drives speed {speed_m_s:?} m/s, second {second:?}"));
-        }
-        calibrate_vehicle(damped(&vehicle), &training, recipe.dt_s, reporter, interrupted)
-            .ok_or(TrainingError::Unprepared("the vehicle's card was calibrated"))
-    };
-    let (vehicle, mut scales) = match &recipe.start {
-        Some(bundle) if recipe.recalibrate => (fitted()?.0, bundle.normalization.clone()),
-        Some(bundle) => (damped(&bundle.vehicle), bundle.normalization.clone()),
-        None => fitted()?,
-    };
+    let stages = Stages { recipe, reporter, interrupted };
+    let (validation_at, mut train_at): (Vec<usize>, Vec<usize>) = (0..drives.len()).partition(|&i| is_validation(i, drives.len()));
+    let (vehicle, mut scales) = stages.card(root, trajectories, &at(&drives, &train_at))?;
     scales.smooth_semantics = recipe.smooth_borders.unwrap_or(scales.smooth_semantics);
 
     let learned_from = train_at.len();
@@ -132,39 +111,18 @@ pub fn run(
         train_at.extend(drives.len()..drives.len() + images.len());
         drives.extend(images);
     }
-
-    let mut weights = recipe.start.as_ref().map_or_else(|| initial_weights(recipe.plan.seed, &scales), |bundle| bundle.weights.clone());
-    prepare_projection(&mut weights, &recipe.pooling, recipe.plan.objective.variant);
-    if recipe.start.is_none() && recipe.plan.objective.variant.is_end_to_end() {
-        let training: Vec<&Drive> = train_at.iter().map(|&i| &drives[i]).collect();
-        let [mean, sd] = measure_increments(&training);
-        scales.residual_scale = sd;
-        weights.insert("residual.bias", &[STATE_DIM], mean.iter().zip(sd).map(|(m, s)| m / s).collect());
-    }
-    let trained_on_maps = any_mapped(&drives, &train_at);
-    if trained_on_maps && recipe.start.is_none() {
-        for (name, array) in encoders(&drives, &train_at, &scales, recipe, reporter, interrupted)?.iter() {
-            weights.get(name, &array.shape)?;
-            weights.insert(name, &array.shape, array.values.clone());
-        }
-    }
+    let weights = stages.first_weights(&drives, &train_at, &mut scales)?;
     // Of encoders that were trained on nothing no drive is shown anything.
-    let has_encoders = trained_on_maps || recipe.start.is_some();
-    if has_encoders && drives.iter().any(|d| d.map.is_some()) && recipe.plan.steps > 0 {
-        let samples = drives.iter().map(|d| d.states.len()).sum();
-        reporter.stage("terrain contexts", samples);
-        let done = AtomicUsize::new(0);
-        let told = |n| reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
-        let encoders = TerrainEncoders::new(&weights)?;
-        encode_drives(&mut drives, &encoders, &scales.patch_scale(), &recipe.pooling, told, interrupted);
+    if recipe.start.is_some() || any_mapped(&drives, &train_at) {
+        stages.show_terrain(&mut drives, &weights, &scales)?;
     }
     if interrupted() {
         return Err(TrainingError::Unprepared("the terrain contexts were computed"));
     }
 
     let set = TrainingSet {
-        train: train_at.iter().map(|&i| &drives[i]).collect(),
-        validation: validation_at.iter().map(|&i| &drives[i]).collect(),
+        train: at(&drives, &train_at),
+        validation: at(&drives, &validation_at),
         scales: &scales,
         model: Arc::new(StepModel::new(&vehicle, scales.dt_s, scales.substeps)),
         pooling: recipe.pooling.clone(),
@@ -211,6 +169,79 @@ pub fn run(
     };
     bundle.save(&recipe.out.join("bundle"))?;
     Ok(bundle)
+}
+
+/// Some of the drives.
+fn at<'a>(drives: &'a [Drive], places: &[usize]) -> Vec<&'a Drive> {
+    places.iter().map(|&i| &drives[i]).collect()
+}
+
+/// What comes before the optimiser.
+struct Stages<'a> {
+    recipe: &'a Recipe,
+    reporter: &'a dyn Reporter,
+    interrupted: &'a (dyn Fn() -> bool + Sync),
+}
+
+impl Stages<'_> {
+    /// The vehicle and the scales of its quantities: of the bundle that training starts from, or calibrated on the drives that train.
+    fn card(&self, root: &DataRoot, trajectories: &[Trajectory], training: &[&Drive]) -> Result<(Vehicle, Normalization), TrainingError> {
+        let damped = |vehicle: &Vehicle| Vehicle {
+            soil_damping_pa_s_m: self.recipe.soil_damping_pa_s_m.unwrap_or(vehicle.soil_damping_pa_s_m),
+            ..vehicle.clone()
+        };
+        let fitted = || {
+            let vehicle = root.vehicle_of(trajectories);
+            if vehicle.command_range != root.vehicle().command_range {
+                let [speed_m_s, second] = vehicle.command_range;
+                let ranges = format!("with that of the drives speed {speed_m_s:?} m/s, second {second:?}");
+                self.reporter.line(&format!("the card states no range of commands; {ranges}"));
+            }
+            calibrate_vehicle(damped(&vehicle), training, self.recipe.dt_s, self.reporter, self.interrupted)
+                .ok_or(TrainingError::Unprepared("the vehicle's card was calibrated"))
+        };
+        match &self.recipe.start {
+            Some(bundle) if self.recipe.recalibrate => Ok((fitted()?.0, bundle.normalization.clone())),
+            Some(bundle) => Ok((damped(&bundle.vehicle), bundle.normalization.clone())),
+            None => fitted(),
+        }
+    }
+
+    /// The weights that training begins from: those of a bundle, or drawn, with encoders that were trained on the maps of the drives. What predicts end to
+    /// end begins from the drives' mean increment, and its scale is theirs.
+    fn first_weights(&self, drives: &[Drive], train_at: &[usize], scales: &mut Normalization) -> Result<Weights, TrainingError> {
+        let Recipe { plan, pooling, start, .. } = self.recipe;
+        let mut weights = start.as_ref().map_or_else(|| initial_weights(plan.seed, scales), |bundle| bundle.weights.clone());
+        prepare_projection(&mut weights, pooling, plan.objective.variant);
+        if start.is_some() {
+            return Ok(weights);
+        }
+        if plan.objective.variant.is_end_to_end() {
+            let [mean, sd] = measure_increments(&at(drives, train_at));
+            scales.residual_scale = sd;
+            weights.insert("residual.bias", &[STATE_DIM], mean.iter().zip(sd).map(|(m, s)| m / s).collect());
+        }
+        if any_mapped(drives, train_at) {
+            for (name, array) in encoders(drives, train_at, scales, self.recipe, self.reporter, self.interrupted)?.iter() {
+                weights.get(name, &array.shape)?;
+                weights.insert(name, &array.shape, array.values.clone());
+            }
+        }
+        Ok(weights)
+    }
+
+    /// Encodes the terrain along drives over maps, if there are any and they are to be trained on.
+    fn show_terrain(&self, drives: &mut [Drive], weights: &Weights, scales: &Normalization) -> Result<(), TrainingError> {
+        if self.recipe.plan.steps == 0 || drives.iter().all(|d| d.map.is_none()) {
+            return Ok(());
+        }
+        self.reporter.stage("terrain contexts", drives.iter().map(|d| d.states.len()).sum());
+        let done = AtomicUsize::new(0);
+        let told = |n| self.reporter.progress(done.fetch_add(n, Ordering::Relaxed) + n, "");
+        let encoders = TerrainEncoders::new(weights)?;
+        encode_drives(drives, &encoders, &scales.patch_scale(), &self.recipe.pooling, told, self.interrupted);
+        Ok(())
+    }
 }
 
 /// Makes W_c equal within the blocks that share a weight, and zero for what the form does not see: training on nothing leaves that so, and the

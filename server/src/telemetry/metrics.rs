@@ -48,6 +48,10 @@ pub struct Metrics {
     queue: Histogram,
     prediction: Histogram,
     refusals: Histogram,
+    /// Predictions that others paused for.
+    urgent: AtomicU64,
+    /// Time for which predictions paused, ns.
+    paused_ns: AtomicU64,
 }
 
 fn count(pairs: &Pairs, key: (&'static str, &'static str)) {
@@ -82,6 +86,8 @@ impl Metrics {
             self.queue.record_ns(answer.queued_ns);
             self.prediction.record_ns(answer.busy_ns);
         }
+        self.urgent.fetch_add(answer.is_urgent.into(), Ordering::Relaxed);
+        self.paused_ns.fetch_add(answer.paused_ns, Ordering::Relaxed);
     }
 
     /// Counts what became of a measurement.
@@ -164,6 +170,12 @@ impl Metrics {
         self.prediction.render("nesam_prediction_compute_seconds", "Time that the engine computed a prediction.", &mut out);
         let help = "Time from the head of a request over gRPC to its refusal for want of room.";
         self.refusals.render("nesam_prediction_refusal_seconds", help, &mut out);
+        let (name, urgent) = ("nesam_predictions_urgent_total", self.urgent.load(Ordering::Relaxed));
+        let help = "Short predictions that were computed at once while a longer one paused for them.";
+        let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} counter\n{name} {urgent}");
+        let (name, paused_s) = ("nesam_prediction_paused_seconds_total", self.paused_ns.load(Ordering::Relaxed) as f64 * 1e-9);
+        let help = "Time for which longer predictions paused; their times of computation contain it.";
+        let _ = writeln!(out, "# HELP {name} {help}\n# TYPE {name} counter\n{name} {paused_s}");
         for (lane, value) in [("commands", waiting_commands), ("predictions", waiting_predictions)] {
             let _ = writeln!(
                 out,
@@ -184,10 +196,10 @@ mod tests {
         let metrics = Metrics::default();
         for queued_ns in [0, 2_000_000, 9_000_000_000] {
             let result = Ok(Reply::Done);
-            metrics.engine_answer("close", &Answer { result, queued_ns, busy_ns: 0 });
+            metrics.engine_answer("close", &Answer { result, queued_ns, busy_ns: 0, is_urgent: queued_ns == 0, paused_ns: queued_ns });
             metrics.queue.record_ns(queued_ns);
         }
-        metrics.engine_answer("predict", &Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 });
+        metrics.engine_answer("predict", &Answer::refused(EngineError::Expired));
         metrics.measurement(Transport::Zenoh, "applied");
         [200, 1000, 1100].into_iter().map(Duration::from_micros).for_each(|after| metrics.refused(after));
         assert_eq!(metrics.refusals(), [3, 2]);
@@ -210,6 +222,8 @@ mod tests {
             "nesam_prediction_queue_seconds_bucket{le=\"+Inf\"} 3",
             "nesam_prediction_refusal_seconds_bucket{le=\"0.001\"} 2",
             "nesam_prediction_refusal_seconds_count 3",
+            "nesam_predictions_urgent_total 1",
+            "nesam_prediction_paused_seconds_total 9.002",
             "nesam_events_total{event=\"map_changed\"} 1",
             "nesam_events_total{event=\"soil_filter_failed\"} 1",
             "nesam_maps 3",

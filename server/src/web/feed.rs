@@ -138,7 +138,7 @@ mod tests {
     use super::*;
 
     fn refused() -> Answer {
-        Answer { result: Err(EngineError::Expired), queued_ns: 0, busy_ns: 0 }
+        Answer::refused(EngineError::Expired)
     }
 
     #[test]

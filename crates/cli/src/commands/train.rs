@@ -157,39 +157,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
     let variant = Variant::from_name(&args.model)
         .ok_or_else(|| Failure::input(format!("no model `{}`; one of {}", args.model, Variant::ALL.map(Variant::as_str).join(", "))))?;
     let shards = args.threads.unwrap_or(if args.device == ComputeDevice::Cpu { 2 } else { 1 });
-    if args.batches * args.batch_size * shards == 0 || (args.epochs == 0 && args.from.is_none()) {
-        return Err(Failure::input("--batches, --batch-size and --threads must be at least 1, and so must --epochs without --from"));
-    }
-    args.horizon.map_or(Ok(()), |horizon| check_count("--horizon", horizon, 1..=MAX_HORIZON))?;
-    for (option, rate) in [("--lr", args.lr), ("--encoder-lr", args.encoder_lr)] {
-        if !(rate > 0.0 && rate <= 1.0) {
-            return Err(Failure::input(format!("{option} {rate} is not above 0 and at most 1")));
-        }
-    }
-    if !(0.0..0.9).contains(&args.dropout) {
-        return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
-    }
+    check_numbers(args, shards)?;
     let pooling = Pooling::new(args.pool).ok_or_else(|| Failure::input(format!("--pool {} is none of 1, 2, 4, 8, 16", args.pool)))?;
-    if !(0.0..100.0).contains(&args.decay) {
-        return Err(Failure::input(format!("--decay {} is not in 0..100", args.decay)));
-    }
-    for (option, weight) in [("--sustained", args.sustained), ("--soil-prior", args.soil_prior)] {
-        if !(0.0..100.0).contains(&weight) {
-            return Err(Failure::input(format!("{option} {weight} is not in 0..100")));
-        }
-    }
-    if let Some(damping) = args.soil_damping.filter(|d| !(0.0..=1e6).contains(d)) {
-        return Err(Failure::input(format!("--soil-damping {damping} is not in 0..1e6 Pa s/m")));
-    }
-    if let Some(name) = args.name.as_ref().filter(|name| !is_name(name)) {
-        return Err(Failure::input(format!("--name `{name}` has other than letters, digits, `-`, `_` and `.`")));
-    }
-    if args.sustained > 0.0 && variant.is_end_to_end() {
-        return Err(Failure::input(format!("--sustained is for models whose physics carries what lasts; {} has none", args.model)));
-    }
-    if args.soil_prior > 0.0 && !variant.has_soil() {
-        return Err(Failure::input(format!("--soil-prior is for models that read a soil off the map; {} does not", args.model)));
-    }
+    check_form(args, variant)?;
     let start = args.from.as_deref().map(|dir| start_of(dir, variant, args.data.dt)).transpose()?;
     // Each thread of `--threads` works on its own share of a batch, so candle's own element-wise threads would only get in their way (0.67 s against 0.42 s per
     // step, measured), and without a set number candle reads the processor list at every matrix product. What a step gives back the next one takes again.
@@ -251,6 +221,48 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         other => other.or_failed()?,
     };
     note!("bundle {} ({}) in {}", bundle.name, &bundle.hash[..12], out.join("bundle").display());
+    Ok(())
+}
+
+/// Refuses numbers out of range, and a name that is none.
+fn check_numbers(args: &TrainArgs, shards: usize) -> Result<(), Failure> {
+    if args.batches * args.batch_size * shards == 0 || (args.epochs == 0 && args.from.is_none()) {
+        return Err(Failure::input("--batches, --batch-size and --threads must be at least 1, and so must --epochs without --from"));
+    }
+    args.horizon.map_or(Ok(()), |horizon| check_count("--horizon", horizon, 1..=MAX_HORIZON))?;
+    for (option, rate) in [("--lr", args.lr), ("--encoder-lr", args.encoder_lr)] {
+        if !(rate > 0.0 && rate <= 1.0) {
+            return Err(Failure::input(format!("{option} {rate} is not above 0 and at most 1")));
+        }
+    }
+    if !(0.0..0.9).contains(&args.dropout) {
+        return Err(Failure::input(format!("--dropout {} is not in 0..0.9", args.dropout)));
+    }
+    if !(0.0..100.0).contains(&args.decay) {
+        return Err(Failure::input(format!("--decay {} is not in 0..100", args.decay)));
+    }
+    for (option, weight) in [("--sustained", args.sustained), ("--soil-prior", args.soil_prior)] {
+        if !(0.0..100.0).contains(&weight) {
+            return Err(Failure::input(format!("{option} {weight} is not in 0..100")));
+        }
+    }
+    if let Some(damping) = args.soil_damping.filter(|d| !(0.0..=1e6).contains(d)) {
+        return Err(Failure::input(format!("--soil-damping {damping} is not in 0..1e6 Pa s/m")));
+    }
+    if let Some(name) = args.name.as_ref().filter(|name| !is_name(name)) {
+        return Err(Failure::input(format!("--name `{name}` has other than letters, digits, `-`, `_` and `.`")));
+    }
+    Ok(())
+}
+
+/// Refuses losses of what a model does not have.
+fn check_form(args: &TrainArgs, variant: Variant) -> Result<(), Failure> {
+    if args.sustained > 0.0 && variant.is_end_to_end() {
+        return Err(Failure::input(format!("--sustained is for models whose physics carries what lasts; {} has none", args.model)));
+    }
+    if args.soil_prior > 0.0 && !variant.has_soil() {
+        return Err(Failure::input(format!("--soil-prior is for models that read a soil off the map; {} does not", args.model)));
+    }
     Ok(())
 }
 
