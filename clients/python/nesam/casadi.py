@@ -1,7 +1,7 @@
 """The rollout of a session as a CasADi function with Jacobians, for gradient-based planners (IPOPT, acados' external functions, ...).
 
 Jacobians hold the terrain as the rollout met it: on rough ground part of the response comes through ground, context and soil that change with the place, and is
-not in them (docs/results.md).
+not in them (docs/results/accuracy.md, "Jacobians").
 
     rollout = nesam.casadi.Rollout("rollout", client, "truck-1", horizon=20)
     u = casadi.MX.sym("u", 2, 20)

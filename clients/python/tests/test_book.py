@@ -42,7 +42,7 @@ class Block:
 
 def pages():
     own = [ROOT / name for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md")]
-    return [*sorted(BOOK.glob("*.md")), *sorted(BOOK.glob("adr/*.md")), *own, *sorted(ROOT.glob("clients/*/README.md")), *sorted(ROOT.glob("deploy/**/README.md"))]
+    return [*sorted(BOOK.glob("*.md")), *sorted(BOOK.glob("*/*.md")), *own, *sorted(ROOT.glob("clients/*/README.md")), *sorted(ROOT.glob("deploy/**/README.md"))]
 
 
 def blocks():
@@ -65,7 +65,7 @@ def test_property_every_block_is_run_or_says_why_not():
         mark = re.fullmatch(allowed, block.mark)
         assert mark, f"say above the block what runs it: {what}"
         assert block.mark != "run" or (block.language, block.page.split("/")[0]) == ("sh", "docs"), f"nobody runs it: {what}"
-        named = re.findall(r"[\w./]+\.(?:rs|py|sh)|tests/fleet/run|docs/[\w-]+\.md", block.mark)
+        named = re.findall(r"[\w./]+\.(?:rs|py|sh)|tests/fleet/run|docs/[\w/-]+\.md", block.mark)
         assert all((ROOT / name).is_file() for name in named), f"runs it, and is not there: {named}"
     assert sum(block.mark == "run" for block in found) >= 12 and sum(map(run_here, found)) >= 9
 

@@ -10,11 +10,12 @@ fn repository() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
 }
 
-/// Markdown files of the book, decisions included.
+/// Markdown files of the book, those of its folders included: decisions, results.
 fn pages() -> Vec<PathBuf> {
-    let docs = repository().join("docs");
-    let of = |folder: PathBuf| std::fs::read_dir(folder).unwrap().flatten().map(|entry| entry.path());
-    of(docs.clone()).chain(of(docs.join("adr"))).filter(|path| path.extension().is_some_and(|e| e == "md")).collect()
+    let of = |folder: &Path| -> Vec<PathBuf> { std::fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path()).collect() };
+    let docs = of(&repository().join("docs"));
+    let below = docs.iter().filter(|path| path.is_dir()).flat_map(|folder| of(folder));
+    docs.iter().cloned().chain(below).filter(|path| path.extension().is_some_and(|e| e == "md")).collect()
 }
 
 /// Shell blocks that are marked to be run.
