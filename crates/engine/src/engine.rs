@@ -12,7 +12,7 @@ use nesam_adaptation::{AdaptationError, CalibratedFilter, FilterConfig, SoilFilt
 use nesam_fleet_soil::{FleetSoilError, FleetSoilSettings};
 use nesam_model::{ModelError, Predictor, RolloutNoise};
 use nesam_physics::Vehicle;
-use nesam_terrain::WorldMap;
+use nesam_terrain::{PatchScale, WorldMap};
 
 use crate::command::{Command, Event, MeasureAnswer, OpenSession, Reply, SessionView, Snapshot, Until};
 use crate::error::EngineError;
@@ -104,6 +104,11 @@ impl Engine {
     /// Vehicle that the bundle knows.
     pub fn vehicle(&self) -> &Vehicle {
         &self.predictor.bundle().vehicle
+    }
+
+    /// How predictions see a map.
+    pub(crate) fn patch_scale(&self) -> PatchScale {
+        self.predictor.bundle().normalization.patch_scale()
     }
 
     /// Answers one command at one instant of the engine's clock. A refused command changes nothing that an answer shows, and neither does a

@@ -6,6 +6,7 @@ use std::sync::atomic::AtomicBool;
 
 use nesam_model::{Interruption, is_raised};
 use nesam_physics::Vehicle;
+use nesam_terrain::{PatchScale, WorldMap};
 
 use crate::clock::Clock;
 use crate::command::{Command, Reply, Until};
@@ -129,6 +130,8 @@ pub struct EngineHandle {
     clock: Arc<dyn Clock>,
     limits: Arc<Limits>,
     vehicle: Arc<Vehicle>,
+    /// How predictions see a map.
+    patches: PatchScale,
     worker: Arc<Worker>,
 }
 
@@ -162,7 +165,7 @@ impl EngineHandle {
     /// When the system refuses to start a thread.
     pub fn spawn_tapped(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
         let queue = Arc::new(Queue::default());
-        let (limits, vehicle) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()));
+        let (limits, vehicle, patches) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()), engine.patch_scale());
         let heard = Arc::new(Heard::new(tap));
         let computing = Computing::start(&queue, &clock, &heard);
         let thread = thread::Builder::new()
@@ -172,18 +175,19 @@ impl EngineHandle {
                 move || run(engine, &queue, clock.as_ref(), computing, &heard)
             })
             .expect("the system starts a thread");
-        Self { queue, clock, limits, vehicle, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
+        Self { queue, clock, limits, vehicle, patches, worker: Arc::new(Worker::Thread(Mutex::new(Some(thread)))) }
     }
 
     /// An engine without a thread: whoever submits executes all that waits before it goes on, unless somebody else is at it. So a simulation runs on one
     /// thread.
     pub fn unthreaded(engine: Engine, clock: Arc<dyn Clock>, tap: Option<Tap>) -> Self {
-        let (limits, vehicle) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()));
+        let (limits, vehicle, patches) = (Arc::new(engine.limits().clone()), Arc::new(engine.vehicle().clone()), engine.patch_scale());
         Self {
             queue: Arc::default(),
             clock,
             limits,
             vehicle,
+            patches,
             worker: Arc::new(Worker::Submitter(Box::new(Mutex::new(Some((engine, Heard::new(tap))))))),
         }
     }
@@ -222,6 +226,11 @@ impl EngineHandle {
                 take_turn(self.queue.next(|| self.clock.now_ns()), engine, &self.queue, self.clock.as_ref(), heard);
             }
         }
+    }
+
+    /// Makes a map ready to be put, which takes up to a second for a large one. Of one that is not, all sessions wait for that at the first pose on it.
+    pub fn make_ready(&self, map: &WorldMap) {
+        map.make_ready(&self.patches);
     }
 
     /// Limits in force.

@@ -1,5 +1,7 @@
 //! The semantic layer: packed colours, and the same without hard borders.
 
+use std::ops::Range;
+
 use crate::geometry::GridGeometry;
 
 /// Standard deviation of the smoothing of borders, m. Chosen: detail finer than the grid of poses that tokens are interpolated between (0.25 m, and 5° are
@@ -22,12 +24,35 @@ pub(crate) fn unpack(packed: u32) -> [u8; 3] {
 
 /// Packed colours with their borders smoothed by about a Gaussian of [`SMOOTHING_M`]; at the border of the map the cells that there are count.
 pub(crate) fn smoothed(geometry: &GridGeometry, colour: &[u32]) -> Vec<u32> {
-    let GridGeometry { width, height, resolution_m, .. } = *geometry;
-    let radius = box_radius(SMOOTHING_M / resolution_m);
-    if radius == 0 {
-        return colour.to_vec();
+    smoothed_rectangle([geometry.width, geometry.height], box_radius(SMOOTHING_M / geometry.resolution_m), |at| colour[at])
+}
+
+/// Brings smoothed colours up to date with `colour`, of which a rectangle of cells has changed: what lies further than the smoothing reaches stays.
+pub(crate) fn smooth_again(geometry: &GridGeometry, colour: &[u32], columns: Range<usize>, rows: Range<usize>, smooth: &mut [u32]) {
+    let radius = box_radius(SMOOTHING_M / geometry.resolution_m);
+    let grown = |range: &Range<usize>, by: usize, end: usize| range.start.saturating_sub(by)..(range.end + by).min(end);
+    // What changes, and what that is computed from.
+    let [changed, seen] = [1, 2].map(|times| {
+        let by = times * PASSES * radius;
+        [grown(&columns, by, geometry.width), grown(&rows, by, geometry.height)]
+    });
+    let [width, height] = [seen[0].len(), seen[1].len()];
+    let cell = |at: usize| (seen[1].start + at / width) * geometry.width + seen[0].start + at % width;
+    let again = smoothed_rectangle([width, height], radius, |at| colour[cell(at)]);
+    for row in changed[1].clone() {
+        let from = (row - seen[1].start) * width + changed[0].start - seen[0].start;
+        let to = row * geometry.width + changed[0].start;
+        smooth[to..to + changed[0].len()].copy_from_slice(&again[from..from + changed[0].len()]);
     }
-    let mut channels = [0, 1, 2].map(|channel| colour.iter().map(|&packed| f32::from(unpack(packed)[channel])).collect::<Vec<f32>>());
+}
+
+/// Smooths a rectangle of colours by means over `radius` cells on either side; at its border the cells that there are count.
+fn smoothed_rectangle([width, height]: [usize; 2], radius: usize, colour: impl Fn(usize) -> u32) -> Vec<u32> {
+    let cells = 0..width * height;
+    if radius == 0 {
+        return cells.map(colour).collect();
+    }
+    let mut channels = [0, 1, 2].map(|channel| cells.clone().map(|at| f32::from(unpack(colour(at))[channel])).collect::<Vec<f32>>());
     let mut line = Vec::new();
     for values in &mut channels {
         for _ in 0..PASSES {
@@ -87,6 +112,24 @@ mod tests {
         }
         // Three means of 9 cells: 61 of the 9³ ways lead back to the cell itself, so (1 + 61/729) / 2 of the last cell's kernel lies on its own side.
         assert_eq!(row[29][0], 154, "100 + 100 · 0.542");
+    }
+
+    /// Goal: a map that is patched is smoothed as one that is uploaded whole. Method: rectangles of other colours all over a speckled map, at its borders too.
+    #[test]
+    fn property_a_patch_is_smoothed_as_the_whole() {
+        let geometry = GridGeometry { width: 83, height: 71, ..square(0) };
+        let speckle = |i: usize, salt: usize| pack([0, 8, 16].map(|shift| ((i * 2_654_435_761 + salt * 40_503) >> shift) as u8));
+        let mut colour: Vec<u32> = (0..83 * 71).map(|i| speckle(i, 0)).collect();
+        let mut smooth = smoothed(&geometry, &colour);
+        for (salt, (columns, rows)) in
+            [(0..1, 0..1), (40..47, 30..33), (60..83, 50..71), (0..83, 35..36), (82..83, 0..9)].into_iter().enumerate()
+        {
+            for row in rows.clone() {
+                columns.clone().for_each(|column| colour[row * 83 + column] = speckle(row * 83 + column, salt + 1));
+            }
+            smooth_again(&geometry, &colour, columns, rows, &mut smooth);
+            assert!(smooth == smoothed(&geometry, &colour), "rectangle {salt}");
+        }
     }
 
     #[test]

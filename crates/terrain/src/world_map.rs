@@ -5,10 +5,10 @@ use std::sync::OnceLock;
 use nesam_physics::SOIL_DIM;
 use sha2::{Digest, Sha256};
 
-use crate::colours::{pack, smoothed, unpack};
-
+use crate::colours::{pack, smooth_again, smoothed, unpack};
 use crate::error::TerrainError;
 use crate::geometry::{Bilinear, GridGeometry};
+use crate::patch::PatchScale;
 use crate::surface::Surface;
 
 /// Prior knowledge about one semantic class: its colour and the range of each soil parameter.
@@ -90,12 +90,23 @@ impl WorldMap {
             let reason = format!("{} cells, the geometry asks for {}", rgb.len(), geometry.cells());
             return Err(wrong("semantic_rgb", reason));
         }
+        Self::checked(id, version, geometry, elevation_m, semantic_rgb.map(|rgb| rgb.into_iter().map(pack).collect()))
+    }
+
+    /// A map of layers that have as many cells as the geometry, with its colours packed.
+    fn checked(
+        id: &str,
+        version: u64,
+        geometry: GridGeometry,
+        elevation_m: Vec<f32>,
+        colour: Option<Vec<u32>>,
+    ) -> Result<Self, TerrainError> {
+        let wrong = |field, reason| TerrainError::Layers { id: id.to_string(), field, reason };
         if let Some(at) = elevation_m.iter().position(|z| z.is_infinite() || z.abs() > 1e4) {
             let (row, column) = (at / geometry.width, at % geometry.width);
             let reason = format!("{} m at row {row}, column {column} is beyond 10 km", elevation_m[at]);
             return Err(wrong("elevation_m", reason));
         }
-        let colour = semantic_rgb.map(|rgb| rgb.into_iter().map(pack).collect::<Vec<u32>>());
         let hash = hash_layers(&geometry, &elevation_m, colour.as_deref());
         let surface =
             Surface::new(&geometry, elevation_m).ok_or_else(|| wrong("elevation_m", "no cell is known (all are holes)".into()))?;
@@ -159,16 +170,23 @@ impl WorldMap {
             ));
         };
         let mut elevation = self.elevation_m();
-        let mut semantic = self.semantic_rgb();
+        let mut colour = self.colour.clone();
         for row in 0..height {
             let to = (row0 + row) * map_width + column0;
             let from = row * width..(row + 1) * width;
             elevation[to..to + width].copy_from_slice(&elevation_m[from.clone()]);
-            if let (Some(map), Some(tile)) = (semantic.as_mut(), semantic_rgb) {
-                map[to..to + width].copy_from_slice(&tile[from]);
+            if let (Some(map), Some(tile)) = (colour.as_mut(), semantic_rgb) {
+                map[to..to + width].iter_mut().zip(&tile[from]).for_each(|(map, tile)| *map = pack(*tile));
             }
         }
-        let patched = Self::from_layers(&self.id, version, self.geometry, elevation, semantic)?;
+        let patched = Self::checked(&self.id, version, self.geometry, elevation, colour)?;
+        if let (Some(smooth), Some(colour)) = (self.smooth_colour.get(), &patched.colour) {
+            let mut smooth = smooth.clone();
+            if semantic_rgb.is_some() {
+                smooth_again(&self.geometry, colour, column0..column0 + width, row0..row0 + height, &mut smooth);
+            }
+            let _ = patched.smooth_colour.set(smooth);
+        }
         Ok(patched.with_soil_classes(self.soil_classes.clone()).with_source(self.source.clone()))
     }
 
@@ -267,6 +285,12 @@ impl WorldMap {
     /// Whether the point lies on the map (holes included).
     pub fn contains(&self, x_m: f64, y_m: f64) -> bool {
         self.geometry.contains(x_m, y_m)
+    }
+
+    /// Makes ready what patches of this scale see, which takes up to a second for a large map; else whoever samples the first patch waits for it. A map that
+    /// is patched after that is ready too.
+    pub fn make_ready(&self, scale: &PatchScale) {
+        self.patch_colours(scale.smooth_semantics);
     }
 
     /// Packed colours as patches see them: as they are, or with borders smoothed over about 0.4 m (see [`crate::PatchScale::smooth_semantics`]).

@@ -48,6 +48,7 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Optio
     for (id, bytes) in &contents.maps {
         let refused = |reason: String| StoreError::Content { what: format!("map `{id}`"), reason };
         let map = map_of(bytes, engine.limits()).map_err(refused)?;
+        engine.make_ready(&map);
         restored.maps.insert(id.clone(), StoredMap::of(&map));
         engine.call(Command::PutMap { map: map.into(), base: None }).map_err(|error| refused(error.to_string()))?;
     }

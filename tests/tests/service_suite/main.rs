@@ -12,6 +12,7 @@ mod fleet_soil;
 mod fleet_soil_sharing;
 mod forecasts;
 mod from_now;
+mod large_maps;
 mod lifecycle;
 mod live_page;
 mod measurements;
