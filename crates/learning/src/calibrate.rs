@@ -142,7 +142,7 @@ pub fn calibrate_vehicle(
         if interrupted() {
             return None;
         }
-        reporter.line(&format!("{name}, symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s"));
+        reporter.line(&format!("{name}, pose of the symbolic model alone {before:.3} m -> {after:.3} m over {seconds:.1} s"));
         if best.as_ref().is_none_or(|(error, _)| after < *error) {
             best = Some((after, candidate));
         }
@@ -184,7 +184,7 @@ pub fn knobs(vehicle: &Vehicle) -> &'static [Knob] {
     if vehicle.driveline.torque.is_some() { &TORQUE } else { &OVERSPEED }
 }
 
-/// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error before and after, m. Where it is interrupted, which is
+/// Fits the drive line by coordinate search (each number in turn, shrinking steps) and returns the error of the pose before and after, m. Where it is interrupted, which is
 /// asked before each number, the vehicle is as fitted by then.
 pub fn calibrate_driveline(
     vehicle: &mut Vehicle,
@@ -193,12 +193,13 @@ pub fn calibrate_driveline(
     mut progress: impl FnMut(&str, f64, f64),
     interrupted: &dyn Fn() -> bool,
 ) -> [f64; 2] {
-    let before = symbolic_error(vehicle, drives, scales).position_m;
+    let error = |vehicle: &Vehicle| symbolic_error(vehicle, drives, scales).pose_m();
+    let before = error(vehicle);
     if vehicle.second == SecondCommand::YawRateRadS {
         let with = |servo| {
             let mut vehicle = vehicle.clone();
             vehicle.driveline.rims = servo;
-            (symbolic_error(&vehicle, drives, scales).position_m, servo)
+            (error(&vehicle), servo)
         };
         let fitted = fit_rims(vehicle, drives, scales.dt_s).into_iter().map(with).min_by(|a, b| a.0.total_cmp(&b.0));
         let (after, servo) = fitted.unwrap_or_else(|| {
@@ -224,7 +225,7 @@ pub fn calibrate_driveline(
                     trial
                 })
             };
-            best = descend(vehicle, best, reach, trials, |trial| symbolic_error(trial, drives, scales).position_m);
+            best = descend(vehicle, best, reach, trials, error);
             progress(name.rsplit('.').next().unwrap_or(name), *knob(vehicle), best);
         }
     }

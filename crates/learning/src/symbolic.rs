@@ -29,6 +29,16 @@ pub struct SymbolicError {
     pub tilt_rad: f64,
     /// Heading, rad.
     pub yaw_rad: f64,
+    /// Length of a measured rollout, from its start to its end; no error, m.
+    pub way_m: f64,
+}
+
+impl SymbolicError {
+    /// Position with what the error of the heading moves it by in the mean over as long a way again, m. By the position alone a vehicle may turn too little for being in the
+    /// right place a moment later.
+    pub fn pose_m(&self) -> f64 {
+        self.position_m + 0.5 * self.yaw_rad * self.way_m
+    }
 }
 
 /// Errors of a vehicle over rollouts from every fortieth sample of drives.
@@ -38,26 +48,27 @@ pub fn symbolic_error(vehicle: &Vehicle, drives: &[&Drive], scales: &Normalizati
     let of_drive = |drive: &&Drive| {
         let last = drive.states.len().saturating_sub(HORIZON + 1);
         let starts = (WARM_UP.min(last.saturating_sub(1))..last).step_by(STRIDE);
-        starts.map(|i| rollout_error(&model, drive, i, &default_soil, scales)).fold(([0.0; 3], 0), plus)
+        starts.map(|i| rollout_error(&model, drive, i, &default_soil, scales)).fold(([0.0; 4], 0), plus)
     };
     // Summed in the order of the drives, so that calibrating again gives the same bits.
-    let sums: Vec<([f64; 3], usize)> = drives.par_iter().map(of_drive).collect();
-    let (sum, count) = sums.into_iter().fold(([0.0; 3], 0), |all, (sum, count)| (plus(all, sum).0, all.1 + count));
-    let [position_m, tilt_rad, yaw_rad] = sum.map(|s| s / count.max(1) as f64);
-    SymbolicError { position_m, tilt_rad, yaw_rad }
+    let sums: Vec<([f64; 4], usize)> = drives.par_iter().map(of_drive).collect();
+    let (sum, count) = sums.into_iter().fold(([0.0; 4], 0), |all, (sum, count)| (plus(all, sum).0, all.1 + count));
+    let [position_m, tilt_rad, yaw_rad, way_m] = sum.map(|s| s / count.max(1) as f64);
+    SymbolicError { position_m, tilt_rad, yaw_rad, way_m }
 }
 
 /// One more rollout in a sum.
-fn plus((sum, count): ([f64; 3], usize), error: [f64; 3]) -> ([f64; 3], usize) {
+fn plus((sum, count): ([f64; 4], usize), error: [f64; 4]) -> ([f64; 4], usize) {
     (core::array::from_fn(|i| sum[i] + error[i]), count + 1)
 }
 
-/// Position (m), tilt and heading (rad). The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
-fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> [f64; 3] {
+/// Position (m), tilt and heading (rad), and the way (m). The soil is the middle of what the map says of the class under the vehicle, or the default where it says nothing.
+fn rollout_error(model: &StepModel, drive: &Drive, i: usize, default_soil: &Soil<f64>, scales: &Normalization) -> [f64; 4] {
     let mut state = drive.states[i];
     let ground = GroundSource::new(drive.map.as_deref(), model, &state);
     let mut actuators = history_actuators(model, &drive.history(i.saturating_sub(31), i), &state, &drive.controls[i], scales.dt_s);
-    let mut error = [0.0; 3];
+    let way = |axis: usize| drive.states[i + HORIZON].position_m[axis] - drive.states[i].position_m[axis];
+    let mut error = [0.0, 0.0, 0.0, f64::hypot(way(0), way(1))];
     for k in 0..HORIZON {
         let control = &drive.controls[i + k];
         let after = actuators.advance(model.vehicle(), control, state.velocity_m_s[0], scales.dt_s);

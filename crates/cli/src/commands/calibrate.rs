@@ -227,8 +227,14 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
     if let (Some(before), Some(after)) = (before.tilt_rad, after.tilt_rad) {
         say!("  roll and pitch together {:.3}° -> {:.3}°", before.to_degrees(), after.to_degrees());
     }
-    let better = scored.iter().filter(|s| s.after.position_m < s.before.position_m).count();
-    say!("  position is better on {better} of {} drives", scored.len());
+    let better = |of: fn(&Errors) -> f64| scored.iter().filter(|s| of(&s.after) < of(&s.before)).count();
+    let (position, yaw) = (better(|e| e.position_m), better(|e| e.yaw_rad));
+    say!("  position is better on {position} of {} drives, yaw on {yaw}", scored.len());
+    for (what, worse) in [("position", after.position_m > before.position_m), ("yaw", after.yaw_rad > before.yaw_rad)] {
+        if worse {
+            say!("  warning: {what} is worse with the fitted card; see which of its numbers below is not what the vehicle is like");
+        }
+    }
     say!("\ncard -> fitted:");
     let shown = |value: &Value| if value.is_null() { "–".into() } else { value.to_string() };
     for (name, [before, after]) in changes {
