@@ -6,8 +6,8 @@ use std::path::{Path, PathBuf};
 use crate::error::ImportError;
 use crate::part::Notes;
 
-/// What to do with a bag in another storage or under compression.
-pub const CONVERT: &str = "only bags in MCAP files without compression are read. Convert it: write `output_bags: [{uri: converted, storage_id: mcap, all: true}]` \
+/// What to do with a bag in another storage, or whose files or messages the recorder compressed.
+pub const CONVERT: &str = "only bags in MCAP files are read, with or without compressed chunks, and no compressed files. Convert it: write `output_bags: [{uri: converted, storage_id: mcap, all: true}]` \
      into a file out.yaml, run `ros2 bag convert -i BAG -o out.yaml`, and import the folder `converted`";
 
 /// File that makes a folder a bag.
@@ -86,6 +86,6 @@ mod tests {
         std::fs::write(folder.path().join(METADATA), "  relative_file_paths:\n    - run_0.db3\n").expect("written");
         assert!(told().contains("run_0.db3") && told().contains("ros2 bag convert -i"), "{}", told());
         std::fs::write(folder.path().join("run_0.mcap.zstd"), "").expect("written");
-        assert!(told().contains("run_0.mcap.zstd") && told().contains("without compression"), "{}", told());
+        assert!(told().contains("run_0.mcap.zstd") && told().contains("no compressed files"), "{}", told());
     }
 }

@@ -1,4 +1,4 @@
-//! MCAP files (version 0 of the format, mcap.dev/spec) without compression.
+//! MCAP files (version 0 of the format, mcap.dev/spec): written without compression, read with chunks of zstd and lz4 too.
 //!
 //! MCAP is a container for messages of any kind with their schemas; viewers and tools of many makers read it. [`Writer`] writes chunks with their
 //! checksums and, at the end, the index that viewers jump by. A file that was not ended, because its program was killed, has whole chunks only,

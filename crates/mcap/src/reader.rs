@@ -131,19 +131,33 @@ fn chunk(fields: &[u8]) -> Result<Vec<u8>, String> {
         Some((size, crc, compression, cursor.take(stored)?))
     })();
     let (size, crc, compression, records) = parsed.ok_or("a chunk is shorter than its fields")?;
-    if !compression.is_empty() {
-        return Err(format!("a chunk is compressed with {compression}, which is not read here; undo it with `mcap decompress`"));
-    }
+    let records = match compression.as_str() {
+        "" => records.to_vec(),
+        "zstd" => unpacked(zstd::Decoder::with_buffer(records).map_err(|error| format!("a chunk is no zstd: {error}"))?, size)?,
+        "lz4" => unpacked(lz4_flex::frame::FrameDecoder::new(records), size)?,
+        other => return Err(format!("a chunk is compressed with {other}, which is not read here; undo it with `mcap decompress`")),
+    };
     // 0 stands for "no checksum".
-    if size != records.len() as u64 || (crc != 0 && crc != crc32fast::hash(records)) {
+    if size != records.len() as u64 || (crc != 0 && crc != crc32fast::hash(&records)) {
         return Err("the checksum of a chunk is wrong: its bytes were changed".into());
     }
-    Ok(records.to_vec())
+    Ok(records)
+}
+
+/// What comes out of a compressed chunk that says that it has `size` bytes; no more than that is taken, whatever the bytes would become.
+fn unpacked(compressed: impl Read, size: u64) -> Result<Vec<u8>, String> {
+    if size > RECORD_BYTES_MAX {
+        return Err(format!("a chunk says that it has {size} bytes, more than the {RECORD_BYTES_MAX} that are read"));
+    }
+    let mut records = Vec::new();
+    compressed.take(size + 1).read_to_end(&mut records).map_err(|error| format!("a compressed chunk is damaged: {error}"))?;
+    Ok(records)
 }
 
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
+    use std::io::Write as _;
 
     use super::*;
     use crate::Writer;
@@ -181,6 +195,56 @@ mod tests {
         assert!(error.is_none(), "{error:?}");
         let expected: Vec<_> = (0..100u32).map(|i| ((i % 2) as u16, i, u64::from(i) * 10, vec![i as u8; 20_000])).collect();
         assert!(messages == expected);
+    }
+
+    /// The same file with its chunks compressed; indices behind them are not read.
+    fn compressed(bytes: &[u8], compression: &str, pack: impl Fn(&[u8]) -> Vec<u8>) -> Vec<u8> {
+        let mut out = MAGIC.to_vec();
+        let mut rest = &bytes[MAGIC.len()..bytes.len() - MAGIC.len()];
+        while let [record_kind, lengths @ ..] = rest {
+            let length = u64::from_le_bytes(lengths[..8].try_into().unwrap()) as usize;
+            let fields = &lengths[8..8 + length];
+            rest = &lengths[8 + length..];
+            let fields = match *record_kind {
+                kind::CHUNK => {
+                    let packed = pack(&fields[28 + 4 + 8..]);
+                    let name = [&(compression.len() as u32).to_le_bytes()[..], compression.as_bytes()].concat();
+                    [&fields[..28], &name, &(packed.len() as u64).to_le_bytes(), &packed].concat()
+                }
+                _ => fields.to_vec(),
+            };
+            out.push(*record_kind);
+            out.extend((fields.len() as u64).to_le_bytes());
+            out.extend(fields);
+        }
+        [&out[..], &MAGIC].concat()
+    }
+
+    /// Goal: files of others are often compressed. Method: the same file with each compression, what is damaged or says that it becomes more than it does, and one that
+    /// nobody knows.
+    #[test]
+    fn property_compressed_chunks_are_read() {
+        let (plain, zstd) = (file(), |bytes: &[u8]| zstd::encode_all(bytes, 3).unwrap());
+        let lz4 = |bytes: &[u8]| {
+            let mut encoder = lz4_flex::frame::FrameEncoder::new(Vec::new());
+            encoder.write_all(bytes).unwrap();
+            encoder.finish().unwrap()
+        };
+        let (all, _) = read(&plain);
+        for packed in [compressed(&plain, "zstd", zstd), compressed(&plain, "lz4", lz4)] {
+            assert!(packed.len() < plain.len() / 10);
+            let (messages, error) = read(&packed);
+            assert!(messages == all && error.is_none(), "{error:?}");
+        }
+        for (bad, why) in [
+            (compressed(&plain, "zstd", |bytes| zstd(bytes)[..40].to_vec()), "damaged"),
+            (compressed(&plain, "lz4", |_| b"no lz4 at all".to_vec()), "damaged"),
+            (compressed(&plain, "zstd", |bytes| zstd(&[bytes, &[0; 9]].concat())), "checksum"),
+            (compressed(&plain, "brotli", <[u8]>::to_vec), "brotli, which is not read"),
+        ] {
+            let (messages, error) = read(&bad);
+            assert!(messages.is_empty() && error.as_ref().is_some_and(|error| error.to_string().contains(why)), "{why}: {error:?}");
+        }
     }
 
     #[test]
