@@ -12,7 +12,7 @@ use nesam_model::encoder::{EncoderScratch, TerrainEncoders};
 use nesam_model::{HistoryStep, ModelBundle, Predictor, RolloutQuery, SoilByClass, Variant};
 use nesam_physics::{SoilCorrection, VehicleState};
 use nesam_terrain::{Patch, Pose2, WorldMap, sample_patch};
-use nesam_trajectories::{DataRoot, SetQuery, SplitFilter};
+use nesam_trajectories::{DataRoot, SetQuery};
 
 /// A piece of work, repeated by calling it.
 pub type Work = Box<dyn FnMut()>;
@@ -109,13 +109,7 @@ impl Buffer {
         let config = CalibratedFilter::config_of(bundle.soil_filter_json.as_deref()).expect("settings of a shipped bundle");
         let predictor = Predictor::new(Arc::new(bundle)).expect("a complete bundle");
         let root = DataRoot::open(&sample_root(), None).expect("the sample");
-        let query = SetQuery {
-            set: "nominal".into(),
-            split: SplitFilter::All,
-            trajectories: Some(vec!["n0005".into()]),
-            dt_s: 0.1,
-            ground_truth: false,
-        };
+        let query = SetQuery { trajectories: Some(vec!["n0005".into()]), ..SetQuery::all("nominal") };
         let drive = root.load_set(&query).expect("drives of the sample").into_iter().next().expect("one drive");
         let map = root.world(drive.world.as_deref().expect("a world")).expect("its map");
         let steps = drive.states.iter().zip(&drive.controls).map(|(&state, &control)| HistoryStep { state, control }).collect();

@@ -33,12 +33,15 @@ pub struct DataArgs {
     /// Step to which drives are resampled, s
     #[arg(long, value_name = "SECONDS", default_value_t = 0.1)]
     pub dt: f64,
+    /// Whether drives of the index may have no samples: where other options say which drives count.
+    #[arg(skip)]
+    pub may_lack_drives: bool,
 }
 
 impl DataArgs {
     /// All drives of a root, at the step of the model.
     pub fn of(data: Option<PathBuf>) -> Self {
-        Self { data, set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S }
+        Self { data, set: None, split: SplitArg::All, trajectories: None, vehicle: None, dt: nesam_physics::DT_S, may_lack_drives: false }
     }
 }
 

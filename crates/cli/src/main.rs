@@ -9,6 +9,7 @@ mod environment;
 mod failure;
 mod interrupt;
 mod logging;
+mod on_map;
 mod output;
 mod progress;
 mod sources;

@@ -92,6 +92,20 @@ pub fn out_dir(given: Option<&Path>, command: &str, set: &str) -> Result<PathBuf
     Ok(dir)
 }
 
+/// Makes a folder and holds it against other runs of the command for as long as what is given lives: two at once would write over one another.
+pub fn hold(dir: &Path) -> Result<std::fs::File, Failure> {
+    let cannot = |error: std::io::Error| Failure::Failed(format!("{}: {error}", dir.display()));
+    std::fs::create_dir_all(dir).map_err(cannot)?;
+    let held = std::fs::File::open(dir).map_err(cannot)?;
+    match held.try_lock() {
+        Err(std::fs::TryLockError::WouldBlock) => {
+            Err(Failure::input(format!("another run writes into {} now; give another folder with --out DIR", dir.display())))
+        }
+        // A file system without locks keeps nobody out.
+        _ => Ok(held),
+    }
+}
+
 /// What is there of a path: itself, or the nearest of what lies above it.
 fn nearest(path: &Path) -> Option<&Path> {
     path.ancestors().map(or_here).find(|above| above.exists())
@@ -196,8 +210,12 @@ pub fn check_files<'a>(files: impl Iterator<Item = &'a PathBuf> + Clone) -> Resu
 
 /// Refuses a file that two outputs, or an output and an input, share: the later one would take the place of the other.
 pub fn check_apart<'a>(files: impl IntoIterator<Item = &'a PathBuf>) -> Result<(), Failure> {
-    let mut known = BTreeSet::new();
+    let (mut known, mut on_standard_output) = (BTreeSet::new(), 0);
     for file in files {
+        on_standard_output += usize::from(file == Path::new(STANDARD_OUTPUT));
+        if on_standard_output > 1 {
+            return Err(Failure::input("standard output (-) is named twice: one of the two has to be a file"));
+        }
         let Ok(Some(place)) = replaceable(file) else { continue };
         let folder = place.parent().map_or(Path::new("."), or_here);
         // A folder that is not there yet is known by its name.

@@ -1,6 +1,6 @@
 //! Opens what the shared options name: data roots, drives with their maps, bundles.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -14,6 +14,7 @@ use nesam_trajectories::{BeyondRange, DataRoot, SetQuery, SplitFilter, Trajector
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::{bundle_dir, bundle_of_hash, bundle_of_vehicle, sample_root};
 use crate::failure::{Failure, OrFail};
+use crate::on_map;
 use crate::output::note;
 
 /// The drives of one set, with the map of each.
@@ -74,6 +75,11 @@ pub fn read_drives(args: &DataArgs, ground_truth: bool) -> Result<Drives, Failur
         crate::output::note!("note: set `{set}`: {}", beyond_range_note(&beyond));
     }
     let maps = maps_of(&root, &drives)?;
+    let worlds: BTreeMap<&str, &Arc<WorldMap>> =
+        drives.iter().zip(&maps).filter_map(|(drive, map)| Some((drive.world.as_deref()?, map.as_ref()?))).collect();
+    for doubt in worlds.into_iter().flat_map(|(world, map)| on_map::doubts(&drives, world, map, root.vehicle())) {
+        note!("note: set `{set}`: {doubt}");
+    }
     Ok(Drives { root, set, drives, maps })
 }
 
@@ -134,7 +140,14 @@ pub fn query(args: &DataArgs, set: &str, split: SplitArg, ground_truth: bool) ->
         SplitArg::Test => SplitFilter::Test,
         SplitArg::All => SplitFilter::All,
     };
-    SetQuery { set: set.into(), split, trajectories: args.trajectories.clone(), dt_s: args.dt, ground_truth }
+    SetQuery {
+        set: set.into(),
+        split,
+        trajectories: args.trajectories.clone(),
+        dt_s: args.dt,
+        ground_truth,
+        may_lack_drives: args.may_lack_drives,
+    }
 }
 
 /// The map of each drive. A drive without a world has none; a world that is there and cannot be read is an error.

@@ -69,12 +69,21 @@ pub struct SetQuery {
     pub dt_s: f64,
     /// Whether to read the `gt_` columns too (evaluation only).
     pub ground_truth: bool,
+    /// Whether drives that the index lists may have no samples; else that is an error, as whoever loads a whole split must get all of it.
+    pub may_lack_drives: bool,
 }
 
 impl SetQuery {
     /// Every drive of a set at 10 Hz, without ground truth.
     pub fn all(set: impl Into<String>) -> Self {
-        Self { set: set.into(), split: SplitFilter::All, trajectories: None, dt_s: nesam_physics::DT_S, ground_truth: false }
+        Self {
+            set: set.into(),
+            split: SplitFilter::All,
+            trajectories: None,
+            dt_s: nesam_physics::DT_S,
+            ground_truth: false,
+            may_lack_drives: false,
+        }
     }
 }
 
@@ -357,8 +366,7 @@ fn wanted(query: &SetQuery, index: &Index, drives: &[DriveRows], samples: &Path)
                 return refuse(format!("trajectory `{id}` is in {found}, not in split {}", query.split.as_str()));
             }
         }
-    } else {
-        // Whoever loads the whole split must get all of it.
+    } else if !query.may_lack_drives {
         let lost = index.order.iter().find(|id| query.split.admits(split(id)) && !has_samples.contains(id.as_str()));
         if let (Some(id), Some(path)) = (lost, &index.path) {
             let reason = format!("`{id}` has no samples in {}", samples.display());

@@ -258,7 +258,14 @@ fn vehicle_card(bytes: &[u8]) {
 /// Loads a set of the folder, with what only evaluation reads.
 fn load(folder: &Path, set: &str) {
     if let Ok(root) = DataRoot::open(folder, Some(&folder.join("vehicle.json"))) {
-        let query = SetQuery { set: set.into(), split: SplitFilter::All, trajectories: None, dt_s: 0.1, ground_truth: true };
+        let query = SetQuery {
+            set: set.into(),
+            split: SplitFilter::All,
+            trajectories: None,
+            dt_s: 0.1,
+            ground_truth: true,
+            may_lack_drives: false,
+        };
         drop(root.load_set(&query));
     }
 }

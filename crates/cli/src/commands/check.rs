@@ -6,18 +6,16 @@ use clap::Args;
 use nesam_evaluation::Baselines;
 use nesam_import::{Doubt, card_doubts, doubts};
 use nesam_model::{ModelBundle, Predictor};
-use nesam_terrain::WorldMap;
-use nesam_trajectories::{DataRoot, Trajectory};
+use nesam_trajectories::DataRoot;
 use serde_json::{Value, json};
 
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
+use crate::on_map;
 use crate::output::{check_apart, check_file, say, write_json};
 use crate::sources::{beyond_range_note, query};
 
-/// Heights of a vehicle that follows its map spread less than this about their mean, m (chosen; the simulated drives have 0.03).
-const HEIGHT_SPREAD_M: f64 = 0.5;
 /// Coordinates beyond this are doubted, m: single precision has steps of 8 mm there (chosen).
 const FAR_M: f64 = 1e5;
 
@@ -187,7 +185,10 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     for world in &worlds {
         match root.world(world) {
             Err(e) => findings.error(format!("set {set}: world {world}: {}", chain(&e))),
-            Ok(map) => heights(&drives, world, &map, set, findings),
+            Ok(map) => {
+                let doubts = on_map::doubts(&drives, world, &map, root.vehicle());
+                findings.doubts.extend(doubts.into_iter().map(|doubt| format!("set {set}: {doubt}")));
+            }
         }
     }
     let without = drives.iter().filter(|d| d.world.is_none()).count();
@@ -214,32 +215,6 @@ fn far_from_origin(positions_m: impl Iterator<Item = [f64; 3]>) -> Option<Doubt>
              maps from an origin nearby"
         ),
     })
-}
-
-/// Whether the drives follow the ground of their map.
-fn heights(drives: &[Trajectory], world: &str, map: &WorldMap, set: &str, findings: &mut Findings) {
-    let there = drives.iter().filter(|d| d.world.as_deref() == Some(world)).flat_map(|d| &d.states);
-    let mut above: Vec<f64> = Vec::new();
-    let mut outside = 0;
-    for [x, y, z] in there.map(|s| s.position_m) {
-        match map.height_m(x, y) {
-            Some(ground) => above.push(z - ground),
-            None => outside += 1,
-        }
-    }
-    if outside * 10 > above.len() {
-        findings.doubts.push(format!(
-            "set {set}: {outside} of {} positions lie off map {world} or in its holes; is it of this place, in this frame?",
-            outside + above.len()
-        ));
-    }
-    let mean = above.iter().sum::<f64>() / above.len().max(1) as f64;
-    let spread = (above.iter().map(|h| (h - mean).powi(2)).sum::<f64>() / above.len().max(1) as f64).sqrt();
-    if spread > HEIGHT_SPREAD_M {
-        findings.doubts.push(format!(
-            "set {set}: heights do not follow map {world}: {mean:.2} ± {spread:.2} m above it; is it of this place, in this frame?"
-        ));
-    }
 }
 
 #[cfg(test)]

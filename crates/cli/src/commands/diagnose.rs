@@ -26,7 +26,7 @@ use nesam_trajectories::{Split, Trajectory};
 use self::recording::RecordingArgs;
 use crate::args::{BundleArgs, CommandsArgs, DataArgs, WindowArgs};
 use crate::bundle_path::bundle_dir;
-use crate::bundle_version::save_with_effects;
+use crate::bundle_version::{save_with_effects, set_aside};
 use crate::failure::{Failure, OrFail};
 use crate::output::say;
 use crate::progress::Progress;
@@ -121,7 +121,8 @@ struct Input {
 
 /// The drives of a set in a data root.
 fn of_set(args: &DiagnoseArgs) -> Result<Input, Failure> {
-    let mut drives = read_drives(&args.data, false)?;
+    // With --fit-on others only say what comes of a claim, as far as they are there.
+    let mut drives = read_drives(&DataArgs { may_lack_drives: args.fit_on.is_some(), ..args.data.clone() }, false)?;
     let long_enough = |drive: &Trajectory| drive.states.len() > SEGMENT_STEPS;
     let all = drives.drives.len();
     let mut short: Vec<(String, usize)> =
@@ -286,6 +287,7 @@ fn diagnose_set(args: &DiagnoseArgs) -> Result<(), Failure> {
     let found =
         diagnose(&predictor, &drives.drives, &drives.maps, &options, &|stage, done, total| console.show(stage, done, total)).or_input()?;
     console.end();
+    set_aside(&out)?;
     let data_hash = if args.fit_on.is_some() { fitted::hash(&drives.drives, &found.fit_on) } else { drives.data_hash.clone() };
     let bundle = match found.claimed.as_slice() {
         [] => None,

@@ -85,7 +85,7 @@ fn data_root(path: &Path, card: Option<&Path>) -> Result<Value, Failure> {
 }
 
 fn set_summary(root: &DataRoot, set: &str) -> Result<Value, Failure> {
-    let all = SetQuery { set: set.into(), split: SplitFilter::All, trajectories: None, dt_s: DT_S, ground_truth: false };
+    let all = SetQuery { set: set.into(), split: SplitFilter::All, trajectories: None, dt_s: DT_S, ..SetQuery::all(set) };
     let drives = root.load_set(&all).or_input()?;
     let in_split = |split| drives.iter().filter(|d| d.split == split).count();
     let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();

@@ -16,7 +16,7 @@ use crate::args::{DataArgs, SplitArg, check_count, horizon_of};
 use crate::bundle_path::MANIFEST;
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
-use crate::output::{note, out_place};
+use crate::output::{hold, note, out_place};
 use crate::progress::Progress;
 use crate::sources::{load_bundle, read_drives};
 
@@ -212,6 +212,9 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         resume: args.resume,
         command: command_line(),
     };
+    let _held = hold(&out)?;
+    // Another run may have ended since.
+    check_unused(&out, args.resume)?;
     stop_on_ctrl_c();
     let console = Console::default();
     let bundle =

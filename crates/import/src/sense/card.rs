@@ -1,6 +1,6 @@
 //! Whether a vehicle card makes sense.
 
-use nesam_physics::Vehicle;
+use nesam_physics::{Vehicle, WHEELS};
 
 use super::{Doubt, doubt};
 
@@ -26,5 +26,14 @@ pub fn card_doubts(vehicle: &Vehicle) -> Vec<Doubt> {
     found.extend(about("the radius of the wheels", vehicle.wheel_radius_m, [0.05, 1.2], "m"));
     found.extend(about("the width of the wheels", vehicle.wheel_width_m, [0.02, 1.2], "m"));
     found.extend(about("the wheelbase", vehicle.wheelbase_m, [0.15, 8.0], "m"));
+    found.extend(about("gravity", vehicle.gravity_m_s2, [9.7, 9.9], "m/s²"));
+    let height_m = vehicle.wheel_radius_m - vehicle.wheel_centre_m.iter().map(|centre| centre[2]).sum::<f64>() / WHEELS as f64;
+    found.extend(about("the height of the centre of gravity over the ground", height_m, [0.02, 3.0], "m"));
+    let mut moments: [f64; 3] = core::array::from_fn(|axis| vehicle.inertia_kg_m2[axis][axis]);
+    moments.sort_by(f64::total_cmp);
+    if moments[2] > 1.001 * (moments[0] + moments[1]) {
+        let what = format!("no body has the moments of inertia {:.0}, {:.0} and {:.0} kg m²", moments[0], moments[1], moments[2]);
+        found.push(doubt(what, "the largest of the three about x, y and z is at most the sum of the other two"));
+    }
     found
 }

@@ -282,4 +282,17 @@ fn analytic_a_mirrored_card_is_doubted() {
     let mut mirrored = nesam_test_vehicles::truck();
     mirrored.wheel_centre_m.iter_mut().for_each(|w| w[1] *= -1.0);
     assert!(card_doubts(&mirrored)[0].what.contains("left wheels"));
+    let said = |change: fn(&mut Vehicle)| {
+        let mut card = nesam_test_vehicles::truck();
+        change(&mut card);
+        card_doubts(&card).into_iter().map(|doubt| doubt.what).collect::<Vec<_>>()
+    };
+    for (change, what) in [
+        ((|card| card.gravity_m_s2 = 1.62) as fn(&mut Vehicle), "gravity is 1.620 m/s²"),
+        (|card| card.wheel_centre_m.iter_mut().for_each(|wheel| wheel[2] += 1.5), "height of the centre of gravity"),
+        (|card| card.inertia_kg_m2[2][2] = 4.0 * card.inertia_kg_m2[1][1], "no body has the moments of inertia"),
+    ] {
+        let said = said(change);
+        assert!(said.len() == 1 && said[0].contains(what), "{said:?}");
+    }
 }

@@ -9,7 +9,7 @@ use nesam_discovery::{Judge, Scoring};
 use nesam_evaluation::report::Short;
 use serde_json::json;
 
-use crate::args::{BundleArgs, DataArgs, check_count};
+use crate::args::{BundleArgs, DataArgs, SplitArg, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
 use crate::output::{check_file, provenance, say, write_json};
@@ -50,7 +50,12 @@ pub(super) struct DiscoveryBench {
 pub(super) fn run(args: &DiscoveryBench) -> Result<(), Failure> {
     args.json.iter().try_for_each(|file| check_file(file))?;
     exit_on_ctrl_c("nothing was written");
-    let drives = validation_drives(&args.data, "bench discovery", "effects are hidden")?;
+    let mut data = args.data.clone();
+    if data.split == SplitArg::All {
+        // Only drives of the train split are left for validation.
+        data.split = SplitArg::Train;
+    }
+    let drives = validation_drives(&data, "bench discovery", "effects are hidden")?;
     let predictor = predictor_for(load_bundle_for(args.bundle.bundle.as_deref(), &drives.root)?, &drives.root, args.data.dt)?;
     let judge = Judge::of(predictor.bundle()).or_input()?;
     let known = judge.drives();
