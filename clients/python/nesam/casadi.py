@@ -11,14 +11,15 @@ not in them (docs/results/accuracy.md, "Jacobians").
 Needs casadi, which this package does not install.
 """
 
-from typing import Any, List, Mapping, Optional, Sequence
+from typing import Any, Dict, List, Mapping, Optional, Sequence, Union
 
 import casadi
 import numpy as np
 
 from ._client import Client
 from ._extras import Extras
-from ._types import Prediction
+from ._fallback import KinematicFallback
+from ._types import Prediction, Session
 
 _STATE, _COMMAND = 12, 2
 
@@ -27,16 +28,27 @@ class Rollout(casadi.Callback):
     """States (12, horizon) of one candidate from its start (12,) and commands (2, horizon).
 
     Order of a state: x y z roll pitch yaw vx vy vz wx wy wz; a command is speed m/s and the second command in the unit of the vehicle card; one step is
-    0.1 s. `options` are arguments of `Client.predict`. The start replaces the newest measured state of the session, whose history and soil are used. Jacobians
+    0.1 s. use_history, timeout_s, fallback and half are those of `Client.predict`; its other arguments have no place here. The start replaces the newest measured state of the session, whose history and soil are used. Jacobians
     hold the terrain as the rollout met it. Each evaluation asks the service, of the session as it is then. Keep a reference to the object as long as
     functions are made from it, as CasADi asks.
 
-    `eval` raises what `Client.predict` raises; with a `fallback` among the options states come all the same, Jacobians do not. Bound the commands to the range of the vehicle card: beyond it the service refuses.
+    `eval` raises what `Client.predict` raises; with a `fallback` states come all the same, Jacobians do not. Bound the commands to the range of the vehicle card: beyond it the service refuses.
     """
 
-    def __init__(self, name: str, client: Client, session_id: str, horizon: int, **options: Any):
+    def __init__(
+        self,
+        name: str,
+        client: Client,
+        session_id: Union[str, Session],
+        horizon: int,
+        use_history: bool = True,
+        timeout_s: Optional[float] = None,
+        fallback: Optional[KinematicFallback] = None,
+        half: bool = False,
+    ):
         casadi.Callback.__init__(self)
-        self._client, self._session_id, self.horizon, self._options = client, session_id, horizon, options
+        self._client, self._session_id, self.horizon = client, session_id, horizon
+        self._options: Dict[str, Any] = {"use_history": use_history, "timeout_s": timeout_s, "fallback": fallback, "half": half}
         self._jacobian: Optional["_Jacobian"] = None
         self.construct(name, {})
 

@@ -129,3 +129,15 @@ def test_service_pytorch_mppi_asks_once_a_cycle(driven):
     assert command.shape == (2,) and command[1] > 0.02, "the goal lies to the left"
     with pytest.raises(RuntimeError, match="candidates of its planner"):
         dynamics(start[None], torch.zeros(1, 2, dtype=start.dtype), 1)
+
+
+def test_property_casadi_says_at_once_what_it_cannot_take():
+    casadi = pytest.importorskip("casadi")
+    from nesam.casadi import Rollout
+
+    no = {"extras": nesam.Extras(risk=True), "start": casadi.DM.zeros(12), "stride": 2, "channels": ["x"], "start_stamp_ns": 5, "sent": [], "samples_min": 1}
+    no["cost"] = nesam.PathCost(np.zeros((2, 2)), 1.0)
+    with nesam.Client("127.0.0.1:9") as client:
+        for name, value in no.items():
+            with pytest.raises(TypeError, match=f"'{name}'"):
+                Rollout("rollout", client, "s", 3, **{name: value})
