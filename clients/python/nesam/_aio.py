@@ -14,7 +14,7 @@ from . import _types as t
 from ._aio_durable import AsyncDurableStream
 from ._candidates import Drawing, PathCost
 from ._connection import ATTEMPTS_MAX, Connected, Options, arguments, finite_timeout, trying_again
-from ._errors import NesamError
+from ._errors import InvalidArgument, NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
@@ -210,7 +210,10 @@ class AsyncClient(Connected):
         semantic_rgb: Optional[np.ndarray] = None,
     ) -> t.MapDescription:
         """As `Client.patch_tile`."""
-        return await self._do(calls.patch_tile(map_id, base_version, row, column, elevation_m, semantic_rgb))
+        try:
+            return await self._do(calls.patch_tile(map_id, base_version, row, column, elevation_m, semantic_rgb))
+        except InvalidArgument as error:
+            raise calls.tile_too_large(error, elevation_m) from None
 
     async def map(self, map_id: str) -> t.MapDescription:
         """As `Client.map`."""

@@ -1,6 +1,7 @@
 """Every unary call: which method of which service, with what, and what the reply means. The clients differ only in how they wait."""
 
 import itertools
+import re
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -12,9 +13,10 @@ import numpy as np
 from . import _messages as m
 from . import _types as t
 from ._candidates import Drawing, PathCost
-from ._errors import DeadlineExceeded, FailedPrecondition, NesamError, NotFound, Overloaded, Unavailable
+from ._errors import DeadlineExceeded, FailedPrecondition, InvalidArgument, NesamError, NotFound, Overloaded, Unavailable
 from ._extras import Extras
-from ._fallback import KinematicFallback, KnownState
+from ._fallback import KinematicFallback, KnownState, invalid
+from ._given import elevations, stamp, unmasked, whole
 from ._refused import check_question
 from .v1 import effects_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2, types_pb2
 
@@ -116,7 +118,7 @@ def revert_effects(session_id: str) -> Call[t.Session]:
 
 def upload_map(world: t.WorldMap) -> Call[t.MapDescription]:
     """Uploads a map in tiles."""
-    elevation = np.ascontiguousarray(world.elevation_m, dtype="<f4")
+    elevation = elevations(world.elevation_m)
     if elevation.ndim != 2:
         raise ValueError(f"elevation_m has shape {elevation.shape}, expected (height, width)")
     return Call("terrain", "UploadMap", m.upload_messages(world, elevation), m.map_description)
@@ -126,9 +128,22 @@ def patch_tile(
     map_id: str, base_version: int, row: int, column: int, elevation_m: np.ndarray, semantic_rgb: Optional[np.ndarray]
 ) -> Call[t.MapDescription]:
     """Replaces a rectangle of a map."""
-    tile = m.tile(row, column, np.ascontiguousarray(elevation_m, dtype="<f4"), semantic_rgb)
-    request = terrain_pb2.PatchTileRequest(map_id=map_id, base_version=base_version, tile=tile)
+    tile = m.tile(row, column, elevations(elevation_m), semantic_rgb)
+    request = terrain_pb2.PatchTileRequest(map_id=map_id, base_version=whole(base_version, "base_version", bits=64), tile=tile)
     return Call("terrain", "PatchTile", request, m.map_description)
+
+
+def tile_too_large(error: InvalidArgument, elevation_m: np.ndarray) -> InvalidArgument:
+    """What to say of a refused tile, (rows, columns): where it is larger than a message may be, as the transport says it, what the user can do."""
+    limit = re.search(r"message length too large.*limit is: (\d+) bytes", error.message)
+    if limit is None:
+        return error
+    rows, columns = np.shape(elevation_m)
+    reason = (
+        f"has {rows} x {columns} cells, more than fit into a message of {limit[1]} bytes (`grpc.tile_bytes_max` of the server; 4 bytes for a cell, 7 with colours); "
+        "patch one part after the other, each at the version that the one before gave, or upload the whole map as a higher version, which planners see at once"
+    )
+    return invalid("elevation_m", reason)
 
 
 def map_(map_id: str) -> Call[t.MapDescription]:
@@ -157,7 +172,8 @@ def delete_map(map_id: str) -> Call[None]:
 
 @dataclass(frozen=True)
 class Question:
-    """A prediction: the call, and what a fallback needs. The arguments are those of `Client.predict`."""
+    """A prediction: the call, and what a fallback needs. The arguments are those of `Client.predict`; iterators are read once, as the call and the fallback both
+    need what they give. ValueError for numbers and commands that do not fit."""
 
     session_id: str
     controls: Union[np.ndarray, Drawing]
@@ -174,9 +190,23 @@ class Question:
     cost: Optional[PathCost] = None
     samples_min: int = 0
 
+    def __post_init__(self) -> None:
+        given: Dict[str, Any] = {
+            "channels": None if self.channels is None else tuple(self.channels),
+            "stride": whole(self.stride, "stride"),
+            "start_stamp_ns": None if self.start_stamp_ns is None else stamp(self.start_stamp_ns, "start_stamp_ns"),
+            "sent": tuple(_sent(i, pair) for i, pair in enumerate(self.sent)),
+            "samples_min": whole(self.samples_min, "samples_min"),
+        }
+        if isinstance(self.controls, Drawing):
+            whole(self.controls.samples, "samples")
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+
     def commands(self) -> np.ndarray:
-        """(samples, horizon, 2) as they are sent, or (1, horizon, 2): the nominal sequence of a drawing. ValueError for another shape."""
-        given = np.asarray(self.controls.nominal)[None] if isinstance(self.controls, Drawing) else self.controls
+        """(samples, horizon, 2) as they are sent, or (1, horizon, 2): the nominal sequence of a drawing. ValueError for another shape, or masked numbers."""
+        drawing = self.controls if isinstance(self.controls, Drawing) else None
+        given = unmasked(self.controls, "controls") if drawing is None else np.asarray(unmasked(drawing.nominal, "nominal"))[None]
         controls = np.ascontiguousarray(given, dtype="<f4")
         if controls.ndim != 3 or controls.shape[2] != 2:
             raise ValueError(f"controls have shape {controls.shape}, expected (samples, horizon, 2)")
@@ -233,6 +263,16 @@ class Question:
             raise error
         answered = m.fallback_prediction(self.fallback, known, controls, names, self.stride, error)
         return replace(answered, controls=controls) if isinstance(self.controls, Drawing) else answered
+
+
+def _sent(i: int, pair: Any) -> Tuple[int, Tuple[float, float]]:
+    """The i-th command of `sent`."""
+    try:
+        stamp_ns, (speed, second) = pair
+        command = float(speed), float(second)
+    except (TypeError, ValueError):
+        raise ValueError(f"sent[{i}] is {pair!r}, expected (stamp_ns, (speed, second))") from None
+    return stamp(stamp_ns, f"sent[{i}].stamp_ns"), command
 
 
 @dataclass(frozen=True)

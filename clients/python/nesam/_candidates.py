@@ -5,6 +5,7 @@ from typing import Optional, Tuple
 
 import numpy as np
 
+from ._given import unmasked, whole
 from .v1 import prediction_pb2
 
 
@@ -25,7 +26,7 @@ class Drawing:
     seed: int = 0
 
     def message(self) -> prediction_pb2.CandidateDrawing:
-        """As message. ValueError for an array of a wrong shape."""
+        """As message. ValueError for an array of a wrong shape or with masked numbers, and a seed that is none of 64 bits."""
         if np.shape(self.sd) != (2,):
             raise ValueError(f"sd must be two numbers, for speed and second command, not {self.sd!r}")
         speed_sd, second_sd = self.sd
@@ -34,7 +35,7 @@ class Drawing:
             speed_sd_m_s=speed_sd,
             second_sd=second_sd,
             correlation=self.correlation,
-            seed=self.seed,
+            seed=whole(self.seed, "seed", bits=64),
         )
 
 
@@ -60,7 +61,7 @@ class PathCost:
     temperature: float = 0.0
 
     def message(self) -> prediction_pb2.PathCost:
-        """As message. ValueError for an array of a wrong shape."""
+        """As message. ValueError for an array of a wrong shape or with masked numbers, and a negative `best`."""
         return prediction_pb2.PathCost(
             path=_pairs(self.path, "path"),
             speed_m_s=self.speed_m_s,
@@ -69,7 +70,7 @@ class PathCost:
             tilt_weight=self.tilt_weight,
             speed_change_weight=self.speed_change_weight,
             second_change_weight=self.second_change_weight,
-            best=self.best,
+            best=whole(self.best, "best"),
             temperature=self.temperature,
         )
 
@@ -88,7 +89,7 @@ class Ranking:
 
 
 def _pairs(values: np.ndarray, name: str) -> bytes:
-    values = np.ascontiguousarray(values, dtype="<f4")
+    values = np.ascontiguousarray(unmasked(values, name), dtype="<f4")
     if values.ndim != 2 or values.shape[1] != 2 or len(values) == 0:
         raise ValueError(f"{name} has shape {values.shape}, expected (any, 2)")
     return values.tobytes()

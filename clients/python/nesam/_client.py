@@ -13,7 +13,7 @@ from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._connection import ATTEMPTS_MAX, Connected, Options, arguments, finite_timeout, trying_again
 from ._durable import DurableStream
-from ._errors import NesamError
+from ._errors import InvalidArgument, NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
@@ -229,12 +229,17 @@ class Client(Connected):
     ) -> t.MapDescription:
         """Replaces the rectangle whose south-west cell is (row, column); without colours the old ones stay. The result is the next version.
 
-        elevation_m: (rows, columns), m in World, NaN = hole. semantic_rgb: (rows, columns, 3) uint8.
+        elevation_m: (rows, columns), m in World, NaN or masked = hole. semantic_rgb: (rows, columns, 3) uint8.
 
-        Raises NotFound, InvalidArgument (it lies outside the map), NesamError with code ABORTED when the map is not at `base_version` any more; ValueError for
-        arrays of a wrong shape.
+        Raises NotFound, InvalidArgument (it lies outside the map, or is larger than a message may be, `grpc.tile_bytes_max` of the server: 1 M cells by default,
+        600 000 with colours), NesamError with code ABORTED when the map is not at `base_version` any more; ValueError for arrays of a wrong shape and a negative
+        row, column or version. One call is one version, all of it at once: what is too large is for you to cut, each part at the version that the one before gave,
+        or for `upload_map` under a higher version.
         """
-        return self._do(calls.patch_tile(map_id, base_version, row, column, elevation_m, semantic_rgb))
+        try:
+            return self._do(calls.patch_tile(map_id, base_version, row, column, elevation_m, semantic_rgb))
+        except InvalidArgument as error:
+            raise calls.tile_too_large(error, elevation_m) from None
 
     def map(self, map_id: str) -> t.MapDescription:
         """Describes a map. Raises NotFound."""

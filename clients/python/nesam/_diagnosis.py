@@ -4,6 +4,7 @@ from typing import Optional
 
 from . import _messages as m
 from . import _types as t
+from ._given import stamp, whole
 from .v1 import diagnosis_pb2
 
 REFERENCES = {"bundle": diagnosis_pb2.DIAGNOSIS_REFERENCE_BUNDLE, "physics": diagnosis_pb2.DIAGNOSIS_REFERENCE_PHYSICS}
@@ -19,15 +20,15 @@ def request(
     reference: str,
     controls: bool,
 ) -> diagnosis_pb2.StartDiagnosisRequest:
-    """What `Client.diagnose` asks for. ValueError for an unknown reference."""
+    """What `Client.diagnose` asks for. ValueError for an unknown reference, and a stamp or a seed that does not fit."""
     if reference not in REFERENCES:
         raise ValueError(f"reference {reference!r} must be one of {tuple(REFERENCES)}")
     return diagnosis_pb2.StartDiagnosisRequest(
         session_id=session_id,
         recording=recording,
-        from_stamp_ns=from_stamp_ns,
-        to_stamp_ns=to_stamp_ns,
-        seed=seed,
+        from_stamp_ns=None if from_stamp_ns is None else stamp(from_stamp_ns, "from_stamp_ns"),
+        to_stamp_ns=None if to_stamp_ns is None else stamp(to_stamp_ns, "to_stamp_ns"),
+        seed=None if seed is None else whole(seed, "seed", bits=64),
         reference=REFERENCES[reference],
         without_controls=not controls,
     )

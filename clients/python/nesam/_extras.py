@@ -5,6 +5,7 @@ from typing import Optional, Tuple
 
 import numpy as np
 
+from ._given import unmasked
 from .v1 import prediction_pb2
 
 
@@ -36,7 +37,7 @@ class Extras:
         return self.soil_deltas is not None or self.soil_sigma_points
 
     def message(self) -> prediction_pb2.PredictExtras:
-        """As message. ValueError for an array of a wrong shape."""
+        """As message. ValueError for an array of a wrong shape or with masked numbers."""
         return prediction_pb2.PredictExtras(
             jacobians=self.jacobians,
             covariance=self.covariance,
@@ -79,7 +80,7 @@ class ExtraOutputs:
 def _packed(values: Optional[np.ndarray], shape: Tuple[Optional[int], ...], name: str) -> bytes:
     if values is None:
         return b""
-    values = np.ascontiguousarray(values, dtype="<f4")
+    values = np.ascontiguousarray(unmasked(values, name), dtype="<f4")
     fits = values.ndim == len(shape) and all(want in (None, got) for want, got in zip(shape, values.shape)) and values.size > 0
     if not fits:
         raise ValueError(f"{name} has shape {values.shape}, expected {tuple('any' if n is None else n for n in shape)}")

@@ -9,6 +9,7 @@ from ._candidates import ranking
 from ._errors import NesamError
 from ._extras import Extras, extra_outputs
 from ._fallback import KinematicFallback, KnownState
+from ._given import stamp, unmasked, whole
 from .v1 import alarms_pb2, effects_pb2, measurements_pb2, prediction_pb2, sessions_pb2, terrain_pb2, types_pb2
 
 CHANNELS: Tuple[str, ...] = ("x", "y", "z", "roll", "pitch", "yaw", "vx", "vy", "vz", "wx", "wy", "wz")
@@ -29,19 +30,20 @@ def channel_names(channels: Optional[Sequence[str]]) -> Tuple[str, ...]:
 
 
 def measurement_message(measurement: t.Measurement) -> measurements_pb2.Measurement:
-    """A measurement as message. ValueError for an array of a wrong shape."""
+    """A measurement as message. ValueError for an array of a wrong shape or with masked numbers, and a number that does not fit."""
     command = t.array(measurement.command, (2,), "command")
     wheels = None
     if measurement.wheel_speed_rad_s is not None or measurement.road_wheel_angle_rad is not None:
         wheels = measurements_pb2.WheelMeasurement(
-            speed_rad_s=measurement.wheel_speed_rad_s, road_wheel_angle_rad=measurement.road_wheel_angle_rad
+            speed_rad_s=unmasked(measurement.wheel_speed_rad_s, "wheel_speed_rad_s"),
+            road_wheel_angle_rad=unmasked(measurement.road_wheel_angle_rad, "road_wheel_angle_rad"),
         )
     return measurements_pb2.Measurement(
         session_id=measurement.session_id,
-        sequence=measurement.sequence,
-        stamp_ns=measurement.stamp_ns,
-        boot_id=measurement.boot_id,
-        run=measurement.run,
+        sequence=whole(measurement.sequence, "sequence", bits=64),
+        stamp_ns=stamp(measurement.stamp_ns),
+        boot_id=whole(measurement.boot_id, "boot_id", bits=64),
+        run=whole(measurement.run, "run", bits=64),
         state=t.state_message(measurement.state),
         command=types_pb2.Control(speed_m_s=command[0], second=command[1]),
         wheels=wheels,
@@ -158,13 +160,13 @@ def tile(row: int, column: int, elevation: np.ndarray, rgb: Optional[np.ndarray]
     if rgb is not None:
         if np.asarray(rgb).dtype != np.uint8:
             raise ValueError(f"semantic_rgb is of {np.asarray(rgb).dtype}, expected uint8 (0 to 255 for red, green and blue)")
-        rgb = np.ascontiguousarray(rgb)
+        rgb = np.ascontiguousarray(unmasked(rgb, "semantic_rgb"))
         if rgb.shape != (*elevation.shape, 3):
             raise ValueError(f"semantic_rgb has shape {rgb.shape}, expected {(*elevation.shape, 3)}")
         colours = rgb.tobytes()
     rows, columns = elevation.shape
     return terrain_pb2.MapTile(
-        row=row, column=column, rows=rows, columns=columns, elevation_m=elevation.tobytes(), semantic_rgb=colours
+        row=whole(row, "row"), column=whole(column, "column"), rows=rows, columns=columns, elevation_m=elevation.tobytes(), semantic_rgb=colours
     )
 
 
@@ -180,14 +182,14 @@ def upload_messages(world: t.WorldMap, elevation: np.ndarray) -> Iterator[terrai
     ]
     header = terrain_pb2.MapHeader(
         map_id=world.map_id,
-        version=world.version,
+        version=whole(world.version, "version", bits=64),
         origin_x_m=world.origin_m[0],
         origin_y_m=world.origin_m[1],
         resolution_m=world.resolution_m,
         width=width,
         height=height,
         semantic=world.semantic_rgb is not None,
-        stamp_ns=world.stamp_ns,
+        stamp_ns=None if world.stamp_ns is None else stamp(world.stamp_ns),
         frame=world.frame,
     )
     return iter([terrain_pb2.UploadMapRequest(header=header), *(terrain_pb2.UploadMapRequest(tile=tile) for tile in tiles)])

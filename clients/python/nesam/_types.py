@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ._candidates import Ranking
 from ._extras import ExtraOutputs
+from ._given import unmasked
 from .v1 import soil_pb2, types_pb2
 
 
@@ -319,7 +320,7 @@ class Answer:
 class WorldMap:
     """A map to upload; row 0 is the southernmost.
 
-    elevation_m: (height, width) float32, m in World, NaN = hole. semantic_rgb: (height, width, 3) uint8 or None. origin_m: World position of cell (0, 0).
+    elevation_m: (height, width) float32, m in World, NaN or masked = hole. semantic_rgb: (height, width, 3) uint8 or None. origin_m: World position of cell (0, 0).
     stamp_ns: instant that it was made at, of the vehicle's clock; frame: as its source names it, at most 64 bytes, "" = World. Both are carried for those who
     read the map, nothing is computed from them.
     """
@@ -394,8 +395,8 @@ class Prediction:
 
 
 def array(values: Vector, shape: Tuple[int, ...], name: str) -> np.ndarray:
-    """`values` as float64 of the given shape; ValueError naming it otherwise."""
-    result = np.asarray(values, dtype=np.float64)
+    """`values` as float64 of the given shape; ValueError naming it otherwise, also with masked numbers."""
+    result = np.asarray(unmasked(values, name), dtype=np.float64)
     if result.shape != shape:
         raise ValueError(f"{name} has shape {result.shape}, expected {shape}")
     return result
