@@ -18,7 +18,7 @@ from ._errors import InvalidArgument, NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import HEADER
-from ._stream import OpenStream
+from ._stream import ON_THE_WAY_MAX, OpenStream
 from .v1 import (
     alarms_pb2,
     diagnosis_pb2_grpc,
@@ -231,11 +231,27 @@ class AsyncClient(Connected):
 
     async def measure(self, measurements: Measurements) -> List[t.Answer]:
         """As `Client.measure`; measurements may also come from an asynchronous iterator."""
+        return [answer async for answer in self.exchange(measurements)]
+
+    async def exchange(self, measurements: Measurements) -> AsyncIterator[t.Answer]:
+        """As `Client.exchange`, for `async for`; measurements may also come from an asynchronous iterator, which a task takes them from. That task ends with
+        `aclose()`, with the end of yours, or with an error."""
         async with self.measurement_stream() as stream:
-            return await stream._send_all(measurements, self.timeout_s)
+            # Of each that was sent (True) and of the end (False).
+            sent: "asyncio.Queue[bool]" = asyncio.Queue()
+            room = asyncio.Semaphore(ON_THE_WAY_MAX)
+            sending = asyncio.ensure_future(stream._put_all(measurements, sent, room))
+            try:
+                while await sent.get():
+                    yield await stream._next(self.timeout_s)
+                    room.release()
+                await sending
+            finally:
+                sending.cancel()
+                await asyncio.gather(sending, return_exceptions=True)
 
     def measurement_stream(self) -> "AsyncMeasurementStream":
-        """An open stream for a vehicle that reports at its own pace; use it in an `async with` block."""
+        """An open stream that waits for the answer to each measurement; use it in an `async with` block."""
         return AsyncMeasurementStream(self)
 
     def durable_stream(
@@ -320,24 +336,11 @@ class AsyncMeasurementStream(OpenStream):
         """Says that no more measurements come."""
         self._say_end()
 
-    async def _send_all(self, measurements: Measurements, timeout_s: float) -> List[t.Answer]:
-        """The answers to measurements that are sent without waiting for them, each within `timeout_s` of the one before or of its own sending."""
-        sent: "asyncio.Queue[bool]" = asyncio.Queue()
-        sending = asyncio.ensure_future(self._put_all(measurements, sent))
-        answers = []
-        try:
-            while await sent.get():
-                answers.append(await self._next(timeout_s))
-            await sending
-            return answers
-        finally:
-            sending.cancel()
-            await asyncio.gather(sending, return_exceptions=True)
-
-    async def _put_all(self, measurements: Measurements, sent: "asyncio.Queue[bool]") -> None:
-        """Sends measurements, and tells of each (True) and of the end (False)."""
+    async def _put_all(self, measurements: Measurements, sent: "asyncio.Queue[bool]", room: asyncio.Semaphore) -> None:
+        """Sends measurements where there is room, and tells of each (True) and of the end (False)."""
         try:
             async for measurement in _each(measurements):
+                await room.acquire()
                 self._put(measurement)
                 sent.put_nowait(True)
                 # What is at hand is sent at once; answers and other tasks have their turn all the same.

@@ -1,6 +1,7 @@
 """The synchronous client."""
 
 import queue
+import threading
 from typing import Any, Callable, Iterable, Iterator, List, Optional, Sequence, Tuple, Union
 
 import grpc
@@ -17,7 +18,7 @@ from ._errors import InvalidArgument, NesamError
 from ._extras import Extras
 from ._fallback import KinematicFallback
 from ._routing import VehicleHeader
-from ._stream import OpenStream
+from ._stream import ON_THE_WAY_MAX, OpenStream
 from .v1 import (
     alarms_pb2,
     diagnosis_pb2_grpc,
@@ -256,16 +257,31 @@ class Client(Connected):
     # Measurements
 
     def measure(self, measurements: Iterable[t.Measurement]) -> List[t.Answer]:
-        """Sends measurements as they come from an iterable, without waiting for answers in between, and returns the answer to each, in order, after the last. What
-        the service refuses is answered (REJECTED), not raised.
+        """Sends measurements without waiting for answers in between, and returns the answer to each, in order, after the last: for recorded drives. It keeps all
+        answers until then, and they are lost where the connection breaks; a vehicle that goes on and on uses `exchange`. What the service refuses is answered
+        (REJECTED), not raised.
 
         Raises DeadlineExceeded when an answer takes longer than the client's `timeout_s`, Unavailable; ValueError for an array of a wrong shape.
         """
         with self.measurement_stream() as stream:
-            return list(stream._exchange(measurements, self.timeout_s))
+            return list(stream._answers(measurements, self.timeout_s))
+
+    def exchange(self, measurements: Iterable[t.Measurement]) -> Iterator[t.Answer]:
+        """Sends each measurement when the iterable gives it, without waiting for answers, and gives the answer to each as it comes, in order: for a vehicle that
+        reports at its own pace. What the service refuses is answered (REJECTED), not raised.
+
+        A thread of its own takes the measurements from the iterable, from when the first answer is asked for. At most 256 are on their way: beyond that it waits
+        until an answer is taken. It ends with the iterable; where the loop over the answers is left before, with the next measurement that the iterable gives,
+        which is not sent.
+
+        Raises, after all answers that came, DeadlineExceeded when one takes longer than the client's `timeout_s`, Unavailable, and what the iterable raises;
+        ValueError for an array of a wrong shape. The measurements that got no answer are for you to send again, or for a `durable_stream`.
+        """
+        with self.measurement_stream() as stream:
+            yield from stream._exchange(measurements, self.timeout_s)
 
     def measurement_stream(self) -> "MeasurementStream":
-        """An open stream for a vehicle that reports at its own pace; use it in a `with` block."""
+        """An open stream that waits for the answer to each measurement; use it in a `with` block."""
         return MeasurementStream(self)
 
     def durable_stream(self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2, pending_max: int = 65536) -> DurableStream:
@@ -340,6 +356,9 @@ class Client(Connected):
             return self._known_states.fall_back(question, error)
 
 
+_SENT = object()
+
+
 class MeasurementStream(OpenStream):
     """One open stream: `send` returns the answer. Threads must not share it."""
 
@@ -355,7 +374,7 @@ class MeasurementStream(OpenStream):
 
     def send(self, measurement: t.Measurement, timeout_s: Optional[float] = None) -> t.Answer:
         """Sends one measurement and waits for its answer, at most for `timeout_s`, default that of the client: a busy service holds up whoever sends so.
-        `Client.measure` with an iterator sends the next measurements meanwhile.
+        `Client.exchange` sends the next measurements meanwhile.
 
         Raises DeadlineExceeded when none comes in time, which ends the stream; what the service ended the stream with, also when asked again; Unavailable after
         `close`; ValueError for an array of a wrong shape.
@@ -368,7 +387,36 @@ class MeasurementStream(OpenStream):
         self._say_end()
 
     def _exchange(self, measurements: Iterable[t.Measurement], timeout_s: float) -> Iterator[t.Answer]:
-        """The answers to measurements that are sent without waiting for them."""
+        """The answers to measurements that another thread sends without waiting for them, each within `timeout_s` of the one before or of its own sending."""
+        # Of each that was sent, and of the end what the iterable raised, None where nothing.
+        sent: "queue.SimpleQueue[Any]" = queue.SimpleQueue()
+        room = threading.Semaphore(ON_THE_WAY_MAX)
+
+        def send_all() -> None:
+            ended: Optional[BaseException] = None
+            try:
+                for measurement in measurements:
+                    room.acquire()
+                    self._put(measurement)
+                    sent.put(_SENT)
+            except BaseException as error:
+                ended = error
+            sent.put(ended)
+
+        threading.Thread(target=send_all, daemon=True).start()
+        try:
+            while (told := sent.get()) is _SENT:
+                yield self._next(timeout_s)
+                room.release()
+            if told is not None:
+                raise told
+        finally:
+            # It sends no more then.
+            self.close()
+            room.release()
+
+    def _answers(self, measurements: Iterable[t.Measurement], timeout_s: float) -> Iterator[t.Answer]:
+        """The answers to measurements that are sent without waiting for them, by this thread."""
         for measurement in measurements:
             self._put(measurement)
             while self._waiting and (not self._heard.empty() or self._left_s(timeout_s) == 0.0):

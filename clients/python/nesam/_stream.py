@@ -20,6 +20,11 @@ from ._errors import DeadlineExceeded, NesamError, Unavailable
 from .v1 import measurements_pb2
 
 
+ON_THE_WAY_MAX = 256
+"""Measurements of an exchange that have been sent and whose answers have not been taken; as many as a service takes from one stream by default
+(`grpc.measurements_in_flight_max`)."""
+
+
 class OpenStream:
     """One open stream. hear: takes every answer, and then the NesamError that says what ended the stream; it is called from another thread. A stream that nobody
     has closed ends with its object, with a ResourceWarning: the service allows a connection no more than some hundred."""
@@ -84,8 +89,9 @@ class OpenStream:
 
     def _leave(self) -> None:
         """Ends it, with what waits unheard."""
-        for reported in self._waiting:
-            self._client._known_states.unheard(reported)
+        # While another thread may still send.
+        while self._waiting:
+            self._client._known_states.unheard(self._waiting.popleft())
         self._say_end()
 
     def _say_end(self) -> None:

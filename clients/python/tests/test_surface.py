@@ -34,7 +34,7 @@ def test_property_asyncio_offers_what_threads_have(threads, tasks):
 
 @pytest.mark.parametrize("threads, tasks", PAIRS)
 def test_property_what_waits_is_awaited(threads, tasks):
-    at_once = {"measurement_stream", "durable_stream", "alarms", "watch_soil", "diagnose"}
+    at_once = {"measurement_stream", "durable_stream", "exchange", "alarms", "watch_soil", "diagnose"}
     for name in surface(threads):
         member = getattr(tasks, name, None)
         if callable(member) and not name.startswith("_") and name != "with":
