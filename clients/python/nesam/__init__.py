@@ -18,6 +18,7 @@ from ._errors import (
     NesamError,
     NotFound,
     Overloaded,
+    Refused,
     Unavailable,
 )
 from ._extras import ExtraOutputs, Extras
@@ -79,6 +80,7 @@ __all__ = [
     "Prediction",
     "Provenance",
     "Ranking",
+    "Refused",
     "Session",
     "Soil",
     "SoilCell",

@@ -31,13 +31,16 @@ class AsyncDurableStream(KeepingStream):
         """As `DurableStream.send`."""
         async with self._turn:
             self._keep(measurement)
-            return await self._deliver()
+            answer = await self._deliver()
+            self._kept.tell_refused(answer)
+            return answer
 
     async def flush(self, timeout_s: float = 10.0) -> None:
         """As `DurableStream.flush`; the time begins with its turn."""
         async with self._turn:
             end = time.monotonic() + timeout_s
             while self._kept:
+                self._look()
                 if self._kept.next:
                     try:
                         await self._deliver(end)
@@ -54,6 +57,7 @@ class AsyncDurableStream(KeepingStream):
                     raise self._kept.overdue(timeout_s)
                 if self._kept:
                     await asyncio.sleep(min(self._pause_s, 0.05))
+            self._kept.tell_refused()
 
     async def close(self) -> None:
         """As `DurableStream.close`."""
@@ -89,10 +93,11 @@ class AsyncDurableStream(KeepingStream):
 
     async def _attempt(self, end: float) -> t.Answer:
         """The same over one connection, each measurement after the answer to the one before."""
+        self._look()
         if self._stream is None:
             self._stream = self._client.measurement_stream()
         while True:
             answer: t.Answer = await self._stream.send(self._kept.next, max(0.0, min(self._reconnect_s, end - time.monotonic())))
-            self._kept.answered(answer)
-            if not self._kept.next:
-                return answer
+            told = self._kept.answered(answer)
+            if told is not None:
+                return told

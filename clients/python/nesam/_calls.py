@@ -322,6 +322,7 @@ class KnownStates:
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
         self._states: Dict[str, _Newest] = {}
+        self._opened: Dict[str, int] = {}
         self._lock = threading.Lock()
 
     def ask(self) -> Moment:
@@ -374,8 +375,13 @@ class KnownStates:
         """Forgets what was known under the name of a session that was opened now, also what comes late, and gives it back."""
         now = self.ask()
         with self._lock:
+            self._opened[session.session_id] = now.number
             self._states[session.session_id] = _Newest(None, now.number, now.number, now.at_s)
         return session
+
+    def opened_last(self, session_id: str) -> int:
+        """Number of when this client opened a session of that name last; 0 = never."""
+        return self._opened.get(session_id, 0)
 
     def forget(self, session_id: str) -> None:
         """Forgets a closed session."""

@@ -13,6 +13,9 @@ class DurableStream(KeepingStream):
     """A stream of the measurements of one session that outlives crashes of the server; open it with `client.durable_stream`.
 
     What is not known to be durable is kept, at most `pending_max` measurements, and sent again over a new connection; the service drops what it has.
+    Where the session was closed and opened again, all that is kept is sent to the new one, the oldest first. One thing is lost then: who opens it from another
+    client between two measurements is noticed only by the answer to the next, and the new session takes nothing before that but what lies within its reorder
+    window; `send` or `flush` raise Refused with the rest.
     Measurements without a number or a boot get one of this program, so that nothing is taken for new that is sent again. Threads must not share it.
     """
 
@@ -23,19 +26,24 @@ class DurableStream(KeepingStream):
         self.close()
 
     def send(self, measurement: t.Measurement) -> t.Answer:
-        """Sends one measurement and awaits its answer, over as many connections as it takes.
+        """Sends one measurement and awaits its answer, over as many connections as it takes. Where the session is not open the answer is REJECTED (code 5 for
+        `session_id`) and the measurement is kept: whoever opens the session gets all that is kept, the oldest first.
 
-        Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises
+        Raises Refused where older measurements that were kept have been refused now: the answer to this one is in its `answer`. Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises
         Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, another session, or numbers
         that some measurements have and some have not; such a one is not kept.
         """
         self._keep(measurement)
-        return self._deliver()
+        answer = self._deliver()
+        self._kept.tell_refused(answer)
+        return answer
 
     def flush(self, timeout_s: float = 10.0) -> None:
-        """Waits until everything is durable. Raises DeadlineExceeded after `timeout_s`, also where the server keeps no store, and Unavailable."""
+        """Waits until everything is durable. Raises DeadlineExceeded after `timeout_s`, also where the server keeps no store, Unavailable, NotFound where the session
+        is not open (all is kept), and, when the rest is durable, Refused where something that was kept has been refused."""
         end = time.monotonic() + timeout_s
         while self._kept:
+            self._look()
             if self._kept.next:
                 try:
                     self._deliver(end)
@@ -52,6 +60,7 @@ class DurableStream(KeepingStream):
                 raise self._kept.overdue(timeout_s)
             if self._kept:
                 time.sleep(min(self._pause_s, 0.05))
+        self._kept.tell_refused()
 
     def close(self) -> None:
         """Ends the connection; what is not durable stays in `pending`, and a later `send` or `flush` sends it over another one."""
@@ -80,10 +89,11 @@ class DurableStream(KeepingStream):
 
     def _attempt(self, end: float) -> t.Answer:
         """The same over one connection, each measurement after the answer to the one before."""
+        self._look()
         if self._stream is None:
             self._stream = self._client.measurement_stream()
         while True:
             answer: t.Answer = self._stream.send(self._kept.next, max(0.0, min(self._reconnect_s, end - time.monotonic())))
-            self._kept.answered(answer)
-            if not self._kept.next:
-                return answer
+            told = self._kept.answered(answer)
+            if told is not None:
+                return told

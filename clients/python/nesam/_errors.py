@@ -1,10 +1,13 @@
 """Errors: one class for each kind of refusal."""
 
-from typing import Any, Dict, Optional, Tuple, Union, cast
+from typing import TYPE_CHECKING, Any, Dict, Optional, Sequence, Tuple, Union, cast
 
 import grpc
 from google.protobuf.message import DecodeError
 from google.rpc import error_details_pb2, status_pb2
+
+if TYPE_CHECKING:
+    from ._types import Answer, Measurement
 
 
 class NesamError(Exception):
@@ -46,6 +49,22 @@ class Overloaded(NesamError):
 
 class DeadlineExceeded(NesamError):
     """No answer came in time."""
+
+
+class Refused(NesamError):
+    """Measurements that a durable stream had kept were refused when it sent them, so that the session does not have them: `refused`, pairs of measurement and
+    answer, oldest first. `answer` is the one to the newest measurement, where `send` raises this; that one is as good as if nothing had been raised.
+    """
+
+    def __init__(self, refused: "Sequence[Tuple[Measurement, Answer]]", answer: "Optional[Answer]" = None):
+        oldest, first = refused[0]
+        reason = f"{len(refused)} kept measurements were refused; the oldest is of stamp_ns {oldest.stamp_ns}, number {oldest.sequence}: {first.outcome}"
+        super().__init__(grpc.StatusCode.DATA_LOSS, first.field, f"{reason} {first.message}".rstrip())
+        self.refused = list(refused)
+        self.answer = answer
+
+    def __reduce__(self) -> Tuple[Any, ...]:
+        return type(self), (self.refused, self.answer)
 
 
 class Unavailable(NesamError):

@@ -1,10 +1,9 @@
 """What a durable stream keeps, however its measurements travel."""
 
 import itertools
-import math
 import secrets
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Deque, Dict, Iterator, List, Optional, Tuple
 
 import grpc
@@ -12,7 +11,7 @@ import numpy as np
 
 from . import _messages as m
 from . import _types as t
-from ._errors import DeadlineExceeded, NesamError, Overloaded, Unavailable
+from ._errors import DeadlineExceeded, NesamError, Overloaded, Refused, Unavailable
 
 BROKEN = {
     grpc.StatusCode.UNAVAILABLE,
@@ -41,6 +40,22 @@ def _kept_copy(measurement: t.Measurement, session_id: str) -> t.Measurement:
     return replace(measurement, **copied, command=command, sequence=number, boot_id=measurement.boot_id or _BOOT_ID, run=0)
 
 
+_IS_GONE = (grpc.StatusCode.NOT_FOUND.value[0], "session_id")
+"""Code and field of the answer where the session is not open."""
+
+
+@dataclass
+class _One:
+    """A measurement that is kept. answer: the last one with a place in the session as it is, None where it has none there."""
+
+    measurement: t.Measurement
+    answer: Optional[t.Answer] = None
+
+    @property
+    def place(self) -> int:
+        return 0 if self.answer is None else self.answer.place
+
+
 class Kept:
     """The measurements of one session that are not known to be durable, at most `pending_max`."""
 
@@ -48,11 +63,14 @@ class Kept:
         self._session_id = session_id
         self._pending_max = pending_max
         # What is kept, oldest first: all that is answered is older than all that waits. Durable ones leave from the left, as places only rise.
-        self._answered: Deque[Tuple[t.Measurement, int]] = deque()
+        self._answered: Deque[_One] = deque()
         # Without an answer of this run of the server.
-        self._waiting: Deque[t.Measurement] = deque()
-        # Who counts the places.
+        self._waiting: Deque[_One] = deque()
+        # What was refused, and is not kept any more.
+        self._refused: List[Tuple[_One, t.Answer]] = []
+        # Who counts the places, and the newest one.
         self._run = 0
+        self._place = 0
         # Whether measurements come with numbers; None before the first.
         self._is_numbered: Optional[bool] = None
 
@@ -62,12 +80,12 @@ class Kept:
     @property
     def pending(self) -> List[t.Measurement]:
         """Oldest first."""
-        return [measurement for measurement, _ in self._answered] + list(self._waiting)
+        return [one.measurement for one in (*self._answered, *self._waiting)]
 
     @property
     def next(self) -> Optional[t.Measurement]:
         """The oldest that has to be sent; None where all is answered."""
-        return self._waiting[0] if self._waiting else None
+        return self._waiting[0].measurement if self._waiting else None
 
     def put(self, measurement: t.Measurement) -> None:
         """Keeps one more. Raises Overloaded where there is no room, ValueError where it does not belong here; it is not kept then."""
@@ -79,28 +97,57 @@ class Kept:
         if measurement.session_id != self._session_id:
             raise ValueError(f"the measurement is of session `{measurement.session_id}`, this stream is of `{self._session_id}`")
         self._is_numbered = self._agrees(measurement)
-        self._waiting.append(_kept_copy(measurement, self._session_id))
+        self._waiting.append(_One(_kept_copy(measurement, self._session_id)))
 
-    def answered(self, answer: t.Answer) -> None:
-        """Notes the answer to `next`. Raises Unavailable where the connection is of no more use."""
+    def answered(self, answer: t.Answer) -> Optional[t.Answer]:
+        """Notes the answer to `next`, and gives the one that the newest is told where no more have to be sent now: none waits, or the session is not open, for which
+        all are kept. Raises Unavailable where the connection is of no more use."""
+        one = self._waiting[0]
         if answer.code in (grpc.StatusCode.RESOURCE_EXHAUSTED.value[0], grpc.StatusCode.UNAVAILABLE.value[0]):
             raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", answer.message)
-        # A refused measurement has no place and is not kept; its answer need not tell who counts.
+        if (answer.code, answer.field) == _IS_GONE:
+            self.begins_anew()
+            newest = self._waiting[-1].measurement
+            return replace(answer, sequence=newest.sequence, stamp_ns=newest.stamp_ns)
         if answer.place:
-            if self._counted_by_another(answer.run, answer.place):
-                raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "another run of the server counts now")
-            self._run = answer.run
-            self._answered.append((self._waiting[0], answer.place))
+            # Places only rise, and a duplicate is told that of the newest.
+            is_anew = answer.run == self._run and answer.place < self._place + (answer.outcome != "DUPLICATE")
+            if is_anew or (self._answered and answer.run != self._run):
+                has_before = bool(self._answered)
+                self.begins_anew()
+                if has_before:
+                    # They come first now, and then this one once more, which is there already.
+                    self._run, self._place, one.answer = answer.run, answer.place, answer
+                    raise Unavailable(grpc.StatusCode.UNAVAILABLE, "", "another run of the server counts now, or the session began anew")
+            if answer.outcome == "DUPLICATE" and one.answer is not None and one.answer.run == answer.run:
+                answer = replace(one.answer, place=answer.place, durable_place=answer.durable_place)
+            self._run, self._place, one.answer = answer.run, answer.place, answer
+            self._answered.append(one)
+        else:
+            # It is not kept.
+            self._refused.append((one, answer))
         self._waiting.popleft()
         if answer.run == self._run:
-            self._durable(answer.run, answer.durable_place)
+            self._durable(answer.durable_place)
+        return None if self._waiting else answer
 
     def told(self, session: t.Session) -> bool:
-        """Notes what the session says is durable; False where another run of the server counts now and all is to be sent again over another connection."""
-        if self._counted_by_another(session.run):
+        """Notes what the session says is durable; False where another run of the server counts now or the session began anew: all is to be sent again over another
+        connection."""
+        if self._answered and (session.run != self._run or session.accepted < self._place):
+            self.begins_anew()
             return False
-        self._durable(session.run, session.durable_place)
+        self._durable(session.durable_place)
         return True
+
+    def tell_refused(self, told: Optional[t.Answer] = None) -> None:
+        """Raises Refused for what was refused since it was raised last, but for the one with the answer `told`."""
+        # What the same session took before is in it, though it may be too old to come again.
+        missing = [pair for pair in self._refused if pair[0].answer is None or pair[0].answer.run != pair[1].run]
+        refused = [(one.measurement, answer) for one, answer in missing if answer is not told]
+        self._refused.clear()
+        if refused:
+            raise Refused(refused, told)
 
     def unheard(self, error: NesamError) -> None:
         """Notes that the session said nothing; raises the error again where it is a refusal."""
@@ -117,8 +164,15 @@ class Kept:
 
     def forget_places(self) -> None:
         """Another run of the server may count otherwise: all is sent again."""
-        self._waiting.extendleft(measurement for measurement, _ in reversed(self._answered))
+        self._waiting.extendleft(reversed(self._answered))
         self._answered.clear()
+
+    def begins_anew(self) -> None:
+        """The session was closed, or began anew: what it had is gone with it, and all is sent again, from the oldest on."""
+        self.forget_places()
+        self._place = 0
+        for one in (*self._waiting, *(refused for refused, _ in self._refused)):
+            one.answer = None
 
     def _agrees(self, measurement: t.Measurement) -> bool:
         """Whether it is numbered, as all of a stream are or none: a number of its own may be one that another got here."""
@@ -127,13 +181,8 @@ class Kept:
             raise ValueError("this stream has measurements with and without a number; a `sequence` of 0 is none, numbers begin at 1")
         return numbered
 
-    def _counted_by_another(self, run: int, place: float = math.inf) -> bool:
-        """Whether the answers so far came from another run of the server, or from a session that began anew: then all is sent again, from the oldest on."""
-        return bool(self._answered) and (run != self._run or place < self._answered[-1][1])
-
-    def _durable(self, run: int, durable_place: int) -> None:
-        self._run = run
-        while self._answered and self._answered[0][1] <= durable_place:
+    def _durable(self, durable_place: int) -> None:
+        while self._answered and self._answered[0].place <= durable_place:
             self._answered.popleft()
 
 
@@ -148,6 +197,7 @@ class KeepingStream:
         self._kept = Kept(session_id, pending_max)
         self._newest: Any = None
         self._stream: Any = None
+        self._opened = client._known_states.opened_last(session_id)
 
     @property
     def pending(self) -> List[t.Measurement]:
@@ -158,6 +208,13 @@ class KeepingStream:
         """Keeps one more. Raises what `Kept.put` raises."""
         self._kept.put(measurement)
         self._newest = self._client._known_states.report(measurement)
+
+    def _look(self) -> None:
+        """Looks whether this client has opened the session anew; what others open shows with the next answer."""
+        opened = self._client._known_states.opened_last(self._session_id)
+        if opened != self._opened:
+            self._opened = opened
+            self._kept.begins_anew()
 
     def _failed(self, error: NesamError) -> None:
         """Notes that a connection broke: where the vehicle was is known by the newest measurement all the same. Raises the error again where it is a refusal, or

@@ -241,7 +241,7 @@ def test_service_a_refusal_takes_no_place_away():
             else:
                 yield measurements_pb2.MeasurementAnswer(rejected=measurements_pb2.Rejected(code=grpc.StatusCode.PERMISSION_DENIED.value[0]))
 
-    session = sessions_pb2.Session(session_id="truck", run=5, durable_place=1)
+    session = sessions_pb2.Session(session_id="truck", run=5, accepted=1, durable_place=1)
     get = grpc.unary_unary_rpc_method_handler(lambda *_: session, None, sessions_pb2.Session.SerializeToString)
     with listening(measurements(second_is_refused), ("nesam.v1.Sessions", "Get", get)) as address, nesam.Client(address) as client:
         first, second = straight("truck", 2)
@@ -259,13 +259,15 @@ def counted(answers, session):
     heard = []
 
     def stream(requests, _):
-        here = []
+        here, newest = [], None
         heard.append(here)
         for (run, place), request in zip(answers[len(heard) - 1], requests):
             here.append(request.sequence)
-            yield measurements_pb2.MeasurementAnswer(place=place, run=run, applied=measurements_pb2.Applied())
+            outcome = {"duplicate": measurements_pb2.Duplicate()} if place == newest else {"applied": measurements_pb2.Applied()}
+            newest = place
+            yield measurements_pb2.MeasurementAnswer(place=place, run=run, **outcome)
 
-    told = sessions_pb2.Session(session_id="truck", run=session[0], durable_place=session[1])
+    told = sessions_pb2.Session(session_id="truck", run=session[0], accepted=session[1], durable_place=session[1])
     get = grpc.unary_unary_rpc_method_handler(lambda *_: told, None, sessions_pb2.Session.SerializeToString)
     with listening(measurements(stream), ("nesam.v1.Sessions", "Get", get)) as address:
         yield address, heard
@@ -288,7 +290,7 @@ def counting(answers, session):
 def test_service_who_counts_otherwise_midway_is_sent_everything_in_order(answers, session):
     with counting(answers, session) as (client, heard), client.durable_stream("truck", pause_s=0.01) as stream:
         for measurement in straight("truck", 4):
-            stream.send(measurement)
+            assert stream.send(measurement).outcome == "APPLIED"
         assert heard == [[1, 2, 3], [1, 2, 3, 4]] and [m.sequence for m in stream.pending] == [1, 2, 3, 4]
         stream.flush()
         assert not stream.pending and len(heard) == 2
