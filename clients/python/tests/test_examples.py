@@ -14,15 +14,16 @@ from conftest import free_port, start_server
 import nesam
 
 CLIENTS = Path(__file__).resolve().parents[2]
-PLANNER, PLANT, PUBLISHER = (
-    CLIENTS / name for name in ("examples/planner.py", "python/examples/plant_stub.py", "python/examples/zenoh_publisher.py")
+PLANNER, PLANT, PUBLISHER, ASKER = (
+    CLIENTS / name
+    for name in ("examples/planner.py", "python/examples/plant_stub.py", "python/examples/zenoh_publisher.py", "python/examples/zenoh_planner.py")
 )
 pytestmark = pytest.mark.skipif(not PLANNER.is_file(), reason="the examples are in the repository")
 
 
 def ran(example, *arguments):
     """How an example ends by itself. That of Zenoh is left out where that is not installed."""
-    if example == PUBLISHER:
+    if example in (PUBLISHER, ASKER):
         pytest.importorskip("zenoh")
     return subprocess.run([sys.executable, example, *arguments], capture_output=True, text=True, timeout=60)
 
@@ -46,7 +47,7 @@ def interrupted(example, *arguments, until):
     return subprocess.CompletedProcess(process.args, process.returncode, out, error)
 
 
-@pytest.mark.parametrize("example", (PLANNER, PLANT, PUBLISHER), ids=lambda example: example.stem)
+@pytest.mark.parametrize("example", (PLANNER, PLANT, PUBLISHER, ASKER), ids=lambda example: example.stem)
 def test_service_an_example_says_how_it_is_called(example):
     told = ran(example, "--help")
     assert told.returncode == 0 and told.stdout.startswith("usage: ") and not told.stderr, told
@@ -67,8 +68,9 @@ def test_service_an_example_says_what_is_missing():
             assert told.returncode == 1 and told.stderr.startswith("error: ") and why in told.stderr and "Traceback" not in told.stderr, told
     told = ran(PLANNER, f"http://127.0.0.1:{port}")
     assert told.returncode == 2 and "expected host:port" in told.stderr and "Traceback" not in told.stderr, told
-    told = ran(PUBLISHER, "--connect", f"tcp/127.0.0.1:{port}")
-    assert told.returncode == 1 and "error: tcp/127.0.0.1" in told.stderr and "Traceback" not in told.stderr, told
+    for example in (PUBLISHER, ASKER):
+        told = ran(example, "--connect", f"tcp/127.0.0.1:{port}")
+        assert told.returncode == 1 and "error: tcp/127.0.0.1" in told.stderr and "Traceback" not in told.stderr, told
 
 
 def test_service_ctrl_c_ends_an_example_and_its_session(request, server_address):
@@ -101,6 +103,8 @@ def test_service_ctrl_c_takes_a_vehicle_out_of_the_network(request, tmp_path):
             client.open_session("truck-1")
             reports = ("--connect", endpoint, "--fleet", "python", "--seconds", "60")
             told = interrupted(PUBLISHER, *reports, until=lambda: client.session("truck-1").accepted > 10)
+            assert told.returncode == 130 and "Traceback" not in told.stderr, told
+            told = interrupted(ASKER, *reports, "--cycle", "1", until="leads to")
             assert told.returncode == 130 and "Traceback" not in told.stderr, told
             deadline = time.monotonic() + 20.0
             while client.session("truck-1").vehicle_alive:
