@@ -41,6 +41,10 @@ class Client(Connected):
     once, and so is all that changes something. ValueError for another number, or an address that begins with http or has no port.
 
     What is asked of a client that is closed, or was on its way when it was, is Unavailable.
+
+    A client is one connection, of which the server takes 256 requests at once by default (`grpc.streams_per_connection_max`). Each `alarms`, `watch_soil`, `diagnose`
+    and open stream is one of them as long as it lasts; beyond that predictions wait and end with DeadlineExceeded. Who watches so many sessions does so with another
+    client. There is no `PredictStream`: calls of `predict` share the connection, and each has its own deadline and fallback.
     """
 
     def __init__(
@@ -214,8 +218,8 @@ class Client(Connected):
     def upload_map(self, world: t.WorldMap, timeout_s: float = 120.0) -> t.MapDescription:
         """Uploads a map in tiles.
 
-        Raises InvalidArgument, AlreadyExists (this or a newer version is there), Overloaded (too many maps or cells); ValueError for arrays of a wrong shape or
-        colours that are not uint8.
+        What is masked in the elevations is a hole. Raises InvalidArgument, AlreadyExists (this or a newer version is there), Overloaded (too many maps or cells);
+        ValueError for arrays of a wrong shape, colours that are not uint8 or are masked.
         """
         return self._do(calls.upload_map(world), timeout_s)
 
@@ -287,7 +291,9 @@ class Client(Connected):
     def durable_stream(self, session_id: str, reconnect_s: float = 30.0, pause_s: float = 0.2, pending_max: int = 65536) -> DurableStream:
         """A stream that keeps measurements until the service has them on stable storage, and sends them again after a crash of the server.
 
-        reconnect_s: longest time without the service before `send` gives up, s. pause_s: time between two attempts where the service asks for none, s. pending_max: measurements that are kept at
+        reconnect_s: longest time without the service before `send` gives up and raises Unavailable, s; the measurement is kept all the same. `send` waits for so long, and
+        meanwhile this client hears of no newer state: after 3.2 s a fallback has none to begin at. Where a planner lives on a fallback give less time than lies between
+        two measurements, such as 0.05 s, and more than an answer takes. pause_s: time between two attempts where the service asks for none, s. pending_max: measurements that are kept at
         most; beyond it `send` raises Overloaded. A store commits at least every second (`store.interval_s`), so the default is more than ten minutes at 100 Hz.
         The server needs a store (`nesam serve --store DIR`): without one nothing becomes durable, and `pending_max` measurements are all that can be sent.
         """
@@ -331,7 +337,8 @@ class Client(Connected):
         nominal sequence of a drawing alone, and has no extras and no `ranking` (None).
 
         Raises InvalidArgument, NotFound, FailedPrecondition (no state to start from, none that is new enough for `start_stamp_ns`, or it lies off the map),
-        Overloaded, DeadlineExceeded, Unavailable; ValueError for arrays of a wrong shape.
+        Overloaded, DeadlineExceeded, Unavailable; ValueError for arrays of a wrong shape or with masked numbers, numbers that do not fit (a negative `stride`,
+        `samples_min`, `seed` or `best`), and a command in `sent` that is no pair.
         """
         question = calls.Question(
             calls.name_of(session_id),

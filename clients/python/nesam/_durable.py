@@ -29,9 +29,10 @@ class DurableStream(KeepingStream):
         """Sends one measurement and awaits its answer, over as many connections as it takes. Where the session is not open the answer is REJECTED (code 5 for
         `session_id`) and the measurement is kept: whoever opens the session gets all that is kept, the oldest first.
 
-        Raises Refused where older measurements that were kept have been refused now: the answer to this one is in its `answer`. Raises Unavailable when the service cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises
-        Overloaded of `pending_max` when so many are kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, another session, or numbers
-        that some measurements have and some have not; such a one is not kept.
+        Raises Refused where older measurements that were kept have been refused now: the answer to this one is in its `answer`. Raises Unavailable when the service
+        cannot be reached for `reconnect_s`; the measurement is kept then, and a later `send` or `flush` sends it. Raises Overloaded of `pending_max` when so many are
+        kept: this one is not, `flush` first. Raises ValueError for an array of a wrong shape, another session, or numbers that some measurements have and some have
+        not; such a one is not kept.
         """
         self._keep(measurement)
         answer = self._deliver()

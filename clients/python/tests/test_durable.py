@@ -219,6 +219,35 @@ def test_service_what_is_kept_is_what_was_sent(start, hills):
                     stream.send(nesam.Measurement(wrong, 10**9, state, (1.0, 0.0), sequence=7))
 
 
+def test_service_a_planner_lives_on_its_fallback_while_the_server_is_away(start):
+    """For longer than a state is one to begin at; the vehicle gives the stream less time than lies between two measurements, as the README says."""
+    drive = list(straight("truck", 70))
+    process, address = start()
+    with nesam.Client(address, timeout_s=60.0) as client, client.durable_stream("truck", reconnect_s=0.05) as stream:
+        fallback = nesam.KinematicFallback(client.open_session("truck").vehicle)
+        by, restarter = [], threading.Timer(4.5, start)
+        for i, measurement in enumerate(drive):
+            begun = time.monotonic()
+            if i == 10:
+                process.kill()
+                process.wait()
+                restarter.start()
+            try:
+                stream.send(measurement)
+            except nesam.Unavailable:
+                pass
+            prediction = client.predict("truck", np.full((4, 8, 2), (2.0, 0.0)), timeout_s=0.05, fallback=fallback)
+            by.append(prediction.computed_by)
+            if prediction.computed_by != "service":
+                np.testing.assert_array_equal(prediction.start, measurement.state)
+            time.sleep(max(0.0, begun + 0.1 - time.monotonic()))
+        restarter.join()
+        assert by.count("kinematic_fallback") >= 35
+        stream.flush()
+        session = client.session("truck")
+        assert session.accepted == session.durable_place == session.last_sequence == 70
+
+
 def test_service_without_a_store_so_many_are_kept_and_no_more(client, hills):
     drive = list(straight("truck", 12))
     client.upload_map(hills)
