@@ -2,7 +2,7 @@
 
 import asyncio
 import functools
-from typing import Any, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, List, Optional, Sequence, Tuple, Union
+from typing import Any, AsyncGenerator, AsyncIterable, AsyncIterator, Awaitable, Callable, Iterable, List, Optional, Sequence, Tuple, Union
 
 import grpc
 import numpy as np
@@ -233,9 +233,9 @@ class AsyncClient(Connected):
         """As `Client.measure`; measurements may also come from an asynchronous iterator."""
         return [answer async for answer in self.exchange(measurements)]
 
-    async def exchange(self, measurements: Measurements) -> AsyncIterator[t.Answer]:
-        """As `Client.exchange`, for `async for`; measurements may also come from an asynchronous iterator, which a task takes them from. That task ends with
-        `aclose()`, with the end of yours, or with an error."""
+    async def exchange(self, measurements: Measurements) -> AsyncGenerator[t.Answer, None]:
+        """As `Client.exchange`, for `async for`; measurements may also come from an asynchronous iterator. A task takes them from it; where the loop is left before
+        its end, `aclose()` ends that."""
         async with self.measurement_stream() as stream:
             # Of each that was sent (True) and of the end (False).
             sent: "asyncio.Queue[bool]" = asyncio.Queue()

@@ -71,6 +71,8 @@ import numpy as np
 def plan(client: nesam.Client) -> Optional[float]:
     state = np.zeros(12)
     client.measure([nesam.Measurement("truck", 0, state, (1.0, 0.0), wheel_speed_rad_s=np.ones(4))])
+    for answer in client.exchange(iter([nesam.Measurement("truck", 0, state, (1.0, 0.0))])):
+        assert answer.outcome
     controls = np.full((64, 32, 2), [2.0, 0.1], np.float32)
     try:
         prediction = client.predict("truck", controls, start=state, cost=nesam.PathCost(np.zeros((2, 2)), speed_m_s=3.0, best=4))
@@ -83,9 +85,18 @@ def plan(client: nesam.Client) -> Optional[float]:
 
 
 async def watch(client: nesam.AsyncClient) -> list[nesam.Alarm]:
+    measurement = nesam.Measurement("truck", 0, [0.0] * 12, np.zeros(2))
     async with client.durable_stream("truck") as stream:
-        answer: nesam.Answer = await stream.send(nesam.Measurement("truck", 0, [0.0] * 12, np.zeros(2)))
-        assert answer.outcome
+        try:
+            answer: Optional[nesam.Answer] = await stream.send(measurement)
+        except nesam.Refused as error:
+            answer, first = error.answer, error.refused[0][0].stamp_ns
+            assert first
+        assert answer and answer.outcome
+    answers = client.exchange([measurement])
+    outcomes = [one.outcome async for one in answers]
+    await answers.aclose()
+    assert outcomes
     return [alarm async for alarm in client.alarms("truck")]
 
 

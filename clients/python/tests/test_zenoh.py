@@ -121,12 +121,12 @@ def test_service_what_a_killed_server_did_not_keep_is_sent_again_before_what_is_
     """The example goes on while the server is killed and away for longer than a silence, and again for less."""
     endpoint, grpc = f"tcp/127.0.0.1:{free_port()}", f"127.0.0.1:{free_port()}"
     process, _ = store_and_router(request, tmp_path, endpoint, grpc)
-    command = [sys.executable, str(EXAMPLE), "--connect", endpoint, "--fleet", "python", "--vehicle", "truck-6", "--rate", "20", "--seconds", "12"]
+    command = [sys.executable, str(EXAMPLE), "--connect", endpoint, "--fleet", "python", "--vehicle", "truck-6", "--rate", "20", "--seconds", "8"]
     with nesam.Client(grpc, timeout_s=60.0) as client:
         client.open_session("truck-6")
         vehicle = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         try:
-            for accepted, away_s in ((50, 2.5), (120, 0.0)):
+            for accepted, away_s in ((30, 1.5), (90, 0.0)):
                 until(lambda: client.session("truck-6").accepted >= accepted, "measurements come")
                 process.kill()
                 process.wait()
@@ -139,7 +139,7 @@ def test_service_what_a_killed_server_did_not_keep_is_sent_again_before_what_is_
         counts = dict(zip(out.split()[::2], map(int, out.split()[1::2])))
         assert vehicle.returncode == 0 and not {"TOO_OLD", "GAP"} & set(counts), (out, error)
         session = client.session("truck-6")
-        assert (session.accepted, session.last_sequence, session.history_steps) == (240, 240, 32), out
+        assert (session.accepted, session.last_sequence, session.history_steps) == (160, 160, 32), out
     process.terminate()
     assert process.wait(timeout=30) == 0
 
