@@ -15,9 +15,12 @@ namespace {
 /// Trailing metadata in which the service names the field at fault.
 constexpr const char* field_metadata = "nesam-field";
 
-/// First and longest time between two attempts to connect, ms. Chosen: a vehicle notices a restart in seconds, and a server that is away is not overrun.
+/// First and longest time between two attempts to connect, ms, to which gRPC adds up to a fifth. Chosen: a vehicle notices a restart within 2 s, and a server
+/// that is away is not overrun.
 constexpr int reconnect_ms_min = 200;
-constexpr int reconnect_ms_max = 2000;
+constexpr int reconnect_ms_max = 1600;
+/// Longest attempt to connect, ms, instead of 20 s: TCP itself asks a machine that says nothing after 1, 3, 7 and 15 s, and anew with each attempt.
+constexpr int connect_ms_max = 5000;
 
 std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const ClientOptions& options) {
   grpc::ChannelArguments arguments;
@@ -26,9 +29,11 @@ std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const Cli
   const auto keepalive_ms = static_cast<int>(std::clamp<std::chrono::milliseconds::rep>(options.keepalive.count(), 1, INT_MAX));
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIME_MS, keepalive_ms);
   arguments.SetInt(GRPC_ARG_KEEPALIVE_TIMEOUT_MS, keepalive_ms);
-  // A server that comes back is found within this, however long it was away.
+  // A server that comes back is found about 2 s after it answers, however long it was away and whether its machine refused connections meanwhile or said nothing;
+  // `Reconnector` sees to it. Tried with a call every 50 ms: 0 to 0.8 s after 3 to 9 s away, 0 to 0.6 s after 9 to 12 s of silence.
   arguments.SetInt(GRPC_ARG_INITIAL_RECONNECT_BACKOFF_MS, reconnect_ms_min);
   arguments.SetInt(GRPC_ARG_MAX_RECONNECT_BACKOFF_MS, reconnect_ms_max);
+  arguments.SetInt(GRPC_ARG_MIN_RECONNECT_BACKOFF_MS, connect_ms_max);
   // A stream may rest for long between two measurements; pings must go on then.
   arguments.SetInt(GRPC_ARG_HTTP2_MAX_PINGS_WITHOUT_DATA, 0);
   if (!options.tls) return grpc::CreateCustomChannel(target, grpc::InsecureChannelCredentials(), arguments);
@@ -42,7 +47,8 @@ std::shared_ptr<grpc::Channel> make_channel(const std::string& target, const Cli
 
 }  // namespace
 
-Error error_from(const grpc::Status& status, const grpc::ClientContext& context) {
+Error Core::error_from(const grpc::Status& status, const grpc::ClientContext& context) const {
+  reconnector.call_failed(*channel);
   const auto& metadata = context.GetServerTrailingMetadata();
   const auto entry = metadata.find(field_metadata);
   std::string field = entry == metadata.end() ? std::string() : std::string(entry->second.data(), entry->second.size());

@@ -18,11 +18,9 @@
 #include "nesam/v1/sessions.grpc.pb.h"
 #include "nesam/v1/soil.grpc.pb.h"
 #include "nesam/v1/terrain.grpc.pb.h"
+#include "reconnector.hpp"
 
 namespace nesam::detail {
-
-/// The failure that a status and its trailing metadata describe.
-Error error_from(const grpc::Status& status, const grpc::ClientContext& context);
 
 /// A timeout that can be added to any clock without overflow.
 inline std::chrono::nanoseconds bounded(std::chrono::nanoseconds timeout) {
@@ -43,6 +41,9 @@ auto open_stream(Open open) -> Result<decltype(open())> {
 class Core {
  public:
   Core(const std::string& target, const ClientOptions& settings);
+  Core(const Core&) = delete;
+  Core& operator=(const Core&) = delete;
+  ~Core() { reconnector.stop(); }
 
   /// Calls a unary method of a stub.
   template <class Stub, class Request, class Reply>
@@ -56,6 +57,9 @@ class Core {
     if (!status.ok()) return error_from(status, context);
     return reply;
   }
+
+  /// The failure that a status and its trailing metadata describe. Where the connection is lost, it is made again from here on.
+  Error error_from(const grpc::Status& status, const grpc::ClientContext& context) const;
 
   /// Tells a proxy which vehicle a call is about.
   void introduce(grpc::ClientContext& context) const {
@@ -78,6 +82,8 @@ class Core {
   Result<MapDescription> patch(const std::string& map_id, std::uint64_t base_version, const MapTile& tile, Timeout timeout) const;
 
   const ClientOptions options;
+  /// Guards itself. Before the channel, whose end it waits for.
+  mutable Reconnector reconnector;
   const std::shared_ptr<grpc::Channel> channel;
   const std::unique_ptr<v1::Sessions::Stub> sessions;
   const std::unique_ptr<v1::Prediction::Stub> prediction;

@@ -195,7 +195,7 @@ void DuplexStream<Kind>::read_all() noexcept {
   changed_.notify_all();
   writer_.join();
   const grpc::Status status = stream_->Finish();
-  if (!failure && !status.ok()) failure = error_from(status, context_);
+  if (!failure && !status.ok()) failure = core->error_from(status, context_);
   end(std::move(failure));
 }
 

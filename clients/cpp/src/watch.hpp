@@ -78,7 +78,7 @@ auto Watch<Kind>::receive(std::chrono::nanoseconds timeout) -> Result<Value> {
     }
     if (auto value = go_on(done)) return *std::move(value);
   }
-  if (!status_.ok()) return error_from(status_, context_);
+  if (!status_.ok()) return core_->error_from(status_, context_);
   return Kind::over();
 }
 

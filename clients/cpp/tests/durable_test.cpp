@@ -1,4 +1,4 @@
-// Goal: a vehicle that keeps what is not durable loses nothing when the server is killed.
+// Goal: a vehicle that keeps what is not durable loses nothing when the server is killed, and a client finds it soon when it is back.
 // Method: the real binary with a store, SIGKILL in the middle of a drive, a restart on the same store; the same drive without a crash must teach the same soil,
 // bit for bit.
 //
@@ -8,6 +8,9 @@
 
 #include <chrono>
 #include <csignal>
+#include <filesystem>
+#include <future>
+#include <optional>
 #include <string>
 #include <thread>
 #include <utility>
@@ -148,6 +151,53 @@ void service_streams_outlive_a_restart(const Place& place) {
   check_error(stream.flush(), nesam::Code::not_found, "session_id", "a closed session");
 }
 
+/// Time from when a server answers again after an outage to the first answer that a client gets which has asked at 20 Hz all the while; that of its destruction
+/// while the server is away once more.
+struct Return {
+  std::chrono::duration<double> late{1e9};
+  std::chrono::duration<double> ending{1e9};
+};
+
+Return back_after(const Place& place, const std::string& name, std::chrono::milliseconds outage) {
+  using Clock = std::chrono::steady_clock;
+  const std::string folder = place.folder + "/" + name;
+  std::filesystem::create_directory(folder);
+  Server server(place.binary, folder, place.arguments);
+  Return measured;
+  std::optional<nesam::Client> client(connected(server));
+  std::thread outside([&] {
+    server.stop(SIGKILL);
+    std::this_thread::sleep_for(outage);
+    server.start();
+  });
+  // Not before the server is away: what it answered before is no answer.
+  while (client->sessions(45ms)) std::this_thread::sleep_for(1ms);
+  std::optional<Clock::time_point> first;
+  for (const auto until = Clock::now() + outage + 30s; !first && Clock::now() < until;) {
+    const auto next = Clock::now() + 50ms;
+    if (client->sessions(45ms)) first = Clock::now();
+    std::this_thread::sleep_until(next);
+  }
+  outside.join();
+  if (first) measured.late = *first - server.ready_since();
+  server.stop(SIGKILL);
+  while (client->sessions(45ms)) std::this_thread::sleep_for(1ms);
+  const auto begin = Clock::now();
+  client.reset();
+  measured.ending = Clock::now() - begin;
+  return measured;
+}
+
+void service_a_server_that_comes_back_is_found(const Place& place) {
+  auto shorter = std::async(std::launch::async, [&] { return back_after(place, "away-3", 3s); });
+  const Return longer = back_after(place, "away-8", 8s);
+  for (const Return& measured : {shorter.get(), longer}) {
+    std::printf("  found after %.2f s, destroyed in %.3f s\n", measured.late.count(), measured.ending.count());
+    check(measured.late < 2500ms, "found " + std::to_string(measured.late.count()) + " s after it was ready");
+    check(measured.ending < 500ms, "destroyed in " + std::to_string(measured.ending.count()) + " s");
+  }
+}
+
 void service_without_a_store_nothing_is_durable(const Place& place) {
   const Server server(place.binary, place.folder, place.arguments);
   nesam::Client client = connected(server);
@@ -171,6 +221,7 @@ int main(int argc, char** argv) {
   const Place place{argv[1], argv[2], {argv + 3, argv + argc}};
   run("service_a_killed_server_costs_nothing", [&] { service_a_killed_server_costs_nothing(place); });
   run("service_streams_outlive_a_restart", [&] { service_streams_outlive_a_restart(place); });
+  run("service_a_server_that_comes_back_is_found", [&] { service_a_server_that_comes_back_is_found(place); });
   run("service_without_a_store_nothing_is_durable", [&] { service_without_a_store_nothing_is_durable(place); });
   std::printf("%d passed, %d failed\n", passed, failed);
   return failed == 0 ? 0 : 1;

@@ -33,6 +33,9 @@ class Server {
   /// Address of gRPC, the same after each start.
   const std::string& address() const { return address_; }
 
+  /// When it said last that it is ready, to within 50 ms.
+  std::chrono::steady_clock::time_point ready_since() const { return ready_since_; }
+
   void start() {
     const std::string out = folder_ + "/durable.out", log = folder_ + "/durable.log";
     std::vector<std::string> words = {binary_, "serve", "--grpc", address_, "--no-http", "--no-zenoh"};
@@ -74,6 +77,7 @@ class Server {
         if (first == "grpc") address = second;
         if (first == "ready;" && !address.empty()) {
           address_ = address;
+          ready_since_ = std::chrono::steady_clock::now();
           return;
         }
       }
@@ -91,5 +95,6 @@ class Server {
   const std::string folder_;
   const std::vector<std::string> arguments_;
   std::string address_ = "127.0.0.1:0";
+  std::chrono::steady_clock::time_point ready_since_;
   pid_t process_ = -1;
 };
