@@ -4,6 +4,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <deque>
+#include <iterator>
 #include <map>
 #include <mutex>
 #include <optional>
@@ -26,6 +27,12 @@ bool broken(const Error& error) {
   const Code code = error.code();
   return code == Code::unavailable || code == Code::cancelled || code == Code::unknown || code == Code::internal;
 }
+
+/// Whether the session is not open.
+bool unknown_session(Code code, const std::string& field) { return code == Code::not_found && field == "session_id"; }
+
+/// Time without an answer after which the session is read before the next measurement goes. Chosen: what is sent at a usual rate waits for one answer each.
+constexpr std::chrono::seconds rest_max{1};
 
 /// Whether the service had no room for a measurement: it has to be sent again.
 bool no_room(const MeasurementAnswer& answer) {
@@ -51,7 +58,7 @@ void number(Measurement& measurement, const std::string& session_id) {
 class DurableStreamImpl {
  public:
   DurableStreamImpl(std::shared_ptr<Core> core, const std::string& session_id, const DurableOptions& options)
-      : core_(std::move(core)), session_id_(session_id), options_(options) {}
+      : core_(std::move(core)), session_id_(session_id), options_(options), opening_(core_->known_states.opening(session_id)) {}
 
   Result<MeasurementAnswer> send(const Measurement& measurement) {
     if (kept() >= options_.pending_max) {
@@ -67,22 +74,25 @@ class DurableStreamImpl {
     waiting_.back().run = 0;
     number(waiting_.back(), session_id_);
     newest_.emplace(waiting_.back(), core_->known_states.ask());
-    return deliver(SteadyTime::max());
+    accepted_.reset();
+    return deliver(SteadyTime::max(), true);
   }
 
   Result<void> flush(std::chrono::nanoseconds timeout) {
     const SteadyTime end = std::chrono::steady_clock::now() + bounded(timeout);
     while (kept() != 0) {
+      if (opened_anew()) close();
       if (!waiting_.empty()) {
-        auto answer = deliver(end);
+        auto answer = deliver(end, false);
         if (!answer && (answer.error().code() != Code::unavailable || !over(end))) return answer.error();
       }
       auto status = core_->session(session_id_, std::min(left(end), core_->options.timeout));
       if (status) {
-        durable(status->run, status->durable_place);
+        told(*status);
       } else if (broken(status.error())) {
         forget_places();
       } else if (status.error().code() != Code::deadline_exceeded) {
+        if (unknown_session(status.error().code(), status.error().field())) close();
         return status.error();
       }
       if (kept() == 0) break;
@@ -91,7 +101,14 @@ class DurableStreamImpl {
       }
       std::this_thread::sleep_for(std::min({bounded(options_.pause), left(end), std::chrono::nanoseconds(std::chrono::milliseconds(50))}));
     }
-    return {};
+    if (refused_.empty()) return {};
+    return Error(Code::data_loss, "", std::to_string(refused_.size()) + " measurements were refused when they were sent again; `take_refused` has them");
+  }
+
+  std::vector<RefusedMeasurement> take_refused() {
+    std::vector<RefusedMeasurement> refused(std::make_move_iterator(refused_.begin()), std::make_move_iterator(refused_.end()));
+    refused_.clear();
+    return refused;
   }
 
   std::vector<Measurement> pending() const {
@@ -123,11 +140,11 @@ class DurableStreamImpl {
     return error.retry_after() ? std::max(least, bounded(*error.retry_after())) : bounded(options_.pause);
   }
 
-  /// Sends what has no answer yet, oldest first, over as many connections as it takes until `end`; the answer to the newest.
-  Result<MeasurementAnswer> deliver(SteadyTime end) {
+  /// Sends what has no answer yet, oldest first, over as many connections as it takes until `end`; the answer to the newest, which the caller is `told`.
+  Result<MeasurementAnswer> deliver(SteadyTime end, bool is_told) {
     const SteadyTime until = std::min(end, std::chrono::steady_clock::now() + bounded(options_.reconnect));
     while (true) {
-      auto answer = attempt(end);
+      auto answer = attempt(end, is_told);
       if (answer) return answer;
       close();
       if (!broken(answer.error())) return answer;
@@ -142,7 +159,8 @@ class DurableStreamImpl {
   }
 
   /// The same over one connection, each measurement after the answer to the one before: where the service has no room for one, later ones must not overtake it.
-  Result<MeasurementAnswer> attempt(SteadyTime end) {
+  Result<MeasurementAnswer> attempt(SteadyTime end, bool is_told) {
+    if (auto same = look(end); !same) return same.error();
     if (!stream_) {
       auto opened = open_stream([this] { return MeasurementStream(core_, session_id_); });
       if (!opened) return opened.error();
@@ -153,35 +171,77 @@ class DurableStreamImpl {
       auto answer = exchange(waiting_.front(), std::min(left(end), bounded(options_.reconnect)));
       if (!answer) return answer.error();
       if (no_room(*answer)) return Error(Code::unavailable, "", answer->is<Rejected>()->message);
+      if (const auto* rejected = answer->is<Rejected>(); rejected && unknown_session(rejected->code, rejected->field)) {
+        return Error(rejected->code, rejected->field, rejected->message);
+      }
+      const bool is_newest = is_told && waiting_.size() == 1;
       // A refused measurement has no place and is not kept; its answer need not tell who counts.
       if (answer->place != 0) {
-        if (counted_by_another(answer->run, answer->place)) return Error(Code::unavailable, "", "another run of the server counts now");
+        if (counted_by_another(answer->run, answer->accepted() ? answer->place - 1 : answer->place)) {
+          if (is_newest && answer->accepted()) accepted_ = std::move(*answer);
+          return Error(Code::unavailable, "", "another run of the server counts now, or the session began anew");
+        }
         run_ = answer->run;
         answered_.push_back({std::move(waiting_.front()), answer->place});
+      } else if (!is_newest) {
+        // Nobody else learns of it.
+        if (refused_.size() >= options_.pending_max) refused_.pop_front();
+        refused_.push_back({std::move(waiting_.front()), *answer});
       }
       waiting_.pop_front();
       if (answer->run == run_) durable(run_, answer->durable_place);
       newest = std::move(*answer);
     }
     if (!newest) return Error(Code::internal, "", "nothing to send; this is a bug");
+    // It was accepted before what is older could be sent again.
+    if (accepted_ && newest->is<Duplicate>()) return *std::exchange(accepted_, std::nullopt);
     return *std::move(newest);
+  }
+
+  /// Looks whether the session began anew while nothing was sent: then what is kept is older than what comes next, and has to go first.
+  Result<void> look(SteadyTime end) {
+    if (opened_anew()) close();
+    if (answered_.empty() || std::chrono::steady_clock::now() - heard_ < rest_max) return {};
+    auto status = core_->session(session_id_, std::min({left(end), bounded(options_.reconnect), core_->options.timeout}));
+    if (status) {
+      told(*status);
+      return {};
+    }
+    const Code code = status.error().code();
+    if (code == Code::deadline_exceeded) return Error(Code::unavailable, "", "the service did not answer in time");
+    if (broken(status.error()) || unknown_session(code, status.error().field())) return status.error();
+    return {};
+  }
+
+  /// Whether this client has opened or closed the session since this was asked last.
+  bool opened_anew() {
+    const std::uint64_t opening = core_->known_states.opening(session_id_);
+    return std::exchange(opening_, opening) != opening;
+  }
+
+  /// What the session says of itself.
+  void told(const SessionStatus& status) {
+    heard_ = std::chrono::steady_clock::now();
+    if (counted_by_another(status.run, status.accepted)) return close();
+    durable(status.run, status.durable_place);
   }
 
   Result<MeasurementAnswer> exchange(const Measurement& measurement, std::chrono::nanoseconds timeout) {
     if (auto queued = stream_->send(measurement); !queued) return queued.error();
     auto answer = stream_->receive(timeout);
+    heard_ = std::chrono::steady_clock::now();
     // Who does not answer is not there; the answer must not be taken for that of the next measurement.
     if (!answer && answer.error().code() == Code::deadline_exceeded) return Error(Code::unavailable, "", "the service did not answer in time");
     return answer;
   }
 
-  /// Whether answers so far came from another run, or from a session that began anew: then everything kept is sent again, from the oldest on.
-  bool counted_by_another(std::uint64_t run, std::uint64_t place = UINT64_MAX) const {
-    return !answered_.empty() && (run != run_ || place < answered_.back().place);
+  /// Whether answers so far came from another run, or from a session that began anew, as it has `accepted` fewer than it had: then everything kept is sent again,
+  /// from the oldest on.
+  bool counted_by_another(std::uint64_t run, std::uint64_t accepted) const {
+    return !answered_.empty() && (run != run_ || accepted < answered_.back().place);
   }
 
   void durable(std::uint64_t run, std::uint64_t durable_place) {
-    if (counted_by_another(run)) return close();
     run_ = run;
     while (!answered_.empty() && answered_.front().place <= durable_place) answered_.pop_front();
   }
@@ -203,6 +263,14 @@ class DurableStreamImpl {
   std::deque<Measurement> waiting_;
   /// Who counts the places.
   std::uint64_t run_ = 0;
+  /// What was refused and nobody was told, oldest first.
+  std::deque<RefusedMeasurement> refused_;
+  /// Which session of the name it was.
+  std::uint64_t opening_;
+  /// When the service was heard last.
+  SteadyTime heard_;
+  /// The answer to the measurement that was given last, where it is sent once more all the same.
+  std::optional<MeasurementAnswer> accepted_;
   /// The measurement that was given last, and when.
   std::optional<std::pair<Measurement, Moment>> newest_;
   /// Whether measurements come with numbers of their own; absent before the first.
@@ -220,6 +288,7 @@ DurableStream::~DurableStream() = default;
 Result<MeasurementAnswer> DurableStream::send(const Measurement& measurement) { return impl_->send(measurement); }
 Result<void> DurableStream::flush(std::chrono::nanoseconds timeout) { return impl_->flush(timeout); }
 std::vector<Measurement> DurableStream::pending() const { return impl_->pending(); }
+std::vector<RefusedMeasurement> DurableStream::take_refused() { return impl_->take_refused(); }
 void DurableStream::close() { impl_->close(); }
 
 }  // namespace nesam

@@ -97,7 +97,14 @@ class KnownStates {
   void opened(const std::string& session_id) {
     const Moment now = ask();
     const std::lock_guard lock(mutex_);
-    states_[session_id] = {std::nullopt, now.number, now.number, now.at, false};
+    states_[session_id] = {std::nullopt, now.number, now.number, now.at, false, now.number};
+  }
+
+  /// Which session of this name it is, as far as the client knows: another number than before where it was opened or closed since. 0 = not known.
+  std::uint64_t opening(const std::string& session_id) const {
+    const std::lock_guard lock(mutex_);
+    const auto held = states_.find(session_id);
+    return held == states_.end() ? 0 : held->second.opened;
   }
 
   /// Forgets a closed session.
@@ -123,6 +130,8 @@ class KnownStates {
     Time at;
     /// Whether it is no step of the session yet, as far as the client knows: it waits for the grid, or got no answer.
     bool ahead = false;
+    /// Number of the opening of the session; 0 where this client has not opened it.
+    std::uint64_t opened = 0;
 
     bool is_before(const KnownState& other) const { return !known || (other.stamp_ns && known->stamp_ns && *other.stamp_ns > *known->stamp_ns); }
     /// Whether a state of the same clock is newer.
@@ -142,7 +151,7 @@ class KnownStates {
     const auto [held, is_new] = states_.try_emplace(session_id);
     Newest& newest = held->second;
     if (!is_new && (sent.number <= newest.clock || !(begins_anew || newest.is_replaced_by(known, sent)))) return;
-    newest = {known, std::max(sent.number, newest.asked), begins_anew ? sent.number : newest.clock, sent.at, ahead};
+    newest = {known, std::max(sent.number, newest.asked), begins_anew ? sent.number : newest.clock, sent.at, ahead, newest.opened};
   }
 
   std::uint64_t asked_ = 0;

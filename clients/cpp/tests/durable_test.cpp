@@ -151,6 +151,68 @@ void service_streams_outlive_a_restart(const Place& place) {
   check_error(stream.flush(), nesam::Code::not_found, "session_id", "a closed session");
 }
 
+/// How a session is closed and opened again between two measurements of a durable stream.
+enum class Anew {
+  by_this_client,
+  by_another_seen_closed,
+  by_another_after_a_rest,
+  by_another_at_once,
+};
+
+void service_a_session_that_began_anew_gets_everything_in_order(const Place& place) {
+  const Server server(place.binary, place.folder, place.with_store("anew"));
+  nesam::Client client = connected(server), other = connected(server);
+  const struct {
+    Anew way;
+    const char* name;
+    int before;
+  } cases[] = {{Anew::by_this_client, "this-client", 8},
+               {Anew::by_another_seen_closed, "seen-closed", 8},
+               {Anew::by_another_after_a_rest, "after-a-rest", 8},
+               {Anew::by_another_at_once, "at-once", 8},
+               {Anew::by_another_at_once, "at-once-after-one", 1}};
+  for (const auto& [way, name, before] : cases) {
+    nesam::Session session = opened(client, name);
+    const nesam::VehicleCard card = session.vehicle();
+    nesam::DurableStream stream = session.durable_measurements();
+    for (int step = 0; step < before; ++step) check_ok(stream.send(cruise(step, card)), name);
+    int next = before;
+    if (way == Anew::by_another_after_a_rest) std::this_thread::sleep_for(1100ms);
+    nesam::Client& opener = way == Anew::by_this_client ? client : other;
+    check_ok(opener.close(name), name);
+    if (way == Anew::by_another_seen_closed) {
+      check_error(stream.send(cruise(next++, card)), nesam::Code::not_found, "session_id", name);
+      check(stream.pending().back().stamp_ns == cruise(before, card).stamp_ns, "what came meanwhile is kept");
+      check_error(stream.flush(), nesam::Code::not_found, "session_id", name);
+    }
+    // Some may be known to be durable, in the session that was.
+    const std::size_t kept = stream.pending().size();
+    const nesam::Session again = opened(opener, name);
+    const auto answer = stream.send(cruise(next, card));
+    if (!check_ok(answer, name)) continue;
+    const auto flushed = stream.flush(30s);
+    const auto status = again.status();
+    if (!check_ok(status, name)) continue;
+    check(stream.pending().empty() && status->durable_place == status->accepted, "everything is durable");
+    check(status->last_stamp_ns == cruise(next, card).stamp_ns, "the newest is the newest");
+    check(answer->is<nesam::Duplicate>() == nullptr && answer->accepted(), std::string(name) + ": the newest is told what became of it");
+    auto refused = stream.take_refused();
+    check(status->accepted + refused.size() == kept + 1, std::string(name) + ": what was not taken is told");
+    if (way == Anew::by_another_at_once && before > 3) {
+      check_error(flushed, nesam::Code::data_loss, "", "what is behind the window");
+      check(kept < 4 || !refused.empty(), "some are too old");
+      for (std::size_t i = 0; i < refused.size(); ++i) {
+        check(refused[i].answer.is<nesam::TooOld>() && refused[i].measurement.stamp_ns == refused[i].answer.stamp_ns, "which and why");
+        check(i == 0 || refused[i].measurement.stamp_ns > refused[i - 1].measurement.stamp_ns, "oldest first");
+      }
+      check_ok(stream.flush(), "it is told until it was heard");
+    } else {
+      check_ok(flushed, name);
+      check(refused.empty(), std::string(name) + ": all were taken");
+    }
+  }
+}
+
 /// Time from when a server answers again after an outage to the first answer that a client gets which has asked at 20 Hz all the while; that of its destruction
 /// while the server is away once more.
 struct Return {
@@ -221,6 +283,7 @@ int main(int argc, char** argv) {
   const Place place{argv[1], argv[2], {argv + 3, argv + argc}};
   run("service_a_killed_server_costs_nothing", [&] { service_a_killed_server_costs_nothing(place); });
   run("service_streams_outlive_a_restart", [&] { service_streams_outlive_a_restart(place); });
+  run("service_a_session_that_began_anew_gets_everything_in_order", [&] { service_a_session_that_began_anew_gets_everything_in_order(place); });
   run("service_a_server_that_comes_back_is_found", [&] { service_a_server_that_comes_back_is_found(place); });
   run("service_without_a_store_nothing_is_durable", [&] { service_without_a_store_nothing_is_durable(place); });
   std::printf("%d passed, %d failed\n", passed, failed);

@@ -25,7 +25,7 @@ enum class Code : int {
   unimplemented = 12,       ///< The server does not know the method: another version.
   internal = 13,            ///< A bug of the service, or a reply that contradicts the request.
   unavailable = 14,         ///< The server is not reached, or it is shutting down.
-  data_loss = 15,           ///< Not used by the service itself.
+  data_loss = 15,           ///< `DurableStream::flush`: some measurements were refused when they were sent again. Not used by the service itself.
   unauthenticated = 16,     ///< The certificate that the client shows says of nobody that the fleet file knows.
 };
 
