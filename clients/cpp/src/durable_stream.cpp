@@ -69,19 +69,20 @@ class DurableStreamImpl {
       return Error(Code::invalid_argument, "sequence", "some measurements have a number and some have none; 0 is none, numbers begin at 1");
     }
     numbered_ = numbered;
-    waiting_.push_back(measurement);
+    waiting_.push_back({measurement, std::nullopt});
+    Measurement& kept_one = waiting_.back().measurement;
     // Which run counts is the matter of this object.
-    waiting_.back().run = 0;
-    number(waiting_.back(), session_id_);
-    newest_.emplace(waiting_.back(), core_->known_states.ask());
+    kept_one.run = 0;
+    number(kept_one, session_id_);
+    newest_.emplace(kept_one, core_->known_states.ask());
     accepted_.reset();
     return deliver(SteadyTime::max(), true);
   }
 
   Result<void> flush(std::chrono::nanoseconds timeout) {
     const SteadyTime end = std::chrono::steady_clock::now() + bounded(timeout);
-    while (kept() != 0) {
-      if (opened_anew()) close();
+    while (kept() != 0 || !doubtful_.empty()) {
+      if (opened_anew()) begin_anew();
       if (!waiting_.empty()) {
         auto answer = deliver(end, false);
         if (!answer && (answer.error().code() != Code::unavailable || !over(end))) return answer.error();
@@ -92,10 +93,10 @@ class DurableStreamImpl {
       } else if (broken(status.error())) {
         forget_places();
       } else if (status.error().code() != Code::deadline_exceeded) {
-        if (unknown_session(status.error().code(), status.error().field())) close();
+        if (unknown_session(status.error().code(), status.error().field())) begin_anew();
         return status.error();
       }
-      if (kept() == 0) break;
+      if (kept() == 0 && doubtful_.empty()) break;
       if (over(end)) {
         return Error(Code::deadline_exceeded, "", std::to_string(kept()) + " measurements are not durable in time; does the server keep a store?");
       }
@@ -106,16 +107,14 @@ class DurableStreamImpl {
   }
 
   std::vector<RefusedMeasurement> take_refused() {
-    std::vector<RefusedMeasurement> refused(std::make_move_iterator(refused_.begin()), std::make_move_iterator(refused_.end()));
-    refused_.clear();
-    return refused;
+    return std::exchange(refused_, {});
   }
 
   std::vector<Measurement> pending() const {
     std::vector<Measurement> measurements;
     measurements.reserve(kept());
     for (const Answered& answered : answered_) measurements.push_back(answered.measurement);
-    measurements.insert(measurements.end(), waiting_.begin(), waiting_.end());
+    for (const Waiting& waiting : waiting_) measurements.push_back(waiting.measurement);
     return measurements;
   }
 
@@ -129,6 +128,11 @@ class DurableStreamImpl {
   struct Answered {
     Measurement measurement;
     std::uint64_t place;
+  };
+  struct Waiting {
+    Measurement measurement;
+    /// Run in which the session took it already, as far as is known.
+    std::optional<std::uint64_t> taken;
   };
 
   static std::chrono::nanoseconds left(SteadyTime end) { return bounded(end - std::chrono::steady_clock::now()); }
@@ -168,25 +172,33 @@ class DurableStreamImpl {
     }
     std::optional<MeasurementAnswer> newest;
     while (!waiting_.empty()) {
-      auto answer = exchange(waiting_.front(), std::min(left(end), bounded(options_.reconnect)));
+      auto answer = exchange(waiting_.front().measurement, std::min(left(end), bounded(options_.reconnect)));
       if (!answer) return answer.error();
       if (no_room(*answer)) return Error(Code::unavailable, "", answer->is<Rejected>()->message);
       if (const auto* rejected = answer->is<Rejected>(); rejected && unknown_session(rejected->code, rejected->field)) {
+        begin_anew();
         return Error(rejected->code, rejected->field, rejected->message);
       }
       const bool is_newest = is_told && waiting_.size() == 1;
       // A refused measurement has no place and is not kept; its answer need not tell who counts.
       if (answer->place != 0) {
         if (counted_by_another(answer->run, answer->accepted() ? answer->place - 1 : answer->place)) {
-          if (is_newest && answer->accepted()) accepted_ = std::move(*answer);
-          return Error(Code::unavailable, "", "another run of the server counts now, or the session began anew");
+          const bool follows = !answered_.empty();
+          begin_anew();
+          if (follows) {
+            // Those before it come first now, and then it once more.
+            if (is_newest && answer->accepted()) accepted_ = std::move(*answer);
+            return Error(Code::unavailable, "", "another run of the server counts now, or the session began anew");
+          }
         }
         run_ = answer->run;
-        answered_.push_back({std::move(waiting_.front()), answer->place});
+        place_ = answer->place;
+        doubtful_.clear();
+        answered_.push_back({std::move(waiting_.front().measurement), answer->place});
       } else if (!is_newest) {
-        // Nobody else learns of it.
-        if (refused_.size() >= options_.pending_max) refused_.pop_front();
-        refused_.push_back({std::move(waiting_.front()), *answer});
+        auto& refused = waiting_.front().taken == answer->run ? doubtful_ : refused_;
+        if (refused.size() >= options_.pending_max) refused.erase(refused.begin());
+        refused.push_back({std::move(waiting_.front().measurement), *answer});
       }
       waiting_.pop_front();
       if (answer->run == run_) durable(run_, answer->durable_place);
@@ -200,7 +212,7 @@ class DurableStreamImpl {
 
   /// Looks whether the session began anew while nothing was sent: then what is kept is older than what comes next, and has to go first.
   Result<void> look(SteadyTime end) {
-    if (opened_anew()) close();
+    if (opened_anew()) begin_anew();
     if (answered_.empty() || std::chrono::steady_clock::now() - heard_ < rest_max) return {};
     auto status = core_->session(session_id_, std::min({left(end), bounded(options_.reconnect), core_->options.timeout}));
     if (status) {
@@ -209,7 +221,9 @@ class DurableStreamImpl {
     }
     const Code code = status.error().code();
     if (code == Code::deadline_exceeded) return Error(Code::unavailable, "", "the service did not answer in time");
-    if (broken(status.error()) || unknown_session(code, status.error().field())) return status.error();
+    const bool is_unknown = unknown_session(code, status.error().field());
+    if (is_unknown) begin_anew();
+    if (is_unknown || broken(status.error())) return status.error();
     return {};
   }
 
@@ -222,7 +236,11 @@ class DurableStreamImpl {
   /// What the session says of itself.
   void told(const SessionStatus& status) {
     heard_ = std::chrono::steady_clock::now();
-    if (counted_by_another(status.run, status.accepted)) return close();
+    if (counted_by_another(status.run, status.accepted)) {
+      stream_.reset();
+      return begin_anew();
+    }
+    doubtful_.clear();
     durable(status.run, status.durable_place);
   }
 
@@ -237,9 +255,7 @@ class DurableStreamImpl {
 
   /// Whether answers so far came from another run, or from a session that began anew, as it has `accepted` fewer than it had: then everything kept is sent again,
   /// from the oldest on.
-  bool counted_by_another(std::uint64_t run, std::uint64_t accepted) const {
-    return !answered_.empty() && (run != run_ || accepted < answered_.back().place);
-  }
+  bool counted_by_another(std::uint64_t run, std::uint64_t accepted) const { return place_ != 0 && (run != run_ || accepted < place_); }
 
   void durable(std::uint64_t run, std::uint64_t durable_place) {
     run_ = run;
@@ -250,7 +266,16 @@ class DurableStreamImpl {
 
   /// Another run of the server may count otherwise.
   void forget_places() {
-    for (; !answered_.empty(); answered_.pop_back()) waiting_.push_front(std::move(answered_.back().measurement));
+    for (; !answered_.empty(); answered_.pop_back()) waiting_.push_front({std::move(answered_.back().measurement), run_});
+  }
+
+  /// The session is closed or began anew, or another run counts: what it had may be gone, and all is sent again, from the oldest on.
+  void begin_anew() {
+    forget_places();
+    for (Waiting& waiting : waiting_) waiting.taken.reset();
+    std::move(doubtful_.begin(), doubtful_.end(), std::back_inserter(refused_));
+    doubtful_.clear();
+    place_ = 0;
   }
 
   const std::shared_ptr<Core> core_;
@@ -260,11 +285,14 @@ class DurableStreamImpl {
   /// What is kept, oldest first: all that is answered is older than all that waits. Durable ones leave from the front, as places only rise.
   std::deque<Answered> answered_;
   /// Without an answer of this run of the server.
-  std::deque<Measurement> waiting_;
-  /// Who counts the places.
+  std::deque<Waiting> waiting_;
+  /// Who counts the places, and the newest one; 0 = none since it began.
   std::uint64_t run_ = 0;
-  /// What was refused and nobody was told, oldest first.
-  std::deque<RefusedMeasurement> refused_;
+  std::uint64_t place_ = 0;
+  /// What was refused and nobody was told: the session does not have it.
+  std::vector<RefusedMeasurement> refused_;
+  /// What the session took and refused when it went again, as too old perhaps: it has it, unless it turns out to have begun anew.
+  std::vector<RefusedMeasurement> doubtful_;
   /// Which session of the name it was.
   std::uint64_t opening_;
   /// When the service was heard last.

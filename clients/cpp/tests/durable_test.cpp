@@ -213,6 +213,33 @@ void service_a_session_that_began_anew_gets_everything_in_order(const Place& pla
   }
 }
 
+void service_flush_notices_that_a_session_began_anew(const Place& place) {
+  const Server server(place.binary, place.folder, place.with_store("flushed"));
+  nesam::Client client = connected(server), other = connected(server);
+  for (const bool is_newer : {false, true}) {
+    nesam::OpenOptions options;
+    options.vehicle_id = is_newer ? "newer" : "blank";
+    nesam::Session session = std::move(client.open(options).value());
+    nesam::DurableStream stream = session.durable_measurements();
+    for (int step = 0; step < 8; ++step) check_ok(stream.send(cruise(step, session.vehicle())), "before");
+    const std::size_t kept = stream.pending().size();
+    // Over another connection it goes again, which says nothing of whether the session has it.
+    if (is_newer) stream.close();
+    check_ok(other.close(session.id()), "close");
+    if (is_newer) options.initial = cruise(40, session.vehicle());
+    const nesam::Session again = std::move(other.open(options).value());
+    const auto flushed = stream.flush(30s);
+    check(stream.pending().empty(), "nothing is kept");
+    if (is_newer) {
+      check_error(flushed, nesam::Code::data_loss, "", "a session that knows something newer");
+      check(stream.take_refused().size() == kept && stream.take_refused().empty(), "all of it, once");
+    } else {
+      check_ok(flushed, "flush");
+      check(again.status().value().accepted == kept && stream.take_refused().empty(), "all of it is there");
+    }
+  }
+}
+
 /// Time from when a server answers again after an outage to the first answer that a client gets which has asked at 20 Hz all the while; that of its destruction
 /// while the server is away once more.
 struct Return {
@@ -284,6 +311,7 @@ int main(int argc, char** argv) {
   run("service_a_killed_server_costs_nothing", [&] { service_a_killed_server_costs_nothing(place); });
   run("service_streams_outlive_a_restart", [&] { service_streams_outlive_a_restart(place); });
   run("service_a_session_that_began_anew_gets_everything_in_order", [&] { service_a_session_that_began_anew_gets_everything_in_order(place); });
+  run("service_flush_notices_that_a_session_began_anew", [&] { service_flush_notices_that_a_session_began_anew(place); });
   run("service_a_server_that_comes_back_is_found", [&] { service_a_server_that_comes_back_is_found(place); });
   run("service_without_a_store_nothing_is_durable", [&] { service_without_a_store_nothing_is_durable(place); });
   std::printf("%d passed, %d failed\n", passed, failed);
