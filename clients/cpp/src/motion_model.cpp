@@ -2,6 +2,9 @@
 
 #include <algorithm>
 #include <cmath>
+#include <deque>
+#include <limits>
+#include <mutex>
 #include <string>
 #include <utility>
 
@@ -11,6 +14,8 @@ namespace {
 
 /// Speed below which a steering angle says little of the yaw rate, m/s.
 constexpr double slow_m_s = 0.3;
+/// A little more than the 32 steps of the service.
+constexpr std::int64_t roll_forward_ns = 3'300'000'000;
 constexpr double pi = 3.14159265358979323846;
 
 double wrapped(double angle_rad) noexcept { return std::remainder(angle_rad, 2.0 * pi); }
@@ -38,11 +43,45 @@ Control command_from_twist(const VehicleCard& card, double speed_m_s, double yaw
   return {std::clamp(speed_m_s, card.speed_min_m_s, card.speed_max_m_s), std::clamp(second, card.second_min, card.second_max)};
 }
 
+struct VelocityRollout::Sent {
+  std::mutex mutex;
+  /// By ascending stamp.
+  std::deque<SentCommand> commands;
+
+  /// Those that may matter to a prediction that begins at this instant.
+  std::vector<SentCommand> before(std::int64_t start_ns) {
+    const std::int64_t oldest_ns = std::max(start_ns, std::numeric_limits<std::int64_t>::min() + roll_forward_ns) - roll_forward_ns;
+    const std::lock_guard lock(mutex);
+    const auto first = std::find_if(commands.begin(), commands.end(), [&](const SentCommand& command) { return command.stamp_ns >= oldest_ns; });
+    return {first, commands.end()};
+  }
+};
+
 VelocityRollout::VelocityRollout(std::shared_ptr<const Session> session, MotionModelOptions options)
-    : session_(std::move(session)), options_(std::move(options)), fineness_(fineness_of(options_.model_dt_s)) {
+    : session_(std::move(session)), options_(std::move(options)), fineness_(fineness_of(options_.model_dt_s)), sent_(std::make_shared<Sent>()) {
   if (fineness_ == 0) {
     throw Error(Code::invalid_argument, "model_dt_s", "`model_dt_s`: " + std::to_string(options_.model_dt_s) + " s, must be 0.1 s or a whole fraction of it");
   }
+  if (!(options_.age_max_s >= 0.0 && options_.age_max_s <= (horizon_max - 1) * step_s)) {
+    throw Error(Code::invalid_argument, "age_max_s", "`age_max_s`: " + std::to_string(options_.age_max_s) + " s, allowed is 0 to 3.1 s");
+  }
+}
+
+void VelocityRollout::sent(std::int64_t stamp_ns, double speed_m_s, double yaw_rate_rad_s) {
+  if (!std::isfinite(speed_m_s) || !std::isfinite(yaw_rate_rad_s)) return;
+  const SentCommand command{stamp_ns, command_from_twist(session_->vehicle(), speed_m_s, yaw_rate_rad_s)};
+  const std::lock_guard lock(sent_->mutex);
+  auto& commands = sent_->commands;
+  // A clock that was set back.
+  while (!commands.empty() && commands.back().stamp_ns >= stamp_ns) commands.pop_back();
+  commands.push_back(command);
+  if (commands.size() > sent_max) commands.pop_front();
+}
+
+std::size_t VelocityRollout::steps_for(std::size_t time) const noexcept {
+  std::size_t steps_max = horizon_max;
+  if (options_.now) steps_max -= static_cast<std::size_t>(std::ceil(options_.age_max_s / step_s - 1e-9));
+  return std::min((time + fineness_ - 1) / fineness_, steps_max);
 }
 
 std::vector<float> VelocityRollout::controls(View3<const float> commands, std::size_t steps) const {
@@ -71,12 +110,18 @@ void VelocityRollout::predict(View3<const float> commands, View3<float> velociti
     throw Error(Code::invalid_argument, "commands", "commands (batch, time, 2) and velocities (batch, time, 3) do not fit each other");
   }
   if (commands.samples() == 0 || time == 0) return;
-  const std::size_t steps = std::min<std::size_t>((time + fineness_ - 1) / fineness_, horizon_max);
+  const std::size_t steps = steps_for(time);
   const std::vector<float> asked = controls(commands, steps);
   PredictRequest request;
   request.controls = {Span<const float>(asked), commands.samples(), steps, 2};
   request.channels = bit(Channel::x) | bit(Channel::y) | bit(Channel::yaw);
   request.fallback = options_.fallback;
+  std::vector<SentCommand> sent;
+  if (options_.now) {
+    request.start_stamp_ns = options_.now();
+    sent = sent_->before(*request.start_stamp_ns);
+  }
+  request.sent = sent;
   auto answer = session_->predict(request, options_.timeout);
   if (!answer) {
     failure_ = answer.error();

@@ -318,6 +318,111 @@ void check_motion_model(const std::shared_ptr<nesam::Session>& session, double m
   check(apart_m < (lateral ? 1e-4 : 0.5) && apart_rad < 1e-4, "integrated " + std::to_string(apart_m) + " m and " + std::to_string(apart_rad) + " rad apart");
 }
 
+/// A motion model that asks from now begins there, with the commands on their way, as a prediction that is asked so.
+void service_motion_model_from_now(nesam::Client& client, const std::string& map_id) {
+  using State = MinimalState<true>;
+  using Model = nesam::RemoteMotionModel<MinimalMotionModel<true>, State>;
+  const auto session = std::make_shared<nesam::Session>(driven(client, "from-now", map_id));
+  const nesam::VehicleCard& card = session->vehicle();
+  const std::int64_t newest_ns = cruise(4, card).stamp_ns;
+  std::int64_t now_ns = newest_ns + 2 * grid_ns + grid_ns / 5;
+  nesam::MotionModelOptions options;
+  options.timeout = 30s;
+  options.failures_max = 2;
+  options.now = [&] { return now_ns; };
+  Model model(session, options);
+  // Of no use any more, of a clock that was set back afterwards, no number, and what is on its way.
+  model.sent(newest_ns - 40 * grid_ns, 0.2, 0.0);
+  model.sent(newest_ns + 90 * grid_ns, 0.2, 0.0);
+  model.sent(newest_ns - grid_ns, 1.0, 0.0);
+  model.sent(newest_ns + grid_ns, nan_d, 0.0);
+  model.sent(newest_ns + grid_ns, 3.0, 0.3);
+  constexpr std::size_t batch = 4, time = 24;
+  const auto fresh = [](std::size_t columns) {
+    State state(batch, columns);
+    for (std::size_t i = 0; i < batch; ++i) {
+      for (std::size_t j = 0; j < columns; ++j) {
+        state.cvx(i, j) = 1.0F + 0.2F * static_cast<float>(i);
+        state.cwz(i, j) = 0.1F * static_cast<float>(i) - 0.2F;
+      }
+    }
+    return state;
+  };
+  State state = fresh(time);
+  model.predict(state);
+  const auto& prediction = model.rollout().prediction();
+  check(!model.rollout().failure() && prediction, model.rollout().failure() ? model.rollout().failure()->what() : "a prediction");
+  if (!prediction) return;
+  check(prediction->start_stamp_ns == newest_ns + 2 * grid_ns && prediction->rolled_forward_steps == 2, "it begins at the nearest step to now");
+
+  std::vector<float> controls;
+  for (std::size_t i = 0; i < batch; ++i) {
+    for (std::size_t j = 0; j < time; ++j) {
+      const nesam::Control control = nesam::command_from_twist(card, state.cvx(i, j), state.cwz(i, j));
+      controls.insert(controls.end(), {static_cast<float>(control.speed_m_s), static_cast<float>(control.second)});
+    }
+  }
+  const nesam::SentCommand sent[] = {{newest_ns + grid_ns, nesam::command_from_twist(card, 3.0, 0.3)}};
+  nesam::PredictRequest request = request_of(controls, batch, time);
+  request.channels = nesam::bit(nesam::Channel::x) | nesam::bit(nesam::Channel::y) | nesam::bit(nesam::Channel::yaw);
+  request.start_stamp_ns = now_ns;
+  request.sent = sent;
+  const auto asked = predicted(*session, request);
+  check(asked.ok() && equal_bits(asked->states().values(), prediction->states().values()), "the bits of a prediction that is asked so");
+  request.sent = {};
+  const auto without = predicted(*session, request);
+  check(without.ok() && !equal_bits(without->states().values(), prediction->states().values()), "what was sent counts");
+  const MinimalPose start = {prediction->start.position_m[0], prediction->start.position_m[1], prediction->start.attitude_rad[2]};
+  check(start.x_m > cruise(4, card).state.position_m[0] + 0.1, "further on than what was measured");
+  double apart_m = 0.0;
+  for (std::size_t i = 0; i < batch; ++i) {
+    const MinimalPose pose = integrated(state, i, time - 1, start, 0.1);
+    apart_m = std::max(apart_m, std::hypot(pose.x_m - prediction->states()(i, time - 1, 0), pose.y_m - prediction->states()(i, time - 1, 1)));
+  }
+  check(apart_m < 1e-4, "integrated " + std::to_string(apart_m) + " m apart");
+
+  // What is kept for the age is not asked for; beyond it velocities go on. A measurement that is too old is a failure of the cycle.
+  State longer = fresh(40);
+  now_ns = newest_ns + 4 * grid_ns;
+  model.predict(longer);
+  check(!model.rollout().failure() && prediction->steps == 28 && prediction->rolled_forward_steps == 4, "as old as it may be");
+  check(longer.vx(1, 39) == longer.vx(1, 27) && longer.vx(1, 27) != longer.vx(1, 26), "beyond the horizon");
+  now_ns += grid_ns;
+  model.predict(longer);
+  check(model.rollout().failure() && model.rollout().failure()->code() == nesam::Code::failed_precondition &&
+            model.rollout().failure()->field() == "start_stamp_ns" && longer.vx(1, 39) == longer.cvx(1, 38),
+        "older than that: the commands are followed");
+  options.fallback = nesam::KinematicFallback{card};
+  Model falling(session, options);
+  falling.predict(longer);
+  check(falling.rollout().prediction() && falling.rollout().prediction()->computed_by == nesam::ComputedBy::kinematic_fallback &&
+            falling.rollout().prediction()->start_stamp_ns == now_ns,
+        "or the kinematics predict from now");
+
+  // As it was where nobody says what time it is; and what `now` throws comes out.
+  options = {};
+  options.timeout = 30s;
+  Model untimed(session, options);
+  untimed.sent(newest_ns + grid_ns, 3.0, 0.3);
+  untimed.predict(state);
+  check(untimed.rollout().prediction() && untimed.rollout().prediction()->start_stamp_ns == newest_ns, "without `now` from the newest measurement");
+  int thrown = 0;
+  options.now = []() -> std::int64_t { throw std::runtime_error("no clock"); };
+  Model clockless(session, options);
+  try {
+    clockless.predict(state);
+  } catch (const std::runtime_error& error) {
+    thrown += std::string(error.what()) == "no clock" ? 1 : 100;
+  }
+  options.age_max_s = 3.2;
+  try {
+    nesam::VelocityRollout(session, options);
+  } catch (const nesam::Error& error) {
+    thrown += error.field() == "age_max_s" ? 10 : 100;
+  }
+  check(thrown == 11, "what is thrown: " + std::to_string(thrown));
+}
+
 void service_motion_model_of_nav2(nesam::Client& client, const std::string& map_id) {
   nesam::OpenOptions options;
   options.vehicle_id = unique("nav2");
@@ -480,6 +585,7 @@ void run_all(nesam::Client& client) {
     run("service_bad_predictions_are_refused", [&] { service_bad_predictions_are_refused(session, client); });
     run("service_the_service_draws_and_ranks", [&] { service_the_service_draws_and_ranks(session); });
     run("service_motion_model_of_nav2", [&] { service_motion_model_of_nav2(client, map_id); });
+    run("service_motion_model_from_now", [&] { service_motion_model_from_now(client, map_id); });
     run("service_threads_share_a_session", [&] { service_threads_share_a_session(session); });
   }
   client.delete_map(map_id).value();

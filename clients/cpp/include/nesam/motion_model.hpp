@@ -2,6 +2,8 @@
 
 #include <chrono>
 #include <cstddef>
+#include <cstdint>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <type_traits>
@@ -36,6 +38,13 @@ struct MotionModelOptions {
   /// Predicts instead of the service when that is late, overloaded or away, from the newest state that the client knows; absent = nothing does. Such a cycle is no
   /// failure, however many there are: `VelocityRollout::failure` and `Prediction::computed_by` tell them.
   std::optional<KinematicFallback> fallback;
+  /// The instant that the first velocities apply to, ns of the vehicle's clock: that of the pose from which the planner integrates. Asked in `predict`, in its
+  /// thread. Predictions then begin there, rounded to the nearest step of 0.1 s after the newest measurement, with the commands of `VelocityRollout::sent` on the way;
+  /// empty = they begin at the newest measurement, which is older: what they say is late by speed x age.
+  std::function<std::int64_t()> now;
+  /// With `now`: age of the newest measurement, s, up to which the service answers in any case; 0 to 3.1. It is kept of the horizon of 3.2 s, beyond which velocities
+  /// go on as the last ones. Where age and sequences together exceed 3.2 s, FAILED_PRECONDITION of `start_stamp_ns` is a failure as others are.
+  double age_max_s = 0.4;
 };
 
 /// Velocities of a batch of command sequences, by the prediction service: what a planner that integrates velocities itself needs.
@@ -45,15 +54,24 @@ struct MotionModelOptions {
 /// horizon of the service, 3.2 s, the last velocities go on. A sample that overturns or has a state that is not finite stands still.
 class VelocityRollout {
  public:
-  /// Throws `Error` (INVALID_ARGUMENT) for a step that is no whole fraction of 0.1 s.
+  /// Most commands that `sent` keeps, as many as a prediction takes.
+  static constexpr std::size_t sent_max = 256;
+
+  /// Throws `Error` (INVALID_ARGUMENT) for a step that is no whole fraction of 0.1 s and for a `MotionModelOptions::age_max_s` outside its range.
   VelocityRollout(std::shared_ptr<const Session> session, MotionModelOptions options);
 
   /// Fills the velocities from the commands.
   ///
   /// `commands` (batch, time, 2): speed in m/s and yaw rate in rad/s. `velocities` (batch, time, 3): forward and lateral in m/s, yaw rate in rad/s; column 0
-  /// is read, the others are written. Starts from the newest measurement of the session. Throws `Error` in the calling thread: INVALID_ARGUMENT for shapes that
-  /// do not fit, and the last failure once more than `failures_max` came in a row.
+  /// is read, the others are written. Starts from the newest measurement of the session, or at `MotionModelOptions::now`. Throws `Error` in the calling thread:
+  /// INVALID_ARGUMENT for shapes that do not fit, the last failure once more than `failures_max` came in a row, and what `now` throws.
   void predict(View3<const float> commands, View3<float> velocities);
+
+  /// Notes a command that the vehicle was sent: it applies from `stamp_ns` on, ns of the vehicle's clock; speed in m/s, yaw rate in rad/s, turned into a command by
+  /// `command_from_twist`. Only read where there is a `MotionModelOptions::now`: without the commands sent since the newest measurement the one that was measured with
+  /// it goes on. The newest `sent_max` are kept, and none that is not before this one. May be called from another thread than `predict`. A number that is not finite
+  /// is no command.
+  void sent(std::int64_t stamp_ns, double speed_m_s, double yaw_rate_rad_s);
 
   const MotionModelOptions& options() const noexcept { return options_; }
   /// The last prediction, for critics that read validity or provenance; absent before the first.
@@ -62,6 +80,8 @@ class VelocityRollout {
   const std::optional<Error>& failure() const noexcept { return failure_; }
 
  private:
+  /// Steps of the service to ask for.
+  std::size_t steps_for(std::size_t time) const noexcept;
   std::vector<float> controls(View3<const float> commands, std::size_t steps) const;
   void follow(std::size_t sample, View3<float> velocities) const;
 
@@ -72,6 +92,9 @@ class VelocityRollout {
   std::optional<Prediction> prediction_;
   std::optional<Error> failure_;
   unsigned failures_ = 0;
+  /// Commands on their way, which copies of a rollout share.
+  struct Sent;
+  std::shared_ptr<Sent> sent_;
 };
 
 /// A motion model of nav2's MPPI controller that asks the prediction service.
@@ -112,6 +135,9 @@ class RemoteMotionModel : public Base {
   }
 
   bool isHolonomic() override { return rollout_.options().lateral; }
+
+  /// As `VelocityRollout::sent`: for each command that the vehicle gets, for example out of a subscription of `cmd_vel`.
+  void sent(std::int64_t stamp_ns, double speed_m_s, double yaw_rate_rad_s) { rollout_.sent(stamp_ns, speed_m_s, yaw_rate_rad_s); }
 
   /// What the last call did.
   const VelocityRollout& rollout() const noexcept { return rollout_; }
