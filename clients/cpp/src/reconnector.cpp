@@ -13,8 +13,12 @@ namespace nesam::detail {
 
 namespace {
 
+using SteadyTime = std::chrono::steady_clock::time_point;
+
 /// Longest wait for a change of the channel. Chosen: no more than a bound of how long the destructor could wait.
 constexpr std::chrono::seconds wait_max{1};
+/// How long the thread goes on after the last call that has failed: who does not call any more is not missed. Chosen: longer than between two calls of whoever minds.
+constexpr std::chrono::seconds wanted_for{60};
 
 }  // namespace
 
@@ -25,7 +29,8 @@ struct Reconnector::Waiting {
   grpc::Channel* channel = nullptr;
   std::optional<grpc::CompletionQueue> queue;
   std::thread thread;
-  bool wanted = false;
+  /// Until when the channel is to be connected; absent while it is, or nobody calls.
+  std::optional<SteadyTime> wanted_until;
   bool stopping = false;
 
   void run() noexcept;
@@ -54,7 +59,7 @@ void Reconnector::call_failed(grpc::Channel& channel) noexcept {
       if (!waiting.queue) waiting.queue.emplace();
       waiting.thread = std::thread([&waiting] { waiting.run(); });
     }
-    waiting.wanted = true;
+    waiting.wanted_until = std::chrono::steady_clock::now() + wanted_for;
   } catch (const std::exception&) {
     return;
   }
@@ -76,12 +81,12 @@ void Reconnector::Waiting::run() noexcept {
   while (true) {
     {
       std::unique_lock lock(mutex);
-      changed.wait(lock, [this] { return wanted || stopping; });
+      changed.wait(lock, [this] { return wanted_until || stopping; });
       if (stopping) break;
       // Asks an idle channel to connect.
       const grpc_connectivity_state state = channel->GetState(true);
-      if (state == GRPC_CHANNEL_READY || state == GRPC_CHANNEL_SHUTDOWN) {
-        wanted = false;
+      if (state == GRPC_CHANNEL_READY || state == GRPC_CHANNEL_SHUTDOWN || std::chrono::steady_clock::now() > *wanted_until) {
+        wanted_until.reset();
         continue;
       }
       channel->NotifyOnStateChange(state, std::chrono::system_clock::now() + wait_max, &*queue, nullptr);

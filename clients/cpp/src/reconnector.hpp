@@ -11,8 +11,8 @@ namespace nesam::detail {
 /// Connects a channel that has lost its server.
 ///
 /// gRPC goes on with a connection only while somebody waits on the channel, else every 5 s. Calls that fail at once do not wait: a planner that asks at a fixed
-/// rate found a server that was restarted 6 to 9 s late. So a thread waits from the first call that fails until the channel is connected. It is started when it is
-/// needed first and sleeps while the channel is connected; how calls fail is not changed. Safe from several threads at once.
+/// rate found a server that was restarted 6 to 9 s late. So a thread waits from the first call that fails until the channel is connected, or none has failed for a
+/// minute. It is started when it is needed first and sleeps else; how calls fail is not changed. Safe from several threads at once.
 ///
 /// The channel has to go between `stop` and the destructor: that ends the wait at once.
 class Reconnector {

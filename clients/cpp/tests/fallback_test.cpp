@@ -219,8 +219,10 @@ void service_the_motion_model_falls_back_every_cycle(const std::shared_ptr<nesam
   }
 
   // Without it, as before: the commands twice, then the planner is told.
-  options.fallback.reset();
-  nesam::RemoteMotionModel<MinimalMotionModel<true>, MinimalState<true>> strict(session, options);
+  nesam::MotionModelOptions without;
+  without.timeout = options.timeout;
+  without.failures_max = options.failures_max;
+  nesam::RemoteMotionModel<MinimalMotionModel<true>, MinimalState<true>> strict(session, without);
   int told = 0;
   for (int cycle = 0; cycle < 3; ++cycle) {
     MinimalState<true> state = fresh();
