@@ -10,7 +10,7 @@ use nesam_evaluation::{median, quantile_sorted};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use rayon::prelude::*;
 
-use crate::bend::{self, Bend, Commands};
+use crate::bend::{self, Bend, Driven};
 use crate::candidates::{Candidate, column_count};
 use crate::channels::{CHANNELS, Row, level_name};
 use crate::metric::Metric;
@@ -32,8 +32,8 @@ pub struct Signatures {
     pub columns: Vec<Vec<Row>>,
     /// One prior standard deviation of each soil parameter.
     pub soil: Vec<Vec<Row>>,
-    /// What each segment was commanded.
-    pub commands: Vec<Commands>,
+    /// What was commanded and done in each segment.
+    pub driven: Vec<Driven>,
     /// Segments that do not count, because an effect that was chosen last may begin within them ([`straddling`](crate::onset)); empty where none does.
     pub uncounted: Vec<usize>,
 }
@@ -165,7 +165,7 @@ pub fn signatures_beside(bench: &Bench<'_>, drive: &ObservedDrive, fitted: &[Bes
             difference(&side(-0.25), &side(0.25), 2.0)
         })
         .collect();
-    Signatures { columns, soil, commands: drive.commands(), uncounted: Vec::new() }
+    Signatures { columns, soil, driven: drive.driven(), uncounted: Vec::new() }
 }
 
 /// (less - more) · factor, row by row: what the deviations look like when the effect is there and the prediction lacks it.
@@ -173,10 +173,10 @@ pub fn difference(less: &[Row], more: &[Row], factor: f64) -> Vec<Row> {
     less.iter().zip(more).map(|(l, m)| core::array::from_fn(|c| (l[c] - m[c]) * factor)).collect()
 }
 
-/// Names of all columns: those of the catalogue, then the level of each channel, then the bends of actuators.
+/// Names of all columns: those of the catalogue, then the level of each channel, then the bends of actuators and sensors.
 pub fn column_names(catalogue: &[Candidate]) -> Vec<String> {
     let effects = catalogue.iter().flat_map(|c| c.columns().into_iter().map(|j| format!("{} {j}", c.label())).collect::<Vec<_>>());
-    effects.chain((0..CHANNELS).map(level_name)).chain(bend::all().map(|bend| bend.name())).collect()
+    effects.chain((0..CHANNELS).map(level_name)).chain(bend::ALL.map(|bend| bend.name())).collect()
 }
 
 /// Column of the level of a channel, after those of all hypotheses.
@@ -189,7 +189,7 @@ pub fn bend_column(catalogue: &[Candidate], bend: Bend) -> usize {
     column_count(catalogue) + CHANNELS + bend.place()
 }
 
-/// Condenses a drive: the catalogue's columns and, after them, the level of every channel and the bends of actuators as columns of their own, which name no
+/// Condenses a drive: the catalogue's columns and, after them, the level of every channel and the bends of actuators and sensors as columns of their own, which name no
 /// cause.
 pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Condensed {
     let mut columns = whitened(metric, &signatures.columns);
@@ -197,9 +197,9 @@ pub fn condense(metric: &Metric, rows: &[Row], signatures: &Signatures) -> Conde
         metric.channels.iter().position(|own| *own == c).map_or_else(|| DVector::zeros(metric.channels.len()), |at| metric.unit(at))
     };
     columns.extend((0..CHANNELS).map(|c| vec![unit(c); rows.len()]));
-    columns.extend(bend::all().map(|bend| {
+    columns.extend(bend::ALL.map(|bend| {
         let unit = unit(bend.channel);
-        bend.over(&signatures.commands).into_iter().map(|share| &unit * share).collect()
+        bend.over(&signatures.driven).into_iter().map(|share| &unit * share).collect()
     }));
     let named = columns.len();
     columns.extend(whitened(metric, &signatures.soil));
@@ -358,7 +358,7 @@ mod tests {
             Signatures {
                 columns: vec![(0..40).map(|k| row(answer(k))).collect()],
                 soil: Vec::new(),
-                commands: Vec::new(),
+                driven: Vec::new(),
                 uncounted: Vec::new(),
             },
         )
@@ -386,9 +386,8 @@ mod tests {
         jumps[17][0] += 3.0;
         let score = |rows: &[Row], uncounted: &[usize]| {
             let soil = vec![vec![[0.0; CHANNELS]; rows.len()]];
-            let commands = vec![[0.0; 2]; rows.len()];
-            condense(&metric, rows, &Signatures { columns: signatures.columns.clone(), soil, commands, uncounted: uncounted.to_vec() })
-                .score
+            let driven = vec![Driven::default(); rows.len()];
+            condense(&metric, rows, &Signatures { columns: signatures.columns.clone(), soil, driven, uncounted: uncounted.to_vec() }).score
         };
         assert!((score(&jumps, &[]) - score(&small, &[])).norm() > 1.0, "a jump is seen");
         let apart = (score(&jumps, &[17]) - score(&small, &[17])).norm();

@@ -263,7 +263,7 @@ mod tests {
     fn analytic_a_column_that_begins_earlier_after_all_is_whole_again() {
         let times_s: Vec<f64> = (0..10).map(f64::from).collect();
         let column: Vec<Row> = times_s.iter().map(|t| [1.0 + t; CHANNELS]).collect();
-        let mut signatures = Signatures { columns: vec![column.clone()], soil: Vec::new(), commands: Vec::new(), uncounted: Vec::new() };
+        let mut signatures = Signatures { columns: vec![column.clone()], soil: Vec::new(), driven: Vec::new(), uncounted: Vec::new() };
         let mut whole = BTreeMap::new();
         for at_s in [8.0, 3.0] {
             begin(&mut whole, &mut signatures, 0, &times_s, Some(at_s));

@@ -123,7 +123,7 @@ impl Diagnosis {
         self.selection.levels.iter().copied().zip(self.channels.iter().copied()).collect()
     }
 
-    /// How unusually actuators bend as they are commanded; empty where the model is on trial.
+    /// How unusually actuators and sensors bend; empty where the model is on trial.
     pub fn bends_seen(&self) -> Vec<(f64, Bend)> {
         self.selection.bends.iter().copied().zip(bend::asked_of(&self.channels)).collect()
     }
@@ -238,8 +238,8 @@ impl Asked<'_> {
         let claims = verdict.claims();
         let assumed = predictor.bundle().normalization.default_soil();
         let soils = soils(&case, assumed, if claims { taught.beside } else { case.bench.ground });
-        if let Some(scores) = scores.as_ref().filter(|_| soils.is_some()) {
-            reason += &said_of_ground(scores);
+        if let Some(scores) = scores.as_ref().filter(|_| soils.is_some() || judge_by.is_some()) {
+            reason += &said_of_ground(scores, judge_by.is_none());
         }
         let named = claims && judgement.verdict.claims();
         let mut of_rims_found = told.findings.clone();

@@ -19,7 +19,7 @@ use crate::work::Work;
 pub struct Learned {
     /// Best soil correction without an effect.
     pub soil: SoilCorrection,
-    /// Soil correction beside the effects; none where the ground is not on trial.
+    /// Soil correction beside the effects; none where the ground is neither on trial nor another than the map shows.
     pub beside: SoilCorrection,
     /// Effects claimed; empty when nothing was.
     pub effects: Vec<ScheduledEffect>,
@@ -53,9 +53,16 @@ pub struct HeldOut {
     pub counted: Counted,
     /// Whether what was learned for a drive begins before its last window ends; true where nothing was learned.
     pub shows: Vec<bool>,
+    /// Whether effects stand on a soil that was fitted beside them, since the ground is another than the map shows.
+    pub another_ground: bool,
 }
 
 impl HeldOut {
+    /// What effects must not make worse: the model before, or on another ground the model on that.
+    pub(crate) fn base(&self) -> &ModelScore {
+        &self.scores[usize::from(self.another_ground)]
+    }
+
     /// As nothing is claimed, nothing is added: after is before, and there is no onset.
     pub(crate) fn add_nothing(&mut self) {
         self.scores[2] = self.scores[0].clone();
@@ -108,7 +115,9 @@ pub fn score_held_out(
             let with = |predictor: &Predictor, soil| roll_out(predictor, Variant::Full, soil, w, None, map);
             let before = with(predictor, SoilCorrection::NONE)?;
             let soil = with(predictor, learned[w.drive].soil)?;
-            let after = if learned[w.drive].effects.is_empty() { before.clone() } else { with(&after[w.drive], learned[w.drive].beside)? };
+            let (effects, beside) = (&learned[w.drive].effects, learned[w.drive].beside);
+            let as_before = effects.is_empty() && beside == SoilCorrection::NONE;
+            let after = if as_before { before.clone() } else { with(&after[w.drive], beside)? };
             work.done();
             Ok([before, soil, after])
         })
@@ -129,6 +138,7 @@ pub fn score_held_out(
         resamples,
         counted: counted(maps),
         shows: shows(&windows, drives.len(), |d| &learned[d].effects),
+        another_ground: false,
     })
 }
 

@@ -13,8 +13,11 @@ use crate::settled::{Settled, onset_in_place};
 const LEFT_MAX: f64 = 0.4;
 /// [`LEFT_MAX`] where every claimed effect is geometry, such as a steering ratio or a gyro bias.
 const LEFT_MAX_GEOMETRY: f64 = 0.2;
-/// [`LEFT_MAX`] of bends of actuators (chosen): a steering that turns a tenth further to one side leaves twice that and more, and none is quite straight.
+/// [`LEFT_MAX`] of bends of actuators and sensors (chosen): a steering that turns a tenth further to one side leaves twice that and more, and none is quite straight.
 const BEND_LEFT_MAX: f64 = 0.03;
+/// Evidence from which a bend of a sensor speaks against a claimed effect of a sensor (chosen: beside it five bends are asked for and no other column, which by chance reach
+/// that once in seventy-five times).
+const BEND_OF_SENSOR: f64 = 3.0;
 
 /// Outcome for a person in a hurry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -222,13 +225,14 @@ fn surely_differs(selection: &Selection) -> bool {
 }
 
 /// What is left and speaks against what is chosen: a level beyond chance, or a hypothesis that could be chosen besides, of more than this share of the largest evidence; or
-/// a bend, of more than [`BEND_LEFT_MAX`] of it.
+/// a bend, of more than [`BEND_LEFT_MAX`] of it, where an effect of a sensor is claimed those of sensors from [`BEND_OF_SENSOR`] on.
 fn left_over(selection: &Selection, share_max: f64) -> Option<&(f64, String)> {
     let needed = |times: f64, share: f64| (times * selection.threshold).max(share * selection.largest());
     let all = [
         (&selection.remaining, needed(FURTHER, share_max)),
         (&selection.remaining_level, needed(1.0, share_max)),
         (&selection.remaining_bend, needed(FURTHER, BEND_LEFT_MAX)),
+        (&selection.remaining_bend_of_sensor, BEND_OF_SENSOR.max(BEND_LEFT_MAX * selection.largest())),
     ];
     all.into_iter().find(|(left, needed)| left.0 >= *needed).map(|(left, _)| left)
 }
@@ -337,6 +341,10 @@ mod tests {
         assert_eq!(refused_by([5.1, 3.0]).as_deref(), Some("anything"));
         assert_eq!(refused_by([4.7, 4.2]).as_deref(), Some("a level"));
         assert!(left_over(&leaving(30.0, [5.1, 5.1]), 0.2).is_none(), "less than a fifth");
+        let beside_a_sensor =
+            |z: f64, largest: f64| Selection { remaining_bend_of_sensor: (z, "a bend".into()), ..leaving(largest, [z, 0.0]) };
+        assert!(left_over(&beside_a_sensor(2.9, 14.0), 0.2).is_none() && left_over(&beside_a_sensor(3.1, 14.0), 0.2).is_some());
+        assert!(left_over(&beside_a_sensor(3.1, 110.0), 0.2).is_none(), "less than three in a hundred");
     }
 
     /// Goal: a reason does not say that nothing stands out where something was refused. Method: two findings that earlier looks refused, with nothing chosen and with

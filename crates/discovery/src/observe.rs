@@ -16,7 +16,7 @@ use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
 use rayon::prelude::*;
 
-use crate::bend::Commands;
+use crate::bend::Driven;
 use crate::candidates::Candidate;
 use crate::channels::{BINS, CHANNELS, RIM_AT, Row, SEGMENT_STEPS, STATE_CHANNELS, STEERING_AT, available};
 use crate::consistency::add_consistency;
@@ -452,12 +452,18 @@ impl ObservedDrive {
         }
     }
 
-    /// Mean commands of each segment.
-    pub fn commands(&self) -> Vec<Commands> {
+    /// What was commanded and done in each segment, in the mean.
+    pub fn driven(&self) -> Vec<Driven> {
         let of = |start: &usize| {
-            let steps = &self.transitions[*start..*start + SEGMENT_STEPS];
-            let mean = |command: fn(&Transition) -> f64| steps.iter().map(command).sum::<f64>() / SEGMENT_STEPS as f64;
-            [mean(|t| t.control.speed_m_s), mean(|t| t.control.second)]
+            let steps = *start..*start + SEGMENT_STEPS;
+            let commanded = |of: fn(&Transition) -> f64| self.transitions[steps.clone()].iter().map(of).sum::<f64>() / SEGMENT_STEPS as f64;
+            let done = |of: fn(&VehicleState<f64>) -> f64| self.states[steps.clone()].iter().map(of).sum::<f64>() / SEGMENT_STEPS as f64;
+            Driven {
+                commanded_m_s: commanded(|t| t.control.speed_m_s),
+                second: commanded(|t| t.control.second),
+                forward_m_s: done(|s| s.velocity_m_s[0]),
+                yaw_rate_rad_s: done(|s| s.angular_velocity_rad_s[2]),
+            }
         };
         self.starts.iter().map(of).collect()
     }

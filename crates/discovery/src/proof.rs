@@ -33,7 +33,7 @@ pub fn counted(maps: &DriveMaps) -> Counted {
 
 /// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the best soil
 /// alone and against the model before, which errors of one drive cannot show. Effects that `each` proved themselves beside the others may cancel in part: the model
-/// before is then no measure of what they explain, and must only not be surely better.
+/// before is then no measure of what they explain, and must only not be surely better. On another ground it is the model on that ground.
 pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Option<String> {
     const WHERE: &str = "on drives that were not fitted";
     let [before, soil, after] = &scores.scores;
@@ -53,7 +53,7 @@ pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Opti
             return Some(format!("no error falls surely{share} {WHERE}"));
         }
     }
-    rises_surely(before, after, scores.counted, &scores.resamples, &scores.shows)
+    rises_surely(scores.base(), after, scores.counted, &scores.resamples, &scores.shows)
         .map(|Rise { name, from, by, .. }| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
 }
 
@@ -90,6 +90,12 @@ pub(crate) fn falls_surely(
     let (_, interval) = paired_difference(&before, &after, resamples);
     let falls = |(interval, error): (Option<[f64; 2]>, Option<f64>)| error.is_some_and(|error| sure_fall(interval, error, gain));
     counting(interval.row(false).into_iter().zip(values(&before).row(false)), counted).any(falls)
+}
+
+/// Whether an error that counts falls by at least a share of itself, in the mean.
+pub(crate) fn falls(before: &ModelScore, after: &ModelScore, gain: f64, counted: Counted) -> bool {
+    let [before, after] = [before, after].map(|score| counting(values(&score.errors).row(false).into_iter(), counted).collect::<Vec<_>>());
+    before.into_iter().zip(after).any(|pair| matches!(pair, (Some(before), Some(after)) if before - after >= gain * before))
 }
 
 /// Whether a fall with this interval is sure, and at least this share of what falls.
@@ -232,6 +238,7 @@ pub(crate) mod tests {
                 resamples: Resamples::draw(6, 50, 1),
                 counted,
                 shows: vec![true; 6],
+                another_ground: false,
             };
             not_proven(&scores, Some(0.1), false)
         };
@@ -270,7 +277,11 @@ pub(crate) mod tests {
         let proof = |shows: Vec<bool>| {
             let (scores, counted) = ([score(before), score(before), after.clone()], counted(&[]));
             let resamples = Resamples::draw(6, 500, 1);
-            not_proven(&HeldOut { scores, controls: Vec::new(), before_onset: None, resamples, counted, shows }, Some(0.0), false)
+            not_proven(
+                &HeldOut { scores, controls: Vec::new(), before_onset: None, resamples, counted, shows, another_ground: false },
+                Some(0.0),
+                false,
+            )
         };
         let two = [[true; 2].to_vec(), vec![false; 4]].concat();
         assert!(proof(vec![true; 6]).is_some_and(|why| why.contains("no error falls surely")));
@@ -280,7 +291,8 @@ pub(crate) mod tests {
         after.errors.trajectory.fill(0);
         let (scores, counted) = ([score(before), score(before), after.clone()], counted(&[]));
         let resamples = Resamples::draw(6, 50, 1);
-        let alone = HeldOut { scores, controls: Vec::new(), before_onset: None, resamples, counted, shows: vec![true; 6] };
+        let alone =
+            HeldOut { scores, controls: Vec::new(), before_onset: None, resamples, counted, shows: vec![true; 6], another_ground: false };
         assert!(not_proven(&alone, Some(0.0), false).is_some_and(|why| why.contains("proves nothing: leave out two or more")));
     }
 }

@@ -14,7 +14,7 @@ use crate::drive_line::DriveLine;
 use crate::ground::Ground;
 use crate::held_out::{HeldOut, Learned, score_held_out, score_models, shows};
 use crate::judgement::{Judgement, Verdict, judge, together};
-use crate::proof::{Counted, Rise, falls_surely, not_proven, rises_surely, several_scored, several_show};
+use crate::proof::{Counted, Rise, falls, falls_surely, not_proven, rises_surely, several_scored, several_show};
 use crate::select::Yardstick;
 use crate::work::Work;
 
@@ -82,7 +82,7 @@ pub(crate) fn prove(
         let with_more = !held.told.is_empty() && !first.verdict.claims() && first.judgement.verdict.claims();
         return if with_more { of_rims_alone(case, yardstick, fewer, first, held) } else { Ok(first) };
     }
-    let mut worse = worsening(&first, held)?;
+    let mut worse = worsening(case, &first, held)?;
     if worse.is_none() {
         return Ok(first);
     }
@@ -102,7 +102,7 @@ pub(crate) fn prove(
             *case = again;
             return Ok(next);
         }
-        worse = worsening(&next, held)?;
+        worse = worsening(&again, &next, held)?;
     }
     // What was refuted first is among the claims of the first judgement, which says so for each of them.
     if let Some(own) = refuted.first() {
@@ -128,10 +128,10 @@ fn of_rims_alone(
 
 /// The claim by which an error of a judgement that is not proven surely rises, refused for that: the only one, or the last of several without which that error is surely
 /// smaller and surely rises no more. `None` where no error rises, or that of none of them.
-fn worsening(proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, EvaluationError> {
+fn worsening(case: &Case<'_>, proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, EvaluationError> {
     let (judgement, claimed) = (&proven.judgement, proven.judgement.claimed());
     let Some(scores) = proven.scores.as_ref().filter(|_| !proven.verdict.claims() && !claimed.is_empty()) else { return Ok(None) };
-    let [before, _, after] = &scores.scores;
+    let (before, [_, _, after]) = (scores.base(), &scores.scores);
     let rises =
         |from: &ModelScore, to: &ModelScore, counted: Counted, shows: &[bool]| rises_surely(from, to, counted, &scores.resamples, shows);
     let Some(risen) = rises(before, after, scores.counted, &scores.shows) else { return Ok(None) };
@@ -145,7 +145,7 @@ fn worsening(proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, 
     }
     let same = core::array::from_fn(|dimension| dimension == risen.dimension);
     for i in claimed.into_iter().rev() {
-        let (without, shows) = held.without(judgement.findings[i].hypothesis, &proven.learned, scores)?;
+        let (without, shows) = held.without(case, judgement.findings[i].hypothesis, (&proven.learned, &proven.taught), scores)?;
         if rises(&without, after, same, &shows).is_some() && rises(before, &without, same, &scores.shows).is_none() {
             return Ok(Some(refuted(i)));
         }
@@ -164,16 +164,23 @@ fn tried(
 ) -> Result<Proven, EvaluationError> {
     let HeldDrives { predictor, drives, maps, options, work, .. } = *held;
     loop {
-        let taught = learned_by_all(case, &judgement, held.told);
-        let learned = match drives.len() {
+        let mut taught = learned_by_all(case, &judgement, held.told);
+        let mut learned = match drives.len() {
             count if !held.fitted => vec![taught.clone(); count],
             0 => Vec::new(),
             _ => leave_each_out(fewer, case, &judgement, held.told),
         };
-        let scores =
-            if drives.is_empty() { None } else { Some(score_held_out(predictor, drives, maps, &learned, &options.scoring, work)?) };
+        let score = |learned: &[Learned]| score_held_out(predictor, drives, maps, learned, &options.scoring, work);
+        let mut scores = if drives.is_empty() { None } else { Some(score(&learned)?) };
+        if !yardstick.model_on_trial && !taught.effects.is_empty() && scores.as_ref().is_some_and(ground_may_be_another) {
+            held.seek_ground(case, &mut learned, &mut taught);
+            held.stand_on_ground(case, &mut learned, &mut taught);
+            scores = Some(HeldOut { another_ground: true, ..score(&learned)? });
+        }
         let needless = match &scores {
-            Some(scores) => last_needless(&judgement, held.told, scores, |hypothesis| held.without(hypothesis, &learned, scores))?,
+            Some(scores) => {
+                last_needless(&judgement, held.told, scores, |hypothesis| held.without(case, hypothesis, (&learned, &taught), scores))?
+            }
             None => None,
         };
         let Some(i) = needless else {
@@ -219,11 +226,49 @@ impl<'a> HeldDrives<'a> {
         before.fall_surely(&after, GAIN_ON_TRIAL, &scores.resamples)
     }
 
-    /// Score of the drives with what was learned but for a hypothesis, and in which of them that one shows.
-    fn without(&self, hypothesis: usize, learned: &[Learned], scores: &HeldOut) -> Result<(ModelScore, Vec<bool>), EvaluationError> {
+    /// Fits the best soil without an effect through the physics, as the one beside effects is: what is compared with it must not be better for that.
+    fn seek_ground(&self, case: &Case<'_>, learned: &mut [Learned], taught: &mut Learned) {
+        let ground = Ground::beside(case, &[]);
+        taught.soil = ground.correction();
+        for (d, own) in learned.iter_mut().enumerate() {
+            own.soil = if self.fitted { ground.correction_without(d) } else { ground.correction() };
+        }
+    }
+
+    /// Fits a soil to the drives of a case beside what they taught, on which each drive is predicted with what the others say of it. Where nothing was learned for a drive
+    /// that is the best soil alone.
+    fn stand_on_ground(&self, case: &Case<'_>, learned: &mut [Learned], taught: &mut Learned) {
+        let ground = Ground::beside(case, &taught.effects);
+        taught.beside = ground.correction();
+        for (d, own) in learned.iter_mut().enumerate() {
+            own.beside = match own.effects.is_empty() {
+                true => own.soil,
+                false if self.fitted => ground.correction_without(d),
+                false => ground.correction(),
+            };
+        }
+    }
+
+    /// Score of the drives with what was learned but for a hypothesis, and in which of them that one shows. On another ground the soil is fitted again, as it makes up
+    /// for what is missing.
+    fn without(
+        &self,
+        case: &Case<'_>,
+        hypothesis: usize,
+        (learned, taught): (&[Learned], &Learned),
+        scores: &HeldOut,
+    ) -> Result<(ModelScore, Vec<bool>), EvaluationError> {
         let apart: Vec<_> = learned.iter().map(|l| l.apart(hypothesis)).collect();
-        let predictors: Vec<Predictor> = apart.iter().map(|[others, _]| self.predictor.with_effects(others)).collect();
-        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().zip(learned).map(|(p, l)| (p, l.beside)).collect();
+        let but = |own: &Learned| {
+            let [effects, _] = own.apart(hypothesis);
+            Learned { effects, ..own.clone() }
+        };
+        let mut others: Vec<Learned> = learned.iter().map(but).collect();
+        if scores.another_ground {
+            self.stand_on_ground(case, &mut others, &mut but(taught));
+        }
+        let predictors: Vec<Predictor> = others.iter().map(|l| self.predictor.with_effects(&l.effects)).collect();
+        let models: Vec<(&Predictor, SoilCorrection)> = predictors.iter().zip(&others).map(|(p, l)| (p, l.beside)).collect();
         let score = self.score(&models, scores.scores[2].parameters, &scores.resamples)?;
         let windows = self.options.scoring.windows(self.drives)?;
         Ok((score, shows(&windows, self.drives.len(), |d| &apart[d][1])))
@@ -355,14 +400,27 @@ pub(crate) fn said_by_others(judgement: &Judgement, told: &DriveLine, model_on_t
     }
 }
 
-/// What held-out drives say of the soil that was assumed under a model on trial.
-pub(crate) fn said_of_ground(scores: &HeldOut) -> String {
+/// Whether another soil alone makes predictions surely better, by a tenth.
+fn ground_is_another(scores: &HeldOut) -> bool {
+    let ([before, soil, _], shows) = (&scores.scores, vec![true; scores.shows.len()]);
+    falls_surely(before, soil, GAIN_ON_TRIAL, scores.counted, &scores.resamples, &shows)
+}
+
+/// Whether another soil alone makes predictions better by a tenth in the mean, sure or not: what is compared with it stands on a soil of its own then.
+fn ground_may_be_another(scores: &HeldOut) -> bool {
     let [before, soil, _] = &scores.scores;
-    let shows = vec![true; scores.shows.len()];
-    if falls_surely(before, soil, GAIN_ON_TRIAL, scores.counted, &scores.resamples, &shows) {
-        return "; the ground is another than the bundle assumes, which alone makes predictions better".into();
+    falls(before, soil, GAIN_ON_TRIAL, scores.counted)
+}
+
+/// What held-out drives say of the soil that is assumed: by the bundle under a model on trial, else by the map.
+pub(crate) fn said_of_ground(scores: &HeldOut, model_on_trial: bool) -> String {
+    let [before, soil, _] = &scores.scores;
+    if ground_is_another(scores) {
+        let assumed = if model_on_trial { "the bundle assumes" } else { "the map shows" };
+        return format!("; the ground is another than {assumed}, which alone makes predictions better");
     }
-    if rises_surely(before, soil, scores.counted, &scores.resamples, &shows).is_some() {
+    let shows = vec![true; scores.shows.len()];
+    if model_on_trial && rises_surely(before, soil, scores.counted, &scores.resamples, &shows).is_some() {
         return "; no other soil alone makes predictions better".into();
     }
     String::new()
@@ -440,7 +498,15 @@ mod tests {
     /// Scores before, with the best soil, after.
     fn held_out(errors: [f64; 3]) -> HeldOut {
         let (resamples, counted) = (Resamples::draw(6, 50, 1), [true; POSE_DIM + 1]);
-        HeldOut { scores: errors.map(score), controls: Vec::new(), before_onset: None, resamples, counted, shows: vec![true; 6] }
+        HeldOut {
+            scores: errors.map(score),
+            controls: Vec::new(),
+            before_onset: None,
+            resamples,
+            counted,
+            shows: vec![true; 6],
+            another_ground: false,
+        }
     }
 
     /// The claim that is needless where the drives have this error without each of some hypotheses, and `after` with all.

@@ -73,7 +73,7 @@ pub struct Reference {
     /// Hypotheses beside the catalogue: written effects, as the text of an `effects.toml`; empty without any.
     #[serde(default, skip_serializing_if = "String::is_empty")]
     pub hypotheses: String,
-    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel and the bends of actuators.
+    /// Names of the columns: those of the catalogue, of the written hypotheses, then the level of each channel and the bends of actuators and sensors.
     pub columns: Vec<String>,
     /// Usual level of each compared channel.
     pub centre: Vec<f64>,

@@ -12,7 +12,7 @@ use nesam_trajectories::Trajectory;
 use safetensors::tensor::TensorView;
 use safetensors::{Dtype, SafeTensors};
 
-use crate::bend::Commands;
+use crate::bend::Driven;
 use crate::candidates::column_count;
 use crate::channels::{CHANNELS, Row};
 use crate::condense::{Signatures, signatures};
@@ -92,10 +92,10 @@ impl ReferenceDrives {
         }
         for (null, signatures) in reference.drives.iter().zip(&segmented.signatures) {
             let columns = || signatures.columns.iter().chain(&signatures.soil);
-            let shape = vec![columns().count(), signatures.commands.len()];
+            let shape = vec![columns().count(), signatures.driven.len()];
             written.add_half(&signatures_name(&null.trajectory), shape, &scale, columns().flatten());
-            let commands = signatures.commands.iter().flatten().flat_map(|v| (*v as f32).to_le_bytes()).collect();
-            written.arrays.push((commands_name(&null.trajectory), Dtype::F32, vec![signatures.commands.len(), 2], commands));
+            let driven = signatures.driven.iter().flat_map(|d| d.to_array()).flat_map(|v| (v as f32).to_le_bytes()).collect();
+            written.arrays.push((driven_name(&null.trajectory), Dtype::F32, vec![signatures.driven.len(), 4], driven));
         }
         Ok(written)
     }
@@ -130,15 +130,15 @@ impl ReferenceDrives {
         let mut segmented = Segmented { rows: Vec::new(), signatures: Vec::new() };
         for null in &reference.drives {
             let id = &null.trajectory;
-            let commands = floats(&file, &commands_name(id), &[None, Some(2)])?;
-            let segments = commands.len() / 2;
-            let commands: Vec<Commands> = commands.chunks_exact(2).map(|c| [c[0], c[1]]).collect();
+            let driven = floats(&file, &driven_name(id), &[None, Some(4)])?;
+            let segments = driven.len() / 4;
+            let driven: Vec<Driven> = driven.as_chunks().0.iter().map(|four| Driven::from_array(*four)).collect();
             let rows = scale.rows(&file, &rows_name(id, &lack), &[Some(segments)])?;
             let mut all = scale.rows(&file, &signatures_name(id), &[Some(columns + SOIL_DIM), Some(segments)])?.into_iter();
             let mut take = |count: usize| (0..count).map(|_| all.by_ref().take(segments).collect()).collect::<Vec<Vec<Row>>>();
             let (own, soil) = (take(columns), take(SOIL_DIM));
             segmented.rows.push(rows);
-            segmented.signatures.push(Signatures { columns: own, soil, commands, uncounted: Vec::new() });
+            segmented.signatures.push(Signatures { columns: own, soil, driven, uncounted: Vec::new() });
         }
         Ok(segmented)
     }
@@ -195,6 +195,6 @@ fn signatures_name(id: &str) -> String {
     format!("{id}/signatures")
 }
 
-fn commands_name(id: &str) -> String {
-    format!("{id}/commands")
+fn driven_name(id: &str) -> String {
+    format!("{id}/driven")
 }

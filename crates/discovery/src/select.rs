@@ -100,7 +100,7 @@ pub struct Selection {
     pub z: Vec<Option<f64>>,
     /// Evidence that the level of each compared channel is unusual.
     pub levels: Vec<f64>,
-    /// Evidence of each bend of an actuator; empty where the model is on trial.
+    /// Evidence of each bend; empty where the model is on trial.
     pub bends: Vec<f64>,
     /// Family-wise threshold.
     pub threshold: f64,
@@ -116,8 +116,10 @@ pub struct Selection {
     pub remaining: (f64, String),
     /// The same of the levels of channels alone.
     pub remaining_level: (f64, String),
-    /// The same of the bends of actuators alone.
+    /// The same of bends alone.
     pub remaining_bend: (f64, String),
+    /// The same of the bends of sensors alone, where an effect of a sensor is chosen: what it was taken for may be one of them.
+    pub remaining_bend_of_sensor: (f64, String),
 }
 
 impl Selection {
@@ -136,6 +138,7 @@ impl Selection {
             remaining: (0.0, String::new()),
             remaining_level: (0.0, String::new()),
             remaining_bend: (0.0, String::new()),
+            remaining_bend_of_sensor: (0.0, String::new()),
         }
     }
 
@@ -263,6 +266,7 @@ impl Yardstick {
             remaining: (largest, String::new()),
             remaining_level: (most(levels), String::new()),
             remaining_bend: (most(bends), String::new()),
+            remaining_bend_of_sensor: (0.0, String::new()),
         };
         if largest < selection.threshold {
             selection.remaining.1 = self.named(&selection, largest);
@@ -366,8 +370,14 @@ impl Yardstick {
         let chosen = &selection.chosen;
         let levels = self.levels_after_fit(left, before, chosen).map(|(channel, z)| (z, level_name(channel)));
         let level = levels.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
-        let bends = self.bends_after_fit(left, before, chosen).map(|(bend, z)| (z, bend_name(bend)));
-        let bend = bends.max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
+        let bends: Vec<(Bend, f64)> = self.bends_after_fit(left, before, chosen).collect();
+        let largest_bend = |of: &dyn Fn(&Bend) -> bool| {
+            let most = bends.iter().filter(|(bend, _)| of(bend)).max_by(|a, b| a.1.total_cmp(&b.1));
+            most.map(|(bend, z)| (*z, bend_name(*bend))).unwrap_or_default()
+        };
+        let bend = largest_bend(&|_| true);
+        let of_sensor = chosen.iter().any(|h| self.catalogue[*h].layer() == Layer::Sensor);
+        selection.remaining_bend_of_sensor = largest_bend(&|bend| of_sensor && bend.channel >= PATH_AT);
         let hypotheses = self.looked_at(chosen).map(|k| (self.after_fit(left, before, chosen, k).0, self.catalogue[k].label()));
         let most = hypotheses.chain([level.clone(), bend.clone()]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap_or_default();
         (selection.remaining, selection.remaining_level, selection.remaining_bend) = (most, level, bend);
@@ -378,7 +388,7 @@ impl Yardstick {
         if self.model_on_trial { Vec::new() } else { bend::asked_of(&self.channels) }
     }
 
-    /// Evidence that actuators bend as they are commanded in what the chosen ones leave.
+    /// Evidence that actuators and sensors bend in what the chosen ones leave.
     fn bends_after_fit(&self, left: &Group, before: &Group, chosen: &[usize]) -> impl Iterator<Item = (Bend, f64)> {
         let first = self.catalogue.len() + self.channels.len();
         let asked = self.bending().into_iter().enumerate().map(move |(i, bend)| (bend, first + i));

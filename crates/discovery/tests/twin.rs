@@ -137,6 +137,20 @@ fn property_a_steering_that_turns_further_to_the_left_is_no_offset() {
     assert!(bends && found.reason.contains("road_wheel_angle_rad"), "{}", found.reason);
 }
 
+/// Goal: a gyro that reads more in left turns is neither a bias nor a scale, nor both. Method: eight drives of 20 s whose yaw rates to the left are recorded a fifth larger.
+#[test]
+fn property_a_gyro_that_reads_more_to_the_left_is_no_bias() {
+    let soil = bundle().default_soil;
+    let mut drives: Vec<_> = (0..8).map(|i| drive(&format!("d{i}"), 880 + i, &[], &soil)).collect();
+    for state in drives.iter_mut().flat_map(|drive| &mut drive.states) {
+        state.angular_velocity_rad_s[2] *= if state.angular_velocity_rad_s[2] > 0.0 { 1.2 } else { 1.0 };
+    }
+    let found = diagnose_drives(&drives, &options());
+    let seen = found.bends_seen();
+    assert!(seen.iter().any(|(z, bend)| bend.name() == "bend of turn_minus_gyro_yaw_rad" && *z > 5.0), "{seen:?}");
+    assert_eq!(found.verdict, Verdict::Unexplained, "{}", found.reason);
+}
+
 /// What is said of drives with the plough at one and a half of its size.
 fn ploughed(options: &nesam_discovery::Options) -> Diagnosis {
     diagnose_twin(&[Effect::Written(plough().at(1.5))], 1100, options)
