@@ -131,7 +131,8 @@ fn of_rims_alone(
 fn worsening(case: &Case<'_>, proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, EvaluationError> {
     let (judgement, claimed) = (&proven.judgement, proven.judgement.claimed());
     let Some(scores) = proven.scores.as_ref().filter(|_| !proven.verdict.claims() && !claimed.is_empty()) else { return Ok(None) };
-    let (before, [_, _, after]) = (scores.base(), &scores.scores);
+    let acting = claimed.iter().any(|i| acts(&judgement.findings[*i]));
+    let (before, [_, _, after]) = (scores.base(acting), &scores.scores);
     let rises =
         |from: &ModelScore, to: &ModelScore, counted: Counted, shows: &[bool]| rises_surely(from, to, counted, &scores.resamples, shows);
     let Some(risen) = rises(before, after, scores.counted, &scores.shows) else { return Ok(None) };

@@ -10,7 +10,7 @@ use crate::stage::*;
 /// Level ground with stripes of two colours.
 fn striped(side: usize) -> WorldMap {
     let geometry = GridGeometry { origin_m: [-0.05 * side as f64; 2], resolution_m: 0.1, width: side, height: side };
-    let colour = |i: usize| if (i / 40) % 2 == 0 { [180, 160, 60] } else { [70, 110, 50] };
+    let colour = |i: usize| if (i / 40).is_multiple_of(2) { [180, 160, 60] } else { [70, 110, 50] };
     WorldMap::from_layers("large", 1, geometry, vec![0.0; side * side], Some((0..side * side).map(colour).collect())).unwrap()
 }
 
