@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nesam_evaluation::DriveMaps;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_physics::effects::written::WRITTEN_MAX;
-use nesam_physics::effects::{Effect, Written};
+use nesam_physics::effects::{Effect, Layer, Written};
 use nesam_physics::{SOIL_DIM, SoilCorrection};
 use nesam_terrain::WorldMap;
 use nesam_trajectories::Trajectory;
@@ -238,7 +238,9 @@ impl Asked<'_> {
         let claims = verdict.claims();
         let assumed = predictor.bundle().normalization.default_soil();
         let soils = soils(&case, assumed, if claims { taught.beside } else { case.bench.ground });
-        if let Some(scores) = scores.as_ref().filter(|_| soils.is_some() || judge_by.is_some()) {
+        // Where the map is wrong another soil imitates it.
+        let of_map = claims && judgement.claimed().into_iter().any(|i| judgement.findings[i].candidate.layer() == Layer::Map);
+        if let Some(scores) = scores.as_ref().filter(|_| soils.is_some() || judge_by.is_some() && !of_map) {
             reason += &said_of_ground(scores, judge_by.is_none());
         }
         let named = claims && judgement.verdict.claims();

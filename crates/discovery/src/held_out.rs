@@ -58,10 +58,9 @@ pub struct HeldOut {
 }
 
 impl HeldOut {
-    /// What effects must not make worse: the model before, or on another ground the model on that, if any of them `acts`; what a sensor is wrong by is no matter of the
-    /// ground.
-    pub(crate) fn base(&self, acts: bool) -> &ModelScore {
-        &self.scores[usize::from(self.another_ground && acts)]
+    /// What effects must not make worse: the model before, or on another ground the model on that.
+    pub(crate) fn base(&self) -> &ModelScore {
+        &self.scores[usize::from(self.another_ground)]
     }
 
     /// As nothing is claimed, nothing is added: after is before, and there is no onset.

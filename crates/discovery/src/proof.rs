@@ -33,7 +33,7 @@ pub fn counted(maps: &DriveMaps) -> Counted {
 
 /// Why effects are not proven on held-out drives; `None` where they are. With a least gain an error has to fall surely by that share of itself, against the best soil
 /// alone and against the model before, which errors of one drive cannot show. Effects that `each` proved themselves beside the others may cancel in part: the model
-/// before is then no measure of what they explain, and must only not be surely better. On another ground it is the model on that ground, where effects have to gain.
+/// before is then no measure of what they explain, and must only not be surely better. On another ground it is the model on that ground.
 pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Option<String> {
     const WHERE: &str = "on drives that were not fitted";
     let [before, soil, after] = &scores.scores;
@@ -53,7 +53,7 @@ pub fn not_proven(scores: &HeldOut, least_gain: Option<f64>, each: bool) -> Opti
             return Some(format!("no error falls surely{share} {WHERE}"));
         }
     }
-    rises_surely(scores.base(least_gain.is_some()), after, scores.counted, &scores.resamples, &scores.shows)
+    rises_surely(scores.base(), after, scores.counted, &scores.resamples, &scores.shows)
         .map(|Rise { name, from, by, .. }| format!("the error of {name} rises surely {WHERE}, from {from} by {by}"))
 }
 

@@ -131,8 +131,7 @@ fn of_rims_alone(
 fn worsening(case: &Case<'_>, proven: &Proven, held: &HeldDrives<'_>) -> Result<Option<Finding>, EvaluationError> {
     let (judgement, claimed) = (&proven.judgement, proven.judgement.claimed());
     let Some(scores) = proven.scores.as_ref().filter(|_| !proven.verdict.claims() && !claimed.is_empty()) else { return Ok(None) };
-    let acting = claimed.iter().any(|i| acts(&judgement.findings[*i]));
-    let (before, [_, _, after]) = (scores.base(acting), &scores.scores);
+    let (before, [_, _, after]) = (scores.base(), &scores.scores);
     let rises =
         |from: &ModelScore, to: &ModelScore, counted: Counted, shows: &[bool]| rises_surely(from, to, counted, &scores.resamples, shows);
     let Some(risen) = rises(before, after, scores.counted, &scores.shows) else { return Ok(None) };
@@ -173,7 +172,9 @@ fn tried(
         };
         let score = |learned: &[Learned]| score_held_out(predictor, drives, maps, learned, &options.scoring, work);
         let mut scores = if drives.is_empty() { None } else { Some(score(&learned)?) };
-        if !yardstick.model_on_trial && !taught.effects.is_empty() && scores.as_ref().is_some_and(ground_may_be_another) {
+        // What a sensor or the map is wrong by is no matter of the soil.
+        let acting = judgement.claimed().into_iter().any(|i| acts(&judgement.findings[i]));
+        if !yardstick.model_on_trial && acting && scores.as_ref().is_some_and(ground_may_be_another) {
             held.seek_ground(case, &mut learned, &mut taught);
             held.stand_on_ground(case, &mut learned, &mut taught);
             scores = Some(HeldOut { another_ground: true, ..score(&learned)? });
