@@ -112,7 +112,8 @@ def test_service_what_is_sent_while_the_session_is_not_open_is_kept(own, planner
     stream.close()
 
 
-def test_service_a_flush_notices_that_another_opened_the_session_again(own, planner):
+def opened_again_after_eight(own, planner):
+    """A stream that has sent eight, whose session another client has closed and opened since, and what it kept before that."""
     planner.open_session("truck")
     stream = own.durable_stream("truck")
     for measurement in DRIVE[:8]:
@@ -120,6 +121,11 @@ def test_service_a_flush_notices_that_another_opened_the_session_again(own, plan
     kept = [measurement.sequence for measurement in stream.pending]
     planner.close_session("truck")
     planner.open_session("truck")
+    return stream, kept
+
+
+def test_service_a_flush_notices_that_another_opened_the_session_again(own, planner):
+    stream, kept = opened_again_after_eight(own, planner)
     stream.flush()
     assert not stream.pending and planner.session("truck").accepted == len(kept)
     stream.close()
@@ -127,14 +133,8 @@ def test_service_a_flush_notices_that_another_opened_the_session_again(own, plan
 
 def test_service_what_the_new_session_cannot_take_is_told(own, planner):
     """Another client opens it between two measurements: only the answer to the next shows it."""
-    planner.open_session("truck")
-    stream = own.durable_stream("truck")
-    for measurement in DRIVE[:8]:
-        stream.send(measurement)
-    kept = [measurement.sequence for measurement in stream.pending]
+    stream, kept = opened_again_after_eight(own, planner)
     assert len(kept) > 3, "the test is quicker than the store"
-    planner.close_session("truck")
-    planner.open_session("truck")
     with pytest.raises(nesam.Refused, match=f"{len(kept) - 1} kept measurements .* number {kept[0]}: TOO_OLD") as refused:
         stream.send(DRIVE[8])
     told = refused.value

@@ -233,8 +233,13 @@ impl<'a> HeldDrives<'a> {
         let ground = Ground::beside(case, &[]);
         taught.soil = ground.correction();
         for (d, own) in learned.iter_mut().enumerate() {
-            own.soil = if self.fitted { ground.correction_without(d) } else { ground.correction() };
+            own.soil = self.told_of(&ground, d);
         }
+    }
+
+    /// The soil that a drive is predicted on: by the others, if it is one of the fitted.
+    fn told_of(&self, ground: &Ground, drive: usize) -> SoilCorrection {
+        if self.fitted { ground.correction_without(drive) } else { ground.correction() }
     }
 
     /// Fits a soil to the drives of a case beside what they taught, on which each drive is predicted with what the others say of it. Where nothing was learned for a drive
@@ -243,11 +248,7 @@ impl<'a> HeldDrives<'a> {
         let ground = Ground::beside(case, &taught.effects);
         taught.beside = ground.correction();
         for (d, own) in learned.iter_mut().enumerate() {
-            own.beside = match own.effects.is_empty() {
-                true => own.soil,
-                false if self.fitted => ground.correction_without(d),
-                false => ground.correction(),
-            };
+            own.beside = if own.effects.is_empty() { own.soil } else { self.told_of(&ground, d) };
         }
     }
 

@@ -30,6 +30,6 @@ pub use frame::FrameConvention;
 pub use log::Log;
 pub use mapping::{COLUMNS, Mapping, Quantity};
 pub use part::{Drive, Notes, Options, drives};
-pub use sense::{Doubt, card_doubts, doubts};
+pub use sense::{Doubt, card_doubts, doubts, standing_height_m};
 pub use table::read_csv;
 pub use write::write_set;

@@ -6,7 +6,7 @@ use clap::Args;
 use nesam_model::ModelBundle;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_physics::{DT_S, SOIL_NAMES, SecondCommand, Vehicle};
-use nesam_trajectories::{DataRoot, SetQuery, Split, SplitFilter};
+use nesam_trajectories::{DataRoot, SetQuery, Split};
 use serde_json::{Map, Value, json};
 
 use crate::bundle_path::{MANIFEST, bundle_dir};
@@ -85,8 +85,7 @@ fn data_root(path: &Path, card: Option<&Path>) -> Result<Value, Failure> {
 }
 
 fn set_summary(root: &DataRoot, set: &str) -> Result<Value, Failure> {
-    let all = SetQuery { set: set.into(), split: SplitFilter::All, trajectories: None, dt_s: DT_S, ..SetQuery::all(set) };
-    let drives = root.load_set(&all).or_input()?;
+    let drives = root.load_set(&SetQuery::all(set)).or_input()?;
     let in_split = |split| drives.iter().filter(|d| d.split == split).count();
     let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();
     worlds.sort_unstable();

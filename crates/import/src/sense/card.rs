@@ -4,6 +4,11 @@ use nesam_physics::{Vehicle, WHEELS};
 
 use super::{Doubt, doubt};
 
+/// Height of the centre of gravity of a vehicle that stands on level ground, m: its springs at rest.
+pub fn standing_height_m(vehicle: &Vehicle) -> f64 {
+    vehicle.wheel_radius_m - vehicle.wheel_centre_m.iter().map(|centre| centre[2]).sum::<f64>() / WHEELS as f64
+}
+
 /// What does not fit together in a card.
 pub fn card_doubts(vehicle: &Vehicle) -> Vec<Doubt> {
     let mut found = Vec::new();
@@ -27,8 +32,7 @@ pub fn card_doubts(vehicle: &Vehicle) -> Vec<Doubt> {
     found.extend(about("the width of the wheels", vehicle.wheel_width_m, [0.02, 1.2], "m"));
     found.extend(about("the wheelbase", vehicle.wheelbase_m, [0.15, 8.0], "m"));
     found.extend(about("gravity", vehicle.gravity_m_s2, [9.7, 9.9], "m/s²"));
-    let height_m = vehicle.wheel_radius_m - vehicle.wheel_centre_m.iter().map(|centre| centre[2]).sum::<f64>() / WHEELS as f64;
-    found.extend(about("the height of the centre of gravity over the ground", height_m, [0.02, 3.0], "m"));
+    found.extend(about("the height of the centre of gravity over the ground", standing_height_m(vehicle), [0.02, 3.0], "m"));
     let mut moments: [f64; 3] = core::array::from_fn(|axis| vehicle.inertia_kg_m2[axis][axis]);
     moments.sort_by(f64::total_cmp);
     if moments[2] > 1.001 * (moments[0] + moments[1]) {

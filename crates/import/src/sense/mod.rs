@@ -21,7 +21,7 @@ use std::ops::Range;
 use nesam_physics::{Vehicle, WHEELS, wrap_angle};
 use nesam_trajectories::Trajectory;
 
-pub use card::card_doubts;
+pub use card::{card_doubts, standing_height_m};
 
 /// Samples of a stretch: a second at 10 Hz (chosen: longer than poses freeze in sound logs, shorter than most motions last).
 const STRETCH: usize = 10;
