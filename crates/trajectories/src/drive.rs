@@ -114,12 +114,12 @@ fn attitudes(channels: &Channels, rows: &[usize]) -> Result<(Vec<[f64; 3]>, [boo
     Ok((attitudes, measured))
 }
 
-/// A channel that may be missing: no column, or one that is null all along the drive.
+/// A channel that may be missing: no column, or one that is null or NaN all along the drive.
 fn recorded(column: Option<&Numbers>, rows: &[usize]) -> Result<Option<Vec<f64>>, TrajectoryError> {
     column.filter(|column| !column.is_absent(rows)).map(|column| column.finite(rows)).transpose()
 }
 
-/// Channels that may be missing: no columns, or columns that are null all along the drive.
+/// Channels that may be missing: no columns, or columns that are null or NaN all along the drive.
 fn optional<const N: usize>(columns: &Option<[Numbers; N]>, rows: &[usize]) -> Result<Option<Vec<[f64; N]>>, TrajectoryError> {
     match columns {
         Some(columns) if !columns.iter().any(|c| c.is_absent(rows)) => together(columns, rows).map(Some),

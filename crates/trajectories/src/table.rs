@@ -29,6 +29,7 @@ pub(crate) struct Table {
 pub(crate) struct Numbers {
     path: PathBuf,
     name: String,
+    /// NaN where null.
     values: Vec<f64>,
     /// True where null; empty when nothing is.
     null: Vec<bool>,
@@ -214,9 +215,9 @@ impl Numbers {
         if value.is_finite() { Ok(value) } else { wrong(format!("{value}, expected a finite number")) }
     }
 
-    /// Whether all of some rows are null: the channel was not recorded there.
+    /// Whether all of some rows are null or NaN, as a column of floats writes a null: the channel was not recorded there.
     pub(crate) fn is_absent(&self, rows: &[usize]) -> bool {
-        rows.iter().all(|row| self.null.get(*row) == Some(&true))
+        rows.iter().all(|row| self.values[*row].is_nan())
     }
 }
 

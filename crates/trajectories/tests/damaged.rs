@@ -100,6 +100,34 @@ fn regress_heights_roll_and_pitch_may_be_missing() {
 }
 
 #[test]
+fn regress_channels_that_are_nan_throughout_are_not_measured() {
+    // Goal: a table of floats writes what it has not as NaN, which says what a null says. Method: the second drive of the circle with NaN, and with NaN and nulls in
+    // turns, in one channel of each kind, beside the same with nulls; a channel that is NaN in some rows is still an error. A column of floats has no nulls at all.
+    let emptied = |name: &str, empty: fn(usize) -> Option<f64>| {
+        let mut columns = two_drives();
+        columns.extend(["vbx", "vby"].map(|name| (name.to_string(), Column::Double(vec![Some(0.5); 80]))));
+        (40..80).for_each(|row| set(&mut columns, name, row, empty(row)));
+        load(&root_of(&columns)).unwrap()
+    };
+    for name in ["z", "pitch", "wz", "om_l", "vby"] {
+        let null = emptied(name, |_| None);
+        assert_ne!(null[0].measured, null[1].measured, "{name}");
+        for empty in [(|_| Some(f64::NAN)) as fn(usize) -> _, |row| (row % 2 == 0).then_some(f64::NAN)] {
+            assert_eq!(emptied(name, empty), null, "{name}");
+        }
+    }
+    let mut floats = two_drives();
+    *column(&mut floats, "roll") = Column::Float(vec![f32::NAN; 80]);
+    assert!(load(&root_of(&floats)).unwrap().iter().all(|drive| drive.measured.attitude == [false, true, true]));
+    for row in [40, 57, 79] {
+        let mut columns = two_drives();
+        (40..80).filter(|other| *other != row).for_each(|row| set(&mut columns, "z", row, Some(f64::NAN)));
+        let error = refusal(&columns);
+        assert!(error.contains("column `z`") && error.contains("NaN, expected a finite number"), "{error}");
+    }
+}
+
+#[test]
 fn regress_drives_without_a_map_of_their_own_are_loaded_without_one() {
     // Goal: a map that is named and not there is done without, and said. Method: one world with an elevation image, one without a folder, one with a folder
     // alone, and one whose world.json names another image; then a drive that does not know its height over a map that is there.
