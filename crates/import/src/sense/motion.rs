@@ -50,13 +50,14 @@ pub(super) fn velocity(drives: &[Trajectory], positions_hold: bool) -> Vec<Doubt
     [wrong, sideways].into_iter().flatten().collect()
 }
 
-/// Measured rates against attitudes.
+/// Measured rates against measured attitudes.
 pub(super) fn rates(drives: &[Trajectory]) -> Vec<Doubt> {
     let checks = [("roll", SHAKEN, TILT_RATE_RAD_S), ("pitch", SHAKEN, TILT_RATE_RAD_S), ("yaw", SAME, YAW_RATE_RAD_S)];
     let judge = |(axis, (name, pass, floor)): (usize, (&str, [f64; 2], f64))| {
         let pairs = Relation::of(drives, floor, |drive, k, _| {
             let told = drive.states[k].angular_velocity_rad_s[axis];
-            drive.measured.angular_velocity[axis].then(|| [angle_rate_rad_s(drive, k, axis), told])
+            let both = drive.measured.angular_velocity[axis] && drive.measured.attitude[axis];
+            both.then(|| [angle_rate_rad_s(drive, k, axis), told])
         });
         pairs.judge(&format!("{name} rate"), &format!("the change of {name}"), pass, "the opposite sign", ANGLES)
     };

@@ -256,6 +256,30 @@ fn property_few_short_drives_with_freezing_poses_raise_no_doubt() {
     }
 }
 
+/// Goal: a gyro is held against angles that are measured, not against the zeros of those that are not. Method: a base that rolls and pitches at up to 0.2 rad/s, with
+/// the angles that follow from it, then with zeros for them: doubted where these are said to be measured, and sound where they are not.
+#[test]
+fn regress_a_gyro_is_not_held_against_angles_that_nobody_measured() {
+    let shaken = |angles: f64, measured: bool| {
+        told(|drive| {
+            for (k, s) in drive.states.iter_mut().enumerate() {
+                let phase = 0.13 * k as f64;
+                for axis in [0, 1] {
+                    (s.attitude_rad[axis], s.angular_velocity_rad_s[axis]) = (angles * 0.2 / 1.3 * phase.sin(), 0.2 * phase.cos());
+                }
+                (s.position_m[2], s.velocity_m_s[2]) = (0.0, 0.0);
+            }
+            drive.measured.angular_velocity = [true; 3];
+            drive.measured.height = measured;
+            drive.measured.attitude = [measured, measured, true];
+        })
+    };
+    assert_eq!(shaken(1.0, true), "");
+    let zeros = shaken(0.0, true);
+    assert!(zeros.contains("roll rate against the change of roll") && zeros.contains("pitch rate"), "{zeros}");
+    assert_eq!(shaken(0.0, false), "");
+}
+
 #[test]
 fn analytic_every_mistake_is_named() {
     let mistakes: [(&str, String); 11] = [
