@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use nesam_evaluation::{ErrorSummary, ErrorTree, Resamples, WindowErrors, median, paired_ratio, summarise as errors_of};
+use nesam_evaluation::{ErrorSummary, ErrorTree, Resamples, WindowErrors, median, paired_ratio, path_length_m, summarise as errors_of};
 use nesam_trajectories::Trajectory;
 use serde::Serialize;
 
@@ -92,8 +92,10 @@ pub fn summarise(
         let measured = drive.measured.pose();
         for asked in &passages[at].asked {
             let Some(other) = clean[at].asked.iter().find(|other| other.sample == asked.sample) else { continue };
-            of_degraded.push(at, &asked.start, &asked.path, &asked.truth, measured);
-            of_clean.push(at, &other.start, &other.path, &other.truth, measured);
+            for (errors, asked) in [(&mut of_degraded, asked), (&mut of_clean, other)] {
+                let path_m = path_length_m(&asked.start, &asked.truth);
+                errors.push(at, &asked.start, &asked.path, &asked.truth, path_m, measured);
+            }
         }
     }
     let (degraded, clean) = (errors_of(&of_degraded, resamples), errors_of(&of_clean, resamples));

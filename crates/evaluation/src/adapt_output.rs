@@ -8,6 +8,7 @@ use nesam_trajectories::Trajectory;
 use serde::Serialize;
 
 use crate::adapt::{Consistency, DriveAdaptation};
+use crate::errors::PATH_FLOOR_M;
 use crate::evaluate::{DriveMaps, ModelScore};
 use crate::known_soil::KnownSoil;
 use crate::output::Provenance;
@@ -99,6 +100,9 @@ struct Document<'a> {
     windows: usize,
     trajectories: usize,
     path_m_median: f64,
+    /// As in `nesam.evaluate/1`.
+    path_floor_m: f64,
+    windows_below_path_floor: usize,
     truth: &'static str,
     failed: usize,
     difference: Difference,
@@ -242,6 +246,8 @@ impl Adaptation<'_> {
             windows: self.fixed.summary.windows,
             trajectories: self.drives.len(),
             path_m_median: self.path_m_median,
+            path_floor_m: PATH_FLOOR_M,
+            windows_below_path_floor: self.fixed.errors.below_path_floor(),
             truth: self.truth.as_str(),
             failed: consistency.failed,
             difference: Difference { value, ci95 },

@@ -14,7 +14,7 @@ pub struct PosePath {
 /// Error of one step.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct StepError {
-    /// Absolute error per dimension, m and degrees.
+    /// Absolute error per dimension, m and degrees; NaN where the drive does not measure it or the model does not predict it.
     pub absolute: [f64; POSE_DIM],
     /// Horizontal distance between predicted and true position, m.
     pub position_m: f64,
@@ -25,7 +25,7 @@ pub struct StepError {
 pub struct WindowErrors {
     /// Steps K of each window.
     pub horizon: usize,
-    /// Dimensions that the model predicts and every drive measures.
+    /// Dimensions that the model predicts and a drive measures.
     pub scored: [bool; POSE_DIM],
     /// Drive of each window (index, also the cluster of the bootstrap).
     pub trajectory: Vec<usize>,
@@ -40,7 +40,7 @@ pub struct WindowErrors {
 impl WindowErrors {
     /// No windows yet.
     pub fn empty(horizon: usize) -> Self {
-        Self { horizon, scored: [true; POSE_DIM], trajectory: Vec::new(), path_m: Vec::new(), steps: Vec::new(), broken: Vec::new() }
+        Self { horizon, scored: [false; POSE_DIM], trajectory: Vec::new(), path_m: Vec::new(), steps: Vec::new(), broken: Vec::new() }
     }
 
     /// Number of windows in which the model gave a number that is not finite.
@@ -53,18 +53,25 @@ impl WindowErrors {
         self.trajectory.len()
     }
 
+    /// Number of windows whose path is too short for a relative error.
+    pub fn below_path_floor(&self) -> usize {
+        self.path_m.iter().filter(|path_m| !above_path_floor(**path_m)).count()
+    }
+
     /// Steps of window `w`.
     pub fn window(&self, w: usize) -> &[StepError] {
         &self.steps[w * self.horizon..(w + 1) * self.horizon]
     }
 
-    /// Adds a window: `start` is the measured pose the prediction began from, `truth` the poses after steps 1…K.
+    /// Adds a window: `start` is the measured pose the prediction began from, `truth` the poses after steps 1…K, `path_m` how long the way to the last of them is,
+    /// and `measured` which dimensions the drive measures.
     ///
     /// A step that is not finite is scored as if the vehicle had stayed at the last finite pose, and the window is counted by
     /// [`WindowErrors::not_finite`]: leaving it out would flatter the model, and a NaN would hide every other window.
-    pub fn push(&mut self, trajectory: usize, start: &Pose, path: &PosePath, truth: &[Pose], measured: [bool; POSE_DIM]) {
+    pub fn push(&mut self, trajectory: usize, start: &Pose, path: &PosePath, truth: &[Pose], path_m: f64, measured: [bool; POSE_DIM]) {
         assert_eq!(path.poses.len(), self.horizon, "a prediction has one pose per step; this is a bug");
         assert_eq!(truth.len(), self.horizon, "a window has one true pose per step; this is a bug");
+        let scored: [bool; POSE_DIM] = core::array::from_fn(|d| path.predicts[d] && measured[d]);
         let (mut last, mut broken) = (*start, false);
         for (pose, true_pose) in path.poses.iter().zip(truth) {
             let usable = (0..POSE_DIM).all(|d| !path.predicts[d] || pose[d].is_finite());
@@ -72,14 +79,16 @@ impl WindowErrors {
             if usable {
                 last = *pose;
             }
-            self.steps.push(StepError { absolute: absolute_error(&last, true_pose), position_m: horizontal_distance(&last, true_pose) });
+            let errors = absolute_error(&last, true_pose);
+            let absolute = core::array::from_fn(|d| if scored[d] { errors[d] } else { f64::NAN });
+            self.steps.push(StepError { absolute, position_m: horizontal_distance(&last, true_pose) });
         }
         self.broken.push(broken);
-        for (scored, (predicted, measured)) in self.scored.iter_mut().zip(path.predicts.into_iter().zip(measured)) {
-            *scored &= predicted && measured;
+        for (any, scored) in self.scored.iter_mut().zip(scored) {
+            *any |= scored;
         }
         self.trajectory.push(trajectory);
-        self.path_m.push(path_length_m(start, truth));
+        self.path_m.push(path_m);
     }
 
     /// The windows for which `keep` is true, with the same drive indices.
@@ -99,6 +108,14 @@ impl WindowErrors {
         let pick = |s: &StepError| if d < POSE_DIM { s.absolute[d] } else { s.position_m };
         (0..self.windows()).map(|w| pick(&self.window(w)[k])).collect()
     }
+}
+
+/// Path below which the relative error of a window says nothing, m (chosen: several times the position noise).
+pub const PATH_FLOOR_M: f64 = 0.2;
+
+/// Whether the relative error of a window of this path counts.
+pub(crate) fn above_path_floor(path_m: f64) -> bool {
+    path_m > PATH_FLOOR_M
 }
 
 /// Horizontal length of the polyline from `start` through `truth`, m. Position noise lengthens it by well under one percent at driving speed.
@@ -124,19 +141,21 @@ mod tests {
     fn analytic_errors_and_path_of_a_straight_drive() {
         let mut e = WindowErrors::empty(2);
         let path = PosePath { poses: vec![along_x(1.5), along_x(2.5)], predicts: [true; 6] };
-        e.push(3, &along_x(0.0), &path, &[along_x(1.0), along_x(3.0)], [true, true, true, true, true, false]);
+        let truth = [along_x(1.0), along_x(3.0)];
+        e.push(3, &along_x(0.0), &path, &truth, path_length_m(&along_x(0.0), &truth), [true, true, true, true, true, false]);
         assert_eq!(e.path_m, [3.0]);
         assert_eq!(e.trajectory, [3]);
         assert_eq!(e.column(0, 0), [0.5]);
         assert_eq!(e.column(1, 6), [0.5]);
         assert_eq!(e.scored, [true, true, true, true, true, false]);
+        assert!(e.column(1, 5)[0].is_nan());
     }
 
     #[test]
     fn analytic_a_step_that_is_not_finite_counts_as_standing_still() {
         let mut e = WindowErrors::empty(2);
         let path = PosePath { poses: vec![along_x(1.0), along_x(f64::NAN)], predicts: [true; 6] };
-        e.push(0, &along_x(0.0), &path, &[along_x(1.0), along_x(2.0)], [true; 6]);
+        e.push(0, &along_x(0.0), &path, &[along_x(1.0), along_x(2.0)], 2.0, [true; 6]);
         assert_eq!(e.column(1, 0), [1.0]);
         assert_eq!(e.not_finite(), 1);
     }
@@ -146,7 +165,7 @@ mod tests {
     fn regress_windows_that_are_kept_keep_whether_they_are_finite() {
         let mut e = WindowErrors::empty(1);
         for (drive, x) in [1.0, f64::NAN, 1.0].into_iter().enumerate() {
-            e.push(drive, &along_x(0.0), &PosePath { poses: vec![along_x(x)], predicts: [true; 6] }, &[along_x(1.0)], [true; 6]);
+            e.push(drive, &along_x(0.0), &PosePath { poses: vec![along_x(x)], predicts: [true; 6] }, &[along_x(1.0)], 1.0, [true; 6]);
         }
         for (left_out, not_finite) in [(0, 1), (1, 0), (2, 1)] {
             let kept = e.filter(|w| w != left_out);

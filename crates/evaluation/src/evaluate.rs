@@ -9,10 +9,10 @@ use rayon::prelude::*;
 use crate::bootstrap::{Resamples, median};
 use crate::dimension::POSE_DIM;
 use crate::error::EvaluationError;
-use crate::errors::{PosePath, WindowErrors, path_length_m};
+use crate::errors::{PosePath, WindowErrors};
 use crate::models::ModelName;
 use crate::predictors::WindowPredictor;
-use crate::score::{ErrorSummary, summarise};
+use crate::score::{ErrorSummary, mean_interval_told, mean_told, summarise};
 use crate::windows::{Truth, Window};
 
 /// What one model predicted for every window, in window order.
@@ -96,7 +96,8 @@ pub fn score(model: &ModelPaths, windows: &[Window<'_>], truth: Truth, resamples
     let horizon = windows.first().map_or(0, |w| w.horizon);
     let mut errors = WindowErrors::empty(horizon);
     for (window, path) in windows.iter().zip(&model.paths) {
-        errors.push(window.drive, &window.start_pose(), path, &window.truth(truth), window.trajectory.measured.pose());
+        let measured = window.trajectory.measured.pose();
+        errors.push(window.drive, &window.start_pose(), path, &window.truth(truth), window.path_m(truth), measured);
     }
     let curves = std::array::from_fn(|d| {
         let scored = if d < POSE_DIM { errors.scored[d] } else { errors.scored[0] && errors.scored[1] };
@@ -107,13 +108,13 @@ pub fn score(model: &ModelPaths, windows: &[Window<'_>], truth: Truth, resamples
 
 fn curve(errors: &WindowErrors, dimension: usize, resamples: &Resamples) -> HorizonCurve {
     let columns: Vec<Vec<f64>> = (0..errors.horizon).map(|k| errors.column(k, dimension)).collect();
-    let mean = columns.iter().map(|c| c.iter().sum::<f64>() / c.len() as f64).collect();
-    let ci95 = columns.par_iter().filter_map(|c| resamples.mean_interval(c, &errors.trajectory)).collect();
+    let mean = columns.iter().map(|c| mean_told(c)).collect();
+    let ci95 = columns.par_iter().filter_map(|c| mean_interval_told(c, &errors.trajectory, resamples)).collect();
     HorizonCurve { mean, ci95 }
 }
 
 /// Median over windows of the true path length, m.
 pub fn path_median_m(windows: &[Window<'_>], truth: Truth) -> f64 {
-    let lengths: Vec<f64> = windows.iter().map(|w| path_length_m(&w.start_pose(), &w.truth(truth))).collect();
+    let lengths: Vec<f64> = windows.iter().map(|w| w.path_m(truth)).collect();
     median(&lengths)
 }

@@ -7,6 +7,7 @@ use serde::Serialize;
 use serde::ser::{SerializeMap, Serializer};
 
 use crate::dimension::DIMENSION_KEYS;
+use crate::errors::PATH_FLOOR_M;
 use crate::evaluate::{HorizonCurve, ModelScore};
 use crate::models::ModelName;
 use crate::score::{ErrorTree, paired_difference, values};
@@ -76,6 +77,9 @@ struct Document<'a> {
     path_m_median: f64,
     /// Null where a model was not scored.
     models: ByName<Option<ModelJson<'a>>>,
+    /// What a window must have driven to count for `final_over_path_median`, and how many windows did not.
+    path_floor_m: f64,
+    windows_below_path_floor: usize,
     trajectories: usize,
     history_steps: usize,
     truth: &'static str,
@@ -147,6 +151,8 @@ impl Evaluation<'_> {
             windows: self.windows,
             path_m_median: self.path_m_median,
             models: ByName(models),
+            path_floor_m: PATH_FLOOR_M,
+            windows_below_path_floor: self.windows_below_path_floor(),
             trajectories: self.trajectories,
             history_steps: self.history_steps,
             truth: self.truth.as_str(),
@@ -157,6 +163,11 @@ impl Evaluation<'_> {
             provenance: self.provenance,
         };
         serde_json::to_string_pretty(&document).expect("finite numbers and text always serialise; this is a bug") + "\n"
+    }
+
+    /// Number of windows whose path is too short for a relative error.
+    pub(crate) fn windows_below_path_floor(&self) -> usize {
+        self.models.first().map_or(0, |model| model.errors.below_path_floor())
     }
 
     fn comparisons(&self) -> Vec<Comparison> {

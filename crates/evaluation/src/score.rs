@@ -4,7 +4,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::bootstrap::{Resamples, median};
 use crate::dimension::POSE_DIM;
-use crate::errors::WindowErrors;
+use crate::errors::{WindowErrors, above_path_floor};
 
 /// One value per scored dimension; `None` (JSON `null`) where the model predicts none or the set measures none.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -43,12 +43,10 @@ pub struct PositionError<T> {
     /// At step K, m.
     #[serde(rename = "final")]
     pub final_: Option<T>,
-    /// Median over windows of (error at step K) / (path driven in the window), -. Windows shorter than [`PATH_FLOOR_M`] are left out.
+    /// Median over windows of (error at step K) / (path driven in the window), -. Windows of no more than [`PATH_FLOOR_M`](crate::PATH_FLOOR_M) of path are left out:
+    /// [`WindowErrors::below_path_floor`].
     pub final_over_path_median: Option<T>,
 }
-
-/// Path below which the relative error of a window says nothing, m (chosen: several times the position noise).
-pub const PATH_FLOOR_M: f64 = 0.2;
 
 /// The tree of numbers that `ERR` carries once as values and once as intervals.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
@@ -85,7 +83,7 @@ pub struct ErrorSummary {
 const STATISTICS: usize = 2 * POSE_DIM + 3;
 const RATIO: usize = STATISTICS - 1;
 
-/// One row per statistic, one column per window.
+/// One row per statistic, one column per window; NaN where a window does not tell it.
 struct Columns {
     values: Vec<Vec<f64>>,
     present: [bool; STATISTICS],
@@ -104,7 +102,7 @@ fn columns(errors: &WindowErrors) -> Columns {
         values[2 * POSE_DIM].push(steps.iter().map(|s| s.position_m).sum::<f64>() / k);
         values[2 * POSE_DIM + 1].push(last);
         let path = errors.path_m[w];
-        values[RATIO].push(if path > PATH_FLOOR_M { last / path } else { f64::NAN });
+        values[RATIO].push(if above_path_floor(path) { last / path } else { f64::NAN });
     }
     let d = errors.scored;
     let horizontal = d[0] && d[1];
@@ -121,8 +119,17 @@ fn tree<T: Copy>(v: [Option<T>; STATISTICS]) -> ErrorTree<T> {
     }
 }
 
-fn mean(values: &[f64]) -> f64 {
-    values.iter().sum::<f64>() / values.len() as f64
+/// Mean over the windows that tell it; NaN where none does.
+pub(crate) fn mean_told(values: &[f64]) -> f64 {
+    let (sum, count) = values.iter().filter(|v| !v.is_nan()).fold((0.0, 0), |(sum, count), v| (sum + v, count + 1));
+    sum / f64::from(count)
+}
+
+/// 95 % interval of the same, by the drives of the windows.
+pub(crate) fn mean_interval_told(values: &[f64], drives: &[usize], resamples: &Resamples) -> Option<[f64; 2]> {
+    let told = values.iter().zip(drives).filter(|(v, _)| !v.is_nan());
+    let (values, drives): (Vec<f64>, Vec<usize>) = told.map(|(v, drive)| (*v, *drive)).unzip();
+    resamples.mean_interval(&values, &drives)
 }
 
 fn finite(v: f64) -> Option<f64> {
@@ -133,7 +140,7 @@ fn finite(v: f64) -> Option<f64> {
 pub fn values(errors: &WindowErrors) -> ErrorTree<f64> {
     let c = columns(errors);
     tree(std::array::from_fn(|s| {
-        let value = if s == RATIO { median(&c.values[s]) } else { mean(&c.values[s]) };
+        let value = if s == RATIO { median(&c.values[s]) } else { mean_told(&c.values[s]) };
         if c.present[s] { finite(value) } else { None }
     }))
 }
@@ -144,7 +151,7 @@ pub fn summarise(errors: &WindowErrors, resamples: &Resamples) -> ErrorSummary {
     let ci95 = tree(std::array::from_fn(|s| {
         let rows = &c.values[s];
         let interval = |r: &[f64]| {
-            if s == RATIO { resamples.median_interval(r, &errors.trajectory) } else { resamples.mean_interval(r, &errors.trajectory) }
+            if s == RATIO { resamples.median_interval(r, &errors.trajectory) } else { mean_interval_told(r, &errors.trajectory, resamples) }
         };
         if c.present[s] { interval(rows) } else { None }
     }));
@@ -156,8 +163,8 @@ pub fn paired_difference(a: &WindowErrors, b: &WindowErrors, resamples: &Resampl
     let (ca, cb) = (columns(a), columns(b));
     let rows: Vec<Vec<f64>> = (0..STATISTICS).map(|s| ca.values[s].iter().zip(&cb.values[s]).map(|(x, y)| x - y).collect()).collect();
     let present = |s: usize| s != RATIO && ca.present[s] && cb.present[s];
-    let difference = tree(std::array::from_fn(|s| if present(s) { finite(mean(&rows[s])) } else { None }));
-    let interval = tree(std::array::from_fn(|s| if present(s) { resamples.mean_interval(&rows[s], &a.trajectory) } else { None }));
+    let difference = tree(std::array::from_fn(|s| if present(s) { finite(mean_told(&rows[s])) } else { None }));
+    let interval = tree(std::array::from_fn(|s| if present(s) { mean_interval_told(&rows[s], &a.trajectory, resamples) } else { None }));
     (difference, interval)
 }
 
@@ -165,13 +172,19 @@ pub fn paired_difference(a: &WindowErrors, b: &WindowErrors, resamples: &Resampl
 pub fn paired_ratio(a: &WindowErrors, b: &WindowErrors, resamples: &Resamples) -> ErrorTree<[f64; 2]> {
     let (ca, cb) = (columns(a), columns(b));
     let present = |s: usize| s != RATIO && ca.present[s] && cb.present[s];
-    tree(std::array::from_fn(|s| if present(s) { resamples.ratio_interval(&ca.values[s], &cb.values[s], &a.trajectory) } else { None }))
+    let interval = |s: usize| {
+        let rows = ca.values[s].iter().zip(&cb.values[s]).zip(&a.trajectory).filter(|((x, y), _)| !(x.is_nan() || y.is_nan()));
+        let (rows, drives): (Vec<(f64, f64)>, Vec<usize>) = rows.map(|((x, y), drive)| ((*x, *y), *drive)).unzip();
+        let (over, under): (Vec<f64>, Vec<f64>) = rows.into_iter().unzip();
+        resamples.ratio_interval(&over, &under, &drives)
+    };
+    tree(std::array::from_fn(|s| if present(s) { interval(s) } else { None }))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::errors::StepError;
+    use crate::errors::{PosePath, StepError};
 
     fn two_windows() -> WindowErrors {
         let step = |x: f64, yaw: f64| StepError { absolute: [x, 0.0, 1.0, 0.0, 0.0, yaw], position_m: x };
@@ -222,6 +235,39 @@ mod tests {
         assert!(json["mae_mean"]["z_m"].is_null() && json["ci95"]["mae_mean"]["z_m"].is_null());
         assert_eq!(json["ci95"]["mae_mean"]["x_m"].as_array().unwrap().len(), 2);
         assert_eq!(serde_json::from_value::<ErrorSummary>(json).unwrap(), summary);
+    }
+
+    /// Goal: a drive that does not measure a dimension does not take it from the others. Method: four drives of one window, all 1 m off in x and the third and fourth of
+    /// them 2 m and 4 m in z, of which two drives know nothing: z is the mean of the two that know it, with an interval between them.
+    #[test]
+    fn regress_a_dimension_is_scored_over_the_drives_that_measure_it() {
+        let start = [0.0; POSE_DIM];
+        let scored = |half: f64, knows_z: [bool; 4]| {
+            let mut errors = WindowErrors::empty(1);
+            for (drive, (z, knows)) in [0.5, 7.0, 2.0, 4.0].into_iter().zip(knows_z).enumerate() {
+                let path = PosePath { poses: vec![[2.0, 0.0, half * z, 0.0, 0.0, 0.0]], predicts: [true; POSE_DIM] };
+                let truth = [[1.0, 0.0, 0.0, 0.0, 0.0, 0.0]];
+                errors.push(drive, &start, &path, &truth, 1.0, [true, true, knows, true, true, true]);
+            }
+            errors
+        };
+        let resamples = Resamples::draw(4, 1000, 1);
+        let some = scored(1.0, [false, false, true, true]);
+        let summary = summarise(&some, &resamples);
+        assert_eq!((summary.tree.mae_mean.x_m, summary.tree.mae_mean.z_m, summary.tree.mae_final.z_m), (Some(1.0), Some(3.0), Some(3.0)));
+        let [low, high] = summary.ci95.mae_mean.z_m.unwrap();
+        assert!((2.0..=3.0).contains(&low) && (3.0..=4.0).contains(&high), "{low} {high}");
+        // Paired with a model that is half as far off.
+        let better = scored(0.5, [false, false, true, true]);
+        let (difference, interval) = paired_difference(&better, &some, &resamples);
+        assert_eq!(difference.mae_mean.z_m, Some(-1.5));
+        assert!(interval.mae_mean.z_m.is_some_and(|[low, high]| -2.0 <= low && high <= -1.0), "{interval:?}");
+        assert_eq!(paired_ratio(&better, &some, &resamples).mae_mean.z_m, Some([0.5, 0.5]));
+        // One drive tells it, without an interval; none does.
+        let one = summarise(&scored(1.0, [false, false, false, true]), &resamples);
+        assert_eq!((one.tree.mae_mean.z_m, one.ci95.mae_mean.z_m), (Some(4.0), None));
+        let none = summarise(&scored(1.0, [false; 4]), &resamples);
+        assert_eq!((none.tree.mae_mean.z_m, none.ci95.mae_mean.z_m, none.tree.mae_mean.x_m), (None, None, Some(1.0)));
     }
 
     #[test]

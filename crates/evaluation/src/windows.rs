@@ -5,6 +5,7 @@ use nesam_trajectories::Trajectory;
 
 use crate::dimension::{Pose, pose_of};
 use crate::error::EvaluationError;
+use crate::errors::path_length_m;
 
 /// What errors are measured against.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
@@ -59,7 +60,22 @@ impl Window<'_> {
 
     /// True poses after steps 1…K.
     pub fn truth(&self, truth: Truth) -> Vec<Pose> {
-        let range = self.start + 1..=self.start + self.horizon;
+        self.true_poses(truth, 1)
+    }
+
+    /// True pose at the start, where the driven path begins; of measured channels that of [`Window::start_pose`].
+    pub fn true_start(&self, truth: Truth) -> Pose {
+        self.true_poses(truth, 0)[0]
+    }
+
+    /// Length of the driven path, horizontal, m.
+    pub fn path_m(&self, truth: Truth) -> f64 {
+        path_length_m(&self.true_start(truth), &self.truth(truth))
+    }
+
+    /// True poses from a step on.
+    fn true_poses(&self, truth: Truth, first: usize) -> Vec<Pose> {
+        let range = self.start + first..=self.start + self.horizon;
         let states = match (truth, &self.trajectory.truth) {
             (Truth::Gt, Some(gt)) => &gt.states[range],
             _ => &self.trajectory.states[range],

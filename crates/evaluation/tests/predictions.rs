@@ -7,12 +7,12 @@ use std::path::Path;
 use std::sync::Arc;
 
 use nesam_evaluation::{
-    Evaluation, Inputs, ModelName, Provenance, Resamples, Truth, WindowPredictor, all_windows, path_median_m, predict_all, report, score,
-    slices, write_predictions,
+    Evaluation, Inputs, ModelName, ModelScore, PATH_FLOOR_M, Provenance, Resamples, Truth, WindowPredictor, all_windows, path_median_m,
+    predict_all, report, score, slices, write_predictions,
 };
 use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::{Control, VehicleState};
-use nesam_trajectories::{MeasuredChannels, Trajectory};
+use nesam_trajectories::{GroundTruth, MeasuredChannels, Trajectory};
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use parquet::record::RowAccessor;
 
@@ -77,6 +77,7 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
     };
     let json: serde_json::Value = serde_json::from_str(&evaluation.to_json()).unwrap();
     assert_eq!(json["schema"], "nesam.evaluate/1");
+    assert_eq!((&json["path_floor_m"], &json["windows_below_path_floor"]), (&PATH_FLOOR_M.into(), &0.into()));
     for key in ["set", "split", "horizon_steps", "dt_s", "windows", "path_m_median", "models"] {
         assert!(!json[key].is_null(), "key `{key}` of the contract");
     }
@@ -120,20 +121,67 @@ fn analytic_errors_recomputed_from_the_predictions_file_are_those_of_the_json() 
 
 #[test]
 fn regress_what_a_drive_does_not_measure_is_null() {
-    // Goal: zeros that stand for heights and pitches are not scored. Method: one of two drives lacks them.
-    let mut drives = [drive("a", 120, 9.0), drive("b", 90, -15.0)];
-    drives[1].measured = MeasuredChannels { height: false, attitude: [true, false, true], ..MeasuredChannels::POSE_AND_TWIST };
-    let windows = all_windows(&drives, 32, 32, Truth::Measured).unwrap();
+    // Goal: zeros that stand for heights and pitches are not scored, and the drives that measure them are. Method: both drives lack them, then the second alone: the
+    // errors in z and pitch are then those of the first by itself, over the horizon too, without an interval, which one drive has none of.
+    let scored = |drives: &[Trajectory]| {
+        let windows = all_windows(drives, 32, 32, Truth::Measured).unwrap();
+        let models = [(ModelName::ConstantVelocity, WindowPredictor::ConstantVelocity)];
+        let paths = predict_all(&models, &windows, &vec![None; drives.len()], &|_| {}).unwrap();
+        score(&paths[0], &windows, Truth::Measured, &Resamples::draw(drives.len(), 1000, 5))
+    };
+    let whole = [drive("a", 120, 9.0), drive("b", 90, -15.0)];
+    let lacking = |lack: [bool; 2]| {
+        let mut drives = whole.clone();
+        for drive in drives.iter_mut().zip(lack).filter_map(|(drive, lacks)| lacks.then_some(drive)) {
+            drive.measured = MeasuredChannels { height: false, attitude: [true, false, true], ..MeasuredChannels::POSE_AND_TWIST };
+        }
+        scored(&drives)
+    };
+    let alone = scored(&whole[..1]);
+    for (lack, known) in [([true, true], false), ([false, true], true)] {
+        let found = lacking(lack);
+        let json = serde_json::to_value(&found.summary).unwrap();
+        for (block, interval) in [(&json["mae_mean"], false), (&json["mae_final"], false), (&json["ci95"]["mae_mean"], true)] {
+            for key in ["x_m", "y_m", "roll_deg", "yaw_deg"] {
+                assert!(!block[key].is_null(), "{key}: {block}");
+            }
+            for key in ["z_m", "pitch_deg"] {
+                assert_eq!(!block[key].is_null(), known && !interval, "{key}: {block}");
+            }
+        }
+        assert!(json["position_m"]["mean"].is_f64());
+        for d in [2, 4] {
+            assert_eq!(found.curves[d], alone.curves[d].clone().filter(|_| known));
+        }
+        let of_one = |score: &ModelScore| [score.summary.tree.mae_mean.z_m, score.summary.tree.mae_final.pitch_deg];
+        assert_eq!(of_one(&found), if known { of_one(&alone) } else { [None; 2] });
+    }
+}
+
+/// Goal: the driven path is that of the truth that errors are measured against. Method: straight drives of 2 m/s whose measured poses lie 1.5 m to the left, with their
+/// noise-free twins, and one drive that stands, whose windows are too short for an error over path and are counted as such.
+#[test]
+fn regress_the_driven_path_begins_where_the_truth_does() {
+    let straight = |id: &str, speed_m_s: f64, left_m: f64| {
+        let mut drive = drive(id, 66, 9.0);
+        let states: Vec<VehicleState<f64>> =
+            (0..66).map(|i| VehicleState { position_m: [0.1 * speed_m_s * f64::from(i), 0.0, 0.0], ..VehicleState::zero() }).collect();
+        drive.states = states.iter().map(|s| VehicleState { position_m: [s.position_m[0], left_m, 0.0], ..*s }).collect();
+        drive.truth = Some(GroundTruth { states, ..GroundTruth::default() });
+        drive
+    };
+    let drives = [straight("a", 2.0, 1.5), straight("stands", 0.0, 0.0)];
+    let windows = all_windows(&drives, 32, 32, Truth::Gt).unwrap();
+    assert_eq!(windows.iter().map(|window| window.drive).collect::<Vec<_>>(), [0, 1]);
+    assert_eq!((windows[0].true_start(Truth::Gt)[1], windows[0].true_start(Truth::Measured)[1]), (0.0, 1.5));
     let models = [(ModelName::ConstantVelocity, WindowPredictor::ConstantVelocity)];
     let paths = predict_all(&models, &windows, &[None, None], &|_| {}).unwrap();
-    let scores = score(&paths[0], &windows, Truth::Measured, &Resamples::draw(2, 1000, 5));
-    let json = serde_json::to_value(&scores.summary).unwrap();
-    for block in [&json["mae_mean"], &json["mae_final"], &json["ci95"]["mae_mean"]] {
-        for (key, scored) in [("x_m", true), ("y_m", true), ("z_m", false), ("roll_deg", true), ("pitch_deg", false), ("yaw_deg", true)] {
-            assert_eq!(!block[key].is_null(), scored, "{key}: {block}");
-        }
+    for truth in [Truth::Gt, Truth::Measured] {
+        let scored = score(&paths[0], &windows, truth, &Resamples::draw(2, 1000, 5)).errors;
+        assert!((scored.path_m[0] - 6.4).abs() < 1e-9 && scored.path_m[1] == 0.0, "{truth:?}: {:?}", scored.path_m);
+        assert_eq!(scored.below_path_floor(), 1);
+        assert!((path_median_m(&windows, truth) - 3.2).abs() < 1e-9);
     }
-    assert!(json["position_m"]["mean"].is_f64());
 }
 
 /// Goal: errors do not depend on where the origin lies. Method: the shipped bundle on a drive and on the same drive at UTM coordinates, where f32 is rounded to

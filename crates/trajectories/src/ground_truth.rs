@@ -8,7 +8,7 @@ use crate::resample::Grid;
 use crate::table::{Numbers, Table};
 
 /// The `gt_` channels of one drive, on the same samples as the drive. Wheels are FL, FR, RL, RR.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct GroundTruth {
     /// Noise-free twins of the measured states.
     pub states: Vec<VehicleState<f64>>,

@@ -150,7 +150,8 @@ fn drive_pair(
             let window = Window { trajectory: drive, drive: index, start: sample, first_history: 0, horizon: args.horizon };
             let poses = predict(&mut engine, now_ns, drive, sample, args.horizon)?;
             let path = PosePath { poses, predicts: [true; POSE_DIM] };
-            errors.push(index, &pose_of(&drive.states[sample]), &path, &window.truth(Truth::Measured), [true; POSE_DIM]);
+            let (truth, path_m) = (window.truth(Truth::Measured), window.path_m(Truth::Measured));
+            errors.push(index, &window.start_pose(), &path, &truth, path_m, [true; POSE_DIM]);
         }
     }
     Ok(())

@@ -187,8 +187,12 @@ fn over_time_plots(a: &Adaptation<'_>) -> Vec<LinePlot> {
         let mut bins: BTreeMap<usize, [f64; 2]> = BTreeMap::new();
         for (w, start_s) in a.starts_s.iter().enumerate().take(model.errors.windows()) {
             let steps = model.errors.window(w);
+            let error = steps.iter().map(|s| if d < POSE_DIM { s.absolute[d] } else { s.position_m }).sum::<f64>() / steps.len() as f64;
+            if error.is_nan() {
+                continue; // Not measured.
+            }
             let bin = bins.entry((start_s / EVERY_S) as usize).or_default();
-            bin[0] += steps.iter().map(|s| if d < POSE_DIM { s.absolute[d] } else { s.position_m }).sum::<f64>() / steps.len() as f64;
+            bin[0] += error;
             bin[1] += 1.0;
         }
         let point = |(bin, [sum, count]): (&usize, &[f64; 2])| ((*bin as f64 + 0.5) * EVERY_S, sum / count);

@@ -1,6 +1,7 @@
 //! The report of `nesam evaluate`.
 
 use crate::dimension::{DIMENSION_KEYS, POSE_DIM};
+use crate::errors::PATH_FLOOR_M;
 use crate::evaluate::{ModelPaths, ModelScore};
 use crate::output::Evaluation;
 use crate::report::table::Cell;
@@ -124,7 +125,10 @@ fn difference_table(e: &Evaluation<'_>) -> Table {
 
 fn position_table(e: &Evaluation<'_>) -> Table {
     let head = ["model", "mean [m]", "at step K [m]", "median of error over path [-]"];
-    let mut table = Table::new("Horizontal position error; smallest in bold", &head);
+    let short = e.windows_below_path_floor();
+    let caption =
+        format!("Horizontal position error; smallest in bold; error over path without {short} windows of at most {PATH_FLOOR_M} m of path");
+    let mut table = Table::new(&caption, &head);
     let pick = |m: &ModelScore| {
         let p = m.summary.tree.position_m;
         [p.mean, p.final_, p.final_over_path_median]
@@ -175,15 +179,14 @@ fn path_plots(models: &[ModelScore], paths: &[ModelPaths], windows: &[Window<'_>
             let title = format!("{} from {:.1} s (error {:.2} m)", window.trajectory.id, window.start_time_s(), last[w]);
             let mut plot = LinePlot::new(&title, "x [m]", "y [m]");
             plot.equal_aspect = true;
-            let start = window.start_pose();
-            let from_start = |poses: &[crate::Pose]| -> Vec<(f64, f64)> {
+            let from = |start: crate::Pose, poses: &[crate::Pose]| -> Vec<(f64, f64)> {
                 std::iter::once((start[0], start[1])).chain(poses.iter().map(|p| (p[0], p[1]))).collect()
             };
-            let mut measured = Series::line("measured", 0, from_start(&window.truth(e.truth)));
+            let mut measured = Series::line("measured", 0, from(window.true_start(e.truth), &window.truth(e.truth)));
             measured.mark_start = true;
             plot.series.push(measured);
             for (i, model) in paths.iter().enumerate() {
-                plot.series.push(Series::line(model.name.as_str(), i + 1, from_start(&model.paths[w].poses)));
+                plot.series.push(Series::line(model.name.as_str(), i + 1, from(window.start_pose(), &model.paths[w].poses)));
             }
             plot
         })
