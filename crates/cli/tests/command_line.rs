@@ -291,10 +291,14 @@ fn service_bench_names_the_one_option_that_is_at_fault() {
         refused(&[&["bench"][..], &args].concat(), here.path(), &[words]);
     }
     refused(&["bench", "plant", "--worlds", "w01", "--drives", "1"], here.path(), &["--drives must be at least 2, not 1"]);
+    // Whoever does not know the sets learns them, from a wrong name as from the help.
+    refused(&["bench", "discovery", "--sets", "null,payload"], here.path(), &["'payload'", "possible values", "actuator", "null_noise"]);
+    let help = nesam(&["bench", "discovery", "--help"], here.path());
+    assert!(stdout(&help).contains("actuator, sensor, map, outside, force_twin"), "{}", stdout(&help));
 }
 
-/// Goal: a drive of 2 s is predicted without options, as far as it goes, and commands of one's own say how many steps there are. Method: the first 20 samples
-/// of the log of the book.
+/// Goal: a drive of 2 s is predicted without options, as far as it goes, and commands of one's own say how many steps there are; what a query of it costs is measured
+/// too. Method: the first 20 samples of the log of the book.
 #[test]
 fn service_predict_takes_what_a_short_drive_allows() {
     let here = tempfile::tempdir().unwrap();
@@ -321,6 +325,16 @@ fn service_predict_takes_what_a_short_drive_allows() {
     assert!(count == 3 && said.contains("note: the first 3 of 7 commands"), "{count}: {said}");
     told(33);
     refused(&[&base[..], &["--controls", "c.csv"]].concat(), here.path(), &["33 steps exceed the model's 32"]);
+    let bench = ["bench", "predict", "--data", "root", "--bundle", &bundle, "--samples", "2", "--horizon", "4", "--queries", "3"];
+    let output = nesam(&[&bench[..], &["--json", "bench.json"]].concat(), here.path());
+    assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
+    assert!(
+        stderr(&output).contains("note: no drive has 40 samples: queries start with less than 32 steps of history"),
+        "{}",
+        stderr(&output)
+    );
+    let json: Value = serde_json::from_str(&std::fs::read_to_string(here.path().join("bench.json")).unwrap()).unwrap();
+    assert!(json["p50_ms"].as_f64().is_some_and(|ms| ms > 0.0), "{json}");
 }
 
 #[test]

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use clap::Args;
+use clap::builder::PossibleValuesParser;
 use nesam_discovery::bench::{Hidden, METHODS, MethodScores, Outcome, Scores, Stage, method_scores, plan, scores};
 use nesam_discovery::{Judge, Scoring};
 use nesam_evaluation::report::Short;
@@ -27,7 +28,7 @@ pub(super) struct DiscoveryBench {
     #[command(flatten)]
     bundle: BundleArgs,
     /// Sets of the benchmark [default: all]
-    #[arg(long, value_name = "NAME,…", value_delimiter = ',')]
+    #[arg(long, value_name = "NAME,…", value_delimiter = ',', value_parser = PossibleValuesParser::new(names_of_sets()))]
     sets: Vec<String>,
     /// Pseudo-vehicles of five validation drives for each hidden effect; at most as many as the drives make
     #[arg(long, default_value_t = 1)]
@@ -44,6 +45,17 @@ pub(super) struct DiscoveryBench {
     /// Write the figures as JSON (schema nesam.bench.discovery/1)
     #[arg(long, value_name = "FILE")]
     json: Option<PathBuf>,
+}
+
+/// Names of the sets of the benchmark, each once, in their order.
+fn names_of_sets() -> Vec<&'static str> {
+    let mut names: Vec<&str> = Vec::new();
+    for hidden in plan() {
+        if !names.contains(&hidden.set) {
+            names.push(hidden.set);
+        }
+    }
+    names
 }
 
 /// Runs the command.
@@ -102,9 +114,6 @@ fn chosen(args: &DiscoveryBench, groups: usize) -> Result<Vec<(Hidden, usize)>, 
         return Err(Failure::input("bench discovery needs at least five validation drives"));
     }
     let plan = plan();
-    if let Some(unknown) = args.sets.iter().find(|s| !plan.iter().any(|h| h.set == s.as_str())) {
-        return Err(Failure::input(format!("--sets {unknown}: no such set of the benchmark")));
-    }
     let wanted = |h: &Hidden| args.sets.is_empty() || args.sets.iter().any(|s| s == h.set);
     // Its place in the whole plan chooses the drives of an effect, so that the choice of sets does not.
     let (nulls, effects): (Vec<_>, Vec<_>) =

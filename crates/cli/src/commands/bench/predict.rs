@@ -18,7 +18,7 @@ use super::{QUERIES_MAX, page, percentile, sweep};
 use crate::args::{BundleArgs, DataArgs, check_count};
 use crate::failure::{Failure, OrFail};
 use crate::interrupt::exit_on_ctrl_c;
-use crate::output::{check_files, provenance, say, write_file, write_json};
+use crate::output::{check_files, note, provenance, say, write_file, write_json};
 use crate::progress::Progress;
 use crate::sources::{Drives, load_bundle_for, predictor_for, read_drives};
 
@@ -68,6 +68,8 @@ const SAMPLES_MAX: usize = 1 << 18;
 const NOISE_MEMORY: f32 = 0.8;
 /// Standard deviation of the noise: speed, m/s, and share of the second command's range.
 const NOISE_SD: [f32; 2] = [0.5, 0.3];
+/// Starts that queries need at least.
+const STARTS_MIN: usize = 8;
 /// Windows on which the cached terrain is held against the exact one.
 const CHECKED_WINDOWS: usize = 24;
 
@@ -174,31 +176,51 @@ pub(super) fn run(args: &PredictBench) -> Result<(), Failure> {
     }
 }
 
-/// A recorded drive from whose samples queries start.
+/// Recorded drives from whose samples queries start.
 pub(super) struct Planner<'a> {
-    steps: Vec<HistoryStep>,
+    drives: Vec<Vec<HistoryStep>>,
+    /// Drive and sample of each start.
+    starts: Vec<(usize, usize)>,
     map: Option<Arc<WorldMap>>,
     range: [[f64; 2]; 2],
     args: &'a PredictBench,
 }
 
 impl<'a> Planner<'a> {
+    /// The first drive whose history is full for some samples, or where none is so long every drive on the map of the first, with the history there is.
     fn new(drives: &Drives, args: &'a PredictBench) -> Result<Self, Failure> {
-        let drive = &drives.drives[0];
-        if drive.states.len() < HISTORY + 8 {
-            return Err(Failure::input(format!("drive `{}` has {} samples, queries need {}", drive.id, drive.states.len(), HISTORY + 8)));
+        let lengths: Vec<usize> = drives.drives.iter().map(|drive| drive.states.len()).collect();
+        let long = lengths.iter().position(|samples| *samples >= HISTORY + STARTS_MIN);
+        let map = drives.maps[long.unwrap_or(0)].clone();
+        let on_map = |drive: usize| drives.maps[drive].as_ref().map(|map| map.hash()) == map.as_ref().map(|map| map.hash());
+        let used = |drive: usize| long.map_or_else(|| on_map(drive), |long| drive == long);
+        let used: Vec<usize> = (0..lengths.len()).filter(|drive| used(*drive)).collect();
+        let starts = starts(&used.iter().map(|drive| lengths[*drive]).collect::<Vec<_>>());
+        if starts.len() < STARTS_MIN {
+            let samples: usize = used.iter().map(|drive| lengths[*drive]).sum();
+            return Err(Failure::input(format!("the drives have {samples} samples, too few to start {STARTS_MIN} queries from")));
         }
-        Ok(Self { steps: history_steps(drive), map: drives.maps[0].clone(), range: drives.root.vehicle().command_range, args })
+        if long.is_none() {
+            note!("note: no drive has {} samples: queries start with less than {HISTORY} steps of history", HISTORY + STARTS_MIN);
+        }
+        let steps = used.iter().map(|drive| history_steps(&drives.drives[*drive])).collect();
+        Ok(Self { drives: steps, starts, map, range: drives.root.vehicle().command_range, args })
     }
 
-    /// Sample of the `q`-th replan; starts again at the beginning when the drive ends.
+    /// Start of the `q`-th replan; starts again at the beginning when the drives end.
     fn along(&self, q: usize) -> usize {
-        HISTORY + q % (self.steps.len() - HISTORY - 1)
+        q % (self.starts.len() - 1)
     }
 
-    /// Sample of the `q`-th of `count` starts spread over the drive; its successor exists too.
+    /// The `q`-th of `count` starts spread over the drives; its successor exists too.
     pub(super) fn anywhere(&self, q: usize, count: usize) -> usize {
-        HISTORY + q * (self.steps.len() - HISTORY - 2) / count
+        q * (self.starts.len() - 2) / count
+    }
+
+    /// The steps before a start, and the start.
+    fn at(&self, start: usize) -> (&[HistoryStep], &HistoryStep) {
+        let (drive, sample) = self.starts[start];
+        (&self.drives[drive][..sample], &self.drives[drive][sample])
     }
 
     /// Commands of all candidates: the recorded command with correlated noise, inside the card's range; (samples, horizon, 2).
@@ -209,7 +231,7 @@ impl<'a> Planner<'a> {
     /// The same for another number of candidates.
     pub(super) fn controls_of(&self, samples: usize, at: usize, seed: u64) -> Vec<f32> {
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let Control { speed_m_s, second } = self.steps[at].control;
+        let Control { speed_m_s, second } = self.at(at).1.control;
         let sd = [NOISE_SD[0], NOISE_SD[1] * (self.range[1][1] - self.range[1][0]) as f32 * 0.5];
         let mut controls = Vec::with_capacity(2 * samples * self.args.horizon);
         for _ in 0..samples {
@@ -232,9 +254,10 @@ impl<'a> Planner<'a> {
 
     /// A query of as many candidates as there are commands.
     pub(super) fn query<'q>(&'q self, at: usize, controls: &'q [f32]) -> RolloutQuery<'q> {
+        let (history, start) = self.at(at);
         RolloutQuery {
-            history: &self.steps[..at],
-            start: self.steps[at].state,
+            history,
+            start: start.state,
             controls,
             samples: controls.len() / self.args.horizon / 2,
             horizon: self.args.horizon,
@@ -245,6 +268,15 @@ impl<'a> Planner<'a> {
             wheels: None,
         }
     }
+}
+
+/// Drives and samples from which queries of drives of so many samples start: all that have a full history, or where a drive is too short for one all that have any.
+fn starts(lengths: &[usize]) -> Vec<(usize, usize)> {
+    let of_drive = |(drive, samples): (usize, &usize)| {
+        let first = if *samples >= HISTORY + STARTS_MIN { HISTORY } else { 1 };
+        (first..*samples).map(move |sample| (drive, sample))
+    };
+    lengths.iter().enumerate().flat_map(of_drive).collect()
 }
 
 /// Largest ratio over the six dimensions of how far the predictions of two predictors lie apart to what the second is off by, both as means over
@@ -282,4 +314,19 @@ fn processor_time_ms() -> Option<f64> {
     let text = std::fs::read_to_string("/proc/self/stat").ok()?;
     // Fields after the name in parentheses; user time is the fourteenth of all.
     text.rsplit_once(')')?.1.split_whitespace().nth(11)?.parse::<f64>().ok().map(|ticks| ticks * TICK_MS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Goal: short drives are asked about one after the other, and a long one as ever. Method: starts of one long drive, of drives of 20, 1 and 3 samples.
+    #[test]
+    fn regress_queries_start_from_the_history_there_is() {
+        let long = starts(&[HISTORY + STARTS_MIN]);
+        assert_eq!((long.len(), long[0], long[7]), (8, (0, 32), (0, 39)));
+        let short = starts(&[20, 1, 3]);
+        assert_eq!((short.len(), short[0], short[18]), (21, (0, 1), (0, 19)));
+        assert_eq!(short[19..], [(2, 1), (2, 2)]);
+    }
 }
