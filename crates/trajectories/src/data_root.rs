@@ -8,6 +8,7 @@ use nesam_physics::{SecondCommand, Vehicle};
 use nesam_terrain::WorldMap;
 use sha2::{Digest, Sha256};
 
+use crate::card_parts::mass_of_parts_kg;
 use crate::channels::{Channels, implied_second};
 use crate::data_sheet::{CardReading, read_with_notes};
 use crate::drive;
@@ -163,6 +164,11 @@ impl DataRoot {
     /// File of its card.
     pub fn card(&self) -> &Path {
         &self.card
+    }
+
+    /// What the parts that the card states weigh together, chassis and wheels, kg; `None` where it states none.
+    pub fn mass_of_parts_kg(&self) -> Option<f64> {
+        mass_of_parts_kg(&self.card)
     }
 
     /// The folder.

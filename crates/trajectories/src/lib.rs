@@ -8,6 +8,7 @@
 //! Every error names the file, and the column and row or the key, that it is about; rows count from 0 over the whole file.
 #![forbid(unsafe_code)]
 
+mod card_parts;
 mod channels;
 mod command_range;
 mod commands;

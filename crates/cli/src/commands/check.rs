@@ -157,7 +157,8 @@ fn data_root(path: &Path, card: Option<&Path>, findings: &mut Findings) {
     if root.vehicle().inertia_estimated {
         findings.note(format!("card of `{}` gives no inertia: a box estimate is used", root.vehicle().name));
     }
-    card_doubts(root.vehicle()).iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", root.vehicle().name), doubt));
+    let doubts = card_doubts(root.vehicle(), root.mass_of_parts_kg());
+    doubts.iter().for_each(|doubt| findings.doubt(&format!("card of `{}`", root.vehicle().name), doubt));
     if root.sets().is_empty() {
         findings.error("no set: no folder with samples.parquet");
     }

@@ -9,9 +9,16 @@ pub fn standing_height_m(vehicle: &Vehicle) -> f64 {
     vehicle.wheel_radius_m - vehicle.wheel_centre_m.iter().map(|centre| centre[2]).sum::<f64>() / WHEELS as f64
 }
 
-/// What does not fit together in a card.
-pub fn card_doubts(vehicle: &Vehicle) -> Vec<Doubt> {
+/// Share of the mass by which its parts may weigh more: numbers of cards are rounded (chosen).
+const ROUNDED: f64 = 0.001;
+
+/// What does not fit together in a card. `mass_of_parts_kg` is what the parts that it states weigh together.
+pub fn card_doubts(vehicle: &Vehicle, mass_of_parts_kg: Option<f64>) -> Vec<Doubt> {
     let mut found = Vec::new();
+    if let Some(parts_kg) = mass_of_parts_kg.filter(|parts_kg| *parts_kg > (1.0 + ROUNDED) * vehicle.mass_kg) {
+        let what = format!("the mass is {:.1} kg, and chassis and wheels alone weigh {parts_kg:.1} kg", vehicle.mass_kg);
+        found.push(doubt(what, "`mass_total` is that of the whole vehicle, with its load"));
+    }
     let [fl, fr, rl, rr] = vehicle.wheel_centre_m;
     if fl[1] <= fr[1] || rl[1] <= rr[1] {
         found

@@ -302,14 +302,14 @@ fn analytic_every_mistake_is_named() {
 
 #[test]
 fn analytic_a_mirrored_card_is_doubted() {
-    assert!(card_doubts(&nesam_test_vehicles::truck()).is_empty());
+    assert!(card_doubts(&nesam_test_vehicles::truck(), None).is_empty());
     let mut mirrored = nesam_test_vehicles::truck();
     mirrored.wheel_centre_m.iter_mut().for_each(|w| w[1] *= -1.0);
-    assert!(card_doubts(&mirrored)[0].what.contains("left wheels"));
+    assert!(card_doubts(&mirrored, None)[0].what.contains("left wheels"));
     let said = |change: fn(&mut Vehicle)| {
         let mut card = nesam_test_vehicles::truck();
         change(&mut card);
-        card_doubts(&card).into_iter().map(|doubt| doubt.what).collect::<Vec<_>>()
+        card_doubts(&card, None).into_iter().map(|doubt| doubt.what).collect::<Vec<_>>()
     };
     for (change, what) in [
         ((|card| card.gravity_m_s2 = 1.62) as fn(&mut Vehicle), "gravity is 1.620 m/s²"),
@@ -318,5 +318,20 @@ fn analytic_a_mirrored_card_is_doubted() {
     ] {
         let said = said(change);
         assert!(said.len() == 1 && said[0].contains(what), "{said:?}");
+    }
+}
+
+/// Goal: a whole that weighs less than its parts is doubted, and rounding is not. Method: parts of a third less, of as much, of 0.05 % and of 1 % more than the mass.
+#[test]
+fn regress_a_mass_below_that_of_its_parts_is_doubted() {
+    let truck = nesam_test_vehicles::truck();
+    for (share, doubted) in [(0.67, false), (1.0, false), (1.0005, false), (1.01, true)] {
+        let found = card_doubts(&truck, Some(share * truck.mass_kg));
+        assert_eq!(
+            found.iter().filter(|doubt| doubt.what.contains("chassis and wheels alone weigh")).count(),
+            usize::from(doubted),
+            "{share}"
+        );
+        assert_eq!(found.len(), usize::from(doubted), "{found:?}");
     }
 }
