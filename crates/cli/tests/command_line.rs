@@ -406,6 +406,7 @@ fn chrono_a_run_starts_from_a_bundle_and_from_none_of_another_form() {
     };
     assert!((limit("made/bundle") / limit("start") - 1.0).abs() < 1e-14);
     let manifest = text("made/bundle", "manifest.toml");
+    assert!(manifest.contains("nesam train --data … --set nominal --epochs 1") && manifest.contains("--from … --out …"), "{manifest}");
     let inspected = nesam(&["inspect", "start"], here.path());
     let parent = manifest.lines().find_map(|line| line.strip_prefix("parent = \"")).unwrap();
     assert!(stdout(&inspected).contains(&parent[..12]), "{parent} is not in {}", stdout(&inspected));

@@ -14,6 +14,7 @@ use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 
 use crate::args::{DataArgs, SplitArg, check_count, horizon_of};
 use crate::bundle_path::MANIFEST;
+use crate::cli::command_without_paths;
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{hold, note, out_place};
@@ -210,7 +211,7 @@ pub fn run(args: &TrainArgs) -> Result<(), Failure> {
         smooth_borders: args.borders.as_ref().map(|borders| borders == "smooth"),
         out: out.clone(),
         resume: args.resume,
-        command: command_line(),
+        command: command_without_paths(),
     };
     let _held = hold(&out)?;
     // Another run may have ended since.
@@ -302,13 +303,4 @@ fn start_of(dir: &Path, variant: Variant, dt_s: f64) -> Result<ModelBundle, Fail
         return Err(Failure::input(format!("--from {}: it carries effects; start from the bundle that they were added to", dir.display())));
     }
     Ok(bundle)
-}
-
-/// The command as typed, without the folders of this machine.
-fn command_line() -> String {
-    let words = std::env::args().skip(1).map(|word| match word.rsplit_once('/') {
-        Some((_, last)) if word.starts_with('/') => format!("…/{last}"),
-        _ => word,
-    });
-    std::iter::once("nesam".to_string()).chain(words).collect::<Vec<_>>().join(" ")
 }
