@@ -241,11 +241,7 @@ impl Report<'_> {
             page.section("Error over the horizon")
                 .plots(&plots, "Mean absolute error after each step on drives that were not fitted; bands are 95 % intervals.");
         }
-        let p = self.provenance;
-        page.footer("command", &p.command)
-            .footer("version", &format!("nesam {}, stop rule {STOP_RULE}", p.version))
-            .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
-            .footer("data", &p.data_hash);
+        page.made_from(self.provenance).footer("stop rule", STOP_RULE);
         page.render()
     }
 

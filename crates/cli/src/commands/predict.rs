@@ -316,11 +316,6 @@ fn as_html(drives: &Drives, predictor: &Predictor, window: &Window<'_>, rollout:
         "Validity: {}.",
         if rollout.flags[0] == 0 { "nothing to say against this prediction".into() } else { flag_names(rollout.flags[0]).join(", ") }
     ));
-    let p = output::provenance(Some(predictor.bundle()), drives);
-    page.footer("command", &p.command)
-        .footer("version", &format!("nesam {}", p.version))
-        .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
-        .footer("data", &p.data_hash)
-        .footer("maps", &p.maps_hash);
+    page.made_from(&output::provenance(Some(predictor.bundle()), drives));
     page.render()
 }

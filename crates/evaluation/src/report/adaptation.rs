@@ -63,12 +63,7 @@ pub fn adaptation_page(adaptation: &Adaptation<'_>) -> String {
         "Soil under the vehicle: the prior is that of the first drive, the band one standard deviation of the posterior. Moduli, cohesion and shear modulus as \
          log10. A flat band as wide as at the start means: not learned.",
     );
-    let p = adaptation.provenance;
-    page.footer("command", &p.command)
-        .footer("version", &format!("nesam {}", p.version))
-        .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
-        .footer("data", &p.data_hash)
-        .footer("maps", &p.maps_hash)
+    page.made_from(adaptation.provenance)
         .footer("filter", &serde_json::to_string(&nesam_adaptation::FilterSettings::of(adaptation.filter)).unwrap_or_default())
         .footer("bootstrap", &format!("{} resamples by drive, seed {}", adaptation.resamples.count(), adaptation.seed));
     page.render()

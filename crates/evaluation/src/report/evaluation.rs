@@ -43,12 +43,7 @@ pub fn evaluation_page(evaluation: &Evaluation<'_>, paths: &[ModelPaths], window
             .text("The same windows apart by world, class under the start, and terciles of this set by speed, turning, relief and slip.")
             .table(&slice_table(evaluation));
     }
-    let p = evaluation.provenance;
-    page.footer("command", &p.command)
-        .footer("version", &format!("nesam {}", p.version))
-        .footer("bundle", &format!("{} {}", p.bundle, p.bundle_hash))
-        .footer("data", &p.data_hash)
-        .footer("maps", &p.maps_hash)
+    page.made_from(evaluation.provenance)
         .footer("bootstrap", &format!("{} resamples by drive, seed {}", evaluation.resamples.count(), evaluation.seed));
     page.render()
 }

@@ -4,6 +4,7 @@ use std::fmt::Write;
 
 use super::line_plot::LinePlot;
 use super::table::Table;
+use crate::output::Provenance;
 
 /// A value of the footer with more bytes than this is folded.
 const LONG: usize = 1000;
@@ -64,6 +65,16 @@ impl Page {
     pub fn footer(&mut self, name: &str, value: &str) -> &mut Self {
         self.footer.push((name.into(), value.into()));
         self
+    }
+
+    /// Adds what made the page and what it was made from to the footer.
+    pub fn made_from(&mut self, provenance: &Provenance) -> &mut Self {
+        let Provenance { version, command, bundle, bundle_hash, data_hash, maps_hash } = provenance;
+        self.footer("command", command)
+            .footer("version", &format!("nesam {version}"))
+            .footer("bundle", &format!("{bundle} {bundle_hash}"))
+            .footer("data", data_hash)
+            .footer("maps", maps_hash)
     }
 
     /// The finished HTML document.

@@ -1,5 +1,6 @@
 //! The report of `nesam bench predict`, made from its JSON.
 
+use nesam_evaluation::Provenance;
 use nesam_evaluation::report::{LinePlot, Page, Series, Table};
 use serde_json::Value;
 
@@ -16,7 +17,7 @@ const ROWS: [(&str, &str, &str); 8] = [
 ];
 
 /// The page. What was not measured is a dash.
-pub(super) fn predict_page(figures: &Value) -> String {
+pub(super) fn predict_page(figures: &Value, provenance: &Provenance) -> String {
     let whole = |key: &str| figures[key].to_string();
     let lead = format!(
         "What a planner's query costs on this machine: {} candidates of {} steps, {} queries of each kind, {} threads, {} instructions.",
@@ -46,12 +47,7 @@ pub(super) fn predict_page(figures: &Value) -> String {
             .plots(&[sweep_plot(rows)], "Median of warm queries.")
             .table(&sweep_table(rows, &number));
     }
-    let p = &figures["provenance"];
-    let text = |key: &str| p[key].as_str().unwrap_or_default().to_string();
-    page.footer("command", &text("command"))
-        .footer("version", &format!("nesam {}", text("version")))
-        .footer("bundle", &format!("{} {}", text("bundle"), text("bundle_hash")))
-        .footer("data", &text("data_hash"));
+    page.made_from(provenance);
     page.render()
 }
 
@@ -89,9 +85,9 @@ mod tests {
         let figures = json!({
             "samples": 1024, "horizon": 32, "queries": 3, "threads": 2, "path": "avx2", "p50_ms": 12.3456, "terrain_cache": {"hit_rate": null},
             "sweep": [{"path": "avx2", "samples": 64, "p50_ms": 1.5, "min_ms": 1.25}, {"path": "portable", "samples": 64, "p50_ms": 3.0, "min_ms": 2.0}],
-            "provenance": {"command": "nesam bench predict", "version": "0.1.0", "bundle": "b", "bundle_hash": "h", "data_hash": "d"},
         });
-        let page = predict_page(&figures);
+        let [command, bundle, bundle_hash] = ["nesam bench predict", "b", "h"].map(String::from);
+        let page = predict_page(&figures, &Provenance { command, bundle, bundle_hash, ..Provenance::default() });
         for expected in
             ["1024 candidates of 32 steps", "12.346", "<td>–", "portable", "<code>nesam bench predict</code>", "<code>b h</code>"]
         {

@@ -117,6 +117,7 @@ pub(super) fn run(args: &PredictBench) -> Result<(), Failure> {
         Precision::F32 => None,
         Precision::Bf16(_) => share_of_error(&drives, [fresh, &fresh.in_precision(Precision::F32)], args.horizon)?,
     };
+    let made_from = provenance(Some(&bundle), &drives);
     let figures = json!({
         "schema": "nesam.bench/1",
         "samples": args.samples,
@@ -137,7 +138,7 @@ pub(super) fn run(args: &PredictBench) -> Result<(), Failure> {
         "parts_ms": args.parts.then(|| sweep::parts(&drive, fresh)).transpose()?,
         "reference": sweep::reference(&drive, fresh, &args.reference)?,
         "sweep": args.sweep.then(|| sweep::sweep(&drive, fresh)).transpose()?,
-        "provenance": provenance(Some(&bundle), &drives),
+        "provenance": made_from,
     });
     say!(
         "{} candidates x {} steps on the {} path, {} threads, {} queries",
@@ -168,7 +169,7 @@ pub(super) fn run(args: &PredictBench) -> Result<(), Failure> {
         say!("  rounding to bf16 moves predictions by at most {:.2} % of the model's own error", 100.0 * rounding);
     }
     if let Some(file) = &args.html {
-        write_file(file, page::predict_page(&figures).as_bytes())?;
+        write_file(file, page::predict_page(&figures, &made_from).as_bytes())?;
     }
     match &args.json {
         Some(file) => write_json(file, &figures),
