@@ -11,7 +11,7 @@ use crate::evaluate::ModelScore;
 use crate::known_soil::KnownSoil;
 use crate::report::table::Cell;
 use crate::report::{LinePlot, Page, Series, Table};
-use crate::score::{PerDimension, paired_difference};
+use crate::score::{ErrorTree, paired_difference};
 
 const SOIL_UNITS: [&str; SOIL_DIM] = ["N/m^(n+2)", "N/m^(n+1)", "-", "Pa", "rad", "m"];
 /// Drives whose soil is plotted; more would not fit the eye.
@@ -73,35 +73,16 @@ fn error_table(a: &Adaptation<'_>, last: bool) -> Table {
     let which = if last { "step K" } else { "steps 1…K" };
     let head: Vec<&str> = std::iter::once("model").chain(DIMENSION_KEYS).chain(["position_m"]).collect();
     let mut table = Table::new(&format!("Mean absolute error, {which}; difference = adapted minus fixed on the same windows"), &head);
-    let join = |six: [Option<f64>; POSE_DIM], position: Option<f64>| six.into_iter().chain([position]).collect::<Vec<_>>();
-    let intervals =
-        |six: &PerDimension<[f64; 2]>, position: Option<[f64; 2]>| six.to_array().into_iter().chain([position]).collect::<Vec<_>>();
-    let mut add = |name: &str, values: Vec<Option<f64>>, ci95: Vec<Option<[f64; 2]>>| {
-        let mut row = vec![Cell::from(name)];
-        row.extend(values.into_iter().zip(ci95).map(|(value, interval)| Cell {
-            text: value.map_or("–".into(), |v| format!("{v:.3}")),
-            small: interval.map_or(String::new(), |[lo, hi]| format!("[{lo:.3}, {hi:.3}]")),
-            best: false,
-        }));
-        table.row(row);
+    let mut add = |name: &str, values: &ErrorTree<f64>, intervals: &ErrorTree<[f64; 2]>| {
+        let cells = values.row(last).into_iter().zip(intervals.row(last)).map(|(value, interval)| Cell::with_interval(value, interval));
+        table.row(std::iter::once(Cell::from(name)).chain(cells).collect());
     };
     for (name, model) in a.models() {
-        let (t, c) = (&model.summary.tree, &model.summary.ci95);
-        if last {
-            add(name, join(t.mae_final.to_array(), t.position_m.final_), intervals(&c.mae_final, c.position_m.final_));
-        } else {
-            add(name, join(t.mae_mean.to_array(), t.position_m.mean), intervals(&c.mae_mean, c.position_m.mean));
-        }
+        add(name, &model.summary.tree, &model.summary.ci95);
     }
-    let (t, c) = paired_difference(&a.adapted.errors, &a.fixed.errors, a.resamples);
-    let (r, rc) = (a.ratio(), a.ratio_ci95());
-    if last {
-        add("difference", join(t.mae_final.to_array(), t.position_m.final_), intervals(&c.mae_final, c.position_m.final_));
-        add("ratio", join(r.mae_final.to_array(), r.position_m.final_), intervals(&rc.mae_final, rc.position_m.final_));
-    } else {
-        add("difference", join(t.mae_mean.to_array(), t.position_m.mean), intervals(&c.mae_mean, c.position_m.mean));
-        add("ratio", join(r.mae_mean.to_array(), r.position_m.mean), intervals(&rc.mae_mean, rc.position_m.mean));
-    }
+    let (difference, interval) = paired_difference(&a.adapted.errors, &a.fixed.errors, a.resamples);
+    add("difference", &difference, &interval);
+    add("ratio", &a.ratio(), &a.ratio_ci95());
     table
 }
 

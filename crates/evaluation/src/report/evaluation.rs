@@ -69,13 +69,8 @@ pub fn evaluation_markdown(evaluation: &Evaluation<'_>) -> String {
     out
 }
 
-fn number(value: Option<f64>) -> String {
-    value.map_or("–".into(), |v| format!("{v:.3}"))
-}
-
 fn cell(value: Option<f64>, interval: Option<[f64; 2]>, best: Option<f64>) -> Cell {
-    let small = interval.map_or(String::new(), |[lo, hi]| format!("[{lo:.3}, {hi:.3}]"));
-    Cell { text: number(value), small, best: value.is_some() && value == best }
+    Cell { best: value.is_some() && value == best, ..Cell::with_interval(value, interval) }
 }
 
 fn smallest(values: impl Iterator<Item = Option<f64>>) -> Option<f64> {
@@ -109,10 +104,8 @@ fn difference_table(e: &Evaluation<'_>) -> Table {
     let mut table = Table::new(&caption, &head);
     for other in &e.models[1..] {
         let (difference, interval) = paired_difference(&first.errors, &other.errors, e.resamples);
-        let values = difference.mae_mean.to_array().into_iter().chain([difference.position_m.mean]);
-        let intervals = interval.mae_mean.to_array().into_iter().chain([interval.position_m.mean]);
         let mut row = vec![Cell::from(other.name.as_str())];
-        row.extend(values.zip(intervals).map(|(v, i)| cell(v, i, None)));
+        row.extend(difference.row(false).into_iter().zip(interval.row(false)).map(|(v, i)| Cell::with_interval(v, i)));
         table.row(row);
     }
     table
@@ -197,7 +190,7 @@ fn slice_table(e: &Evaluation<'_>) -> Table {
             let numbers =
                 [t.position_m.final_, t.position_m.mean, t.mae_mean.z_m, t.mae_mean.roll_deg, t.mae_mean.pitch_deg, t.mae_mean.yaw_deg];
             let mut row: Vec<Cell> = vec![slice.name.as_str().into(), slice.windows().to_string().into(), model.name.as_str().into()];
-            row.extend(numbers.map(|v| Cell::from(number(v))));
+            row.extend(numbers.map(|v| Cell::with_interval(v, None)));
             table.row(row);
         }
     }

@@ -32,6 +32,14 @@ impl<T: Into<String>> From<T> for Cell {
     }
 }
 
+impl Cell {
+    /// A number with its interval; a dash where there is none.
+    pub fn with_interval(value: Option<f64>, interval: Option<[f64; 2]>) -> Self {
+        let small = interval.map_or(String::new(), |[lo, hi]| format!("[{lo:.3}, {hi:.3}]"));
+        Self { text: value.map_or("–".into(), |v| format!("{v:.3}")), small, best: false }
+    }
+}
+
 impl Table {
     /// A table with a caption and column heads.
     pub fn new(caption: &str, head: &[&str]) -> Self {
