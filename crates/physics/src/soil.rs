@@ -6,6 +6,9 @@ pub const SOIL_DIM: usize = 6;
 /// Names in the order of every array, JSON and message: `k_phi, k_c, n, c, phi, k_shear`.
 pub const SOIL_NAMES: [&str; SOIL_DIM] = ["k_phi", "k_c", "n", "c", "phi", "k_shear"];
 
+/// Units in the order of [`SOIL_NAMES`].
+pub const SOIL_UNITS: [&str; SOIL_DIM] = ["N/m^(n+2)", "N/m^(n+1)", "-", "Pa", "rad", "m"];
+
 /// Soil vector θ (paper §III-B): Bekker pressure-sinkage, Mohr-Coulomb and Janosi-Hanamoto parameters.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Soil<T> {

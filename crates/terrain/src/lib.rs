@@ -22,4 +22,5 @@ pub use error::TerrainError;
 pub use geometry::{GridGeometry, MAX_CELLS, ORIGIN_MAX_M, Pose2};
 pub use image::read_gray8;
 pub use patch::{PATCH_PX, PATCH_RESOLUTION_M, Patch, PatchScale, sample_patch};
+pub use read::SOIL_KEYS;
 pub use world_map::{Ground, MapSource, SoilClassRange, WorldMap};

@@ -10,8 +10,8 @@ use crate::geometry::GridGeometry;
 use crate::image::{GRAY_16, RGB_8, read_image};
 use crate::world_map::{SoilClassRange, WorldMap};
 
-/// Names of the soil parameters in `soil_prior_ranges`, in the order of the soil vector.
-const SOIL_KEYS: [&str; SOIL_DIM] = ["Kphi", "Kc", "n", "c", "phi", "K"];
+/// Names of the soil parameters in the files of a world, in the order of the soil vector.
+pub const SOIL_KEYS: [&str; SOIL_DIM] = ["Kphi", "Kc", "n", "c", "phi", "K"];
 
 /// Name of the elevation image where `world.json` gives none.
 const ELEVATION: &str = "elevation.png";

@@ -3,14 +3,11 @@
 use std::path::Path;
 
 use nesam_physics::{SOIL_DIM, Soil};
-use nesam_terrain::{GridGeometry, read_gray8};
+use nesam_terrain::{GridGeometry, SOIL_KEYS, read_gray8};
 use serde_json::Value;
 
 use crate::error::TrajectoryError;
 use crate::json::JsonFile;
-
-/// Names of the soil parameters in the file, in the order of the soil vector.
-const PARAMETERS: [&str; SOIL_DIM] = ["Kphi", "Kc", "n", "c", "phi", "K"];
 
 /// True soil of one region.
 #[derive(Clone, Debug, PartialEq)]
@@ -54,7 +51,7 @@ pub fn read_ground_truth_soil(world_dir: &Path) -> Result<SoilTruth, TrajectoryE
     let listed = file.get("params").and_then(Value::as_array).ok_or_else(|| file.wrong("params", "missing"))?;
     let place = |name: &str| listed.iter().position(|p| p.as_str() == Some(name));
     let mut order = [0; SOIL_DIM];
-    for (to, name) in order.iter_mut().zip(PARAMETERS) {
+    for (to, name) in order.iter_mut().zip(SOIL_KEYS) {
         *to = place(name).ok_or_else(|| file.wrong("params", format!("does not list `{name}`")))?;
     }
     let regions = file.get("regions").and_then(Value::as_array).ok_or_else(|| file.wrong("regions", "missing"))?;

@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use nesam_engine::{ALARM_ACTIVE, FORECAST_AHEAD, ForecastCheck, SOIL_NOT_LEARNED};
 use nesam_model::{Predictor, flag};
-use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SOIL_NAMES, STATE_DIM};
+use nesam_physics::{SOIL_BOUNDS, SOIL_DIM, SOIL_LOGARITHMIC, SOIL_NAMES, SOIL_UNITS, STATE_DIM};
 use nesam_terrain::{Pose2, WorldMap};
 use serde_json::{Value, json};
 
@@ -21,8 +21,6 @@ const REGIONS: usize = 8;
 const TWO_SIDED_95: f64 = 1.96;
 /// Flags that speak of session and start and not of the candidate.
 const OF_SESSION: u32 = flag::NO_MAP | flag::START_OFF_GROUND | SOIL_NOT_LEARNED | ALARM_ACTIVE;
-/// Units in the order of `SOIL_NAMES`.
-const SOIL_UNITS: [&str; SOIL_DIM] = ["N/m^(n+2)", "N/m^(n+1)", "-", "Pa", "rad", "m"];
 
 /// What has been told already.
 #[derive(Clone, Debug, Default)]
@@ -162,6 +160,7 @@ fn soil_json(name: &str, session: &SessionNotes, scenery: &Scenery) -> Value {
         "names": SOIL_NAMES,
         "units": SOIL_UNITS,
         "bounds": SOIL_BOUNDS,
+        "logarithmic": SOIL_LOGARITHMIC,
         "epoch": soil.state.epoch,
         "prior": prior,
         "value": value,

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nesam_adaptation::{SoilUpdate, chi_square_tail};
-use nesam_physics::{SOIL_DIM, SOIL_LOGARITHMIC, SOIL_NAMES};
+use nesam_physics::{SOIL_DIM, SOIL_LOGARITHMIC, SOIL_NAMES, SOIL_UNITS};
 
 use crate::adapt_output::Adaptation;
 use crate::dimension::{DIMENSION_KEYS, POSE_DIM};
@@ -13,7 +13,6 @@ use crate::report::table::Cell;
 use crate::report::{LinePlot, Page, Series, Table};
 use crate::score::{ErrorTree, paired_difference};
 
-const SOIL_UNITS: [&str; SOIL_DIM] = ["N/m^(n+2)", "N/m^(n+1)", "-", "Pa", "rad", "m"];
 /// Drives whose soil is plotted; more would not fit the eye.
 const DRIVES_PLOTTED: usize = 6;
 

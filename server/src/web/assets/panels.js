@@ -39,7 +39,6 @@ const SOIL = {
   k_phi: ["<i>K<sub>φ</sub></i>", "frictional modulus of sinkage", 1e-3, "kN/mⁿ⁺²"], k_c: ["<i>K<sub>c</sub></i>", "cohesive modulus of sinkage", 1e-3, "kN/mⁿ⁺¹"],
   n: ["<i>n</i>", "sinkage exponent", 1, ""], c: ["<i>c</i>", "cohesion", 1e-3, "kPa"], phi: ["<i>φ</i>", "angle of internal friction", DEG, "°"], k_shear: ["<i>K</i>", "shear deformation modulus", 1e3, "mm"],
 };
-const LOGARITHMIC = new Set(["k_phi", "k_c", "c", "k_shear"]);
 const digits = (v) => (Math.abs(v) >= 100 ? 0 : Math.abs(v) >= 10 ? 1 : 2);
 
 export function soil(element, text, session) {
@@ -47,7 +46,7 @@ export function soil(element, text, session) {
   text.textContent = !s ? "" : `${s.class ? `on ${s.class.replaceAll("_", " ")}, ` : ""}${s.epoch} update${s.epoch === 1 ? "" : "s"}`;
   if (!s) return put(element, `<p class="soft">${!session ? "no vehicle" : session.newest ? "not known here: the page asks the network for nothing, and nobody has predicted from this place yet" : "known with the first prediction"}</p>`);
   const rows = s.names.map((name, i) => {
-    const [symbol, meaning, factor, unit] = SOIL[name], [low, high] = s.bounds[i], scale = LOGARITHMIC.has(name) ? Math.log : (v) => v;
+    const [symbol, meaning, factor, unit] = SOIL[name], [low, high] = s.bounds[i], scale = s.logarithmic[i] ? Math.log : (v) => v;
     const at = (v) => `${(100 * Math.min(Math.max((scale(v) - scale(low)) / (scale(high) - scale(low)), 0), 1)).toFixed(2)}%`;
     const value = s.value[i] * factor, known = s.learned[i] && s.epoch > 0, band = s.low ? [s.low[i] * factor, s.high[i] * factor] : null;
     const withUnit = (v) => `${fixed(v, digits(v))}${unit ? ` ${unit}` : ""}`, told = withUnit(value), prior = withUnit(s.prior[i] * factor);
