@@ -2,11 +2,11 @@
 
 use std::path::{Path, PathBuf};
 
+use nesam_model::ModelBundle;
+use nesam_model::bundle::MANIFEST;
+
 use crate::failure::Failure;
 use crate::output::or_here;
-
-/// File that makes a folder a bundle.
-pub const MANIFEST: &str = "manifest.toml";
 
 /// Finds the bundle to use: `--bundle`, else the last by name in `deploy/bundles`, searched upward from the executable and then from the
 /// current folder.
@@ -40,10 +40,9 @@ pub fn bundle_of_vehicle(name: &str) -> Option<PathBuf> {
     upward("deploy/bundles").iter().flat_map(|folder| bundles_in(folder)).find(|dir| of(dir).is_some_and(|v| v.name == name))
 }
 
-/// The shipped bundle of this hash, which is that of its manifest.
+/// The shipped bundle of this hash.
 pub fn bundle_of_hash(hash: &str) -> Option<PathBuf> {
-    let of = |dir: &PathBuf| std::fs::read(dir.join(MANIFEST)).ok().map(|manifest| nesam_model::bundle::sha256_hex(&manifest));
-    upward("deploy/bundles").iter().flat_map(|folder| bundles_in(folder)).find(|dir| of(dir).as_deref() == Some(hash))
+    upward("deploy/bundles").iter().flat_map(|folder| bundles_in(folder)).find(|dir| ModelBundle::hash_of(dir).as_deref() == Some(hash))
 }
 
 /// Folders of shipped baseline bundles.

@@ -2,8 +2,9 @@
 
 use clap::builder::ValueParser;
 use clap::{CommandFactory, FromArgMatches, Parser, Subcommand};
+use nesam_model::ModelBundle;
 
-use crate::bundle_path::{MANIFEST, default_bundle};
+use crate::bundle_path::default_bundle;
 use crate::commands;
 use crate::failure::Failure;
 use crate::output::{check_printed, note, say, shell_line};
@@ -170,9 +171,8 @@ fn command(command: Option<Command>) -> Result<(), Failure> {
 
 fn version() -> String {
     let bundle = default_bundle().and_then(|dir| {
-        let manifest = std::fs::read(dir.join(MANIFEST)).ok()?;
         let name = dir.file_name()?.to_string_lossy().into_owned();
-        Some(format!("bundle {name} {}", nesam_model::bundle::sha256_hex(&manifest)))
+        Some(format!("bundle {name} {}", ModelBundle::hash_of(&dir)?))
     });
     format!("nesam {}\n{}", env!("CARGO_PKG_VERSION"), bundle.unwrap_or_else(|| "no bundle found".into()))
 }

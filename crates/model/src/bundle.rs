@@ -18,7 +18,8 @@ use crate::weights::Weights;
 
 /// Version of the layout; another version is refused.
 pub const FORMAT: &str = "nesam.bundle/1";
-const MANIFEST: &str = "manifest.toml";
+/// File that makes a folder a bundle.
+pub const MANIFEST: &str = "manifest.toml";
 const WEIGHTS: &str = "weights.safetensors";
 const VEHICLE: &str = "vehicle.json";
 const NORMALIZATION: &str = "normalization.toml";
@@ -137,6 +138,11 @@ impl Folder<'_> {
 }
 
 impl ModelBundle {
+    /// The hash of the bundle in a folder, of which nothing else is read; `None` where there is no manifest.
+    pub fn hash_of(dir: &Path) -> Option<String> {
+        std::fs::read(dir.join(MANIFEST)).ok().map(|manifest| sha256_hex(&manifest))
+    }
+
     /// Loads and verifies a bundle folder.
     ///
     /// # Errors

@@ -5,7 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use nesam_model::ModelBundle;
-use sha2::{Digest as _, Sha256};
+use nesam_model::bundle::sha256_hex;
 
 /// Truncations and flips tried of each file.
 const TRIES: usize = 24;
@@ -18,10 +18,6 @@ fn shipped() -> PathBuf {
 fn files() -> Vec<String> {
     let manifest: toml::Table = fs::read_to_string(shipped().join("manifest.toml")).expect("readable").parse().expect("a manifest");
     manifest["files"].as_table().expect("files by name").keys().cloned().collect()
-}
-
-fn sha256_hex(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|b| format!("{b:02x}")).collect()
 }
 
 /// Copies of one file with something wrong, with words for it.

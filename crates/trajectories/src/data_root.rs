@@ -470,6 +470,7 @@ fn hash_of<'a>(files: impl Iterator<Item = (&'a String, &'a String)>) -> String 
     hex(&hash.finalize())
 }
 
-fn hex(bytes: &[u8]) -> String {
+/// Bytes as lower-case hex.
+pub(crate) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }

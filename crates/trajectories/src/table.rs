@@ -12,6 +12,7 @@ use parquet::file::metadata::{ColumnChunkMetaData, ParquetMetaData};
 use parquet::file::reader::{FileReader, SerializedFileReader};
 use sha2::{Digest, Sha256};
 
+use crate::data_root::hex;
 use crate::error::TrajectoryError;
 
 /// Most rows for which memory is set aside before they are seen, so that a damaged footer cannot ask for all of it.
@@ -42,7 +43,7 @@ impl Table {
     /// Reads the file whole (it is also hashed) and parses its footer.
     pub(crate) fn open(path: &Path) -> Result<Self, TrajectoryError> {
         let content = std::fs::read(path).map_err(|source| TrajectoryError::Read { path: path.into(), source })?;
-        let hash = Sha256::digest(&content).iter().map(|byte| format!("{byte:02x}")).collect();
+        let hash = hex(&Sha256::digest(&content));
         let length = content.len();
         let bad = |reason| TrajectoryError::Parquet { path: path.into(), reason };
         let reader = guarded(|| SerializedFileReader::new(Bytes::from(content))).map_err(bad)?;

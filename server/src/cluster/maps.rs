@@ -1,7 +1,7 @@
 //! Maps that servers share: whoever takes a session brings its map, and a newer one replaces what is held.
 
 use nesam_engine::EngineError;
-use sha2::{Digest as _, Sha256};
+use nesam_model::bundle::sha256_hex;
 use tonic::Status;
 
 use super::record::{MapHead, json, of_json, session_of};
@@ -33,7 +33,7 @@ impl Cluster {
             let parts = self.0.etcd.all(vec![get_all(&keys.parts(map, Some(&head.sha256)))]).await?.read.into_iter().flatten();
             let parts: Vec<_> = parts.map(|found| found.value).collect();
             let bytes = parts.concat();
-            if parts.len() != head.parts || sha256(&bytes) != head.sha256 {
+            if parts.len() != head.parts || sha256_hex(&bytes) != head.sha256 {
                 // Replaced while it was read.
                 continue;
             }
@@ -111,7 +111,7 @@ impl Cluster {
     /// # Errors
     /// What etcd says.
     pub(crate) async fn write_map(&self, map: &str, bytes: &[u8]) -> Result<(), Status> {
-        let (keys, sha256) = (&self.0.keys, sha256(bytes));
+        let (keys, sha256) = (&self.0.keys, sha256_hex(bytes));
         let parts = bytes.chunks(PART_BYTES);
         let head = MapHead { sha256: sha256.clone(), parts: parts.len(), version: map_version(bytes) };
         for _ in 0..ATTEMPTS {
@@ -181,8 +181,4 @@ impl Cluster {
 fn drives_on(session: &str, image: &[u8], map: &str) -> bool {
     let image = session_of(session, image).and_then(|stored| session_image(&stored.image).ok());
     image.and_then(|image| image.map).is_some_and(|(id, _)| id == map)
-}
-
-fn sha256(bytes: &[u8]) -> String {
-    Sha256::digest(bytes).iter().map(|byte| format!("{byte:02x}")).collect()
 }

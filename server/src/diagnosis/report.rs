@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use nesam_engine::UNCERTAIN_MAX;
-use nesam_model::bundle::sha256_hex;
+use nesam_model::ModelBundle;
 use nesam_model::named_effect;
 use nesam_proto::v1 as pb;
 use serde_json::Value;
@@ -50,12 +50,12 @@ pub fn knows_report(folder: &Path) -> bool {
     read(folder, String::new(), Vec::new()).is_ok()
 }
 
-/// Hash of a bundle, which is that of its manifest; empty without one.
+/// Hash of a bundle; empty without one.
 fn bundle_hash(bundle: &str) -> String {
     if bundle.is_empty() {
         return String::new();
     }
-    std::fs::read(Path::new(bundle).join("manifest.toml")).map(|manifest| sha256_hex(&manifest)).unwrap_or_default()
+    ModelBundle::hash_of(Path::new(bundle)).unwrap_or_default()
 }
 
 fn verdict(document: &Value) -> Option<pb::DiagnosisVerdict> {

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 use nesam_evaluation::Baselines;
 use nesam_import::{Doubt, card_doubts, doubts};
+use nesam_model::bundle::MANIFEST;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_trajectories::DataRoot;
 use serde_json::{Value, json};
 
 use crate::args::{DataArgs, SplitArg};
-use crate::bundle_path::MANIFEST;
 use crate::failure::{Failure, chain};
 use crate::on_map;
 use crate::output::{check_apart, check_file, say, write_json};

@@ -4,12 +4,13 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use nesam_model::ModelBundle;
+use nesam_model::bundle::MANIFEST;
 use nesam_physics::effects::ScheduledEffect;
 use nesam_physics::{DT_S, SOIL_NAMES, SecondCommand, Vehicle};
 use nesam_trajectories::{DataRoot, SetQuery, Split};
 use serde_json::{Map, Value, json};
 
-use crate::bundle_path::{MANIFEST, bundle_dir};
+use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output;
 use crate::output::say;

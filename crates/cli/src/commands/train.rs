@@ -9,11 +9,11 @@ use nesam_evaluation::Baselines;
 use nesam_learning::origin::Origin;
 use nesam_learning::recipe::{Recipe, Reporter, run as train};
 use nesam_learning::{Objective, Pooling, TrainingError, TrainingPlan};
+use nesam_model::bundle::MANIFEST;
 use nesam_model::reference::ComputeDevice;
 use nesam_model::{MAX_HORIZON, ModelBundle, Variant};
 
 use crate::args::{DataArgs, SplitArg, check_count, horizon_of};
-use crate::bundle_path::MANIFEST;
 use crate::cli::command_without_paths;
 use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
