@@ -266,12 +266,30 @@ fn check_step(dt_s: f64) -> Result<(), Failure> {
     Err(Failure::input(format!("--dt {dt_s} is outside 0.01…1 s")))
 }
 
+/// Whether a bundle was trained with drives in this step.
+fn has_step(bundle: &ModelBundle, dt_s: f64) -> bool {
+    (dt_s - bundle.normalization.dt_s).abs() < 1e-9
+}
+
+/// A bundle of which another is made: in the step of the drives, and without effects, which were found beside what is changed now. `option` names it.
+pub fn bundle_to_change(option: &str, dir: &Path, dt_s: f64) -> Result<ModelBundle, Failure> {
+    let bundle = load_bundle(Some(dir))?;
+    let refused = |why: String| Err(Failure::input(format!("{option} {}: {why}", dir.display())));
+    if !bundle.effects.is_empty() {
+        return refused("it carries effects; give the bundle that they were added to".into());
+    }
+    if !has_step(&bundle, dt_s) {
+        return refused(format!("it steps by {} s, --dt is {dt_s} s", bundle.normalization.dt_s));
+    }
+    Ok(bundle)
+}
+
 /// Refuses drives in another step than the one that the bundle was trained with: its network would take them for drives at another speed.
 pub fn check_model_step(bundle: &ModelBundle, dt_s: f64) -> Result<(), Failure> {
-    let own_s = bundle.normalization.dt_s;
-    if (dt_s - own_s).abs() < 1e-9 {
+    if has_step(bundle, dt_s) {
         return Ok(());
     }
+    let own_s = bundle.normalization.dt_s;
     Err(Failure::input(format!(
         "bundle {} predicts in steps of {own_s} s, the drives are read in steps of {dt_s} s (--dt {dt_s}); without a bundle, `nesam evaluate --models \
          kinematic,constant_velocity` takes any step",

@@ -21,7 +21,7 @@ use crate::failure::{Failure, OrFail};
 use crate::interrupt;
 use crate::output::{check_files, or_here, out_dir, provenance, say, write_file, write_json};
 use crate::progress::Progress;
-use crate::sources::{Drives, load_bundle, read_drives};
+use crate::sources::{Drives, bundle_to_change, read_drives};
 
 /// Parts of the drives that are left out in turn: every part costs one more calibration.
 const FOLDS: usize = 5;
@@ -90,7 +90,7 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     interrupt::exit_on_ctrl_c("nothing was written");
     let drives = read_drives(&args.data, false)?;
     let card = drives.root.vehicle();
-    let bundle = args.bundle.as_deref().map(|dir| bundle_to_change(dir, args.data.dt)).transpose()?;
+    let bundle = args.bundle.as_deref().map(|dir| bundle_to_change("--bundle", dir, args.data.dt)).transpose()?;
     let out = out_dir(args.out.as_deref(), "calibrate", &drives.set)?;
     if drives.root.card().parent().is_some_and(|root| same_folder(root, &out)) {
         let card = drives.root.card().display();
@@ -135,18 +135,6 @@ fn same_folder(a: &Path, b: &Path) -> bool {
 /// Calibrates to the end: Ctrl-C ends this command as a whole.
 fn calibrated(card: Vehicle, drives: &[&Drive], dt_s: f64, reporter: &dyn Reporter) -> (Vehicle, Normalization) {
     calibrate_vehicle(card, drives, dt_s, reporter, &|| false).expect("nothing interrupts it; this is a bug")
-}
-
-/// The bundle whose card is replaced; the effects of one that has some were found beside its old card.
-fn bundle_to_change(dir: &Path, dt_s: f64) -> Result<ModelBundle, Failure> {
-    let bundle = load_bundle(Some(dir))?;
-    if !bundle.effects.is_empty() {
-        return Err(Failure::input(format!("--bundle {}: it carries effects; give the bundle that they were added to", dir.display())));
-    }
-    if (bundle.normalization.dt_s - dt_s).abs() > 1e-9 {
-        return Err(Failure::input(format!("--bundle {}: it steps by {} s, --dt is {dt_s} s", dir.display(), bundle.normalization.dt_s)));
-    }
-    Ok(bundle)
 }
 
 /// Errors of every drive with a card that was fitted on others.

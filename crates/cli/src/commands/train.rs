@@ -19,7 +19,7 @@ use crate::environment::{PURGE_DELAY, restart_with};
 use crate::failure::{Failure, OrFail};
 use crate::output::{hold, note, out_place};
 use crate::progress::Progress;
-use crate::sources::{load_bundle, read_drives};
+use crate::sources::{bundle_to_change, read_drives};
 
 /// Options of `nesam train`.
 #[derive(Args, Debug)]
@@ -292,15 +292,9 @@ fn is_name(text: &str) -> bool {
 
 /// The bundle that a run starts from.
 fn start_of(dir: &Path, variant: Variant, dt_s: f64) -> Result<ModelBundle, Failure> {
-    let bundle = load_bundle(Some(dir))?;
+    let bundle = bundle_to_change("--from", dir, dt_s)?;
     if bundle.form != variant {
         return Err(Failure::input(format!("--from {}: it is a {}, not a {}", dir.display(), bundle.form.as_str(), variant.as_str())));
-    }
-    if (bundle.normalization.dt_s - dt_s).abs() > 1e-9 {
-        return Err(Failure::input(format!("--from {}: it steps by {} s, --dt is {dt_s} s", dir.display(), bundle.normalization.dt_s)));
-    }
-    if !bundle.effects.is_empty() {
-        return Err(Failure::input(format!("--from {}: it carries effects; start from the bundle that they were added to", dir.display())));
     }
     Ok(bundle)
 }
