@@ -201,11 +201,6 @@ impl Group {
         variance
     }
 
-    /// Fall of the squared distance by a set of columns together, in the metric.
-    pub fn joint_gain(&self, columns: &[usize]) -> f64 {
-        self.remainder(&[], columns).gain
-    }
-
     /// Shares of a set of columns fitted together.
     pub fn joint_shares(&self, columns: &[usize]) -> Vec<f64> {
         self.remainder(&[], columns).shares

@@ -75,21 +75,7 @@ mod tests {
         let vehicle = bicycle();
         let rates = [150e3, 150e3, 280e3, 280e3];
         let n = 10 * TOGETHER;
-        let mut truth = GroundTruth {
-            states: Vec::new(),
-            sinkage_mean_m: Vec::new(),
-            sinkage_max_m: Vec::new(),
-            wheel_force_n: Vec::new(),
-            slip: Vec::new(),
-            lateral_speed_m_s: Vec::new(),
-            region: Vec::new(),
-            wheel_speed_rad_s: Vec::new(),
-            road_wheel_angle_rad: Vec::new(),
-            steering_actuator: Vec::new(),
-            drive_torque_nm: Vec::new(),
-            wheel_height_m: Vec::new(),
-            contact_nodes: Vec::new(),
-        };
+        let mut truth = GroundTruth::default();
         for k in 0..n {
             // The attitude holds within a mean, in which a product would not be that of the means.
             let t = (k / TOGETHER) as f64;

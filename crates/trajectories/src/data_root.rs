@@ -228,16 +228,6 @@ impl DataRoot {
         hash_of(self.hashes.lock().unwrap_or_else(PoisonError::into_inner).iter())
     }
 
-    /// SHA-256 (hex) over the samples and index files of one set that was loaded; `None` before.
-    pub fn set_hash(&self, set: &str) -> Option<String> {
-        let hashes = self.hashes.lock().unwrap_or_else(PoisonError::into_inner);
-        let prefix = format!("{set}/");
-        let of_set = |path: &str| path.strip_prefix(&prefix).is_some_and(|file| !file.contains('/'));
-        let mut files = hashes.iter().filter(|(path, _)| of_set(path)).peekable();
-        files.peek()?;
-        Some(hash_of(files))
-    }
-
     /// Loads drives in the order of the samples file.
     ///
     /// A drive without an index entry has neither split nor world; one whose split is neither train nor test has no split, which [`DataRoot::notes`] says.

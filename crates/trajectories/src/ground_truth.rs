@@ -20,8 +20,6 @@ pub struct GroundTruth {
     pub wheel_force_n: Vec<[[f64; 3]; WHEELS]>,
     /// Longitudinal slip of each wheel, -.
     pub slip: Vec<[f64; WHEELS]>,
-    /// Lateral speed of each wheel centre, left positive, m/s.
-    pub lateral_speed_m_s: Vec<[f64; WHEELS]>,
     /// Region of the world under each wheel: a row of the true soil table.
     pub region: Vec<[usize; WHEELS]>,
     /// Noise-free wheel speeds, rad/s.
@@ -30,12 +28,8 @@ pub struct GroundTruth {
     pub road_wheel_angle_rad: Vec<[f64; 2]>,
     /// Steering actuator output, normalised.
     pub steering_actuator: Vec<f64>,
-    /// Drive torque at each hub, N m.
-    pub drive_torque_nm: Vec<[f64; WHEELS]>,
     /// World z of each wheel centre, m.
     pub wheel_height_m: Vec<[f64; WHEELS]>,
-    /// Loaded soil nodes under each wheel.
-    pub contact_nodes: Vec<[usize; WHEELS]>,
 }
 
 /// The `gt_` columns of a samples file.
@@ -48,14 +42,11 @@ pub(crate) struct TruthColumns {
     sinkage_max: [Numbers; WHEELS],
     force: [[Numbers; WHEELS]; 3],
     slip: [Numbers; WHEELS],
-    lateral_speed: [Numbers; WHEELS],
     region: [Numbers; WHEELS],
     wheel_speed: [Numbers; WHEELS],
     road_wheel_angle: [Numbers; 2],
     steering_actuator: [Numbers; 1],
-    drive_torque: [Numbers; WHEELS],
     wheel_height: [Numbers; WHEELS],
-    contact_nodes: [Numbers; WHEELS],
 }
 
 impl TruthColumns {
@@ -74,14 +65,11 @@ impl TruthColumns {
             sinkage_max: wheels("sink_max")?,
             force: [wheels("fx")?, wheels("fy")?, wheels("fz")?],
             slip: wheels("slip")?,
-            lateral_speed: wheels("vlat")?,
             region: wheels("region")?,
             wheel_speed: wheels("om")?,
             road_wheel_angle: all(table, ["gt_steer_fl", "gt_steer_fr"])?,
             steering_actuator: all(table, ["gt_steer_act"])?,
-            drive_torque: wheels("drive_torque")?,
             wheel_height: wheels("wheel_z")?,
-            contact_nodes: wheels("contact_nodes")?,
         })
     }
 
@@ -101,24 +89,19 @@ impl TruthColumns {
         let [fx, fy, fz] = force.map(|axis| axis.map(|values| grid.linear(&values)));
         let (fx, fy, fz) = (fx?, fy?, fz?);
         let wheel_force_n = (0..fx.len()).map(|k| core::array::from_fn(|w| [fx[k][w], fy[k][w], fz[k][w]]));
-        // Counts and ids have no value in between: they are held, not interpolated.
-        let held = |columns| -> Result<Vec<[usize; WHEELS]>, TrajectoryError> {
-            Ok(grid.held(&together(columns, rows)?).iter().map(|v: &[f64; WHEELS]| v.map(|x| x.max(0.0) as usize)).collect())
-        };
+        // Ids have no value in between: they are held, not interpolated.
+        let region = grid.held(&together(&self.region, rows)?);
         Ok(GroundTruth {
             states: states.collect(),
             sinkage_mean_m: grid.linear(&together(&self.sinkage_mean, rows)?),
             sinkage_max_m: grid.linear(&together(&self.sinkage_max, rows)?),
             wheel_force_n: wheel_force_n.collect(),
             slip: grid.linear(&together(&self.slip, rows)?),
-            lateral_speed_m_s: grid.linear(&together(&self.lateral_speed, rows)?),
-            region: held(&self.region)?,
+            region: region.iter().map(|ids: &[f64; WHEELS]| ids.map(|id| id.max(0.0) as usize)).collect(),
             wheel_speed_rad_s: grid.linear(&together(&self.wheel_speed, rows)?),
             road_wheel_angle_rad: grid.linear(&together(&self.road_wheel_angle, rows)?),
             steering_actuator: grid.linear(&together(&self.steering_actuator, rows)?).iter().map(|v| v[0]).collect(),
-            drive_torque_nm: grid.linear(&together(&self.drive_torque, rows)?),
             wheel_height_m: grid.linear(&together(&self.wheel_height, rows)?),
-            contact_nodes: held(&self.contact_nodes)?,
         })
     }
 }
