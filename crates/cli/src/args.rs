@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 use nesam_evaluation::{Inputs, Truth};
 use nesam_model::{HISTORY, MAX_HORIZON};
-use nesam_trajectories::Trajectory;
+use nesam_trajectories::{SplitFilter, Trajectory};
 
 use crate::failure::Failure;
 use crate::output::note;
@@ -59,10 +59,16 @@ pub enum SplitArg {
 impl SplitArg {
     /// As in JSON.
     pub fn as_str(self) -> &'static str {
-        match self {
-            Self::Train => "train",
-            Self::Test => "test",
-            Self::All => "all",
+        SplitFilter::from(self).as_str()
+    }
+}
+
+impl From<SplitArg> for SplitFilter {
+    fn from(split: SplitArg) -> Self {
+        match split {
+            SplitArg::Train => Self::Train,
+            SplitArg::Test => Self::Test,
+            SplitArg::All => Self::All,
         }
     }
 }

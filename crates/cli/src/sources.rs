@@ -9,7 +9,7 @@ use nesam_model::{ModelBundle, Precision, Predictor};
 use nesam_physics::Vehicle;
 use nesam_server::recording::RecordingHeader;
 use nesam_terrain::WorldMap;
-use nesam_trajectories::{BeyondRange, DataRoot, SetQuery, SplitFilter, Trajectory};
+use nesam_trajectories::{BeyondRange, DataRoot, SetQuery, Trajectory};
 
 use crate::args::{DataArgs, SplitArg};
 use crate::bundle_path::{bundle_dir, bundle_of_hash, bundle_of_vehicle, sample_root};
@@ -135,14 +135,9 @@ pub fn worlds_of(drives: &[Trajectory]) -> BTreeSet<String> {
 
 /// The query behind the options.
 pub fn query(args: &DataArgs, set: &str, split: SplitArg, ground_truth: bool) -> SetQuery {
-    let split = match split {
-        SplitArg::Train => SplitFilter::Train,
-        SplitArg::Test => SplitFilter::Test,
-        SplitArg::All => SplitFilter::All,
-    };
     SetQuery {
         set: set.into(),
-        split,
+        split: split.into(),
         trajectories: args.trajectories.clone(),
         dt_s: args.dt,
         ground_truth,

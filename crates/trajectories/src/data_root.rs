@@ -48,7 +48,8 @@ impl SplitFilter {
         }
     }
 
-    fn as_str(self) -> &'static str {
+    /// As on the command line and in JSON.
+    pub fn as_str(self) -> &'static str {
         match self {
             Self::Train => "train",
             Self::Test => "test",
