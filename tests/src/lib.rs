@@ -18,11 +18,7 @@ pub fn full_data() -> Option<PathBuf> {
     Some(repository().join("../shared/data")).filter(|path| path.join("chrono").is_dir())
 }
 
-/// The newest shipped bundle.
+/// The bundle that is shipped for the vehicle of the sample.
 pub fn shipped_bundle() -> PathBuf {
-    let mut bundles: Vec<PathBuf> = std::fs::read_dir(repository().join("deploy/bundles"))
-        .map(|entries| entries.filter_map(Result::ok).map(|e| e.path()).filter(|p| p.join("manifest.toml").is_file()).collect())
-        .unwrap_or_default();
-    bundles.sort();
-    bundles.pop().unwrap_or_default()
+    repository().join("deploy/bundles/hmmwv-nominal")
 }

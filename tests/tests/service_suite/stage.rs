@@ -7,8 +7,7 @@ use nesam_adaptation::{CalibratedFilter, FilterConfig};
 use nesam_client::{Candidates, Client, Prediction, measurement, v1};
 use nesam_engine::{PredictExtras, PredictQuery, WheelMeasurement};
 use nesam_evaluation::adapt_drive;
-use nesam_learning::{Drive, initial::initial_weights, scales};
-use nesam_model::{HistoryStep, ModelBundle, Predictor, Provenance, Rollout, RolloutQuery, Variant};
+use nesam_model::{HistoryStep, ModelBundle, Predictor, Rollout, RolloutQuery, Variant};
 use nesam_physics::SoilCorrection;
 use nesam_server::{Config, RunningServer, serve};
 use nesam_terrain::WorldMap;
@@ -42,39 +41,10 @@ pub fn recorded() -> Recorded {
     Recorded { drive, world }
 }
 
-/// The shipped bundle; untrained weights where none is shipped yet, as no test here depends on how good the model is.
+/// The shipped bundle.
 fn bundle() -> Arc<ModelBundle> {
     static BUNDLE: OnceLock<Arc<ModelBundle>> = OnceLock::new();
-    BUNDLE
-        .get_or_init(|| {
-            let dir = shipped_bundle();
-            if dir.join("manifest.toml").is_file() {
-                return Arc::new(ModelBundle::load(&dir).unwrap());
-            }
-            eprintln!("no bundle is shipped; the service is tested with untrained weights");
-            let Recorded { drive, world } = recorded();
-            let vehicle = DataRoot::open(&sample_root(), None).unwrap().vehicle().clone();
-            let drive = Drive::new(drive.id, Some(world), drive.states, drive.controls);
-            let normalization = scales::measure(&[&drive], &vehicle, 0.1);
-            Arc::new(ModelBundle {
-                name: "untrained".into(),
-                hash: "0".repeat(64),
-                vehicle,
-                default_soil: normalization.default_soil(),
-                parameters: 0,
-                form: Variant::Full,
-                weights: initial_weights(7, &normalization),
-                normalization,
-                baselines_json: None,
-                reference_json: None,
-                reference_drives: None,
-                soil_filter_json: None,
-                rollout_noise_json: None,
-                effects: Vec::new(),
-                provenance: Provenance::default(),
-            })
-        })
-        .clone()
+    BUNDLE.get_or_init(|| Arc::new(ModelBundle::load(&shipped_bundle()).unwrap())).clone()
 }
 
 /// A predictor that has answered nothing yet.
