@@ -1,14 +1,13 @@
 //! Goal: the book leads somewhere. Method: every shell block after `<!-- run -->` is run with the real binary, every link within the book is followed.
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use common::repository;
 use nesam_adaptation::FilterSettings;
-
-fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
-}
 
 /// Markdown files of the book, those of its folders included: decisions, results.
 fn pages() -> Vec<PathBuf> {

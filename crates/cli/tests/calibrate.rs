@@ -1,36 +1,16 @@
 //! Goal: the card of a vehicle can be fitted to its logs, and used. Method: the real binary on the committed sample.
 #![allow(clippy::unwrap_used)]
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+mod common;
 
+use common::{bundle, nesam, said, sample};
 use serde_json::Value;
-
-fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
-}
-
-fn sample() -> String {
-    repository().join("tests/data/chrono_sample").display().to_string()
-}
-
-fn shipped(name: &str) -> String {
-    repository().join("deploy/bundles").join(name).display().to_string()
-}
-
-fn nesam(args: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
-}
-
-fn said(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
 
 /// Goal: the fit is that of training, it is scored on drives that it did not see, and card and bundle can be passed on. Method: the two drives of the train split.
 #[test]
 fn chrono_a_card_is_fitted_as_training_does_and_helps_on_other_drives() {
     let here = tempfile::tempdir().unwrap();
-    let (data, bundle) = (sample(), shipped("hmmwv-nominal"));
+    let (data, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let set = ["--data", data.as_str(), "--set", "nominal", "--split", "train"];
     let calibrated = nesam(&[&["calibrate"], &set[..], &["--bundle", &bundle, "--out", "fit"]].concat(), here.path());
     assert_eq!(calibrated.status.code(), Some(0), "{}", said(&calibrated));
@@ -64,7 +44,7 @@ fn chrono_a_card_is_fitted_as_training_does_and_helps_on_other_drives() {
 #[test]
 fn chrono_a_single_drive_is_scored_on_itself_and_says_so() {
     let here = tempfile::tempdir().unwrap();
-    let (data, bundle) = (sample(), shipped("hmmwv-nominal"));
+    let (data, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let args = ["calibrate", "--data", &data, "--set", "nominal", "--trajectories", "n0001", "--out", "fit", "--json", "c.json"];
     let output = nesam(&args, here.path());
     assert!(output.status.success() && said(&output).contains("the drive that the card was fitted on"), "{}", said(&output));
@@ -82,13 +62,13 @@ fn chrono_a_single_drive_is_scored_on_itself_and_says_so() {
 #[test]
 fn chrono_a_number_that_ends_at_its_range_is_told() {
     let here = tempfile::tempdir().unwrap();
-    let mut card: Value = serde_json::from_slice(&std::fs::read(Path::new(&sample()).join("vehicle_hmmwv.json")).unwrap()).unwrap();
+    let mut card: Value = serde_json::from_slice(&std::fs::read(sample().join("vehicle_hmmwv.json")).unwrap()).unwrap();
     for axle in ["front", "rear"] {
         let spring = &mut card["suspension"][axle]["spring_N_per_m"];
         *spring = (spring.as_f64().unwrap() / 20.0).into();
     }
     std::fs::write(here.path().join("soft.json"), card.to_string()).unwrap();
-    let data = sample();
+    let data = sample().display().to_string();
     let fitted = |more: &[&str], out: &str| {
         let args = ["calibrate", "--data", &data, "--set", "nominal", "--trajectories", "n0001", "--out", out];
         let output = nesam(&[&args[..], more].concat(), here.path());

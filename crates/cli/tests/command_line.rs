@@ -2,39 +2,15 @@
 //! purpose; exit codes and the words of the messages are the contract.
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 use std::sync::OnceLock;
 
+use common::{bundle, nesam, refused, repository, sample, stderr, stdout};
 use serde_json::Value;
-
-fn sample() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample")
-}
-
-fn nesam(args: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
-}
-
-fn stdout(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stdout).into_owned()
-}
-
-/// Runs and checks exit code 2 and that stderr has every one of `words`.
-fn refused(args: &[&str], folder: &Path, words: &[&str]) {
-    let output = nesam(args, folder);
-    let text = stderr(&output);
-    assert_eq!(output.status.code(), Some(2), "{args:?}: {text}");
-    for word in words {
-        assert!(text.contains(word), "{args:?} should say `{word}`: {text}");
-    }
-    assert!(!text.contains("panicked"), "{text}");
-}
 
 fn copy_folder(from: &Path, to: &Path) {
     std::fs::create_dir_all(to).unwrap();
@@ -46,11 +22,6 @@ fn copy_folder(from: &Path, to: &Path) {
             std::fs::copy(entry.path(), target).unwrap();
         }
     }
-}
-
-/// The bundle that is shipped for the vehicle of the sample.
-fn shipped() -> String {
-    sample().join("../../../deploy/bundles/hmmwv-nominal").display().to_string()
 }
 
 /// A set of the sample with index rows, and its first drive.
@@ -302,10 +273,10 @@ fn service_bench_names_the_one_option_that_is_at_fault() {
 #[test]
 fn service_predict_takes_what_a_short_drive_allows() {
     let here = tempfile::tempdir().unwrap();
-    let log = std::fs::read_to_string(sample().join("../../../docs/example/run.csv")).unwrap();
+    let log = std::fs::read_to_string(repository().join("docs/example/run.csv")).unwrap();
     let short: Vec<&str> = log.lines().take(21).collect();
     std::fs::write(here.path().join("short.csv"), short.join("\n") + "\n").unwrap();
-    let (card, bundle) = (sample().join("vehicle_hmmwv.json").display().to_string(), shipped());
+    let (card, bundle) = (sample().join("vehicle_hmmwv.json").display().to_string(), bundle("hmmwv-nominal"));
     let imported = nesam(&["import", "short.csv", "--to", "root", "--set", "short", "--vehicle", &card], here.path());
     assert_eq!(imported.status.code(), Some(0), "{}", stderr(&imported));
     let base = ["predict", "--data", "root", "--bundle", &bundle];
@@ -341,7 +312,7 @@ fn service_predict_takes_what_a_short_drive_allows() {
 fn chrono_a_card_that_says_otherwise_than_the_bundle_is_told() {
     let root = tempfile::tempdir().unwrap();
     copy_folder(&sample(), root.path());
-    let bundle = shipped();
+    let bundle = bundle("hmmwv-nominal");
     let said = || {
         let output = nesam(&["predict", "--data", ".", "--set", "nominal", "--bundle", &bundle, "--horizon", "2"], root.path());
         assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
@@ -495,7 +466,7 @@ fn chrono_a_bundle_of_another_step_reads_drives_in_its_own() {
 fn chrono_diagnose_names_a_steering_offset_and_nothing_without_one() {
     let here = tempfile::tempdir().unwrap();
     let root = sample().display().to_string();
-    let shipped = shipped();
+    let shipped = bundle("hmmwv-nominal");
     let run = |set: &str, out: &str| -> Value {
         let output = nesam(&["diagnose", "--data", &root, "--set", set, "--bundle", &shipped, "--out", out], here.path());
         assert_eq!(output.status.code(), Some(0), "{}", stderr(&output));
@@ -684,7 +655,7 @@ fn service_effects_say_why_a_server_is_not_reached() {
 #[test]
 fn service_laps_with_a_diagnosed_bundle_differ_by_its_effects_alone() {
     let folder = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample().display().to_string(), shipped());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let quick = ["--worlds", "w01", "--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
     let asked = |more: &[&'static str]| [&["navigate", "--data", &root, "--bundle", &bundle][..], &quick, more].concat();
     refused(&asked(&["--configurations", "diagnosed"]), folder.path(), &["--diagnosed"]);
@@ -710,7 +681,7 @@ fn root_of_a_world(card: &Path, name: &str) -> tempfile::TempDir {
 #[test]
 fn service_laps_are_driven_again_where_card_or_soil_changed() {
     let root = root_of_a_world(&sample().join("vehicle_hmmwv.json"), "vehicle_hmmwv.json");
-    let bundle = shipped();
+    let bundle = bundle("hmmwv-nominal");
     let drive = || {
         let quick = ["--runs", "1", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
         let asked = ["navigate", "--data", ".", "--bundle", &bundle, "--worlds", "w01", "--configurations", "kinematic"];
@@ -730,8 +701,8 @@ fn service_laps_are_driven_again_where_card_or_soil_changed() {
 /// built-in plant is not.
 #[test]
 fn service_laps_of_another_vehicle_than_that_of_the_bundle_are_told() {
-    let root = root_of_a_world(&sample().join("../../../deploy/bundles/clearpath-husky/vehicle.json"), "vehicle_husky.json");
-    let bundle = shipped();
+    let root = root_of_a_world(&repository().join("deploy/bundles/clearpath-husky/vehicle.json"), "vehicle_husky.json");
+    let bundle = bundle("hmmwv-nominal");
     let asked =
         |more: &[&'static str]| [&["navigate", "--data", ".", "--bundle", &bundle, "--worlds", "w01", "--runs", "1"][..], more].concat();
     let moved = "was trained for `HMMWV";

@@ -2,42 +2,28 @@
 //! sign, and on drives of the plant.
 #![allow(clippy::unwrap_used)]
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+mod common;
+
+use std::path::Path;
 use std::sync::Arc;
 
+use common::{bundle, nesam, repository, sample};
 use nesam_plant::{Command as Told, DriveRecorder, Ground, HiddenEffects, Plant, PlantVehicle, Sensors, write_set};
 use serde_json::Value;
-
-fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
-}
-
-fn shipped() -> String {
-    repository().join("deploy/bundles/hmmwv-nominal").display().to_string()
-}
-
-fn nesam(args: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
-}
 
 fn text(bytes: &[u8]) -> String {
     String::from_utf8_lossy(bytes).into_owned()
 }
 
-fn sample() -> String {
-    repository().join("tests/data/chrono_sample").display().to_string()
-}
-
 fn imported(log: &str, set: &str, folder: &Path, more: &[&str]) {
-    let card = format!("{}/vehicle_hmmwv.json", sample());
+    let card = sample().join("vehicle_hmmwv.json").display().to_string();
     let output = nesam(&[&["import", log, "--to", "mine", "--set", set, "--vehicle", &card], more].concat(), folder);
     assert!(output.status.success(), "{}", text(&output.stderr));
 }
 
 /// Asserts that a diagnosis of a set of `mine` ends with exit code 2 and says this.
 fn refused(set: &str, folder: &Path, more: &[&str], words: &[&str]) {
-    let bundle = shipped();
+    let bundle = bundle("hmmwv-nominal");
     let output = nesam(&[&["diagnose", "--data", "mine", "--bundle", &bundle, "--set", set], more].concat(), folder);
     let said = text(&output.stderr);
     assert!(output.status.code() == Some(2) && words.iter().all(|word| said.contains(word)), "{words:?}: {said}");
@@ -65,7 +51,7 @@ fn chrono_doubts_are_printed_as_the_json_has_them() {
     std::fs::read_dir(world).unwrap().flatten().for_each(|file| {
         std::fs::copy(file.path(), copy.join(file.file_name())).unwrap();
     });
-    let bundle = shipped();
+    let bundle = bundle("hmmwv-nominal");
     for (set, doubted) in [("turned", true), ("sound", false)] {
         imported(&format!("{set}.csv"), set, here.path(), &["--world", "w25"]);
         let output = nesam(&["diagnose", "--data", "mine", "--set", set, "--bundle", &bundle, "--no-controls", "--out", set], here.path());
@@ -101,8 +87,8 @@ fn chrono_doubts_are_printed_as_the_json_has_them() {
 fn service_a_drive_that_is_too_short_to_fit_on_is_told_as_such() {
     let here = tempfile::tempdir().unwrap();
     let root = here.path().join("mine");
-    let vehicle = Arc::new(PlantVehicle::of_root(Path::new(&sample())).unwrap());
-    let ground = Arc::new(Ground::read(&Path::new(&sample()).join("worlds/w01")).unwrap());
+    let vehicle = Arc::new(PlantVehicle::of_root(&sample()).unwrap());
+    let ground = Arc::new(Ground::read(&sample().join("worlds/w01")).unwrap());
     let effects = HiddenEffects::default();
     let drive = |id: &str, samples: usize| {
         let mut plant = Plant::at_rest(Arc::clone(&vehicle), Arc::clone(&ground), effects, 0.0, 0.0, 0.0);
@@ -116,7 +102,7 @@ fn service_a_drive_that_is_too_short_to_fit_on_is_told_as_such() {
         recorder.finish(id, "w01", "test")
     };
     write_set(&root.join("plant"), &[drive("long", 30), drive("brief", 5)]).unwrap();
-    std::fs::copy(format!("{}/vehicle_hmmwv.json", sample()), root.join("vehicle_hmmwv.json")).unwrap();
+    std::fs::copy(sample().join("vehicle_hmmwv.json"), root.join("vehicle_hmmwv.json")).unwrap();
     let short = ["--fit-on brief: the drive is too short to be judged, 0.4 s (5 samples of 0.1 s)", "0.8 s (9 samples) or more"];
     for ids in ["brief", "long,brief"] {
         refused("plant", here.path(), &["--fit-on", ids], &short);

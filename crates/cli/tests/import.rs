@@ -1,23 +1,19 @@
 //! Goal: a log of one's own becomes a set that every command reads, and what is odd in it is told. Method: the real binary on the example of the book.
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, Stdio};
 
-fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
-}
-
-fn nesam(folder: &Path, args: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
-}
+use common::{nesam, repository, said, sample};
 
 fn example() -> PathBuf {
     repository().join("docs/example/run.csv")
 }
 
 fn card() -> PathBuf {
-    repository().join("tests/data/chrono_sample/vehicle_hmmwv.json")
+    sample().join("vehicle_hmmwv.json")
 }
 
 /// Imports the example with further arguments; exit code and all that was said.
@@ -29,8 +25,8 @@ fn import(folder: &Path, set: &str, more: &[&str]) -> (Option<i32>, String) {
 fn import_of(folder: &Path, log: &Path, card: &Path, set: &str, more: &[&str]) -> (Option<i32>, String) {
     let (log, card) = (log.to_string_lossy().into_owned(), card.to_string_lossy().into_owned());
     let args = [&["import", &log, "--to", "root", "--set", set, "--vehicle", &card][..], more].concat();
-    let output = nesam(folder, &args);
-    (output.status.code(), format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr)))
+    let output = nesam(&args, folder);
+    (output.status.code(), said(&output))
 }
 
 #[test]
@@ -41,7 +37,7 @@ fn service_an_imported_log_is_a_set() {
     assert!(said.contains("run: 11.9 s, 120 samples, 10.0 Hz") && !said.contains("doubt"), "{said}");
     let page = std::fs::read_to_string(folder.path().join("root/mine/first/import.html")).unwrap();
     assert!(page.matches("<svg class=\"plot\"").count() == 3 && said.contains("wrote root/mine/first/import.html"), "{said}");
-    let check = nesam(folder.path(), &["check", "root"]);
+    let check = nesam(&["check", "root"], folder.path());
     let said = String::from_utf8_lossy(&check.stdout).into_owned();
     assert!(check.status.success() && said.contains("set mine/first: 1 drives, 120 samples") && said.contains("sound"), "{said}");
     let (code, said) = import(folder.path(), "mine/first", &[]);
@@ -124,7 +120,7 @@ fn regress_a_flat_log_is_a_set_whose_heights_are_not_scored() {
     let (code, said) = import_of(folder.path(), &log, &card(), "level", &["--flat"]);
     assert!(code == Some(0) && said.contains("no z, roll, pitch in the set"), "{said}");
     let args = ["evaluate", "--data", "root", "--set", "level", "--models", "constant_velocity", "--json", "scores.json"];
-    let output = nesam(folder.path(), &args);
+    let output = nesam(&args, folder.path());
     let told = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success() && told.contains("note: set `level`: z, roll, pitch not measured in 1 drives"), "{told}");
     let json: serde_json::Value = serde_json::from_slice(&std::fs::read(folder.path().join("scores.json")).unwrap()).unwrap();
@@ -215,7 +211,7 @@ fn service_an_interrupted_import_leaves_nothing_and_left_overs_block_nothing() {
     assert!(folder.path().join("root/a/b/plots.html").is_file());
     let (code, said) = import(folder.path(), "c", &["--column", "cmd_steer=-cmd_steer"]);
     assert!(code == Some(0) && !said.contains(".import-"), "{said}");
-    let check = nesam(folder.path(), &["check", "root"]);
+    let check = nesam(&["check", "root"], folder.path());
     let said = String::from_utf8_lossy(&check.stdout).into_owned();
     assert!(check.status.success() && said.contains("set a/b: 1 drives") && !said.contains(".import-"), "{said}");
     let visible = std::fs::read_dir(folder.path().join("root")).unwrap().flatten().map(|e| e.file_name().to_string_lossy().into_owned());

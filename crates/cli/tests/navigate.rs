@@ -3,28 +3,22 @@
 
 #[path = "../../navigation/tests/common/bicycle.rs"]
 mod bicycle;
+mod common;
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::process::{Command, Output};
 
 use bicycle::bicycle;
+use common::{bundle, sample, stderr};
 use serde_json::Value;
-
-fn sample() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample")
-}
 
 /// Drives laps with small plans; `more` has a plant.
 fn navigate(folder: &Path, root: &Path, more: &[&str]) -> Output {
-    let bundle = sample().join("../../../deploy/bundles/hmmwv-nominal");
+    let bundle = bundle("hmmwv-nominal");
     let quick = ["--worlds", "w01", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
     let mut command = Command::new(env!("CARGO_BIN_EXE_nesam"));
     command.current_dir(folder).arg("navigate").arg("--data").arg(root).arg("--bundle").arg(bundle).args(quick).args(more);
     command.output().expect("the binary runs")
-}
-
-fn stderr(output: &Output) -> String {
-    String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
 fn json(file: &Path) -> Value {

@@ -5,20 +5,12 @@
 mod common;
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Output};
+use std::process::{Child, Command};
 use std::time::Duration;
 
-use common::{BINARY, bundle};
+use common::{bundle, nesam, said};
 use nesam_client::{Candidates, Client, measurement, v1};
 use serde_json::Value;
-
-fn nesam(args: &[&str], folder: &Path) -> Output {
-    Command::new(BINARY).args(args).current_dir(folder).output().unwrap()
-}
-
-fn said(output: &Output) -> String {
-    format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr))
-}
 
 /// A recording server and the address of its gRPC.
 fn serve(folder: &Path, more: &[&str]) -> (Child, String) {

@@ -2,37 +2,17 @@
 //! on the committed sample; exit codes, files and the words of the messages are the contract.
 #![allow(clippy::unwrap_used)]
 
-use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+mod common;
 
+use std::path::Path;
+
+use common::{bundle, nesam, refused, sample, stderr, stdout};
 use serde_json::Value;
-
-fn sample() -> String {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample").display().to_string()
-}
-
-fn bundle() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles/hmmwv-nominal")
-}
-
-fn nesam(args: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
-}
 
 fn done(args: &[&str], folder: &Path) -> String {
     let output = nesam(args, folder);
-    assert_eq!(output.status.code(), Some(0), "{args:?}: {}", String::from_utf8_lossy(&output.stderr));
-    String::from_utf8_lossy(&output.stdout).into_owned()
-}
-
-/// Runs and checks exit code 2 and that stderr has every one of `words`.
-fn refused(args: &[&str], folder: &Path, words: &[&str]) {
-    let output = nesam(args, folder);
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2), "{args:?}: {text}");
-    for word in words {
-        assert!(text.contains(word), "{args:?} should say `{word}`: {text}");
-    }
+    assert_eq!(output.status.code(), Some(0), "{args:?}: {}", stderr(&output));
+    stdout(&output)
 }
 
 /// A folder that only has a manifest is a bundle to whoever writes.
@@ -46,7 +26,7 @@ fn folder_with_a_bundle() -> tempfile::TempDir {
 #[test]
 fn service_a_place_that_cannot_take_results_is_refused_before_the_work() {
     let here = folder_with_a_bundle();
-    let root = sample();
+    let root = sample().display().to_string();
     std::fs::write(here.path().join("file"), "").unwrap();
     let evaluate = |more: &[&'static str]| {
         [&["evaluate", "--data", &root, "--set", "nominal", "--models", "constant_velocity", "--out", "out"][..], more].concat()
@@ -78,7 +58,7 @@ fn names(folder: &Path) -> Vec<String> {
 #[test]
 fn service_no_folder_is_made_that_no_result_needs() {
     let here = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample(), bundle().display().to_string());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let evaluate =
         |more: &[&'static str]| [&["evaluate", "--data", &root, "--set", "nominal/", "--models", "constant_velocity"][..], more].concat();
     let missing = ["evaluate", "--data", &root, "--set", "nominal", "--models", "tal_elev", "--baselines", "."];
@@ -104,7 +84,7 @@ fn service_no_folder_is_made_that_no_result_needs() {
 #[test]
 fn service_a_document_on_standard_output_is_alone_there() {
     let here = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample(), bundle().display().to_string());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     for (args, schema) in [
         (&["evaluate", "--data", &root, "--set", "nominal", "--models", "constant_velocity", "--json", "-"][..], "nesam.evaluate/1"),
         (&["predict", "--data", &root, "--set", "nominal", "--bundle", &bundle, "--horizon", "2", "--json=-"], "nesam.predict/1"),
@@ -121,7 +101,7 @@ fn service_a_document_on_standard_output_is_alone_there() {
 #[test]
 fn service_a_prediction_goes_where_it_is_asked_for() {
     let here = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample(), bundle().display().to_string());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let predict = |more: &[&str]| {
         done(&[&["predict", "--data", &root, "--set", "nominal", "--bundle", &bundle, "--horizon", "2"][..], more].concat(), here.path())
     };
@@ -143,7 +123,7 @@ fn service_a_prediction_goes_where_it_is_asked_for() {
 #[test]
 fn service_a_check_is_told_in_json() {
     let here = tempfile::tempdir().unwrap();
-    let root = sample();
+    let root = sample().display().to_string();
     refused(&["check", &root, "none", "--json", "c.json"], here.path(), &["the check found errors: 1"]);
     let found: Value = serde_json::from_slice(&std::fs::read(here.path().join("c.json")).unwrap()).unwrap();
     assert!(found["errors"] == 1 && found["checked"][0]["kind"] == "data root", "{found}");
@@ -155,7 +135,7 @@ fn service_a_check_is_told_in_json() {
 #[test]
 fn service_an_option_that_a_command_cannot_follow_is_refused() {
     let here = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample(), bundle().display().to_string());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let of = |command: &'static str, more: &[&'static str]| {
         [&[command, "--data", &root, "--set", "nominal", "--bundle", &bundle][..], more].concat()
     };
@@ -172,7 +152,7 @@ fn service_an_option_that_a_command_cannot_follow_is_refused() {
 #[test]
 fn service_wheels_that_a_set_does_not_measure_are_wrong_input() {
     let here = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample(), bundle().display().to_string());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let (log, card) = (format!("{root}/../../../docs/example/run.csv"), format!("{root}/vehicle_hmmwv.json"));
     done(&["import", &log, "--to", "mine", "--set", "first", "--vehicle", &card], here.path());
     let evaluate = ["evaluate", "--data", "mine", "--bundle", &bundle, "--inputs", "wheels", "--models"];
@@ -184,8 +164,8 @@ fn service_wheels_that_a_set_does_not_measure_are_wrong_input() {
 /// other names; the same command writes the same bytes, and the bundle names what it has.
 #[test]
 fn service_a_patched_bundle_is_made_of_the_fitted_drives_alone() {
-    let bundle = bundle().display().to_string();
-    let root = sample();
+    let bundle = bundle("hmmwv-nominal");
+    let root = sample().display().to_string();
     let patched = |drives: &str, data: &str, out: &str| {
         let here = tempfile::tempdir().unwrap();
         let write = ["plant", "write", "--data", &root, "--out", data, "--set", "hidden", "--worlds", "w01,w05", "--drives", drives];
@@ -222,8 +202,8 @@ fn service_a_patched_bundle_is_made_of_the_fitted_drives_alone() {
 /// plain in the steering and too small to show in predictions, and with a larger one, judged alone and among others; the same comes out, and what the others say is told.
 #[test]
 fn service_drives_that_are_not_fitted_change_no_claim() {
-    let bundle = bundle().display().to_string();
-    let root = sample();
+    let bundle = bundle("hmmwv-nominal");
+    let root = sample().display().to_string();
     let found = |effect: &str, drives: &str| {
         let here = tempfile::tempdir().unwrap();
         let write = ["plant", "write", "--data", &root, "--out", "root", "--set", "hidden", "--worlds", "w01,w05", "--drives", drives];
@@ -249,7 +229,7 @@ fn service_drives_that_are_not_fitted_change_no_claim() {
 #[test]
 fn service_a_diagnosis_that_finds_nothing_names_what_stands_out_most() {
     let here = tempfile::tempdir().unwrap();
-    let (root, bundle) = (sample(), bundle().display().to_string());
+    let (root, bundle) = (sample().display().to_string(), bundle("hmmwv-nominal"));
     let args = ["diagnose", "--data", &root, "--set", "effect_open/null_open", "--bundle", &bundle, "--no-controls"];
     let said = done(&args, here.path());
     let line = said.lines().find(|l| l.starts_with("the most that stands out: z = ")).unwrap_or_else(|| panic!("{said}"));

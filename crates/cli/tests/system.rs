@@ -10,16 +10,12 @@ use std::net::{TcpListener, TcpStream};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{BINARY, bundle, start, told};
+use common::{BINARY, bundle, send, start, told};
 use nesam_client::{Client, Tls, v1};
 use rcgen::{BasicConstraints, CertificateParams, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair, SanType};
 
 /// Longest time that a server may take to end, on a machine that does much else.
 const PATIENCE: Duration = Duration::from_secs(30);
-
-fn send(signal: &str, server: &Child) {
-    assert!(Command::new("kill").args([signal, &server.id().to_string()]).status().unwrap().success());
-}
 
 /// Sends a signal, every tenth of a second once more where that is asked for; the exit code.
 fn end(mut server: Child, signal: &str, again: bool) -> Option<i32> {

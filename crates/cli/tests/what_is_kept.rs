@@ -2,25 +2,13 @@
 //! tired person asks for; exit codes, the words of the messages, and every byte that was there before.
 #![allow(clippy::unwrap_used)]
 
+mod common;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
-use std::process::{Command, Output};
+use std::process::Command;
 
-fn sample() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/chrono_sample").canonicalize().unwrap()
-}
-
-fn nesam(args: &[&str], folder: &Path) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_nesam")).args(args).current_dir(folder).output().expect("the binary runs")
-}
-
-/// Runs it and checks exit code 2 and that the last lines have every one of `words`.
-fn refused(args: &[&str], folder: &Path, words: &[&str]) {
-    let output = nesam(args, folder);
-    let text = String::from_utf8_lossy(&output.stderr).into_owned();
-    assert_eq!(output.status.code(), Some(2), "{args:?}: {text}");
-    words.iter().for_each(|word| assert!(text.contains(word), "{args:?} should say `{word}`: {text}"));
-}
+use common::{nesam, refused, sample};
 
 /// The files of a folder with what they hold.
 fn files(folder: &Path) -> BTreeMap<PathBuf, Vec<u8>> {

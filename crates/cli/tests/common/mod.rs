@@ -1,18 +1,65 @@
-//! A server of the real binary, as tests of the command line start it.
+//! The real binary as tests of the command line run it, alone or as a server, and what is shipped.
+#![allow(dead_code, reason = "every test program takes its part of it")]
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, Stdio};
+use std::process::{Child, Command, Output, Stdio};
 
 pub const BINARY: &str = env!("CARGO_BIN_EXE_nesam");
 
 pub fn repository() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../..").canonicalize().unwrap()
+}
+
+/// The committed sample of drives.
+pub fn sample() -> PathBuf {
+    repository().join("tests/data/chrono_sample")
 }
 
 /// A shipped bundle.
 pub fn bundle(name: &str) -> String {
     repository().join("deploy/bundles").join(name).display().to_string()
+}
+
+/// The binary with these arguments, in a folder.
+pub fn command(args: &[&str], folder: &Path) -> Command {
+    let mut command = Command::new(BINARY);
+    command.args(args).current_dir(folder);
+    command
+}
+
+/// Runs it to its end.
+pub fn nesam(args: &[&str], folder: &Path) -> Output {
+    command(args, folder).output().expect("the binary runs")
+}
+
+pub fn stdout(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stdout).into_owned()
+}
+
+pub fn stderr(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+/// Both of them.
+pub fn said(output: &Output) -> String {
+    stdout(output) + &stderr(output)
+}
+
+/// Runs it and checks exit code 2 and that stderr has every one of `words`.
+pub fn refused(args: &[&str], folder: &Path, words: &[&str]) {
+    let output = nesam(args, folder);
+    let text = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{args:?}: {text}");
+    for word in words {
+        assert!(text.contains(word), "{args:?} should say `{word}`: {text}");
+    }
+    assert!(!text.contains("panicked"), "{text}");
+}
+
+/// Sends a signal to a process.
+pub fn send(signal: &str, to: &Child) {
+    assert!(Command::new("kill").args([signal, &to.id().to_string()]).status().unwrap().success());
 }
 
 /// Starts a server without Zenoh in a folder and gives its process and what it said before it was ready.
