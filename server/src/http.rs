@@ -82,13 +82,14 @@ async fn metrics(State(state): State<HttpState>) -> Response {
 }
 
 fn store_metrics(counts: &StoreCounts) -> String {
-    let StoreCounts { commits, failures, bytes, commit_s, waiting, oldest_s } = *counts;
+    let StoreCounts { commits, failures, bytes, commit_s, waiting, oldest_s, set_aside } = *counts;
     [
         ("commits_total", "counter", "Commits of sessions and maps to the store.", commits as f64),
         ("failures_total", "counter", "Commits that the store did not take; they are tried again.", failures as f64),
         ("bytes_total", "counter", "Bytes of sessions and maps committed.", bytes as f64),
         ("commit_seconds_total", "counter", "Time of all commits together.", commit_s),
         ("waiting", "gauge", "Sessions and maps that are not durable yet.", waiting as f64),
+        ("set_aside", "gauge", "Sessions of the store that the server could not read at its start; the log names them.", set_aside as f64),
         ("oldest_waiting_seconds", "gauge", "Time for which the oldest change that is not durable has waited; 0 = none waits.", oldest_s),
     ]
     .map(|(name, kind, help, value)| metric(&format!("nesam_store_{name}"), kind, help, value))

@@ -273,7 +273,7 @@ impl Engine {
         let bundle = self.predictor.bundle();
         if image.bundle_hash != bundle.hash {
             let reason = format!("was exported with bundle {}, this service has {} ({})", image.bundle_hash, bundle.hash, bundle.name);
-            return Err(refused(reason));
+            return Err(EngineError::ForeignImage { reason });
         }
         if let Some((map, hash)) = &image.map {
             let held = self.maps.get(map)?;

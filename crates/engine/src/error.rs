@@ -61,6 +61,12 @@ pub enum EngineError {
         /// What was wrong and what is allowed.
         reason: String,
     },
+    /// A session in bytes is sound perhaps, and not for this service: of another bundle, other settings of the soil filter, another version of the format.
+    #[error("`image`: {reason}")]
+    ForeignImage {
+        /// What it is of.
+        reason: String,
+    },
     /// The session cannot answer yet.
     #[error("`{field}`: {reason}")]
     NotReady {
@@ -139,6 +145,7 @@ impl EngineError {
         match self {
             Self::Invalid { field, .. } | Self::NotReady { field, .. } | Self::Exhausted { field, .. } => field,
             Self::SessionExists { field, .. } => field,
+            Self::ForeignImage { .. } => "image",
             Self::UnknownSession { .. } => "session_id",
             Self::UnknownMap { .. } | Self::MapExists { .. } | Self::MapInUse { .. } => "map_id",
             Self::MapChanged { .. } => "base_version",

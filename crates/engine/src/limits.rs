@@ -9,6 +9,9 @@ use crate::measurement::WheelMeasurement;
 /// Longest name of a session, a vehicle or a map, bytes.
 pub const NAME_LENGTH_MAX: usize = 64;
 
+/// |yaw| of a state, rad: it may be unwrapped.
+pub(crate) const YAW_MAX_RAD: f64 = 1e4;
+
 /// Names of the entries of a state, as paths below the state.
 const STATE_FIELDS: [&str; STATE_DIM] = [
     "position_m.x",
@@ -147,7 +150,7 @@ impl Limits {
             let limit = match i {
                 0..3 => self.position_max_m,
                 3 | 4 => angle,
-                5 => 1e4, // yaw may be unwrapped
+                5 => YAW_MAX_RAD,
                 6..9 => self.speed_max_m_s,
                 _ => self.angular_speed_max_rad_s,
             };

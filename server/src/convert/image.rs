@@ -31,7 +31,7 @@ pub fn image_bytes(image: &SessionImage) -> Vec<u8> {
 /// The session in such bytes.
 ///
 /// # Errors
-/// `Invalid` naming `image`: empty, no export, another version, damaged, or not of the shape of a session.
+/// `ForeignImage` of another version, `Invalid` naming `image`: empty, no export, damaged, or not of the shape of a session.
 pub fn session_image(bytes: &[u8]) -> Result<SessionImage, EngineError> {
     if bytes.is_empty() {
         return Err(refused("is empty; give what an export has answered"));
@@ -43,7 +43,7 @@ pub fn session_image(bytes: &[u8]) -> Result<SessionImage, EngineError> {
             "is of version {} of the format, this service reads version {VERSION}; export it again from a service of this version",
             outer.version
         );
-        return Err(refused(reason));
+        return Err(EngineError::ForeignImage { reason });
     }
     if *Sha256::digest(&outer.content) != *outer.checksum {
         return Err(refused("is damaged: its checksum does not fit; export it again"));

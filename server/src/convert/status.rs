@@ -16,7 +16,7 @@ pub fn code(error: &EngineError) -> Code {
         EngineError::SessionExists { .. } | EngineError::MapExists { .. } => Code::AlreadyExists,
         EngineError::MapChanged { .. } => Code::Aborted,
         EngineError::MapInUse { .. } | EngineError::NotReady { .. } => Code::FailedPrecondition,
-        EngineError::Invalid { .. } => Code::InvalidArgument,
+        EngineError::Invalid { .. } | EngineError::ForeignImage { .. } => Code::InvalidArgument,
         EngineError::Exhausted { .. } | EngineError::Overloaded { .. } => Code::ResourceExhausted,
         EngineError::Expired => Code::DeadlineExceeded,
         EngineError::Abandoned => Code::Cancelled,

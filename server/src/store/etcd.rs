@@ -53,6 +53,8 @@ impl EtcdStore {
                 }
                 // The other servers of the fleet hold it.
                 Change::PutSoil(_) | Change::RemoveSoil(_) => continue,
+                // Nothing is read from here at a start.
+                Change::SetAside(_) => continue,
                 Change::PutSession(session) => (&session.name, Some(session)),
                 Change::RemoveSession(name) => (name, None),
             };

@@ -59,6 +59,8 @@ pub(crate) struct StoreCounts {
     pub waiting: usize,
     /// Time for which the oldest of them has waited, s.
     pub oldest_s: f64,
+    /// Sessions that the server could not read at its start.
+    pub set_aside: usize,
 }
 
 #[derive(Debug, Default)]
@@ -269,8 +271,9 @@ impl Keeper {
         state.renamed.clear();
         state.soil.clear();
         state.durable = restored.accepted;
+        state.counts.set_aside = restored.set_aside.len();
         drop(state);
-        Work { keeper: Arc::clone(self), store, engine, maps: restored.maps }
+        Work { keeper: Arc::clone(self), store, engine, maps: restored.maps, set_aside: restored.set_aside }
     }
 
     /// Does in the calling task what the thread does, without an end, for a server on one thread.
@@ -429,6 +432,8 @@ struct Work {
     engine: EngineHandle,
     /// Each map in the store.
     maps: BTreeMap<String, StoredMap>,
+    /// Sessions in the store that nobody could read, and whose names nobody has taken yet.
+    set_aside: BTreeSet<String>,
 }
 
 impl Work {
@@ -472,6 +477,7 @@ impl Work {
             Ok(foreign) => {
                 let Batch { mut places, maps, bytes, .. } = batch;
                 places.retain(|session, _| !foreign.contains(session));
+                self.set_aside.retain(|session| !places.contains_key(session));
                 self.maps = maps;
                 self.keeper.committed(due, &places, bytes, begun.elapsed());
                 true
@@ -509,6 +515,9 @@ impl Work {
         let saved_unix_ns = unix_ns();
         for (name, image) in snapshot.sessions {
             places.insert(name.clone(), image.as_ref().map(|image| image.accepted));
+            if self.set_aside.contains(&name) {
+                changes.push(Change::SetAside(name.clone()));
+            }
             changes.push(match image {
                 Some(image) => Change::PutSession(StoredSession { name, saved_unix_ns, image: image_bytes(&image) }),
                 None => Change::RemoveSession(name),
@@ -542,7 +551,7 @@ fn weight(change: &Change) -> u64 {
         Change::PutSession(session) => session.image.len() as u64,
         Change::PutMap(_, bytes) => bytes.len() as u64,
         Change::PutSoil(soil) => soil.share.len() as u64,
-        Change::RemoveSession(_) | Change::RemoveMap(_) | Change::RemoveSoil(_) => 0,
+        Change::SetAside(_) | Change::RemoveSession(_) | Change::RemoveMap(_) | Change::RemoveSoil(_) => 0,
     }
 }
 

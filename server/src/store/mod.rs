@@ -98,6 +98,8 @@ pub struct StoredSession {
 pub enum Change {
     /// A session, new or not.
     PutSession(StoredSession),
+    /// What is held under this name, which no server could read, goes to another place: a session of that name begins.
+    SetAside(String),
     /// No session of this name.
     RemoveSession(String),
     /// A map, new or not: id and bytes.

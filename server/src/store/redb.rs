@@ -3,12 +3,17 @@
 use std::io::Read as _;
 use std::path::Path;
 
-use ::redb::{Database, DatabaseError, Durability, ReadableDatabase as _, ReadableTable as _, TableDefinition};
+use ::redb::{
+    AccessGuard, Database, DatabaseError, Durability, ReadTransaction, ReadableDatabase as _, ReadableTable as _, StorageError,
+    TableDefinition,
+};
 
 use super::{Change, Contents, SessionStore, StoreError, StoredSession, StoredSoil};
 
 /// Name → when it was saved, image.
 const SESSIONS: TableDefinition<'_, &str, (i64, &[u8])> = TableDefinition::new("sessions");
+/// Name and when it was saved → image: sessions that no server could read, whose names others have now.
+const SET_ASIDE: TableDefinition<'_, (&str, i64), &[u8]> = TableDefinition::new("set_aside");
 /// Id → bytes.
 const MAPS: TableDefinition<'_, &str, &[u8]> = TableDefinition::new("maps");
 /// Key → when it was brought, evidence of the soil.
@@ -145,6 +150,7 @@ impl RedbStore {
                 None => drop(facts.insert(FORMAT.0, FORMAT.1).map_err(failed)?),
             }
             transaction.open_table(SESSIONS).map_err(failed)?;
+            transaction.open_table(SET_ASIDE).map_err(failed)?;
             transaction.open_table(MAPS).map_err(failed)?;
             transaction.open_table(SOIL).map_err(failed)?;
         }
@@ -159,12 +165,19 @@ fn write(database: &Database, changes: &[Change]) -> Result<(), StoreError> {
     transaction.set_durability(Durability::Immediate).map_err(failed)?;
     {
         let mut sessions = transaction.open_table(SESSIONS).map_err(failed)?;
+        let mut set_aside = transaction.open_table(SET_ASIDE).map_err(failed)?;
         let mut maps = transaction.open_table(MAPS).map_err(failed)?;
         let mut soil = transaction.open_table(SOIL).map_err(failed)?;
         for change in changes {
             match change {
                 Change::PutSession(s) => {
                     drop(sessions.insert(s.name.as_str(), (s.saved_unix_ns, s.image.as_slice())).map_err(failed)?);
+                }
+                Change::SetAside(name) => {
+                    if let Some(held) = sessions.remove(name.as_str()).map_err(failed)? {
+                        let (saved_unix_ns, image) = held.value();
+                        drop(set_aside.insert((name.as_str(), saved_unix_ns), image).map_err(failed)?);
+                    }
                 }
                 Change::RemoveSession(name) => drop(sessions.remove(name.as_str()).map_err(failed)?),
                 Change::PutMap(id, bytes) => drop(maps.insert(id.as_str(), bytes.as_slice()).map_err(failed)?),
@@ -177,10 +190,30 @@ fn write(database: &Database, changes: &[Change]) -> Result<(), StoreError> {
     transaction.commit().map_err(failed)
 }
 
+impl RedbStore {
+    fn read(&self) -> Result<ReadTransaction, StoreError> {
+        let database = self.database.as_ref().ok_or_else(|| failed("is closed, as the last commit failed"))?;
+        database.begin_read().map_err(failed)
+    }
+
+    /// Sessions that no server could read, whose names others have now.
+    ///
+    /// # Errors
+    /// `StoreError` when they cannot be read.
+    pub fn set_aside(&self) -> Result<Vec<StoredSession>, StoreError> {
+        let entries = self.read()?.open_table(SET_ASIDE).map_err(failed)?;
+        let session = |entry: Result<_, StorageError>| {
+            let (key, image): (AccessGuard<'_, (&str, i64)>, AccessGuard<'_, &[u8]>) = entry.map_err(failed)?;
+            let (name, saved_unix_ns) = key.value();
+            Ok(StoredSession { name: name.into(), saved_unix_ns, image: image.value().to_vec() })
+        };
+        entries.iter().map_err(failed)?.map(session).collect()
+    }
+}
+
 impl SessionStore for RedbStore {
     fn load(&self) -> Result<Contents, StoreError> {
-        let database = self.database.as_ref().ok_or_else(|| failed("is closed, as the last commit failed"))?;
-        let transaction = database.begin_read().map_err(failed)?;
+        let transaction = self.read()?;
         let mut contents = Contents::default();
         for entry in transaction.open_table(SESSIONS).map_err(failed)?.iter().map_err(failed)? {
             let (name, value) = entry.map_err(failed)?;

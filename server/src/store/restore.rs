@@ -1,6 +1,6 @@
 //! Sessions and maps of a store back into an engine.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nesam_engine::{Command, EngineError, EngineHandle, Reply, SessionImage};
 use nesam_proto::v1 as pb;
@@ -35,14 +35,17 @@ pub struct Restored {
     pub accepted: BTreeMap<String, u64>,
     /// Each map.
     pub maps: BTreeMap<String, StoredMap>,
+    /// Sessions that cannot go on. They stay in the store as they are.
+    pub set_aside: BTreeSet<String>,
     /// Keys of evidence of the soil that has faded.
     pub faded: Vec<String>,
 }
 
-/// Puts everything into an engine that holds nothing yet; evidence of the soil where that is kept for this server (`soil_of`).
+/// Puts everything into an engine that holds nothing yet; evidence of the soil where that is kept for this server (`soil_of`). A session that cannot go on is set aside: the
+/// vehicles of the others do not wait for it.
 ///
 /// # Errors
-/// `StoreError::Content` naming the session or map that the engine refuses: of another bundle, damaged, or beyond its limits.
+/// `StoreError::Content` naming the session or map that another server would take, with another bundle or more room; also a map that is damaged.
 pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Option<&SoilTeller>) -> Result<Restored, StoreError> {
     let mut restored = Restored::default();
     for (id, bytes) in &contents.maps {
@@ -53,12 +56,27 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Optio
         engine.call(Command::PutMap { map: map.into(), base: None }).map_err(|error| refused(error.to_string()))?;
     }
     for session in &contents.sessions {
-        let accepted = import(session, &restored.maps, engine).map_err(|error| {
-            let reason =
-                format!("{error}; start the server with the bundle and the limits that the store was written with, or with another store");
-            StoreError::Content { what: format!("session `{}`", session.name), reason }
-        })?;
-        restored.accepted.insert(session.name.clone(), accepted);
+        let name = session.name.clone();
+        match import(session, &restored.maps, engine) {
+            Ok(accepted) => drop(restored.accepted.insert(name, accepted)),
+            Err(error) if is_of_another_server(&error) => {
+                let reason = format!(
+                    "{error}; start the server with the bundle and the limits that the store was written with, or with another store"
+                );
+                return Err(StoreError::Content { what: format!("session `{name}`"), reason });
+            }
+            Err(error) => {
+                let (bytes, reason) = (session.image.len(), error.to_string());
+                tracing::error!(
+                    session = name,
+                    bytes,
+                    reason,
+                    "a session of the store cannot go on and is set aside; its bytes stay in the store and are tried again at the next start, until one of its name \
+                     is opened: then they go to the table `set_aside`"
+                );
+                restored.set_aside.insert(name);
+            }
+        }
     }
     for (row, of) in contents.soil.iter().zip(soil_of.into_iter().cycle()) {
         if recall(row, of, engine) == Some(0) {
@@ -66,6 +84,12 @@ pub(crate) fn restore(contents: &Contents, engine: &EngineHandle, soil_of: Optio
         }
     }
     Ok(restored)
+}
+
+/// Whether the session is sound as far as is known, and this server the wrong one.
+fn is_of_another_server(error: &EngineError) -> bool {
+    use EngineError::{Exhausted, Expired, ForeignImage, Overloaded, Stopped};
+    matches!(error, ForeignImage { .. } | Exhausted { .. } | Overloaded { .. } | Expired | Stopped)
 }
 
 /// A stored session as it goes on where its vehicle is now: the time without a server counts as silence.

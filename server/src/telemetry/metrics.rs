@@ -67,7 +67,7 @@ fn refusal(error: &EngineError) -> &'static str {
         EngineError::SessionExists { .. } | EngineError::MapExists { .. } => "already_exists",
         EngineError::MapChanged { .. } => "aborted",
         EngineError::MapInUse { .. } | EngineError::NotReady { .. } => "failed_precondition",
-        EngineError::Invalid { .. } => "invalid_argument",
+        EngineError::Invalid { .. } | EngineError::ForeignImage { .. } => "invalid_argument",
         EngineError::Exhausted { .. } => "exhausted",
         EngineError::Overloaded { .. } => "overloaded",
         EngineError::Expired => "deadline_exceeded",

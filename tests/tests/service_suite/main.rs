@@ -32,6 +32,7 @@ mod routing;
 mod security;
 mod session_model;
 mod sessions;
+mod set_aside;
 mod sharing;
 mod simulation;
 mod slides;

@@ -1,6 +1,9 @@
 //! Goal: a session that is exported and imported, on the same or another server, answers as the original, bit for bit; anything else than an export is refused.
 
 use nesam_client::{outcome_label, v1};
+use nesam_engine::{Command, Engine, Limits, Measurement, OpenSession, Reply, WheelMeasurement};
+use nesam_physics::{Control, VehicleState};
+use nesam_server::convert::{image_bytes, session_image};
 use prost::Message as _;
 use tonic::Code;
 
@@ -45,6 +48,81 @@ async fn service_an_imported_session_goes_on_as_the_original() {
     assert_same(&there, &offline(&recorded, 90, &query, 31, learned(&recorded, 90).0));
     server.shutdown().await;
     other_server.shutdown().await;
+}
+
+/// Goal: whatever a session accepts, it can be exported, imported and go on as it was, so a store of it can be opened. Method: streams from a seed at several rates, with losses, late
+/// ones, pauses and restarts, whose values lie at either limit, at zero and between; after every few measurements an export, through its bytes and into an engine that holds nothing.
+#[test]
+fn property_whatever_a_session_accepted_can_be_imported() {
+    let (recorded, limits) = (recorded(), Limits::default());
+    let range = fresh_predictor().bundle().vehicle.command_range;
+    let position_m = limits.position_max_m;
+    // Of each entry of a state: its limit, which the first two share with what is on the map.
+    let angle_rad = core::f64::consts::PI + 1e-6;
+    let most = [position_m, position_m, position_m, angle_rad, angle_rad, 1e4, 100.0, 100.0, 100.0, 50.0, 50.0, 50.0];
+    let engine = || {
+        let mut engine = Engine::new(predictor(), limits.clone()).unwrap();
+        engine.execute(0, &Command::PutMap { map: recorded.world.clone(), base: None }).unwrap();
+        engine
+    };
+    let (mut accepted, mut imported) = (0, 0);
+    for seed in 1..=24_u64 {
+        let mut bits = seed.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        let mut random = |below: u64| {
+            bits = bits.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (bits >> 33) % below
+        };
+        let mut original = engine();
+        let map = if seed % 2 == 0 { recorded.world.id().into() } else { String::new() };
+        original.execute(0, &Command::Open(OpenSession { vehicle: "s".into(), map, ..Default::default() })).unwrap();
+        let interval_ns = [100_000_000, 66_666_667, 41_000_000, 140_000_000][(seed % 4) as usize];
+        let (mut stamp_ns, mut boot) = (if seed % 6 == 5 { i64::MAX - 8_000_000_000 } else { 0 }, 1);
+        for i in 0..60_u64 {
+            stamp_ns += interval_ns;
+            match random(40) {
+                0 => boot += 1,
+                1 => stamp_ns += 2 * interval_ns,
+                2 => continue,
+                _ => {}
+            }
+            let late_ns = if random(8) == 0 { 3 * interval_ns / 2 } else { 0 };
+            // Half of the streams jump between the limits, the others drive and have one entry at a limit.
+            let mut state = recorded.drive.states[i as usize].to_array();
+            for (entry, value) in state.iter_mut().enumerate() {
+                if seed % 2 == 1 || entry as u64 == seed % 12 {
+                    *value = [1.0, -1.0, 0.0, -0.0, 1.0 - 1e-9, -0.999_7][random(6) as usize] * most[entry];
+                }
+            }
+            let command = |of: usize, random: u64| [range[of][0], range[of][1], 0.0][random as usize];
+            let measurement = Measurement {
+                sequence: Some(i + 1),
+                boot: Some(boot),
+                stamp_ns: stamp_ns - late_ns,
+                state: VehicleState::from_array(state),
+                command: Control { speed_m_s: command(0, random(3)), second: command(1, random(3)) },
+                wheels: WheelMeasurement { road_wheel_angle_rad: Some([core::f64::consts::FRAC_PI_2; 2]), ..Default::default() },
+            };
+            let told = original.execute(i * interval_ns as u64, &Command::Measure { session: "s".into(), vehicle: None, measurement });
+            let Reply::Measured(told) = told.unwrap_or_else(|error| panic!("seed {seed}, {i}: {error}")) else { panic!("another reply") };
+            accepted += usize::from(told.outcome.accepted());
+            if i % 5 != 4 {
+                continue;
+            }
+            let now_ns = i * interval_ns as u64;
+            let export = |engine: &mut Engine| match engine.execute(now_ns, &Command::Export { session: "s".into() }).unwrap() {
+                Reply::Image(image) => image_bytes(&image),
+                other => panic!("{other:?}"),
+            };
+            let bytes = export(&mut original);
+            let image = Box::new(session_image(&bytes).unwrap());
+            let mut copy = engine();
+            copy.execute(now_ns, &Command::Import { image, session: "s".into() })
+                .unwrap_or_else(|error| panic!("seed {seed}, after {i}: {measurement:?}: {error}"));
+            assert!(export(&mut copy) == bytes, "seed {seed}, after {i}: another session");
+            imported += 1;
+        }
+    }
+    assert!(accepted > 800 && imported > 250, "{accepted} accepted, {imported} imported");
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -172,7 +172,7 @@ impl Session {
     /// The session of an image under a name. The caller has compared bundle and map and prepared the effects.
     ///
     /// # Errors
-    /// `EngineError::Invalid` naming `image` when it was made with other settings of the soil filter, or holds what no session can hold.
+    /// `EngineError::ForeignImage` when it was made with other settings of the soil filter, `Invalid` naming `image` when it holds what no session can hold.
     pub(crate) fn from_image(
         id: &str,
         image: &SessionImage,
@@ -182,7 +182,7 @@ impl Session {
         rules: Rules<'_>,
     ) -> Result<Self, EngineError> {
         if image.filter_settings != settings_of(&filter) {
-            return Err(refused("was exported with other settings of the soil filter"));
+            return Err(EngineError::ForeignImage { reason: "was exported with other settings of the soil filter".into() });
         }
         image.check(filter.config().buffer, rules)?;
         let filter = filter.restored(&image.filter).map_err(|error| refused(error.to_string()))?;
