@@ -4,7 +4,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <deque>
-#include <iterator>
 #include <map>
 #include <mutex>
 #include <optional>
@@ -81,7 +80,7 @@ class DurableStreamImpl {
 
   Result<void> flush(std::chrono::nanoseconds timeout) {
     const SteadyTime end = std::chrono::steady_clock::now() + bounded(timeout);
-    while (kept() != 0 || !doubtful_.empty()) {
+    while (kept() != 0) {
       if (opened_anew()) begin_anew();
       if (!waiting_.empty()) {
         auto answer = deliver(end, false);
@@ -96,7 +95,7 @@ class DurableStreamImpl {
         if (unknown_session(status.error().code(), status.error().field())) begin_anew();
         return status.error();
       }
-      if (kept() == 0 && doubtful_.empty()) break;
+      if (kept() == 0) break;
       if (over(end)) {
         return Error(Code::deadline_exceeded, "", std::to_string(kept()) + " measurements are not durable in time; does the server keep a store?");
       }
@@ -129,10 +128,14 @@ class DurableStreamImpl {
     Measurement measurement;
     std::uint64_t place;
   };
+  struct Taken {
+    std::uint64_t run;
+    std::uint64_t place;
+  };
   struct Waiting {
     Measurement measurement;
-    /// Run in which the session took it already, as far as is known.
-    std::optional<std::uint64_t> taken;
+    /// Run in which the session took it already and its place there, as far as is known.
+    std::optional<Taken> taken;
   };
 
   static std::chrono::nanoseconds left(SteadyTime end) { return bounded(end - std::chrono::steady_clock::now()); }
@@ -193,15 +196,17 @@ class DurableStreamImpl {
         }
         run_ = answer->run;
         place_ = answer->place;
-        doubtful_.clear();
         answered_.push_back({std::move(waiting_.front().measurement), answer->place});
+        durable(run_, answer->durable_place);
+      } else if (const auto& taken = waiting_.front().taken; taken && taken->run == answer->run && !answer->is<Rejected>()) {
+        // The session has it, and does not know it again: it is of a boot that has ended. It keeps its place until that is durable, which this answer cannot tell:
+        // the session may have begun anew.
+        answered_.push_back({std::move(waiting_.front().measurement), taken->place});
       } else if (!is_newest) {
-        auto& refused = waiting_.front().taken == answer->run ? doubtful_ : refused_;
-        if (refused.size() >= options_.pending_max) refused.erase(refused.begin());
-        refused.push_back({std::move(waiting_.front().measurement), *answer});
+        if (refused_.size() >= options_.pending_max) refused_.erase(refused_.begin());
+        refused_.push_back({std::move(waiting_.front().measurement), *answer});
       }
       waiting_.pop_front();
-      if (answer->run == run_) durable(run_, answer->durable_place);
       newest = std::move(*answer);
     }
     if (!newest) return Error(Code::internal, "", "nothing to send; this is a bug");
@@ -240,7 +245,6 @@ class DurableStreamImpl {
       stream_.reset();
       return begin_anew();
     }
-    doubtful_.clear();
     durable(status.run, status.durable_place);
   }
 
@@ -266,15 +270,15 @@ class DurableStreamImpl {
 
   /// Another run of the server may count otherwise.
   void forget_places() {
-    for (; !answered_.empty(); answered_.pop_back()) waiting_.push_front({std::move(answered_.back().measurement), run_});
+    for (; !answered_.empty(); answered_.pop_back()) {
+      waiting_.push_front({std::move(answered_.back().measurement), Taken{run_, answered_.back().place}});
+    }
   }
 
   /// The session is closed or began anew, or another run counts: what it had may be gone, and all is sent again, from the oldest on.
   void begin_anew() {
     forget_places();
     for (Waiting& waiting : waiting_) waiting.taken.reset();
-    std::move(doubtful_.begin(), doubtful_.end(), std::back_inserter(refused_));
-    doubtful_.clear();
     place_ = 0;
   }
 
@@ -291,8 +295,6 @@ class DurableStreamImpl {
   std::uint64_t place_ = 0;
   /// What was refused and nobody was told: the session does not have it.
   std::vector<RefusedMeasurement> refused_;
-  /// What the session took and refused when it went again, as too old perhaps: it has it, unless it turns out to have begun anew.
-  std::vector<RefusedMeasurement> doubtful_;
   /// Which session of the name it was.
   std::uint64_t opening_;
   /// When the service was heard last.

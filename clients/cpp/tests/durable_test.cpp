@@ -300,6 +300,32 @@ void service_without_a_store_nothing_is_durable(const Place& place) {
   check(stream.pending().size() == 3 && session.status().value().accepted == 3, "three are accepted and kept");
 }
 
+void service_a_new_boot_or_a_clock_that_is_set_loses_nothing(const Place& place) {
+  const Server server(place.binary, place.folder, place.arguments);
+  nesam::Client client = connected(server);
+  for (const bool is_boot : {true, false}) {
+    nesam::Session session = opened(client, is_boot ? "boot" : "clock");
+    nesam::DurableStream stream = session.durable_measurements();
+    const auto measurement = [&](int step) {
+      nesam::Measurement one = cruise(step, session.vehicle());
+      if (is_boot) one.boot_id = step < 10 ? 7 : 8;
+      if (!is_boot && step >= 10) one.stamp_ns += std::chrono::nanoseconds(1h).count();
+      return one;
+    };
+    for (int step = 0; step < 20; ++step) check_ok(stream.send(measurement(step)), "first over one connection");
+    // Of a clock that was set the first measurement is taken for an error.
+    std::size_t accepted = is_boot ? 20 : 19;
+    check(stream.pending().size() == accepted && session.status().value().accepted == accepted, "all that was accepted is kept");
+    for (int step = 20; step < 22; ++step) {
+      stream.close();
+      const auto answer = stream.send(measurement(step));
+      check(answer.ok() && answer->accepted() && answer->place == ++accepted, answer.ok() ? "place" : answer.error().what());
+      check(stream.pending().size() == accepted && stream.take_refused().empty(), std::to_string(stream.pending().size()) + " kept over another connection");
+    }
+    check(session.status().value().accepted == accepted, "nothing twice");
+  }
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -313,6 +339,7 @@ int main(int argc, char** argv) {
   run("service_a_session_that_began_anew_gets_everything_in_order", [&] { service_a_session_that_began_anew_gets_everything_in_order(place); });
   run("service_flush_notices_that_a_session_began_anew", [&] { service_flush_notices_that_a_session_began_anew(place); });
   run("service_a_server_that_comes_back_is_found", [&] { service_a_server_that_comes_back_is_found(place); });
+  run("service_a_new_boot_or_a_clock_that_is_set_loses_nothing", [&] { service_a_new_boot_or_a_clock_that_is_set_loses_nothing(place); });
   run("service_without_a_store_nothing_is_durable", [&] { service_without_a_store_nothing_is_durable(place); });
   std::printf("%d passed, %d failed\n", passed, failed);
   return failed == 0 ? 0 : 1;

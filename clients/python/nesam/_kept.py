@@ -109,6 +109,11 @@ class Kept:
             self.begins_anew()
             newest = self._waiting[-1].measurement
             return replace(answer, sequence=newest.sequence, stamp_ns=newest.stamp_ns)
+        if one.answer is not None and one.answer.run == answer.run and not answer.code and not answer.place:
+            # The session has it, and does not know it again: it is of a boot that has ended. It keeps its place until that is durable, which this answer cannot
+            # tell: the session may have begun anew.
+            self._answered.append(self._waiting.popleft())
+            return None if self._waiting else replace(one.answer, durable_place=answer.durable_place)
         if answer.place:
             # Places only rise, and a duplicate is told that of the newest.
             is_anew = answer.run == self._run and answer.place < self._place + (answer.outcome != "DUPLICATE")

@@ -196,6 +196,51 @@ def test_service_what_is_sent_again_is_never_new(client, hills):
     np.testing.assert_array_equal(after.state, before.state)
 
 
+@pytest.mark.parametrize("change", ["clock", "boot"])
+def test_service_a_clock_that_is_set_or_a_new_boot_loses_nothing(client, change):
+    """What was accepted before is kept until it is durable, over as many connections as it takes; the server keeps no store, so all of it is."""
+    hour_ns = 3_600_000_000_000 if change == "clock" else 0
+    drive = [replace(m, sequence=0) for m in straight(change, 22)]
+    drive = [*drive[:10], *(replace(m, stamp_ns=m.stamp_ns + hour_ns) for m in drive[10:])]
+    if change == "boot":
+        drive = [replace(m, boot_id=7 + (i >= 10)) for i, m in enumerate(drive)]
+    client.open_session(change)
+    with client.durable_stream(change) as stream:
+        outcomes = [stream.send(measurement).outcome for measurement in drive[:20]]
+        assert outcomes[10:12] == (["FUTURE", "CLOCK_JUMP"] if change == "clock" else ["RESTARTED", "APPLIED"])
+        accepted = 19 if change == "clock" else 20
+        assert len(stream.pending) == client.session(change).accepted == accepted
+        for more in (20, 21):
+            stream.close()
+            assert stream.send(drive[more]).outcome == "APPLIED"
+            accepted += 1
+            assert len(stream.pending) == client.session(change).accepted == accepted
+
+
+def test_service_a_new_boot_loses_nothing_in_a_crash(request, tmp_path):
+    """The same with a store that does not write in time, and a server that is killed."""
+    (tmp_path / "nesam.toml").write_text("[store]\ninterval_s = 60.0\n")
+    options = ("--grpc", f"127.0.0.1:{free_port()}", "--no-http", "--no-zenoh", "--store", "store", "--config", "nesam.toml")
+    process, address = start_server(request, *options, folder=tmp_path)
+    try:
+        with nesam.Client(address, timeout_s=60.0) as client:
+            client.open_session("truck")
+            drive = [replace(m, sequence=0, boot_id=7 + (i >= 10)) for i, m in enumerate(straight("truck", 22))]
+            with client.durable_stream("truck") as stream:
+                for measurement in drive[:20]:
+                    stream.send(measurement)
+                stream.close()
+                stream.send(drive[20])
+                process.kill()
+                process.wait()
+                process, _ = start_server(request, *options, folder=tmp_path)
+                stream.send(drive[21])
+                assert client.session("truck").accepted == 22 and client.session("truck").last_stamp_ns == drive[-1].stamp_ns
+    finally:
+        process.kill()
+        process.wait()
+
+
 def test_service_what_is_kept_is_what_was_sent(start, hills):
     """The vehicle writes its next state into the array of the last one; the server dies before that is durable."""
     process, address = start()

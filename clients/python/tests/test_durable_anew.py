@@ -160,8 +160,8 @@ def test_service_what_the_new_session_cannot_take_is_told(own, planner):
     stream.close()
 
 
-def answer(outcome, place=0, run=1):
-    return nesam.Answer(outcome, "truck", 0, 0, 0, 0, place=place, run=run)
+def answer(outcome, place=0, run=1, durable_place=0):
+    return nesam.Answer(outcome, "truck", 0, 0, 0, 0, place=place, run=run, durable_place=durable_place)
 
 
 def kept_of(*numbers):
@@ -191,12 +191,31 @@ def test_analytic_what_a_session_has_is_not_missing_when_it_is_refused_again():
 
 
 def test_analytic_what_another_session_refuses_is_missing():
-    for later, why in ((answer("APPLIED", 1), "it counts from 1"), (answer("APPLIED", 1, run=2), "another run")):
-        kept = kept_of(1, 2, 3)
-        kept.answered(answer("TOO_OLD", run=later.run))
-        kept.answered(later)
-        assert refused(kept) == [1], why
-        assert refused(kept) == [], "once"
+    kept = kept_of(1, 2, 3)
+    kept.answered(answer("TOO_OLD", run=2))
+    kept.answered(answer("APPLIED", 1, run=2))
+    assert refused(kept) == [1], "another run"
+    assert refused(kept) == [], "once"
+    # The same run may have it, until it counts from 1: then all go to it, the oldest first.
+    kept = kept_of(1, 2, 3)
+    kept.answered(answer("TOO_OLD"))
+    with pytest.raises(nesam.Unavailable):
+        kept.answered(answer("APPLIED", 1))
+    kept.forget_places()
+    assert refused(kept) == [] and kept.next.sequence == 1
+    kept.answered(answer("TOO_OLD"))
+    kept.answered(answer("DUPLICATE", 1))
+    assert refused(kept) == [1] and kept.next.sequence == 3
+
+
+def test_regress_what_the_session_does_not_know_again_keeps_its_place():
+    """Two boots, of which the first is over when all go again over another connection: what the session has of it is TOO_OLD, and kept until it is durable."""
+    kept = kept_of(1, 2, 3)
+    for _ in range(2):
+        kept.answered(answer("TOO_OLD", durable_place=3))
+    assert len(kept) == 3, "an answer without a place does not say that the session is the same"
+    kept.answered(answer("DUPLICATE", 3, durable_place=1))
+    assert [measurement.sequence for measurement in kept.pending] == [2, 3] and refused(kept) == []
     # One that never had a place: nobody was told of it, as its connection broke.
     kept = kept_of(1)
     kept.put(DRIVE[1])

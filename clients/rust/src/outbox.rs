@@ -36,6 +36,8 @@ pub struct Outbox {
     on_the_way: VecDeque<u64>,
     /// Those of `kept` that were accepted: place in the session, number in `kept`.
     received: BTreeSet<(u64, u64)>,
+    /// Places of those of `kept` that this run has accepted, now or before they were sent again, by number in `kept`.
+    places: BTreeMap<u64, u64>,
     /// Those of `kept` that the service had no room for and has not answered otherwise since.
     no_room: BTreeSet<u64>,
     /// How many were pushed.
@@ -63,6 +65,7 @@ impl Outbox {
             unsent: BTreeSet::new(),
             on_the_way: VecDeque::new(),
             received: BTreeSet::new(),
+            places: BTreeMap::new(),
             no_room: BTreeSet::new(),
             pushed: 0,
             run: 0,
@@ -136,7 +139,8 @@ impl Outbox {
             Some(number) => self.settle(number, answer),
             None => None,
         };
-        if answer.run == self.run {
+        // Without a place it does not tell whether the session is the same.
+        if answer.run == self.run && answer.place != 0 {
             self.durable(answer.run, answer.durable_place);
         }
         lost
@@ -153,11 +157,19 @@ impl Outbox {
                 None
             }
             outcome if answer.place == 0 => {
+                let place = self.places.get(&number).filter(|_| answer.run == self.run && !matches!(outcome, Some(Outcome::Rejected(_))));
+                if let Some(place) = place {
+                    // The session has it, and does not know it again: it is of a boot that has ended. It keeps its place until that is durable.
+                    self.received.insert((*place, number));
+                    return None;
+                }
+                self.places.remove(&number);
                 let overtaken = self.no_room.remove(&number) && matches!(outcome, Some(Outcome::TooOld(_)));
                 self.kept.remove(&number).filter(|_| overtaken)
             }
             _ => {
                 self.no_room.remove(&number);
+                self.places.insert(number, answer.place);
                 self.received.insert((answer.place, number));
                 None
             }
@@ -172,6 +184,7 @@ impl Outbox {
             && received <= place
         {
             self.received.pop_first();
+            self.places.remove(&number);
             self.kept.remove(&number);
         }
     }
@@ -179,6 +192,7 @@ impl Outbox {
     fn counted_by(&mut self, run: u64) {
         if run != self.run {
             self.run = run;
+            self.places.clear();
             let received = std::mem::take(&mut self.received);
             self.unsent.extend(received.into_iter().map(|(_, number)| number));
         }
@@ -337,6 +351,34 @@ mod tests {
         let mut outbox = holding(1);
         assert_eq!(sequences(&mut outbox), [1]);
         assert!(outbox.answered(&too_old()).is_none() && outbox.is_empty());
+    }
+
+    /// Goal: what the session has is kept until that is durable, though the session does not know it again. Method: of two starts of a vehicle the first is over when a new stream
+    /// begins, and its measurements are TOO_OLD; the same where another run counts, which may not have them.
+    #[test]
+    fn regress_a_measurement_of_an_ended_boot_keeps_its_place() {
+        let of = |run: u64, answer: v1::MeasurementAnswer| v1::MeasurementAnswer { run, ..answer };
+        let mut outbox = holding(3);
+        assert_eq!(sequences(&mut outbox), [1, 2, 3]);
+        (1..=3).for_each(|place| drop(outbox.answered(&of(5, answer(place, 0)))));
+        outbox.reconnected();
+        assert_eq!(sequences(&mut outbox), [1, 2, 3]);
+        for _ in 0..2 {
+            assert!(outbox.answered(&v1::MeasurementAnswer { durable_place: 3, ..of(5, too_old()) }).is_none());
+        }
+        assert_eq!(outbox.len(), 3, "an answer without a place may be of a session that began anew");
+        outbox.answered(&of(5, answer(3, 1)));
+        assert_eq!(outbox.len(), 2, "the first is durable");
+        outbox.durable(5, 3);
+        assert!(outbox.is_empty());
+
+        let mut outbox = holding(1);
+        assert_eq!(sequences(&mut outbox), [1]);
+        outbox.answered(&of(5, answer(1, 0)));
+        outbox.reconnected();
+        assert_eq!(sequences(&mut outbox), [1]);
+        outbox.answered(&of(6, too_old()));
+        assert!(outbox.is_empty(), "another run has refused it");
     }
 
     /// Goal: a server that keeps no store does not fill the memory of the vehicle. Method: one more than is kept; one becomes durable.

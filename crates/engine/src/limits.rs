@@ -69,7 +69,8 @@ pub struct Limits {
     pub speed_max_m_s: f64,
     /// |angular velocity| about each axis, rad/s.
     pub angular_speed_max_rad_s: f64,
-    /// Longest pause between two measurements of one session, s. A stamp further ahead is taken for a broken clock.
+    /// How far ahead of the last measurement of a session one may be stamped, s, before as much time has passed on the server too. A stamp further ahead is taken for a broken
+    /// clock; after a pause that both clocks have seen the history starts again, however long it was.
     pub pause_max_s: f64,
     /// How far behind the newest measurement one may arrive and still be put in its place, s; at most 1. Later ones are refused. Measurements inside this window
     /// count for predictions at once, but the soil filter sees them only when they have left it: the soil is older by as much. 0 = every measurement

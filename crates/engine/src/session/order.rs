@@ -84,7 +84,7 @@ impl Order {
     /// Judges a measurement that arrives now; only notes what is off the line.
     ///
     /// # Errors
-    /// `EngineError::Invalid` when the vehicle was silent for longer than `pause_max_s`.
+    /// `EngineError::Invalid` for a stamp further ahead than `pause_max_s` that arrives before so much time has passed.
     pub(super) fn judge(&mut self, measurement: &Measurement, now_ns: u64, step_ns: i64, limits: &Limits) -> Result<Verdict, EngineError> {
         let stamp_ns = measurement.stamp_ns;
         let behind_s = self.newest_ns().map_or(0.0, |newest| seconds(newest.saturating_sub(stamp_ns)).max(0.0));
@@ -118,9 +118,11 @@ impl Order {
             OffLine::Renumbered
         } else if ahead_s - silent_s > limits.clock_ahead_max_s {
             OffLine::Ahead
-        } else if ahead_s > limits.pause_max_s {
+        } else if ahead_s > limits.pause_max_s && silent_s <= limits.pause_max_s {
             let limit = limits.pause_max_s;
-            let reason = format!("lies {ahead_s} s after the last one, allowed are {limit} s; open a new session after a longer pause");
+            let reason = format!(
+                "lies {ahead_s} s after the last one, which came {silent_s} s ago; above {limit} s (limits.pause_max_s) it is believed when as much time has passed"
+            );
             return Err(EngineError::invalid("stamp_ns", reason));
         } else {
             return Ok(Verdict::Accept);
@@ -204,9 +206,13 @@ impl Order {
     /// Forgets the line: the next measurement begins another one.
     pub(super) fn begin(&mut self, boot: Option<u64>) {
         let mut ended_boots = core::mem::take(&mut self.ended_boots);
-        // A start that goes on does not tell anew what it has told.
+        // A start that goes on does not tell anew what it has told, whether its clock was set or another one came between.
+        let goes_on = boot.is_some() && boot == self.boot;
         let told_before = ended_boots.iter().find(|(ended, _)| Some(*ended) == boot).and_then(|(_, last)| *last);
-        let numbers = told_before.map(Numbers::up_to).unwrap_or_default();
+        let (numbers, last_sequence) = match goes_on {
+            true => (core::mem::take(&mut self.numbers), self.last_sequence),
+            false => (told_before.map(Numbers::up_to).unwrap_or_default(), None),
+        };
         ended_boots.retain(|(ended, _)| Some(*ended) != boot);
         if let Some(ended) = self.boot.filter(|present| boot.is_some_and(|boot| boot != *present)) {
             ended_boots.push_back((ended, self.last_sequence));
@@ -214,7 +220,7 @@ impl Order {
                 ended_boots.pop_front();
             }
         }
-        *self = Self { boot: boot.or(self.boot), ended_boots, numbers, ..Self::default() };
+        *self = Self { boot: boot.or(self.boot), ended_boots, numbers, last_sequence, ..Self::default() };
     }
 }
 
