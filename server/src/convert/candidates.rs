@@ -3,7 +3,7 @@
 use nesam_engine::{Candidates, CostWeights, Drawing, EngineError, PathCost};
 use nesam_proto::v1 as pb;
 
-use super::{Precision, decode_f32, encode};
+use super::{Precision, decode_f32, encode, unsigned_zero};
 
 /// The candidates of a request. Lengths are checked here, values by the engine.
 ///
@@ -19,8 +19,8 @@ pub(super) fn candidates(message: &pb::PredictRequest) -> Result<Candidates, Eng
     }
     Ok(Candidates::Drawn(Drawing {
         nominal: decode_f32("drawing.nominal", &drawing.nominal, horizon * 2)?,
-        sd: [drawing.speed_sd_m_s, drawing.second_sd],
-        correlation: drawing.correlation,
+        sd: [drawing.speed_sd_m_s, drawing.second_sd].map(unsigned_zero),
+        correlation: unsigned_zero(drawing.correlation),
         seed: drawing.seed,
     }))
 }
@@ -60,15 +60,15 @@ pub(super) fn path_cost(message: &pb::PathCost) -> Result<PathCost, EngineError>
     } = message;
     Ok(PathCost {
         path: decode_f32("cost.path", path, path.len() / 4)?,
-        speed_m_s: *speed_m_s,
+        speed_m_s: unsigned_zero(*speed_m_s),
         weights: CostWeights {
-            path: *path_weight,
-            speed: *speed_weight,
-            tilt: *tilt_weight,
-            change: [*speed_change_weight, *second_change_weight],
+            path: unsigned_zero(*path_weight),
+            speed: unsigned_zero(*speed_weight),
+            tilt: unsigned_zero(*tilt_weight),
+            change: [*speed_change_weight, *second_change_weight].map(unsigned_zero),
         },
         best: *best as usize,
-        temperature: *temperature,
+        temperature: unsigned_zero(*temperature),
     })
 }
 

@@ -87,6 +87,7 @@ fn extras_message(extras: &PredictExtras) -> pb::PredictExtras {
 mod tests {
     use nesam_engine::{Candidates, CostWeights, CovarianceQuery, Drawing, Limits, PathCost, StartInstant};
     use nesam_physics::{Control, VehicleState};
+    use prost::Message as _;
 
     use super::*;
     use crate::convert::{measurement, open_session, predict_query};
@@ -108,6 +109,38 @@ mod tests {
             assert_eq!(format!("{back:?}"), format!("{given:?}"));
             let open = OpenSession { session: "s".into(), vehicle: "v".into(), initial: Some(given), ..Default::default() };
             assert_eq!(format!("{:?}", open_session(&open_message(&open)).unwrap()), format!("{open:?}"));
+        }
+    }
+
+    /// Goal: what is recorded is what the engine had, though the bytes of a message leave out a number that equals 0, whatever its sign. Method: messages with zeros below 0 as
+    /// other clients send them, read; then through the bytes of a recording.
+    #[test]
+    fn regress_a_zero_below_0_is_recorded_as_the_engine_had_it() {
+        let below = VehicleState::from_array([-0.0; 12]);
+        let command = Control { speed_m_s: -0.0, second: -0.0 };
+        let measured = measurement_message("s", &Measurement { state: below, command, ..some_measurement(None, Default::default()) });
+        let read = measurement(&measured).unwrap();
+        let recorded = pb::Measurement::decode(measurement_message("s", &read).encode_to_vec().as_slice()).unwrap();
+        assert_eq!(format!("{:?}", measurement(&recorded).unwrap()), format!("{read:?}"));
+        let weights = CostWeights { path: -0.0, speed: -0.0, tilt: -0.0, change: [-0.0; 2] };
+        for (start, instant) in
+            [(Some(below), None), (None, Some(StartInstant { stamp_ns: 9, sent: vec![SentCommand { stamp_ns: 5, command }] }))]
+        {
+            let query = PredictQuery {
+                session: "s".into(),
+                start,
+                instant,
+                use_history: true,
+                samples: 1,
+                samples_min: 0,
+                horizon: 1,
+                controls: Candidates::Drawn(Drawing { nominal: vec![-0.0; 2], sd: [-0.0; 2], correlation: -0.0, seed: 1 }),
+                cost: Some(PathCost { path: vec![-0.0, 1.0], speed_m_s: -0.0, weights, best: 1, temperature: -0.0 }),
+                extras: PredictExtras::default(),
+            };
+            let (read, _) = predict_query(&predict_message(&query), &Limits::default()).unwrap();
+            let recorded = pb::PredictRequest::decode(predict_message(&read).encode_to_vec().as_slice()).unwrap();
+            assert_eq!(format!("{:?}", predict_query(&recorded, &Limits::default()).unwrap().0), format!("{read:?}"));
         }
     }
 

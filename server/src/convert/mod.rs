@@ -25,6 +25,7 @@ pub use measurement::{measurement, measurement_answer};
 pub use packed::{Precision, decode_f32, encode};
 pub use prediction::{OutputSelection, predict_bytes_max, predict_error, predict_query, predict_reply};
 pub use session::{open_session, provenance, session_view, soil_correction, soil_estimate, soil_of, soil_vector};
+pub(crate) use state::unsigned_zero;
 pub use state::{control, control_message, vehicle_state, vehicle_state_message};
 pub(crate) use status::refused;
 pub use status::{FIELD_METADATA, code, to_status};

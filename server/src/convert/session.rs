@@ -5,7 +5,7 @@ use nesam_engine::{ForecastCheck, OpenSession, Provenance, SessionView, SoilEsti
 use nesam_physics::{SOIL_DIM, SecondCommand, SoilCoordinates, Vehicle};
 use nesam_proto::v1 as pb;
 
-use super::{alarm_message, control_message, effect_messages, measurement, vehicle_state_message};
+use super::{alarm_message, control_message, effect_messages, measurement, unsigned_zero, vehicle_state_message};
 
 /// A session to open.
 ///
@@ -117,7 +117,7 @@ pub fn soil_vector(values: &[f64; SOIL_DIM]) -> pb::SoilVector {
 /// The same read.
 pub fn soil_of(message: &pb::SoilVector) -> [f64; SOIL_DIM] {
     let pb::SoilVector { k_phi, k_c, n, c_pa, phi_rad, k_shear_m } = *message;
-    [k_phi, k_c, n, c_pa, phi_rad, k_shear_m]
+    [k_phi, k_c, n, c_pa, phi_rad, k_shear_m].map(unsigned_zero)
 }
 
 /// What is known of the soil as message.

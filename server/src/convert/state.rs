@@ -4,8 +4,13 @@ use nesam_engine::EngineError;
 use nesam_physics::{Control, VehicleState};
 use nesam_proto::v1 as pb;
 
+/// Zero without a sign, everything else as it is: a message leaves a number out that equals 0, so that a recording would lose the sign, and what depends on it.
+pub(crate) fn unsigned_zero(value: f64) -> f64 {
+    value + 0.0
+}
+
 fn vector(path: &str, part: &str, message: Option<pb::Vector3>) -> Result<[f64; 3], EngineError> {
-    message.map(|v| [v.x, v.y, v.z]).ok_or_else(|| EngineError::invalid(format!("{path}.{part}"), "is missing"))
+    message.map(|v| [v.x, v.y, v.z].map(unsigned_zero)).ok_or_else(|| EngineError::invalid(format!("{path}.{part}"), "is missing"))
 }
 
 /// A state whose four parts must be present; values are checked by the engine.
@@ -34,7 +39,7 @@ pub fn vehicle_state_message(state: &VehicleState<f64>) -> pb::VehicleState {
 
 /// A command.
 pub fn control(message: &pb::Control) -> Control<f64> {
-    Control { speed_m_s: message.speed_m_s, second: message.second }
+    Control { speed_m_s: unsigned_zero(message.speed_m_s), second: unsigned_zero(message.second) }
 }
 
 /// A command as message.

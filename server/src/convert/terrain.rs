@@ -4,7 +4,7 @@ use nesam_engine::{EngineError, Limits, check_name};
 use nesam_proto::v1 as pb;
 use nesam_terrain::{GridGeometry, MapSource, ORIGIN_MAX_M, TerrainError, WorldMap};
 
-use super::decode_f32;
+use super::{decode_f32, unsigned_zero};
 
 /// Longest name of a frame, bytes.
 const FRAME_LENGTH_MAX: usize = 64;
@@ -72,7 +72,12 @@ impl MapBuilder {
             let reason = format!("{width} x {height} cells; at least 2 x 2 and at most {} cells are allowed", limits.map_cells_max);
             return Err(EngineError::invalid("header.width", reason));
         }
-        let geometry = GridGeometry { origin_m: [header.origin_x_m, header.origin_y_m], resolution_m: header.resolution_m, width, height };
+        let geometry = GridGeometry {
+            origin_m: [header.origin_x_m, header.origin_y_m].map(unsigned_zero),
+            resolution_m: header.resolution_m,
+            width,
+            height,
+        };
         for (field, value) in [
             ("header.origin_x_m", header.origin_x_m),
             ("header.origin_y_m", header.origin_y_m),

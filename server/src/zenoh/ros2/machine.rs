@@ -5,11 +5,12 @@ use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 use nesam_engine::{Command, EngineError, MeasureAnswer, Measurement, OpenSession, WheelMeasurement};
-use nesam_physics::Control;
+use nesam_physics::{Control, VehicleState};
 use nesam_ros2::messages::{CommandType, Level, Odometry};
 
 use super::reading;
 use crate::config::{Ros2Config, Ros2Vehicle};
+use crate::convert::unsigned_zero;
 use crate::grpc::Edge;
 use crate::telemetry::Transport;
 use crate::zenoh::arrival::Arrival;
@@ -112,12 +113,14 @@ impl Machine {
         self.edge.engine.metrics().request(Transport::Zenoh, "measurement");
         let read = message.and_then(|bytes| Odometry::read(bytes).ok_or_else(|| unreadable("nav_msgs/msg/Odometry")));
         let measurement = read.and_then(|odometry| {
+            let state = reading::state(&odometry, self.config.reference_m)?;
             Ok(Measurement {
                 // Numbers of rmw_zenoh count what was sent; stamps tell what is new as well, and go on where a publisher begins anew.
                 sequence: None,
                 boot: None,
                 stamp_ns: odometry.stamp_ns,
-                state: reading::state(&odometry, self.config.reference_m)?,
+                // As messages of ours give them.
+                state: VehicleState::from_array(state.to_array().map(unsigned_zero)),
                 command: self.control(),
                 wheels: WheelMeasurement::default(),
             })
@@ -142,7 +145,7 @@ impl Machine {
         if limited {
             heard.count("command_beyond_card");
         }
-        control
+        Control { speed_m_s: unsigned_zero(control.speed_m_s), second: unsigned_zero(control.second) }
     }
 
     fn answered(&self, result: &Result<MeasureAnswer, EngineError>) {
