@@ -321,6 +321,8 @@ pub enum Event {
         vehicle: String,
         /// The alarm.
         alarm: Box<Alarm>,
+        /// The session came with it, as a copy or from elsewhere: nothing was raised.
+        carried: bool,
     },
     /// The soil filter of a session could not learn from a buffer, take over what the fleet knows or bring something to it. It goes on with what it knew.
     SoilFilterFailed {
@@ -371,6 +373,7 @@ impl Event {
             Self::SoilChanged { .. } => "soil_changed",
             Self::FleetSoilChanged { .. } => "fleet_soil_changed",
             Self::SessionOpened { .. } => "session_opened",
+            Self::AlarmChanged { carried: true, .. } => "alarm_carried",
             Self::AlarmChanged { alarm, .. } if alarm.active => "alarm_raised",
             Self::AlarmChanged { .. } => "alarm_cleared",
             Self::SoilFilterFailed { .. } => Self::SOIL_FILTER_FAILED,

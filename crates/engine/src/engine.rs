@@ -205,7 +205,8 @@ impl Engine {
         let view = self.view(&session);
         self.emit(Event::SessionOpened { session: view.session.clone(), vehicle: view.vehicle.clone() });
         if let Some(alarm) = view.alarm {
-            self.emit(Event::AlarmChanged { session: view.session.clone(), vehicle: view.vehicle.clone(), alarm: Box::new(alarm) });
+            let (session, vehicle, alarm) = (view.session.clone(), view.vehicle.clone(), Box::new(alarm));
+            self.emit(Event::AlarmChanged { session, vehicle, alarm, carried: true });
         }
         self.sessions.insert(view.session.clone(), session);
         Reply::Session(Box::new(view))

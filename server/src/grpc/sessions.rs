@@ -140,7 +140,7 @@ impl pb::sessions_server::Sessions for Service {
         self.0.engine.metrics().request(Transport::Grpc, "watch_alarms");
         let news = News {
             of_event: |session, event| match event {
-                Event::AlarmChanged { session: of, vehicle, alarm } if of == session => Some(alarm_message(session, &vehicle, &alarm)),
+                Event::AlarmChanged { session: of, vehicle, alarm, .. } if of == session => Some(alarm_message(session, &vehicle, &alarm)),
                 _ => None,
             },
             of_session: |session, view| view.alarm.as_ref().map(|alarm| alarm_message(session, &view.vehicle, alarm)),

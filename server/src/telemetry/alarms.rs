@@ -16,9 +16,13 @@ impl AlarmCounts {
         let Ok(mut state) = self.0.lock() else { return };
         let (raised, active) = &mut *state;
         match event {
-            Event::AlarmChanged { session, vehicle, alarm } => {
+            Event::AlarmChanged { session, vehicle, alarm, carried } => {
                 let (kind, onset_ns) = (alarm.kind.label(), alarm.onset_ns);
-                if alarm.active {
+                if *carried {
+                    // Its episode was counted where it began.
+                    active.insert(session.clone());
+                    tracing::info!(session, vehicle, kind, onset_ns, "session with an active alarm");
+                } else if alarm.active {
                     *raised.entry(kind).or_default() += 1;
                     active.insert(session.clone());
                     let (statistic, threshold, diagnose) = (alarm.statistic, alarm.threshold, alarm.diagnose(session));

@@ -32,7 +32,7 @@ pub async fn publish_changes(
                     }
                 }
             }
-            Ok(Event::AlarmChanged { session, vehicle, alarm }) => {
+            Ok(Event::AlarmChanged { session, vehicle, alarm, .. }) => {
                 let key = keys::of_vehicle(&fleet, &vehicle, "alarm");
                 if sender.send((key, encode(&alarm_message(&session, &vehicle, &alarm)))).await.is_err() {
                     return;

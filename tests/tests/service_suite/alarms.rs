@@ -148,6 +148,11 @@ async fn service_an_onset_raises_an_alarm_is_diagnosed_and_repaired_while_drivin
     assert_eq!(found.claimed.iter().map(|e| e.effect.id()).collect::<Vec<_>>(), ["velocity_scale"]);
 
     client.fork_session("s", "without").await.unwrap();
+    let text = server.metrics().render(0, 0);
+    assert!(
+        text.contains("nesam_alarms_total{kind=\"sensor_jump\"} 1\n") && text.contains("nesam_alarms_active 2\n"),
+        "a copy raises nothing: {text}"
+    );
     let sd =
         |name: &str| found.estimates.iter().find(|e| e.name == name).and_then(|e| e.ci95).map_or(0.0, |[low, high]| (high - low) / 3.92);
     let effects: Vec<v1::Effect> = found

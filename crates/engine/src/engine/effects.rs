@@ -49,7 +49,8 @@ impl Engine {
     /// Tells what a watch has raised or cleared.
     pub(super) fn emit_alarms(&mut self, session: &str, vehicle: &str, told: Vec<Alarm>) {
         for alarm in told {
-            self.emit(Event::AlarmChanged { session: session.into(), vehicle: vehicle.into(), alarm: Box::new(alarm) });
+            let (session, vehicle, alarm) = (session.into(), vehicle.into(), Box::new(alarm));
+            self.emit(Event::AlarmChanged { session, vehicle, alarm, carried: false });
         }
     }
 }
