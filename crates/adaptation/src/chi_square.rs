@@ -11,6 +11,10 @@ pub fn chi_square_tail(dof: usize, x: f64) -> f64 {
     if x <= 0.0 {
         return 1.0;
     }
+    // What is infinite, or no number, is as far out as can be.
+    if !x.is_finite() {
+        return 0.0;
+    }
     let half = 0.5 * x;
     let mut log_term = -half;
     let mut tail = log_term.exp();
@@ -38,6 +42,7 @@ mod tests {
     fn property_far_tails_neither_overflow_nor_leave_the_unit_interval() {
         assert_eq!(chi_square_tail(60, 1e9), 0.0);
         assert_eq!(chi_square_tail(60, -1.0), 1.0);
+        assert_eq!([f64::MAX, f64::INFINITY, f64::NAN].map(|x| chi_square_tail(60, x)), [0.0; 3]);
         let tail = chi_square_tail(60, 300.0);
         assert!(tail > 0.0 && tail < 1e-30, "{tail}");
     }
