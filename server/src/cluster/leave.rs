@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use nesam_engine::EngineError;
 use nesam_proto::etcd as pb;
 use pb::request_op::Request;
 use tonic::Status;
@@ -14,6 +15,8 @@ use crate::store::Key;
 const STAY: Duration = Duration::from_millis(500);
 /// Longest wait for what is not durable yet; what is left then is sent again by the clients.
 const LAST_COMMIT: Duration = Duration::from_secs(2);
+/// Pause before an engine that had no room is told again to close a session.
+const CLOSE_AGAIN: Duration = Duration::from_millis(100);
 /// Pause before etcd is asked again to take something back.
 const INSIST_AGAIN: Duration = Duration::from_millis(100);
 
@@ -108,8 +111,10 @@ impl Cluster {
     /// Takes a session out of the engine. It is not held any more, so nothing that the store does from now on changes what is stored of it.
     pub(super) async fn forget(&self, session: &str) {
         self.0.keeper.forget(session);
-        // A name that was only claimed is not in the engine.
-        let _ = self.0.engine.close(session, ENGINE_WAIT).await;
+        // A name that was only claimed is not in the engine. One that has no room for a command has the session still, which another server has too.
+        while let Err(EngineError::Overloaded { .. } | EngineError::Expired) = self.0.engine.close(session, ENGINE_WAIT).await {
+            tokio::time::sleep(CLOSE_AGAIN).await;
+        }
         self.0.keeper.forgotten(session);
         let _ = self.0.left.send(Arc::from(session));
     }
