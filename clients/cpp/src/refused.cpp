@@ -30,10 +30,18 @@ bool takes(const CandidateDrawing& drawing) noexcept {
   return within(drawing.speed_sd_m_s, 0.0, 1e6) && within(drawing.second_sd, 0.0, 1e6) && drawing.correlation >= 0.0 && drawing.correlation < 1.0;
 }
 
+/// Whether not all points are the same.
+bool leads_somewhere(const Span<const float>& path_m) noexcept {
+  for (std::size_t i = 2; i + 1 < path_m.size(); i += 2) {
+    if (path_m[i] != path_m[0] || path_m[i + 1] != path_m[1]) return true;
+  }
+  return false;
+}
+
 bool takes(const PathCost& cost, std::size_t samples) noexcept {
   const std::size_t points = cost.path_m.size() / 2;
   const double weights[] = {cost.path_weight, cost.speed_weight, cost.tilt_weight, cost.speed_change_weight, cost.second_change_weight, cost.temperature};
-  return cost.path_m.size() % 2 == 0 && points >= 2 && points <= path_points_max &&
+  return cost.path_m.size() % 2 == 0 && points >= 2 && points <= path_points_max && leads_somewhere(cost.path_m) &&
          std::all_of(cost.path_m.begin(), cost.path_m.end(), [](float value) { return std::isfinite(value); }) &&
          std::all_of(std::begin(weights), std::end(weights), [](double weight) { return within(weight, 0.0, 1e12); }) && std::isfinite(cost.speed_m_s) &&
          cost.best <= samples;

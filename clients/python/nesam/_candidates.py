@@ -44,10 +44,10 @@ class PathCost:
     """What candidates are worth along a path: the mean over the steps of weighted squares; only the best are sent.
 
     path: (points, 2), World, m, in the order they are driven. speed_m_s: to be made along it. path_weight: of the distance, per m^2. speed_weight: of the
-    velocity along the path against `speed_m_s`, per (m/s)^2. tilt_weight: of roll and pitch, per rad^2. speed_change_weight, second_change_weight: of the
-    changes of the commands from step to step, per unit squared. best: candidates to send, 0 = none. temperature: of the mean command, in units of the cost; 0 = no
-    mean. A candidate that overturns, leaves the map or has a state that is not finite costs infinitely much; other flags of
-    `Prediction.validity`, such as SPEED_UNTRAINED, cost nothing. Not together with extras.
+    velocity along the path (vx and vy turned by the yaw alone) against `speed_m_s`, per (m/s)^2. tilt_weight: of roll and pitch, per rad^2.
+    speed_change_weight, second_change_weight: of the changes of the commands from step to step, per unit squared. best: candidates to send, 0 = none.
+    temperature: of the mean command, in units of the cost; 0 = no mean. A candidate that overturns, leaves the map or has a state that is not finite costs
+    infinitely much; other flags of `Prediction.validity`, such as SPEED_UNTRAINED, cost nothing. Not together with extras.
     """
 
     path: np.ndarray

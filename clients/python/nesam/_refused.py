@@ -65,6 +65,8 @@ def _check_cost(cost: PathCost, samples: int) -> None:
         raise invalid("cost.path", f"has {path.size} numbers, allowed are 2 to {_PATH_POINTS_MAX} points of two")
     if not np.isfinite(path).all():
         raise invalid("cost.path", "holds a number that is not finite")
+    if (path == path[0]).all():
+        raise invalid("cost.path", f"holds {len(path)} times the same point, which has no direction")
     for field in _WEIGHTS:
         value = getattr(cost, field)
         if not 0.0 <= value <= 1e12:

@@ -53,6 +53,7 @@ fn takes_cost(cost: &v1::PathCost, samples: usize) -> bool {
     path.len().is_multiple_of(2)
         && (2..=1024).contains(&(path.len() / 2))
         && path.iter().all(|value| value.is_finite())
+        && !path.chunks_exact(2).all(|point| point == &path[..2])
         && weights.iter().all(|weight| (0.0..=1e12).contains(weight))
         && cost.speed_m_s.is_finite()
         && cost.best as usize <= samples
@@ -72,7 +73,7 @@ mod tests {
         };
         assert!(takes(&sound()));
         type Change = fn(&mut Candidates);
-        let wrong: [(&str, Change); 15] = [
+        let wrong: [(&str, Change); 16] = [
             ("no sample", |asked| asked.samples = 0),
             ("more than all", |asked| asked.samples_min = 5),
             ("no step", |asked| asked.horizon = 0),
@@ -85,6 +86,7 @@ mod tests {
             ("a negative deviation", |asked| asked.drawing = Some(v1::CandidateDrawing { second_sd: -0.1, ..Default::default() })),
             ("noise that stays", |asked| asked.drawing = Some(v1::CandidateDrawing { correlation: 1.0, ..Default::default() })),
             ("a path of one point", |asked| *asked = asked.clone().ranked(&[0.0; 2], v1::PathCost::default())),
+            ("a path that stays where it is", |asked| *asked = asked.clone().ranked(&[5.0; 6], v1::PathCost::default())),
             ("a path that is none", |asked| *asked = asked.clone().ranked(&[f32::NAN; 4], v1::PathCost::default())),
             ("a negative weight", |asked| {
                 *asked = asked.clone().ranked(&[0.0; 4], v1::PathCost { tilt_weight: -1.0, ..Default::default() })

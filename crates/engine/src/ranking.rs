@@ -36,7 +36,7 @@ pub struct PathCost {
 pub struct CostWeights {
     /// Distance from the path, per m².
     pub path: f64,
-    /// Velocity along the path against the wanted one, per (m/s)².
+    /// Velocity along the path against the wanted one, per (m/s)²: of vx and vy, turned by the yaw alone.
     pub speed: f64,
     /// Roll and pitch, per rad².
     pub tilt: f64,
@@ -68,6 +68,9 @@ impl PathCost {
         }
         if !self.path.iter().all(|v| v.is_finite()) {
             return fail("path", "holds a number that is not finite".into());
+        }
+        if self.path.chunks_exact(2).all(|point| point == &self.path[..2]) {
+            return fail("path", format!("holds {points} times the same point, which has no direction"));
         }
         let CostWeights { path, speed, tilt, change: [speed_change, second_change] } = self.weights;
         let at_least_0 = [
@@ -330,6 +333,7 @@ mod tests {
             (PathCost { path: vec![0.0, 0.0], ..sound.clone() }, "cost.path"),
             (PathCost { path: vec![0.0; 5], ..sound.clone() }, "cost.path"),
             (PathCost { path: vec![0.0, f32::NAN, 1.0, 1.0], ..sound.clone() }, "cost.path"),
+            (PathCost { path: vec![3.0, -4.0, 3.0, -4.0, 3.0, -4.0], ..sound.clone() }, "cost.path"),
             (PathCost { temperature: -1.0, ..sound.clone() }, "cost.temperature"),
             (PathCost { speed_m_s: f64::NAN, ..sound.clone() }, "cost.speed_m_s"),
             (PathCost { best: 5, ..sound.clone() }, "cost.best"),

@@ -850,7 +850,8 @@ pub struct MeasurementAnswer {
     pub reordered: bool,
     /// Place of the measurement among those that the session has accepted, counted from 1 in the order of arrival; that of the newest accepted one for a
     /// duplicate; 0 when it was refused. The measurement is RECEIVED now and DURABLE as soon as an answer of the same run of the server, or
-    /// Sessions.Get, tells a `durable_place` that reaches it. After a reconnect everything that is not known to be durable is sent again.
+    /// Sessions.Get, tells a `durable_place` that reaches it. After a reconnect everything that is not known to be durable is sent again. What this run has
+    /// given a place, and is TOO_OLD then because another boot has begun since, keeps that place.
     #[prost(uint64, tag = "8")]
     pub place: u64,
     /// What the session has accepted up to this place is on stable storage and survives a crash of the server and of its machine. 0 where the server
@@ -1356,7 +1357,7 @@ pub struct CandidateDrawing {
 pub struct PathCost {
     /// Points of the path in the order they are driven, packed f32, shape (points, 2), World, m; 2 to 1024 points. A step is held against the place of
     /// the path that is nearest to it, from 1 m behind that of the step before to 3.5 m ahead of it or some segments further, so that a path may cross itself.
-    /// Points nearer than 5 cm to the one before are left out.
+    /// Points nearer than 5 cm to the one before are left out. Points that are all the same are INVALID_ARGUMENT.
     #[prost(bytes = "bytes", tag = "1")]
     pub path: ::prost::bytes::Bytes,
     /// Speed to be made along the path, m/s.
@@ -1365,7 +1366,8 @@ pub struct PathCost {
     /// Weight of the squared distance from the path, per m^2.
     #[prost(double, tag = "3")]
     pub path_weight: f64,
-    /// Weight of the squared difference between `speed_m_s` and the velocity along the path, per (m/s)^2.
+    /// Weight of the squared difference between `speed_m_s` and the velocity along the path, per (m/s)^2: vx and vy turned by the yaw alone, whatever roll and
+    /// pitch are, onto the direction of the path.
     #[prost(double, tag = "4")]
     pub speed_weight: f64,
     /// Weight of roll^2 + pitch^2, per rad^2.

@@ -65,8 +65,8 @@ struct PathCost {
   Span<const float> path_m;
   /// Speed to be made along the path, m/s.
   double speed_m_s = 0.0;
-  /// Weights of the distance from the path (per m^2), of the speed along it (per (m/s)^2), of roll and pitch (per rad^2), and of the change of the commands
-  /// from step to step (per (m/s)^2 and per unit of the second command squared).
+  /// Weights of the distance from the path (per m^2), of the speed along it (per (m/s)^2; vx and vy turned by the yaw alone), of roll and pitch
+  /// (per rad^2), and of the change of the commands from step to step (per (m/s)^2 and per unit of the second command squared).
   double path_weight = 1.0;
   double speed_weight = 0.0;
   double tilt_weight = 0.0;
