@@ -1,4 +1,4 @@
-//! The six-by-six solve of the semi-implicit step.
+//! The six-by-six solve of the semi-implicit step, and what inertias must be.
 
 use crate::scalar::Real;
 
@@ -31,4 +31,12 @@ pub fn solve_spd<T: Real, const N: usize>(mut a: [[T; N]; N], mut b: [T; N]) -> 
         b[i] = b[i] / a[i][i];
     }
     b
+}
+
+/// Whether a symmetric matrix is positive definite (Sylvester's criterion).
+pub fn is_positive_definite(m: &[[f64; 3]; 3]) -> bool {
+    let minor = m[0][0] * m[1][1] - m[0][1] * m[1][0];
+    let determinant = m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
+        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
+    m[0][0] > 0.0 && minor > 0.0 && determinant > 0.0
 }

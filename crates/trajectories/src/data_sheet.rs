@@ -11,6 +11,7 @@
 //! * Wheel centres: half wheelbase ahead and behind, half track to the sides.
 //! * Suspension: none means stiff, a static deflection of 10 mm and a damping ratio of 0.7. A sheet's spring and damper act at the
 //!   shock; with a motion ratio of about 0.8 the wheel sees 0.6 of the rate and 0.64 of the damping.
+//! * Driven axles: both, which is said of a car unless `drive` or `driveline.type` has the words all-wheel, four-wheel, AWD, 4WD or 4x4.
 //! * Drive line: a car-like vehicle holds 0.15 of its speed error as rim over-speed, at most 0.8 m/s, and one whose wheels are smaller than 0.46 m as much more as their
 //!   contact is shorter: soil is sheared by slip times the length of the contact. A skid-steer vehicle servoes its
 //!   rims (gain 1) with an actuator lag of 0.1 s, up to 3 m/s of rim speed. [`Vehicle`] parameters that matter can be calibrated later.
@@ -18,6 +19,7 @@
 use std::path::Path;
 
 use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, Vehicle, WHEELS};
+use nesam_vehicle_card::{are_in_order, is_inertia};
 use serde_json::Value;
 
 use crate::channels::names_of;
@@ -75,10 +77,10 @@ pub(crate) struct CardReading {
 pub(crate) fn read_with_notes(path: &Path, of_columns: OfColumns<'_>) -> Result<CardReading, TrajectoryError> {
     let sheet = JsonFile::read(path)?;
     let mut notes = Vec::new();
+    let refused = |error: nesam_vehicle_card::CardError| TrajectoryError::Card { path: path.into(), reason: error.to_string() };
     if sheet.get("format").is_some() {
-        return card_from_json(&sheet.root().to_string())
-            .map(|vehicle| CardReading { vehicle, notes, implied_range: [false; 2] })
-            .map_err(|error| TrajectoryError::Card { path: path.into(), reason: error.to_string() });
+        let vehicle = card_from_json(&sheet.root().to_string()).map_err(refused)?;
+        return Ok(CardReading { vehicle, notes, implied_range: [false; 2] });
     }
     let second = second_command(&sheet, of_columns, &mut notes)?;
     let wheels = Wheels::read(&sheet, second, &mut notes)?;
@@ -111,6 +113,10 @@ pub(crate) fn read_with_notes(path: &Path, of_columns: OfColumns<'_>) -> Result<
         soil_damping_pa_s_m: 0.0,
         effects: Default::default(),
     };
+    nesam_vehicle_card::check(&vehicle).map_err(refused)?;
+    if second != SecondCommand::YawRateRadS && !says_all_wheels(&sheet) {
+        notes.push("vehicle card: neither `drive` nor `driveline.type` says which axles are driven: taken for both".into());
+    }
     Ok(CardReading { vehicle, notes, implied_range })
 }
 
@@ -167,7 +173,7 @@ impl Wheels {
         if let Some((key, value)) = sheet.first(centres) {
             let centre_m: [[f64; 3]; WHEELS] = sheet.matrix(key, value)?;
             let apart = |a: usize, b: usize, axis: usize| centre_m[a][axis] - centre_m[b][axis];
-            if !(apart(0, 2, 0) > 0.0 && apart(1, 3, 0) > 0.0 && apart(0, 1, 1) > 0.0 && apart(2, 3, 1) > 0.0) {
+            if !are_in_order(&centre_m) {
                 return Err(sheet.wrong(key, "expected the order FL, FR, RL, RR with x forward and y left"));
             }
             let track_m = round((apart(0, 1, 1) + apart(2, 3, 1)) / 2.0);
@@ -189,6 +195,19 @@ impl Wheels {
         let centre_m = [[x, front / 2.0, z], [x, -front / 2.0, z], [-x, rear / 2.0, z], [-x, -rear / 2.0, z]];
         Ok(Self { centre_m, radius_m, width_m, track_m: round((front + rear) / 2.0), wheelbase_m })
     }
+}
+
+/// Whether the card says that every wheel is driven, which is what the physics does.
+fn says_all_wheels(sheet: &JsonFile) -> bool {
+    let says = |key: &str| sheet.get(key).and_then(Value::as_str).unwrap_or_default().to_lowercase();
+    ["drive", "driveline.type"].into_iter().any(|key| {
+        let text = says(key);
+        text.contains("all wheel")
+            || text.contains("all-wheel")
+            || text.contains("four wheel")
+            || text.contains("four-wheel")
+            || text.split(|c: char| !c.is_alphanumeric()).any(|word| matches!(word, "awd" | "4wd" | "4x4"))
+    })
 }
 
 /// What the second command means: stated, implied by the kind of drive, or told by the columns of the data.
@@ -243,8 +262,7 @@ fn implied_by(drive: &str) -> Option<SecondCommand> {
 fn inertia(sheet: &JsonFile, mass_kg: f64, wheels: &Wheels) -> Result<([[f64; 3]; 3], bool), TrajectoryError> {
     if let Some((key, value)) = sheet.first(&["inertia_about_cg.matrix", "inertia_kg_m2"]) {
         let matrix: [[f64; 3]; 3] = sheet.matrix(key, value)?;
-        let symmetric = (0..3).all(|i| (0..3).all(|j| (matrix[i][j] - matrix[j][i]).abs() <= 1e-6 * matrix[i][i].abs()));
-        if !(symmetric && is_positive_definite(&matrix)) {
+        if !is_inertia(&matrix) {
             return Err(sheet.wrong(key, "expected a symmetric positive definite matrix"));
         }
         return Ok((matrix, false));
@@ -255,14 +273,6 @@ fn inertia(sheet: &JsonFile, mass_kg: f64, wheels: &Wheels) -> Result<([[f64; 3]
     let about = |a: f64, b: f64| round(mass_kg * (a * a + b * b) / 12.0);
     let (xx, yy, zz) = (about(width, height), about(length, height), about(length, width));
     Ok(([[xx, 0.0, 0.0], [0.0, yy, 0.0], [0.0, 0.0, zz]], true))
-}
-
-/// Sylvester's criterion.
-fn is_positive_definite(m: &[[f64; 3]; 3]) -> bool {
-    let minor = m[0][0] * m[1][1] - m[0][1] * m[1][0];
-    let determinant = m[0][0] * (m[1][1] * m[2][2] - m[1][2] * m[2][1]) - m[0][1] * (m[1][0] * m[2][2] - m[1][2] * m[2][0])
-        + m[0][2] * (m[1][0] * m[2][1] - m[1][1] * m[2][0]);
-    m[0][0] > 0.0 && minor > 0.0 && determinant > 0.0
 }
 
 /// Rate and damping at each wheel.

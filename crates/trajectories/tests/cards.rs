@@ -101,7 +101,7 @@ fn analytic_what_a_card_leaves_out_is_estimated_and_said() {
         let opened = DataRoot::open(root.path(), None).unwrap();
         (opened.vehicle().clone(), opened.notes())
     };
-    let (skid, car) = ("skid_steer", "ackermann");
+    let (skid, car) = ("skid_steer", "ackermann, all-wheel drive");
     let cases: [(&str, &str, fn(&Vehicle) -> f64, f64); 3] = [
         ("wheel_width_m", skid, |v| v.wheel_width_m, 0.6 * 0.16),
         ("wheelbase_m", skid, |v| v.wheelbase_m, 0.5),
@@ -250,4 +250,77 @@ fn regress_a_range_of_commands_in_another_shape_is_refused() {
     {
         assert_eq!(with(range.clone()).unwrap().command_range[0], expected, "{range}");
     }
+}
+
+/// Goal: what no vehicle is, is refused by its key, in the schema of bundles and in a data sheet by the same rules; the given cards are none of it. Method: the bundle's card
+/// of the car and of the robot with one number spoilt each; some of them panicked or went the other way.
+#[test]
+fn regress_cards_of_vehicles_that_cannot_be_are_refused() {
+    let card = |vehicle: &Vehicle| serde_json::from_str::<Value>(&card_to_json(vehicle)).unwrap();
+    let (mut car, mut robot) = (read_vehicle_card(&hmmwv_path()).unwrap(), read(SKID_CARD).unwrap());
+    car.driveline.rims.yaw_lag_s = 0.0625; // not the default, so that the card holds it
+    robot.driveline.rims.acceleration_limit = [2.0; 2];
+    let centres = car.wheel_centre_m;
+    let swapped = json!([centres[1], centres[0], centres[3], centres[2]]);
+    let ahead = json!([[-0.2, 0.9, -0.1], [-0.2, -0.9, -0.1], [-3.5, 0.9, -0.1], [-3.5, -0.9, -0.1]]);
+    for (vehicle, pointer, value) in [
+        (&car, "/driveline/speed_integral_limit_m", json!(-1.0)),
+        (&car, "/driveline/steering_rate_limit_per_s", json!(-1.0)),
+        (&car, "/driveline/steering_lag_s", json!(-1.0)),
+        (&car, "/driveline/speed_gain", json!(-0.1)),
+        (&car, "/driveline/speed_integral_gain_per_s", json!(-0.1)),
+        (&car, "/suspension_n_m", json!([0.0, 1e5, 1e5, 1e5])),
+        (&car, "/suspension_n_m", json!([-1e5, -1e5, -1e5, -1e5])),
+        (&car, "/suspension_n_s_m", json!([-1e5, -1e5, -1e5, -1e5])),
+        (&car, "/inertia_kg_m2", json!([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])),
+        (&car, "/inertia_kg_m2", json!([[-100.0, 0.0, 0.0], [0.0, -100.0, 0.0], [0.0, 0.0, -100.0]])),
+        (&car, "/wheel_centre_m", swapped),
+        (&car, "/wheel_centre_m", ahead.clone()),
+        (&car, "/speed_range_m_s", json!([12.0, -2.0])),
+        (&car, "/second_range", json!([0.0, 0.0])),
+        (&car, "/steering", Value::Null),
+        (&robot, "/driveline/rims/yaw_lag_s", json!(-1.0)),
+        (&robot, "/driveline/rims/turn_efficiency", json!(0.0)),
+        (&robot, "/driveline/rims/speed_gain", json!(0.0)),
+        (&robot, "/driveline/rims/yaw_limit_rad_s", json!(-1.0)),
+        (&robot, "/driveline/rims/acceleration_limit", json!([-1.0, -1.0])),
+    ] {
+        let mut spoilt = card(vehicle);
+        card_from_json(&spoilt.to_string()).unwrap();
+        *spoilt.pointer_mut(pointer).unwrap() = value.clone();
+        let error = card_from_json(&spoilt.to_string()).unwrap_err().to_string();
+        assert!(error.contains(&format!("`{}", pointer[1..].replace('/', "."))), "{pointer} {value}: {error}");
+    }
+    // The other dialect, by the same rules.
+    let mut sheet = hmmwv_json();
+    sheet["wheel_centres_rel_P_static"] = ahead;
+    let error = read(&sheet.to_string()).unwrap_err().to_string();
+    assert!(error.contains("`wheel_centre_m`"), "{error}");
+    let mut sheet = hmmwv_json();
+    sheet["driveline"]["steering_rate_limit_per_s"] = json!(0.0);
+    sheet["steering"]["actuator"].as_object_mut().unwrap().remove("rate_limit_per_s");
+    let error = read(&sheet.to_string()).unwrap_err().to_string();
+    assert!(error.contains("`driveline.steering_rate_limit_per_s`"), "{error}");
+    let bundles = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../deploy/bundles");
+    for name in ["hmmwv-nominal", "clearpath-husky"] {
+        card_from_json(&std::fs::read_to_string(bundles.join(name).join("vehicle.json")).unwrap()).unwrap();
+    }
+}
+
+/// Goal: that both axles are taken for driven is said of a car whose card does not say it. Method: the words of cards.
+#[test]
+fn regress_driven_axles_that_a_card_does_not_state_are_said() {
+    let notes = |drive: &str| {
+        let root = tempfile::TempDir::new().unwrap();
+        std::fs::write(root.path().join("vehicle_test.json"), SKID_CARD.replace("skid_steer", drive)).unwrap();
+        DataRoot::open(root.path(), None).unwrap().notes()
+    };
+    for drive in ["ackermann", "car, rear wheel drive", "car, front-wheel drive"] {
+        let said = notes(drive);
+        assert!(said.len() == 1 && said[0].contains("which axles are driven: taken for both"), "{drive}: {said:?}");
+    }
+    for drive in ["skid_steer", "tracked", "car, all wheel drive", "car, 4x4", "car (AWD)"] {
+        assert_eq!(notes(drive), Vec::<String>::new(), "{drive}");
+    }
+    assert_eq!(DataRoot::open(&sample_root(), None).unwrap().notes(), Vec::<String>::new());
 }

@@ -4,15 +4,16 @@
 //! vehicle as JSON with units in the names.
 #![forbid(unsafe_code)]
 
+mod rules;
+
+pub use rules::{are_in_order, check, is_inertia};
+
 use nesam_physics::terramechanics::ContactLaw;
 use nesam_physics::{Driveline, RimServo, SecondCommand, SteeringTable, TORQUE_KNOTS, TorqueDrive, Vehicle, WHEELS};
 use serde::{Deserialize, Serialize};
 
 /// Format tag of the card.
 pub const FORMAT: &str = "nesam.vehicle/1";
-
-/// Longest dead time of a card, s: what the last commands that are kept reach back to at steps of 0.1 s, less what effects may add.
-const DEAD_TIME_MAX_S: f64 = 0.6;
 
 /// A card that cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -117,16 +118,6 @@ impl From<Torque> for TorqueDrive {
     }
 }
 
-/// What is wrong with engine and brakes, if anything.
-fn torque_at_fault(t: &Torque) -> Option<String> {
-    let numbers = [t.per_demand_n_m_s_m, t.holding_demand_m_s, t.integral_observer_per_s, t.closed_n_m, t.brake_ratio];
-    if numbers.iter().chain(&t.curve).any(|v| !(v.is_finite() && *v >= 0.0)) {
-        return Some("`driveline.torque` has a number that is negative or not finite".into());
-    }
-    let ascending = t.curve_speed_m_s.windows(2).all(|w| w[0] < w[1]);
-    (!ascending).then(|| "`driveline.torque.curve_speed_m_s` must ascend".into())
-}
-
 /// Servo of the rims of a skid-steer vehicle.
 #[derive(Serialize, Deserialize)]
 #[serde(remote = "RimServo", deny_unknown_fields)]
@@ -229,44 +220,13 @@ pub fn to_json(vehicle: &Vehicle) -> String {
 /// The vehicle of a card.
 ///
 /// # Errors
-/// `CardError` naming the key at fault: unknown or missing keys, another format, numbers that are not positive where they must be.
+/// `CardError` naming the key at fault: unknown or missing keys, another format, what [`check`] refuses.
 pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
     let c: Card = serde_json::from_str(text).map_err(|e| CardError(e.to_string()))?;
     if c.format != FORMAT {
         return Err(CardError(format!("format is `{}`, expected `{FORMAT}`", c.format)));
     }
-    let positive = [
-        ("mass_kg", c.mass_kg),
-        ("wheel_radius_m", c.wheel_radius_m),
-        ("wheel_width_m", c.wheel_width_m),
-        ("track_m", c.track_m),
-        ("wheelbase_m", c.wheelbase_m),
-        ("gravity_m_s2", c.gravity_m_s2),
-        ("driveline.speed_integral_leak_s", c.driveline.speed_integral_leak_s),
-        ("driveline.overspeed_limit_m_s", c.driveline.overspeed_limit_m_s),
-        ("wheel_centre_m: distance between the axles", c.wheel_centre_m[0][0] - c.wheel_centre_m[2][0]),
-    ];
-    if let Some((key, value)) = positive.iter().find(|(_, value)| value.is_nan() || *value <= 0.0) {
-        return Err(CardError(format!("`{key}` is {value}, must be positive")));
-    }
-    let not_negative = [("driveline.side_coupling_n_m_s", c.driveline.side_coupling_n_m_s), ("soil_damping_pa_s_m", c.soil_damping_pa_s_m)];
-    if let Some((key, value)) = not_negative.iter().find(|(_, value)| !value.is_finite() || *value < 0.0) {
-        return Err(CardError(format!("`{key}` is {value}, must not be negative")));
-    }
-    if let Some(value) = c.driveline.rims.dead_time_s.iter().find(|value| !(0.0..=DEAD_TIME_MAX_S).contains(*value)) {
-        return Err(CardError(format!("`driveline.rims.dead_time_s` is {value}, must lie between 0 and {DEAD_TIME_MAX_S} s")));
-    }
-    if let Some(fault) = c.driveline.torque.as_ref().and_then(torque_at_fault) {
-        return Err(CardError(fault));
-    }
-    if let Some(t) = &c.steering {
-        let ascending = t.command.windows(2).all(|w| w[0] < w[1]);
-        let same = t.command.len() == t.front_left_rad.len() && t.command.len() == t.front_right_rad.len();
-        if t.command.len() < 2 || !ascending || !same {
-            return Err(CardError("`steering` needs at least two ascending commands with one angle each".into()));
-        }
-    }
-    Ok(Vehicle {
+    let vehicle = Vehicle {
         name: c.name,
         mass_kg: c.mass_kg,
         inertia_kg_m2: c.inertia_kg_m2,
@@ -305,5 +265,7 @@ pub fn from_json(text: &str) -> Result<Vehicle, CardError> {
         contact_law: c.contact_law,
         soil_damping_pa_s_m: c.soil_damping_pa_s_m,
         effects: Default::default(),
-    })
+    };
+    check(&vehicle)?;
+    Ok(vehicle)
 }
