@@ -4,8 +4,13 @@ use crate::scalar::Real;
 use crate::state::Control;
 use crate::vehicle::{SecondCommand, Vehicle};
 
-/// Commands that are kept, so the longest delay in steps.
-const SENT: usize = 8;
+/// Commands that are kept, so the longest delay in steps: the longest dead time of a card and the longest that an effect adds, 0.6 s each, at steps of 0.1 s.
+const SENT: usize = 12;
+/// Longest delay that is followed at steps of `dt_s`, s.
+pub fn longest_delay_s(dt_s: f64) -> f64 {
+    SENT as f64 * dt_s
+}
+
 /// Pieces of a step in which lags and a steering actuator advance (chosen: 10 ms of 0.1 s; a held mean within a piece errs in its square).
 const PIECES: usize = 10;
 
@@ -59,10 +64,25 @@ impl<T: Real> CommandPath<T> {
             each(arrived[1], piece_s);
             mean = core::array::from_fn(|c| mean[c] + arrived[c] * T::lit(1.0 / pieces as f64));
         }
-        self.sent.copy_within(0..SENT - 1, 1);
-        self.sent[0] = now;
+        self.send(now);
         self.speed_over_step_m_s = mean[0] * T::lit(1.0 + terms.speed_gain);
         Control { speed_m_s: self.speed_over_step_m_s, second: mean[1] }
+    }
+
+    /// Follows a step in which a command arrives as it is sent and leaves the steering there, so that a delay, a lag or play that begins afterwards begins with what was
+    /// last told.
+    #[inline(always)]
+    pub(crate) fn pass(&mut self, control: &Control<T>, steering: T) {
+        let now = [control.speed_m_s, control.second];
+        self.send(now);
+        (self.lagged, self.speed_over_step_m_s, self.play) = (now, control.speed_m_s, steering);
+    }
+
+    /// Keeps a command as the newest one.
+    #[inline(always)]
+    fn send(&mut self, command: [T; 2]) {
+        self.sent.copy_within(0..SENT - 1, 1);
+        self.sent[0] = command;
     }
 
     /// Mean of a channel from `from_s` (s after the begin of the present step, negative before) on for `over_s`: commands are held over their steps.

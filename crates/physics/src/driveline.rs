@@ -23,7 +23,7 @@ pub struct DrivelineState<T = f64> {
     pub rim_speed_m_s: T,
     /// What the rims of a skid-steer vehicle are asked for between the two lags: (mean speed m/s, turning rad/s).
     pub rim_demand: [T; 2],
-    /// Commands between sender and actuators; followed only where a dead time or an effect alters them.
+    /// Commands between sender and actuators; followed in every step, so that what alters them can begin at any time.
     pub path: CommandPath<T>,
 }
 
@@ -65,7 +65,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
             return Self { speed_error_integral_m: T::lit(held_by_integral_m(vehicle, stands)), ..Self::settled(control) };
         }
         let servo = &vehicle.limited_rims();
-        let measured = state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency);
+        let measured = before_linkage(vehicle, state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency));
         let turning = clamp(measured, -servo.yaw_limit_rad_s, servo.yaw_limit_rad_s);
         Self::turning(vehicle, [state.velocity_m_s[0], turning])
     }
@@ -111,14 +111,17 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
         if vehicle.alters_commands() {
             return self.advance_altered(vehicle, control, forward_m_s, dt_s);
         }
-        if vehicle.second == SecondCommand::YawRateRadS {
-            return self.advance_rims(vehicle, control, dt_s);
-        }
-        Self {
-            steering: steered(vehicle, self.steering, control.second, dt_s),
-            speed_error_integral_m: self.integrated(vehicle, control.speed_m_s, forward_m_s, dt_s),
-            ..*self
-        }
+        let mut next = if vehicle.second == SecondCommand::YawRateRadS {
+            self.advance_rims(vehicle, control, dt_s)
+        } else {
+            Self {
+                steering: steered(vehicle, self.steering, control.second, dt_s),
+                speed_error_integral_m: self.integrated(vehicle, control.speed_m_s, forward_m_s, dt_s),
+                ..*self
+            }
+        };
+        next.path.pass(control, next.steering);
+        next
     }
 
     /// The same where commands arrive late, lagged or enlarged, or leave the steering with play. The way of the commands and a car's steering advance in
@@ -162,7 +165,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
     /// Speeds of the left and right rims of a skid-steer base at an instant, m/s: what its wheel encoders tell.
     pub fn rim_speeds_m_s(&self, vehicle: &Vehicle) -> [T; 2] {
         let half_turn =
-            T::lit(0.5 * (vehicle.track_m + vehicle.effects.actuator.track_m)) * behind_actuator(vehicle, self.position(vehicle));
+            T::lit(0.5 * (vehicle.track_m + vehicle.effects.actuator.track_m)) * behind_linkage(vehicle, self.position(vehicle));
         [self.rim_speed_m_s - half_turn, self.rim_speed_m_s + half_turn]
     }
 
@@ -173,7 +176,7 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
 
     /// Road-wheel angles FL, FR, RL, RR at an instant, rad.
     pub fn road_wheel_angles(&self, vehicle: &Vehicle) -> [T; WHEELS] {
-        road_wheel_angles(vehicle, behind_actuator(vehicle, self.position(vehicle)))
+        road_wheel_angles(vehicle, behind_linkage(vehicle, self.position(vehicle)))
     }
 }
 
@@ -186,9 +189,8 @@ pub fn rim_speeds_m_s(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHEELS]) -> [
 /// back from wheels to actuators, through what effects change between them.
 pub fn rim_twist(vehicle: &Vehicle, wheel_speed_rad_s: &[f64; WHEELS]) -> [f64; 2] {
     let [left, right] = rim_speeds_m_s(vehicle, wheel_speed_rad_s);
-    let terms = &vehicle.effects.actuator;
-    let turning = (right - left) / (vehicle.track_m + terms.track_m);
-    [0.5 * (left + right), (turning - terms.steering_offset) / (1.0 + terms.steering_ratio)]
+    let turning = (right - left) / (vehicle.track_m + vehicle.effects.actuator.track_m);
+    [0.5 * (left + right), before_linkage(vehicle, turning)]
 }
 
 /// The rims of a skid-steer base run freely from commands: its actuators at every sample after the first, at which its wheels turn so (FL, FR, RL, RR, rad/s).
@@ -215,10 +217,17 @@ fn steered<T: Real>(vehicle: &Vehicle, steering: T, command: T, dt_s: f64) -> T 
 }
 
 /// What steering ratio and offset make of a position of the actuator.
-fn behind_actuator<T: Real>(vehicle: &Vehicle, position: T) -> T {
+fn behind_linkage<T: Real>(vehicle: &Vehicle, position: T) -> T {
     let terms = &vehicle.effects.actuator;
     let position = if terms.steering_ratio != 0.0 { position * T::lit(1.0 + terms.steering_ratio) } else { position };
     position + T::lit(terms.steering_offset)
+}
+
+/// Position of the actuator of which steering ratio and offset make this: the inverse of [`behind_linkage`].
+fn before_linkage<T: Real>(vehicle: &Vehicle, behind: T) -> T {
+    let terms = &vehicle.effects.actuator;
+    let position = behind - T::lit(terms.steering_offset);
+    if terms.steering_ratio != 0.0 { position / T::lit(1.0 + terms.steering_ratio) } else { position }
 }
 
 /// Smooth saturation d / sqrt(1 + (d / limit)²) of a demand: slope one at zero, the limit far out.
@@ -319,11 +328,12 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
         0.0 => half * (before.steering + after.steering),
         _ => half * (before.path.play + after.path.play),
     };
-    let steering = behind_actuator(vehicle, position);
+    let steering = behind_linkage(vehicle, position);
     let skid = vehicle.second == SecondCommand::YawRateRadS;
+    let told_m_s = after.told_speed_m_s(vehicle, control);
     let mut base = [T::lit(line.speed_integral_gain_per_s) * before.speed_error_integral_m; WHEELS];
     if let Some(torque) = &line.torque {
-        let held = torque.held_m_s(control.speed_m_s);
+        let held = torque.held_m_s(told_m_s);
         base = base.map(|b| b + held);
     }
     if skid {
@@ -338,7 +348,7 @@ pub fn differentiable_wheels<T: Real<Value = f64>>(
         rim_follow: T::lit(if skid { 0.0 } else { 1.0 }),
         rim_gain: T::lit(if skid { 0.0 } else { line.speed_gain }),
         overspeed_limit_m_s: T::lit(line.overspeed_limit_m_s * if line.torque.is_some() { 1.0 } else { 1.0 - actuator.torque_lost }),
-        speed_m_s: after.told_speed_m_s(vehicle, control),
+        speed_m_s: told_m_s,
     }
 }
 

@@ -70,7 +70,7 @@ impl StepModel {
         let Some(brought) = torque.demand_m_s(usual_n_m + force_n * self.vehicle().wheel_radius_m, speed, share) else { return *advanced };
         let demand = unlimited(brought.clamp(-UNSATURATED * limit, UNSATURATED * limit), limit);
         let told = advanced.told_speed_m_s(self.vehicle(), control);
-        let integral = (demand - torque.held_m_s(control.speed_m_s) - line.speed_gain * (told - speed)) / line.speed_integral_gain_per_s;
+        let integral = (demand - torque.held_m_s(told) - line.speed_gain * (told - speed)) / line.speed_integral_gain_per_s;
         let integral = integral.clamp(-line.speed_integral_limit_m, line.speed_integral_limit_m);
         let rate = (torque.integral_observer_per_s * dt_s).min(1.0);
         let kept = advanced.speed_error_integral_m;

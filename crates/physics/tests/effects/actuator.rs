@@ -2,8 +2,8 @@
 
 use nesam_physics::driveline::{DrivelineState, WheelCommand, command_wheels};
 use nesam_physics::effects::*;
-use nesam_physics::{Control, DT_S, RimServo, SecondCommand, Vehicle};
-use nesam_test_vehicles::{robot, truck};
+use nesam_physics::{Control, DT_S, RimServo, SecondCommand, Vehicle, VehicleState};
+use nesam_test_vehicles::{robot, torque_truck, truck};
 
 use crate::common::Drive;
 
@@ -221,7 +221,7 @@ fn analytic_a_wheel_speed_limit_shrinks_both_rims_alike() {
 #[test]
 fn analytic_a_turn_efficiency_tells_the_rims_from_the_motion() {
     let slides = robot().with_effects(&[Effect::TurnEfficiency(TurnEfficiency { factor: 0.4 })]);
-    let mut state = nesam_physics::VehicleState::from_array([0.0; 12]);
+    let mut state = VehicleState::from_array([0.0; 12]);
     (state.velocity_m_s[0], state.angular_velocity_rad_s[2]) = (0.5, 0.3);
     let begun = |vehicle: &Vehicle| DrivelineState::<f64>::starting(vehicle, &state, &Control { speed_m_s: 0.5, second: 0.3 });
     assert!((begun(&slides).steering / begun(&robot()).steering - 1.0 / 0.4).abs() < 1e-12);
@@ -289,4 +289,92 @@ fn analytic_a_lock_spreads_the_slips_of_an_axle() {
     let want = locked.angular_velocity_rad_s[2] * 1.82 / locked.velocity_m_s[0];
     assert!(((spread - apart) / want - 1.0).abs() < 0.25, "{spread} {apart} {want}");
     assert!(locked.angular_velocity_rad_s[2] < open.angular_velocity_rad_s[2], "a lock resists the turn");
+}
+
+/// Goal: an actuator that becomes late, lagged or loose in the middle of a drive begins with what it was last told, not with the first command of the history. Method: a
+/// history that begins otherwise and then holds one command; from then on the effect, or none: the same wheels. And under commands that go on changing: those of
+/// an effect that was there before, once its memory has passed.
+#[test]
+fn regress_an_onset_replays_no_old_commands() {
+    let effects = [
+        Effect::SpeedLag(SpeedLag { seconds: 1.0 }),
+        Effect::SpeedDelay(SpeedDelay { seconds: 0.45 }),
+        Effect::SteeringLag(SteeringLag { seconds: 0.5 }),
+        Effect::SteeringDelay(SteeringDelay { seconds: 0.5 }),
+        Effect::SteeringBacklash(SteeringBacklash { second: 0.2 }),
+    ];
+    let wheels = |before: &Vehicle, after: &Vehicle, commands: &[[f64; 2]], onset: usize| -> Vec<WheelCommand<f64>> {
+        let mut state = DrivelineState::settled(&Control { speed_m_s: 0.0, second: 1.0 });
+        let step = |(k, &[speed_m_s, second]): (usize, &[f64; 2])| {
+            let (vehicle, control) = (if k < onset { before } else { after }, Control { speed_m_s, second });
+            let next = state.advance(vehicle, &control, 1.5, DT_S);
+            let told = command_wheels(vehicle, &state, &next, &control);
+            state = next;
+            told
+        };
+        commands.iter().enumerate().map(step).collect()
+    };
+    let same = |a: &WheelCommand<f64>, b: &WheelCommand<f64>, says: &str| {
+        let of = |w: &WheelCommand<f64>| [w.angle_rad, w.rim_base_m_s, [w.speed_m_s; 4]].concat();
+        of(a).iter().zip(of(b)).for_each(|(a, b)| assert!((a - b).abs() < 1e-12, "{says}: {a} {b}"));
+    };
+    let held = [vec![[0.0, 1.0]; 3], vec![[2.0, 0.25]; 160]].concat();
+    let changing: Vec<[f64; 2]> = (0..160).map(|k| [2.0 + (k as f64 * 0.3).sin(), 0.4 * (k as f64 * 0.2).cos()]).collect();
+    for plain in [truck(), robot()] {
+        for effect in effects {
+            let (altered, says) = (plain.with_effects(&[effect]), format!("{} on {}", effect.id(), plain.name));
+            let [with, without] = [&altered, &plain].map(|after| wheels(&plain, after, &held, 150));
+            with[150..].iter().zip(&without[150..]).for_each(|(a, b)| same(a, b, &says));
+            // A lag, unlike a delay, begins where it is told to be.
+            if matches!(effect, Effect::SpeedDelay(_) | Effect::SteeringDelay(_)) {
+                let [late, always] = [(&plain, 20), (&altered, 0)].map(|(before, onset)| wheels(before, &altered, &changing, onset));
+                same(&late[150], &always[150], &says);
+                let mean = |w: &WheelCommand<f64>| w.speed_m_s;
+                assert!((20..25).all(|k| (mean(&late[k]) - mean(&always[k])).abs() < 1e-12), "{says}");
+            }
+        }
+    }
+}
+
+/// Goal: a skid-steer base whose steering is off begins with rims that turn as its motion tells. Method: the rims at the start against yaw rate over efficiency, and the
+/// command that keeps them.
+#[test]
+fn regress_an_offset_and_a_ratio_count_once_where_a_drive_begins() {
+    let mut vehicle = robot();
+    vehicle.driveline.rims.turn_efficiency = 0.5;
+    let effects = [Effect::SteeringOffset(SteeringOffset { second: 0.3 }), Effect::SteeringRatio(SteeringRatio { relative: 0.5 })];
+    let vehicle = vehicle.with_effects(&effects);
+    let mut state = VehicleState::zero();
+    state.angular_velocity_rad_s[2] = 0.4;
+    let told = Control { speed_m_s: 0.0, second: (0.4 / 0.5 - 0.3) / 1.5 };
+    let begun = DrivelineState::<f64>::starting(&vehicle, &state, &told);
+    for actuators in [begun, begun.advance(&vehicle, &told, 0.0, DT_S)] {
+        let [left, right] = actuators.rim_speeds_m_s(&vehicle);
+        assert!(((right - left) / vehicle.track_m - 0.4 / 0.5).abs() < 1e-12, "{left} {right}");
+    }
+}
+
+/// Goal: what a car under torque holds against the usual resistance is asked for by the command that arrives, not by the one that is sent. Method: a command that is taken
+/// back, late or lagged; what the integral's observer takes off is the same.
+#[test]
+fn regress_a_late_command_is_held_until_another_one_arrives() {
+    let sound = torque_truck();
+    let holding_m_s = sound.driveline.torque.expect("a torque drives this car").holding_demand_m_s;
+    let commands = [[2.0, 0.0]; 12].into_iter().chain([[0.0, 0.0]; 4]).collect::<Vec<_>>();
+    let base = |vehicle: &Vehicle| -> Vec<f64> {
+        let integral_m = |state: &DrivelineState| vehicle.driveline.speed_integral_gain_per_s * state.speed_error_integral_m;
+        let mut before = DrivelineState::settled(&Control { speed_m_s: 0.0, second: 0.0 });
+        let held = |(state, wheels): &(DrivelineState, WheelCommand<f64>)| {
+            let held = wheels.rim_base_m_s[0] - integral_m(&before);
+            before = *state;
+            held
+        };
+        follow(vehicle, &commands).iter().map(held).collect()
+    };
+    let late = base(&sound.with_effects(&[Effect::SpeedDelay(SpeedDelay { seconds: 0.3 })]));
+    let now = base(&sound);
+    assert!((now[11] - holding_m_s).abs() < 1e-3 && now[12].abs() < 1e-9, "{now:?}");
+    assert!(late[12..15].iter().all(|held| (held - now[11]).abs() < 1e-9) && late[15].abs() < 1e-9, "{late:?}");
+    let lagged = base(&sound.with_effects(&[Effect::SpeedLag(SpeedLag { seconds: 1.0 })]));
+    assert!(lagged[12] > 0.9 * holding_m_s, "{lagged:?}");
 }
