@@ -481,6 +481,7 @@ impl ObservedDrive {
             let (residual, sinkage_log_ratio) = self.follows.get(start + j).map_or(unshifted, |follows| {
                 // A vehicle is as much lower over the ground as that lies higher than the map says.
                 let [x_m, y_m, _] = self.states[start + j].position_m;
+                let (x_m, y_m) = ground.from_middle(x_m, y_m);
                 let raised = |map: &MapTerms| map.raised(x_m, y_m, (0.0, [0.0; 2])).0;
                 let up_m = raised(&model.vehicle().effects.map) - raised(&self.known.map);
                 follows.said(transition, &[ride_shift[0] + up_m, ride_shift[1], ride_shift[2]])

@@ -217,6 +217,14 @@ impl ModelBundle {
         patched
     }
 
+    /// Checks that the vehicle can have the bundle's effects; `dir` is where the bundle is.
+    ///
+    /// # Errors
+    /// `ModelError::Bundle` naming the effects that it cannot have ([`Vehicle::check_effects`]).
+    pub(crate) fn check_effects(&self, dir: &Path) -> Result<(), ModelError> {
+        self.vehicle.check_effects(&self.effects, self.normalization.dt_s).map_err(|reason| Folder(dir).fail(EFFECTS, reason))
+    }
+
     /// How the vehicle that the network knows rides: without effects, on the default soil.
     pub fn usual_ride(&self) -> UsualRide {
         let scales = &self.normalization;
@@ -267,9 +275,10 @@ impl ModelBundle {
     /// Writes the bundle into a folder (created if absent; files of an older bundle there are replaced) and sets [`ModelBundle::hash`].
     ///
     /// # Errors
-    /// `ModelError::Bundle` naming the file that could not be written.
+    /// `ModelError::Bundle` naming the file that could not be written, or effects that the vehicle cannot have.
     pub fn save(&mut self, dir: &Path) -> Result<PathBuf, ModelError> {
         let folder = Folder(dir);
+        self.check_effects(dir)?;
         std::fs::create_dir_all(dir).map_err(|e| folder.fail("", format!("cannot be created: {e}")))?;
         let normalization = toml::to_string(&self.normalization).expect("plain numbers serialise; this is a bug");
         let mut files: Vec<(&str, Vec<u8>)> = vec![

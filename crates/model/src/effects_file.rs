@@ -15,14 +15,16 @@
 //! parameters.fade = { value = 0.2, unit = "m/s", range = [0.05, 1.0] }
 //! ```
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use nesam_physics::effects::written::{WRITTEN_MAX, WrittenParameter, WrittenText};
-use nesam_physics::effects::{Effect, ScheduledEffect, Written};
+use nesam_physics::effects::{Effect, PLACES_MAX, Scaling, ScheduledEffect, Written};
 use serde::{Deserialize, Serialize};
 
 /// Version of the file; absent in files without effects.
 const FORMAT: &str = "nesam.effects/1";
+/// Effects that act at a place of their own, each of them.
+const LISTED: [&str; 3] = ["soil_drift", "soil_crust", "free_form"];
 /// The text of a bundle without effects.
 const NONE: &str = "# Effects found by `nesam diagnose`; none yet.\neffects = []\n";
 
@@ -133,7 +135,23 @@ pub fn read(text: &str) -> Result<Vec<ScheduledEffect>, String> {
     if let Some(twice) = texts.iter().find(|a| texts.iter().any(|b| same(a, b))) {
         return Err(format!("has two written effects `{}` that differ", twice.id()));
     }
-    file.effects.iter().map(effect).chain(written.into_iter().map(Ok)).collect()
+    let named: Vec<ScheduledEffect> = file.effects.iter().map(effect).collect::<Result<_, _>>()?;
+    for id in LISTED {
+        let places = places_of(&named, id);
+        if places > PLACES_MAX {
+            return Err(format!("has `{id}` at {places} places; {PLACES_MAX} can act at once"));
+        }
+    }
+    Ok(named.into_iter().chain(written).collect())
+}
+
+/// Number of different places (what scaling holds) at which effects of an id act.
+fn places_of(effects: &[ScheduledEffect], id: &str) -> usize {
+    let held = |e: &ScheduledEffect| -> Vec<u64> {
+        let of = e.effect.quantities().iter().zip(e.effect.values());
+        of.filter(|(q, _)| q.scaling == Scaling::Held).map(|(_, value)| value.to_bits()).collect()
+    };
+    effects.iter().filter(|e| e.effect.id() == id).map(held).collect::<BTreeSet<_>>().len()
 }
 
 /// The text of a list of effects, as [`read`] reads it.
@@ -192,7 +210,7 @@ fn onset(id: &str, onset_s: f64) -> Result<f64, String> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nesam_physics::effects::{Payload, SteeringOffset, WheelDrag};
+    use nesam_physics::effects::{Payload, SoilDrift, SteeringOffset, WheelDrag};
 
     #[test]
     fn property_effects_round_trip_bit_for_bit() {
@@ -261,6 +279,19 @@ parameters.wheelbase = { value = 3.3, unit = "m", range = [1.0, 5.0] }
         assert!(read(&many).unwrap_err().contains("at once"));
         let nothing = "[[written]]\nid = \"nothing\"\n";
         assert!(read(nothing).unwrap_err().contains("no formula"));
+    }
+
+    /// Goal: no entry of a file is left out unsaid. Method: as many drifts of the soil at times of their own as can act, the same once more, and one more.
+    #[test]
+    fn regress_more_places_than_can_act_are_refused() {
+        let drifts = |count: usize| -> Vec<ScheduledEffect> {
+            let of = |i: usize| Effect::SoilDrift(SoilDrift { factor_end: 0.9, begin_s: i as f64, end_s: 50.0 });
+            (0..count).map(|i| of(i).into()).collect()
+        };
+        let all = [drifts(PLACES_MAX), drifts(1)].concat();
+        assert_eq!(read(&write(&all)).unwrap(), all, "the same again is more of it");
+        let error = read(&write(&drifts(PLACES_MAX + 1))).unwrap_err();
+        assert!(error.contains("`soil_drift` at 5 places"), "{error}");
     }
 
     #[test]

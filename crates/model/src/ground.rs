@@ -41,8 +41,20 @@ impl<'a> GroundSource<'a> {
                     Some(ground) => ((ground.height_m, [ground.slope_x, ground.slope_y]), true),
                     None => ((map.nearest_height_m(x_m, y_m), [0.0; 2]), false),
                 };
+                let (x_m, y_m) = self.from_middle(x_m, y_m);
                 let (height, slope) = effects.raised(x_m, y_m, mapped);
                 (height, slope, known)
+            }
+        }
+    }
+
+    /// A point of World seen from the middle of the map, where effects on the map begin to count, m.
+    pub fn from_middle(&self, x_m: f64, y_m: f64) -> (f64, f64) {
+        match self {
+            Self::Level(_) => (x_m, y_m),
+            Self::Map(map) => {
+                let [middle_x, middle_y] = map.geometry().middle_m();
+                (x_m - middle_x, y_m - middle_y)
             }
         }
     }
@@ -115,4 +127,27 @@ pub(crate) fn actuators_along<'a>(
             None => advanced,
         }
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use nesam_physics::effects::{Effect, EffectTerms, MapTilt};
+    use nesam_terrain::GridGeometry;
+
+    use super::*;
+
+    /// Goal: a map that is tilted is tilted about its middle, wherever World begins. Method: the same level map at the origin and far from it.
+    #[test]
+    fn regress_a_tilted_map_turns_about_its_middle() {
+        let mut terms = EffectTerms::default();
+        Effect::MapTilt(MapTilt { pitch_rad: 0.01, roll_rad: -0.02 }).add_to(&mut terms);
+        for middle in [[0.0, 0.0], [5.0e5, 5.4e6]] {
+            let geometry = GridGeometry { origin_m: middle.map(|m| m - 20.0), resolution_m: 0.5, width: 81, height: 81 };
+            let map = WorldMap::from_layers("level", 1, geometry, vec![3.0; geometry.cells()], None).expect("a map");
+            let at = |x: f64, y: f64| GroundSource::Map(&map).at(&terms.map, middle[0] + x, middle[1] + y);
+            assert!((at(0.0, 0.0).0 - 3.0).abs() < 1e-9, "{middle:?}: {}", at(0.0, 0.0).0);
+            let want = 3.0 - 10.0 * 0.01f64.tan() + 8.0 * (-0.02f64).tan();
+            assert!((at(10.0, 8.0).0 - want).abs() < 1e-6, "{middle:?}: {} {want}", at(10.0, 8.0).0);
+        }
+    }
 }

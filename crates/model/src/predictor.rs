@@ -86,8 +86,9 @@ impl Predictor {
     /// Prepares the bundle for inference.
     ///
     /// # Errors
-    /// `ModelError::Weights` naming an array that is missing or has another shape.
+    /// `ModelError::Weights` naming an array that is missing or has another shape, `ModelError::Bundle` naming effects that the vehicle cannot have.
     pub fn new(bundle: Arc<ModelBundle>) -> Result<Self, ModelError> {
+        bundle.check_effects(std::path::Path::new(""))?;
         let (weights, scales) = (&bundle.weights, &bundle.normalization);
         let projection = TerrainProjection::new(
             TerrainEncoders::new(weights)?,

@@ -34,27 +34,27 @@ impl StepModel {
     /// with this input.
     pub fn traction_reserve<T: Real>(&self, input: &StepInput<T>, contacts: &[WheelContact<T>; WHEELS]) -> T {
         let motion = ContactMotion::<T>::from_slip(RESERVE_SLIP, 0.0);
+        let speed = input.state.velocity_m_s[0];
+        let of_motion = speed / speed.abs_smooth(DIRECTION_SPEED_M_S);
+        let (told, threshold) = (input.wheels.speed_m_s, T::lit(DIRECTION_SPEED_M_S));
+        let backwards_or_none = T::select_ge0(-told - threshold, T::lit(-1.0), of_motion);
+        let direction = T::select_ge0(told - threshold, T::lit(1.0), backwards_or_none);
         let mut pull_n = T::lit(0.0);
         for (i, (contact, log_ratio)) in contacts.iter().zip(input.sinkage_log_ratio).enumerate() {
             let (wheel, support) = (self.wheel_at(i), Support { preload_n: contact.normal_n, rate_n_m: T::lit(0.0) });
             let (mut soil, mut ratio) = (input.soil, log_ratio.exp());
             if self.altered.on_wheels {
                 ratio = ratio * self.digging(motion.slip);
-                soil = self.soil_under(i, &support, ratio, &motion, &soil);
+                soil = self.soil_under(i, direction, &support, ratio, &motion, &soil);
             }
             let sinkage = balance_sinkage(wheel, &support, &motion, &soil) * ratio;
             let wrench = wheel_wrench(wheel, sinkage, &motion, &soil);
             let mut pulled = wrench.drawbar_n() * contact.normal_n / wrench.normal_n.relu_smooth(1.0);
             if self.altered.on_wheels {
-                pulled = self.altered_pull_n(i, contact.normal_n, sinkage, pulled, &soil);
+                pulled = self.altered_pull_n(i, direction, contact.normal_n, sinkage, pulled, &soil);
             }
             pull_n = pull_n + pulled;
         }
-        let speed = input.state.velocity_m_s[0];
-        let of_motion = speed / speed.abs_smooth(DIRECTION_SPEED_M_S);
-        let (told, threshold) = (input.wheels.speed_m_s, T::lit(DIRECTION_SPEED_M_S));
-        let backwards_or_none = T::select_ge0(-told - threshold, T::lit(-1.0), of_motion);
-        let direction = T::select_ge0(told - threshold, T::lit(1.0), backwards_or_none);
         // Pitch is positive nose down, so the body climbs by -pitch.
         let climb = -input.state.attitude_rad[1].sin_cos().0;
         let weight_n = T::lit(self.body.mass_kg * self.vehicle().gravity_m_s2);

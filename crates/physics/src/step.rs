@@ -6,7 +6,7 @@
 
 use crate::contacts::{Rolling, Sunk, Wheels};
 use crate::driveline::WheelCommand;
-use crate::linear::solve_spd;
+use crate::linear::{is_positive_definite, solve_spd};
 use crate::ride::Ride;
 use crate::scalar::Real;
 use crate::soil::Soil;
@@ -103,11 +103,23 @@ pub(crate) struct RigidBody {
 }
 
 impl RigidBody {
-    fn new(vehicle: &Vehicle) -> Self {
+    /// Element (i, j) of the inertia of a mass (kg) at a point (m), kg m².
+    fn of_point(m: f64, r: [f64; 3], i: usize, j: usize) -> f64 {
+        m * (if i == j { dot(r, r) } else { 0.0 } - r[i] * r[j])
+    }
+
+    /// Whether a body can be so: a mass, and an inertia about the centre of mass that is positive definite.
+    pub(crate) fn is_physical(&self) -> bool {
+        let (m, c) = (self.mass_kg, self.centre_m);
+        let about_centre = core::array::from_fn(|i| core::array::from_fn(|j| self.inertia_kg_m2[i][j] - Self::of_point(m, c, i, j)));
+        self.mass_kg > 0.0 && is_positive_definite(&about_centre)
+    }
+
+    pub(crate) fn new(vehicle: &Vehicle) -> Self {
         let force = &vehicle.effects.force;
         let (m, r) = (force.added_mass_kg, force.added_at_m);
         let mass_kg = vehicle.mass_kg + m;
-        let point = |m: f64, r: [f64; 3], i: usize, j: usize| m * (if i == j { dot(r, r) } else { 0.0 } - r[i] * r[j]);
+        let point = Self::of_point;
         let mut inertia_kg_m2: [[f64; 3]; 3] =
             core::array::from_fn(|i| core::array::from_fn(|j| vehicle.inertia_kg_m2[i][j] + point(m, r, i, j)));
         let mut centre_m = scale(r, m / mass_kg);
@@ -262,6 +274,9 @@ impl StepModel {
                 lhs[r + 3][c] = T::lit(self.body.coupling_kg_m[r][c]);
             }
         }
+        if self.altered.on_body {
+            self.damp_by_drag(v, h, &mut lhs);
+        }
 
         let mut stances: [Stance<T>; WHEELS] = core::array::from_fn(|i| self.stance(i, state, &tilt, input));
         let grips = self.grips(&stances.each_ref().map(|s| (s.preload_n, s.forward_m_s)), &input.soil);
@@ -338,7 +353,10 @@ impl StepModel {
         let rate = T::lit(self.vehicle.suspension_n_m[i]);
         let mut ratio = input.sinkage_log_ratio[i].exp();
         let rim_speed_m_s = match (driven, self.altered.on_wheels) {
-            (Some(driven), _) => input.wheels.servo_m_s(i) + input.wheels.rim_follow * (forward_m_s + driven.overspeed_m_s),
+            (Some(driven), altered) => {
+                let servo_m_s = if altered { self.resized_servo_m_s(i, input) } else { input.wheels.servo_m_s(i) };
+                servo_m_s + input.wheels.rim_follow * (forward_m_s + driven.overspeed_m_s)
+            }
             (None, false) => input.wheels.rim_speed_m_s(i, forward_m_s, state.velocity_m_s[0]),
             (None, true) => self.altered_rim_speed(i, state, axes[0], input),
         };
@@ -350,7 +368,7 @@ impl StepModel {
         let mut soil = input.soil;
         if self.altered.on_wheels {
             ratio = ratio * self.digging(motion.slip);
-            soil = self.soil_under(i, &Support { preload_n, rate_n_m: rate * ratio }, ratio, &motion, &soil);
+            soil = self.soil_under(i, forward_m_s, &Support { preload_n, rate_n_m: rate * ratio }, ratio, &motion, &soil);
         }
         let support = Support { preload_n, rate_n_m: rate * ratio };
         Roll { motion: wheel_motion, direction, contact: Rolling { support, motion, soil, ratio } }

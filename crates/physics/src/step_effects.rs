@@ -16,6 +16,17 @@ use crate::vehicle::SecondCommand;
 /// Speed around which a resistance of a wheel changes its sign, m/s (chosen, as for wheel drag).
 const RESISTANCE_SPEED_M_S: f64 = 0.07;
 
+/// Speed backwards at which the rear wheels have become the leading ones, m/s (chosen, as for slip).
+const LEAD_CHANGE_M_S: f64 = 0.1;
+
+/// Share to which a wheel that goes ahead at `forward_m_s` leads, so that the wheels of the other axle follow in its rut: the front wheels do unless the vehicle goes
+/// backwards. One that stands is taken to have come forwards.
+fn leading_share<T: Real>(wheel: usize, forward_m_s: T) -> T {
+    let one = T::lit(1.0);
+    let front = (one + forward_m_s * T::lit(1.0 / LEAD_CHANGE_M_S)).max(T::lit(0.0)).min(one);
+    if wheel < 2 { front } else { one - front }
+}
+
 fn add_wrench<T: Real>(rhs: &mut [T; 6], wrench: &[T]) {
     for (sum, part) in rhs.iter_mut().zip(wrench) {
         *sum = *sum + *part;
@@ -85,9 +96,7 @@ impl StepModel {
     ) {
         let terms = &self.vehicle.effects.force;
         let v = state.velocity_m_s;
-        let speed = (dot(v, v) + T::lit(1e-12)).sqrt();
-        let drag = T::lit(-terms.linear_drag_n_s_m) - T::lit(terms.quadratic_drag_n_s2_m2) * speed;
-        let mut force = scale(v, drag);
+        let mut force = scale(v, -self.drag_n_s_m(v));
         force[0] = force[0] - T::lit(terms.tow_n);
         if terms.wind_n != [0.0; 2] {
             let [east, north] = terms.wind_n.map(T::lit);
@@ -104,8 +113,8 @@ impl StepModel {
             let most = T::lit(0.25 * terms.turning_resistance * weight * wheelbase);
             rhs[5] = rhs[5] - most * sideways / sideways.abs_smooth(RESISTANCE_SPEED_M_S);
         }
-        if terms.free_form.acts() {
-            add_wrench(rhs, terms.free_form.at(v[0], angle, ahead, left).as_flattened());
+        for free_form in terms.free_form.iter().filter(|form| form.acts()) {
+            add_wrench(rhs, free_form.at(v[0], angle, ahead, left).as_flattened());
         }
         if terms.written[0].is_some() {
             let (rate, [roll, pitch, _]) = (state.angular_velocity_rad_s, state.attitude_rad);
@@ -115,6 +124,24 @@ impl StepModel {
             for written in terms.written.iter().flatten() {
                 add_wrench(rhs, &written.wrench(&variables, mass));
             }
+        }
+    }
+
+    /// Drag of the body over its speed, N s/m.
+    fn drag_n_s_m<T: Real>(&self, velocity_m_s: Vec3<T>) -> T {
+        let terms = &self.vehicle.effects.force;
+        let speed = (dot(velocity_m_s, velocity_m_s) + T::lit(1e-12)).sqrt();
+        T::lit(terms.linear_drag_n_s_m) + T::lit(terms.quadratic_drag_n_s2_m2) * speed
+    }
+
+    /// Adds what a drag C takes away in a sub-step of `h` s beyond the whole speed, h C - M, to the matrix: a drag that is large against the mass stops it and does not
+    /// turn it around. Smaller ones add nothing.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn damp_by_drag<T: Real>(&self, velocity_m_s: Vec3<T>, h: T, lhs: &mut [[T; 6]; 6]) {
+        let damping = (h * self.drag_n_s_m(velocity_m_s) - T::lit(self.body.mass_kg)).max(T::lit(0.0));
+        for (axis, row) in lhs.iter_mut().enumerate().take(3) {
+            row[axis] = row[axis] + damping;
         }
     }
 
@@ -151,8 +178,15 @@ impl StepModel {
         let rim = input.wheels.rim_speed_m_s(i, followed, state.velocity_m_s[0]);
         match effects.force.radius_relative[i / 2] {
             0.0 => rim,
-            relative => rim + input.wheels.rim_base_m_s[i] * (T::lit(1.0) - input.wheels.rim_follow) * T::lit(relative),
+            _ => rim + (self.resized_servo_m_s(i, input) - input.wheels.servo_m_s(i)),
         }
+    }
+
+    /// Rim speed of a wheel of another radius where it is servoed or measured, m/s, else 0.
+    #[cold]
+    #[inline(never)]
+    pub(crate) fn resized_servo_m_s<T: Real>(&self, i: usize, input: &StepInput<T>) -> T {
+        input.wheels.servo_m_s(i) * T::lit(1.0 + self.vehicle.effects.force.radius_relative[i / 2])
     }
 
     /// Sinkage over that which balances the load, from the slip.
@@ -181,12 +215,13 @@ impl StepModel {
         (T::lit(roll) * in_roll + T::lit(pitch) * in_pitch) * T::lit(self.vehicle.suspension_n_m[i])
     }
 
-    /// Soil that a wheel meets, its crust as the mean down to the sinkage of the balance without it.
+    /// Soil that a wheel meets that goes ahead at `forward_m_s`, its crust as the mean down to the sinkage of the balance without it.
     #[cold]
     #[inline(never)]
     pub(crate) fn soil_under<T: Real>(
         &self,
         i: usize,
+        forward_m_s: T,
         support: &Support<T>,
         ratio: T,
         motion: &ContactMotion<T>,
@@ -194,8 +229,8 @@ impl StepModel {
     ) -> Soil<T> {
         let terms = &self.vehicle.effects.soil;
         let wheel = self.wheel_at(i);
-        let soil = terms.under_wheel(soil, i > 1, wheel.width_m);
-        if terms.crust[0] == 0.0 {
+        let soil = terms.under_wheel(soil, T::lit(1.0) - leading_share(i, forward_m_s), wheel.width_m);
+        if !terms.has_crust() {
             return soil;
         }
         let sinkage = balance_sinkage(wheel, support, motion, &soil) * ratio;
@@ -217,7 +252,7 @@ impl StepModel {
         contact: &mut WheelContact<T>,
     ) {
         let wheel = self.wheel_at(i);
-        let resistance = self.resistance_n(i, contact.normal_n, contact.sinkage_m, soil);
+        let resistance = self.resistance_n(i, wheel_motion.forward_m_s, contact.normal_n, contact.sinkage_m, soil);
         let speed = wheel_motion.forward_m_s.abs_smooth(RESISTANCE_SPEED_M_S);
         contact.forward_n = contact.forward_n - resistance * wheel_motion.forward_m_s / speed;
         damping[0] = damping[0] + (resistance / speed).max(T::lit(0.0));
@@ -236,15 +271,16 @@ impl StepModel {
         }
     }
 
-    /// Force that effects hold against the rolling of a wheel at a load (N) and a sinkage (m), N.
-    fn resistance_n<T: Real>(&self, i: usize, normal_n: T, sinkage_m: T, soil: &Soil<T>) -> T {
+    /// Force that effects hold against the rolling of a wheel that goes ahead at `forward_m_s`, at a load (N) and a sinkage (m), N.
+    fn resistance_n<T: Real>(&self, i: usize, forward_m_s: T, normal_n: T, sinkage_m: T, soil: &Soil<T>) -> T {
         let effects = &self.vehicle.effects;
         let [front_share, front_weight] = effects.soil.front_bulldozing;
         let rolling = T::lit(effects.force.rolling_resistance) * normal_n;
-        if front_share == 0.0 || i > 1 {
+        if front_share == 0.0 {
             return rolling;
         }
-        rolling + T::lit(front_share) * front_bulldozing(self.wheel_at(i).width_m, sinkage_m, front_weight, soil)
+        let heaped = T::lit(front_share) * front_bulldozing(self.wheel_at(i).width_m, sinkage_m, front_weight, soil);
+        rolling + leading_share(i, forward_m_s) * heaped
     }
 
     /// Share of a tangential force (forward, left; N) that a cap on friction leaves at a load, N.
@@ -253,11 +289,11 @@ impl StepModel {
         (normal_n * T::lit(1.0 / self.vehicle.effects.force.friction_cap_inverse) / tangential).min(T::lit(1.0))
     }
 
-    /// What a wheel at this load (N), sinkage (m) and drawbar pull (N) pulls on with the resistances and the cap of effects, N.
+    /// What a wheel that goes ahead at `forward_m_s` at this load (N), sinkage (m) and drawbar pull (N) pulls on with the resistances and the cap of effects, N.
     #[cold]
     #[inline(never)]
-    pub(crate) fn altered_pull_n<T: Real>(&self, i: usize, normal_n: T, sinkage_m: T, drawbar_n: T, soil: &Soil<T>) -> T {
-        let pull = drawbar_n - self.resistance_n(i, normal_n, sinkage_m, soil);
+    pub(crate) fn altered_pull_n<T: Real>(&self, i: usize, forward_m_s: T, normal_n: T, sinkage_m: T, drawbar_n: T, soil: &Soil<T>) -> T {
+        let pull = drawbar_n - self.resistance_n(i, forward_m_s, normal_n, sinkage_m, soil);
         match self.vehicle.effects.force.friction_cap_inverse {
             0.0 => pull,
             _ => pull * self.kept_by_cap(normal_n, [pull, T::lit(0.0)]),

@@ -49,6 +49,13 @@ impl GridGeometry {
         [self.origin_m[0] + self.resolution_m * column as f64, self.origin_m[1] + self.resolution_m * row as f64]
     }
 
+    /// Middle of the grid in World, m.
+    #[inline]
+    pub fn middle_m(&self) -> [f64; 2] {
+        let half = |cells: usize| 0.5 * self.resolution_m * (cells - 1) as f64;
+        [self.origin_m[0] + half(self.width), self.origin_m[1] + half(self.height)]
+    }
+
     /// Whether a World point lies in the closed rectangle spanned by the cell points.
     ///
     /// A slack of 1e-9 cells keeps the outermost points inside in spite of rounding.

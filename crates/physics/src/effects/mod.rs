@@ -19,6 +19,7 @@
 
 mod act;
 pub mod actuator;
+mod fit;
 pub mod force;
 pub mod map;
 mod schedule;
@@ -36,6 +37,17 @@ pub use soil::*;
 pub use written::Written;
 
 use crate::vehicle::Vehicle;
+
+/// Effects of one id that hold a place of their own (a depth, a time, a region) and act at once, at most.
+pub const PLACES_MAX: usize = 4;
+
+/// Adds a size at a place, (size, place …), to what is there, else to the next free one; one beyond [`PLACES_MAX`] is left out.
+fn add_at_place<const N: usize>(places: &mut [[f64; N]; PLACES_MAX], added: [f64; N]) {
+    let same = places.iter().position(|p| p[0] != 0.0 && p[1..] == added[1..]);
+    if let Some(i) = same.or(places.iter().position(|p| p[0] == 0.0)) {
+        places[i] = core::array::from_fn(|k| if k == 0 { places[i][0] + added[0] } else { added[k] });
+    }
+}
 
 /// What effects change; all zero by default.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -57,9 +57,14 @@ impl<M> Phases<M> {
         &self.phases[phase.min(last)].1
     }
 
+    /// All of them, in time.
+    pub fn all(&self) -> impl Iterator<Item = &M> {
+        self.phases.iter().map(|(_, phase)| phase)
+    }
+
     /// Whether some phase is such.
     pub fn any(&self, is_such: impl Fn(&M) -> bool) -> bool {
-        self.phases.iter().any(|(_, phase)| is_such(phase))
+        self.all().any(is_such)
     }
 
     /// What holds when every effect has begun.

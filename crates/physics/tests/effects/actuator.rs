@@ -378,3 +378,27 @@ fn regress_a_late_command_is_held_until_another_one_arrives() {
     let lagged = base(&sound.with_effects(&[Effect::SpeedLag(SpeedLag { seconds: 1.0 })]));
     assert!(lagged[12] > 0.9 * holding_m_s, "{lagged:?}");
 }
+
+/// Goal: the longest dead time of a card and the longest delay of an effect act together at steps of 0.1 s, and the longest delay at half of that; what is longer is
+/// refused. Method: when a command gets to the actuator.
+#[test]
+fn regress_long_delays_are_followed_or_refused() {
+    let delay = [Effect::SteeringDelay(SteeringDelay { seconds: 0.6 })];
+    let arrives_s = |vehicle: &Vehicle, dt_s: f64| {
+        let mut state = DrivelineState::settled(&Control { speed_m_s: 1.0, second: 0.0 });
+        let begins = (0..60).position(|_| {
+            state = state.advance(vehicle, &Control { speed_m_s: 1.0, second: 0.5 }, 1.0, dt_s);
+            state.steering > 1e-9
+        });
+        begins.map(|k| k as f64 * dt_s)
+    };
+    assert!((arrives_s(&truck().with_effects(&delay), 0.05).unwrap() - 0.6).abs() < 1e-9);
+    let mut late = truck();
+    late.driveline.rims.dead_time_s = [0.6; 2];
+    assert!((arrives_s(&late.with_effects(&delay), 0.1).unwrap() - 1.2).abs() < 1e-9);
+    let scheduled = delay.map(ScheduledEffect::from);
+    late.check_effects(&scheduled, 0.1).unwrap();
+    late.check_effects(&[], 0.05).unwrap();
+    let error = late.check_effects(&scheduled, 0.05).unwrap_err();
+    assert!(error.contains("1.2 s late (by `steering_delay`)") && error.contains("0.6"), "{error}");
+}

@@ -1,10 +1,11 @@
 //! Goal: bodies and wheels obey mechanics under each force effect. Method: closed forms in free space, statics on level and sloping ground, forces of one
 //! sub-step.
 
+use nesam_physics::driveline::measured_wheels;
 use nesam_physics::effects::*;
-use nesam_physics::step::{StepModel, WheelContact};
+use nesam_physics::step::{StepInput, StepModel, WheelContact};
 use nesam_physics::{Control, Vehicle, VehicleState};
-use nesam_test_vehicles::{robot, truck};
+use nesam_test_vehicles::{robot, torque_truck, truck};
 
 use crate::common::Drive;
 use crate::settle;
@@ -236,4 +237,74 @@ fn analytic_a_free_form_is_its_wrench_inside_its_region_and_held_outside() {
     form.wrench[0][0] = -500.0;
     let v = in_free_space(&[Effect::FreeForm(form)], 2.0).velocity_m_s[0];
     assert!((v - (2.0 - 500.0 / 2493.56)).abs() < 2e-5, "{v}");
+}
+
+/// Goal: measured wheel speeds are rim speeds of the wheels that are mounted, of a car under torque too. Method: the over-speed of each contact at the first instant, by the
+/// radius.
+#[test]
+fn regress_measured_rims_of_a_car_under_torque_turn_with_the_radius() {
+    let (speed, relative) = (2.0, 0.1);
+    let effects = [Effect::TyreRadius(TyreRadius { relative })];
+    for (radius, effects) in [(1.0, &effects[..0]), (1.0 + relative, &effects[..])] {
+        let car = torque_truck().with_effects(effects);
+        let drive = Drive::new(car.clone(), speed);
+        let (input, _) = drive.input(&Control { speed_m_s: speed, second: 0.0 });
+        let wheels = measured_wheels(&car, &[speed / car.wheel_radius_m; 4], &[0.0; 4]);
+        for contact in StepModel::new(&car, 0.05, 1).step(&StepInput { wheels, ..input }).contacts {
+            assert!((contact.overspeed_m_s - (radius - 1.0) * speed).abs() < 1e-9, "{}", contact.overspeed_m_s);
+        }
+    }
+}
+
+/// Goal: a drag that is large against the mass stops a vehicle and does not throw it back. Method: a car of 6 kg in drags up to the end of their range, told to stand; it
+/// comes to rest from 1 m/s but for what its springs make of it (5 cm/s).
+#[test]
+fn regress_a_large_drag_stops_a_light_vehicle() {
+    let share = 6.0 / truck().mass_kg;
+    let mut car = Vehicle { mass_kg: 6.0, inertia_kg_m2: truck().inertia_kg_m2.map(|row| row.map(|x| x * share)), ..truck() };
+    (car.suspension_n_m, car.suspension_n_s_m) = (car.suspension_n_m.map(|x| x * share), car.suspension_n_s_m.map(|x| x * share));
+    let drags = [200.0, 400.0, 1500.0].map(|n_s_m| Effect::LinearDrag(LinearDrag { n_s_m }));
+    for drag in drags.into_iter().chain([Effect::QuadraticDrag(QuadraticDrag { n_s2_m2: 500.0 })]) {
+        let mut drive = Drive::new(car.with_effects(&[drag]), 1.0);
+        let mut before = 1.0;
+        for _ in 0..20 {
+            drive.step(0.0, 0.0);
+            let speed = drive.state.velocity_m_s[0];
+            assert!(speed > -0.05 && speed < before + 0.05, "{drag:?}: {before} {speed}");
+            before = speed;
+        }
+    }
+}
+
+/// Goal: effects that leave no body are refused by their names, in the phase in which they do. Method: a payload that takes more than there is, one that takes mass from
+/// where none is, and one that another one makes up for from the start, or later.
+#[test]
+fn regress_effects_that_leave_no_body_are_refused() {
+    let payload = |mass_kg: f64, x_m: f64| Effect::Payload(Payload { mass_kg, at_m: [x_m, 0.0, 0.0] });
+    let from = |effect: Effect, onset_s: f64| ScheduledEffect { effect, onset_s };
+    let offset = Effect::SteeringOffset(SteeringOffset { second: 0.1 });
+    let error = robot().check_effects(&[offset.into(), payload(-60.0, 0.0).into()], 0.1).unwrap_err();
+    assert!(error.contains("`robot` a mass of -10 kg (by `payload`)"), "{error}");
+    let error = robot().check_effects(&[offset.into(), payload(-40.0, 1.0).into()], 0.1).unwrap_err();
+    assert!(error.contains("inertia") && error.contains("(by `payload`)"), "{error}");
+    robot().check_effects(&[payload(-60.0, 0.0).into(), payload(60.0, 0.0).into()], 0.1).unwrap();
+    robot().check_effects(&[payload(-60.0, 0.0).into(), from(payload(60.0, 0.0), 5.0)], 0.1).unwrap_err();
+    // What the catalogue gives as typical of a car can be put on one, each and all at once.
+    let examples: Vec<ScheduledEffect> = Effect::examples().into_iter().map(ScheduledEffect::from).collect();
+    truck().check_effects(&examples, 0.1).unwrap();
+}
+
+/// Goal: two free forms act each in its own region. Method: forces ahead in free space, over a second, of one alone and of two.
+#[test]
+fn regress_free_forms_of_two_regions_act_beside_each_other() {
+    let form = |speed_high_m_s: f64, force_n: f64, per_speed: f64| {
+        let mut form = FreeForm { speed_low_m_s: 0.0, speed_high_m_s, ..FreeForm::default() };
+        form.wrench[0] = [force_n, per_speed, 0.0, 0.0];
+        Effect::FreeForm(form)
+    };
+    let gained = |effects: &[Effect]| in_free_space(effects, 2.0).velocity_m_s[0] - 2.0;
+    let (one, other) = (form(1.0, -300.0, 100.0), form(4.0, -200.0, 0.0));
+    let both = gained(&[one, other]);
+    assert!((both - gained(&[one]) - gained(&[other])).abs() < 2e-5, "{both}");
+    assert_eq!(truck().with_effects(&[other, other]).effects, truck().with_effects(&[form(4.0, -400.0, 0.0)]).effects, "more of the same");
 }

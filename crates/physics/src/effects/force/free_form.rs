@@ -91,9 +91,12 @@ impl Act for FreeForm {
         Some(Self { wrench, speed_low_m_s, speed_high_m_s, angle_max_rad, slope_max })
     }
 
-    /// A second one adds its coefficients; its valid region holds for both.
+    /// A second one of the same region adds its coefficients; one of another region acts beside it, up to [`PLACES_MAX`](crate::effects::PLACES_MAX).
     fn add_to(&self, terms: &mut EffectTerms) {
-        let sum = &mut terms.force.free_form;
+        let forms = &mut terms.force.free_form;
+        let region = |form: &Self| Self { wrench: Default::default(), ..*form };
+        let same = forms.iter().position(|form| form.acts() && region(form) == region(self));
+        let Some(sum) = same.or(forms.iter().position(|form| !form.acts())).map(|i| &mut forms[i]) else { return };
         let wrench = core::array::from_fn(|a| core::array::from_fn(|f| sum.wrench[a][f] + self.wrench[a][f]));
         *sum = Self { wrench, ..*self };
     }

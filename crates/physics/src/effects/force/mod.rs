@@ -38,6 +38,7 @@ pub use tyre_radius_rear::TyreRadiusRear;
 pub use wheel_drag::WheelDrag;
 pub use wind::Wind;
 
+use crate::effects::PLACES_MAX;
 use crate::effects::written::{WRITTEN_MAX, Written};
 use crate::vehicle::WHEELS;
 
@@ -72,8 +73,8 @@ pub struct ForceTerms {
     pub roll_pitch_stiffness: [f64; 2],
     /// 1 / μ of a cap on the tangential force of a wheel; 0 = none.
     pub friction_cap_inverse: f64,
-    /// A wrench without a cause.
-    pub free_form: FreeForm,
+    /// Wrenches without a cause, each with the region that it is valid in.
+    pub free_form: [FreeForm; PLACES_MAX],
     /// Wrenches that somebody wrote down.
     pub written: [Option<Written>; WRITTEN_MAX],
 }
@@ -87,7 +88,7 @@ impl ForceTerms {
             || self.tow_moment_n_m != 0.0
             || self.turning_resistance != 0.0
             || self.wind_n != [0.0; 2]
-            || self.free_form.acts()
+            || self.free_form.iter().any(FreeForm::acts)
             || self.written[0].is_some()
     }
 

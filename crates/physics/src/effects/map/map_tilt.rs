@@ -4,8 +4,8 @@ use crate::effects::Scaling::Size;
 use crate::effects::act::effect;
 
 effect! {
-    /// Map tilt (catalogue no. 31): the ground is at m(x, y) - x tan β_p + y tan β_r, turned about the origin of World by a pitch (positive: falls to the east) and
-    /// a roll (positive: rises to the north) in the sense of the attitude angles. What the encoders see of the map stays.
+    /// Map tilt (catalogue no. 31): the ground is at m(x, y) - x tan β_p + y tan β_r with x and y from the middle of the map, about which it is turned by a pitch
+    /// (positive: falls to the east) and a roll (positive: rises to the north) in the sense of the attitude angles. What the encoders see of the map stays.
     struct MapTilt = "map_tilt" in Map {
         /// β_p, rad.
         pitch_rad: ("rad", [-0.2, 0.2], 0.015, Size),

@@ -11,8 +11,5 @@ effect! {
         /// Unit weight of the soil, N/m³.
         unit_weight_n_m3: ("N/m³", [5e3, 25e3], 16e3, Held),
     }
-    |effect, terms| {
-        terms.soil.side_bulldozing[0] += effect.share;
-        terms.soil.side_bulldozing[1] = effect.unit_weight_n_m3
-    }
+    |effect, terms| super::add_bulldozing(&mut terms.soil.side_bulldozing, effect.share, effect.unit_weight_n_m3)
 }

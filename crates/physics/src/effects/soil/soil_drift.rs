@@ -13,5 +13,5 @@ effect! {
         /// t_1, s.
         end_s: ("s", [0.1, 1e5], 25.0, Held),
     }
-    |effect, terms| terms.soil.drift = [terms.soil.drift[0] + effect.factor_end.ln(), effect.begin_s, effect.end_s]
+    |effect, terms| crate::effects::add_at_place(&mut terms.soil.drift, [effect.factor_end.ln(), effect.begin_s, effect.end_s])
 }
