@@ -7,7 +7,7 @@
 //! server rebuilds it from the history of a session.
 
 use crate::command_path::CommandPath;
-use crate::integral_observer::{SLOWEST_M_S, held_by_integral_m};
+use crate::integral_observer::held_by_integral_m;
 use crate::scalar::Real;
 use crate::state::{Control, VehicleState};
 use crate::vehicle::{RimServo, SecondCommand, Vehicle, WHEELS};
@@ -61,8 +61,8 @@ impl<T: Real<Value = f64>> DrivelineState<T> {
     /// torque holds what a weak engine asks for beyond the usual resistance, and of one that stands nothing: what holds the resistance comes as it drives.
     pub fn starting(vehicle: &Vehicle, state: &VehicleState<T>, control: &Control<T>) -> Self {
         if vehicle.second != SecondCommand::YawRateRadS {
-            let stands = state.velocity_m_s[0].value().abs() < SLOWEST_M_S;
-            return Self { speed_error_integral_m: T::lit(held_by_integral_m(vehicle, stands)), ..Self::settled(control) };
+            let held_m = held_by_integral_m(vehicle, state.velocity_m_s[0], control.speed_m_s);
+            return Self { speed_error_integral_m: held_m, ..Self::settled(control) };
         }
         let servo = &vehicle.limited_rims();
         let measured = before_linkage(vehicle, state.angular_velocity_rad_s[2] / T::lit(servo.turn_efficiency));

@@ -11,10 +11,10 @@ use crate::step::StepModel;
 use crate::terramechanics::Support;
 use crate::torque_drive::Grip;
 use crate::vec3::Tilt;
-use crate::vehicle::{Vehicle, WHEELS};
+use crate::vehicle::{Vehicle, WHEELS, told_backwards};
 
-/// Slowest motion that says something of the drive, m/s (chosen: below it a climb per way is noise).
-pub(crate) const SLOWEST_M_S: f64 = 0.3;
+/// Speeds between which a motion comes to say something of the drive, m/s (chosen: below them a climb per way is noise).
+const MOVING_M_S: [f64; 2] = [0.15, 0.45];
 /// Share of the largest demand up to which a torque says what was demanded (chosen: beyond it the limit hides it).
 const UNSATURATED: f64 = 0.9;
 /// Integral gain below which the integral says nothing, 1/s.
@@ -25,15 +25,24 @@ const COMPACTION_POWER: f64 = 1.42;
 /// Smallest share of its torque that an engine is taken to give where its integral is told.
 const SMALLEST_SHARE: f64 = 0.05;
 
-/// What the integral of the speed error, m, amounts to beyond what holds the usual resistance of a sound car under torque: all of it is missing in a car that stands,
-/// a weak engine asks for more. 0 where there is no torque or no integral.
-pub(crate) fn held_by_integral_m(vehicle: &Vehicle, stands: bool) -> f64 {
+/// Share to which a speed ahead, m/s, is a motion that says something of the drive: 0 at rest, 1 when driving, smooth between.
+fn moving<T: Real>(speed_m_s: T) -> T {
+    let [rests, moves] = MOVING_M_S;
+    let share = ((speed_m_s - T::lit(rests)) * T::lit(1.0 / (moves - rests))).max(T::lit(0.0)).min(T::lit(1.0));
+    share.sqr() * (T::lit(3.0) - share * T::lit(2.0))
+}
+
+/// What the integral of the speed error, m, amounts to beyond what holds the usual resistance of a sound car under torque that goes at a speed and is told another one, m/s:
+/// all of it is missing in a car that stands, a weak engine asks for more. It points where the car is told to go, ahead where it is told to stand. 0 where there is
+/// no torque or no integral.
+pub(crate) fn held_by_integral_m<T: Real<Value = f64>>(vehicle: &Vehicle, speed_m_s: T, told_m_s: T) -> T {
     let line = &vehicle.driveline;
-    let Some(torque) = line.torque.as_ref().filter(|_| line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S) else { return 0.0 };
+    let Some(torque) = line.torque.as_ref().filter(|_| line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S) else { return T::lit(0.0) };
     let share = (1.0 - vehicle.effects.actuator.torque_lost).max(SMALLEST_SHARE);
-    let more = if stands { -1.0 } else { 1.0 / share - 1.0 };
-    let limit = line.speed_integral_limit_m;
-    (more * torque.holding_demand_m_s / line.speed_integral_gain_per_s).clamp(-limit, limit)
+    let more = moving(T::select_ge0(speed_m_s, speed_m_s, -speed_m_s)) * T::lit(1.0 / share) - T::lit(1.0);
+    let direction = T::lit(1.0) - T::lit(2.0) * told_backwards(told_m_s);
+    let limit = T::lit(line.speed_integral_limit_m);
+    (more * direction * T::lit(torque.holding_demand_m_s / line.speed_integral_gain_per_s)).max(-limit).min(limit)
 }
 
 impl StepModel {
@@ -55,7 +64,7 @@ impl StepModel {
         let Some(torque) = line.torque.as_ref().filter(|t| t.integral_observer_per_s > 0.0) else { return *advanced };
         let [speed_before, speed_after] = [before, after].map(|s| s.velocity_m_s[0]);
         let speed = 0.5 * (speed_before + speed_after);
-        if speed < SLOWEST_M_S || line.speed_integral_gain_per_s < SMALLEST_GAIN_PER_S {
+        if speed <= MOVING_M_S[0] || line.speed_integral_gain_per_s < SMALLEST_GAIN_PER_S {
             return *advanced;
         }
         let climb = (after.position_m[2] - before.position_m[2]) / (speed * dt_s);
@@ -72,7 +81,7 @@ impl StepModel {
         let told = advanced.told_speed_m_s(self.vehicle(), control);
         let integral = (demand - torque.held_m_s(told) - line.speed_gain * (told - speed)) / line.speed_integral_gain_per_s;
         let integral = integral.clamp(-line.speed_integral_limit_m, line.speed_integral_limit_m);
-        let rate = (torque.integral_observer_per_s * dt_s).min(1.0);
+        let rate = (torque.integral_observer_per_s * dt_s).min(1.0) * moving(speed);
         let kept = advanced.speed_error_integral_m;
         DrivelineState { speed_error_integral_m: kept + rate * (integral - kept), ..*advanced }
     }
@@ -87,11 +96,11 @@ impl StepModel {
     /// in the usual resistance, but another one: the demand that compaction asks for on the one less that on the other, over the gain. `share` of it is
     /// told by the history ([`StepModel::observed_share`]). Without it a softer soil predicts a slowing that the speed control made up for long ago.
     ///
-    /// Compaction is that of four wheels which carry the weight alike at the sinkage of a [`Grip`]. Zero at and near rest and where no torque drives the hubs.
+    /// Compaction is that of four wheels which carry the weight alike at the sinkage of a [`Grip`]. Fades out towards rest; zero where no torque drives the hubs.
     pub fn compaction_made_up_for_m<T: Real<Value = f64>>(&self, prior: &Soil<f64>, soil: &Soil<T>, speed_m_s: T, share: f64) -> T {
         let line = &self.vehicle().driveline;
         let driven = line.torque.as_ref().filter(|_| share > 0.0 && line.speed_integral_gain_per_s >= SMALLEST_GAIN_PER_S);
-        let Some(torque) = driven.filter(|_| speed_m_s.value() >= SLOWEST_M_S) else { return T::lit(0.0) };
+        let Some(torque) = driven.filter(|_| speed_m_s.value() > MOVING_M_S[0]) else { return T::lit(0.0) };
         let usual_n = if self.wheel.is_damped() {
             self.compaction_n(&Soil::from_array(prior.to_array().map(T::lit)), speed_m_s)
         } else {
@@ -101,7 +110,7 @@ impl StepModel {
         let engine = 1.0 - self.vehicle().effects.actuator.torque_lost;
         let demand = force_n * T::lit(self.vehicle().wheel_radius_m) / torque.driving_n_m_s_m(speed_m_s, engine);
         let limit = UNSATURATED * line.overspeed_limit_m_s;
-        demand.max(T::lit(-limit)).min(T::lit(limit)) * T::lit(share / line.speed_integral_gain_per_s)
+        demand.max(T::lit(-limit)).min(T::lit(limit)) * moving(speed_m_s) * T::lit(share / line.speed_integral_gain_per_s)
     }
 
     /// Force at the rims that compaction takes of four wheels which carry the weight alike, N; it depends on the speed where the soil is damped, under the

@@ -97,7 +97,7 @@ impl TorqueDrive {
         let ahead = self.driving_n_m_s_m(speed_m_s, share) * demand_m_s.max(zero);
         let other = demand_m_s.min(zero) * T::lit(self.brake_ratio * self.per_demand_n_m_s_m);
         let closed = speed_m_s / speed_m_s.abs_smooth(CLOSED_SPEED_M_S) * T::lit(self.closed_n_m);
-        let backwards = (told_m_s * T::lit(-1.0 / HOLDING_SPEED_M_S)).max(zero).min(one);
+        let backwards = told_backwards(told_m_s);
         HubTorques { driving_n_m: ahead + backwards * other - closed, braking_n_m: (backwards - one) * other }
     }
 
@@ -130,6 +130,12 @@ impl TorqueDrive {
         }
         factor
     }
+}
+
+/// Share to which a car under torque that is told a speed, m/s, drives backwards.
+#[inline(always)]
+pub(crate) fn told_backwards<T: Real>(told_m_s: T) -> T {
+    (told_m_s * T::lit(-1.0 / HOLDING_SPEED_M_S)).max(T::lit(0.0)).min(T::lit(1.0))
 }
 
 /// Speed around which the drag of the engine turns its direction, m/s (chosen).

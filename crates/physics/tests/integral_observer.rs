@@ -200,3 +200,32 @@ fn analytic_a_weak_engine_is_asked_for_more_by_its_integral() {
         assert!((begun - want).abs() < 1e-9, "{fraction}: {begun} m, not {want} m");
     }
 }
+
+/// Goal: nothing of what a car is predicted to do leaps where it comes to move, and backwards is as ahead. Method: the integral that it begins with, and what a softer soil is
+/// made up for, at speeds 2 mm/s apart; a car that stands and is told to go, one way and the other.
+#[test]
+fn regress_what_a_slow_car_holds_grows_with_its_speed() {
+    let car = observed(RATE_PER_S);
+    let hold = car.driveline.torque.expect("this car's hubs are under torque").holding_demand_m_s;
+    let begun = |speed_m_s: f64, told_m_s: f64| {
+        let moving = VehicleState { velocity_m_s: [speed_m_s, 0.0, 0.0], ..VehicleState::zero() };
+        DrivelineState::starting(&car, &moving, &Control { speed_m_s: told_m_s, second: 0.0 })
+    };
+    let whole_m = hold / car.driveline.speed_integral_gain_per_s;
+    let (watching, [softer, _]) = (StepModel::new(&car, DT_S, 2), softer_and_firmer());
+    let made_up_for = |speed_m_s: f64| watching.compaction_made_up_for_m(&loam(), &softer, speed_m_s, 1.0);
+    for k in 0..500 {
+        let (slower, faster) = (2e-3 * f64::from(k), 2e-3 * f64::from(k + 1));
+        let integral_m = |speed: f64| begun(speed, 1.0).speed_error_integral_m;
+        let gained = integral_m(faster) - integral_m(slower);
+        assert!((0.0..0.02 * whole_m).contains(&gained), "{slower} m/s: {gained} m of {whole_m} m");
+        assert!((made_up_for(faster) - made_up_for(slower)).abs() < 0.02 * made_up_for(1.0).abs(), "{slower} m/s");
+        assert_eq!(integral_m(faster).to_bits(), (-begun(-faster, -1.0).speed_error_integral_m + 0.0).to_bits(), "backwards");
+    }
+    assert!((begun(0.0, 1.0).speed_error_integral_m + whole_m).abs() < 1e-9 && begun(0.6, 1.0).speed_error_integral_m == 0.0);
+    for told in [1.0, -1.0] {
+        let (at_rest, control) = (begun(0.0, told), Control { speed_m_s: told, second: 0.0 });
+        let demand = command_wheels::<f64>(&car, &at_rest, &at_rest, &control).demand_m_s(0, 0.0);
+        assert!((demand / (car.driveline.speed_gain * told) - 1.0).abs() < 1e-2, "told {told}: {demand}");
+    }
+}
