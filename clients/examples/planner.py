@@ -62,7 +62,7 @@ def plan(client: nesam.Client, session: nesam.Session) -> bool:
     with client.measurement_stream() as vehicle:
         for step in range(300):
             # The plant is the service: the next prediction begins at this measurement, so its answer is waited for. A vehicle hands an iterator to
-            # `client.measure` in a thread of its own, which waits for none.
+            # `client.exchange` in a thread of its own, which waits for none.
             vehicle.send(nesam.Measurement(session.session_id, int(step * DT_S * 1e9), state, nominal[0].astype(float)))
             noise = random.normal(0.0, (0.4, 0.35), (SAMPLES, HORIZON // HELD, 2)).astype(np.float32).repeat(HELD, axis=1)
             controls = np.clip(nominal + noise, low, high)

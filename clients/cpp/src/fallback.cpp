@@ -40,48 +40,62 @@ VehicleState stepped(const VehicleState& from, double speed_m_s, double rate_rad
   return state;
 }
 
-/// Where a fallback begins, and the steps that a known state was rolled forward to it.
-struct Start {
-  detail::KnownState at;
-  std::uint32_t rolled_forward_steps = 0;
-};
-
-/// A known state rolled forward to an instant, rounded to the nearest step; absent where it is too old for that, and itself where it is later. Each step uses the
-/// command that is in effect at its middle; before the first of them the vehicle goes on as it moves.
-std::optional<Start> rolled_forward(const KinematicFallback& fallback, const detail::KnownState& known, std::int64_t until_ns, Span<const SentCommand> sent) {
-  if (!known.stamp_ns) return Start{known};
-  const std::int64_t known_ns = *known.stamp_ns;
-  const double step_ns = fallback.dt_s * 1e9;
+/// Steps between two instants, with their fractions.
+double steps_between(const KinematicFallback& fallback, std::int64_t from_ns, std::int64_t until_ns) noexcept {
   // Whole seconds apart from the rest: a double does not hold the nanoseconds since 1970.
-  const auto steps_since = [&](std::int64_t stamp_ns) {
-    constexpr std::int64_t second_ns = 1'000'000'000;
-    const double apart_s = static_cast<double>(stamp_ns / second_ns - known_ns / second_ns);
-    const double apart_ns = apart_s * 1e9 + static_cast<double>(stamp_ns % second_ns - known_ns % second_ns);
-    return apart_ns / step_ns;
-  };
-  const double steps = std::max(0.0, std::floor(steps_since(until_ns) + 0.5));
-  if (!(steps <= horizon_max)) return std::nullopt;
-  Start start{known, static_cast<std::uint32_t>(steps)};
-  for (std::uint32_t k = 0; k < start.rolled_forward_steps; ++k) {
-    VehicleState& state = start.at.state;
+  constexpr std::int64_t second_ns = 1'000'000'000;
+  const double apart_s = static_cast<double>(until_ns / second_ns - from_ns / second_ns);
+  const double apart_ns = apart_s * 1e9 + static_cast<double>(until_ns % second_ns - from_ns % second_ns);
+  return apart_ns / (fallback.dt_s * 1e9);
+}
+
+/// The same, rounded to the nearest step.
+double whole_steps_between(const KinematicFallback& fallback, std::int64_t from_ns, std::int64_t until_ns) noexcept {
+  return std::floor(steps_between(fallback, from_ns, until_ns) + 0.5);
+}
+
+/// A known state rolled forward to an instant, rounded to the nearest step; absent where it lies too far after the measurement, and itself where it is earlier. Each
+/// step uses the command that is in effect at its middle; before the first of them the vehicle goes on as it moves.
+std::optional<detail::KnownState> rolled_forward(const KinematicFallback& fallback, const detail::KnownState& known, std::int64_t until_ns,
+                                                 Span<const SentCommand> sent) {
+  if (!known.stamp_ns) return known;
+  const std::int64_t known_ns = *known.stamp_ns;
+  const double steps = std::max(0.0, whole_steps_between(fallback, known_ns, until_ns));
+  if (!(known.rolled_forward_steps + steps <= horizon_max)) return std::nullopt;
+  detail::KnownState start = known;
+  for (std::uint32_t k = 0; k < static_cast<std::uint32_t>(steps); ++k) {
+    VehicleState& state = start.state;
     double speed_m_s = state.velocity_m_s[0], rate_rad_s = state.angular_velocity_rad_s[2];
     for (const SentCommand& command : sent) {
-      if (steps_since(command.stamp_ns) > k + 0.5) break;
+      if (steps_between(fallback, known_ns, command.stamp_ns) > k + 0.5) break;
       speed_m_s = command.command.speed_m_s;
       rate_rad_s = fallback.yaw_rate_rad_s(speed_m_s, command.command.second);
     }
     state = stepped(state, speed_m_s, rate_rad_s, fallback.dt_s);
   }
-  start.at.stamp_ns = known_ns + static_cast<std::int64_t>(std::llround(steps * step_ns));
+  start.stamp_ns = known_ns + static_cast<std::int64_t>(std::llround(steps * fallback.dt_s * 1e9));
+  start.rolled_forward_steps += static_cast<std::uint32_t>(steps);
   return start;
 }
 
-/// Where the fallback of a request begins.
-std::optional<Start> start_of(const PredictRequest& request, const std::optional<detail::KnownState>& known) {
-  if (request.start) return Start{{*request.start, std::nullopt}};
-  if (!known) return std::nullopt;
-  if (!request.start_stamp_ns) return Start{*known};
-  return rolled_forward(*request.fallback, *known, *request.start_stamp_ns, request.sent);
+/// Whether a state that the service rolled forward serves where a prediction from an instant begins: it is no measurement, so not where it is later than the instant
+/// or a newer measurement is known.
+bool serves(const KinematicFallback& fallback, const detail::Known& known, std::int64_t until_ns) noexcept {
+  if (!known.ahead || !known.ahead->stamp_ns) return false;
+  if (whole_steps_between(fallback, *known.ahead->stamp_ns, until_ns) < 0.0) return false;
+  if (!known.measured || !known.measured->stamp_ns) return true;
+  return std::llround(steps_between(fallback, *known.measured->stamp_ns, *known.ahead->stamp_ns) * 1e6) >=
+         static_cast<long long>(known.ahead->rolled_forward_steps) * 1'000'000;
+}
+
+/// Where the fallback of a request begins. Without an instant that is the measured state.
+std::optional<detail::KnownState> start_of(const PredictRequest& request, const detail::Known& known) {
+  if (request.start) return detail::KnownState{*request.start, std::nullopt};
+  const auto& newest = known.measured ? known.measured : known.ahead;
+  if (!request.start_stamp_ns) return newest;
+  const auto& begin = serves(*request.fallback, known, *request.start_stamp_ns) ? known.ahead : known.measured;
+  if (!begin) return std::nullopt;
+  return rolled_forward(*request.fallback, *begin, *request.start_stamp_ns, request.sent);
 }
 
 /// Whether the service would take a command: finite and within the card's range, compared in single precision, so that the ends of the range are admitted in both.
@@ -136,9 +150,9 @@ std::vector<float> KinematicFallback::rollout(const VehicleState& start, View3<c
 
 namespace detail {
 
-std::optional<Prediction> fallback_prediction(const PredictRequest& request, const std::optional<KnownState>& known, const Error& reason) {
+std::optional<Prediction> fallback_prediction(const PredictRequest& request, const Known& known, const Error& reason) {
   if (!request.fallback || !late(reason) || !takes(request)) return std::nullopt;
-  const std::optional<Start> start = start_of(request, known);
+  const std::optional<KnownState> start = start_of(request, known);
   if (!start) return std::nullopt;
   View3<const float> controls = request.controls;
   if (request.drawing) controls = {request.drawing->nominal, 1, request.drawing->nominal.size() / 2, 2};
@@ -151,8 +165,8 @@ std::optional<Prediction> fallback_prediction(const PredictRequest& request, con
   prediction.steps = controls.steps() / stride;
   prediction.channels = channels;
   prediction.validity.assign(prediction.samples, 0);
-  prediction.start = start->at.state;
-  prediction.start_stamp_ns = start->at.stamp_ns;
+  prediction.start = start->state;
+  prediction.start_stamp_ns = start->stamp_ns;
   prediction.rolled_forward_steps = start->rolled_forward_steps;
   if (request.drawing) prediction.drawn_storage.assign(request.drawing->nominal.begin(), request.drawing->nominal.end());
   constexpr double unknown = std::numeric_limits<double>::quiet_NaN();

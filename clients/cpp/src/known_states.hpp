@@ -25,10 +25,17 @@ inline bool finite(const VehicleState& state) noexcept {
   return true;
 }
 
-/// A state of a session and its instant, ns of the vehicle's clock; absent for a start that was given.
+/// A state of a session, its instant, ns of the vehicle's clock (absent for a start that was given), and the steps from the newest measurement to it.
 struct KnownState {
   VehicleState state;
   std::optional<std::int64_t> stamp_ns;
+  std::uint32_t rolled_forward_steps = 0;
+};
+
+/// What is known of where a vehicle was: its newest measured state, and the state that the service last rolled forward from a measurement.
+struct Known {
+  std::optional<KnownState> measured;
+  std::optional<KnownState> ahead;
 };
 
 /// When something was sent: its number among all that is, and the client's clock.
@@ -37,7 +44,8 @@ struct Moment {
   std::chrono::steady_clock::time_point at;
 };
 
-/// The newest state that a client knows of each session; a fallback without a given start begins there, unless it is too old. Safe from several threads at once.
+/// The newest state that a client knows of each session; a fallback without a given start begins there, unless it is too old. Where a prediction began that was rolled
+/// forward is kept apart: it is later than what was measured, and no measurement. Safe from several threads at once.
 ///
 /// What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only where its
 /// stamp is larger and neither session nor vehicle's clock has begun anew since. A measurement that is no step of the session yet stays until a state with a larger
@@ -64,7 +72,10 @@ class KnownStates {
     }
     if (!answer.accepted() || answer.reordered) return;
     const bool begins_anew = answer.is<ClockJump>() || answer.is<Restarted>();
-    note(session_id, {measurement.state, measurement.stamp_ns}, sent, begins_anew, answer.is<Buffered>());
+    Noted noted;
+    noted.begins_anew = begins_anew;
+    noted.ahead = answer.is<Buffered>();
+    note(session_id, {measurement.state, measurement.stamp_ns}, sent, noted);
   }
 
   /// Notes a measured state that got no answer: the vehicle was there all the same. The same one sent again, or what was kept meanwhile, is not where it is now.
@@ -72,7 +83,11 @@ class KnownStates {
     const std::lock_guard lock(mutex_);
     const auto held = states_.find(session_id);
     const KnownState known{measurement.state, measurement.stamp_ns};
-    if (held == states_.end() || held->second.is_before(known)) note_locked(session_id, known, sent, false, true);
+    if (held == states_.end() || held->second.is_before(known)) {
+      Noted noted;
+      noted.ahead = true;
+      note_locked(session_id, known, sent, noted);
+    }
   }
 
   /// Notes where a prediction of the session began that was not given its start; `asked` is when its question was.
@@ -82,15 +97,21 @@ class KnownStates {
     const double age_s = request.start_stamp_ns ? 0.0 : prediction.measurement_age_s.value_or(0.0);
     if (!(age_s >= 0.0 && age_s < 1e6)) return;
     asked.at -= std::chrono::duration_cast<Time::duration>(std::chrono::duration<double>(age_s));
-    note(session_id, {prediction.start, prediction.start_stamp_ns}, asked, false, false);
+    const KnownState known{prediction.start, prediction.start_stamp_ns, prediction.rolled_forward_steps};
+    if (known.rolled_forward_steps > 0) return note_ahead(session_id, known, asked);
+    // Measurements may have overtaken the instant that was asked from.
+    Noted noted;
+    noted.overtaken = request.start_stamp_ns.has_value();
+    note(session_id, known, asked, noted);
   }
 
-  /// The newest known state of a session, where it is not too old to begin at.
-  std::optional<KnownState> of(const std::string& session_id, Time now = std::chrono::steady_clock::now()) const {
+  /// What is known of a session and not too old to begin at.
+  Known of(const std::string& session_id, Time now = std::chrono::steady_clock::now()) const {
     const std::lock_guard lock(mutex_);
-    const auto held = states_.find(session_id);
-    if (held == states_.end() || now - held->second.at > age_max) return std::nullopt;
-    return held->second.known;
+    Known known;
+    if (const auto held = states_.find(session_id); held != states_.end() && now - held->second.at <= age_max) known.measured = held->second.known;
+    if (const auto held = ahead_.find(session_id); held != ahead_.end() && now - held->second.asked.at <= age_max) known.ahead = held->second.known;
+    return known;
   }
 
   /// Forgets what was known under the name of a session that was opened now, also what comes late.
@@ -98,6 +119,7 @@ class KnownStates {
     const Moment now = ask();
     const std::lock_guard lock(mutex_);
     states_[session_id] = {std::nullopt, now.number, now.number, now.at, false, now.number};
+    ahead_.erase(session_id);
   }
 
   /// Which session of this name it is, as far as the client knows: another number than before where it was opened or closed since. 0 = not known.
@@ -111,6 +133,7 @@ class KnownStates {
   void forget(const std::string& session_id) {
     const std::lock_guard lock(mutex_);
     states_.erase(session_id);
+    ahead_.erase(session_id);
   }
 
   /// Forgets a session where the service says that it is not open.
@@ -134,29 +157,57 @@ class KnownStates {
     std::uint64_t opened = 0;
 
     bool is_before(const KnownState& other) const { return !known || (other.stamp_ns && known->stamp_ns && *other.stamp_ns > *known->stamp_ns); }
-    /// Whether a state of the same clock is newer.
-    bool is_replaced_by(const KnownState& other, const Moment& sent) const {
-      const bool stays = ahead && sent.at - at <= age_max;
+    /// Whether a state of the same clock is newer. One that measurements may have overtaken is so where it is later.
+    bool is_replaced_by(const KnownState& other, const Moment& sent, bool overtaken) const {
+      const bool stays = (ahead || overtaken) && sent.at - at <= age_max;
       return is_before(other) || (!stays && sent.number > asked);
     }
   };
 
-  void note(const std::string& session_id, const KnownState& known, const Moment& sent, bool begins_anew, bool ahead) {
+  /// A state that the service rolled forward, and when it was asked for.
+  struct Ahead {
+    KnownState known;
+    Moment asked;
+  };
+
+  /// How a state becomes known.
+  struct Noted {
+    /// The session or the vehicle's clock begins anew with it.
+    bool begins_anew = false;
+    /// It is no step of the session yet.
+    bool ahead = false;
+    /// Measurements may have overtaken it.
+    bool overtaken = false;
+  };
+
+  void note(const std::string& session_id, const KnownState& known, const Moment& sent, const Noted& noted) {
     const std::lock_guard lock(mutex_);
-    note_locked(session_id, known, sent, begins_anew, ahead);
+    note_locked(session_id, known, sent, noted);
   }
 
-  void note_locked(const std::string& session_id, const KnownState& known, const Moment& sent, bool begins_anew, bool ahead) {
+  void note_locked(const std::string& session_id, const KnownState& known, const Moment& sent, const Noted& noted) {
     if (!finite(known.state)) return;
+    if (const auto rolled = ahead_.find(session_id); noted.begins_anew && rolled != ahead_.end() && rolled->second.asked.number < sent.number) ahead_.erase(rolled);
     const auto [held, is_new] = states_.try_emplace(session_id);
     Newest& newest = held->second;
-    if (!is_new && (sent.number <= newest.clock || !(begins_anew || newest.is_replaced_by(known, sent)))) return;
-    newest = {known, std::max(sent.number, newest.asked), begins_anew ? sent.number : newest.clock, sent.at, ahead, newest.opened};
+    if (!is_new && (sent.number <= newest.clock || !(noted.begins_anew || newest.is_replaced_by(known, sent, noted.overtaken)))) return;
+    newest = {known, std::max(sent.number, newest.asked), noted.begins_anew ? sent.number : newest.clock, sent.at, noted.ahead, newest.opened};
+  }
+
+  /// Notes a state that the service rolled forward, unless a later question has told of another one or the clock has begun anew since.
+  void note_ahead(const std::string& session_id, const KnownState& known, const Moment& asked) {
+    if (!finite(known.state)) return;
+    const std::lock_guard lock(mutex_);
+    const auto measured = states_.find(session_id);
+    if (measured != states_.end() && asked.number <= measured->second.clock) return;
+    const auto [held, is_new] = ahead_.try_emplace(session_id);
+    if (is_new || asked.number > held->second.asked.number) held->second = {known, asked};
   }
 
   std::uint64_t asked_ = 0;
   mutable std::mutex mutex_;
   std::unordered_map<std::string, Newest> states_;
+  std::unordered_map<std::string, Ahead> ahead_;
 };
 
 }  // namespace nesam::detail

@@ -24,7 +24,19 @@ using namespace std::chrono_literals;
 
 /// What is known of the session "s", told by stamps.
 struct Known : nesam::detail::KnownStates {
-  std::optional<std::int64_t> newest() const { return of("s") ? of("s")->stamp_ns : std::nullopt; }
+  /// Where a fallback begins that is asked plainly.
+  std::optional<std::int64_t> newest(Time now = std::chrono::steady_clock::now()) const {
+    const nesam::detail::Known known = of("s", now);
+    return known.measured ? stamp(known.measured) : stamp(known.ahead);
+  }
+
+  /// The measurement, and where a prediction began that was rolled forward.
+  std::pair<std::optional<std::int64_t>, std::optional<std::int64_t>> both() const {
+    const nesam::detail::Known known = of("s");
+    return {stamp(known.measured), stamp(known.ahead)};
+  }
+
+  static std::optional<std::int64_t> stamp(const std::optional<nesam::detail::KnownState>& known) { return known ? known->stamp_ns : std::nullopt; }
 
   static nesam::Measurement measurement(std::int64_t stamp_ns) {
     nesam::Measurement measurement;
@@ -52,7 +64,20 @@ struct Known : nesam::detail::KnownStates {
     predicted(asked, "s", nesam::PredictRequest{}, prediction);
     return newest();
   }
+
+  /// The answer to a question from an instant, which began so many steps after a measurement.
+  std::pair<std::optional<std::int64_t>, std::optional<std::int64_t>> rolls(const Moment& asked, std::int64_t stamp_ns, std::uint32_t steps) {
+    nesam::Prediction prediction;
+    prediction.start_stamp_ns = stamp_ns;
+    prediction.rolled_forward_steps = steps;
+    nesam::PredictRequest request;
+    request.start_stamp_ns = stamp_ns;
+    predicted(asked, "s", request, prediction);
+    return both();
+  }
 };
+
+using Stamps = std::pair<std::optional<std::int64_t>, std::optional<std::int64_t>>;
 
 void analytic_what_was_asked_for_earlier_replaces_only_what_is_older() {
   Known known;
@@ -93,10 +118,7 @@ void analytic_a_state_grows_too_old() {
   Known known;
   const auto now = std::chrono::steady_clock::now();
   const auto at = [&](std::chrono::milliseconds after) { return Moment{known.ask().number, now + after}; };
-  const auto after = [&](std::chrono::milliseconds later) {
-    const auto state = known.of("s", now + later);
-    return state ? state->stamp_ns : std::nullopt;
-  };
+  const auto after = [&](std::chrono::milliseconds later) { return known.newest(now + later); };
   known.hear(at(0ms), 10, nesam::Applied{});
   check(after(3200ms) == 10 && !after(3201ms), "at its limit and beyond");
   known.lose(at(4000ms), 10);
@@ -128,6 +150,69 @@ void analytic_a_session_of_the_same_name_is_another_one() {
   check(!known.hear(known.ask(), 3, nesam::Rejected{nesam::Code::not_found, "session_id", ""}), "and says so to a measurement");
 }
 
+void regress_a_state_that_was_rolled_forward_is_kept_apart() {
+  Known known;
+  known.hear(known.ask(), 100, nesam::Applied{});
+  const Moment late = known.ask();
+  check(known.rolls(known.ask(), 900, 8) == Stamps(100, 900) && known.newest() == 100, "no measurement");
+  check(known.rolls(known.ask(), 300, 2) == Stamps(100, 300), "the last one");
+  check(known.rolls(late, 600, 5) == Stamps(100, 300), "it was asked for before");
+  known.hear(known.ask(), 200, nesam::Applied{});
+  check(known.rolls(known.ask(), 100, 0) == Stamps(200, 300), "measurements overtook the question");
+  check(known.rolls(known.ask(), 250, 0) == Stamps(250, 300), "somebody else has measured more");
+  const Moment of_the_old_clock = known.ask();
+  known.hear(known.ask(), 5, nesam::ClockJump{});
+  check(known.both() == Stamps(5, std::nullopt), "the clock has begun anew");
+  check(known.rolls(of_the_old_clock, 400, 3) == Stamps(5, std::nullopt), "of the clock before");
+  known.opened("s");
+  check(known.rolls(known.ask(), 400, 3) == Stamps(std::nullopt, 400) && known.newest() == 400, "nothing was measured here");
+  known.forget("s");
+  check(known.both() == Stamps(std::nullopt, std::nullopt), "closed");
+}
+
+/// A measurement at 1 s and a state that the service rolled forward from it to 1.8 s: instants before and after that, and none; then a newer measurement, and none.
+void regress_a_fallback_begins_no_later_than_it_is_asked_to() {
+  const std::vector<float> commands = {0.5F, 0.0F};
+  nesam::PredictRequest asked;
+  asked.controls = {nesam::Span<const float>(commands), 1, 1, 2};
+  asked.fallback.emplace();
+  asked.fallback->vehicle.speed_max_m_s = asked.fallback->vehicle.second_max = 1.0;
+  asked.fallback->vehicle.second = nesam::SecondCommand::yaw_rate_rad_s;
+  const nesam::Error late(nesam::Code::deadline_exceeded, "", "late");
+  const auto state = [](double z_m, std::int64_t stamp_ns, std::uint32_t steps) {
+    nesam::detail::KnownState known{{}, stamp_ns, steps};
+    known.state.position_m[2] = z_m;
+    return known;
+  };
+  struct Begin {
+    std::int64_t stamp_ns;
+    std::uint32_t steps;
+    double z_m;
+  };
+  constexpr std::int64_t tenth_ns = 100'000'000;
+  const auto begins = [&](const nesam::detail::Known& known, std::optional<std::int64_t> tenths, std::optional<Begin> expected, const char* what) {
+    asked.start_stamp_ns = tenths ? std::optional(*tenths * tenth_ns) : std::nullopt;
+    const auto answered = nesam::detail::fallback_prediction(asked, known, late);
+    check(answered.has_value() == expected.has_value(), what);
+    if (!answered || !expected) return;
+    check(answered->start_stamp_ns == expected->stamp_ns * tenth_ns && answered->rolled_forward_steps == expected->steps, what);
+    check(answered->start.position_m[2] == expected->z_m, what);
+  };
+  const auto ahead = state(7.0, 18 * tenth_ns, 8);
+  const nesam::detail::Known both{state(3.0, 10 * tenth_ns, 0), ahead};
+  begins(both, std::nullopt, Begin{10, 0, 3.0}, "what was measured");
+  begins(both, 11, Begin{11, 1, 3.0}, "not later than was asked");
+  begins(both, 18, Begin{18, 8, 7.0}, "as the service rolled it");
+  begins(both, 19, Begin{19, 9, 7.0}, "steps count from the measurement");
+  begins(both, 42, Begin{42, 32, 7.0}, "as far as the service");
+  begins(both, 43, std::nullopt, "no further");
+  begins({state(3.0, 11 * tenth_ns, 0), ahead}, 19, Begin{19, 8, 3.0}, "a newer measurement");
+  const nesam::detail::Known alone{std::nullopt, ahead};
+  begins(alone, std::nullopt, Begin{18, 8, 7.0}, "nothing else is known");
+  begins(alone, 19, Begin{19, 9, 7.0}, "nothing else is known from then");
+  begins(alone, 11, std::nullopt, "nothing is known of before");
+}
+
 /// What the service refuses, here and in the other clients: test_client.py holds these against the service.
 void regress_a_fallback_answers_nothing_that_the_service_refuses() {
   const std::vector<float> commands(2 * 3 * 40, 0.5F), path = {0.0F, 0.0F, 9.0F, 0.0F}, broken = {0.0F, 0.0F, std::nanf(""), 0.0F};
@@ -138,7 +223,7 @@ void regress_a_fallback_answers_nothing_that_the_service_refuses() {
   sound.fallback.emplace();
   sound.fallback->vehicle.speed_max_m_s = sound.fallback->vehicle.second_max = 1.0;
   sound.fallback->vehicle.second = nesam::SecondCommand::yaw_rate_rad_s;
-  const nesam::detail::KnownState known{{}, 0};
+  const nesam::detail::Known known{nesam::detail::KnownState{{}, 0}, std::nullopt};
   const nesam::Error late(nesam::Code::deadline_exceeded, "", "late");
   const auto answers = [&](const nesam::PredictRequest& request) { return nesam::detail::fallback_prediction(request, known, late).has_value(); };
   check(answers(sound), "nothing is wrong");
@@ -190,6 +275,8 @@ int main() {
   run("analytic_a_measurement_counts_whatever_became_of_it_unless_it_is_refused", analytic_a_measurement_counts_whatever_became_of_it_unless_it_is_refused);
   run("analytic_a_state_grows_too_old", analytic_a_state_grows_too_old);
   run("analytic_a_session_of_the_same_name_is_another_one", analytic_a_session_of_the_same_name_is_another_one);
+  run("regress_a_state_that_was_rolled_forward_is_kept_apart", regress_a_state_that_was_rolled_forward_is_kept_apart);
+  run("regress_a_fallback_begins_no_later_than_it_is_asked_to", regress_a_fallback_begins_no_later_than_it_is_asked_to);
   run("regress_a_fallback_answers_nothing_that_the_service_refuses", regress_a_fallback_answers_nothing_that_the_service_refuses);
   std::printf("%d passed, %d failed\n", passed, failed);
   return failed == 0 ? 0 : 1;

@@ -15,7 +15,7 @@ from . import _types as t
 from ._candidates import Drawing, PathCost
 from ._errors import DeadlineExceeded, FailedPrecondition, InvalidArgument, NesamError, NotFound, Overloaded, Unavailable
 from ._extras import Extras
-from ._fallback import KinematicFallback, KnownState, invalid
+from ._fallback import KinematicFallback, Known, KnownState, invalid
 from ._given import elevations, stamp, unmasked, whole
 from ._refused import check_question
 from .v1 import effects_pb2, prediction_pb2, sessions_pb2, soil_pb2, terrain_pb2, types_pb2
@@ -244,8 +244,8 @@ class Question:
         service = "prediction" if self.fallback is None else "prediction_once"
         return Call(service, "Predict", request, lambda reply: m.prediction(reply, self.stride, horizon, self.extras))
 
-    def fall_back(self, error: NesamError, known: Optional[KnownState]) -> t.Prediction:
-        """What the fallback answers from `start` or the newest known state, rolled forward to `start_stamp_ns`; raises the error again without one of them.
+    def fall_back(self, error: NesamError, known: Known) -> t.Prediction:
+        """What the fallback answers from `start` or what is known, rolled forward to `start_stamp_ns`; raises the error again without one of them.
 
         Raises InvalidArgument where the service would refuse the question, too.
         """
@@ -256,12 +256,12 @@ class Question:
         sent = self.sent if self.start_stamp_ns is not None else ()
         self.fallback.check(controls, sent, "drawing.nominal" if isinstance(self.controls, Drawing) else "controls")
         if self.start is not None:
-            known = KnownState(t.array(self.start, (12,), "start"))
-        elif known is not None and self.start_stamp_ns is not None:
-            known = self.fallback.rolled_forward(known, self.start_stamp_ns, self.sent)
-        if known is None:
+            begin: Optional[KnownState] = KnownState(t.array(self.start, (12,), "start"))
+        else:
+            begin = self.fallback.begins(known, self.start_stamp_ns, sent)
+        if begin is None:
             raise error
-        answered = m.fallback_prediction(self.fallback, known, controls, names, self.stride, error)
+        answered = m.fallback_prediction(self.fallback, begin, controls, names, self.stride, error)
         return replace(answered, controls=controls) if isinstance(self.controls, Drawing) else answered
 
 
@@ -312,7 +312,8 @@ class _Newest:
 
 
 class KnownStates:
-    """The newest state that a client knows of each session; a fallback without a given start begins there.
+    """The newest state that a client knows of each session; a fallback without a given start begins there. Where a prediction began that was rolled forward is
+    kept apart: it is later than what was measured, and no measurement.
 
     What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only where
     its stamp is larger and neither session nor vehicle's clock has begun anew since. A measurement that is no step of the session yet stays until a state with
@@ -322,6 +323,7 @@ class KnownStates:
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
         self._states: Dict[str, _Newest] = {}
+        self._ahead: Dict[str, _Newest] = {}
         self._opened: Dict[str, int] = {}
         self._lock = threading.Lock()
 
@@ -358,8 +360,13 @@ class KnownStates:
         if question.start is None:
             # Who asks from an instant asks from now.
             age_s = 0.0 if question.start_stamp_ns is not None else prediction.measurement_age_s or 0.0
-            known = KnownState(np.array(prediction.start, dtype=np.float64), prediction.start_stamp_ns)
-            self._note(question.session_id, known, replace(asked, at_s=asked.at_s - age_s))
+            known = KnownState(np.array(prediction.start, dtype=np.float64), prediction.start_stamp_ns, prediction.rolled_forward_steps)
+            begun = replace(asked, at_s=asked.at_s - age_s)
+            if known.rolled_forward_steps > 0:
+                self._note_ahead(question.session_id, known, begun)
+            else:
+                # Measurements may have overtaken the instant that was asked from.
+                self._note(question.session_id, known, begun, is_overtaken=question.start_stamp_ns is not None)
         return prediction
 
     def fall_back(self, question: Question, error: NesamError) -> t.Prediction:
@@ -368,8 +375,9 @@ class KnownStates:
             self.forget(question.session_id)
         if not is_late(error):
             raise error
-        newest = self._states.get(question.session_id)
-        return question.fall_back(error, None if newest is None else newest.young())
+        measured, ahead = (states.get(question.session_id) for states in (self._states, self._ahead))
+        known = Known(None if measured is None else measured.young(), None if ahead is None else ahead.young())
+        return question.fall_back(error, known)
 
     def opened(self, session: t.Session) -> t.Session:
         """Forgets what was known under the name of a session that was opened now, also what comes late, and gives it back."""
@@ -377,6 +385,7 @@ class KnownStates:
         with self._lock:
             self._opened[session.session_id] = now.number
             self._states[session.session_id] = _Newest(None, now.number, now.number, now.at_s)
+            self._ahead.pop(session.session_id, None)
         return session
 
     def opened_last(self, session_id: str) -> int:
@@ -385,23 +394,38 @@ class KnownStates:
 
     def forget(self, session_id: str) -> None:
         """Forgets a closed session."""
-        self._states.pop(session_id, None)
+        with self._lock:
+            self._states.pop(session_id, None)
+            self._ahead.pop(session_id, None)
 
-    def _note(self, session_id: str, known: Optional[KnownState], sent: Moment, begins_anew: bool = False, is_ahead: bool = False) -> None:
+    def _note(
+        self, session_id: str, known: Optional[KnownState], sent: Moment, begins_anew: bool = False, is_ahead: bool = False, is_overtaken: bool = False
+    ) -> None:
         if known is None:
             return
         with self._lock:
             newest = self._states.get(session_id)
             if newest is None:
                 self._states[session_id] = _Newest(known, sent.number, sent.number if begins_anew else 0, sent.at_s, is_ahead)
-            elif sent.number > newest.clock and (begins_anew or _replaces(known, sent, newest)):
+            elif sent.number > newest.clock and (begins_anew or _replaces(known, sent, newest, newest.is_ahead or is_overtaken)):
                 clock = sent.number if begins_anew else newest.clock
                 self._states[session_id] = _Newest(known, max(sent.number, newest.asked), clock, sent.at_s, is_ahead)
+            ahead = self._ahead.get(session_id)
+            if begins_anew and ahead is not None and ahead.asked < sent.number:
+                del self._ahead[session_id]
+
+    def _note_ahead(self, session_id: str, known: KnownState, asked: Moment) -> None:
+        """Notes a state that the service rolled forward, unless a later question has told of another one or the clock has begun anew since."""
+        with self._lock:
+            measured, ahead = self._states.get(session_id), self._ahead.get(session_id)
+            clock = 0 if measured is None else measured.clock
+            if asked.number > max(clock, 0 if ahead is None else ahead.asked):
+                self._ahead[session_id] = _Newest(known, asked.number, clock, asked.at_s)
 
 
-def _replaces(known: KnownState, sent: Moment, newest: _Newest) -> bool:
-    """Whether a state of the same clock is newer than the newest one."""
-    if newest.is_ahead and sent.at_s - newest.at_s <= KNOWN_AGE_MAX_S:
+def _replaces(known: KnownState, sent: Moment, newest: _Newest, stays: bool) -> bool:
+    """Whether a state of the same clock is newer than the newest one, which stays before one that is not later."""
+    if stays and sent.at_s - newest.at_s <= KNOWN_AGE_MAX_S:
         return _is_later(known, newest.known)
     return sent.number > newest.asked or _is_later(known, newest.known)
 

@@ -15,11 +15,19 @@ ROLLED_FORWARD_STEPS_MAX = 32
 
 @dataclass(frozen=True)
 class KnownState:
-    """A state of a session, its instant by the vehicle's clock (None for a start that was given) and the steps that it was rolled forward."""
+    """A state of a session, its instant by the vehicle's clock (None for a start that was given) and the steps from the newest measurement to it."""
 
     state: np.ndarray
     stamp_ns: Optional[int] = None
     rolled_forward_steps: int = 0
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of where a vehicle was: its newest measured state, and the state that the service last rolled forward from a measurement."""
+
+    measured: Optional[KnownState] = None
+    ahead: Optional[KnownState] = None
 
 
 @dataclass(frozen=True)
@@ -75,15 +83,15 @@ class KinematicFallback:
         return states
 
     def rolled_forward(self, known: KnownState, until_ns: int, sent: Sequence[Tuple[int, Sequence[float]]]) -> Optional[KnownState]:
-        """A known state rolled forward to an instant, rounded to the nearest step; None where it is too old for that, and itself where it is later.
+        """A known state rolled forward to an instant, rounded to the nearest step; None where it lies too far after the measurement, and itself where it is earlier.
 
         Each step uses the command of `sent` that is in effect at its middle; before the first of them the vehicle goes on as it moves.
         """
         if known.stamp_ns is None:
             return known
-        step_ns = max(1, round(self.dt_s * 1e9))
-        steps = max(0, (2 * (until_ns - known.stamp_ns) + step_ns) // (2 * step_ns))
-        if steps > ROLLED_FORWARD_STEPS_MAX:
+        step_ns = self._step_ns()
+        steps = max(0, self._steps(known.stamp_ns, until_ns))
+        if known.rolled_forward_steps + steps > ROLLED_FORWARD_STEPS_MAX:
             return None
         state = np.asarray(known.state, dtype=np.float64)[None]
         for k in range(steps):
@@ -93,7 +101,27 @@ class KinematicFallback:
                 state = self._step(state, speed, self.yaw_rate_rad_s(speed, second))
             else:
                 state = self._step(state, state[:, 6], state[:, 11])
-        return KnownState(state[0], known.stamp_ns + steps * step_ns, steps)
+        return KnownState(state[0], known.stamp_ns + steps * step_ns, known.rolled_forward_steps + steps)
+
+    def begins(self, known: Known, until_ns: Optional[int], sent: Sequence[Tuple[int, Sequence[float]]]) -> Optional[KnownState]:
+        """Where a prediction without a given start begins, None where nothing that is known serves. Without an instant it is the measured state. A state that the
+        service rolled forward is no measurement: it serves where it is not later than the instant and no newer measurement is known."""
+        measured, ahead = known.measured, known.ahead
+        if until_ns is None:
+            return measured or ahead
+        if ahead is not None and ahead.stamp_ns is not None and self._steps(ahead.stamp_ns, until_ns) >= 0:
+            since_ns = ahead.stamp_ns - ahead.rolled_forward_steps * self._step_ns()
+            if measured is None or measured.stamp_ns is None or measured.stamp_ns <= since_ns:
+                return self.rolled_forward(ahead, until_ns, sent)
+        return None if measured is None else self.rolled_forward(measured, until_ns, sent)
+
+    def _step_ns(self) -> int:
+        return max(1, round(self.dt_s * 1e9))
+
+    def _steps(self, from_ns: int, until_ns: int) -> int:
+        """Steps between two instants, rounded to the nearest."""
+        step_ns = self._step_ns()
+        return (2 * (until_ns - from_ns) + step_ns) // (2 * step_ns)
 
     def _step(self, states: np.ndarray, speed: np.ndarray, rate: np.ndarray) -> np.ndarray:
         """States (samples, 12) one step after `states` at speeds and yaw rates (samples,)."""

@@ -308,7 +308,7 @@ def test_service_fallback_of_a_planner_that_only_asks(server_address, driven):
         question = dict(start_stamp_ns=asked_ns + 100_000_000, sent=sent, timeout_s=0.0, fallback=fallback)
         late = planner.predict("truck", fan(3, 24), **question)
         assert late.computed_by == "kinematic_fallback" and late.states.shape == (3, 24, 12)
-        assert (late.rolled_forward_steps, late.start_stamp_ns) == (1, asked_ns + 100_000_000)
+        assert (late.rolled_forward_steps, late.start_stamp_ns) == (3, asked_ns + 100_000_000), "steps from the measurement, two of the service among them"
         np.testing.assert_allclose(late.start, fallback.rollout(known.start, np.float32([[[1.5, 0.1]]]))[0, 0], rtol=1e-6, atol=1e-6)
         # The fallback ranks nothing, and says which commands it predicts.
         drawing = nesam.Drawing(fan(1, 24)[0], samples=64, sd=(0.5, 0.1), seed=1)

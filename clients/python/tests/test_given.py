@@ -80,7 +80,7 @@ def test_service_iterators_are_read_once_for_the_service_and_the_fallback(driven
     for first, late in ((asked(500_000_000, 60.0), asked(800_000_000, 0.0)), asyncio.run(awaited())):
         assert first.computed_by == "service" and first.channels == ("x", "y")
         np.testing.assert_array_equal(first.states, expected.states[:, :, :2])
-        assert late.computed_by == "kinematic_fallback" and late.rolled_forward_steps == 3 and late.channels == ("x", "y")
+        assert late.computed_by == "kinematic_fallback" and late.rolled_forward_steps == 5 + 3 and late.channels == ("x", "y")
         np.testing.assert_array_equal(late.start, begun.start)
         assert late.start[6] == 3.0, "the commands were heeded"
 

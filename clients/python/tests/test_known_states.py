@@ -30,15 +30,22 @@ class Known(KnownStates):
         self.measured(reported, SimpleNamespace(**{"outcome": outcome, "reordered": False, "code": 0, "field": "", **answer}))
         return self.newest()
 
-    def begins(self, asked, stamp_ns, age_s=0.0):
-        """Hears of a prediction that began there."""
-        self.predicted(asked, Question("s", fan(1, 1)), SimpleNamespace(start=np.zeros(12), start_stamp_ns=stamp_ns, measurement_age_s=age_s))
+    def begins(self, asked, stamp_ns, age_s=0.0, steps=0, **question):
+        """Hears of a prediction that began there, so many steps after a measurement."""
+        began = {"start": np.full(12, float(stamp_ns)), "start_stamp_ns": stamp_ns, "measurement_age_s": age_s, "rolled_forward_steps": steps}
+        self.predicted(asked, Question("s", fan(1, 1), **question), SimpleNamespace(**began))
         return self.newest()
 
     def newest(self):
         """Stamp of where a fallback begins; None where it does not."""
+        begin = self.from_(None)
+        return None if begin is None else begin[0]
+
+    def from_(self, instant_ns):
+        """Stamp of where a fallback begins that is asked from an instant, and the steps from the measurement; None where it does not."""
         try:
-            return self.fall_back(Question("s", fan(1, 1), fallback=nesam.KinematicFallback(CARD)), LATE).start_stamp_ns
+            prediction = self.fall_back(Question("s", fan(1, 1), fallback=nesam.KinematicFallback(CARD), start_stamp_ns=instant_ns), LATE)
+            return prediction.start_stamp_ns, prediction.rolled_forward_steps
         except nesam.DeadlineExceeded:
             return None
 
@@ -84,6 +91,37 @@ def test_analytic_a_measurement_counts_whatever_became_of_it_unless_it_is_refuse
     assert known.newest() == 40, "it is nowhere"
     known.unheard(known.measurement(35))
     assert known.newest() == 40, "kept since before, sent again"
+
+
+def test_regress_a_state_that_was_rolled_forward_is_no_measurement():
+    """Method: a measurement at 1 s, and predictions that the service rolled forward from it; who asks plainly, from earlier or from later than they began, and after
+    a newer measurement. Then a planner that only asks."""
+    known, tenth = Known(), 100_000_000
+    second = 10 * tenth
+    known.hear(known.measurement(second), "APPLIED")
+    late = known.ask()
+    known.begins(known.ask(), second + 8 * tenth, steps=8, start_stamp_ns=second + 8 * tenth)
+    assert known.newest() == second, "what was measured"
+    assert known.from_(second) == (second, 0) and known.from_(second + tenth) == (second + tenth, 1), "not later than was asked"
+    assert known.from_(second + 9 * tenth) == (second + 9 * tenth, 9), "steps count from the measurement"
+    assert known.from_(second + 32 * tenth) == (second + 32 * tenth, 32) and known.from_(second + 33 * tenth) is None
+    known.begins(known.ask(), second + 2 * tenth, steps=2, start_stamp_ns=second + 2 * tenth)
+    known.begins(late, second + 5 * tenth, steps=5, start_stamp_ns=second + 5 * tenth)
+    asked = Question("s", fan(1, 1), fallback=nesam.KinematicFallback(CARD), start_stamp_ns=second + 2 * tenth)
+    assert known.fall_back(asked, LATE).start[0] == second + 2 * tenth, "the last answer, as the service rolled it"
+    known.hear(known.measurement(second + tenth), "APPLIED")
+    assert known.newest() == second + tenth and known.from_(second + 3 * tenth) == (second + 3 * tenth, 2), "a newer measurement"
+    # Measurements overtake a question: the step that was measured then is older.
+    known.begins(known.ask(), second, start_stamp_ns=second)
+    assert known.newest() == second + tenth
+    known.hear(known.measurement(5), "CLOCK_JUMP")
+    assert known.newest() == 5 and known.from_(second + 9 * tenth) == (5 + 19 * tenth, 19), "what was rolled forward is of the clock before"
+    known.opened(SimpleNamespace(session_id="s"))
+    known.begins(known.ask(), second, steps=3, start_stamp_ns=second)
+    assert known.newest() == second and known.from_(second + tenth) == (second + tenth, 4), "nothing was measured here"
+    assert known.from_(second - tenth) is None, "and nothing is known of before"
+    known.forget("s")
+    assert known.newest() is None
 
 
 def test_analytic_a_state_is_a_copy_of_what_was_sent():

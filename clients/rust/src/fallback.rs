@@ -8,7 +8,7 @@ use nesam_proto::v1;
 use tonic::Code;
 
 use crate::error::ClientError;
-use crate::known_states::KnownState;
+use crate::known_states::{Known, KnownState};
 use crate::prediction::{Candidates, ComputedBy, ExtraOutputs, FallbackReason, Prediction};
 use crate::refused;
 
@@ -87,13 +87,36 @@ impl KinematicFallback {
         state[6..].copy_from_slice(&[speed_m_s, 0.0, 0.0, 0.0, 0.0, rate_rad_s]);
     }
 
-    /// A known state rolled forward to an instant, rounded to the nearest step, and the steps; `None` where it is too old for that, and itself where it is
-    /// later. Each step uses the command that is in effect at its middle; before the first of them the vehicle goes on as it moves.
-    fn rolled_forward(&self, known: KnownState, until_ns: i64, sent: &[(i64, [f64; 2])]) -> Option<(KnownState, usize)> {
-        let step_ns = ((self.dt_s * 1e9).round() as i64).max(1);
+    fn step_ns(&self) -> i64 {
+        ((self.dt_s * 1e9).round() as i64).max(1)
+    }
+
+    /// Steps between two instants, rounded to the nearest.
+    fn steps(&self, from_ns: i64, until_ns: i64) -> i128 {
+        let step_ns = i128::from(self.step_ns());
+        (2 * (i128::from(until_ns) - i128::from(from_ns)) + step_ns).div_euclid(2 * step_ns)
+    }
+
+    /// Where a prediction without a given start begins, `None` where nothing that is known serves. Without an instant it is the measured state. A state that the
+    /// service rolled forward is no measurement: it serves where it is not later than the instant and no newer measurement is known.
+    fn begins(&self, known: Known, until_ns: Option<i64>, sent: &[(i64, [f64; 2])]) -> Option<KnownState> {
+        let Some(until_ns) = until_ns else {
+            return known.measured.or(known.ahead);
+        };
+        let serves = |ahead: &KnownState| {
+            let since_ns = i128::from(ahead.stamp_ns) - ahead.rolled_forward_steps as i128 * i128::from(self.step_ns());
+            self.steps(ahead.stamp_ns, until_ns) >= 0 && known.measured.is_none_or(|measured| i128::from(measured.stamp_ns) <= since_ns)
+        };
+        self.rolled_forward(known.ahead.filter(serves).or(known.measured)?, until_ns, sent)
+    }
+
+    /// A known state rolled forward to an instant, rounded to the nearest step; `None` where it lies too far after the measurement, and itself where it is
+    /// earlier. Each step uses the command that is in effect at its middle; before the first of them the vehicle goes on as it moves.
+    fn rolled_forward(&self, known: KnownState, until_ns: i64, sent: &[(i64, [f64; 2])]) -> Option<KnownState> {
+        let step_ns = self.step_ns();
         let since_ns = |stamp_ns: i64| i128::from(stamp_ns) - i128::from(known.stamp_ns);
-        let steps = (2 * since_ns(until_ns) + i128::from(step_ns)).div_euclid(2 * i128::from(step_ns)).max(0);
-        let steps = usize::try_from(steps).ok().filter(|steps| *steps <= ROLLED_FORWARD_STEPS_MAX)?;
+        let steps = usize::try_from(self.steps(known.stamp_ns, until_ns).max(0)).ok()?;
+        let rolled_forward_steps = known.rolled_forward_steps.checked_add(steps).filter(|all| *all <= ROLLED_FORWARD_STEPS_MAX)?;
         let mut state = known.state;
         for step in 0..steps as i128 {
             let in_effect = sent.iter().take_while(|(stamp_ns, _)| 2 * since_ns(*stamp_ns) <= (2 * step + 1) * i128::from(step_ns)).last();
@@ -103,13 +126,13 @@ impl KinematicFallback {
             };
             self.step(&mut state, speed, rate);
         }
-        Some((KnownState { state, stamp_ns: known.stamp_ns.saturating_add(steps as i64 * step_ns) }, steps))
+        Some(KnownState { state, stamp_ns: known.stamp_ns.saturating_add(steps as i64 * step_ns), rolled_forward_steps })
     }
 
     /// What it answers instead of the service, and why. `None` where the error is no lateness, where there is neither a start nor a known state that is new
     /// enough, or where the candidates contradict themselves or are not what the service takes: a number that is none, a command
     /// beyond the card, a shape, start or cost beyond the limits.
-    pub(crate) fn answer(&self, candidates: &Candidates, known: Option<KnownState>, error: &ClientError) -> Option<Prediction> {
+    pub(crate) fn answer(&self, candidates: &Candidates, known: Known, error: &ClientError) -> Option<Prediction> {
         let reason = match error {
             ClientError::Refused { code, field, message, .. } if is_late(*code, field) => {
                 FallbackReason { code: *code, message: message.clone() }
@@ -120,12 +143,11 @@ impl KinematicFallback {
         if !refused::takes(candidates) || !self.admits(&sent) {
             return None;
         }
-        let (start, start_stamp_ns, rolled_forward_steps) = match (candidates.start, candidates.start_stamp_ns) {
-            (Some(start), _) => (start, None, 0),
-            (None, None) => known.map(|known| (known.state, Some(known.stamp_ns), 0))?,
-            (None, Some(until_ns)) => {
-                let (ahead, steps) = self.rolled_forward(known?, until_ns, &candidates.sent)?;
-                (ahead.state, Some(ahead.stamp_ns), steps)
+        let (start, start_stamp_ns, rolled_forward_steps) = match candidates.start {
+            Some(start) => (start, None, 0),
+            None => {
+                let begin = self.begins(known, candidates.start_stamp_ns, &candidates.sent)?;
+                (begin.state, Some(begin.stamp_ns), begin.rolled_forward_steps)
             }
         };
         let (samples, controls) = match &candidates.drawing {
@@ -198,8 +220,8 @@ mod tests {
         tonic::Status::deadline_exceeded("no answer came in time").into()
     }
 
-    fn known(state: [f64; STATE], stamp_ns: i64) -> Option<KnownState> {
-        Some(KnownState { state, stamp_ns })
+    fn known(state: [f64; STATE], stamp_ns: i64) -> Known {
+        Known { measured: Some(KnownState { state, stamp_ns, rolled_forward_steps: 0 }), ahead: None }
     }
 
     /// Goal: the fallback is the one of the Python client. Method: x, y, yaw, vx, wz that `nesam.KinematicFallback` gives for the same start, commands and
@@ -273,7 +295,7 @@ mod tests {
         let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
         let answers = |controls: Vec<f32>, start: [f64; STATE]| {
             let asked = Candidates { start: Some(start), ..Candidates::new("s", 1, 2, controls) };
-            fallback.answer(&asked, None, &late()).is_some()
+            fallback.answer(&asked, Known::default(), &late()).is_some()
         };
         assert!(answers(vec![4.0, -1.0, -2.0, 1.0], [0.0; STATE]));
         for beyond in [[4.001, 0.0], [-2.001, 0.0], [0.0, 1.001], [0.0, -1.001], [f32::NAN, 0.0], [0.0, f32::INFINITY]] {
@@ -333,6 +355,31 @@ mod tests {
         assert!(from(4_300_000_000).is_none() && from(i64::MAX).is_none(), "what is known is too old");
     }
 
+    /// Goal: a fallback begins no later than it is asked to where a measurement says where the vehicle was before. Method: a measurement at 1 s and a state that the
+    /// service rolled forward from it to 1.8 s; questions from instants before and after that, and a plain one; then a newer measurement, and none.
+    #[test]
+    fn regress_a_fallback_begins_no_later_than_it_is_asked_to() {
+        let fallback = KinematicFallback::new(card(v1::SecondCommand::YawRateRadS, 1.0));
+        let ahead = |from_ns: i64| KnownState { state: [7.0; STATE], stamp_ns: from_ns, rolled_forward_steps: 8 };
+        let both = Known { ahead: Some(ahead(1_800_000_000)), ..known([3.0; STATE], 1_000_000_000) };
+        let begin = |known: Known, instant_ns: Option<i64>| {
+            let asked = Candidates { start_stamp_ns: instant_ns, ..Candidates::new("s", 1, 1, vec![1.0, 0.0]) };
+            let answered = fallback.answer(&asked, known, &late())?;
+            Some((answered.start_stamp_ns.unwrap(), answered.rolled_forward_steps, answered.start[2]))
+        };
+        assert_eq!(begin(both, None), Some((1_000_000_000, 0, 3.0)), "what was measured");
+        assert_eq!(begin(both, Some(1_100_000_000)), Some((1_100_000_000, 1, 3.0)));
+        assert_eq!(begin(both, Some(1_800_000_000)), Some((1_800_000_000, 8, 7.0)), "as the service rolled it");
+        assert_eq!(begin(both, Some(1_900_000_000)), Some((1_900_000_000, 9, 7.0)), "steps count from the measurement");
+        assert_eq!(begin(both, Some(4_200_000_000)), Some((4_200_000_000, 32, 7.0)));
+        assert_eq!(begin(both, Some(4_300_000_000)), None);
+        let newer = Known { ahead: both.ahead, ..known([3.0; STATE], 1_100_000_000) };
+        assert_eq!(begin(newer, Some(1_900_000_000)), Some((1_900_000_000, 8, 3.0)), "a newer measurement");
+        let alone = Known { ahead: both.ahead, measured: None };
+        assert_eq!(begin(alone, None), Some((1_800_000_000, 8, 7.0)), "nothing else is known");
+        assert_eq!((begin(alone, Some(1_900_000_000)), begin(alone, Some(1_100_000_000))), (Some((1_900_000_000, 9, 7.0)), None));
+    }
+
     /// Goal: nothing but lateness is answered, and nothing is made up. Method: other errors, no state, controls without their shape.
     #[test]
     fn analytic_a_fallback_keeps_out_of_everything_else() {
@@ -354,9 +401,9 @@ mod tests {
         let stalled = fallback.answer(&from_now, known, &refusal("start_stamp_ns")).unwrap();
         assert_eq!((stalled.rolled_forward_steps, stalled.fallback_reason.unwrap().code), (3, Code::FailedPrecondition));
         assert!(fallback.answer(&from_now, known, &refusal("")).is_none(), "the session has no measurement");
-        assert!(fallback.answer(&asked, None, &late()).is_none());
+        assert!(fallback.answer(&asked, Known::default(), &late()).is_none());
         let given = Candidates { start: Some([0.0; STATE]), ..asked.clone() };
-        assert!(fallback.answer(&given, None, &late()).is_some());
+        assert!(fallback.answer(&given, Known::default(), &late()).is_some());
         for (samples, horizon) in [(2, 1), (1, 2), (usize::MAX, 2), (0, 1)] {
             assert!(fallback.answer(&Candidates { samples, horizon, ..asked.clone() }, known, &late()).is_none(), "{samples} x {horizon}");
         }

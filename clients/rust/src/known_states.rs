@@ -14,11 +14,19 @@ use crate::prediction::{Candidates, Prediction};
 /// Oldest state that a fallback begins at, by the client's clock: as far as it rolls one forward.
 const AGE_MAX: Duration = Duration::from_millis(3200);
 
-/// A state of a session and its instant, ns of the vehicle's clock.
+/// A state of a session, its instant, ns of the vehicle's clock, and the steps from the newest measurement to it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct KnownState {
     pub state: [f64; 12],
     pub stamp_ns: i64,
+    pub rolled_forward_steps: usize,
+}
+
+/// What is known of where a vehicle was: its newest measured state, and the state that the service last rolled forward from a measurement.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub(crate) struct Known {
+    pub measured: Option<KnownState>,
+    pub ahead: Option<KnownState>,
 }
 
 /// When something was sent: its number among all that is, and the client's clock.
@@ -28,7 +36,8 @@ pub(crate) struct Moment {
     at: Instant,
 }
 
-/// The newest state that a client and its clones know of each session; a fallback without a given start begins there, unless it is too old.
+/// The newest state that a client and its clones know of each session; a fallback without a given start begins there, unless it is too old. Where a prediction
+/// began that was rolled forward is kept apart: it is later than what was measured, and no measurement.
 ///
 /// What is sent is numbered, as answers may overtake each other: a state that was asked for later replaces another, one that was asked for earlier only
 /// where its stamp is larger and neither session nor vehicle's clock has begun anew since. A measurement that is no step of the session yet stays until a
@@ -40,6 +49,14 @@ pub(crate) struct KnownStates(Arc<Mutex<Numbered>>);
 struct Numbered {
     asked: u64,
     states: HashMap<String, Newest>,
+    ahead: HashMap<String, Ahead>,
+}
+
+/// A state that the service rolled forward, and when it was asked for.
+#[derive(Clone, Copy, Debug)]
+struct Ahead {
+    known: KnownState,
+    asked: Moment,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -61,11 +78,22 @@ impl Newest {
         self.known.is_none_or(|held| known.stamp_ns > held.stamp_ns)
     }
 
-    /// Whether a state of the same clock is newer.
-    fn is_replaced_by(&self, known: &KnownState, sent: Moment) -> bool {
-        let stays = self.ahead && sent.at.saturating_duration_since(self.at) <= AGE_MAX;
+    /// Whether a state of the same clock is newer. One that measurements may have overtaken is so where it is later.
+    fn is_replaced_by(&self, known: &KnownState, sent: Moment, overtaken: bool) -> bool {
+        let stays = (self.ahead || overtaken) && sent.at.saturating_duration_since(self.at) <= AGE_MAX;
         self.is_before(known) || (!stays && sent.number > self.asked)
     }
+}
+
+/// How a state becomes known.
+#[derive(Clone, Copy, Debug, Default)]
+struct Noted {
+    /// The session or the vehicle's clock begins anew with it.
+    begins_anew: bool,
+    /// It is no step of the session yet.
+    ahead: bool,
+    /// Measurements may have overtaken it.
+    overtaken: bool,
 }
 
 /// What is kept of a measurement until its answer comes; no state where it holds a number that is not finite.
@@ -87,7 +115,7 @@ impl KnownStates {
     /// A measurement that is sent now.
     pub(crate) fn report(&self, measurement: &v1::Measurement) -> Reported {
         let state = measurement.state.as_ref().and_then(state_array).filter(|state| state.iter().all(|value| value.is_finite()));
-        let known = state.map(|state| KnownState { state, stamp_ns: measurement.stamp_ns });
+        let known = state.map(|state| KnownState { state, stamp_ns: measurement.stamp_ns, rolled_forward_steps: 0 });
         Reported { session: measurement.session_id.clone(), known, sent: self.ask() }
     }
 
@@ -100,9 +128,9 @@ impl KnownStates {
                 _ => {}
             },
             _ if answer.reordered => {}
-            Some(Outcome::ClockJump(_) | Outcome::Restarted(_)) => self.note(reported, true, false),
-            Some(Outcome::Buffered(_)) => self.note(reported, false, true),
-            Some(Outcome::Applied(_) | Outcome::Gap(_) | Outcome::Gated(_)) => self.note(reported, false, false),
+            Some(Outcome::ClockJump(_) | Outcome::Restarted(_)) => self.note(reported, Noted { begins_anew: true, ..Noted::default() }),
+            Some(Outcome::Buffered(_)) => self.note(reported, Noted { ahead: true, ..Noted::default() }),
+            Some(Outcome::Applied(_) | Outcome::Gap(_) | Outcome::Gated(_)) => self.note(reported, Noted::default()),
             _ => {}
         }
     }
@@ -112,7 +140,7 @@ impl KnownStates {
     pub(crate) fn unheard(&self, reported: &Reported) {
         let newest = self.numbered().states.get(&reported.session).copied();
         if reported.known.is_some_and(|known| newest.is_none_or(|newest| newest.is_before(&known))) {
-            self.note(reported, false, true);
+            self.note(reported, Noted { ahead: true, ..Noted::default() });
         }
     }
 
@@ -121,32 +149,45 @@ impl KnownStates {
         // Who asks from an instant asks from now.
         let age_s = if candidates.start_stamp_ns.is_some() { 0.0 } else { prediction.measurement_age_s.unwrap_or(0.0) };
         let at = Duration::try_from_secs_f64(age_s).ok().and_then(|age| asked.at.checked_sub(age));
-        if let (None, Some(stamp_ns), Some(at)) = (candidates.start, prediction.start_stamp_ns, at) {
-            let known = Some(KnownState { state: prediction.start, stamp_ns });
-            self.note(&Reported { session: candidates.session.clone(), known, sent: Moment { at, ..asked } }, false, false);
+        let (None, Some(stamp_ns), Some(at)) = (candidates.start, prediction.start_stamp_ns, at) else {
+            return;
+        };
+        let (begun, sent) = (prediction.rolled_forward_steps, Moment { at, ..asked });
+        let known = KnownState { state: prediction.start, stamp_ns, rolled_forward_steps: begun };
+        if begun > 0 {
+            return self.note_ahead(&candidates.session, Ahead { known, asked: sent });
         }
+        let overtaken = candidates.start_stamp_ns.is_some();
+        let reported = Reported { session: candidates.session.clone(), known: Some(known), sent };
+        self.note(&reported, Noted { overtaken, ..Noted::default() });
     }
 
-    /// The newest known state of a session, where it is not too old to begin at.
-    pub(crate) fn of(&self, session: &str) -> Option<KnownState> {
+    /// What is known of a session and not too old to begin at.
+    pub(crate) fn of(&self, session: &str) -> Known {
         self.of_at(session, Instant::now())
     }
 
-    fn of_at(&self, session: &str, now: Instant) -> Option<KnownState> {
-        let newest = *self.numbered().states.get(session)?;
-        newest.known.filter(|_| now.saturating_duration_since(newest.at) <= AGE_MAX)
+    fn of_at(&self, session: &str, now: Instant) -> Known {
+        let numbered = self.numbered();
+        let young = |at: Instant| now.saturating_duration_since(at) <= AGE_MAX;
+        let measured = numbered.states.get(session).filter(|newest| young(newest.at)).and_then(|newest| newest.known);
+        Known { measured, ahead: numbered.ahead.get(session).filter(|ahead| young(ahead.asked.at)).map(|ahead| ahead.known) }
     }
 
     /// Forgets what was known under the name of a session that was opened now, also what comes late.
     pub(crate) fn opened(&self, session: &str) {
         let now = self.ask();
         let newest = Newest { known: None, asked: now.number, clock: now.number, at: now.at, ahead: false };
-        self.numbered().states.insert(session.into(), newest);
+        let mut numbered = self.numbered();
+        numbered.states.insert(session.into(), newest);
+        numbered.ahead.remove(session);
     }
 
     /// Forgets a closed session.
     pub(crate) fn forget(&self, session: &str) {
-        self.numbered().states.remove(session);
+        let mut numbered = self.numbered();
+        numbered.states.remove(session);
+        numbered.ahead.remove(session);
     }
 
     /// Forgets a session where the service says that it is not open.
@@ -156,18 +197,31 @@ impl KnownStates {
         }
     }
 
-    fn note(&self, reported: &Reported, begins_anew: bool, ahead: bool) {
+    fn note(&self, reported: &Reported, Noted { begins_anew, ahead, overtaken }: Noted) {
         let (Some(known), sent) = (reported.known, reported.sent) else {
             return;
         };
         let mut numbered = self.numbered();
         let newest = numbered.states.get(&reported.session).copied();
-        let replaced = |newest: Newest| sent.number > newest.clock && (begins_anew || newest.is_replaced_by(&known, sent));
+        let replaced = |newest: Newest| sent.number > newest.clock && (begins_anew || newest.is_replaced_by(&known, sent, overtaken));
         if newest.is_none_or(replaced) {
             let (asked, clock) = newest.map_or((0, 0), |newest| (newest.asked, newest.clock));
             let clock = if begins_anew { sent.number } else { clock };
             let noted = Newest { known: Some(known), asked: asked.max(sent.number), clock, at: sent.at, ahead };
             numbered.states.insert(reported.session.clone(), noted);
+        }
+        if begins_anew && numbered.ahead.get(&reported.session).is_some_and(|ahead| ahead.asked.number < sent.number) {
+            numbered.ahead.remove(&reported.session);
+        }
+    }
+
+    /// Notes a state that the service rolled forward, unless a later question has told of another one or the clock has begun anew since.
+    fn note_ahead(&self, session: &str, ahead: Ahead) {
+        let mut numbered = self.numbered();
+        let clock = numbered.states.get(session).map_or(0, |newest| newest.clock);
+        let before = numbered.ahead.get(session).map_or(0, |before| before.asked.number);
+        if ahead.asked.number > clock.max(before) {
+            numbered.ahead.insert(session.into(), ahead);
         }
     }
 
@@ -226,7 +280,12 @@ mod tests {
     }
 
     fn newest(known: &KnownStates) -> Option<i64> {
-        known.of("s").map(|known| known.stamp_ns)
+        begun(known.of("s"))
+    }
+
+    /// Where a fallback begins that is asked plainly.
+    fn begun(known: Known) -> Option<i64> {
+        known.measured.or(known.ahead).map(|known| known.stamp_ns)
     }
 
     fn hear(known: &KnownStates, reported: &Reported, outcome: Outcome) -> Option<i64> {
@@ -241,6 +300,16 @@ mod tests {
     }
 
     fn begins_aged(known: &KnownStates, asked: Moment, stamp_ns: i64, measurement_age_s: Option<f64>) {
+        predicted(known, asked, stamp_ns, measurement_age_s, None);
+    }
+
+    /// The answer to a question from an instant, which began so many steps after a measurement.
+    fn rolled(known: &KnownStates, asked: Moment, stamp_ns: i64, steps: u32) -> Known {
+        predicted(known, asked, stamp_ns, None, Some(steps));
+        known.of("s")
+    }
+
+    fn predicted(known: &KnownStates, asked: Moment, stamp_ns: i64, measurement_age_s: Option<f64>, from_now_steps: Option<u32>) {
         let reply = v1::PredictReply {
             start: Some(v1::VehicleState {
                 position_m: Some(v1::Vector3::default()),
@@ -249,6 +318,7 @@ mod tests {
                 angular_velocity_rad_s: Some(v1::Vector3::default()),
             }),
             start_stamp_ns: Some(stamp_ns),
+            rolled_forward_steps: from_now_steps.unwrap_or(0),
             measurement_age_s,
             soil: Some(v1::SoilVector::default()),
             soil_correction: Some(v1::SoilCorrection::default()),
@@ -256,7 +326,33 @@ mod tests {
             ..Default::default()
         };
         let prediction = Prediction::from_message(&reply).expect("a whole reply");
-        known.predicted(asked, &Candidates::new("s", 1, 1, vec![0.0; 2]), &prediction);
+        let asked_plainly = Candidates::new("s", 1, 1, vec![0.0; 2]);
+        known.predicted(asked, &Candidates { start_stamp_ns: from_now_steps.map(|_| stamp_ns), ..asked_plainly }, &prediction);
+    }
+
+    /// Goal: a state that was rolled forward is no measurement. Method: beside one, in answers that overtake each other, with a clock that begins anew, and of a
+    /// planner that only asks.
+    #[test]
+    fn regress_a_state_that_was_rolled_forward_is_kept_apart() {
+        let known = KnownStates::default();
+        let stamps = |known: Known| [known.measured, known.ahead].map(|known| known.map(|known| known.stamp_ns));
+        hear(&known, &report(&known, 100), applied());
+        let late = known.ask();
+        assert_eq!(stamps(rolled(&known, known.ask(), 900, 8)), [Some(100), Some(900)]);
+        assert_eq!(stamps(rolled(&known, known.ask(), 300, 2)), [Some(100), Some(300)], "the last one");
+        assert_eq!(stamps(rolled(&known, late, 600, 5)), [Some(100), Some(300)], "it was asked for before");
+        assert_eq!(known.of("s").ahead.map(|ahead| ahead.rolled_forward_steps), Some(2));
+        hear(&known, &report(&known, 200), applied());
+        assert_eq!(stamps(rolled(&known, known.ask(), 100, 0)), [Some(200), Some(300)], "measurements overtook the question");
+        assert_eq!(stamps(rolled(&known, known.ask(), 250, 0)), [Some(250), Some(300)], "somebody else has measured more");
+        let of_the_old_clock = known.ask();
+        hear(&known, &report(&known, 5), Outcome::ClockJump(v1::ClockJump::default()));
+        assert_eq!(stamps(known.of("s")), [Some(5), None]);
+        assert_eq!(stamps(rolled(&known, of_the_old_clock, 400, 3)), [Some(5), None]);
+        known.opened("s");
+        assert_eq!(stamps(rolled(&known, known.ask(), 400, 3)), [None, Some(400)]);
+        known.forget("s");
+        assert_eq!(known.of("s"), Known::default());
     }
 
     /// Goal: a fallback begins at the newest state of its own session. Method: answers of several kinds, late ones among them.
@@ -266,16 +362,17 @@ mod tests {
         let hear = |state: f64, outcome: Outcome, reordered: bool| {
             let answer = v1::MeasurementAnswer { outcome: Some(outcome), reordered, ..Default::default() };
             known.measured(&known.report(&measurement("s", 0, [state; 12], [0.0; 2])), &answer);
-            known.of("s").map(|known| known.state[0])
+            known.of("s").measured.map(|known| known.state[0])
         };
         assert_eq!(hear(1.0, Outcome::Rejected(v1::Rejected::default()), false), None);
         assert_eq!(hear(2.0, applied(), false), Some(2.0));
         assert_eq!(hear(3.0, applied(), true), Some(2.0), "it came after a later one");
         assert_eq!(hear(5.0, Outcome::Gap(v1::Gap::default()), false), Some(5.0));
-        assert_eq!(known.clone().of("s"), Some(KnownState { state: [5.0; 12], stamp_ns: 0 }), "clones know the same");
-        assert_eq!(known.of("another"), None);
+        let five = KnownState { state: [5.0; 12], stamp_ns: 0, rolled_forward_steps: 0 };
+        assert_eq!(known.clone().of("s"), Known { measured: Some(five), ahead: None }, "clones know the same");
+        assert_eq!(known.of("another"), Known::default());
         known.forget("s");
-        assert_eq!(known.of("s"), None);
+        assert_eq!(known.of("s"), Known::default());
     }
 
     /// Goal: an answer that comes late is not taken for newer than what is known. Method: questions and measurements, numbered as they are sent and heard in
@@ -340,7 +437,7 @@ mod tests {
             reported.sent.at = now + Duration::from_millis(after_ms);
             reported
         };
-        let after = |ms: u64| known.of_at("s", now + Duration::from_millis(ms)).map(|known| known.stamp_ns);
+        let after = |ms: u64| begun(known.of_at("s", now + Duration::from_millis(ms)));
         hear(&known, &sent(10, 0), applied());
         assert_eq!((after(3200), after(3201)), (Some(10), None));
         known.unheard(&sent(10, 4000));
@@ -353,7 +450,7 @@ mod tests {
         for age_s in [f64::NAN, -1.0, 1e300] {
             begins_aged(&known, asked, 30, Some(age_s));
         }
-        assert_eq!(known.of_at("s", now).map(|known| known.stamp_ns), Some(20), "an age that is none");
+        assert_eq!(begun(known.of_at("s", now)), Some(20), "an age that is none");
         // One that is no step yet holds nothing up for longer.
         known.unheard(&sent(90, 7000));
         hear(&known, &sent(60, 10_200), applied());
