@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use nesam_learning::recipe::{VALIDATED_FROM, is_validation};
 use nesam_model::{ModelBundle, Precision, Predictor};
-use nesam_physics::Vehicle;
+use nesam_physics::{SecondCommand, Vehicle};
 use nesam_server::recording::RecordingHeader;
 use nesam_terrain::WorldMap;
 use nesam_trajectories::{BeyondRange, DataRoot, SetQuery, Trajectory};
@@ -186,12 +186,16 @@ pub fn on_vehicle_of(mut bundle: ModelBundle, root: &DataRoot) -> ModelBundle {
     let (own, given) = (&bundle.vehicle, root.vehicle());
     let otherwise = uncalibrated_differences(own, given);
     if !bundle.is_of(given) {
+        // Cards of one name may be told in different ways where to go.
+        let [of_own, of_given] = [own, given].map(|card| {
+            let second =
+                if own.name == given.name { format!(" with the second command `{}`", second_as_str(card.second)) } else { String::new() };
+            format!("`{}`{second}", card.name)
+        });
         note!(
-            "note: bundle {} was trained for `{}`; its physics now uses the card of `{}`, its learned parts are as trained, and what it knows of its errors \
-             (reference, soil filter, covariance) is left out",
-            bundle.name,
-            own.name,
-            given.name
+            "note: bundle {} was trained for {of_own}; its physics now uses the card of {of_given}, its learned parts are as trained, and what it knows of its errors \
+             (reference, soil filter, covariance) and its kinematic model are left out",
+            bundle.name
         );
         bundle.move_to(given);
     } else if !otherwise.is_empty() {
@@ -203,6 +207,15 @@ pub fn on_vehicle_of(mut bundle: ModelBundle, root: &DataRoot) -> ModelBundle {
         );
     }
     bundle
+}
+
+/// As on a card.
+pub fn second_as_str(second: SecondCommand) -> &'static str {
+    match second {
+        SecondCommand::SteeringNormalised => "steering_normalised",
+        SecondCommand::RoadWheelAngleRad => "road_wheel_angle_rad",
+        SecondCommand::YawRateRadS => "yaw_rate_rad_s",
+    }
 }
 
 /// Refuses to write into a bundle, as `option` does, what was measured on the drives of another vehicle: a bundle drops it there.

@@ -6,7 +6,7 @@ use clap::Args;
 use nesam_model::ModelBundle;
 use nesam_model::bundle::MANIFEST;
 use nesam_physics::effects::ScheduledEffect;
-use nesam_physics::{DT_S, SOIL_NAMES, SecondCommand, Vehicle};
+use nesam_physics::{DT_S, SOIL_NAMES, Vehicle};
 use nesam_trajectories::{DataRoot, SetQuery, Split};
 use serde_json::{Map, Value, json};
 
@@ -14,6 +14,7 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output;
 use crate::output::say;
+use crate::sources::second_as_str;
 
 /// Options of `nesam inspect`.
 #[derive(Args, Debug)]
@@ -104,11 +105,6 @@ fn set_summary(root: &DataRoot, set: &str) -> Result<Value, Failure> {
 }
 
 fn vehicle(v: &Vehicle) -> Value {
-    let second = match v.second {
-        SecondCommand::SteeringNormalised => "steering_normalised",
-        SecondCommand::RoadWheelAngleRad => "road_wheel_angle_rad",
-        SecondCommand::YawRateRadS => "yaw_rate_rad_s",
-    };
     json!({
         "name": v.name,
         "mass_kg": v.mass_kg,
@@ -116,7 +112,7 @@ fn vehicle(v: &Vehicle) -> Value {
         "wheelbase_m": v.wheelbase_m,
         "track_m": v.track_m,
         "wheel_radius_m": v.wheel_radius_m,
-        "second": second,
+        "second": second_as_str(v.second),
         "speed_range_m_s": v.command_range[0],
         "second_range": v.command_range[1],
     })
