@@ -709,6 +709,8 @@ fn service_laps_of_another_vehicle_than_that_of_the_bundle_are_told() {
     refused(&asked(&["--speed", "3.5"]), root.path(), &[moved, "--speed 3.5 is not 0.5 to 3 m/s"]);
     let words = [moved, "no kinematic model fitted for `Clearpath Husky"];
     refused(&asked(&["--configurations", "kinematic"]), root.path(), &words);
+    let advice = ["no kinematic model", "use --configurations fixed,adapted"];
+    refused(&asked(&["--configurations", "fixed,kinematic,adapted"]), root.path(), &advice);
     refused(&asked(&[]), root.path(), &[moved, "kinematic is left out", "vehicle_husky.json"]);
 }
 

@@ -8,16 +8,17 @@ mod common;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use bicycle::bicycle;
+use bicycle::{Habits, RIGHT, bicycle, bicycle_with};
 use common::{bundle, sample, stderr};
 use serde_json::Value;
 
 /// Drives laps with small plans; `more` has a plant.
 fn navigate(folder: &Path, root: &Path, more: &[&str]) -> Output {
     let bundle = bundle("hmmwv-nominal");
-    let quick = ["--worlds", "w01", "--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
+    let worlds: &[&str] = if more.contains(&"--worlds") { &[] } else { &["--worlds", "w01"] };
+    let quick = ["--candidates", "4", "--horizon", "10", "--plan-every", "10", "--out", "laps"];
     let mut command = Command::new(env!("CARGO_BIN_EXE_nesam"));
-    command.current_dir(folder).arg("navigate").arg("--data").arg(root).arg("--bundle").arg(bundle).args(quick).args(more);
+    command.current_dir(folder).arg("navigate").arg("--data").arg(root).arg("--bundle").arg(bundle).args(worlds).args(quick).args(more);
     command.output().expect("the binary runs")
 }
 
@@ -151,6 +152,13 @@ fn service_a_root_without_true_soil_serves_another_simulator() {
         laps["each"].as_array().unwrap().iter().map(|run| ["configuration", "soil"].map(|key| run[key].as_str().unwrap())).collect();
     assert_eq!(driven, [["fixed", "unknown"], ["adapted", "unknown"], ["kinematic", "unknown"]]);
     assert_eq!(laps["configurations"]["fixed"]["by_soil"]["unknown"]["runs"], 1);
+    assert!(laps["runs"] == 1 && laps["laps"] == 3, "laps of each configuration, and all: {laps}");
+    // Every figure can be computed again from the file of its lap.
+    for run in laps["each"].as_array().unwrap() {
+        let lap = &json(&folder.path().join(run["file"].as_str().unwrap()))["run"]["lap"];
+        let [path, lean] = ["path", "lean"].map(|key| lap[key].as_array().unwrap().len());
+        assert!(path == lean + 1 && lap["hausdorff_m"] == run["lap"]["hausdorff_m"], "{path} {lean}");
+    }
     assert!(laps["configurations"]["fixed"]["time_s"]["sd"].is_null(), "no lap was completed");
 }
 
@@ -162,8 +170,43 @@ fn service_options_of_another_simulator_without_one_are_refused() {
         (&["--plant-timeout", "5"][..], "--plant"),
         (&["--plant", "localhost:5599", "--plant-timeout", "0"][..], "--plant-timeout 0"),
         (&["--plant", "localhost", "--configurations", "kinematic"][..], "plant localhost"),
+        (&["--configurations", "fixed,kinematic,fixed"][..], "--configurations has `fixed` twice"),
+        (&["--worlds", "w01,w05,w01"][..], "--worlds has `w01` twice"),
     ] {
         let output = navigate(folder.path(), &sample(), asked);
         assert!(output.status.code() == Some(2) && stderr(&output).contains(word), "{asked:?}: {}", stderr(&output));
     }
+}
+
+/// Goal: who sees a table of laps that failed learns why, and what may be wrong with the plant. Method: plants whose laps are lost, blocked, of steps of half their
+/// time, and with the steering to the other side.
+#[test]
+fn regress_why_laps_were_not_completed_is_said() {
+    let folder = tempfile::tempdir().unwrap();
+    let said = |address: &str| {
+        let output = navigate(folder.path(), &sample(), &[&KINEMATIC[..], &["--plant", address]].concat());
+        assert!(output.status.success(), "{}", stderr(&output));
+        (String::from_utf8_lossy(&output.stdout).into_owned(), stderr(&output))
+    };
+    let (table, notes) = said(&bicycle(|_, steps, mut reply| {
+        if steps == 59 {
+            reply["state"][6] = Value::Null;
+        }
+        vec![reply.to_string()]
+    }));
+    assert!(table.contains("not completed by kinematic: plant_lost 1 (at 3.3 s)"), "{table}");
+    assert!(notes.contains("warning: every lap of kinematic is lost"), "{notes}");
+    let (table, notes) = said(&bicycle(|_, _, mut reply| {
+        reply["ended"] = "spawn\u{1b}[31m\nblocked".into();
+        vec![reply.to_string()]
+    }));
+    assert!(table.contains(r"not completed by kinematic: spawn\u{1b}[31m\nblocked 1 (before the lap began)"), "{table}");
+    assert!(notes.contains("the answer to the first `reset` did not say which plant it is"), "{notes}");
+    let (_, notes) = said(&bicycle_with(Habits { step_s: 0.05, ..RIGHT }, |_, _, reply| vec![reply.to_string()]));
+    assert!(
+        notes.contains("move 0.50 times as far as its velocities say: does a step take 0.1 s") && !notes.contains("in Body"),
+        "{notes}"
+    );
+    let (_, notes) = said(&bicycle_with(Habits { left: -1.0, ..RIGHT }, |_, _, reply| vec![reply.to_string()]));
+    assert!(notes.contains("turns right where it is told to turn left"), "{notes}");
 }

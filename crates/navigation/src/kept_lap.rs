@@ -25,7 +25,9 @@ impl KeptLap {
     /// # Errors
     /// What is wrong with it, and where.
     pub fn from_json(bytes: &[u8]) -> Result<Self, String> {
-        serde_json::from_slice(bytes).map_err(|error| error.to_string())
+        let mut kept: Self = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+        kept.run.lap = kept.run.lap.without_inventions();
+        Ok(kept)
     }
 }
 
@@ -44,8 +46,22 @@ mod tests {
             run.lap.path = vec![[value, -value]];
             let kept = KeptLap { settings: serde_json::json!({ "speed_m_s": value }), run };
             let read = KeptLap::from_json(kept.to_json().as_bytes()).unwrap();
-            assert_eq!(read.run.lap.hausdorff_m.to_bits(), value.to_bits(), "{value}");
+            assert_eq!(read.run.lap.hausdorff_m.unwrap().to_bits(), value.to_bits(), "{value}");
             assert_eq!(read, kept, "{value}");
         }
+    }
+
+    /// Goal: what an earlier version kept of a lap that never began is no figure. Method: its zeros and the place of its start, in a file as it was written then.
+    #[test]
+    fn regress_zeros_of_a_lap_that_never_began_are_not_read() {
+        let mut kept = KeptLap { settings: Value::Null, run: run("fixed", "w36", 0, 1, 0.25, false) };
+        (kept.run.lap.lean, kept.run.lap.time_s, kept.run.lap.roll_deg) = (Vec::new(), 0.0, Some(0.0));
+        let mut written: Value = serde_json::from_str(&kept.to_json()).unwrap();
+        for key in ["moved_over_told", "turn_correlation"] {
+            written["run"]["lap"].as_object_mut().unwrap().remove(key);
+        }
+        let lap = KeptLap::from_json(written.to_string().as_bytes()).unwrap().run.lap;
+        let figures = [lap.hausdorff_m, lap.hausdorff_whole_path_m, lap.off_path_mean_m, lap.roll_deg, lap.pitch_deg];
+        assert!(figures == [None; 5] && lap.path.is_empty() && lap.end == "off_path", "{lap:?}");
     }
 }

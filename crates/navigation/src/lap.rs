@@ -10,7 +10,7 @@ use crate::error::NavigationError;
 use crate::forecast::{Forecaster, Situation};
 use crate::link::{PlantLink, Reading, Start};
 use crate::mppi::{Mppi, MppiSettings};
-use crate::plausibility::{VelocityCheck, usable};
+use crate::plausibility::{TurnCheck, VelocityCheck, usable};
 use crate::reference_path::{ReferencePath, distance_to_line, hausdorff_m, unwrapped};
 use crate::tracker::TrackingCost;
 
@@ -75,7 +75,7 @@ pub enum Scored {
     State,
 }
 
-/// What came of it. Distances and angles are those of the true motion where the plant tells it.
+/// What came of it. Distances and angles are those of the true motion where the plant tells it; `None` of a lap that ended before its first step.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Lap {
     /// Whether the whole lap was driven in time and never more than 5 m off the path.
@@ -87,17 +87,17 @@ pub struct Lap {
     /// Share of the lap driven.
     pub progress: f64,
     /// Hausdorff distance between what was driven and that part of the path, m: how well the path was kept to, also by a lap that ends early.
-    pub hausdorff_m: f64,
-    /// Hausdorff distance between what was driven and the whole path, m: a lap that ends early is as far off as the farthest place that it never came to. `None` of a
-    /// lap that an earlier version has kept.
+    pub hausdorff_m: Option<f64>,
+    /// Hausdorff distance between what was driven and the whole path, m: a lap that ends early is as far off as the farthest place that it never came to. `None`
+    /// also of a lap that an earlier version has kept.
     #[serde(default)]
     pub hausdorff_whole_path_m: Option<f64>,
     /// Mean distance from the path, m.
-    pub off_path_mean_m: f64,
+    pub off_path_mean_m: Option<f64>,
     /// Mean |roll|, degrees.
-    pub roll_deg: f64,
+    pub roll_deg: Option<f64>,
     /// Mean |pitch|, degrees.
-    pub pitch_deg: f64,
+    pub pitch_deg: Option<f64>,
     /// What became of the measurements.
     pub measurements: BTreeMap<String, usize>,
     /// Correction of the soil prior that the service held at the end.
@@ -109,7 +109,14 @@ pub struct Lap {
     /// for a lap of less than a second.
     #[serde(default)]
     pub velocity_mismatch_m_s: Option<f64>,
-    /// x, y driven, every 0.2 s, m.
+    /// How many times as far as measured velocities say the measured positions move, where one factor is most of what they differ by: a step that takes another
+    /// time than 0.1 s, or another unit.
+    #[serde(default)]
+    pub moved_over_told: Option<f64>,
+    /// Correlation of the commanded second with the measured yaw rate above 1 m/s: near -1 where the vehicle turns the other way; `None` where it hardly turned.
+    #[serde(default)]
+    pub turn_correlation: Option<f64>,
+    /// x, y driven from the beginning of the lap to its end, every 0.1 s, m; every 0.2 s in a lap that an earlier version has kept.
     pub path: Vec<[f64; 2]>,
     /// How the vehicle leant, every 0.1 s.
     pub lean: Vec<Lean>,
@@ -127,17 +134,32 @@ pub struct Lean {
 }
 
 impl Lap {
+    /// Whether it was driven at all: one that ended before its first step says nothing of how the vehicle drives.
+    pub fn is_begun(&self) -> bool {
+        !self.lean.is_empty()
+    }
+
+    /// Leaves out what is told of a lap that was not driven: an earlier version kept zeros for it, and the place where it was to begin.
+    pub(crate) fn without_inventions(mut self) -> Self {
+        if !self.is_begun() {
+            (self.hausdorff_m, self.hausdorff_whole_path_m, self.off_path_mean_m) = (None, None, None);
+            (self.roll_deg, self.pitch_deg) = (None, None);
+            self.path.clear();
+        }
+        self
+    }
+
     /// Mean of an angle over the first part of the lap, from its beginning to where the vehicle first came to `progress`: what two laps, of which one ends
-    /// earlier, are compared by, since ground that one never came to says nothing of how the other drives.
-    pub fn mean_lean_until(&self, progress: f64, of: fn(&Lean) -> f64) -> f64 {
+    /// earlier, are compared by, since ground that one never came to says nothing of how the other drives. `None` where nothing was driven.
+    pub fn mean_lean_until(&self, progress: f64, of: fn(&Lean) -> f64) -> Option<f64> {
         let steps = self.lean.iter().position(|lean| lean.progress >= progress).map_or(self.lean.len(), |first| first + 1);
         mean_lean(&self.lean[..steps], of)
     }
 }
 
-/// Mean of an angle; 0 of no step.
-fn mean_lean(lean: &[Lean], of: fn(&Lean) -> f64) -> f64 {
-    lean.iter().map(of).sum::<f64>() / lean.len().max(1) as f64
+/// Mean of an angle; `None` of no step.
+fn mean_lean(lean: &[Lean], of: fn(&Lean) -> f64) -> Option<f64> {
+    (!lean.is_empty()).then(|| lean.iter().map(of).sum::<f64>() / lean.len() as f64)
 }
 
 /// Drives a lap.
@@ -206,7 +228,7 @@ impl Driver<'_> {
             }
             match usable(&plant.step(command)?) {
                 Ok(next) => {
-                    track.add(plan, &next);
+                    track.add(plan, &next, command);
                     reading = next;
                 }
                 Err(end) => track.ended = Some(end),
@@ -270,6 +292,7 @@ struct Track {
     whole: Vec<[f64; 2]>,
     scored: Scored,
     velocity: VelocityCheck,
+    turns: TurnCheck,
     /// How the lap ended before its time: the vehicle or its simulation is beyond driving.
     ended: Option<String>,
 }
@@ -288,6 +311,7 @@ impl Track {
             whole: plan.path.points_between(0.0, std::f64::consts::TAU, REFERENCE_STEP_M),
             scored: Scored::Truth,
             velocity: VelocityCheck::default(),
+            turns: TurnCheck::default(),
             ended: None,
         }
     }
@@ -307,13 +331,15 @@ impl Track {
         self.velocity.add(&reading.measured);
     }
 
-    fn add(&mut self, plan: &LapPlan, reading: &Reading) {
+    /// What the vehicle did with a command.
+    fn add(&mut self, plan: &LapPlan, reading: &Reading, command: Control<f64>) {
         let [x, y, _, roll, pitch, ..] = *reading.scored();
         self.phi = unwrapped(plan.path.offset(x, y).phi, self.phi);
         self.positions.push([x, y]);
         self.off_path_m = distance_to_line([x, y], &self.whole);
         self.off_path_sum_m += self.off_path_m;
         self.lean.push(Lean { progress: self.progress(plan), roll_deg: roll.abs().to_degrees(), pitch_deg: pitch.abs().to_degrees() });
+        self.turns.add(command, &reading.measured);
         self.note(reading);
     }
 
@@ -340,27 +366,29 @@ impl Track {
 
     fn lap(&self, plan: &LapPlan) -> Lap {
         let end = self.end(plan).unwrap_or("too_slow");
-        let steps = (self.positions.len() - 1).max(1) as f64;
         let reached = self.phi.max(self.begun_phi + 1e-3);
         let part = plan.path.points_between(self.begun_phi, reached, REFERENCE_STEP_M);
-        Lap {
+        let lap = Lap {
             // Whatever a plant calls the end that it makes, it is none of a whole lap.
             completed: self.ended.is_none() && end == "complete",
             end: end.into(),
             time_s: self.time_s(),
             progress: self.progress(plan).clamp(0.0, 1.0),
-            hausdorff_m: hausdorff_m(&self.positions, &part),
+            hausdorff_m: Some(hausdorff_m(&self.positions, &part)),
             hausdorff_whole_path_m: Some(hausdorff_m(&self.positions, &self.whole)),
-            off_path_mean_m: self.off_path_sum_m / steps,
+            off_path_mean_m: Some(self.off_path_sum_m / self.lean.len() as f64),
             roll_deg: mean_lean(&self.lean, |lean| lean.roll_deg),
             pitch_deg: mean_lean(&self.lean, |lean| lean.pitch_deg),
             measurements: BTreeMap::new(),
             soil_delta: None,
             scored: self.scored,
             velocity_mismatch_m_s: self.velocity.mismatch_m_s(),
-            path: self.positions.iter().step_by(2).copied().collect(),
+            moved_over_told: self.velocity.moved_over_told(),
+            turn_correlation: self.turns.correlation(),
+            path: self.positions.clone(),
             lean: self.lean.clone(),
-        }
+        };
+        lap.without_inventions()
     }
 }
 
@@ -395,15 +423,18 @@ mod tests {
             let mut track = Track::at(&plan, path.point(0.0));
             track.positions = path.points_between(0.0, until_phi, REFERENCE_STEP_M);
             track.phi = until_phi;
-            track.lap(&plan)
+            track.lean.push(Lean { progress: 1.0, roll_deg: 0.0, pitch_deg: 0.0 });
+            let lap = track.lap(&plan);
+            assert_eq!(lap.path, track.positions, "figures can be computed again");
+            (lap.hausdorff_m.unwrap(), lap.hausdorff_whole_path_m.unwrap())
         };
-        let half = driven(std::f64::consts::PI);
+        let (half_m, half_of_whole_m) = driven(std::f64::consts::PI);
         let left = path.points_between(std::f64::consts::PI, std::f64::consts::TAU, REFERENCE_STEP_M);
         let line = path.points_between(0.0, std::f64::consts::PI, REFERENCE_STEP_M);
         let farthest_m = left.iter().map(|point| distance_to_line(*point, &line)).fold(0.0, f64::max);
-        assert!(half.hausdorff_m < 0.01, "{}", half.hausdorff_m);
-        assert!(farthest_m > 10.0 && (half.hausdorff_whole_path_m.unwrap() - farthest_m).abs() < 0.1, "{half:?}");
-        let whole = driven(std::f64::consts::TAU);
-        assert!(whole.hausdorff_m < 0.01 && whole.hausdorff_whole_path_m.unwrap() < 0.01, "{}", whole.hausdorff_m);
+        assert!(half_m < 0.01, "{half_m}");
+        assert!(farthest_m > 10.0 && (half_of_whole_m - farthest_m).abs() < 0.1, "{half_of_whole_m} {farthest_m}");
+        let (whole_m, of_whole_m) = driven(std::f64::consts::TAU);
+        assert!(whole_m < 0.01 && of_whole_m < 0.01, "{whole_m} {of_whole_m}");
     }
 }

@@ -36,7 +36,7 @@ pub use oracle::SoilAhead;
 pub use reference_path::ReferencePath;
 pub use remote::RemotePlant;
 pub use report::{NavigationReport, SoilKind};
-pub use score::{Figures, Ratio, Run, Summary, configuration_names, ratio, summarise};
+pub use score::{Figures, Ratio, Run, Summary, configuration_names, lap_file_name, ratio, summarise};
 pub use session::{ServedForecaster, session_request};
 pub use tracker::TrackingCost;
 pub use trial::Surroundings;

@@ -1,9 +1,9 @@
-//! What readings have to be for a lap to go on, and whether their velocities are those of their positions.
+//! What readings have to be for a lap to go on, whether their velocities are those of their positions, and whether the vehicle turns where it is told to.
 
 use std::f64::consts::{FRAC_PI_2, PI};
 
-use nesam_physics::DT_S;
 use nesam_physics::vec3::Tilt;
+use nesam_physics::{Control, DT_S};
 
 use crate::link::{Answer, Reading};
 
@@ -27,6 +27,12 @@ const LIMITS: [f64; 12] = {
 };
 /// Steps over which positions are compared with velocities: over one second, noise of 2 cm makes 0.03 m/s.
 const COMPARED_STEPS: usize = 10;
+/// One factor between positions and velocities is what they differ by where it leaves no more than this share of the difference.
+const LEFT_BY_FACTOR: f64 = 0.5;
+/// Whether a vehicle turns as it is told is seen above this speed, m/s, over so many steps, where it turns faster than noise (rms), rad/s.
+const TURNING_ABOVE_M_S: f64 = 1.0;
+const TURNING_STEPS_MIN: usize = 15;
+const TURNING_MIN_RAD_S: f64 = 0.03;
 
 /// The reading of an answer that a lap can go on with; else how the lap ends: `plant_lost` where a number is none or beyond what a vehicle does, `overturned`
 /// beyond 90 degrees of roll or pitch, or what the plant says.
@@ -64,18 +70,65 @@ impl VelocityCheck {
 
     /// Root mean square over the stretches of a second, m/s; `None` where there is none.
     pub(crate) fn mismatch_m_s(&self) -> Option<f64> {
-        let squares: Vec<f64> =
-            self.read.windows(COMPARED_STEPS + 1).map(|stretch| (0..2).map(|i| mismatch(stretch, i).powi(2)).sum()).collect();
-        (!squares.is_empty()).then(|| (squares.iter().sum::<f64>() / squares.len() as f64).sqrt())
+        self.left_m_s(1.0)
+    }
+
+    /// How many times as far as velocities say positions move (least squares), where this factor is most of what they differ by.
+    pub(crate) fn moved_over_told(&self) -> Option<f64> {
+        let (both, squares) =
+            self.speeds_m_s().fold((0.0, 0.0), |(both, squares), [moved, told]| (both + moved * told, squares + told * told));
+        let factor = both / squares;
+        let (all, left) = (self.left_m_s(1.0)?, self.left_m_s(factor)?);
+        // Velocities that point backwards are those of another frame.
+        (factor > 0.0 && left <= LEFT_BY_FACTOR * all).then_some(factor)
+    }
+
+    /// What is left of the difference where velocities are multiplied by a factor: root mean square, m/s.
+    fn left_m_s(&self, factor: f64) -> Option<f64> {
+        let stretches = self.read.len().checked_sub(COMPARED_STEPS).filter(|count| *count > 0)?;
+        let squares: f64 = self.speeds_m_s().map(|[moved, told]| (moved - factor * told).powi(2)).sum();
+        Some((squares / stretches as f64).sqrt())
+    }
+
+    /// Speeds along both axes of every stretch: by its ends, and the mean of the velocities on it (trapezoids), m/s.
+    fn speeds_m_s(&self) -> impl Iterator<Item = [f64; 2]> {
+        self.read.windows(COMPARED_STEPS + 1).flat_map(|stretch| [0, 1].map(|axis| speeds_m_s(stretch, axis)))
     }
 }
 
-/// Speed along one axis by the ends of a stretch, less the mean of the velocities on it (trapezoids), m/s.
-fn mismatch(stretch: &[[[f64; 2]; 2]], axis: usize) -> f64 {
+fn speeds_m_s(stretch: &[[[f64; 2]; 2]], axis: usize) -> [f64; 2] {
     let steps = (stretch.len() - 1) as f64;
     let moved = (stretch[stretch.len() - 1][0][axis] - stretch[0][0][axis]) / (steps * DT_S);
     let told: f64 = stretch.windows(2).map(|pair| 0.5 * (pair[0][1][axis] + pair[1][1][axis])).sum();
-    moved - told / steps
+    [moved, told / steps]
+}
+
+/// Holds the turning of the vehicle against what it was told: to the left is positive in either.
+#[derive(Default)]
+pub(crate) struct TurnCheck {
+    steps: usize,
+    /// Sums of command times yaw rate, and of the squares of either.
+    products: [f64; 3],
+}
+
+impl TurnCheck {
+    /// A command, and what was measured at the end of its step.
+    pub(crate) fn add(&mut self, command: Control<f64>, measured: &[f64; 12]) {
+        let (speed_m_s, rate_rad_s) = (measured[6], measured[11]);
+        if speed_m_s < TURNING_ABOVE_M_S {
+            return;
+        }
+        self.steps += 1;
+        let products = [command.second * rate_rad_s, command.second.powi(2), rate_rad_s.powi(2)];
+        self.products.iter_mut().zip(products).for_each(|(sum, product)| *sum += product);
+    }
+
+    /// Correlation about zero, -1 to 1; `None` where the vehicle hardly turned.
+    pub(crate) fn correlation(&self) -> Option<f64> {
+        let [both, commands, rates] = self.products;
+        let turned = self.steps >= TURNING_STEPS_MIN && (rates / self.steps as f64).sqrt() >= TURNING_MIN_RAD_S;
+        (turned && commands > 0.0).then(|| both / (commands * rates).sqrt())
+    }
 }
 
 #[cfg(test)]
@@ -124,7 +177,53 @@ mod tests {
                 assert!(body.mismatch_m_s().is_none(), "no second has passed");
             }
         }
+        assert_eq!(world.moved_over_told(), None, "no factor turns a frame");
         let (body, world) = (body.mismatch_m_s().unwrap(), world.mismatch_m_s().unwrap());
         assert!(body < 1e-4 && world > 1.0, "{body} {world}");
+    }
+
+    /// Goal: a plant whose step takes another time than 0.1 s is told from one whose velocities are in another frame. Method: the same circle in steps of 0.05 s,
+    /// 0.09 s and 0.2 s; with steps of 0.1 s and a position that jumps by 5 cm, no factor is seen.
+    #[test]
+    fn regress_a_step_of_another_length_is_a_factor() {
+        let (speed_m_s, rate_rad_s) = (2.0, 0.2);
+        let circle = |step_s: f64, jump_m: f64| {
+            let mut check = VelocityCheck::default();
+            for k in 0..300 {
+                let (yaw, jump_m) = (rate_rad_s * step_s * f64::from(k), if k % 2 == 0 { jump_m } else { -jump_m });
+                let at = [speed_m_s / rate_rad_s * yaw.sin() + jump_m * f64::from(k % 3), -speed_m_s / rate_rad_s * yaw.cos()];
+                check.add(&[at[0], at[1], 0.6, 0.0, 0.0, yaw, speed_m_s, 0.0, 0.0, 0.0, 0.0, rate_rad_s]);
+            }
+            check.moved_over_told()
+        };
+        for step_s in [0.05, 0.09, 0.2] {
+            let factor = circle(step_s, 0.0).unwrap();
+            // The chord of a second is shorter than its arc by 0.2 % at most.
+            assert!((factor / (step_s / DT_S) - 1.0).abs() < 0.005, "{step_s}: {factor}");
+        }
+        assert_eq!(circle(DT_S, 0.05), None);
+        assert_eq!(VelocityCheck::default().moved_over_told(), None);
+        let mut standing = VelocityCheck::default();
+        (0..30).for_each(|_| standing.add(&[0.0; 12]));
+        assert_eq!(standing.moved_over_told(), None, "nothing moves and nothing is told to");
+    }
+
+    /// Goal: a vehicle that turns right where it is told to turn left is seen, one that answers late, slides or stands is not. Method: commands of a sinusoid, yaw
+    /// rates that follow them 0.3 s later, with either sign, without any and at little speed.
+    #[test]
+    fn regress_reversed_steering_is_seen() {
+        let driven = |gain: f64, speed_m_s: f64, steps: u32| {
+            let command = |k: u32| 0.3 + 0.4 * (0.1 * f64::from(k)).sin();
+            let mut check = TurnCheck::default();
+            for k in 3..3 + steps {
+                let mut measured = [0.0; 12];
+                (measured[6], measured[11]) = (speed_m_s, gain * command(k - 3));
+                check.add(Control { speed_m_s, second: command(k) }, &measured);
+            }
+            check.correlation()
+        };
+        assert!(driven(0.3, 3.0, 40).is_some_and(|r| r > 0.8));
+        assert!(driven(-0.3, 3.0, 40).is_some_and(|r| r < -0.8));
+        assert_eq!([driven(0.0, 3.0, 40), driven(-0.3, 0.9, 40), driven(-0.3, 3.0, 14)], [None; 3]);
     }
 }

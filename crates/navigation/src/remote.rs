@@ -1,5 +1,7 @@
 //! Another simulator in the plant's place: datagrams of JSON in lock-step (docs/plant-adapter.md).
 
+use std::f64::consts::TAU;
+use std::io::ErrorKind;
 use std::net::{ToSocketAddrs, UdpSocket};
 use std::time::{Duration, Instant};
 
@@ -22,6 +24,8 @@ const PLACED_WITHIN: [f64; 2] = [1.0, 0.2];
 const RESET_FIRST: &str = "reset comes first";
 /// Longest text of a plant that becomes the end of a lap, characters.
 const END_MAX: usize = 200;
+/// Silence after which whoever waits is told.
+const TOLD_AFTER: Duration = Duration::from_secs(5);
 
 /// A plant behind a UDP address.
 pub struct RemotePlant {
@@ -31,6 +35,10 @@ pub struct RemotePlant {
     timeout: Duration,
     /// What the plant calls itself.
     name: Option<String>,
+    /// Told of a plant that is silent.
+    tell: Option<fn(&str)>,
+    /// Whether it has been told since the plant last answered soon.
+    told: bool,
     /// The answer to a `reset` that was asked to learn the name: the vehicle stands there.
     prepared: Option<(Start, Answer)>,
 }
@@ -50,7 +58,13 @@ impl RemotePlant {
         let socket = UdpSocket::bind(if to.is_ipv4() { "0.0.0.0:0" } else { "[::]:0" }).map_err(failed)?;
         socket.connect(to).map_err(failed)?;
         socket.set_read_timeout(Some(ASK_AGAIN)).map_err(failed)?;
-        Ok(Self { address: address.into(), socket, number: first_number, timeout, name: None, prepared: None })
+        Ok(Self { address: address.into(), socket, number: first_number, timeout, name: None, tell: None, told: false, prepared: None })
+    }
+
+    /// Tells, once in a silence of five seconds, that nothing is heard and what is heard instead. A plant that always takes longer is told of once.
+    #[must_use]
+    pub fn telling(self, tell: fn(&str)) -> Self {
+        Self { tell: Some(tell), ..self }
     }
 
     fn wrong(&self, reason: impl Into<String>) -> NavigationError {
@@ -70,27 +84,47 @@ impl RemotePlant {
         let mut buffer = vec![0; DATAGRAM_MAX];
         let mut strays = Strays::default();
         let mut begin = Instant::now();
+        let asked = begin;
         while begin.elapsed() < self.timeout {
             let sent = Instant::now();
             // Where nobody listens yet the datagram is refused at once; the plant may still come.
-            let mut heard = self.socket.send(datagram.as_bytes()).is_ok();
-            while heard && sent.elapsed() < ASK_AGAIN && begin.elapsed() < self.timeout {
-                let Ok(length) = self.socket.recv(&mut buffer) else {
-                    heard = false;
-                    continue;
+            let mut failed = self.socket.send(datagram.as_bytes()).err();
+            while failed.is_none() && sent.elapsed() < ASK_AGAIN && begin.elapsed() < self.timeout {
+                let length = match self.socket.recv(&mut buffer) {
+                    Ok(length) => length,
+                    Err(error) => {
+                        failed = Some(error);
+                        continue;
+                    }
                 };
+                strays.refused = None;
                 match read_json(&buffer[..length]) {
                     None => strays.unreadable += 1,
                     // 30.0 is 30: some languages know one kind of number.
                     Some(reply) if reply["id"].as_f64() != Some(self.number as f64) => strays.note(&reply),
                     Some(reply) if reply["busy"] == true => begin = Instant::now(),
-                    Some(reply) => return Ok(reply),
+                    Some(reply) => {
+                        self.told &= asked.elapsed() > TOLD_AFTER;
+                        return Ok(reply);
+                    }
                 }
             }
+            // Silence is no error of the socket.
+            if let Some(error) = failed.filter(|e| !matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut)) {
+                strays.refused = Some(error);
+            }
+            self.tell_of_silence(begin.elapsed(), &strays);
             let left = self.timeout.saturating_sub(begin.elapsed());
             std::thread::sleep(ASK_AGAIN.saturating_sub(sent.elapsed()).min(left));
         }
         Err(format!("no answer within {} s{}", self.timeout.as_secs_f64(), strays.text()))
+    }
+
+    fn tell_of_silence(&mut self, silent: Duration, strays: &Strays) {
+        let Some(tell) = self.tell.filter(|_| !self.told && silent > TOLD_AFTER && silent < self.timeout) else { return };
+        self.told = true;
+        let (address, timeout_s) = (&self.address, self.timeout.as_secs_f64());
+        tell(&format!("plant {address}: no answer for {} s{}; it is asked for {timeout_s} s", silent.as_secs(), strays.text()));
     }
 
     fn answer(&self, reply: &Value) -> Result<Answer, NavigationError> {
@@ -98,11 +132,13 @@ impl RemotePlant {
             return Err(self.wrong(format!("it speaks version {version} of the protocol, this program version {VERSION}")));
         }
         if let Some(reason) = reply.get("error").filter(|v| !v.is_null()) {
-            return Err(self.wrong(reason.as_str().map_or_else(|| reason.to_string(), str::to_string)));
+            return Err(self.wrong(reason.as_str().map_or_else(|| reason.to_string(), printable)));
         }
         match &reply["ended"] {
             Value::Null | Value::Bool(false) => {}
-            Value::String(why) if !why.trim().is_empty() => return Ok(Answer::Ended(why.trim().chars().take(END_MAX).collect())),
+            Value::String(why) if !why.trim().is_empty() => {
+                return Ok(Answer::Ended(printable(&why.trim().chars().take(END_MAX).collect::<String>())));
+            }
             _ => return Ok(Answer::Ended("plant_lost".into())),
         }
         let measured = reply.get("state").and_then(twelve).ok_or_else(|| self.wrong("`state` must be twelve numbers"))?;
@@ -125,12 +161,15 @@ impl RemotePlant {
         let [x_m, y_m] = start.position_m;
         let [within_m, within_rad] = PLACED_WITHIN;
         let channels = [("x", measured[0], x_m, within_m), ("y", measured[1], y_m, within_m)];
-        let yaw = ("yaw", start.yaw_rad + wrap_angle(measured[5] - start.yaw_rad), start.yaw_rad, within_rad);
-        let off = channels.into_iter().chain([yaw]).find(|(_, is, asked, within)| (is - asked).abs() > *within);
+        let off = channels.into_iter().find(|(_, is, asked, within)| (is - asked).abs() > *within);
+        // As it came: a yaw of 90 is 90, and not the angle of a turn that it is taken for.
+        let turned = wrap_angle(measured[5] - start.yaw_rad).abs() > within_rad;
+        let off = off.or(turned.then_some(("yaw", measured[5], start.yaw_rad, within_rad)));
         off.map_or(Ok(()), |(channel, is, asked, within)| {
+            let doubt = if channel == "yaw" && is.abs() > TAU { " (degrees?)" } else { "" };
             Err(self.wrong(format!(
-                "after `reset` {channel} reads {is:.3} where {asked:.3} was asked for (within {within}): `state` begins with x, y, z of the reference point in World, \
-                 in m, and roll, pitch, yaw in rad"
+                "after `reset` {channel} reads {is:.3}{doubt} where {asked:.3} was asked for (within {within}): `state` begins with x, y, z of the reference point in \
+                 World, in m, and roll, pitch, yaw in rad"
             )))
         })
     }
@@ -139,7 +178,7 @@ impl RemotePlant {
     fn note_name(&mut self, reply: &Value) -> Result<(), NavigationError> {
         let Some(name) = reply["plant"].as_str() else { return Ok(()) };
         if let Some(before) = self.name.as_deref().filter(|before| *before != name) {
-            return Err(self.wrong(format!("it calls itself `{name}` and was `{before}` before")));
+            return Err(self.wrong(format!("it calls itself `{}` and was `{}` before", printable(name), printable(before))));
         }
         self.name = Some(name.into());
         Ok(())
@@ -167,7 +206,7 @@ impl PlantLink for RemotePlant {
         let request = json!({ "type": "step", "speed_m_s": command.speed_m_s, "second": command.second });
         let reply = self.ask(request).map_err(|reason| self.lost(reason))?;
         match reply["error"].as_str() {
-            Some(reason) if reason.contains(RESET_FIRST) => Err(self.lost(reason)),
+            Some(reason) if reason.contains(RESET_FIRST) => Err(self.lost(printable(reason))),
             _ => self.answer(&reply),
         }
     }
@@ -179,9 +218,17 @@ impl PlantLink for RemotePlant {
     }
 }
 
-/// Datagrams from the plant's address that answered nothing.
+/// A text of a plant on one line, with its control characters as they are written in programs.
+fn printable(text: &str) -> String {
+    let escaped = |c: char| if c.is_control() { c.escape_default().to_string() } else { c.to_string() };
+    text.chars().map(escaped).collect()
+}
+
+/// What came from the plant's address and answered nothing.
 #[derive(Default)]
 struct Strays {
+    /// The last error of the socket, where nothing came since.
+    refused: Option<std::io::Error>,
     others: usize,
     last: String,
     unreadable: usize,
@@ -195,6 +242,11 @@ impl Strays {
 
     fn text(&self) -> String {
         let mut text = String::new();
+        if let Some(refused) = &self.refused {
+            text += &format!("; the last error was: {refused}");
+        } else if self.others + self.unreadable == 0 {
+            text += "; nothing came from the address and port that are asked";
+        }
         if self.others > 0 {
             text += &format!("; {} answers came with other ids, the last was {}", self.others, self.last);
         }

@@ -1,5 +1,8 @@
 //! JSON (`nesam.navigate/1`) and HTML of closed-loop runs.
 
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
 use nesam_evaluation::report::{LinePlot, Page, Series, Table};
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value, json};
@@ -42,19 +45,21 @@ impl SoilKind {
 
 /// The configuration that others are compared with.
 const BASE: &str = "fixed";
+/// Ends of laps that are told of a configuration.
+const ENDS_MAX: usize = 5;
 /// Quantities that are compared: distances over the part that each drove, angles over the part that both drove.
-const COMPARED: [(&str, fn(&Lap, f64) -> f64); 4] = [
+const COMPARED: [(&str, fn(&Lap, f64) -> Option<f64>); 4] = [
     ("hausdorff_m", |lap, _| lap.hausdorff_m),
     ("off_path_m", |lap, _| lap.off_path_mean_m),
     ("roll_deg", roll_deg),
     ("pitch_deg", pitch_deg),
 ];
 
-fn roll_deg(lap: &Lap, progress: f64) -> f64 {
+fn roll_deg(lap: &Lap, progress: f64) -> Option<f64> {
     lap.mean_lean_until(progress, |lean| lean.roll_deg)
 }
 
-fn pitch_deg(lap: &Lap, progress: f64) -> f64 {
+fn pitch_deg(lap: &Lap, progress: f64) -> Option<f64> {
     lap.mean_lean_until(progress, |lean| lean.pitch_deg)
 }
 
@@ -65,13 +70,15 @@ pub struct NavigationReport {
     pub runs: Vec<Run>,
     /// Settings of planner and scenario, for the JSON.
     pub settings: Value,
+    /// Folder with a file for each lap: its path, and how the vehicle leant on it.
+    pub folder: PathBuf,
     /// What the numbers were made from: name and value, for JSON and footer.
     pub provenance: Vec<(String, String)>,
 }
 
 impl NavigationReport {
-    /// The JSON of the contract, extended by intervals, kinds of soil and comparisons with `fixed`. `hausdorff_m` is over the part of the path that a lap drove,
-    /// `hausdorff_whole_path_m` over all of it.
+    /// The JSON of the contract, extended by intervals, kinds of soil and comparisons with `fixed`. `runs` are the laps of each configuration (the most that one
+    /// has, where the command ended early), `laps` all of them. `hausdorff_m` is over the part of the path that a lap drove, `hausdorff_whole_path_m` over all of it.
     pub fn to_json(&self) -> Value {
         let configurations: Map<String, Value> = configuration_names(&self.runs)
             .iter()
@@ -89,15 +96,18 @@ impl NavigationReport {
         let provenance: Map<String, Value> = self.provenance.iter().map(|(name, value)| (name.clone(), json!(value))).collect();
         let each = self.runs.iter().map(|run| {
             let mut value = json!(run);
-            // Step by step they are in the files of the runs; the HTML draws the paths.
+            // Step by step they are in the file of the lap; the HTML draws the paths.
             if let Some(lap) = value["lap"].as_object_mut() {
                 lap.retain(|key, _| key != "path" && key != "lean");
             }
+            value["file"] = json!(self.folder.join(run.file_name()));
             value
         });
+        let of = |name: &String| self.runs.iter().filter(|run| run.configuration == *name).count();
         json!({
             "schema": "nesam.navigate/1",
-            "runs": self.runs.len(),
+            "runs": configuration_names(&self.runs).iter().map(of).max().unwrap_or(0),
+            "laps": self.runs.len(),
             "configurations": configurations,
             "settings": self.settings,
             "provenance": provenance,
@@ -146,6 +156,22 @@ impl NavigationReport {
             }
         }
         rows
+    }
+
+    /// Why laps were not completed: a line for each configuration with such laps.
+    pub fn ends(&self) -> Vec<String> {
+        let of = |name: &String| {
+            let incomplete: Vec<&Lap> =
+                self.runs.iter().filter(|run| run.configuration == *name && !run.lap.completed).map(|run| &run.lap).collect();
+            (!incomplete.is_empty()).then(|| format!("{name}: {}", ends_text(&incomplete)))
+        };
+        configuration_names(&self.runs).iter().filter_map(of).collect()
+    }
+
+    /// Configurations of which every lap is lost: that is no way to drive, but a simulation that diverges or readings that are none.
+    pub fn lost(&self) -> Vec<String> {
+        let all_lost = |name: &String| self.runs.iter().filter(|run| run.configuration == *name).all(|run| run.lap.end == "plant_lost");
+        configuration_names(&self.runs).into_iter().filter(all_lost).collect()
     }
 
     /// Heads of the columns of [`NavigationReport::rows`].
@@ -204,7 +230,10 @@ impl NavigationReport {
         plot.equal_aspect = true;
         plot.series.push(Series::line("path to follow", 0, reference.to_vec()));
         for run in self.runs.iter().filter(|r| r.configuration == name && r.world == world) {
-            let points = run.lap.path.iter().map(|[x, y]| (*x, *y)).collect();
+            // Every second position is enough to see, and the last.
+            let path = &run.lap.path;
+            let last = path.last().filter(|_| path.len().is_multiple_of(2));
+            let points = path.iter().step_by(2).chain(last).map(|[x, y]| (*x, *y)).collect();
             let label = format!("start {}, seed {}: {}", run.start, run.seed, run.lap.end);
             plot.series.push(Series::line(&label, 1 + (run.seed as usize + 3 * run.start) % 6, points));
         }
@@ -216,6 +245,7 @@ fn of_summary(s: &Summary) -> Value {
     let figures = |f: &Figures| json!({ "mean": finite(f.mean), "sd": finite(f.sd), "ci95": f.ci95 });
     json!({
         "runs": s.runs,
+        "never_began": s.never_began,
         "places": s.places,
         "completion": s.completion,
         "completion_ci95": s.completion_ci95,
@@ -233,8 +263,34 @@ fn finite(value: f64) -> Option<f64> {
     Some(value).filter(|v| v.is_finite())
 }
 
+/// The deviation of one lap is none.
 fn mean_sd(f: &Figures, digits: usize) -> String {
-    if f.mean.is_finite() { format!("{:.digits$} ± {:.digits$}", f.mean, f.sd) } else { "–".into() }
+    match [f.mean, f.sd].map(finite) {
+        [None, _] => "–".into(),
+        [Some(mean), None] => format!("{mean:.digits$} ± –"),
+        [Some(mean), Some(sd)] => format!("{mean:.digits$} ± {sd:.digits$}"),
+    }
+}
+
+/// How laps ended, the most frequent first, with their times since the beginning of the lap.
+fn ends_text(laps: &[&Lap]) -> String {
+    let mut ends: BTreeMap<&str, Vec<&Lap>> = BTreeMap::new();
+    laps.iter().for_each(|lap| ends.entry(&lap.end).or_default().push(lap));
+    let mut ends: Vec<_> = ends.into_iter().collect();
+    ends.sort_by_key(|(_, laps)| std::cmp::Reverse(laps.len()));
+    let others: usize = ends.iter().skip(ENDS_MAX).map(|(_, laps)| laps.len()).sum();
+    let told = ends.iter().take(ENDS_MAX).map(|(end, laps)| format!("{end} {} ({})", laps.len(), when(laps)));
+    told.chain((others > 0).then(|| format!("other ends {others}"))).collect::<Vec<_>>().join(", ")
+}
+
+fn when(laps: &[&Lap]) -> String {
+    if laps.iter().any(|lap| !lap.is_begun()) {
+        let begun = laps.iter().filter(|lap| lap.is_begun()).count();
+        return if begun == 0 { "before the lap began".into() } else { format!("{} before the lap began", laps.len() - begun) };
+    }
+    let times_s = laps.iter().map(|lap| lap.time_s);
+    let [first, last] = [times_s.clone().fold(f64::INFINITY, f64::min), times_s.fold(0.0, f64::max)].map(|s| format!("{s:.1}"));
+    if first == last { format!("at {first} s") } else { format!("at {first} to {last} s") }
 }
 
 fn with_interval(f: &Figures, digits: usize) -> String {
@@ -250,14 +306,62 @@ fn ratio_text(r: &Ratio) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::score::tests::run;
+    use crate::score::tests::{never_begun, run};
+
+    fn report(runs: Vec<Run>) -> NavigationReport {
+        NavigationReport { runs, settings: json!({}), folder: "laps".into(), provenance: Vec::new() }
+    }
+
+    /// Goal: who reads the table learns why laps were not completed. Method: laps that end in several ways, and none that is complete but one.
+    #[test]
+    fn regress_why_laps_were_not_completed_is_told() {
+        let ended = |configuration: &str, seed: u64, end: &str, time_s: f64| {
+            let mut run = run(configuration, "a", 0, seed, 1.0, end == "complete");
+            (run.lap.end, run.lap.time_s) = (end.into(), time_s);
+            run
+        };
+        let mut runs = vec![ended("kinematic", 1, "complete", 50.0), never_begun(run("fixed", "a", 0, 1, 1.0, false))];
+        runs.extend([3.4, 3.42].map(|time_s| ended("fixed", 2, "off_path", time_s)));
+        runs.extend([("plant_lost", 2.0), ("plant_lost", 12.04)].map(|(end, time_s)| ended("adapted", 3, end, time_s)));
+        let told = report(runs.clone());
+        assert_eq!(
+            told.ends(),
+            ["fixed: off_path 2 (at 3.4 s), spawn blocked 1 (before the lap began)", "adapted: plant_lost 2 (at 2.0 to 12.0 s)"]
+        );
+        assert_eq!(told.lost(), ["adapted"]);
+        runs.extend((0..6).map(|i| ended("oracle", i, &format!("ditch {i}"), 1.0)));
+        let told = report(runs).ends();
+        assert!(told[2].starts_with("oracle: ditch 0 1 (at 1.0 s), ") && told[2].ends_with(", other ends 1"), "{told:?}");
+    }
+
+    /// Goal: what was never driven is null in the JSON, a dash in the table and an empty line in the page. Method: one lap alone, which was blocked; then one that
+    /// was driven, which has no deviation.
+    #[test]
+    fn regress_figures_without_laps_are_none() {
+        let blocked = report(vec![never_begun(run("fixed", "a", 0, 1, 2.0, true))]);
+        let value = blocked.to_json();
+        for key in ["hausdorff_m", "hausdorff_whole_path_m", "off_path_mean_m", "roll_deg", "pitch_deg"] {
+            assert!(value["each"][0]["lap"][key].is_null(), "{key}");
+        }
+        let of = &value["configurations"]["fixed"];
+        assert!(of["roll_deg"]["mean"].is_null() && of["completion"] == 0.0 && of["never_began"] == 1, "{of}");
+        assert!(blocked.rows()[0][4..].iter().all(|cell| cell == "–"), "{:?}", blocked.rows());
+        assert!(blocked.page().render().contains("spawn blocked"));
+        let one = report(vec![run("fixed", "a", 0, 1, 2.0, true)]);
+        let of = &one.to_json()["configurations"]["fixed"]["hausdorff_m"];
+        assert!(of["mean"] == 2.0 && of["sd"].is_null(), "{of}");
+        assert_eq!(one.rows()[0][5], "2.00 ± –");
+    }
 
     #[test]
     fn property_json_keeps_the_contract() {
         let runs = vec![run("fixed", "a", 0, 1, 2.0, false), run("adapted", "a", 0, 1, 1.0, true)];
-        let report = NavigationReport { runs, settings: json!({}), provenance: vec![("command".into(), "nesam navigate".into())] };
+        let provenance = vec![("command".into(), "nesam navigate".into())];
+        let report = NavigationReport { provenance, ..report(runs) };
         let value = report.to_json();
         assert_eq!(value["schema"], "nesam.navigate/1");
+        assert_eq!((&value["runs"], &value["laps"]), (&json!(1), &json!(2)), "laps of each configuration, and all");
+        assert_eq!(value["each"][1]["file"], "laps/adapted-a-start0-seed1.json");
         for name in ["fixed", "adapted"] {
             let of = &value["configurations"][name];
             assert!(of["completion"].is_number());
@@ -287,7 +391,7 @@ mod tests {
     fn property_no_mean_where_a_lap_does_not_tell_it() {
         let mut runs = vec![run("fixed", "a", 0, 1, 2.0, true), run("fixed", "a", 0, 2, 2.0, true)];
         runs[1].lap.hausdorff_whole_path_m = None;
-        let value = NavigationReport { runs, settings: json!({}), provenance: Vec::new() }.to_json();
+        let value = report(runs).to_json();
         let fixed = &value["configurations"]["fixed"];
         assert!(fixed["hausdorff_whole_path_m"]["mean"].is_null() && fixed["hausdorff_m"]["mean"] == 2.0, "{fixed}");
     }
@@ -297,7 +401,7 @@ mod tests {
     fn property_unknown_soil_is_a_kind_of_its_own() {
         let known = |soil: SoilKind, seed: u64| Run { soil, ..run("fixed", "a", 0, seed, 2.0, true) };
         let runs = vec![known(SoilKind::Nominal, 1), known(SoilKind::Unknown, 2)];
-        let value = NavigationReport { runs, settings: json!({}), provenance: Vec::new() }.to_json();
+        let value = report(runs).to_json();
         let kinds = &value["configurations"]["fixed"]["by_soil"];
         assert!(kinds["nominal"]["runs"] == 1 && kinds["unknown"]["runs"] == 1, "{kinds}");
         assert_eq!(value["each"][1]["soil"], "unknown");

@@ -29,10 +29,20 @@ pub struct Run {
 }
 
 impl Run {
+    /// The file that it is kept in.
+    pub fn file_name(&self) -> String {
+        lap_file_name(&self.configuration, &self.world, self.start, self.seed)
+    }
+
     /// Runs of one world and start share path and soil: they are one piece of evidence.
     fn place(&self) -> (String, usize) {
         (self.world.clone(), self.start)
     }
+}
+
+/// The file of a lap.
+pub fn lap_file_name(configuration: &str, world: &str, start: usize, seed: u64) -> String {
+    format!("{configuration}-{world}-start{start}-seed{seed}.json")
 }
 
 /// Mean, standard deviation over runs and 95 % interval of the mean (percentile bootstrap over places = world and start).
@@ -40,17 +50,19 @@ impl Run {
 pub struct Figures {
     /// Mean; NaN without runs.
     pub mean: f64,
-    /// Standard deviation over runs; NaN without runs.
+    /// Standard deviation over runs; NaN with fewer than two.
     pub sd: f64,
     /// Interval of the mean; `None` with fewer than two places.
     pub ci95: Option<[f64; 2]>,
 }
 
-/// Figures of one configuration on one kind of soil.
+/// Figures of one configuration on one kind of soil. A lap that ended before its first step counts as not completed and is in no mean.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Summary {
     /// Runs.
     pub runs: usize,
+    /// Those that ended before their first step.
+    pub never_began: usize,
     /// Places (world and start) that they come from.
     pub places: usize,
     /// Share of completed laps.
@@ -101,41 +113,45 @@ pub fn summarise(runs: &[Run], configuration: &str, soil: Option<SoilKind>) -> O
     }
     let completed: Vec<&Run> = chosen.iter().filter(|r| r.lap.completed).copied().collect();
     let completion = completed.len() as f64 / chosen.len() as f64;
-    let whole: &[&Run] = if chosen.iter().all(|r| r.lap.hausdorff_whole_path_m.is_some()) { &chosen } else { &[] };
+    let begun: Vec<&Run> = chosen.iter().filter(|r| r.lap.is_begun()).copied().collect();
+    let whole: &[&Run] = if begun.iter().all(|r| r.lap.hausdorff_whole_path_m.is_some()) { &begun } else { &[] };
     Some(Summary {
         runs: chosen.len(),
+        never_began: chosen.len() - begun.len(),
         places: places(&chosen).1,
         completion,
         completion_ci95: wilson(completion, chosen.len()),
-        time_s: figures(&completed, |lap| lap.time_s),
-        hausdorff_m: figures(&chosen, |lap| lap.hausdorff_m),
-        hausdorff_whole_path_m: figures(whole, |lap| lap.hausdorff_whole_path_m.unwrap_or(f64::NAN)),
-        off_path_m: figures(&chosen, |lap| lap.off_path_mean_m),
-        roll_deg: figures(&chosen, |lap| lap.roll_deg),
-        pitch_deg: figures(&chosen, |lap| lap.pitch_deg),
+        time_s: figures(&completed, |lap| Some(lap.time_s)),
+        hausdorff_m: figures(&begun, |lap| lap.hausdorff_m),
+        hausdorff_whole_path_m: figures(whole, |lap| lap.hausdorff_whole_path_m),
+        off_path_m: figures(&begun, |lap| lap.off_path_mean_m),
+        roll_deg: figures(&begun, |lap| lap.roll_deg),
+        pitch_deg: figures(&begun, |lap| lap.pitch_deg),
     })
 }
 
 /// Ratio of a quantity between two configurations, over runs of the same world, start and seed. `of` gives the quantity of a lap over its first part, up to the
-/// share of the lap that both came to.
-pub fn ratio(runs: &[Run], over: &str, under: &str, soil: Option<SoilKind>, of: fn(&Lap, f64) -> f64) -> Option<Ratio> {
+/// share of the lap that both came to; a pair of which one lap has none is left out.
+pub fn ratio(runs: &[Run], over: &str, under: &str, soil: Option<SoilKind>, of: fn(&Lap, f64) -> Option<f64>) -> Option<Ratio> {
     let same = |a: &Run, b: &Run| a.place() == b.place() && a.seed == b.seed;
     let is = |r: &Run, name: &str| r.configuration == name && soil.is_none_or(|soil| r.soil == soil);
-    let pairs: Vec<(&Run, &Run)> =
-        runs.iter().filter(|r| is(r, over)).filter_map(|a| runs.iter().find(|b| is(b, under) && same(a, b)).map(|b| (a, b))).collect();
-    let both = |(a, b): &(&Run, &Run)| {
+    let pair = |a: &Run, b: &Run| {
         let progress = a.lap.progress.min(b.lap.progress);
-        (of(&a.lap, progress), of(&b.lap, progress))
+        Some((of(&a.lap, progress)?, of(&b.lap, progress)?))
     };
-    let (above, below): (Vec<f64>, Vec<f64>) = pairs.iter().map(both).unzip();
+    let pairs = runs.iter().filter(|r| is(r, over)).filter_map(|a| {
+        let b = runs.iter().find(|b| is(b, under) && same(a, b))?;
+        pair(a, b).map(|values| (a, values))
+    });
+    let (firsts, values): (Vec<&Run>, Vec<(f64, f64)>) = pairs.unzip();
+    let (above, below): (Vec<f64>, Vec<f64>) = values.into_iter().unzip();
     let total: f64 = below.iter().sum();
-    if pairs.is_empty() || total <= 0.0 {
+    if total <= 0.0 {
         return None;
     }
-    let firsts: Vec<&Run> = pairs.iter().map(|(a, _)| *a).collect();
     let (cluster, count) = places(&firsts);
     let ci95 = Resamples::draw(count, DEFAULT_RESAMPLES, BOOTSTRAP_SEED).ratio_interval(&above, &below, &cluster);
-    Some(Ratio { ratio: above.iter().sum::<f64>() / total, ci95, pairs: pairs.len() })
+    Some(Ratio { ratio: above.iter().sum::<f64>() / total, ci95, pairs: firsts.len() })
 }
 
 /// The place of each run as an index, and how many there are.
@@ -152,13 +168,14 @@ fn places(runs: &[&Run]) -> (Vec<usize>, usize) {
     (index, known.len())
 }
 
-fn figures(runs: &[&Run], of: fn(&Lap) -> f64) -> Figures {
-    let values: Vec<f64> = runs.iter().map(|r| of(&r.lap)).collect();
+/// Figures of a quantity over the runs that have it.
+fn figures(runs: &[&Run], of: fn(&Lap) -> Option<f64>) -> Figures {
+    let (runs, values): (Vec<&Run>, Vec<f64>) = runs.iter().filter_map(|r| Some((*r, of(&r.lap)?))).unzip();
     let count = values.len() as f64;
     let mean = values.iter().sum::<f64>() / count;
-    let sd =
-        if values.is_empty() { f64::NAN } else { (values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (count - 1.0).max(1.0)).sqrt() };
-    let (cluster, places) = places(runs);
+    let squares: f64 = values.iter().map(|v| (v - mean).powi(2)).sum();
+    let sd = if values.len() < 2 { f64::NAN } else { (squares / (count - 1.0)).sqrt() };
+    let (cluster, places) = places(&runs);
     Figures { mean, sd, ci95: Resamples::draw(places, DEFAULT_RESAMPLES, BOOTSTRAP_SEED).mean_interval(&values, &cluster) }
 }
 
@@ -182,17 +199,19 @@ pub(crate) mod tests {
             end: if completed { "complete" } else { "off_path" }.into(),
             time_s: 50.0,
             progress: 1.0,
-            hausdorff_m,
+            hausdorff_m: Some(hausdorff_m),
             hausdorff_whole_path_m: Some(10.0 * hausdorff_m),
-            off_path_mean_m: 0.3 * hausdorff_m,
-            roll_deg: 2.0,
-            pitch_deg: 3.0,
+            off_path_mean_m: Some(0.3 * hausdorff_m),
+            roll_deg: Some(2.0),
+            pitch_deg: Some(3.0),
             measurements: Default::default(),
             soil_delta: None,
             scored: Scored::Truth,
             velocity_mismatch_m_s: None,
+            moved_over_told: None,
+            turn_correlation: None,
             path: vec![[23.5, 0.0], [23.0, 2.0]],
-            lean: Vec::new(),
+            lean: vec![Lean { progress: 1.0, roll_deg: 2.0, pitch_deg: 3.0 }],
         };
         Run { configuration: configuration.into(), world: world.into(), soil: SoilKind::Soft, start, seed, lap }
     }
@@ -226,8 +245,47 @@ pub(crate) mod tests {
         };
         let runs = vec![lap("fixed", 5), lap("adapted", 10)];
         let roll = |lap: &Lap, progress: f64| lap.mean_lean_until(progress, |lean| lean.roll_deg);
-        assert!((roll(&runs[1].lap, 1.0) - 5.0).abs() < 1e-12);
+        assert!((roll(&runs[1].lap, 1.0).unwrap() - 5.0).abs() < 1e-12);
         assert!((ratio(&runs, "adapted", "fixed", None, roll).unwrap().ratio - 1.0).abs() < 1e-12);
+    }
+
+    /// A lap that a plant ended at its `reset`.
+    pub(crate) fn never_begun(run: Run) -> Run {
+        let lap = Lap { completed: false, end: "spawn blocked".into(), time_s: 0.0, progress: 0.0, lean: Vec::new(), ..run.lap };
+        Run { lap: lap.without_inventions(), ..run }
+    }
+
+    /// Goal: a lap that never began says nothing of how a model drives. Method: two pairs, in one of which a lap was blocked: means and ratios are those of the
+    /// laps that were driven, intervals have one place alone, and the lap counts as not completed.
+    #[test]
+    fn regress_a_lap_that_never_began_is_in_no_mean_and_no_ratio() {
+        let roll: fn(&Lap, f64) -> Option<f64> = |lap, progress| lap.mean_lean_until(progress, |lean| lean.roll_deg);
+        let runs = vec![
+            run("fixed", "a", 0, 1, 2.0, true),
+            run("fixed", "b", 0, 1, 4.0, true),
+            run("adapted", "a", 0, 1, 1.0, true),
+            never_begun(run("adapted", "b", 0, 1, 1.0, true)),
+        ];
+        let adapted = summarise(&runs, "adapted", None).unwrap();
+        assert_eq!((adapted.runs, adapted.never_began, adapted.completion), (2, 1, 0.5));
+        for (figures, mean) in [
+            (adapted.hausdorff_m, 1.0),
+            (adapted.hausdorff_whole_path_m, 10.0),
+            (adapted.off_path_m, 0.3),
+            (adapted.roll_deg, 2.0),
+            (adapted.pitch_deg, 3.0),
+        ] {
+            assert!(figures.mean == mean && figures.sd.is_nan() && figures.ci95.is_none(), "{figures:?}");
+        }
+        for of in [roll, |lap, _| lap.hausdorff_m] {
+            let over = ratio(&runs, "adapted", "fixed", None, of).unwrap();
+            assert!(over.pairs == 1 && over.ci95.is_none(), "{over:?}");
+        }
+        assert_eq!(ratio(&runs, "adapted", "fixed", None, roll).unwrap().ratio, 1.0);
+        assert!(
+            ratio(&runs[1..2], "fixed", "adapted", None, roll).is_none() && ratio(&runs[1..], "adapted", "adapted", None, roll).is_some()
+        );
+        assert!(ratio(&runs[3..], "adapted", "adapted", None, roll).is_none());
     }
 
     /// Wilson (1927), as tabulated for 0 of 10: 0 to 0.2775; for 5 of 10: 0.2366 to 0.7634.

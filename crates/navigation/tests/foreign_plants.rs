@@ -7,11 +7,11 @@ mod bicycle;
 mod common;
 
 use std::net::UdpSocket;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use bicycle::bicycle;
+use bicycle::{Habits, RIGHT, bicycle, bicycle_with};
 use common::lap_on;
 use nesam_navigation::{Answer, Lap, NavigationError, PlantLink, RemotePlant, Scored, Start};
 use nesam_physics::Control;
@@ -85,8 +85,11 @@ fn held(address: &str, from: usize, end: &str) {
     let lap = lap_on(&mut connect(address), "w05", 1).unwrap();
     let text = serde_json::to_string(&lap).unwrap();
     assert!(serde_json::from_str::<Lap>(&text).is_ok() && !lap.completed && lap.end == end, "{from} {end}: {text}");
-    assert!(lap.hausdorff_m < 5.0 && lap.roll_deg == 0.0 && lap.pitch_deg == 0.0, "{from} {end}: {text}");
     assert_eq!(lap.time_s > 0.0, from == FAILS_AT, "{text}");
+    // A lap that never began has no figures.
+    let figures = [lap.roll_deg, lap.pitch_deg, lap.hausdorff_m.map(|m| if m < 5.0 { 0.0 } else { m })];
+    assert_eq!(figures, [(from == FAILS_AT).then_some(0.0); 3], "{from} {end}: {text}");
+    assert_eq!(lap.path.len(), if from == FAILS_AT { lap.lean.len() + 1 } else { 0 }, "every position: {text}");
 }
 
 /// Goal: a fault of the simulator itself ends the command, with its words; a plant that was started anew can drive the lap again. Method: both at one step.
@@ -109,6 +112,8 @@ fn service_answers_of_another_form_are_refused() {
         (r#"{"state": [0,0,0]}"#, "`state`"),
         (r#"{"state": [23.5,-0.9,0.6,0,0,1.57,0,0,0,0,0,0]}"#, "y reads -0.900 where -2.250"),
         (r#"{"state": [23.5,-2.25,0.6,0,0,0.1,0,0,0,0,0,0]}"#, "yaw reads 0.100 where 1.570"),
+        (r#"{"state": [23.5,-2.25,0.6,0,0,90.1,0,0,0,0,0,0]}"#, "yaw reads 90.100 (degrees?) where 1.570"),
+        (r#"{"error": "solver\nexploded"}"#, r"solver\nexploded"),
     ] {
         let address = spoilt(0, part);
         let error = connect(&address).reset(&start()).unwrap_err().to_string();
@@ -171,6 +176,34 @@ fn service_a_plant_that_never_answers_is_given_up_in_time() {
     assert!(matches!(lost, NavigationError::Lost { .. }), "a step without an answer can be driven again: {lost}");
 }
 
+/// What was told of plants that are silent.
+static TOLD: Mutex<Vec<String>> = Mutex::new(Vec::new());
+
+/// Goal: who waits for a plant that is not there learns of it before the timeout, and why. Method: a port where nobody listens, for longer than the five seconds
+/// after which that is told; then one whose answers come from another port.
+#[test]
+fn regress_a_plant_that_is_not_there_is_told_of() {
+    let free = UdpSocket::bind("127.0.0.1:0").unwrap().local_addr().unwrap().to_string();
+    let plant = RemotePlant::connect(&free, 0, Duration::from_secs(7)).unwrap();
+    let error = plant.telling(|text| TOLD.lock().unwrap().push(text.into())).reset(&start()).unwrap_err().to_string();
+    assert!(error.contains("no answer within 7 s; the last error was: ") && error.to_lowercase().contains("refused"), "{error}");
+    let told = TOLD.lock().unwrap().clone();
+    assert!(told.len() == 1 && told[0].contains("for 5 s") && told[0].to_lowercase().contains("refused"), "{told:?}");
+    assert!(told[0].contains(&free) && told[0].contains("it is asked for 7 s"), "{told:?}");
+    let asked = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let address = asked.local_addr().unwrap().to_string();
+    std::thread::spawn(move || {
+        let (mut buffer, answering) = ([0; 2048], UdpSocket::bind("127.0.0.1:0").unwrap());
+        while let Ok((length, from)) = asked.recv_from(&mut buffer) {
+            let request: Value = serde_json::from_slice(&buffer[..length]).unwrap();
+            let reading = json!({ "id": request["id"], "state": [23.5, -2.25, 0.6, 0, 0, 1.57, 0, 0, 0, 0, 0, 0] });
+            answering.send_to(reading.to_string().as_bytes(), from).unwrap();
+        }
+    });
+    let error = RemotePlant::connect(&address, 0, Duration::from_secs(1)).unwrap().reset(&start()).unwrap_err().to_string();
+    assert!(error.contains("nothing came from the address and port that are asked"), "{error}");
+}
+
 /// Goal: a plant that says that it is still computing is waited for. Method: it says so for three times the timeout.
 #[test]
 fn service_a_busy_plant_is_waited_for() {
@@ -226,7 +259,25 @@ fn service_velocities_in_world_are_seen() {
         vec![reply.to_string()]
     });
     let wrong = lap_on(&mut connect(&in_world), "w05", 1).unwrap();
+    assert_eq!(wrong.moved_over_told, None, "no factor turns a frame");
     assert!(wrong.scored == Scored::Truth && wrong.velocity_mismatch_m_s.is_some_and(|m_s| m_s > 0.5), "{:?}", wrong.velocity_mismatch_m_s);
     let right = lap_on(&mut connect(&spoilt(0, "{}")), "w05", 1).unwrap();
+    assert!(right.turn_correlation.is_some_and(|correlation| correlation > 0.5), "{:?}", right.turn_correlation);
     assert!(right.scored == Scored::State && right.velocity_mismatch_m_s.is_some_and(|m_s| m_s < 0.1), "{:?}", right.velocity_mismatch_m_s);
+}
+
+/// Goal: what a plant makes of time and of the sign of a command is seen in a lap. Method: steps of half and of twice their time, and steering to the other side.
+#[test]
+fn regress_steps_of_another_time_and_reversed_steering_are_seen() {
+    let lap = |habits: Habits| lap_on(&mut connect(&bicycle_with(habits, |_, _, reply| vec![reply.to_string()])), "w05", 1).unwrap();
+    for step_s in [0.05, 0.2] {
+        let factor = lap(Habits { step_s, ..RIGHT }).moved_over_told;
+        assert!(factor.is_some_and(|factor| (factor * 0.1 / step_s - 1.0).abs() < 0.02), "{step_s}: {factor:?}");
+    }
+    let reversed = lap(Habits { left: -1.0, ..RIGHT });
+    assert!(
+        reversed.end == "off_path" && reversed.turn_correlation.is_some_and(|correlation| correlation < -0.8),
+        "{:?}",
+        reversed.turn_correlation
+    );
 }

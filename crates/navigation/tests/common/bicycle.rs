@@ -23,16 +23,17 @@ impl Bicycle {
         *self = Self { x_m, y_m, yaw_rad, ..Self::default() };
     }
 
-    fn step(&mut self, request: &Value) {
+    fn step(&mut self, request: &Value, habits: Habits) {
         let [wanted_m_s, steering] = ["speed_m_s", "second"].map(|key| request[key].as_f64().unwrap());
+        let part_s = habits.step_s / 10.0;
         for _ in 0..10 {
-            self.speed_m_s += 0.02 * (wanted_m_s - self.speed_m_s);
-            self.rate_rad_s = self.speed_m_s * (0.37 * steering).tan() / 3.3;
+            self.speed_m_s += 2.0 * part_s * (wanted_m_s - self.speed_m_s);
+            self.rate_rad_s = self.speed_m_s * (0.37 * habits.left * steering).tan() / 3.3;
             let (sin, cos) = self.yaw_rad.sin_cos();
             let left_m_s = REFERENCE_M * self.rate_rad_s;
-            self.x_m += 0.01 * (self.speed_m_s * cos - left_m_s * sin);
-            self.y_m += 0.01 * (self.speed_m_s * sin + left_m_s * cos);
-            self.yaw_rad += 0.01 * self.rate_rad_s;
+            self.x_m += part_s * (self.speed_m_s * cos - left_m_s * sin);
+            self.y_m += part_s * (self.speed_m_s * sin + left_m_s * cos);
+            self.yaw_rad += part_s * self.rate_rad_s;
         }
     }
 
@@ -42,8 +43,25 @@ impl Bicycle {
     }
 }
 
+/// What a plant makes of the protocol.
+#[derive(Clone, Copy)]
+pub struct Habits {
+    /// Time of a step, s.
+    pub step_s: f64,
+    /// 1 where a positive command is to the left, -1 where it is to the right.
+    pub left: f64,
+}
+
+/// What it asks for.
+pub const RIGHT: Habits = Habits { step_s: 0.1, left: 1.0 };
+
 /// Starts a plant and gives its address. What it sends is what `answer` makes of a request, the number of steps since the last `reset`, and the right reply.
-pub fn bicycle(mut answer: impl FnMut(&Value, usize, Value) -> Vec<String> + Send + 'static) -> String {
+pub fn bicycle(answer: impl FnMut(&Value, usize, Value) -> Vec<String> + Send + 'static) -> String {
+    bicycle_with(RIGHT, answer)
+}
+
+/// The same, with habits of its own.
+pub fn bicycle_with(habits: Habits, mut answer: impl FnMut(&Value, usize, Value) -> Vec<String> + Send + 'static) -> String {
     let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
     let address = socket.local_addr().unwrap().to_string();
     std::thread::spawn(move || {
@@ -57,7 +75,7 @@ pub fn bicycle(mut answer: impl FnMut(&Value, usize, Value) -> Vec<String> + Sen
                     vehicle.reset(&request);
                     steps = 0;
                 } else {
-                    vehicle.step(&request);
+                    vehicle.step(&request, habits);
                     steps += 1;
                 }
                 answers = answer(&request, steps, json!({ "nesam_plant": 1, "id": request["id"], "state": vehicle.state() }));

@@ -3,7 +3,8 @@
 use std::collections::HashMap;
 use std::path::PathBuf;
 
-use nesam_navigation::{KeptLap, Run, Scored};
+use nesam_navigation::{KeptLap, Lap, Run, Scored};
+use nesam_physics::DT_S;
 use serde_json::{Value, json};
 use tokio::runtime::Runtime;
 
@@ -15,6 +16,11 @@ use crate::progress::Progress;
 
 /// Measured positions and velocities that differ by more are not those of one point in one frame, m/s: noise of a few centimetres makes a tenth of it.
 const VELOCITY_MISMATCH_MAX_M_S: f64 = 0.5;
+
+/// Positions that move more than this share further or less far than velocities say are those of a step that takes another time.
+const STEP_OFF_MAX: f64 = 0.05;
+/// A vehicle whose yaw rate correlates with the command by less turns the other way.
+const TURN_CORRELATION_MIN: f64 = -0.5;
 
 /// Which plant laps are driven on.
 #[derive(Clone, Debug, PartialEq)]
@@ -93,7 +99,7 @@ impl Kept {
 /// Drives the laps that are not in files yet. Gives the laps there are, in the order of the tasks, and why there are no more where one failed.
 pub fn drive_all(stage: &mut Stage<'_>, runtime: &Runtime, tasks: &[Task], kept: &Kept) -> (Vec<Run>, Result<(), Failure>) {
     let progress = Progress::start("laps", tasks.len());
-    let mut notes = Notes { of_another: kept.plant != Identity::BuiltIn, no_truth: false, velocity: false };
+    let mut notes = Notes { of_another: kept.plant != Identity::BuiltIn, no_truth: false, velocity: false, turning: false };
     let (mut runs, mut taken, mut ended) = (Vec::new(), 0, Ok(()));
     for task in tasks {
         let run = match kept.earlier(task) {
@@ -129,6 +135,7 @@ struct Notes {
     of_another: bool,
     no_truth: bool,
     velocity: bool,
+    turning: bool,
 }
 
 impl Notes {
@@ -140,13 +147,29 @@ impl Notes {
             self.no_truth = true;
             note!("note: the plant tells no `truth`: laps are scored by `state`, with its noise");
         }
-        let mismatch_m_s = run.lap.velocity_mismatch_m_s.filter(|m_s| *m_s > VELOCITY_MISMATCH_MAX_M_S && !self.velocity);
-        if let Some(mismatch_m_s) = mismatch_m_s {
+        if let Some(doubt) = doubt_of_velocities(&run.lap).filter(|_| !self.velocity) {
             self.velocity = true;
+            note!("warning: {}: {doubt}", task.file_name());
+        }
+        if run.lap.turn_correlation.is_some_and(|correlation| correlation < TURN_CORRELATION_MIN) && !self.turning {
+            self.turning = true;
             note!(
-                "warning: {}: positions and velocities of `state` differ by {mismatch_m_s:.2} m/s (rms): are velocities in Body, and those of the reference point?",
+                "warning: {}: the vehicle turns right where it is told to turn left: a positive `second` is to the left, and so is a positive yaw rate",
                 task.file_name()
             );
         }
     }
+}
+
+/// What positions and velocities that do not fit each other say.
+fn doubt_of_velocities(lap: &Lap) -> Option<String> {
+    let mismatch_m_s = lap.velocity_mismatch_m_s?;
+    if let Some(factor) = lap.moved_over_told.filter(|factor| (factor - 1.0).abs() > STEP_OFF_MAX) {
+        return Some(format!(
+            "positions of `state` move {factor:.2} times as far as its velocities say: does a step take {DT_S} s, and are velocities in m/s?"
+        ));
+    }
+    (mismatch_m_s > VELOCITY_MISMATCH_MAX_M_S).then(|| {
+        format!("positions and velocities of `state` differ by {mismatch_m_s:.2} m/s (rms): are velocities in Body, and those of the reference point?")
+    })
 }

@@ -9,7 +9,9 @@ use std::path::{Path, PathBuf};
 use clap::{Args, ValueEnum};
 use nesam_model::ModelBundle;
 use nesam_model::bundle::sha256_hex;
-use nesam_navigation::{CautionSettings, MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, Stretch, TrackingCost};
+use nesam_navigation::{
+    CautionSettings, MppiSettings, NavigationReport, ReferencePath, Run, SoilKind, Stretch, TrackingCost, lap_file_name,
+};
 use nesam_physics::{SecondCommand, Vehicle, driveline::road_wheel_angles};
 use nesam_plant::HiddenEffects;
 use nesam_terrain::WorldMap;
@@ -158,7 +160,7 @@ pub struct Task {
 
 impl Task {
     fn file_name(&self) -> String {
-        format!("{}-{}-start{}-seed{}.json", self.configuration.as_str(), self.world, self.start, self.seed)
+        lap_file_name(self.configuration.as_str(), &self.world, self.start, self.seed)
     }
 
     fn is_of(&self, run: &Run) -> bool {
@@ -206,14 +208,14 @@ pub fn run(args: &NavigateArgs) -> Result<(), Failure> {
     let plant = stage.identity(&tasks[0])?;
     provenance.push(("plant".to_string(), plant_text(args, &plant)));
     of_worlds.values_mut().chain([&mut settings]).for_each(|settings| settings["plant"] = plant.in_settings());
-    let kept = Kept { out, settings: of_worlds, plant, resume: args.resume };
+    let kept = Kept { out: out.clone(), settings: of_worlds, plant, resume: args.resume };
     let (runs, ended) = drive_all(&mut stage, &runtime, &tasks, &kept);
     if ended.is_ok() {
         runtime.block_on(stage.stop());
     } else {
         provenance.push(("ended early".to_string(), format!("{} of {} laps", runs.len(), tasks.len())));
     }
-    let reported = if runs.is_empty() { Ok(()) } else { report(args, NavigationReport { runs, settings, provenance }) };
+    let reported = if runs.is_empty() { Ok(()) } else { report(args, NavigationReport { runs, settings, folder: out, provenance }) };
     ended.and(reported)
 }
 
@@ -236,6 +238,13 @@ fn check(args: &NavigateArgs) -> Result<(), Failure> {
     if args.horizon == 0 || args.horizon > HORIZON_MAX || args.plan_every > args.horizon {
         return Err(Failure::input(format!("--horizon {} is not 1 to {HORIZON_MAX}, or shorter than --plan-every", args.horizon)));
     }
+    // A lap that counts twice is no more evidence than once.
+    let twice = |option: &str, names: &[String]| {
+        let name = names.iter().enumerate().find(|(i, name)| names[..*i].contains(name)).map(|(_, name)| name);
+        name.map_or(Ok(()), |name| Err(Failure::input(format!("{option} has `{name}` twice; give each once"))))
+    };
+    twice("--worlds", args.worlds.as_deref().unwrap_or_default())?;
+    twice("--configurations", &args.configurations.iter().flatten().map(|c| c.as_str().to_string()).collect::<Vec<_>>())?;
     if args.plant_timeout == Some(0) {
         return Err(Failure::input("--plant-timeout 0 leaves no time to answer; give a second or more"));
     }
@@ -282,7 +291,9 @@ fn configurations(
             && chosen.contains(&configuration)
         {
             if args.configurations.is_some() {
-                return Err(failure);
+                let others: Vec<_> = chosen.iter().filter(|c| **c != configuration).map(|c| c.as_str()).collect();
+                let without = if others.is_empty() { "fixed,adapted".into() } else { others.join(",") };
+                return Err(Failure::input(format!("{failure}; use --configurations {without}")));
             }
             crate::output::note!("note: {} is left out: {failure}", configuration.as_str());
             chosen.retain(|c| *c != configuration);
@@ -424,6 +435,10 @@ fn report(args: &NavigateArgs, report: NavigationReport) -> Result<(), Failure> 
     line(NavigationReport::HEAD.to_vec());
     for row in report.rows() {
         line(row.iter().map(String::as_str).collect());
+    }
+    report.ends().iter().for_each(|ends| say!("not completed by {ends}"));
+    for name in report.lost() {
+        output::note!("warning: every lap of {name} is lost: a number of `state` or `truth` is none, or beyond what a vehicle does");
     }
     if let Some(file) = &args.json {
         output::write_json(file, &report.to_json())?;

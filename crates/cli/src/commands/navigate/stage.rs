@@ -81,7 +81,8 @@ impl<'a> Stage<'a> {
         let plant: Box<dyn PlantLink> = match &args.plant {
             Some(address) => {
                 let timeout = Duration::from_secs(args.plant_timeout.unwrap_or(PLANT_TIMEOUT_S));
-                Box::new(RemotePlant::connect(address, first_number(), timeout).or_input()?)
+                let plant = RemotePlant::connect(address, first_number(), timeout).or_input()?;
+                Box::new(plant.telling(|text| crate::output::note!("note: {text}")))
             }
             None => Box::new(BuiltInPlant::new(&data, effects).or_input()?),
         };
@@ -97,7 +98,7 @@ impl<'a> Stage<'a> {
         let name = self.plant.name(&start).or_failed()?;
         if name.is_none() && !self.args.resume {
             crate::output::note!(
-                "note: the plant does not say which it is (`plant` in its answer to `reset`): earlier laps are driven again; --resume takes them"
+                "note: the answer to the first `reset` did not say which plant it is (`plant`): earlier laps are driven again; --resume takes them"
             );
         }
         Ok(name.map_or(Identity::Unnamed, Identity::Named))
