@@ -1,7 +1,7 @@
 //! ROS 2 bags in MCAP files: odometry, commands and, where it is wanted, another gyro.
 //!
 //! One row per odometry message and one per command, by time; a gyro reading counts until the next one. A message counts from its stamp; from when it was
-//! recorded where it has none, where the stamps of its topic are of another clock, or those of the odometry.
+//! recorded where it has none, where the stamps of its topic are of another clock, or those of the odometry. Where a clock is set back, the drive is parted.
 
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -12,6 +12,7 @@ use nesam_mcap::{ReadError, Reader, Record};
 use nesam_ros2::messages::{self, Command, CommandType, Odometry, imu_rates};
 
 use crate::bag_folder::parts;
+use crate::clock::begins_anew;
 use crate::error::ImportError;
 use crate::log::Log;
 use crate::part::Notes;
@@ -20,6 +21,10 @@ use crate::part::Notes;
 const CLOCKS_APART_NS: u64 = 1_000_000_000;
 /// Commands this long before the first odometry say nothing of the drive, ns (chosen: longer than any command holds).
 const BEFORE_NS: i64 = 60_000_000_000;
+/// Stamps of a part that are this much further from the recorder's clock than those of another were set apart from it, ns.
+const SET_APART_NS: u64 = 100_000_000;
+/// Stamps that go back this many messages from where the times of recording do are set back with them (chosen).
+const TOGETHER: usize = 5;
 
 /// Topics to read; `None` = the only one of a type that fits.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -40,8 +45,15 @@ const COMMANDS: [&str; 4] = {
 };
 const IMU: [&str; 1] = [messages::IMU.name];
 
-/// Messages of a bag: by topic the type, when each was recorded in ns, and its bytes.
-type Messages = BTreeMap<String, (String, Vec<(i64, Vec<u8>)>)>;
+/// A message of a topic: its place among those that were read, in the order of the files.
+struct Message {
+    place: usize,
+    recorded_ns: i64,
+    bytes: Vec<u8>,
+}
+
+/// Messages of a bag: by topic the type and the messages in the order of the files.
+type Messages = BTreeMap<String, (String, Vec<Message>)>;
 
 /// Reads a bag, a file or a folder with its parts, as a log with the columns `t x y z qx qy qz qw vbx vby vbz wx wy wz cmd_speed` and `cmd_yaw_rate` or `cmd_road_wheel_angle`.
 /// Rows of odometry lack the commands and rows of commands the rest.
@@ -55,45 +67,107 @@ pub fn read_bag(path: &Path, topics: &Topics) -> Result<(Log, Notes), ImportErro
     let (kind, commands) = pick(&topics.command, &COMMANDS, "--command")?;
     let gyro = topics.imu.as_ref().map(|_| pick(&topics.imu, &IMU, "--imu")).transpose()?;
 
-    let unreadable = |topic: &str, at: usize| ImportError::log(path, format!("{topic} message {at} is not readable as little-endian CDR"));
-    let mut poses: Vec<Received<Odometry>> = Vec::new();
-    for (at, (recorded_ns, bytes)) in odometries.iter().enumerate() {
-        let value = Odometry::read(bytes).ok_or_else(|| unreadable("odometry", at))?;
-        poses.push(Received { recorded_ns: *recorded_ns, stamp_ns: Some(value.stamp_ns), value });
-    }
-    let foreign_clock = is_foreign(poses.iter().filter_map(|p| Some((p.recorded_ns, p.stamp_ns.filter(|ns| *ns != 0)?))));
-    if foreign_clock {
-        notes.push(of_another_clock("odometry"));
-    }
     let kind = CommandType::named(kind).expect("a type of COMMANDS; this is a bug");
-    let mut told: Vec<Received<Command>> = Vec::new();
-    for (at, (recorded_ns, bytes)) in commands.iter().enumerate() {
-        let value = kind.read(bytes).ok_or_else(|| unreadable("command", at))?;
-        told.push(Received { recorded_ns: *recorded_ns, stamp_ns: value.stamp_ns, value });
+    let poses = received(path, "odometry", odometries, |bytes| Odometry::read(bytes).map(|pose| (Some(pose.stamp_ns), pose)))?;
+    let told = received(path, "command", commands, |bytes| kind.read(bytes).map(|command| (command.stamp_ns, command)))?;
+    let imu = gyro.map_or(&[][..], |(_, messages)| messages);
+    let turned = received(path, "imu", imu, |bytes| imu_rates(bytes).map(|(stamp_ns, rates)| (Some(stamp_ns), rates)))?;
+
+    let set_back_at = set_back(&poses);
+    if let Some((_, back_s)) = set_back_at.first() {
+        let times = set_back_at.len();
+        notes.push(format!("the clock of the odometry goes back {times} times, first by {back_s:.2} s: parted there"));
     }
-    let mut turned: Vec<Received<[f64; 3]>> = Vec::new();
-    for (at, (recorded_ns, bytes)) in gyro.iter().flat_map(|(_, messages)| messages.iter()).enumerate() {
-        let (stamp_ns, value) = imu_rates(bytes).ok_or_else(|| unreadable("imu", at))?;
-        turned.push(Received { recorded_ns: *recorded_ns, stamp_ns: Some(stamp_ns), value });
+    let begins: Vec<usize> = set_back_at.iter().map(|(at, _)| *at).collect();
+    let places: Vec<usize> = begins.iter().map(|at| poses[*at].place).collect();
+    let (of_commands, of_imu) = (begins_of(&told, &places), begins_of(&turned, &places));
+    let has_gyro = gyro.is_some();
+    let apart_ns: Vec<Option<u64>> = (0..=begins.len()).map(|part| apart_ns(&part_of(&poses, &begins, part))).collect();
+    let least_ns = apart_ns.iter().flatten().min().copied().unwrap_or(0);
+    let (mut rows, mut log_begins) = (Vec::new(), Vec::new());
+    for part in 0..=begins.len() {
+        let (poses, told, turned) = (part_of(&poses, &begins, part), part_of(&told, &of_commands, part), part_of(&turned, &of_imu, part));
+        let foreign_clock = apart_ns[part].is_some_and(|ns| ns > CLOCKS_APART_NS || ns - least_ns > SET_APART_NS);
+        if foreign_clock {
+            notes.push(of_another_clock("odometry"));
+        }
+        let told = by_instant("commands", told, foreign_clock, &mut notes);
+        let turned = by_instant("imu", turned, foreign_clock, &mut notes);
+        let poses = by_instant("odometry", poses, foreign_clock, &mut notes);
+        log_begins.extend((part > 0).then_some(rows.len()));
+        rows.extend(of_one_clock(&poses, &told, has_gyro.then_some(turned.as_slice())));
     }
-    let told = by_instant("commands", told, foreign_clock, &mut notes);
-    let turned = by_instant("imu", turned, foreign_clock, &mut notes);
-    let rows = by_instant("odometry", poses, foreign_clock, &mut notes);
-    Ok((log(path, &rows, (kind, told.as_slice()), gyro.is_some().then_some(turned.as_slice())), notes))
+    let told_once = notes.iter().enumerate().filter(|(i, note)| !notes[..*i].contains(note)).map(|(_, note)| note.clone()).collect();
+    Ok((log(path, rows, log_begins, kind), told_once))
 }
 
 /// A message of a topic that is held between its messages.
+#[derive(Clone)]
 struct Received<T> {
+    place: usize,
     recorded_ns: i64,
+    /// `None` where nobody set it.
     stamp_ns: Option<i64>,
     value: T,
 }
 
-/// Whether stamps are of another clock than the recorder's: (recorded, stamp) of the messages of a topic, ns.
-fn is_foreign(times: impl Iterator<Item = (i64, i64)>) -> bool {
-    let mut apart: Vec<u64> = times.map(|(recorded_ns, stamp_ns)| recorded_ns.abs_diff(stamp_ns)).collect();
+/// The messages of a topic, read.
+fn received<T>(
+    path: &Path,
+    topic: &str,
+    messages: &[Message],
+    read: impl Fn(&[u8]) -> Option<(Option<i64>, T)>,
+) -> Result<Vec<Received<T>>, ImportError> {
+    let one = |(at, message): (usize, &Message)| {
+        let unreadable = || ImportError::log(path, format!("{topic} message {at} is not readable as little-endian CDR"));
+        let (stamp_ns, value) = read(&message.bytes).ok_or_else(unreadable)?;
+        // A stamp of zero is one that nobody set.
+        let stamp_ns = stamp_ns.filter(|ns| *ns != 0);
+        Ok(Received { place: message.place, recorded_ns: message.recorded_ns, stamp_ns, value })
+    };
+    messages.iter().enumerate().map(one).collect()
+}
+
+/// Messages of a topic at which one of its clocks is set back, and by how much, s: that of its stamps or the recorder's.
+fn set_back<T>(messages: &[Received<T>]) -> Vec<(usize, f64)> {
+    let back = |of: &dyn Fn(&Received<T>) -> i64| -> Vec<(usize, f64)> {
+        let Some(first_ns) = messages.first().map(of) else { return Vec::new() };
+        let instants_s: Vec<f64> = messages.iter().map(|message| of(message).saturating_sub(first_ns) as f64 * 1e-9).collect();
+        begins_anew(&instants_s).into_iter().map(|at| (at, instants_s[at - 1] - instants_s[at])).collect()
+    };
+    let recorded = back(&|message| message.recorded_ns);
+    if messages.iter().any(|message| message.stamp_ns.is_none()) {
+        return recorded;
+    }
+    let mut found = back(&|message| message.stamp_ns.unwrap_or_default());
+    // A message that was on its way may have an old stamp and a new time of recording.
+    let alone: Vec<_> = recorded.into_iter().filter(|(at, _)| found.iter().all(|(other, _)| other.abs_diff(*at) > TOGETHER)).collect();
+    found.extend(alone);
+    found.sort_by_key(|(at, _)| *at);
+    found
+}
+
+/// Messages of another topic at which the parts of the odometry begin, given the places of these: where it is set back itself, as often as the odometry, and else by
+/// the order of the files.
+fn begins_of<T>(messages: &[Received<T>], places: &[usize]) -> Vec<usize> {
+    let own = set_back(messages);
+    if own.len() == places.len() {
+        return own.iter().map(|(at, _)| *at).collect();
+    }
+    places.iter().map(|place| messages.partition_point(|message| message.place < *place)).collect()
+}
+
+/// The messages of a part.
+fn part_of<T: Clone>(messages: &[Received<T>], begins: &[usize], part: usize) -> Vec<Received<T>> {
+    let from = part.checked_sub(1).map_or(0, |before| begins[before]);
+    messages[from..begins.get(part).copied().unwrap_or(messages.len())].to_vec()
+}
+
+/// How far the stamps of messages lie from when they were recorded, in the middle, ns; `None` where none has one.
+fn apart_ns<T>(messages: &[Received<T>]) -> Option<u64> {
+    let mut apart: Vec<u64> = messages.iter().filter_map(|message| Some(message.recorded_ns.abs_diff(message.stamp_ns?))).collect();
     apart.sort_unstable();
-    apart.get(apart.len() / 2).is_some_and(|ns| *ns > CLOCKS_APART_NS)
+    apart.get(apart.len() / 2).copied()
 }
 
 fn of_another_clock(topic: &str) -> String {
@@ -102,9 +176,8 @@ fn of_another_clock(topic: &str) -> String {
 
 /// The messages of a topic in the order of the instants from which they count.
 fn by_instant<T>(topic: &str, mut messages: Vec<Received<T>>, as_recorded: bool, notes: &mut Notes) -> Vec<(i64, T)> {
-    // A stamp of zero is one that nobody set.
-    messages.iter_mut().for_each(|message| message.stamp_ns = message.stamp_ns.filter(|ns| !as_recorded && *ns != 0));
-    let foreign_clock = is_foreign(messages.iter().filter_map(|message| Some((message.recorded_ns, message.stamp_ns?))));
+    messages.iter_mut().for_each(|message| message.stamp_ns = message.stamp_ns.filter(|_| !as_recorded));
+    let foreign_clock = apart_ns(&messages).is_some_and(|ns| ns > CLOCKS_APART_NS);
     if foreign_clock {
         notes.push(of_another_clock(topic));
     }
@@ -114,49 +187,60 @@ fn by_instant<T>(topic: &str, mut messages: Vec<Received<T>>, as_recorded: bool,
     entries
 }
 
-/// What a row of a bag tells.
-enum Told<'a> {
-    Odometry(&'a Odometry),
-    Command(&'a Command),
+/// A row of a bag, at an instant that counts from the first odometry of its part, ns.
+struct Row {
+    at_ns: i64,
+    told: Told,
+    /// Angular velocity by the gyro that was chosen, rad/s.
+    turned: Option<[f64; 3]>,
 }
 
-fn log(
-    path: &Path,
-    poses: &[(i64, Odometry)],
-    (kind, commands): (CommandType, &[(i64, Command)]),
-    turned: Option<&[(i64, [f64; 3])]>,
-) -> Log {
+/// What a row of a bag tells.
+enum Told {
+    Odometry(Odometry),
+    Command(Command),
+}
+
+/// The rows of a part in which the clock runs on; `turned` are the readings of another gyro where one was chosen.
+fn of_one_clock(poses: &[(i64, Odometry)], commands: &[(i64, Command)], turned: Option<&[(i64, [f64; 3])]>) -> Vec<Row> {
     let first = poses.first().map_or(0, |(at_ns, _)| *at_ns);
     let of_drive = commands.iter().filter(|(at_ns, _)| *at_ns >= first.saturating_sub(BEFORE_NS));
-    let mut rows: Vec<(i64, Told)> = poses.iter().map(|(at_ns, pose)| (*at_ns, Told::Odometry(pose))).collect();
-    rows.extend(of_drive.map(|(at_ns, command)| (*at_ns, Told::Command(command))));
+    let mut rows: Vec<(i64, Told)> = poses.iter().map(|(at_ns, pose)| (*at_ns, Told::Odometry(*pose))).collect();
+    rows.extend(of_drive.map(|(at_ns, command)| (*at_ns, Told::Command(*command))));
     rows.sort_by_key(|(at_ns, _)| *at_ns);
-    let mut log = Log { path: path.into(), rows: rows.len(), places: (0..rows.len()).collect(), ..Log::default() };
-    let mut add = |name: &str, of: &dyn Fn(i64, &Told) -> Option<f64>| {
-        log.numbers.push((name.into(), rows.iter().map(|(at_ns, told)| of(*at_ns, told)).collect()));
+    let row = |(at_ns, told): (i64, Told)| {
+        let turned = match (turned, &told) {
+            (Some(turned), _) => held(turned, at_ns),
+            (None, Told::Odometry(pose)) => Some(pose.angular_rad_s),
+            (None, Told::Command(_)) => None,
+        };
+        // Nanoseconds since 1970 have more digits than a float.
+        Row { at_ns: at_ns.saturating_sub(first), told, turned }
     };
-    let posed = |told: &Told, of: &dyn Fn(&Odometry) -> f64| if let Told::Odometry(pose) = told { Some(of(pose)) } else { None };
-    let commanded = |told: &Told, of: &dyn Fn(&Command) -> f64| if let Told::Command(command) = told { Some(of(command)) } else { None };
-    // Nanoseconds since 1970 have more digits than a float.
-    add("t", &|at_ns, _| Some(at_ns.saturating_sub(first) as f64 * 1e-9));
+    rows.into_iter().map(row).collect()
+}
+
+fn log(path: &Path, rows: Vec<Row>, begins: Vec<usize>, kind: CommandType) -> Log {
+    let mut log = Log { path: path.into(), rows: rows.len(), places: (0..rows.len()).collect(), begins, ..Log::default() };
+    let mut add = |name: &str, of: &dyn Fn(&Row) -> Option<f64>| log.numbers.push((name.into(), rows.iter().map(of).collect()));
+    let posed = |row: &Row, of: &dyn Fn(&Odometry) -> f64| if let Told::Odometry(pose) = &row.told { Some(of(pose)) } else { None };
+    let commanded = |row: &Row, of: &dyn Fn(&Command) -> f64| if let Told::Command(command) = &row.told { Some(of(command)) } else { None };
+    add("t", &|row| Some(row.at_ns as f64 * 1e-9));
     for (axis, name) in ["x", "y", "z"].into_iter().enumerate() {
-        add(name, &|_, told| posed(told, &|pose| pose.position_m[axis]));
+        add(name, &|row| posed(row, &|pose| pose.position_m[axis]));
     }
     for (axis, name) in ["qx", "qy", "qz", "qw"].into_iter().enumerate() {
-        add(name, &|_, told| posed(told, &|pose| pose.orientation[axis]));
+        add(name, &|row| posed(row, &|pose| pose.orientation[axis]));
     }
     for (axis, name) in ["vbx", "vby", "vbz"].into_iter().enumerate() {
-        add(name, &|_, told| posed(told, &|pose| pose.linear_m_s[axis]));
+        add(name, &|row| posed(row, &|pose| pose.linear_m_s[axis]));
     }
     for (axis, name) in ["wx", "wy", "wz"].into_iter().enumerate() {
-        add(name, &|at_ns, told| match turned {
-            Some(turned) => held(turned, at_ns).map(|rates| rates[axis]),
-            None => posed(told, &|pose| pose.angular_rad_s[axis]),
-        });
+        add(name, &|row| row.turned.map(|rates| rates[axis]));
     }
     let second = if kind.is_steered() { "cmd_road_wheel_angle" } else { "cmd_yaw_rate" };
-    add("cmd_speed", &|_, told| commanded(told, &|command| command.speed_m_s));
-    add(second, &|_, told| commanded(told, &|command| command.turn));
+    add("cmd_speed", &|row| commanded(row, &|command| command.speed_m_s));
+    add(second, &|row| commanded(row, &|command| command.turn));
     log
 }
 
@@ -165,17 +249,16 @@ fn held<T: Copy>(entries: &[(i64, T)], at_ns: i64) -> Option<T> {
     entries[..entries.partition_point(|(ns, _)| *ns <= at_ns)].last().map(|(_, value)| *value)
 }
 
-/// Messages of all parts of a bag, those of each topic in the order in which they were recorded.
+/// Messages of all parts of a bag, in the order of the files.
 fn messages(path: &Path) -> Result<(Messages, Notes), ImportError> {
     let (files, mut notes) = parts(path)?;
-    let mut messages = Messages::new();
+    let (mut messages, mut place) = (Messages::new(), 0);
     for file in &files {
-        if add_messages(file, &mut messages)? == Ending::CutOff {
+        if add_messages(file, &mut messages, &mut place)? == Ending::CutOff {
             let what = if files.len() > 1 { file.display().to_string() } else { "the bag".into() };
             notes.push(format!("{what} was cut off: what is whole of it is used"));
         }
     }
-    messages.values_mut().for_each(|(_, kept)| kept.sort_by_key(|(ns, _)| *ns));
     Ok((messages, notes))
 }
 
@@ -186,8 +269,8 @@ enum Ending {
     CutOff,
 }
 
-/// Adds the messages of a file; ids of schemas and channels count within it.
-fn add_messages(path: &Path, messages: &mut Messages) -> Result<Ending, ImportError> {
+/// Adds the messages of a file, the next of which is at `place`; ids of schemas and channels count within it.
+fn add_messages(path: &Path, messages: &mut Messages, place: &mut usize) -> Result<Ending, ImportError> {
     let file = File::open(path).map_err(|source| ImportError::file(path, source))?;
     let mut reader = Reader::new(BufReader::new(file));
     let (mut types, mut channels) = (BTreeMap::new(), BTreeMap::new());
@@ -205,7 +288,8 @@ fn add_messages(path: &Path, messages: &mut Messages) -> Result<Ending, ImportEr
                 if let Some((_, kept)) =
                     held.filter(|(name, _)| [&ODOMETRY[..], &COMMANDS, &IMU].iter().any(|kind| kind.contains(&name.as_str())))
                 {
-                    kept.push((i64::try_from(log_time_ns).unwrap_or(i64::MAX), data));
+                    kept.push(Message { place: *place, recorded_ns: i64::try_from(log_time_ns).unwrap_or(i64::MAX), bytes: data });
+                    *place += 1;
                 }
             }
             Ok(Some(_)) => {}
@@ -223,7 +307,7 @@ fn choose<'a>(
     wanted: Option<&str>,
     types: &[&str],
     option: &str,
-) -> Result<(&'a str, &'a [(i64, Vec<u8>)]), ImportError> {
+) -> Result<(&'a str, &'a [Message]), ImportError> {
     let fit: Vec<&String> =
         messages.iter().filter(|(_, (name, kept))| types.contains(&name.as_str()) && !kept.is_empty()).map(|(t, _)| t).collect();
     let listed = |topics: &[&String]| topics.iter().map(|t| t.as_str()).collect::<Vec<_>>().join(", ");
@@ -414,6 +498,57 @@ mod tests {
             assert!(notes.iter().any(|note| note.contains("older than 0.50 s")) && speeds.len() < 36, "{} rows: {notes:?}", speeds.len());
             assert_eq!(notes.iter().any(|note| note.contains("commands change between rows")), commands_hz != 10 || late_ns != 0);
         }
+    }
+
+    /// Goal: a recording whose clock is set back is parted there, whichever clock it is. Method: 20 s at 50 Hz with commands at 10 Hz that change at the half, where the
+    /// clocks of stamps and recorder fall back by 0.4, 5 and 9.993 s or begin at zero again, and the stamps alone by 0.807 and 5 s; odometry is recorded 2 ms after its stamp, so that one
+    /// message comes with the old stamp. Nothing is parted where one message is recorded a second late.
+    #[test]
+    fn regress_a_bag_is_parted_where_a_clock_is_set_back() {
+        let read = |stamp_s: &dyn Fn(i64) -> f64, recorded_s: &dyn Fn(i64) -> f64| {
+            let folder = tempfile::tempdir().expect("a folder");
+            let path = folder.path().join("run.mcap");
+            let mut writer = writer(&path);
+            let mut channel = |name: &str, topic: &str| channel(&mut writer, name, topic);
+            let (odometry, twist) = (channel("nav_msgs/msg/Odometry", "/odom"), channel("geometry_msgs/msg/Twist", "/cmd_vel"));
+            let ns = |seconds: f64| (1e9 * seconds).round() as i64;
+            for i in 0..1000_i64 {
+                let (stamp_ns, recorded_ns) = (ns(stamp_s(i)), ns(recorded_s(i)));
+                writer.write(odometry, 0, recorded_ns as u64, &odometry_bytes(stamp_ns, 0.02 * i as f64, 1.0)).expect("written");
+                if i % 5 == 0 {
+                    let speed = if i < 500 { 1.0 } else { 2.0 };
+                    let values: Vec<u8> = [speed, 0.0, 0.0, 0.0, 0.0, 0.5].iter().flat_map(|v: &f64| v.to_le_bytes()).collect();
+                    writer.write(twist, 0, recorded_ns as u64 + 1000, &[vec![0, 1, 0, 0], values].concat()).expect("written");
+                }
+            }
+            writer.finish().expect("finished");
+            let (log, notes) = read_bag(&path, &Topics::default()).expect("readable");
+            let (drives, more) = drives(&log, &Options { name: "run".into(), ..Options::default() }).expect("drives");
+            (drives, [notes, more].concat())
+        };
+        let at = |i: i64| 1.0e9 + 0.02 * i as f64;
+        let mut told = Vec::new();
+        for back_s in [0.4, 5.0, 9.993] {
+            let clock = move |i: i64, begin: i64| at(i) - if i >= begin { back_s } else { 0.0 };
+            told.push(read(&|i| clock(i, 501), &|i| clock(i, 500) + 0.002));
+        }
+        told.push(read(&|i| 5.0 + 0.02 * (i % 500) as f64, &|i| 5.002 + 0.02 * (i % 500) as f64));
+        for back_s in [0.807, 5.0] {
+            told.push(read(&|i| at(i) - if i >= 500 { back_s } else { 0.0 }, &|i| at(i) + 0.002));
+        }
+        for (drives, notes) in &told {
+            let lengths: Vec<(&str, bool)> = drives.iter().map(|d| (d.id.as_str(), (490..=501).contains(&d.time_s().len()))).collect();
+            assert_eq!(lengths, [("run-1", true), ("run-2", true)], "{notes:?}");
+            for (drive, speed) in drives.iter().zip([1.0, 2.0]) {
+                let of = |name: &str| &drive.columns.iter().find(|(held, _)| held == name).expect("there").1;
+                let steps = of("x").windows(2).zip(of("t").windows(2));
+                assert!(steps.into_iter().all(|(x, t)| (x[1] - x[0] - 0.02).abs() < 1e-9 && t[1] > t[0]), "{notes:?}");
+                assert!(of("cmd_speed").iter().skip(10).all(|told| *told == speed), "{notes:?}");
+            }
+            assert!(notes.iter().any(|note| note.contains("the clock of the odometry goes back 1 times")), "{notes:?}");
+        }
+        let (drives, notes) = read(&at, &|i| at(i) + if i == 700 { -1.0 } else { 0.002 });
+        assert!(drives.len() == 1 && !notes.iter().any(|note| note.contains("goes back")), "{notes:?}");
     }
 
     #[test]

@@ -23,7 +23,7 @@ pub(crate) fn parts(path: &Path) -> Result<(Vec<PathBuf>, Notes), ImportError> {
     }
     let entries = std::fs::read_dir(path).map_err(|source| ImportError::file(path, source))?;
     let mut present: Vec<String> = entries.flatten().map(|entry| entry.file_name().to_string_lossy().into_owned()).collect();
-    present.sort();
+    present.sort_by_key(|name| numbered(name));
     let is_part = |name: &str| name.to_ascii_lowercase().ends_with(".mcap");
     let metadata = path.join(METADATA);
     let listed = match std::fs::read_to_string(&metadata) {
@@ -44,6 +44,13 @@ pub(crate) fn parts(path: &Path) -> Result<(Vec<PathBuf>, Notes), ImportError> {
         return Err(ImportError::log(path, format!("has no part in MCAP (it has {holds}); {CONVERT}")));
     }
     Ok((files, notes))
+}
+
+/// A name such that the tenth part comes after the second one: what stands before the number at its end, and the number.
+fn numbered(name: &str) -> (String, u64, String) {
+    let stem = name.rsplit_once('.').map_or(name, |(stem, _)| stem);
+    let before = stem.trim_end_matches(|c: char| c.is_ascii_digit());
+    (before.into(), stem[before.len()..].parse().unwrap_or(0), name.into())
 }
 
 /// File names under `relative_file_paths` of a bag's metadata; the names of its folder are left out.
@@ -74,7 +81,10 @@ mod tests {
         assert_eq!(names, ["run_0.mcap", "run_2.mcap", "run_10.mcap", "late.mcap"]);
         assert!(notes.len() == 1 && notes[0].starts_with("run_11.mcap"), "{notes:?}");
         std::fs::remove_file(bag.join(METADATA)).expect("removed");
-        assert_eq!(parts(&bag).expect("a bag that was cut off").0.len(), 4);
+        // Without metadata they come by their numbers.
+        let names: Vec<_> =
+            parts(&bag).expect("a bag").0.iter().filter_map(|file| Some(file.file_name()?.to_string_lossy().into_owned())).collect();
+        assert_eq!(names, ["late.mcap", "run_0.mcap", "run_2.mcap", "run_10.mcap"], "a bag that was cut off");
         assert_eq!(parts(&bag.join("run_0.mcap")).expect("a file").0, [bag.join("run_0.mcap")]);
     }
 

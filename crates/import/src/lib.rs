@@ -2,7 +2,7 @@
 //!
 //! A [`Log`] is a file as named columns, whatever it was: a CSV table ([`read_csv`]) or a ROS 2 bag ([`read_bag`]). A [`Mapping`] says which column is what,
 //! in which unit and with which sign. [`drives`] makes drives of both in the conventions of a data root: World x east, y north, z up, Body x forward,
-//! y left, z up, SI units and radians; it parts them at gaps and says what it left out. [`write_set`] writes them as a set. [`doubts`] says of any recorded
+//! y left, z up, SI units and radians; it parts them at gaps and where a clock is set back, and says what it left out. [`write_set`] writes them as a set. [`doubts`] says of any recorded
 //! drives what does not fit together: units, signs, frames.
 //!
 //! Nothing is smoothed, resampled or guessed here: a number in a set is a number of the log in another unit or frame. Commands alone are averaged, over the
@@ -11,6 +11,7 @@
 
 mod bag;
 mod bag_folder;
+mod clock;
 mod commands;
 mod error;
 mod frame;

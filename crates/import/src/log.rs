@@ -15,6 +15,8 @@ pub struct Log {
     pub texts: Vec<(String, Vec<String>)>,
     /// Where in the file each row is, for errors: line or message.
     pub places: Vec<usize>,
+    /// Rows at which something else begins by what the reader of the file knows: drives are parted there.
+    pub begins: Vec<usize>,
 }
 
 impl Log {

@@ -209,6 +209,7 @@ mod tests {
             numbers: vec![("heading".into(), vec![Some(90.0)]), ("a:b".into(), vec![Some(36.0)]), ("t".into(), vec![Some(2.0)])],
             texts: vec![("run".into(), vec!["one".into()]), ("x".into(), vec!["n/a".into()])],
             places: vec![2],
+            ..Log::default()
         };
         let mapping = Mapping::parse(["# comment", "", "yaw = -heading:deg", "cmd_speed=a:b:km/h", "trajectory=run"]).expect("valid");
         let value = |target| mapping.numbers(&log, target).map(|column| column.map(|c| c[0].unwrap_or(f64::NAN)));

@@ -2,6 +2,7 @@
 
 use nesam_trajectories::{STEP_MAX_S, gap_limit_s};
 
+use crate::clock::begins_anew;
 use crate::commands::{Span, Told, usual_step_s};
 use crate::error::ImportError;
 use crate::frame::FrameConvention;
@@ -86,10 +87,10 @@ struct Row {
 /// Makes drives of a log.
 ///
 /// # Errors
-/// `ImportError::Log` naming the channel that is missing, the line at which time goes backwards, or time stamps that count no seconds.
+/// `ImportError::Log` naming the channel that is missing, the line at which rows are out of order, or time stamps that count no seconds.
 pub fn drives(log: &Log, options: &Options) -> Result<(Vec<Drive>, Notes), ImportError> {
     let mut notes = Notes::new();
-    let channels = Channels {
+    let mut channels = Channels {
         time: time(log, options, &mut notes)?,
         pose: pose(log, options, &mut notes)?,
         commands: commands(log, options)?,
@@ -99,7 +100,7 @@ pub fn drives(log: &Log, options: &Options) -> Result<(Vec<Drive>, Notes), Impor
     let (mut drives, mut left_out, mut of_drives) = (Vec::new(), LeftOut::default(), Notes::new());
     let all = by_name(log.rows, names.as_deref(), &options.name);
     for (name, rows) in &all {
-        let of_one = of_one_name(log, &channels, name, rows, &mut left_out, &mut of_drives)?;
+        let of_one = of_one_name(log, &mut channels, name, rows, &mut left_out, &mut of_drives)?;
         drives.extend(of_one);
     }
     notes.extend(left_out.notes(all.len()));
@@ -110,15 +111,44 @@ pub fn drives(log: &Log, options: &Options) -> Result<(Vec<Drive>, Notes), Impor
     Ok((drives, notes))
 }
 
-/// The drives between the gaps of the rows of one name.
+/// The drives of the rows of one name: between gaps, and where its clock is set back.
 fn of_one_name(
+    log: &Log,
+    channels: &mut Channels,
+    name: &str,
+    rows: &[usize],
+    left_out: &mut LeftOut,
+    notes: &mut Notes,
+) -> Result<Vec<Drive>, ImportError> {
+    let mut parts: Vec<Vec<(String, Vec<f64>)>> = Vec::new();
+    for run in runs(log, channels, name, rows, notes) {
+        count_from_own_begin(&mut channels.time, run, name, notes);
+        parts.extend(of_one_run(log, channels, name, run, left_out, notes)?);
+    }
+    let several = parts.len() > 1;
+    let mut drives = Vec::new();
+    for (i, columns) in parts.into_iter().enumerate() {
+        let id = if several { format!("{name}-{}", i + 1) } else { name.to_string() };
+        let drive = Drive { id, columns };
+        let length_s = drive.time_s().last().copied().unwrap_or(0.0) - drive.time_s().first().copied().unwrap_or(0.0);
+        if length_s < DRIVE_MIN_S {
+            notes.push(format!("{}: left out, {length_s:.2} s long, at least {DRIVE_MIN_S} s are of use", drive.id));
+        } else {
+            drives.push(drive);
+        }
+    }
+    Ok(drives)
+}
+
+/// The columns of the drives between the gaps of rows in which the clock runs on.
+fn of_one_run(
     log: &Log,
     channels: &Channels,
     name: &str,
     rows: &[usize],
     left_out: &mut LeftOut,
     notes: &mut Notes,
-) -> Result<Vec<Drive>, ImportError> {
+) -> Result<Vec<Vec<(String, Vec<f64>)>>, ImportError> {
     let mut lacking = LeftOut::default();
     let posed = posed(channels, rows, &mut lacking);
     let posed = ascending(log, &channels.time, posed, notes)?;
@@ -131,20 +161,43 @@ fn of_one_name(
     }
     left_out.add(lacking);
     let parts = at_gaps(log, &whole, name, notes)?;
-    let several = parts.len() > 1;
-    let mut drives = Vec::new();
-    for (i, part) in parts.into_iter().enumerate() {
-        let id = if several { format!("{name}-{}", i + 1) } else { name.to_string() };
-        let columns = columns(channels, &told, &measured, &part);
-        let drive = Drive { id, columns };
-        let length_s = drive.time_s().last().copied().unwrap_or(0.0) - drive.time_s().first().copied().unwrap_or(0.0);
-        if length_s < DRIVE_MIN_S {
-            notes.push(format!("{}: left out, {length_s:.2} s long, at least {DRIVE_MIN_S} s are of use", drive.id));
-        } else {
-            drives.push(drive);
+    Ok(parts.iter().map(|part| columns(channels, &told, &measured, part)).collect())
+}
+
+/// Rows of one name between which its clock runs on, in the order of the file. Rows with a pose tell it: those with commands alone may stand after all of them.
+fn runs<'a>(log: &Log, channels: &Channels, name: &str, rows: &'a [usize], notes: &mut Notes) -> Vec<&'a [usize]> {
+    let at = |i: usize| channels.time[rows[i]].unwrap_or(f64::NAN);
+    let is_posed = |i: &usize| channels.time[rows[*i]].is_some() && channels.pose.iter().all(|(_, values)| values[rows[*i]].is_some());
+    let posed: Vec<usize> = (0..rows.len()).filter(is_posed).collect();
+    // A set-back that the reader of the log told of is none of its own.
+    let mut begins: Vec<usize> = log.begins.iter().map(|begin| rows.partition_point(|row| row < begin)).collect();
+    let mut set_back: Vec<(usize, f64)> = Vec::new();
+    for known in posed.chunk_by(|a, b| !begins.iter().any(|begin| a < begin && begin <= b)) {
+        for k in begins_anew(&known.iter().map(|i| at(*i)).collect::<Vec<_>>()) {
+            let (before, after) = (known[k - 1], known[k]);
+            // Commands in between are of the clock that they are closer to.
+            let is_new = |i: &usize| (at(*i) - at(after)).abs() < (at(*i) - at(before)).abs();
+            set_back.push(((before + 1..after).find(is_new).unwrap_or(after), at(before) - at(after)));
         }
     }
-    Ok(drives)
+    if let Some((first, back_s)) = set_back.first() {
+        let (times, line) = (set_back.len(), log.places[rows[*first]]);
+        let what = format!("time goes back {times} times, first in line {line} by {back_s:.2} s");
+        notes.push(format!("{name}: {what}: parted there, as where a clock is set back or a recording begins again"));
+    }
+    begins.extend(set_back.iter().map(|(begin, _)| *begin));
+    begins.extend([0, rows.len()]);
+    begins.sort_unstable();
+    begins.windows(2).map(|run| &rows[run[0]..run[1]]).filter(|run| !run.is_empty()).collect()
+}
+
+/// Times of rows that still count from an epoch are made to count from the first of them.
+fn count_from_own_begin(time: &mut [Option<f64>], rows: &[usize], name: &str, notes: &mut Notes) {
+    let Some(first_s) = rows.iter().filter_map(|row| time[*row]).reduce(f64::min).filter(|first_s| first_s.abs() >= EPOCH_S) else {
+        return;
+    };
+    notes.push(format!("{name}: time counts from {first_s:.3} s where its clock runs on from there"));
+    rows.iter().for_each(|row| time[*row] = time[*row].map(|t| t - first_s));
 }
 
 /// The rows that have a pose. Those that have none and a command are of another topic.
@@ -339,7 +392,7 @@ fn ascending(log: &Log, time: &[Option<f64>], rows: Vec<usize>, notes: &mut Note
             Some(last) if at(row) == at(*last) => repeated += 1,
             Some(last) if at(row) < at(*last) => {
                 let reason = format!(
-                    "line {}: time goes backwards, {} s after {} s; sort the log, or name the drives with --column trajectory=COLUMN",
+                    "line {}: time goes backwards, {} s after {} s, and does not go on from there: rows are out of order; sort the log, or name the drives with --column trajectory=COLUMN",
                     log.places[row],
                     at(row),
                     at(*last)

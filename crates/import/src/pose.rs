@@ -9,6 +9,9 @@ use crate::part::{Channel, Notes, Options, absent, incomplete, required, turned}
 const ANGLES: [&str; 3] = ["roll", "pitch", "yaw"];
 const QUATERNION: [&str; 4] = ["qx", "qy", "qz", "qw"];
 
+/// Deviation from unit length of a quaternion that rounding does not make, and share of such rows that is told (chosen).
+const LENGTH_OFF: f64 = 0.05;
+
 /// A column of a log; `None` = it has no such column.
 type Found = Option<Vec<Option<f64>>>;
 
@@ -50,7 +53,9 @@ fn attitude(log: &Log, options: &Options, lacking: &mut Vec<&str>, notes: &mut N
         if !there.is_empty() {
             notes.push(format!("attitude of the quaternion {}; {} not used", QUATERNION.join(", "), there.join(", ")));
         }
-        return Ok(of_quaternion(log.rows, &quaternion.into_iter().flatten().collect::<Vec<_>>()));
+        let quaternion: Vec<_> = quaternion.into_iter().flatten().collect();
+        notes.extend(of_wrong_length(&quaternion));
+        return Ok(of_quaternion(log.rows, &quaternion));
     }
     if whole {
         notes.push(format!("attitude of {}, which the mapping names; {} not used", there.join(", "), QUATERNION.join(", ")));
@@ -67,6 +72,21 @@ fn attitude(log: &Log, options: &Options, lacking: &mut Vec<&str>, notes: &mut N
 /// Which of some columns a log has.
 fn there<'a>(names: &[&'a str], columns: &[Found]) -> Vec<&'a str> {
     names.iter().zip(columns).filter(|(_, column)| column.is_some()).map(|(name, _)| *name).collect()
+}
+
+/// Says of the columns of a quaternion that it is none of unit length in more than a row here and there.
+fn of_wrong_length(columns: &[Vec<Option<f64>>]) -> Option<String> {
+    let length = |row: usize| columns.iter().map(|column| column[row].map(|v| v * v)).sum::<Option<f64>>().map(f64::sqrt);
+    let mut all: Vec<f64> = (0..columns.first()?.len()).filter_map(length).collect();
+    all.sort_by(f64::total_cmp);
+    let off = all.iter().filter(|length| (**length - 1.0).abs() > LENGTH_OFF).count();
+    (off as f64 > LENGTH_OFF * all.len() as f64).then(|| {
+        let (rows, middle) = (all.len(), all[all.len() / 2]);
+        format!(
+            "the quaternion is not of unit length in {off} of {rows} rows ({middle:.2} in the middle): rows below 0.5 and from 2 on are left out, the others are scaled to one; \
+             see the columns that `qx` to `qw` are read from, and their scale"
+        )
+    })
 }
 
 /// Roll, pitch and yaw of the columns of a quaternion.

@@ -343,3 +343,51 @@ fn regress_planar_velocities_are_used_and_half_a_pair_is_told() {
         assert!(!notes.iter().any(|n| n.starts_with('v')), "{notes:?}");
     }
 }
+
+/// Goal: a log whose clock is set back or begins anew loses nothing but the second in between, and no two recordings are made one. Method: 3 s and 4 s at 10 Hz that both
+/// begin at zero, with commands in rows of their own; the same with stamps since 1970 before and since the start after; one late row, which is disorder.
+#[test]
+fn regress_a_table_is_parted_where_its_clock_is_set_back() {
+    let rows = |from_s: f64, count: usize, x: f64| -> Vec<String> {
+        let row = |k: usize| {
+            let t = from_s + 0.1 * k as f64;
+            [format!("{t:.2},{},0,0,,\n", x + 0.1 * k as f64), format!("{:.2},,,,{x},0\n", t + 0.05)]
+        };
+        (0..count).flat_map(row).collect()
+    };
+    let table = |rows: &[String]| "t,x,y,yaw,cmd_speed,cmd_steer\n".to_string() + &rows.concat();
+    for from_s in [0.0, 1.7e9] {
+        let (found, notes) = read(&table(&[rows(from_s, 30, 1.0), rows(0.0, 40, 2.0)].concat()), &flat(&[])).expect("two drives");
+        let drives: Vec<(&str, usize, f64)> = found.iter().map(|d| (d.id.as_str(), d.time_s().len(), d.time_s()[0])).collect();
+        // No command is known at the first row of either.
+        assert_eq!(drives, [("log-1", 30, 0.0), ("log-2", 40, 0.0)], "{notes:?}");
+        for (drive, speed) in found.iter().zip([1.0, 2.0]) {
+            assert!(column(drive, "cmd_speed").is_some_and(|told| told.iter().all(|v| *v == speed)), "{drive:?}");
+        }
+        assert!(notes.iter().any(|n| n.starts_with("log: time goes back 1 times, first in line 62 by ")), "{notes:?}");
+    }
+    let mut late = rows(0.0, 30, 1.0);
+    late[40] = late[40].replacen("2.00,", "0.55,", 1);
+    let told = read(&table(&late), &flat(&[])).expect_err("disorder").to_string();
+    assert!(told.contains("line 42: time goes backwards, 0.55 s after 1.9 s") && told.contains("sort the log"), "{told}");
+}
+
+/// Goal: a quaternion that is none is called so. Method: one of twice the length, which is left out, and one of 1.5 times, of which the direction counts.
+#[test]
+fn regress_a_quaternion_that_is_not_of_unit_length_is_told() {
+    let table = |length: f64| {
+        let mut table = "t,x,y,z,qx,qy,qz,qw,cmd_speed,cmd_steer\n".to_string();
+        for k in 0..30 {
+            let half = length * std::f64::consts::FRAC_1_SQRT_2;
+            let _ = writeln!(table, "{},0,0,0,0,0,{half},{half},1,0", 0.1 * f64::from(k));
+        }
+        table
+    };
+    let strict = options(&[], FrameConvention::EnuFlu);
+    let said = read(&table(2.1), &strict).expect_err("none").to_string();
+    assert!(said.contains("the quaternion is not of unit length in 30 of 30 rows (2.10 in the middle)"), "{said}");
+    let (found, notes) = read(&table(1.5), &strict).expect("a drive");
+    assert!(column(&found[0], "yaw").is_some_and(|yaw| (yaw[0] - std::f64::consts::FRAC_PI_2).abs() < 1e-12));
+    assert!(notes.iter().any(|n| n.contains("not of unit length in 30 of 30 rows (1.50")), "{notes:?}");
+    assert!(read(&table(1.001), &strict).expect("a drive").1.is_empty());
+}
