@@ -88,6 +88,35 @@ fn service_time_stamps_in_nanoseconds_are_refused_without_their_unit() {
     assert!(code == Some(0) && said.contains("120 samples, 10.0 Hz"), "{said}");
 }
 
+/// Goal: what `import` doubts in the rows of a log, `check` does too. Method: the example with every second row, and with every position repeated twice more at 30 Hz.
+#[test]
+fn regress_what_is_measured_too_seldom_is_doubted_by_import_and_check() {
+    let folder = tempfile::tempdir().unwrap();
+    let text = std::fs::read_to_string(example()).unwrap();
+    let (head, rows): (&str, Vec<&str>) = (text.lines().next().unwrap(), text.lines().skip(1).collect());
+    let column = |name: &str| head.split(',').position(|held| held == name).unwrap();
+    let [x, y] = [column("x"), column("y")];
+    let every_second: String = rows.iter().step_by(2).map(|row| format!("{row}\n")).collect();
+    let held = |i: usize, row: &str| {
+        let held: Vec<&str> = rows[i / 3 * 3].split(',').collect();
+        let cells = row.split(',').enumerate().map(|(at, cell)| if at == x || at == y { held[at] } else { cell });
+        cells.collect::<Vec<_>>().join(",") + "\n"
+    };
+    let held: String = rows.iter().enumerate().map(|(i, row)| held(i, row)).collect();
+    for (set, rows, doubt) in [
+        ("seldom", every_second, "1 of 1 drives are measured more seldom than the model steps, `log` at 5.0 Hz"),
+        ("held", held, "positions come at 3.3 Hz in rows at 10.0 Hz in `log`"),
+    ] {
+        let log = folder.path().join("log.csv");
+        std::fs::write(&log, format!("{head}\n{rows}")).unwrap();
+        let (code, said) = import_of(folder.path(), &log, &card(), set, &[]);
+        assert!(code == Some(0) && said.contains(&format!("doubt: {doubt}")), "{said}");
+        let check = nesam(folder.path(), &["check", "root"]);
+        let said = String::from_utf8_lossy(&check.stdout).into_owned();
+        assert!(check.status.success() && said.contains(&format!("doubt: set {set}: {doubt}")), "{said}");
+    }
+}
+
 #[test]
 fn service_folders_are_bags_or_refused_with_what_to_do() {
     let folder = tempfile::tempdir().unwrap();

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use clap::Args;
 use nesam_evaluation::Baselines;
-use nesam_import::{Doubt, card_doubts, doubts};
+use nesam_import::{Doubt, card_doubts, doubts, read_recorded, recorded_doubts};
 use nesam_model::bundle::MANIFEST;
 use nesam_model::{ModelBundle, Predictor};
 use nesam_trajectories::DataRoot;
@@ -177,8 +177,12 @@ fn check_set(root: &DataRoot, set: &str, findings: &mut Findings) {
     };
     let samples: usize = drives.iter().map(|d| d.states.len()).sum();
     findings.note(format!("set {set}: {} drives, {samples} samples at {} s", drives.len(), args.dt));
+    let recorded = match read_recorded(&root.path().join(set).join("samples.parquet")) {
+        Ok(recorded) => recorded,
+        Err(e) => return findings.error(format!("set {set}: {}", chain(&e))),
+    };
     let positions = drives.iter().flat_map(|d| &d.states).map(|s| s.position_m);
-    let all = doubts(&drives, root.vehicle()).into_iter().chain(far_from_origin(positions));
+    let all = recorded_doubts(&recorded).into_iter().chain(doubts(&drives, root.vehicle())).chain(far_from_origin(positions));
     all.for_each(|doubt| findings.doubt(&format!("set {set}"), &doubt));
     let mut worlds: Vec<&str> = drives.iter().filter_map(|d| d.world.as_deref()).collect();
     worlds.sort_unstable();

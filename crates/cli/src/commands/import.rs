@@ -8,7 +8,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use clap::{Args, ValueEnum};
-use nesam_import::{CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, write_set};
+use nesam_import::{
+    CONVERT, Drive, FrameConvention, Mapping, Options, Topics, doubts, drives, read_bag, read_csv, read_recorded, recorded_doubts,
+    write_set,
+};
 use nesam_trajectories::{DataRoot, SetQuery, Trajectory, read_vehicle_card};
 
 use self::draft::Draft;
@@ -65,10 +68,6 @@ pub struct ImportArgs {
     html: Option<PathBuf>,
 }
 
-/// Logs that are measured less often are doubted: the model steps at 10 Hz, and stamps tremble.
-const RATE_MIN_HZ: f64 = 9.0;
-/// Those that are measured less often than this may count their time in milliseconds: at a kilohertz they would lie a second apart.
-const SECONDS_MIN_HZ: f64 = 1.5;
 /// Plots of the drives, in the folder of their set.
 const PAGE: &str = "import.html";
 
@@ -88,7 +87,7 @@ Examples:
 enum FrameArg {
     /// x east, y north, z up; body x forward, y left, z up (ROS)
     EnuFlu,
-    /// x north, y east, z down; body x forward, y right, z down (PX4, ArduPilot)
+    /// x north, y east, z down; body x forward, y right, z down (PX4, ArduPilot); the second command and road-wheel angles are positive to the right
     NedFrd,
 }
 
@@ -224,14 +223,6 @@ fn read(args: &ImportArgs, log: &Path, mapping: &Mapping) -> Result<Vec<Drive>, 
         let length_s = t[t.len() - 1] - t[0];
         let rate_hz = (t.len() - 1) as f64 / length_s;
         say!("  {}: {length_s:.1} s, {} samples, {rate_hz:.1} Hz", drive.id, t.len());
-        if rate_hz < RATE_MIN_HZ {
-            let advice = if rate_hz < SECONDS_MIN_HZ {
-                "record at 10 Hz or faster, or, where its time stamps are milliseconds, import with `--column t=COLUMN:ms`"
-            } else {
-                "record at 10 Hz or faster"
-            };
-            say!("  doubt: {rate_hz:.1} Hz is slower than the model's steps of 0.1 s: what lies between is interpolated; {advice}");
-        }
     }
     Ok(found)
 }
@@ -291,7 +282,8 @@ fn judge(args: &ImportArgs, card: Option<&Path>, draft: &Draft) -> Result<(), Fa
     for note in root.notes().iter().filter(|note| args.world.is_some() || of_card.contains(note)) {
         say!("  note: {note}");
     }
-    for doubt in doubts(&drives, root.vehicle()) {
+    let recorded = read_recorded(&draft.root().join(&args.set).join("samples.parquet")).or_input()?;
+    for doubt in recorded_doubts(&recorded).into_iter().chain(doubts(&drives, root.vehicle())) {
         say!("  doubt: {}; {}", doubt.what, doubt.advice);
     }
     for beyond in root.beyond_range(&drives) {

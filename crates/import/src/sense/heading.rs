@@ -3,6 +3,7 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 use std::ops::Range;
 
+use nesam_physics::wrap_angle;
 use nesam_trajectories::Trajectory;
 
 use super::relation::surely_most;
@@ -14,6 +15,47 @@ const MOVING_M_S: f64 = 0.7;
 const SLIDES_RAD: f64 = 0.45;
 /// Agreement of directions, 0 to 1, that is none by chance.
 const AGREE: f64 = 0.8;
+
+/// A heading turns no faster than this many times the fastest yaw rate (chosen, as positions).
+const FASTER: f64 = 2.0;
+/// What it may turn beyond that, rad (chosen: poses correct themselves).
+const CORRECTION_RAD: f64 = 0.5;
+/// Fastest yaw rate where no gyro tells one, rad/s (chosen: beyond that of ground vehicles).
+const UNMEASURED_RAD_S: f64 = 3.0;
+
+/// Headings that no yaw rate of the drive reaches.
+pub(super) fn turns(drives: &[Trajectory]) -> Option<Doubt> {
+    let mut found: Vec<(&Trajectory, usize, f64, f64, f64)> = Vec::new();
+    for drive in drives {
+        let rates = drive.states.iter().map(|s| s.angular_velocity_rad_s[2].abs());
+        let fastest_rad_s = if drive.measured.angular_velocity[2] { rates.fold(0.0, f64::max) } else { UNMEASURED_RAD_S };
+        let (mut begin, yaw) = (0, |k: usize| drive.states[k].attitude_rad[2]);
+        for k in 1..drive.states.len() {
+            let turned = wrap_angle(yaw(k) - yaw(k - 1)).abs();
+            if turned == 0.0 {
+                continue;
+            }
+            // A heading that was held catches up.
+            let time_s = (k - begin) as f64 * drive.dt_s;
+            if turned > FASTER * fastest_rad_s * time_s + CORRECTION_RAD {
+                found.push((drive, k, turned, time_s, fastest_rad_s));
+            }
+            begin = k;
+        }
+    }
+    let (drive, k, turned, time_s, fastest_rad_s) = found.iter().max_by(|a, b| a.2.total_cmp(&b.2))?;
+    let what = format!(
+        "the heading jumps {} times: in `{}` by {:.0} degrees within {time_s:.1} s at {:.1} s, where no yaw rate is above {fastest_rad_s:.1} rad/s",
+        found.len(),
+        drive.id,
+        turned.to_degrees(),
+        drive.time_s[*k]
+    );
+    Some(doubt(
+        what,
+        "it seems to be taken from the course over ground, or to be lost in between: part the drives there, or leave them out",
+    ))
+}
 
 /// The vehicle goes where it points.
 pub(super) fn heading(drives: &[Trajectory]) -> Option<Doubt> {

@@ -10,6 +10,8 @@ mod commands;
 mod heading;
 mod motion;
 mod positions;
+mod quaternion;
+mod recorded;
 mod relation;
 mod road_wheels;
 #[cfg(test)]
@@ -22,6 +24,7 @@ use nesam_physics::{Vehicle, WHEELS, wrap_angle};
 use nesam_trajectories::Trajectory;
 
 pub use card::{card_doubts, standing_height_m};
+pub use recorded::recorded_doubts;
 
 /// Samples of a stretch: a second at 10 Hz (chosen: longer than poses freeze in sound logs, shorter than most motions last).
 const STRETCH: usize = 10;
@@ -45,12 +48,23 @@ fn doubt(what: String, advice: impl Into<String>) -> Doubt {
 
 /// What does not fit together in these drives of one vehicle, causes first. Nothing is said of what they hardly exercise, nor of what a wrong heading explains.
 pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
-    let attitude: Vec<Doubt> = [motion::tilt(drives), heading::heading(drives)].into_iter().flatten().collect();
-    let positions: Vec<Doubt> = [positions::frozen(drives, vehicle), positions::jumps(drives, vehicle)].into_iter().flatten().collect();
+    // Whatever else is odd follows from attitudes that are none.
+    if let Some(order) = quaternion::order(drives) {
+        return vec![order];
+    }
+    let jumps = positions::jumps(drives, vehicle);
+    // Of positions that jump back and forth all the time, nothing follows.
+    let torn = jumps.as_ref().is_some_and(|jumps| jumps.often && jumps.back_and_forth);
+    let attitude: Vec<Doubt> = motion::tilt(drives).into_iter().chain(heading::heading(drives).filter(|_| !torn)).collect();
+    // A path in another unit is all jumps, and told by the velocities.
+    let (jumps, unit) =
+        jumps.map_or((None, None), |found| if found.often && !torn { (None, Some(found.doubt)) } else { (Some(found.doubt), None) });
+    let positions: Vec<Doubt> = positions::frozen(drives, vehicle).into_iter().chain(jumps).collect();
     let (attitude_holds, positions_hold) = (attitude.is_empty(), positions.is_empty());
     let rates = motion::rates(drives);
-    let mut found = [attitude, positions].concat();
-    if attitude_holds {
+    let turns = heading::turns(drives).filter(|_| attitude_holds && !torn && rates.is_empty());
+    let mut found = [attitude, positions, turns.into_iter().collect()].concat();
+    if attitude_holds && !torn {
         found.extend(motion::velocity(drives, positions_hold));
         let rims = wheels::speeds(drives, vehicle);
         if rims.is_empty() && rates.is_empty() {
@@ -59,10 +73,13 @@ pub fn doubts(drives: &[Trajectory], vehicle: &Vehicle) -> Vec<Doubt> {
         found.extend(rims);
     }
     found.extend(rates);
-    found.extend(motion::climb(drives));
-    found.extend(commands::speed(drives, attitude_holds));
+    found.extend(motion::climb(drives).filter(|_| !torn));
+    found.extend(commands::speed(drives, attitude_holds && !torn));
     found.extend(commands::turning(drives, vehicle));
     found.extend(road_wheels::angles(drives, vehicle));
+    if found.is_empty() {
+        found.extend(unit);
+    }
     found
 }
 

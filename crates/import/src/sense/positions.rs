@@ -13,8 +13,12 @@ const FROZEN: (f64, f64) = (1.5, 1.0);
 const FASTER: f64 = 2.0;
 /// What it may move beyond that, m (chosen: poses of the Husky correct themselves by 0.8 m at most).
 const CORRECTION_M: f64 = 1.0;
-/// More jumps than one in so many steps are no jumps but a unit, which the velocities tell (chosen).
+/// More jumps than one in so many steps are often: a unit, which the velocities tell, or positions of two places (chosen).
 const JUMPS_ONE_IN: usize = 20;
+/// Positions within this share of the way of a jump are back where it began (chosen).
+const BACK: f64 = 0.5;
+/// Share of the jumps after which positions come back, from which on they go to and fro (chosen): of single positions that mean none it is half.
+const TO_AND_FRO: f64 = 0.25;
 
 /// Samples without a break at one position, to the bit: sensors have noise, and one that repeats itself exactly has nothing new.
 fn stays(drive: &Trajectory) -> Vec<Range<usize>> {
@@ -54,16 +58,31 @@ pub(super) fn frozen(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Doubt> 
 }
 
 /// Positions that no speed of the drive reaches.
-pub(super) fn jumps(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Doubt> {
+pub(super) struct Jumps {
+    pub(super) doubt: Doubt,
+    /// More than one in [`JUMPS_ONE_IN`] steps.
+    pub(super) often: bool,
+    /// Positions come back after them.
+    pub(super) back_and_forth: bool,
+}
+
+/// Positions that no speed of the drive reaches.
+pub(super) fn jumps(drives: &[Trajectory], vehicle: &Vehicle) -> Option<Jumps> {
     let found: Vec<Jump> = drives.iter().flat_map(|drive| jumps_of(drive, vehicle)).collect();
     let steps: usize = drives.iter().map(|drive| drive.states.len()).sum();
-    let Jump { drive, way_m, time_s, at_s, fastest_m_s } =
-        found.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m)).filter(|_| found.len() * JUMPS_ONE_IN <= steps)?;
+    let Jump { drive, way_m, time_s, at_s, fastest_m_s, .. } = found.iter().max_by(|a, b| a.way_m.total_cmp(&b.way_m))?;
+    let (count, come_back) = (found.len(), found.iter().filter(|jump| jump.comes_back).count());
+    let back_and_forth = come_back as f64 >= TO_AND_FRO * count as f64;
+    let times = if back_and_forth { format!("back and forth, {count} times") } else { format!("{count} times") };
     let what = format!(
-        "positions jump {} times: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s",
-        found.len()
+        "positions jump {times}: in `{drive}` by {way_m:.1} m within {time_s:.1} s at {at_s:.1} s, where no speed is above {fastest_m_s:.1} m/s"
     );
-    Some(doubt(what, "the localisation seems to have been set anew: part the drives there, or leave them out"))
+    let advice = if back_and_forth {
+        "two recordings seem to be in one, or zeros or the like to stand for positions that are missing: leave such cells empty"
+    } else {
+        "the localisation seems to have been set anew: part the drives there, or leave them out"
+    };
+    Some(Jumps { doubt: doubt(what, advice), often: count * JUMPS_ONE_IN > steps, back_and_forth })
 }
 
 struct Jump<'a> {
@@ -72,16 +91,30 @@ struct Jump<'a> {
     time_s: f64,
     at_s: f64,
     fastest_m_s: f64,
+    /// One of the next two positions lies near the one before.
+    comes_back: bool,
 }
 
 fn jumps_of<'a>(drive: &'a Trajectory, vehicle: &Vehicle) -> Vec<Jump<'a>> {
     let speeds = (0..drive.states.len()).map(|k| told_m_s(drive, vehicle, k).unwrap_or(0.0).max(drive.controls[k].speed_m_s.abs()));
     let fastest_m_s = speeds.fold(0.0, f64::max);
-    let step = |pair: &[Range<usize>]| {
-        let [a, b] = [0, 1].map(|i| drive.states[pair[i].start].position_m);
-        let (way_m, time_s) = ((b[0] - a[0]).hypot(b[1] - a[1]), pair[0].len() as f64 * drive.dt_s);
-        let jump = way_m > FASTER * fastest_m_s * time_s + CORRECTION_M;
-        jump.then(|| Jump { drive: &drive.id, way_m, time_s, at_s: drive.time_s[pair[1].start], fastest_m_s })
+    let stays = stays(drive);
+    let way_m = |a: usize, b: usize| {
+        let [a, b] = [a, b].map(|i| drive.states[stays[i].start].position_m);
+        (b[0] - a[0]).hypot(b[1] - a[1])
     };
-    stays(drive).windows(2).filter_map(step).collect()
+    let step = |i: usize| {
+        let (way_m_of, time_s) = (way_m(i, i + 1), stays[i].len() as f64 * drive.dt_s);
+        let comes_back = || (i + 2..stays.len().min(i + 4)).any(|later| way_m(i, later) < BACK * way_m_of);
+        let jump = || Jump {
+            drive: &drive.id,
+            way_m: way_m_of,
+            time_s,
+            at_s: drive.time_s[stays[i + 1].start],
+            fastest_m_s,
+            comes_back: comes_back(),
+        };
+        (way_m_of > FASTER * fastest_m_s * time_s + CORRECTION_M).then(jump)
+    };
+    (0..stays.len().saturating_sub(1)).filter_map(step).collect()
 }

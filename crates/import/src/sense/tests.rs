@@ -110,6 +110,62 @@ fn analytic_frozen_and_jumping_positions_are_doubted() {
     assert_eq!(frozen(8) + &jump(0.8), "");
 }
 
+/// Goal: positions that jump back and forth are told however often they do, and nothing else of them. Method: every tenth position zero, and every second one of another
+/// place; a path in millimetres, which the velocities tell; the same with nothing that tells a speed.
+#[test]
+fn regress_positions_that_jump_often_are_told() {
+    let every = |nth: usize, x_m: f64| {
+        told(move |drive| drive.states.iter_mut().step_by(nth).for_each(|s| s.position_m = [x_m, x_m, s.position_m[2]]))
+    };
+    for (told, times) in [(every(10, -9999.0), 79), (every(2, 500.0), 399)] {
+        let expected = format!("positions jump back and forth, {times} times: in `a`");
+        assert!(told.contains(&expected) && told.contains("leave such cells empty") && told.lines().count() == 1, "{expected}: {told}");
+    }
+    let in_mm = |drive: &mut Trajectory| drive.states.iter_mut().for_each(|s| s.position_m = s.position_m.map(|v| 1e3 * v));
+    let told_in_mm = told(in_mm);
+    assert!(told_in_mm.contains("forward velocity against positions") && !told_in_mm.contains("jump"), "{told_in_mm}");
+    let nothing_else = told(|drive| {
+        in_mm(drive);
+        drive.measured.velocity_source = VelocitySource::Positions;
+        (drive.wheel_speed_rad_s, drive.road_wheel_angle_rad) = (None, None);
+        drive.states.iter_mut().for_each(|s| s.velocity_m_s = [0.0; 3]);
+        drive.controls.iter_mut().for_each(|c| *c = Control { speed_m_s: 0.0, second: 0.0 });
+    });
+    assert!(!nothing_else.is_empty(), "something is told");
+}
+
+/// Goal: a heading that jumps is told. Method: half a turn for 5 s of 40, and a quarter of a turn without a gyro; a heading that is held for 0.9 s and catches up is sound.
+#[test]
+fn regress_headings_that_jump_are_told() {
+    let turned = |by_rad: f64, gyro: bool| {
+        told(move |drive| {
+            drive.measured.angular_velocity[2] = gyro;
+            drive.states[200..250].iter_mut().for_each(|s| s.attitude_rad[2] = wrap_angle(s.attitude_rad[2] + by_rad));
+        })
+    };
+    for (told, degrees) in [(turned(std::f64::consts::PI, true), "180"), (turned(-1.6, false), "9")] {
+        let expected = format!("the heading jumps 2 times: in `a` by {degrees}");
+        assert!(told.contains(&expected) && told.contains("course over ground") && told.lines().count() == 1, "{expected}: {told}");
+    }
+    let held = told(|drive| {
+        let held = drive.states[100].attitude_rad;
+        drive.states[100..109].iter_mut().for_each(|s| s.attitude_rad = held);
+    });
+    assert_eq!(held, "");
+}
+
+/// Goal: quaternions w, x, y, z that were read as x, y, z, w are called so. Method: the attitudes of the sound drive through both orders.
+#[test]
+fn regress_quaternions_in_another_order_are_named() {
+    let told = told(states(|s| {
+        let [(sr, cr), (sp, cp), (sy, cy)] = s.attitude_rad.map(|angle| (0.5 * angle).sin_cos());
+        let [x, y, z, w] =
+            [sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy];
+        s.attitude_rad = nesam_physics::vec3::attitude_of_quaternion([w, x, y, z]).unwrap();
+    }));
+    assert!(told.contains("seem to hold w, x, y, z") && told.contains("--column qw=qx") && told.lines().count() == 1, "{told}");
+}
+
 /// Goal: positions in degrees of latitude and longitude are called so, whatever else is measured. Method: the sound drive at 50 degrees of latitude with its
 /// velocities, with its wheels alone, with its commands alone.
 #[test]
@@ -314,6 +370,22 @@ fn analytic_a_mirrored_card_is_doubted() {
     for (change, what) in [
         ((|card| card.gravity_m_s2 = 1.62) as fn(&mut Vehicle), "gravity is 1.620 m/s²"),
         (|card| card.wheel_centre_m.iter_mut().for_each(|wheel| wheel[2] += 1.5), "height of the centre of gravity"),
+        (|card| card.wheel_centre_m.iter_mut().for_each(|wheel| wheel[1] *= 5.0), "the track is 9.138 m"),
+        (|card| card.wheel_centre_m.iter_mut().for_each(|wheel| wheel[1] *= 0.2), "the track over the wheelbase is 0.111"),
+        (|card| card.suspension_n_m = [5.0; 4], "the deflection of the springs under the weight is 1223"),
+        (|card| card.driveline.steering_lag_s = 300.0, "the lag of the steering is 300.000 s"),
+        (
+            |card| (card.mass_kg, card.suspension_n_m) = (7.5, card.suspension_n_m.map(|rate| 0.003 * rate)),
+            "the mass is 7.500 kg, vehicles on wheels of 0.467 m in radius have 50.9 to",
+        ),
+        (
+            |card| card.steering.iter_mut().for_each(|table| table.front_left_rad.iter_mut().for_each(|a| *a *= 57.3)),
+            "the largest road-wheel angle is",
+        ),
+        (
+            |card| (card.second, card.command_range[1]) = (SecondCommand::RoadWheelAngleRad, [-30.0, 30.0]),
+            "the largest road-wheel angle of the range of commands is 30.000 rad",
+        ),
         (|card| card.inertia_kg_m2[2][2] = 4.0 * card.inertia_kg_m2[1][1], "no body has the moments of inertia"),
     ] {
         let said = said(change);
