@@ -22,6 +22,12 @@ fn chrono_a_card_is_fitted_as_training_does_and_helps_on_other_drives() {
     // The data sheet says nothing of the drive line and takes another contact law: what is fitted on one drive helps on the other.
     let error = |stage: &str| json[stage]["position_m"].as_f64().unwrap();
     assert!(error("after") < error("before") && json["after"]["tilt_deg"].is_f64(), "{json}");
+    // Beside it stands what a planner without terramechanics would have, and whether the physics turns as the vehicle does.
+    assert!(
+        json["kinematic"]["position_m"].is_f64() && said(&calibrated).contains("a kinematic fit, which knows no soil: position"),
+        "{json}"
+    );
+    assert!(["before", "after", "kinematic"].iter().all(|stage| (0.5..1.5).contains(&json[stage]["turning"].as_f64().unwrap())), "{json}");
     let parameters = json["parameters"].as_array().unwrap();
     assert!(parameters.iter().any(|p| p["name"] == "driveline.steering_lag_s" && p["card"] != p["fitted"]), "{json}");
     assert!(json["provenance"]["command"].as_str().unwrap().starts_with("nesam calibrate"));

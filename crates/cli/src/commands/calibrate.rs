@@ -1,9 +1,12 @@
 //! `nesam calibrate`: what the card of a vehicle does not say, from its logs, with the physics alone.
 
+mod kinematic;
+
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use clap::Args;
+use nesam_evaluation::Kinematic;
 use nesam_learning::Drive;
 use nesam_learning::at_end::{AtEnd, at_ends};
 use nesam_learning::calibrate::calibrate_vehicle;
@@ -11,9 +14,10 @@ use nesam_learning::recipe::{Reporter, load_drives};
 use nesam_learning::symbolic::{HORIZON, symbolic_error};
 use nesam_model::{ModelBundle, Normalization};
 use nesam_physics::{SecondCommand, Vehicle};
-use nesam_trajectories::card_to_json;
+use nesam_trajectories::{Trajectory, card_to_json};
 use serde_json::{Value, json};
 
+use self::kinematic::kinematic_error;
 use super::train::Console;
 use crate::args::DataArgs;
 use crate::bundle_version::derived_from;
@@ -25,6 +29,10 @@ use crate::sources::{Drives, bundle_to_change, read_drives};
 
 /// Parts of the drives that are left out in turn: every part costs one more calibration.
 const FOLDS: usize = 5;
+/// Heading changes over a rollout, as root of the mean square, from which on it is told how much of them the physics makes, rad (chosen: beyond noise).
+const TURNS_RAD: f64 = 0.1;
+/// A share of the turning that is further from one than this is a warning (chosen).
+const TURNING_OFF: f64 = 0.1;
 /// Name of the fitted card.
 const CARD: &str = "vehicle_calibrated.json";
 
@@ -36,7 +44,8 @@ which were measured with the old card: make them again with `nesam adapt --calib
 
 What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
 rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds or, \
-without any, from the motion. A range of commands that the card does not state is widened to the commands of the drives. A number that ends at an end of \
+without any, from the motion. Beside its errors are those of a kinematic fit (`kinematic` in the JSON), which knows no soil, no slip and no slopes; where the \
+fitted physics turns less or more than the vehicle by a tenth, that is a line of warning (`turning` is the share): a base on casters is none that it can be. A range of commands that the card does not state is widened to the commands of the drives. A number that ends at an end of \
 what is tried is a line of warning (`at_ends` in the JSON): the drives chose the end and not the number.
 
 Examples:
@@ -65,15 +74,27 @@ struct Scored {
     trajectory: String,
     before: Errors,
     after: Errors,
+    /// Of the kinematic fit; `None` where the drives are too short for one.
+    kinematic: Option<Errors>,
 }
 
-/// Mean absolute errors of the symbolic model over rollouts.
+/// Mean absolute errors over rollouts.
 #[derive(Clone, Copy, Default)]
 struct Errors {
     position_m: f64,
     yaw_rad: f64,
     /// Roll and pitch together; `None` without a map, where they tell of the ground.
     tilt_rad: Option<f64>,
+    /// Turning over a rollout: mean of predicted times measured and of measured squared, rad².
+    turning_rad2: [f64; 2],
+}
+
+impl Errors {
+    /// How much of the measured turning is predicted, by least squares; `None` where the vehicle hardly turns.
+    fn turning(&self) -> Option<f64> {
+        let [both, measured] = self.turning_rad2;
+        (measured >= TURNS_RAD * TURNS_RAD).then(|| both / measured)
+    }
 }
 
 /// A calibration on a part of the drives says nothing.
@@ -109,7 +130,11 @@ pub fn run(args: &CalibrateArgs) -> Result<(), Failure> {
     }
     let widened = drives.root.vehicle_of(&drives.drives);
     let (vehicle, scales) = calibrated(widened.clone(), &usable, args.data.dt, &Console::default());
-    let scored = if usable.len() > 1 { held_out(card, &usable, &scales) } else { scored(card, &vehicle, &usable, &scales) };
+    let scored = if usable.len() > 1 {
+        held_out(card, &usable, &drives.drives, &scales)
+    } else {
+        scored(card, &vehicle, [&usable, &usable], &drives.drives, &scales)
+    };
     let changes = changes(card, &vehicle);
     let seconds = HORIZON as f64 * args.data.dt;
     summary(&scored, &changes, usable.len() > 1, seconds);
@@ -138,7 +163,7 @@ fn calibrated(card: Vehicle, drives: &[&Drive], dt_s: f64, reporter: &dyn Report
 }
 
 /// Errors of every drive with a card that was fitted on others.
-fn held_out(card: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Scored> {
+fn held_out(card: &Vehicle, drives: &[&Drive], recorded: &[Trajectory], scales: &Normalization) -> Vec<Scored> {
     let folds = FOLDS.min(drives.len());
     let progress = Progress::start("drives left out in turn", folds);
     let mut all: Vec<Scored> = Vec::with_capacity(drives.len());
@@ -147,7 +172,7 @@ fn held_out(card: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Sc
             drives.iter().enumerate().filter(|(i, _)| (i % folds == fold) == held).map(|(_, drive)| *drive).collect()
         };
         let fitted = calibrated(card.clone(), &part(false), scales.dt_s, &Silent).0;
-        all.extend(scored(card, &fitted, &part(true), scales));
+        all.extend(scored(card, &fitted, [&part(false), &part(true)], recorded, scales));
         progress.set(fold + 1);
     }
     progress.finish();
@@ -155,13 +180,29 @@ fn held_out(card: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Sc
     all
 }
 
-/// Errors of `drives` with two cards.
-fn scored(card: &Vehicle, fitted: &Vehicle, drives: &[&Drive], scales: &Normalization) -> Vec<Scored> {
+/// Errors of drives with two cards, and of the kinematic fit to the drives that the second card was fitted on: (fitted on, scored).
+fn scored(
+    card: &Vehicle,
+    fitted: &Vehicle,
+    [fitted_on, drives]: [&[&Drive]; 2],
+    recorded: &[Trajectory],
+    scales: &Normalization,
+) -> Vec<Scored> {
     let errors = |vehicle: &Vehicle, drive: &Drive| {
         let error = symbolic_error(vehicle, &[drive], scales);
-        Errors { position_m: error.position_m, yaw_rad: error.yaw_rad, tilt_rad: drive.map.is_some().then_some(error.tilt_rad) }
+        let tilt_rad = drive.map.is_some().then_some(error.tilt_rad);
+        Errors { position_m: error.position_m, yaw_rad: error.yaw_rad, tilt_rad, turning_rad2: error.turning_rad2 }
     };
-    drives.iter().map(|drive| Scored { trajectory: drive.id.clone(), before: errors(card, drive), after: errors(fitted, drive) }).collect()
+    let training: Vec<Trajectory> = recorded.iter().filter(|t| fitted_on.iter().any(|drive| drive.id == t.id)).cloned().collect();
+    // Drives that are too short for a window of it have none.
+    let kinematic = Kinematic::fit(card, &training, HORIZON).ok();
+    let one = |drive: &&Drive| Scored {
+        trajectory: drive.id.clone(),
+        before: errors(card, drive),
+        after: errors(fitted, drive),
+        kinematic: kinematic.map(|fit| kinematic_error(&fit, card, drive, scales.dt_s)),
+    };
+    drives.iter().map(one).collect()
 }
 
 /// Mean over drives; of roll and pitch over those with a map.
@@ -173,7 +214,14 @@ fn mean(errors: impl Iterator<Item = Errors>) -> Errors {
         position_m: over(|e| e.position_m),
         yaw_rad: over(|e| e.yaw_rad),
         tilt_rad: (!tilts.is_empty()).then(|| tilts.iter().sum::<f64>() / tilts.len() as f64),
+        turning_rad2: [over(|e| e.turning_rad2[0]), over(|e| e.turning_rad2[1])],
     }
+}
+
+/// Mean errors of the kinematic fit; `None` where a drive has none.
+fn kinematic_mean(scored: &[Scored]) -> Option<Errors> {
+    let all: Option<Vec<Errors>> = scored.iter().map(|s| s.kinematic).collect();
+    all.map(|all| mean(all.into_iter()))
 }
 
 /// Numbers of the card that the fit changed: as the card has them, as fitted; null where one of the two does not have it.
@@ -215,6 +263,10 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
     if let (Some(before), Some(after)) = (before.tilt_rad, after.tilt_rad) {
         say!("  roll and pitch together {:.3}° -> {:.3}°", before.to_degrees(), after.to_degrees());
     }
+    if let Some(kinematic) = kinematic_mean(scored) {
+        let (position_m, yaw_deg) = (kinematic.position_m, kinematic.yaw_rad.to_degrees());
+        say!("  a kinematic fit, which knows no soil: position {position_m:.3} m, yaw {yaw_deg:.3}°");
+    }
     let better = |of: fn(&Errors) -> f64| scored.iter().filter(|s| of(&s.after) < of(&s.before)).count();
     let (position, yaw) = (better(|e| e.position_m), better(|e| e.yaw_rad));
     say!("  position is better on {position} of {} drives, yaw on {yaw}", scored.len());
@@ -222,6 +274,12 @@ fn summary(scored: &[Scored], changes: &BTreeMap<String, [Value; 2]>, held_out: 
         if worse {
             say!("  warning: {what} is worse with the fitted card; see which of its numbers below is not what the vehicle is like");
         }
+    }
+    if let Some(turning) = after.turning().filter(|turning| (turning - 1.0).abs() > TURNING_OFF) {
+        say!(
+            "  warning: with the fitted card the physics turns {turning:.2} times as much as the vehicle: no number that is fitted makes up for that. See track, \
+             wheelbase, wheels and centre of gravity of the card; a base on casters, or one that rolls on more than four wheels, is not what the physics can be"
+        );
     }
     say!("\ncard -> fitted:");
     let shown = |value: &Value| if value.is_null() { "–".into() } else { value.to_string() };
@@ -237,8 +295,7 @@ fn document(
     (changes, ends): (&BTreeMap<String, [Value; 2]>, &[AtEnd]),
     card: &Path,
 ) -> Value {
-    let errors =
-        |e: Errors| json!({"position_m": e.position_m, "yaw_deg": e.yaw_rad.to_degrees(), "tilt_deg": e.tilt_rad.map(f64::to_degrees)});
+    let errors = |e: Errors| json!({"position_m": e.position_m, "yaw_deg": e.yaw_rad.to_degrees(), "tilt_deg": e.tilt_rad.map(f64::to_degrees), "turning": e.turning()});
     let parameters: Vec<Value> =
         changes.iter().map(|(name, [before, after])| json!({"name": name, "card": before, "fitted": after})).collect();
     let trajectories: Vec<Value> =
@@ -254,6 +311,7 @@ fn document(
         "held_out": scored.len() > 1,
         "before": errors(mean(scored.iter().map(|s| s.before))),
         "after": errors(mean(scored.iter().map(|s| s.after))),
+        "kinematic": kinematic_mean(scored).map(errors),
         "trajectories": trajectories,
         "parameters": parameters,
         "at_ends": at_ends,
@@ -306,9 +364,10 @@ mod tests {
 
     #[test]
     fn analytic_means_are_of_what_was_measured() {
-        let error = |position_m, tilt_rad| Errors { position_m, yaw_rad: 0.1, tilt_rad };
+        let error = |position_m, tilt_rad| Errors { position_m, yaw_rad: 0.1, tilt_rad, turning_rad2: [0.1, 0.2] };
         let all = mean([error(1.0, None), error(3.0, Some(0.2))].into_iter());
         assert_eq!((all.position_m, all.tilt_rad), (2.0, Some(0.2)));
         assert_eq!(mean([error(1.0, None)].into_iter()).tilt_rad, None);
+        assert_eq!((all.turning(), Errors::default().turning()), (Some(0.5), None), "of what hardly turns nothing is said");
     }
 }
