@@ -136,6 +136,17 @@ impl FilterConfig {
         prior_sd.map(|sd| 0.1 * sd)
     }
 
+    /// The same filter on ground of unseen colour: one soil stands in for all that the prior would tell apart, so P₀ is wider by their variance, and no ground is
+    /// what it looks like. `soil_sd` are their standard deviations in logarithmic coordinates; with physical ones, the paper's, nothing changes.
+    pub fn on_unseen_soil(&self, soil_sd: &[f64; SOIL_DIM]) -> Self {
+        match self.coordinates {
+            SoilCoordinates::Physical => self.clone(),
+            SoilCoordinates::Logarithmic => {
+                Self { prior_sd: core::array::from_fn(|i| self.prior_sd[i].hypot(soil_sd[i])), looks_share: 1.0, ..self.clone() }
+            }
+        }
+    }
+
     /// Algorithm 1 word for word: Δθ in physical units, one linearisation, nothing held at a bound, P⁻ = P⁺ + Q_B without a cap.
     pub fn literal() -> Self {
         let prior_sd = [1.0e6, 3.0e3, 0.15, 1.5e3, 0.08, 0.008];

@@ -32,6 +32,8 @@ pub struct Engine {
     limits: Limits,
     /// The filter that every session starts with.
     filter: SoilFilter,
+    /// The same for maps without colours, where the bundle says by how much more soils differ there.
+    unseen_filter: Option<SoilFilter>,
     /// What the bundle knows of its own errors.
     noise: Option<Arc<RolloutNoise>>,
     step_ns: i64,
@@ -56,20 +58,22 @@ impl Engine {
     pub fn new(predictor: Arc<Predictor>, limits: Limits) -> Result<Self, AdaptationError> {
         predictor.keep_maps(limits.maps_max);
         let step_ns = (predictor.bundle().normalization.dt_s * 1e9).round() as i64;
-        let filter = SoilFilter::new(CalibratedFilter::config_of(predictor.bundle().soil_filter_json.as_deref())?)?;
+        let config = CalibratedFilter::config_of(predictor.bundle().soil_filter_json.as_deref())?;
         let unreadable = |error: ModelError| AdaptationError::Settings { reason: error.to_string() };
         let noise = predictor.bundle().rollout_noise_json.as_deref().map(RolloutNoise::from_json).transpose().map_err(unreadable)?;
-        Ok(Self {
+        Self {
             predictor,
             limits,
-            filter,
+            filter: SoilFilter::new(config.clone())?,
+            unseen_filter: None,
             noise: noise.map(Arc::new),
             step_ns,
             sessions: BTreeMap::new(),
             maps: MapRegistry::default(),
             fleet: None,
             events: None,
-        })
+        }
+        .with_filter(config)
     }
 
     /// Sessions opened from now on learn the soil with these settings.
@@ -77,6 +81,8 @@ impl Engine {
     /// # Errors
     /// `AdaptationError::Config` naming the setting that is unusable.
     pub fn with_filter(mut self, config: FilterConfig) -> Result<Self, AdaptationError> {
+        let soil_sd = self.predictor.bundle().normalization.stand_in.as_ref().map(|stand_in| &stand_in.soil_sd);
+        self.unseen_filter = soil_sd.map(|soil_sd| SoilFilter::new(config.on_unseen_soil(soil_sd))).transpose()?;
         self.filter = SoilFilter::new(config)?;
         Ok(self)
     }
@@ -157,6 +163,17 @@ impl Engine {
         }
     }
 
+    /// The filter that a session begins with on a map: wider where no colours show what soil is where.
+    fn filter_on(&self, map: Option<&str>) -> Result<&SoilFilter, EngineError> {
+        let sees_colours = map.map_or(Ok(true), |map| self.maps.get(map).map(|map| map.has_semantics()))?;
+        Ok(self.unseen_filter.as_ref().filter(|_| !sees_colours).unwrap_or(&self.filter))
+    }
+
+    /// All the filters that a session can have begun with: a map may have come by its colours since.
+    fn filters(&self) -> impl Iterator<Item = &SoilFilter> {
+        core::iter::once(&self.filter).chain(&self.unseen_filter)
+    }
+
     fn session(&self, id: &str) -> Result<&Session, EngineError> {
         self.sessions.get(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })
     }
@@ -175,7 +192,7 @@ impl Engine {
             self.maps.get(map)?;
         }
         self.check_room("session_id", id, &open.vehicle)?;
-        let mut session = Session::new(id, &open.vehicle, map, self.filter.clone(), now_ns);
+        let mut session = Session::new(id, &open.vehicle, map, self.filter_on(map)?.clone(), now_ns);
         if self.watches() {
             session.begin_watch();
         }
@@ -287,7 +304,7 @@ impl Engine {
         self.check_room("session_id", id, &image.vehicle)?;
         let rules = Rules { step_ns: self.step_ns, vehicle: &bundle.vehicle, limits: &self.limits };
         let acting = Acting::new(&self.predictor, &image.effects).map_err(|error| refused(error.to_string()))?;
-        let mut session = Session::from_image(id, image, self.filter.clone(), acting, now_ns, rules)?;
+        let mut session = Session::from_image(id, image, self.filters(), acting, now_ns, rules)?;
         if self.watches() {
             session.begin_watch();
         }

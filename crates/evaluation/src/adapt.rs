@@ -187,9 +187,11 @@ pub fn adapt_drive(
     map: Option<&Arc<WorldMap>>,
     config: &FilterConfig,
 ) -> Result<DriveAdaptation, EvaluationError> {
-    let mut filter = SoilFilter::new(config.clone())?;
     let mut out = DriveAdaptation::default();
     let Some(map) = map else { return Ok(out) };
+    let wider = predictor.unseen_soil_sd(map).map(|soil_sd| config.on_unseen_soil(soil_sd));
+    let config = wider.as_ref().unwrap_or(config);
+    let mut filter = SoilFilter::new(config.clone())?;
     let steps = history_steps(drive);
     let mut start = 0;
     while start + config.buffer < steps.len() {

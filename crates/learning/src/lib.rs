@@ -21,6 +21,7 @@ pub mod recipe;
 pub mod rims;
 pub mod scales;
 pub mod schedule;
+pub mod stand_in;
 pub mod suspension;
 pub mod symbolic;
 pub mod trainer;

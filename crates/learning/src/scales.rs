@@ -79,5 +79,6 @@ pub fn measure(drives: &[&Drive], vehicle: &Vehicle, dt_s: f64) -> Normalization
         trained_speed_m_s: speed,
         trained_second: second,
         trained_tilt_rad: tilt,
+        stand_in: None,
     }
 }

@@ -225,10 +225,11 @@ impl ModelBundle {
         self.vehicle.check_effects(&self.effects, self.normalization.dt_s).map_err(|reason| Folder(dir).fail(EFFECTS, reason))
     }
 
-    /// How the vehicle that the network knows rides: without effects, on the default soil.
+    /// How the vehicle that the network knows rides: without effects, on the soil that its prior began with.
     pub fn usual_ride(&self) -> UsualRide {
         let scales = &self.normalization;
-        UsualRide::of(&self.vehicle, scales.dt_s, scales.substeps, &Soil::from_array(scales.default_soil()))
+        let soil = Soil::from_array(soil_coordinates::from_raw(&scales.default_soil_raw));
+        UsualRide::of(&self.vehicle, scales.dt_s, scales.substeps, &soil)
     }
 
     /// The bundle with its network silenced: nothing is said of sinkage and of the next state, the soil prior stays.
@@ -245,7 +246,7 @@ impl ModelBundle {
     /// The bundle with another soil where a map tells of none.
     pub fn on_soil(&self, soil: &[f64; SOIL_DIM]) -> Self {
         let mut on_soil = self.clone();
-        on_soil.normalization.default_soil_raw = soil_coordinates::to_raw(soil);
+        on_soil.normalization.set_default_soil(soil);
         on_soil
     }
 

@@ -35,7 +35,7 @@ pub use effects_file::{read as effects_from_toml, write as effects_to_toml};
 pub use fused::{Order, Path};
 pub use ground::{GroundSource, history_actuators};
 pub use interruption::{Gate, Interruption};
-pub use normalization::Normalization;
+pub use normalization::{Normalization, StandIn};
 pub use precision::Precision;
 pub use predictor::{PartTimes, Predictor, Transition};
 pub use rollout::{Due, HistoryStep, MeasuredWheels, RiskOutputs, Rollout, RolloutExtras, RolloutQuery, Variant, flag, is_raised};

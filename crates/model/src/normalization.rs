@@ -6,7 +6,7 @@ use nesam_physics::{SOIL_DIM, STATE_DIM};
 use nesam_terrain::PatchScale;
 use serde::{Deserialize, Serialize};
 
-use crate::dims::STATE_CONTROL;
+use crate::dims::{HIDDEN, STATE_CONTROL};
 use crate::soil_coordinates;
 use crate::token::TokenScale;
 
@@ -42,7 +42,7 @@ pub struct Normalization {
     pub sinkage_log_ratio_max: f32,
     /// Scale of each state entry in the training loss, same units and order as the state.
     pub loss_scale: [f32; STATE_DIM],
-    /// Raw soil coordinates used without a map or without semantics, and as the bias of an untrained prior.
+    /// Raw soil coordinates that an untrained prior begins with, also used without a map or without semantics where there is no [`StandIn`].
     pub default_soil_raw: [f32; SOIL_DIM],
     /// Range of speed commands in the training data, m/s.
     pub trained_speed_m_s: [f64; 2],
@@ -50,6 +50,23 @@ pub struct Normalization {
     pub trained_second: [f64; 2],
     /// Largest |roll| and |pitch| in the training data, rad.
     pub trained_tilt_rad: f64,
+    /// What stands in for ground that no map shows; bundles trained without colours have none, and those before 0.1.0.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stand_in: Option<StandIn>,
+}
+
+/// What stands in for ground that no map shows, for a network that was trained on maps with colours alone: means along the drives that trained it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct StandIn {
+    /// What colours add to the context W_c c of the same ground without them, (128).
+    pub colours: Vec<f32>,
+    /// Context W_c c, (128): of ground without a map.
+    pub ground: Vec<f32>,
+    /// Soil prior in raw coordinates: the soil without a map or without colours.
+    pub soil_raw: [f32; SOIL_DIM],
+    /// Standard deviation of the soil prior, of the logarithms of k_φ, k_c, c and K and of n and φ (rad) themselves.
+    pub soil_sd: [f64; SOIL_DIM],
 }
 
 impl Normalization {
@@ -93,7 +110,7 @@ impl Normalization {
         if !(self.trained_tilt_rad.is_finite() && self.trained_tilt_rad >= 0.0) {
             return Err(format!("`trained_tilt_rad` is {}, allowed are finite numbers from 0", self.trained_tilt_rad));
         }
-        Ok(())
+        self.stand_in.as_ref().map_or(Ok(()), StandIn::check)
     }
 
     /// Scale of patches.
@@ -111,9 +128,37 @@ impl Normalization {
         TokenScale { mean: self.token_mean, scale: self.token_scale }
     }
 
-    /// Soil without semantics.
+    /// Soil without a map or without semantics, raw.
+    pub fn unseen_soil_raw(&self) -> &[f32; SOIL_DIM] {
+        self.stand_in.as_ref().map_or(&self.default_soil_raw, |stand_in| &stand_in.soil_raw)
+    }
+
+    /// The same, order of `SOIL_NAMES`.
     pub fn default_soil(&self) -> [f64; SOIL_DIM] {
-        soil_coordinates::from_raw(&self.default_soil_raw)
+        soil_coordinates::from_raw(self.unseen_soil_raw())
+    }
+
+    /// Takes another soil where a map tells of none.
+    pub fn set_default_soil(&mut self, soil: &[f64; SOIL_DIM]) {
+        let raw = soil_coordinates::to_raw(soil);
+        *self.stand_in.as_mut().map_or(&mut self.default_soil_raw, |stand_in| &mut stand_in.soil_raw) = raw;
+    }
+}
+
+impl StandIn {
+    fn check(&self) -> Result<(), String> {
+        for (key, values) in [("colours", &self.colours), ("ground", &self.ground)] {
+            if values.len() != HIDDEN || !values.iter().all(|value| value.is_finite()) {
+                return Err(format!("`stand_in.{key}` holds {} numbers, allowed are {HIDDEN} that are finite", values.len()));
+            }
+        }
+        if !self.soil_raw.iter().all(|value| value.is_finite()) {
+            return Err(format!("`stand_in.soil_raw` is {:?}, allowed are finite numbers", self.soil_raw));
+        }
+        if !self.soil_sd.iter().all(|sd| sd.is_finite() && *sd >= 0.0) {
+            return Err(format!("`stand_in.soil_sd` is {:?}, allowed are finite numbers from 0", self.soil_sd));
+        }
+        Ok(())
     }
 }
 
@@ -172,6 +217,18 @@ mod tests {
         for tilt_rad in [-0.1, f64::NAN] {
             says(refused(|n| n.trained_tilt_rad = tilt_rad), "trained_tilt_rad", "from 0", &tilt_rad.to_string());
         }
+        let stand_in =
+            StandIn { colours: vec![0.1; HIDDEN], ground: vec![0.2; HIDDEN], soil_raw: [0.0; SOIL_DIM], soil_sd: [0.3; SOIL_DIM] };
+        let with = |change: fn(&mut StandIn)| {
+            let mut changed = stand_in.clone();
+            change(&mut changed);
+            refused(|n| n.stand_in = Some(changed))
+        };
+        assert_eq!(with(|_| {}), None);
+        says(with(|s| s.colours.truncate(5)), "stand_in.colours", "128", "five");
+        says(with(|s| s.ground[7] = f32::NAN), "stand_in.ground", "finite", "NaN");
+        says(with(|s| s.soil_raw[2] = f32::INFINITY), "stand_in.soil_raw", "finite", "infinity");
+        says(with(|s| s.soil_sd[5] = -0.1), "stand_in.soil_sd", "from 0", "-0.1");
     }
 
     #[test]

@@ -253,7 +253,7 @@ impl Predictor {
     /// an onlooker can ask while others predict.
     pub fn known_soil_prior(&self, map: Option<&Arc<WorldMap>>, pose: Pose2) -> Option<[f64; SOIL_DIM]> {
         let Some(map) = map.filter(|map| map.has_semantics()) else {
-            return Some(from_raw(&self.bundle.normalization.default_soil_raw));
+            return Some(from_raw(self.bundle.normalization.unseen_soil_raw()));
         };
         self.held_tokens(map)?.known(&pose).map(|token| from_raw(&raw_soil(&token)))
     }
@@ -288,24 +288,37 @@ impl Predictor {
         self.maps.lock().expect("no holder panics; this is a bug")
     }
 
-    /// Terrain tokens at poses; where there is no map or no semantics, the default soil.
+    /// Terrain tokens at poses; where there is no map or no semantics, what stands in for them.
     fn terrain(&self, tokens: Option<&TerrainTokens>, poses: &[Pose2]) -> Vec<TerrainToken> {
         let mut terrain = match (tokens, self.mode) {
             (None, _) => vec![[0.0; VALUES]; poses.len()],
             (Some(tokens), TerrainMode::Grid) => tokens.at(&self.projection, poses),
             (Some(tokens), TerrainMode::Exact) => self.projection.exact(tokens.map(), poses),
         };
-        self.default_soil(tokens, &mut terrain);
+        self.stand_in(tokens, &mut terrain);
         terrain
     }
 
-    /// Puts the default soil into tokens of a map without semantics, or of none.
-    fn default_soil(&self, tokens: Option<&TerrainTokens>, terrain: &mut [TerrainToken]) {
-        if !tokens.is_some_and(|t| t.map().has_semantics()) {
-            for token in terrain {
-                token[HIDDEN..].copy_from_slice(&self.bundle.normalization.default_soil_raw);
-            }
+    /// Puts what stands in for unseen ground into tokens of a map without semantics, or of none.
+    fn stand_in(&self, tokens: Option<&TerrainTokens>, terrain: &mut [TerrainToken]) {
+        if tokens.is_some_and(|t| t.map().has_semantics()) {
+            return;
         }
+        let scales = &self.bundle.normalization;
+        let unseen = scales.stand_in.as_ref().map(|s| if tokens.is_some() { &s.colours } else { &s.ground });
+        for token in terrain {
+            if let Some(unseen) = unseen {
+                token[..HIDDEN].iter_mut().zip(unseen).for_each(|(value, unseen)| *value += unseen);
+            }
+            token[HIDDEN..].copy_from_slice(scales.unseen_soil_raw());
+        }
+    }
+
+    /// By how much soils differ for which one stands in on a map, as [`crate::StandIn::soil_sd`]; `None` where colours show what soil is where, and for bundles
+    /// that do not say.
+    pub fn unseen_soil_sd(&self, map: &WorldMap) -> Option<&[f64; SOIL_DIM]> {
+        let stand_in = self.bundle.normalization.stand_in.as_ref();
+        stand_in.filter(|_| !map.has_semantics()).map(|stand_in| &stand_in.soil_sd)
     }
 
     /// Encodes the measured history for a form that remembers it.

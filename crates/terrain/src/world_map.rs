@@ -202,6 +202,12 @@ impl WorldMap {
         mirrored.with_soil_classes(self.soil_classes.clone())
     }
 
+    /// The same heights as a map that shows no colours.
+    pub fn without_colours(&self) -> Self {
+        let bare = Self::checked(&self.id, self.version, self.geometry, self.elevation_m(), None);
+        bare.expect("a valid map stays valid; this is a bug").with_source(self.source.clone())
+    }
+
     /// World id.
     pub fn id(&self) -> &str {
         &self.id

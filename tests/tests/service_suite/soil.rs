@@ -5,6 +5,7 @@ use std::sync::{Arc, Mutex};
 use nesam_adaptation::FilterConfig;
 use nesam_client::{outcome_label, v1};
 use nesam_engine::{Command, Engine, Event, Limits, OpenSession, Reply};
+use nesam_terrain::WorldMap;
 
 use crate::stage::*;
 
@@ -93,4 +94,36 @@ fn analytic_a_filter_that_fails_says_so_and_learns_nothing() {
         told.iter().all(|(session, vehicle, reason)| session == "s" && vehicle == "truck" && reason.contains("innovation")),
         "{told:?}"
     );
+}
+
+/// Goal: where no colours show what soil is where, a session is less sure of its soil, and comes back as it was. Method: the map of a recorded drive with and without its
+/// colours; the session on bare ground goes on under a map that has come by colours since.
+#[test]
+fn property_on_bare_ground_a_session_is_less_sure_of_the_soil() {
+    let recorded = recorded();
+    let bare = Arc::new(recorded.world.without_colours());
+    let on = |world: &Arc<WorldMap>| {
+        let mut engine = Engine::new(predictor(), Limits::default()).unwrap();
+        engine.execute(0, &Command::PutMap { map: Arc::clone(world), base: None }).unwrap();
+        engine
+    };
+    let sd = |reply: Reply| {
+        let Reply::Session(view) = reply else { panic!("no session") };
+        (0..6).map(|i| view.soil.covariance[i][i].sqrt()).collect::<Vec<_>>()
+    };
+    let mut engines = [on(&recorded.world), on(&bare)];
+    let open = OpenSession { vehicle: "v".into(), map: bare.id().into(), ..Default::default() };
+    let [seen, unseen] = [0, 1].map(|i| sd(engines[i].execute(0, &Command::Open(open.clone())).unwrap()));
+    let soil_sd = *predictor().unseen_soil_sd(&bare).expect("the shipped bundle says how soils differ");
+    for i in 0..6 {
+        let wider = filter_config().prior_sd[i].hypot(soil_sd[i]);
+        assert!((unseen[i] - wider).abs() < 1e-9 && unseen[i] > seen[i], "{i}: {} {}", seen[i], unseen[i]);
+    }
+    let Reply::Image(image) = engines[1].execute(0, &Command::Export { session: "v".into() }).unwrap() else { panic!("no image") };
+    let back = |engine: &mut Engine| engine.execute(0, &Command::Import { image: image.clone(), session: "w".into() });
+    assert_eq!(sd(back(&mut engines[1]).unwrap()), unseen);
+    let mut coloured = image.clone();
+    coloured.map = Some((recorded.world.id().into(), recorded.world.hash().into()));
+    let moved = engines[0].execute(0, &Command::Import { image: coloured, session: "w".into() }).unwrap();
+    assert_eq!(sd(moved), unseen);
 }

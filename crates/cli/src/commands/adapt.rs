@@ -13,6 +13,7 @@ use nesam_evaluation::{
     Adaptation, Consistency, DEFAULT_RESAMPLES, DriveAdaptation, ErrorSummary, ErrorTree, Inputs, KnownSoil, ModelName, Resamples, Row,
     Truth, WindowPredictor, adapt_all, all_windows, calibrate_noise, path_median_m, predict_all, score, write_predictions,
 };
+use nesam_learning::stand_in;
 use nesam_model::{ModelBundle, Predictor, Variant};
 use nesam_physics::SOIL_NAMES;
 use nesam_terrain::{Disguise, WorldMap};
@@ -26,7 +27,7 @@ use crate::bundle_path::bundle_dir;
 use crate::failure::{Failure, OrFail};
 use crate::output::{note, say};
 use crate::progress::Progress;
-use crate::sources::{Drives, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, read_drives, validation_drives};
+use crate::sources::{Drives, check_own_vehicle, load_bundle, load_bundle_for, predictor_for, query, read_drives, validation_drives};
 use crate::{interrupt, output};
 
 /// Options of `nesam adapt`.
@@ -46,8 +47,8 @@ pub struct AdaptArgs {
     /// Algorithm 1 of the paper to the letter: physical units, one linearisation, nothing held at a bound
     #[arg(long)]
     literal: bool,
-    /// Estimate the noise of the soil filter on the drives of the train split that training left for validation, and put it into the bundle; run once
-    /// for every new bundle
+    /// Estimate the noise of the soil filter on the drives of the train split that training left for validation, and on the others what stands in where
+    /// a map has no colours, and put both into the bundle; run once for every new bundle
     #[arg(long, conflicts_with = "literal")]
     calibrate: bool,
     /// With --calibrate: follow errors that carry on from buffer to buffer as a state, instead of counting repeated evidence less
@@ -132,6 +133,8 @@ enum DisguiseArg {
     Softer,
     /// Some classes firmer, some softer, some as they are, in each world by the seed.
     Mixed,
+    /// Like nothing: a map of heights alone.
+    Bare,
 }
 
 /// Runs the command.
@@ -267,13 +270,13 @@ fn disguise(drives: &mut Drives, look: DisguiseArg, seed: u64) -> Result<(), Fai
     let mut painted: BTreeMap<String, Arc<WorldMap>> = BTreeMap::new();
     for map in drives.maps.iter_mut().flatten() {
         if !painted.contains_key(map.hash()) {
-            let disguise = match look {
-                DisguiseArg::Firmer => Disguise::Firmer,
-                DisguiseArg::Softer => Disguise::Softer,
-                DisguiseArg::Mixed => Disguise::Mixed(rng.random()),
+            let other = match look {
+                DisguiseArg::Firmer => Disguise::Firmer.of(map),
+                DisguiseArg::Softer => Disguise::Softer.of(map),
+                DisguiseArg::Mixed => Disguise::Mixed(rng.random()).of(map),
+                DisguiseArg::Bare => Some(map.without_colours()),
             };
-            let other =
-                disguise.of(map).ok_or_else(|| Failure::input(format!("map {} states no colours of soil classes to repaint", map.id())))?;
+            let other = other.ok_or_else(|| Failure::input(format!("map {} states no colours of soil classes to repaint", map.id())))?;
             painted.insert(map.hash().into(), Arc::new(other));
         }
         *map = Arc::clone(&painted[map.hash()]);
@@ -287,6 +290,10 @@ fn calibrate(args: &AdaptArgs) -> Result<(), Failure> {
     let drives = validation_drives(&args.data, "--calibrate", "the noise is estimated")?;
     let mut bundle = load_bundle(Some(&dir))?;
     check_own_vehicle(&bundle, &drives.root, "--calibrate")?;
+    let train_split = drives.root.load_set(&query(&args.data, &drives.set, SplitArg::Train, false)).or_input()?;
+    if let Some(measured) = stand_in::measure_on(&bundle, &drives.root, &train_split).or_input()? {
+        bundle.normalization.stand_in = Some(measured);
+    }
     let predictor = predictor_for(bundle.clone(), &drives.root, args.data.dt)?;
     let mut given = settings_file(args.filter.as_deref())?;
     given.tail_dof.get_or_insert(TAIL_DOF);

@@ -11,10 +11,9 @@ use crate::session::{Acting, Alarm, AppliedEffects};
 impl Engine {
     /// Puts effects on a session, in place of those that were applied before. The same again change their source alone.
     pub(super) fn set_effects(&mut self, id: &str, effects: &AppliedEffects) -> Result<Reply, EngineError> {
-        self.session(id)?;
+        let filter = self.filter_on(self.session(id)?.map())?.clone();
         let acting = Acting::new(&self.predictor, effects)?;
         self.check_effects_fit(effects)?;
-        let filter = self.filter.clone();
         let session = self.sessions.get_mut(id).ok_or_else(|| EngineError::UnknownSession { session: id.into() })?;
         let before = session.applied();
         session.act(acting, filter);

@@ -173,19 +173,19 @@ impl Session {
     ///
     /// # Errors
     /// `EngineError::ForeignImage` when it was made with other settings of the soil filter, `Invalid` naming `image` when it holds what no session can hold.
-    pub(crate) fn from_image(
+    pub(crate) fn from_image<'a>(
         id: &str,
         image: &SessionImage,
-        filter: SoilFilter,
+        mut filters: impl Iterator<Item = &'a SoilFilter>,
         acting: Option<Arc<Acting>>,
         now_ns: u64,
         rules: Rules<'_>,
     ) -> Result<Self, EngineError> {
-        if image.filter_settings != settings_of(&filter) {
-            return Err(EngineError::ForeignImage { reason: "was exported with other settings of the soil filter".into() });
-        }
+        let filter = filters
+            .find(|filter| image.filter_settings == settings_of(filter))
+            .ok_or_else(|| EngineError::ForeignImage { reason: "was exported with other settings of the soil filter".into() })?;
         image.check(filter.config().buffer, rules)?;
-        let filter = filter.restored(&image.filter).map_err(|error| refused(error.to_string()))?;
+        let filter = filter.clone().restored(&image.filter).map_err(|error| refused(error.to_string()))?;
         let arrived = |age: Option<i64>| (now_ns as i64).saturating_sub(age.unwrap_or(0));
         Ok(Self {
             id: id.into(),

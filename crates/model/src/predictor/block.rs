@@ -78,7 +78,7 @@ impl Predictor {
                     tokens.add_missing(paths, &mut block.missing);
                     return false;
                 }
-                self.default_soil(scene.tokens, &mut terrain[..distinct]);
+                self.stand_in(scene.tokens, &mut terrain[..distinct]);
             }
             _ => terrain[..distinct].copy_from_slice(&self.terrain(scene.tokens, &poses[..distinct])),
         }
