@@ -391,9 +391,20 @@ fn held_against<'a>(
     let Some(judge_by) = judge_by else {
         let mut ground_alone = None;
         if asked.fit_maps.iter().all(Option::is_none) {
+            let plain_predictor = plain;
             let plain = Bench { vehicle: &plain.bundle().vehicle, ..bench };
             let drives: Vec<&ObservedDrive> = observed.iter().collect();
-            ground_alone = Some(Ground::fitted(&plain, &own_reference::metric(&plain, &observed)?, &drives, &[]));
+            let ground = Ground::fitted(&plain, &own_reference::metric(&plain, &observed)?, &drives, &[]);
+            let work = Work::begin("drives predicted on another soil", progress);
+            let trial = Trial {
+                predictor: plain_predictor,
+                drives: asked.fit_drives,
+                maps: asked.fit_maps,
+                scoring: &options.scoring,
+                work: &work,
+            };
+            let better = trial.ground_is_better((&[], &SoilCorrection::NONE), (&[], &ground.correction()))?;
+            ground_alone = Some(if better { ground } else { ground.declined() });
         }
         let mut case = case_of(own_reference::metric(&bench, &observed)?, bench, observed, progress);
         case.ground_alone = ground_alone;

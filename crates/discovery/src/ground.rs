@@ -44,6 +44,8 @@ pub(crate) struct Ground {
     shares: DVector<f64>,
     /// What each drive says of the shares there.
     drives: Vec<Condensed>,
+    /// Whether predictions are no better on it, so that the assumed one stays.
+    declined: bool,
 }
 
 impl Ground {
@@ -65,7 +67,7 @@ impl Ground {
         let shares = DVector::zeros(SOIL_DIM);
         let rows = rows_at(&shares);
         let mut least = distance(&shares, &rows);
-        let mut best = Self { from: bench.ground, drives: said_at(&shares, &rows), shares };
+        let mut best = Self { from: bench.ground, drives: said_at(&shares, &rows), shares, declined: false };
         for _ in 0..ITERATIONS {
             let mut to = best.without(None);
             let next = (0..=HALVINGS).find_map(|_| {
@@ -93,7 +95,12 @@ impl Ground {
 
     /// The soil as a correction of the assumed one.
     pub fn correction(&self) -> SoilCorrection {
-        self.moved(&self.shares)
+        if self.declined { SoilCorrection::NONE } else { self.moved(&self.shares) }
+    }
+
+    /// The assumed soil in its place.
+    pub fn declined(self) -> Self {
+        Self { declined: true, ..self }
     }
 
     fn moved(&self, shares: &DVector<f64>) -> SoilCorrection {
@@ -103,7 +110,7 @@ impl Ground {
 
     /// The same by one step without a drive.
     pub fn correction_without(&self, drive: usize) -> SoilCorrection {
-        self.moved(&self.without(Some(drive)))
+        if self.declined { SoilCorrection::NONE } else { self.moved(&self.without(Some(drive))) }
     }
 
     /// Where one step leads from here, a drive left out.

@@ -84,7 +84,14 @@ impl Judgement {
             self.reason =
                 format!("{DIFFER_FROM_MODEL}, most in {what} (z = {most:.1}); {label} stands out (z = {z:.1}) but was refused: {why}");
         }
-        self.findings.extend(refused);
+        // A look after the ground was taken to be another may refuse the same again.
+        let mut said: Vec<usize> = Vec::new();
+        self.findings.extend(refused.into_iter().rev().filter(|f| {
+            !said.contains(&f.hypothesis) && {
+                said.push(f.hypothesis);
+                true
+            }
+        }));
         self
     }
 

@@ -191,6 +191,18 @@ impl Trial<'_> {
         Ok(rises_surely(&before, &after, counted, &resamples, &shows).map(told))
     }
 
+    /// Whether predictions of these drives are better on the second ground than on the first, which drives without a window cannot say.
+    ///
+    /// # Errors
+    /// The first error of the model.
+    pub(crate) fn ground_is_better(
+        &self,
+        before: (&[ScheduledEffect], &SoilCorrection),
+        after: (&[ScheduledEffect], &SoilCorrection),
+    ) -> Result<bool, EvaluationError> {
+        Ok(self.scoring.windows(self.drives).is_ok() && self.no_better(before, after, false)?.is_none())
+    }
+
     /// Channels in which measurements contradict one another otherwise with the second effects than with the first, if they surely do less; else none.
     pub(crate) fn agreeing(&self, without: &[ScheduledEffect], with: &[ScheduledEffect]) -> Vec<usize> {
         let vehicle = &self.predictor.bundle().vehicle;

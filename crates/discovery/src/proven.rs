@@ -179,6 +179,13 @@ fn tried(
             held.stand_on_ground(case, &mut learned, &mut taught);
             scores = Some(HeldOut { another_ground: true, ..score(&learned)? });
         }
+        let contradicted =
+            scores.as_ref().filter(|_| yardstick.model_on_trial).and_then(|s| held.last_contradicted(&judgement, &learned, s));
+        if let Some(i) = contradicted {
+            let why = "measurements of drives that were not fitted contradict one another no less with it";
+            judgement = judgement.dropping(case, yardstick, i, why.into());
+            continue;
+        }
         let needless = match &scores {
             Some(scores) => {
                 last_needless(&judgement, held.told, scores, |hypothesis| held.without(case, hypothesis, (&learned, &taught), scores))?
@@ -226,6 +233,27 @@ impl<'a> HeldDrives<'a> {
         let before = Contradictions::of(vehicle, self.drives, |_| &[]);
         let after = Contradictions::of(vehicle, self.drives, |d| learned[d].effects.as_slice());
         before.fall_surely(&after, GAIN_ON_TRIAL, &scores.resamples)
+    }
+
+    /// Position of the last claimed sensor that the measurements of the drives can tell of and do not: with it beside the other claims they do not surely contradict one
+    /// another less. Predictions of a wrong model gain by it as by anything else that bends them.
+    fn last_contradicted(&self, judgement: &Judgement, learned: &[Learned], scores: &HeldOut) -> Option<usize> {
+        let vehicle = &self.predictor.bundle().vehicle;
+        let with = Contradictions::of(vehicle, self.drives, |d| learned[d].effects.as_slice());
+        let speaks_against = |i: &usize| {
+            let hypothesis = judgement.findings[*i].hypothesis;
+            let others: Vec<Vec<ScheduledEffect>> = learned
+                .iter()
+                .map(|own| {
+                    let [others, _] = own.apart(hypothesis);
+                    others
+                })
+                .collect();
+            let without = Contradictions::of(vehicle, self.drives, |d| others[d].as_slice());
+            !without.changed(&with).is_empty() && !without.fall_surely(&with, 0.0, &scores.resamples)
+        };
+        let mut sensors = judgement.claimed().into_iter().rev().filter(|i| judgement.findings[*i].candidate.layer() == Layer::Sensor);
+        sensors.find(speaks_against)
     }
 
     /// Fits the best soil without an effect through the physics, as the one beside effects is: what is compared with it must not be better for that.
