@@ -111,7 +111,7 @@ fn regress_what_is_measured_too_seldom_is_doubted_by_import_and_check() {
         std::fs::write(&log, format!("{head}\n{rows}")).unwrap();
         let (code, said) = import_of(folder.path(), &log, &card(), set, &[]);
         assert!(code == Some(0) && said.contains(&format!("doubt: {doubt}")), "{said}");
-        let check = nesam(folder.path(), &["check", "root"]);
+        let check = nesam(&["check", "root"], folder.path());
         let said = String::from_utf8_lossy(&check.stdout).into_owned();
         assert!(check.status.success() && said.contains(&format!("doubt: set {set}: {doubt}")), "{said}");
     }

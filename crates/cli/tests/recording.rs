@@ -5,10 +5,10 @@
 mod common;
 
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command};
+use std::process::Child;
 use std::time::Duration;
 
-use common::{bundle, nesam, said};
+use common::{bundle, nesam, said, send};
 use nesam_client::{Candidates, Client, measurement, v1};
 use serde_json::Value;
 
@@ -43,7 +43,7 @@ async fn service_a_stopped_server_leaves_a_recording_that_replays() {
     let here = tempfile::tempdir().unwrap();
     let (mut server, address) = serve(here.path(), &[]);
     drive(&address).await;
-    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+    send("-TERM", &server);
     assert_eq!(server.wait().unwrap().code(), Some(0));
     let output = nesam(&["replay", "run", "--json", "out.json"], here.path());
     assert_eq!(output.status.code(), Some(0), "{}", said(&output));
@@ -89,7 +89,7 @@ async fn service_recordings_of_one_folder_are_read_one_after_the_other() {
     for vehicle in ["truck", "other"] {
         let (mut server, address) = serve(here.path(), &[]);
         drive_as(vehicle, &address).await;
-        assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+        send("-TERM", &server);
         assert_eq!(server.wait().unwrap().code(), Some(0));
     }
     let output = nesam(&["replay", "run", "--json", "out.json"], here.path());
@@ -141,7 +141,7 @@ async fn service_a_run_in_bf16_replays_in_bf16() {
     assert!(said(&checked).contains("path   a"), "{}", said(&checked));
     let (mut server, address) = serve(here.path(), &["--bf16"]);
     drive(&address).await;
-    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+    send("-TERM", &server);
     assert_eq!(server.wait().unwrap().code(), Some(0));
     let output = nesam(&["replay", "run", "--json", "out.json"], here.path());
     assert_eq!(output.status.code(), Some(0), "{}", said(&output));
@@ -163,7 +163,7 @@ async fn service_a_diagnosis_takes_the_bundle_of_the_recording() {
     std::fs::write(own.join("manifest.toml"), manifest.replace("name = \"hmmwv-nominal\"", "name = \"own\"")).unwrap();
     let (mut server, lines) = common::start_on(here.path(), "own", &["--no-http", "--record", "run"]);
     drive(&format!("http://{}", common::told(&lines, "grpc").expect("an address"))).await;
-    assert!(Command::new("kill").args(["-TERM", &server.id().to_string()]).status().unwrap().success());
+    send("-TERM", &server);
     assert_eq!(server.wait().unwrap().code(), Some(0));
 
     // Two seconds are too few for a diagnosis, which is said once the bundle is right.
