@@ -44,9 +44,9 @@ which were measured with the old card: make them again with `nesam adapt --calib
 
 What is fitted: how soil and engine act (contact law, rims at an over-speed or hubs under torque), the numbers of the drive line, and over a map the \
 rates and dampings of the suspension; of a skid-steer base the servo of its rims, from measured wheel speeds or, \
-without any, from the motion. Beside its errors are those of a kinematic fit (`kinematic` in the JSON), which knows no soil, no slip and no slopes; where the \
-fitted physics turns less or more than the vehicle by a tenth, that is a line of warning (`turning` is the share): a base on casters is none that it can be. A range of commands that the card does not state is widened to the commands of the drives. A number that ends at an end of \
-what is tried is a line of warning (`at_ends` in the JSON): the drives chose the end and not the number.
+without any, from the motion. Beside its errors are those of a kinematic fit (`kinematic` in the JSON), which knows no soil, no slip and no slopes. \
+Where the fitted physics turns less or more than the vehicle by a tenth (`turning`), that is a line of warning: a base on casters is none that it can be. \
+A range of commands that the card does not state is widened to the commands of the drives. A number that ends at an end of what is tried is a line of warning (`at_ends` in the JSON): the drives chose the end and not the number.
 
 Examples:
   nesam calibrate --data mine --set first --out mine-calibrated
@@ -295,7 +295,10 @@ fn document(
     (changes, ends): (&BTreeMap<String, [Value; 2]>, &[AtEnd]),
     card: &Path,
 ) -> Value {
-    let errors = |e: Errors| json!({"position_m": e.position_m, "yaw_deg": e.yaw_rad.to_degrees(), "tilt_deg": e.tilt_rad.map(f64::to_degrees), "turning": e.turning()});
+    let errors = |e: Errors| {
+        let (yaw_deg, tilt_deg) = (e.yaw_rad.to_degrees(), e.tilt_rad.map(f64::to_degrees));
+        json!({"position_m": e.position_m, "yaw_deg": yaw_deg, "tilt_deg": tilt_deg, "turning": e.turning()})
+    };
     let parameters: Vec<Value> =
         changes.iter().map(|(name, [before, after])| json!({"name": name, "card": before, "fitted": after})).collect();
     let trajectories: Vec<Value> =
