@@ -105,6 +105,11 @@ async fn service_effects_outside_the_catalogue_are_refused() {
         ("wide sd", offset(&[("second", 0.1, 1e3)]), "effects[0]"),
         ("the second one", [both(), offset(&[])].concat(), "effects[2]"),
         ("not on a car", [both(), vec![effect("skid_steer_track", &[("metres", 0.3, 0.0)])]].concat(), "effects[2]"),
+        (
+            "no mass left",
+            vec![effect("payload", &[("mass_kg", -500.0, 0.0), ("x_m", 0.0, 0.0), ("y_m", 0.0, 0.0), ("z_m", 0.0, 0.0)]); 6],
+            "effects",
+        ),
         ("too many", vec![both()[1].clone(); 17], "effects"),
         ("none", vec![], "effects"),
     ];

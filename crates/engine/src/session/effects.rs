@@ -63,7 +63,7 @@ impl Acting {
     /// Puts effects on a predictor; `None` when there are none.
     ///
     /// # Errors
-    /// `EngineError::Invalid` naming the effect that the catalogue does not allow, or the limit that is passed.
+    /// `EngineError::Invalid` naming the effect that the catalogue does not allow or that leaves the vehicle no body, or the limit that is passed.
     pub fn new(base: &Predictor, applied: &AppliedEffects) -> Result<Option<Arc<Self>>, EngineError> {
         if applied.effects.is_empty() {
             return Ok(None);
@@ -78,6 +78,9 @@ impl Acting {
         let named: Vec<(ScheduledEffect, AppliedEffect)> =
             applied.effects.iter().enumerate().map(|(i, effect)| checked(i, effect)).collect::<Result<_, _>>()?;
         let effects: Vec<ScheduledEffect> = named.iter().map(|(effect, _)| *effect).collect();
+        let bundle = base.bundle();
+        let all: Vec<ScheduledEffect> = bundle.effects.iter().chain(&effects).copied().collect();
+        bundle.vehicle.check_effects(&all, bundle.normalization.dt_s).map_err(|reason| EngineError::invalid("effects", reason))?;
         let in_order: Vec<AppliedEffect> = named.into_iter().map(|(_, effect)| effect).collect();
         let uncertain = in_order.iter().flat_map(|effect| &effect.parameters).filter(|p| p.sd > 0.0).count();
         if uncertain > UNCERTAIN_MAX {
