@@ -30,8 +30,6 @@ use crate::select::{EFFECTS_ON_TRIAL_MAX, FURTHER, Known, Yardstick};
 const LOOKS: usize = 2 * EFFECTS_ON_TRIAL_MAX;
 /// Share below which a fitted effect is not there.
 const LEAST_SHARE: f64 = 1e-3;
-/// Share of the level of a contradiction that may be left of it where it still stands out (chosen).
-const SETTLED: f64 = 0.1;
 
 /// What a pursuit leads to.
 #[derive(Debug)]
@@ -171,25 +169,18 @@ fn not_better(
     fit: &Fit,
     trial: &Trial<'_>,
 ) -> Result<Option<String>, EvaluationError> {
-    let others = case.size(yardstick, group, &chosen[1..], onsets);
-    let (without, with) = (others.effects(), fit.effects());
+    let (without, with) = (case.size(yardstick, group, &chosen[1..], onsets).effects(), fit.effects());
     let sensors_tell = yardstick.catalogue[chosen[0]].layer() == Layer::Sensor && {
         let own = trial.agreeing(&without, &with);
-        let left = |fit: &Fit| yardstick.group(case.left(fit).iter());
-        !own.is_empty() && settled(yardstick, &left(&others), &left(fit), &own)
+        !own.is_empty() && none_stands_out(yardstick, &yardstick.group(case.left(fit).iter()), &own)
     };
     let ground = &case.bench.ground;
     trial.no_better((&without, ground), (&with, ground), sensors_tell)
 }
 
-/// Whether a fit settles the level of each of these channels: it no longer stands out in what is `left`, or no more than a little is left of what was there `before`.
-/// Predictions of a wrong model draw a size away from what its sensor measures, and of a large fault the little that this leaves stands out again.
-fn settled(yardstick: &Yardstick, before: &Group, left: &Group, channels: &[usize]) -> bool {
-    let levels =
-        |left: &Group| yardstick.levels_after_fit(left, left, &[]).filter(|(channel, _)| channels.contains(channel)).collect::<Vec<_>>();
-    let was: Vec<(usize, f64)> = levels(before);
-    let of = |channel: usize| was.iter().find(|(c, _)| *c == channel).map_or(0.0, |(_, z)| *z);
-    levels(left).into_iter().all(|(channel, z)| z < yardstick.threshold() || z < SETTLED * of(channel))
+/// Whether the level of none of these channels stands out in what a fit left.
+fn none_stands_out(yardstick: &Yardstick, left: &Group, channels: &[usize]) -> bool {
+    yardstick.levels_after_fit(left, left, &[]).all(|(channel, z)| !channels.contains(&channel) || z < yardstick.threshold())
 }
 
 /// Measures scatter and signatures of every drive beside fitted effects; returns what these leave of each drive.
@@ -267,10 +258,8 @@ mod tests {
         let nulls = Nulls::about_zero(&nulls.each_ref()).unwrap();
         let yardstick = Yardstick::new(nulls, None, &catalogue, &[roll, yaw], &[]);
         let left = |score: f64| yardstick.group([drive(score)].iter());
-        assert!(settled(&yardstick, &left(200.0), &left(5.0), &[roll, yaw]));
-        assert!(!settled(&yardstick, &left(200.0), &left(100.0), &[roll, yaw]));
-        assert!(settled(&yardstick, &left(200.0), &left(100.0), &[roll]), "another's");
-        assert!(settled(&yardstick, &left(2000.0), &left(100.0), &[roll, yaw]), "a twentieth of what was there");
-        assert!(!settled(&yardstick, &left(-200.0), &left(-100.0), &[roll, yaw]));
+        assert!(none_stands_out(&yardstick, &left(5.0), &[roll, yaw]));
+        assert!(!none_stands_out(&yardstick, &left(100.0), &[roll, yaw]));
+        assert!(none_stands_out(&yardstick, &left(100.0), &[roll]), "another's");
     }
 }
