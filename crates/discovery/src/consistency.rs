@@ -163,16 +163,16 @@ mod tests {
         assert!(!alone(&[]).fall_surely(&alone(&right), 0.0, &resamples), "one drive proves nothing");
     }
 
-    /// Goal: a bias about the vertical is asked for the turn about it, not for what little it makes of the others on a slope. Method: the circles with their nose down by
-    /// 0.02 rad and a roll that is measured with noise.
+    /// Goal: a bias about the vertical is asked for the turn about it, not for what little it makes of the others on a slope. Method: the circles with their nose down and
+    /// roll and pitch that are measured with noise.
     #[test]
     fn regress_a_lean_makes_no_other_channel_the_sensors_own() {
-        let mut leaning = circling(0.05);
+        let mut leaning = circling(0.01);
         for (k, state) in leaning.states.iter_mut().enumerate() {
             state.attitude_rad[0] = if k % 16 < 8 { 0.01 } else { -0.01 };
-            state.attitude_rad[1] = 0.02;
+            state.attitude_rad[1] = if k % 24 < 12 { 0.02 } else { -0.01 };
         }
-        let effects = [ScheduledEffect { effect: Effect::GyroBias(GyroBias { rad_s: 0.05 }), onset_s: 0.0 }];
+        let effects = [ScheduledEffect { effect: Effect::GyroBias(GyroBias { rad_s: 0.01 }), onset_s: 0.0 }];
         let [before, after] =
             [&[][..], &effects].map(|own| Contradictions::of(&nesam_test_vehicles::robot(), core::slice::from_ref(&leaning), |_| own));
         assert!(

@@ -68,11 +68,7 @@ struct Ratios {
 
 fn ratios(rim_m_s: &Tensor, forward_m_s: &Tensor, left_m_s: &Tensor) -> Result<Ratios> {
     let sum = (rim_m_s + forward_m_s)?;
-    let smooth = (&sum / abs_smooth(&sum, SLIP_SPEED_FLOOR_M_S)?)?;
-    // Where rim and ground run against each other the direction stays near that of one of the two.
-    let sliding = abs_smooth(&(rim_m_s - forward_m_s)?, SLIP_SPEED_FLOOR_M_S)?;
-    let least = (1.0 - (SLIP_SPEED_FLOOR_M_S / sliding)?)?;
-    let direction = sum.ge(0.0)?.where_cond(&smooth.maximum(&least)?, &smooth.minimum(&least.neg()?)?)?;
+    let direction = (&sum / abs_smooth(&sum, SLIP_SPEED_FLOOR_M_S)?)?;
     let (rim, travel) = ((&direction * rim_m_s)?, (&direction * forward_m_s)?);
     let size = abs_smooth(&rim, SLIP_SPEED_FLOOR_M_S)?;
     let slip = ((&rim - &travel)? / abs_smooth(&rim.maximum(&travel)?, SLIP_SPEED_FLOOR_M_S)?)?;

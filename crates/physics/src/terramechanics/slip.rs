@@ -64,15 +64,11 @@ impl<T> ContactMotion<T> {
 impl<T: Real> WheelMotion<T> {
     /// Rolling direction in (-1, 1), smooth through standstill, and the ratios seen along it.
     ///
-    /// Speeds are measured along the direction of rΩ + v_x, so driving, braking, locked, towed and reversed wheels share one formula. Where rim and ground run against
-    /// each other the direction is none; there it stays near that of one of the two, by the more the faster the wheel slides, and jumps: thrust is the same in either.
+    /// Speeds are measured along the direction of rΩ + v_x, so driving, braking, locked, towed and reversed wheels share one formula.
     #[inline(always)]
     pub fn contact(&self) -> (T, ContactMotion<T>) {
         let sum = self.rim_speed_m_s + self.forward_m_s;
-        let smooth = sum / sum.abs_smooth(SLIP_SPEED_FLOOR_M_S);
-        let sliding = self.rim_speed_m_s - self.forward_m_s;
-        let least = T::lit(1.0) - T::lit(SLIP_SPEED_FLOOR_M_S) / sliding.abs_smooth(SLIP_SPEED_FLOOR_M_S);
-        let direction = T::select_ge0(sum, smooth.max(least), smooth.min(-least));
+        let direction = sum / sum.abs_smooth(SLIP_SPEED_FLOOR_M_S);
         let rim = direction * self.rim_speed_m_s;
         let travel = direction * self.forward_m_s;
         let scale = T::lit(1.0) / rim.abs_smooth(SLIP_SPEED_FLOOR_M_S);
