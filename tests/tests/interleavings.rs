@@ -231,7 +231,7 @@ impl SessionStore for MemoryStore {
                     let accepted = session_image(&stored.image).unwrap().accepted;
                     self.0.lock().unwrap().insert(stored.name.clone(), accepted);
                 }
-                Change::RemoveSession(name) => drop(self.0.lock().unwrap().remove(name)),
+                Change::RemoveSession(name) | Change::SetAside(name) => drop(self.0.lock().unwrap().remove(name)),
                 Change::PutMap(..) | Change::RemoveMap(_) | Change::PutSoil(_) | Change::RemoveSoil(_) => {}
             }
         }
